@@ -1,0 +1,1 @@
+"""What flies: beacon frames and their bytes, the almanac, the schedule, and what a radio reports of a frame."""

@@ -1,0 +1,51 @@
+"""The almanac: all that a tag must know of a site, sent as rotating pages of 17 bytes."""
+
+from msgspec import Struct
+
+
+class AnchorPage(Struct, frozen=True, gc=False, tag="anchor"):
+    """Where one anchor stands (antenna phase centre), to the millimetre."""
+
+    anchor: int
+    x_m: float
+    y_m: float
+    z_m: float
+    slot: int
+    """Its first slot in the superframe."""
+
+
+class SchedulePage(Struct, frozen=True, gc=False, tag="schedule"):
+    """The superframe, and where tags may be."""
+
+    slot_ticks: int
+    slots: int
+    frames_per_node: int
+    master: int
+    anchors: int
+    """Number of anchors of the site, so that a tag knows when its almanac is complete."""
+    tag_height_m: float | None
+    """Height at which every tag of the site moves (2-D positioning); None where height is to be estimated."""
+
+
+class NoisePage(Struct, frozen=True, gc=False, tag="noise"):
+    """The site's noise figures, for the filters of its tags."""
+
+    tx_stamp_s: float
+    rx_stamp_s: float
+    white_fm: float
+    """Oscillators' white frequency noise: Allan deviation at 1 s, dimensionless."""
+    random_walk_fm: float
+    """Oscillators' random-walk frequency noise in 1/√s: standard deviation of the rate gained in 1 s."""
+
+
+class GeoreferencePage(Struct, frozen=True, gc=False, tag="georeference"):
+    """Where the site's origin lies on the Earth (WGS 84) and how its x axis points."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    heading_deg: float
+    """Azimuth of the site's y axis, clockwise from true north."""
+
+
+Page = AnchorPage | SchedulePage | NoisePage | GeoreferencePage

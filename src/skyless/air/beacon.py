@@ -1,0 +1,54 @@
+"""The beacon: what every anchor broadcasts in its slots (``docs/protocol.md``)."""
+
+from msgspec import Struct
+
+from skyless.air.almanac import Page
+
+
+class Heard(Struct, frozen=True, gc=False):
+    """When a beacon of another anchor was last heard: a raw stamp of the relaying anchor's own counter."""
+
+    anchor: int
+    """Identifier of the anchor that was heard, 16 bits."""
+    sequence: int
+    """Sequence number (8 bits) of the frame that was heard."""
+    rx_ticks: int
+    """RX stamp in the relaying anchor's clock, 40 bits."""
+
+
+class MasterTime(Struct, frozen=True, gc=False):
+    """The frame's TX time on the master's scale, as the sending anchor's clock filter knows it."""
+
+    tx_subticks_master: int
+    """TX time on the master's scale in 1/256 tick, 48 bits."""
+    std_ticks: float
+    """Standard deviation of that time in ticks; sent in steps of 1/64 tick up to 1023.98."""
+
+
+class Beacon(Struct, frozen=True, gc=False):
+    """One decoded beacon frame, version 1."""
+
+    site: int
+    """Site identifier, 16 bits, sent as the PAN identifier."""
+    anchor: int
+    """Identifier of the sending anchor, 16 bits, sent as the short source address."""
+    sequence: int
+    """Frame counter of the sender, 8 bits."""
+    superframe: int
+    """Number of the superframe, 32 bits, counted by the master."""
+    slot: int
+    """Slot within the superframe in which this frame flies, 8 bits."""
+    tx_ticks: int
+    """TX stamp in the sender's own clock, 40 bits."""
+    almanac_issue: int
+    """Changes when the almanac changes, 8 bits; a tag then forgets the old one."""
+    master: int
+    """Identifier of the master that this anchor follows; its own for the master."""
+    master_heard: Heard | None
+    """The last master beacon that this anchor heard (raw stamp), None for the master or when none was heard."""
+    master_time: MasterTime | None
+    """None until the sender's clock is known against the master; exact (std 0) for the master itself."""
+    heard: tuple[Heard, ...]
+    """The other anchors, the master excluded, in the order of the most recent first; as many as fit."""
+    page: Page | None
+    """One page of the almanac."""

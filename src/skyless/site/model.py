@@ -1,0 +1,97 @@
+"""The values of a site file, already validated (``skyless.site.load`` makes them)."""
+
+from msgspec import Struct
+
+from skyless.constants import DEFAULT_ANTENNA_DELAY_TICKS
+
+
+class AnchorSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """One anchor: where its antenna stands and when it speaks."""
+
+    id: int
+    x_m: float
+    y_m: float
+    z_m: float = 0.0
+    slot: int | None = None
+    """Its first slot; by default the anchors speak in the order of the file, the master first."""
+    tx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+    rx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+
+
+class ScheduleSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """The superframe."""
+
+    slot_s: float = 2**27 / 63.8976e9
+    """Length of a slot; rounded to whole steps of the delayed transmission (8.013 ns)."""
+    slots: int | None = None
+    """Slots in a superframe; by default one for each frame of each anchor."""
+    frames_per_node: int = 1
+    """1: one frame per node and superframe; 2: the paper's pair in every superframe."""
+    guard_s: float = 0.5e-3
+    """Time at the end of each slot in which nobody may be on the air."""
+
+
+class NoiseSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """Noise figures that the filters assume (never under-tune: MATHS.md section 5)."""
+
+    tx_stamp_ps: float = 100.0
+    rx_stamp_ps: float = 100.0
+    white_fm: float = 2e-11
+    random_walk_fm: float = 1e-9
+
+
+class TagsSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """What is known of the tags."""
+
+    height_m: float | None = None
+    """All tags move at this height (2-D positioning); leave out to estimate the height."""
+
+
+class FloorPlanSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """An image of the floor, and where it lies."""
+
+    image: str
+    """Path of a PNG or JPEG, relative to the site file."""
+    width_m: float
+    """What the image's width measures on the floor."""
+    x_m: float = 0.0
+    y_m: float = 0.0
+    """Site coordinates of the image's lower left corner."""
+
+
+class GeoreferenceSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the site's origin lies on the Earth (WGS 84)."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float = 0.0
+    heading_deg: float = 0.0
+    """Azimuth of the site's y axis, clockwise from true north."""
+
+
+class WallSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """A wall on the floor plan, full height, and what it does to a signal that crosses it."""
+
+    x1_m: float
+    y1_m: float
+    x2_m: float
+    y2_m: float
+    loss_db: float = 6.0
+    delay_m: float = 0.1
+
+
+class Site(Struct, frozen=True, forbid_unknown_fields=True):
+    """A whole site."""
+
+    name: str
+    id: int
+    """Identifier on the air, 16 bits."""
+    master: int
+    """The anchor whose clock is the site's time."""
+    anchors: tuple[AnchorSite, ...]
+    schedule: ScheduleSite = ScheduleSite()
+    noise: NoiseSite = NoiseSite()
+    tags: TagsSite = TagsSite()
+    walls: tuple[WallSite, ...] = ()
+    floor_plan: FloorPlanSite | None = None
+    georeference: GeoreferenceSite | None = None
