@@ -1,0 +1,35 @@
+"""What is raised at the user: a fault that he can mend, told so that he can."""
+
+import json
+from os import PathLike, fspath
+
+_LONGEST_VALUE = 60
+
+
+class SkylessError(Exception):
+    """A fault outside the program; the message is for the user (the command line prints it and exits with 2)."""
+
+
+class ConfigurationError(SkylessError):
+    """A configuration that cannot be used: which file, which key, what stands there, what would be right."""
+
+    def __init__(self, file: str | PathLike[str], key: str, value: object, expected: str) -> None:
+        """``key`` is empty when the file as a whole is meant; ``value`` is None when nothing stands there."""
+        self.file = fspath(file)
+        self.key = key
+        self.value = value
+        self.expected = expected
+        super().__init__(f"{self.file}: {self._finding()}it should be {expected}")
+
+    def _finding(self) -> str:
+        if not self.key:
+            return ""
+        if self.value is None:
+            return f"{self.key} is missing; "
+        return f"{self.key} is {_shown(self.value)}; "
+
+
+def _shown(value: object) -> str:
+    """The value as a configuration file would write it, shortened."""
+    text = json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else str(value)
+    return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"
