@@ -7,7 +7,7 @@ _LONGEST_VALUE = 60
 
 
 class SkylessError(Exception):
-    """A fault outside the program; the message is for the user (the command line prints it and exits with 2)."""
+    """A fault outside the program; its message is for the user, and the command line exits with 2."""
 
 
 class ConfigurationError(SkylessError):
@@ -30,6 +30,6 @@ class ConfigurationError(SkylessError):
 
 
 def _shown(value: object) -> str:
-    """The value as a configuration file would write it, shortened."""
+    """Write the value as a configuration file would, shortened."""
     text = json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else str(value)
     return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"
