@@ -1,0 +1,1 @@
+"""The command line: one program, ``skyless``, with a module for each command."""

@@ -1,0 +1,73 @@
+"""The program ``skyless``: its table of commands, and what all of them share at their start and end."""
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from io import TextIOWrapper
+
+from cyclopts import App, Parameter
+
+from skyless.errors import SkylessError
+
+_COMMANDS = (
+    # name, where it is (imported only when it is called), what it does
+    ("site", "skyless.cli.site:app", "Write and check site files."),
+)
+
+_INTERRUPTED = 130
+_BROKEN_PIPE = 1
+_USER_ERROR = 2
+
+
+def program() -> App:
+    """The program with all its commands, none of them imported yet."""
+    app = App(
+        name="skyless",
+        help="GPS without a sky: fixed UWB anchors broadcast, tags only listen and compute their own position.",
+        help_epilogue="Example: skyless site new site.toml && skyless site check site.toml",
+        help_format="plaintext",
+        version=lambda: version("skyless"),
+        result_action="return_value",
+        default_parameter=Parameter(negative=()),
+    )
+    for name, place, summary in _COMMANDS:
+        app.command(place, name=name, help=summary)
+    return app
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return the exit code: 0, 2 for a fault of the user's, 130 after Ctrl-C.
+
+    A command's own exit code is what it returns, None meaning 0.
+    """
+    _write_any_character()
+    try:
+        result = program()(arguments)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except SkylessError as error:
+        print(f"skyless: {error}", file=sys.stderr)
+        return _USER_ERROR
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except BrokenPipeError:
+        _drop_output()
+        return _BROKEN_PIPE
+    return result if isinstance(result, int) else 0
+
+
+def _write_any_character() -> None:
+    """A terminal or pipe that cannot show a character gets its code instead of ending the program."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _drop_output() -> None:
+    """Whoever read the output has gone; the interpreter must not complain when it flushes the rest at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

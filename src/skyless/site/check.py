@@ -1,0 +1,160 @@
+"""What a site must fulfil beyond the types of its values; every breach is a configuration error."""
+
+import re
+from collections.abc import Iterable, Iterator
+from itertools import combinations
+from math import dist
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.air.airtime import air_time_s
+from skyless.air.codec import MAX_FRAME_BYTES
+from skyless.air.schedule import Schedule, first_slots, schedule_of
+from skyless.constants import TICK_BITS, TICK_S
+from skyless.errors import ConfigurationError
+from skyless.site.image import image_size
+from skyless.site.limits import LIMITS, expected
+from skyless.site.model import AnchorSite, Site
+
+HALF_WRAP_S: Final = (1 << (TICK_BITS - 1)) * TICK_S
+"""Longest gap over which a stamp can be unwrapped without a host time."""
+
+_CLOSEST_M: Final = 1e-3
+
+
+def check_site(site: Site, file: Path) -> None:
+    """Check everything that the site says of itself.
+
+    Raises:
+        ConfigurationError: naming ``file``, the key, its value and what would be right.
+    """
+    if not site.name.strip():
+        raise ConfigurationError(file, "name", site.name, "a text of at least one character")
+    for place, value in _numbers(site):
+        key = re.sub(r"\[\d+\]", "", place)
+        if not LIMITS[key].hold(value):
+            raise ConfigurationError(file, with_anchor(place, site.anchors), value, expected(key))
+    _check_anchors(site, file)
+    _check_slots(site, file)
+    _check_times(site, file)
+
+
+def check_floor_plan(site: Site, file: Path) -> None:
+    """Check that the floor plan's image is a PNG or JPEG that can be read.
+
+    Raises:
+        ConfigurationError: when it is not.
+    """
+    if site.floor_plan is None:
+        return
+    image = site.floor_plan.image
+    path = file.parent / image
+    try:
+        size = image_size(path.read_bytes())
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigurationError(
+            file, "floor_plan.image", image, f"a file that can be read ({path}: {reason})"
+        ) from None
+    if size is None:
+        raise ConfigurationError(file, "floor_plan.image", image, "a PNG or JPEG image")
+
+
+def with_anchor(place: str, anchors: Iterable[object]) -> str:
+    """Add to a place in the list of anchors the identifier of that anchor, which its owner knows it by."""
+    match = re.match(r"anchors\[(\d+)\]", place)
+    if match is None:
+        return place
+    anchor = list(anchors)[int(match[1])]
+    identifier = anchor.get("id") if isinstance(anchor, dict) else getattr(anchor, "id", None)
+    return place if identifier is None else f"{place} (anchor {identifier})"
+
+
+def _numbers(value: object, place: str = "") -> Iterator[tuple[str, float]]:
+    """Every number in a tree of structs, with its key."""
+    if isinstance(value, Struct):
+        for field in value.__struct_fields__:
+            yield from _numbers(getattr(value, field), f"{place}.{field}".lstrip("."))
+    elif isinstance(value, tuple):
+        for index, entry in enumerate(value):
+            yield from _numbers(entry, f"{place}[{index}]")
+    elif isinstance(value, int | float):
+        yield place, value
+
+
+def _check_anchors(site: Site, file: Path) -> None:
+    if not site.anchors:
+        raise ConfigurationError(file, "anchors", [], "at least one [[anchors]] table")
+    identifiers = [anchor.id for anchor in site.anchors]
+    for index, identifier in enumerate(identifiers):
+        if identifier in identifiers[:index]:
+            first = identifiers.index(identifier)
+            right = f"an identifier of its own; anchors[{first}] has this one already"
+            raise ConfigurationError(file, f"anchors[{index}].id", identifier, right)
+    if site.master not in identifiers:
+        right = f"the id of an anchor: {', '.join(map(str, identifiers))}"
+        raise ConfigurationError(file, "master", site.master, right)
+    for (_, one), (index, other) in combinations(enumerate(site.anchors), 2):
+        if dist(_point(one), _point(other)) < _CLOSEST_M:
+            key = with_anchor(f"anchors[{index}]", site.anchors)
+            raise ConfigurationError(
+                file, key, f"at {_point(other)}", f"elsewhere; anchor {one.id} is at the same point"
+            )
+
+
+def _check_slots(site: Site, file: Path) -> None:
+    frames = site.schedule.frames_per_node
+    schedule = schedule_of(site)
+    needed = len(site.anchors) * frames
+    share = f"{len(site.anchors)} anchors × {frames} frames"
+    if schedule.slots < needed:
+        raise ConfigurationError(file, "schedule.slots", schedule.slots, f"at least {needed} ({share})")
+    if schedule.slots > LIMITS["schedule.slots"].high:
+        right = f"less: {share} need more than 255 slots"
+        raise ConfigurationError(file, "schedule.frames_per_node", frames, right)
+    _check_own_slots(site, schedule, file)
+    try:
+        first_slots(site)
+    except ValueError as error:
+        right = f"more, best a multiple of frames_per_node: {error}"
+        raise ConfigurationError(file, "schedule.slots", schedule.slots, right) from None
+
+
+def _check_own_slots(site: Site, schedule: Schedule, file: Path) -> None:
+    """Check the slots that the file gives to anchors; the others find theirs."""
+    taken: dict[int, int] = {}
+    for index, anchor in enumerate(site.anchors):
+        if anchor.slot is None:
+            continue
+        key = with_anchor(f"anchors[{index}].slot", site.anchors)
+        if anchor.slot >= schedule.slots:
+            raise ConfigurationError(file, key, anchor.slot, f"a whole number from 0 to {schedule.slots - 1}")
+        for slot in schedule.slots_of(anchor.slot):
+            if slot in taken:
+                right = f"another slot; anchor {taken[slot]} sends in slot {slot} already"
+                raise ConfigurationError(file, key, anchor.slot, right)
+            taken[slot] = anchor.id
+
+
+def _check_times(site: Site, file: Path) -> None:
+    schedule = site.schedule
+    longest_s = air_time_s(MAX_FRAME_BYTES)
+    if schedule.slot_s < longest_s + schedule.guard_s:
+        right = (
+            f"at least {longest_s + schedule.guard_s:.6f}: the longest frame is {longest_s * 1e6:.0f} µs on the "
+            f"air and schedule.guard_s is {schedule.guard_s * 1e6:.0f} µs"
+        )
+        raise ConfigurationError(file, "schedule.slot_s", schedule.slot_s, right)
+    slots = schedule_of(site).slots
+    if slots * schedule.slot_s >= HALF_WRAP_S:
+        right = (
+            f"below {HALF_WRAP_S / slots:.4g}: {slots} slots make a superframe, which must be shorter than half a "
+            f"wrap of the radios' counters ({HALF_WRAP_S:.2f} s)"
+        )
+        raise ConfigurationError(file, "schedule.slot_s", schedule.slot_s, right)
+
+
+def _point(anchor: AnchorSite) -> tuple[float, float, float]:
+    return anchor.x_m, anchor.y_m, anchor.z_m

@@ -1,0 +1,104 @@
+"""Site files to start from: every key with a comment."""
+
+import json
+
+from skyless.site.model import AnchorSite, Site
+
+_HEAD = """\
+# A Skyless site. Lengths are metres in the site's own frame: x and y on the floor, z up.
+# `skyless site check FILE` says whether all is well.
+
+name = {name}
+id = {id}                          # of the site on the air, 0 to 65534; neighbouring sites need different ones
+master = {master}                      # the anchor whose clock is the site's time; best in the middle, heard by all
+
+[schedule]                      # the anchors speak in turn, one in each slot; all slots make a superframe
+slot_s = {slot_s}                 # length of a slot in seconds
+guard_s = {guard_s}                # silence at the end of each slot, for the hosts to prepare the next frame
+frames_per_node = {frames}             # frames of each anchor in a superframe
+# slots = {slots}                     # slots in a superframe; by default as many as there are frames
+
+[noise]                         # what the filters assume; too small costs more than too large
+tx_stamp_ps = {tx_ps}             # standard deviation of a transmit stamp in picoseconds
+rx_stamp_ps = {rx_ps}             # of a receive stamp; a DW1000 has 100 to 150
+white_fm = {white}                # crystals' white frequency noise: Allan deviation at 1 s
+random_walk_fm = {walk}          # crystals' random-walk frequency noise in 1/√s
+"""
+
+_KNOWN_HEIGHT = """
+[tags]
+height_m = {height}                  # all tags move at this height (2-D); leave the key out to estimate the height
+"""
+
+_ESTIMATED_HEIGHT = """
+[tags]
+# height_m = 1.2                # for tags that all move at one height (2-D); without it the height is estimated
+"""
+
+_ANCHORS = """
+# The anchors: where the antennas stand. Optional keys, with their defaults:
+#   slot = 0                         its first slot; otherwise the master speaks first, the others as listed
+#   tx_antenna_delay_ticks = 16436   antenna delays in ticks of 15.65 ps
+#   rx_antenna_delay_ticks = 16436
+"""
+
+_ANCHOR = """
+[[anchors]]
+id = {id}
+x_m = {x}
+y_m = {y}
+z_m = {z}
+"""
+
+_TAIL = """
+# Walls, full height, for planning and simulation; one table for each.
+# [[walls]]
+# x1_m = 2.0
+# y1_m = 0.0
+# x2_m = 2.0
+# y2_m = 3.5
+# loss_db = 6.0                 # what a signal loses on its way through
+# delay_m = 0.1                 # by how much it comes late, as a length
+
+# An image of the floor behind the map.
+# [floor_plan]
+# image = "floor.png"           # PNG or JPEG, relative to this file
+# width_m = 6.0                 # what the image's width measures on the floor
+# x_m = 0.0                     # where its lower left corner lies
+# y_m = 0.0
+
+# Where the site's origin lies on the Earth (WGS 84).
+# [georeference]
+# latitude_deg = 47.3769
+# longitude_deg = 8.5417
+# height_m = 408.0
+# heading_deg = 0.0             # azimuth of the y axis, clockwise from true north
+"""
+
+
+def site_template(site: Site) -> str:
+    """Site file, with a comment on every key, of a site's names, anchors, schedule, noise figures and tags.
+
+    Walls, floor plan and georeference stand in it as commented examples.
+    """
+    schedule, noise = site.schedule, site.noise
+    head = _HEAD.format(
+        name=json.dumps(site.name, ensure_ascii=False),
+        id=site.id,
+        master=site.master,
+        slot_s=schedule.slot_s,
+        guard_s=schedule.guard_s,
+        frames=schedule.frames_per_node,
+        slots=len(site.anchors) * schedule.frames_per_node,
+        tx_ps=noise.tx_stamp_ps,
+        rx_ps=noise.rx_stamp_ps,
+        white=noise.white_fm,
+        walk=noise.random_walk_fm,
+    )
+    height = site.tags.height_m
+    tags = _ESTIMATED_HEIGHT if height is None else _KNOWN_HEIGHT.format(height=height)
+    return head + tags + _ANCHORS + "".join(map(_anchor, site.anchors)) + _TAIL
+
+
+def _anchor(anchor: AnchorSite) -> str:
+    return _ANCHOR.format(id=anchor.id, x=anchor.x_m, y=anchor.y_m, z=anchor.z_m)

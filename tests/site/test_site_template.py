@@ -1,0 +1,92 @@
+"""Templates: they load, equal what they were made from, and leave no key unexplained."""
+
+import re
+import tomllib
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyless.site.advice import warnings_of
+from skyless.site.lab import lab_site
+from skyless.site.load import load_site
+from skyless.site.model import Site
+from skyless.site.room import room_site
+from skyless.site.template import site_template
+
+
+def reload(tmp_path, site):
+    path = tmp_path / "site.toml"
+    path.write_text(site_template(site), encoding="utf-8")
+    return load_site(path)
+
+
+def test_the_template_of_the_lab_is_the_lab(tmp_path):
+    assert reload(tmp_path, lab_site()) == lab_site()
+
+
+def test_the_lab_is_the_published_one():
+    """MATHS.md section 5."""
+    site = lab_site()
+    assert [(a.x_m, a.y_m, a.z_m) for a in site.anchors] == [
+        (0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0),
+    ]  # fmt: skip
+    assert (site.master, site.schedule.slot_s, site.schedule.frames_per_node) == (1, 0.0025, 1)
+    assert (site.noise.white_fm, site.noise.random_walk_fm, site.tags.height_m) == (2e-11, 1e-9, 0.0)
+    assert warnings_of(site) == []
+
+
+def test_every_key_stands_in_the_template(tmp_path):
+    """With the comment signs taken from its examples, the template holds each key of the model once."""
+    text = re.sub(r"^# ?(?=\[|\w+ = )", "", site_template(lab_site()), flags=re.MULTILINE)
+    text = re.sub(r"^#   (?=\w+ = )", "", text, flags=re.MULTILINE)
+    first = {"slot": 0, "tx_antenna_delay_ticks": 16436, "rx_antenna_delay_ticks": 16436}
+    for key, value in first.items():
+        text, count = re.subn(rf"^{key} = .*$", "", text, count=1, flags=re.MULTILINE)
+        assert count == 1
+        text = text.replace("[[anchors]]", f"[[anchors]]\n{key} = {value}", 1)
+    document = tomllib.loads(text)
+    site = msgspec.convert(document, Site)
+    assert set(document) == set(Site.__struct_fields__)
+    for name, table in document.items():
+        struct = getattr(site, name)
+        if isinstance(struct, tuple):
+            assert set(table[0]) == set(struct[0].__struct_fields__)
+        elif isinstance(struct, msgspec.Struct):
+            assert set(table) == set(struct.__struct_fields__)
+
+
+@given(
+    st.floats(1, 500),
+    st.floats(1, 500),
+    st.integers(1, 60),
+    st.floats(0.5, 30),
+    st.none() | st.floats(-5, 30),
+)
+def test_rooms_load_and_their_anchors_hang_on_the_walls(tmp_path_factory, width, depth, anchors, height, tag_height):
+    site = room_site(width, depth, anchors, height, tag_height)
+    assert reload(tmp_path_factory.getbasetemp(), site) == site
+    assert len(site.anchors) == anchors
+    for a in site.anchors:
+        assert min(abs(a.x_m), abs(a.x_m - width), abs(a.y_m), abs(a.y_m - depth)) < 1e-3
+        assert -1e-3 < a.x_m < width + 1e-3
+        assert -1e-3 < a.y_m < depth + 1e-3
+        assert 0 <= a.z_m <= height
+
+
+def test_room_of_the_handbook():
+    site = room_site(6, 8, 4, 3, None)
+    assert [(a.x_m, a.y_m, a.z_m) for a in site.anchors] == [(0, 0, 2.5), (6, 1, 0.5), (6, 8, 2.5), (0, 7, 0.5)]
+    assert [a.z_m for a in room_site(6, 8, 4, 3, 1.0).anchors] == [2.5] * 4
+
+
+@pytest.mark.parametrize("anchors", range(5, 13))
+def test_rooms_have_a_good_geometry(anchors):
+    assert warnings_of(room_site(12, 8, anchors, 3, None)) == []
+    assert warnings_of(room_site(12, 8, anchors, 3, 1.2)) == []
+
+
+def test_names_are_quoted(tmp_path):
+    site = msgspec.structs.replace(lab_site(), name='Süd "7" \\ \t\n𝄞')
+    assert reload(tmp_path, site) == site
