@@ -3,18 +3,57 @@
 With ``NUMBA_DISABLE_JIT=1`` every kernel runs as plain Python and gives the same values to rounding.
 """
 
+import hashlib
+import os
+import shutil
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from pathlib import Path
+from typing import Any, Final, TypeVar, cast
 
-from numba import njit
+from numba import config, njit
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+_PACKAGE: Final = Path(__file__).parent
+
+
+def _cache_folder() -> str:
+    """Folder of compiled kernels for exactly these sources.
+
+    Numba notices a change of the kernel's own file but not of the kernels that it calls, so a digest of all
+    sources stands in the folder's name; folders of older sources are removed.
+    """
+    digest = hashlib.sha1(usedforsecurity=False)
+    for source in sorted(_PACKAGE.rglob("*.py")):
+        status = source.stat()
+        digest.update(f"{source}:{status.st_mtime_ns}:{status.st_size}".encode())
+    folder = _cache_home() / f"kernels-{digest.hexdigest()[:16]}"
+    if not folder.exists():
+        for old in folder.parent.glob("kernels-*"):
+            shutil.rmtree(old, ignore_errors=True)
+        folder.mkdir(parents=True, exist_ok=True)
+    return str(folder)
+
+
+def _cache_home() -> Path:
+    beside_sources = _PACKAGE / "__pycache__"
+    if os.access(_PACKAGE, os.W_OK):
+        return beside_sources
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "skyless"
+
+
+_CACHE_FOLDER: Final = os.environ.get("NUMBA_CACHE_DIR") or _cache_folder()
+
 
 def kernel(function: Function) -> Function:
-    """Compile a scalar function over arrays that its caller owns; the result is cached beside the source.
+    """Compile a scalar function over arrays that its caller owns; the result is cached on disk.
 
     ``error_model="numpy"`` makes a division by zero an infinity instead of an exception, as in NumPy.
     Fast-math stays off: streaming and batch must give identical bits.
     """
-    return cast("Function", njit(cache=True, error_model="numpy")(function))
+    callers_folder = config.CACHE_DIR
+    config.CACHE_DIR = _CACHE_FOLDER
+    try:
+        return cast("Function", njit(cache=True, error_model="numpy")(function))
+    finally:
+        config.CACHE_DIR = callers_folder

@@ -29,6 +29,11 @@ def difference(later: int, earlier: int, bits: int = TICK_BITS) -> int:
     return ((later - earlier + half) & ((half << 1) - 1)) - half
 
 
+def nearest(counter: int, expected_ticks: int, bits: int = TICK_BITS) -> int:
+    """The unwrapped time that the counter shows and that lies nearest to the expected one."""
+    return expected_ticks + difference(counter, expected_ticks, bits)
+
+
 def to_seconds(ticks: int) -> float:
     """Seconds of a tick difference; of an epoch far from zero the result keeps only 53 bits."""
     return ticks * TICK_S
@@ -65,11 +70,14 @@ class Unwrapper:
         if self._last_ticks is None:
             ticks = counter
         else:
-            expected = self._last_ticks + self._elapsed_ticks(host_s)
-            ticks = expected + difference(counter, expected, self._bits)
+            ticks = nearest(counter, self._last_ticks + self._elapsed_ticks(host_s), self._bits)
         self._last_ticks = ticks
         self._last_host_s = host_s
         return ticks
+
+    def expect(self, counter: int) -> int:
+        """Unwrapped ticks of a counter value near the last stamp, without taking it as a stamp."""
+        return counter if self._last_ticks is None else nearest(counter, self._last_ticks, self._bits)
 
     def _elapsed_ticks(self, host_s: float | None) -> int:
         if host_s is None or self._last_host_s is None:

@@ -1,0 +1,1 @@
+"""Clocks: the paper's model and two-message synchronisation, and the two-state clock filter."""

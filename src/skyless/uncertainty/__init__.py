@@ -1,0 +1,1 @@
+"""How well positions are known: geometry (DOPs), propagated covariances, bounds."""

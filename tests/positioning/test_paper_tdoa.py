@@ -1,0 +1,74 @@
+"""The paper's TDoA and the bracketed one: exact on ideal clocks, and as noisy as the corrected theory says."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyless.constants import TICK_M, TICK_RATE_HZ
+from skyless.positioning.paper import bracketed_tdoa, literal_tdoa
+from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance, literal_delayed_covariance
+
+SUPERFRAME = round(15e-3 * TICK_RATE_HZ)
+
+
+def stamps(rates, epochs, delay, range_im, range_i, range_m, noise=(0.0,) * 10):
+    """Stamps of two rounds: master at 0 and Δ, anchor ``delay`` later; true times in ticks, noise in ticks."""
+    tof_im, tof_i, tof_m = range_im / TICK_M, range_i / TICK_M, range_m / TICK_M
+
+    def clock(which, true, extra):
+        return epochs[which] + round(true * rates[which] + extra)
+
+    times = (0.0, float(SUPERFRAME))
+    m = [clock(0, t, 0.0) for t in times]
+    emitted_m = [t + noise[k] for k, t in enumerate(times)]
+    s = [clock(1, t + tof_im, noise[2 + k]) for k, t in enumerate(emitted_m)]
+    a = [clock(1, t + delay, 0.0) for t in times]
+    r = [clock(2, t + delay + noise[4 + k] + tof_i, noise[6 + k]) for k, t in enumerate(times)]
+    rm = [clock(2, t + tof_m, noise[8 + k]) for k, t in enumerate(emitted_m)]
+    return m, s, a, r, rm, tof_im
+
+
+ppm = st.floats(-20e-6, 20e-6)
+metres = st.floats(0.5, 30.0)
+
+
+@given(ppm, ppm, ppm, st.integers(1, 5), metres, metres, metres, st.integers(0, 2**50))
+def test_ideal_clocks_give_the_difference_of_ranges(rm, ri, rt, slot, range_im, range_i, range_m, epoch):
+    """What is left is ν(ρ_i - ρ_m) - c·ν̄·e_im (eq:GPSTDoA), below 2.5 mm here, and the rounding of ten stamps."""
+    delay = slot * SUPERFRAME / 6
+    m, s, a, r, tag_m, tof = stamps(
+        (1 + rm, 1 + ri, 1 + rt), (epoch, 3 * epoch + 7, 5), delay, range_im, range_i, range_m
+    )
+    first, delayed = literal_tdoa(*m, *s, *a, *r, *tag_m, tof)
+    bracketed = bracketed_tdoa(*m, *s, *a, *r, tag_m[1], tof)
+    expected = (range_i - range_m) / TICK_M
+    for value in (first, delayed, bracketed):
+        assert value == pytest.approx(expected, abs=6.0)
+
+
+def test_standard_deviations_are_the_corrected_theorys():
+    """Monte Carlo of the exact algorithm against MATHS.md sections 2 and 5, for three places of the anchor's slot."""
+    generator = np.random.default_rng(11)
+    draws, sigma = 20_000, 60.0
+    sigma_m2 = (sigma * TICK_M) ** 2
+    for slot in (1, 3, 5):
+        kappa = np.array([slot / 6])
+        values = np.empty((draws, 3))
+        for k in range(draws):
+            noise = tuple(sigma * generator.standard_normal(10))
+            m, s, a, r, tag_m, tof = stamps((1.0, 1.0, 1.0), (0, 0, 0), slot * SUPERFRAME / 6, 5.0, 4.0, 3.0, noise)
+            values[k, :2] = literal_tdoa(*m, *s, *a, *r, *tag_m, tof)
+            values[k, 2] = bracketed_tdoa(*m, *s, *a, *r, tag_m[1], tof)
+        theory = [
+            np.sqrt(covariance(kappa, sigma_m2, sigma_m2)[0, 0])
+            for covariance in (literal_covariance, literal_delayed_covariance, bracketed_covariance)
+        ]
+        np.testing.assert_allclose(values.std(axis=0) * TICK_M, theory, rtol=4.0 / np.sqrt(2 * draws))
+
+
+def test_covariance_of_two_anchors_is_the_shared_stamp_of_the_reference():
+    sigma2 = 0.01
+    covariance = literal_covariance(np.array([1 / 6, 5 / 6]), sigma2, sigma2)
+    assert covariance[0, 1] == sigma2
+    assert covariance[0, 0] == pytest.approx(2 * sigma2 * ((7 / 6) ** 2 + (1 / 6) ** 2 + 1))
