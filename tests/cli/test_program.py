@@ -1,0 +1,130 @@
+"""The program as its user meets it: in a process of its own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.metadata import version
+
+import pytest
+
+from skyless.cli.main import main
+from skyless.site.lab import lab_site
+from skyless.site.template import site_template
+
+SKYLESS = [sys.executable, "-m", "skyless.cli.main"]
+
+
+def skyless(*arguments, **options):
+    return subprocess.run([*SKYLESS, *map(str, arguments)], capture_output=True, text=True, check=False, **options)
+
+
+@pytest.fixture
+def lab(tmp_path):
+    path = tmp_path / "lab.toml"
+    path.write_text(site_template(lab_site()), encoding="utf-8")
+    return path
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys\nfrom skyless.cli.main import main\n"
+        "try: main(['--help'])\nfinally: print(*sorted(sys.modules), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stderr.split())
+    assert "cyclopts" in loaded
+    assert loaded.isdisjoint({"numpy", "numba", "scipy", "matplotlib", "yaml", "msgspec"})
+    assert "Usage: skyless COMMAND" in done.stdout
+
+
+def test_version():
+    done = skyless("--version")
+    assert (done.returncode, done.stdout.strip()) == (0, version("skyless"))
+
+
+def test_every_command_has_help_with_an_example():
+    for command in (["site"], ["site", "new"], ["site", "check"]):
+        done = skyless(*command, "--help")
+        assert done.returncode == 0
+        assert f"Example: skyless {' '.join(command)}" in done.stdout
+    assert skyless("site", "--help").stdout.count("--no-") == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["sit"], 'Did you mean "site"?'),
+        (["site", "check", "--jso"], "Did you mean --json?"),
+        (["site", "check"], "requires an argument"),
+        (["site", "new", "x.toml", "--width", "wide", "--depth", "3"], "--width"),
+    ],
+)
+def test_a_slip_is_told_on_standard_error(arguments, said):
+    done = skyless(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert said in " ".join(done.stderr.split())
+
+
+def test_a_configuration_error_is_one_line(tmp_path):
+    done = skyless("site", "check", tmp_path / "none.toml", "--json")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("skyless: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_interrupt_leaves_no_traceback(tmp_path):
+    """A site file that is a pipe nobody writes to keeps the program waiting until Ctrl-C."""
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    process = subprocess.Popen([*SKYLESS, "site", "check", str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    for _ in range(600):
+        try:
+            writer = os.open(path, os.O_WRONLY | os.O_NONBLOCK)  # fails until the program has opened the other end
+            break
+        except OSError:
+            time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    os.close(writer)
+    assert (process.returncode, out, err) == (130, b"", b"")
+
+
+def test_a_reader_that_goes_away(lab):
+    for arguments in (["site", "check", lab], ["site", "check", lab, "--json"], ["--help"]):
+        reader, writer = os.pipe()
+        os.close(reader)
+        done = subprocess.run([*SKYLESS, *map(str, arguments)], stdout=writer, stderr=subprocess.PIPE, check=False)
+        os.close(writer)
+        assert (done.returncode, done.stderr) == (1, b"")
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_streams(lab, closed):
+    done = subprocess.run(["sh", "-c", f'"$@" {closed}', "sh", *SKYLESS, "site", "check", str(lab)], check=False)
+    assert done.returncode == 0
+
+
+def test_a_terminal_without_unicode(lab):
+    done = skyless("site", "check", lab, env={**os.environ, "PYTHONIOENCODING": "ascii"})
+    assert done.returncode == 0
+    assert "315 \\xb5s" in done.stdout
+
+
+def test_json_is_the_last_line(lab):
+    done = skyless("site", "check", lab, "--json")
+    report = json.loads(done.stdout.splitlines()[-1])
+    assert (done.returncode, done.stderr, done.stdout.count("\n")) == (0, "", 1)
+    assert report["superframes_per_s"] == pytest.approx(1 / 0.015, rel=1e-5)
+    assert report["messages_per_s"] == pytest.approx(400, rel=1e-5)
+    assert report["longest_frame_s"] == pytest.approx(315e-6, abs=0.5e-6)  # RADIO.md
+    assert report["occupancy"] == pytest.approx(0.315 / 2.5, rel=1e-3)
+    assert [anchor["slots"] for anchor in report["anchors"]] == [[0], [1], [2], [3], [4], [5]]
+    assert report["warnings"] == []
+
+
+def test_main_returns_the_exit_code(capsys, tmp_path):
+    assert main(["site", "check", str(tmp_path / "none.toml")]) == 2
+    assert "none.toml" in capsys.readouterr().err

@@ -1,0 +1,55 @@
+"""The progress bar: on a terminal when the work is long, nowhere else."""
+
+import os
+import pty
+import subprocess
+import sys
+import threading
+
+WORK = """
+from skyless.cli import progress
+progress._PATIENCE_S = {patience}
+with progress.progress_bar("replaying", 3) as bar:
+    for done in range(4):
+        bar.reach(done)
+"""
+
+
+def on_terminal(code):
+    """What a program writes to its standard error when that is a terminal."""
+    ours, theirs = pty.openpty()
+    written = []
+
+    def read():
+        try:
+            while data := os.read(ours, 4096):
+                written.append(data)
+        except OSError:  # the last writer has gone
+            pass
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    environment = {**os.environ, "TERM": "xterm"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], stderr=theirs, capture_output=False, check=True, env=environment
+    )
+    os.close(theirs)
+    reader.join()
+    os.close(ours)
+    assert done.returncode == 0
+    return b"".join(written).decode()
+
+
+def test_long_work_on_a_terminal():
+    assert "replaying" in on_terminal(WORK.format(patience=0))
+
+
+def test_short_work_on_a_terminal():
+    assert on_terminal(WORK.format(patience=60)) == ""
+
+
+def test_never_in_a_pipe():
+    environment = {**os.environ, "FORCE_COLOR": "1"}
+    code = WORK.format(patience=0)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, env=environment)
+    assert done.stdout + done.stderr == b""

@@ -1,0 +1,85 @@
+"""``skyless site new`` and ``skyless site check``, called as the program calls them."""
+
+import os
+
+import pytest
+
+from skyless.cli.main import main
+from skyless.site.lab import lab_site
+from skyless.site.load import load_site
+
+
+def test_new_writes_the_lab(tmp_path):
+    path = tmp_path / "lab.toml"
+    assert main(["site", "new", str(path)]) == 0
+    assert load_site(path) == lab_site()
+    assert list(tmp_path.iterdir()) == [path]  # nothing left beside it
+    umask = os.umask(0)
+    os.umask(umask)
+    assert path.stat().st_mode & 0o777 == 0o666 & ~umask
+
+
+def test_new_writes_a_room(tmp_path):
+    path = tmp_path / "hall.toml"
+    size = ["--width", "30", "--depth", "20", "--anchors", "8", "--height", "4.5", "--name", "Hall 3"]
+    assert main(["site", "new", str(path), *size]) == 0
+    site = load_site(path)
+    assert (site.name, len(site.anchors), site.tags.height_m) == ("Hall 3", 8, None)
+    assert {anchor.z_m for anchor in site.anchors} == {0.5, 4.0}
+
+
+def test_new_overwrites_only_by_force(tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    path.write_text("precious")
+    assert main(["site", "new", str(path)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert path.read_text() == "precious"
+    assert main(["site", "new", str(path), "--force"]) == 0
+    assert load_site(path).name == "mine"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--width", "3"], "both --width and --depth"),
+        (["--anchors", "8"], "both --width and --depth"),
+        (["--tag-height", "0"], "both --width and --depth"),
+        (["--width", "3", "--depth", "3", "--tag-height", "nan"], "tags.height_m"),
+        (["--width", "0.001", "--depth", "0.001", "--anchors", "20"], "elsewhere"),
+    ],
+)
+def test_new_refuses(tmp_path, capsys, options, said):
+    assert main(["site", "new", str(tmp_path / "x.toml"), *options]) == 2
+    assert said in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("option", [["--width", "0"], ["--width", "nan"], ["--anchors", "0"], ["--anchors", "256"]])
+def test_new_refuses_numbers_out_of_range(tmp_path, option):
+    with pytest.raises(SystemExit) as end:
+        main(["site", "new", str(tmp_path / "x.toml"), "--width", "3", "--depth", "3", *option])
+    assert end.value.code == 2
+
+
+def test_new_where_nothing_can_be_written(tmp_path, capsys):
+    assert main(["site", "new", str(tmp_path / "no" / "x.toml")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_check_shows_the_site(tmp_path, capsys):
+    path = tmp_path / "[red]lab.toml"  # no markup of the terminal library's
+    main(["site", "new", str(path)])
+    assert main(["site", "check", str(path)]) == 0
+    shown = capsys.readouterr().out
+    for part in ("1 (master)", "66.7 superframes/s", "400 messages/s", "315 µs", "the site file is valid"):
+        assert part in shown
+
+
+def test_check_shows_warnings(tmp_path, capsys):
+    path = tmp_path / "flat.toml"
+    main(["site", "new", str(path)])
+    path.write_text(path.read_text().replace("height_m = 0.0", "# height_m = 0.0"))
+    assert main(["site", "check", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert "warning: all anchors lie nearly in one plane" in shown
+    assert "valid, with warnings" in shown
