@@ -1,0 +1,109 @@
+"""What a listener has gathered of a site's almanac."""
+
+from typing import Final
+
+from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
+
+_SIGHTINGS: Final = 2
+"""A frame corrupted on the air passes its FCS once in 65,536 times; the same error twice in a row is not expected."""
+
+
+class AlmanacBook:
+    """Gathers the pages of one site as its beacons bring them, page by page.
+
+    What contradicts the book must be heard twice before it is believed. A new issue empties the book once two frames
+    in a row carry it. A page that differs from the one held under the same issue replaces it once it was heard twice
+    with nothing else for its place in between. So one corrupt frame that passed its FCS cannot do lasting harm.
+    """
+
+    def __init__(self) -> None:
+        self._issue: int | None = None
+        self._rival_issue: int | None = None
+        self._rival_frames = 0
+        self._rival_pages: list[Page] = []
+        self._clear()
+
+    def _clear(self) -> None:
+        self._pages: dict[object, Page] = {}
+        self._doubted: dict[object, Page] = {}
+        self._anchors_m: dict[int, tuple[float, float, float]] = {}
+        self._schedule: SchedulePage | None = None
+        self._noise: NoisePage | None = None
+        self._georeference: GeoreferencePage | None = None
+
+    @property
+    def issue(self) -> int | None:
+        """Issue of the almanac held, None before the first beacon."""
+        return self._issue
+
+    @property
+    def anchors_m(self) -> dict[int, tuple[float, float, float]]:
+        """Position of each anchor known so far; another dict whenever one changes, never changed in place."""
+        return self._anchors_m
+
+    @property
+    def schedule(self) -> SchedulePage | None:
+        """The superframe and the tags' height, once heard."""
+        return self._schedule
+
+    @property
+    def noise(self) -> NoisePage | None:
+        """The site's noise figures, once heard."""
+        return self._noise
+
+    @property
+    def georeference(self) -> GeoreferencePage | None:
+        """Where the site lies on the Earth, once heard; many sites send none."""
+        return self._georeference
+
+    @property
+    def complete(self) -> bool:
+        """Whether schedule, noise and all anchors are known."""
+        schedule = self._schedule
+        return schedule is not None and self._noise is not None and len(self._anchors_m) >= schedule.anchors
+
+    def hear(self, issue: int, page: Page | None) -> bool:
+        """Take in the issue and the page (if any) of one beacon; return whether the book changed."""
+        if self._issue is None:
+            self._issue = issue
+        if issue != self._issue:
+            return self._hear_rival(issue, page)
+        self._rival_issue = None
+        return page is not None and self._enter(page)
+
+    def _hear_rival(self, issue: int, page: Page | None) -> bool:
+        if issue != self._rival_issue:
+            self._rival_issue, self._rival_frames, self._rival_pages = issue, 0, []
+        self._rival_frames += 1
+        if page is not None:
+            self._rival_pages.append(page)
+        if self._rival_frames < _SIGHTINGS:
+            return False
+        self._clear()
+        self._issue, self._rival_issue = issue, None
+        for rival_page in self._rival_pages:
+            self._enter(rival_page)
+        return True
+
+    def _enter(self, page: Page) -> bool:
+        place: object = page.anchor if isinstance(page, AnchorPage) else type(page)
+        held = self._pages.get(place)
+        if held == page:
+            if self._doubted:
+                self._doubted.pop(place, None)
+            return False
+        if held is not None and self._doubted.get(place) != page:
+            self._doubted[place] = page
+            return False
+        self._doubted.pop(place, None)
+        self._pages[place] = page
+        match page:
+            case AnchorPage():
+                self._anchors_m = self._anchors_m | {page.anchor: (page.x_m, page.y_m, page.z_m)}
+            case SchedulePage():
+                self._schedule = page
+            case NoisePage():
+                self._noise = page
+            case GeoreferencePage():
+                self._georeference = page
+        return True

@@ -1,0 +1,240 @@
+"""Beacons and their bytes, version 1 (``docs/protocol.md``); little endian throughout.
+
+A frame is an IEEE 802.15.4 data frame of at most 127 bytes. 40-bit stamps travel as a low word of 32 bits and
+a high byte, 48-bit ones as a low word and a high half-word.
+"""
+
+import math
+import struct
+from functools import lru_cache
+from operator import index
+from typing import Final, SupportsIndex
+
+from skyless.air.beacon import Beacon, Heard, MasterTime
+from skyless.air.fcs import fcs, is_intact
+from skyless.air.malformed import Malformed
+from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
+
+MAX_FRAME_BYTES: Final = 127
+"""Longest PSDU (IEEE 802.15.4-2015, aMaxPhyPacketSize)."""
+AUTHENTICATION_BYTES: Final = 16
+"""Room that every frame keeps for an authentication trailer."""
+STD_STEPS_PER_TICK: Final = 64
+SATURATED_STD: Final = 0xFFFF
+
+_FRAME_CONTROL: Final = 0x8841
+"""Data frame, PAN identifier compressed, 16-bit addresses."""
+_BROADCAST: Final = 0xFFFF
+_MAGIC: Final = 0xB053
+"""The bytes 53 B0; the low half of the second is the version."""
+_MAGIC_MASK: Final = 0xF0FF
+_VERSION_1: Final = _MAGIC | 0x0100
+
+_HAS_MASTER_HEARD: Final = 0x01
+_HAS_MASTER_TIME: Final = 0x02
+_HAS_PAGE: Final = 0x04
+_HAS_AUTHENTICATION: Final = 0x08
+_RESERVED_FLAGS: Final = 0xF0
+
+_FIXED: Final = struct.Struct("<HBHHHHBIBIBBH")
+_START: Final = struct.Struct("<HBHHHH")
+_STAMP: Final = struct.Struct("<BIB")
+_TIME: Final = struct.Struct("<IHH")
+_HEARD: Final = struct.Struct("<HBIB")
+_FCS_BYTES: Final = 2
+_SHORTEST_MAC_FRAME_BYTES: Final = 5
+
+
+def _bare_bytes(flags: int) -> int:
+    """Length of a frame with these flags that relays no stamps."""
+    return (
+        _FIXED.size
+        + (_STAMP.size if flags & _HAS_MASTER_HEARD else 0)
+        + (_TIME.size if flags & _HAS_MASTER_TIME else 0)
+        + 1
+        + (PAGE_BYTES if flags & _HAS_PAGE else 0)
+        + (AUTHENTICATION_BYTES if flags & _HAS_AUTHENTICATION else 0)
+        + _FCS_BYTES
+    )
+
+
+_BARE_BYTES: Final = tuple(_bare_bytes(flags) for flags in range(16))
+_COUNT_AT: Final = tuple(_bare_bytes(flags & (_HAS_MASTER_HEARD | _HAS_MASTER_TIME)) - 3 for flags in range(16))
+_CAPACITY: Final = tuple(
+    (MAX_FRAME_BYTES - _bare_bytes(flags | _HAS_AUTHENTICATION)) // _HEARD.size for flags in range(16)
+)
+
+
+def heard_capacity(master_heard: bool, master_time: bool, page: bool) -> int:
+    """How many ``heard`` entries a frame with these parts may carry, room for authentication kept: 6 to 10."""
+    return _CAPACITY[master_heard * _HAS_MASTER_HEARD | master_time * _HAS_MASTER_TIME | page * _HAS_PAGE]
+
+
+def encode(beacon: Beacon) -> bytes:
+    """Return the whole frame, FCS included.
+
+    The standard deviation of the master time is rounded up to 1/64 tick, so that it never claims too much.
+
+    Raises:
+        ValueError: a field is out of its range, or there are more ``heard`` than fit; the message names it.
+    """
+    fault = _heard_fault(beacon.anchor, beacon.master, beacon.master_heard, beacon.heard)
+    if fault is not None:
+        raise ValueError(fault)
+    capacity = _CAPACITY[_flags(beacon)]
+    if len(beacon.heard) > capacity:
+        raise ValueError(f"heard has {len(beacon.heard)} entries; {capacity} fit")
+    try:
+        body = _body(beacon)
+    except (struct.error, TypeError):
+        raise ValueError(_first_fault(beacon)) from None
+    return body + fcs(body)
+
+
+def decode(frame: bytes) -> Beacon | Malformed:
+    """Return the beacon in a whole frame (FCS included), or why there is none; never raises."""
+    length = len(frame)
+    if not _SHORTEST_MAC_FRAME_BYTES <= length <= MAX_FRAME_BYTES:
+        return Malformed.TOO_LONG if length > MAX_FRAME_BYTES else Malformed.TOO_SHORT
+    if not is_intact(frame):
+        return Malformed.BAD_FCS
+    foreign = _foreign(frame)
+    return _decode_version_1(frame) if foreign is None else foreign
+
+
+decode_cached = lru_cache(maxsize=256)(decode)
+"""``decode`` that remembers the last 256 frames: for a program that runs many tags which hear the same bytes."""
+
+
+def _foreign(frame: bytes) -> Malformed | None:
+    """Why an intact frame is no beacon of version 1, None if it is one."""
+    if len(frame) < _START.size + _FCS_BYTES:
+        return Malformed.NOT_A_BEACON
+    control, _, _, destination, _, magic = _START.unpack_from(frame)
+    if control != _FRAME_CONTROL or destination != _BROADCAST or magic & _MAGIC_MASK != _MAGIC:
+        return Malformed.NOT_A_BEACON
+    if magic != _VERSION_1:
+        return Malformed.UNKNOWN_VERSION
+    return Malformed.TOO_SHORT if len(frame) < _BARE_BYTES[0] else None
+
+
+def _decode_version_1(frame: bytes) -> Beacon | Malformed:
+    (_, sequence, site, _, anchor, _, flags, superframe, slot, tx_low, tx_high, issue, master) = _FIXED.unpack_from(
+        frame
+    )
+    if flags & _RESERVED_FLAGS:
+        return Malformed.BAD_FLAGS
+    heard_bytes = len(frame) - _BARE_BYTES[flags]
+    count_at = _COUNT_AT[flags]
+    if heard_bytes < 0 or heard_bytes != frame[count_at] * _HEARD.size:
+        return Malformed.BAD_LENGTH
+    master_heard = _master_heard(frame, master) if flags & _HAS_MASTER_HEARD else None
+    master_time = _master_time(frame, count_at - _TIME.size) if flags & _HAS_MASTER_TIME else None
+    page_at = count_at + 1 + heard_bytes
+    heard = _heard(frame[count_at + 1 : page_at])
+    if _heard_fault(anchor, master, master_heard, heard):
+        return Malformed.BAD_HEARD
+    page = decode_page(frame[page_at : page_at + PAGE_BYTES]) if flags & _HAS_PAGE else None
+    if isinstance(page, Malformed):
+        return page
+    return Beacon(
+        site, anchor, sequence, superframe, slot, tx_low | tx_high << 32, issue, master,
+        master_heard, master_time, heard, page,
+    )  # fmt: skip
+
+
+def _master_heard(frame: bytes, master: int) -> Heard:
+    sequence, low, high = _STAMP.unpack_from(frame, _FIXED.size)
+    return Heard(master, sequence, low | high << 32)
+
+
+def _master_time(frame: bytes, at: int) -> MasterTime:
+    low, high, std_steps = _TIME.unpack_from(frame, at)
+    return MasterTime(low | high << 32, std_steps / STD_STEPS_PER_TICK)
+
+
+def _heard(entries: bytes) -> tuple[Heard, ...]:
+    return tuple(
+        [Heard(anchor, sequence, low | high << 32) for anchor, sequence, low, high in _HEARD.iter_unpack(entries)]
+    )
+
+
+def _heard_fault(anchor: int, master: int, master_heard: Heard | None, heard: tuple[Heard, ...]) -> str | None:
+    """What is impossible among the stamps that a beacon relays, None if nothing is."""
+    if master_heard is not None and (anchor == master or master_heard.anchor != master):
+        return (
+            f"master_heard is of anchor {master_heard.anchor}; it must be of another than {anchor}, the master {master}"
+        )
+    seen = {anchor, master}
+    for entry in heard:
+        if entry.anchor in seen:
+            return f"heard repeats anchor {entry.anchor}, or it is the sender or the master"
+        seen.add(entry.anchor)
+    return None
+
+
+def _body(beacon: Beacon) -> bytes:
+    """All bytes before the FCS."""
+    master_heard, master_time, page = beacon.master_heard, beacon.master_time, beacon.page
+    flags = _flags(beacon)
+    parts = [
+        _FIXED.pack(
+            _FRAME_CONTROL, beacon.sequence, beacon.site, _BROADCAST, beacon.anchor, _VERSION_1, flags,
+            beacon.superframe, beacon.slot, *_split(beacon.tx_ticks), beacon.almanac_issue, beacon.master,
+        )
+    ]  # fmt: skip
+    if master_heard is not None:
+        parts.append(_STAMP.pack(master_heard.sequence, *_split(master_heard.rx_ticks)))
+    if master_time is not None:
+        parts.append(_TIME.pack(*_split(master_time.tx_subticks_master), _std_steps(master_time.std_ticks)))
+    parts.append(bytes((len(beacon.heard),)))
+    parts += [_HEARD.pack(entry.anchor, entry.sequence, *_split(entry.rx_ticks)) for entry in beacon.heard]
+    if page is not None:
+        parts.append(encode_page(page))
+    return b"".join(parts)
+
+
+def _flags(beacon: Beacon) -> int:
+    return (
+        (beacon.master_heard is not None) * _HAS_MASTER_HEARD
+        | (beacon.master_time is not None) * _HAS_MASTER_TIME
+        | (beacon.page is not None) * _HAS_PAGE
+    )
+
+
+def _split(ticks: int) -> tuple[int, int]:
+    """Low word and the rest; a value out of range leaves a rest that its field cannot hold."""
+    return ticks & 0xFFFFFFFF, ticks >> 32
+
+
+def _std_steps(std_ticks: float) -> int:
+    if not std_ticks >= 0.0:
+        raise ValueError(f"master_time.std_ticks is {std_ticks!r}; it must be 0 or more")
+    steps = std_ticks * STD_STEPS_PER_TICK
+    return SATURATED_STD if steps >= SATURATED_STD else math.ceil(steps)
+
+
+def _first_fault(beacon: Beacon) -> str:
+    """Name the first field that does not fit its bits."""
+    fields: list[tuple[str, object, int]] = [
+        ("site", beacon.site, 16),
+        ("anchor", beacon.anchor, 16),
+        ("sequence", beacon.sequence, 8),
+        ("superframe", beacon.superframe, 32),
+        ("slot", beacon.slot, 8),
+        ("tx_ticks", beacon.tx_ticks, 40),
+        ("almanac_issue", beacon.almanac_issue, 8),
+        ("master", beacon.master, 16),
+    ]
+    if beacon.master_time is not None:
+        fields.append(("master_time.tx_subticks_master", beacon.master_time.tx_subticks_master, 48))
+    relayed = [("master_heard", beacon.master_heard)] if beacon.master_heard is not None else []
+    relayed += [(f"heard[{number}]", entry) for number, entry in enumerate(beacon.heard)]
+    for name, entry in relayed:
+        fields.append((f"{name}.anchor", entry.anchor, 16))
+        fields.append((f"{name}.sequence", entry.sequence, 8))
+        fields.append((f"{name}.rx_ticks", entry.rx_ticks, 40))
+    for name, value, bits in fields:
+        if not isinstance(value, SupportsIndex) or not 0 <= index(value) < 1 << bits:
+            return f"{name} is {value!r}; it must be a whole number of {bits} bits, 0 to {(1 << bits) - 1}"
+    return "a field of the beacon has the wrong type"

@@ -1,0 +1,120 @@
+import itertools
+import random
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, SchedulePage
+from skyless.air.page_codec import decode_page, encode_page
+from skyless.air.rotation import almanac_issue, page_for, pages_of
+from skyless.site.model import AnchorSite, GeoreferenceSite, ScheduleSite, Site, TagsSite
+
+
+def site(anchors=7, **changes):
+    nodes = tuple(AnchorSite(number, 0.1 * number, 1.0, 2.5) for number in range(1, anchors + 1))
+    return Site("lab", 1, 1, nodes, **changes)
+
+
+def some_pages(count):
+    return tuple(AnchorPage(number, 0.0, 0.0, 0.0, 0) for number in range(count))
+
+
+def receptions_until_complete(pages, receptions):
+    """How many (superframe, slot) it takes until every page was heard."""
+    missing = set(pages)
+    for count, (superframe, slot) in enumerate(receptions, 1):
+        missing.discard(page_for(pages, superframe, slot))
+        if not missing:
+            return count
+    return None
+
+
+def prime_from(count):
+    return next(number for number in itertools.count(max(count, 2)) if all(number % d for d in range(2, number)))
+
+
+def test_pages_of_a_site():
+    earth = GeoreferenceSite(52.0, 4.0, 3.0, -90.0)
+    pages = pages_of(site(2, georeference=earth, tags=TagsSite(height_m=1.2), schedule=ScheduleSite(slots=5)))
+    assert pages == (
+        SchedulePage(2**27, 5, 1, 1, 2, 1.2),
+        NoisePage(pytest.approx(100e-12), pytest.approx(100e-12), 2e-11, 1e-9),
+        AnchorPage(1, 0.1, 1.0, 2.5, 0),
+        AnchorPage(2, 0.2, 1.0, 2.5, 1),
+        GeoreferencePage(52.0, 4.0, 3.0, 270.0),
+    )
+    assert len(pages_of(site(2))) == 4
+
+
+@given(st.integers(1, 60), st.integers(0, 254), st.integers(0, 2**32 - 500), st.integers(1, 500))
+def test_one_slot_brings_every_page_whatever_the_duty_cycle(count, slot, start, every):
+    pages = some_pages(count)
+    heard = ((start + every * number, slot) for number in range(2 * count + 2))
+    positions = receptions_until_complete(pages, ((start + number, slot) for number in range(10 * count + 2)))
+    # The rotation's length is a prime below twice the number of pages (Bertrand); 2 at least.
+    assert positions <= max(2, 2 * count - 1)
+    period = prime_from(count)
+    if every % period:
+        assert receptions_until_complete(pages, heard) <= period
+
+
+@given(st.integers(1, 255), st.integers(0, 2**32 - 1))
+def test_slots_of_one_superframe_bring_different_pages(count, superframe):
+    pages = some_pages(count)
+    carried = [page_for(pages, superframe, slot) for slot in range(count)]
+    # No page twice, but for those that fill the rotation up to a prime.
+    assert len(set(carried)) >= count - (prime_from(count) - count)
+
+
+@pytest.mark.parametrize("anchors", range(3, 33))
+def test_all_anchors_heard_fill_the_almanac_in_three_superframes(anchors):
+    pages = pages_of(site(anchors, georeference=GeoreferenceSite(52.0, 4.0)))
+    for start in range(50):
+        heard = ((start + number // anchors, number % anchors) for number in range(3 * anchors))
+        assert receptions_until_complete(pages, heard) is not None
+
+
+@pytest.mark.parametrize("anchors", [4, 7, 16, 40, 200])
+def test_a_few_anchors_heard_at_random_fill_it_in_due_time(anchors):
+    # Each superframe another four of the slots: as if pages were drawn, n ln n receptions and some n more.
+    rng = random.Random(anchors)
+    pages = pages_of(site(anchors))
+    heard = ((superframe, slot) for superframe in range(10_000) for slot in rng.sample(range(anchors), 4))
+    assert receptions_until_complete(pages, heard) < 12 * len(pages)
+
+
+def test_issue_is_the_same_for_the_same_contents():
+    assert almanac_issue(pages_of(site())) == almanac_issue(pages_of(site()))
+    quantised = tuple(decode_page(encode_page(page)) for page in pages_of(site()))
+    assert almanac_issue(quantised) == almanac_issue(pages_of(site()))
+    assert 0 <= almanac_issue(pages_of(site())) <= 255
+
+
+def test_issue_depends_on_every_page():
+    pages = pages_of(site(anchors=9))
+    issue = almanac_issue(pages)
+    for at, page in enumerate(pages):
+        moved = msgspec.structs.replace(page, **changed_field(page))
+        assert almanac_issue((*pages[:at], moved, *pages[at + 1 :])) != issue
+    assert almanac_issue(pages[::-1]) != issue
+
+
+def changed_field(page):
+    match page:
+        case AnchorPage():
+            return {"z_m": page.z_m + 0.001}
+        case SchedulePage():
+            return {"slots": page.slots + 1}
+        case _:
+            return {"white_fm": page.white_fm * 2}
+
+
+def test_issue_spreads_over_all_values():
+    # 2000 almanacs over 256 values: chi-squared of 255 degrees of freedom, 5 sigma.
+    counts = [0] * 256
+    for number in range(2000):
+        counts[almanac_issue((AnchorPage(1, number / 1000, 0.0, 0.0, 0),))] += 1
+    chi_squared = sum((count - 2000 / 256) ** 2 / (2000 / 256) for count in counts)
+    assert chi_squared < 255 + 5 * (2 * 255) ** 0.5
