@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.air.beacon import Beacon, Heard, MasterTime
 from skyless.air.codec import heard_capacity
-from skyless.air.page_codec import MAX_CLOCK_NOISE, MAX_STAMP_NOISE_S, MAX_SUPERFRAME_TICKS
+from skyless.air.page_codec import MAX_NOISE, MAX_SUPERFRAME_TICKS
 
 
 def unsigned(bits):
@@ -16,20 +16,11 @@ def on_grid(low, high, steps_per_unit):
     return st.integers(low * steps_per_unit, high * steps_per_unit).map(lambda step: step / steps_per_unit)
 
 
-def float32(high):
-    return st.floats(0.0, high, width=32)
-
-
-coordinates_m = on_grid(-100_000, 100_000, 1000)
+coordinates_m = on_grid(-1_000_000, 1_000_000, 1000)
 
 anchor_pages = st.builds(AnchorPage, unsigned(16), coordinates_m, coordinates_m, coordinates_m, unsigned(8))
-noise_pages = st.builds(
-    NoisePage,
-    float32(MAX_STAMP_NOISE_S),
-    float32(MAX_STAMP_NOISE_S),
-    float32(MAX_CLOCK_NOISE),
-    float32(MAX_CLOCK_NOISE),
-)
+noises = st.floats(0.0, MAX_NOISE, width=32)
+noise_pages = st.builds(NoisePage, noises, noises, noises, noises)
 georeference_pages = st.builds(
     GeoreferencePage,
     on_grid(-90, 90, 10**7),

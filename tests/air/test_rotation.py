@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.air.page_codec import decode_page, encode_page
 from skyless.air.rotation import almanac_issue, page_for, pages_of
-from skyless.site.model import AnchorSite, GeoreferenceSite, ScheduleSite, Site, TagsSite
+from skyless.site.limits import LIMITS
+from skyless.site.model import AnchorSite, GeoreferenceSite, NoiseSite, ScheduleSite, Site, TagsSite
 
 
 def site(anchors=7, **changes):
@@ -83,6 +84,27 @@ def test_a_few_anchors_heard_at_random_fill_it_in_due_time(anchors):
     pages = pages_of(site(anchors))
     heard = ((superframe, slot) for superframe in range(10_000) for slot in rng.sample(range(anchors), 4))
     assert receptions_until_complete(pages, heard) < 12 * len(pages)
+
+
+@pytest.mark.parametrize("end", ["low", "high"])
+def test_whatever_a_site_file_may_say_fits_the_pages(end):
+    def at_end(*keys):
+        return [getattr(LIMITS[key], end) for key in keys]
+
+    places = at_end("anchors.id", "anchors.x_m", "anchors.y_m", "anchors.z_m")
+    noise = at_end("noise.tx_stamp_ps", "noise.rx_stamp_ps", "noise.white_fm", "noise.random_walk_fm")
+    earth = at_end(*(f"georeference.{field}" for field in GeoreferenceSite.__struct_fields__))
+    extreme = Site(
+        "lab",
+        *at_end("id", "master"),
+        (AnchorSite(*places, *at_end("anchors.slot")),),
+        ScheduleSite(slots=255),
+        NoiseSite(*noise),
+        TagsSite(*at_end("tags.height_m")),
+        georeference=GeoreferenceSite(*earth),
+    )
+    for page in pages_of(extreme):
+        assert type(decode_page(encode_page(page))) is type(page)
 
 
 def test_issue_is_the_same_for_the_same_contents():

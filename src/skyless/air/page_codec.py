@@ -9,12 +9,10 @@ from skyless.air.malformed import Malformed
 
 PAGE_BYTES: Final = 17
 
-MAX_COORDINATE_M: Final = 100_000.0
-"""Coordinates and heights beyond 100 km from the origin are taken for errors."""
-MAX_STAMP_NOISE_S: Final = 2.0**-20
-"""Stamp noise beyond 0.95 µs, 286 m, is taken for an error; a power of two, so that float32 keeps it."""
-MAX_CLOCK_NOISE: Final = 2.0**-10
-"""Oscillator noise beyond 0.1 % is taken for an error."""
+MAX_COORDINATE_M: Final = 1e6
+"""Coordinates and heights beyond 1000 km from the origin are taken for errors."""
+MAX_NOISE: Final = 2.0**-19
+"""Stamp noise beyond 1.9 µs (572 m) and oscillator noise beyond 1.9 ppm are errors; float32 keeps the bound."""
 MAX_SUPERFRAME_TICKS: Final = (1 << 39) - 1
 """A superframe is shorter than half a wrap of the counter (8.6 s), else stamps become ambiguous."""
 
@@ -111,10 +109,10 @@ def _encode_schedule(page: SchedulePage) -> bytes:
 def _encode_noise(page: NoisePage) -> bytes:
     return _NOISE.pack(
         _NOISE_TYPE,
-        _real("NoisePage.tx_stamp_s", page.tx_stamp_s, 0.0, MAX_STAMP_NOISE_S),
-        _real("NoisePage.rx_stamp_s", page.rx_stamp_s, 0.0, MAX_STAMP_NOISE_S),
-        _real("NoisePage.white_fm", page.white_fm, 0.0, MAX_CLOCK_NOISE),
-        _real("NoisePage.random_walk_fm", page.random_walk_fm, 0.0, MAX_CLOCK_NOISE),
+        _real("NoisePage.tx_stamp_s", page.tx_stamp_s, 0.0, MAX_NOISE),
+        _real("NoisePage.rx_stamp_s", page.rx_stamp_s, 0.0, MAX_NOISE),
+        _real("NoisePage.white_fm", page.white_fm, 0.0, MAX_NOISE),
+        _real("NoisePage.random_walk_fm", page.random_walk_fm, 0.0, MAX_NOISE),
     )
 
 
@@ -151,10 +149,8 @@ def _decode_schedule(data: bytes) -> SchedulePage | None:
 
 
 def _decode_noise(data: bytes) -> NoisePage | None:
-    _, tx_stamp_s, rx_stamp_s, white_fm, random_walk_fm = _NOISE.unpack(data)
-    stamps_fit = 0.0 <= tx_stamp_s <= MAX_STAMP_NOISE_S and 0.0 <= rx_stamp_s <= MAX_STAMP_NOISE_S
-    clocks_fit = 0.0 <= white_fm <= MAX_CLOCK_NOISE and 0.0 <= random_walk_fm <= MAX_CLOCK_NOISE
-    return NoisePage(tx_stamp_s, rx_stamp_s, white_fm, random_walk_fm) if stamps_fit and clocks_fit else None
+    _, *figures = _NOISE.unpack(data)
+    return NoisePage(*figures) if all(0.0 <= figure <= MAX_NOISE for figure in figures) else None
 
 
 def _decode_georeference(data: bytes) -> GeoreferencePage | None:
