@@ -3,7 +3,6 @@
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from io import TextIOWrapper
 
 from cyclopts import App, Parameter
@@ -27,7 +26,7 @@ def program() -> App:
         help="GPS without a sky: fixed UWB anchors broadcast, tags only listen and compute their own position.",
         help_epilogue="Example: skyless site new site.toml && skyless site check site.toml",
         help_format="plaintext",
-        version=lambda: version("skyless"),
+        version=_version,
         result_action="return_value",
         default_parameter=Parameter(negative=()),
     )
@@ -55,6 +54,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _drop_output()
         return _BROKEN_PIPE
     return result if isinstance(result, int) else 0
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("skyless")
 
 
 def _write_any_character() -> None:
