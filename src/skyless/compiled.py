@@ -10,10 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
-from numba import config, njit
+import numba
+from numba import njit
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+_CONFIG: Any = numba.config
 _PACKAGE: Final = Path(__file__).parent
 
 
@@ -51,9 +53,9 @@ def kernel(function: Function) -> Function:
     ``error_model="numpy"`` makes a division by zero an infinity instead of an exception, as in NumPy.
     Fast-math stays off: streaming and batch must give identical bits.
     """
-    callers_folder = config.CACHE_DIR
-    config.CACHE_DIR = _CACHE_FOLDER
+    callers_folder = _CONFIG.CACHE_DIR
+    _CONFIG.CACHE_DIR = _CACHE_FOLDER
     try:
         return cast("Function", njit(cache=True, error_model="numpy")(function))
     finally:
-        config.CACHE_DIR = callers_folder
+        _CONFIG.CACHE_DIR = callers_folder

@@ -26,7 +26,7 @@ class Fix(Struct, frozen=True, gc=False):
     """One position with all that is known of its quality. SI units, site frame."""
 
     time_s: float
-    """Master time since the receiver's first beacon."""
+    """Master time at which the position holds, since the receiver's first fix."""
     position_m: NDArray[np.float64]
     """Shape (3,)."""
     covariance_m2: NDArray[np.float64]
@@ -57,3 +57,42 @@ class Fix(Struct, frozen=True, gc=False):
     def dops(self) -> Dops:
         """Dilutions of precision of the anchors in use, seen from the position."""
         return dilution_of_precision(self.anchors_m, self.position_m, height_known=self.height_known)
+
+
+def motion_fix(
+    time_s: float,
+    x: NDArray[np.float64],
+    P: NDArray[np.float64],
+    height_m: float | None,
+    anchors: tuple[int, ...],
+    anchors_m: NDArray[np.float64],
+    statistics: NDArray[np.float64],
+    method: str,
+) -> Fix:
+    """Make the fix of a filter whose state begins with position and velocity (2 axes each at a known height).
+
+    ``statistics`` holds the running means of the normalised and of the plain squared innovation.
+    """
+    dim = 3 if height_m is None else 2
+    position, velocity = np.zeros(3), np.zeros(3)
+    covariance, velocity_covariance = np.zeros((3, 3)), np.zeros((3, 3))
+    position[:dim] = x[:dim]
+    velocity[:dim] = x[dim : 2 * dim]
+    covariance[:dim, :dim] = P[:dim, :dim]
+    velocity_covariance[:dim, :dim] = P[dim : 2 * dim, dim : 2 * dim]
+    if height_m is not None:
+        position[2] = height_m
+    return Fix(
+        time_s=time_s,
+        position_m=position,
+        covariance_m2=covariance,
+        velocity_mps=velocity,
+        velocity_covariance=velocity_covariance,
+        anchors=anchors,
+        anchors_m=anchors_m,
+        chi2=float(statistics[0]),
+        dof=1,
+        residual_rms_m=float(np.sqrt(statistics[1])),
+        method=method,
+        height_known=height_m is not None,
+    )

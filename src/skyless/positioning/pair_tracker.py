@@ -21,11 +21,11 @@ SETTING_QA, SETTING_VARIANCE, SETTING_GATE, SETTING_HEIGHT = range(4)
 class PairSettings(Struct, frozen=True):
     """What the filter of pair differences assumes."""
 
-    qa: float = 2.0
+    qa: float = 1.0
     """Spectral density of the acceleration, m²/s³ per axis."""
     tdoa_std_m: float = 0.22
     """Of one time difference, in metres."""
-    gate: float = 3.0
+    gate: float = 2.5
     """Innovations beyond so many standard deviations are not used."""
     height_m: float | None = None
     """Height of the tag where it is given; None to estimate it."""

@@ -1,0 +1,94 @@
+"""Error statistics in bounded memory: sums are exact, percentiles and plots come from an even sample of the run."""
+
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+SAMPLE_ROWS: Final = 1 << 17
+"""Rows kept at most; with fewer, percentiles are exact."""
+
+
+class EvenSample:
+    """Every k-th row of a stream, k doubling whenever the store is full: an even sample, reproducible."""
+
+    def __init__(self, columns: int, rows: int = SAMPLE_ROWS) -> None:
+        self._store = np.empty((rows, columns))
+        self._kept = 0
+        self._stride = 1
+        self._seen = 0
+
+    def add(self, row: tuple[float, ...]) -> None:
+        """Offer one row."""
+        if self._seen % self._stride == 0:
+            if self._kept == len(self._store):
+                self._halve()
+            if self._seen % self._stride == 0:
+                self._store[self._kept] = row
+                self._kept += 1
+        self._seen += 1
+
+    def _halve(self) -> None:
+        kept = self._store[::2].copy()
+        self._kept = len(kept)
+        self._store[: self._kept] = kept
+        self._stride *= 2
+
+    @property
+    def rows(self) -> NDArray[np.float64]:
+        """The rows kept, shape (kept, columns), in their order."""
+        return self._store[: self._kept]
+
+
+class ErrorSummary(Struct, frozen=True):
+    """Errors of a run in metres; None where there were none to judge."""
+
+    count: int
+    rmse_2d_m: float | None
+    rmse_3d_m: float | None
+    p95_m: float | None
+    max_m: float | None
+    bias_m: tuple[float, float, float] | None
+
+
+class ErrorStatistics:
+    """Position errors, one vector at a time."""
+
+    def __init__(self, *, planar: bool) -> None:
+        """``planar``: percentiles and the maximum are of the horizontal error, because the height was given."""
+        self._planar = planar
+        self._count = 0
+        self._sum = [0.0, 0.0, 0.0]
+        self._squares = [0.0, 0.0, 0.0]
+        self._max = 0.0
+        self._sample = EvenSample(1)
+
+    def add(self, x_m: float, y_m: float, z_m: float) -> None:
+        """Take one error vector."""
+        self._count += 1
+        for axis, value in enumerate((x_m, y_m, z_m)):
+            self._sum[axis] += value
+            self._squares[axis] += value * value
+        error_m = (x_m * x_m + y_m * y_m + (0.0 if self._planar else z_m * z_m)) ** 0.5
+        self._max = max(self._max, error_m)
+        self._sample.add((error_m,))
+
+    @property
+    def count(self) -> int:
+        """How many errors there were."""
+        return self._count
+
+    def summary(self) -> ErrorSummary:
+        """What the errors come to."""
+        if self._count == 0:
+            return ErrorSummary(0, None, None, None, None, None)
+        mean_squares = [value / self._count for value in self._squares]
+        return ErrorSummary(
+            count=self._count,
+            rmse_2d_m=(mean_squares[0] + mean_squares[1]) ** 0.5,
+            rmse_3d_m=None if self._planar else sum(mean_squares) ** 0.5,
+            p95_m=float(np.percentile(self._sample.rows, 95)),
+            max_m=self._max,
+            bias_m=(self._sum[0] / self._count, self._sum[1] / self._count, self._sum[2] / self._count),
+        )

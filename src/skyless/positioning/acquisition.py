@@ -1,0 +1,105 @@
+"""The tracker's cold start: position and clock from beacons alone, without a guess.
+
+The tag's clock runs up to 20 ppm off, so pseudoranges of one superframe drift by tens of metres. Two messages of the
+same anchor tell the drift; then all anchors' newest pseudoranges are carried to one time and solved in closed form.
+"""
+
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from skyless.constants import TICK_M, TICK_S
+from skyless.positioning.fix import NoFixReason
+from skyless.positioning.observation import Observation
+from skyless.positioning.solver import NoSolution, locate_pseudoranges
+
+MAX_AGE_S: Final = 0.5
+"""Older messages no longer serve the start."""
+
+SPEED_STD_MPS: Final = 1.0
+"""Typical speed of a tag; it smears pseudoranges taken at different times and starts the velocity."""
+
+
+class Start(Struct, frozen=True):
+    """A first state: everything ``PseudorangeTracker.start`` wants."""
+
+    rx_ticks_tag: int
+    whole_offset_ticks: int
+    solution: NDArray[np.float64]
+    """[position (dim), clock offset], metres."""
+    covariance: NDArray[np.float64]
+    clock_rate_mps: float
+    clock_rate_variance: float
+    speed_variance: float = SPEED_STD_MPS**2
+
+
+class Acquisition:
+    """Gathers beacons until a start is possible."""
+
+    def __init__(
+        self, height_m: float | None, stamp_variance_m2: float, z_bounds_m: tuple[float, float] | None = None
+    ) -> None:
+        self._height_m = height_m
+        self._variance_m2 = stamp_variance_m2
+        self._z_bounds_m = z_bounds_m
+        self._heard: dict[int, list[Observation]] = {}
+
+    def hear(self, observation: Observation) -> Start | NoFixReason:
+        """Take one observation; try to start each time an anchor comes around again."""
+        now = observation.rx_ticks_tag
+        for anchor, kept in list(self._heard.items()):
+            if (now - kept[-1].rx_ticks_tag) * TICK_S > MAX_AGE_S:
+                del self._heard[anchor]
+        kept = self._heard.setdefault(observation.anchor, [])
+        came_around = len(kept) == 2
+        self._heard[observation.anchor] = [*kept[-1:], observation]
+        pairs = [kept for kept in self._heard.values() if len(kept) == 2]
+        needed = 4 if self._height_m is None else 3
+        if len(pairs) < needed:
+            return NoFixReason.TOO_FEW_ANCHORS
+        return self._solve(pairs, now) if came_around else NoFixReason.ACQUIRING
+
+    def _solve(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
+        base = _offset_ticks(pairs[0][-1])[0]
+        rates = np.array([_clock_rate(first, second) for first, second in pairs])
+        intervals = np.array([(second.rx_ticks_tag - first.rx_ticks_tag) * TICK_S for first, second in pairs])
+        rate = float(np.median(rates))
+        rate_variance = 2.0 * self._variance_m2 / float(np.min(intervals)) ** 2 + SPEED_STD_MPS**2
+        newest = [second for _, second in pairs]
+        ages_s = np.array([(now - o.rx_ticks_tag) * TICK_S for o in newest])
+        pseudoranges = np.array([_pseudorange_m(o, base) for o in newest]) + rate * ages_s
+        variances = self._variance_m2 + np.array([o.tx_variance_m2 for o in newest])
+        variances += ages_s**2 * (rate_variance / len(pairs) + SPEED_STD_MPS**2)
+        result = locate_pseudoranges(
+            np.array([o.anchor_m for o in newest]),
+            pseudoranges,
+            variances,
+            height_m=self._height_m,
+            z_bounds_m=self._z_bounds_m,
+        )
+        if isinstance(result, NoSolution):
+            return result.reason
+        dim = 3 if self._height_m is None else 2
+        solution = np.append(result.position_m[:dim], result.bias_m)
+        return Start(now, base, solution, result.covariance_joint_m2, rate, rate_variance)
+
+
+def _offset_ticks(observation: Observation) -> tuple[int, float]:
+    """Tag's reading minus the master's TX time: whole ticks and the fraction to take off."""
+    assert observation.tx_ticks_master is not None
+    return observation.rx_ticks_tag - observation.tx_ticks_master, observation.tx_fraction_ticks
+
+
+def _pseudorange_m(observation: Observation, base_ticks: int) -> float:
+    whole, fraction = _offset_ticks(observation)
+    return (whole - base_ticks - fraction) * TICK_M
+
+
+def _clock_rate(first: Observation, second: Observation) -> float:
+    """Rate of the tag's clock against the master's in m/s, from two messages of one anchor."""
+    change_m = _pseudorange_m(second, _offset_ticks(first)[0]) - _pseudorange_m(first, _offset_ticks(first)[0])
+    assert first.tx_ticks_master is not None
+    assert second.tx_ticks_master is not None
+    return change_m / ((second.tx_ticks_master - first.tx_ticks_master) * TICK_S)

@@ -1,0 +1,39 @@
+"""One beacon as the positioning methods see it: every stamp unwrapped on its own clock."""
+
+from typing import Protocol
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from skyless.positioning.fix import Fix, NoFixReason
+
+
+class Observation(Struct, frozen=True, gc=False):
+    """A beacon heard by the tag; integers never wrap."""
+
+    anchor: int
+    anchor_m: NDArray[np.float64]
+    """Shape (3,)."""
+    round: int
+    """Counts the frames that each node sends: the superframe, or a fraction of it with several frames per node."""
+    sequence: int
+    rx_ticks_tag: int
+    tx_ticks_anchor: int
+    master_sequence: int | None
+    """Sequence number of the last master beacon that the anchor heard."""
+    master_rx_ticks_anchor: int | None
+    """The anchor's RX stamp of it."""
+    tx_ticks_master: int | None
+    """TX time on the master's scale, whole ticks; None while the anchor does not know it."""
+    tx_fraction_ticks: float
+    tx_variance_m2: float
+    """Variance of the TX time on the master's scale, from the anchor's clock filter."""
+
+
+class Method(Protocol):
+    """A positioning method: observations in, fixes out."""
+
+    def hear(self, observation: Observation) -> Fix | NoFixReason:
+        """Take one observation; a fix, or why there is none yet."""
+        ...

@@ -1,0 +1,139 @@
+"""Fixes from time differences of pairs: cold start from a window of them, then the filter, and again when lost."""
+
+from collections import Counter, deque
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.air.packet import PairTdoa
+from skyless.positioning.fix import Fix, NoFixReason, motion_fix
+from skyless.positioning.pair_tracker import PairSettings, PairTracker
+from skyless.positioning.pairs import against_reference
+from skyless.positioning.solver import NoSolution, Solution, locate
+from skyless.positioning.tracker import REJECTED_IN_ROW
+
+WINDOW: Final = 60
+"""Differences that a start looks at, the newest ones ..."""
+
+WINDOW_S: Final = 20.0
+"""... and none older than this."""
+
+MAX_GAP_S: Final = 10.0
+"""After a longer silence the state says less than a new start would."""
+
+MAX_REJECTED_IN_ROW: Final = 40
+"""So many differences in a row beyond the gate mean that the state is wrong, not the differences."""
+
+SPEED_STD_MPS: Final = 1.0
+"""Of the velocity at the start."""
+
+IN_USE_S: Final = 0.5
+"""An anchor counts as in use while its last accepted difference is younger."""
+
+
+class PairTracking:
+    """One tag that hears pairs of anchors."""
+
+    def __init__(
+        self,
+        settings: PairSettings,
+        anchors_m: dict[int, tuple[float, float, float]],
+        z_bounds_m: tuple[float, float] | None = None,
+    ) -> None:
+        """``anchors_m`` places the anchors; a difference that brings its own positions needs none."""
+        self.counters: Counter[str] = Counter()
+        self.reason: NoFixReason = NoFixReason.NO_BEACONS
+        self._settings = settings
+        self._places = {anchor: np.array(place) for anchor, place in anchors_m.items()}
+        self._z_bounds_m = z_bounds_m
+        self._tracker = PairTracker(settings)
+        self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
+        self._started = False
+        self._last_s = 0.0
+        self._used: dict[int, tuple[float, NDArray[np.float64]]] = {}
+        self._since_try = 0
+
+    def hear(self, pair: PairTdoa) -> Fix | None:
+        """Take one difference, in the order of time; a fix if it was used, else ``reason`` says why not."""
+        a_m, b_m = self._place(pair.anchor_a, pair.a_m), self._place(pair.anchor_b, pair.b_m)
+        if a_m is None or b_m is None:
+            self.counters["unknown-anchor"] += 1
+            self.reason = NoFixReason.NO_ALMANAC
+            return None
+        dt_s = pair.time_s - self._last_s
+        if self._started and (dt_s < 0.0 or dt_s > MAX_GAP_S or self._lost()):
+            self.counters["restart"] += 1
+            self._started = False
+            self._window.clear()
+        self._last_s = pair.time_s
+        if not self._started:
+            return self._try_start(pair)
+        if not self._tracker.hear(a_m, b_m, dt_s, pair.tdoa_m):
+            self.counters["outlier"] += 1
+            self.reason = NoFixReason.RESIDUALS
+            return None
+        self._used[pair.anchor_a] = (pair.time_s, a_m)
+        self._used[pair.anchor_b] = (pair.time_s, b_m)
+        return self._fix(pair.time_s)
+
+    def _place(self, anchor: int, given: tuple[float, float, float] | None) -> NDArray[np.float64] | None:
+        return self._places.get(anchor) if given is None else np.array(given)
+
+    def _lost(self) -> bool:
+        return bool(self._tracker.whole[REJECTED_IN_ROW] >= MAX_REJECTED_IN_ROW)
+
+    def _try_start(self, pair: PairTdoa) -> Fix | None:
+        """Look for a start at every sixth difference; medians of each pair keep single outliers out of it."""
+        self._window.append(pair)
+        while pair.time_s - self._window[0].time_s > WINDOW_S:
+            self._window.popleft()
+        self._since_try += 1
+        if self._since_try < 6 and len(self._window) < WINDOW:
+            return None
+        self._since_try = 0
+        solution = self._solve()
+        if isinstance(solution, NoSolution):
+            self.reason = solution.reason
+            return None
+        dim = self._tracker.dim
+        self._tracker.start(solution.position_m[:dim], solution.covariance_m2[:dim, :dim], SPEED_STD_MPS**2)
+        self._started = True
+        self._window.clear()
+        self.counters["start"] += 1
+        return self._fix(pair.time_s)
+
+    def _solve(self) -> Solution | NoSolution:
+        grouped: dict[tuple[int, int], list[PairTdoa]] = {}
+        for pair in self._window:
+            grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(pair)
+        values = [float(np.median([pair.tdoa_m for pair in group])) for group in grouped.values()]
+        variance = self._settings.tdoa_std_m**2
+        joined = against_reference(list(grouped), values, [variance] * len(values))
+        if not joined.anchors:
+            return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
+        newest = self._newest_places()
+        return locate(
+            np.array([newest[anchor] for anchor in joined.anchors]),
+            joined.tdoa_m,
+            joined.covariance_m2,
+            height_m=self._settings.height_m,
+            z_bounds_m=self._z_bounds_m,
+        )
+
+    def _newest_places(self) -> dict[int, NDArray[np.float64]]:
+        places = dict(self._places)
+        for pair in self._window:
+            for anchor, given in ((pair.anchor_a, pair.a_m), (pair.anchor_b, pair.b_m)):
+                if given is not None:
+                    places[anchor] = np.array(given)
+        return places
+
+    def _fix(self, time_s: float) -> Fix:
+        self.counters["fixes"] += 1
+        used = {anchor: place for anchor, (when, place) in self._used.items() if time_s - when <= IN_USE_S}
+        anchors_m = np.array(list(used.values())).reshape(-1, 3)
+        tracker = self._tracker
+        return motion_fix(
+            time_s, tracker.x, tracker.P, self._settings.height_m, tuple(used), anchors_m, tracker.statistics, "tracker"
+        )
