@@ -1,0 +1,30 @@
+"""True time that passes from event to event."""
+
+import heapq
+from collections.abc import Callable, Iterator
+from typing import Generic, TypeVar
+
+Told = TypeVar("Told")
+
+
+class Timeline(Generic[Told]):
+    """Events in the order of true time (whole ideal ticks); those of one tick in the order of their planning."""
+
+    def __init__(self) -> None:
+        self.now_ticks = 0
+        self._serial = 0
+        self._events: list[tuple[int, int, Callable[[], Told | None]]] = []
+
+    def at(self, ticks: int, happen: Callable[[], Told | None]) -> None:
+        """Plan an event; one that should have happened already happens now."""
+        self._serial += 1
+        heapq.heappush(self._events, (max(ticks, self.now_ticks), self._serial, happen))
+
+    def run(self, until_ticks: int) -> Iterator[Told]:
+        """Let everything happen up to a time, and give what the events have to tell."""
+        while self._events and self._events[0][0] <= until_ticks:
+            self.now_ticks, _, happen = heapq.heappop(self._events)
+            told = happen()
+            if told is not None:
+                yield told
+        self.now_ticks = max(self.now_ticks, until_ticks)
