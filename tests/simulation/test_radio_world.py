@@ -372,6 +372,21 @@ def test_a_restarted_tag_has_a_new_counter_and_its_owner_is_told():
     assert 2 <= len(phases) <= 4
 
 
+def test_overlapping_outages_end_with_the_last():
+    made = []
+
+    def factory(anchor):
+        made.append(anchor)
+        return Metronome(anchor)
+
+    outages = (AnchorOutage(1, Outage(0.0, 0.3)), AnchorOutage(1, Outage(0.1, 0.5)))
+    world = World(site_of((0, 0)), factory, [AT_P1], _with(anchor_outages=outages), 1)
+    times = [broadcast.emission_s for broadcast in world.run(1.0)]
+    assert made == [1]
+    assert times[0] == pytest.approx(0.505, abs=1e-7)
+    assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 15e-3), abs=1e-7)
+
+
 def test_impairments_of_unknown_anchors_are_refused():
     with pytest.raises(ValueError, match=r"anchor_biases names anchor 9; .*1, 2, 3, 4, 5, 6"):
         World(LAB, staggered(), [], _with(anchor_biases=(AnchorBias(9, 1.0),)), 1)

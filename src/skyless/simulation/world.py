@@ -77,6 +77,7 @@ class World:
         self._lead_ticks = from_seconds(lead_s)
         self._machines: list[AnchorMachine | None] = [None] * len(keys)
         self._boots = [0] * len(keys)
+        self._reasons_off = [1] * len(keys)
         self._air = OnAir()
         self._heard = np.zeros(len(keys), dtype=RECEIVED)
         self._counts = np.zeros((2, len(OUTCOMES)), dtype=np.int64)
@@ -116,23 +117,24 @@ class World:
         outages = [(self._node_of[planned.anchor], planned.outage) for planned in self._impairments.anchor_outages]
         for index, tag in enumerate(self._tags):
             outages += [(len(self._anchors) + index, outage) for outage in tag.outages]
-        off_at_first = {node for node, outage in outages if outage.off_s <= 0.0}
-        for node in range(len(self._boots)):
-            if node not in off_at_first:
-                self._timeline.at(0, partial(self._switch_on, node))
         for node, outage in outages:
-            if outage.off_s > 0.0:
-                self._timeline.at(from_seconds(outage.off_s), partial(self._switch_off, node))
+            self._timeline.at(from_seconds(outage.off_s), partial(self._switch_off, node))
             if math.isfinite(outage.on_s):
                 self._timeline.at(from_seconds(outage.on_s), partial(self._switch_on, node))
+        for node in range(len(self._boots)):
+            self._timeline.at(0, partial(self._switch_on, node))
 
     def _switch_off(self, node: int) -> None:
+        self._reasons_off[node] += 1
         self._stations[node]["on"] = 0
         self._machines[node] = None
         self._boots[node] += 1
 
     def _switch_on(self, node: int) -> None:
         """Start a node, with a new counter and a new machine if it ran before."""
+        self._reasons_off[node] -= 1
+        if self._reasons_off[node] > 0:
+            return
         tag = node - len(self._anchors)
         self._stations[node]["on"] = 1
         if self._timeline.now_ticks > 0:
