@@ -1,0 +1,395 @@
+"""The solver on exact data: random rooms, mirrors, and every reason for no position."""
+
+import math
+import os
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skyless.positioning.fix import NoFixReason
+from skyless.positioning.minima import mean_if_positive
+from skyless.positioning.solver import NoSolution, PseudorangeSolution, Solution, locate, locate_pseudoranges
+from skyless.uncertainty.dop import dilution_of_precision
+
+LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def tdoas(anchors, p):
+    ranges = np.linalg.norm(anchors - p, axis=1)
+    return ranges[1:] - ranges[0]
+
+
+def sigma(n, std=1e-3):
+    return std**2 * (np.eye(n) + 1)
+
+
+def room(seed, n, *, outside=3.0):
+    """Anchors in a room of some metres, somewhere; a tag in it or some metres outside."""
+    draw = np.random.default_rng(seed)
+    size, corner = draw.uniform([4, 4, 2.5], [20, 20, 8]), draw.uniform(-100, 100, 3)
+    anchors, p = corner + draw.uniform(0, size, (n, 3)), corner + draw.uniform(-outside, size + outside)
+    return anchors, p
+
+
+def refused(solution, reason):
+    assert isinstance(solution, NoSolution), solution
+    assert solution.reason is reason, solution
+    return solution
+
+
+@settings(max_examples=300)
+@given(seed=SEEDS, n=st.integers(5, 10), weighted=st.booleans())
+def test_known_height_recovers_the_position(seed, n, weighted):
+    anchors, p = room(seed, n)
+    if dilution_of_precision(anchors, p, height_known=True).pdop > 30:
+        return
+    solution = locate(anchors, tdoas(anchors, p), sigma(n - 1), height_m=p[2], weighted=weighted)
+    if isinstance(solution, NoSolution):
+        _second_place_is_true(refused(solution, NoFixReason.MIRROR), p)
+        return
+    np.testing.assert_allclose(solution.position_m, p, atol=1e-6)
+    assert solution.position_m[2] == pytest.approx(p[2], abs=1e-12)
+    assert not solution.covariance_m2[2].any()
+    assert not solution.covariance_m2[:, 2].any()
+    assert solution.dof == n - 3
+    assert solution.chi2 < 1e-9
+
+
+@settings(max_examples=300)
+@given(seed=SEEDS, n=st.integers(6, 10), weighted=st.booleans())
+def test_free_height_recovers_the_position(seed, n, weighted):
+    anchors, p = room(seed, n)
+    if dilution_of_precision(anchors, p, height_known=False).pdop > 30:
+        return
+    solution = locate(anchors, tdoas(anchors, p), sigma(n - 1), weighted=weighted)
+    if isinstance(solution, NoSolution):
+        _second_place_is_true(refused(solution, NoFixReason.MIRROR), p)
+        return
+    np.testing.assert_allclose(solution.position_m, p, atol=1e-6)
+    assert solution.dof == n - 4
+
+
+def _second_place_is_true(solution, p):
+    """An ambiguity names the true position among the two."""
+    assert "({:.2f}, {:.2f}, {:.2f}) m".format(*(p + 0.0)) in solution.detail
+
+
+@settings(max_examples=300)
+@given(seed=SEEDS, height_known=st.booleans())
+def test_exactly_determined_gives_the_position_or_names_both(seed, height_known):
+    """Three hyperbolas' anchors, or four hyperboloids', may meet twice; the truth is always one of the places."""
+    anchors, p = room(seed, 3 if height_known else 4)
+    if dilution_of_precision(anchors, p, height_known=height_known).pdop > 30:
+        return
+    height = p[2] if height_known else None
+    solution = locate(anchors, tdoas(anchors, p), sigma(len(anchors) - 1), height_m=height)
+    if isinstance(solution, NoSolution):
+        _second_place_is_true(refused(solution, NoFixReason.MIRROR), p)
+    else:
+        np.testing.assert_allclose(solution.position_m, p, atol=1e-6)
+        assert solution.dof == 0
+
+
+def test_both_roots_of_an_exactly_determined_case_solve_it():
+    anchors = np.array([(0, 0, 0), (6, 0, 0), (0, 6, 0)], float)
+    p = np.array([-1.5, -1.0, 0])
+    solution = refused(locate(anchors, tdoas(anchors, p), sigma(2), height_m=0), NoFixReason.MIRROR)
+    _second_place_is_true(solution, p)
+    places = [place.strip("( ").split(",") for place in solution.detail.split(") m")[:2]]
+    for place in [[float(x.replace("and (", "")) for x in place] for place in places]:
+        np.testing.assert_allclose(tdoas(anchors, place), tdoas(anchors, p), atol=0.02)  # printed with two digits
+
+
+def coplanar_room(seed, n):
+    """Anchors in a plane of any tilt, a tag at least a metre off it, bounds that hold only the tag."""
+    draw = np.random.default_rng(seed)
+    axes, _ = np.linalg.qr(draw.normal(size=(3, 3)))
+    flat = np.column_stack([draw.uniform(-6, 6, (n, 2)), np.zeros(n)])
+    local = np.append(draw.uniform(-4, 4, 2), draw.uniform(1, 4))
+    mirrored = local * [1, 1, -1]
+    return flat @ axes + 10, local @ axes + 10, mirrored @ axes + 10
+
+
+@settings(max_examples=300)
+@given(seed=SEEDS, n=st.integers(4, 9), weighted=st.booleans())
+def test_coplanar_anchors_have_a_mirror_image(seed, n, weighted):
+    anchors, p, image = coplanar_room(seed, n)
+    apart = abs(p[2] - image[2])
+    if dilution_of_precision(anchors, p, height_known=False).pdop > 200 or apart < 0.1:
+        return
+    measured, covariance = tdoas(anchors, p), sigma(n - 1, 1e-4)
+    _second_place_is_true(refused(locate(anchors, measured, covariance, weighted=weighted), NoFixReason.MIRROR), p)
+    low, high = p[2] - 0.4 * apart, p[2] + 0.4 * apart
+    solution = locate(anchors, measured, covariance, weighted=weighted, z_bounds_m=(low, high))
+    assert isinstance(solution, Solution), solution
+    np.testing.assert_allclose(solution.position_m, p, atol=1e-6)
+    np.testing.assert_allclose(solution.mirror_m, image, atol=1e-6)
+    wide = locate(anchors, measured, covariance, weighted=weighted, z_bounds_m=(-1000, 1000))
+    refused(wide, NoFixReason.MIRROR)
+
+
+def test_the_bounds_decide_for_the_nearer_only_if_it_is_near():
+    p = np.array([2.0, 3.0, 1.5])
+    measured, covariance = tdoas(LAB, p), sigma(5, 0.01)
+    std = math.sqrt(locate(LAB, measured, covariance, z_bounds_m=(0, 5)).covariance_m2[2, 2])
+    solution = locate(LAB, measured, covariance, z_bounds_m=(-0.5, 1.5 - 2 * std))
+    assert solution.position_m[2] == pytest.approx(1.5)
+    assert solution.mirror_m[2] == pytest.approx(-1.5)
+    refused(locate(LAB, measured, covariance, z_bounds_m=(-0.5, 1.5 - 4 * std)), NoFixReason.MIRROR)
+    refused(locate(LAB, measured, covariance, z_bounds_m=(-0.5, 0.5)), NoFixReason.MIRROR)
+
+
+def test_nearly_coplanar_anchors_have_a_mirror_image_too():
+    anchors = LAB + np.column_stack([np.zeros((6, 2)), [0.02, -0.02, 0.01, 0.02, -0.01, 0]])
+    p = np.array([1.2, 1.6, 1.5])
+    refused(locate(anchors, tdoas(anchors, p), sigma(5, 0.1)), NoFixReason.MIRROR)
+    solution = locate(anchors, tdoas(anchors, p), sigma(5, 0.03), z_bounds_m=(0, 3))
+    np.testing.assert_allclose(solution.position_m, p, atol=1e-6)
+    np.testing.assert_allclose(solution.mirror_m, [1.2, 1.6, -1.5], atol=0.3)
+    # A tenth of a millimetre of noise tells the sides apart.
+    np.testing.assert_allclose(locate(anchors, tdoas(anchors, p), sigma(5, 1e-4)).position_m, p, atol=1e-6)
+
+
+def in_two_orders(seed, n, height_known):
+    """Solutions from noisy pseudoranges to the same anchors, in two orders; None for bad geometry."""
+    anchors, p = room(seed, n, outside=0.0)
+    if dilution_of_precision(anchors, p, height_known=height_known).pdop > 10:
+        return None
+    draw = np.random.default_rng(seed)
+    pseudoranges = np.linalg.norm(anchors - p, axis=1) + 1234.5 + draw.normal(0, 0.05, n)
+    variances = draw.uniform(0.03**2, 0.08**2, n)
+    order, height = draw.permutation(n), p[2] if height_known else None
+    straight = locate_pseudoranges(anchors, pseudoranges, variances, height_m=height, residual_tail=0)
+    return straight, locate_pseudoranges(
+        anchors[order], pseudoranges[order], variances[order], height_m=height, residual_tail=0
+    )
+
+
+@settings(max_examples=200)
+@given(seed=SEEDS, n=st.integers(6, 9), height_known=st.booleans())
+def test_the_order_of_the_anchors_does_not_move_the_position(seed, n, height_known):
+    both = in_two_orders(seed, n, height_known)
+    if both is None or any(isinstance(s, NoSolution) for s in both):
+        return
+    straight, shuffled = both
+    if np.abs(shuffled.position_m - straight.position_m).max() > 0.1:
+        return  # two minima within one error ellipse: either is right
+    np.testing.assert_allclose(shuffled.position_m, straight.position_m, atol=1e-6)
+    np.testing.assert_allclose(shuffled.covariance_joint_m2, straight.covariance_joint_m2, rtol=1e-4, atol=1e-9)
+    assert shuffled.bias_m == pytest.approx(straight.bias_m, abs=1e-6)
+    assert shuffled.chi2 == pytest.approx(straight.chi2, rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize("height_known", [True, False])
+def test_the_order_of_the_anchors_hardly_ever_decides_whether_a_rival_is_found(height_known):
+    """Rivals are searched from starts that depend on the reference: 1 in 1000 rooms may differ."""
+    both = [pair for seed in range(1000) if (pair := in_two_orders(seed, 5 + seed % 4, height_known)) is not None]
+    different = [pair for pair in both if isinstance(pair[0], NoSolution) != isinstance(pair[1], NoSolution)]
+    apart = [
+        pair
+        for pair in both
+        if all(isinstance(s, Solution) for s in pair) and np.abs(pair[0].position_m - pair[1].position_m).max() > 1e-6
+    ]
+    assert len(both) > 500
+    assert len(different) <= 3
+    assert len(apart) <= 3
+
+
+@pytest.mark.parametrize("height_known", [True, False])
+def test_pseudoranges_give_bias_and_the_joint_covariance_of_gps(height_known):
+    draw = np.random.default_rng(3)
+    anchors, p = room(8, 7, outside=0)
+    variances = draw.uniform(0.01, 0.09, 7)
+    ranges = np.linalg.norm(anchors - p, axis=1)
+    solution = locate_pseudoranges(anchors, ranges - 77.0, variances, height_m=p[2] if height_known else None)
+    assert isinstance(solution, PseudorangeSolution)
+    np.testing.assert_allclose(solution.position_m, p, atol=1e-6)
+    assert solution.bias_m == pytest.approx(-77.0, abs=1e-6)
+    unit = ((p - anchors) / ranges[:, None])[:, : 2 if height_known else 3]
+    H = np.column_stack([unit, np.ones(7)])
+    np.testing.assert_allclose(
+        solution.covariance_joint_m2, np.linalg.inv(H.T @ (H / variances[:, None])), rtol=1e-6, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(("count", "height"), [(3, None), (2, 0.0), (1, 0.0), (0, None)])
+def test_too_few_anchors(count, height):
+    solution = refused(
+        locate(LAB[:count], np.zeros(max(count - 1, 0)), sigma(max(count - 1, 0)), height_m=height),
+        NoFixReason.TOO_FEW_ANCHORS,
+    )
+    assert f"{4 if height is None else 3} anchors are needed, {count} are there" in solution.detail
+    pseudo = locate_pseudoranges(LAB[:count], np.zeros(count), np.ones(count), height_m=height)
+    refused(pseudo, NoFixReason.TOO_FEW_ANCHORS)
+
+
+@pytest.mark.parametrize("height", [None, 0.0])
+@pytest.mark.parametrize(
+    "anchors",
+    [
+        np.column_stack([np.arange(6), 2 * np.arange(6), np.zeros(6)]),
+        np.full((6, 3), 4.0),
+        np.array([(1, 2, 0)] * 3 + [(4, 5, 0)] * 3),
+    ],
+)
+def test_anchors_in_one_line_or_one_point(anchors, height):
+    anchors = anchors.astype(float)
+    refused(locate(anchors, tdoas(anchors, [1, 5, 2]), sigma(5), height_m=height), NoFixReason.BAD_GEOMETRY)
+
+
+def test_a_circle_says_nothing_of_the_height_above_its_centre():
+    circle = LAB[[0, 1, 3, 4]]
+    refused(locate(circle, np.zeros(3), sigma(3)), NoFixReason.BAD_GEOMETRY)
+
+
+@pytest.mark.parametrize("distance", [1e4, 1e6, 1e8])
+def test_a_tag_too_far_outside(distance):
+    p = np.array([3.0, 4.0 + distance, 0.0])
+    refused(locate(LAB, tdoas(LAB, p), sigma(5, 0.1), height_m=0), NoFixReason.BAD_GEOMETRY)
+
+
+def test_an_impossible_tdoa_is_no_fix():
+    """|TDoA| beyond the anchors' distance: no hyperbola at all."""
+    refused(locate(LAB[:3], [20.0, 20.0], sigma(2, 0.1), height_m=0), NoFixReason.RESIDUALS)
+
+
+@pytest.mark.parametrize("anchor", range(5))
+@pytest.mark.parametrize("late", [-5.0, 2.0, 30.0])
+def test_gross_outliers_do_not_pass(anchor, late):
+    measured = tdoas(LAB, np.array([3.0, 3.0, 0.0]))
+    measured[anchor] += late
+    refused(locate(LAB, measured, sigma(5, 0.05), height_m=0), NoFixReason.RESIDUALS)
+    assert isinstance(locate(LAB, measured, sigma(5, 10.0), height_m=0), (Solution, NoSolution))
+    everything = locate(LAB, measured, sigma(5, 0.05), height_m=0, residual_tail=0)
+    if isinstance(everything, NoSolution) and late < 30:  # 30 m between anchors 10 m apart belong to no position
+        assert everything.reason is not NoFixReason.RESIDUALS
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
+@pytest.mark.parametrize("where", ["anchors", "tdoa", "covariance", "height"])
+@pytest.mark.parametrize("height", [None, 0.0])
+def test_values_that_are_no_measurement_are_refused_in_silence(bad, where, height):
+    anchors, measured, covariance = LAB.copy(), tdoas(LAB, np.array([2.0, 3.0, 0.0])), sigma(5)
+    if where == "height":
+        height = bad
+    else:
+        {"anchors": anchors, "tdoa": measured, "covariance": covariance}[where].flat[2] = bad
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        refused(locate(anchors, measured, covariance, height_m=height), NoFixReason.BAD_GEOMETRY)
+
+
+@pytest.mark.parametrize("variance", [0.0, -1.0, math.nan, math.inf])
+def test_variances_that_are_none_are_refused(variance):
+    covariance = sigma(5)
+    covariance[2, 2] = variance
+    refused(locate(LAB, np.zeros(5), covariance, height_m=0), NoFixReason.BAD_GEOMETRY)
+    variances = np.array([1, 1, variance, 1, 1, 1])
+    refused(locate_pseudoranges(LAB, np.ones(6), variances, height_m=0), NoFixReason.BAD_GEOMETRY)
+
+
+def test_a_singular_covariance_is_refused():
+    refused(locate(LAB, np.zeros(5), np.ones((5, 5)), height_m=0), NoFixReason.BAD_GEOMETRY)
+
+
+def test_iterations_that_do_not_settle_are_told(monkeypatch):
+    from skyless.positioning import minima
+    from skyless.positioning.least_squares import EXHAUSTED
+
+    monkeypatch.setattr(minima, "minimise", lambda *_: (EXHAUSTED, 100))
+    refused(locate(LAB, np.zeros(5), sigma(5), height_m=0), NoFixReason.NOT_CONVERGED)
+
+
+def test_arrays_that_do_not_fit_each_other_raise():
+    with pytest.raises(ValueError, match="expected"):
+        locate(LAB[:5], np.zeros(5), sigma(5), height_m=0)
+    with pytest.raises(ValueError, match="expected"):
+        locate(LAB, np.zeros(5), sigma(4), height_m=0)
+    with pytest.raises(ValueError, match="expected"):
+        locate_pseudoranges(LAB, np.zeros(6), np.ones(5), height_m=0)
+
+
+@settings(max_examples=500)
+@given(seed=SEEDS, height_known=st.booleans(), weighted=st.booleans(), tail=st.sampled_from([0.0, 1e-9]))
+def test_no_numbers_at_all_make_it_raise_or_warn(seed, height_known, weighted, tail):
+    draw = np.random.default_rng(seed)
+    n = int(draw.integers(1, 9))
+    scale = 10.0 ** draw.integers(-6, 9)
+    anchors = np.round(scale * draw.normal(size=(n + 1, 3)), int(draw.integers(-2, 9)))
+    measured = 10.0 ** draw.integers(-6, 9) * draw.normal(size=n)
+    covariance = sigma(n, 10.0 ** draw.integers(-5, 4))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = locate(
+            anchors,
+            measured,
+            covariance,
+            height_m=0.0 if height_known else None,
+            weighted=weighted,
+            residual_tail=tail,
+            z_bounds_m=(-scale, scale),
+        )
+    if isinstance(result, Solution):
+        assert np.isfinite(result.position_m).all()
+        assert np.isfinite(result.covariance_m2).all()
+        assert np.isfinite(result.chi2)
+
+
+@pytest.mark.parametrize("mean", [-60, -30.01, -29.99, -7, -3, 0, 0.5, 4, 40])
+def test_mean_of_a_truncated_normal(mean):
+    from scipy.stats import truncnorm
+
+    expected = truncnorm.mean(-mean, np.inf, loc=mean)
+    assert mean_if_positive(3.0 * mean, 3.0) == pytest.approx(3.0 * expected, rel=2e-5)
+
+
+WITHOUT_COMPILER = """
+import sys, warnings
+warnings.simplefilter("error")
+import numpy as np
+from skyless.positioning.solver import locate, NoSolution
+from skyless.uncertainty.dop import dops_at
+draw = np.random.default_rng(9)
+anchors = draw.uniform(0, 8, (7, 3))
+for kind in range(4):
+    used = anchors * [1, 1, 0] if kind == 3 else anchors
+    for _ in range(5):
+        p = draw.uniform(1, 7, 3)
+        r = np.linalg.norm(used - p, axis=1)
+        tdoa = r[1:] - r[0] + draw.normal(0, 0.02, 6)
+        s = locate(used, tdoa, 4e-4 * (np.eye(6) + 1), height_m=p[2] if kind < 2 else None,
+                   weighted=kind % 2 == 0, z_bounds_m=(0, 8) if kind == 3 else None)
+        if isinstance(s, NoSolution):
+            print(s.reason)
+        else:
+            print(*s.position_m, *s.covariance_m2.ravel(), s.chi2, s.dof)
+print(*dops_at(anchors, draw.uniform(0, 8, (3, 3)), height_known=False).ravel())
+print(locate(anchors[:4] * [1, 1, 0], [1e8, -1e8, 3], np.eye(3)).reason)
+"""
+
+
+def test_without_the_compiler_the_same_values():
+    outputs = []
+    for disabled in ("0", "1"):
+        run = subprocess.run(
+            [sys.executable, "-c", WITHOUT_COMPILER],
+            env=os.environ | {"NUMBA_DISABLE_JIT": disabled},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert run.returncode == 0, run.stderr
+        outputs.append(run.stdout.split())
+    compiled, plain = outputs
+    assert len(compiled) == len(plain)
+    for one, other in zip(compiled, plain, strict=True):
+        try:
+            assert float(other) == pytest.approx(float(one), rel=1e-6, abs=1e-8)
+        except ValueError:
+            assert one == other
