@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from skyless.positioning.closed_form import FREE, HEIGHT, MOST_STARTS, PLANE, starting_points
 from skyless.positioning.least_squares import CONVERGED, assess, minimise
+from skyless.positioning.problem import Problem
 from skyless.uncertainty.cholesky import factorise, solve
 
 Array = NDArray[np.float64]
@@ -17,26 +18,6 @@ DISTINCT_CHI2: Final = 9.0
 """Two minima are distinct where one lies outside the 3-sigma ellipsoid of the other."""
 MERGED_SIGMAS: Final = 2.0
 """Mirror images have merged while the square of their distance from the plane is within these sigmas of zero."""
-
-
-class Problem(Struct, frozen=True, gc=False):
-    """TDoAs in the local frame of ``closed_form``: p = origin + axesᵀ·local."""
-
-    kind: int
-    anchors: Array
-    tdoa: Array
-    covariance: Array
-    factor: Array
-    weighted: bool
-    extent: float
-    height: float
-    origin: Array
-    axes: Array
-
-    @property
-    def dof(self) -> int:
-        """Measurements beyond the unknowns."""
-        return len(self.tdoa) - (2 if self.kind == HEIGHT else 3)
 
 
 class Minimum(Struct, frozen=True, gc=False):

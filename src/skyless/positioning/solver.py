@@ -8,10 +8,11 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
-from skyless.positioning.closed_form import FREE, HEIGHT, PLANE, spread
+from skyless.positioning.closed_form import PLANE
 from skyless.positioning.fix import NoFixReason
 from skyless.positioning.least_squares import EXHAUSTED
-from skyless.positioning.minima import Minimum, Problem, below_plane, distinct, find_minima, unfold
+from skyless.positioning.minima import Minimum, below_plane, distinct, find_minima, unfold
+from skyless.positioning.problem import Problem, frame
 from skyless.uncertainty.cholesky import factorise
 
 Array = NDArray[np.float64]
@@ -22,10 +23,6 @@ RIVAL_CHI2: Final = 9.0
 """A second minimum is a rival while its chi2 is less than this above the best one (a likelihood ratio of 90)."""
 BOUND_SIGMAS: Final = 3.0
 """A height may exceed the bounds by these sigmas if its mirror image exceeds them more."""
-COLLINEAR: Final = 1e-6
-"""Anchors are in one line, or one point, if their figure's width is below this part of its length."""
-THIN_SIGMAS: Final = 0.1
-"""Anchors are in one plane if they leave it by less than this part of the smallest TDoA sigma."""
 IMPOSSIBLE_SIGMAS: Final = 6.0
 """A TDoA that exceeds its anchors' distance by these sigmas belongs to no position."""
 LARGEST: Final = 1e9
@@ -76,8 +73,8 @@ def locate(
 ) -> Solution | NoSolution:
     """Locate a tag by TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``.
 
-    ``anchors_m``: shape (n + 1, 3), the reference first. ``covariance_m2``: Σ of the TDoAs, shape (n, n), of which
-    the lower triangle is read. ``height_m``: the tag's known height (2-D positioning; anchors may have any
+    ``anchors_m``: shape (n + 1, 3), the reference first. ``covariance_m2``: Σ of the TDoAs, shape (n, n),
+    symmetric. ``height_m``: the tag's known height (2-D positioning; anchors may have any
     heights). ``weighted=False`` minimises the plain sum of squares; its covariance still follows from Σ.
 
     Where two positions explain the data about equally well, as the two sides of the anchors' plane do in 3-D,
@@ -201,28 +198,10 @@ def _prepare(
         return NoSolution(NoFixReason.BAD_GEOMETRY, "the TDoAs' covariance is not positive definite")
     origin = anchors[0].copy()
     height = None if height_m is None else height_m - float(origin[2])
-    kind, local, extent, axes = _frame(anchors - origin, height, math.sqrt(covariance.diagonal().min()))
+    kind, local, extent, axes = frame(anchors - origin, height, math.sqrt(covariance.diagonal().min()))
     if not extent > 0.0:
         return NoSolution(NoFixReason.BAD_GEOMETRY, "the anchors are in one line or in one point")
     return Problem(kind, local, tdoa, covariance, factor, weighted, extent, height or 0.0, origin, axes)
-
-
-def _frame(anchors: Array, height: float | None, sigma: float) -> tuple[int, Array, float, Array]:
-    """Kind of problem, anchors in its axes, their extent (0 if they are in one line), and the axes as rows."""
-    axes = np.zeros((3, 3))
-    flat = anchors.copy()
-    if height is not None:
-        flat[:, 2] = 0.0
-    extent, width, thickness = spread(flat, axes)
-    if not width > COLLINEAR * extent:
-        return FREE, anchors, 0.0, axes
-    if height is not None:
-        return HEIGHT, anchors, extent, np.eye(3)
-    local = anchors @ axes.T
-    if thickness > max(1e-9 * extent, THIN_SIGMAS * sigma):
-        return FREE, local, extent, axes
-    local[:, 2] = 0.0
-    return PLANE, local, extent, axes
 
 
 def _why_none(problem: Problem, status: int) -> NoSolution:
