@@ -1,0 +1,54 @@
+"""What a tag hears in a system without a master, and the time differences that follow from it.
+
+Anchors of such a system tell when they sent and when they heard each other, each in its own clock. How many bits
+their counters have is a property of the whole stream, so it is kept with the stream and not in each value.
+"""
+
+from msgspec import Struct
+
+Point = tuple[float, float, float]
+"""x, y, z in metres."""
+
+
+class Relay(Struct, frozen=True, gc=False):
+    """The sender of a packet heard another anchor."""
+
+    anchor: int
+    """Identifier of the anchor that was heard."""
+    sequence: int
+    """Sequence number of the packet that was heard."""
+    rx_ticks: int
+    """When it was heard, in the clock of the sender of this relay; as many bits as its TX stamps."""
+    tof_ticks: float | None
+    """Time of flight between the two anchors, antenna delays included where the stamps include them."""
+
+
+class Packet(Struct, frozen=True, gc=False):
+    """One packet of an anchor as a tag heard it."""
+
+    host_s: float | None
+    """The host's clock, needed only to bridge gaps over 8.6 s."""
+    anchor: int
+    """Identifier of the sender."""
+    sequence: int
+    tx_ticks: int
+    """When it was sent, in the sender's clock."""
+    rx_ticks: int
+    """When the tag heard it, in the tag's own clock."""
+    relays: tuple[Relay, ...]
+    position_m: Point | None = None
+    """Where the sender says that it stands."""
+
+
+class PairTdoa(Struct, frozen=True, gc=False):
+    """One time difference of arrival between two anchors, in metres."""
+
+    time_s: float
+    """In the tag's clock, since its first packet, or in the time of the recording that it comes from."""
+    anchor_a: int
+    anchor_b: int
+    tdoa_m: float
+    """Range to b less range to a."""
+    a_m: Point | None = None
+    """Where a was, if it moves and the recording says so; otherwise the site's coordinates hold."""
+    b_m: Point | None = None

@@ -1,0 +1,82 @@
+"""Binary stream of Bitcraze's sniffer (after it was sent ``b``), found again after garbage.
+
+A record is ``BC | RX stamp 5 bytes | from u8 | to u8 | length u16 | payload | length u16``, little-endian. There is no
+checksum: the length that is told twice is all that marks a record.
+"""
+
+from collections.abc import Iterator
+from io import BufferedIOBase
+from typing import Final
+
+from skyless.air.packet import Packet
+from skyless.recordings.bitcraze_payload import TDOA2, TDOA3, decode
+from skyless.recordings.source import Drops, chunks
+
+MAX_PAYLOAD_BYTES: Final = 1014
+"""Of a long DW1000 frame, less the MAC header of at least 7 bytes and the check sequence."""
+
+_MARK: Final = 0xBC
+_HEADER_BYTES: Final = 10
+_TRAILER_BYTES: Final = 2
+_LONGEST_BYTES: Final = _HEADER_BYTES + MAX_PAYLOAD_BYTES + _TRAILER_BYTES
+
+
+def recognise(head: bytes, name: str) -> bool:
+    """Tell whether a whole record of a known payload stands near the beginning."""
+    del name
+    at = head.find(_MARK)
+    while at >= 0:
+        if _size(head, at) and head[at + _HEADER_BYTES] in (TDOA2, TDOA3):
+            return True
+        at = head.find(_MARK, at + 1)
+    return False
+
+
+def read(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
+    """Yield the packets of a stream; each stretch of bytes that belongs to no record is counted once."""
+    for record in _records(stream, drops):
+        rx_ticks = int.from_bytes(record[1:6], "little")
+        packet = decode(record[_HEADER_BYTES:-_TRAILER_BYTES], None, record[6], rx_ticks)
+        if isinstance(packet, Packet):
+            yield packet
+        else:
+            drops[packet] += 1
+
+
+def _records(stream: BufferedIOBase, drops: Drops) -> Iterator[bytes]:
+    """Cut the stream into records; while more bytes may come, the longest possible record must be in the buffer."""
+    buffer = b""
+    at = 0
+    lost = False
+    source = chunks(stream, drops)
+    whole = False
+    while not (whole and at >= len(buffer)):
+        if len(buffer) - at < _LONGEST_BYTES and not whole:
+            chunk = next(source, b"")
+            whole = not chunk
+            buffer = buffer[at:] + chunk
+            at = 0
+            continue
+        size = _size(buffer, at)
+        if size:
+            yield buffer[at : at + size]
+            at += size
+            lost = False
+            continue
+        if not lost:
+            drops["bytes-of-no-record"] += 1
+            lost = True
+        following = buffer.find(_MARK, at + 1)
+        at = following if following >= 0 else len(buffer)
+
+
+def _size(buffer: bytes, at: int) -> int:
+    """Size of the whole record at that place, 0 where none stands."""
+    left = len(buffer) - at
+    if left <= _HEADER_BYTES + _TRAILER_BYTES or buffer[at] != _MARK:
+        return 0
+    length = buffer[at + 8] | buffer[at + 9] << 8
+    size = _HEADER_BYTES + length + _TRAILER_BYTES
+    if not 1 <= length <= MAX_PAYLOAD_BYTES or left < size:
+        return 0
+    return size if buffer[at + size - 2 : at + size] == buffer[at + 8 : at + 10] else 0

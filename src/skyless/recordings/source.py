@@ -1,0 +1,102 @@
+"""The bytes of a recording: gzip or plain, whole or cut off, in chunks and in lines; memory does not grow with it."""
+
+import gzip
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from io import BufferedIOBase
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+from skyless.errors import ConfigurationError
+
+CHUNK_BYTES: Final = 1 << 16
+HEAD_BYTES: Final = 1 << 14
+"""How much of a recording is looked at to recognise its format."""
+
+MAX_LINE_BYTES: Final = 1 << 14
+
+_GZIP_MAGIC: Final = b"\x1f\x8b"
+
+Drops = Counter[str]
+
+
+def open_source(path: str | PathLike[str]) -> BufferedIOBase:
+    """Open a file for reading, through gzip if its first bytes say so.
+
+    Raises:
+        ConfigurationError: the file cannot be opened.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            compressed = stream.read(len(_GZIP_MAGIC)) == _GZIP_MAGIC
+        return gzip.open(path, "rb") if compressed else Path(path).open("rb")
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ConfigurationError(path, "the file", reason, "a file that can be read") from error
+
+
+def read_lines(path: str | PathLike[str]) -> list[str]:
+    """All lines of a text file that is small, or needed whole.
+
+    Raises:
+        ConfigurationError: the file cannot be opened or read to its end.
+    """
+    faults: Drops = Counter()
+    with open_source(path) as stream:
+        text = b"".join(chunks(stream, faults))
+    if faults:
+        raise ConfigurationError(path, "the file", next(iter(faults)), "a whole file")
+    return text.decode("utf-8-sig", "replace").splitlines()
+
+
+def read_head(path: str | PathLike[str]) -> bytes:
+    """First bytes of a recording, decompressed; fewer where the file is shorter or corrupt."""
+    with open_source(path) as stream:
+        head = b""
+        for chunk in chunks(stream, Counter()):
+            head += chunk
+            if len(head) >= HEAD_BYTES:
+                break
+        return head[:HEAD_BYTES]
+
+
+def chunks(stream: BufferedIOBase, drops: Drops) -> Iterator[bytes]:
+    """Yield the stream piece by piece; a compressed stream that breaks off or is corrupt ends there, and is counted."""
+    while True:
+        try:
+            chunk = stream.read1(CHUNK_BYTES)  # what was readable before a fault is returned before it raises
+        except EOFError:
+            drops["compressed-stream-cut-off"] += 1
+            return
+        except (OSError, zlib.error):
+            drops["unreadable-bytes"] += 1
+            return
+        if not chunk:
+            return
+        yield chunk
+
+
+def lines(stream: BufferedIOBase, drops: Drops) -> Iterator[bytes]:
+    r"""Yield the lines without their ends (\n or \r\n).
+
+    A last line without an end is dropped and counted, as a number in it may be cut off; so are overlong lines.
+    """
+    rest = b""
+    overlong = False
+    for chunk in chunks(stream, drops):
+        parts = (rest + chunk).split(b"\n")
+        rest = parts.pop()
+        if overlong and parts:
+            del parts[0]
+            overlong = False
+        for line in parts:
+            yield line[:-1] if line.endswith(b"\r") else line
+        if len(rest) > MAX_LINE_BYTES:
+            if not overlong:
+                drops["overlong-line"] += 1
+            overlong = True
+            rest = b""
+    if rest:
+        drops["unfinished-line"] += 1

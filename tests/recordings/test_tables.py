@@ -1,0 +1,117 @@
+import gzip
+import io
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyless.air.packet import PairTdoa
+from skyless.errors import ConfigurationError
+from skyless.recordings import pair_table
+from skyless.recordings.anchors import read_anchors
+from skyless.recordings.truth import read_truth
+
+HEADER = b"t_s,idA,idB,tdoa_m\n"
+
+
+def tdoas(table):
+    drops = Counter()
+    return list(pair_table.read(io.BytesIO(table), drops)), drops
+
+
+def test_a_table_with_all_kinds_of_bad_lines():
+    table = (
+        HEADER
+        + b"0.5,1,2,-0.25\n"
+        + HEADER
+        + b"1,1,2,nan\n2,1,,3\n3,1,2\n4,1,2,3,4\n5,x,2,3\n\n6,3,3,1\n7,4,5,1e0\n8,1,2,1"
+    )
+    values, drops = tdoas(table)
+    assert values == [PairTdoa(0.5, 1, 2, -0.25), PairTdoa(7.0, 4, 5, 1.0)]
+    assert drops == {
+        "repeated-header": 1,
+        "not-finite": 1,
+        "blank-field": 1,
+        "wrong-number-of-columns": 2,
+        "malformed-number": 1,
+        "blank-line": 1,
+        "anchor-against-itself": 1,
+        "unfinished-line": 1,
+    }
+
+
+def test_columns_are_found_by_name():
+    values, drops = tdoas(b"tdoa_m,snr,t_s,idB,idA\r\n0.5,9,1.5,7,6\r\n")
+    assert values == [PairTdoa(1.5, 6, 7, 0.5)]
+    assert not drops
+
+
+@given(st.binary(max_size=2000))
+def test_random_tables_never_raise(noise):
+    values, _ = tdoas(HEADER + noise)
+    assert all(math.isfinite(value.tdoa_m) for value in values)
+
+
+def write(folder, text):
+    file = folder / "table.csv"
+    file.write_text(text)
+    return file
+
+
+def test_anchors_with_other_columns_and_hexadecimal_identifiers(tmp_path):
+    file = write(tmp_path, "name,id,z_m,y_m,x_m\nfirst,1,0.5,2,3\n\nsecond,0x90000A05B,1,1,1")
+    assert read_anchors(file) == {1: (3.0, 2.0, 0.5), 0x90000A05B: (1.0, 1.0, 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "line 1"),
+        ("id,x_m,y_m\n1,2,3\n", "line 1"),
+        ("id,x_m,y_m,z_m\n", "the table"),
+        ("id,x_m,y_m,z_m\n1,2,3\n", "line 2"),
+        ("id,x_m,y_m,z_m\n1,2,3,4\n2,2,three,4\n", "line 3, column y_m"),
+        ("id,x_m,y_m,z_m\n1,2,3,nan\n", "line 2, column z_m"),
+        ("id,x_m,y_m,z_m\nA,2,3,4\n", "line 2, column id"),
+        ("id,x_m,y_m,z_m\n1,2,3,4\n1,2,3,4\n", "line 3, column id"),
+    ],
+)
+def test_bad_anchors_are_named(tmp_path, text, named):
+    file = write(tmp_path, text)
+    with pytest.raises(ConfigurationError) as caught:
+        read_anchors(file)
+    assert caught.value.key == named
+    assert str(file) in str(caught.value)
+
+
+def test_truth_with_and_without_attitude(tmp_path):
+    truth = read_truth(write(tmp_path, "t_s,x_m,y_m,z_m,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n1,2,3,4,0,0,1,0\n"))
+    np.testing.assert_array_equal(truth.position_m, [[1, 2, 3], [2, 3, 4]])
+    np.testing.assert_array_equal(truth.quaternion, [[0, 0, 0, 1], [0, 0, 1, 0]])
+    assert read_truth(write(tmp_path, "t_s,x_m,y_m,z_m\n0,1,2,3\n")).quaternion is None
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("a,b\n1,2\n", "line 1"),
+        ("t_s,x_m,y_m,z_m\n", "the table"),
+        ("t_s,x_m,y_m,z_m\n0,1,2\n", "line 2"),
+        ("t_s,x_m,y_m,z_m\n0,1,2,inf\n", "line 2, column z_m"),
+        ("t_s,x_m,y_m,z_m\n1,1,2,3\n0.5,1,2,3\n", "column t_s"),
+    ],
+)
+def test_bad_truth_is_named(tmp_path, text, named):
+    with pytest.raises(ConfigurationError) as caught:
+        read_truth(write(tmp_path, text))
+    assert caught.value.key == named
+
+
+def test_truth_in_a_broken_archive_is_an_error(tmp_path):
+    file = tmp_path / "truth.csv.gz"
+    file.write_bytes(gzip.compress(b"t_s,x_m,y_m,z_m\n" + b"0,1,2,3\n" * 1000)[:-20])
+    with pytest.raises(ConfigurationError, match="whole file"):
+        read_truth(file)
