@@ -8,6 +8,8 @@ import math
 from collections import Counter
 from typing import Final
 
+from msgspec import Struct
+
 from skyless.air.almanac import Page
 from skyless.air.beacon import Beacon, Heard, MasterTime
 from skyless.air.codec import decode_cached, encode, heard_capacity
@@ -28,6 +30,16 @@ REJECTIONS_BEFORE_RESTART: Final = 3
 """So many master beacons in a row that do not fit mean that the master's clock, or the own one, has jumped."""
 
 SUBTICKS: Final = 256
+
+
+class Synchronisation(Struct, frozen=True):
+    """How well an anchor knows the master's time."""
+
+    beacons: int
+    """Master beacons taken since the clock filter's last start."""
+    rate_ppm: float
+    offset_std_m: float
+    """After the last beacon, in metres of light."""
 
 
 class Anchor:
@@ -59,6 +71,13 @@ class Anchor:
     def is_master(self) -> bool:
         """Whether this anchor's clock is the site's time."""
         return self.id == self._site.master
+
+    @property
+    def synchronisation(self) -> Synchronisation:
+        """State of the own clock against the master's; exact for the master itself."""
+        if self.is_master:
+            return Synchronisation(0, 0.0, 0.0)
+        return Synchronisation(self._clock.updates, self._clock.rate * 1e6, self._clock.offset_std_m)
 
     def hear(self, reception: Reception) -> None:
         """Take a frame off the air; what does not belong here is counted and dropped."""

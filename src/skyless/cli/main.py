@@ -11,6 +11,9 @@ from skyless.errors import SkylessError
 
 _COMMANDS = (
     # name, where it is (imported only when it is called), what it does
+    ("demo", "skyless.cli.demo:app", "Show a site and walking tags in real time."),
+    ("simulate", "skyless.cli.simulate:app", "Run a site in the simulated world and judge it against the truth."),
+    ("replay", "skyless.cli.replay:app", "Turn a recording into fixes and judge them against the truth."),
     ("site", "skyless.cli.site:app", "Write and check site files."),
 )
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from skyless.cli.options import finite_numbers, open_for_writing
 from skyless.cli.output import console, print_json
 from skyless.cli.progress import progress_bar
 from skyless.errors import SkylessError
@@ -110,7 +111,7 @@ def simulate(
         method=method,
         seed=seed,
         noise_ps=noise_ps,
-        positions_m=tuple(_numbers("position", text, (2, 3)) for text in position or ()),
+        positions_m=tuple(finite_numbers("position", text, (2, 3)) for text in position or ()),
         tags=tags,
         speed_mps=speed,
         qa=qa,
@@ -144,31 +145,17 @@ def _site(scenario: str, file: Path | None) -> "Site":
     return lab_site()
 
 
-def _numbers(option: str, text: str, counts: tuple[int, ...], separator: str = ",") -> tuple[float, ...]:
-    """Finite numbers of an option's value."""
-    import math
-
-    try:
-        values = tuple(float(part) for part in text.split(separator))
-    except ValueError:
-        values = ()
-    if len(values) not in counts or not all(math.isfinite(value) for value in values):
-        wanted = " or ".join(str(count) for count in counts)
-        raise SkylessError(f"--{option} is {text!r}; it should be {wanted} numbers separated by {separator!r}")
-    return values
-
-
 def _bias(text: str) -> "AnchorBias":
     from skyless.simulation.impairments import AnchorBias
 
-    anchor, metres, *burst = _numbers("bias", text, (2, 3), ":")
+    anchor, metres, *burst = finite_numbers("bias", text, (2, 3), ":")
     return AnchorBias(int(anchor), metres, *burst)
 
 
 def _outage(text: str) -> "AnchorOutage":
     from skyless.simulation.impairments import AnchorOutage, Outage
 
-    anchor, *times = _numbers("outage", text, (2, 3), ":")
+    anchor, *times = finite_numbers("outage", text, (2, 3), ":")
     if len(times) == 2 and times[1] <= times[0]:
         raise SkylessError(f"--outage is {text!r}; the anchor should come back after it has stopped")
     return AnchorOutage(int(anchor), Outage(*times))
@@ -187,16 +174,9 @@ def _run(request: "Request", fixes: int | None, duration: float | None, fixes_cs
     if fixes_csv is None:
         _pass_time(fleet, fixes, until_s, None)
     else:
-        with _open(fixes_csv) as file:
+        with open_for_writing(fixes_csv) as file:
             _pass_time(fleet, fixes, until_s, file)
     return report(fleet, request.method, started_s)
-
-
-def _open(path: Path) -> TextIO:
-    try:
-        return path.open("w", newline="")
-    except OSError as error:
-        raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def _pass_time(fleet: "Fleet", fixes: int | None, until_s: float, file: TextIO | None) -> None:

@@ -167,6 +167,11 @@ class ClockFilter:
         """Fractional rate of the own clock against the master's."""
         return float(self.state[RATE]) / SPEED_OF_LIGHT_MPS
 
+    @property
+    def offset_std_m(self) -> float:
+        """Standard deviation of the offset at the last beacon, in metres of light."""
+        return float(np.sqrt(self.state[VAR_OFFSET]))
+
     def hear(self, tx_ticks_master: int, rx_ticks_own: int, range_m: float) -> float:
         """Take a master beacon, both stamps unwrapped; return the normalised innovation squared (0 at the start)."""
         if self.updates == 0:

@@ -79,6 +79,15 @@ class ErrorStatistics:
         """How many errors there were."""
         return self._count
 
+    def std(self) -> tuple[float, float, float]:
+        """Standard deviation of each component about its mean."""
+        mean = [value / self._count for value in self._sum]
+        x, y, z = (
+            max(square / self._count - value * value, 0.0) ** 0.5
+            for square, value in zip(self._squares, mean, strict=True)
+        )
+        return x, y, z
+
     def summary(self) -> ErrorSummary:
         """What the errors come to."""
         if self._count == 0:

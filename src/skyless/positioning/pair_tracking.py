@@ -32,6 +32,13 @@ IN_USE_S: Final = 0.5
 """An anchor counts as in use while its last accepted difference is younger."""
 
 
+TRY_EVERY: Final = 6
+"""Differences between two attempts at a start."""
+
+NEIGHBOURHOOD: Final = 1.5
+"""A tag farther from the anchors' centre than this part of their figure's diagonal, in x or y, is lost."""
+
+
 class PairTracking:
     """One tag that hears pairs of anchors."""
 
@@ -53,14 +60,15 @@ class PairTracking:
         self._last_s = 0.0
         self._used: dict[int, tuple[float, NDArray[np.float64]]] = {}
         self._since_try = 0
+        self._area_m = (np.zeros(2), 0.0)
 
-    def hear(self, pair: PairTdoa) -> Fix | None:
-        """Take one difference, in the order of time; a fix if it was used, else ``reason`` says why not."""
+    def hear(self, pair: PairTdoa) -> bool:
+        """Take one difference, in the order of time; True if it made a fix, else ``reason`` says why not."""
         a_m, b_m = self._place(pair.anchor_a, pair.a_m), self._place(pair.anchor_b, pair.b_m)
         if a_m is None or b_m is None:
             self.counters["unknown-anchor"] += 1
             self.reason = NoFixReason.NO_ALMANAC
-            return None
+            return False
         dt_s = pair.time_s - self._last_s
         if self._started and (dt_s < 0.0 or dt_s > MAX_GAP_S or self._lost()):
             self.counters["restart"] += 1
@@ -72,49 +80,73 @@ class PairTracking:
         if not self._tracker.hear(a_m, b_m, dt_s, pair.tdoa_m):
             self.counters["outlier"] += 1
             self.reason = NoFixReason.RESIDUALS
-            return None
+            return False
         self._used[pair.anchor_a] = (pair.time_s, a_m)
         self._used[pair.anchor_b] = (pair.time_s, b_m)
-        return self._fix(pair.time_s)
+        return True
+
+    @property
+    def position_m(self) -> tuple[float, float, float]:
+        """The newest position."""
+        x, _, *z = self._tracker.x[: self._tracker.dim].tolist()
+        return x, float(self._tracker.x[1]), z[0] if z else self._settings.height_m or 0.0
+
+    def fix(self) -> Fix:
+        """The newest position with all that is known of it; only after a ``hear`` that made one."""
+        used = {anchor: place for anchor, (when, place) in self._used.items() if self._last_s - when <= IN_USE_S}
+        anchors_m = np.array(list(used.values())).reshape(-1, 3)
+        tracker, height_m = self._tracker, self._settings.height_m
+        return motion_fix(
+            self._last_s, tracker.x, tracker.P, height_m, tuple(used), anchors_m, tracker.statistics, "tracker"
+        )
 
     def _place(self, anchor: int, given: tuple[float, float, float] | None) -> NDArray[np.float64] | None:
         return self._places.get(anchor) if given is None else np.array(given)
 
     def _lost(self) -> bool:
-        return bool(self._tracker.whole[REJECTED_IN_ROW] >= MAX_REJECTED_IN_ROW)
+        """Whether the data do not fit the state any more, or the state has left the neighbourhood of the anchors."""
+        if self._tracker.whole[REJECTED_IN_ROW] >= MAX_REJECTED_IN_ROW:
+            return True
+        centre, radius_m = self._area_m
+        x = self._tracker.x
+        return bool(abs(x[0] - centre[0]) > radius_m or abs(x[1] - centre[1]) > radius_m)
 
-    def _try_start(self, pair: PairTdoa) -> Fix | None:
+    def _try_start(self, pair: PairTdoa) -> bool:
         """Look for a start at every sixth difference; medians of each pair keep single outliers out of it."""
         self._window.append(pair)
         while pair.time_s - self._window[0].time_s > WINDOW_S:
             self._window.popleft()
         self._since_try += 1
-        if self._since_try < 6 and len(self._window) < WINDOW:
-            return None
+        if self._since_try < TRY_EVERY:
+            return False
         self._since_try = 0
         solution = self._solve()
         if isinstance(solution, NoSolution):
             self.reason = solution.reason
-            return None
+            return False
         dim = self._tracker.dim
         self._tracker.start(solution.position_m[:dim], solution.covariance_m2[:dim, :dim], SPEED_STD_MPS**2)
         self._started = True
         self._window.clear()
+        self._used.clear()
         self.counters["start"] += 1
-        return self._fix(pair.time_s)
+        return True
 
     def _solve(self) -> Solution | NoSolution:
-        grouped: dict[tuple[int, int], list[PairTdoa]] = {}
+        grouped: dict[tuple[int, int], list[float]] = {}
         for pair in self._window:
-            grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(pair)
-        values = [float(np.median([pair.tdoa_m for pair in group])) for group in grouped.values()]
+            grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(pair.tdoa_m)
+        values = [float(np.median(group)) for group in grouped.values()]
         variance = self._settings.tdoa_std_m**2
         joined = against_reference(list(grouped), values, [variance] * len(values))
         if not joined.anchors:
             return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
         newest = self._newest_places()
+        anchors_m = np.array([newest[anchor] for anchor in joined.anchors])
+        low, high = anchors_m.min(axis=0)[:2], anchors_m.max(axis=0)[:2]
+        self._area_m = ((low + high) / 2.0, NEIGHBOURHOOD * max(float(np.linalg.norm(high - low)), 5.0))
         return locate(
-            np.array([newest[anchor] for anchor in joined.anchors]),
+            anchors_m,
             joined.tdoa_m,
             joined.covariance_m2,
             height_m=self._settings.height_m,
@@ -128,12 +160,3 @@ class PairTracking:
                 if given is not None:
                     places[anchor] = np.array(given)
         return places
-
-    def _fix(self, time_s: float) -> Fix:
-        self.counters["fixes"] += 1
-        used = {anchor: place for anchor, (when, place) in self._used.items() if time_s - when <= IN_USE_S}
-        anchors_m = np.array(list(used.values())).reshape(-1, 3)
-        tracker = self._tracker
-        return motion_fix(
-            time_s, tracker.x, tracker.P, self._settings.height_m, tuple(used), anchors_m, tracker.statistics, "tracker"
-        )

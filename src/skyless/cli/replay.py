@@ -1,0 +1,277 @@
+"""``skyless replay``: a recording becomes fixes, and is judged against the truth where there is one."""
+
+import csv
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+from cyclopts.validators import Number
+
+from skyless.cli.options import finite_numbers, open_for_writing
+from skyless.cli.output import console, print_json
+from skyless.cli.progress import progress_bar
+from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from skyless.air.packet import Point
+    from skyless.experiments.judge import Judge
+    from skyless.experiments.replay import Replay, ReplayReport
+    from skyless.positioning.fix import Fix
+    from skyless.recordings.truth import Truth
+
+_Positive = Annotated[float, Parameter(validator=Number(gt=0))]
+
+COLUMNS = (
+    *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
+    *("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2"),
+    *("anchors", "anchor_ids", "chi2", "residual_rms_m"),
+)
+"""Columns of the file that --fixes writes."""
+
+app = App(
+    name="replay",
+    help_epilogue="Example: skyless replay flight_tdoa.csv.gz --anchors anchors.csv --truth flight_pose.csv.gz --json",
+)
+
+
+@app.default
+def replay(
+    file: Path,
+    /,
+    *,
+    anchors: Path | None = None,
+    site: Path | None = None,
+    truth: Path | None = None,
+    lever_arm: str | None = None,
+    height: str = "auto",
+    format: str | None = None,  # noqa: A002 - the option's natural name
+    listener: str | None = None,
+    settle: Annotated[float, Parameter(validator=Number(gte=0))] | None = None,
+    above: float | None = None,
+    qa: _Positive | None = None,
+    tdoa_std: _Positive | None = None,
+    fixes: Path | None = None,
+    plot: Path | None = None,
+    json: bool = False,
+) -> None:
+    """Turn a recording into fixes; judge them where the truth is known.
+
+    Reads Bitcraze sniffer captures (YAML, binary, text; TDoA2 and TDoA3), tables of time differences, MILUV passive
+    ticks and Avalue receptions; the format is recognised by the content.
+
+    Parameters
+    ----------
+    file
+        The recording, plain or gzip.
+    anchors
+        Table of anchors: id,x_m,y_m,z_m.
+    site
+        A site file instead, for its anchors and its tags' height.
+    truth
+        Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns. MILUV ticks bring their own.
+    lever_arm
+        The antenna in the body's frame, x,y,z in metres, added to the truth.
+    height
+        The tag's height: metres, truth (its median), free (estimated), or auto: free where the anchors can tell it.
+    format
+        Name of the format, if the content should not decide.
+    listener
+        Whose ears, in recordings with several listeners.
+    settle
+        Seconds from the start that are not judged; by default 3 with a truth table, 2 without.
+    above
+        Judge only while the true height exceeds this; by default 0.3 m for a table of differences that starts below
+        it and later flies, as tags on the floor hear reflections only.
+    qa
+        Agility that the filter assumes, m²/s³.
+    tdoa_std
+        Noise of a time difference that the filter assumes, metres.
+    fixes
+        Write every fix into this table.
+    plot
+        Draw track, errors and histograms into this PNG, SVG or PDF.
+    json
+        Write one JSON object instead of the table.
+    """
+    from skyless.experiments.judge import Judge
+    from skyless.experiments.replay import Replay, ReplayRequest
+
+    places, site_height_m = _anchors(anchors, site)
+    known = _truth(file, truth, lever_arm, format, listener)
+    height_m, note = _height(height, places, site_height_m, known, file)
+    settle_s = settle if settle is not None else (2.0 if known is None else 3.0)
+    judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=_above(above, known))
+    request = ReplayRequest(
+        path=file,
+        anchors_m=places,
+        format=format,
+        listener=listener,
+        height_m=height_m,
+        qa=qa,
+        tdoa_std_m=tdoa_std,
+    )
+    report = _run(Replay(request, judge), file, fixes)
+    distances = _distances(file, report.format)
+    if plot is not None:
+        _draw(plot, judge, report)
+    if json:
+        import msgspec
+
+        print_json({**msgspec.to_builtins(report), "height_note": note, "anchor_distances_m": distances})
+    else:
+        _show(report, note, distances)
+
+
+def _anchors(table: Path | None, site: Path | None) -> "tuple[dict[int, Point], float | None]":
+    from skyless.recordings.anchors import read_anchors
+    from skyless.site.load import load_site
+
+    if table is not None and site is not None:
+        raise SkylessError("give either --anchors or --site, not both")
+    if table is not None:
+        return read_anchors(table), None
+    if site is None:
+        return {}, None
+    known = load_site(site)
+    return {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in known.anchors}, known.tags.height_m
+
+
+def _truth(file: Path, table: Path | None, arm: str | None, name: str | None, listener: str | None) -> "Truth | None":
+    from skyless.experiments.judge import antenna_truth
+    from skyless.recordings.formats import format_of
+    from skyless.recordings.truth import read_truth
+
+    if table is None and format_of(file, name).name == "miluv":
+        table = file
+    if table is None:
+        if arm is not None:
+            raise SkylessError("--lever-arm moves the truth, which --truth must give")
+        return None
+    truth = read_truth(table, listener)
+    if arm is None:
+        return truth
+    x, y, z = finite_numbers("lever-arm", arm, (3,))
+    return antenna_truth(truth, (x, y, z))
+
+
+def _height(
+    wish: str, places: "dict[int, Point]", site_m: float | None, truth: "Truth | None", file: Path
+) -> tuple[float | None, str]:
+    """Height to hold, and what to tell the user about it."""
+    import numpy as np
+
+    from skyless.experiments.observability import plane_height_m
+    from skyless.recordings.formats import format_of
+
+    if wish == "free":
+        return None, "estimated"
+    if wish == "truth" or (wish == "auto" and truth is not None and format_of(file, None).name == "miluv"):
+        if truth is None:
+            raise SkylessError("--height truth takes the height from the truth, which --truth must give")
+        return float(np.median(truth.position_m[:, 2])), "the truth's median"
+    if wish != "auto":
+        return finite_numbers("height", wish, (1,))[0], "given"
+    if site_m is not None:
+        return site_m, "from the site file"
+    plane_m = plane_height_m(places)
+    if plane_m is None:
+        return None, "estimated"
+    return plane_m, "the anchors' mean: they lie too flat to tell the height (--height free estimates it all the same)"
+
+
+def _above(wish: float | None, truth: "Truth | None") -> float | None:
+    """Judge flights in the air only: the truth begins on the floor and rises well above it."""
+    if wish is not None or truth is None:
+        return wish
+    from skyless.experiments.observability import FLIGHT_M, flies
+
+    return FLIGHT_M if flies(truth) else None
+
+
+def _run(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
+    with ExitStack() as stack:
+        bar = stack.enter_context(progress_bar("replaying", file.stat().st_size))
+        on_fix = None if fixes is None else _writer(stack, fixes)
+        return run.run(on_fix, bar.reach)
+
+
+def _writer(stack: ExitStack, path: Path) -> "Callable[[Fix], None]":
+    writer = csv.writer(stack.enter_context(open_for_writing(path)))
+    writer.writerow(COLUMNS)
+    return lambda fix: writer.writerow(_row(fix))
+
+
+def _row(fix: "Fix") -> list[str]:
+    velocity = ("", "", "") if fix.velocity_mps is None else (f"{value:.5g}" for value in fix.velocity_mps)
+    covariance = fix.covariance_m2[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return [
+        f"{fix.time_s:.6f}",
+        *(f"{value:.5f}" for value in fix.position_m),
+        *velocity,
+        *(f"{value:.5g}" for value in covariance),
+        str(len(fix.anchors)),
+        " ".join(map(str, fix.anchors)),
+        f"{fix.chi2:.4g}",
+        f"{fix.residual_rms_m:.4g}",
+    ]
+
+
+def _distances(file: Path, name: str) -> dict[str, float]:
+    """Distances of the anchors, where the recording itself measures them."""
+    if name != "avalue":
+        return {}
+    from collections import Counter
+
+    from skyless.recordings.avalue import anchor_distances_m
+
+    return {f"{a:X}-{b:X}": metres for (a, b), metres in sorted(anchor_distances_m(file, Counter()).items())}
+
+
+def _draw(path: Path, judge: "Judge", report: "ReplayReport") -> None:
+    from skyless.experiments.replay_plot import draw
+
+    try:
+        draw(path, judge.track.rows, f"{report.format}, {report.fixes} fixes")
+    except (OSError, ValueError) as error:
+        raise SkylessError(f"{path} cannot be drawn: {error}") from None
+
+
+def _show(report: "ReplayReport", note: str, distances: dict[str, float]) -> None:
+    from rich.table import Table
+
+    table = Table("replay", "", title=f"{report.format}: {report.receptions} receptions", show_header=False)
+    for name, value in _lines(report, note):
+        table.add_row(name, value)
+    for reason, count in report.drops.items():
+        table.add_row(f"dropped: {reason}", str(count))
+    for pair, metres in distances.items():
+        table.add_row(f"distance {pair}", f"{metres:.3f} m")
+    console().print(table)
+
+
+def _lines(report: "ReplayReport", note: str) -> list[tuple[str, str]]:
+    fixes = str(report.fixes) if report.reason is None else f"none: {report.reason}"
+    height = note if report.height_m is None else f"{report.height_m:.3f} m, {note}"
+    return [
+        ("fixes", fixes),
+        ("rate", "–" if report.rate_hz is None else f"{report.rate_hz:.1f} Hz"),
+        ("height", height),
+        ("median position", _triple(report.median_m)),
+        ("standard deviation", _triple(report.std_m)),
+        ("noise of a difference", _metres(report.tdoa_noise_m)),
+        ("RMSE 2-D", _metres(report.rmse_2d_m)),
+        ("RMSE 3-D", _metres(report.rmse_3d_m)),
+        ("95 %", _metres(report.p95_m)),
+        ("largest error", _metres(report.max_m)),
+        ("speed", f"{report.receptions_per_s:,.0f} receptions/s"),
+    ]
+
+
+def _metres(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f} m"
+
+
+def _triple(values: tuple[float, float, float] | None) -> str:
+    return "–" if values is None else ", ".join(f"{value:.3f}" for value in values) + " m"

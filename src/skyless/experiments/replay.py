@@ -1,0 +1,173 @@
+"""Replay of recordings: records in, fixes out, judged against the truth where there is one."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from os import PathLike
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.air.packet import Packet, PairTdoa, Point
+from skyless.experiments.judge import Judge, Judgement
+from skyless.experiments.noise import NoiseBook, PairNoise
+from skyless.positioning.fix import Fix, NoFixReason
+from skyless.positioning.masterless import PairEngine
+from skyless.positioning.pair_tracker import PairSettings
+from skyless.positioning.pair_tracking import PairTracking
+from skyless.recordings.formats import Recording, open_recording
+
+PROFILES: Final[Mapping[str, PairSettings]] = {
+    "miluv": PairSettings(qa=0.01, tdoa_std_m=0.3),
+}
+"""Settings for formats whose nature asks for others: MILUV's exchanges come once or twice a second."""
+
+
+class ReplayRequest(Struct, frozen=True):
+    """What is asked of a replay."""
+
+    path: str | PathLike[str]
+    anchors_m: dict[int, Point]
+    format: str | None = None
+    listener: str | None = None
+    height_m: float | None = None
+    """Height of the tag where it is known."""
+    qa: float | None = None
+    tdoa_std_m: float | None = None
+    z_bounds_m: tuple[float, float] | None = None
+
+
+class ReplayReport(Struct, frozen=True):
+    """What a replay came to; metres and seconds, None where it cannot be told."""
+
+    format: str
+    receptions: int
+    """Packets, or rows of a table of differences."""
+    fixes: int
+    dropped: int
+    median_m: tuple[float, float, float] | None
+    """Median position after the settling time."""
+    std_m: tuple[float, float, float] | None
+    """Standard deviation of the position after the settling time, for tags at rest."""
+    rmse_2d_m: float | None
+    rmse_3d_m: float | None
+    p95_m: float | None
+    max_m: float | None
+    rate_hz: float | None
+    """Fixes per second of recorded time."""
+    tdoa_noise_m: float | None
+    """Median over the pairs of anchors of their differences' noise (1.4826 MAD), about the truth or the median."""
+    bias_m: tuple[float, float, float] | None
+    first_fix_s: float | None
+    height_m: float | None
+    reason: str | None
+    """Why there is no fix at all."""
+    drops: dict[str, int]
+    pairs: tuple[PairNoise, ...]
+    wall_s: float
+    receptions_per_s: float
+
+
+class Replay:
+    """One recording on its way through the filter."""
+
+    def __init__(self, request: ReplayRequest, judge: Judge) -> None:
+        self._request = request
+        self._judge = judge
+        self.recording: Recording = open_recording(request.path, request.format, request.listener)
+        self._settings = self._settings_of(self.recording.format.name)
+        self._tracking = PairTracking(self._settings, request.anchors_m, request.z_bounds_m)
+        bits = self.recording.format.tx_bits
+        self._engine = None if bits is None else PairEngine(bits, anchors_m=request.anchors_m)
+        self._noise = NoiseBook(judge, request.anchors_m)
+        self.receptions = 0
+        self.fixes = 0
+        self._first_s: float | None = None
+        self._last_s = 0.0
+        self._first_fix_s: float | None = None
+
+    def _settings_of(self, name: str) -> PairSettings:
+        base = PROFILES.get(name, PairSettings())
+        request = self._request
+        return PairSettings(
+            qa=base.qa if request.qa is None else request.qa,
+            tdoa_std_m=base.tdoa_std_m if request.tdoa_std_m is None else request.tdoa_std_m,
+            gate=base.gate,
+            height_m=request.height_m,
+        )
+
+    def run(self, on_fix: Callable[[Fix], None] | None, on_progress: Callable[[int], None]) -> ReplayReport:
+        """Read to the end; ``on_fix`` gets every fix, ``on_progress`` now and then the bytes read so far."""
+        started_s = time.perf_counter()
+        with closing(self.recording):
+            for pairs in self._differences():
+                self.receptions += 1
+                if self.receptions % 1024 == 0:
+                    on_progress(self.recording.bytes_read)
+                if pairs:
+                    self._take(pairs, on_fix)
+        return self._report(time.perf_counter() - started_s)
+
+    def _differences(self) -> Iterator[tuple[PairTdoa, ...] | list[PairTdoa]]:
+        for record in self.recording:
+            if isinstance(record, Packet):
+                assert self._engine is not None
+                yield self._engine.hear(record)
+            else:
+                yield (record,)
+
+    def _take(self, pairs: tuple[PairTdoa, ...] | list[PairTdoa], on_fix: Callable[[Fix], None] | None) -> None:
+        """Take what one reception gave: one fix at most."""
+        time_s = pairs[0].time_s
+        if self._first_s is None:
+            self._first_s = time_s
+        self._last_s = time_s
+        made = False
+        for pair in pairs:
+            made = self._tracking.hear(pair) or made
+            self._noise.add(pair)
+        if not made:
+            return
+        self.fixes += 1
+        if self._first_fix_s is None:
+            self._first_fix_s = time_s - self._first_s
+        self._judge.add(time_s, time_s - self._first_s, self._tracking.position_m)
+        if on_fix is not None:
+            on_fix(self._tracking.fix())
+
+    def _drops(self) -> dict[str, int]:
+        total = self.recording.drops.copy()
+        if self._engine is not None:
+            total.update(self._engine.drops)
+        total.update({name: self._tracking.counters[name] for name in ("outlier", "unknown-anchor")})
+        return {name: count for name, count in sorted(total.items()) if count}
+
+    def _report(self, wall_s: float) -> ReplayReport:
+        judgement: Judgement = self._judge.judgement()
+        drops = self._drops()
+        pairs = self._noise.pairs()
+        span_s = self._last_s - (self._first_s or 0.0)
+        reason = self._tracking.reason if self._request.anchors_m or self.fixes else NoFixReason.NO_ALMANAC
+        return ReplayReport(
+            format=self.recording.format.name,
+            receptions=self.receptions,
+            fixes=self.fixes,
+            dropped=sum(drops.values()),
+            median_m=judgement.median_m,
+            std_m=judgement.std_m,
+            rmse_2d_m=judgement.errors.rmse_2d_m,
+            rmse_3d_m=judgement.errors.rmse_3d_m,
+            p95_m=judgement.errors.p95_m,
+            max_m=judgement.errors.max_m,
+            rate_hz=self.fixes / span_s if span_s > 0.0 else None,
+            tdoa_noise_m=float(np.median([pair.noise_m for pair in pairs])) if pairs else None,
+            bias_m=judgement.errors.bias_m,
+            first_fix_s=self._first_fix_s,
+            height_m=self._request.height_m,
+            reason=None if self.fixes else str(reason),
+            drops=drops,
+            pairs=pairs,
+            wall_s=wall_s,
+            receptions_per_s=self.receptions / wall_s if wall_s > 0.0 else 0.0,
+        )

@@ -1,0 +1,124 @@
+"""Simulations by name and number: from what a person asks for to a fleet in a world."""
+
+import itertools
+import math
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.experiments.fleet import Fleet, FleetSettings
+from skyless.simulation.channel import ChannelModel
+from skyless.simulation.impairments import AnchorBias, AnchorOutage, Impairments
+from skyless.simulation.oscillator import OscillatorModel, Temperature
+from skyless.simulation.trajectory import RandomWalk, Static, Trajectory, Waypoints
+from skyless.site.model import Site
+
+WALL_MARGIN_M = 0.5
+"""Walking tags keep this distance from the box around the anchors."""
+
+
+class Request(Struct, frozen=True):
+    """A simulation: what is asked of ``skyless simulate``."""
+
+    site: Site
+    method: str = "tracker"
+    seed: int = 1
+    noise_ps: float | None = None
+    """Noise of every TX and RX stamp, and what the filters assume; None for the site's own figures."""
+    positions_m: tuple[tuple[float, ...], ...] = ()
+    """Tags that lie still, (x, y) or (x, y, z) each; with none, ``tags`` of them walk about."""
+    tags: int = 1
+    speed_mps: float = 1.0
+    """Typical speed of the tags that walk about."""
+    qa: float = 0.3
+    warmup_s: float = 2.0
+    loss: float = 0.0
+    nlos: float = 0.0
+    nlos_mean_m: float = 1.0
+    power_bias: bool = False
+    temperature: bool = False
+    biases: tuple[AnchorBias, ...] = ()
+    outages: tuple[AnchorOutage, ...] = ()
+
+
+def fleet_of(request: Request) -> Fleet:
+    """Make the world and its tags.
+
+    Raises:
+        ValueError: the method, or an anchor that is to fail, does not exist.
+    """
+    site = request.site
+    if request.noise_ps is not None:
+        noise = replace(site.noise, tx_stamp_ps=request.noise_ps, rx_stamp_ps=request.noise_ps)
+        site = replace(site, noise=noise)
+    settings = FleetSettings(request.method, request.qa, request.warmup_s)
+    return Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, settings)
+
+
+def impairments_of(request: Request, site: Site) -> Impairments:
+    """Noise and faults: the site's noise figures are taken for true."""
+    noise = site.noise
+    return Impairments(
+        tx_stamp_ps=noise.tx_stamp_ps,
+        rx_stamp_ps=noise.rx_stamp_ps,
+        oscillator=OscillatorModel(
+            white_fm=noise.white_fm,
+            random_walk_fm=noise.random_walk_fm,
+            temperature=Temperature() if request.temperature else None,
+        ),
+        channel=ChannelModel(
+            loss_probability=request.loss,
+            nlos_probability=request.nlos,
+            nlos_mean_m=request.nlos_mean_m,
+            power_bias=request.power_bias,
+        ),
+        anchor_biases=request.biases,
+        anchor_outages=request.outages,
+    )
+
+
+def trajectories_of(request: Request) -> list[Trajectory]:
+    """Tags at the given positions, or walking about inside the box around the anchors."""
+    height_m = request.site.tags.height_m
+    if request.positions_m:
+        default_z_m = 0.0 if height_m is None else height_m
+        return [Static(p[0], p[1], p[2] if len(p) > 2 else default_z_m) for p in request.positions_m]
+    return [_walk(request, index) for index in range(request.tags)]
+
+
+def _walk(request: Request, index: int) -> Trajectory:
+    low, high = _walkable_box(request.site)
+    generator = np.random.default_rng([request.seed, index])
+    damping_s = 2.0
+    axes = 2 if low[2] == high[2] else 3
+    qa = 2.0 * request.speed_mps**2 / axes / damping_s
+    start, seed = generator.uniform(low, high), int(generator.integers(2**31))
+    return RandomWalk(start, low, high, qa_m2ps3=qa, damping_s=damping_s, seed=seed)
+
+
+def _walkable_box(site: Site) -> tuple[np.ndarray, np.ndarray]:
+    places = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    low, high = places.min(axis=0), places.max(axis=0)
+    margin = np.minimum(WALL_MARGIN_M, (high - low) / 4.0)
+    low, high = low + margin, high - margin
+    if site.tags.height_m is not None:
+        low[2] = high[2] = site.tags.height_m
+    return low, high
+
+
+def patrols(site: Site, tags: int, speed_mps: float = 1.0) -> list[Trajectory]:
+    """Tags walking round the site one behind the other, each on a narrower path: what the demo shows."""
+    low, high = _walkable_box(site)
+    paths: list[Trajectory] = []
+    for index in range(tags):
+        inset = (high - low)[:2] * 0.12 * (index % 3)
+        x0, y0 = low[:2] + inset
+        x1, y1 = high[:2] - inset
+        z = float((low[2] + high[2]) / 2.0)
+        corners = [(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]
+        turned = corners[index % 4 :] + corners[: index % 4]
+        shortest = min(math.dist(a, b) for a, b in itertools.pairwise(turned))
+        corner_s = min(0.8, 0.5 * shortest / speed_mps)
+        paths.append(Waypoints(turned, speed_mps, loop=True, corner_s=corner_s))
+    return paths
