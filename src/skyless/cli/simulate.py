@@ -72,7 +72,7 @@ def simulate(
     tags
         How many tags walk about.
     speed
-        Their typical speed in m/s.
+        Their speed in m/s.
     qa
         Agility that the tracker assumes, m²/s³.
     noise_ps

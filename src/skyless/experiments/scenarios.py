@@ -1,21 +1,27 @@
 """Simulations by name and number: from what a person asks for to a fleet in a world."""
 
-import itertools
-import math
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
+from numpy.typing import ArrayLike, NDArray
 
 from skyless.experiments.fleet import Fleet, FleetSettings
 from skyless.simulation.channel import ChannelModel
 from skyless.simulation.impairments import AnchorBias, AnchorOutage, Impairments
 from skyless.simulation.oscillator import OscillatorModel, Temperature
-from skyless.simulation.trajectory import RandomWalk, Static, Trajectory, Waypoints
+from skyless.simulation.trajectory import Static, Trajectory, Waypoints
 from skyless.site.model import Site
 
-WALL_MARGIN_M = 0.5
+WALL_MARGIN_M: Final = 0.5
 """Walking tags keep this distance from the box around the anchors."""
+
+WAYPOINTS: Final = 8
+
+COMFORT_MPS2: Final = 2.0
+"""Acceleration with which people and robots turn."""
 
 
 class Request(Struct, frozen=True):
@@ -30,7 +36,7 @@ class Request(Struct, frozen=True):
     """Tags that lie still, (x, y) or (x, y, z) each; with none, ``tags`` of them walk about."""
     tags: int = 1
     speed_mps: float = 1.0
-    """Typical speed of the tags that walk about."""
+    """Speed of the tags that walk about."""
     qa: float = 0.3
     warmup_s: float = 2.0
     loss: float = 0.0
@@ -88,16 +94,26 @@ def trajectories_of(request: Request) -> list[Trajectory]:
 
 
 def _walk(request: Request, index: int) -> Trajectory:
+    """Walk between random points inside the box, round and round, turning gently at each."""
     low, high = _walkable_box(request.site)
     generator = np.random.default_rng([request.seed, index])
-    damping_s = 2.0
-    axes = 2 if low[2] == high[2] else 3
-    qa = 2.0 * request.speed_mps**2 / axes / damping_s
-    start, seed = generator.uniform(low, high), int(generator.integers(2**31))
-    return RandomWalk(start, low, high, qa_m2ps3=qa, damping_s=damping_s, seed=seed)
+    points = [generator.uniform(low, high)]
+    while len(points) < WAYPOINTS:
+        point = generator.uniform(low, high)
+        if np.linalg.norm(point - points[-1]) > np.linalg.norm(high - low) / 4.0:
+            points.append(point)
+    return _smooth_path(points, request.speed_mps)
 
 
-def _walkable_box(site: Site) -> tuple[np.ndarray, np.ndarray]:
+def _smooth_path(points: Sequence[ArrayLike], speed_mps: float) -> Waypoints:
+    """Round path whose corners are as gentle as the legs allow, at most ``COMFORT_MPS2``."""
+    places = np.array(points, dtype=np.float64)
+    legs_m = np.linalg.norm(np.roll(places, -1, axis=0) - places, axis=1)
+    corner_s = min(2.0 * speed_mps / COMFORT_MPS2, 0.9 * float(legs_m.min()) / speed_mps)
+    return Waypoints(places, speed_mps, loop=True, corner_s=corner_s)
+
+
+def _walkable_box(site: Site) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     places = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     low, high = places.min(axis=0), places.max(axis=0)
     margin = np.minimum(WALL_MARGIN_M, (high - low) / 4.0)
@@ -118,7 +134,5 @@ def patrols(site: Site, tags: int, speed_mps: float = 1.0) -> list[Trajectory]:
         z = float((low[2] + high[2]) / 2.0)
         corners = [(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]
         turned = corners[index % 4 :] + corners[: index % 4]
-        shortest = min(math.dist(a, b) for a, b in itertools.pairwise(turned))
-        corner_s = min(0.8, 0.5 * shortest / speed_mps)
-        paths.append(Waypoints(turned, speed_mps, loop=True, corner_s=corner_s))
+        paths.append(_smooth_path(turned, speed_mps))
     return paths

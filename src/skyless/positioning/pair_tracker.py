@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skyless.compiled import kernel
 from skyless.positioning.kalman import innovation_variance, predict_motion, range_and_direction
-from skyless.positioning.tracker import RESIDUAL_SQUARED, gated_correct
+from skyless.positioning.tracker import AGILITY, LOST_SHARE, REJECTED_SHARE, gated_correct
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -58,7 +58,7 @@ def pair_update(
     """Advance by ``dt_s`` and take one difference; False if it lies beyond the gate."""
     n = x.shape[0]
     dim = n // 2
-    predict_motion(x, P, dim, dt_s, settings[SETTING_QA])
+    predict_motion(x, P, dim, dt_s, settings[SETTING_QA] * statistics[AGILITY])
     for place in range(n):
         h[place] = 0.0
     range_b = range_and_direction(x, dim, settings[SETTING_HEIGHT], b_m, h, 1.0)
@@ -101,7 +101,7 @@ class PairTracker:
         self.x = np.zeros(n)
         self.P = np.zeros((n, n))
         self.whole = np.zeros(5, dtype=np.int64)
-        self.statistics = np.ones(2)
+        self.statistics = np.ones(4)
         self.h = np.zeros(n)
         self.ph = np.zeros(n)
 
@@ -114,8 +114,12 @@ class PairTracker:
         self.P[:dim, :dim] = covariance_m2
         self.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
         self.whole[:] = 0
-        self.statistics[:] = 1.0
-        self.statistics[RESIDUAL_SQUARED] = self.settings[SETTING_VARIANCE]
+        self.statistics[:] = (1.0, self.settings[SETTING_VARIANCE], 0.0, 1.0)
+
+    @property
+    def lost(self) -> bool:
+        """Whether so many differences do not fit that the state must be wrong."""
+        return bool(self.statistics[REJECTED_SHARE] > LOST_SHARE)
 
     def hear(self, a_m: Vector, b_m: Vector, dt_s: float, tdoa_m: float) -> bool:
         """Take one difference, ``dt_s`` after the last one (``pair_update``)."""

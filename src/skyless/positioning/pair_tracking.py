@@ -11,7 +11,6 @@ from skyless.positioning.fix import Fix, NoFixReason, motion_fix
 from skyless.positioning.pair_tracker import PairSettings, PairTracker
 from skyless.positioning.pairs import against_reference
 from skyless.positioning.solver import NoSolution, Solution, locate
-from skyless.positioning.tracker import REJECTED_IN_ROW
 
 WINDOW: Final = 60
 """Differences that a start looks at, the newest ones ..."""
@@ -21,9 +20,6 @@ WINDOW_S: Final = 20.0
 
 MAX_GAP_S: Final = 10.0
 """After a longer silence the state says less than a new start would."""
-
-MAX_REJECTED_IN_ROW: Final = 40
-"""So many differences in a row beyond the gate mean that the state is wrong, not the differences."""
 
 SPEED_STD_MPS: Final = 1.0
 """Of the velocity at the start."""
@@ -105,7 +101,7 @@ class PairTracking:
 
     def _lost(self) -> bool:
         """Whether the data do not fit the state any more, or the state has left the neighbourhood of the anchors."""
-        if self._tracker.whole[REJECTED_IN_ROW] >= MAX_REJECTED_IN_ROW:
+        if self._tracker.lost:
             return True
         centre, radius_m = self._area_m
         x = self._tracker.x

@@ -26,13 +26,27 @@ Matrix = NDArray[np.float64]
 EPOCH, WHOLE_OFFSET, ACCEPTED, REJECTED, REJECTED_IN_ROW = range(5)
 """Places in a tracker's integer state: tag ticks, ticks, counts."""
 
-CHI2, RESIDUAL_SQUARED = range(2)
-"""Places in a tracker's statistics: running means per message."""
+CHI2, RESIDUAL_SQUARED, REJECTED_SHARE, AGILITY = range(4)
+"""Places in a tracker's statistics: running means per message, and the factor on the agility ``qa``."""
 
 SETTING_QA, SETTING_WHITE, SETTING_WALK, SETTING_VARIANCE, SETTING_GATE, SETTING_HEIGHT = range(6)
 
 FORGETTING: Final = 0.02
 """Weight of the newest message in the running means, about the last 50 messages."""
+
+RESTLESS_CHI2: Final = 1.6
+"""Accepted innovations that are larger than this on average show a tag more agile than assumed (noise alone: 1)."""
+
+AGILITY_GAIN: Final = 1.1
+AGILITY_LOSS: Final = 0.99
+MAX_AGILITY: Final = 300.0
+"""The agility grows by the gain at every message while the tag is restless, up to this factor, and then decays."""
+
+LOST_IN_ROW: Final = 8
+"""So many messages beyond the gate in a row, of more anchors than can all be blocked, mean the same."""
+
+LOST_SHARE: Final = 0.5
+"""With a larger share of messages beyond the gate the state is wrong, not the messages."""
 
 
 class TrackerSettings(Struct, frozen=True):
@@ -63,9 +77,9 @@ class TrackerSettings(Struct, frozen=True):
 
 
 @kernel
-def tracker_predict(x: Vector, P: Matrix, dim: int, dt_s: float, settings: Vector) -> None:
-    """Advance the state by ``dt_s`` of master time."""
-    predict_motion(x, P, dim, dt_s, settings[SETTING_QA])
+def tracker_predict(x: Vector, P: Matrix, dim: int, dt_s: float, settings: Vector, qa: float) -> None:
+    """Advance the state by ``dt_s`` of master time; ``qa`` is the agility of the moment."""
+    predict_motion(x, P, dim, dt_s, qa)
     predict_clock(x, P, 2 * dim, dt_s, settings[SETTING_WHITE], settings[SETTING_WALK])
 
 
@@ -93,7 +107,8 @@ def tracker_update(
     dim = (n - 2) // 2
     clock = 2 * dim
     elapsed_s = (rx_ticks_tag - whole[EPOCH]) * TICK_S
-    tracker_predict(x, P, dim, elapsed_s / (1.0 + x[clock + 1] / SPEED_OF_LIGHT_MPS), settings)
+    dt_s = elapsed_s / (1.0 + x[clock + 1] / SPEED_OF_LIGHT_MPS)
+    tracker_predict(x, P, dim, dt_s, settings, settings[SETTING_QA] * statistics[AGILITY])
     whole[EPOCH] = rx_ticks_tag
     for place in range(n):
         h[place] = 0.0
@@ -118,16 +133,26 @@ def gated_correct(
     spread: float,
     gate: float,
 ) -> bool:
-    """Correct the state unless the innovation lies beyond the gate; keep the counts and running means."""
+    """Correct the state unless the innovation lies beyond the gate; keep the counts, running means and agility.
+
+    The agility follows accepted messages only: those of a blocked anchor are late by more than the gate, while a tag
+    that turns shows in all anchors at once and first within it.
+    """
     normalised = innovation * innovation / spread
+    statistics[REJECTED_SHARE] *= 1.0 - FORGETTING
     if not normalised <= gate * gate:
         whole[REJECTED] += 1
         whole[REJECTED_IN_ROW] += 1
+        statistics[REJECTED_SHARE] += FORGETTING
         return False
     whole[ACCEPTED] += 1
     whole[REJECTED_IN_ROW] = 0
     statistics[CHI2] += FORGETTING * (normalised - statistics[CHI2])
     statistics[RESIDUAL_SQUARED] += FORGETTING * (innovation * innovation - statistics[RESIDUAL_SQUARED])
+    if statistics[CHI2] > RESTLESS_CHI2:
+        statistics[AGILITY] = min(statistics[AGILITY] * AGILITY_GAIN, MAX_AGILITY)
+    else:
+        statistics[AGILITY] = max(statistics[AGILITY] * AGILITY_LOSS, 1.0)
     correct(x, P, ph, innovation, spread)
     return True
 
@@ -191,7 +216,7 @@ class PseudorangeTracker:
         self.x = np.zeros(n)
         self.P = np.zeros((n, n))
         self.whole = np.zeros(5, dtype=np.int64)
-        self.statistics = np.ones(2)
+        self.statistics = np.ones(4)
         self.h = np.zeros(n)
         self.ph = np.zeros(n)
 
@@ -221,7 +246,13 @@ class PseudorangeTracker:
         self.x[2 * dim + 1] = clock_rate_mps
         self.P[2 * dim + 1, 2 * dim + 1] = clock_rate_variance
         self.whole[:] = (rx_ticks_tag, whole_offset_ticks, 0, 0, 0)
-        self.statistics[:] = (1.0, self.settings[SETTING_VARIANCE])
+        self.statistics[:] = (1.0, self.settings[SETTING_VARIANCE], 0.0, 1.0)
+
+    @property
+    def lost(self) -> bool:
+        """Whether so many messages do not fit that the state must be wrong."""
+        in_row = self.whole[REJECTED_IN_ROW]
+        return bool(self.statistics[REJECTED_SHARE] > LOST_SHARE or in_row >= LOST_IN_ROW)
 
     def hear(
         self,

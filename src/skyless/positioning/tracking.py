@@ -11,7 +11,6 @@ from skyless.positioning.fix import Fix, NoFixReason, motion_fix
 from skyless.positioning.observation import Observation
 from skyless.positioning.tracker import (
     EPOCH,
-    REJECTED_IN_ROW,
     PseudorangeTracker,
     TrackerSettings,
 )
@@ -19,9 +18,6 @@ from skyless.ticks import from_seconds
 
 MAX_GAP_S: Final = 5.0
 """After a longer silence the state says less than a new start would."""
-
-MAX_REJECTED_IN_ROW: Final = 30
-"""So many messages in a row beyond the gate mean that the state is wrong, not the messages."""
 
 IN_USE_S: Final = 0.1
 """An anchor counts as in use while its last accepted message is younger."""
@@ -77,7 +73,7 @@ class Tracking:
     def _lost(self, observation: Observation) -> bool:
         whole = self._tracker.whole
         gap_s = (observation.rx_ticks_tag - int(whole[EPOCH])) * TICK_S
-        return gap_s > MAX_GAP_S or bool(whole[REJECTED_IN_ROW] >= MAX_REJECTED_IN_ROW)
+        return gap_s > MAX_GAP_S or self._tracker.lost
 
     def _begin(self, start: Start, observation: Observation) -> None:
         """Start the filter; where there was one before, the time of its fixes goes on by the tag's own clock."""

@@ -48,7 +48,7 @@ LIMITS: Final = {
     "anchors.slot": Limits(0, 254, whole=True),
     "anchors.tx_antenna_delay_ticks": _DELAY,
     "anchors.rx_antenna_delay_ticks": _DELAY,
-    "schedule.slot_s": Limits(0, 1, "seconds", above=True),
+    "schedule.slot_s": Limits(0, 0.067, "seconds", above=True),
     "schedule.slots": Limits(1, 255, whole=True),
     "schedule.frames_per_node": Limits(1, 255, whole=True),
     "schedule.guard_s": Limits(0, 1, "seconds"),
