@@ -31,7 +31,8 @@ def difference(later: int, earlier: int, bits: int = TICK_BITS) -> int:
 
 def nearest(counter: int, expected_ticks: int, bits: int = TICK_BITS) -> int:
     """The unwrapped time that the counter shows and that lies nearest to the expected one."""
-    return expected_ticks + difference(counter, expected_ticks, bits)
+    half = 1 << (bits - 1)
+    return expected_ticks + ((counter - expected_ticks + half) & ((half << 1) - 1)) - half
 
 
 def to_seconds(ticks: int) -> float:

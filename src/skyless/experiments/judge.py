@@ -58,13 +58,18 @@ class Judge:
 
     def add(self, time_s: float, since_start_s: float, position_m: Triple) -> None:
         """Take one position; ``time_s`` is in the recording's own time."""
-        truth = self.at(time_s)
+        truth = self.at(time_s) if self.has_truth else None
         self.track.add((time_s, *position_m, *(truth or (np.nan, np.nan, np.nan))))
         if since_start_s < self._settle_s:
             return
         self._settled.add(*position_m)
         if truth is not None and (self._above_m is None or truth[2] > self._above_m):
             self._errors.add(position_m[0] - truth[0], position_m[1] - truth[1], position_m[2] - truth[2])
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether there is anything to compare with."""
+        return len(self._times) > 0
 
     def at(self, time_s: float) -> Triple | None:
         """Truth at a time by linear interpolation, None outside the table or in a gap of it."""

@@ -52,6 +52,8 @@ class NoiseBook:
         sample.add((pair.tdoa_m - (predicted_m or 0.0),))
 
     def _predicted_m(self, pair: PairTdoa) -> float | None:
+        if not self._judge.has_truth:
+            return None
         truth = self._judge.at(pair.time_s)
         a_m = pair.a_m or self._anchors_m.get(pair.anchor_a)
         b_m = pair.b_m or self._anchors_m.get(pair.anchor_b)

@@ -19,9 +19,9 @@ from skyless.positioning.pair_tracking import PairTracking
 from skyless.recordings.formats import Recording, open_recording
 
 PROFILES: Final[Mapping[str, PairSettings]] = {
-    "miluv": PairSettings(qa=0.01, tdoa_std_m=0.3),
+    "miluv": PairSettings(qa=0.1, tdoa_std_m=0.5, gate=3.0),
 }
-"""Settings for formats whose nature asks for others: MILUV's exchanges come once or twice a second."""
+"""Settings for formats whose nature asks for others: MILUV's exchanges come once or twice a second, among obstacles."""
 
 
 class ReplayRequest(Struct, frozen=True):

@@ -28,6 +28,9 @@ IN_USE_S: Final = 0.5
 """An anchor counts as in use while its last accepted difference is younger."""
 
 
+MAX_STD_M: Final = 3.0
+"""While the horizontal standard deviation is larger, there is no fix."""
+
 TRY_EVERY: Final = 6
 """Differences between two attempts at a start."""
 
@@ -56,7 +59,7 @@ class PairTracking:
         self._last_s = 0.0
         self._used: dict[int, tuple[float, NDArray[np.float64]]] = {}
         self._since_try = 0
-        self._area_m = (np.zeros(2), 0.0)
+        self._area_m = (0.0, 0.0, 0.0)
 
     def hear(self, pair: PairTdoa) -> bool:
         """Take one difference, in the order of time; True if it made a fix, else ``reason`` says why not."""
@@ -66,16 +69,24 @@ class PairTracking:
             self.reason = NoFixReason.NO_ALMANAC
             return False
         dt_s = pair.time_s - self._last_s
-        if self._started and (dt_s < 0.0 or dt_s > MAX_GAP_S or self._lost()):
-            self.counters["restart"] += 1
-            self._started = False
-            self._window.clear()
+        if self._started and not 0.0 <= dt_s <= MAX_GAP_S:
+            self._stop()
         self._last_s = pair.time_s
         if not self._started:
             return self._try_start(pair)
         if not self._tracker.hear(a_m, b_m, dt_s, pair.tdoa_m):
             self.counters["outlier"] += 1
             self.reason = NoFixReason.RESIDUALS
+            if self._tracker.lost:
+                self._stop()
+            return False
+        if self._outside():
+            self.reason = NoFixReason.NOT_CONVERGED
+            self._stop()
+            return False
+        P = self._tracker.P
+        if P[0, 0] + P[1, 1] > MAX_STD_M**2:
+            self.reason = NoFixReason.ACQUIRING
             return False
         self._used[pair.anchor_a] = (pair.time_s, a_m)
         self._used[pair.anchor_b] = (pair.time_s, b_m)
@@ -99,13 +110,17 @@ class PairTracking:
     def _place(self, anchor: int, given: tuple[float, float, float] | None) -> NDArray[np.float64] | None:
         return self._places.get(anchor) if given is None else np.array(given)
 
-    def _lost(self) -> bool:
-        """Whether the data do not fit the state any more, or the state has left the neighbourhood of the anchors."""
-        if self._tracker.lost:
-            return True
-        centre, radius_m = self._area_m
+    def _stop(self) -> None:
+        """Forget the state; a new start is looked for."""
+        self.counters["restart"] += 1
+        self._started = False
+        self._window.clear()
+
+    def _outside(self) -> bool:
+        """Whether the state has left the neighbourhood of the anchors, where differences tell nothing any more."""
+        x_m, y_m, radius_m = self._area_m
         x = self._tracker.x
-        return bool(abs(x[0] - centre[0]) > radius_m or abs(x[1] - centre[1]) > radius_m)
+        return bool(abs(x[0] - x_m) > radius_m or abs(x[1] - y_m) > radius_m)
 
     def _try_start(self, pair: PairTdoa) -> bool:
         """Look for a start at every sixth difference; medians of each pair keep single outliers out of it."""
@@ -140,7 +155,8 @@ class PairTracking:
         newest = self._newest_places()
         anchors_m = np.array([newest[anchor] for anchor in joined.anchors])
         low, high = anchors_m.min(axis=0)[:2], anchors_m.max(axis=0)[:2]
-        self._area_m = ((low + high) / 2.0, NEIGHBOURHOOD * max(float(np.linalg.norm(high - low)), 5.0))
+        x_m, y_m = ((low + high) / 2.0).tolist()
+        self._area_m = (x_m, y_m, NEIGHBOURHOOD * max(float(np.linalg.norm(high - low)), 5.0))
         return locate(
             anchors_m,
             joined.tdoa_m,

@@ -9,11 +9,7 @@ from skyless.constants import TICK_S
 from skyless.positioning.acquisition import Acquisition, Start
 from skyless.positioning.fix import Fix, NoFixReason, motion_fix
 from skyless.positioning.observation import Observation
-from skyless.positioning.tracker import (
-    EPOCH,
-    PseudorangeTracker,
-    TrackerSettings,
-)
+from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings
 from skyless.ticks import from_seconds
 
 MAX_GAP_S: Final = 5.0
@@ -37,6 +33,7 @@ class Tracking:
         self._anchors: tuple[int, ...] = ()
         self._anchors_m: NDArray[np.float64] = np.empty((0, 3))
         self._checked_ticks = 0
+        self._heard_ticks = 0
 
     @property
     def state(self) -> NDArray[np.float64]:
@@ -47,7 +44,7 @@ class Tracking:
         """Take one observation; a fix for every accepted message once started."""
         if observation.tx_ticks_master is None:
             return NoFixReason.ACQUIRING
-        if self._acquisition is None and self._lost(observation):
+        if self._acquisition is None and self._is_silent_too_long(observation):
             self._acquisition = self._new_acquisition()
         if self._acquisition is not None:
             start = self._acquisition.hear(observation)
@@ -62,7 +59,10 @@ class Tracking:
             observation.tx_fraction_ticks,
             observation.tx_variance_m2,
         )
+        self._heard_ticks = observation.rx_ticks_tag
         if not accepted:
+            if self._tracker.lost:
+                self._acquisition = self._new_acquisition()
             return NoFixReason.RESIDUALS
         self._use(observation)
         return self._fix(observation)
@@ -70,14 +70,13 @@ class Tracking:
     def _new_acquisition(self) -> Acquisition:
         return Acquisition(self._settings.height_m, self._settings.stamp_variance_m2, self._z_bounds_m)
 
-    def _lost(self, observation: Observation) -> bool:
-        whole = self._tracker.whole
-        gap_s = (observation.rx_ticks_tag - int(whole[EPOCH])) * TICK_S
-        return gap_s > MAX_GAP_S or self._tracker.lost
+    def _is_silent_too_long(self, observation: Observation) -> bool:
+        return (observation.rx_ticks_tag - self._heard_ticks) * TICK_S > MAX_GAP_S
 
     def _begin(self, start: Start, observation: Observation) -> None:
         """Start the filter; where there was one before, the time of its fixes goes on by the tag's own clock."""
         self._acquisition = None
+        self._heard_ticks = observation.rx_ticks_tag
         self._used.clear()
         self._use(observation)
         assert observation.tx_ticks_master is not None
