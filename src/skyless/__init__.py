@@ -1,1 +1,68 @@
-"""GPS without a sky: fixed anchors broadcast, tags only listen, and each computes its own position."""
+"""GPS without a sky: listen-only ultra-wideband positioning indoors.
+
+The names below are the front door for programs and notebooks; they are imported when first used, so that
+``import skyless`` stays light. Everything else is found in the rooms that ``docs/architecture.md`` describes.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from skyless.air.reception import Reception, Transmission
+    from skyless.anchor import Anchor
+    from skyless.experiments.fleet import Fleet
+    from skyless.experiments.scenarios import Request, fleet_of
+    from skyless.positioning.fix import Fix, NoFixReason
+    from skyless.positioning.solver import locate
+    from skyless.receiver import METHODS, Receiver
+    from skyless.recordings.formats import open_recording
+    from skyless.site.lab import lab_site
+    from skyless.site.load import load_site
+    from skyless.site.model import Site
+
+_PLACES: Final = {
+    "METHODS": "skyless.receiver",
+    "Anchor": "skyless.anchor",
+    "Fix": "skyless.positioning.fix",
+    "Fleet": "skyless.experiments.fleet",
+    "NoFixReason": "skyless.positioning.fix",
+    "Receiver": "skyless.receiver",
+    "Reception": "skyless.air.reception",
+    "Request": "skyless.experiments.scenarios",
+    "Site": "skyless.site.model",
+    "Transmission": "skyless.air.reception",
+    "fleet_of": "skyless.experiments.scenarios",
+    "lab_site": "skyless.site.lab",
+    "load_site": "skyless.site.load",
+    "locate": "skyless.positioning.solver",
+    "open_recording": "skyless.recordings.formats",
+}
+
+__all__ = [
+    "METHODS",
+    "Anchor",
+    "Fix",
+    "Fleet",
+    "NoFixReason",
+    "Receiver",
+    "Reception",
+    "Request",
+    "Site",
+    "Transmission",
+    "fleet_of",
+    "lab_site",
+    "load_site",
+    "locate",
+    "open_recording",
+]
+
+
+def __getattr__(name: str) -> object:
+    place = _PLACES.get(name)
+    if place is None:
+        raise AttributeError(f"module 'skyless' has no attribute {name!r}")
+    return getattr(import_module(place), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -24,7 +24,7 @@ from skyless.ticks import Unwrapper, nearest, wrap
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
 MAX_OFFSET_STD_M: Final = 0.3
-"""An anchor speaks only while its offset is known better than this (``MATHS.md`` section 6)."""
+"""An anchor speaks only while its offset is known better than this (``docs/maths.md`` section 6)."""
 
 REJECTIONS_BEFORE_RESTART: Final = 3
 """So many master beacons in a row that do not fit mean that the master's clock, or the own one, has jumped."""

@@ -1,6 +1,6 @@
 """Time as the radio counts it: 40-bit counters of 15.65 ps ticks, unwrapped to integers.
 
-Ticks are subtracted as integers and only then turned into seconds or metres (``MATHS.md`` section 3):
+Ticks are subtracted as integers and only then turned into seconds or metres (``docs/maths.md`` section 3):
 float64 seconds lose 0.6 mm after an hour, integers lose nothing.
 """
 

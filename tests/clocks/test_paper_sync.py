@@ -14,7 +14,7 @@ interval_s = st.floats(1e-3, 20.0)
 
 @given(ppm, ppm, interval_s, st.floats(0.5, 200.0), st.floats(-1.0, 1.0))
 def test_an_anchors_time_is_converted_up_to_the_systematic_error(rate_m, rate_i, spacing_s, range_m, later_s):
-    """The error left is e_im = (1 - ν_i)·δ/ν̄ (eq:AnchorSync), 2 mm at 100 m and 20 ppm (MATHS.md section 4)."""
+    """The error left is e_im = (1 - ν_i)·δ/ν̄ (eq:AnchorSync), 2 mm at 100 m and 20 ppm (docs/maths.md section 4)."""
     spacing = spacing_s * TICK_RATE_HZ
     tof = range_m / TICK_M
     master, anchor = LinearClock(0.0, 1.0 + rate_m), LinearClock(0.0, 1.0 + rate_i)
@@ -30,7 +30,7 @@ def test_an_anchors_time_is_converted_up_to_the_systematic_error(rate_m, rate_i,
 
 @given(st.lists(st.integers(-1000, 1000), min_size=3, max_size=3), interval_s, st.floats(0, 1e5))
 def test_averaging_the_two_offsets_changes_nothing(noise, spacing_s, tof):
-    """MATHS.md E2: with a single two-point rate both offsets are the same for any noise."""
+    """docs/maths.md E2: with a single two-point rate both offsets are the same for any noise."""
     spacing = round(spacing_s * TICK_RATE_HZ)
     tx, rx = float(spacing + noise[0]), float(spacing + noise[1])
     rate = relative_rate(rx, tx)

@@ -48,7 +48,7 @@ def test_ideal_clocks_give_the_difference_of_ranges(rm, ri, rt, slot, range_im, 
 
 
 def test_standard_deviations_are_the_corrected_theorys():
-    """Monte Carlo of the exact algorithm against MATHS.md sections 2 and 5, for three places of the anchor's slot."""
+    """Monte Carlo of the exact algorithm against docs/maths.md section 2, for three places of the anchor's slot."""
     generator = np.random.default_rng(11)
     draws, sigma = 20_000, 60.0
     sigma_m2 = (sigma * TICK_M) ** 2

@@ -12,7 +12,7 @@ from skyless.positioning.solver import NoSolution, Solution, locate, locate_pseu
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 LAB_3D = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
-"""Alternating heights, as MATHS.md section 5 advises."""
+"""Alternating heights, as docs/maths.md section 5 advises."""
 P1, P2 = np.array([3.0, 4.0, 0.0]), np.array([1.2, 1.6, 0.0])
 LITERAL = (np.diag([5.0, 9, 13, 17, 21]) + 1) / 15
 """Shape of the paper's covariance: own variances that grow with the slot, and the tag's reference in common."""

@@ -27,7 +27,7 @@ def test_the_template_of_the_lab_is_the_lab(tmp_path):
 
 
 def test_the_lab_is_the_published_one():
-    """MATHS.md section 5."""
+    """docs/maths.md section 5."""
     site = lab_site()
     assert [(a.x_m, a.y_m, a.z_m) for a in site.anchors] == [
         (0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0),

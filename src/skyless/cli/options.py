@@ -33,3 +33,16 @@ def open_for_writing(path: Path) -> TextIO:
         return path.open("w", newline="", encoding="utf-8")
     except OSError as error:
         raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def spare_inputs(option: str, output: Path | None, *inputs: Path | None) -> None:
+    """See that an output is none of the files that are read: opening it would empty them.
+
+    Raises:
+        SkylessError: it is one of them, be it by another name.
+    """
+    if output is None or not output.exists():
+        return
+    for read in inputs:
+        if read is not None and read.exists() and output.samefile(read):
+            raise SkylessError(f"--{option} is {str(output)!r}, which is read; it should be another file")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import finite_numbers, open_for_writing
+from skyless.cli.options import finite_numbers, open_for_writing, spare_inputs
 from skyless.cli.output import console, print_json
 from skyless.cli.progress import progress_bar
 from skyless.errors import SkylessError
@@ -98,6 +98,8 @@ def replay(
     from skyless.experiments.judge import Judge
     from skyless.experiments.replay import Replay, ReplayRequest
 
+    spare_inputs("fixes", fixes, file, anchors, site, truth)
+    spare_inputs("plot", plot, file, anchors, site, truth, fixes)
     places, site_height_m = _anchors(anchors, site)
     known = _truth(file, truth, lever_arm, format, listener)
     height_m, note = _height(height, places, site_height_m, known, file)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import finite_numbers, open_for_writing
+from skyless.cli.options import finite_numbers, open_for_writing, spare_inputs
 from skyless.cli.output import console, print_json
 from skyless.cli.progress import progress_bar
 from skyless.errors import SkylessError
@@ -106,6 +106,7 @@ def simulate(
     """
     from skyless.experiments.scenarios import Request
 
+    spare_inputs("fixes-csv", fixes_csv, site)
     request = Request(
         site=_site(scenario, site),
         method=method,
@@ -116,6 +117,7 @@ def simulate(
         speed_mps=speed,
         qa=qa,
         warmup_s=warmup,
+        most_fixes=fixes,
         loss=loss,
         nlos=nlos,
         nlos_mean_m=nlos_mean,
@@ -124,7 +126,7 @@ def simulate(
         biases=tuple(_bias(text) for text in bias or ()),
         outages=tuple(_outage(text) for text in outage or ()),
     )
-    result = _run(request, fixes, duration, fixes_csv)
+    result = _run(request, duration, fixes_csv)
     if json:
         import msgspec
 
@@ -161,7 +163,7 @@ def _outage(text: str) -> "AnchorOutage":
     return AnchorOutage(int(anchor), Outage(*times))
 
 
-def _run(request: "Request", fixes: int | None, duration: float | None, fixes_csv: Path | None) -> "FleetReport":
+def _run(request: "Request", duration: float | None, fixes_csv: Path | None) -> "FleetReport":
     from skyless.experiments.fleet import report
     from skyless.experiments.scenarios import fleet_of
 
@@ -170,6 +172,7 @@ def _run(request: "Request", fixes: int | None, duration: float | None, fixes_cs
     except ValueError as error:
         raise SkylessError(str(error)) from None
     started_s = time.perf_counter()
+    fixes = request.most_fixes
     until_s = duration if duration is not None else (float("inf") if fixes else 60.0)
     if fixes_csv is None:
         _pass_time(fleet, fixes, until_s, None)

@@ -72,7 +72,7 @@ class BroadcastClock:
         """Unwrapped time of the anchor's counter at about the listener's time ``rx_ticks``.
 
         The listener's 40 bits tell how often the anchor's 32 bits wrapped since the last packet; right for gaps of
-        minutes, which 32 bits alone are not beyond 67 ms (``MATHS.md`` section 3).
+        minutes, which 32 bits alone are not beyond 67 ms (``docs/maths.md`` section 3).
         """
         elapsed = rx_ticks - self.rx_ticks
         guess = self.tx_ticks + elapsed - int(self.rate * elapsed)

@@ -1,4 +1,4 @@
-"""The two-state clock filter: an anchor's offset and rate against the master (``MATHS.md`` section 6).
+"""The two-state clock filter: an anchor's offset and rate against the master (``docs/maths.md`` section 6).
 
 The offset is kept in two parts, whole ticks in an integer and a remainder below one tick in metres of light, so that
 nothing is lost however long the filter runs. One update takes one master beacon.
@@ -84,7 +84,7 @@ def clock_update(
     """Take one master beacon; return the normalised innovation squared.
 
     The state is at the time at which the beacon arrives, so the rate acts on the flight time as it should
-    (``MATHS.md`` section 4). An innovation beyond ``gate`` standard deviations changes nothing but the time.
+    (``docs/maths.md`` section 4). An innovation beyond ``gate`` standard deviations changes nothing but the time.
     """
     dt_s = (tx_ticks_master - whole[EPOCH_MASTER]) * TICK_S
     clock_predict(state, dt_s, white, walk)

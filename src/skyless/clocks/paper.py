@@ -39,7 +39,7 @@ def relative_offset(rx_anchor: float, tx_master: float, rate: float, tof_ticks: 
 def averaged_offset(first: float, delayed: float) -> float:
     """Mean of the offsets of the two messages (``eq:AverageRelOff``).
 
-    With one two-point rate both are identical for any noise (``MATHS.md`` E2): averaging changes nothing.
+    With one two-point rate both are identical for any noise (``docs/maths.md`` E2): averaging changes nothing.
     """
     return (first + delayed) / 2.0
 

@@ -49,6 +49,8 @@ class FleetSettings(Struct, frozen=True):
     qa: float = 0.3
     warmup_s: float = 2.0
     """True time before which no fix counts for the errors; cold starts are told by ``first_fix_s``."""
+    most_fixes: int | None = None
+    """Judged fixes per tag after which no more are judged."""
 
 
 class TagRecord(Struct):
@@ -119,10 +121,11 @@ class Fleet:
     def _judge(self, judged: JudgedFix) -> None:
         """Count one fix per tag and superframe, so that all methods are judged at the same times."""
         superframe = int(judged.time_s / self._superframe_s)
-        if superframe == self._judged_round[judged.tag]:
+        record = self.records[judged.tag]
+        if superframe == self._judged_round[judged.tag] or record.judged == self._settings.most_fixes:
             return
         self._judged_round[judged.tag] = superframe
-        self.records[judged.tag].judged += 1
+        record.judged += 1
         error = judged.error_m
         self.errors.add(float(error[0]), float(error[1]), float(error[2]))
         self.sigma_squared_sum += float(np.trace(judged.fix.covariance_m2))

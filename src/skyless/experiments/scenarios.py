@@ -39,6 +39,8 @@ class Request(Struct, frozen=True):
     """Speed of the tags that walk about."""
     qa: float = 0.3
     warmup_s: float = 2.0
+    most_fixes: int | None = None
+    """Judged fixes per tag, one per superframe, after which no more are judged."""
     loss: float = 0.0
     nlos: float = 0.0
     nlos_mean_m: float = 1.0
@@ -58,7 +60,7 @@ def fleet_of(request: Request) -> Fleet:
     if request.noise_ps is not None:
         noise = replace(site.noise, tx_stamp_ps=request.noise_ps, rx_stamp_ps=request.noise_ps)
         site = replace(site, noise=noise)
-    settings = FleetSettings(request.method, request.qa, request.warmup_s)
+    settings = FleetSettings(request.method, request.qa, request.warmup_s, request.most_fixes)
     return Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, settings)
 
 

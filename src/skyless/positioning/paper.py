@@ -38,7 +38,7 @@ def literal_tdoa(
     """TDoAs of the first and of the delayed messages in ticks of the tag (``eq:GPSTDoA``), to the letter.
 
     Both stamps of the anchor's pair are converted with the same synchronisation; converting each with the newest one
-    doubles the error (``MATHS.md`` section 5, "the trap").
+    doubles the error (``docs/maths.md`` section 5, "the trap").
     """
     rate, offset = synchronise(m1, m2, s1, s2, tof_ticks)
     first = to_master(float(a1 - s1), rate, offset)
@@ -53,7 +53,7 @@ def literal_tdoa(
 def bracketed_tdoa(
     m1: int, m2: int, s1: int, s2: int, a1: int, a2: int, r1: int, r2: int, rm2: int, tof_ticks: float
 ) -> float:
-    """TDoA in ticks against the master's second message, which the anchor's two enclose (``MATHS.md`` section 5).
+    """TDoA in ticks against the master's second message, which the anchor's two enclose (``docs/maths.md`` section 5).
 
     The anchor's own RX stamp of that message says where between its two transmissions it was sent; no
     synchronisation parameter enters but the rate that scales the flight time.

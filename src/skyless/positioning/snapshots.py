@@ -1,7 +1,7 @@
 """The snapshot methods: one fix a round from two consecutive frames of every node.
 
 ``literal`` is the paper to the letter (first messages, unweighted), ``literal-delayed`` its delayed messages,
-``weighted`` the paper's TDoAs with their full covariance, ``bracketed`` the free gain of a third (``MATHS.md``
+``weighted`` the paper's TDoAs with their full covariance, ``bracketed`` the free gain of a third (``docs/maths.md``
 section 5).
 """
 

@@ -1,4 +1,4 @@
-"""``tracker``: a filter of position, velocity and the tag's clock, updated by every message (``MATHS.md`` section 6).
+"""``tracker``: a filter of position, velocity and the tag's clock, updated by every message (``docs/maths.md`` 6).
 
 Pseudoranges as in GPS: nothing is differenced, so no cross-covariance has to be carried, and each beacon is an update.
 The same kernels serve message by message (``PseudorangeTracker``) and over arrays (``track``).

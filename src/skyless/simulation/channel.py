@@ -98,7 +98,7 @@ def received_power_dbm(tx_power_dbm: float, distance_m: float, loss_db: float) -
 
 @kernel
 def power_bias_m(rx_power_dbm: float) -> float:
-    """Range bias of an RX stamp by received power (APS011 in RADIO.md): straight lines, held beyond the ends."""
+    """Range bias of an RX stamp by received power (APS011 in docs/radio.md): straight lines, held beyond the ends."""
     place = (_POWER_BIAS_FIRST_DBM - rx_power_dbm) / _POWER_BIAS_STEP_DB
     place = min(max(place, 0.0), _POWER_BIAS_M.shape[0] - 1.0)
     low = min(int(place), _POWER_BIAS_M.shape[0] - 2)

@@ -34,7 +34,7 @@ def _count(site: Site) -> list[str]:
 
 
 def _geometry(site: Site) -> list[str]:
-    """Anchors in one line (2-D) or one plane (3-D) leave two mirror positions (``MATHS.md`` section 5)."""
+    """Anchors in one line (2-D) or one plane (3-D) leave two mirror positions (``docs/maths.md`` section 5)."""
     flat = site.tags.height_m is not None
     dimensions = 2 if flat else 3
     points = _points(site)[:, :dimensions]

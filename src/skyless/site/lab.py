@@ -1,4 +1,4 @@
-"""The lab: the named scenario that the figures of ``MATHS.md`` section 5 belong to."""
+"""The lab: the named scenario that the figures of ``docs/maths.md`` section 5 belong to."""
 
 from skyless.site.model import AnchorSite, NoiseSite, ScheduleSite, Site, TagsSite
 

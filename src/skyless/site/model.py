@@ -32,7 +32,7 @@ class ScheduleSite(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NoiseSite(Struct, frozen=True, forbid_unknown_fields=True):
-    """Noise figures that the filters assume (never under-tune: MATHS.md section 5)."""
+    """Noise figures that the filters assume (never under-tune: docs/maths.md section 5)."""
 
     tx_stamp_ps: float = 100.0
     rx_stamp_ps: float = 100.0

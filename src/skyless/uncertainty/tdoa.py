@@ -1,4 +1,4 @@
-"""Covariance of the vector of TDoAs, all against the master, in m² (``MATHS.md`` sections 2 and 5).
+"""Covariance of the vector of TDoAs, all against the master, in m² (``docs/maths.md`` sections 2 and 5).
 
 κ_i = Δ_im / Δ_i is the anchor's delay after the reference message over the spacing of its pair. Rates against each
 other differ from one by less than 40 ppm and are left out of the variances.

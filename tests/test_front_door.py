@@ -1,0 +1,35 @@
+"""The package's front door."""
+
+import subprocess
+import sys
+
+import pytest
+
+import skyless
+
+
+def test_every_name_opens():
+    for name in skyless.__all__:
+        assert getattr(skyless, name) is not None
+    assert set(skyless.__all__) <= set(dir(skyless))
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        skyless.nothing  # noqa: B018
+
+
+def test_importing_it_is_light():
+    script = "import sys, skyless; print({'numpy', 'numba', 'msgspec'} & set(sys.modules))"
+    assert subprocess.check_output([sys.executable, "-c", script], text=True).strip() == "set()"
+
+
+def test_a_position_from_a_notebook():
+    """Five anchors, ideal differences: the position comes back without a guess."""
+    import numpy as np
+
+    anchors_m = np.array([[0, 0, 0.5], [6, 0, 2.5], [6, 8, 0.5], [0, 8, 2.5], [3, 4, 3.0]], dtype=float)
+    tag_m = np.array([2.0, 3.0, 1.2])
+    ranges_m = np.linalg.norm(anchors_m - tag_m, axis=1)
+    solution = skyless.locate(anchors_m, ranges_m[1:] - ranges_m[0], 0.01 * (np.eye(4) + 1.0))
+    np.testing.assert_allclose(solution.position_m, tag_m, atol=1e-6)
