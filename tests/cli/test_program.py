@@ -119,7 +119,7 @@ def test_json_is_the_last_line(lab):
     assert (done.returncode, done.stderr, done.stdout.count("\n")) == (0, "", 1)
     assert report["superframes_per_s"] == pytest.approx(1 / 0.015, rel=1e-5)
     assert report["messages_per_s"] == pytest.approx(400, rel=1e-5)
-    assert report["longest_frame_s"] == pytest.approx(315e-6, abs=0.5e-6)  # RADIO.md
+    assert report["longest_frame_s"] == pytest.approx(315e-6, abs=0.5e-6)  # docs/radio.md
     assert report["occupancy"] == pytest.approx(0.315 / 2.5, rel=1e-3)
     assert [anchor["slots"] for anchor in report["anchors"]] == [[0], [1], [2], [3], [4], [5]]
     assert report["warnings"] == []

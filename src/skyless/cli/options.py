@@ -36,13 +36,21 @@ def open_for_writing(path: Path) -> TextIO:
 
 
 def spare_inputs(option: str, output: Path | None, *inputs: Path | None) -> None:
-    """See that an output is none of the files that are read: opening it would empty them.
+    """See that an output is none of the other files of the command: opening it would empty them.
 
     Raises:
         SkylessError: it is one of them, be it by another name.
     """
-    if output is None or not output.exists():
+    if output is None:
         return
-    for read in inputs:
-        if read is not None and read.exists() and output.samefile(read):
-            raise SkylessError(f"--{option} is {str(output)!r}, which is read; it should be another file")
+    for other in inputs:
+        if other is not None and _same(output, other):
+            raise SkylessError(f"--{option} is {str(output)!r}, another file of this command; writing would destroy it")
+
+
+def _same(a: Path, b: Path) -> bool:
+    """Whether two paths lead to one file, through links of either kind, existing or not."""
+    try:
+        return a.samefile(b)
+    except OSError:
+        return a.absolute() == b.absolute()

@@ -5,8 +5,8 @@ from typing import Final
 
 from msgspec import Struct
 
-ANY_ADDRESS: Final = 65_534
-"""Highest identifier on the air; 65535 is the broadcast address (IEEE 802.15.4-2015, 7.2.2.5)."""
+ANY_ADDRESS: Final = 65_533
+"""Highest identifier on the air; 65534 means "no short address" and 65535 is broadcast in IEEE 802.15.4."""
 FARTHEST_M: Final = 1e6
 """Coordinates travel as 32-bit millimetres, ±2147 km; far beyond a building, metres are probably something else."""
 

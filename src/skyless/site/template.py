@@ -9,7 +9,7 @@ _HEAD = """\
 # `skyless site check FILE` says whether all is well.
 
 name = {name}
-id = {id}                          # of the site on the air, 0 to 65534; neighbouring sites need different ones
+id = {id}                          # of the site on the air, 0 to 65533; neighbouring sites need different ones
 master = {master}                      # the anchor whose clock is the site's time; best in the middle, heard by all
 
 [schedule]                      # the anchors speak in turn, one in each slot; all slots make a superframe
