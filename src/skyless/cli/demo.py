@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from skyless.cli.options import Positive
 from skyless.cli.output import console, print_json
+from skyless.cli.progress import status
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -25,10 +27,10 @@ app = App(name="demo", help_epilogue="Example: skyless demo --duration 10 --json
 @app.default
 def demo(
     *,
-    duration: Annotated[float, Parameter(validator=Number(gt=0))] | None = None,
+    duration: Positive | None = None,
     tags: Annotated[int, Parameter(validator=Number(gte=1, lte=50))] = 3,
     speed: Annotated[float, Parameter(validator=Number(gt=0, lte=10))] = 1.0,
-    noise_ps: Annotated[float, Parameter(validator=Number(gt=0))] = 100.0,
+    noise_ps: Positive = 100.0,
     seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
     json: bool = False,
 ) -> None:
@@ -71,14 +73,14 @@ def demo(
 
 
 def _fleet(tags: int, speed: float, noise_ps: float, seed: int) -> "Fleet":
-    print("preparing (the first start compiles the kernels, later ones load them)", file=sys.stderr)
     from skyless.experiments.fleet import Fleet, FleetSettings
     from skyless.experiments.scenarios import patrols
     from skyless.experiments.warm import compile_kernels
     from skyless.simulation.scenario import lab_impairments
     from skyless.site.lab import lab_site
 
-    compile_kernels()
+    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
+        compile_kernels()
     site = lab_site(noise_ps)
     paths = patrols(site, tags, speed)
     return Fleet(site, paths, lab_impairments(noise_ps), seed, FleetSettings(warmup_s=1.0))

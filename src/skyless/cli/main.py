@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from io import TextIOWrapper
 
-from cyclopts import App, Parameter
+from cyclopts import App, CycloptsError, Parameter
 
 from skyless.errors import SkylessError
 
@@ -30,6 +30,7 @@ def program() -> App:
         help_epilogue="Example: skyless site new site.toml && skyless site check site.toml",
         help_format="plaintext",
         version=_version,
+        error_formatter=_slip,
         result_action="return_value",
         default_parameter=Parameter(negative=()),
     )
@@ -57,6 +58,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _drop_output()
         return _BROKEN_PIPE
     return result if isinstance(result, int) else 0
+
+
+def _slip(error: CycloptsError) -> str:
+    """A slip in the arguments, told as other faults are: in one line."""
+    return f"skyless: {' '.join(str(error).split())}"
 
 
 def _version() -> str:

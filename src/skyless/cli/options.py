@@ -2,9 +2,16 @@
 
 import math
 from pathlib import Path
-from typing import TextIO
+from typing import Annotated, TextIO
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from skyless.errors import SkylessError
+
+Positive = Annotated[float, Parameter(validator=Number(gt=0, lt=math.inf))]
+NotNegative = Annotated[float, Parameter(validator=Number(gte=0, lt=math.inf))]
+Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 
 
 def finite_numbers(option: str, text: str, counts: tuple[int, ...], separator: str = ",") -> tuple[float, ...]:

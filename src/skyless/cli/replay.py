@@ -4,15 +4,14 @@ import csv
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import App, Parameter
-from cyclopts.validators import Number
+from cyclopts import App
 
-from skyless.cli.options import finite_numbers, open_for_writing, spare_inputs
+from skyless.cli.options import Finite, NotNegative, Positive, finite_numbers, open_for_writing, spare_inputs
 from skyless.cli.output import console, print_json
-from skyless.cli.progress import progress_bar
-from skyless.errors import SkylessError
+from skyless.cli.progress import progress_bar, status
+from skyless.errors import ConfigurationError, SkylessError
 
 if TYPE_CHECKING:
     from skyless.air.packet import Point
@@ -21,14 +20,14 @@ if TYPE_CHECKING:
     from skyless.positioning.fix import Fix
     from skyless.recordings.truth import Truth
 
-_Positive = Annotated[float, Parameter(validator=Number(gt=0))]
-
 COLUMNS = (
     *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
     *("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2"),
     *("anchors", "anchor_ids", "chi2", "residual_rms_m"),
 )
 """Columns of the file that --fixes writes."""
+
+PICTURES = (".png", ".svg", ".pdf")
 
 app = App(
     name="replay",
@@ -48,10 +47,10 @@ def replay(
     height: str = "auto",
     format: str | None = None,  # noqa: A002 - the option's natural name
     listener: str | None = None,
-    settle: Annotated[float, Parameter(validator=Number(gte=0))] | None = None,
-    above: float | None = None,
-    qa: _Positive | None = None,
-    tdoa_std: _Positive | None = None,
+    settle: NotNegative | None = None,
+    above: Finite | None = None,
+    qa: Positive | None = None,
+    tdoa_std: Positive | None = None,
     fixes: Path | None = None,
     plot: Path | None = None,
     json: bool = False,
@@ -97,12 +96,14 @@ def replay(
     """
     from skyless.experiments.judge import Judge
     from skyless.experiments.replay import Replay, ReplayRequest
+    from skyless.recordings.formats import format_of
 
     spare_inputs("fixes", fixes, file, anchors, site, truth)
     spare_inputs("plot", plot, file, anchors, site, truth, fixes)
+    _see_that_it_can_be_drawn(plot)
     places, site_height_m = _anchors(anchors, site)
     known = _truth(file, truth, lever_arm, format, listener)
-    height_m, note = _height(height, places, site_height_m, known, file)
+    height_m, note = _height(height, places, site_height_m, known, format_of(file, format).name)
     settle_s = settle if settle is not None else (2.0 if known is None else 3.0)
     judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=_above(above, known))
     request = ReplayRequest(
@@ -115,6 +116,9 @@ def replay(
         tdoa_std_m=tdoa_std,
     )
     report = _run(Replay(request, judge), file, fixes)
+    _see_that_it_was_heard(file, listener, report)
+    if truth is not None and known is not None:
+        _see_that_truth_matches(truth, known, judge)
     distances = _distances(file, report.format)
     if plot is not None:
         _draw(plot, judge, report)
@@ -124,6 +128,32 @@ def replay(
         print_json({**msgspec.to_builtins(report), "height_note": note, "anchor_distances_m": distances})
     else:
         _show(report, note, distances)
+
+
+def _see_that_it_can_be_drawn(plot: Path | None) -> None:
+    """Before the long work, not after it."""
+    if plot is None:
+        return
+    if plot.suffix.lower() not in PICTURES:
+        raise SkylessError(f"--plot is {str(plot)!r}; its ending should be one of {', '.join(PICTURES)}")
+    if plot.is_dir() or not plot.parent.is_dir():
+        raise SkylessError(f"--plot is {str(plot)!r}; it should be a file in a folder that exists")
+
+
+def _see_that_it_was_heard(file: Path, listener: str | None, report: "ReplayReport") -> None:
+    if listener is not None and report.receptions == 0:
+        raise ConfigurationError(file, "listener", listener, "one that the recording names")
+
+
+def _see_that_truth_matches(table: Path, truth: "Truth", judge: "Judge") -> None:
+    """Fixes without any truth beside them mean that the table belongs to another recording, or to another clock."""
+    import numpy as np
+
+    times_s, true_x_m = judge.track.rows[:, 0], judge.track.rows[:, 4]
+    if len(times_s) and np.isnan(true_x_m).all():
+        span = f"{truth.t_s[0]:.3f} to {truth.t_s[-1]:.3f}"
+        expected = f"in the time of the recording, whose fixes are from {times_s.min():.3f} to {times_s.max():.3f}"
+        raise ConfigurationError(table, "column t_s", span, expected)
 
 
 def _anchors(table: Path | None, site: Path | None) -> "tuple[dict[int, Point], float | None]":
@@ -159,28 +189,34 @@ def _truth(file: Path, table: Path | None, arm: str | None, name: str | None, li
 
 
 def _height(
-    wish: str, places: "dict[int, Point]", site_m: float | None, truth: "Truth | None", file: Path
+    wish: str, places: "dict[int, Point]", site_m: float | None, truth: "Truth | None", format_name: str
 ) -> tuple[float | None, str]:
     """Height to hold, and what to tell the user about it."""
     import numpy as np
 
     from skyless.experiments.observability import plane_height_m
-    from skyless.recordings.formats import format_of
 
     if wish == "free":
         return None, "estimated"
-    if wish == "truth" or (wish == "auto" and truth is not None and format_of(file, None).name == "miluv"):
+    if wish == "truth" or (wish == "auto" and truth is not None and format_name == "miluv"):
         if truth is None:
             raise SkylessError("--height truth takes the height from the truth, which --truth must give")
         return float(np.median(truth.position_m[:, 2])), "the truth's median"
     if wish != "auto":
-        return finite_numbers("height", wish, (1,))[0], "given"
+        return _metres_of(wish), "given"
     if site_m is not None:
         return site_m, "from the site file"
     plane_m = plane_height_m(places)
     if plane_m is None:
         return None, "estimated"
     return plane_m, "the anchors' mean: they lie too flat to tell the height (--height free estimates it all the same)"
+
+
+def _metres_of(wish: str) -> float:
+    try:
+        return finite_numbers("height", wish, (1,))[0]
+    except SkylessError:
+        raise SkylessError(f"--height is {wish!r}; it should be metres, or truth, free or auto") from None
 
 
 def _above(wish: float | None, truth: "Truth | None") -> float | None:
@@ -193,6 +229,10 @@ def _above(wish: float | None, truth: "Truth | None") -> float | None:
 
 
 def _run(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
+    from skyless.experiments.warm import compile_pair_kernels
+
+    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
+        compile_pair_kernels()
     with ExitStack() as stack:
         bar = stack.enter_context(progress_bar("replaying", file.stat().st_size))
         on_fix = None if fixes is None else _writer(stack, fixes)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import finite_numbers, open_for_writing, spare_inputs
+from skyless.cli.options import NotNegative, Positive, finite_numbers, open_for_writing, spare_inputs
 from skyless.cli.output import console, print_json
-from skyless.cli.progress import progress_bar
+from skyless.cli.progress import progress_bar, status
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from skyless.simulation.impairments import AnchorBias, AnchorOutage
     from skyless.site.model import Site
 
-_Positive = Annotated[float, Parameter(validator=Number(gt=0))]
 _Share = Annotated[float, Parameter(validator=Number(gte=0, lt=1))]
 
 app = App(
@@ -38,16 +37,16 @@ def simulate(
     method: str = "tracker",
     position: list[str] | None = None,
     tags: Annotated[int, Parameter(validator=Number(gte=1, lte=10_000))] = 1,
-    speed: _Positive = 1.0,
-    qa: _Positive = 0.3,
-    noise_ps: _Positive | None = None,
+    speed: Positive = 1.0,
+    qa: Positive = 0.3,
+    noise_ps: Positive | None = None,
     fixes: Annotated[int, Parameter(validator=Number(gte=1))] | None = None,
-    duration: _Positive | None = None,
-    warmup: Annotated[float, Parameter(validator=Number(gte=0))] = 2.0,
+    duration: Positive | None = None,
+    warmup: NotNegative = 2.0,
     seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
     loss: _Share = 0.0,
     nlos: _Share = 0.0,
-    nlos_mean: _Positive = 1.0,
+    nlos_mean: Positive = 1.0,
     bias: list[str] | None = None,
     outage: list[str] | None = None,
     power_bias: bool = False,
@@ -151,7 +150,9 @@ def _bias(text: str) -> "AnchorBias":
     from skyless.simulation.impairments import AnchorBias
 
     anchor, metres, *burst = finite_numbers("bias", text, (2, 3), ":")
-    return AnchorBias(int(anchor), metres, *burst)
+    if burst and burst[0] <= 0.0:
+        raise SkylessError(f"--bias is {text!r}; a burst should last longer than 0 s")
+    return AnchorBias(_whole("bias", text, anchor), metres, *burst)
 
 
 def _outage(text: str) -> "AnchorOutage":
@@ -160,17 +161,28 @@ def _outage(text: str) -> "AnchorOutage":
     anchor, *times = finite_numbers("outage", text, (2, 3), ":")
     if len(times) == 2 and times[1] <= times[0]:
         raise SkylessError(f"--outage is {text!r}; the anchor should come back after it has stopped")
-    return AnchorOutage(int(anchor), Outage(*times))
+    if times[0] < 0.0:
+        raise SkylessError(f"--outage is {text!r}; the anchor should stop at 0 s or later")
+    return AnchorOutage(_whole("outage", text, anchor), Outage(*times))
+
+
+def _whole(option: str, text: str, anchor: float) -> int:
+    if not anchor.is_integer():
+        raise SkylessError(f"--{option} is {text!r}; the anchor should be a whole number")
+    return int(anchor)
 
 
 def _run(request: "Request", duration: float | None, fixes_csv: Path | None) -> "FleetReport":
     from skyless.experiments.fleet import report
     from skyless.experiments.scenarios import fleet_of
+    from skyless.experiments.warm import compile_kernels
 
     try:
         fleet = fleet_of(request)
     except ValueError as error:
         raise SkylessError(str(error)) from None
+    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
+        compile_kernels(request.method)
     started_s = time.perf_counter()
     fixes = request.most_fixes
     until_s = duration if duration is not None else (float("inf") if fixes else 60.0)

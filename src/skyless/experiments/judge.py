@@ -53,6 +53,7 @@ class Judge:
         self._places: NDArray[np.float64] = np.empty((0, 3)) if truth is None else truth.position_m
         self._errors = ErrorStatistics(planar=planar)
         self._settled = ErrorStatistics(planar=planar)
+        self._places_settled = EvenSample(3)
         self.track = EvenSample(7)
         """Rows of time, position, and true position (NaN where there is none)."""
 
@@ -63,6 +64,7 @@ class Judge:
         if since_start_s < self._settle_s:
             return
         self._settled.add(*position_m)
+        self._places_settled.add(position_m)
         if truth is not None and (self._above_m is None or truth[2] > self._above_m):
             self._errors.add(position_m[0] - truth[0], position_m[1] - truth[1], position_m[2] - truth[2])
 
@@ -74,9 +76,9 @@ class Judge:
     def at(self, time_s: float) -> Triple | None:
         """Truth at a time by linear interpolation, None outside the table or in a gap of it."""
         times = self._times
-        after = bisect_right(times, time_s)
-        if after == 0 or after == len(times):
+        if not times or not times[0] <= time_s <= times[-1]:
             return None
+        after = min(bisect_right(times, time_s), len(times) - 1)
         before_s, span_s = times[after - 1], times[after] - times[after - 1]
         if span_s > self._max_gap_s:
             return None
@@ -86,10 +88,7 @@ class Judge:
 
     def judgement(self) -> Judgement:
         """What the positions come to."""
-        settled = self._settled.summary()
-        if settled.bias_m is None:
+        if self._settled.count == 0:
             return Judgement(None, None, self._errors.summary())
-        rows = self.track.rows
-        late = rows[rows[:, 0] >= rows[0, 0] + self._settle_s]
-        x, y, z = np.median(late[:, 1:4], axis=0).tolist()
+        x, y, z = np.median(self._places_settled.rows, axis=0).tolist()
         return Judgement((x, y, z), self._settled.std(), self._errors.summary())

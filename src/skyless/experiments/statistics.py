@@ -59,6 +59,8 @@ class ErrorStatistics:
         """``planar``: percentiles and the maximum are of the horizontal error, because the height was given."""
         self._planar = planar
         self._count = 0
+        self._origin = (0.0, 0.0, 0.0)
+        """The first vector: sums are about it, so that far from the site's origin no digits are lost."""
         self._sum = [0.0, 0.0, 0.0]
         self._squares = [0.0, 0.0, 0.0]
         self._max = 0.0
@@ -66,10 +68,13 @@ class ErrorStatistics:
 
     def add(self, x_m: float, y_m: float, z_m: float) -> None:
         """Take one error vector."""
+        if self._count == 0:
+            self._origin = (x_m, y_m, z_m)
         self._count += 1
         for axis, value in enumerate((x_m, y_m, z_m)):
-            self._sum[axis] += value
-            self._squares[axis] += value * value
+            offset = value - self._origin[axis]
+            self._sum[axis] += offset
+            self._squares[axis] += offset * offset
         error_m = (x_m * x_m + y_m * y_m + (0.0 if self._planar else z_m * z_m)) ** 0.5
         self._max = max(self._max, error_m)
         self._sample.add((error_m,))
@@ -81,23 +86,28 @@ class ErrorStatistics:
 
     def std(self) -> tuple[float, float, float]:
         """Standard deviation of each component about its mean."""
-        mean = [value / self._count for value in self._sum]
-        x, y, z = (
-            max(square / self._count - value * value, 0.0) ** 0.5
-            for square, value in zip(self._squares, mean, strict=True)
-        )
+        x, y, z = (variance**0.5 for variance in self._variances())
         return x, y, z
+
+    def _variances(self) -> list[float]:
+        count = self._count
+        return [
+            max(square / count - (total / count) ** 2, 0.0)
+            for square, total in zip(self._squares, self._sum, strict=True)
+        ]
 
     def summary(self) -> ErrorSummary:
         """What the errors come to."""
         if self._count == 0:
             return ErrorSummary(0, None, None, None, None, None)
-        mean_squares = [value / self._count for value in self._squares]
+        x_m, y_m, z_m = (start + total / self._count for start, total in zip(self._origin, self._sum, strict=True))
+        means_m = (x_m, y_m, z_m)
+        mean_squares = [mean**2 + variance for mean, variance in zip(means_m, self._variances(), strict=True)]
         return ErrorSummary(
             count=self._count,
             rmse_2d_m=(mean_squares[0] + mean_squares[1]) ** 0.5,
             rmse_3d_m=None if self._planar else sum(mean_squares) ** 0.5,
             p95_m=float(np.percentile(self._sample.rows, 95)),
             max_m=self._max,
-            bias_m=(self._sum[0] / self._count, self._sum[1] / self._count, self._sum[2] / self._count),
+            bias_m=means_m,
         )

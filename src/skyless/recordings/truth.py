@@ -42,6 +42,8 @@ def read_truth(path: str | PathLike[str], listener: str | None = None) -> Truth:
     columns = _columns(path, names)
     values = _values(path, table, names, columns, listener)
     times = values[:, 0]
+    if len(times) == 0 and listener is not None and columns == LISTENER_COLUMNS:
+        raise ConfigurationError(path, "listener", listener, "one that the recording names")
     if len(times) == 0:
         raise ConfigurationError(path, "the table", "empty", "at least one row below the header")
     backwards = np.flatnonzero(np.diff(times) < 0.0)

@@ -1,0 +1,50 @@
+"""No command writes over a file that it reads, by whatever name it is called."""
+
+import pytest
+
+from skyless.cli.main import main
+
+RECORDING = "t_s,idA,idB,tdoa_m\n0.0,1,2,0.5\n"
+ANCHORS = "id,x_m,y_m,z_m\n1,0,0,0\n2,4,0,0\n3,0,4,0\n"
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "recording.csv").write_text(RECORDING)
+    (tmp_path / "anchors.csv").write_text(ANCHORS)
+    (tmp_path / "soft.csv").symlink_to("recording.csv")
+    (tmp_path / "hard.csv").hardlink_to("recording.csv")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "outputs",
+    [
+        ["--fixes", "recording.csv"],
+        ["--fixes", "./recording.csv"],
+        ["--fixes", "soft.csv"],
+        ["--fixes", "hard.csv"],
+        ["--fixes", "anchors.csv"],
+        ["--plot", "recording.csv"],
+        ["--fixes", "new.svg", "--plot", "new.svg"],
+    ],
+)
+def test_replay_spares_what_it_reads(files, capsys, outputs):
+    before = sorted(entry.name for entry in files.iterdir())
+    assert main(["replay", "recording.csv", "--anchors", "anchors.csv", *outputs]) == 2
+    said = capsys.readouterr().err
+    assert f"{outputs[-2]} is" in said
+    assert said.count("\n") == 1
+    assert (files / "recording.csv").read_text() == RECORDING
+    assert (files / "anchors.csv").read_text() == ANCHORS
+    assert sorted(entry.name for entry in files.iterdir()) == before
+
+
+def test_simulate_spares_its_site(tmp_path, capsys):
+    site = tmp_path / "site.toml"
+    assert main(["site", "new", str(site)]) == 0
+    before = site.read_bytes()
+    assert main(["simulate", "--site", str(site), "--duration", "1", "--fixes-csv", str(site)]) == 2
+    assert "site.toml" in capsys.readouterr().err
+    assert site.read_bytes() == before
