@@ -1,0 +1,83 @@
+"""What ``skyless replay`` writes: a table of fixes row by row, and the report for people."""
+
+import csv
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from skyless.cli.options import open_for_writing
+from skyless.cli.output import console
+
+if TYPE_CHECKING:
+    from skyless.experiments.replay import ReplayReport
+    from skyless.positioning.fix import Fix
+
+COLUMNS = (
+    *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
+    *("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2"),
+    *("anchors", "anchor_ids", "chi2", "residual_rms_m"),
+)
+"""Columns of the file that --fixes writes."""
+
+
+def fix_writer(stack: ExitStack, path: Path) -> "Callable[[Fix], None]":
+    """Open the table, closed by the stack; the result writes one fix."""
+    writer = csv.writer(stack.enter_context(open_for_writing(path)))
+    writer.writerow(COLUMNS)
+    return lambda fix: writer.writerow(_row(fix))
+
+
+def _row(fix: "Fix") -> list[str]:
+    velocity = ("", "", "") if fix.velocity_mps is None else (f"{value:.5g}" for value in fix.velocity_mps)
+    covariance = fix.covariance_m2[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return [
+        f"{fix.time_s:.6f}",
+        *(f"{value:.5f}" for value in fix.position_m),
+        *velocity,
+        *(f"{value:.5g}" for value in covariance),
+        str(len(fix.anchors)),
+        " ".join(map(str, fix.anchors)),
+        f"{fix.chi2:.4g}",
+        f"{fix.residual_rms_m:.4g}",
+    ]
+
+
+def show(report: "ReplayReport", note: str, distances: dict[str, float]) -> None:
+    """Show a replay as a table; ``note`` says where the height is from."""
+    from rich.table import Table
+
+    table = Table("replay", "", title=f"{report.format}: {report.receptions} receptions", show_header=False)
+    for name, value in _lines(report, note):
+        table.add_row(name, value)
+    for reason, count in report.drops.items():
+        table.add_row(f"dropped: {reason}", str(count))
+    for pair, metres in distances.items():
+        table.add_row(f"distance {pair}", f"{metres:.3f} m")
+    console().print(table)
+
+
+def _lines(report: "ReplayReport", note: str) -> list[tuple[str, str]]:
+    fixes = str(report.fixes) if report.reason is None else f"none: {report.reason}"
+    height = note if report.height_m is None else f"{report.height_m:.3f} m, {note}"
+    return [
+        ("fixes", fixes),
+        ("rate", "–" if report.rate_hz is None else f"{report.rate_hz:.1f} Hz"),
+        ("height", height),
+        ("median position", _triple(report.median_m)),
+        ("standard deviation", _triple(report.std_m)),
+        ("noise of a difference", _metres(report.tdoa_noise_m)),
+        ("RMSE 2-D", _metres(report.rmse_2d_m)),
+        ("RMSE 3-D", _metres(report.rmse_3d_m)),
+        ("95 %", _metres(report.p95_m)),
+        ("largest error", _metres(report.max_m)),
+        ("speed", f"{report.receptions_per_s:,.0f} receptions/s"),
+    ]
+
+
+def _metres(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f} m"
+
+
+def _triple(values: tuple[float, float, float] | None) -> str:
+    return "–" if values is None else ", ".join(f"{value:.3f}" for value in values) + " m"
