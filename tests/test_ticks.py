@@ -112,9 +112,10 @@ def test_a_gap_without_host_time_loses_whole_wraps_only():
 
 
 def test_host_time_that_comes_and_goes():
-    """Only when both neighbours have a host time does it bridge the gap between them."""
+    """Stamps without a host time in between do not keep the others from bridging a gap."""
     unwrapper = ticks.Unwrapper()
     assert unwrapper.unwrap(1) == 1
     assert unwrapper.unwrap(2, host_s=100.0) == 2
     assert unwrapper.unwrap(3, host_s=100.0 + float(10 * WRAP_S)) == 3 + 10 * 2**40
     assert unwrapper.unwrap(4) == 4 + 10 * 2**40
+    assert unwrapper.unwrap(5, host_s=100.0 + float(15 * WRAP_S)) == 5 + 15 * 2**40

@@ -29,6 +29,14 @@ MAX_OFFSET_STD_M: Final = 0.3
 REJECTIONS_BEFORE_RESTART: Final = 3
 """So many master beacons in a row that do not fit mean that the master's clock, or the own one, has jumped."""
 
+MAX_DRIFT: Final = 50e-6
+"""Two clocks cannot drift apart faster: two crystals of 20 ppm, and room for noise."""
+
+DRIFT_SLACK_TICKS: Final = 64
+
+MAX_RELAY_AGE_S: Final = 1.0
+"""Older stamps are not relayed: sequence numbers come around after 256 frames, and then name another frame."""
+
 SUBTICKS: Final = 256
 
 
@@ -61,9 +69,10 @@ class Anchor:
         self._clock = _filter_of(site)
         self._range_to_master_m = _distance_m(self._own, self._anchors[site.master])
         self._epoch_master: int | None = None
-        self._master_tx: int | None = None
+        self._master_last: tuple[int, int, tuple[int, int]] | None = None
+        self._misfits = 0
         self._master_heard: Heard | None = None
-        self._heard: dict[int, Heard] = {}
+        self._heard: dict[int, tuple[Heard, int]] = {}
         self._pending: dict[int, tuple[int, int]] = {}
         self._sequence = 0
 
@@ -93,26 +102,46 @@ class Anchor:
             rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
             heard = Heard(beacon.anchor, beacon.sequence, reception.rx_ticks)
             if beacon.anchor == self._site.master:
-                self._master_heard = heard
-                self._hear_master(beacon, rx_ticks)
+                self._hear_master(beacon, heard, rx_ticks)
             else:
                 self._heard.pop(beacon.anchor, None)
-                self._heard[beacon.anchor] = heard
+                self._heard[beacon.anchor] = (heard, rx_ticks)
 
-    def _hear_master(self, beacon: Beacon, rx_ticks: int) -> None:
-        if self._master_tx is None:
-            tx_ticks = beacon.tx_ticks
-        else:
-            elapsed = rx_ticks - self._clock.from_master(self._master_tx)
-            tx_ticks = nearest(beacon.tx_ticks, self._master_tx + elapsed)
-        self._clock.hear(tx_ticks, rx_ticks, self._range_to_master_m)
-        if self._clock.rejected >= REJECTIONS_BEFORE_RESTART:
+    def _hear_master(self, beacon: Beacon, heard: Heard, rx_ticks: int) -> None:
+        """Follow the master; a beacon that does not fit changes nothing, unless others like it follow."""
+        if self._master_last is not None and (beacon.tx_ticks, beacon.sequence) == self._master_last[2]:
+            self.counters["duplicate"] += 1
+            return
+        tx_ticks = self._take_master(beacon, rx_ticks)
+        if tx_ticks is None:
+            self._misfits += 1
+            if self._misfits < REJECTIONS_BEFORE_RESTART:
+                return
             self.counters["clock-restart"] += 1
             tx_ticks = beacon.tx_ticks
             self._clock.restart(tx_ticks, rx_ticks, self._range_to_master_m)
-        self._master_tx = tx_ticks
+        self._misfits = 0
+        self._master_last = (tx_ticks, rx_ticks, (beacon.tx_ticks, beacon.sequence))
+        self._master_heard = heard
         since_epoch = self._schedule.slot_start_ticks(beacon.superframe, beacon.slot)
         self._epoch_master = tx_ticks - since_epoch
+
+    def _take_master(self, beacon: Beacon, rx_ticks: int) -> int | None:
+        """Give a beacon to the clock filter; its unwrapped TX stamp, or None where it does not fit."""
+        if self._master_last is None:
+            self._clock.restart(beacon.tx_ticks, rx_ticks, self._range_to_master_m)
+            return beacon.tx_ticks
+        last_tx, last_rx, _ = self._master_last
+        elapsed = rx_ticks - last_rx
+        tx_ticks = nearest(beacon.tx_ticks, last_tx + elapsed)
+        if elapsed <= 0 or abs(tx_ticks - last_tx - elapsed) > MAX_DRIFT * elapsed + DRIFT_SLACK_TICKS:
+            self.counters["impossible-stamp"] += 1
+            return None
+        self._clock.hear(tx_ticks, rx_ticks, self._range_to_master_m)
+        if self._clock.rejected:
+            self.counters["clock-outlier"] += 1
+            return None
+        return tx_ticks
 
     def next_transmission_ticks(self, now_ticks: int) -> int | None:
         """TX stamp (40-bit, own counter) of the next frame that can still be made; None while the clock is unknown."""
@@ -143,7 +172,6 @@ class Anchor:
 
     def _beacon(self, tx_ticks: int, superframe: int, slot: int) -> Beacon:
         page = page_for(self._pages, superframe, slot)
-        recent = tuple(reversed(self._heard.values()))
         room = heard_capacity(master_heard=self._master_heard is not None, master_time=True, page=True)
         return Beacon(
             site=self._site.id,
@@ -156,9 +184,14 @@ class Anchor:
             master=self._site.master,
             master_heard=self._master_heard,
             master_time=self._master_time(tx_ticks),
-            heard=recent[:room],
+            heard=self._relayed(self._own_ticks.expect(tx_ticks))[:room],
             page=page,
         )
+
+    def _relayed(self, ticks_own: int) -> tuple[Heard, ...]:
+        """What was heard of late of the other anchors, the most recent first."""
+        oldest = ticks_own - round(MAX_RELAY_AGE_S * TICK_RATE_HZ)
+        return tuple(heard for heard, rx_ticks in reversed(self._heard.values()) if rx_ticks > oldest)
 
     def _master_time(self, tx_ticks: int) -> MasterTime:
         ticks, fraction, variance_m2 = self._to_master(self._own_ticks.expect(tx_ticks))

@@ -22,13 +22,14 @@ _PACKAGE: Final = Path(__file__).parent
 def _cache_folder() -> str:
     """Folder of compiled kernels for exactly these sources.
 
-    Numba notices a change of the kernel's own file but not of the kernels that it calls, so a digest of all
-    sources stands in the folder's name; folders of older sources are removed.
+    Numba notices a change of the kernel's own file but not of the kernels that it calls, so a digest of all files
+    with kernels, and of the constants that they use, stands in the folder's name; folders of older ones are removed.
     """
     digest = hashlib.sha1(usedforsecurity=False)
     for source in sorted(_PACKAGE.rglob("*.py")):
-        status = source.stat()
-        digest.update(f"{source}:{status.st_mtime_ns}:{status.st_size}".encode())
+        text = source.read_bytes()
+        if b"skyless.compiled" in text or source.name in {"constants.py", "compiled.py"}:
+            digest.update(text)
     folder = _cache_home() / f"kernels-{digest.hexdigest()[:16]}"
     if not folder.exists():
         for old in folder.parent.glob("kernels-*"):

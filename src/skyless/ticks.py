@@ -55,7 +55,7 @@ class Unwrapper:
 
     Without a host time a stamp is taken to lie within half a wrap (8.6 s for 40 bits) of the stamp before it,
     before or after. With one, the host's clock says which wrap it is, however long the gap, as long as the
-    host's clock errs by less than half a wrap over that gap.
+    host's clock errs by less than half a wrap over that gap. Stamps with and without a host time may alternate.
     """
 
     def __init__(self, bits: int = TICK_BITS) -> None:
@@ -72,6 +72,8 @@ class Unwrapper:
             ticks = counter
         else:
             ticks = nearest(counter, self._last_ticks + self._elapsed_ticks(host_s), self._bits)
+            if host_s is None and self._last_host_s is not None:
+                host_s = self._last_host_s + to_seconds(ticks - self._last_ticks)
         self._last_ticks = ticks
         self._last_host_s = host_s
         return ticks

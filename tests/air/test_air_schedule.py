@@ -109,3 +109,13 @@ def test_given_slots_are_kept_and_the_others_go_around():
 def test_slots_that_cannot_be_are_named(a_site, message):
     with pytest.raises(ValueError, match=message):
         first_slots(a_site)
+
+
+@given(st.integers(1, 8), st.integers(1, 8), st.integers(0, 5))
+def test_every_node_speaks_once_in_each_round(nodes, frames, spare):
+    """Also where the slots are no multiple of the frames per node."""
+    slots = nodes * frames + spare
+    schedule = Schedule(2**27, slots, frames)
+    for first in first_slots(site((None,) * nodes, slots=slots, frames_per_node=frames)).values():
+        rounds = [schedule.round_of(7, slot) for slot in schedule.slots_of(first)]
+        assert rounds == list(range(7 * frames, 8 * frames))

@@ -47,8 +47,12 @@ class Schedule(Struct, frozen=True, gc=False):
         return superframe * self.superframe_ticks + slot * self.slot_ticks
 
     def round_of(self, superframe: int, slot: int) -> int:
-        """Round of a frame; in each every node speaks once: the superframe, or its share with several frames."""
-        return superframe * self.frames_per_node + slot * self.frames_per_node // self.slots
+        """Round of a frame; in each every node speaks once: the superframe, or its share with several frames.
+
+        Slots beyond the last whole share (``slots`` no multiple of the frames per node) count to the last one.
+        """
+        share = min(slot // (self.slots // self.frames_per_node), self.frames_per_node - 1)
+        return superframe * self.frames_per_node + share
 
     def next_slot(self, ticks_master: int, slots: tuple[int, ...]) -> tuple[int, int]:
         """Superframe and slot of a node's first frame at or after a time, given its slots in ascending order.

@@ -56,3 +56,15 @@ def progress_bar(description: str, total: float | None) -> Iterator[Bar]:
         yield bar
     finally:
         bar.close()
+
+
+@contextmanager
+def status(description: str) -> Iterator[None]:
+    """A spinner for work whose length is not known, on a terminal only."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(description):
+        yield

@@ -37,23 +37,19 @@ class NoiseBook:
         self._judge = judge
         self._anchors_m = anchors_m
         self._samples: dict[tuple[int, int, bool], EvenSample] = {}
-        self._counts: dict[tuple[int, int, bool], int] = {}
 
     def add(self, pair: PairTdoa) -> None:
         """Take one difference."""
-        predicted_m = self._predicted_m(pair)
+        predicted_m = self._predicted_m(pair) if self._judge.has_truth else None
         key = (pair.anchor_a, pair.anchor_b, predicted_m is not None)
         sample = self._samples.get(key)
         if sample is None:
             if len(self._samples) >= MOST_PAIRS:
                 return
             sample = self._samples[key] = EvenSample(1, ROWS_PER_PAIR)
-        self._counts[key] = self._counts.get(key, 0) + 1
-        sample.add((pair.tdoa_m - (predicted_m or 0.0),))
+        sample.add((pair.tdoa_m if predicted_m is None else pair.tdoa_m - predicted_m,))
 
     def _predicted_m(self, pair: PairTdoa) -> float | None:
-        if not self._judge.has_truth:
-            return None
         truth = self._judge.at(pair.time_s)
         a_m = pair.a_m or self._anchors_m.get(pair.anchor_a)
         b_m = pair.b_m or self._anchors_m.get(pair.anchor_b)
@@ -68,6 +64,5 @@ class NoiseBook:
             if len(sample.rows) >= FEWEST:
                 median = float(np.median(sample.rows))
                 noise = 1.4826 * float(np.median(np.abs(sample.rows - median)))
-                count = self._counts[a, b, against_truth]
-                found.append(PairNoise(a, b, count, median, noise, against_truth))
+                found.append(PairNoise(a, b, sample.seen, median, noise, against_truth))
         return tuple(found)

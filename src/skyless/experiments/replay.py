@@ -1,7 +1,7 @@
 """Replay of recordings: records in, fixes out, judged against the truth where there is one."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from os import PathLike
 from typing import Final
@@ -109,7 +109,7 @@ class Replay:
                     self._take(pairs, on_fix)
         return self._report(time.perf_counter() - started_s)
 
-    def _differences(self) -> Iterator[tuple[PairTdoa, ...] | list[PairTdoa]]:
+    def _differences(self) -> Iterator[Sequence[PairTdoa]]:
         for record in self.recording:
             if isinstance(record, Packet):
                 assert self._engine is not None
@@ -117,17 +117,15 @@ class Replay:
             else:
                 yield (record,)
 
-    def _take(self, pairs: tuple[PairTdoa, ...] | list[PairTdoa], on_fix: Callable[[Fix], None] | None) -> None:
+    def _take(self, pairs: Sequence[PairTdoa], on_fix: Callable[[Fix], None] | None) -> None:
         """Take what one reception gave: one fix at most."""
         time_s = pairs[0].time_s
         if self._first_s is None:
             self._first_s = time_s
         self._last_s = time_s
-        made = False
         for pair in pairs:
-            made = self._tracking.hear(pair) or made
             self._noise.add(pair)
-        if not made:
+        if not self._tracking.hear(pairs):
             return
         self.fixes += 1
         if self._first_fix_s is None:

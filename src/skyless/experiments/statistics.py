@@ -1,5 +1,6 @@
 """Error statistics in bounded memory: sums are exact, percentiles and plots come from an even sample of the run."""
 
+from array import array
 from typing import Final
 
 import numpy as np
@@ -14,31 +15,33 @@ class EvenSample:
     """Every k-th row of a stream, k doubling whenever the store is full: an even sample, reproducible."""
 
     def __init__(self, columns: int, rows: int = SAMPLE_ROWS) -> None:
-        self._store = np.empty((rows, columns))
-        self._kept = 0
+        self._columns = columns
+        self._most = rows * columns
+        self._store = array("d")
         self._stride = 1
-        self._seen = 0
+        self.seen = 0
+        """Rows offered so far."""
 
     def add(self, row: tuple[float, ...]) -> None:
         """Offer one row."""
-        if self._seen % self._stride == 0:
-            if self._kept == len(self._store):
-                self._halve()
-            if self._seen % self._stride == 0:
-                self._store[self._kept] = row
-                self._kept += 1
-        self._seen += 1
+        seen = self.seen
+        self.seen = seen + 1
+        if seen % self._stride:
+            return
+        if len(self._store) >= self._most:
+            self._halve()
+            if seen % self._stride:
+                return
+        self._store.extend(row)
 
     def _halve(self) -> None:
-        kept = self._store[::2].copy()
-        self._kept = len(kept)
-        self._store[: self._kept] = kept
+        self._store = array("d", self.rows[::2].tobytes())
         self._stride *= 2
 
     @property
     def rows(self) -> NDArray[np.float64]:
-        """The rows kept, shape (kept, columns), in their order."""
-        return self._store[: self._kept]
+        """The rows kept, shape (kept, columns), in their order; a copy."""
+        return np.array(self._store).reshape(-1, self._columns)
 
 
 class ErrorSummary(Struct, frozen=True):

@@ -1,6 +1,11 @@
 """Compile the kernels before a clock runs: the first time takes seconds, later ones load them from disk."""
 
+from math import dist
+
+from skyless.air.packet import PairTdoa
 from skyless.experiments.fleet import Fleet, FleetSettings
+from skyless.positioning.pair_tracker import PairSettings
+from skyless.positioning.pair_tracking import PairTracking
 from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import lab_site
@@ -11,3 +16,13 @@ def compile_kernels(method: str = "tracker") -> None:
     fleet = Fleet(lab_site(), [Static(3.0, 4.0)], lab_impairments(100.0), 0, FleetSettings(method, warmup_s=0.0))
     for _ in fleet.run(0.2):
         pass
+
+
+def compile_pair_kernels() -> None:
+    """Start a filter of pair differences and feed it a little."""
+    places = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors}
+    tracking = PairTracking(PairSettings(height_m=0.0), places)
+    tag_m = (2.0, 3.0, 0.0)
+    for k in range(24):
+        a, b = 1 + k % 6, 1 + (k + 1) % 6
+        tracking.hear((PairTdoa(0.01 * k, a, b, dist(tag_m, places[b]) - dist(tag_m, places[a])),))

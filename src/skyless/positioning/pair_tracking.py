@@ -1,6 +1,7 @@
 """Fixes from time differences of pairs: cold start from a window of them, then the filter, and again when lost."""
 
 from collections import Counter, deque
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -57,39 +58,62 @@ class PairTracking:
         self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
         self._started = False
         self._last_s = 0.0
-        self._used: dict[int, tuple[float, NDArray[np.float64]]] = {}
+        self._heard_s: dict[int, float] = {}
         self._since_try = 0
         self._area_m = (0.0, 0.0, 0.0)
 
-    def hear(self, pair: PairTdoa) -> bool:
-        """Take one difference, in the order of time; True if it made a fix, else ``reason`` says why not."""
-        a_m, b_m = self._place(pair.anchor_a, pair.a_m), self._place(pair.anchor_b, pair.b_m)
-        if a_m is None or b_m is None:
-            self.counters["unknown-anchor"] += 1
-            self.reason = NoFixReason.NO_ALMANAC
-            return False
-        dt_s = pair.time_s - self._last_s
+    def hear(self, pairs: Sequence[PairTdoa]) -> bool:
+        """Take the differences of one reception, receptions in the order of time.
+
+        True if they made a fix, else ``reason`` says why not.
+        """
+        used = False
+        for pair in pairs:
+            places = self._places_of(pair)
+            if places is None:
+                self.counters["unknown-anchor"] += 1
+                self.reason = NoFixReason.NO_ALMANAC
+            else:
+                used = self._take(pair, *places) or used
+        return used and self._started and self._is_sane()
+
+    def _places_of(self, pair: PairTdoa) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        places = self._places
+        if pair.a_m is not None:
+            places[pair.anchor_a] = np.array(pair.a_m)
+        if pair.b_m is not None:
+            places[pair.anchor_b] = np.array(pair.b_m)
+        a_m, b_m = places.get(pair.anchor_a), places.get(pair.anchor_b)
+        return None if a_m is None or b_m is None else (a_m, b_m)
+
+    def _take(self, pair: PairTdoa, a_m: NDArray[np.float64], b_m: NDArray[np.float64]) -> bool:
+        time_s = pair.time_s
+        dt_s = time_s - self._last_s
         if self._started and not 0.0 <= dt_s <= MAX_GAP_S:
             self._stop()
-        self._last_s = pair.time_s
+        self._last_s = time_s
         if not self._started:
             return self._try_start(pair)
-        if not self._tracker.hear(a_m, b_m, dt_s, pair.tdoa_m):
-            self.counters["outlier"] += 1
-            self.reason = NoFixReason.RESIDUALS
-            if self._tracker.lost:
-                self._stop()
-            return False
-        if self._outside():
+        if self._tracker.hear(a_m, b_m, dt_s, pair.tdoa_m):
+            self._heard_s[pair.anchor_a] = self._heard_s[pair.anchor_b] = time_s
+            return True
+        self.counters["outlier"] += 1
+        self.reason = NoFixReason.RESIDUALS
+        if self._tracker.lost:
+            self._stop()
+        return False
+
+    def _is_sane(self) -> bool:
+        """Whether the state is near the anchors, beyond which differences tell nothing, and known well enough."""
+        x_m, y_m, radius_m = self._area_m
+        x, P = self._tracker.x, self._tracker.P
+        if abs(x[0] - x_m) > radius_m or abs(x[1] - y_m) > radius_m:
             self.reason = NoFixReason.NOT_CONVERGED
             self._stop()
             return False
-        P = self._tracker.P
         if P[0, 0] + P[1, 1] > MAX_STD_M**2:
             self.reason = NoFixReason.ACQUIRING
             return False
-        self._used[pair.anchor_a] = (pair.time_s, a_m)
-        self._used[pair.anchor_b] = (pair.time_s, b_m)
         return True
 
     @property
@@ -100,27 +124,18 @@ class PairTracking:
 
     def fix(self) -> Fix:
         """The newest position with all that is known of it; only after a ``hear`` that made one."""
-        used = {anchor: place for anchor, (when, place) in self._used.items() if self._last_s - when <= IN_USE_S}
-        anchors_m = np.array(list(used.values())).reshape(-1, 3)
+        used = [anchor for anchor, when_s in self._heard_s.items() if self._last_s - when_s <= IN_USE_S]
+        anchors_m = np.array([self._places[anchor] for anchor in used]).reshape(-1, 3)
         tracker, height_m = self._tracker, self._settings.height_m
         return motion_fix(
             self._last_s, tracker.x, tracker.P, height_m, tuple(used), anchors_m, tracker.statistics, "tracker"
         )
-
-    def _place(self, anchor: int, given: tuple[float, float, float] | None) -> NDArray[np.float64] | None:
-        return self._places.get(anchor) if given is None else np.array(given)
 
     def _stop(self) -> None:
         """Forget the state; a new start is looked for."""
         self.counters["restart"] += 1
         self._started = False
         self._window.clear()
-
-    def _outside(self) -> bool:
-        """Whether the state has left the neighbourhood of the anchors, where differences tell nothing any more."""
-        x_m, y_m, radius_m = self._area_m
-        x = self._tracker.x
-        return bool(abs(x[0] - x_m) > radius_m or abs(x[1] - y_m) > radius_m)
 
     def _try_start(self, pair: PairTdoa) -> bool:
         """Look for a start at every sixth difference; medians of each pair keep single outliers out of it."""
@@ -139,7 +154,7 @@ class PairTracking:
         self._tracker.start(solution.position_m[:dim], solution.covariance_m2[:dim, :dim], SPEED_STD_MPS**2)
         self._started = True
         self._window.clear()
-        self._used.clear()
+        self._heard_s.clear()
         self.counters["start"] += 1
         return True
 
@@ -152,8 +167,7 @@ class PairTracking:
         joined = against_reference(list(grouped), values, [variance] * len(values))
         if not joined.anchors:
             return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
-        newest = self._newest_places()
-        anchors_m = np.array([newest[anchor] for anchor in joined.anchors])
+        anchors_m = np.array([self._places[anchor] for anchor in joined.anchors])
         low, high = anchors_m.min(axis=0)[:2], anchors_m.max(axis=0)[:2]
         x_m, y_m = ((low + high) / 2.0).tolist()
         self._area_m = (x_m, y_m, NEIGHBOURHOOD * max(float(np.linalg.norm(high - low)), 5.0))
@@ -164,11 +178,3 @@ class PairTracking:
             height_m=self._settings.height_m,
             z_bounds_m=self._z_bounds_m,
         )
-
-    def _newest_places(self) -> dict[int, NDArray[np.float64]]:
-        places = dict(self._places)
-        for pair in self._window:
-            for anchor, given in ((pair.anchor_a, pair.a_m), (pair.anchor_b, pair.b_m)):
-                if given is not None:
-                    places[anchor] = np.array(given)
-        return places
