@@ -13,13 +13,19 @@ Rows = NDArray[np.float64]
 
 
 def draw(path: Path, rows: Rows, title: str) -> None:
-    """Draw rows of time, position (3) and true position (3, NaN where unknown) into a file.
+    """Draw rows of time, position (3) and true position (3, NaN where unknown) into a file; without rows, the title.
 
     Raises:
         OSError, ValueError: the file cannot be written, or its ending names no kind of picture.
     """
     figure = Figure(figsize=(11, 8), layout="constrained")
     figure.suptitle(title)
+    if len(rows):
+        _fill(figure, rows)
+    save_figure(figure, path)
+
+
+def _fill(figure: Figure, rows: Rows) -> None:
     axes = figure.subplots(2, 2)
     judged = rows[np.isfinite(rows[:, 4])]
     known = len(judged) > 0
@@ -28,7 +34,6 @@ def draw(path: Path, rows: Rows, title: str) -> None:
     _over_time(axes[0, 1], (judged if known else rows)[:, 0], errors, known=known)
     _histogram(axes[1, 0], errors[:, :2], ("x", "y"), known=known)
     _distribution(axes[1, 1], np.linalg.norm(errors[:, :2], axis=1), known=known)
-    save_figure(figure, path)
 
 
 def _track(axes: Axes, rows: Rows, judged: Rows) -> None:
