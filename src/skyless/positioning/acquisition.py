@@ -10,13 +10,14 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.constants import TICK_M, TICK_S
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.fix import NoFixReason
+from skyless.positioning.fix_time import MAX_DRIFT
 from skyless.positioning.observation import Observation
 from skyless.positioning.solver import NoSolution, locate_pseudoranges
 
 MAX_AGE_S: Final = 0.5
-"""Older messages no longer serve the start."""
+"""Older messages no longer serve the start, unless superframes are so long."""
 
 SPEED_STD_MPS: Final = 1.0
 """Typical speed of a tag; it smears pseudoranges taken at different times and starts the velocity."""
@@ -39,8 +40,13 @@ class Acquisition:
     """Gathers beacons until a start is possible."""
 
     def __init__(
-        self, height_m: float | None, stamp_variance_m2: float, z_bounds_m: tuple[float, float] | None = None
+        self,
+        height_m: float | None,
+        stamp_variance_m2: float,
+        z_bounds_m: tuple[float, float] | None = None,
+        max_age_s: float = MAX_AGE_S,
     ) -> None:
+        self._max_age_s = max_age_s
         self._height_m = height_m
         self._variance_m2 = stamp_variance_m2
         self._z_bounds_m = z_bounds_m
@@ -50,16 +56,27 @@ class Acquisition:
         """Take one observation; try to start each time an anchor comes around again."""
         now = observation.rx_ticks_tag
         for anchor, kept in list(self._heard.items()):
-            if (now - kept[-1].rx_ticks_tag) * TICK_S > MAX_AGE_S:
+            if (now - kept[-1].rx_ticks_tag) * TICK_S > self._max_age_s:
                 del self._heard[anchor]
         kept = self._heard.setdefault(observation.anchor, [])
         came_around = len(kept) == 2
         self._heard[observation.anchor] = [*kept[-1:], observation]
-        pairs = [kept for kept in self._heard.values() if len(kept) == 2]
+        pairs = [kept for kept in self._heard.values() if len(kept) == 2 and _possible(*kept)]
         needed = 4 if self._height_m is None else 3
         if len(pairs) < needed:
             return NoFixReason.TOO_FEW_ANCHORS
-        return self._solve(pairs, now) if came_around else NoFixReason.ACQUIRING
+        if not came_around:
+            return NoFixReason.ACQUIRING
+        result = self._solve(pairs, now)
+        if result is NoFixReason.RESIDUALS and len(pairs) > needed + 1 and observation is pairs[0][-1]:
+            return self._solve_without_one(pairs, now)
+        return result
+
+    def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
+        """Where one anchor alone contradicts all others, do without it; they must still be able to contradict."""
+        results = [self._solve(pairs[:k] + pairs[k + 1 :], now) for k in range(len(pairs))]
+        starts = [result for result in results if isinstance(result, Start)]
+        return starts[0] if len(starts) == 1 else NoFixReason.RESIDUALS
 
     def _solve(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
         base = _offset_ticks(pairs[0][-1])[0]
@@ -100,6 +117,11 @@ def _pseudorange_m(observation: Observation, base_ticks: int) -> float:
 def _clock_rate(first: Observation, second: Observation) -> float:
     """Rate of the tag's clock against the master's in m/s, from two messages of one anchor."""
     change_m = _pseudorange_m(second, _offset_ticks(first)[0]) - _pseudorange_m(first, _offset_ticks(first)[0])
-    assert first.tx_ticks_master is not None
-    assert second.tx_ticks_master is not None
-    return change_m / ((second.tx_ticks_master - first.tx_ticks_master) * TICK_S)
+    return change_m / ((second.rx_ticks_tag - first.rx_ticks_tag) * TICK_S)
+
+
+def _possible(first: Observation, second: Observation) -> bool:
+    """Whether two messages of one anchor are on one scale, that of a crystal."""
+    if second.rx_ticks_tag <= first.rx_ticks_tag:
+        return False
+    return abs(_clock_rate(first, second)) <= MAX_DRIFT * SPEED_OF_LIGHT_MPS

@@ -12,8 +12,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.constants import TICK_M, TICK_S
+from skyless.constants import TICK_M
 from skyless.positioning.fix import Fix, NoFixReason
+from skyless.positioning.fix_time import MAX_DRIFT, SLACK_TICKS, FixTime
 from skyless.positioning.observation import Observation
 from skyless.positioning.paper import bracketed_tdoa, literal_tdoa
 from skyless.positioning.solver import NoSolution, Solution, locate
@@ -54,13 +55,14 @@ class SnapshotSettings(Struct, frozen=True):
 class Snapshots:
     """Collects two rounds of beacons and solves them."""
 
-    def __init__(self, method: SnapshotMethod, settings: SnapshotSettings) -> None:
+    def __init__(self, method: SnapshotMethod, settings: SnapshotSettings, fix_time: FixTime | None = None) -> None:
+        """``fix_time``: the receiver's, where it outlives this method."""
         self._method = method
         self._settings = settings
         self._previous: dict[int, Observation] = {}
         self._current: dict[int, Observation] = {}
         self._round: int | None = None
-        self._first_ticks: int | None = None
+        self._time = fix_time or FixTime()
 
     def hear(self, observation: Observation) -> Fix | NoFixReason:
         """Take one observation; a fix when it completes its round or is the first of the next one."""
@@ -127,12 +129,10 @@ class Snapshots:
         anchors_m: NDArray[np.float64],
     ) -> Fix:
         first_message = self._method in {SnapshotMethod.LITERAL, SnapshotMethod.WEIGHTED}
-        ticks = reference[0 if first_message else 1].tx_ticks_anchor
-        if self._first_ticks is None:
-            self._first_ticks = ticks
+        message = reference[0 if first_message else 1]
         residuals = solution.residuals_m
         return Fix(
-            time_s=(ticks - self._first_ticks) * TICK_S,
+            time_s=self._time.time_s(message.tx_ticks_anchor, message.rx_ticks_tag),
             position_m=solution.position_m,
             covariance_m2=solution.covariance_m2,
             velocity_mps=None,
@@ -148,14 +148,23 @@ class Snapshots:
 
 
 def _synchronised(first: Observation, second: Observation, reference: tuple[Observation, Observation]) -> bool:
-    """Whether the anchor heard, before each of its two frames, the very master frames that the tag heard."""
+    """Whether the anchor heard, before its two frames, the very master frames that the tag heard, and its clock ran."""
     return (
         first.anchor != reference[0].anchor
         and first.master_rx_ticks_anchor is not None
         and second.master_rx_ticks_anchor is not None
         and first.master_sequence == reference[0].sequence
         and second.master_sequence == reference[1].sequence
+        and _in_step(second.tx_ticks_anchor - first.tx_ticks_anchor, first, second)
+        and _in_step(second.master_rx_ticks_anchor - first.master_rx_ticks_anchor, *reference)
+        and _in_step(reference[1].tx_ticks_anchor - reference[0].tx_ticks_anchor, *reference)
     )
+
+
+def _in_step(elapsed_ticks: int, first: Observation, second: Observation) -> bool:
+    """Whether an interval on an anchor's clock can be the one that the tag measured between two receptions."""
+    elapsed = second.rx_ticks_tag - first.rx_ticks_tag
+    return elapsed > 0 and abs(elapsed_ticks - elapsed) <= MAX_DRIFT * elapsed + SLACK_TICKS
 
 
 def _kappa(first: Observation, second: Observation) -> float:

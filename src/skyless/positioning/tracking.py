@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
-from skyless.positioning.acquisition import Acquisition, Start
+from skyless.positioning.acquisition import MAX_AGE_S, Acquisition, Start
 from skyless.positioning.fix import Fix, NoFixReason, motion_fix
+from skyless.positioning.fix_time import FixTime
 from skyless.positioning.observation import Observation
 from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings
-from skyless.ticks import from_seconds
 
 MAX_GAP_S: Final = 5.0
 """After a longer silence the state says less than a new start would."""
@@ -22,13 +22,21 @@ IN_USE_S: Final = 0.1
 class Tracking:
     """One tag's tracker from the first beacon on."""
 
-    def __init__(self, settings: TrackerSettings, z_bounds_m: tuple[float, float] | None = None) -> None:
+    def __init__(
+        self,
+        settings: TrackerSettings,
+        z_bounds_m: tuple[float, float] | None = None,
+        fix_time: FixTime | None = None,
+        superframe_s: float = 0.0,
+    ) -> None:
+        """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites."""
         self._settings = settings
+        self._superframe_s = superframe_s
+        self._in_use_s = max(IN_USE_S, 1.5 * superframe_s)
         self._z_bounds_m = z_bounds_m
         self._tracker = PseudorangeTracker(settings)
         self._acquisition: Acquisition | None = self._new_acquisition()
-        self._first_ticks_master: int | None = None
-        self._last: tuple[float, int] | None = None
+        self._time = fix_time or FixTime()
         self._used: dict[int, Observation] = {}
         self._anchors: tuple[int, ...] = ()
         self._anchors_m: NDArray[np.float64] = np.empty((0, 3))
@@ -44,7 +52,7 @@ class Tracking:
         """Take one observation; a fix for every accepted message once started."""
         if observation.tx_ticks_master is None:
             return NoFixReason.ACQUIRING
-        if self._acquisition is None and self._is_silent_too_long(observation):
+        if self._acquisition is None and self._is_out_of_reach(observation):
             self._acquisition = self._new_acquisition()
         if self._acquisition is not None:
             start = self._acquisition.hear(observation)
@@ -68,22 +76,18 @@ class Tracking:
         return self._fix(observation)
 
     def _new_acquisition(self) -> Acquisition:
-        return Acquisition(self._settings.height_m, self._settings.stamp_variance_m2, self._z_bounds_m)
+        max_age_s = max(MAX_AGE_S, 2.5 * self._superframe_s)
+        return Acquisition(self._settings.height_m, self._settings.stamp_variance_m2, self._z_bounds_m, max_age_s)
 
-    def _is_silent_too_long(self, observation: Observation) -> bool:
-        return (observation.rx_ticks_tag - self._heard_ticks) * TICK_S > MAX_GAP_S
+    def _is_out_of_reach(self, observation: Observation) -> bool:
+        """Whether the filter cannot predict up to here: after a long silence, or when the tag's counter fell back."""
+        return not 0.0 <= (observation.rx_ticks_tag - self._heard_ticks) * TICK_S <= MAX_GAP_S
 
     def _begin(self, start: Start, observation: Observation) -> None:
-        """Start the filter; where there was one before, the time of its fixes goes on by the tag's own clock."""
         self._acquisition = None
         self._heard_ticks = observation.rx_ticks_tag
         self._used.clear()
         self._use(observation)
-        assert observation.tx_ticks_master is not None
-        self._first_ticks_master = observation.tx_ticks_master
-        if self._last is not None:
-            last_s, last_rx_ticks = self._last
-            self._first_ticks_master -= from_seconds(last_s) + observation.rx_ticks_tag - last_rx_ticks
         self._tracker.start(
             start.rx_ticks_tag,
             start.whole_offset_ticks,
@@ -99,9 +103,9 @@ class Tracking:
         now = observation.rx_ticks_tag
         changed = observation.anchor not in self._used
         self._used[observation.anchor] = observation
-        if (now - self._checked_ticks) * TICK_S > IN_USE_S:
+        if (now - self._checked_ticks) * TICK_S > self._in_use_s:
             self._checked_ticks = now
-            stale = [a for a, o in self._used.items() if (now - o.rx_ticks_tag) * TICK_S > IN_USE_S]
+            stale = [a for a, o in self._used.items() if (now - o.rx_ticks_tag) * TICK_S > self._in_use_s]
             changed = changed or bool(stale)
             for anchor in stale:
                 del self._used[anchor]
@@ -111,9 +115,7 @@ class Tracking:
 
     def _fix(self, observation: Observation) -> Fix:
         assert observation.tx_ticks_master is not None
-        assert self._first_ticks_master is not None
-        time_s = (observation.tx_ticks_master - self._first_ticks_master) * TICK_S
-        self._last = (time_s, observation.rx_ticks_tag)
+        time_s = self._time.time_s(observation.tx_ticks_master, observation.rx_ticks_tag)
         tracker, height_m = self._tracker, self._settings.height_m
         return motion_fix(
             time_s, tracker.x, tracker.P, height_m, self._anchors, self._anchors_m, tracker.statistics, "tracker"
