@@ -69,7 +69,7 @@ def packets(count, seed=1, speed_mps=0.5):
         relays = [(anchor, *told) for anchor, told in heard[sender].items()]
         heard[sender] = {}
         payload = tdoa3(sequence, stamp(sender, t, random, 32), relays)
-        flight_s = dist(place_m(t, speed_mps), ANCHORS_M[sender]) / C_MPS
+        flight_s = dist(place_m(k * PERIOD_S, speed_mps), ANCHORS_M[sender]) / C_MPS
         yield 1.7e9 + t, sender, stamp(TAG, t + flight_s, random), payload
         for other in names:
             if other != sender:
@@ -101,7 +101,7 @@ def avalue_table(count, seed=1, speed_mps=0.5):
     for k in range(count):
         sender, t = names[k % len(names)], 1.0 + k * PERIOD_S
         tx_ticks = stamp(sender, t, random)
-        places = {TAG: place_m(t, speed_mps)} | ANCHORS_M
+        places = {TAG: place_m(k * PERIOD_S, speed_mps)} | ANCHORS_M
         for other, place in places.items():
             if other != sender:
                 rx_ticks = stamp(other, t + dist(place, ANCHORS_M[sender]) / C_MPS, random)

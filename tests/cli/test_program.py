@@ -46,11 +46,11 @@ def test_version():
 
 
 def test_every_command_has_help_with_an_example():
-    for command in (["site"], ["site", "new"], ["site", "check"]):
+    for command in (["demo"], ["simulate"], ["replay"], ["site"], ["site", "new"], ["site", "check"]):
         done = skyless(*command, "--help")
         assert done.returncode == 0
         assert f"Example: skyless {' '.join(command)}" in done.stdout
-    assert skyless("site", "--help").stdout.count("--no-") == 0
+        assert done.stdout.count("--no-") == 0
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,9 @@ def test_every_command_has_help_with_an_example():
 def test_a_slip_is_told_on_standard_error(arguments, said):
     done = skyless(*arguments)
     assert (done.returncode, done.stdout) == (2, "")
-    assert said in " ".join(done.stderr.split())
+    assert done.stderr.startswith("skyless: ")
+    assert done.stderr.count("\n") == 1
+    assert said in done.stderr
 
 
 def test_a_configuration_error_is_one_line(tmp_path):

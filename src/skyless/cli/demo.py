@@ -69,7 +69,7 @@ def demo(
     elif not sys.stdout.isatty():
         console().print(_tags(fleet))
     if not json:
-        console().print(_closing(result))
+        console().print(_closing(result), soft_wrap=True)
 
 
 def _fleet(tags: int, speed: float, noise_ps: float, seed: int) -> "Fleet":

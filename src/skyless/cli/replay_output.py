@@ -60,13 +60,15 @@ def show(report: "ReplayReport", note: str, distances: dict[str, float]) -> None
 def _lines(report: "ReplayReport", note: str) -> list[tuple[str, str]]:
     fixes = str(report.fixes) if report.reason is None else f"none: {report.reason}"
     height = note if report.height_m is None else f"{report.height_m:.3f} m, {note}"
+    truth_known = any(pair.against_truth for pair in report.pairs)
     return [
         ("fixes", fixes),
         ("rate", "–" if report.rate_hz is None else f"{report.rate_hz:.1f} Hz"),
         ("height", height),
         ("median position", _triple(report.median_m)),
         ("standard deviation", _triple(report.std_m)),
-        ("noise of a difference", _metres(report.tdoa_noise_m)),
+        # without truth, the tag's own motion is in it
+        ("noise of a difference" if truth_known else "spread of a difference", _metres(report.tdoa_noise_m)),
         ("RMSE 2-D", _metres(report.rmse_2d_m)),
         ("RMSE 3-D", _metres(report.rmse_3d_m)),
         ("95 %", _metres(report.p95_m)),

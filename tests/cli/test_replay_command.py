@@ -1,0 +1,282 @@
+"""``skyless replay`` as its user meets it, on recordings of a made-up room (``synthetic_recordings``)."""
+
+import csv
+import gzip
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+import synthetic_recordings as synthetic
+from skyless.cli.main import main
+from skyless.cli.replay_output import COLUMNS
+from skyless.site.lab import lab_site
+from skyless.site.template import site_template
+
+ROWS = 1500
+PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256))
+COMMAND = [sys.executable, "-m", "skyless.cli.main", "replay"]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A recording of each format, called as the format is; nothing is ever written beside them."""
+    folder = tmp_path_factory.mktemp("room")
+    (folder / "anchors.csv").write_text(synthetic.anchors_csv())
+    (folder / "truth.csv").write_text(synthetic.truth_csv(ROWS * 0.005 + 1.0))
+    (folder / "lab.toml").write_text(site_template(lab_site()))
+    for name in synthetic.MAKERS:
+        synthetic.write(folder / name, name, ROWS)
+    return folder
+
+
+@pytest.fixture
+def run(room, capsys, monkeypatch):
+    """The command in the room's folder: exit code, standard output and standard error."""
+    monkeypatch.chdir(room)
+
+    def call(*arguments):
+        try:
+            code = main(["replay", *map(str, arguments)])
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def report(result):
+    code, out, err = result
+    assert (code, err, out.count("\n")) == (0, "", 1)
+    return json.loads(out)
+
+
+@pytest.mark.parametrize("name", synthetic.MAKERS)
+def test_every_format_gives_fixes_at_the_truth(run, name):
+    options = ["--anchors", "anchors.csv", "--truth", "truth.csv", "--settle", "1", "--json"]
+    told = report(run(name, *options, *synthetic.LISTENER.get(name, [])))
+    assert told["format"] == name
+    assert told["receptions"] == ROWS
+    assert told["fixes"] > 0.98 * ROWS
+    assert told["rmse_2d_m"] < 0.05  # 100 ps of a stamp are 3 cm, differences of the table have 10 cm
+    assert told["rmse_3d_m"] is None or told["rmse_3d_m"] < 0.1
+    assert told["rate_hz"] == pytest.approx(200.0 if name == "miluv" else 500.0, rel=0.02)
+    assert told["dropped"] == sum(told["drops"].values()) < 0.02 * ROWS * 8
+
+
+def test_fixes_file_and_report_agree(run, room, tmp_path):
+    path = tmp_path / "fixes.csv"
+    told = report(run("tdoa-table", "--anchors", "anchors.csv", "--fixes", path, "--settle", "0", "--json"))
+    with path.open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert tuple(table[0]) == COLUMNS
+    assert len(table) == told["fixes"]
+    values = {name: np.array([float(row[name]) for row in table]) for name in COLUMNS if name != "anchor_ids"}
+    assert (np.diff(values["t_s"]) > 0.0).all()
+    places = np.stack([values["x_m"], values["y_m"], values["z_m"]], axis=1)
+    assert np.median(places, axis=0) == pytest.approx(told["median_m"], abs=1e-5)
+    assert places.std(axis=0) == pytest.approx(told["std_m"], rel=1e-3)
+    covariance = np.array([[values[f"cov_{''.join(sorted(a + b))}_m2"] for a in "xyz"] for b in "xyz"])
+    assert (np.linalg.eigvalsh(np.moveaxis(covariance, 2, 0)) > 0.0).all()
+    for row in table[20:]:
+        anchors = row["anchor_ids"].split()
+        assert len(anchors) == int(row["anchors"]) >= 4
+        assert set(map(int, anchors)) <= synthetic.ANCHORS_M.keys()
+
+
+def test_a_fixes_file_of_a_tag_at_known_height_has_that_height(run, tmp_path):
+    path = tmp_path / "fixes.csv"
+    told = report(run("tdoa-table", "--anchors", "anchors.csv", "--fixes", path, "--height", "1.2", "--json"))
+    assert (told["height_m"], told["height_note"], told["rmse_3d_m"]) == (1.2, "given", None)
+    with path.open(newline="") as file:
+        assert {row["z_m"] for row in csv.DictReader(file)} == {"1.20000"}
+
+
+def test_heights(run):
+    arguments = ["tdoa-table", "--anchors", "anchors.csv", "--json"]
+    assert report(run(*arguments))["height_m"] is None  # these anchors tell it
+    assert report(run(*arguments, "--height", "free"))["height_note"] == "estimated"
+    told = report(run(*arguments, "--height", "truth", "--truth", "truth.csv"))
+    assert (told["height_m"], told["height_note"]) == (1.2, "the truth's median")
+
+
+def test_a_site_file_serves_as_anchors(run):
+    told = report(run("tdoa-table", "--site", "lab.toml", "--json"))
+    assert told["height_note"] == "from the site file"
+    assert told["drops"]["unknown-anchor"] > 0  # the lab has six anchors, the recording eight
+
+
+def test_pictures(run, tmp_path):
+    arguments = ["tdoa-table", "--anchors", "anchors.csv", "--json"]
+    report(run(*arguments, "--truth", "truth.csv", "--plot", tmp_path / "a.png"))
+    report(run(*arguments, "--plot", tmp_path / "b.SVG"))
+    assert imread(tmp_path / "a.png").shape[1] > 800
+    assert b"<svg" in (tmp_path / "b.SVG").read_bytes()
+
+
+def test_a_table_for_people_in_a_pipe_has_no_control_characters(room):
+    environment = {**os.environ, "FORCE_COLOR": "", "COLUMNS": "80"}
+    done = subprocess.run(
+        [*COMMAND, "bitcraze-yaml", "--anchors", "anchors.csv"],
+        cwd=room,
+        capture_output=True,
+        text=True,
+        check=True,
+        env=environment,
+    )
+    assert done.stderr == ""
+    assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f]", done.stdout)
+    assert f"{ROWS} receptions" in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 80
+
+
+def test_what_is_left_of_a_damaged_recording_is_used(run, room, tmp_path):
+    whole = (room / "tdoa-table").read_bytes()
+    packed = gzip.compress(whole)
+    (tmp_path / "cut.gz").write_bytes(packed[: len(packed) // 2])
+    lines = whole.splitlines(keepends=True)
+    lines[100:100] = [b"nan,1,2,3\n", b"0.2,1,2,inf\n", b"0.2,1,2,x\n", b"0.2,1\n", b"\n", b"0.2,1,1,0\n"]
+    (tmp_path / "holes.csv").write_bytes(b"".join(lines))
+    told = report(run(tmp_path / "cut.gz", "--anchors", "anchors.csv", "--json"))
+    assert told["fixes"] > 300
+    assert told["drops"]["compressed-stream-cut-off"] == 1
+    told = report(run(tmp_path / "holes.csv", "--anchors", "anchors.csv", "--json"))
+    assert told["fixes"] > 0.98 * ROWS
+    assert told["drops"].items() >= {"not-finite": 2, "malformed-number": 1, "anchor-against-itself": 1}.items()
+
+
+def test_without_anchors_there_is_no_fix_and_a_reason(run):
+    told = report(run("tdoa-table", "--json"))
+    assert (told["fixes"], told["reason"], told["median_m"]) == (0, "no-almanac", None)
+    code, out, err = run("tdoa-table")
+    assert (code, err) == (0, "")
+    assert "none: no-almanac" in out
+
+
+BAD_FILES = {
+    "empty": b"",
+    "picture": PNG,
+    "letter": b"Dear reader,\n",
+    "bad-number.csv": b"id,x_m,y_m,z_m\n1,0,0,far\n",
+    "twice.csv": b"id,x_m,y_m,z_m\n1,0,0,0\n1,0,0,1\n",
+    "no-z.csv": b"id,x_m,y_m\n1,0,0\n",
+    "nan.csv": b"id,x_m,y_m,z_m\n1,0,nan,0\n",
+    "ragged.csv": b"id,x_m,y_m,z_m\n1,0,0\n",
+    "late.csv": b"t_s,x_m,y_m,z_m\n1000,0,0,0\n1001,0,0,0\n",
+    "backwards.csv": b"t_s,x_m,y_m,z_m\n2,0,0,0\n1,0,0,0\n",
+    "cut.csv.gz": gzip.compress(synthetic.truth_csv(100).encode())[:-400],
+}
+A, T = ["--anchors", "anchors.csv"], ["--truth", "truth.csv"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["missing.csv"], ["missing.csv", "No such file"]),
+        (["."], ["Is a directory"]),
+        (["{bad}/empty"], ["empty", "one of the formats", "tdoa-table"]),
+        (["{bad}/picture"], ["PNG", "one of the formats"]),
+        (["{bad}/letter"], ["Dear reader", "one of the formats"]),
+        (["tdoa-table", "--format", "mp3"], ["format", "mp3", "bitcraze-yaml"]),
+        (["tdoa-table", "--listener", "3"], ["listener", "one listener only"]),
+        (["avalue", "--listener", "tag"], ["listener", "tag", "hexadecimal"]),
+        (["avalue", "--listener", "77"], ["listener", "77", "that the recording names"]),
+        (["miluv", "--listener", "77"], ["listener", "77", "that the recording names"]),
+        (["tdoa-table", "--anchors", "missing.csv"], ["missing.csv", "No such file"]),
+        (["tdoa-table", "--anchors", "."], ["Is a directory"]),
+        (["tdoa-table", "--anchors", "{bad}/picture"], ["picture", "line 1", "id,x_m,y_m,z_m"]),
+        (["tdoa-table", "--anchors", "{bad}/empty"], ["empty", "line 1", "id,x_m,y_m,z_m"]),
+        (["tdoa-table", "--anchors", "{bad}/bad-number.csv"], ["line 2", "z_m", "far", "finite number"]),
+        (["tdoa-table", "--anchors", "{bad}/nan.csv"], ["line 2", "y_m", "nan", "finite number"]),
+        (["tdoa-table", "--anchors", "{bad}/twice.csv"], ["line 3", "id is 1", "only once"]),
+        (["tdoa-table", "--anchors", "{bad}/no-z.csv"], ["line 1", "id,x_m,y_m,z_m"]),
+        (["tdoa-table", "--anchors", "{bad}/ragged.csv"], ["line 2", "4 columns"]),
+        (["tdoa-table", "--site", "missing.toml"], ["missing.toml", "readable site file"]),
+        (["tdoa-table", "--site", "anchors.csv"], ["anchors.csv"]),
+        (["tdoa-table", *A, "--site", "lab.toml"], ["--anchors", "--site", "not both"]),
+        (["tdoa-table", *A, "--truth", "missing.csv"], ["missing.csv", "No such file"]),
+        (["tdoa-table", *A, "--truth", "{bad}/late.csv"], ["late.csv", "t_s", "1000.000 to 1001.000", "recording"]),
+        (["tdoa-table", *A, "--truth", "{bad}/backwards.csv"], ["backwards.csv", "t_s", "at least 2"]),
+        (["tdoa-table", *A, "--truth", "{bad}/cut.csv.gz"], ["cut.csv.gz", "whole file"]),
+        (["tdoa-table", *A, "--truth", "anchors.csv"], ["anchors.csv", "line 1", "t_s,x_m,y_m,z_m"]),
+        (["tdoa-table", *A, "--lever-arm", "1,2,3"], ["--lever-arm", "--truth"]),
+        (["tdoa-table", *A, *T, "--lever-arm", "1,2"], ["--lever-arm", "1,2", "3 number"]),
+        (["tdoa-table", *A, *T, "--lever-arm", "1,2,nan"], ["--lever-arm", "nan"]),
+        (["tdoa-table", *A, "--height", "tall"], ["--height", "tall", "metres"]),
+        (["tdoa-table", *A, "--height", "truth"], ["--height", "--truth"]),
+        (["tdoa-table", *A, "--fixes", "no/fixes.csv"], ["no/fixes.csv", "cannot be written"]),
+        (["tdoa-table", *A, "--fixes", "."], ["cannot be written", "Is a directory"]),
+        (["tdoa-table", *A, "--plot", "no/plot.png"], ["--plot", "no/plot.png", "folder that exists"]),
+        (["tdoa-table", *A, "--plot", "plot.xyz"], ["--plot", "plot.xyz", ".png, .svg, .pdf"]),
+        (["tdoa-table", *A, "--plot", "plot"], ["--plot", "ending"]),
+        (["tdoa-table", *A, "--qa", "0"], ["--qa", "0"]),
+        (["tdoa-table", *A, "--qa", "inf"], ["--qa", "inf"]),
+        (["tdoa-table", *A, "--tdoa-std", "nan"], ["--tdoa-std", "nan"]),
+        (["tdoa-table", *A, "--settle", "-1"], ["--settle", "-1"]),
+        (["tdoa-table", *A, "--above", "nan"], ["--above", "nan"]),
+        (["tdoa-table", *A, "--antenna", "4"], ["--antenna"]),
+        ([], ["FILE"]),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(run, room, tmp_path, arguments, said):
+    for name, data in BAD_FILES.items():
+        (tmp_path / name).write_bytes(data)
+    code, out, err = run(*(argument.format(bad=tmp_path) for argument in arguments))
+    assert (code, out) == (2, "")
+    assert err.startswith("skyless: ")
+    assert err.count("\n") == 1
+    for part in said:
+        assert part in err
+    assert sorted(entry.name for entry in room.iterdir()) == sorted(
+        {*synthetic.MAKERS, "anchors.csv", "truth.csv", "lab.toml"}
+    )
+
+
+def test_a_named_format_holds_where_the_content_does_not_show_it(run, room, tmp_path):
+    path = tmp_path / "late.bin"
+    path.write_bytes(bytes(40_000) + (room / "bitcraze-binary").read_bytes())
+    code, _, err = run(path, *A, *T, "--json")
+    assert code == 2
+    assert "one of the formats" in err
+    told = report(run(path, *A, *T, "--format", "bitcraze-binary", "--json"))
+    assert told["receptions"] == ROWS
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_file_that_may_not_be_written(run, tmp_path):
+    path = tmp_path / "fixes.csv"
+    path.touch(mode=0o400)
+    code, _, err = run("tdoa-table", *A, "--fixes", path)
+    assert code == 2
+    assert "Permission denied" in err
+
+
+def test_interrupted_replay_keeps_what_it_has_written(room, tmp_path):
+    long = synthetic.write(tmp_path / "long", "bitcraze-binary", 100_000)
+    path = tmp_path / "fixes.csv"
+    process = subprocess.Popen(
+        [*COMMAND, long, "--anchors", room / "anchors.csv", "--fixes", path, "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    for _ in range(1200):
+        if path.exists() and path.stat().st_size > 0:
+            break
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (130, b"", b"")
+    with path.open(newline="") as file:
+        table = list(csv.reader(file))
+    assert tuple(table[0]) == COLUMNS
+    assert 10 < len(table) < 100_000
+    assert all(len(row) == len(COLUMNS) for row in table)
+    assert float(table[-1][0]) > 0.0
+    assert path.read_bytes().endswith(b"\n")

@@ -1,0 +1,168 @@
+"""``skyless simulate`` as its user meets it."""
+
+import csv
+import json
+import math
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from skyless.cli.main import main
+from skyless.cli.simulate import COLUMNS
+
+COMMAND = [sys.executable, "-m", "skyless.cli.main", "simulate"]
+KEYS = {
+    *("method", "tags", "messages", "fixes", "rmse_m", "p95_m", "max_m", "updates_per_s", "dropped"),
+    *("simulated_s", "wall_s", "speed", "seed", "site"),
+}
+
+
+@pytest.fixture
+def run(capsys, monkeypatch, tmp_path):
+    """The command in an empty folder: exit code, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        try:
+            code = main(["simulate", *map(str, arguments)])
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def report(result):
+    code, out, err = result
+    assert (code, err, out.count("\n")) == (0, "", 1)
+    told = json.loads(out)
+    assert told.keys() >= KEYS
+    return told
+
+
+def test_a_run_tells_what_was_asked_of_it(run):
+    told = report(run("--noise-ps", "100", "--position", "3,4", "--duration", "8", "--seed", "3", "--json"))
+    assert (told["method"], told["tags"], told["site"], told["seed"]) == ("tracker", 1, "lab", 3)
+    assert told["simulated_s"] == 8.0
+    assert told["messages"] == pytest.approx(8.0 * 400, rel=0.02)
+    assert told["fixes"] == pytest.approx((8.0 - 2.0) / 0.015, abs=2)  # one a superframe after the warm-up
+    assert told["updates_per_s"] == pytest.approx(400.0, rel=0.01)
+    assert 0.0 < told["rmse_m"] < 0.03
+    assert told["rmse_m"] < told["p95_m"] < told["max_m"]
+    assert told["dropped"] == sum(told["drops"].values())
+
+
+def test_the_same_seed_gives_the_same_run(run):
+    arguments = ["--duration", "2.5", "--tags", "2", "--json"]
+    first, again, other = (report(run(*arguments, "--seed", seed)) for seed in (5, 5, 6))
+    for told in (first, again, other):
+        for name in ("wall_s", "speed"):
+            del told[name]
+    assert first == again
+    assert first["rmse_m"] != other["rmse_m"]
+
+
+@pytest.mark.parametrize("method", ["literal", "literal-delayed", "weighted", "bracketed", "tracker"])
+def test_it_stops_at_the_wanted_number_of_fixes(run, method):
+    told = report(run("--method", method, "--position", "3,4", "--fixes", "40", "--warmup", "1", "--json"))
+    assert told["method"] == method
+    assert 40 <= told["fixes"] <= 40 + math.ceil(0.25 / 0.015)
+
+
+def test_fixes_file_and_report_agree(run, tmp_path):
+    told = report(run("--position", "3,4", "--duration", "3", "--warmup", "0", "--fixes-csv", "fixes.csv", "--json"))
+    with (tmp_path / "fixes.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert tuple(table[0]) == ("t_s", "tag", *COLUMNS)
+    assert len(table) == pytest.approx(told["updates_per_s"] * (3.0 - told["first_fix_s"]), abs=1)
+    errors = [
+        math.dist((float(r["x_m"]), float(r["y_m"])), (float(r["truth_x_m"]), float(r["truth_y_m"]))) for r in table
+    ]
+    assert max(errors) >= told["max_m"] - 1e-5  # the report judges one fix a superframe, of these
+    assert {(row["truth_x_m"], row["truth_y_m"]) for row in table} == {("3", "4")}
+
+
+def test_faults_show_in_the_figures(run):
+    base = ["--position", "3,4", "--duration", "6", "--noise-ps", "100", "--json"]
+    clean = report(run(*base))
+    assert report(run(*base, "--bias", "2:0.5", "--method", "literal"))["rmse_m"] > 3 * clean["rmse_m"]
+    lossy = report(run(*base, "--loss", "0.3"))
+    assert lossy["messages"] == pytest.approx(0.7 * clean["messages"], rel=0.1)
+    silent = report(run(*base, "--outage", "3:2"))
+    assert silent["messages"] == pytest.approx(clean["messages"] * (1 - 4 / 6 / 6), rel=0.02)
+
+
+def test_a_table_for_people_has_no_control_characters(run):
+    code, out, err = run("--duration", "3")
+    assert (code, err) == (0, "")
+    assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f]", out)
+    for part in ("real time", "RMSE", "cm", "per second and tag"):
+        assert part in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--scenario", "moon"], ["--scenario", "moon", "lab"]),
+        (["--site", "missing.toml"], ["missing.toml", "readable site file"]),
+        (["--site", "."], ["readable site file"]),
+        (["--method", "magic"], ["method", "magic", "tracker", "literal"]),
+        (["--position", "3"], ["--position", "'3'", "2 or 3"]),
+        (["--position", "north"], ["--position", "north", "2 or 3"]),
+        (["--position", "nan,1"], ["--position", "nan,1"]),
+        (["--position", "1,2,3,4"], ["--position", "1,2,3,4"]),
+        (["--duration", "-1"], ["--duration", "-1"]),
+        (["--duration", "0"], ["--duration", "0"]),
+        (["--duration", "inf"], ["--duration", "inf"]),
+        (["--fixes", "0"], ["--fixes", "0"]),
+        (["--noise-ps", "inf"], ["--noise-ps", "inf"]),
+        (["--noise-ps", "nan"], ["--noise-ps", "nan"]),
+        (["--warmup", "-1"], ["--warmup", "-1"]),
+        (["--tags", "0"], ["--tags", "0"]),
+        (["--seed", "-1"], ["--seed", "-1"]),
+        (["--loss", "1"], ["--loss", "1"]),
+        (["--nlos", "nan"], ["--nlos", "nan"]),
+        (["--bias", "99:1"], ["99", "1, 2, 3, 4, 5, 6"]),
+        (["--bias", "2"], ["--bias", "'2'", "2 or 3"]),
+        (["--bias", "2.5:1"], ["--bias", "2.5:1", "whole number"]),
+        (["--bias", "2:1:0"], ["--bias", "2:1:0", "longer than 0 s"]),
+        (["--outage", "99:1"], ["99", "1, 2, 3, 4, 5, 6"]),
+        (["--outage", "2:3:1"], ["--outage", "2:3:1", "come back after"]),
+        (["--outage", "2:-3"], ["--outage", "2:-3", "0 s or later"]),
+        (["--fixes-csv", "no/fixes.csv"], ["no/fixes.csv", "cannot be written"]),
+        (["--fixes-csv", "."], ["cannot be written"]),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(run, tmp_path, arguments, said):
+    code, out, err = run(*arguments, *(["--duration", "1"] if "--duration" not in arguments else []))
+    assert (code, out) == (2, "")
+    assert err.startswith("skyless: ")
+    assert err.count("\n") == 1
+    for part in said:
+        assert part in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_run_keeps_what_it_has_written(tmp_path):
+    path = tmp_path / "fixes.csv"
+    process = subprocess.Popen(
+        [*COMMAND, "--duration", "100000", "--fixes-csv", path, "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    for _ in range(1200):
+        if path.exists() and path.stat().st_size > 0:
+            break
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (130, b"", b"")
+    with path.open(newline="") as file:
+        table = list(csv.reader(file))
+    assert len(table) > 10
+    assert all(len(row) == len(COLUMNS) + 2 for row in table)
+    assert path.read_bytes().endswith(b"\n")
