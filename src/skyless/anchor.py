@@ -18,7 +18,7 @@ from skyless.air.reception import Reception, Transmission
 from skyless.air.rotation import almanac_issue, page_for, pages_of
 from skyless.air.schedule import first_slots, schedule_of
 from skyless.clocks.filter import ClockFilter, clock_noise
-from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ
+from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, MAX_DRIFT, TICK_M, TICK_RATE_HZ
 from skyless.site.model import AnchorSite, Site
 from skyless.ticks import Unwrapper, nearest, wrap
 from skyless.uncertainty.tdoa import stamp_variance_m2
@@ -28,9 +28,6 @@ MAX_OFFSET_STD_M: Final = 0.3
 
 REJECTIONS_BEFORE_RESTART: Final = 3
 """So many master beacons in a row that do not fit mean that the master's clock, or the own one, has jumped."""
-
-MAX_DRIFT: Final = 50e-6
-"""Two clocks cannot drift apart faster: two crystals of 20 ppm, and room for noise."""
 
 DRIFT_SLACK_TICKS: Final = 64
 

@@ -26,5 +26,8 @@ DELAYED_TX_GRANULARITY_TICKS: Final = 512
 DEFAULT_ANTENNA_DELAY_TICKS: Final = 16_436
 """Common default of TX_ANTD and LDE_RXANTD at 64 MHz PRF (DW1000 User Manual v2.12, 7.2.25)."""
 
+MAX_DRIFT: Final = 50e-6
+"""Two clocks cannot drift apart faster: each within 20 ppm (IEEE 802.15.4-2015, 16.4.9), and room for motion."""
+
 CHANNEL_5_HZ: Final = 6489.6e6
 """Centre frequency of channel 5 (IEEE 802.15.4-2015, table 16-3)."""

@@ -7,7 +7,6 @@ from collections import Counter
 from typing import Final
 
 import numpy as np
-from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.air.almanac_book import AlmanacBook
@@ -17,32 +16,25 @@ from skyless.air.malformed import Malformed
 from skyless.air.reception import Reception
 from skyless.air.schedule import Schedule, schedule_from_page
 from skyless.clocks.filter import clock_noise
-from skyless.constants import TICK_M
+from skyless.clocks.stamps import AnchorStamps
+from skyless.constants import MAX_DRIFT, TICK_M
 from skyless.positioning.fix import Fix, NoFixReason
+from skyless.positioning.fix_time import SLACK_TICKS, FixTime
 from skyless.positioning.observation import Method, Observation
 from skyless.positioning.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.positioning.tracker import TrackerSettings
 from skyless.positioning.tracking import Tracking
-from skyless.ticks import Unwrapper, nearest
+from skyless.ticks import Unwrapper, from_seconds, nearest, to_seconds
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
 METHODS: Final = (*(str(method) for method in SnapshotMethod), "tracker")
 """Names of the positioning methods."""
 
-MAX_RATE_ERROR: Final = 50e-6
-"""An anchor's clock and the tag's cannot drift apart faster: two crystals of 20 ppm, and room for motion."""
+SITE_SILENCE_TICKS: Final = from_seconds(2.0)
+"""A tag that may choose its site leaves one that is silent for so long when it hears another."""
 
-STAMPS_BEFORE_RESTART: Final = 3
-"""So many impossible stamps of one anchor in a row mean that its counter has started anew."""
-
-
-class _Track(Struct):
-    """The last stamps of one anchor, unwrapped."""
-
-    rx_ticks_tag: int
-    tx_ticks: int
-    sequence: int
-    impossible: int = 0
+COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
+"""Stamps that go back farther than radios and hosts reorder mean that the tag's own counter has started anew."""
 
 
 class Receiver:
@@ -71,14 +63,19 @@ class Receiver:
         self.almanac = AlmanacBook()
         self._method_name = method
         self._site = site
+        self._may_change_site = site is None
+        self._site_heard_ticks = 0
+        self._time = FixTime()
         self._qa = qa
         self._z_bounds_m = z_bounds_m
         self._own_ticks = Unwrapper()
-        self._tracks: dict[int, _Track] = {}
+        self._stamps = AnchorStamps(self.counters)
         self._master_scale: tuple[int, int] | None = None
         self._method: Method | None = None
-        self._issue: int | None = None
+        self._made_of: object = None
         self._schedule: Schedule | None = None
+        self._master: int | None = None
+        self._master_slot = 0
         self._positions: dict[int, NDArray[np.float64]] = {}
 
     @property
@@ -95,15 +92,13 @@ class Receiver:
         if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
             return None
-        if self._site is None:
-            self._site = beacon.site
-        if beacon.site != self._site:
-            self.counters["foreign-site"] += 1
-            return None
         rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
-        tx_ticks = self._unwrap_tx(beacon, rx_ticks)
+        if not self._belongs(beacon, rx_ticks):
+            return None
+        tx_ticks = self._stamps.unwrap(beacon, rx_ticks)
         if tx_ticks is None:
             return None
+        self._site_heard_ticks = rx_ticks
         self.counters["heard"] += 1
         self._read_almanac(beacon)
         anchor_m = self._positions.get(beacon.anchor)
@@ -119,38 +114,56 @@ class Receiver:
             self.counters["outlier"] += 1
         return None
 
-    def _unwrap_tx(self, beacon: Beacon, rx_ticks: int) -> int | None:
-        """The anchor's TX stamp on its own unwrapped scale; None for a repeated frame or an impossible stamp."""
-        track = self._tracks.get(beacon.anchor)
-        if track is None:
-            self._tracks[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence)
-            return beacon.tx_ticks
-        elapsed = rx_ticks - track.rx_ticks_tag
-        tx_ticks = nearest(beacon.tx_ticks, track.tx_ticks + elapsed)
-        fault = _stamp_fault(beacon, track, elapsed, tx_ticks)
-        if fault is None:
-            track.rx_ticks_tag, track.tx_ticks = rx_ticks, tx_ticks
-            track.sequence, track.impossible = beacon.sequence, 0
-            return tx_ticks
-        self.counters[fault] += 1
-        track.impossible += fault == "impossible-stamp"
-        if track.impossible >= STAMPS_BEFORE_RESTART:
-            del self._tracks[beacon.anchor]
-            self.counters["anchor-restart"] += 1
-        return None
+    def _belongs(self, beacon: Beacon, rx_ticks: int) -> bool:
+        """Whether a beacon is of the site and of an anchor that the almanac, once complete, knows."""
+        newest = self._stamps.newest_rx_ticks
+        if newest is not None and rx_ticks < newest - COUNTER_JUMP_TICKS:
+            self.counters["counter-jump"] += 1
+            self._forget_stamps()
+            self._site_heard_ticks = rx_ticks
+        if beacon.site != self._site and not self._change_site(beacon.site, rx_ticks):
+            self.counters["foreign-site"] += 1
+            return False
+        if beacon.anchor not in self._positions and self.almanac.complete:
+            self.counters["unknown-anchor"] += 1
+            return False
+        return True
+
+    def _change_site(self, site: int, rx_ticks: int) -> bool:
+        """Whether to listen to this site from now on: the first one, or another when the present one is silent."""
+        if not self._may_change_site:
+            return False
+        if self._site is not None:
+            if rx_ticks - self._site_heard_ticks < SITE_SILENCE_TICKS:
+                return False
+            self.counters["site-change"] += 1
+            self.almanac = AlmanacBook()
+            self._positions = {}
+            self._forget_stamps()
+        self._site, self._site_heard_ticks = site, rx_ticks
+        return True
+
+    def _forget_stamps(self) -> None:
+        """Start anew in all but the almanac."""
+        self._stamps.forget()
+        self._master_scale = None
+        self._method = self._made_of = None
 
     def _read_almanac(self, beacon: Beacon) -> None:
-        """Keep the page; a new issue of the almanac, or its completion, makes the method anew."""
+        """Keep the page; another issue, schedule or noise makes the method anew."""
         book = self.almanac
-        if beacon.page is not None and not (book.complete and beacon.almanac_issue == book.issue):
-            book.hear(beacon.almanac_issue, beacon.page)
+        if book.hear(beacon.almanac_issue, beacon.page):
             self._positions = {anchor: np.array(place) for anchor, place in book.anchors_m.items()}
-        if book.issue != self._issue:
-            self._method = None
-        if self._method is None and book.schedule is not None and book.noise is not None:
-            self._issue = book.issue
-            self._schedule = schedule_from_page(book.schedule)
-            self._method = self._new_method()
+            self._master_slot = book.master_slot or 0
+        elif self._method is not None:
+            return
+        made_of = (book.issue, book.schedule, book.noise)
+        if made_of != self._made_of:
+            self._made_of, self._method = made_of, None
+            if book.schedule is not None and book.noise is not None:
+                self._schedule = schedule_from_page(book.schedule)
+                self._master = book.schedule.master
+                self._method = self._new_method()
 
     def _new_method(self) -> Method:
         schedule, noise = self.almanac.schedule, self.almanac.noise
@@ -162,7 +175,7 @@ class Receiver:
             settings = SnapshotSettings(
                 schedule.master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, self._z_bounds_m
             )
-            return Snapshots(SnapshotMethod(self._method_name), settings)
+            return Snapshots(SnapshotMethod(self._method_name), settings, self._time)
         clock = clock_noise(noise.white_fm, noise.random_walk_fm)
         return Tracking(
             TrackerSettings(
@@ -173,6 +186,8 @@ class Receiver:
                 height_m=schedule.tag_height_m,
             ),
             self._z_bounds_m,
+            self._time,
+            to_seconds(schedule.slot_ticks * schedule.slots),
         )
 
     def _observation(
@@ -183,7 +198,7 @@ class Receiver:
         return Observation(
             beacon.anchor,
             anchor_m,
-            schedule.round_of(beacon.superframe, beacon.slot),
+            self._round(beacon, schedule),
             beacon.sequence,
             rx_ticks,
             tx_ticks,
@@ -194,25 +209,28 @@ class Receiver:
             variance_m2,
         )
 
+    def _round(self, beacon: Beacon, schedule: Schedule) -> int:
+        """Round of a frame, counted from the master's slot: what follows a frame of the master refers to it."""
+        superframe, slot = divmod(beacon.superframe * schedule.slots + beacon.slot - self._master_slot, schedule.slots)
+        return schedule.round_of(superframe, slot)
+
     def _master_time(self, beacon: Beacon, rx_ticks: int) -> tuple[int | None, float, float]:
-        """TX time on the master's scale: unwrapped whole ticks, fraction, variance in m²."""
+        """TX time on the master's scale: unwrapped whole ticks, fraction, variance in m².
+
+        Only the master, and anchors that agree with what was heard before, lead the scale on.
+        """
         time = beacon.master_time
         if time is None:
             return None, 0.0, 0.0
         whole, fraction = divmod(time.tx_subticks_master, 256)
-        if self._master_scale is not None:
+        follow = beacon.anchor == self._master
+        if self._master_scale is None:
+            follow = True
+        else:
             last_whole, last_rx = self._master_scale
-            whole = nearest(whole, last_whole + rx_ticks - last_rx)
-        self._master_scale = (whole, rx_ticks)
+            elapsed = rx_ticks - last_rx
+            whole = nearest(whole, last_whole + elapsed)
+            follow = follow or abs(whole - last_whole - elapsed) <= MAX_DRIFT * elapsed + SLACK_TICKS
+        if follow:
+            self._master_scale = (whole, rx_ticks)
         return whole, fraction / 256.0, (time.std_ticks * TICK_M) ** 2
-
-
-def _stamp_fault(beacon: Beacon, track: _Track, elapsed: int, tx_ticks: int) -> str | None:
-    """Why a stamp cannot follow the last one of its anchor, None if it can; 64 ticks (0.3 m) allow for noise."""
-    if tx_ticks == track.tx_ticks and beacon.sequence == track.sequence:
-        return "duplicate"
-    if elapsed <= 0:
-        return "out-of-order"
-    if abs(tx_ticks - track.tx_ticks - elapsed) > MAX_RATE_ERROR * elapsed + 64:
-        return "impossible-stamp"
-    return None

@@ -7,6 +7,9 @@ from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, Page, S
 _SIGHTINGS: Final = 2
 """A frame corrupted on the air passes its FCS once in 65,536 times; the same error twice in a row is not expected."""
 
+_MOST_ANCHORS: Final = 255
+"""As many as a site can have; forged pages beyond that take no memory."""
+
 
 class AlmanacBook:
     """Gathers the pages of one site as its beacons bring them, page by page.
@@ -57,6 +60,12 @@ class AlmanacBook:
         return self._georeference
 
     @property
+    def master_slot(self) -> int | None:
+        """First slot of the master, once its page and the schedule were heard."""
+        page = self._pages.get(self._schedule.master) if self._schedule is not None else None
+        return page.slot if isinstance(page, AnchorPage) else None
+
+    @property
     def complete(self) -> bool:
         """Whether schedule, noise and all anchors are known."""
         schedule = self._schedule
@@ -94,6 +103,8 @@ class AlmanacBook:
             return False
         if held is not None and self._doubted.get(place) != page:
             self._doubted[place] = page
+            return False
+        if held is None and isinstance(page, AnchorPage) and len(self._anchors_m) >= _MOST_ANCHORS:
             return False
         self._doubted.pop(place, None)
         self._pages[place] = page

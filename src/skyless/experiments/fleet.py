@@ -22,7 +22,7 @@ from skyless.simulation.trajectory import Trajectory
 from skyless.simulation.world import World
 from skyless.site.model import Site
 
-NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart"})
+NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
 """Counters of a receiver that do not count dropped frames."""
 
 

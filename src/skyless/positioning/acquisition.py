@@ -10,9 +10,8 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.fix_time import MAX_DRIFT
 from skyless.positioning.observation import Observation
 from skyless.positioning.solver import NoSolution, locate_pseudoranges
 

@@ -2,11 +2,8 @@
 
 from typing import Final
 
-from skyless.constants import TICK_S
+from skyless.constants import MAX_DRIFT, TICK_S
 from skyless.ticks import from_seconds
-
-MAX_DRIFT: Final = 50e-6
-"""The tag's clock and the master's cannot drift apart faster: two crystals of 20 ppm, and room for motion."""
 
 SLACK_TICKS: Final = from_seconds(1e-6)
 """Flight times differ between anchors by less than this (300 m)."""

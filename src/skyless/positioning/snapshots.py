@@ -12,9 +12,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.constants import TICK_M
+from skyless.constants import MAX_DRIFT, TICK_M
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.fix_time import MAX_DRIFT, SLACK_TICKS, FixTime
+from skyless.positioning.fix_time import SLACK_TICKS, FixTime
 from skyless.positioning.observation import Observation
 from skyless.positioning.paper import bracketed_tdoa, literal_tdoa
 from skyless.positioning.solver import NoSolution, Solution, locate
