@@ -4,10 +4,14 @@ import os
 import sys
 from collections.abc import Sequence
 from io import TextIOWrapper
+from typing import TYPE_CHECKING
 
 from cyclopts import App, CycloptsError, Parameter
 
 from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from rich.text import Text
 
 _COMMANDS = (
     # name, where it is (imported only when it is called), what it does
@@ -60,9 +64,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return result if isinstance(result, int) else 0
 
 
-def _slip(error: CycloptsError) -> str:
+def _slip(error: CycloptsError) -> "Text":
     """A slip in the arguments, told as other faults are: in one line."""
-    return f"skyless: {' '.join(str(error).split())}"
+    from rich.text import Text
+
+    return Text(f"skyless: {' '.join(str(error).split())}", no_wrap=True, overflow="ignore")
 
 
 def _version() -> str:
