@@ -11,7 +11,7 @@ from cyclopts import App, CycloptsError, Parameter
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from rich.text import Text
+    from rich.console import Group
 
 _COMMANDS = (
     # name, where it is (imported only when it is called), what it does
@@ -64,11 +64,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return result if isinstance(result, int) else 0
 
 
-def _slip(error: CycloptsError) -> "Text":
+def _slip(error: CycloptsError) -> "Group":
     """A slip in the arguments, told as other faults are: in one line."""
+    from rich.console import Group
     from rich.text import Text
 
-    return Text(f"skyless: {' '.join(str(error).split())}", no_wrap=True, overflow="ignore")
+    return Group(Text(f"skyless: {' '.join(str(error).split())}", no_wrap=True, overflow="ignore"))
 
 
 def _version() -> str:
