@@ -43,11 +43,7 @@ def run(room, capsys, monkeypatch):
     monkeypatch.chdir(room)
 
     def call(*arguments):
-        try:
-            code = main(["replay", *map(str, arguments)])
-        except SystemExit as end:
-            code = end.code
-        return code, *capsys.readouterr()
+        return main(["replay", *map(str, arguments)]), *capsys.readouterr()
 
     return call
 

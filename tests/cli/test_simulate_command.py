@@ -27,11 +27,7 @@ def run(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments):
-        try:
-            code = main(["simulate", *map(str, arguments)])
-        except SystemExit as end:
-            code = end.code
-        return code, *capsys.readouterr()
+        return main(["simulate", *map(str, arguments)]), *capsys.readouterr()
 
     return call
 

@@ -56,9 +56,7 @@ def test_new_refuses(tmp_path, capsys, options, said):
 
 @pytest.mark.parametrize("option", [["--width", "0"], ["--width", "nan"], ["--anchors", "0"], ["--anchors", "256"]])
 def test_new_refuses_numbers_out_of_range(tmp_path, option):
-    with pytest.raises(SystemExit) as end:
-        main(["site", "new", str(tmp_path / "x.toml"), "--width", "3", "--depth", "3", *option])
-    assert end.value.code == 2
+    assert main(["site", "new", str(tmp_path / "x.toml"), "--width", "3", "--depth", "3", *option]) == 2
 
 
 def test_new_where_nothing_can_be_written(tmp_path, capsys):

@@ -4,14 +4,10 @@ import os
 import sys
 from collections.abc import Sequence
 from io import TextIOWrapper
-from typing import TYPE_CHECKING
 
 from cyclopts import App, CycloptsError, Parameter
 
 from skyless.errors import SkylessError
-
-if TYPE_CHECKING:
-    from rich.console import Group
 
 _COMMANDS = (
     # name, where it is (imported only when it is called), what it does
@@ -34,7 +30,8 @@ def program() -> App:
         help_epilogue="Example: skyless site new site.toml && skyless site check site.toml",
         help_format="plaintext",
         version=_version,
-        error_formatter=_slip,
+        print_error=False,
+        exit_on_error=False,
         result_action="return_value",
         default_parameter=Parameter(negative=()),
     )
@@ -53,8 +50,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         result = program()(arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
-    except SkylessError as error:
-        print(f"skyless: {error}", file=sys.stderr)
+    except (SkylessError, CycloptsError) as error:
+        message = " ".join(str(error).split()) if isinstance(error, CycloptsError) else error
+        print(f"skyless: {message}", file=sys.stderr)
         return _USER_ERROR
     except KeyboardInterrupt:
         return _INTERRUPTED
@@ -62,14 +60,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _drop_output()
         return _BROKEN_PIPE
     return result if isinstance(result, int) else 0
-
-
-def _slip(error: CycloptsError) -> "Group":
-    """A slip in the arguments, told as other faults are: in one line."""
-    from rich.console import Group
-    from rich.text import Text
-
-    return Group(Text(f"skyless: {' '.join(str(error).split())}", no_wrap=True, overflow="ignore"))
 
 
 def _version() -> str:
