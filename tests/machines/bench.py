@@ -21,7 +21,7 @@ from skyless.site.room import room_site
 LAB = lab_site()
 ROOM = room_site(8.0, 6.0, 8, 3.0, None)
 """Eight anchors at alternating heights: the height is to be estimated."""
-LOFT = replace(ROOM, anchors=tuple(replace(anchor, z_m=2.5) for anchor in ROOM.anchors))
+LOFT = replace(ROOM, anchors=tuple(replace(anchor, z_m=5.0) for anchor in ROOM.anchors))
 """All anchors in one plane, so that every position has a mirror image above it."""
 PAIRS = replace(LAB, schedule=replace(LAB.schedule, frames_per_node=2))
 """The paper's pair in every superframe."""
