@@ -54,9 +54,18 @@ def kernel(function: Function) -> Function:
     ``error_model="numpy"`` makes a division by zero an infinity instead of an exception, as in NumPy.
     Fast-math stays off: streaming and batch must give identical bits.
     """
+    return _compile(function, nogil=False)
+
+
+def threaded_kernel(function: Function) -> Function:
+    """Compile a long loop that runs without the interpreter's lock, so that threads run it side by side."""
+    return _compile(function, nogil=True)
+
+
+def _compile(function: Function, *, nogil: bool) -> Function:
     callers_folder = _CONFIG.CACHE_DIR
     _CONFIG.CACHE_DIR = _CACHE_FOLDER
     try:
-        return cast("Function", njit(cache=True, error_model="numpy")(function))
+        return cast("Function", njit(cache=True, error_model="numpy", nogil=nogil)(function))
     finally:
         _CONFIG.CACHE_DIR = callers_folder

@@ -75,24 +75,40 @@ def geometry_matrix(anchors: NDArray[np.float64], position: NDArray[np.float64],
     leading 3 × 3 block is the matrix of a known height. False where some anchor has no direction.
     """
     normal[:] = 0.0
+    directed = True
     for i in range(len(anchors)):
-        x = position[0] - anchors[i, 0]
-        y = position[1] - anchors[i, 1]
-        z = position[2] - anchors[i, 2]
-        if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
-            return False
-        distance = math.sqrt(x * x + y * y + z * z)
-        if distance == 0.0:
-            return False
-        x, y, z = x / distance, y / distance, z / distance
-        normal[0, 0] += 1.0
-        normal[1, 0] += x
-        normal[2, 0] += y
-        normal[3, 0] += z
-        normal[1, 1] += x * x
-        normal[2, 1] += y * x
-        normal[3, 1] += z * x
-        normal[2, 2] += y * y
-        normal[3, 2] += z * y
-        normal[3, 3] += z * z
+        directed = directed and add_anchor(anchors, i, position, 1.0, normal)
+    return directed
+
+
+@kernel
+def add_anchor(
+    anchors: NDArray[np.float64], i: int, position: NDArray[np.float64], weight: float, normal: NDArray[np.float64]
+) -> bool:
+    """Add an anchor's row to the normal matrix of ``geometry_matrix``; False where it has no direction."""
+    x, y, z = direction(anchors, i, position)
+    if math.isnan(x):
+        return False
+    normal[0, 0] += weight
+    normal[1, 0] += weight * x
+    normal[2, 0] += weight * y
+    normal[3, 0] += weight * z
+    normal[1, 1] += weight * x * x
+    normal[2, 1] += weight * y * x
+    normal[3, 1] += weight * z * x
+    normal[2, 2] += weight * y * y
+    normal[3, 2] += weight * z * y
+    normal[3, 3] += weight * z * z
     return True
+
+
+@kernel
+def direction(anchors: NDArray[np.float64], i: int, position: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Unit vector from anchor ``i`` to the position; NaNs where there is none."""
+    x = position[0] - anchors[i, 0]
+    y = position[1] - anchors[i, 1]
+    z = position[2] - anchors[i, 2]
+    distance = math.sqrt(x * x + y * y + z * z)
+    if distance == 0.0 or not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+        return math.nan, math.nan, math.nan
+    return x / distance, y / distance, z / distance

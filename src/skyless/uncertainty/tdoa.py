@@ -1,16 +1,50 @@
 """Covariance of the vector of TDoAs, all against the master, in m² (``docs/maths.md`` sections 2 and 5).
 
-κ_i = Δ_im / Δ_i is the anchor's delay after the reference message over the spacing of its pair. Rates against each
-other differ from one by less than 40 ppm and are left out of the variances.
+``chain_covariance`` is the paper's chain in full. The other three are what the positioning methods use, all with a
+synchronisation packet as the reference: κ_i = Δ_im / Δ_i is the anchor's delay after the reference message over the
+spacing of its pair, and rates, which differ from one by less than 40 ppm, are left out of the variances.
 """
+
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.uncertainty.chain import Chain
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+
+
+class Reference(StrEnum):
+    """Which packet of the master the TDoAs refer to (t_m), as far as it matters."""
+
+    APART = "apart"
+    """None of the synchronisation packets: the paper's assumption."""
+    FIRST_SYNC = "first-sync"
+    SECOND_SYNC = "second-sync"
+
+
+def chain_covariance(chain: Chain, reference: Reference) -> Matrix:
+    """Of the paper's TDoAs (``eq:GPSTDoA``) of n anchors, shape (n, n), first order in the noise.
+
+    The tag's stamp of the reference packet is common to all, and so are the master's stamps: with weights w1 and w2
+    those of the synchronisation, and with one that of the reference packet. If that is one of the two, its weights
+    cancel and the master's noise is gone, with the rate error β. ``chain.reference_s`` must be the time of that packet.
+
+    Raises:
+        ValueError: it is not.
+    """
+    expected_s = {Reference.FIRST_SYNC: chain.sync_s, Reference.SECOND_SYNC: chain.sync_s + chain.sync_spacing_s}
+    if reference in expected_s and chain.reference_s != expected_s[reference]:
+        raise ValueError(f"reference_s is {chain.reference_s}, the {reference} packet is at {expected_s[reference]}")
+    w1, w2 = 0.5 - chain.u / chain.L, 0.5 + chain.u / chain.L
+    masters = 1.0 + w1**2 + w2**2 if reference is Reference.APART else 0.0
+    common = chain.sigma_tag_s**2 + chain.V**2 * chain.sigma_master_s**2 * masters
+    anchors = (chain.V / chain.N) ** 2 * chain.sigma_anchor_s**2 * (chain.Q + w1**2 + w2**2)
+    covariance: Matrix = np.diag(chain.Q * chain.sigma_tag_s**2 + anchors) + common
+    return SPEED_OF_LIGHT_MPS**2 * covariance
 
 
 def stamp_variance_m2(stamp_s: float, *, rounded: bool) -> float:
@@ -36,6 +70,20 @@ def literal_delayed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float
 def bracketed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
     """Of the bracketed TDoAs; the same stamps with the same weights as the delayed messages, so the same variance."""
     return literal_delayed_covariance(kappa, tx_var_m2, rx_var_m2)
+
+
+def own_and_common(covariance_m2: Matrix) -> tuple[Vector, float]:
+    """Split Σ = diag(own) + common, the form of every covariance here, into own (n,) and common.
+
+    Raises:
+        ValueError: it has another form.
+    """
+    n = len(covariance_m2)
+    apart = covariance_m2[~np.eye(n, dtype=bool)]
+    common = float(apart.mean()) if n > 1 else 0.0
+    if not np.allclose(apart, common, rtol=1e-3, atol=1e-9 * float(np.abs(covariance_m2).max(initial=0.0))):
+        raise ValueError("the TDoAs' covariance is not a diagonal plus one number common to all")
+    return np.diag(covariance_m2) - common, common
 
 
 def _shared_reference(q: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
