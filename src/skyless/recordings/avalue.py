@@ -24,6 +24,7 @@ BLINK_COLUMNS: Final = ("tag", "anchor", "rx_ticks_u40")
 HELD_TRANSMISSIONS: Final = 6
 """So many newer transmissions may begin before a row of an older one."""
 
+RANGED: Final = 2001
 MOST_RELAYS: Final = 64
 MOST_ANCHORS: Final = 256
 _LAST_HOST_S: Final = 1e11
@@ -105,12 +106,14 @@ def cross_receptions(stream: BufferedIOBase, drops: Drops) -> Iterator[CrossRece
 
 
 def anchor_distances_m(path: str | PathLike[str], drops: Drops) -> dict[tuple[int, int], float]:
-    """Distance of every pair of anchors that hear each other, by two-way ranging, the median over the capture.
+    """Distance of every pair of anchors that hear each other, by two-way ranging.
+
+    Each is the median of the latest ``RANGED`` exchanges, so that memory stays flat in the length of the capture.
 
     Raises:
         ConfigurationError: the file cannot be opened.
     """
-    ranging = TwoWayRanging(TICK_BITS, window=100_001)
+    ranging = TwoWayRanging(TICK_BITS, window=RANGED)
     with open_source(path) as stream:
         for heard in cross_receptions(stream, drops):
             ranging.hear(heard.sender, heard.receiver, heard.tx_ticks, heard.rx_ticks)

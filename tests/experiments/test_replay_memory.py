@@ -1,0 +1,41 @@
+"""The memory of a replay does not grow with its recording."""
+
+import subprocess
+import sys
+
+import pytest
+
+import synthetic_recordings as synthetic
+
+ROWS = {"tdoa-table": 15_000, "bitcraze-binary": 4_000, "avalue": 4_000}
+PEAKS = """
+import sys
+from pathlib import Path
+from skyless.cli.main import main
+
+for recording in sys.argv[1:4]:
+    Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here on
+    if main(["replay", recording, *sys.argv[4:], "--json"]) != 0:
+        sys.exit(1)
+    status = Path("/proc/self/status").read_text()
+    print(status.partition("VmHWM:")[2].split()[0], file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_ten_times_the_recording_takes_the_same_memory(tmp_path, name):
+    """What may grow is bounded: samples of 131 072 rows (13 MB at most) that percentiles and pictures come from.
+
+    One process replays a few rows first, which load the kernels or compile them, and then the two recordings.
+    """
+    (tmp_path / "anchors.csv").write_text(synthetic.anchors_csv())
+    counts = 500, ROWS[name], 10 * ROWS[name]
+    files = [synthetic.write(tmp_path / str(rows), name, rows) for rows in counts]
+    options = ["--anchors", tmp_path / "anchors.csv", *synthetic.LISTENER.get(name, [])]
+    if name == "bitcraze-binary":
+        options += ["--fixes", tmp_path / "fixes.csv"]
+    command = [sys.executable, "-c", PEAKS, *map(str, [*files, *options])]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    _, short, long = map(int, done.stderr.split())
+    samples = min(9 * ROWS[name], 2**17) * (7 + 3 + 1 + 1) * 8 / 1024
+    assert long - short < 2 * samples + 4_000, (short, long)  # they are copied to be halved and to be sorted
