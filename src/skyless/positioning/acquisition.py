@@ -18,6 +18,9 @@ from skyless.positioning.solver import NoSolution, locate_pseudoranges
 MAX_AGE_S: Final = 0.5
 """Older messages no longer serve the start, unless superframes are so long."""
 
+CONTRADICTIONS: Final = frozenset({NoFixReason.RESIDUALS, NoFixReason.BAD_GEOMETRY, NoFixReason.NOT_CONVERGED})
+"""What one lying anchor makes of a start; absurd pseudoranges count as bad geometry."""
+
 SPEED_STD_MPS: Final = 1.0
 """Typical speed of a tag; it smears pseudoranges taken at different times and starts the velocity."""
 
@@ -67,9 +70,11 @@ class Acquisition:
         if not came_around:
             return NoFixReason.ACQUIRING
         result = self._solve(pairs, now)
-        if result is NoFixReason.RESIDUALS and len(pairs) > needed + 1 and observation is pairs[0][-1]:
-            return self._solve_without_one(pairs, now)
-        return result
+        if isinstance(result, Start) or result not in CONTRADICTIONS:
+            return result
+        if len(pairs) <= needed + 1 or observation is not pairs[0][-1]:
+            return result
+        return self._solve_without_one(pairs, now)
 
     def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
         """Where one anchor alone contradicts all others, do without it; they must still be able to contradict."""
