@@ -8,7 +8,7 @@ Everything is in ticks, integers as long as they are large.
 from typing import Final
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.ticks import difference
+from skyless.ticks import difference, nearest
 
 STAMP_TICKS: Final = 150e-12 / TICK_S
 """Noise of TX and RX stamp together; a DW1000 has 100 to 163 ps on a reception."""
@@ -76,7 +76,7 @@ class BroadcastClock:
         """
         elapsed = rx_ticks - self.rx_ticks
         guess = self.tx_ticks + elapsed - int(self.rate * elapsed)
-        return guess + difference(counter, guess, self._tx_bits)
+        return nearest(counter, guess, self._tx_bits)
 
     def hear(self, tx_counter: int, rx_ticks: int) -> bool:
         """Take one packet; False when it does not fit the clock and was left out."""

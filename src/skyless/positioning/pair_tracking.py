@@ -153,8 +153,8 @@ class PairTracking:
         dim = self._tracker.dim
         self._tracker.start(solution.position_m[:dim], solution.covariance_m2[:dim, :dim], SPEED_STD_MPS**2)
         self._started = True
+        self._heard_s = {anchor: pair.time_s for kept in self._window for anchor in (kept.anchor_a, kept.anchor_b)}
         self._window.clear()
-        self._heard_s.clear()
         self.counters["start"] += 1
         return True
 
