@@ -140,7 +140,7 @@ def gated_correct(
     """
     normalised = innovation * innovation / spread
     statistics[REJECTED_SHARE] *= 1.0 - FORGETTING
-    if not normalised <= gate * gate:
+    if not 0.0 <= normalised <= gate * gate:
         whole[REJECTED] += 1
         whole[REJECTED_IN_ROW] += 1
         statistics[REJECTED_SHARE] += FORGETTING
