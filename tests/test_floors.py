@@ -16,7 +16,7 @@ FLOORS = (
     {"positioning"},
     {"anchor", "receiver"},
     {"simulation", "recordings"},
-    {"experiments"},
+    {"experiments", "planning"},
     {"cli"},
 )
 FLOOR_OF = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}

@@ -1,0 +1,1 @@
+"""Planning: what a site will give before anything is mounted, and where its anchors should hang."""

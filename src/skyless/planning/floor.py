@@ -1,0 +1,118 @@
+"""The floor of a site: its outline, what lies inside, and the walls on which anchors may hang."""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from skyless.errors import ConfigurationError
+from skyless.planning.links import anchor_positions
+from skyless.site.image import image_size
+from skyless.site.model import Site
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Box = tuple[float, float, float, float]
+
+OUTSIDE_M: Final = 0.5
+"""Anchors hang on walls, whose thickness a plan may leave out: so far outside of it they pass."""
+
+
+class Floor(Struct, frozen=True):
+    """Outline of the floor and region of interest."""
+
+    outline_m: Matrix
+    """Corners in order, shape (k, 2)."""
+    region_m: Box
+    """x1, y1, x2, y2 of the region; of it, what lies inside the outline counts."""
+
+
+def floor_plan_box(site: Site, file: Path) -> Box | None:
+    """Where the floor plan's image lies, from the width that the site gives and the image's shape."""
+    plan = site.floor_plan
+    if plan is None:
+        return None
+    size = image_size((file.parent / plan.image).read_bytes())
+    if size is None:
+        return None
+    return plan.x_m, plan.y_m, plan.x_m + plan.width_m, plan.y_m + plan.width_m * size[1] / size[0]
+
+
+def floor_of(site: Site, file: Path, outline_m: Matrix | None, region_m: Box | None) -> Floor:
+    """The floor: the given outline, or the floor plan, or the box around the anchors.
+
+    Raises:
+        ConfigurationError: an anchor lies outside the floor, or the floor has no area.
+    """
+    plan = floor_plan_box(site, file)
+    anchors = anchor_positions(site)[:, :2]
+    if outline_m is None:
+        low, high = anchors.min(axis=0), anchors.max(axis=0)
+        x1, y1, x2, y2 = plan or (*low.tolist(), *high.tolist())
+        outline_m = np.array([(x1, y1), (x2, y1), (x2, y2), (x1, y2)])
+    if abs(area(outline_m)) < 1e-6:
+        right = "anchors that are not all in one line, or a floor plan; --outline gives the room else"
+        raise ConfigurationError(file, "anchors", f"{len(anchors)} in one line", right)
+    for index, place in enumerate(anchors):
+        if distance_outside(place, outline_m) > OUTSIDE_M:
+            raise _outside(site, file, index, outline_m)
+    low, high = outline_m.min(axis=0), outline_m.max(axis=0)
+    return Floor(outline_m, region_m or (*low.tolist(), *high.tolist()))
+
+
+def _outside(site: Site, file: Path, index: int, outline_m: Matrix) -> ConfigurationError:
+    anchor = site.anchors[index]
+    (x1, y1), (x2, y2) = outline_m.min(axis=0).tolist(), outline_m.max(axis=0).tolist()
+    key = f"anchors[{index}] (anchor {anchor.id})"
+    right = f"on the floor, which reaches from ({x1:g}, {y1:g}) to ({x2:g}, {y2:g}) m"
+    return ConfigurationError(file, key, f"at ({anchor.x_m:g}, {anchor.y_m:g})", right)
+
+
+def area(outline_m: Matrix) -> float:
+    """Signed area of a polygon."""
+    x, y = outline_m.T
+    return float(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+
+
+def inside(points_m: Matrix, outline_m: Matrix) -> NDArray[np.bool_]:
+    """Which points, shape (m, 2), lie inside a polygon (even-odd rule)."""
+    x, y = points_m[:, 0], points_m[:, 1]
+    within = np.zeros(len(points_m), dtype=np.bool_)
+    for (x1, y1), (x2, y2) in zip(outline_m, np.roll(outline_m, -1, axis=0), strict=True):
+        if y1 != y2:
+            within ^= ((y1 > y) != (y2 > y)) & (x < (x2 - x1) * (y - y1) / (y2 - y1) + x1)
+    return within
+
+
+def distance_outside(point_m: Vector, outline_m: Matrix) -> float:
+    """How far a point, shape (2,), lies outside a polygon; 0 inside."""
+    if inside(point_m[None], outline_m)[0]:
+        return 0.0
+    starts, ends = outline_m, np.roll(outline_m, -1, axis=0)
+    along = ends - starts
+    lengths2 = np.maximum((along * along).sum(axis=1), 1e-12)
+    share = np.clip(((point_m - starts) * along).sum(axis=1) / lengths2, 0.0, 1.0)
+    return float(np.linalg.norm(starts + share[:, None] * along - point_m, axis=1).min())
+
+
+def sides(outline_m: Matrix) -> Matrix:
+    """Sides of a polygon as segments, shape (k, 4)."""
+    return np.hstack([outline_m, np.roll(outline_m, -1, axis=0)])
+
+
+def total_length(segments_m: Matrix) -> float:
+    """Length of all segments, shape (k, 4), together."""
+    return float(np.linalg.norm(segments_m[:, 2:] - segments_m[:, :2], axis=1).sum())
+
+
+def along(segments_m: Matrix, ways_m: Vector) -> Matrix:
+    """Points, shape (m, 2), so far along the segments one after the other, round and round."""
+    lengths = np.linalg.norm(segments_m[:, 2:] - segments_m[:, :2], axis=1)
+    ends = np.cumsum(lengths)
+    ways = np.mod(ways_m, ends[-1])
+    place = np.minimum(np.searchsorted(ends, ways, side="right"), len(lengths) - 1)
+    share = (ways - (ends[place] - lengths[place])) / np.maximum(lengths[place], 1e-12)
+    points: Matrix = segments_m[place, :2] + share[:, None] * (segments_m[place, 2:] - segments_m[place, :2])
+    return points

@@ -1,0 +1,72 @@
+"""What the anchors in view make of a point: shares, delays, directions and DOPs, for the kernels of the methods."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.compiled import kernel
+from skyless.planning.columns import ANCHORS, GDOP, HDOP, PDOP, TDOP, VDOP
+from skyless.planning.links import IN_VIEW, hears
+from skyless.uncertainty.cholesky import factorise, invert
+from skyless.uncertainty.dop import geometry_matrix
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+
+@kernel
+def observe(
+    anchors: Matrix,
+    speaks: NDArray[np.bool_],
+    budget: Vector,
+    walls: Matrix,
+    point: Vector,
+    share: Vector,
+    sight: Matrix,
+) -> None:
+    """Fill ``share`` with the part of each anchor's frames that arrives and ``sight`` with unit vectors and delays.
+
+    ``sight`` has shape (anchors, 4): the direction from the anchor to the point, and the walls' delay in metres.
+    """
+    for i in range(len(anchors)):
+        share[i] = 0.0
+        if not speaks[i]:
+            continue
+        share[i], sight[i, 3] = hears(budget, walls, anchors[i], point)
+        x, y, z = point[0] - anchors[i, 0], point[1] - anchors[i, 1], point[2] - anchors[i, 2]
+        distance = max(math.sqrt(x * x + y * y + z * z), 1e-6)
+        sight[i, 0], sight[i, 1], sight[i, 2] = x / distance, y / distance, z / distance
+
+
+@kernel
+def fill_dops(
+    anchors: Matrix,
+    share: Vector,
+    point: Vector,
+    dim: int,
+    seen: Matrix,
+    normal: Matrix,
+    inverse: Matrix,
+    row: Vector,
+) -> int:
+    """Fill the columns of DOPs from the anchors in view; return how many there are."""
+    count = 0
+    for i in range(len(anchors)):
+        if share[i] >= IN_VIEW:
+            seen[count] = anchors[i]
+            count += 1
+    row[ANCHORS] = count
+    size = dim + 1
+    row[GDOP : TDOP + 1] = math.inf
+    if count < size or not (geometry_matrix(seen[:count], point, normal) and factorise(normal, size)):
+        return count
+    invert(normal, size, inverse)
+    horizontal = inverse[1, 1] + inverse[2, 2]
+    vertical = inverse[3, 3] if dim == 3 else 0.0
+    row[GDOP] = math.sqrt(horizontal + vertical + inverse[0, 0])
+    row[PDOP] = math.sqrt(horizontal + vertical)
+    row[HDOP] = math.sqrt(horizontal)
+    row[VDOP] = math.sqrt(vertical)
+    row[TDOP] = math.sqrt(inverse[0, 0])
+    return count

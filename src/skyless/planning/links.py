@@ -1,0 +1,95 @@
+"""Who hears whom at a site: the simulated channel's own formulas, without its chance."""
+
+import math
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from skyless.compiled import kernel
+from skyless.simulation.channel import (
+    FREE_SPACE_LOSS_1_M_DB,
+    ChannelModel,
+    cross_walls,
+    delivery_probability,
+    received_power_dbm,
+)
+from skyless.site.model import Site
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+IN_VIEW: Final = 0.5
+"""An anchor is in view where at least this share of its frames arrives."""
+
+HOPELESS: Final = 1e-4
+"""A share below this, in free space already, counts as none."""
+
+LEAST_SYNC: Final = 0.01
+"""An anchor that misses more of the master's frames than all but these stays silent, for planning."""
+
+
+class AnchorLinks(Struct, frozen=True):
+    """How the anchors of a site, in the order of its file, hear their master; shape (anchors,) each."""
+
+    share: Vector
+    """Share of the master's frames that arrive; 1 for the master itself."""
+    delay_m: Vector
+    """By how much walls delay them."""
+
+
+def range_of(channel: ChannelModel) -> float:
+    """Distance in metres at which half of the frames arrive with nothing between."""
+    budget_db = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - channel.sensitivity_dbm
+    return float(10.0 ** (budget_db / 20.0))
+
+
+def with_range(channel: ChannelModel, range_m: float) -> ChannelModel:
+    """A channel like this one that carries so far: its sensitivity follows."""
+    sensitivity_dbm = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 20.0 * math.log10(range_m)
+    values = {name: getattr(channel, name) for name in channel.__struct_fields__}
+    return ChannelModel(**{**values, "sensitivity_dbm": sensitivity_dbm})
+
+
+def anchor_positions(site: Site) -> Matrix:
+    """Anchors of a site in the order of its file, shape (anchors, 3)."""
+    return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]).reshape(-1, 3)
+
+
+def link_budget(channel: ChannelModel) -> Vector:
+    """What ``hears`` wants of a channel: power sent, sensitivity, its width, share lost by chance, farthest m²."""
+    hopeless_db = math.log(1.0 / HOPELESS) * channel.sensitivity_width_db
+    farthest_m = range_of(channel) * 10.0 ** (hopeless_db / 20.0)
+    return np.array(
+        [
+            channel.tx_power_dbm,
+            channel.sensitivity_dbm,
+            channel.sensitivity_width_db,
+            channel.loss_probability,
+            farthest_m**2,
+        ]
+    )
+
+
+@kernel
+def hears(budget: Vector, walls: Matrix, a_m: Vector, b_m: Vector) -> tuple[float, float]:
+    """Share of the frames that arrive over the straight line from a to b, and the walls' delay in metres."""
+    loss_db, delay_m = 0.0, 0.0
+    x, y, z = b_m[0] - a_m[0], b_m[1] - a_m[1], b_m[2] - a_m[2]
+    squared_m2 = x * x + y * y + z * z
+    if squared_m2 > budget[4]:
+        return 0.0, 0.0
+    if walls.shape[0] > 0:
+        loss_db, delay_m = cross_walls(walls, a_m[0], a_m[1], b_m[0], b_m[1])
+    power_dbm = received_power_dbm(budget[0], math.sqrt(squared_m2), loss_db)
+    return (1.0 - budget[3]) * delivery_probability(power_dbm, budget[1], budget[2]), delay_m
+
+
+def anchor_links(anchors_m: Matrix, master: int, budget: Vector, walls: Matrix) -> AnchorLinks:
+    """How anchors, shape (anchors, 3), hear the one in row ``master``."""
+    share, delay_m = np.ones(len(anchors_m)), np.zeros(len(anchors_m))
+    for row in range(len(anchors_m)):
+        if row != master:
+            share[row], delay_m[row] = hears(budget, walls, anchors_m[master], anchors_m[row])
+    return AnchorLinks(share, delay_m)

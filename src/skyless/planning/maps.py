@@ -1,0 +1,220 @@
+"""Maps: predictions over a grid of the floor, one slice for each height.
+
+The tracker's points are dear. On large grids it is computed on a coarser one, and its ratio to the PDOP, which is
+smooth, is interpolated; PDOP and anchors in view are computed at every point, so that edges behind walls stay sharp.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from skyless.planning.columns import (
+    ANCHORS,
+    BIAS,
+    CLAIMED,
+    COLUMNS,
+    FIX_SHARE,
+    PDOP,
+    RMSE,
+    SIGMA,
+    SIGMA_X,
+    SIGMA_Y,
+    SIGMA_Z,
+)
+from skyless.planning.floor import Floor, inside
+from skyless.planning.predict import Predictor
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Array = NDArray[np.float64]
+
+MOST_POINTS: Final = 5_000_000
+NICE_POINTS: Final = 12_000
+STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+TRACKER_BUDGET: Final = 150_000
+"""Points of the tracker times what one costs, anchors and a constant."""
+
+
+class Grid(Struct, frozen=True):
+    """Cell centres over the box of the region; those outside the outline do not count."""
+
+    x_m: Vector
+    y_m: Vector
+    heights_m: Vector
+    step_m: float
+    within: NDArray[np.bool_]
+    """Shape (ny, nx)."""
+
+    @property
+    def points(self) -> int:
+        """How many points count."""
+        return int(self.within.sum()) * len(self.heights_m)
+
+
+class PlanMap(Struct, frozen=True):
+    """Predictions over a grid."""
+
+    grid: Grid
+    table: Array
+    """Shape (heights, ny, nx, columns); NaN outside the outline."""
+    computed_every_m: float
+    """Spacing of the points that were computed in full; wider than the grid's where the rest was interpolated."""
+
+    def column(self, place: int) -> Array:
+        """One column, shape (heights, ny, nx)."""
+        return self.table[..., place]
+
+
+class MapSummary(Struct, frozen=True):
+    """A map in a few numbers, metres; None where no point has a fix."""
+
+    points: int
+    covered_share: float
+    """Of the points, those with a fix in at least half of the rounds or messages."""
+    mean_sigma_m: float | None
+    """Over the covered points."""
+    median_sigma_m: float | None
+    p95_sigma_m: float | None
+    worst_sigma_m: float | None
+    worst_at_m: tuple[float, float, float] | None
+    mean_rmse_m: float | None
+    worst_rmse_m: float | None
+    fewest_anchors: int
+    target_share: float | None
+    """Of all points, those that meet the target; None without one."""
+
+
+def grid_of(floor: Floor, heights_m: tuple[float, ...], step_m: float | None) -> Grid:
+    """Grid over the floor's region; without a step, one that makes some ten thousand points.
+
+    Raises:
+        ValueError: the region has no area or no point inside the outline, or there would be too many points.
+    """
+    x1, y1, x2, y2 = floor.region_m
+    if not (x2 > x1 and y2 > y1):
+        raise ValueError("the region has no area")
+    step = step_m or next(
+        (s for s in STEPS_M if (x2 - x1) * (y2 - y1) / s**2 * len(heights_m) <= NICE_POINTS), STEPS_M[-1]
+    )
+    nx, ny = max(round((x2 - x1) / step), 1), max(round((y2 - y1) / step), 1)
+    if nx * ny * len(heights_m) > MOST_POINTS:
+        raise ValueError(f"a step of {step:g} m makes {nx * ny * len(heights_m)} points; {MOST_POINTS} are the most")
+    xs = x1 + (np.arange(nx) + 0.5) * (x2 - x1) / nx
+    ys = y1 + (np.arange(ny) + 0.5) * (y2 - y1) / ny
+    flat = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    within = inside(flat, floor.outline_m).reshape(ny, nx)
+    if not within.any():
+        raise ValueError("no point of the region lies inside the outline")
+    return Grid(xs, ys, np.array(heights_m, dtype=np.float64), step, within)
+
+
+def plan_map(predictor: Predictor, grid: Grid, progress: Callable[[float], None] | None = None) -> PlanMap:
+    """Predict over a grid; ``progress`` gets the share done."""
+    slices = [_slice(predictor, grid, height, _part(progress, k, grid)) for k, height in enumerate(grid.heights_m)]
+    return PlanMap(grid, np.stack([table for table, _ in slices]), slices[0][1])
+
+
+def summary_of(plan: PlanMap, target_m: float | None = None) -> MapSummary:
+    """Sum a map up."""
+    table = plan.table[:, plan.grid.within].reshape(-1, len(COLUMNS))
+    covered = table[:, FIX_SHARE] >= 0.5
+    sigma, rmse = table[covered, SIGMA], table[covered, RMSE]
+    some = len(sigma) > 0
+    worst_at = None
+    if some:
+        k, y, x = (indices[0] for indices in np.nonzero(plan.column(SIGMA) == sigma.max()))
+        worst_at = (float(plan.grid.x_m[x]), float(plan.grid.y_m[y]), float(plan.grid.heights_m[k]))
+    return MapSummary(
+        points=len(table),
+        covered_share=float(covered.mean()),
+        mean_sigma_m=float(sigma.mean()) if some else None,
+        median_sigma_m=float(np.median(sigma)) if some else None,
+        p95_sigma_m=float(np.percentile(sigma, 95)) if some else None,
+        worst_sigma_m=float(sigma.max()) if some else None,
+        worst_at_m=worst_at,
+        mean_rmse_m=float(rmse.mean()) if some else None,
+        worst_rmse_m=float(rmse.max()) if some else None,
+        fewest_anchors=int(table[:, ANCHORS].min()),
+        target_share=None if target_m is None else float((covered & (table[:, SIGMA] <= target_m)).mean()),
+    )
+
+
+def _part(progress: Callable[[float], None] | None, k: int, grid: Grid) -> Callable[[float], None] | None:
+    if progress is None:
+        return None
+    per_slice = grid.points / len(grid.heights_m)
+    return lambda done: progress((k + min(done / per_slice, 1.0)) / len(grid.heights_m))
+
+
+def _slice(
+    predictor: Predictor, grid: Grid, height_m: float, progress: Callable[[float], None] | None
+) -> tuple[Array, float]:
+    points = points_of(grid, height_m)
+    table = np.full((*grid.within.shape, len(COLUMNS)), np.nan)
+    stride = _stride(predictor, grid)
+    if stride == 1:
+        table[grid.within] = predictor.at(points[grid.within], progress)
+        return table, grid.step_m
+    rows, columns = _every(stride, len(grid.y_m)), _every(stride, len(grid.x_m))
+    coarse = predictor.at(points[np.ix_(rows, columns)].reshape(-1, 3), progress)
+    fine = predictor.geometry_at(points[grid.within])
+    _interpolate(coarse.reshape(len(rows), len(columns), -1), rows, columns, grid.within, fine)
+    table[grid.within] = fine
+    return table, stride * grid.step_m
+
+
+def points_of(grid: Grid, height_m: float) -> Array:
+    """Points of one slice, shape (ny, nx, 3)."""
+    x, y = np.meshgrid(grid.x_m, grid.y_m)
+    return np.stack([x, y, np.full_like(x, height_m)], axis=-1)
+
+
+def _stride(predictor: Predictor, grid: Grid) -> int:
+    if predictor.settings.method != "tracker":
+        return 1
+    most = TRACKER_BUDGET / (len(predictor.anchors_m) + 14.0)
+    return max(1, math.ceil(math.sqrt(grid.points / most)))
+
+
+def _every(stride: int, count: int) -> NDArray[np.int64]:
+    """Every so many indices, the last one included."""
+    return np.unique(np.append(np.arange(0, count, stride), count - 1))
+
+
+def _interpolate(
+    coarse: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], within: NDArray[np.bool_], fine: Matrix
+) -> None:
+    """Fill the method's columns of ``fine`` from a coarse table that holds these rows and columns of the grid."""
+    from scipy.ndimage import distance_transform_edt, map_coordinates  # noqa: PLC0415 (SciPy is loaded late)
+
+    ys, xs = np.nonzero(within)
+    at = np.array([np.interp(ys, rows, np.arange(len(rows))), np.interp(xs, columns, np.arange(len(columns)))])
+    known = np.isfinite(coarse[..., SIGMA])
+    if not known.any():
+        fine[:, SIGMA:] = math.inf
+        fine[:, FIX_SHARE] = 0.0
+        return
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    steady = known & np.isfinite(coarse[..., PDOP])
+    near_steady = distance_transform_edt(~steady, return_distances=False, return_indices=True)
+
+    def bilinear(values: Array) -> Vector:
+        taken: Vector = map_coordinates(values, at, order=1, mode="nearest")
+        return taken
+
+    by_geometry = np.isfinite(fine[:, PDOP]) & bool(steady.any())
+    for column in (SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, CLAIMED):
+        plain = bilinear(coarse[..., column][tuple(nearest)])
+        with np.errstate(invalid="ignore"):
+            ratio = bilinear((coarse[..., column] / coarse[..., PDOP])[tuple(near_steady)])
+        fine[:, column] = np.where(by_geometry, ratio * np.where(by_geometry, fine[:, PDOP], 1.0), plain)
+    fine[:, BIAS] = bilinear(coarse[..., BIAS][tuple(nearest)])
+    fine[:, RMSE] = np.hypot(fine[:, SIGMA], fine[:, BIAS])
+    fine[:, FIX_SHARE] = bilinear(coarse[..., FIX_SHARE])
+    without = ~(map_coordinates(known.astype(np.float64), at, order=0, mode="nearest") > 0.5)
+    fine[without, SIGMA:] = math.inf
+    fine[without, FIX_SHARE] = 0.0

@@ -1,0 +1,163 @@
+"""Predictions for a site at any points: its numbers gathered once, then compiled work on all cores."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from skyless.clocks.filter import clock_noise
+from skyless.compiled import threaded_kernel
+from skyless.planning.anchor_clocks import anchor_clocks, stamp_variances
+from skyless.planning.columns import COLUMNS
+from skyless.planning.geometry import fill_dops, observe
+from skyless.planning.links import AnchorLinks, anchor_links, anchor_positions, link_budget
+from skyless.planning.rounds import rounds_of
+from skyless.planning.snapshot_sigma import fill_snapshot_sigma
+from skyless.planning.tracker_sigma import fill_tracker_sigma
+from skyless.positioning.snapshots import SnapshotMethod
+from skyless.simulation.channel import ChannelModel, pack_walls
+from skyless.site.model import Site
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Fill = Callable[[Matrix, Matrix], None]
+
+CHUNK: Final = 2000
+"""Points that a thread takes at once; fewer for the tracker, whose points are dear."""
+
+
+class PlanSettings(Struct, frozen=True):
+    """What is assumed beyond the site file."""
+
+    method: str = "tracker"
+    noise_ps: float | None = None
+    """Noise of every TX and RX stamp; None for the site's own figures."""
+    qa: float = 0.3
+    """Agility that the tracker assumes, m²/s³."""
+    channel: ChannelModel = ChannelModel()
+
+
+class Predictor:
+    """The predictions of one site by one method."""
+
+    def __init__(self, site: Site, settings: PlanSettings) -> None:
+        self.site = with_noise(site, settings.noise_ps)
+        self.settings = settings
+        self.dim = 3 if site.tags.height_m is None else 2
+        self.anchors_m = anchor_positions(site)
+        self.master = [anchor.id for anchor in site.anchors].index(site.master)
+        self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls)
+        self.links: AnchorLinks = anchor_links(self.anchors_m, self.master, self.budget, self.walls)
+        self.clocks = anchor_clocks(self.site, self.links.share)
+        self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
+        tracker = settings.method == "tracker"
+        self._fill = self._tracker() if tracker else self._snapshots(SnapshotMethod(settings.method))
+        self._chunk = 100 if tracker else CHUNK
+
+    def _snapshots(self, method: SnapshotMethod) -> Fill:
+        rounds = rounds_of(self.site, method)
+        n = len(self.anchors_m)
+        in_step = np.where(rounds.usable & self.clocks.speaks, self.links.share**2, 0.0)
+        in_step[self.master] = 1.0
+        weighted = method in {SnapshotMethod.WEIGHTED, SnapshotMethod.BRACKETED}
+        weights = 1.0 / rounds.assumed_own if weighted else np.ones(n)
+        return lambda points, table: fill_snapshot_sigma(
+            points,
+            self.dim,
+            self.anchors_m,
+            self.clocks.speaks,
+            self.budget,
+            self.walls,
+            self.master,
+            in_step,
+            self.links.delay_m,
+            weights,
+            rounds.assumed_common if weighted else 0.0,
+            rounds.assumed_own,
+            np.full((n, 1), rounds.assumed_common**0.5),
+            rounds.true_own,
+            rounds.common,
+            self.farthest_m,
+            table,
+        )
+
+    def _tracker(self) -> Fill:
+        clocks, noise = self.clocks, self.site.noise
+        one = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
+        settings = np.array([one.white, one.walk, *stamp_variances(self.site)])
+        return lambda points, table: fill_tracker_sigma(
+            points,
+            self.dim,
+            self.anchors_m,
+            clocks.speaks,
+            self.budget,
+            self.walls,
+            self.master,
+            self.links.delay_m,
+            clocks.sender,
+            clocks.gap_s,
+            clocks.variance_m2,
+            clocks.with_others,
+            clocks.gain,
+            clocks.share,
+            self.settings.qa,
+            settings,
+            self.farthest_m,
+            table,
+        )
+
+    def at(self, points_m: Matrix, progress: Callable[[float], None] | None = None) -> Matrix:
+        """Predictions at points, shape (m, 3): a table (m, len(COLUMNS)); ``progress`` gets the points done."""
+        return in_threads(self._fill, np.ascontiguousarray(points_m, np.float64), self._chunk, progress)
+
+    def geometry_at(self, points_m: Matrix) -> Matrix:
+        """The same table with anchors in view and DOPs only; the method's columns are not filled."""
+        fill = partial(_fill_geometry, self.dim, self.anchors_m, self.clocks.speaks, self.budget, self.walls)
+        return in_threads(fill, np.ascontiguousarray(points_m, np.float64), CHUNK)
+
+
+@threaded_kernel
+def _fill_geometry(
+    dim: int,
+    anchors: Matrix,
+    speaks: NDArray[np.bool_],
+    budget: Vector,
+    walls: Matrix,
+    points: Matrix,
+    table: Matrix,
+) -> None:
+    n = len(anchors)
+    share, sight, seen = np.zeros(n), np.zeros((n, 4)), np.zeros((n, 3))
+    normal, inverse = np.zeros((4, 4)), np.zeros((4, 4))
+    for m in range(len(points)):
+        observe(anchors, speaks, budget, walls, points[m], share, sight)
+        fill_dops(anchors, share, points[m], dim, seen, normal, inverse, table[m])
+
+
+def with_noise(site: Site, noise_ps: float | None) -> Site:
+    """The site with another noise of every stamp, unless it is None."""
+    if noise_ps is None:
+        return site
+    return replace(site, noise=replace(site.noise, tx_stamp_ps=noise_ps, rx_stamp_ps=noise_ps))
+
+
+def in_threads(fill: Fill, points_m: Matrix, chunk: int, progress: Callable[[float], None] | None = None) -> Matrix:
+    """Fill a table of predictions for points, in pieces on all cores."""
+    table: Matrix = np.zeros((len(points_m), len(COLUMNS)))
+    starts = range(0, len(points_m), chunk)
+    if len(starts) == 1:
+        fill(points_m, table)
+        return table
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        tasks = [pool.submit(partial(fill, points_m[s : s + chunk], table[s : s + chunk])) for s in starts]
+        for done, task in enumerate(as_completed(tasks), start=1):
+            task.result()
+            if progress is not None:
+                progress(min(done * chunk, len(points_m)))
+    return table

@@ -1,0 +1,357 @@
+"""Predicted errors of ``tracker`` for a tag at rest: two covariances side by side, message by message.
+
+P is the filter's own, with the motion that it allows for; it gives the gains. Σ is that of the true error under those
+gains: no motion, the crystals as they are, and the anchors' clock errors as long as they last (``anchor_clocks``),
+through the covariance X of the tag's error with theirs. Both are run through superframes until they are periodic.
+Where walls delay messages so that the innovations look restless, the filter's agility grows; it is searched for.
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.compiled import kernel, threaded_kernel
+from skyless.planning.columns import (
+    BIAS,
+    CLAIMED,
+    FIX_SHARE,
+    RMSE,
+    SIGMA,
+    SIGMA_X,
+    SIGMA_Z,
+)
+from skyless.planning.geometry import fill_dops, observe
+from skyless.positioning.kalman import innovation_variance, predict_clock, predict_motion
+from skyless.positioning.tracker import FORGETTING, MAX_AGILITY, RESTLESS_CHI2
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+SETTLED: Final = 2e-4
+"""Relative change of the traces over a superframe below which the errors count as periodic."""
+
+LONGEST_S: Final = 4.0
+"""Filter time after which they count so in any case."""
+
+LEAST_S: Final = 0.5
+"""Filter time after which a position that is worse than the site is large has no hope left."""
+
+RESTLESS_SIGMAS: Final = 1.31
+"""The agility stands where its running mean is restless log(1/AGILITY_LOSS)/log(AGILITY_GAIN/AGILITY_LOSS) = 9.5 % of
+the time, the normal distribution's tail beyond so many standard deviations."""
+
+RARELY: Final = 0.1
+"""An anchor of whose frames fewer arrive does not help a tag to start."""
+
+
+@kernel
+def _with_anchors_predict(X: Matrix, dim: int, count: int, dt_s: float, white: float, walk: float) -> None:
+    """Advance the covariance of the tag's error with the anchors'; the master's noise is common to its clocks."""
+    clock = 2 * dim
+    q00, q01, q11 = dt_s * (white + walk * dt_s * dt_s / 3.0), walk * dt_s * dt_s / 2.0, walk * dt_s
+    for column in range(2 * count):
+        for axis in range(dim):
+            X[axis, column] += dt_s * X[dim + axis, column]
+        X[clock, column] += dt_s * X[clock + 1, column]
+    for c in range(count):
+        for row in range(X.shape[0]):
+            X[row, 2 * c] += dt_s * X[row, 2 * c + 1]
+        X[clock, 2 * c] += q00
+        X[clock, 2 * c + 1] += q01
+        X[clock + 1, 2 * c] += q01
+        X[clock + 1, 2 * c + 1] += q11
+
+
+@kernel
+def _true_correct(
+    S: Matrix, X: Matrix, K: Vector, h: Vector, part: float, noise: float, own: int, active: NDArray[np.int64],
+    count: int, with_others: Vector, g: Vector,
+) -> float:  # fmt: skip
+    """Σ and X after a message that arrives with probability ``part``: error x − K(hx − v), v with its clock error.
+
+    ``own`` is the sender's place among the active anchors, −1 for the master. Returns the innovation's true variance.
+    """
+    n = S.shape[0]
+    spread = noise
+    for row in range(n):
+        g[row] = 0.0
+        for column in range(n):
+            g[row] += S[row, column] * h[column]
+        spread += h[row] * g[row]
+    if own >= 0:
+        spread += with_others[2 * active[own]]
+        for row in range(n):
+            g[row] -= X[row, 2 * own]
+            spread -= 2.0 * h[row] * X[row, 2 * own]
+    for row in range(n):
+        for column in range(n):
+            S[row, column] += part * (K[row] * K[column] * spread - K[row] * g[column] - g[row] * K[column])
+    for column in range(2 * count):
+        seen = 0.0
+        if own >= 0:
+            seen = -with_others[2 * active[column // 2] + column % 2]
+        for row in range(n):
+            seen += h[row] * X[row, column]
+        for row in range(n):
+            X[row, column] -= part * K[row] * seen
+    return spread
+
+
+@kernel
+def _anchors_hear(
+    X: Matrix, K: Vector, part: float, active: NDArray[np.int64], count: int, share: Vector, gain: Matrix, tx_var: float
+) -> None:
+    """X after the master's message, which the anchors hear too, with the same emission noise."""
+    for c in range(count):
+        i = active[c]
+        for row in range(X.shape[0]):
+            own = X[row, 2 * c] - part * K[row] * tx_var
+            X[row, 2 * c] -= share[i] * gain[i, 0] * own
+            X[row, 2 * c + 1] -= share[i] * gain[i, 1] * own
+
+
+@kernel
+def choose_active(share: Vector, anchor_share: Vector, active: NDArray[np.int64], place: NDArray[np.int64]) -> int:
+    """List the anchors, the master apart, that a point hears; ``place`` is where each stands in the list, or −1."""
+    count = 0
+    for i in range(len(share)):
+        place[i] = -1
+        if share[i] > 0.0 and anchor_share[i] > 0.0:
+            active[count] = i
+            place[i] = count
+            count += 1
+    return count
+
+
+@kernel
+def _advance(
+    dim: int,
+    dt_s: float,
+    qa: float,
+    settings: Vector,
+    work: tuple[Matrix, Matrix, Matrix],
+    vectors: tuple[Vector, Vector, Vector, Vector, Vector],
+    count: int,
+) -> None:
+    """Let time pass: the filter allows for motion, the tag rests."""
+    P, S, X = work
+    idle, _, _, _, shift = vectors
+    white, walk = settings[0], settings[1]
+    predict_motion(idle, P, dim, dt_s, qa)
+    predict_clock(idle, P, 2 * dim, dt_s, 2.0 * white, 2.0 * walk)
+    predict_motion(shift, S, dim, dt_s, 0.0)
+    predict_clock(shift, S, 2 * dim, dt_s, 2.0 * white, 2.0 * walk)
+    _with_anchors_predict(X, dim, count, dt_s, white, walk)
+
+
+@kernel
+def _assumed_correct(
+    dim: int,
+    direction: Vector,
+    noise: float,
+    delay_m: float,
+    part: float,
+    work: tuple[Matrix, Matrix, Matrix],
+    vectors: tuple[Vector, Vector, Vector, Vector, Vector],
+) -> tuple[float, float]:
+    """The filter's own P, its gain, and the mean error after a message; the innovation's variance and mean."""
+    P, _, _ = work
+    h, ph, K, _, shift = vectors
+    n = P.shape[0]
+    h[:] = 0.0
+    for a in range(dim):
+        h[a] = direction[a]
+    h[2 * dim] = 1.0
+    spread, off = innovation_variance(P, h, ph, noise), delay_m
+    for a in range(n):
+        K[a] = ph[a] / spread
+        off -= h[a] * shift[a]
+    for a in range(n):
+        shift[a] += part * K[a] * off
+        for b in range(n):
+            P[a, b] -= part * K[a] * ph[b]
+    return spread, off
+
+
+@kernel
+def _superframe(
+    dim: int,
+    share: Vector,
+    sight: Matrix,
+    sender: NDArray[np.int64],
+    gap_s: Vector,
+    told: Vector,
+    with_others: Matrix,
+    anchor_gain: Matrix,
+    anchor_share: Vector,
+    sync_delay: Vector,
+    master: int,
+    settings: Vector,
+    work: tuple[Matrix, Matrix, Matrix],
+    vectors: tuple[Vector, Vector, Vector, Vector, Vector],
+    lists: tuple[NDArray[np.int64], NDArray[np.int64]],
+    count: int,
+    qa: float,
+    sums: Vector,
+    row: Vector,
+) -> None:
+    """Run one superframe; leave sums over its messages in ``row`` and ``sums`` (updates, chi2, its variance, rest)."""
+    P, S, X = work
+    h, _, K, g, shift = vectors
+    stamps, tx_var = settings[2] + settings[3], settings[2]
+    row[SIGMA_X : SIGMA_Z + 1] = 0.0
+    row[CLAIMED], row[BIAS], sums[:3] = 0.0, 0.0, 0.0
+    for k in range(len(sender)):
+        i = sender[k]
+        part = share[i]
+        sums[3] += gap_s[k]
+        if part == 0.0 and i != master:
+            continue
+        _advance(dim, sums[3], qa, settings, work, vectors, count)
+        sums[3] = 0.0
+        K[:] = 0.0
+        if part > 0.0:
+            delay_m = sight[i, 3] + sync_delay[i]
+            spread, off = _assumed_correct(dim, sight[i], stamps + told[k], delay_m, part, work, vectors)
+            own, others = lists[1][i], with_others[k]
+            true = _true_correct(S, X, K, h, part, stamps, own, lists[0], count, others, g) / spread
+            sums[0] += part
+            sums[1] += part * (true + off * off / spread)
+            sums[2] += part * true * (2.0 * true + 4.0 * off * off / spread)
+        if i == master:
+            _anchors_hear(X, K, part, lists[0], count, anchor_share, anchor_gain, tx_var)
+        for a in range(dim):
+            row[SIGMA_X + a] += part * S[a, a]
+            row[CLAIMED] += part * P[a, a]
+            row[BIAS] += part * shift[a] * shift[a]
+
+
+@kernel
+def settle_tracker(
+    dim: int,
+    share: Vector,
+    sight: Matrix,
+    sender: NDArray[np.int64],
+    gap_s: Vector,
+    told: Vector,
+    with_others: Matrix,
+    anchor_gain: Matrix,
+    anchor_share: Vector,
+    sync_delay: Vector,
+    master: int,
+    settings: Vector,
+    work: tuple[Matrix, Matrix, Matrix],
+    vectors: tuple[Vector, Vector, Vector, Vector, Vector],
+    lists: tuple[NDArray[np.int64], NDArray[np.int64]],
+    qa: float,
+    farthest: float,
+    row: Vector,
+) -> float:
+    """Run a point's filter until it is periodic and fill the columns from the mean over its last superframe.
+
+    ``settings``: white and walk (m²/s, m²/s³) of one clock, tx and rx variance in m². Returns how high the running mean
+    of the normalised squared innovations reaches, ``RESTLESS_SIGMAS`` above its mean.
+    """
+    count = choose_active(share, anchor_share, lists[0], lists[1])
+    superframe_s, passed_s, before_p, before_s = gap_s.sum(), 0.0, 0.0, 0.0
+    sums = np.zeros(4)
+    while passed_s < LONGEST_S + 20.0 * superframe_s:
+        _superframe(
+            dim, share, sight, sender, gap_s, told, with_others, anchor_gain, anchor_share, sync_delay, master,
+            settings, work, vectors, lists, count, qa, sums, row,
+        )  # fmt: skip
+        passed_s += superframe_s
+        told_p, true_s = row[CLAIMED], row[SIGMA_X] + row[SIGMA_X + 1] + row[SIGMA_Z]
+        if abs(told_p - before_p) <= SETTLED * told_p and abs(true_s - before_s) <= SETTLED * true_s:
+            break
+        if passed_s > LEAST_S and true_s > farthest * farthest * sums[0]:
+            break
+        before_p, before_s = told_p, true_s
+    _finish(row, dim, sums[0])
+    row[FIX_SHARE] = sums[0] / len(sender)
+    scatter = math.sqrt(sums[2] / sums[0] * FORGETTING / (2.0 - FORGETTING))
+    return float(sums[1] / sums[0] + RESTLESS_SIGMAS * scatter)
+
+
+@kernel
+def _finish(row: Vector, dim: int, updates: float) -> None:
+    """Turn sums of squares over a superframe into the columns."""
+    squares = 0.0
+    for a in range(dim):
+        squares += row[SIGMA_X + a] / updates
+        row[SIGMA_X + a] = math.sqrt(row[SIGMA_X + a] / updates)
+    row[SIGMA] = math.sqrt(squares)
+    row[RMSE] = math.sqrt(squares + row[BIAS] / updates)
+    row[BIAS] = math.sqrt(row[BIAS] / updates)
+    row[CLAIMED] = math.sqrt(row[CLAIMED] / updates)
+
+
+@kernel
+def begin(dim: int, work: tuple[Matrix, Matrix, Matrix], shift: Vector) -> None:
+    """Start both covariances somewhere sensible; the steady state does not depend on it."""
+    P, S, X = work
+    clock = 2 * dim
+    P[:], S[:], X[:], shift[:] = 0.0, 0.0, 0.0, 0.0
+    for axis in range(dim):
+        P[axis, axis] = S[axis, axis] = 0.01
+        P[dim + axis, dim + axis] = S[dim + axis, dim + axis] = 0.05
+    P[clock, clock] = S[clock, clock] = 0.01
+    P[clock + 1, clock + 1] = S[clock + 1, clock + 1] = 0.5
+
+
+@threaded_kernel
+def fill_tracker_sigma(
+    points: Matrix,
+    dim: int,
+    anchors: Matrix,
+    speaks: NDArray[np.bool_],
+    budget: Vector,
+    walls: Matrix,
+    master: int,
+    sync_delay: Vector,
+    sender: NDArray[np.int64],
+    gap_s: Vector,
+    told: Vector,
+    with_others: Matrix,
+    anchor_gain: Matrix,
+    anchor_share: Vector,
+    qa: float,
+    settings: Vector,
+    farthest: float,
+    table: Matrix,
+) -> None:
+    """Fill ``table`` (points, columns) for the points, shape (m, 3)."""
+    n, states = len(anchors), 2 * dim + 2
+    share, sight = np.zeros(n), np.zeros((n, 4))
+    seen, normal, inverse = np.zeros((n, 3)), np.zeros((4, 4)), np.zeros((4, 4))
+    work = (np.zeros((states, states)), np.zeros((states, states)), np.zeros((states, 2 * n)))
+    vectors = (
+        np.zeros(states), np.zeros(states), np.zeros(states), np.zeros(states), np.zeros(states),
+    )  # fmt: skip
+    lists = (np.zeros(n, np.int64), np.zeros(n, np.int64))
+    for m in range(len(points)):
+        row = table[m]
+        observe(anchors, speaks, budget, walls, points[m], share, sight)
+        fill_dops(anchors, share, points[m], dim, seen, normal, inverse, row)
+        heard = 0
+        for i in range(n):
+            heard += share[i] >= RARELY
+        row[SIGMA:] = math.inf
+        row[FIX_SHARE] = 0.0
+        if heard > dim:
+            begin(dim, work, vectors[4])
+            low, high, factor = 0.0, math.log(MAX_AGILITY), 0.0
+            for trial in range(8):
+                restless = settle_tracker(
+                    dim, share, sight, sender, gap_s, told, with_others, anchor_gain, anchor_share, sync_delay, master,
+                    settings, work, vectors, lists, qa * math.exp(factor), farthest, row,
+                )  # fmt: skip
+                if trial == 0 and restless <= RESTLESS_CHI2:
+                    break
+                low, high = (factor, high) if restless > RESTLESS_CHI2 else (low, factor)
+                factor = 0.5 * (low + high)
+            if not row[SIGMA] < farthest:
+                row[SIGMA:] = math.inf
+                row[FIX_SHARE] = 0.0
