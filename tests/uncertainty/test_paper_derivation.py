@@ -12,11 +12,20 @@ from skyless.positioning.paper import protocol_interval, tag_rate
 from skyless.uncertainty import corrected, printed
 from skyless.uncertainty.chain import Chain
 
-POSITIVE = (
-    "master_rate tag_rate anchor_rate anchor_tof_s tag_tof_s tag_master_tof_s sync_spacing_s spacing_s "
-    "sigma_master_s sigma_anchor_s sigma_tag_s"
-).split()
-REAL = "master_offset_s tag_offset_s anchor_offset_s sync_s reference_s delay_s".split()
+POSITIVE = [
+    "master_rate",
+    "tag_rate",
+    "anchor_rate",
+    "anchor_tof_s",
+    "tag_tof_s",
+    "tag_master_tof_s",
+    "sync_spacing_s",
+    "spacing_s",
+    "sigma_master_s",
+    "sigma_anchor_s",
+    "sigma_tag_s",
+]
+REAL = ["master_offset_s", "tag_offset_s", "anchor_offset_s", "sync_s", "reference_s", "delay_s"]
 CHAIN = Chain(
     **{name: sp.Symbol(name, positive=True) for name in POSITIVE},
     **{name: sp.Symbol(name, real=True) for name in REAL},
