@@ -14,6 +14,8 @@ _COMMANDS = (
     ("demo", "skyless.cli.demo:app", "Show a site and walking tags in real time."),
     ("simulate", "skyless.cli.simulate:app", "Run a site in the simulated world and judge it against the truth."),
     ("replay", "skyless.cli.replay:app", "Turn a recording into fixes and judge them against the truth."),
+    ("paper", "skyless.cli.paper:app", "Reproduce the paper's figures and claims in one report."),
+    ("bench", "skyless.cli.bench:app", "Measure how fast Monte Carlo draws run on this machine."),
     ("site", "skyless.cli.site:app", "Write and check site files."),
 )
 

@@ -13,7 +13,17 @@ def save_figure(figure: Figure, path: Path) -> None:
     Raises:
         OSError, ValueError: the file cannot be written, or its ending names no kind of picture.
     """
+    path.write_bytes(picture(figure, path.suffix.removeprefix(".") or "png"))
+
+
+def picture(figure: Figure, kind: str, dpi: float = 130.0) -> bytes:
+    """A figure as the bytes of a file of that kind; the same figure gives the same bytes at any time.
+
+    Raises:
+        ValueError: there is no such kind.
+    """
     FigureCanvasAgg(figure)
-    picture = io.BytesIO()
-    figure.savefig(picture, format=path.suffix.removeprefix(".") or "png", dpi=130)
-    path.write_bytes(picture.getvalue())
+    file = io.BytesIO()
+    undated = {"Date": None} if kind == "svg" else None
+    figure.savefig(file, format=kind, dpi=dpi, metadata=undated)
+    return file.getvalue()

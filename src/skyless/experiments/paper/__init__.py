@@ -1,0 +1,1 @@
+"""The paper's figures and claims, simulated, judged and written as one report."""

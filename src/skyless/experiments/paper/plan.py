@@ -1,0 +1,65 @@
+"""How much of everything the report simulates, and the places and noises that its figures share."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from msgspec import Struct
+
+Place = tuple[float, float]
+
+P1: Final[Place] = (3.0, 4.0)
+P2: Final[Place] = (1.2, 1.6)
+"""Stand-ins for the paper's two static test positions, whose coordinates it does not give."""
+
+RADIO_PS: Final = 100.0
+"""Noise of every stamp where a figure does not vary it: the low end of what is reported for DW1000 stamps."""
+
+PAPER_PS: Final = 15.65
+"""The paper's largest stamp error, one tick."""
+
+DW1000_PS: Final = (100.0, 150.0)
+"""Range of a DW1000's stamp noise (``docs/radio.md``)."""
+
+CLAIM_M: Final = 0.20
+"""The paper's bound on the position error."""
+
+Progress = Callable[[float], None]
+"""Told the share done, 0 to 1; raises when the work should end."""
+
+Results = Mapping[str, Any]
+"""What the tasks returned, by their names."""
+
+
+class Plan(Struct, frozen=True):
+    """Sizes of the simulations."""
+
+    seed: int
+    quick: bool = False
+    fixes: int = 30_000
+    """Fixes, one per superframe, at each static position."""
+    noises_ps: tuple[float, ...] = (5.2, PAPER_PS, 50.0, RADIO_PS, 150.0, 200.0, 300.0)
+    laps: int = 20
+    """Rounds of the walking test."""
+    fleet_sizes: tuple[int, ...] = (1, 10, 100, 1_000, 10_000)
+    rate_s: float = 10.0
+    """Simulated seconds over which updates are counted."""
+    draws: int = 2_000_000
+    """Monte Carlo draws per anchor and kind of noise."""
+
+
+def plan_of(seed: int, *, quick: bool) -> Plan:
+    """The whole report, or one that is ready in seconds and scatters more."""
+    if not quick:
+        return Plan(seed)
+    return Plan(seed, quick, fixes=1_500, laps=2, fleet_sizes=(1, 10, 100), rate_s=3.0, draws=100_000)
+
+
+class Task(Struct, frozen=True):
+    """A piece of work that shares nothing with the others; it runs in a process of its own."""
+
+    name: str
+    function: Callable[..., Any]
+    """Defined at the top of a module; called with ``progress`` first, then ``arguments``."""
+    arguments: dict[str, Any]
+    weight_s: float
+    """About how long it takes: the longest are begun first."""
