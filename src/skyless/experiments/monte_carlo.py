@@ -70,7 +70,8 @@ class ChainMoments(Struct, frozen=True):
     def epsilon_covariance_error_s2(self) -> Array:
         """Standard error of ``epsilon_covariance_s2``, for jointly Gaussian errors."""
         both = self.variance[Quantity.EPSILON_FIRST] * self.variance[Quantity.EPSILON_DELAYED]
-        return np.sqrt((both + self.epsilon_covariance_s2**2) / self.draws)
+        error: Array = np.sqrt((both + self.epsilon_covariance_s2**2) / self.draws)
+        return error
 
     @property
     def lambda_covariance_error_m2(self) -> Array:

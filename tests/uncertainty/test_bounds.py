@@ -1,0 +1,168 @@
+"""Cramér–Rao bounds: against the textbook's matrices, against the published table, and against what methods reach."""
+
+import numpy as np
+import pytest
+
+from skyless.constants import SPEED_OF_LIGHT_MPS
+from skyless.experiments.lab_bound import lab_tracking_bound_m, random_path
+from skyless.uncertainty.bounds import (
+    OFFSET_STD_M,
+    POSITION_STD_M,
+    RATE_STD_MPS,
+    bound_settings,
+    snapshot_bound,
+    tracking_bound,
+)
+from skyless.uncertainty.position import position_covariance
+from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
+
+LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
+SLOT_S = 2.5e-3
+STAMP_S = 100e-12
+STAMP_M = SPEED_OF_LIGHT_MPS * STAMP_S
+TABLE = [
+    (100e-12, 1e-9, 0.5, 0.02207, 0.01698, 500),
+    (150e-12, 1e-9, 0.5, 0.02983, 0.02301, 500),
+    (100e-12, 1e-9, 2.0, 0.02966, 0.02316, 2000),
+    (100e-12, 1e-8, 0.5, 0.02339, 0.01732, 500),
+]
+"""Stamp, random walk, qa, bound without and with mesh; and how many paths average to well below 2 %."""
+
+
+@pytest.mark.parametrize(("stamp_s", "walk", "qa", "without", "with_mesh", "paths"), TABLE)
+def test_the_published_bounds_of_the_lab(stamp_s, walk, qa, without, with_mesh, paths):
+    for mesh, expected in ((False, without), (True, with_mesh)):
+        found = lab_tracking_bound_m(stamp_s, random_walk_fm=walk, qa=qa, mesh=mesh, paths=paths)
+        assert found == pytest.approx(expected, rel=0.02)
+
+
+def textbook(anchors, path, stamp_m, walk, white, qa, speed_std, mesh, dims):
+    """The same bound with dense matrices: clocks against true time, all receptions of a frame in one update.
+
+    The states are another set on purpose: here every clock has its own offset and rate, the first anchor's too, and
+    its prior is exact; TX noise is in the measurements' covariance. States: [p, v, (offset, rate) of tag and anchors].
+    """
+    n = len(anchors)
+    size = 2 * dims + 2 * (n + 1)
+    clock = np.square([OFFSET_STD_M, RATE_STD_MPS])
+    first = 2 * dims + 2
+    P = np.diag([POSITION_STD_M**2] * dims + [speed_std**2] * dims + [*clock] * (n + 1))
+    P[first, first] = P[first + 1, first + 1] = 0.0
+    dt = SLOT_S
+    F = np.eye(size)
+    Q = np.zeros((size, size))
+    for value, rate, w, q in [(a, dims + a, 0.0, qa) for a in range(dims)] + [
+        (i, i + 1, white, walk) for i in range(2 * dims, size, 2)
+    ]:
+        F[value, rate] = dt
+        Q[np.ix_([value, rate], [value, rate])] = [[w * dt + q * dt**3 / 3, q * dt**2 / 2], [q * dt**2 / 2, q * dt]]
+    bounds = []
+    for frame, place in enumerate(path):
+        if frame:
+            P = F @ P @ F.T + Q
+        sender = frame % n
+        listeners = [i for i in range(n) if i != sender and (mesh or sender == 0)]
+        H = np.zeros((1 + len(listeners), size))
+        H[0, :dims] = ((place - anchors[sender]) / np.linalg.norm(place - anchors[sender]))[:dims]
+        H[0, 2 * dims] = 1.0
+        for row, listener in enumerate(listeners, start=1):
+            H[row, first + 2 * listener] = 1.0
+        H[:, first + 2 * sender] -= 1.0
+        R = stamp_m**2 * (np.eye(len(H)) + 1.0)
+        P -= P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)
+        if sender == n - 1:
+            bounds.append(P[:dims, :dims].copy())
+    return np.array(bounds)
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+@pytest.mark.parametrize("dims", [2, 3])
+def test_the_recursion_is_the_textbooks(mesh, dims):
+    anchors = LAB if dims == 2 else LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
+    path = random_path(np.random.default_rng(5), np.array([3.0, 4.0]), np.array([1.0, 1.0]), SLOT_S, 30 * 6, 0.5)
+    path += [0.0, 0.0, 0.0 if dims == 2 else 1.2]
+    settings = bound_settings(
+        STAMP_S,
+        white_fm=2e-11,
+        random_walk_fm=1e-9,
+        qa=0.5,
+        slot_s=SLOT_S,
+        speed_std_mps=0.4,
+        mesh=mesh,
+        height_known=dims == 2,
+    )
+    c2 = SPEED_OF_LIGHT_MPS**2
+    expected = textbook(anchors, path, STAMP_M, c2 * 1e-18, c2 * 4e-22, 0.5, 0.4, mesh, dims)
+    np.testing.assert_allclose(tracking_bound(anchors, path, settings)[2:], expected[2:], rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+@pytest.mark.parametrize("superframes", [2, 5])
+def test_a_snapshots_bound_is_that_of_least_squares_with_all_clocks_as_unknowns(mesh, superframes):
+    """One design matrix of every stamp, unknown lines for the clocks, one unknown per TX stamp with its own row."""
+    n, place = 6, np.array([1.2, 1.6, 0.0])
+    frames = n * superframes
+    unknowns = 2 + 2 * n + frames
+    rows = []
+    for frame in range(frames):
+        sender, t = frame % n, frame * SLOT_S
+        row = np.zeros(unknowns)
+        row[2 + 2 * n + frame] = 1.0
+        rows.append(row.copy())
+        for listener in [None, *range(n)]:
+            if listener == sender or (listener is not None and sender != 0 and not mesh):
+                continue
+            row = np.zeros(unknowns)
+            row[2 + 2 * n + frame] = -1.0
+            if listener is None:
+                row[:2] = ((place - LAB[sender]) / np.linalg.norm(place - LAB[sender]))[:2]
+                row[2:4] = [1.0, t]
+            elif listener > 0:
+                row[2 + 2 * listener : 4 + 2 * listener] = [1.0, t]
+            if sender > 0:
+                row[2 + 2 * sender : 4 + 2 * sender] -= [1.0, t]
+            rows.append(row)
+    design = np.array(rows) / STAMP_M
+    expected = np.linalg.inv(design.T @ design)[:2, :2]
+    found = snapshot_bound(LAB, place, STAMP_S, slot_s=SLOT_S, superframes=superframes, mesh=mesh)
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("place", [(3.0, 4.0, 0.0), (1.2, 1.6, 0.0), (5.0, 7.0, 0.0)])
+def test_no_snapshot_method_beats_its_bound(place):
+    """The full-covariance methods use other parts of the same two superframes' stamps."""
+    bound = snapshot_bound(LAB, place, STAMP_S, slot_s=SLOT_S)
+    kappa = np.arange(1, 6) / 6.0
+    for covariance in (literal_covariance, bracketed_covariance):
+        reached = position_covariance(
+            LAB, [place], covariance(kappa, STAMP_M**2, STAMP_M**2), height_known=True, weighted=True
+        )[0, :2, :2]
+        assert np.linalg.eigvalsh(reached - bound).min() > 0.0
+
+
+def test_more_information_never_makes_the_bound_worse():
+    path = np.tile([2.0, 3.0, 0.0], (6 * 20, 1))
+
+    def last(**changes):
+        base = {
+            "white_fm": 2e-11,
+            "random_walk_fm": 1e-9,
+            "qa": 0.5,
+            "slot_s": SLOT_S,
+            "speed_std_mps": 0.4,
+            "mesh": False,
+        }
+        stamp_s = changes.pop("stamp_s", STAMP_S)
+        return tracking_bound(LAB, path, bound_settings(stamp_s, **(base | changes)))[-1]
+
+    base = last()
+    for better in ({"stamp_s": 50e-12}, {"mesh": True}, {"qa": 0.1}, {"random_walk_fm": 1e-10}):
+        assert np.linalg.eigvalsh(base - last(**better)).min() > 0.0
+
+
+def test_a_path_must_have_whole_superframes():
+    settings = bound_settings(
+        STAMP_S, white_fm=0.0, random_walk_fm=0.0, qa=0.0, slot_s=SLOT_S, speed_std_mps=0.0, mesh=False
+    )
+    with pytest.raises(ValueError, match="7 places, no multiple of 6 anchors"):
+        tracking_bound(LAB, np.zeros((7, 3)), settings)
