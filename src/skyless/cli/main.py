@@ -16,6 +16,7 @@ _COMMANDS = (
     ("replay", "skyless.cli.replay:app", "Turn a recording into fixes and judge them against the truth."),
     ("paper", "skyless.cli.paper:app", "Reproduce the paper's figures and claims in one report."),
     ("bench", "skyless.cli.bench:app", "Measure how fast Monte Carlo draws run on this machine."),
+    ("plan", "skyless.cli.plan:app", "Predict a site's errors before it is mounted, and place its anchors."),
     ("site", "skyless.cli.site:app", "Write and check site files."),
 )
 

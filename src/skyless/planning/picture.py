@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, LogNorm
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from msgspec import Struct
 from numpy.typing import NDArray
 
@@ -82,7 +83,7 @@ def draw_layer(plan: PlanMap, layer: Layer, background: Background) -> Figure:
     axes[0].set_ylabel("y in m")
     bar = figure.colorbar(mesh, ax=list(axes), label=f"{layer.title} in {layer.unit}" if layer.unit else layer.title)
     if ticks is not None:
-        bar.set_ticks(ticks, labels=[f"{tick:.3g}" for tick in ticks])
+        bar.set_ticks(ticks.tolist(), labels=[f"{tick:.3g}" for tick in ticks])
         bar.ax.minorticks_off()
     return figure
 
@@ -97,8 +98,8 @@ def _norm(values: Array, layer: Layer) -> tuple[LogNorm | BoundaryNorm | None, A
         return BoundaryNorm(bounds.tolist(), 256), bounds[:-1] + 0.5
     if layer.column == FIX_SHARE or len(known) == 0:
         return None, None
-    low, high = np.percentile(known, 1), np.percentile(known, 98)
-    low, high = max(low, 1e-6), max(high, 1.3 * low)
+    low = max(float(np.percentile(known, 1)), 1e-6)
+    high = max(float(np.percentile(known, 98)), 1.3 * low)
     return LogNorm(low, high), _nice(low, high)
 
 
@@ -118,7 +119,7 @@ def _nice(low: float, high: float) -> Array:
 
 def _slice(
     axes: Axes, plan: PlanMap, values: Array, norm: LogNorm | BoundaryNorm | None, layer: Layer, background: Background
-) -> object:
+) -> AxesImage:
     grid = plan.grid
     _image(axes, background)
     shown = np.where(grid.within, values, np.nan)
@@ -129,10 +130,10 @@ def _slice(
         np.where(hopeless, 1.0, np.nan), extent=extent, origin="lower", cmap="Greys", vmin=0.0, vmax=5.0,
         interpolation="nearest", zorder=1,
     )  # fmt: skip
-    limits = {"vmin": 0.0, "vmax": 100.0} if norm is None else {}
+    most = 100.0 if norm is None else None
     mesh = axes.imshow(
         np.where(np.isfinite(shown), shown, np.nan), extent=extent, origin="lower", cmap="cividis", norm=norm,
-        interpolation="nearest", alpha=see_through, zorder=2, **limits,
+        interpolation="nearest", alpha=see_through, zorder=2, vmin=None if most is None else 0.0, vmax=most,
     )  # fmt: skip
     if isinstance(norm, LogNorm) and np.isfinite(shown).sum() > 3 and min(shown.shape) > 1:
         _contours(axes, plan, shown, norm, layer)

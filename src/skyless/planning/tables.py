@@ -47,10 +47,11 @@ def geojson_lines(plan: PlanMap, georeference: GeoreferenceSite | None) -> Itera
     they are the site's metres, and a member ``skyless:frame`` says so.
     """
     frame = "WGS 84" if georeference else "site, metres"
-    yield '{"type":"FeatureCollection","skyless:frame":"%s","features":[\n' % frame
+    yield f'{{"type":"FeatureCollection","skyless:frame":"{frame}","features":[\n'
     keys = ",".join(f'"{name}":' + ("%d" if k == ANCHORS else "%.4g") for k, name in enumerate(COLUMNS))
     place = "[%.8f,%.8f,%.3f]" if georeference else "[%.3f,%.3f,%.3f]"
-    pattern = '{"type":"Feature","geometry":{"type":"Point","coordinates":%s},"properties":{%s}}' % (place, keys)
+    geometry = f'"geometry":{{"type":"Point","coordinates":{place}}}'
+    pattern = f'{{"type":"Feature",{geometry},"properties":{{{keys}}}}}'
     first = True
     for rows in _pieces(plan):
         if georeference:

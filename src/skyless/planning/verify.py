@@ -12,6 +12,7 @@ from skyless.air.schedule import schedule_of
 from skyless.experiments.fleet import Fleet, FleetSettings
 from skyless.experiments.scenarios import Request, impairments_of
 from skyless.planning.columns import CLAIMED, FIX_SHARE, RMSE, SIGMA
+from skyless.planning.maps import PlanMap
 from skyless.planning.predict import Predictor
 from skyless.simulation.trajectory import Static
 
@@ -81,6 +82,18 @@ class _Batches:
         count = len(rows)
         error = np.sqrt((spread @ spread) * count / max(count - 1, 1)) / (total[0] * variance)
         return float(np.sqrt(variance)), float(np.sqrt(total[4] / total[0])), float(error / 2.0)
+
+
+def random_points(plan: PlanMap, count: int, seed: int) -> Matrix:
+    """So many points, evenly random over a map's region and between its heights, shape (count, 3)."""
+    grid, random = plan.grid, np.random.default_rng(seed)
+    half = 0.5 * grid.step_m
+    y, x = np.nonzero(grid.within)
+    chosen = random.integers(len(x), size=count)
+    places = np.column_stack([grid.x_m[x[chosen]], grid.y_m[y[chosen]]]) + random.uniform(-half, half, (count, 2))
+    levels = random.uniform(grid.heights_m.min(), grid.heights_m.max(), count)
+    points: Matrix = np.column_stack([places, levels])
+    return points
 
 
 def verify(

@@ -2,7 +2,9 @@
 
 import json
 
-from skyless.site.model import AnchorSite, Site
+from msgspec import structs
+
+from skyless.site.model import AnchorSite, FloorPlanSite, GeoreferenceSite, Site
 
 _HEAD = """\
 # A Skyless site. Lengths are metres in the site's own frame: x and y on the floor, z up.
@@ -50,7 +52,7 @@ y_m = {y}
 z_m = {z}
 """
 
-_TAIL = """
+_NO_WALLS = """
 # Walls, full height, for planning and simulation; one table for each.
 # [[walls]]
 # x1_m = 2.0
@@ -59,27 +61,48 @@ _TAIL = """
 # y2_m = 3.5
 # loss_db = 6.0                 # what a signal loses on its way through
 # delay_m = 0.1                 # by how much it comes late, as a length
-
-# An image of the floor behind the map.
-# [floor_plan]
-# image = "floor.png"           # PNG or JPEG, relative to this file
-# width_m = 6.0                 # what the image's width measures on the floor
-# x_m = 0.0                     # where its lower left corner lies
-# y_m = 0.0
-
-# Where the site's origin lies on the Earth (WGS 84).
-# [georeference]
-# latitude_deg = 47.3769
-# longitude_deg = 8.5417
-# height_m = 408.0
-# heading_deg = 0.0             # azimuth of the y axis, clockwise from true north
 """
+
+_WALLS = """
+# Walls, full height, for planning and simulation: what a signal loses on its way through, and how late it comes.
+"""
+
+_WALL = """
+[[walls]]
+x1_m = {x1_m}
+y1_m = {y1_m}
+x2_m = {x2_m}
+y2_m = {y2_m}
+loss_db = {loss_db}
+delay_m = {delay_m}
+"""
+
+_FLOOR_PLAN = """
+# An image of the floor behind the map.
+{off}[floor_plan]
+{off}image = {image}           # PNG or JPEG, relative to this file
+{off}width_m = {width_m}                 # what the image's width measures on the floor
+{off}x_m = {x_m}                     # where its lower left corner lies
+{off}y_m = {y_m}
+"""
+
+_GEOREFERENCE = """
+# Where the site's origin lies on the Earth (WGS 84).
+{off}[georeference]
+{off}latitude_deg = {latitude_deg}
+{off}longitude_deg = {longitude_deg}
+{off}height_m = {height_m}
+{off}heading_deg = {heading_deg}             # azimuth of the y axis, clockwise from true north
+"""
+
+_EXAMPLE_PLAN = FloorPlanSite(image="floor.png", width_m=6.0)
+_EXAMPLE_PLACE = GeoreferenceSite(latitude_deg=47.3769, longitude_deg=8.5417, height_m=408.0)
 
 
 def site_template(site: Site) -> str:
-    """Site file, with a comment on every key, of a site's names, anchors, schedule, noise figures and tags.
+    """Site file, with a comment on every key, of a site without slots and antenna delays of its own.
 
-    Walls, floor plan and georeference stand in it as commented examples.
+    Walls, floor plan and georeference that the site has not stand in it as commented examples.
     """
     schedule, noise = site.schedule, site.noise
     head = _HEAD.format(
@@ -97,8 +120,20 @@ def site_template(site: Site) -> str:
     )
     height = site.tags.height_m
     tags = _ESTIMATED_HEIGHT if height is None else _KNOWN_HEIGHT.format(height=height)
-    return head + tags + _ANCHORS + "".join(map(_anchor, site.anchors)) + _TAIL
+    return head + tags + _ANCHORS + "".join(map(_anchor, site.anchors)) + _tail(site)
 
 
 def _anchor(anchor: AnchorSite) -> str:
     return _ANCHOR.format(id=anchor.id, x=anchor.x_m, y=anchor.y_m, z=anchor.z_m)
+
+
+def _tail(site: Site) -> str:
+    """Walls, floor plan and georeference, or an example of each."""
+    walls = "".join(_WALL.format(**structs.asdict(wall)) for wall in site.walls)
+    plan, place = site.floor_plan or _EXAMPLE_PLAN, site.georeference or _EXAMPLE_PLACE
+    image = json.dumps(plan.image, ensure_ascii=False)
+    return (
+        (_WALLS + walls if walls else _NO_WALLS)
+        + _FLOOR_PLAN.format(**{**structs.asdict(plan), "image": image}, off="" if site.floor_plan else "# ")
+        + _GEOREFERENCE.format(**structs.asdict(place), off="" if site.georeference else "# ")
+    )

@@ -1,0 +1,214 @@
+"""What ``skyless plan`` tells: one report for JSON, the terminal and the page."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from skyless.cli.output import console
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from skyless.planning.floor import Floor
+    from skyless.planning.maps import MapSummary, PlanMap
+    from skyless.planning.mounts import Mounts
+    from skyless.planning.optimise import OneMore, Optimised, Scored
+    from skyless.planning.picture import Background
+    from skyless.planning.predict import Predictor
+    from skyless.planning.verify import Verification
+
+NOTES: Final = (
+    "Tags are at rest. A moving tag's tracker is less exact; the paper's methods hardly notice motion up to 1 m/s.",
+    "Stamps' noise and crystals are those of the site file, and the filters know them.",
+    "Links are free space on channel 5 with the walls' losses of the site file; people, furniture, reflections and "
+    "antennas' patterns are not known to the plan.",
+    "Walls delay what crosses them as the site file says; nothing else comes late.",
+    "Positions of the anchors, antenna delays and power-dependent range biases are taken to be right.",
+)
+
+
+def report(
+    predictor: "Predictor",
+    floor: "Floor",
+    mounts: "Mounts",
+    mapped: "PlanMap",
+    summary: "MapSummary",
+    optimised: "Optimised | None",
+    checked: "Verification | None",
+) -> dict[str, Any]:
+    """All there is to say, SI units."""
+    import numpy as np
+
+    from skyless.air.schedule import schedule_of
+    from skyless.planning.advice import plan_warnings
+    from skyless.planning.columns import BIAS
+    from skyless.planning.links import range_of
+    from skyless.planning.optimise import one_more
+
+    site, settings = predictor.site, predictor.settings
+    heights = tuple(mapped.grid.heights_m.tolist())
+    bias = mapped.column(BIAS)
+    more = one_more(site, settings, floor, mounts, heights) if len(site.anchors) < 200 else None
+    return {
+        "site": site.name,
+        "method": settings.method,
+        "tx_stamp_ps": site.noise.tx_stamp_ps,
+        "rx_stamp_ps": site.noise.rx_stamp_ps,
+        "qa": settings.qa,
+        "range_m": range_of(settings.channel),
+        "superframe_s": 1.0 / schedule_of(site).superframe_rate_hz,
+        "master": site.master,
+        "heights_m": heights,
+        "region_m": floor.region_m,
+        "outline_m": floor.outline_m,
+        "step_m": mapped.grid.step_m,
+        "computed_every_m": mapped.computed_every_m,
+        **msgspec.to_builtins(summary),
+        "walls_bias": bool((bias[np.isfinite(bias)] > 1e-4).any()),
+        "anchors": [
+            {
+                "id": anchor.id,
+                "x_m": anchor.x_m,
+                "y_m": anchor.y_m,
+                "z_m": anchor.z_m,
+                "hears_master": float(predictor.links.share[row]),
+                "speaks": bool(predictor.clocks.speaks[row]),
+            }
+            for row, anchor in enumerate(site.anchors)
+        ],
+        "warnings": plan_warnings(predictor, floor, mapped),
+        "one_more": more,
+        "optimised": None if optimised is None else _optimised(optimised),
+        "verification": checked,
+    }
+
+
+def _optimised(found: "Optimised") -> dict[str, Any]:
+    return {
+        "best": _scored(found.best),
+        "even": _scored(found.even),
+        "mean_ratio": found.best.mean_sigma_m / found.even.mean_sigma_m,
+        "worst_ratio": found.best.worst_sigma_m / found.even.worst_sigma_m,
+        "target_met": found.target_met,
+        "evaluations": found.evaluations,
+        "finished": found.finished,
+    }
+
+
+def _scored(scored: "Scored") -> dict[str, Any]:
+    return {
+        "mean_sigma_m": scored.mean_sigma_m,
+        "worst_sigma_m": scored.worst_sigma_m,
+        "covered_share": scored.covered_share,
+        "master": scored.site.master,
+        "anchors": [(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in scored.site.anchors],
+    }
+
+
+def described(result: dict[str, Any]) -> str:
+    """Method, noise and schedule in one line."""
+    tx_ps, rx_ps = result["tx_stamp_ps"], result["rx_stamp_ps"]
+    noise = f"{tx_ps:g} ps" if tx_ps == rx_ps else f"{tx_ps:g} ps (TX) and {rx_ps:g} ps (RX)"
+    agility = f" with qa {result['qa']:g} m²/s³" if result["method"] == "tracker" else ""
+    return (
+        f"predicted for {result['method']}{agility}, stamps of {noise}, "
+        f"superframes of {1e3 * result['superframe_s']:.1f} ms, tags at rest"
+    )
+
+
+def _lines(result: dict[str, Any]) -> dict[str, str]:
+    """The numbers for people."""
+    worst_at = result["worst_at_m"]
+    place = "" if worst_at is None else " at ({:.2f}, {:.2f}, {:.2f}) m".format(*worst_at)
+    lines = {
+        "anchors": f"{len(result['anchors'])}, master {result['master']}, range {result['range_m']:.0f} m in the open",
+        "map": _map_line(result),
+        "covered": f"{result['covered_share']:.1%} of the region; fewest anchors in view: {result['fewest_anchors']}",
+        "standard deviation": f"mean {_cm(result['mean_sigma_m'])}, median {_cm(result['median_sigma_m'])}, "
+        f"95 % {_cm(result['p95_sigma_m'])}, worst {_cm(result['worst_sigma_m'])}{place}",
+    }
+    if result["walls_bias"]:
+        lines["with the walls' delays"] = f"RMSE mean {_cm(result['mean_rmse_m'])}, worst {_cm(result['worst_rmse_m'])}"
+    if result["target_share"] is not None:
+        lines["target met"] = f"in {result['target_share']:.1%} of the region"
+    if result["one_more"] is not None:
+        lines["one more anchor"] = _one_more(result["one_more"])
+    if result["optimised"] is not None:
+        lines["optimised"] = _against_even(result["optimised"])
+    if result["verification"] is not None:
+        lines["simulated"] = _verified(result["verification"])
+    return lines
+
+
+def _map_line(result: dict[str, Any]) -> str:
+    line = f"{result['points']} points, {result['step_m']:g} m apart"
+    if result["computed_every_m"] > result["step_m"]:
+        line += f"; {result['method']} computed every {result['computed_every_m']:g} m and interpolated by the PDOP"
+    return line
+
+
+def _one_more(more: "OneMore") -> str:
+    x, y, z = more.place_m
+    if more.mean_after_m >= more.mean_before_m and more.worst_after_m >= more.worst_before_m:
+        return "would not help: the superframe grows, and the geometry is good"
+    return (
+        f"helps most at ({x:.2f}, {y:.2f}, {z:.2f}) m: mean {_cm(more.mean_before_m)} → {_cm(more.mean_after_m)}, "
+        f"worst {_cm(more.worst_before_m)} → {_cm(more.worst_after_m)}"
+    )
+
+
+def _against_even(found: dict[str, Any]) -> str:
+    best, even = found["best"], found["even"]
+    text = (
+        f"mean {_cm(best['mean_sigma_m'])}, worst {_cm(best['worst_sigma_m'])}; evenly along the walls "
+        f"{_cm(even['mean_sigma_m'])} and {_cm(even['worst_sigma_m'])}"
+    )
+    if found["target_met"] is not None:
+        text += "; the target is met everywhere" if found["target_met"] else "; the target is not met everywhere"
+    return text if found["finished"] else text + "; the time ran out before the search ended"
+
+
+def _verified(checked: "Verification") -> str:
+    if checked.mean_ratio is None or checked.smallest_ratio is None or checked.largest_ratio is None:
+        return "no point with a fix in both"
+    return (
+        f"simulated over predicted at {len(checked.points)} points: mean {checked.mean_ratio:.3f}, from "
+        f"{checked.smallest_ratio:.3f} to {checked.largest_ratio:.3f}; each ± {checked.mean_ratio_error:.3f}"
+    )
+
+
+def _cm(value_m: float | None) -> str:
+    return "–" if value_m is None else f"{100 * value_m:.2f} cm"
+
+
+def show(file: Path, result: dict[str, Any]) -> None:
+    """Show a plan in the terminal."""
+    from rich.table import Table
+    from rich.text import Text
+
+    out = console()
+    table = Table("", "", title=Text(f"{result['site']} ({file}): {described(result)}"), show_header=False)
+    for name, value in _lines(result).items():
+        table.add_row(name, Text(value))
+    out.print(table)
+    for warning in result["warnings"]:
+        out.print(Text.assemble(("warning: ", "bold yellow"), warning))
+
+
+def html_page(result: dict[str, Any], mapped: "PlanMap", background: "Background") -> str:
+    """The plan as a page."""
+    from skyless.planning.page import page
+    from skyless.planning.picture import draw_layer, layers_for
+
+    sections: list[tuple[str, Figure]] = [
+        (layer.title.capitalize() if layer.title.islower() else layer.title, draw_layer(mapped, layer, background))
+        for layer in layers_for(mapped)
+    ]
+    lines = _lines(result)
+    for anchor in result["anchors"]:
+        speaks = "" if anchor["speaks"] else ", silent"
+        place = f"({anchor['x_m']:g}, {anchor['y_m']:g}, {anchor['z_m']:g}) m"
+        lines[f"anchor {anchor['id']}"] = f"{place}, hears {anchor['hears_master']:.0%} of the master's frames{speaks}"
+    title = f"Plan of {result['site']}"
+    return page(title, described(result), lines, result["warnings"], sections, NOTES)

@@ -1,0 +1,145 @@
+"""What a plan warns of: links, geometry, mirrors, weak corners and holes, each in a sentence."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.planning.anchor_clocks import stamp_variances
+from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA
+from skyless.planning.floor import Floor
+from skyless.planning.links import IN_VIEW, hears
+from skyless.planning.maps import PlanMap
+from skyless.planning.mounts import sample_points
+from skyless.planning.predict import Predictor
+from skyless.planning.rounds import delays
+from skyless.positioning.fix import NoFixReason
+from skyless.positioning.solver import NoSolution, locate
+from skyless.site.advice import warnings_of
+from skyless.uncertainty.tdoa import literal_covariance
+
+Array = NDArray[np.float64]
+
+RELIABLE: Final = 0.95
+"""An anchor should hear at least this share of the master's frames."""
+
+WEAK: Final = 2.0
+"""A place is weak where the error is so many times the median."""
+
+MIRROR_POINTS: Final = 150
+
+
+def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
+    """All that may cost accuracy or the fix, from the site alone and from its map."""
+    return [
+        *warnings_of(predictor.site),
+        *_master(predictor),
+        *_order(predictor),
+        *_mirrors(predictor, floor, plan),
+        *_holes(plan),
+        *_weak(plan),
+        *_walls(plan),
+    ]
+
+
+def _master(predictor: Predictor) -> list[str]:
+    """Anchors that hear the master badly have a poor clock, or none and stay silent."""
+    found = []
+    for row, (anchor, share) in enumerate(zip(predictor.site.anchors, predictor.links.share, strict=True)):
+        if share >= RELIABLE:
+            continue
+        distance = float(np.linalg.norm(predictor.anchors_m[row] - predictor.anchors_m[predictor.master]))
+        what = "stays silent" if not predictor.clocks.speaks[row] else "follows its clock badly"
+        found.append(
+            f"anchor {anchor.id}, {distance:.1f} m from the master, hears {share:.0%} of its frames and {what}: "
+            "choose a master in the middle, or move it"
+        )
+    return found
+
+
+def _order(predictor: Predictor) -> list[str]:
+    if predictor.settings.method == "tracker":
+        return []
+    kappa, _ = delays(predictor.site)
+    early = [anchor.id for anchor, delay in zip(predictor.site.anchors, kappa, strict=True) if delay < 0.0]
+    if not early:
+        return []
+    numbers = ", ".join(map(str, early))
+    return [f"anchor {numbers}: sends before the master in a round, and {predictor.settings.method} cannot use it"]
+
+
+def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
+    """Ask the solver itself, with TDoAs that are exact, whether a place has a mirror image that fits as well."""
+    points = sample_points(floor, tuple(plan.grid.heights_m.tolist()), MIRROR_POINTS)
+    tx_var, rx_var = stamp_variances(predictor.site)
+    height = predictor.site.tags.height_m
+    ambiguous = [point for point in points if _has_mirror(predictor, point, height, tx_var, rx_var)]
+    if not ambiguous:
+        return []
+    x, y, z = ambiguous[len(ambiguous) // 2]
+    return [
+        f"{len(ambiguous) / len(points):.0%} of the region has a mirror image that explains the measurements as well, "
+        f"for one around ({x:.1f}, {y:.1f}, {z:.1f}): vary the anchors' heights, or set tags.height_m if it is known"
+    ]
+
+
+def _has_mirror(predictor: Predictor, point: Array, height_m: float | None, tx_var: float, rx_var: float) -> bool:
+    seen = [
+        row
+        for row, place in enumerate(predictor.anchors_m)
+        if predictor.clocks.speaks[row] and hears(predictor.budget, predictor.walls, place, point)[0] >= IN_VIEW
+    ]
+    if len(seen) < predictor.dim + 2:
+        return False
+    anchors = predictor.anchors_m[seen]
+    ranges = np.linalg.norm(anchors - point, axis=1)
+    covariance = literal_covariance(np.full(len(seen) - 1, 0.5), tx_var, rx_var)
+    solution = locate(anchors, ranges[1:] - ranges[0], covariance, height_m=height_m)
+    return isinstance(solution, NoSolution) and solution.reason is NoFixReason.MIRROR
+
+
+def _holes(plan: PlanMap) -> list[str]:
+    share = np.where(plan.grid.within, plan.column(FIX_SHARE), np.nan)
+    missing = share < 0.5
+    if not missing.any():
+        return []
+    part = missing.sum() / (plan.grid.points)
+    x, y, z = _place(plan, missing)
+    return [f"{part:.1%} of the region has no fix most of the time, as around ({x:.1f}, {y:.1f}, {z:.1f})"]
+
+
+def _weak(plan: PlanMap) -> list[str]:
+    """The worst place of those whose error is a multiple of the median."""
+    sigma = np.where(plan.column(FIX_SHARE) >= 0.5, plan.column(SIGMA), np.nan)
+    if not np.isfinite(sigma).any():
+        return []
+    median, worst = float(np.nanmedian(sigma)), float(np.nanmax(sigma))
+    if worst < WEAK * median:
+        return []
+    part = float(np.nansum(sigma > WEAK * median)) / plan.grid.points
+    x, y, z = _place(plan, sigma == worst)
+    return [
+        f"weak corner at ({x:.1f}, {y:.1f}, {z:.1f}): {100 * worst:.1f} cm, {worst / median:.1f} times the median; "
+        f"{part:.1%} of the region is worse than {WEAK:g} times the median"
+    ]
+
+
+def _walls(plan: PlanMap) -> list[str]:
+    bias, sigma = plan.column(BIAS), plan.column(SIGMA)
+    known = np.isfinite(bias) & np.isfinite(sigma)
+    worse = known & (bias > sigma)
+    if not worse.any():
+        return []
+    largest = float(bias[known].max())
+    return [
+        f"walls' delays shift positions by more than their standard deviation in {worse.sum() / known.sum():.0%} of "
+        f"the region, by {100 * largest:.0f} cm at most"
+    ]
+
+
+def _place(plan: PlanMap, where: NDArray[np.bool_]) -> tuple[float, float, float]:
+    """The marked point that is nearest to the middle of all marked ones."""
+    k, y, x = np.nonzero(where)
+    places = np.column_stack([plan.grid.x_m[x], plan.grid.y_m[y], plan.grid.heights_m[k]])
+    nearest = places[np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1))]
+    return float(nearest[0]), float(nearest[1]), float(nearest[2])
