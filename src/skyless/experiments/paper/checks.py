@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from skyless.experiments.paper.plan import Plan, Progress, Results, Task
-from skyless.experiments.paper.section import Panel, Section, Verdict
+from skyless.experiments.paper.section import Panel, Section, Verdict, grouped
 from skyless.experiments.paper.style import BLUE, INK, RED, panel
 from skyless.experiments.paper_checks import ANCHORS, PaperCheck, paper_checks
 
@@ -55,13 +55,14 @@ def judge(checks: tuple[PaperCheck, ...]) -> tuple[Verdict, str]:
         {check.quantity for check, fine in zip(checks, right, strict=True) if not fine}, key=list(SYMBOLS).index
     )
     names = ", ".join(SYMBOLS[name] for name in wrong)
+    most = grouped(round(max(off)))
     fine = ", ".join(symbol for name, symbol in SYMBOLS.items() if name not in wrong)
     corrected = f"the corrected ones are within {max(check.corrected_error_pct for check in checks):.2f} %"
     if all(right):
         return Verdict.HOLDS, f"All printed deviations agree with the draws; {corrected}."
     if all(_agrees(check.corrected_error_pct, check) for check in checks):
         return Verdict.CORRECTED, (
-            f"As printed, the deviations of {names} are off, by up to {max(off):,.0f} %; {corrected} of the draws, "
+            f"As printed, the deviations of {names} are off, by up to {most} %; {corrected} of the draws, "
             f"whose standard error is {checks[0].standard_error_pct:.3f} % (errata E1 to E7). {fine} are right as "
             "printed to within parts per million, and averaging the two offsets changes nothing (E2)."
         )
@@ -101,11 +102,11 @@ def section(plan: Plan, results: Results) -> Section:
             "draws very well, whichever is considered; the same is said of all other quantities."
         ),
         simulated=(
-            f"{plan.draws:,} draws of the exact algorithm for each of ten anchors with random clocks, places and "
-            "delays, stamps Gaussian and uniform within ±15.65 ps. Shown is the absolute relative error of each "
-            "standard deviation, as the paper defines it. 10 000 draws have a standard error of 0.7 %; these have "
-            f"{checks[0].standard_error_pct:.3f} %. The printed terms depend on when the clocks started, which the "
-            f"paper leaves open: once they read a few milliseconds at the synchronisation, once {FAR_S:g} s."
+            f"{grouped(plan.draws)} draws of the exact algorithm for each of ten anchors with random clocks, places "
+            "and delays, stamps Gaussian and uniform within ±15.65 ps. Shown is the absolute relative error of "
+            "each standard deviation, as the paper defines it. 10 000 draws have a standard error of 0.7 %; these "
+            f"have {checks[0].standard_error_pct:.3f} %. The printed terms depend on when the clocks started, which "
+            f"the paper leaves open: once they read a few milliseconds at the synchronisation, once {FAR_S:g} s."
         ),
         verdict=verdict,
         reason=reason,
@@ -153,7 +154,8 @@ def _by_quantity(name: str, title: str, checks: tuple[PaperCheck, ...]) -> Panel
     _logarithmic(axes)
     axes.legend(loc="upper left", ncols=2)
     caption = (
-        f"Absolute relative error of σ of every quantity, {checks[0].draws:,} draws; a dot for each of ten anchors."
+        f"Absolute relative error of σ of every quantity, {grouped(checks[0].draws)} draws; a dot for each of ten "
+        "anchors."
     )
     return Panel(name, caption, figure)
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from skyless.experiments.paper.listening import listen
 from skyless.experiments.paper.plan import CLAIM_M, DW1000_PS, P1, PAPER_PS, Plan, Progress, Results, Task
-from skyless.experiments.paper.section import Panel, Section, Verdict
+from skyless.experiments.paper.section import Panel, Section, Verdict, grouped
 from skyless.experiments.paper.style import GREEN, INK, METHOD_COLOURS, MUTED, panel
 from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.trajectory import Static
@@ -137,7 +137,7 @@ def section(plan: Plan, results: Results) -> Section:
     trends = {method: trend_of(found) for method, found in by_method.items()}
     crossings = {method: trend.crossings_ps for method, trend in trends.items()}
     verdict, reason = judge({method: crossing[1] for method, crossing in crossings.items()})
-    heads = ("stamp noise in ps", "seed", *(f"{method}: largest (RMSE) in cm" for method in METHODS))
+    heads = ("stamp noise in ps", "seed", *(f"{method}: largest (RMSE), cm" for method in METHODS))
     table = [heads]
     for noise_ps in plan.noises_ps:
         cells = [row for row in rows if row.noise_ps == noise_ps]
@@ -151,7 +151,7 @@ def section(plan: Plan, results: Results) -> Section:
         label="abstract, sec:ExperimentalResults, sec:conclusion",
         claim="The system's largest absolute position error is stated as below 20 cm.",
         simulated=(
-            f"{plan.fixes:,} fixes at P1 for each of {len(plan.noises_ps)} stamp noises, each in a world of its "
+            f"{grouped(plan.fixes)} fixes at P1 for each of {len(plan.noises_ps)} stamp noises, each in a world of its "
             "own; four methods on the same receptions. A largest error scatters from run to run, so a power law is "
             f"fitted from {FIT_FROM_PS:g} ps on; the bands hold 90 % of the largest of so many independent Gaussian "
             "errors. No obstacles and no biased stamps."
@@ -196,7 +196,7 @@ def _all(by_method: dict[str, list[Worst]], trends: dict[str, Trend], plan: Plan
     )
     axes.set(
         xlabel="noise of every stamp in ps",
-        ylabel=f"largest of {plan.fixes:,} errors in cm",
+        ylabel=f"largest of {grouped(plan.fixes)} errors in cm",
         xlim=(0, None),
         ylim=(0, None),
     )
@@ -222,7 +222,7 @@ def _limits(crossings: dict[str, tuple[float, float, float]], plan: Plan) -> Pan
     )
     axes.grid(visible=False, axis="y")
     caption = (
-        f"Largest stamp noise that keeps {plan.fixes:,} errors below 20 cm; black: where 90 % of runs lie. Grey: "
-        "what is reported for a DW1000; dotted: the paper's ±15.65 ps."
+        f"Largest stamp noise that keeps {grouped(plan.fixes)} errors below 20 cm; black: where 90 % of runs lie. "
+        "Grey: what is reported for a DW1000; dotted: the paper's ±15.65 ps."
     )
     return Panel("09-limits", caption, figure)

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.stats import norm
 
 from skyless.experiments.paper.plan import Plan, Progress, Results, Task
-from skyless.experiments.paper.section import Panel, Section, Verdict
+from skyless.experiments.paper.section import Panel, Section, Verdict, grouped
 from skyless.experiments.paper.style import BLUE, INK, RED, panel
 from skyless.experiments.paper_checks import LambdaDistribution, lambda_distributions
 
@@ -56,7 +56,7 @@ def section(plan: Plan, results: Results) -> Section:
     for one in both:
         printed = "variance negative" if one.printed_std_m is None else f"{1e3 * one.printed_std_m:.3f}"
         distance = f"{100 * shape_distance(one):.2f} %"
-        rows.append((one.noise, f"{1e3 * one.std_m:.3f}", f"{1e3 * one.corrected_std_m:.3f}", printed, distance))
+        rows.append((_named(one), f"{1e3 * one.std_m:.3f}", f"{1e3 * one.corrected_std_m:.3f}", printed, distance))
     return Section(
         key="dtdoa-distribution",
         title="The distribution of a DTDoA",
@@ -66,8 +66,8 @@ def section(plan: Plan, results: Results) -> Section:
             "normally."
         ),
         simulated=(
-            f"{plan.draws:,} draws of the exact algorithm for anchor 1 of figure 2, stamps within ±15.65 ps: Gaussian "
-            "(three standard deviations) and uniform."
+            f"{grouped(plan.draws)} draws of the exact algorithm for anchor 1 of figure 2, stamps within ±15.65 ps: "
+            "Gaussian (three standard deviations) and uniform."
         ),
         verdict=verdict,
         reason=reason,
@@ -91,8 +91,12 @@ def section(plan: Plan, results: Results) -> Section:
     )
 
 
+def _named(one: LambdaDistribution) -> str:
+    return "Gaussian" if one.noise == "gaussian" else one.noise
+
+
 def _density(one: LambdaDistribution) -> Panel:
-    figure, axes = panel(f"λ with {one.noise.title() if one.noise == 'gaussian' else one.noise} stamps", 3.2)
+    figure, axes = panel(f"λ with {_named(one)} stamps", 3.2)
     edges_mm = 1e3 * one.edges_m
     density = one.counts / one.draws / np.diff(edges_mm)
     axes.stairs(density, edges_mm, fill=True, color=BLUE, alpha=0.4, label="draws")
@@ -107,6 +111,6 @@ def _density(one: LambdaDistribution) -> Panel:
     axes.legend(loc="upper left")
     return Panel(
         f"03-lambda-{one.noise}",
-        f"Error of one DTDoA, {one.noise} stamps, and the densities that theory gives.",
+        f"Error of one DTDoA, {_named(one)} stamps, and the densities that theory gives.",
         figure,
     )

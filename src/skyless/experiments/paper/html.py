@@ -102,9 +102,9 @@ def _summary(sections: Sequence[Section]) -> str:
 
 def _section(number: int, section: Section, pictures: dict[str, bytes]) -> str:
     facts = (
-        ("The paper", f"{escape(section.claim)} <span class='label'>({escape(section.label)})</span>"),
-        ("Simulated", escape(section.simulated)),
-        ("Verdict", f"{_verdict(section.verdict)}. {escape(section.reason)}"),
+        ("The paper", f"{_text(section.claim)} <span class='label'>({escape(section.label)})</span>"),
+        ("Simulated", _text(section.simulated)),
+        ("Verdict", f"{_verdict(section.verdict)}. {_text(section.reason)}"),
         ("Again", f"<code>{escape(section.command)}</code>"),
     )
     listed = "\n".join(f"<dt>{name}</dt><dd>{text}</dd>" for name, text in facts)
@@ -115,18 +115,24 @@ def _section(number: int, section: Section, pictures: dict[str, bytes]) -> str:
     )
 
 
+def _text(words: str) -> str:
+    """Words for the page: true minus signs, and no line ends between a number and its unit."""
+    words = re.sub(r"(?<![\w-])-(?=\d)", "−", words)
+    return escape(re.sub(r"(?<=\d) (?=(%|mm|cm|m|ps|µs|ms|s|Hz|ppm|m/s)\b|%)", "\u00a0", words))
+
+
 def _verdict(verdict: Verdict) -> str:
-    return f"<span class='verdict {_CLASSES[verdict]}'>{escape(verdict)}</span>"
+    return f"<span class='verdict {_CLASSES[verdict]}'>{escape(verdict.capitalize())}</span>"
 
 
 def _figure(panel: Panel, svg: bytes) -> str:
     drawing = inline_svg(svg, panel.name, panel.caption)
-    return f"<figure>\n{drawing}\n<figcaption>{escape(panel.caption)}</figcaption>\n</figure>"
+    return f"<figure>\n{drawing}\n<figcaption>{_text(panel.caption)}</figcaption>\n</figure>"
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
     heads = "".join(f"<th scope='col'>{escape(cell)}</th>" for cell in rows[0])
-    body = "\n".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows[1:])
+    body = "\n".join("<tr>" + "".join(f"<td>{_text(cell)}</td>" for cell in row) + "</tr>" for row in rows[1:])
     table = f"<table>\n<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table>"
     return f"<div class='scroll' tabindex='0'>{table}</div>"
 

@@ -37,7 +37,7 @@ class Plan(Struct, frozen=True):
     quick: bool = False
     fixes: int = 30_000
     """Fixes, one per superframe, at each static position."""
-    noises_ps: tuple[float, ...] = (5.2, PAPER_PS, 50.0, RADIO_PS, 150.0, 200.0, 300.0)
+    noises_ps: tuple[float, ...] = (5.2, PAPER_PS, 50.0, RADIO_PS, 150.0, 200.0, 300.0, 500.0)
     laps: int = 20
     """Rounds of the walking test."""
     fleet_sizes: tuple[int, ...] = (1, 10, 100, 1_000, 10_000)
@@ -51,7 +51,16 @@ def plan_of(seed: int, *, quick: bool) -> Plan:
     """The whole report, or one that is ready in seconds and scatters more."""
     if not quick:
         return Plan(seed)
-    return Plan(seed, quick, fixes=1_500, laps=2, fleet_sizes=(1, 10, 100), rate_s=3.0, draws=100_000)
+    return Plan(
+        seed,
+        quick,
+        fixes=1_200,
+        noises_ps=(PAPER_PS, 50.0, RADIO_PS, 200.0, 500.0),
+        laps=2,
+        fleet_sizes=(1, 10, 100),
+        rate_s=3.0,
+        draws=50_000,
+    )
 
 
 class Task(Struct, frozen=True):

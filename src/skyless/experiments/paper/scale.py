@@ -9,10 +9,9 @@ from matplotlib.ticker import FuncFormatter
 from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
-from skyless.air.schedule import schedule_of
 from skyless.anchor import Anchor
 from skyless.experiments.paper.plan import P1, RADIO_PS, Plan, Progress, Results, Task
-from skyless.experiments.paper.section import Panel, Section, Verdict
+from skyless.experiments.paper.section import Panel, Section, Verdict, grouped
 from skyless.experiments.paper.style import BLUE, GREEN, INK, MUTED, ORANGE, panel
 from skyless.receiver import Receiver
 from skyless.simulation.scenario import lab_impairments
@@ -124,10 +123,10 @@ def judge(fleets: list[FleetResult]) -> tuple[Verdict, str]:
     same_air = len({fleet.frames_per_s for fleet in fleets}) == 1
     if same_fixes and same_rate and same_air:
         return Verdict.HOLDS, (
-            f"With {most.tags:,} tags the first one computes bit for bit what it computes alone, every tag has its "
-            f"{first.fixes_per_s:.0f} fixes a second, and the air carries the same {first.frames_per_s:.0f} frames "
-            "a second. That the simulated radios of listeners do not touch each other is built in, as it is in the "
-            "physics: they never send."
+            f"With {grouped(most.tags)} tags the first one computes bit for bit what it computes alone, every tag "
+            f"has its {first.fixes_per_s:.0f} fixes a second, and the air carries the same {first.frames_per_s:.0f} "
+            "frames a second. That the simulated radios of listeners do not touch each other is built in, as it is "
+            "in the physics: they never send."
         )
     if same_air and same_fixes:
         return Verdict.CORRECTED, "The accuracy stays, but some tags have fewer fixes."
@@ -153,9 +152,9 @@ def section(plan: Plan, results: Results) -> Section:
         low, high = fleet.tag_rmse_m
         rows.append(
             (
-                f"{fleet.tags:,}",
+                grouped(fleet.tags),
                 f"{100 * fleet.rmse_m:.2f}{error}",
-                f"{100 * low:.2f}–{100 * high:.2f}",
+                f"{100 * low:.2f}–{100 * high:.2f}" if fleet.tags > 1 else "",
                 f"{fleet.fixes_per_s:.1f}",
                 f"{fleet.frames_per_s:.0f}",
                 f"{1e3 * fleet.cpu_s_per_tag_s:.1f} ms per s",
@@ -167,7 +166,7 @@ def section(plan: Plan, results: Results) -> Section:
         label="abstract, sec:conclusion",
         claim="Any number of tags can be tracked without a lower update rate; the paper shows it with three.",
         simulated=(
-            f"Fleets of {', '.join(f'{tags:,}' for tags in plan.fleet_sizes)} tags, all at P1 with radios and "
+            f"Fleets of {', '.join(grouped(tags) for tags in plan.fleet_sizes)} tags, all at P1 with radios and "
             f"clocks of their own, {RADIO_PS:g} ps, tracker, from a cold start; judged from {FROM_S:g} to "
             f"{UNTIL_S:g} s, so that the anchors' noise is the same for all sizes (a single short stretch: the RMSE "
             "belongs to it, figure 4 has the long run). Every tag is the real receiver, every message is decoded "
@@ -186,7 +185,7 @@ def _logarithmic(title: str, fleets: list[FleetResult], height_in: float = 3.2) 
     figure, axes = panel(title, height_in)
     axes.set_xscale("log")
     axes.set_xticks([fleet.tags for fleet in fleets])
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda tags, _: f"{tags:,.0f}"))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda tags, _: grouped(round(tags))))
     axes.minorticks_off()
     axes.set_xlabel("tags")
     return Panel("", "", figure)
@@ -209,14 +208,13 @@ def _rates(fleets: list[FleetResult]) -> Panel:
     (axes,) = figure.axes
     tags = np.array([fleet.tags for fleet in fleets], dtype=float)
     slots_hz = 1.0 / (lab_site().schedule.slot_s)
-    messages = schedule_of(lab_site()).messages_per_s(len(lab_site().anchors))
     axes.set_yscale("log")
     axes.plot(tags, [fleet.fixes_per_s for fleet in fleets], "o-", color=BLUE, label="downlink: simulated")
     axes.plot(tags, slots_hz / tags, "--", color=ORANGE, label="uplink, one slot per blink")
     ranging = slots_hz / (RANGINGS_OF_TWR * MESSAGES_PER_RANGING)
     axes.plot(tags, ranging / tags, ":", color=MUTED, label="two-way ranging, 24 messages")
-    axes.set(ylabel="updates per second and tag", ylim=(None, 30 * messages))
-    axes.legend(loc="upper right")
+    axes.set(ylabel="updates per second and tag", ylim=(None, 3 * slots_hz))
+    axes.legend(loc="lower left")
     caption = f"Updates per tag. Downlink simulated; the other lines share the same {slots_hz:.0f} slots a second."
     return Panel("10-rate", caption, figure)
 

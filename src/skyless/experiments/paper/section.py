@@ -42,3 +42,8 @@ class Section(Struct, frozen=True):
     """The same and more for programs, SI units in the names."""
     command: str
     """A command that makes the central number again."""
+
+
+def grouped(count: int) -> str:
+    """A whole number with its thousands apart."""
+    return f"{count:,}".replace(",", "\u00a0")

@@ -12,7 +12,7 @@ from scipy.stats import kurtosis, norm, skew
 from skyless.constants import TICK_M
 from skyless.experiments.paper.listening import Track, listen
 from skyless.experiments.paper.plan import CLAIM_M, P1, P2, RADIO_PS, Place, Plan, Progress, Results, Task
-from skyless.experiments.paper.section import Panel, Section, Verdict
+from skyless.experiments.paper.section import Panel, Section, Verdict, grouped
 from skyless.experiments.paper.style import INK, METHOD_COLOURS, MUTED, RED, panel
 from skyless.simulation.channel import ChannelModel, power_bias_m, received_power_dbm
 from skyless.simulation.impairments import DelayError, Impairments
@@ -188,10 +188,10 @@ def section(plan: Plan, results: Results) -> Section:
             "finds the precision within 20 cm."
         ),
         simulated=(
-            f"{plan.fixes:,} fixes at P1 (3, 4) and at P2 (1.2, 1.6), one per superframe, stamp noise {RADIO_PS:g} "
-            "ps: once with nothing but noise, once with the DW1000's range bias by received power on every RX "
-            f"stamp (APS011), once with antenna delays wrong by {100 * DELAY_STD_M:g} cm (standard deviation, "
-            "assumed) for TX and RX of every anchor. Both methods compute from the same receptions."
+            f"{grouped(plan.fixes)} fixes at P1 (3, 4) and at P2 (1.2, 1.6), one per superframe, stamp noise "
+            f"{RADIO_PS:g} ps: once with nothing but noise, once with the DW1000's range bias by received power on "
+            f"every RX stamp (APS011), once with antenna delays wrong by {100 * DELAY_STD_M:g} cm (standard "
+            "deviation, assumed) for TX and RX of every anchor. Both methods compute from the same receptions."
         ),
         verdict=verdict,
         reason=reason,
@@ -212,14 +212,15 @@ def _histogram(place: str, axis: int, tracks: dict[str, Track]) -> Panel:
         error_cm = 100 * track.error_m[:, axis]
         colour = METHOD_COLOURS[method]
         axes.hist(error_cm, edges.tolist(), density=True, histtype="stepfilled", color=colour, alpha=0.35)
-        label = f"{method}: mean {error_cm.mean():+.2f}, σ {error_cm.std():.2f} cm"
+        label = f"{method}: mean {error_cm.mean():+.2f}, σ {error_cm.std():.2f} cm".replace("-", "−")
         axes.plot(edges, norm.pdf(edges, error_cm.mean(), error_cm.std()), color=colour, label=label)
     axes.set(xlabel=f"error along {name.upper()} in cm", ylabel="density in 1/cm")
     axes.set_ylim(0, 1.45 * axes.get_ylim()[1])
     axes.legend(loc="upper left")
     count = len(next(iter(tracks.values())).time_s)
     caption = (
-        f"{count:,} errors along {name.upper()} at {place}, stamp noise only; lines: Gaussians of that mean and σ."
+        f"{grouped(count)} errors along {name.upper()} at {place}, stamp noise only; lines: Gaussians of that mean "
+        "and σ."
     )
     return Panel(f"04-{place.lower()}-{name}", caption, figure)
 

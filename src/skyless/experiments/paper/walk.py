@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from skyless.experiments.paper.dop_map import ANCHORS_M, literal_covariance_m2
 from skyless.experiments.paper.listening import Track, listen
 from skyless.experiments.paper.plan import RADIO_PS, Plan, Progress, Results, Task
-from skyless.experiments.paper.section import Panel, Section, Verdict
+from skyless.experiments.paper.section import Panel, Section, Verdict, grouped
 from skyless.experiments.paper.style import INK, METHOD_COLOURS, RED, floor, panel
 from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.trajectory import Waypoints
@@ -104,7 +104,7 @@ def section(plan: Plan, results: Results) -> Section:
     for method, track in tracks.items():
         radial = np.linalg.norm(track.error_m, axis=1)
         rmse, p95, worst = float((radial**2).mean() ** 0.5), float(np.percentile(radial, 95)), float(radial.max())
-        rows.append((method, f"{100 * rmse:.2f}", f"{100 * p95:.1f}", f"{100 * worst:.1f}", f"{len(radial):,}"))
+        rows.append((method, f"{100 * rmse:.2f}", f"{100 * p95:.1f}", f"{100 * worst:.1f}", grouped(len(radial))))
         numbers.append({"method": method, "rmse_m": rmse, "p95_m": p95, "max_m": worst, "fixes": len(radial)})
     return Section(
         key="walking-test",
