@@ -64,7 +64,7 @@ class LambdaDistribution(Struct, frozen=True):
 
     noise: str
     edges_m: NDArray[np.float64]
-    """Shape (bins + 1,), symmetric about zero."""
+    """Shape (bins + 1,), to five sigma on both sides; the one draw in two million beyond is not counted."""
     counts: NDArray[np.int64]
     """Shape (bins,)."""
     std_m: float
