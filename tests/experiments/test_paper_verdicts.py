@@ -66,7 +66,7 @@ def test_distance_of_shapes_is_that_of_the_normal_law():
 
 
 def moments(mean_sigmas, skewness=0.0, excess=0.0):
-    return static.Moments(mean_sigmas * 1e-4, 1e-4, 0.04, skewness, excess)
+    return static.Moments(30_000, mean_sigmas * 1e-4, 1e-4, 0.04, skewness, excess)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,8 @@ def test_the_largest_of_many_long_errors_is_that_of_draws():
 
 def test_a_power_law_crosses_where_it_should():
     rows = [
-        claim.Worst("literal", ps, 1, 30_000, 0.002 * ps**0.9, 0.01, (0.9, 1.1)) for ps in (5.2, 50.0, 100.0, 200.0)
+        claim.Worst("literal", ps, 1, 30_000, 0.002 * ps**0.9, 0.01, 1.0, (0.9, 1.1))
+        for ps in (5.2, 50.0, 100.0, 200.0)
     ]
     unlucky, typical, lucky = claim.trend_of(rows).crossings_ps
     assert typical == pytest.approx(100.0 ** (1.0 / 0.9), rel=1e-9)

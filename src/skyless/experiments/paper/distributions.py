@@ -37,7 +37,8 @@ def judge(gaussian: LambdaDistribution, uniform: LambdaDistribution) -> tuple[Ve
     standard_error_pct = 100.0 / (2.0 * uniform.draws) ** 0.5
     told = (
         f"σ is {deviation_pct(gaussian):+.2f} % off for Gaussian and {deviation_pct(uniform):+.2f} % for uniform "
-        f"stamps; {100 * shape_distance(uniform):.1f} % of the uniform draws lie otherwise than in a Gaussian"
+        f"stamps, with a standard error of {standard_error_pct:.2f} %; {100 * shape_distance(uniform):.1f} % of the "
+        "uniform draws lie otherwise than in a Gaussian"
     )
     if abs(deviation_pct(uniform)) <= max(AGREES_SIGMAS * standard_error_pct, 0.1):
         return Verdict.FAILS, (

@@ -92,9 +92,9 @@ def section(plan: Plan, results: Results) -> Section:  # noqa: ARG001 - computed
         claim="The PDoP is a simple, valid measure of how accurate positions are, obstacles apart.",
         simulated=(
             f"Computed, not simulated: cells of {100 * STEP_M:g} cm, tags at the anchors' height. All anchors lie "
-            "in one plane, so with the height unknown the PDoP is unbounded in that plane. Right: the deviation of "
-            f"the paper's method at {RADIO_PS:g} ps from the full covariance of its TDoAs; figures 4 and 5 confirm "
-            "it."
+            "in one plane, so with the height unknown the PDoP is unbounded in that plane. The second map: the "
+            f"deviation of the paper's method at {RADIO_PS:g} ps from the full covariance of its TDoAs; figures 4 "
+            "and 5 confirm it."
         ),
         verdict=verdict,
         reason=reason,
@@ -104,7 +104,7 @@ def section(plan: Plan, results: Results) -> Section:  # noqa: ARG001 - computed
                 "06-sigma-map",
                 "σ of literal in cm",
                 (x, y, 100 * sigma_m),
-                "Predicted standard deviation of one fix of `literal`.",
+                "Predicted standard deviation of one fix of literal.",
             ),
         ),
         table=rows,

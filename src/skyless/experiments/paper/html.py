@@ -17,7 +17,7 @@ _STYLE: Final = """
   --soft: #1c2229; --good: #4cc296; --mixed: #e3a74a; --bad: #f0808e; --link: #7db8ee; } }
 @media print { :root { --paper: #ffffff; --ink: #1f2933; --muted: #5f6b7a; --grid: #d9dee5; --soft: #f3f5f8;
   --good: #14724f; --mixed: #8a5600; --bad: #b02a3c; --link: #1f2933; }
-  section, figure, tr { break-inside: avoid-page; } section { break-before: auto; } nav { display: none; } }
+  figure, tr, dl { break-inside: avoid; } h2 { break-after: avoid; } body { font-size: 10pt; padding: 0; } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; padding: 1.2rem clamp(0.9rem, 4vw, 2.5rem) 4rem; max-width: 68rem; overflow-wrap: break-word;
   background: var(--paper); color: var(--ink); font: 1rem/1.55 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; }
@@ -38,11 +38,12 @@ dt { color: var(--muted); } dd { margin: 0; }
   margin: 1.1rem 0; }
 figure { margin: 0; } figure svg { display: block; width: 100%; max-width: 34rem; height: auto; }
 figcaption { color: var(--muted); font-size: 0.88rem; line-height: 1.4; margin-top: 0.3rem; max-width: 34rem; }
-.scroll { overflow-x: auto; }
+.scroll { overflow-x: auto; } .scroll td { white-space: nowrap; }
 table { border-collapse: collapse; font-size: 0.88rem; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: 0.25rem 0.9rem 0.25rem 0; vertical-align: top; }
 th, td { border-bottom: 1px solid var(--grid); }
 th { color: var(--muted); font-weight: 500; } .summary td { padding: 0.4rem 0.9rem 0.4rem 0; }
+@media print { .panels { grid-template-columns: 1fr 1fr; } .scroll td { white-space: normal; } }
 """
 
 _THEMED: Final = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--grid)", PAPER: "var(--paper)"}
