@@ -115,6 +115,8 @@ def plan(
     outputs = {"plot": plot, "grid": grid, "html": html, "out": out}
     site = _load(file, outputs)
     settings = _settings(method, noise_ps, qa, range_m)
+    if optimise is None:
+        _check_count(site, file)
     if out is not None and optimise is None:
         raise SkylessError("--out writes an optimised site; --optimise N asks for one")
     ground = floor_of(site, file, _outline(outline), _region(region))
@@ -126,7 +128,6 @@ def plan(
         site = optimised.best.site
         if out is not None:
             _write_site(out, site, file)
-    _check_count(site, file)
     predictor = Predictor(site, settings)
     mapped = _map(predictor, ground, tag_heights, step)
     checked = None if verify is None else _verify(predictor, mapped, verify, rounds, seed)

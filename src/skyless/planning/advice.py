@@ -89,7 +89,7 @@ def _has_mirror(predictor: Predictor, point: Array, height_m: float | None, tx_v
         for row, place in enumerate(predictor.anchors_m)
         if predictor.clocks.speaks[row] and hears(predictor.budget, predictor.walls, place, point)[0] >= IN_VIEW
     ]
-    if len(seen) < predictor.dim + 2:
+    if len(seen) < predictor.dim + 1:
         return False
     anchors = predictor.anchors_m[seen]
     ranges = np.linalg.norm(anchors - point, axis=1)

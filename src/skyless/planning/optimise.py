@@ -36,8 +36,8 @@ Matrix = NDArray[np.float64]
 SEARCH_POINTS: Final = 140
 JUDGE_POINTS: Final = 1500
 MOST_CANDIDATES: Final = 220
-STARTS: Final = 10
-REFINED: Final = 3
+STARTS: Final = 16
+REFINED: Final = 4
 """Starts that the method's own prediction improves further, the even layout among them."""
 
 FINEST_M: Final = 0.05
@@ -167,9 +167,9 @@ class Search:
         return layout
 
     def _moves(self, layout: Layout, k: int, step: float) -> list[Layout]:
-        """Layouts with one anchor elsewhere, far enough from all others."""
+        """Layouts with one anchor elsewhere, a step away or anywhere, far enough from all others."""
         moves = []
-        for shift in (step, -step):
+        for shift in (step, -step, self._random.uniform(step, self._mounts.length_m - step)):
             ways = layout.ways_m.copy()
             ways[k] = (ways[k] + shift) % self._mounts.length_m
             moves.append(Layout(ways, layout.levels))

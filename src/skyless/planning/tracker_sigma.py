@@ -24,7 +24,7 @@ from skyless.planning.columns import (
 )
 from skyless.planning.geometry import fill_dops, observe
 from skyless.positioning.kalman import innovation_variance, predict_clock, predict_motion
-from skyless.positioning.tracker import FORGETTING, MAX_AGILITY, RESTLESS_CHI2
+from skyless.positioning.tracker import FORGETTING, MAX_AGILITY, RESTLESS_CHI2, TrackerSettings
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -41,6 +41,8 @@ LEAST_S: Final = 0.5
 RESTLESS_SIGMAS: Final = 1.31
 """The agility stands where its running mean is restless log(1/AGILITY_LOSS)/log(AGILITY_GAIN/AGILITY_LOSS) = 9.5 % of
 the time, the normal distribution's tail beyond so many standard deviations."""
+
+GATE: Final = TrackerSettings().gate
 
 RARELY: Final = 0.1
 """An anchor of whose frames fewer arrive does not help a tag to start."""
@@ -65,13 +67,36 @@ def _with_anchors_predict(X: Matrix, dim: int, count: int, dt_s: float, white: f
 
 
 @kernel
+def gated(mean: float, variance: float) -> tuple[float, float, float, float, float]:
+    """What the gate leaves of a normal innovation in units of the assumed spread: share, E[f], E[f²], E[f⁴], E[f'].
+
+    f(z) is z within the gate and 0 beyond; E[f'] is the slope of E[f] in the mean.
+    """
+    if abs(mean) < 0.5 and variance < 1.3:
+        square = mean * mean
+        fourth = 3.0 * variance * variance + 6.0 * variance * square + square * square
+        return 1.0, mean, variance + square, fourth, 1.0
+    deviation = math.sqrt(variance)
+    high, low = (GATE - mean) / deviation, (-GATE - mean) / deviation
+    share = 0.5 * (math.erf(high / math.sqrt(2.0)) - math.erf(low / math.sqrt(2.0)))
+    scale = 1.0 / (deviation * math.sqrt(2.0 * math.pi))
+    top, bottom = scale * math.exp(-0.5 * high * high), scale * math.exp(-0.5 * low * low)
+    first = mean * share - variance * (top - bottom)
+    second = variance * share + mean * first - variance * GATE * (top + bottom)
+    third = 2.0 * variance * first + mean * second - variance * GATE**2 * (top - bottom)
+    fourth = 3.0 * variance * second + mean * third - variance * GATE**3 * (top + bottom)
+    return share, first, second, fourth, share - GATE * (top + bottom)
+
+
+@kernel
 def _true_correct(
     S: Matrix, X: Matrix, K: Vector, h: Vector, part: float, noise: float, own: int, active: NDArray[np.int64],
-    count: int, with_others: Vector, g: Vector,
-) -> float:  # fmt: skip
+    count: int, with_others: Vector, g: Vector, off: float, assumed: float,
+) -> tuple[float, float, float, float, float]:  # fmt: skip
     """Σ and X after a message that arrives with probability ``part``: error x − K(hx − v), v with its clock error.
 
-    ``own`` is the sender's place among the active anchors, −1 for the master. Returns the innovation's true variance.
+    ``own`` is the sender's place among the active anchors, −1 for the master; ``off`` the innovation's mean. What the
+    gate does to it is taken in the mean (statistical linearisation). Returns the moments of ``gated``.
     """
     n = S.shape[0]
     spread = noise
@@ -85,9 +110,11 @@ def _true_correct(
         for row in range(n):
             g[row] -= X[row, 2 * own]
             spread -= 2.0 * h[row] * X[row, 2 * own]
+    moments = gated(off / math.sqrt(assumed), spread / assumed)
+    spread, slope = assumed * (moments[2] - moments[1] * moments[1]), moments[4]
     for row in range(n):
         for column in range(n):
-            S[row, column] += part * (K[row] * K[column] * spread - K[row] * g[column] - g[row] * K[column])
+            S[row, column] += part * (K[row] * K[column] * spread - slope * (K[row] * g[column] + g[row] * K[column]))
     for column in range(2 * count):
         seen = 0.0
         if own >= 0:
@@ -95,8 +122,8 @@ def _true_correct(
         for row in range(n):
             seen += h[row] * X[row, column]
         for row in range(n):
-            X[row, column] -= part * K[row] * seen
-    return spread
+            X[row, column] -= part * slope * K[row] * seen
+    return moments
 
 
 @kernel
@@ -147,32 +174,38 @@ def _advance(
 
 
 @kernel
-def _assumed_correct(
+def _innovation(
     dim: int,
     direction: Vector,
     noise: float,
     delay_m: float,
-    part: float,
     work: tuple[Matrix, Matrix, Matrix],
     vectors: tuple[Vector, Vector, Vector, Vector, Vector],
 ) -> tuple[float, float]:
-    """The filter's own P, its gain, and the mean error after a message; the innovation's variance and mean."""
+    """Fill h, P·h and the gain for a message; the innovation's variance as assumed, and its true mean."""
     P, _, _ = work
     h, ph, K, _, shift = vectors
-    n = P.shape[0]
     h[:] = 0.0
     for a in range(dim):
         h[a] = direction[a]
     h[2 * dim] = 1.0
     spread, off = innovation_variance(P, h, ph, noise), delay_m
-    for a in range(n):
+    for a in range(len(h)):
         K[a] = ph[a] / spread
         off -= h[a] * shift[a]
-    for a in range(n):
-        shift[a] += part * K[a] * off
-        for b in range(n):
-            P[a, b] -= part * K[a] * ph[b]
     return spread, off
+
+
+@kernel
+def _assumed_correct(
+    P: Matrix, vectors: tuple[Vector, Vector, Vector, Vector, Vector], accepted: float, moved_m: float
+) -> None:
+    """The filter's own P, and the mean error, after a message that is accepted with this probability."""
+    _, ph, K, _, shift = vectors
+    for a in range(len(K)):
+        shift[a] += K[a] * moved_m
+        for b in range(len(K)):
+            P[a, b] -= accepted * K[a] * ph[b]
 
 
 @kernel
@@ -214,14 +247,18 @@ def _superframe(
         K[:] = 0.0
         if part > 0.0:
             delay_m = sight[i, 3] + sync_delay[i]
-            spread, off = _assumed_correct(dim, sight[i], stamps + told[k], delay_m, part, work, vectors)
+            spread, off = _innovation(dim, sight[i], stamps + told[k], delay_m, work, vectors)
             own, others = lists[1][i], with_others[k]
-            true = _true_correct(S, X, K, h, part, stamps, own, lists[0], count, others, g) / spread
+            passed, first, second, fourth, _ = _true_correct(
+                S, X, K, h, part, stamps, own, lists[0], count, others, g, off, spread
+            )
+            part *= passed
+            _assumed_correct(P, vectors, part, share[i] * first * math.sqrt(spread))
             sums[0] += part
-            sums[1] += part * (true + off * off / spread)
-            sums[2] += part * true * (2.0 * true + 4.0 * off * off / spread)
+            sums[1] += share[i] * second
+            sums[2] += share[i] * (fourth - second * second / max(passed, 1e-9))
         if i == master:
-            _anchors_hear(X, K, part, lists[0], count, anchor_share, anchor_gain, tx_var)
+            _anchors_hear(X, K, share[i], lists[0], count, anchor_share, anchor_gain, tx_var)
         for a in range(dim):
             row[SIGMA_X + a] += part * S[a, a]
             row[CLAIMED] += part * P[a, a]
