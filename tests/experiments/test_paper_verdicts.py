@@ -145,14 +145,14 @@ def test_predicted_deviations_are_the_published_ones():
 
 def test_antenna_delays_of_all_anchors_alike_act_like_the_masters_alone():
     """All DTDoAs late by d is the master near by d: the bias solves J b = d·1, here by the normal equations."""
-    bias = static.expected_bias_m("clean", P2, 1)
+    bias = stamp_bias.expected_bias_m("clean", P2, 1)
     assert bias == pytest.approx([0.0, 0.0], abs=1e-12)
-    late_m = np.array([error.tx_ticks + error.rx_ticks for error in static.delay_errors(7)])[1:] * 4.691764e-3
+    late_m = np.array([error.tx_ticks + error.rx_ticks for error in stamp_bias.delay_errors(7)])[1:] * 4.691764e-3
     anchors = np.array([(anchor.x_m, anchor.y_m) for anchor in lab_site().anchors])
     units = (np.array(P2) - anchors) / np.linalg.norm(np.array(P2) - anchors, axis=1)[:, None]
     rows = units[1:] - units[0]
     expected = np.linalg.inv(rows.T @ rows) @ rows.T @ late_m
-    assert static.expected_bias_m("delay", P2, 7) == pytest.approx(expected, rel=1e-5)
+    assert stamp_bias.expected_bias_m("delay", P2, 7) == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_command_beside_a_figure_makes_its_number_again():

@@ -62,9 +62,10 @@ def judge(checks: tuple[PaperCheck, ...]) -> tuple[Verdict, str]:
         return Verdict.HOLDS, f"All printed deviations agree with the draws; {corrected}."
     if all(_agrees(check.corrected_error_pct, check) for check in checks):
         return Verdict.CORRECTED, (
-            f"As printed, the deviations of {names} are off, by up to {most} %; {corrected} of the draws, "
-            f"whose standard error is {checks[0].standard_error_pct:.3f} % (errata E1 to E7). {fine} are right as "
-            "printed to within parts per million, and averaging the two offsets changes nothing (E2)."
+            f"As printed, the deviations of {names} are off, by up to {most} %; {corrected} of the draws, whose "
+            f"standard error is {checks[0].standard_error_pct:.3f} % (errata E1 to E7). {fine} are right to within "
+            "parts per million, misprinted symbols read as meant, and averaging the two offsets changes nothing "
+            "(E2)."
         )
     return Verdict.FAILS, f"Even the corrected deviation of {worst.name} is {worst.corrected_error_pct:.2f} % off."
 
