@@ -70,7 +70,7 @@ def _order(predictor: Predictor) -> list[str]:
 
 def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
     """Ask the solver itself, with TDoAs that are exact, whether a place has a mirror image that fits as well."""
-    points = sample_points(floor, tuple(plan.grid.heights_m.tolist()), MIRROR_POINTS)
+    points, _ = sample_points(floor, tuple(plan.grid.heights_m.tolist()), MIRROR_POINTS)
     tx_var, rx_var = stamp_variances(predictor.site)
     height = predictor.site.tags.height_m
     ambiguous = [point for point in points if _has_mirror(predictor, point, height, tx_var, rx_var)]

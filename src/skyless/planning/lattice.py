@@ -41,18 +41,22 @@ class Lattice(Struct, frozen=True):
     """Weighted rows [1, unit vector] of H; shape (candidates, points, 4)."""
     heard: Matrix
     """Share of each candidate's frames that reach each other one; shape (candidates, candidates)."""
+    weights: Vector
+    """Of the points in a mean; of sum 1."""
     dim: int
     cap_m: float
     """Error that stands for "no position"."""
 
 
-def lattice_of(places_m: Matrix, points_m: Matrix, budget: Vector, walls: Matrix, dim: int, sigma_m: float) -> Lattice:
+def lattice_of(
+    places_m: Matrix, points_m: Matrix, weights: Vector, budget: Vector, walls: Matrix, dim: int, sigma_m: float
+) -> Lattice:
     """Candidates at places, shape (c, 3), for points, shape (m, 3); ``sigma_m`` is a pseudorange's noise."""
     rows = np.zeros((len(places_m), len(points_m), 4))
     heard = np.ones((len(places_m), len(places_m)))
     fill_lattice(places_m, points_m, budget, walls, sigma_m, rows, heard)
     cap_m = float(np.linalg.norm(np.ptp(np.concatenate([places_m, points_m]), axis=0)))
-    return Lattice(places_m, rows, heard, dim, cap_m)
+    return Lattice(places_m, rows, heard, weights, dim, cap_m)
 
 
 @threaded_kernel
@@ -78,7 +82,14 @@ def fill_lattice(
 
 @threaded_kernel
 def mean_and_worst(
-    chosen: Indices, rows: Rows, heard: Matrix, dim: int, cap: float, normal: Matrix, inverse: Matrix
+    chosen: Indices,
+    rows: Rows,
+    heard: Matrix,
+    weights: Vector,
+    dim: int,
+    cap: float,
+    normal: Matrix,
+    inverse: Matrix,
 ) -> tuple[float, float]:
     """Mean and largest error over the points for these candidates, the best heard of them being the master."""
     best, master = -1.0, 0
@@ -103,9 +114,9 @@ def mean_and_worst(
             for a in range(1, dim + 1):
                 trace += inverse[a, a]
             error = min(math.sqrt(trace), cap)
-        mean += error
+        mean += weights[m] * error
         worst = max(worst, error)
-    return mean / rows.shape[1], worst
+    return mean, worst
 
 
 @threaded_kernel
@@ -122,6 +133,7 @@ def exchange(
     places: Matrix,
     rows: Rows,
     heard: Matrix,
+    weights: Vector,
     dim: int,
     cap: float,
     reference: tuple[float, float],
@@ -129,7 +141,7 @@ def exchange(
 ) -> float:
     """Move one anchor after the other to its best candidate until none moves; the first ``fixed`` stay. The score."""
     normal, inverse = np.zeros((4, 4)), np.zeros((4, 4))
-    mean, worst = mean_and_worst(chosen, rows, heard, dim, cap, normal, inverse)
+    mean, worst = mean_and_worst(chosen, rows, heard, weights, dim, cap, normal, inverse)
     score = relative_score(mean, worst, reference[0], reference[1])
     for _ in range(passes):
         moved = False
@@ -140,7 +152,7 @@ def exchange(
                 if c == home or too_close(places, chosen, k, c):
                     continue
                 chosen[k] = c
-                mean, worst = mean_and_worst(chosen, rows, heard, dim, cap, normal, inverse)
+                mean, worst = mean_and_worst(chosen, rows, heard, weights, dim, cap, normal, inverse)
                 trial = relative_score(mean, worst, reference[0], reference[1])
                 if trial < score * (1.0 - 1e-9):
                     score, best = trial, c

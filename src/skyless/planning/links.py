@@ -26,6 +26,9 @@ IN_VIEW: Final = 0.5
 HOPELESS: Final = 1e-4
 """A share below this, in free space already, counts as none."""
 
+UNSURE: Final = 1e-7
+"""A share of losses below this, in free space, counts as none."""
+
 LEAST_SYNC: Final = 0.01
 """An anchor that misses more of the master's frames than all but these stays silent, for planning."""
 
@@ -58,9 +61,14 @@ def anchor_positions(site: Site) -> Matrix:
 
 
 def link_budget(channel: ChannelModel) -> Vector:
-    """What ``hears`` wants of a channel: power sent, sensitivity, its width, share lost by chance, farthest m²."""
+    """What ``hears`` wants of a channel.
+
+    Power sent, sensitivity, its width, share lost by chance, and the squared
+    distances, m², beyond which nothing arrives and within which all does.
+    """
     hopeless_db = math.log(1.0 / HOPELESS) * channel.sensitivity_width_db
     farthest_m = range_of(channel) * 10.0 ** (hopeless_db / 20.0)
+    certain_m = range_of(channel) * 10.0 ** (math.log(UNSURE) * channel.sensitivity_width_db / 20.0)
     return np.array(
         [
             channel.tx_power_dbm,
@@ -68,6 +76,7 @@ def link_budget(channel: ChannelModel) -> Vector:
             channel.sensitivity_width_db,
             channel.loss_probability,
             farthest_m**2,
+            certain_m**2,
         ]
     )
 
@@ -82,6 +91,8 @@ def hears(budget: Vector, walls: Matrix, a_m: Vector, b_m: Vector) -> tuple[floa
         return 0.0, 0.0
     if walls.shape[0] > 0:
         loss_db, delay_m = cross_walls(walls, a_m[0], a_m[1], b_m[0], b_m[1])
+    if loss_db == 0.0 and squared_m2 < budget[5]:
+        return 1.0 - budget[3], delay_m
     power_dbm = received_power_dbm(budget[0], math.sqrt(squared_m2), loss_db)
     return (1.0 - budget[3]) * delivery_probability(power_dbm, budget[1], budget[2]), delay_m
 

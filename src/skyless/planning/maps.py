@@ -1,7 +1,8 @@
 """Maps: predictions over a grid of the floor, one slice for each height.
 
-The tracker's points are dear. On large grids it is computed on a coarser one, and its ratio to the PDOP, which is
-smooth, is interpolated; PDOP and anchors in view are computed at every point, so that edges behind walls stay sharp.
+The tracker's points are dear. On large grids it is computed on a coarser one (on the largest the other methods, too),
+and its ratio to the PDOP, which is smooth, is interpolated; PDOP and anchors in view are computed at every point, so
+that edges behind walls stay sharp.
 """
 
 import math
@@ -37,6 +38,9 @@ NICE_POINTS: Final = 12_000
 STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 TRACKER_BUDGET: Final = 150_000
 """Points of the tracker times what one costs, anchors and a constant."""
+
+SNAPSHOT_BUDGET: Final = 20_000_000
+"""The same for the snapshot methods, which only the largest grids exceed."""
 
 
 class Grid(Struct, frozen=True):
@@ -174,9 +178,8 @@ def points_of(grid: Grid, height_m: float) -> Array:
 
 
 def _stride(predictor: Predictor, grid: Grid) -> int:
-    if predictor.settings.method != "tracker":
-        return 1
-    most = TRACKER_BUDGET / (len(predictor.anchors_m) + 14.0)
+    budget = TRACKER_BUDGET if predictor.settings.method == "tracker" else SNAPSHOT_BUDGET
+    most = budget / (len(predictor.anchors_m) + 14.0)
     return max(1, math.ceil(math.sqrt(grid.points / most)))
 
 

@@ -70,8 +70,11 @@ def masters_by_links(places_m: Matrix, budget: Vector, walls: Matrix) -> NDArray
     return np.array(sorted(range(len(places_m)), key=lambda row: (-round(heard[row], 3), middle[row])))
 
 
-def sample_points(floor: Floor, heights_m: tuple[float, ...], most: int) -> Matrix:
-    """About so many points all over the region, its edges included up to a hand's breadth; shape (m, 3)."""
+def sample_points(floor: Floor, heights_m: tuple[float, ...], most: int) -> tuple[Matrix, Vector]:
+    """About so many points all over the region, its edges included up to a hand's breadth; shape (m, 3).
+
+    With them their weights in a mean over the area, shape (m,), of sum 1: half on edges, a quarter in corners.
+    """
     x1, y1, x2, y2 = floor.region_m
     width, depth = x2 - x1, y2 - y1
     per_slice = max(most / len(heights_m), 4.0)
@@ -80,5 +83,14 @@ def sample_points(floor: Floor, heights_m: tuple[float, ...], most: int) -> Matr
     inset = min(0.1, 0.02 * min(width, depth))
     xs, ys = np.linspace(x1 + inset, x2 - inset, nx), np.linspace(y1 + inset, y2 - inset, ny)
     flat = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
-    flat = flat[inside(flat, floor.outline_m)]
-    return np.concatenate([np.column_stack([flat, np.full(len(flat), height)]) for height in heights_m])
+    weights = np.outer(_trapezoid(ny), _trapezoid(nx)).ravel()
+    within = inside(flat, floor.outline_m)
+    flat, weights = flat[within], np.tile(weights[within], len(heights_m))
+    points = np.concatenate([np.column_stack([flat, np.full(len(flat), height)]) for height in heights_m])
+    return points, weights / weights.sum()
+
+
+def _trapezoid(count: int) -> Vector:
+    weights = np.ones(count)
+    weights[[0, -1]] = 0.5
+    return weights

@@ -115,10 +115,10 @@ class Search:
         dim = 3 if self._site.tags.height_m is None else 2
         noise_m = sum(stamp_variances(with_noise(self._site, self._settings.noise_ps))) ** 0.5
         places = mounts.at(all_ways, all_levels)
-        lattice = lattice_of(places, self._points, self._budget, self._walls, dim, noise_m)
+        lattice = lattice_of(places, *self._points, self._budget, self._walls, dim, noise_m)
         snapped = np.array([_nearest(places, place) for place in mounts.at(even.ways_m, even.levels)])
         work = np.zeros((4, 4)), np.zeros((4, 4))
-        reference = mean_and_worst(snapped, lattice.rows, lattice.heard, dim, lattice.cap_m, *work)
+        reference = mean_and_worst(snapped, lattice.rows, lattice.heard, lattice.weights, dim, lattice.cap_m, *work)
         found = []
         for number in range(STARTS):
             chosen = snapped.copy() if number == 0 else self._random.choice(len(places), self._anchors, replace=False)
@@ -136,13 +136,13 @@ class Search:
         master = int(masters_by_links(places, self._budget, self._walls)[rank])
         return site_with(self._site, places, master)
 
-    def _sigma(self, site: Site, points_m: Matrix) -> tuple[float, float, float]:
+    def _sigma(self, site: Site, sample: tuple[Matrix, Vector]) -> tuple[float, float, float]:
         """Mean and worst over the points, those without a fix counting as lost; and the share with one."""
         self.evaluations += 1
-        rows = Predictor(site, self._settings).at(points_m)
+        rows = Predictor(site, self._settings).at(sample[0])
         covered = rows[:, FIX_SHARE] >= 0.5
         sigma = np.where(covered, np.minimum(rows[:, SIGMA], self._cap_m), self._cap_m)
-        return float(sigma.mean()), float(sigma.max()), float(covered.mean())
+        return float(sample[1] @ sigma), float(sigma.max()), float(covered.mean())
 
     def _score(self, layout: Layout) -> tuple[float, float]:
         mean, worst, _ = self._sigma(self._site_of(layout), self._points)
@@ -203,9 +203,8 @@ def _nearest(places: Matrix, place: Vector) -> int:
 
 
 def _exchange(lattice: Lattice, chosen: NDArray[np.int64], fixed: int, reference: tuple[float, float]) -> float:
-    return exchange(
-        chosen, fixed, lattice.places_m, lattice.rows, lattice.heard, lattice.dim, lattice.cap_m, reference, 12
-    )  # fmt: skip
+    rows, heard, weights = lattice.rows, lattice.heard, lattice.weights
+    return exchange(chosen, fixed, lattice.places_m, rows, heard, weights, lattice.dim, lattice.cap_m, reference, 12)
 
 
 class OneMore(Struct, frozen=True):
@@ -226,31 +225,33 @@ def one_more(
     The place follows from the quick measure of ``lattice``, what it brings from the method's own prediction.
     """
     before = Predictor(site, settings)
-    points = sample_points(floor, heights_m, SEARCH_POINTS)
+    points, weights = sample_points(floor, heights_m, SEARCH_POINTS)
     levels = len(mounts.heights_m)
     count = MOST_CANDIDATES // 2 // levels
     ways = np.repeat(np.arange(count) * mounts.length_m / count, levels)
     free = mounts.at(ways, np.tile(np.arange(levels), count))
     places = np.concatenate([before.anchors_m, free])
     noise_m = sum(stamp_variances(before.site)) ** 0.5
-    lattice = lattice_of(places, points, before.budget, before.walls, before.dim, noise_m)
+    lattice = lattice_of(places, points, weights, before.budget, before.walls, before.dim, noise_m)
     n = len(before.anchors_m)
     gaps = np.linalg.norm(free[:, None] - before.anchors_m[None], axis=2).min(axis=1)
     if not (gaps >= CLOSEST_M).any():
         return None
     chosen = np.append(np.arange(n), n + int(np.argmax(gaps)))
     work = np.zeros((4, 4)), np.zeros((4, 4))
-    reference = mean_and_worst(np.arange(n), lattice.rows, lattice.heard, before.dim, lattice.cap_m, *work)
+    reference = mean_and_worst(
+        np.arange(n), lattice.rows, lattice.heard, lattice.weights, before.dim, lattice.cap_m, *work
+    )
     _exchange(lattice, chosen, n, reference)
     place = places[chosen[n]]
     after = Predictor(site_with_one_more(site, place), settings)
     (mean_before, worst_before), (mean_after, worst_after) = (
-        _mean_and_worst(predictor.at(points)[:, SIGMA], lattice.cap_m) for predictor in (before, after)
+        _mean_and_worst(predictor.at(points)[:, SIGMA], weights, lattice.cap_m) for predictor in (before, after)
     )
     x, y, z = place.tolist()
     return OneMore((x, y, z), mean_before, mean_after, worst_before, worst_after)
 
 
-def _mean_and_worst(sigma: Vector, cap_m: float) -> tuple[float, float]:
+def _mean_and_worst(sigma: Vector, weights: Vector, cap_m: float) -> tuple[float, float]:
     capped = np.minimum(sigma, cap_m)
-    return float(capped.mean()), float(capped.max())
+    return float(weights @ capped), float(capped.max())

@@ -90,26 +90,18 @@ def propagate(
     dim: int,
     own: Vector,
     common: Matrix,
-    covariance: Matrix,
+    variances: Vector,
 ) -> None:
-    """Write G·(diag(own) + common·commonᵀ)·Gᵀ into the leading block of ``covariance``."""
+    """Write the diagonal of G·(diag(own) + common·commonᵀ)·Gᵀ into ``variances``."""
     for a in range(dim):
-        for b in range(dim):
-            covariance[a, b] = 0.0
-    for k in range(count):
-        for a in range(dim):
-            scaled = own[chosen[k]] * gain[k, a]
-            for b in range(dim):
-                covariance[a, b] += scaled * gain[k, b]
-    for column in range(common.shape[1]):
-        for a in range(dim):
-            gain[count, a] = 0.0
+        variances[a] = 0.0
         for k in range(count):
-            for a in range(dim):
-                gain[count, a] += gain[k, a] * common[chosen[k], column]
-        for a in range(dim):
-            for b in range(dim):
-                covariance[a, b] += gain[count, a] * gain[count, b]
+            variances[a] += own[chosen[k]] * gain[k, a] * gain[k, a]
+        for column in range(common.shape[1]):
+            total = 0.0
+            for k in range(count):
+                total += gain[k, a] * common[chosen[k], column]
+            variances[a] += total * total
 
 
 @kernel
@@ -167,7 +159,7 @@ def fill_snapshot_sigma(
     share, part, sight = np.zeros(n), np.zeros(n), np.zeros((n, 4))
     seen, gain = np.zeros((n, 3)), np.zeros((n + 1, 3))
     normal, inverse = np.zeros((4, 4)), np.zeros((4, 4))
-    covariance, total, claimed = np.zeros((3, 3)), np.zeros((3, 3)), 0.0
+    variances, total, claimed = np.zeros(3), np.zeros(3), 0.0
     bias = np.zeros(3)
     chosen, doubtful = np.zeros(n, np.int64), np.zeros(MOST_DOUBTFUL + 1, np.int64)
     for m in range(len(points)):
@@ -194,13 +186,13 @@ def fill_snapshot_sigma(
                 sight, chosen, count, dim, master, weights, weighing_common, normal, inverse, gain
             ):
                 continue
-            propagate(gain, chosen, count, dim, assumed_own, assumed_common, covariance)
+            propagate(gain, chosen, count, dim, assumed_own, assumed_common, variances)
             said = 0.0
             for a in range(dim):
-                said += covariance[a, a]
+                said += variances[a]
             if not said < farthest * farthest:
                 continue
-            propagate(gain, chosen, count, dim, true_own, common, covariance)
+            propagate(gain, chosen, count, dim, true_own, common, variances)
             fixes += probability
             claimed += probability * said
             for a in range(dim):
@@ -209,7 +201,7 @@ def fill_snapshot_sigma(
                     i = chosen[k]
                     shift += gain[k, a] * (sight[i, 3] - sight[master, 3] + sync_delay[i])
                 bias[a] += probability * shift
-                total[a, a] += probability * (covariance[a, a] + shift * shift)
+                total[a] += probability * (variances[a] + shift * shift)
         row[SIGMA:] = math.inf
         row[FIX_SHARE] = fixes * part[master]
         if row[FIX_SHARE] >= DOUBT:
@@ -217,13 +209,13 @@ def fill_snapshot_sigma(
 
 
 @kernel
-def _finish(row: Vector, total: Matrix, bias: Vector, dim: int, fixes: float, claimed: float) -> None:
+def _finish(row: Vector, total: Vector, bias: Vector, dim: int, fixes: float, claimed: float) -> None:
     """Turn sums over the sets of anchors into the columns."""
     squares, shifts = 0.0, 0.0
     row[SIGMA_Z] = 0.0
     for a in range(dim):
         shift = bias[a] / fixes
-        variance = max(total[a, a] / fixes - shift * shift, 0.0)
+        variance = max(total[a] / fixes - shift * shift, 0.0)
         row[SIGMA_X + a] = math.sqrt(variance)
         squares += variance
         shifts += shift * shift
