@@ -16,7 +16,8 @@ from skyless.positioning.observation import Observation
 from skyless.positioning.solver import NoSolution, locate_pseudoranges
 
 MAX_AGE_S: Final = 0.5
-"""Older messages no longer serve the start, unless superframes are so long."""
+"""Older messages no longer serve the start, unless superframes are so long; and then only for the rate of the clock, as
+the tag may be elsewhere by now."""
 
 CONTRADICTIONS: Final = frozenset({NoFixReason.RESIDUALS, NoFixReason.BAD_GEOMETRY, NoFixReason.NOT_CONVERGED})
 """What one lying anchor makes of a start; absurd pseudoranges count as bad geometry."""
@@ -64,6 +65,7 @@ class Acquisition:
         came_around = len(kept) == 2
         self._heard[observation.anchor] = [*kept[-1:], observation]
         pairs = [kept for kept in self._heard.values() if len(kept) == 2 and _possible(*kept)]
+        pairs = [kept for kept in pairs if (now - kept[-1].rx_ticks_tag) * TICK_S < MAX_AGE_S]
         needed = 4 if self._height_m is None else 3
         if len(pairs) < needed:
             return NoFixReason.TOO_FEW_ANCHORS

@@ -22,6 +22,15 @@ def predict_motion(x: Vector, P: Matrix, dim: int, dt_s: float, qa: float) -> No
 
 
 @kernel
+def horizontal_variance(P: Matrix, dim: int, dt_s: float, qa: float) -> float:
+    """Sum of the variances of x and y that ``predict_motion`` would give, m²."""
+    total = 2.0 * qa * dt_s * dt_s * dt_s / 3.0
+    for axis in range(2):
+        total += P[axis, axis] + dt_s * (2.0 * P[axis, dim + axis] + dt_s * P[dim + axis, dim + axis])
+    return float(total)
+
+
+@kernel
 def predict_clock(x: Vector, P: Matrix, offset: int, dt_s: float, white: float, walk: float) -> None:
     """Advance the clock whose offset (m) and rate (m/s) stand at ``offset`` and ``offset + 1``."""
     _shear(x, P, offset, offset + 1, dt_s)

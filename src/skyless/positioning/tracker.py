@@ -14,6 +14,7 @@ from skyless.compiled import kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.kalman import (
     correct,
+    horizontal_variance,
     innovation_variance,
     predict_clock,
     predict_motion,
@@ -253,6 +254,10 @@ class PseudorangeTracker:
         """Whether so many messages do not fit that the state must be wrong."""
         in_row = self.whole[REJECTED_IN_ROW]
         return bool(self.statistics[REJECTED_SHARE] > LOST_SHARE or in_row >= LOST_IN_ROW)
+
+    def horizontal_variance_m2(self, ahead_s: float) -> float:
+        """Sum of the variances of x and y so much later, if nothing is heard until then."""
+        return horizontal_variance(self.P, self.dim, ahead_s, self.settings[SETTING_QA] * self.statistics[AGILITY])
 
     def hear(
         self,

@@ -15,6 +15,17 @@ from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings
 MAX_GAP_S: Final = 5.0
 """After a longer silence the state says less than a new start would."""
 
+MAX_SPREAD: Final = 0.05
+"""With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
+state: updates would make it confident of a wrong place, so a new start is better."""
+
+SLOW_S: Final = 0.2
+SLOW_SPREAD: Final = 0.2
+"""Borne in longer superframes, where a new start takes seconds."""
+
+SHORT_SILENCE_S: Final = 0.1
+"""Over shorter silences no state grows much wider."""
+
 IN_USE_S: Final = 0.1
 """An anchor counts as in use while its last accepted message is younger."""
 
@@ -33,6 +44,7 @@ class Tracking:
         self._settings = settings
         self._superframe_s = superframe_s
         self._in_use_s = max(IN_USE_S, 1.5 * superframe_s)
+        self._max_spread = MAX_SPREAD if superframe_s < SLOW_S else SLOW_SPREAD
         self._z_bounds_m = z_bounds_m
         self._tracker = PseudorangeTracker(settings)
         self._acquisition: Acquisition | None = self._new_acquisition()
@@ -80,8 +92,20 @@ class Tracking:
         return Acquisition(self._settings.height_m, self._settings.stamp_variance_m2, self._z_bounds_m, max_age_s)
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
-        """Whether the filter cannot predict up to here: after a long silence, or when the tag's counter fell back."""
-        return not 0.0 <= (observation.rx_ticks_tag - self._heard_ticks) * TICK_S <= MAX_GAP_S
+        """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
+        silent_s = (observation.rx_ticks_tag - self._heard_ticks) * TICK_S
+        if not 0.0 <= silent_s <= MAX_GAP_S:
+            return True
+        if silent_s < SHORT_SILENCE_S:
+            return False
+        std_m = self._tracker.horizontal_variance_m2(silent_s) ** 0.5
+        return std_m > self._max_spread * self._mean_range_m()
+
+    def _mean_range_m(self) -> float:
+        """From the position to the anchors in use."""
+        dim = self._tracker.dim
+        away = self._anchors_m[:, :dim] - self._tracker.x[:dim]
+        return float(np.linalg.norm(away, axis=1).mean())
 
     def _begin(self, start: Start, observation: Observation) -> None:
         self._acquisition = None
