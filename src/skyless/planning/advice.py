@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA
 from skyless.planning.floor import Floor
-from skyless.planning.links import IN_VIEW, hears
+from skyless.planning.links import IN_VIEW, anchor_links, hears
 from skyless.planning.maps import PlanMap
-from skyless.planning.mounts import sample_points
+from skyless.planning.mounts import masters_by_links, sample_points
 from skyless.planning.predict import Predictor
 from skyless.planning.rounds import delays
 from skyless.positioning.fix import NoFixReason
@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 
 RELIABLE: Final = 0.95
 """An anchor should hear at least this share of the master's frames."""
+
+MOST_NAMED: Final = 8
+"""Anchors named in one warning."""
 
 WEAK: Final = 2.0
 """A place is weak where the error is so many times the median."""
@@ -43,18 +46,32 @@ def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str
 
 
 def _master(predictor: Predictor) -> list[str]:
-    """Anchors that hear the master badly have a poor clock, or none and stay silent."""
-    found = []
-    for row, (anchor, share) in enumerate(zip(predictor.site.anchors, predictor.links.share, strict=True)):
-        if share >= RELIABLE:
-            continue
-        distance = float(np.linalg.norm(predictor.anchors_m[row] - predictor.anchors_m[predictor.master]))
-        what = "stays silent" if not predictor.clocks.speaks[row] else "follows its clock badly"
-        found.append(
-            f"anchor {anchor.id}, {distance:.1f} m from the master, hears {share:.0%} of its frames and {what}: "
-            "choose a master in the middle, or move it"
-        )
-    return found
+    """Anchors that hear the master badly have a poor clock, or none and stay silent; a better master, if there is."""
+    share, speaks = predictor.links.share, predictor.clocks.speaks
+    found = [
+        _hears_badly(predictor, np.flatnonzero(~speaks), "stay silent"),
+        _hears_badly(predictor, np.flatnonzero(speaks & (share < RELIABLE)), "follow its clock badly"),
+    ]
+    told = [text for text in found if text]
+    best = int(masters_by_links(predictor.anchors_m, predictor.budget, predictor.walls)[0])
+    hear_best = anchor_links(predictor.anchors_m, best, predictor.budget, predictor.walls).share
+    if told and (hear_best >= RELIABLE).sum() > (share >= RELIABLE).sum():
+        number = predictor.site.anchors[best].id
+        told[0] += f"; with anchor {number} as the master {(hear_best < RELIABLE).sum()} would hear it so badly"
+    return told
+
+
+def _hears_badly(predictor: Predictor, rows: NDArray[np.int64], what: str) -> str:
+    """One sentence for all anchors that do the same."""
+    if len(rows) == 0:
+        return ""
+    numbers = [str(predictor.site.anchors[row].id) for row in rows]
+    listed = ", ".join(numbers[:MOST_NAMED]) + (
+        f" and {len(numbers) - MOST_NAMED} more" if numbers[MOST_NAMED:] else ""
+    )
+    distances = np.linalg.norm(predictor.anchors_m[rows] - predictor.anchors_m[predictor.master], axis=1)
+    nearest, share = float(distances.min()), float(predictor.links.share[rows].max())
+    return f"anchor(s) {listed}, {nearest:.0f} m or more from the master, hear {share:.0%} of its frames at most and {what}"
 
 
 def _order(predictor: Predictor) -> list[str]:

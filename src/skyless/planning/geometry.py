@@ -70,3 +70,22 @@ def fill_dops(
     row[VDOP] = math.sqrt(vertical)
     row[TDOP] = math.sqrt(inverse[0, 0])
     return count
+
+
+@kernel
+def weighted_pdop(share: Vector, sight: Matrix, dim: int, normal: Matrix, inverse: Matrix) -> float:
+    """PDOP with every anchor weighted by its share of frames, so that none comes or goes at once; may be infinite."""
+    normal[:] = 0.0
+    for i in range(len(share)):
+        normal[0, 0] += share[i]
+        for a in range(dim):
+            normal[a + 1, 0] += share[i] * sight[i, a]
+            for b in range(a + 1):
+                normal[a + 1, b + 1] += share[i] * sight[i, a] * sight[i, b]
+    if not factorise(normal, dim + 1):
+        return math.inf
+    invert(normal, dim + 1, inverse)
+    trace = 0.0
+    for a in range(1, dim + 1):
+        trace += inverse[a, a]
+    return math.sqrt(trace)

@@ -1,8 +1,8 @@
 """Maps: predictions over a grid of the floor, one slice for each height.
 
 The tracker's points are dear. On large grids it is computed on a coarser one (on the largest the other methods, too),
-and its ratio to the PDOP, which is smooth, is interpolated; PDOP and anchors in view are computed at every point, so
-that edges behind walls stay sharp.
+and its ratio to the PDOP of anchors weighted by their share of frames, which is smooth, is interpolated; that PDOP is
+computed at every point, so that edges behind walls stay sharp.
 """
 
 import math
@@ -19,7 +19,6 @@ from skyless.planning.columns import (
     CLAIMED,
     COLUMNS,
     FIX_SHARE,
-    PDOP,
     RMSE,
     SIGMA,
     SIGMA_X,
@@ -164,9 +163,11 @@ def _slice(
         table[grid.within] = predictor.at(points[grid.within], progress)
         return table, grid.step_m
     rows, columns = _every(stride, len(grid.y_m)), _every(stride, len(grid.x_m))
-    coarse = predictor.at(points[np.ix_(rows, columns)].reshape(-1, 3), progress)
+    nodes = points[np.ix_(rows, columns)].reshape(-1, 3)
+    coarse = predictor.at(nodes, progress).reshape(len(rows), len(columns), -1)
+    carrier = predictor.geometry_at(nodes)[:, SIGMA].reshape(len(rows), len(columns))
     fine = predictor.geometry_at(points[grid.within])
-    _interpolate(coarse.reshape(len(rows), len(columns), -1), rows, columns, grid.within, fine)
+    _interpolate(coarse, carrier, rows, columns, grid.within, fine)
     table[grid.within] = fine
     return table, stride * grid.step_m
 
@@ -189,9 +190,17 @@ def _every(stride: int, count: int) -> NDArray[np.int64]:
 
 
 def _interpolate(
-    coarse: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], within: NDArray[np.bool_], fine: Matrix
+    coarse: Array,
+    carrier: Matrix,
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+    within: NDArray[np.bool_],
+    fine: Matrix,
 ) -> None:
-    """Fill the method's columns of ``fine`` from a coarse table that holds these rows and columns of the grid."""
+    """Fill the method's columns of ``fine`` from a coarse table that holds these rows and columns of the grid.
+
+    ``carrier`` is the coarse points' weighted PDOP; that of the fine ones stands in their column of ``sigma_m``.
+    """
     from scipy.ndimage import distance_transform_edt, map_coordinates  # noqa: PLC0415 (SciPy is loaded late)
 
     ys, xs = np.nonzero(within)
@@ -202,19 +211,20 @@ def _interpolate(
         fine[:, FIX_SHARE] = 0.0
         return
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    steady = known & np.isfinite(coarse[..., PDOP])
+    steady = known & np.isfinite(carrier)
+    fine_carrier = fine[:, SIGMA].copy()
     near_steady = distance_transform_edt(~steady, return_distances=False, return_indices=True)
 
     def bilinear(values: Array) -> Vector:
         taken: Vector = map_coordinates(values, at, order=1, mode="nearest")
         return taken
 
-    by_geometry = np.isfinite(fine[:, PDOP]) & bool(steady.any())
+    by_geometry = np.isfinite(fine_carrier) & bool(steady.any())
     for column in (SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, CLAIMED):
         plain = bilinear(coarse[..., column][tuple(nearest)])
         with np.errstate(invalid="ignore"):
-            ratio = bilinear((coarse[..., column] / coarse[..., PDOP])[tuple(near_steady)])
-        fine[:, column] = np.where(by_geometry, ratio * np.where(by_geometry, fine[:, PDOP], 1.0), plain)
+            ratio = bilinear((coarse[..., column] / carrier)[tuple(near_steady)])
+        fine[:, column] = np.where(by_geometry, ratio * np.where(by_geometry, fine_carrier, 1.0), plain)
     fine[:, BIAS] = bilinear(coarse[..., BIAS][tuple(nearest)])
     fine[:, RMSE] = np.hypot(fine[:, SIGMA], fine[:, BIAS])
     fine[:, FIX_SHARE] = bilinear(coarse[..., FIX_SHARE])

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from skyless.clocks.filter import clock_noise
 from skyless.compiled import threaded_kernel
 from skyless.planning.anchor_clocks import anchor_clocks, stamp_variances
-from skyless.planning.columns import COLUMNS
-from skyless.planning.geometry import fill_dops, observe
+from skyless.planning.columns import COLUMNS, SIGMA
+from skyless.planning.geometry import fill_dops, observe, weighted_pdop
 from skyless.planning.links import AnchorLinks, anchor_links, anchor_positions, link_budget
 from skyless.planning.rounds import rounds_of
 from skyless.planning.snapshot_sigma import fill_snapshot_sigma
@@ -117,7 +117,7 @@ class Predictor:
         return in_threads(self._fill, np.ascontiguousarray(points_m, np.float64), self._chunk, progress)
 
     def geometry_at(self, points_m: Matrix) -> Matrix:
-        """The same table with anchors in view and DOPs only; the method's columns are not filled."""
+        """The same table with anchors in view and DOPs only; in the place of ``sigma_m`` the weighted PDOP."""
         fill = partial(_fill_geometry, self.dim, self.anchors_m, self.clocks.speaks, self.budget, self.walls)
         return in_threads(fill, np.ascontiguousarray(points_m, np.float64), CHUNK)
 
@@ -138,6 +138,7 @@ def _fill_geometry(
     for m in range(len(points)):
         observe(anchors, speaks, budget, walls, points[m], share, sight)
         fill_dops(anchors, share, points[m], dim, seen, normal, inverse, table[m])
+        table[m, SIGMA] = weighted_pdop(share, sight, dim, normal, inverse)
 
 
 def with_noise(site: Site, noise_ps: float | None) -> Site:
