@@ -66,12 +66,12 @@ def _hears_badly(predictor: Predictor, rows: NDArray[np.int64], what: str) -> st
     if len(rows) == 0:
         return ""
     numbers = [str(predictor.site.anchors[row].id) for row in rows]
-    listed = ", ".join(numbers[:MOST_NAMED]) + (
-        f" and {len(numbers) - MOST_NAMED} more" if numbers[MOST_NAMED:] else ""
-    )
+    more = f" and {len(numbers) - MOST_NAMED} more" if len(numbers) > MOST_NAMED else ""
+    listed = ", ".join(numbers[:MOST_NAMED]) + more
     distances = np.linalg.norm(predictor.anchors_m[rows] - predictor.anchors_m[predictor.master], axis=1)
     nearest, share = float(distances.min()), float(predictor.links.share[rows].max())
-    return f"anchor(s) {listed}, {nearest:.0f} m or more from the master, hear {share:.0%} of its frames at most and {what}"
+    heard = f"hear {share:.0%} of its frames at most"
+    return f"anchor(s) {listed}, {nearest:.0f} m or more from the master, {heard} and {what}"
 
 
 def _order(predictor: Predictor) -> list[str]:
