@@ -99,7 +99,7 @@ class Tracking:
         if silent_s < SHORT_SILENCE_S:
             return False
         std_m = self._tracker.horizontal_variance_m2(silent_s) ** 0.5
-        return std_m > self._max_spread * self._mean_range_m()
+        return bool(std_m > self._max_spread * self._mean_range_m())
 
     def _mean_range_m(self) -> float:
         """From the position to the anchors in use."""
