@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import asdict, replace
 
 from skyless.experiments.fleet import report
-from skyless.experiments.scenarios import Request, fleet_of
+from skyless.experiments.scenarios import Request, fleet_of, trajectories_of
 from skyless.simulation.impairments import AnchorOutage, Outage
 from skyless.site.lab import lab_site
 
@@ -157,3 +157,13 @@ def test_two_frames_per_superframe_give_twice_the_fixes():
         assert len(errors) == pytest.approx(rate * 1.9, rel=0.05)
         assert max(errors) < 6.0
         assert fleet.drops == {}
+
+
+@pytest.mark.parametrize("anchors", [LAB.anchors[:1], LAB.anchors[:2]])
+def test_tags_find_room_to_walk_where_anchors_span_none(anchors):
+    """Around a point, or along a line: a metre each way, and no search without an end."""
+    (path,) = trajectories_of(Request(replace(LAB, anchors=anchors)))
+    places = np.array([path.position(0.5 * step) for step in range(60)])
+    assert np.all(np.ptp(places, axis=0)[:2] > 0.25)
+    assert np.all(np.abs(places[:, 1]) <= 0.5)
+    assert np.all(places[:, 2] == 0.0)

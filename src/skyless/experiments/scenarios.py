@@ -18,6 +18,9 @@ from skyless.site.model import Site
 WALL_MARGIN_M: Final = 0.5
 """Walking tags keep this distance from the box around the anchors."""
 
+LEAST_WALK_M: Final = 1.0
+"""And have at least this much room along x and y, were there one anchor only."""
+
 WAYPOINTS: Final = 8
 
 COMFORT_MPS2: Final = 2.0
@@ -119,7 +122,8 @@ def _walkable_box(site: Site) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     places = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     low, high = places.min(axis=0), places.max(axis=0)
     margin = np.minimum(WALL_MARGIN_M, (high - low) / 4.0)
-    low, high = low + margin, high - margin
+    lacking = np.maximum((LEAST_WALK_M, LEAST_WALK_M, 0.0) - (high - low - 2.0 * margin), 0.0) / 2.0
+    low, high = low + margin - lacking, high - margin + lacking
     if site.tags.height_m is not None:
         low[2] = high[2] = site.tags.height_m
     return low, high
