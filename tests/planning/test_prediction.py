@@ -11,7 +11,7 @@ from skyless.planning.columns import CLAIMED, COLUMNS, FIX_SHARE, GDOP, RMSE, SI
 from skyless.planning.links import anchor_positions, hears, link_budget, range_of, with_range
 from skyless.planning.predict import PlanSettings, Predictor, with_noise
 from skyless.planning.rounds import delays, phase_covariance
-from skyless.planning.tracker_sigma import gated
+from skyless.planning.tracker_steps import gated
 from skyless.positioning.snapshots import SnapshotMethod
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import lab_site
