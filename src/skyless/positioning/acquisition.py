@@ -36,7 +36,7 @@ class Start(Struct, frozen=True):
     covariance: NDArray[np.float64]
     clock_rate_mps: float
     clock_rate_variance: float
-    speed_variance: float = SPEED_STD_MPS**2
+    speed_variance: float
 
 
 class Acquisition:
@@ -48,8 +48,10 @@ class Acquisition:
         stamp_variance_m2: float,
         z_bounds_m: tuple[float, float] | None = None,
         max_age_s: float = MAX_AGE_S,
+        speed_std_mps: float = SPEED_STD_MPS,
     ) -> None:
         self._max_age_s = max_age_s
+        self._speed_variance = speed_std_mps**2
         self._height_m = height_m
         self._variance_m2 = stamp_variance_m2
         self._z_bounds_m = z_bounds_m
@@ -89,12 +91,12 @@ class Acquisition:
         rates = np.array([_clock_rate(first, second) for first, second in pairs])
         intervals = np.array([(second.rx_ticks_tag - first.rx_ticks_tag) * TICK_S for first, second in pairs])
         rate = float(np.median(rates))
-        rate_variance = 2.0 * self._variance_m2 / float(np.min(intervals)) ** 2 + SPEED_STD_MPS**2
+        rate_variance = 2.0 * self._variance_m2 / float(np.min(intervals)) ** 2 + self._speed_variance
         newest = [second for _, second in pairs]
         ages_s = np.array([(now - o.rx_ticks_tag) * TICK_S for o in newest])
         pseudoranges = np.array([_pseudorange_m(o, base) for o in newest]) + rate * ages_s
         variances = self._variance_m2 + np.array([o.tx_variance_m2 for o in newest])
-        variances += ages_s**2 * (rate_variance / len(pairs) + SPEED_STD_MPS**2)
+        variances += ages_s**2 * (rate_variance / len(pairs) + self._speed_variance)
         result = locate_pseudoranges(
             np.array([o.anchor_m for o in newest]),
             pseudoranges,
@@ -106,7 +108,7 @@ class Acquisition:
             return result.reason
         dim = 3 if self._height_m is None else 2
         solution = np.append(result.position_m[:dim], result.bias_m)
-        return Start(now, base, solution, result.covariance_joint_m2, rate, rate_variance)
+        return Start(now, base, solution, result.covariance_joint_m2, rate, rate_variance, self._speed_variance)
 
 
 def _offset_ticks(observation: Observation) -> tuple[int, float]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
-from skyless.positioning.acquisition import MAX_AGE_S, Acquisition, Start
+from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Acquisition, Start
 from skyless.positioning.fix import Fix, NoFixReason, motion_fix
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.observation import Observation
@@ -25,6 +25,13 @@ SLOW_SPREAD: Final = 0.2
 
 SHORT_SILENCE_S: Final = 0.1
 """Over shorter silences no state grows much wider."""
+
+SOON_S: Final = 1.0
+"""A filter that is lost so soon after its start may have a tag that is faster than assumed; ..."""
+
+HASTE: Final = 4.0
+MAX_SPEED_STD_MPS: Final = 32.0
+"""... the next start assumes a speed higher by this factor, up to this."""
 
 IN_USE_S: Final = 0.1
 """An anchor counts as in use while its last accepted message is younger."""
@@ -47,6 +54,8 @@ class Tracking:
         self._max_spread = MAX_SPREAD if superframe_s < SLOW_S else SLOW_SPREAD
         self._z_bounds_m = z_bounds_m
         self._tracker = PseudorangeTracker(settings)
+        self._speed_std_mps = SPEED_STD_MPS
+        self._started_ticks = 0
         self._acquisition: Acquisition | None = self._new_acquisition()
         self._time = fix_time or FixTime()
         self._used: dict[int, Observation] = {}
@@ -82,6 +91,8 @@ class Tracking:
         self._heard_ticks = observation.rx_ticks_tag
         if not accepted:
             if self._tracker.lost:
+                soon = (observation.rx_ticks_tag - self._started_ticks) * TICK_S < SOON_S
+                self._speed_std_mps = min(HASTE * self._speed_std_mps, MAX_SPEED_STD_MPS) if soon else SPEED_STD_MPS
                 self._acquisition = self._new_acquisition()
             return NoFixReason.RESIDUALS
         self._use(observation)
@@ -89,7 +100,10 @@ class Tracking:
 
     def _new_acquisition(self) -> Acquisition:
         max_age_s = max(MAX_AGE_S, 2.5 * self._superframe_s)
-        return Acquisition(self._settings.height_m, self._settings.stamp_variance_m2, self._z_bounds_m, max_age_s)
+        settings = self._settings
+        return Acquisition(
+            settings.height_m, settings.stamp_variance_m2, self._z_bounds_m, max_age_s, self._speed_std_mps
+        )
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
@@ -109,7 +123,7 @@ class Tracking:
 
     def _begin(self, start: Start, observation: Observation) -> None:
         self._acquisition = None
-        self._heard_ticks = observation.rx_ticks_tag
+        self._heard_ticks = self._started_ticks = observation.rx_ticks_tag
         self._used.clear()
         self._use(observation)
         self._tracker.start(
