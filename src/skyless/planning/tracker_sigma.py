@@ -39,6 +39,9 @@ Matrix = NDArray[np.float64]
 SETTLED: Final = 2e-4
 """Relative change of the traces over a superframe below which the errors count as periodic."""
 
+SETTLED_IN_A_ROW: Final = 12
+"""For so many superframes: one alone may be the turning point of an overshoot."""
+
 LONGEST_S: Final = 4.0
 """Filter time after which they count so in any case."""
 
@@ -137,7 +140,7 @@ def settle_tracker(
     of the normalised squared innovations reaches, ``RESTLESS_SIGMAS`` above its mean.
     """
     count = choose_active(share, anchor_share, lists[0], lists[1])
-    superframe_s, passed_s, before_p, before_s = gap_s.sum(), 0.0, 0.0, 0.0
+    superframe_s, passed_s, before_p, before_s, settled = gap_s.sum(), 0.0, 0.0, 0.0, 0
     sums = np.zeros(4)
     while passed_s < LONGEST_S + 20.0 * superframe_s:
         _superframe(
@@ -146,7 +149,9 @@ def settle_tracker(
         )  # fmt: skip
         passed_s += superframe_s
         told_p, true_s = row[CLAIMED], row[SIGMA_X] + row[SIGMA_X + 1] + row[SIGMA_Z]
-        if abs(told_p - before_p) <= SETTLED * told_p and abs(true_s - before_s) <= SETTLED * true_s:
+        is_settled = abs(told_p - before_p) <= SETTLED * told_p and abs(true_s - before_s) <= SETTLED * true_s
+        settled = settled + 1 if is_settled else 0
+        if settled >= SETTLED_IN_A_ROW:
             break
         if passed_s > LEAST_S and true_s > farthest * farthest * sums[0]:
             break
