@@ -6,7 +6,9 @@ With ``NUMBA_DISABLE_JIT=1`` every kernel runs as plain Python and gives the sam
 import hashlib
 import os
 import shutil
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
@@ -17,13 +19,15 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 _CONFIG: Any = numba.config
 _PACKAGE: Final = Path(__file__).parent
+_KEPT_S: Final = 86_400.0
+"""Kernels of older sources are kept for a day: a program that was started with them may still be compiling."""
 
 
 def _cache_folder() -> str:
     """Folder of compiled kernels for exactly these sources.
 
     Numba notices a change of the kernel's own file but not of the kernels that it calls, so a digest of all files
-    with kernels, and of the constants that they use, stands in the folder's name; folders of older ones are removed.
+    with kernels, and of the constants that they use, stands in the folder's name; older folders are removed when no running program can need them.
     """
     digest = hashlib.sha1(usedforsecurity=False)
     for source in sorted(_PACKAGE.rglob("*.py")):
@@ -33,7 +37,9 @@ def _cache_folder() -> str:
     folder = _cache_home() / f"kernels-{digest.hexdigest()[:16]}"
     if not folder.exists():
         for old in folder.parent.glob("kernels-*"):
-            shutil.rmtree(old, ignore_errors=True)
+            with suppress(FileNotFoundError):  # another program may be tidying up as well
+                if time.time() - old.stat().st_mtime > _KEPT_S:
+                    shutil.rmtree(old, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
     return str(folder)
 
