@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import Positive
+from skyless.cli.options import Picoseconds, Positive
 from skyless.cli.output import console, print_json
 from skyless.cli.progress import status
 
@@ -30,7 +30,7 @@ def demo(
     duration: Positive | None = None,
     tags: Annotated[int, Parameter(validator=Number(gte=1, lte=50))] = 3,
     speed: Annotated[float, Parameter(validator=Number(gt=0, lte=10))] = 1.0,
-    noise_ps: Positive = 100.0,
+    noise_ps: Picoseconds = 100.0,
     seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
     json: bool = False,
 ) -> None:

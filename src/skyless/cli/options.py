@@ -11,6 +11,9 @@ from skyless.errors import SkylessError
 
 Positive = Annotated[float, Parameter(validator=Number(gt=0, lt=math.inf))]
 NotNegative = Annotated[float, Parameter(validator=Number(gte=0, lt=math.inf))]
+Picoseconds = Annotated[float, Parameter(validator=Number(gt=0, lte=1e6))]
+"""Noise of a stamp, as far as a site file and the almanac can tell it."""
+
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import NotNegative, Positive, finite_numbers, open_for_writing, spare_inputs
+from skyless.cli.options import NotNegative, Picoseconds, Positive, finite_numbers, open_for_writing, spare_inputs
 from skyless.cli.output import console, print_json
 from skyless.cli.progress import progress_bar, status
 from skyless.errors import SkylessError
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 _Share = Annotated[float, Parameter(validator=Number(gte=0, lt=1))]
 
+_LATEST_S = 1e8
+"""Three years: the 64 bits of unwrapped ticks last four and a half."""
+
 app = App(
     name="simulate",
     help_epilogue=(
@@ -32,14 +35,14 @@ app = App(
 @app.default
 def simulate(
     *,
-    scenario: str = "lab",
+    scenario: str | None = None,
     site: Path | None = None,
     method: str = "tracker",
     position: list[str] | None = None,
-    tags: Annotated[int, Parameter(validator=Number(gte=1, lte=10_000))] = 1,
-    speed: Positive = 1.0,
+    tags: Annotated[int, Parameter(validator=Number(gte=1, lte=10_000))] | None = None,
+    speed: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] | None = None,
     qa: Positive = 0.3,
-    noise_ps: Positive | None = None,
+    noise_ps: Picoseconds | None = None,
     fixes: Annotated[int, Parameter(validator=Number(gte=1))] | None = None,
     duration: Positive | None = None,
     warmup: NotNegative = 2.0,
@@ -61,7 +64,7 @@ def simulate(
     Parameters
     ----------
     scenario
-        A named site: lab (six anchors on the walls of 6 m × 8 m, 2-D).
+        A named site: lab (six anchors on the walls of 6 m × 8 m, 2-D), the default.
     site
         A site file instead of a named one.
     method
@@ -69,9 +72,9 @@ def simulate(
     position
         Where a tag lies still, x,y or x,y,z in metres; may be given several times. Without it the tags walk about.
     tags
-        How many tags walk about.
+        How many tags walk about; 1 by default.
     speed
-        Their speed in m/s.
+        Their speed in m/s; 1 by default.
     qa
         Agility that the tracker assumes, m²/s³.
     noise_ps
@@ -106,14 +109,16 @@ def simulate(
     from skyless.experiments.scenarios import Request
 
     spare_inputs("fixes-csv", fixes_csv, site)
+    if position and (tags is not None or speed is not None):
+        raise SkylessError("--position is for tags that lie still, --tags and --speed for tags that walk; give either")
     request = Request(
         site=_site(scenario, site),
         method=method,
         seed=seed,
         noise_ps=noise_ps,
         positions_m=tuple(finite_numbers("position", text, (2, 3)) for text in position or ()),
-        tags=tags,
-        speed_mps=speed,
+        tags=1 if tags is None else tags,
+        speed_mps=1.0 if speed is None else speed,
         qa=qa,
         warmup_s=warmup,
         most_fixes=fixes,
@@ -135,13 +140,15 @@ def simulate(
         show(result)
 
 
-def _site(scenario: str, file: Path | None) -> "Site":
+def _site(scenario: str | None, file: Path | None) -> "Site":
     from skyless.site.lab import lab_site
     from skyless.site.load import load_site
 
     if file is not None:
+        if scenario is not None:
+            raise SkylessError("give either --scenario or --site, not both")
         return load_site(file)
-    if scenario != "lab":
+    if scenario not in {None, "lab"}:
         raise SkylessError(f"--scenario is {scenario!r}; it should be lab (or give a site file with --site)")
     return lab_site()
 
@@ -161,8 +168,8 @@ def _outage(text: str) -> "AnchorOutage":
     anchor, *times = finite_numbers("outage", text, (2, 3), ":")
     if len(times) == 2 and times[1] <= times[0]:
         raise SkylessError(f"--outage is {text!r}; the anchor should come back after it has stopped")
-    if times[0] < 0.0:
-        raise SkylessError(f"--outage is {text!r}; the anchor should stop at 0 s or later")
+    if not 0.0 <= times[0] <= times[-1] <= _LATEST_S:
+        raise SkylessError(f"--outage is {text!r}; times should be 0 s or later, and at most {_LATEST_S:g} s")
     return AnchorOutage(_whole("outage", text, anchor), Outage(*times))
 
 
