@@ -511,6 +511,12 @@ def test_a_master_in_a_late_slot():
         assert len(fixes[-1].anchors) == 6
 
 
+def test_the_first_fix_names_the_anchors_it_rests_on():
+    first = listen(Receiver(), tape())[0]
+    assert len(set(first.anchors)) >= 3
+    assert first.dops.hdop < 3.0
+
+
 def test_slow_superframes():
     """Twelve slots of 66 ms: two messages of an anchor lie 0.8 s apart."""
     slow = replace(LAB, schedule=replace(LAB.schedule, slot_s=66e-3, slots=12))

@@ -29,6 +29,8 @@ SPEED_STD_MPS: Final = 1.0
 class Start(Struct, frozen=True):
     """A first state: everything ``PseudorangeTracker.start`` wants."""
 
+    used: tuple[Observation, ...]
+    """The messages that it rests on, one of each anchor."""
     rx_ticks_tag: int
     whole_offset_ticks: int
     solution: NDArray[np.float64]
@@ -108,7 +110,16 @@ class Acquisition:
             return result.reason
         dim = 3 if self._height_m is None else 2
         solution = np.append(result.position_m[:dim], result.bias_m)
-        return Start(now, base, solution, result.covariance_joint_m2, rate, rate_variance, self._speed_variance)
+        return Start(
+            tuple(newest),
+            now,
+            base,
+            solution,
+            result.covariance_joint_m2,
+            rate,
+            rate_variance,
+            self._speed_variance,
+        )
 
 
 def _offset_ticks(observation: Observation) -> tuple[int, float]:

@@ -125,7 +125,8 @@ class Tracking:
         self._acquisition = None
         self._heard_ticks = self._started_ticks = observation.rx_ticks_tag
         self._used.clear()
-        self._use(observation)
+        for used in start.used:
+            self._use(used)
         self._tracker.start(
             start.rx_ticks_tag,
             start.whole_offset_ticks,
