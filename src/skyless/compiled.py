@@ -26,8 +26,9 @@ _KEPT_S: Final = 86_400.0
 def _cache_folder() -> str:
     """Folder of compiled kernels for exactly these sources.
 
-    Numba notices a change of the kernel's own file but not of the kernels that it calls, so a digest of all files
-    with kernels, and of the constants that they use, stands in the folder's name; older folders are removed when no running program can need them.
+    Numba notices a change of the kernel's own file but not of the kernels that it calls. So a digest of all files with
+    kernels, and of the constants that they use, stands in the folder's name; older folders are removed when no
+    running program can need them.
     """
     digest = hashlib.sha1(usedforsecurity=False)
     for source in sorted(_PACKAGE.rglob("*.py")):
