@@ -40,7 +40,7 @@ RESTLESS_CHI2: Final = 1.6
 
 AGILITY_GAIN: Final = 1.1
 AGILITY_LOSS: Final = 0.99
-MAX_AGILITY: Final = 300.0
+MAX_AGILITY: Final = 100.0
 """The agility grows by the gain at every message while the tag is restless, up to this factor, and then decays."""
 
 LOST_IN_ROW: Final = 8
