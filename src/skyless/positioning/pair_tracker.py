@@ -9,7 +9,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.compiled import kernel
-from skyless.positioning.kalman import innovation_variance, predict_motion, range_and_direction
+from skyless.positioning.kalman import horizontal_variance, innovation_variance, predict_motion, range_and_direction
 from skyless.positioning.tracker import AGILITY, LOST_SHARE, REJECTED_SHARE, gated_correct
 
 Vector = NDArray[np.float64]
@@ -120,6 +120,10 @@ class PairTracker:
     def lost(self) -> bool:
         """Whether so many differences do not fit that the state must be wrong."""
         return bool(self.statistics[REJECTED_SHARE] > LOST_SHARE)
+
+    def horizontal_variance_m2(self, ahead_s: float) -> float:
+        """Sum of the variances of x and y so much later, if nothing is heard until then."""
+        return horizontal_variance(self.P, self.dim, ahead_s, self.settings[SETTING_QA] * self.statistics[AGILITY])
 
     def hear(self, a_m: Vector, b_m: Vector, dt_s: float, tdoa_m: float) -> bool:
         """Take one difference, ``dt_s`` after the last one (``pair_update``)."""

@@ -30,7 +30,10 @@ IN_USE_S: Final = 0.5
 
 
 MAX_STD_M: Final = 3.0
-"""While the horizontal standard deviation is larger, there is no fix."""
+"""While the horizontal standard deviation is larger, there is no fix; a silence that makes it so means a new start."""
+
+SHORT_SILENCE_S: Final = 0.1
+"""Over shorter silences no state grows much wider."""
 
 TRY_EVERY: Final = 6
 """Differences between two attempts at a start."""
@@ -89,7 +92,7 @@ class PairTracking:
     def _take(self, pair: PairTdoa, a_m: NDArray[np.float64], b_m: NDArray[np.float64]) -> bool:
         time_s = pair.time_s
         dt_s = time_s - self._last_s
-        if self._started and not 0.0 <= dt_s <= MAX_GAP_S:
+        if self._started and self._is_out_of_reach(dt_s):
             self._stop()
         self._last_s = time_s
         if not self._started:
@@ -102,6 +105,12 @@ class PairTracking:
         if self._tracker.lost:
             self._stop()
         return False
+
+    def _is_out_of_reach(self, dt_s: float) -> bool:
+        """Whether the filter cannot predict so far: too long a silence for it, or a clock that went back."""
+        if not 0.0 <= dt_s <= MAX_GAP_S:
+            return True
+        return dt_s > SHORT_SILENCE_S and self._tracker.horizontal_variance_m2(dt_s) > MAX_STD_M**2
 
     def _is_sane(self) -> bool:
         """Whether the state is near the anchors, beyond which differences tell nothing, and known well enough."""
