@@ -34,7 +34,7 @@ def open_source(path: str | PathLike[str]) -> BufferedIOBase:
         return gzip.open(path, "rb") if compressed else Path(path).open("rb")
     except OSError as error:
         reason = error.strerror or str(error)
-        raise ConfigurationError(path, "the file", reason, "a file that can be read") from error
+        raise ConfigurationError(path, "", None, f"a file that can be read ({reason})") from error
 
 
 def read_lines(path: str | PathLike[str]) -> list[str]:
