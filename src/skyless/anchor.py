@@ -168,13 +168,14 @@ class Anchor:
         return Transmission(encode(beacon), tx_ticks)
 
     def _beacon(self, tx_ticks: int, superframe: int, slot: int) -> Beacon:
+        superframe &= 0xFFFFFFFF  # as the frame shows it: whoever reads it can tell the page
         page = page_for(self._pages, superframe, slot)
         room = heard_capacity(master_heard=self._master_heard is not None, master_time=True, page=True)
         return Beacon(
             site=self._site.id,
             anchor=self.id,
             sequence=self._sequence,
-            superframe=superframe & 0xFFFFFFFF,
+            superframe=superframe,
             slot=slot,
             tx_ticks=tx_ticks,
             almanac_issue=self._issue,

@@ -11,7 +11,7 @@ from skyless.air.beacon import Beacon, MasterTime
 from skyless.air.codec import decode, encode
 from skyless.air.page_codec import decode_page, encode_page
 from skyless.air.reception import Reception
-from skyless.air.rotation import pages_of
+from skyless.air.rotation import page_for, pages_of
 from skyless.air.schedule import first_slots, schedule_of
 from skyless.anchor import MAX_OFFSET_STD_M, Anchor
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
@@ -334,3 +334,15 @@ def test_superframes_wrap_after_two_years():
         )
         if step in {40, 99}:
             assert ideal.sent(step).superframe == superframe
+
+
+@pytest.mark.parametrize("ahead", [-1, 0, 1, 2**20])
+def test_pages_rotate_with_the_number_on_the_air_beyond_two_years(ahead):
+    """A master that has counted past 2³² sends the page that belongs to the number its frame shows."""
+    master, schedule = Anchor(LAB, 1), schedule_of(LAB)
+    master._epoch_master = -(2**32 + ahead) * schedule.superframe_ticks
+    for k in range(7):
+        tx_ticks = master.next_transmission_ticks(k * schedule.superframe_ticks + 5)
+        beacon = decode(master.transmission(tx_ticks).frame)
+        assert beacon.superframe == (ahead + k + 1) % 2**32
+        assert beacon.page == decode_page(encode_page(page_for(pages_of(LAB), beacon.superframe, beacon.slot)))
