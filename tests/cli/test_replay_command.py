@@ -150,7 +150,7 @@ def test_what_is_left_of_a_damaged_recording_is_used(run, room, tmp_path):
 
 def test_without_anchors_there_is_no_fix_and_a_reason(run):
     told = report(run("tdoa-table", "--json"))
-    assert (told["fixes"], told["reason"], told["median_m"]) == (0, "no-almanac", None)
+    assert (told["fixes"], told["reason"], told["median_m"], told["rate_hz"]) == (0, "no-almanac", None, None)
     code, out, err = run("tdoa-table")
     assert (code, err) == (0, "")
     assert "none: no-almanac" in out

@@ -55,7 +55,7 @@ class ReplayReport(Struct, frozen=True):
     p95_m: float | None
     max_m: float | None
     rate_hz: float | None
-    """Fixes per second of recorded time."""
+    """Fixes per second of recorded time, None without fixes."""
     tdoa_noise_m: float | None
     """Median over the pairs of anchors of their differences' noise (1.4826 MAD), about the truth or the median."""
     bias_m: tuple[float, float, float] | None
@@ -158,7 +158,7 @@ class Replay:
             rmse_3d_m=judgement.errors.rmse_3d_m,
             p95_m=judgement.errors.p95_m,
             max_m=judgement.errors.max_m,
-            rate_hz=self.fixes / span_s if span_s > 0.0 else None,
+            rate_hz=self.fixes / span_s if self.fixes and span_s > 0.0 else None,
             tdoa_noise_m=float(np.median([pair.noise_m for pair in pairs])) if pairs else None,
             bias_m=judgement.errors.bias_m,
             first_fix_s=self._first_fix_s,
