@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 
@@ -19,8 +20,13 @@ def test_an_unknown_name_is_an_attribute_error():
         skyless.nothing  # noqa: B018
 
 
+def test_its_version_is_the_installed_one():
+    told = subprocess.check_output([sys.executable, "-m", "skyless.cli.main", "--version"], text=True).strip()
+    assert skyless.__version__ == told == version("skyless")
+
+
 def test_importing_it_is_light():
-    script = "import sys, skyless; print({'numpy', 'numba', 'msgspec'} & set(sys.modules))"
+    script = "import sys, skyless; print({'numpy', 'numba', 'msgspec', 'importlib.metadata'} & set(sys.modules))"
     assert subprocess.check_output([sys.executable, "-c", script], text=True).strip() == "set()"
 
 

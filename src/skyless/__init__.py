@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from skyless.site.load import load_site
     from skyless.site.model import Site
 
+    __version__: str
+
 _PLACES: Final = {
     "METHODS": "skyless.receiver",
     "Anchor": "skyless.anchor",
@@ -58,6 +60,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
+    if name == "__version__":
+        return import_module("importlib.metadata").version(__name__)
     place = _PLACES.get(name)
     if place is None:
         raise AttributeError(f"module 'skyless' has no attribute {name!r}")
@@ -65,4 +69,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, "__version__"])
