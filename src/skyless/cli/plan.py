@@ -1,22 +1,30 @@
 """``skyless plan``: what a site will give before anything is mounted, and where its anchors should hang."""
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import Positive, finite_numbers, open_for_writing, spare_inputs
-from skyless.cli.output import print_json, write_atomically
+from skyless.cli.options import Positive
+from skyless.cli.output import print_json
+from skyless.cli.plan_files import write_files, write_site
+from skyless.cli.plan_input import (
+    check_count,
+    load_inputs,
+    mounts_of,
+    outline_of,
+    region_of,
+    settings_of,
+    tag_heights_of,
+)
 from skyless.cli.plan_output import report, show
 from skyless.cli.progress import progress_bar
-from skyless.errors import ConfigurationError, SkylessError
+from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.planning.floor import Box, Floor, Matrix
+    from skyless.planning.floor import Floor
     from skyless.planning.maps import PlanMap
     from skyless.planning.mounts import Mounts
     from skyless.planning.optimise import Optimised
@@ -113,134 +121,32 @@ def plan(
 
     started_s = time.perf_counter()
     outputs = {"plot": plot, "grid": grid, "html": html, "out": out}
-    site = _load(file, outputs)
-    settings = _settings(method, noise_ps, qa, range_m)
+    site = load_inputs(file, outputs)
+    settings = settings_of(method, noise_ps, qa, range_m)
     if optimise is None:
-        _check_count(site, file)
+        check_count(site, file)
     if out is not None and optimise is None:
         raise SkylessError("--out writes an optimised site; --optimise N asks for one")
-    ground = floor_of(site, file, _outline(outline), _region(region))
-    tag_heights = _slices(slices, site)
-    hangers = _mounts(site, ground, heights, mounts or [])
+    ground = floor_of(site, file, outline_of(outline), region_of(region))
+    tag_heights = tag_heights_of(slices, site)
+    hangers = mounts_of(site, ground, heights, mounts or [])
     optimised = None
     if optimise is not None:
         optimised = _optimise(site, settings, ground, hangers, tag_heights, (optimise, seed, seconds), target)
         site = optimised.best.site
         if out is not None:
-            _write_site(out, site, file)
+            write_site(out, site, file)
     predictor = Predictor(site, settings)
     mapped = _map(predictor, ground, tag_heights, step)
     checked = None if verify is None else _verify(predictor, mapped, verify, rounds, seed)
     summary = summary_of(mapped, None if target is None else target / 100.0)
     result = report(predictor, ground, hangers, mapped, summary, optimised, checked)
-    _write(file, predictor, ground, mapped, result, plot, grid, html)
+    write_files(file, predictor, ground, mapped, result, plot, grid, html)
     result["wall_s"] = time.perf_counter() - started_s
     if json:
         print_json(result)
     else:
         show(file, result)
-
-
-def _load(file: Path, outputs: dict[str, Path | None]) -> "Site":
-    """Read the site and its image, and see that no output is an input or another output."""
-    from skyless.site.load import load_site
-
-    site = load_site(file)
-    image = None if site.floor_plan is None else file.parent / site.floor_plan.image
-    for name, path in outputs.items():
-        spare_inputs(name, path, file, image, *(other for key, other in outputs.items() if key != name))
-    if outputs["grid"] is not None and outputs["grid"].suffix.lower() not in {".csv", ".geojson", ".json"}:
-        raise SkylessError(f"--grid is {str(outputs['grid'])!r}; it should end with .csv or .geojson")
-    if outputs["out"] is not None and outputs["out"].exists():
-        raise SkylessError(f"--out is {str(outputs['out'])!r}, which exists; it should be a new file")
-    if image is not None:
-        _check_image(file, site, image)
-    return site
-
-
-def _check_image(file: Path, site: "Site", image: Path) -> None:
-    """See that the whole image can be read, not only its size."""
-    from matplotlib.image import imread
-
-    try:
-        imread(image)
-    except (OSError, SyntaxError, ValueError) as error:
-        shown = site.floor_plan.image if site.floor_plan else ""
-        right = f"an image that can be read to its end ({' '.join(str(error).split())})"
-        raise ConfigurationError(file, "floor_plan.image", shown, right) from None
-
-
-def _settings(method: str, noise_ps: float | None, qa: float, range_m: float | None) -> "PlanSettings":
-    from skyless.planning.links import with_range
-    from skyless.planning.predict import PlanSettings
-    from skyless.receiver import METHODS
-    from skyless.simulation.channel import ChannelModel
-
-    if method not in METHODS:
-        raise SkylessError(f"--method is {method!r}; it should be one of {', '.join(METHODS)}")
-    channel = ChannelModel() if range_m is None else with_range(ChannelModel(), range_m)
-    return PlanSettings(method, noise_ps, qa, channel)
-
-
-def _check_count(site: "Site", file: Path) -> None:
-    needed, what = (4, "with its height") if site.tags.height_m is None else (3, "at a known height")
-    if len(site.anchors) < needed:
-        right = f"at least {needed}, which a position {what} needs"
-        raise ConfigurationError(file, "anchors", f"a list of {len(site.anchors)}", right)
-
-
-def _outline(text: str | None) -> "Matrix | None":
-    import numpy as np
-
-    if text is None:
-        return None
-    corners = [finite_numbers("outline", part, (2,)) for part in text.replace(";", " ").split()]
-    if len(corners) < 3:
-        raise SkylessError(f"--outline is {text!r}; it should be three or more corners, 'x1,y1 x2,y2 x3,y3'")
-    return np.array(corners)
-
-
-def _region(text: str | None) -> "Box | None":
-    if text is None:
-        return None
-    x1, y1, x2, y2 = finite_numbers("region", text, (4,))
-    if not (x2 > x1 and y2 > y1):
-        raise SkylessError(f"--region is {text!r}; it should be x1,y1,x2,y2 with x1 < x2 and y1 < y2")
-    return x1, y1, x2, y2
-
-
-def _numbers(option: str, text: str) -> tuple[float, ...]:
-    return finite_numbers(option, text, (text.count(",") + 1,))
-
-
-def _slices(text: str | None, site: "Site") -> tuple[float, ...]:
-    """Heights of the maps: the known one, or those asked for, or three between the lowest and the highest anchor."""
-    if site.tags.height_m is not None:
-        if text is not None:
-            raise SkylessError(f"--slices is {text!r}; this site's tags are all at {site.tags.height_m:g} m")
-        return (site.tags.height_m,)
-    if text is not None:
-        return _numbers("slices", text)
-    low, high = _lowest_and_highest(site)
-    return tuple(round(low + share * (high - low), 2) for share in (1 / 6, 1 / 2, 5 / 6))[: 3 if high > low else 1]
-
-
-def _lowest_and_highest(site: "Site") -> tuple[float, float]:
-    levels = [anchor.z_m for anchor in site.anchors]
-    return min(levels), max(levels)
-
-
-def _mounts(site: "Site", floor: "Floor", heights: str | None, walls: list[str]) -> "Mounts":
-    import numpy as np
-
-    from skyless.planning.floor import sides, total_length
-    from skyless.planning.mounts import Mounts
-
-    segments = np.array([finite_numbers("mounts", text, (4,)) for text in walls]) if walls else sides(floor.outline_m)
-    if not total_length(segments) > 0.0:
-        raise SkylessError("--mounts has no length; it should be x1,y1,x2,y2 with two different ends")
-    levels = _numbers("heights", heights) if heights is not None else tuple(dict.fromkeys(_lowest_and_highest(site)))
-    return Mounts(segments, levels)
 
 
 def _optimise(
@@ -280,60 +186,3 @@ def _verify(predictor: "Predictor", mapped: "PlanMap", count: int, rounds: int, 
 
     with progress_bar("simulating", 1.0) as bar:
         return verify(predictor, random_points(mapped, count, seed), rounds, seed, bar.reach)
-
-
-def _write_site(out: Path, site: "Site", source: Path) -> None:
-    import os
-
-    from skyless.site.check import check_site
-    from skyless.site.template import site_template
-
-    if site.floor_plan is not None:
-        image = os.path.relpath(source.parent / site.floor_plan.image, out.parent)
-        site = msgspec.structs.replace(site, floor_plan=msgspec.structs.replace(site.floor_plan, image=image))
-    check_site(site, out)
-    _save(out, site_template(site).encode())
-
-
-def _save(path: Path, data: bytes) -> None:
-    try:
-        write_atomically(path, data)
-    except OSError as error:
-        raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
-
-
-def _write(
-    file: Path,
-    predictor: "Predictor",
-    floor: "Floor",
-    mapped: "PlanMap",
-    result: dict[str, Any],
-    plot: Path | None,
-    grid: Path | None,
-    html: Path | None,
-) -> None:
-    """Write the files that were asked for."""
-    if grid is not None:
-        with open_for_writing(grid) as table:
-            table.writelines(_lines(mapped, grid, predictor.site))
-    if plot is None and html is None:
-        return
-    from skyless.cli.plan_output import described, html_page
-    from skyless.experiments.figures import save_figure
-    from skyless.planning.picture import RMSE_LAYER, SIGMA_LAYER, Background, draw_layer
-
-    background = Background(predictor.site, floor, file, described(result))
-    if plot is not None:
-        layer = RMSE_LAYER if result["walls_bias"] else SIGMA_LAYER
-        try:
-            save_figure(draw_layer(mapped, layer, background), plot)
-        except (OSError, ValueError) as error:
-            raise SkylessError(f"{plot} cannot be written: {error}") from None
-    if html is not None:
-        _save(html, html_page(result, mapped, background).encode())
-
-
-def _lines(mapped: "PlanMap", path: Path, site: "Site") -> Iterator[str]:
-    from skyless.planning.tables import csv_lines, geojson_lines
-
-    return csv_lines(mapped) if path.suffix.lower() == ".csv" else geojson_lines(mapped, site.georeference)
