@@ -9,20 +9,17 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.options import NotNegative, Picoseconds, Positive, finite_numbers, open_for_writing, spare_inputs
-from skyless.cli.output import console, print_json
+from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
+from skyless.cli.simulate_input import bias_of, outage_of, site_of
+from skyless.cli.simulate_output import COLUMNS, row_of, show
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.experiments.fleet import Fleet, FleetReport, JudgedFix
+    from skyless.experiments.fleet import Fleet, FleetReport
     from skyless.experiments.scenarios import Request
-    from skyless.simulation.impairments import AnchorBias, AnchorOutage
-    from skyless.site.model import Site
 
 _Share = Annotated[float, Parameter(validator=Number(gte=0, lt=1))]
-
-_LATEST_S = 1e8
-"""Three years: the 64 bits of unwrapped ticks last four and a half."""
 
 app = App(
     name="simulate",
@@ -112,7 +109,7 @@ def simulate(
     if position and (tags is not None or speed is not None):
         raise SkylessError("--position is for tags that lie still, --tags and --speed for tags that walk; give either")
     request = Request(
-        site=_site(scenario, site),
+        site=site_of(scenario, site),
         method=method,
         seed=seed,
         noise_ps=noise_ps,
@@ -127,8 +124,8 @@ def simulate(
         nlos_mean_m=nlos_mean,
         power_bias=power_bias,
         temperature=temperature,
-        biases=tuple(_bias(text) for text in bias or ()),
-        outages=tuple(_outage(text) for text in outage or ()),
+        biases=tuple(bias_of(text) for text in bias or ()),
+        outages=tuple(outage_of(text) for text in outage or ()),
     )
     result = _run(request, duration, fixes_csv)
     if json:
@@ -138,45 +135,6 @@ def simulate(
         print_json({**msgspec.to_builtins(result), **settings})
     else:
         show(result)
-
-
-def _site(scenario: str | None, file: Path | None) -> "Site":
-    from skyless.site.lab import lab_site
-    from skyless.site.load import load_site
-
-    if file is not None:
-        if scenario is not None:
-            raise SkylessError("give either --scenario or --site, not both")
-        return load_site(file)
-    if scenario not in {None, "lab"}:
-        raise SkylessError(f"--scenario is {scenario!r}; it should be lab (or give a site file with --site)")
-    return lab_site()
-
-
-def _bias(text: str) -> "AnchorBias":
-    from skyless.simulation.impairments import AnchorBias
-
-    anchor, metres, *burst = finite_numbers("bias", text, (2, 3), ":")
-    if burst and burst[0] <= 0.0:
-        raise SkylessError(f"--bias is {text!r}; a burst should last longer than 0 s")
-    return AnchorBias(_whole("bias", text, anchor), metres, *burst)
-
-
-def _outage(text: str) -> "AnchorOutage":
-    from skyless.simulation.impairments import AnchorOutage, Outage
-
-    anchor, *times = finite_numbers("outage", text, (2, 3), ":")
-    if len(times) == 2 and times[1] <= times[0]:
-        raise SkylessError(f"--outage is {text!r}; the anchor should come back after it has stopped")
-    if not 0.0 <= times[0] <= times[-1] <= _LATEST_S:
-        raise SkylessError(f"--outage is {text!r}; times should be 0 s or later, and at most {_LATEST_S:g} s")
-    return AnchorOutage(_whole("outage", text, anchor), Outage(*times))
-
-
-def _whole(option: str, text: str, anchor: float) -> int:
-    if not anchor.is_integer():
-        raise SkylessError(f"--{option} is {text!r}; the anchor should be a whole number")
-    return int(anchor)
 
 
 def _run(request: "Request", duration: float | None, fixes_csv: Path | None) -> "FleetReport":
@@ -205,7 +163,7 @@ def _pass_time(fleet: "Fleet", fixes: int | None, until_s: float, file: TextIO |
     """Let the world run in steps, so that the bar moves and the goal is seen; without any fix it ends after 60 s."""
     writer = None if file is None else csv.writer(file)
     if writer is not None:
-        writer.writerow(("t_s", "tag", *COLUMNS))
+        writer.writerow(COLUMNS)
     goal = fixes if fixes is not None else until_s
     with progress_bar("simulating", goal) as bar:
         now_s = 0.0
@@ -213,7 +171,7 @@ def _pass_time(fleet: "Fleet", fixes: int | None, until_s: float, file: TextIO |
             now_s = min(now_s + 0.25, until_s)
             for judged in fleet.run(now_s):
                 if writer is not None:
-                    writer.writerow(_row(judged))
+                    writer.writerow(row_of(judged))
             bar.reach(fleet.errors.count / len(fleet.records) if fixes is not None else now_s)
 
 
@@ -222,44 +180,3 @@ def _enough(fleet: "Fleet", fixes: int | None, now_s: float) -> bool:
         return False
     hopeless = now_s > 60.0 and all(record.fixes == 0 for record in fleet.records)
     return hopeless or all(record.judged >= fixes for record in fleet.records)
-
-
-COLUMNS = ("x_m", "y_m", "z_m", "var_x_m2", "var_y_m2", "var_z_m2", "truth_x_m", "truth_y_m", "truth_z_m", "anchors")
-
-
-def _row(judged: "JudgedFix") -> tuple[object, ...]:
-    fix = judged.fix
-    numbers = [*fix.position_m, *fix.covariance_m2.diagonal(), *judged.truth_m]
-    anchors = " ".join(map(str, fix.anchors))
-    return (f"{judged.time_s:.6f}", judged.tag, *(f"{number:.6g}" for number in numbers), anchors)
-
-
-def show(result: "FleetReport") -> None:
-    """Show a run as a table."""
-    from rich.table import Table
-
-    table = Table("simulated", "", title=f"{result.method}, {result.tags} tag(s)", show_header=False)
-    lines = (
-        ("simulated time", f"{result.simulated_s:.1f} s in {result.wall_s:.1f} s ({result.speed:.1f} × real time)"),
-        ("messages at tags", f"{result.messages} ({result.dropped} dropped)"),
-        ("fixes judged", f"{result.fixes}"),
-        ("updates", f"{result.updates_per_s:.1f} per second and tag"),
-        ("first fix", _seconds(result.first_fix_s)),
-        ("RMSE", _centimetres(result.rmse_m)),
-        ("said by the fixes", _centimetres(result.sigma_m)),
-        ("95 %", _centimetres(result.p95_m)),
-        ("largest", _centimetres(result.max_m)),
-    )
-    for name, value in lines:
-        table.add_row(name, value)
-    for reason, count in result.drops.items():
-        table.add_row(f"dropped: {reason}", str(count))
-    console().print(table)
-
-
-def _centimetres(value_m: float | None) -> str:
-    return "–" if value_m is None else f"{100 * value_m:.2f} cm"
-
-
-def _seconds(value_s: float | None) -> str:
-    return "none" if value_s is None else f"{value_s:.3f} s after power-on"

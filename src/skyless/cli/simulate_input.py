@@ -1,0 +1,56 @@
+"""What ``skyless simulate`` is given: the texts of its options become values."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from skyless.cli.options import finite_numbers
+from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from skyless.simulation.impairments import AnchorBias, AnchorOutage
+    from skyless.site.model import Site
+
+_LATEST_S: Final = 1e8
+"""Three years: the 64 bits of unwrapped ticks last four and a half."""
+
+
+def site_of(scenario: str | None, file: Path | None) -> "Site":
+    """The site of that name, or in that file; the lab by default. Raises SkylessError."""
+    from skyless.site.lab import lab_site
+    from skyless.site.load import load_site
+
+    if file is not None:
+        if scenario is not None:
+            raise SkylessError("give either --scenario or --site, not both")
+        return load_site(file)
+    if scenario not in {None, "lab"}:
+        raise SkylessError(f"--scenario is {scenario!r}; it should be lab (or give a site file with --site)")
+    return lab_site()
+
+
+def bias_of(text: str) -> "AnchorBias":
+    """ANCHOR:METRES or ANCHOR:METRES:BURST_S. Raises SkylessError."""
+    from skyless.simulation.impairments import AnchorBias
+
+    anchor, metres, *burst = finite_numbers("bias", text, (2, 3), ":")
+    if burst and burst[0] <= 0.0:
+        raise SkylessError(f"--bias is {text!r}; a burst should last longer than 0 s")
+    return AnchorBias(_whole("bias", text, anchor), metres, *burst)
+
+
+def outage_of(text: str) -> "AnchorOutage":
+    """ANCHOR:OFF_S or ANCHOR:OFF_S:ON_S. Raises SkylessError."""
+    from skyless.simulation.impairments import AnchorOutage, Outage
+
+    anchor, *times = finite_numbers("outage", text, (2, 3), ":")
+    if len(times) == 2 and times[1] <= times[0]:
+        raise SkylessError(f"--outage is {text!r}; the anchor should come back after it has stopped")
+    if not 0.0 <= times[0] <= times[-1] <= _LATEST_S:
+        raise SkylessError(f"--outage is {text!r}; times should be 0 s or later, and at most {_LATEST_S:g} s")
+    return AnchorOutage(_whole("outage", text, anchor), Outage(*times))
+
+
+def _whole(option: str, text: str, anchor: float) -> int:
+    if not anchor.is_integer():
+        raise SkylessError(f"--{option} is {text!r}; the anchor should be a whole number")
+    return int(anchor)
