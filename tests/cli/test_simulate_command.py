@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 
 import pytest
 
@@ -82,6 +83,18 @@ def test_fixes_file_and_report_agree(run, tmp_path):
     assert {(row["truth_x_m"], row["truth_y_m"]) for row in table} == {("3", "4")}
 
 
+def test_a_tag_walks_its_path_and_rests_at_its_end(run, tmp_path):
+    path = ["--waypoints", "1,1;5,1;5,4", "--speed", "2", "--duration", "6", "--fixes-csv", "fixes.csv"]
+    assert report(run(*path, "--position", "3,4", "--json"))["tags"] == 2
+    with (tmp_path / "fixes.csv").open(newline="") as file:
+        table = [row for row in csv.DictReader(file) if row["tag"] == "1"]
+    truth = [(float(row["t_s"]), float(row["truth_x_m"]), float(row["truth_y_m"])) for row in table]
+    # Corners, the start and the end among them, take 0.9 of the shorter leg's 1.5 s.
+    assert {y for t, x, y in truth if t < 2.0} == {1.0}
+    assert {(x, y) for t, x, y in truth if t > 3.5 + 1.35} == {(5.0, 4.0)}
+    assert all(math.dist(a[1:], b[1:]) <= 2.0 * (b[0] - a[0]) + 1e-5 for a, b in pairwise(truth))
+
+
 def test_faults_show_in_the_figures(run):
     base = ["--position", "3,4", "--duration", "6", "--noise-ps", "100", "--json"]
     clean = report(run(*base))
@@ -107,6 +120,12 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--scenario", "lab", "--site", "lab.toml"], ["--scenario", "--site", "not both"]),
         (["--position", "1,2", "--tags", "5"], ["--position", "--tags", "either"]),
         (["--position", "1,2", "--speed", "2"], ["--position", "--speed", "either"]),
+        (["--waypoints", "1,1;5,1", "--tags", "2"], ["--waypoints", "--tags", "either"]),
+        (["--waypoints", "1,1"], ["--waypoints", "'1,1'", "two or more", "quotes"]),
+        (["--waypoints", "1,1;5"], ["--waypoints", "'5'", "2 or 3"]),
+        (["--waypoints", "1,1;5,1,2"], ["--waypoints", "1,1;5,1,2", "all of its points"]),
+        (["--waypoints", "1,1;2e6,1"], ["--waypoints", "1,1;2e6,1", "within 1e+06 m"]),
+        (["--waypoints", "1,1;5,1;5,1"], ["--waypoints", "1,1;5,1;5,1", "0.01 m or more"]),
         (["--site", "missing.toml"], ["missing.toml", "readable site file"]),
         (["--site", "."], ["readable site file"]),
         (["--method", "magic"], ["method", "magic", "tracker", "literal"]),

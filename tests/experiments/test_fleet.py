@@ -167,3 +167,23 @@ def test_tags_find_room_to_walk_where_anchors_span_none(anchors):
     assert np.all(np.ptp(places, axis=0)[:2] > 0.25)
     assert np.all(np.abs(places[:, 1]) <= 0.5)
     assert np.all(places[:, 2] == 0.0)
+
+
+def test_a_path_that_ends_where_it_began_is_walked_round_and_round():
+    """A square of 4 m at 1 m/s: laps of 16 s; corners of 1 s cut off an eighth of a metre along both of their legs."""
+    square = ((1.0, 1.0), (5.0, 1.0), (5.0, 5.0), (1.0, 5.0), (1.0, 1.0))
+    closed, again = trajectories_of(Request(LAB, paths_m=(square, square[:4])))
+    for lap_s in (0.0, 16.0, 160.0):
+        assert closed.position(lap_s + 3.0) == pytest.approx((3.5, 1.0, 0.0))  # half a corner late since the start
+        assert closed.position(lap_s + 4.5) == pytest.approx((4.875, 1.125, 0.0))
+    assert again.position(40.0) == pytest.approx((1.0, 5.0, 0.0))
+    assert again.velocity(40.0) == pytest.approx(np.zeros(3))
+
+
+def test_paths_without_heights_lie_at_the_height_of_the_tags():
+    raised = replace(LAB, tags=replace(LAB.tags, height_m=1.2))
+    flat, slope = trajectories_of(
+        Request(raised, paths_m=(((1.0, 1.0), (2.0, 1.0)), ((1.0, 1.0, 0.0), (1.0, 1.0, 2.0))))
+    )
+    assert flat.position(0.7)[2] == 1.2
+    assert slope.position(60.0)[2] == 2.0

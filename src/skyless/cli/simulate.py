@@ -11,7 +11,7 @@ from cyclopts.validators import Number
 from skyless.cli.options import NotNegative, Picoseconds, Positive, finite_numbers, open_for_writing, spare_inputs
 from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
-from skyless.cli.simulate_input import bias_of, outage_of, site_of
+from skyless.cli.simulate_input import bias_of, outage_of, path_of, site_of
 from skyless.cli.simulate_output import COLUMNS, row_of, show
 from skyless.errors import SkylessError
 
@@ -36,6 +36,7 @@ def simulate(
     site: Path | None = None,
     method: str = "tracker",
     position: list[str] | None = None,
+    waypoints: list[str] | None = None,
     tags: Annotated[int, Parameter(validator=Number(gte=1, lte=10_000))] | None = None,
     speed: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] | None = None,
     qa: Positive = 0.3,
@@ -67,11 +68,13 @@ def simulate(
     method
         literal, literal-delayed, weighted, bracketed or tracker.
     position
-        Where a tag lies still, x,y or x,y,z in metres; may be given several times. Without it the tags walk about.
+        Where a tag lies still, x,y or x,y,z in metres; may be given several times.
+    waypoints
+        A tag's path, "x,y;x,y;..." with or without z, walked once, or for ever if it ends where it begins; repeatable.
     tags
-        How many tags walk about; 1 by default.
+        How many tags walk about where neither --position nor --waypoints is given; 1 by default.
     speed
-        Their speed in m/s; 1 by default.
+        How fast tags walk, in m/s; 1 by default.
     qa
         Agility that the tracker assumes, m²/s³.
     noise_ps
@@ -106,14 +109,17 @@ def simulate(
     from skyless.experiments.scenarios import Request
 
     spare_inputs("fixes-csv", fixes_csv, site)
-    if position and (tags is not None or speed is not None):
+    if position and not waypoints and (tags is not None or speed is not None):
         raise SkylessError("--position is for tags that lie still, --tags and --speed for tags that walk; give either")
+    if waypoints and tags is not None:
+        raise SkylessError("--waypoints is the path of one tag, --tags a number of tags that walk about; give either")
     request = Request(
         site=site_of(scenario, site),
         method=method,
         seed=seed,
         noise_ps=noise_ps,
         positions_m=tuple(finite_numbers("position", text, (2, 3)) for text in position or ()),
+        paths_m=tuple(path_of(text) for text in waypoints or ()),
         tags=1 if tags is None else tags,
         speed_mps=1.0 if speed is None else speed,
         qa=qa,

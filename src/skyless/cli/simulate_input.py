@@ -1,5 +1,7 @@
 """What ``skyless simulate`` is given: the texts of its options become values."""
 
+from itertools import pairwise
+from math import dist
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -12,6 +14,9 @@ if TYPE_CHECKING:
 
 _LATEST_S: Final = 1e8
 """Three years: the 64 bits of unwrapped ticks last four and a half."""
+
+_SHORTEST_M: Final = 0.01
+"""Of the legs of a path, which are where its corners find room."""
 
 
 def site_of(scenario: str | None, file: Path | None) -> "Site":
@@ -26,6 +31,22 @@ def site_of(scenario: str | None, file: Path | None) -> "Site":
     if scenario not in {None, "lab"}:
         raise SkylessError(f"--scenario is {scenario!r}; it should be lab (or give a site file with --site)")
     return lab_site()
+
+
+def path_of(text: str) -> tuple[tuple[float, ...], ...]:
+    """Points of a path, x,y or x,y,z each, separated by semicolons or spaces. Raises SkylessError."""
+    from skyless.site.limits import FARTHEST_M
+
+    points = tuple(finite_numbers("waypoints", part, (2, 3)) for part in text.replace(";", " ").split())
+    if len(points) < 2:
+        raise SkylessError(f"--waypoints is {text!r}; it should be two or more points in quotes, 'x,y;x,y;x,y'")
+    if len({len(point) for point in points}) > 1:
+        raise SkylessError(f"--waypoints is {text!r}; all of its points should have a height, or none")
+    if any(abs(value) > FARTHEST_M for point in points for value in point):
+        raise SkylessError(f"--waypoints is {text!r}; its points should lie within {FARTHEST_M:g} m")
+    if any(dist(a, b) < _SHORTEST_M for a, b in pairwise(points)):
+        raise SkylessError(f"--waypoints is {text!r}; from point to point it should be {_SHORTEST_M:g} m or more")
+    return points
 
 
 def bias_of(text: str) -> "AnchorBias":

@@ -36,10 +36,13 @@ class Request(Struct, frozen=True):
     noise_ps: float | None = None
     """Noise of every TX and RX stamp, and what the filters assume; None for the site's own figures."""
     positions_m: tuple[tuple[float, ...], ...] = ()
-    """Tags that lie still, (x, y) or (x, y, z) each; with none, ``tags`` of them walk about."""
+    """Tags that lie still, (x, y) or (x, y, z) each."""
+    paths_m: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    """Tags that walk from point to point, each along its path: once, or round and round if it ends where it began."""
     tags: int = 1
+    """How many tags walk about where neither positions nor paths are given."""
     speed_mps: float = 1.0
-    """Speed of the tags that walk about."""
+    """Speed of the tags that walk."""
     qa: float = 0.3
     warmup_s: float = 2.0
     most_fixes: int | None = None
@@ -57,7 +60,7 @@ def fleet_of(request: Request) -> Fleet:
     """Make the world and its tags.
 
     Raises:
-        ValueError: the method, or an anchor that is to fail, does not exist.
+        ValueError: the method, or an anchor that is to fail, does not exist; a path has points in one place.
     """
     site = request.site
     if request.noise_ps is not None:
@@ -90,12 +93,20 @@ def impairments_of(request: Request, site: Site) -> Impairments:
 
 
 def trajectories_of(request: Request) -> list[Trajectory]:
-    """Tags at the given positions, or walking about inside the box around the anchors."""
-    height_m = request.site.tags.height_m
-    if request.positions_m:
-        default_z_m = 0.0 if height_m is None else height_m
-        return [Static(p[0], p[1], p[2] if len(p) > 2 else default_z_m) for p in request.positions_m]
-    return [_walk(request, index) for index in range(request.tags)]
+    """Tags at the given positions and on the given paths, else walking about inside the box around the anchors."""
+    height_m = request.site.tags.height_m or 0.0
+    given: list[Trajectory] = [Static(*_with_height(point, height_m)) for point in request.positions_m]
+    given += [_path([_with_height(p, height_m) for p in path], request.speed_mps) for path in request.paths_m]
+    return given or [_walk(request, index) for index in range(request.tags)]
+
+
+def _with_height(point: tuple[float, ...], height_m: float) -> tuple[float, float, float]:
+    return point[0], point[1], point[2] if len(point) > 2 else height_m
+
+
+def _path(points: list[tuple[float, float, float]], speed_mps: float) -> Waypoints:
+    closed = len(points) > 2 and points[0] == points[-1]
+    return _smooth_path(points[:-1] if closed else points, speed_mps, loop=closed)
 
 
 def _walk(request: Request, index: int) -> Trajectory:
@@ -110,12 +121,13 @@ def _walk(request: Request, index: int) -> Trajectory:
     return _smooth_path(points, request.speed_mps)
 
 
-def _smooth_path(points: Sequence[ArrayLike], speed_mps: float) -> Waypoints:
-    """Round path whose corners are as gentle as the legs allow, at most ``COMFORT_MPS2``."""
+def _smooth_path(points: Sequence[ArrayLike], speed_mps: float, *, loop: bool = True) -> Waypoints:
+    """Path whose corners are as gentle as the legs allow, at most ``COMFORT_MPS2``; ``loop``: round and round."""
     places = np.array(points, dtype=np.float64)
-    legs_m = np.linalg.norm(np.roll(places, -1, axis=0) - places, axis=1)
+    steps_m = np.roll(places, -1, axis=0) - places
+    legs_m = np.linalg.norm(steps_m if loop else steps_m[:-1], axis=1)
     corner_s = min(2.0 * speed_mps / COMFORT_MPS2, 0.9 * float(legs_m.min()) / speed_mps)
-    return Waypoints(places, speed_mps, loop=True, corner_s=corner_s)
+    return Waypoints(places, speed_mps, loop=loop, corner_s=corner_s)
 
 
 def _walkable_box(site: Site) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
