@@ -15,9 +15,9 @@ FLOORS = (
     {"clocks", "uncertainty"},
     {"positioning"},
     {"anchor", "receiver"},
-    {"simulation", "recordings"},
-    {"experiments", "planning"},
-    {"cli"},
+    {"simulation", "radios", "recordings", "outputs"},
+    {"experiments", "nodes", "planning"},
+    {"cli", "dashboard"},
 )
 FLOOR_OF = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init__.py")

@@ -1,0 +1,1 @@
+"""The programs of a running site, asyncio around the protocol machines."""

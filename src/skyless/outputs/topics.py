@@ -1,0 +1,56 @@
+"""MQTT topics, version 1 (``docs/mqtt.md``); everything of a site stands under ``skyless/v1/<site>/``."""
+
+from typing import Final
+
+ROOT: Final = "skyless/v1"
+EVERY_SITE: Final = "+"
+
+
+def site_topic(site: int | str) -> str:
+    """Retained ``SiteMessage``."""
+    return f"{ROOT}/{site}/site"
+
+
+def floor_plan_topic(site: int | str) -> str:
+    """Retained image of the floor, the bytes of a PNG or JPEG."""
+    return f"{ROOT}/{site}/floor_plan"
+
+
+def fix_topic(site: int | str, tag: str) -> str:
+    """``FixMessage``."""
+    return f"{ROOT}/{site}/tag/{tag}/fix"
+
+
+def status_topic(site: int | str, kind: str, name: int | str) -> str:
+    """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard`` or ``recorder``; its last will."""
+    return f"{ROOT}/{site}/{kind}/{name}/status"
+
+
+def health_topic(site: int | str, kind: str, name: int | str) -> str:
+    """``TagHealth``, ``AnchorHealth`` or ``EtherHealth``, once a second."""
+    return f"{ROOT}/{site}/{kind}/{name}/health"
+
+
+def receptions_topic(site: int | str, tag: str) -> str:
+    """``ReceptionsMessage``, on request."""
+    return f"{ROOT}/{site}/tag/{tag}/receptions"
+
+
+def request_topic(site: int | str) -> str:
+    """``RequestMessage``: who wants raw receptions of which tags."""
+    return f"{ROOT}/{site}/request"
+
+
+def truth_topic(site: int | str) -> str:
+    """``TruthMessage``; only a simulated site has one."""
+    return f"{ROOT}/{site}/truth"
+
+
+def zones_topic(site: int | str) -> str:
+    """Retained ``ZonesMessage``."""
+    return f"{ROOT}/{site}/zones"
+
+
+def zone_event_topic(site: int | str, zone: str) -> str:
+    """``ZoneEvent``."""
+    return f"{ROOT}/{site}/zone/{zone}/event"

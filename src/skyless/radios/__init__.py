@@ -1,0 +1,1 @@
+"""The narrow radio interface, and the radios behind it."""

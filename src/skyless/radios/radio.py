@@ -1,0 +1,52 @@
+"""What a daemon asks of a radio, and no more."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+from msgspec import Struct
+
+from skyless.air.reception import Reception, Transmission
+
+
+class Sent(Struct, frozen=True, gc=False):
+    """The frame has left the antenna."""
+
+    tx_ticks: int
+
+
+class Late(Struct, frozen=True, gc=False):
+    """The frame came too late for its time, and was not sent."""
+
+    tx_ticks: int
+
+
+class Restarted(Struct, frozen=True, gc=False):
+    """The radio is ready, with a counter that has nothing to do with what it counted before."""
+
+
+class Gone(Struct, frozen=True, gc=False):
+    """The radio does not answer; it is being looked for."""
+
+    reason: str
+
+
+RadioEvent = Reception | Sent | Late | Restarted | Gone
+Listener = Callable[[RadioEvent], None]
+"""Called from the event loop as soon as something happens; must return quickly and not raise."""
+
+
+class Radio(Protocol):
+    """One radio. It is used from one event loop."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+
+    async def run(self, listener: Listener) -> None:
+        """Configure the radio and receive until cancelled; finds a radio that went away again by itself."""
+
+    def now_ticks(self) -> int | None:
+        """The radio's 40-bit counter now, to about 0.1 ms; None while the radio is not ready."""
+
+    def transmit(self, transmission: Transmission) -> None:
+        """Send a frame so that its RMARKER leaves at ``tx_ticks``; ``Sent`` or ``Late`` tells what became of it."""
