@@ -10,11 +10,14 @@ import sys
 import time
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from skyless.cli.main import main
 from skyless.cli.simulate_output import COLUMNS
+from skyless.site.lab import lab_site
 
+C = 299_792_458.0
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "simulate"]
 KEYS = {
     *("method", "tags", "messages", "fixes", "rmse_m", "p95_m", "max_m", "updates_per_s", "dropped"),
@@ -105,6 +108,23 @@ def test_faults_show_in_the_figures(run):
     assert silent["messages"] == pytest.approx(clean["messages"] * (1 - 4 / 6 / 6), rel=0.02)
 
 
+def test_wrong_antenna_delays_bias_the_position_as_least_squares_says(run):
+    """To first order (JᵀJ)⁻¹Jᵀ of what each difference is late: TX plus RX delay of its anchor, none for the master.
+
+    The same seed without them has the same noise, which the difference of the two biases therefore has not.
+    """
+    late_m = np.array([0.0, 0.0, 0.2 + 0.1, 0.0, -0.25, 0.0]) * C * 1e-9
+    away = np.array([3.0, 4.0]) - [(anchor.x_m, anchor.y_m) for anchor in lab_site().anchors]
+    units = away / np.linalg.norm(away, axis=1)[:, None]
+    expected_m = np.linalg.lstsq(units[1:] - units[0], late_m[1:], rcond=None)[0]
+    base = ["--method", "literal", "--noise-ps", "100", "--position", "3,4", "--duration", "5", "--json"]
+    wrong, right = report(run(*base, "--delay-error", "3:0.2:0.1", "--delay-error", "5:0:-0.25")), report(run(*base))
+    assert wrong["fixes"] == right["fixes"]
+    bias_m = np.subtract(wrong["bias_m"], right["bias_m"])[:2]
+    assert np.linalg.norm(expected_m) > 0.03
+    assert bias_m == pytest.approx(expected_m, abs=0.02 * np.linalg.norm(expected_m))
+
+
 def test_a_table_for_people_has_no_control_characters(run):
     code, out, err = run("--duration", "3")
     assert (code, err) == (0, "")
@@ -153,6 +173,11 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--outage", "2:3:1"], ["--outage", "2:3:1", "come back after"]),
         (["--outage", "2:-3"], ["--outage", "2:-3", "0 s or later"]),
         (["--outage", "2:1e300"], ["--outage", "1e300", "at most"]),
+        (["--delay-error", "99:1:1"], ["99", "1, 2, 3, 4, 5, 6"]),
+        (["--delay-error", "2:1"], ["--delay-error", "2:1", "3 number(s)"]),
+        (["--delay-error", "2.5:1:1"], ["--delay-error", "2.5:1:1", "whole number"]),
+        (["--delay-error", "2:1:1e4"], ["--delay-error", "2:1:1e4", "within 1000 ns"]),
+        (["--delay-error", "2:1:1", "--delay-error", "2:0:1"], ["--delay-error", "2:0:1", "already"]),
         (["--speed", "1e300"], ["--speed", "1e+300"]),
         (["--fixes-csv", "no/fixes.csv"], ["no/fixes.csv", "cannot be written"]),
         (["--fixes-csv", "."], ["cannot be written"]),

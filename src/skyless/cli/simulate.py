@@ -11,7 +11,7 @@ from cyclopts.validators import Number
 from skyless.cli.options import NotNegative, Picoseconds, Positive, finite_numbers, open_for_writing, spare_inputs
 from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
-from skyless.cli.simulate_input import bias_of, outage_of, path_of, site_of
+from skyless.cli.simulate_input import bias_of, delay_errors_of, outage_of, path_of, site_of
 from skyless.cli.simulate_output import COLUMNS, row_of, show
 from skyless.errors import SkylessError
 
@@ -50,6 +50,7 @@ def simulate(
     nlos_mean: Positive = 1.0,
     bias: list[str] | None = None,
     outage: list[str] | None = None,
+    delay_error: list[str] | None = None,
     power_bias: bool = False,
     temperature: bool = False,
     fixes_csv: Path | None = None,
@@ -97,6 +98,8 @@ def simulate(
         ANCHOR:METRES, or ANCHOR:METRES:BURST_S for bursts: tags hear this anchor late.
     outage
         ANCHOR:OFF_S or ANCHOR:OFF_S:ON_S: an anchor that stops, and restarts.
+    delay_error
+        ANCHOR:TX_NS:RX_NS: by how much this anchor's antenna delays are longer than its site file says.
     power_bias
         Give RX stamps the DW1000's bias by received power.
     temperature
@@ -132,6 +135,7 @@ def simulate(
         temperature=temperature,
         biases=tuple(bias_of(text) for text in bias or ()),
         outages=tuple(outage_of(text) for text in outage or ()),
+        delay_errors=delay_errors_of(delay_error or []),
     )
     result = _run(request, duration, fixes_csv)
     if json:

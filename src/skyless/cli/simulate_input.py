@@ -9,7 +9,7 @@ from skyless.cli.options import finite_numbers
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.simulation.impairments import AnchorBias, AnchorOutage
+    from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError
     from skyless.site.model import Site
 
 _LATEST_S: Final = 1e8
@@ -17,6 +17,9 @@ _LATEST_S: Final = 1e8
 
 _SHORTEST_M: Final = 0.01
 """Of the legs of a path, which are where its corners find room."""
+
+_LONGEST_DELAY_NS: Final = 1000.0
+"""Of an antenna, as far as a site file can tell it."""
 
 
 def site_of(scenario: str | None, file: Path | None) -> "Site":
@@ -69,6 +72,23 @@ def outage_of(text: str) -> "AnchorOutage":
     if not 0.0 <= times[0] <= times[-1] <= _LATEST_S:
         raise SkylessError(f"--outage is {text!r}; times should be 0 s or later, and at most {_LATEST_S:g} s")
     return AnchorOutage(_whole("outage", text, anchor), Outage(*times))
+
+
+def delay_errors_of(texts: list[str]) -> "tuple[DelayError, ...]":
+    """ANCHOR:TX_NS:RX_NS, each of another anchor. Raises SkylessError."""
+    from skyless.constants import TICK_S
+    from skyless.simulation.impairments import DelayError
+
+    errors: dict[int, DelayError] = {}
+    for text in texts:
+        number, *delays_ns = finite_numbers("delay-error", text, (3,), ":")
+        anchor = _whole("delay-error", text, number)
+        if anchor in errors:
+            raise SkylessError(f"--delay-error is {text!r}; anchor {anchor} already has one")
+        if any(abs(delay_ns) > _LONGEST_DELAY_NS for delay_ns in delays_ns):
+            raise SkylessError(f"--delay-error is {text!r}; delays should be within {_LONGEST_DELAY_NS:g} ns")
+        errors[anchor] = DelayError(anchor, *(delay_ns * 1e-9 / TICK_S for delay_ns in delays_ns))
+    return tuple(errors.values())
 
 
 def _whole(option: str, text: str, anchor: float) -> int:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from skyless.experiments.fleet import Fleet, FleetSettings
 from skyless.simulation.channel import ChannelModel
-from skyless.simulation.impairments import AnchorBias, AnchorOutage, Impairments
+from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments
 from skyless.simulation.oscillator import OscillatorModel, Temperature
 from skyless.simulation.trajectory import Static, Trajectory, Waypoints
 from skyless.site.model import Site
@@ -54,6 +54,8 @@ class Request(Struct, frozen=True):
     temperature: bool = False
     biases: tuple[AnchorBias, ...] = ()
     outages: tuple[AnchorOutage, ...] = ()
+    delay_errors: tuple[DelayError, ...] = ()
+    """Antenna delays that the site file has wrong, one entry an anchor at most."""
 
 
 def fleet_of(request: Request) -> Fleet:
@@ -88,6 +90,7 @@ def impairments_of(request: Request, site: Site) -> Impairments:
             power_bias=request.power_bias,
         ),
         anchor_biases=request.biases,
+        delay_errors=request.delay_errors,
         anchor_outages=request.outages,
     )
 
