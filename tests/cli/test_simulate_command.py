@@ -108,6 +108,29 @@ def test_faults_show_in_the_figures(run):
     assert silent["messages"] == pytest.approx(clean["messages"] * (1 - 4 / 6 / 6), rel=0.02)
 
 
+@pytest.mark.parametrize("method", ["weighted", "tracker"])
+def test_deaf_tags_make_no_fix_and_find_themselves_again(run, tmp_path, method):
+    base = ["--method", method, "--duration", "8", "--fixes-csv", "fixes.csv", "--json"]
+    told = report(run(*base, "--deaf", "3:4.5", "--deaf", "5:5.5"))
+    assert told["drops"]["deaf"] == pytest.approx(2.0 * 400, abs=2)
+    with (tmp_path / "fixes.csv").open(newline="") as file:
+        times_s = [float(row["t_s"]) for row in csv.DictReader(file)]
+    assert not any(3.0 <= time_s < 4.5 or 5.0 <= time_s < 5.5 for time_s in times_s)
+    for lost_s, found_s in ((3.0, 4.5), (5.0, 5.5)):
+        assert any(lost_s - 0.05 < time_s < lost_s for time_s in times_s)
+        assert any(found_s <= time_s < found_s + 0.15 for time_s in times_s)
+    assert told["max_m"] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("fault", "end_s"), [(["--deaf", "3"], 63), (["--outage", "1:3"], 63), (["--deaf", "3:70"], 70.5)]
+)
+def test_a_goal_that_cannot_be_reached_is_given_up(run, fault, end_s):
+    told = report(run("--method", "literal", "--position", "3,4", "--fixes", "100", *fault, "--json"))
+    assert told["simulated_s"] == pytest.approx(end_s, abs=0.5)
+    assert (told["fixes"] < 100) == (end_s == 63)
+
+
 def test_wrong_antenna_delays_bias_the_position_as_least_squares_says(run):
     """To first order (JᵀJ)⁻¹Jᵀ of what each difference is late: TX plus RX delay of its anchor, none for the master.
 
@@ -178,6 +201,10 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--delay-error", "2.5:1:1"], ["--delay-error", "2.5:1:1", "whole number"]),
         (["--delay-error", "2:1:1e4"], ["--delay-error", "2:1:1e4", "within 1000 ns"]),
         (["--delay-error", "2:1:1", "--delay-error", "2:0:1"], ["--delay-error", "2:0:1", "already"]),
+        (["--deaf", "now"], ["--deaf", "now", "1 or 2"]),
+        (["--deaf", "3:3"], ["--deaf", "3:3", "end after"]),
+        (["--deaf", "-1:3"], ["--deaf", "-1:3"]),
+        (["--deaf", "1e300"], ["--deaf", "1e300", "at most"]),
         (["--speed", "1e300"], ["--speed", "1e+300"]),
         (["--fixes-csv", "no/fixes.csv"], ["no/fixes.csv", "cannot be written"]),
         (["--fixes-csv", "."], ["cannot be written"]),

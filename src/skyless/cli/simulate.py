@@ -1,9 +1,10 @@
 """``skyless simulate``: a site in the simulated world, judged against the truth."""
 
 import csv
+import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TextIO
+from typing import TYPE_CHECKING, Annotated, Final, TextIO
 
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
@@ -11,7 +12,7 @@ from cyclopts.validators import Number
 from skyless.cli.options import NotNegative, Picoseconds, Positive, finite_numbers, open_for_writing, spare_inputs
 from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
-from skyless.cli.simulate_input import bias_of, delay_errors_of, outage_of, path_of, site_of
+from skyless.cli.simulate_input import bias_of, delay_errors_of, outage_of, path_of, silence_of, site_of
 from skyless.cli.simulate_output import COLUMNS, row_of, show
 from skyless.errors import SkylessError
 
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
     from skyless.experiments.scenarios import Request
 
 _Share = Annotated[float, Parameter(validator=Number(gte=0, lt=1))]
+
+_USUAL_S: Final = 60.0
+"""A run without goal lasts so long."""
+
+_PATIENCE_S: Final = 60.0
+"""Simulated time that a run whose goal is fixes waits for one."""
 
 app = App(
     name="simulate",
@@ -51,6 +58,7 @@ def simulate(
     bias: list[str] | None = None,
     outage: list[str] | None = None,
     delay_error: list[str] | None = None,
+    deaf: list[str] | None = None,
     power_bias: bool = False,
     temperature: bool = False,
     fixes_csv: Path | None = None,
@@ -81,7 +89,7 @@ def simulate(
     noise_ps
         Noise of every TX and RX stamp in picoseconds, known to the filters; by default the site's own figures.
     fixes
-        Stop when every tag has so many judged fixes (one per superframe).
+        Stop when every tag has so many judged fixes (one per superframe), or waits for one for 60 s in vain.
     duration
         Stop after so many simulated seconds; by default 60 unless --fixes is given.
     warmup
@@ -100,6 +108,8 @@ def simulate(
         ANCHOR:OFF_S or ANCHOR:OFF_S:ON_S: an anchor that stops, and restarts.
     delay_error
         ANCHOR:TX_NS:RX_NS: by how much this anchor's antenna delays are longer than its site file says.
+    deaf
+        FROM_S or FROM_S:TO_S: the tags' radios hear nothing from then on, or for that time.
     power_bias
         Give RX stamps the DW1000's bias by received power.
     temperature
@@ -136,6 +146,7 @@ def simulate(
         biases=tuple(bias_of(text) for text in bias or ()),
         outages=tuple(outage_of(text) for text in outage or ()),
         delay_errors=delay_errors_of(delay_error or []),
+        silences=tuple(silence_of(text) for text in deaf or ()),
     )
     result = _run(request, duration, fixes_csv)
     if json:
@@ -159,25 +170,24 @@ def _run(request: "Request", duration: float | None, fixes_csv: Path | None) -> 
     with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
         compile_kernels(request.method)
     started_s = time.perf_counter()
-    fixes = request.most_fixes
-    until_s = duration if duration is not None else (float("inf") if fixes else 60.0)
+    until_s = duration if duration is not None else (math.inf if request.most_fixes else _USUAL_S)
     if fixes_csv is None:
-        _pass_time(fleet, fixes, until_s, None)
+        _pass_time(fleet, request, until_s, None)
     else:
         with open_for_writing(fixes_csv) as file:
-            _pass_time(fleet, fixes, until_s, file)
+            _pass_time(fleet, request, until_s, file)
     return report(fleet, request.method, started_s)
 
 
-def _pass_time(fleet: "Fleet", fixes: int | None, until_s: float, file: TextIO | None) -> None:
-    """Let the world run in steps, so that the bar moves and the goal is seen; without any fix it ends after 60 s."""
+def _pass_time(fleet: "Fleet", request: "Request", until_s: float, file: TextIO | None) -> None:
+    """Let the world run in steps, so that the bar moves and the goal is seen."""
     writer = None if file is None else csv.writer(file)
     if writer is not None:
         writer.writerow(COLUMNS)
-    goal = fixes if fixes is not None else until_s
-    with progress_bar("simulating", goal) as bar:
+    fixes = request.most_fixes
+    with progress_bar("simulating", fixes if fixes is not None else until_s) as bar:
         now_s = 0.0
-        while now_s < until_s and not _enough(fleet, fixes, now_s):
+        while now_s < until_s and not _enough(fleet, request, now_s):
             now_s = min(now_s + 0.25, until_s)
             for judged in fleet.run(now_s):
                 if writer is not None:
@@ -185,8 +195,12 @@ def _pass_time(fleet: "Fleet", fixes: int | None, until_s: float, file: TextIO |
             bar.reach(fleet.errors.count / len(fleet.records) if fixes is not None else now_s)
 
 
-def _enough(fleet: "Fleet", fixes: int | None, now_s: float) -> bool:
+def _enough(fleet: "Fleet", request: "Request", now_s: float) -> bool:
+    """Whether all tags have their fixes, or those that have not wait in vain, with nothing planned to come back."""
+    fixes = request.most_fixes
     if fixes is None:
         return False
-    hopeless = now_s > 60.0 and all(record.fixes == 0 for record in fleet.records)
-    return hopeless or all(record.judged >= fixes for record in fleet.records)
+    returns_s = [planned.outage.on_s for planned in request.outages] + [silence.on_s for silence in request.silences]
+    planned_s = max(filter(math.isfinite, returns_s), default=0.0)
+    last_s = (0.0 if tag.last is None else tag.last.time_s for tag in fleet.records if tag.judged < fixes)
+    return all(now_s - max(tag_s, planned_s) > _PATIENCE_S for tag_s in last_s)

@@ -1,5 +1,6 @@
 """What ``skyless simulate`` is given: the texts of its options become values."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 from math import dist
 from pathlib import Path
@@ -9,7 +10,7 @@ from skyless.cli.options import finite_numbers
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError
+    from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Outage
     from skyless.site.model import Site
 
 _LATEST_S: Final = 1e8
@@ -64,14 +65,26 @@ def bias_of(text: str) -> "AnchorBias":
 
 def outage_of(text: str) -> "AnchorOutage":
     """ANCHOR:OFF_S or ANCHOR:OFF_S:ON_S. Raises SkylessError."""
-    from skyless.simulation.impairments import AnchorOutage, Outage
+    from skyless.simulation.impairments import AnchorOutage
 
-    anchor, *times = finite_numbers("outage", text, (2, 3), ":")
-    if len(times) == 2 and times[1] <= times[0]:
-        raise SkylessError(f"--outage is {text!r}; the anchor should come back after it has stopped")
-    if not 0.0 <= times[0] <= times[-1] <= _LATEST_S:
-        raise SkylessError(f"--outage is {text!r}; times should be 0 s or later, and at most {_LATEST_S:g} s")
-    return AnchorOutage(_whole("outage", text, anchor), Outage(*times))
+    anchor, *times_s = finite_numbers("outage", text, (2, 3), ":")
+    outage = _off_and_on("outage", text, times_s, "the anchor should come back after it has stopped")
+    return AnchorOutage(_whole("outage", text, anchor), outage)
+
+
+def silence_of(text: str) -> "Outage":
+    """FROM_S or FROM_S:TO_S. Raises SkylessError."""
+    return _off_and_on("deaf", text, finite_numbers("deaf", text, (1, 2), ":"), "it should end after it has begun")
+
+
+def _off_and_on(option: str, text: str, times_s: Sequence[float], order: str) -> "Outage":
+    from skyless.simulation.impairments import Outage
+
+    if len(times_s) == 2 and times_s[1] <= times_s[0]:
+        raise SkylessError(f"--{option} is {text!r}; {order}")
+    if not 0.0 <= times_s[0] <= times_s[-1] <= _LATEST_S:
+        raise SkylessError(f"--{option} is {text!r}; times should be 0 s or later, and at most {_LATEST_S:g} s")
+    return Outage(*times_s)
 
 
 def delay_errors_of(texts: list[str]) -> "tuple[DelayError, ...]":

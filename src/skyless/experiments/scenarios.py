@@ -8,9 +8,10 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import ArrayLike, NDArray
 
+from skyless.experiments.deaf_receiver import DeafReceiver
 from skyless.experiments.fleet import Fleet, FleetSettings
 from skyless.simulation.channel import ChannelModel
-from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments
+from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage
 from skyless.simulation.oscillator import OscillatorModel, Temperature
 from skyless.simulation.trajectory import Static, Trajectory, Waypoints
 from skyless.site.model import Site
@@ -56,6 +57,8 @@ class Request(Struct, frozen=True):
     outages: tuple[AnchorOutage, ...] = ()
     delay_errors: tuple[DelayError, ...] = ()
     """Antenna delays that the site file has wrong, one entry an anchor at most."""
+    silences: tuple[Outage, ...] = ()
+    """When all tags' radios are deaf; their counters go on."""
 
 
 def fleet_of(request: Request) -> Fleet:
@@ -69,7 +72,12 @@ def fleet_of(request: Request) -> Fleet:
         noise = replace(site.noise, tx_stamp_ps=request.noise_ps, rx_stamp_ps=request.noise_ps)
         site = replace(site, noise=noise)
     settings = FleetSettings(request.method, request.qa, request.warmup_s, request.most_fixes)
-    return Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, settings)
+    fleet = Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, settings)
+    if request.silences:
+        fleet.receivers = [
+            DeafReceiver(request.method, qa=request.qa, silences=request.silences) for _ in fleet.receivers
+        ]
+    return fleet
 
 
 def impairments_of(request: Request, site: Site) -> Impairments:
