@@ -178,6 +178,9 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--position", "1,2,3,4"], ["--position", "1,2,3,4"]),
         (["--duration", "-1"], ["--duration", "-1"]),
         (["--duration", "0"], ["--duration", "0"]),
+        (["--duration", "1"], ["--warmup is 2", "1 s", "--duration", "before any fix is judged"]),
+        (["--duration", "2", "--fixes", "5"], ["--warmup is 2", "2 s", "before any fix is judged"]),
+        (["--warmup", "60", "--duration", "60"], ["--warmup is 60", "60 s", "before any fix is judged"]),
         (["--duration", "inf"], ["--duration", "inf"]),
         (["--fixes", "0"], ["--fixes", "0"]),
         (["--noise-ps", "1e7"], ["--noise-ps", "10000000"]),
@@ -211,7 +214,7 @@ def test_a_table_for_people_has_no_control_characters(run):
     ],
 )
 def test_a_mistake_is_told_in_one_line(run, tmp_path, arguments, said):
-    code, out, err = run(*arguments, *(["--duration", "1"] if "--duration" not in arguments else []))
+    code, out, err = run(*arguments, *(["--duration", "3"] if "--duration" not in arguments else []))
     assert (code, out) == (2, "")
     assert err.startswith("skyless: ")
     assert err.count("\n") == 1

@@ -93,7 +93,7 @@ def simulate(
     duration
         Stop after so many simulated seconds; by default 60 unless --fixes is given.
     warmup
-        Simulated seconds before which fixes are not judged.
+        Simulated seconds before which fixes are not judged; less than the run lasts.
     seed
         Same seed, same bytes and ticks.
     loss
@@ -148,7 +148,10 @@ def simulate(
         delay_errors=delay_errors_of(delay_error or []),
         silences=tuple(silence_of(text) for text in deaf or ()),
     )
-    result = _run(request, duration, fixes_csv)
+    until_s = duration if duration is not None else (math.inf if fixes is not None else _USUAL_S)
+    if warmup >= until_s:
+        raise SkylessError(f"--warmup is {warmup:g}; a run of {until_s:g} s (--duration) ends before any fix is judged")
+    result = _run(request, until_s, fixes_csv)
     if json:
         import msgspec
 
@@ -158,7 +161,7 @@ def simulate(
         show(result)
 
 
-def _run(request: "Request", duration: float | None, fixes_csv: Path | None) -> "FleetReport":
+def _run(request: "Request", until_s: float, fixes_csv: Path | None) -> "FleetReport":
     from skyless.experiments.fleet import report
     from skyless.experiments.scenarios import fleet_of
     from skyless.experiments.warm import compile_kernels
@@ -170,7 +173,6 @@ def _run(request: "Request", duration: float | None, fixes_csv: Path | None) -> 
     with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
         compile_kernels(request.method)
     started_s = time.perf_counter()
-    until_s = duration if duration is not None else (math.inf if request.most_fixes else _USUAL_S)
     if fixes_csv is None:
         _pass_time(fleet, request, until_s, None)
     else:
