@@ -29,7 +29,7 @@ def beacons(stage, until_s):
 
 def master_reading(world, broadcast):
     """What the master's counter truly shows when a frame leaves: unwrapped ticks and fraction."""
-    clock = world._clocks[0]
+    clock = world.medium.clocks[0]
     ahead = broadcast.emission_ticks - int(clock["true_ticks"])
     elapsed = (ahead + broadcast.emission_fraction - float(clock["true_fraction"])) * (1.0 + float(clock["rate"]))
     whole = math.floor(elapsed)
@@ -118,7 +118,7 @@ def test_the_master_time_is_as_good_as_it_says():
     squares, largest = [], 0.0
     for seed in range(8):
         stage = Stage(LAB, seed)
-        stage.world._stations["tx_noise_ticks"][1:] = 0.0
+        stage.world.medium.stations["tx_noise_ticks"][1:] = 0.0
         for broadcast, beacon in beacons(stage, 5.0):
             if beacon.anchor == 1 or broadcast.end_s < 1.0:
                 continue

@@ -1,0 +1,211 @@
+"""The medium: true time, the nodes' clocks and radios, and the frames that fly between them.
+
+A frame has two events: its RMARKER leaves, and it ends, when the listeners get it. The emulated radio takes the low
+nine bits off DX = TX stamp - configured antenna delay, as the DW1000 does, so a node that ignores the granularity
+sends with a wrong stamp. Who sends what and when is the affair of the medium's owner.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.air.airtime import after_rmarker_s, preamble_s
+from skyless.air.reception import Transmission
+from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_S
+from skyless.simulation.broadcast import Tally, make_tally
+from skyless.simulation.channel import pack_channel, pack_walls
+from skyless.simulation.ether import OUTCOMES, Flight, OnAir
+from skyless.simulation.impairments import Impairments
+from skyless.simulation.listening import RECEIVED, hear
+from skyless.simulation.oscillator import advance, emit, foresee, make_clocks, restart_counter
+from skyless.simulation.stations import TagSpec, make_stations, set_piece
+from skyless.simulation.streams import ANCHOR_KEY, TAG_KEY, Streams, stream
+from skyless.simulation.timeline import Timeline
+from skyless.site.model import Site
+from skyless.ticks import difference, from_seconds, wrap
+
+TURNAROUND_S: Final = 0.2e-3
+"""What a host needs to hand a frame to its radio; a preamble that should begin earlier is too late (HPDWARN).
+
+Longer than any frame after its RMARKER (177 µs), so that all that overlap it are known when the RMARKER leaves.
+"""
+
+_TURNAROUND_TICKS: Final = from_seconds(TURNAROUND_S)
+_PREAMBLE_TICKS: Final = from_seconds(preamble_s())
+_DX_MASK: Final = ~(DELAYED_TX_GRANULARITY_TICKS - 1)
+
+Told = TypeVar("Told")
+
+
+@dataclass(slots=True, eq=False)
+class Delivery:
+    """A frame that has just ended, and the rows (``RECEIVED``) of the nodes that heard it."""
+
+    flight: Flight
+    by_anchors: NDArray[np.void]
+    by_tags: NDArray[np.void]
+
+
+class Medium(Generic[Told]):
+    """A site's air, deterministic by its seed; memory stays flat however long it runs.
+
+    Nodes are numbered: the site's anchors in the order of its file, then the tags; all are off at first. A node's noise
+    depends on the seed and on its own key alone: more tags do not change what the others hear.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        tags: Sequence[TagSpec],
+        impairments: Impairments,
+        seed: int,
+        deliver: Callable[[Delivery], Told | None],
+    ) -> None:
+        """``deliver`` is given every frame when it ends; what it returns comes out of ``run``.
+
+        Raises ValueError when an impairment names an anchor that the site has not.
+        """
+        self._anchors, self._tags, self._impairments = site.anchors, tuple(tags), impairments
+        self.node_of = {anchor.id: node for node, anchor in enumerate(site.anchors)}
+        """Nodes of the anchors, by their identifiers."""
+        _check_names(impairments, self.node_of)
+        keys = [(ANCHOR_KEY, anchor.id) for anchor in site.anchors] + [(TAG_KEY, tag) for tag in range(len(tags))]
+        self._setups = [stream(seed, *key, purpose=1) for key in keys]
+        self._streams = Streams([stream(seed, *key) for key in keys])
+        self.clocks = make_clocks(impairments.oscillator, self._setups)
+        self.stations = make_stations(site.anchors, self._tags, impairments)
+        self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
+        self._piece_ends_s = np.full(len(self._tags), -math.inf)
+        self.boots = [0] * len(keys)
+        """How often each node was switched off."""
+        self._air = OnAir()
+        self._heard = np.zeros(len(keys), dtype=RECEIVED)
+        self._counts = np.zeros((2, len(OUTCOMES)), dtype=np.int64)
+        self._transmissions = self._late = 0
+        self._deliver = deliver
+        self.timeline: Timeline[Told] = Timeline()
+
+    @property
+    def tally(self) -> Tally:
+        """What was sent, heard and lost so far, by reason."""
+        return make_tally(self._transmissions, self._late, self._counts)
+
+    @property
+    def now_s(self) -> float:
+        """True time that has passed."""
+        return self.timeline.now_ticks * TICK_S
+
+    def run(self, until_s: float) -> Iterator[Told]:
+        """Let true time pass up to ``until_s``. Can be called again."""
+        return self.timeline.run(from_seconds(until_s))
+
+    # Power
+
+    def switch_off(self, node: int) -> None:
+        """Take a node off the air; a frame of its whose RMARKER has not left is not sent."""
+        self.stations[node]["on"] = 0
+        self.boots[node] += 1
+
+    def switch_on(self, node: int) -> None:
+        """Put a node on the air, with a new counter unless time has only begun."""
+        self.stations[node]["on"] = 1
+        if self.timeline.now_ticks > 0:
+            restart_counter(self.clocks, node, self._setups[node])
+
+    # Clocks
+
+    def read_counter(self, node: int) -> int:
+        """Bring a node to the present and return its unwrapped counter."""
+        cursors = self._streams.cursors
+        advance(self.clocks, self._streams.normals, cursors, node, self.timeline.now_ticks, 0.0)
+        self._streams.refill(int(cursors[node]))
+        return int(self.clocks[node]["local_ticks"])
+
+    def foresee(self, node: int, local_ticks: int) -> int:
+        """True time in whole ticks at which a node's unwrapped counter will show a value."""
+        return foresee(self.clocks, node, local_ticks)
+
+    # Tags
+
+    def _move_tags(self, t_s: float) -> None:
+        """Take the next piece of every trajectory whose present one has ended."""
+        for tag in np.flatnonzero(self._piece_ends_s <= t_s).tolist():
+            piece = self._tags[tag].trajectory.piece(t_s)
+            set_piece(self.stations, len(self._anchors) + tag, piece)
+            self._piece_ends_s[tag] = piece.end_s
+
+    # Transmissions
+
+    def transmit(self, node: int, transmission: Transmission) -> bool:
+        """Plan the flight of a frame; False, and a count, if it comes too late."""
+        local_ticks = self.read_counter(node)
+        delay_ticks = self._anchors[node].tx_antenna_delay_ticks
+        leaves = wrap(((transmission.tx_ticks - delay_ticks) & _DX_MASK) + delay_ticks)
+        ahead = difference(leaves, wrap(local_ticks))
+        if ahead < _PREAMBLE_TICKS + _TURNAROUND_TICKS:
+            self._late += 1
+            return False
+        marker = self.foresee(node, local_ticks + ahead)
+        end = marker + from_seconds(after_rmarker_s(len(transmission.frame)))
+        begin = marker - _PREAMBLE_TICKS
+        flight = Flight(node, self.boots[node], transmission.frame, local_ticks + ahead, begin, marker, end)
+        self._air.add(flight, self.timeline.now_ticks)
+        self.timeline.at(marker, partial(self._radiate, flight))
+        return True
+
+    def _radiate(self, flight: Flight) -> None:
+        """Let the RMARKER leave, and every node that can hear the frame stamp it."""
+        node, streams = flight.sender, self._streams
+        if flight.boot != self.boots[node]:
+            self._air.withdraw(flight)
+            return
+        normals, cursors = streams.normals, streams.cursors
+        local_ticks, noise_ticks = flight.marker_local_ticks, float(self.stations[node]["tx_noise_ticks"])
+        error_ticks = float(self.stations[node]["tx_error_ticks"])
+        ticks, fraction = emit(self.clocks, normals, cursors, node, local_ticks, noise_ticks, error_ticks)
+        streams.refill(int(cursors[node]))
+        flight.emission_ticks, flight.emission_fraction = ticks, fraction
+        t_s = ticks * TICK_S
+        self._move_tags(t_s)
+        anchors, count, highest = hear(
+            self.clocks,
+            normals,
+            cursors,
+            self.stations,
+            self._channel,
+            self._walls,
+            self._air.others(flight),
+            node,
+            ticks,
+            fraction,
+            ((flight.begin_ticks - flight.marker_ticks) * TICK_S, (flight.end_ticks - flight.marker_ticks) * TICK_S),
+            self._bias_m(node, t_s),
+            self._impairments.diagnostics,
+            self._heard,
+            self._counts,
+        )
+        streams.refill(highest)
+        self._transmissions += 1
+        delivery = Delivery(flight, self._heard[:anchors].copy(), self._heard[anchors:count].copy())
+        self.timeline.at(flight.end_ticks, partial(self._deliver, delivery))
+
+    def _bias_m(self, node: int, t_s: float) -> float:
+        anchor = self._anchors[node].id
+        return sum((b.active_m(t_s) for b in self._impairments.anchor_biases if b.anchor == anchor), 0.0)
+
+
+def _check_names(faults: Impairments, node_of: dict[int, int]) -> None:
+    for name, values in (
+        ("anchor_biases", faults.anchor_biases),
+        ("delay_errors", faults.delay_errors),
+        ("anchor_outages", faults.anchor_outages),
+    ):
+        unknown = {value.anchor for value in values} - node_of.keys()
+        if unknown:
+            known = ", ".join(map(str, node_of))
+            raise ValueError(f"{name} names anchor {min(unknown)}; it should be one of the site's: {known}")
