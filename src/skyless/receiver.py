@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.air.almanac_book import AlmanacBook
-from skyless.air.beacon import Beacon
+from skyless.air.beacon import Beacon, Heard
 from skyless.air.codec import decode_cached
 from skyless.air.malformed import Malformed
 from skyless.air.reception import Reception
@@ -35,6 +35,9 @@ SITE_SILENCE_TICKS: Final = from_seconds(2.0)
 
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
 """Stamps that go back farther than radios and hosts reorder mean that the tag's own counter has started anew."""
+
+MOST_REPEATS: Final = 4
+"""Beyond this beacons of an anchor that has lost the master weigh no less: what changes between them is still true."""
 
 
 class Receiver:
@@ -77,6 +80,7 @@ class Receiver:
         self._master: int | None = None
         self._master_slot = 0
         self._positions: dict[int, NDArray[np.float64]] = {}
+        self._synchronised: dict[int, tuple[Heard, int]] = {}
 
     @property
     def method(self) -> Method | None:
@@ -146,6 +150,7 @@ class Receiver:
     def _forget_stamps(self) -> None:
         """Start anew in all but the almanac."""
         self._stamps.forget()
+        self._synchronised.clear()
         self._master_scale = None
         self._method = self._made_of = None
 
@@ -206,8 +211,19 @@ class Receiver:
             None if heard is None else nearest(heard.rx_ticks, tx_ticks),
             ticks_master,
             fraction,
-            variance_m2,
+            variance_m2 if heard is None else variance_m2 * self._repeats(beacon.anchor, heard) ** 2,
         )
+
+    def _repeats(self, anchor: int, heard: Heard) -> int:
+        """How many beacons of an anchor, this one included, rest on the same beacon of the master.
+
+        They share one clock error, which filters take for independent ones: their variances count times the square
+        of this number (``docs/maths.md`` section 6).
+        """
+        last, count = self._synchronised.get(anchor, (heard, 0))
+        count = min(count + 1, MOST_REPEATS) if last == heard else 1
+        self._synchronised[anchor] = (heard, count)
+        return count
 
     def _round(self, beacon: Beacon, schedule: Schedule) -> int:
         """Round of a frame, counted from the master's slot: what follows a frame of the master refers to it."""
