@@ -64,6 +64,7 @@ class PairTracking:
         self._heard_s: dict[int, float] = {}
         self._since_try = 0
         self._area_m = (0.0, 0.0, 0.0)
+        self._extent_m = 0.0
 
     def hear(self, pairs: Sequence[PairTdoa]) -> bool:
         """Take the differences of one reception, receptions in the order of time.
@@ -123,6 +124,9 @@ class PairTracking:
         if P[0, 0] + P[1, 1] > MAX_STD_M**2:
             self.reason = NoFixReason.ACQUIRING
             return False
+        if self._tracker.dim == 3 and P[2, 2] > self._extent_m**2:
+            self.reason = NoFixReason.BAD_GEOMETRY
+            return False
         return True
 
     @property
@@ -177,6 +181,7 @@ class PairTracking:
         if not joined.anchors:
             return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
         anchors_m = np.array([self._places[anchor] for anchor in joined.anchors])
+        self._extent_m = float(np.ptp(anchors_m, axis=0).max())
         low, high = anchors_m.min(axis=0)[:2], anchors_m.max(axis=0)[:2]
         x_m, y_m = ((low + high) / 2.0).tolist()
         self._area_m = (x_m, y_m, NEIGHBOURHOOD * max(float(np.linalg.norm(high - low)), 5.0))

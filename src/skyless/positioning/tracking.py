@@ -61,6 +61,7 @@ class Tracking:
         self._used: dict[int, Observation] = {}
         self._anchors: tuple[int, ...] = ()
         self._anchors_m: NDArray[np.float64] = np.empty((0, 3))
+        self._extent_m = 0.0
         self._checked_ticks = 0
         self._heard_ticks = 0
 
@@ -70,7 +71,11 @@ class Tracking:
         return self._tracker.x.copy()
 
     def hear(self, observation: Observation) -> Fix | NoFixReason:
-        """Take one observation; a fix for every accepted message once started."""
+        """Take one observation; a fix for every accepted message once started.
+
+        Anchors in the tag's own plane cannot tell its height: where that is known no better than to the anchors'
+        extent, there is no fix.
+        """
         if observation.tx_ticks_master is None:
             return NoFixReason.ACQUIRING
         if self._acquisition is None and self._is_out_of_reach(observation):
@@ -125,6 +130,7 @@ class Tracking:
         self._acquisition = None
         self._heard_ticks = self._started_ticks = observation.rx_ticks_tag
         self._used.clear()
+        self._extent_m = 0.0
         for used in start.used:
             self._use(used)
         self._tracker.start(
@@ -151,11 +157,14 @@ class Tracking:
         if changed:
             self._anchors = tuple(self._used)
             self._anchors_m = np.array([o.anchor_m for o in self._used.values()])
+            self._extent_m = max(self._extent_m, float(np.ptp(self._anchors_m, axis=0).max()))
 
-    def _fix(self, observation: Observation) -> Fix:
+    def _fix(self, observation: Observation) -> Fix | NoFixReason:
         assert observation.tx_ticks_master is not None
-        time_s = self._time.time_s(observation.tx_ticks_master, observation.rx_ticks_tag)
         tracker, height_m = self._tracker, self._settings.height_m
+        if height_m is None and tracker.P[2, 2] > self._extent_m**2:
+            return NoFixReason.BAD_GEOMETRY
+        time_s = self._time.time_s(observation.tx_ticks_master, observation.rx_ticks_tag)
         return motion_fix(
             time_s, tracker.x, tracker.P, height_m, self._anchors, self._anchors_m, tracker.statistics, "tracker"
         )
