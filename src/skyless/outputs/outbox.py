@@ -1,0 +1,163 @@
+"""What waits to be sent to a broker: bounded, so that a slow or absent one costs memory only up to a limit."""
+
+from collections import OrderedDict, deque
+
+from msgspec import Struct
+
+from skyless.outputs import packets
+
+_LAST_NUMBER = 65_535
+
+
+class Limits(Struct, frozen=True):
+    """How much may wait. Payload bytes."""
+
+    topics: int = 1000
+    """Topics of QoS 0, each with its newest message, and as many that are retained."""
+    topic_bytes: int = 16_000_000
+    messages: int = 20_000
+    """Messages of QoS 1."""
+    bytes: int = 64_000_000
+    window: int = 64
+    """Messages of QoS 1 that may be sent and not yet acknowledged."""
+    payload: int = 8_000_000
+    """The largest message; the embedded broker takes no larger one."""
+
+
+class Waiting(Struct, frozen=True, gc=False):
+    """One message on its way."""
+
+    topic: str
+    payload: bytes
+    qos: int
+    retain: bool
+
+
+class Outbox:
+    """Messages not yet sent, and those of QoS 1 not yet acknowledged.
+
+    Of QoS 0 the newest message of a topic stays, and the oldest topics go when there are too many. Of QoS 1 all stay in
+    their order, and the oldest that is not on its way goes when there are too many. Retained messages are a topic's
+    state: the newest one stays for ever, to be sent again after a reconnect.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._newest: OrderedDict[str, Waiting] = OrderedDict()
+        self._newest_bytes = 0
+        self._queue: deque[Waiting] = deque()
+        self._queue_bytes = 0
+        self._again: deque[tuple[int, Waiting]] = deque()
+        self._flying: dict[int, Waiting] = {}
+        self._kept: dict[str, Waiting] = {}
+        self._kept_bytes = 0
+        self._to_keep: dict[str, Waiting] = {}
+        self._number = 0
+        self.dropped = 0
+        self.sent = 0
+        """Messages of QoS 0 given to the connection, and messages of QoS 1 acknowledged."""
+
+    def put(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> None:
+        """Add a message."""
+        message = Waiting(topic, payload, qos, retain)
+        if len(payload) > self._limits.payload:
+            self.dropped += 1
+        elif retain:
+            self._keep(message)
+        elif qos:
+            self._queue.append(message)
+            self._queue_bytes += len(payload)
+            self._shorten_queue()
+        else:
+            self._replace(message)
+
+    def take(self) -> bytes | None:
+        """The next packet to send; None when nothing is left, or the window is full."""
+        open_window = len(self._flying) < self._limits.window
+        if self._again:
+            number, message = self._again.popleft()
+            return packets.publish(message.topic, message.payload, packet=number, retain=message.retain, again=True)
+        if self._to_keep and (open_window or not next(iter(self._to_keep.values())).qos):
+            return self._send(self._to_keep.pop(next(iter(self._to_keep))))
+        if self._queue and open_window:
+            message = self._queue.popleft()
+            return self._send(message)
+        if self._newest:
+            message = self._newest.popitem(last=False)[1]
+            self._newest_bytes -= len(message.payload)
+            return self._send(message)
+        return None
+
+    def acknowledge(self, number: int) -> None:
+        """The broker has the message of QoS 1 with this packet number."""
+        message = self._flying.pop(number, None)
+        if message is None:
+            return
+        self.sent += 1
+        if not message.retain:
+            self._queue_bytes -= len(message.payload)
+
+    def restart(self) -> None:
+        """A new connection: send again what was not acknowledged, and what the broker should have retained."""
+        self._flying = {number: message for number, message in self._flying.items() if not message.retain}
+        self._again = deque(self._flying.items())
+        self._to_keep = dict(self._kept)
+
+    def forget(self, topic: str) -> None:
+        """Send the retained message of a topic no more: somebody else has written a newer one."""
+        self._to_keep.pop(topic, None)
+        old = self._kept.pop(topic, None)
+        self._kept_bytes -= len(old.payload) if old else 0
+
+    @property
+    def unacknowledged(self) -> int:
+        """Messages of QoS 1, and retained ones, that the broker does not have for certain."""
+        return len(self._flying) + len(self._queue) + len(self._to_keep)
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Payload of everything in here."""
+        return self._newest_bytes + self._queue_bytes + self._kept_bytes
+
+    def _send(self, message: Waiting) -> bytes:
+        if not message.qos:
+            self.sent += 1
+            return packets.publish(message.topic, message.payload, retain=message.retain)
+        number = self._next_number()
+        self._flying[number] = message
+        return packets.publish(message.topic, message.payload, packet=number, retain=message.retain)
+
+    def _next_number(self) -> int:
+        while True:
+            self._number = self._number % _LAST_NUMBER + 1
+            if self._number not in self._flying:
+                return self._number
+
+    def _replace(self, message: Waiting) -> None:
+        old = self._newest.get(message.topic)
+        if old is not None:
+            self._newest_bytes -= len(old.payload)
+            self.dropped += 1
+        self._newest[message.topic] = message
+        self._newest_bytes += len(message.payload)
+        while len(self._newest) > self._limits.topics or self._newest_bytes > self._limits.topic_bytes:
+            self._newest_bytes -= len(self._newest.popitem(last=False)[1].payload)
+            self.dropped += 1
+
+    def _shorten_queue(self) -> None:
+        while self._queue and (
+            len(self._queue) + len(self._flying) > self._limits.messages or self._queue_bytes > self._limits.bytes
+        ):
+            self._queue_bytes -= len(self._queue.popleft().payload)
+            self.dropped += 1
+
+    def _keep(self, message: Waiting) -> None:
+        """Newer state of a topic in the place of the old."""
+        self.forget(message.topic)
+        more = len(self._kept) >= self._limits.topics
+        if more or self._kept_bytes + len(message.payload) > self._limits.topic_bytes:
+            self.dropped += 1
+            return
+        self._kept[message.topic] = message
+        self._kept_bytes += len(message.payload)
+        self._to_keep[message.topic] = message
