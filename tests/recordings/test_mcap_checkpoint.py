@@ -1,0 +1,157 @@
+"""Receivers as bytes and back: the same bits afterwards, and nothing that a hostile recording could do."""
+
+import pickle
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from machines.bench import LAB, PAIRS, ROOM, tape
+from skyless.air.reception import Reception
+from skyless.receiver import METHODS, Receiver
+from skyless.recordings.checkpoint import RefusedError, load, save
+from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
+from skyless.recordings.checkpoint_writer import write_graph
+
+RNG = np.random.default_rng(20)
+
+
+def bits(fix):
+    """All of a fix, to the bit."""
+    return None if fix is None else save_value([getattr(fix, name) for name in fix.__struct_fields__])
+
+
+def save_value(value):
+    return msgspec.msgpack.encode(write_graph(value, {}))
+
+
+@pytest.mark.parametrize("site", [LAB, ROOM, PAIRS], ids=["lab", "room", "pairs"])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_receiver_goes_on_with_the_same_bits(method, site):
+    heard = [one.reception for one in tape(site, 2.5)]
+    cuts = set(RNG.choice(len(heard), 25, replace=False)) | {0, 1}
+    straight, cut = Receiver(method), Receiver(method)
+    fixes = 0
+    for number, reception in enumerate(heard):
+        if number in cuts:
+            cut = load(save(cut))
+        expected = straight.hear(reception)
+        assert bits(cut.hear(reception)) == bits(expected)
+        assert cut.reason == straight.reason
+        fixes += expected is not None
+    assert fixes > 50
+    assert cut.counters == straight.counters
+    assert save(load(save(cut))) == save(cut)
+
+
+def test_a_receiver_in_trouble_goes_on_with_the_same_bits():
+    heard = [one.reception for one in tape(LAB, 2.5)]
+    rng = np.random.default_rng(3)
+    noisy = [reception for reception in heard for _ in range(1 + (rng.random() < 0.05))]
+    noisy = [
+        Reception(r.frame, int(r.rx_ticks + rng.integers(0, 1 << 20)) % (1 << 40)) if rng.random() < 0.1 else r
+        for r in noisy
+    ]
+    straight, cut = Receiver(), Receiver()
+    for number, reception in enumerate(noisy):
+        if number % 11 == 0:
+            cut = load(save(cut))
+        assert bits(cut.hear(reception)) == bits(straight.hear(reception))
+    assert straight.counters["outlier"] > 0
+    assert cut.counters == straight.counters
+
+
+class Bomb:
+    def __reduce__(self):
+        return (Path.touch, (Path("/tmp/skyless-was-here"),))
+
+
+def refusal(state):
+    with pytest.raises(RefusedError) as caught:
+        load(state)
+    return caught.value.reason
+
+
+def test_pickles_are_not_executed():
+    assert refusal(pickle.dumps(Bomb())) == "checkpoint-damaged"
+    assert not Path("/tmp/skyless-was-here").exists()
+
+
+def test_another_version_is_refused():
+    envelope = msgspec.msgpack.decode(save(Receiver()))
+    for change in ({"version": "0.0.1"}, {"format": 2}):
+        assert refusal(msgspec.msgpack.encode(envelope | change)) == "checkpoint-of-another-version"
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [],
+        [["object", "pathlib", "Path", [], []]],
+        [["object", "skyless.cli.main", "main", [], []]],
+        [["object", "skyless.air", "../x", [], []]],
+        [["object", "skyless.receiver", "np", [], []]],
+        [["class", "skyless.receiver", "Receiver"]],
+        [["object", "skyless.air.codec", "Struct", [], []]],
+        [["object", "skyless.receiver", "Receiver", ["__class__"], [1]], ["class", "skyless.ticks", "Unwrapper"]],
+        [["tuple", [0]]],
+        [["array", "O", [1], False, True, b"12345678"]],
+        [["array", "<f8", [1 << 40], False, True, b"12345678"]],
+        [["array", "<f8", [-1], False, True, b"12345678"]],
+        [["dict", [1], [1]], ["list", []]],
+        [["list", [1 << 70]]],
+        [["=", {"a": 1}]],
+        [[]],
+        [17],
+        [["tuple", [k + 1]] for k in range(5000)],
+        [["int", "9" * 100_000]],
+    ],
+)
+def test_graphs_of_other_things_are_refused(nodes):
+    envelope = {"format": 1, "version": msgspec.msgpack.decode(save(Receiver()))["version"]}
+    try:
+        state = msgspec.msgpack.encode({**envelope, "nodes": nodes})
+    except OverflowError:
+        with pytest.raises(DamagedGraphError):
+            read_graph(nodes, {})
+    else:
+        assert refusal(state) == "checkpoint-damaged"
+
+
+def test_arrays_that_kernels_would_run_over_are_refused():
+    """Compiled code checks no bounds: a covariance of one number instead of 64 would be read and written beyond."""
+    receiver = Receiver()
+    for one in tape(LAB, 2.5):
+        receiver.hear(one.reception)
+    state = msgspec.msgpack.decode(save(receiver))
+    arrays = [node for node in state["nodes"] if node[0] == "array"]
+    assert len(arrays) > 10
+    for node in arrays:
+        kept = list(node)
+        node[2], node[5] = [1], kept[5][:8]
+        assert refusal(msgspec.msgpack.encode(state)) == "checkpoint-damaged"
+        node[:] = kept
+        node[1] = "<i8" if kept[1] == "<f8" else "<f8"
+        assert refusal(msgspec.msgpack.encode(state)) == "checkpoint-damaged"
+        node[:] = kept
+    load(msgspec.msgpack.encode(state))
+
+
+STATE = save(Receiver())
+
+
+@given(st.data())
+@settings(max_examples=300)
+def test_damaged_bytes_are_refused_or_harmless(data):
+    state = bytearray(STATE)
+    for _ in range(data.draw(st.integers(1, 4))):
+        state[data.draw(st.integers(0, len(state) - 1))] = data.draw(st.integers(0, 255))
+    cut = bytes(state[: data.draw(st.integers(0, len(state)))])
+    for damaged in (bytes(state), cut):
+        try:
+            assert type(load(damaged)) is Receiver
+        except RefusedError as error:
+            assert error.reason.startswith("checkpoint-")

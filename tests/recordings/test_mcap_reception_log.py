@@ -1,0 +1,128 @@
+"""What a tag keeps for those who record it: whole runs, each with the receiver's state before it."""
+
+import msgspec
+import pytest
+
+from machines.bench import LAB, tape
+from skyless.air.reception import Diagnostics, Reception
+from skyless.outputs.messages import RawReception, ReceptionsMessage, RequestMessage
+from skyless.receiver import Receiver
+from skyless.recordings.checkpoint import load
+from skyless.recordings.reception_log import MOST_PENDING, ReceptionLog, raw, receiver_settings
+
+SETTINGS = receiver_settings("tracker")
+HEARD = [one.reception for one in tape(LAB, 2.0)]
+
+
+def ask(by="r", receptions=("*",), lease_s=5.0):
+    return RequestMessage(by, receptions, lease_s)
+
+
+class Bench:
+    """A tag's day: receptions 2.5 ms apart, collected every 20 ms."""
+
+    def __init__(self):
+        self.log = ReceptionLog("a", SETTINGS, "run")
+        self.receiver = Receiver()
+        self.serial = 0
+        self.now_s = 100.0
+        self.messages = []
+
+    def hear(self, receptions):
+        for number, reception in enumerate(receptions):
+            self.log.hear(self.receiver, reception, self.serial)
+            self.serial += self.receiver.hear(reception) is not None
+            self.now_s += 0.0025
+            if number % 8 == 0:
+                self.collect()
+
+    def collect(self):
+        while (message := self.log.collect(self.now_s, 0.5)) is not None:
+            self.messages.append(msgspec.json.decode(msgspec.json.encode(message), type=ReceptionsMessage))
+
+
+def segments(messages):
+    found = {}
+    for message in messages:
+        run = found.setdefault(message.segment, [])
+        assert (message.start is None) == bool(run)
+        assert message.first == sum(len(m.receptions) for m in run)
+        run.append(message)
+    return list(found.values())
+
+
+def flat(run):
+    return [one for message in run for one in message.receptions]
+
+
+def test_nothing_is_kept_until_somebody_asks():
+    bench = Bench()
+    bench.hear(HEARD[:100])
+    bench.log.request(ask(receptions=("b",)), bench.now_s)
+    bench.hear(HEARD[100:200])
+    assert bench.messages == []
+    assert not bench.log.wanted
+
+
+def test_a_lease_gives_one_whole_run_that_replays_to_the_same_fixes():
+    bench = Bench()
+    bench.hear(HEARD[:300])
+    bench.log.request(ask(), bench.now_s)
+    bench.hear(HEARD[300:400])
+    bench.log.request(ask(), bench.now_s)
+    bench.hear(HEARD[400:500])
+    bench.log.interrupt()
+    bench.collect()
+    (run,) = segments(bench.messages)
+    assert flat(run) == [raw(reception) for reception in HEARD[300:500]]
+    assert all(20 <= len(message.receptions) <= 60 for message in run[:-1])
+    start = run[0].start
+    assert start.settings == SETTINGS
+    receiver, serial = load(start.state), start.serial
+    for one in flat(run):
+        serial += receiver.hear(Reception(one.frame, one.rx_ticks, one.host_s)) is not None
+    assert serial == bench.serial
+    assert receiver.counters == bench.receiver.counters
+
+
+def test_a_lease_that_ended_and_one_who_joins_begin_other_segments():
+    bench = Bench()
+    bench.log.request(ask(lease_s=0.1), bench.now_s)
+    bench.hear(HEARD[:100])  # 0.25 s
+    assert len(flat(bench.messages)) < 60
+    assert not bench.log.wanted
+    bench.log.request(ask(lease_s=9.0), bench.now_s)
+    bench.hear(HEARD[100:150])
+    bench.log.request(ask("another", ("a",)), bench.now_s)
+    bench.hear(HEARD[150:200])
+    bench.log.request(ask("another", ("a",)), bench.now_s)
+    bench.log.request(ask("another", ()), bench.now_s)
+    bench.hear(HEARD[200:250])
+    bench.now_s += 1.0
+    bench.collect()
+    _first, second, third = segments(bench.messages)
+    assert flat(second) == [raw(reception) for reception in HEARD[100:150]]
+    assert flat(third) == [raw(reception) for reception in HEARD[150:250]]
+    assert len({message.segment for message in bench.messages}) == 3
+    assert second[0].start.serial <= third[0].start.serial
+
+
+def test_a_log_that_nobody_collects_takes_no_memory():
+    log, receiver = ReceptionLog("a", SETTINGS, "run"), Receiver()
+    log.request(ask(lease_s=60.0), 0.0)
+    for _ in range(2 * MOST_PENDING + 3):
+        log.hear(receiver, HEARD[0], 0)
+    assert log.counters["not-collected"] == 2 * MOST_PENDING
+    message = log.collect(1.0, 0.0)
+    assert message is not None
+    assert len(message.receptions) == 3
+    assert message.start is not None
+    assert log.collect(1.0, 0.0) is None
+
+
+@pytest.mark.parametrize("diagnostics", [None, Diagnostics(-80.5, -81.25, 3.0)])
+def test_raw_receptions_keep_every_bit(diagnostics):
+    reception = Reception(bytes(range(127)), (1 << 40) - 1, 0.1 + 1.7e9, diagnostics)
+    again = msgspec.json.decode(msgspec.json.encode(raw(reception)), type=RawReception)
+    assert again == raw(reception)
+    assert again.host_s == reception.host_s
