@@ -6,6 +6,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED, RESTLESS_CHI2
 from skyless.uncertainty.dop import Dops, dilution_of_precision
 
 
@@ -71,15 +72,19 @@ def motion_fix(
 ) -> Fix:
     """Make the fix of a filter whose state begins with position and velocity (2 axes each at a known height).
 
-    ``statistics`` holds the running means of the normalised and of the plain squared innovation.
+    ``statistics`` holds the running means of the normalised and of the plain squared innovation. While the former shows
+    a tag more agile than the filter assumes, the covariances are scaled by its square: most of an innovation is the
+    stamps' noise, so the state errs by more than the innovations tell (``docs/maths.md`` section 6).
     """
+    chi2 = float(statistics[CHI2])
+    scale = chi2**2 if chi2 > RESTLESS_CHI2 else 1.0
     dim = 3 if height_m is None else 2
     position, velocity = np.zeros(3), np.zeros(3)
     covariance, velocity_covariance = np.zeros((3, 3)), np.zeros((3, 3))
     position[:dim] = x[:dim]
     velocity[:dim] = x[dim : 2 * dim]
-    covariance[:dim, :dim] = P[:dim, :dim]
-    velocity_covariance[:dim, :dim] = P[dim : 2 * dim, dim : 2 * dim]
+    covariance[:dim, :dim] = scale * P[:dim, :dim]
+    velocity_covariance[:dim, :dim] = scale * P[dim : 2 * dim, dim : 2 * dim]
     if height_m is not None:
         position[2] = height_m
     return Fix(
@@ -90,9 +95,9 @@ def motion_fix(
         velocity_covariance=velocity_covariance,
         anchors=anchors,
         anchors_m=anchors_m,
-        chi2=float(statistics[0]),
+        chi2=chi2,
         dof=1,
-        residual_rms_m=float(np.sqrt(statistics[1])),
+        residual_rms_m=float(np.sqrt(statistics[RESIDUAL_SQUARED])),
         method=method,
         height_known=height_m is not None,
     )
