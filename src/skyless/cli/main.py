@@ -12,11 +12,15 @@ from skyless.errors import SkylessError
 _COMMANDS = (
     # name, where it is (imported only when it is called), what it does
     ("demo", "skyless.cli.demo:app", "Show a site and walking tags in real time."),
+    ("broker", "skyless.cli.broker:app", "Run the MQTT broker that comes with Skyless."),
     ("simulate", "skyless.cli.simulate:app", "Run a site in the simulated world and judge it against the truth."),
     ("replay", "skyless.cli.replay:app", "Turn a recording into fixes and judge them against the truth."),
     ("paper", "skyless.cli.paper:app", "Reproduce the paper's figures and claims in one report."),
     ("bench", "skyless.cli.bench:app", "Measure how fast Monte Carlo draws run on this machine."),
     ("plan", "skyless.cli.plan:app", "Predict a site's errors before it is mounted, and place its anchors."),
+    ("ether", "skyless.cli.ether:app", "Emulate a site's air in real time, for the programs of anchors and tags."),
+    ("anchor", "skyless.cli.anchor:app", "Run anchors of a site."),
+    ("tag", "skyless.cli.tag:app", "Run listening tags."),
     ("site", "skyless.cli.site:app", "Write and check site files."),
 )
 

