@@ -33,6 +33,9 @@ METHODS: Final = (*(str(method) for method in SnapshotMethod), "tracker")
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)
 """A tag that may choose its site leaves one that is silent for so long when it hears another."""
 
+NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
+"""Counters of a receiver that do not count dropped frames."""
+
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
 """Stamps that go back farther than radios and hosts reorder mean that the tag's own counter has started anew."""
 
@@ -81,6 +84,11 @@ class Receiver:
         self._master_slot = 0
         self._positions: dict[int, NDArray[np.float64]] = {}
         self._synchronised: dict[int, tuple[Heard, int]] = {}
+
+    @property
+    def site(self) -> int | None:
+        """Identifier of the site that it listens to, None before the first beacon."""
+        return self._site
 
     @property
     def method(self) -> Method | None:

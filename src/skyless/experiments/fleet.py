@@ -3,7 +3,6 @@
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import Final
 
 import numpy as np
 from msgspec import Struct
@@ -14,16 +13,13 @@ from skyless.air.schedule import schedule_of
 from skyless.anchor import Anchor
 from skyless.experiments.statistics import ErrorStatistics, ErrorSummary
 from skyless.positioning.fix import Fix
-from skyless.receiver import Receiver
+from skyless.receiver import NOT_DROPS, Receiver
 from skyless.simulation.broadcast import Broadcast, Tally
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Trajectory
 from skyless.simulation.world import World
 from skyless.site.model import Site
-
-NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
-"""Counters of a receiver that do not count dropped frames."""
 
 
 class JudgedFix(Struct, frozen=True, gc=False):

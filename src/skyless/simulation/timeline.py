@@ -15,6 +15,11 @@ class Timeline(Generic[Told]):
         self._serial = 0
         self._events: list[tuple[int, int, Callable[[], Told | None]]] = []
 
+    @property
+    def next_ticks(self) -> int | None:
+        """When the next event happens; None while nothing is planned."""
+        return self._events[0][0] if self._events else None
+
     def at(self, ticks: int, happen: Callable[[], Told | None]) -> None:
         """Plan an event; one that should have happened already happens now."""
         self._serial += 1

@@ -1,0 +1,55 @@
+"""``skyless anchor``: anchors as a program."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
+from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, broker, say, site_named
+from skyless.errors import SkylessError
+from skyless.radios.open import DEFAULT_RADIO
+
+app = App(name="anchor", help_epilogue="Example: skyless anchor 3 --site site.toml")
+
+
+@app.default
+def anchor(
+    *ids: Annotated[int, Parameter(name="IDS")],
+    site: str = "lab",
+    radio: str = DEFAULT_RADIO,
+    mqtt: Mqtt = DEFAULT_MQTT,
+    mqtt_ca: MqttCa = None,
+) -> None:
+    """Run anchors of a site until Ctrl-C.
+
+    An anchor listens first, sets its clock by the master's, and speaks in its slots. It does its work with or without
+    a broker.
+
+    Parameters
+    ----------
+    ids
+        Identifiers of one or more anchors in the site file.
+    site
+        Site file, or lab.
+    radio
+        The anchors' radio: ether:HOST:PORT is the emulated air of skyless ether.
+    mqtt
+        Broker for health and site, or none.
+    mqtt_ca
+        Certificates (PEM) to trust for mqtts.
+    """
+    from skyless.experiments.warm import compile_kernels
+    from skyless.nodes.anchors import Anchors
+    from skyless.nodes.loop import run
+    from skyless.radios.open import is_simulated, open_radios
+
+    plan, address = site_named(site), broker(mqtt, mqtt_ca)
+    known = [node.id for node in plan.anchors]
+    for number in ids or (None,):
+        if number not in known or ids.count(number) > 1:
+            listed = ", ".join(map(str, known))
+            raise SkylessError(f"anchor is {number}; it should be one or more of the site's, each once: {listed}")
+    radios = open_radios(radio, "anchor", tuple(map(str, ids)))
+    image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
+    compile_kernels()
+    run(Anchors(plan, radios, address, say, simulated=is_simulated(radio), floor_plan=image).run())

@@ -1,0 +1,83 @@
+"""``skyless anchor``: one process with one or several anchors, each with its own radio and its own MQTT connection."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from skyless.nodes.anchor import AnchorNode
+from skyless.nodes.running import HEALTH_S, Say, every, link_of, together
+from skyless.outputs.address import MqttAddress
+from skyless.outputs.link import Link
+from skyless.outputs.messages import AnchorHealth, Counters, SiteMessage
+from skyless.outputs.topics import floor_plan_topic, health_topic, site_topic
+from skyless.radios.radio import Radio
+from skyless.site.model import Site
+
+
+class Anchors:
+    """The anchors of one process."""
+
+    def __init__(
+        self,
+        site: Site,
+        radios: Sequence[Radio],
+        address: MqttAddress | None,
+        say: Say,
+        *,
+        simulated: bool,
+        floor_plan: Path | None = None,
+    ) -> None:
+        self._site, self._simulated, self._floor_plan = site, simulated, floor_plan
+        self.nodes = tuple(AnchorNode(site, int(radio.name), radio, say) for radio in radios)
+        self._links = tuple(link_of(address, node.id, site=site.id, kind="anchor") for node in self.nodes)
+        self._told_site = False
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        parts = [node.run() for node in self.nodes]
+        parts += [link.run() for link in self._links if link is not None]
+        await together(*parts, every(HEALTH_S, self._tell))
+
+    def _tell(self) -> None:
+        unix_s, now_s = time.time(), time.monotonic()
+        for node, link in zip(self.nodes, self._links, strict=True):
+            if link is not None:
+                if node.machine.is_master and not self._told_site:
+                    self._tell_site(link, unix_s)
+                link.publish(
+                    health_topic(self._site.id, "anchor", node.id), health_of(node, link.counters, unix_s, now_s)
+                )
+
+    def _tell_site(self, link: Link, unix_s: float) -> None:
+        """The master tells the site; retained, so that whoever comes later knows it at once."""
+        self._told_site = True
+        message = SiteMessage(self._site, self._simulated, unix_s)
+        link.publish(site_topic(self._site.id), message, qos=1, retain=True)
+        if self._floor_plan is not None:
+            link.publish(floor_plan_topic(self._site.id), self._floor_plan.read_bytes(), qos=1, retain=True)
+
+
+def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> AnchorHealth:
+    """How an anchor does; ``now_s`` is the host's monotonic clock."""
+    machine = node.machine
+    state = machine.synchronisation
+    known = machine.is_master or state.beacons > 1
+    return AnchorHealth(
+        anchor=node.id,
+        unix_s=unix_s,
+        uptime_s=now_s - node.started_s,
+        role="master" if machine.is_master else "anchor",
+        master=node.site.master,
+        term=0,
+        synchronised=known,
+        offset_s=None,
+        rate_ppm=state.rate_ppm if known else None,
+        offset_std_m=state.offset_std_m if known else None,
+        sent=machine.counters["sent"],
+        late=node.late,
+        heard=machine.counters["heard"],
+        superframe=None,
+        heard_age_s={str(anchor): now_s - heard_s for anchor, heard_s in sorted(node.heard_s.items())},
+        counters=dict(machine.counters),
+        mqtt=mqtt,
+    )

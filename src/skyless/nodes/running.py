@@ -1,0 +1,38 @@
+"""What all programs of a site share: tasks that stand and fall together, and something once a second."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any, Final
+
+from skyless.outputs.address import MqttAddress
+from skyless.outputs.link import Link
+
+HEALTH_S: Final = 1.0
+
+Say = Callable[[str], None]
+"""Takes one line for a person."""
+
+
+async def together(*parts: Coroutine[Any, Any, None]) -> None:
+    """Run until one part fails or all are cancelled; a failure cancels the others and is raised as itself."""
+    tasks = [asyncio.ensure_future(part) for part in parts]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def every(seconds: float, act: Callable[[], None]) -> None:
+    """Do something once in so many seconds, for ever."""
+    while True:
+        await asyncio.sleep(seconds)
+        act()
+
+
+def link_of(address: MqttAddress | None, name: int | str, *, site: int, kind: str) -> Link | None:
+    """The node's connection to the broker; None without one."""
+    return None if address is None else Link(address, name, site=site, kind=kind)

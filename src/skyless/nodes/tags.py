@@ -1,0 +1,101 @@
+"""``skyless tag``: one process with one or several tags, each with its own radio and its own MQTT connection."""
+
+import asyncio
+import time
+from collections.abc import Sequence
+
+from skyless.nodes.running import HEALTH_S, Say, every, together
+from skyless.nodes.tag import TagNode, TagSettings
+from skyless.nodes.usage import Usage
+from skyless.outputs.address import MqttAddress
+from skyless.outputs.link import Link
+from skyless.outputs.messages import Counters, FixMessage, TagHealth
+from skyless.outputs.topics import fix_topic, health_topic
+from skyless.radios.radio import Radio
+from skyless.receiver import NOT_DROPS
+
+
+class Tag:
+    """A tag and its link, which comes about once the tag's site is known."""
+
+    def __init__(self, settings: TagSettings, radio: Radio, address: MqttAddress | None, say: Say) -> None:
+        self._address = address
+        self.link: Link | None = None
+        self._link_task: asyncio.Task[None] | None = None
+        self._fix_topic = self._health_topic = ""
+        self.node = TagNode(settings, radio, self._publish, say)
+        self._told_fixes = 0
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        try:
+            await self.node.run()
+        finally:
+            if self._link_task is not None:
+                self._link_task.cancel()
+                await asyncio.gather(self._link_task, return_exceptions=True)
+
+    def _publish(self, message: FixMessage) -> None:
+        if self.link is None:
+            self._connect()
+        if self.link is not None:
+            self.link.publish(self._fix_topic, message)
+
+    def _connect(self) -> None:
+        site = self.node.receiver.site
+        if self._address is None or site is None:
+            return
+        self.link = Link(self._address, self.node.name, site=site, kind="tag")
+        self._fix_topic = fix_topic(site, self.node.name)
+        self._health_topic = health_topic(site, "tag", self.node.name)
+        self._link_task = asyncio.ensure_future(self.link.run())
+
+    def tell_health(self, cpu: float, memory_bytes: int) -> None:
+        """Publish how the tag does."""
+        self.node.unix_less_host_s = time.time() - time.monotonic()
+        if self.link is None:
+            self._connect()
+        health = self._health(cpu, memory_bytes)
+        if self.link is not None:
+            self.link.publish(self._health_topic, health)
+
+    def _health(self, cpu: float, memory_bytes: int) -> TagHealth:
+        node, now_s = self.node, time.monotonic()
+        median_s, late_s, _ = node.latencies.take()
+        fixes, self._told_fixes = node.serial - self._told_fixes, node.serial
+        silent = node.last_fix_s is None or now_s - node.last_fix_s > HEALTH_S
+        return TagHealth(
+            tag=node.name,
+            unix_s=time.time(),
+            uptime_s=now_s - node.started_s,
+            method=node.settings.method,
+            receptions=node.receptions,
+            fixes=node.serial,
+            updates_per_s=fixes / HEALTH_S,
+            reason=str(node.receiver.reason) if silent else None,
+            first_fix_s=node.first_fix_s,
+            latency_p50_s=median_s,
+            latency_p99_s=late_s,
+            counters={reason: count for reason, count in node.receiver.counters.items() if reason not in NOT_DROPS},
+            mqtt=Counters(0, 0, 0) if self.link is None else self.link.counters,
+            cpu=cpu,
+            memory_bytes=memory_bytes,
+            phases=node.phases.last,
+        )
+
+
+class Tags:
+    """The tags of one process."""
+
+    def __init__(self, settings: TagSettings, radios: Sequence[Radio], address: MqttAddress | None, say: Say) -> None:
+        self.tags = tuple(Tag(settings, radio, address, say) for radio in radios)
+        self._usage = Usage()
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        await together(*(tag.run() for tag in self.tags), every(HEALTH_S, self._tell))
+
+    def _tell(self) -> None:
+        share, memory_bytes = self._usage.take()
+        for tag in self.tags:
+            tag.tell_health(share / len(self.tags), memory_bytes)
