@@ -1,25 +1,30 @@
-"""``skyless demo``: a site and walking tags in real time, in the terminal."""
+"""``skyless demo``: a whole site as it runs, with emulated radios, from one command."""
 
+import asyncio
+import contextlib
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from skyless.cli.nodes import MqttCa, broker, say, site_named
 from skyless.cli.options import Picoseconds, Positive
 from skyless.cli.output import console, print_json
 from skyless.cli.progress import status
+from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from skyless.cli.demo_screen import Screen
+    from skyless.nodes.whole_site import SiteRun, WholeSite
 
-    from skyless.experiments.fleet import Fleet, FleetReport
+_START_S: Final = 60.0
+"""Programs that have not made a fix for every tag by then will not."""
 
+_LOOK_S: Final = 0.05
 _REDRAW_S: Final = 0.25
-_STEP_S: Final = 0.02
 
 app = App(name="demo", help_epilogue="Example: skyless demo --duration 10 --json")
 
@@ -28,21 +33,27 @@ app = App(name="demo", help_epilogue="Example: skyless demo --duration 10 --json
 def demo(
     *,
     duration: Positive | None = None,
-    tags: Annotated[int, Parameter(validator=Number(gte=1, lte=50))] = 3,
+    tags: Annotated[int, Parameter(validator=Number(gte=1, lte=200))] = 3,
     speed: Annotated[float, Parameter(validator=Number(gt=0, lte=10))] = 1.0,
     noise_ps: Picoseconds = 100.0,
     seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
+    site: Path | None = None,
+    method: str = "tracker",
+    mqtt: Annotated[str | None, Parameter(env_var="SKYLESS_MQTT")] = None,
+    mqtt_ca: MqttCa = None,
+    record: Path | None = None,
+    no_record: bool = False,
     json: bool = False,
 ) -> None:
-    """Show the lab with walking tags in real time; Ctrl-C stops.
+    """Run a site with walking tags in real time; Ctrl-C stops.
 
-    Six anchors on the walls of 6 m × 8 m broadcast, the tags only listen. Radios, clocks and motion are simulated, the
-    anchors' and tags' programs are the real ones.
+    Anchors, tags, broker, page and recorder are the real programs, each a process; radios, clocks and motion are
+    simulated. Watch it on the page, or with: mosquitto_sub -t 'skyless/#' -v
 
     Parameters
     ----------
     duration
-        Seconds to run; by default until Ctrl-C.
+        Seconds to run, from when all tags have a fix; by default until Ctrl-C.
     tags
         How many tags walk.
     speed
@@ -50,155 +61,109 @@ def demo(
     noise_ps
         Noise of every TX and RX stamp in picoseconds.
     seed
-        Same seed, same radio world.
+        Same seed, same crystals and noise; what processes do in real time is never the same.
+    site
+        Site file; by default the lab, six anchors on the walls of 6 m × 8 m.
+    method
+        How positions are computed.
+    mqtt
+        Another broker than the embedded one.
+    mqtt_ca
+        Certificates (PEM) to trust for mqtts.
+    record
+        File for the recording, .mcap; by default one in the folder that the page shows.
+    no_record
+        Record nothing.
     json
         Write one JSON object at the end instead of the tables.
     """
-    from skyless.experiments.fleet import report
-
-    fleet = _fleet(tags, speed, noise_ps, seed)
-    started_s = time.perf_counter()
-    with _screen(fleet, show=not json) as redraw:
-        try:
-            _in_real_time(fleet, duration, redraw)
-        except KeyboardInterrupt:
-            print("stopped", file=sys.stderr)
-    result = report(fleet, "tracker", started_s)
-    if json:
-        print_json(_summary(result))
-    elif not sys.stdout.isatty():
-        console().print(_tags(fleet))
-    if not json:
-        console().print(_closing(result), soft_wrap=True)
-
-
-def _fleet(tags: int, speed: float, noise_ps: float, seed: int) -> "Fleet":
-    from skyless.experiments.fleet import Fleet, FleetSettings
-    from skyless.experiments.scenarios import patrols
+    from skyless.cli.demo_screen import Screen
     from skyless.experiments.warm import compile_kernels
-    from skyless.simulation.scenario import lab_impairments
-    from skyless.site.lab import lab_site
+    from skyless.nodes.loop import run
+    from skyless.nodes.places import new_recording, recordings_folder
+    from skyless.nodes.whole_site import SiteRun, WholeSite
+    from skyless.receiver import METHODS
 
-    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
-        compile_kernels()
-    site = lab_site(noise_ps)
-    paths = patrols(site, tags, speed)
-    return Fleet(site, paths, lab_impairments(noise_ps), seed, FleetSettings(warmup_s=1.0))
-
-
-def _in_real_time(fleet: "Fleet", duration: float | None, redraw: "Redraw") -> None:
-    """Let the world keep pace with the wall clock."""
-    begin_s = time.monotonic()
-    until_s = float("inf") if duration is None else duration
-    now_s = 0.0
-    while now_s < until_s:
-        now_s = min(time.monotonic() - begin_s, until_s)
-        for _ in fleet.run(now_s):
-            pass
-        redraw.reach(now_s)
-        ahead_s = now_s + _STEP_S - (time.monotonic() - begin_s)
-        if ahead_s > 0.0 and now_s < until_s:
-            time.sleep(ahead_s)
-
-
-class Redraw:
-    """Draws the tables a few times a second, or never."""
-
-    def __init__(self, fleet: "Fleet") -> None:
-        self._fleet = fleet
-        self._next_s = 0.0
-        self.draw = self._nothing
-
-    def _nothing(self, picture: "RenderableType") -> None:
-        pass
-
-    def reach(self, now_s: float) -> None:
-        """Draw if it is time."""
-        if self.draw != self._nothing and now_s >= self._next_s:
-            self._next_s = now_s + _REDRAW_S
-            self.draw(_picture(self._fleet, now_s))
-
-
-@contextmanager
-def _screen(fleet: "Fleet", *, show: bool) -> "Iterator[Redraw]":
-    redraw = Redraw(fleet)
-    if not (show and sys.stdout.isatty()):
-        yield redraw
-        return
-    from rich.live import Live
-
-    with Live(console=console(), auto_refresh=False) as live:
-        redraw.draw = lambda picture: live.update(picture, refresh=True)
-        yield redraw
-
-
-def _picture(fleet: "Fleet", now_s: float) -> "RenderableType":
-    from rich.console import Group
-
-    line = f"lab, {now_s:.1f} s, {fleet.world.tally.transmissions} beacons on the air; Ctrl-C stops"
-    return Group(line, _tags(fleet), _anchors(fleet))
-
-
-def _tags(fleet: "Fleet") -> "RenderableType":
-    from rich.table import Table
-
-    columns = ("tag", "x m", "y m", "m/s", "error cm", "sigma cm", "fixes/s", "anchors", "lost")
-    table = Table(*columns, title="tags (radio world simulated)")
-    now_s = fleet.world.now_s
-    for number, record in enumerate(fleet.records, start=1):
-        if record.last is None or record.first_fix_s is None:
-            table.add_row(str(number), *("–",) * 7, str(fleet.receivers[number - 1].reason))
-            continue
-        fix, error = record.last.fix, record.last.error_m
-        velocity = fix.velocity_mps
-        table.add_row(
-            str(number),
-            f"{fix.position_m[0]:.3f}",
-            f"{fix.position_m[1]:.3f}",
-            "–" if velocity is None else f"{float(velocity @ velocity) ** 0.5:.2f}",
-            f"{100 * float(error @ error) ** 0.5:.1f}",
-            f"{100 * fix.std_m:.1f}",
-            f"{record.fixes / max(now_s - record.first_fix_s, 1e-9):.0f}",
-            str(len(fix.anchors)),
-            str(record.messages - record.fixes),
-        )
-    return table
-
-
-def _anchors(fleet: "Fleet") -> "RenderableType":
-    from rich.table import Table
-
-    table = Table("anchor", "role", "beacons heard", "rate ppm", "clock sigma cm", "sent", title="synchronisation")
-    for anchor in fleet.anchors.values():
-        state = anchor.synchronisation
-        measured = ("–", "–") if anchor.is_master else (f"{state.rate_ppm:+.4f}", f"{100 * state.offset_std_m:.2f}")
-        role = "master" if anchor.is_master else "anchor"
-        heard, sent = str(anchor.counters["heard"]), str(anchor.counters["sent"])
-        table.add_row(str(anchor.id), role, heard, *measured, sent)
-    return table
-
-
-def _summary(result: "FleetReport") -> dict[str, object]:
-    return {
-        "tags": result.tags,
-        "fixes": result.fixes,
-        "rmse_m": result.rmse_m,
-        "max_m": result.max_m,
-        "updates_per_s": result.updates_per_s,
-        "p95_m": result.p95_m,
-        "sigma_m": result.sigma_m,
-        "messages": result.messages,
-        "dropped": result.dropped,
-        "first_fix_s": result.first_fix_s,
-        "duration_s": result.simulated_s,
-    }
-
-
-def _closing(result: "FleetReport") -> str:
-    if result.rmse_m is None or result.max_m is None:
-        return "no fix was made"
-    return (
-        f"{result.tags} tags, {result.messages} messages in {result.simulated_s:.1f} s: "
-        f"RMSE {100 * result.rmse_m:.1f} cm, largest error {100 * result.max_m:.1f} cm, "
-        f"{result.updates_per_s:.0f} updates per second and tag"
+    if method not in METHODS:
+        raise SkylessError(f"--method is {method!r}; it should be one of {', '.join(METHODS)}")
+    if record is not None and no_record:
+        raise SkylessError("give either --record or --no-record, not both")
+    name = f"lab:{noise_ps:g}" if site is None else str(site.absolute())
+    folder = recordings_folder()
+    asked = SiteRun(
+        site=site_named(name),
+        site_name=name,
+        tags=tags,
+        speed_mps=speed,
+        noise_ps=noise_ps,
+        seed=seed,
+        method=method,
+        broker=None if mqtt is None else broker(mqtt, mqtt_ca),
+        record=None if no_record else record or new_recording(folder, "demo"),
+        record_limit_mb=1000.0,
+        recordings=folder,
     )
+    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
+        compile_kernels(method)
+    whole = WholeSite(asked, say)
+    screen = Screen(whole, show=not json and sys.stdout.isatty())
+    with screen, contextlib.suppress(KeyboardInterrupt):
+        run(_run(whole, asked, screen, duration, json=json))
+    _report(screen, json=json)
+
+
+async def _run(whole: "WholeSite", asked: "SiteRun", screen: "Screen", duration: float | None, *, json: bool) -> None:
+    """Start everything, tell where it is, and watch for as long as was asked."""
+    site = asyncio.ensure_future(whole.run())
+    try:
+        await _either(site, whole.ready.wait())
+        screen.tell_places(asked, json=json)
+        await _either(site, _until_all_fix(whole, asked.tags))
+        screen.begin()
+        await _either(site, _watch(screen, duration))
+        screen.stopped_early = False
+    finally:
+        screen.end()
+        site.cancel()
+        await asyncio.gather(site, return_exceptions=True)
+
+
+async def _either(site: "asyncio.Task[None]", part: object) -> None:
+    """Wait for a part, unless the site fails first."""
+    waiting = asyncio.ensure_future(part)  # type: ignore[call-overload]
+    try:
+        await asyncio.wait((site, waiting), return_when=asyncio.FIRST_COMPLETED)
+        if site.done():
+            site.result()
+    finally:
+        waiting.cancel()
+
+
+async def _until_all_fix(whole: "WholeSite", tags: int) -> None:
+    """Until every tag has been heard with a fix and with its health."""
+    begun_s = time.monotonic()
+    while time.monotonic() - begun_s < _START_S:
+        known = whole.watch.tags.values() if whole.watch is not None else ()
+        if sum(tag.health is not None for tag in known) >= tags:
+            return
+        await asyncio.sleep(_LOOK_S)
+    say("not all tags have a fix yet; skyless/… on the broker and the page tell more")
+
+
+async def _watch(screen: "Screen", duration: float | None) -> None:
+    begun_s = time.monotonic()
+    while duration is None or time.monotonic() - begun_s < duration:
+        screen.draw()
+        left_s = _REDRAW_S if duration is None else begun_s + duration - time.monotonic()
+        await asyncio.sleep(min(max(left_s, 0.0), _REDRAW_S))
+
+
+def _report(screen: "Screen", *, json: bool) -> None:
+    if screen.stopped_early:
+        say("stopped")
+    if json:
+        print_json(screen.summary())
+        return
+    if not sys.stdout.isatty():
+        console().print(screen.tags())
+    console().print(screen.closing(), soft_wrap=True)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import Parameter
 
+from skyless.cli.options import finite_numbers
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -29,11 +30,14 @@ def broker(mqtt: str, mqtt_ca: Path | None) -> "MqttAddress | None":
 
 
 def site_named(site: str) -> "Site":
-    """The site in a file, or the built-in ``lab``. Raises SkylessError."""
+    """The site in a file, or the built-in ``lab``, with other noise than 100 ps as ``lab:PS``. Raises SkylessError."""
     from skyless.site.lab import lab_site
     from skyless.site.load import load_site
 
-    return lab_site() if site == "lab" else load_site(Path(site))
+    name, colon, noise_ps = site.partition(":")
+    if name != "lab":
+        return load_site(Path(site))
+    return lab_site(*finite_numbers("site", noise_ps, (1,))) if colon else lab_site()
 
 
 def listen_address(text: str, default_port: int) -> tuple[str, int]:

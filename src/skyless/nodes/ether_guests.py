@@ -49,6 +49,7 @@ class Guest(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """A process has come."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         endpoint = transport.get_extra_info("socket")
@@ -64,6 +65,7 @@ class Guest(asyncio.Protocol):
         return True
 
     def data_received(self, data: bytes) -> None:
+        """It says something; one that is not understood is sent away."""
         try:
             for body in self._unpacker.feed(data):
                 self._hear(body)
@@ -89,5 +91,6 @@ class Guest(asyncio.Protocol):
             self._transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason is all one here
+        """It has gone, and its nodes with it."""
         if self._seat is not None:
             self._ether.leave(self._seat)

@@ -4,6 +4,7 @@ from typing import Final
 
 ROOT: Final = "skyless/v1"
 EVERY_SITE: Final = "+"
+EVERY_NODE: Final = "+"
 
 
 def site_topic(site: int | str) -> str:

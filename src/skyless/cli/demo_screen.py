@@ -1,0 +1,185 @@
+"""What the demo shows: tables while it runs, figures at its end."""
+
+import sys
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from skyless.cli.output import console
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.live import Live
+
+    from skyless.nodes.watch import Watch, Watched
+    from skyless.nodes.whole_site import SiteRun, WholeSite
+
+
+class Screen:
+    """Draws the tables a few times a second, or never, and sums up."""
+
+    def __init__(self, whole: "WholeSite", *, show: bool) -> None:
+        self.stopped_early = True
+        self._whole, self._show = whole, show
+        self._live: Live | None = None
+        self._begun_s: float | None = None
+        self._took_s = 0.0
+
+    def __enter__(self) -> Self:
+        if self._show:
+            from rich.live import Live
+
+            self._live = Live(console=console(), auto_refresh=False)
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def tell_places(self, asked: "SiteRun", *, json: bool) -> None:
+        """Say where to look; on standard error when standard output is for a program."""
+        whole = self._whole
+        lines = [f"page      {whole.page}", f"broker    {whole.address}"]
+        lines.append(f"fixes     mosquitto_sub -p {whole.address.port if whole.address else 1883} -t 'skyless/v1/#' -v")
+        if asked.record is not None:
+            lines.append(f"recording {asked.record}")
+        to = sys.stderr if json else sys.stdout
+        if self._live is not None:
+            self._live.console.print("\n".join(lines), soft_wrap=True)
+        else:
+            print("\n".join(lines), file=to, flush=True)
+
+    def begin(self) -> None:
+        """All tags have a fix."""
+        self._begun_s = time.monotonic()
+
+    def end(self) -> None:
+        """The programs are about to be ended."""
+        if self._begun_s is not None:
+            self._took_s = time.monotonic() - self._begun_s
+
+    def draw(self) -> None:
+        """Draw the tables, where there is a terminal."""
+        if self._live is not None:
+            from rich.console import Group
+
+            self._live.update(Group(self._line(), self.tags(), self._anchors()), refresh=True)
+
+    @property
+    def _watch(self) -> "Watch | None":
+        return self._whole.watch
+
+    def _tags(self) -> "list[tuple[str, Watched]]":
+        known = [] if self._watch is None else list(self._watch.tags.items())
+        return sorted(known, key=lambda item: (len(item[0]), item[0]))
+
+    def _line(self) -> str:
+        sent = 0 if self._watch is None or self._watch.ether is None else self._watch.ether.transmissions
+        return f"{sent} beacons on the air; page {self._whole.page}; Ctrl-C stops"
+
+    def tags(self) -> "RenderableType":
+        """The table of tags."""
+        from rich.table import Table
+
+        columns = ("tag", "x m", "y m", "m/s", "error cm", "sigma cm", "fixes/s", "anchors", "lost", "late ms")
+        table = Table(*columns, title="tags (radio world simulated)")
+        for name, tag in self._tags():
+            fix, health = tag.fix, tag.health
+            speed = None if fix.velocity_mps is None else sum(v * v for v in fix.velocity_mps) ** 0.5
+            table.add_row(
+                name,
+                f"{fix.position_m[0]:.3f}",
+                f"{fix.position_m[1]:.3f}",
+                _number(speed, "{:.2f}"),
+                _number(tag.error_m, "{:.1f}", 100.0),
+                f"{100 * fix.std_m:.1f}",
+                _number(None if health is None else health.updates_per_s, "{:.0f}"),
+                str(len(fix.anchors)),
+                "–" if health is None else str(sum(health.counters.values())),
+                _number(None if health is None else health.latency_p99_s, "{:.1f}", 1e3),
+            )
+        return table
+
+    def _anchors(self) -> "RenderableType":
+        from rich.table import Table
+
+        table = Table("anchor", "role", "heard", "rate ppm", "clock sigma cm", "sent", "late", title="synchronisation")
+        anchors = {} if self._watch is None else self._watch.anchors
+        for number, health in sorted(anchors.items()):
+            table.add_row(
+                str(number),
+                health.role,
+                str(health.heard),
+                "–" if health.role == "master" else _number(health.rate_ppm, "{:+.4f}"),
+                "–" if health.role == "master" else _number(health.offset_std_m, "{:.2f}", 100.0),
+                str(health.sent),
+                str(health.late),
+            )
+        return table
+
+    def summary(self) -> dict[str, Any]:
+        """The figures, for a program."""
+        tags = [tag for _, tag in self._tags()]
+        rates = [rate for tag in tags if (rate := tag.updates_per_s) is not None]
+        healths = [tag.health for tag in tags if tag.health is not None]
+        firsts = sorted(health.first_fix_s for health in healths if health.first_fix_s is not None)
+        return {
+            "tags": len(tags),
+            "fixes": sum(health.fixes for health in healths),
+            **self._errors(),
+            "updates_per_s": sum(rates) / len(rates) if rates else 0.0,
+            "messages": sum(health.receptions for health in healths),
+            "dropped": sum(sum(health.counters.values()) for health in healths),
+            "first_fix_s": firsts[len(firsts) // 2] if firsts else None,
+            **self._latencies(),
+            "late_transmissions": sum(health.late for health in self._watch.anchors.values()) if self._watch else 0,
+            "restarts": sum(max(0, child.starts - 1) for child in self._whole.children),
+            "duration_s": self._took_s,
+            "page": self._whole.page,
+            "broker": str(self._whole.address),
+        }
+
+    def _errors(self) -> dict[str, float | int | None]:
+        watch = self._watch
+        found = None if watch is None else watch.errors.summary()
+        if watch is None or found is None or not watch.judged:
+            return {"judged": 0, "rmse_m": None, "p95_m": None, "max_m": None, "sigma_m": None}
+        return {
+            "judged": watch.judged,
+            "rmse_m": found.rmse_3d_m if found.rmse_2d_m is None else found.rmse_2d_m,
+            "p95_m": found.p95_m,
+            "max_m": found.max_m,
+            "sigma_m": (watch.variance_sum_m2 / watch.judged) ** 0.5,
+        }
+
+    def _latencies(self) -> dict[str, float | None]:
+        """From the end of a frame on the air to the fix, and to a subscriber of the broker."""
+        if self._watch is None:
+            return {}
+        fix_p50_s, fix_p99_s, _ = self._watch.latencies.take()
+        here_p50_s, here_p99_s, _ = self._watch.arrivals.take()
+        return {
+            "fix_latency_p50_s": fix_p50_s,
+            "fix_latency_p99_s": fix_p99_s,
+            "subscriber_latency_p50_s": here_p50_s,
+            "subscriber_latency_p99_s": here_p99_s,
+        }
+
+    def closing(self) -> str:
+        """The figures, for a person."""
+        told = self.summary()
+        if told["rmse_m"] is None:
+            return "no fix was made"
+        return (
+            f"{told['tags']} tags, {told['messages']} messages in {told['duration_s']:.1f} s: "
+            f"RMSE {100 * told['rmse_m']:.1f} cm, largest error {100 * told['max_m']:.1f} cm, "
+            f"{told['updates_per_s']:.0f} updates per second and tag, "
+            f"99 % of fixes within {1e3 * (told['fix_latency_p99_s'] or 0.0):.1f} ms of the frame"
+        )
+
+
+def _number(value: float | None, form: str, scale: float = 1.0) -> str:
+    return "–" if value is None else form.format(scale * value)

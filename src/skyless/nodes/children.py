@@ -1,0 +1,117 @@
+"""Programs that a program starts: watched, started again when they die, ended together."""
+
+import asyncio
+import contextlib
+import os
+import socket
+import sys
+from collections import deque
+from collections.abc import Sequence
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.nodes.loop import CHILD_VARIABLE
+from skyless.nodes.running import Say
+
+_AGAIN_S: Final = 0.2
+_LONGEST_S: Final = 5.0
+_SOUND_S: Final = 10.0
+"""A program that has run for so long was not faulty from the start."""
+
+_STOP_S: Final = 5.0
+_LINES: Final = 20
+
+
+class Program(Struct, frozen=True):
+    """A command of ``skyless`` to run."""
+
+    name: str
+    arguments: tuple[str, ...]
+
+
+class Child:
+    """One program, started again whenever it ends."""
+
+    def __init__(self, program: Program, say: Say) -> None:
+        self.program = program
+        self.starts = 0
+        self.pid: int | None = None
+        """Of its present life."""
+        self._say = say
+        self._last_words: deque[str] = deque(maxlen=_LINES)
+
+    async def run(self) -> None:
+        """Keep it alive until cancelled."""
+        wait_s = _AGAIN_S
+        while True:
+            begun_s = asyncio.get_running_loop().time()
+            code = await self._one_life()
+            words = self._last_words[-1] if self._last_words else "it said nothing"
+            self._say(f"{self.program.name} ended ({_how(code)}): {words}; started again")
+            sound = asyncio.get_running_loop().time() - begun_s > _SOUND_S
+            wait_s = _AGAIN_S if sound else min(2.0 * wait_s, _LONGEST_S)
+            await asyncio.sleep(wait_s)
+
+    async def _one_life(self) -> int:
+        self.starts += 1
+        self._last_words.clear()
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "skyless.cli.main",
+            *self.program.arguments,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C in a terminal is for the one that started it
+            env={**os.environ, CHILD_VARIABLE: str(os.getpid())},
+        )
+        self.pid = process.pid
+        try:
+            assert process.stderr is not None
+            async for line in process.stderr:
+                self._last_words.append(line.decode(errors="replace").rstrip())
+            return await process.wait()
+        finally:
+            self.pid = None
+            await end(process)
+
+
+async def end(process: asyncio.subprocess.Process) -> None:
+    """Ask a process to end, and make it."""
+    if process.returncode is not None:
+        return
+    with contextlib.suppress(ProcessLookupError):
+        process.terminate()
+    try:
+        async with asyncio.timeout(_STOP_S):
+            await process.wait()
+    except TimeoutError:
+        process.kill()
+        await process.wait()
+
+
+def _how(code: int) -> str:
+    return f"signal {-code}" if code < 0 else f"exit code {code}"
+
+
+def free_ports(host: str, first: Sequence[int]) -> tuple[int, ...]:
+    """For each port the port itself, or the next one that is free."""
+    taken: list[int] = []
+    for port in first:
+        found = port
+        while found in taken or not _is_free(host, found):
+            found += 1
+        taken.append(found)
+    return tuple(taken)
+
+
+def _is_free(host: str, port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError:
+            return False
+    return True

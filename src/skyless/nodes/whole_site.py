@@ -1,0 +1,123 @@
+"""A whole site from one command: broker, ether, anchors, tags, page and recorder as processes, and one who watches."""
+
+import asyncio
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.nodes.broker import Broker, start_broker
+from skyless.nodes.broker_settings import BrokerSettings
+from skyless.nodes.children import Child, Program, free_ports
+from skyless.nodes.running import Say, together
+from skyless.nodes.watch import Watch
+from skyless.outputs.address import MqttAddress
+from skyless.outputs.link import Link
+from skyless.radios.ether_wire import DEFAULT_PORT
+from skyless.site.model import Site
+
+HOST: Final = "127.0.0.1"
+PAGE_PORT: Final = 8080
+TAGS_PER_PROCESS: Final = 25
+_BROKER_AGAIN_S: Final = 0.2
+
+
+class SiteRun(Struct, frozen=True):
+    """What to run."""
+
+    site: Site
+    site_name: str
+    """How the programs' ``--site`` calls it."""
+    tags: int
+    speed_mps: float
+    noise_ps: float | None
+    seed: int
+    method: str
+    broker: MqttAddress | None
+    """None: an embedded one."""
+    record: Path | None
+    record_limit_mb: float
+    recordings: Path
+    """Folder of recordings that the page shows."""
+
+
+class WholeSite:
+    """Starts everything and keeps it alive; ``ready`` is set when the watch is connected."""
+
+    def __init__(self, asked: SiteRun, say: Say) -> None:
+        self._asked, self._say = asked, say
+        self.ether_port, self.page_port = free_ports(HOST, (DEFAULT_PORT, PAGE_PORT))
+        self.address: MqttAddress | None = asked.broker
+        self.watch: Watch | None = None
+        self.children: list[Child] = []
+        self.ready = asyncio.Event()
+        """The broker is there and the programs are starting."""
+
+    @property
+    def page(self) -> str:
+        """Address of the page."""
+        return f"http://{HOST}:{self.page_port}"
+
+    async def run(self) -> None:
+        """Keep everything alive until cancelled.
+
+        Raises:
+            SkylessError: the embedded broker cannot be started.
+        """
+        if self._asked.broker is not None:
+            await self._run_with(self._asked.broker, None)
+        else:
+            broker = await start_broker()
+            await self._run_with(broker.address, broker)
+
+    async def _run_with(self, address: MqttAddress, broker: Broker | None) -> None:
+        self.address = address
+        site = self._asked.site
+        link = Link(address, "demo", site=site.id, kind="watch")
+        self.watch = Watch(link, site.id, planar=site.tags.height_m is not None)
+        self.children = [Child(program, self._say) for program in self._programs(address)]
+        self.ready.set()
+        parts = [link.run(), *(child.run() for child in self.children)]
+        if broker is not None:
+            parts.append(self._keep(broker))
+        await together(*parts)
+
+    async def _keep(self, broker: Broker) -> None:
+        """Start the embedded broker again, on the same port and with the same store, whenever it ends."""
+        settings = BrokerSettings(port=broker.address.port, data=broker.data)
+        try:
+            while True:
+                code = await broker.wait()
+                self._say(f"broker ended (exit code {code}); started again")
+                await broker.stop()
+                await asyncio.sleep(_BROKER_AGAIN_S)
+                broker = await start_broker(settings)
+        finally:
+            await asyncio.shield(broker.stop())
+
+    def _programs(self, address: MqttAddress) -> list[Program]:
+        asked = self._asked
+        mqtt: tuple[str, ...] = ("--mqtt", str(replace(address, password=None)))
+        if address.ca is not None:
+            mqtt += ("--mqtt-ca", str(address.ca))
+        radio = ("--radio", f"ether:{HOST}:{self.ether_port}")
+        site = ("--site", asked.site_name)
+        ether = ["ether", *site, *mqtt, "--listen", f"{HOST}:{self.ether_port}", "--tags", str(asked.tags)]
+        ether += ["--speed", str(asked.speed_mps), "--seed", str(asked.seed)]
+        if asked.noise_ps is not None:
+            ether += ["--noise-ps", str(asked.noise_ps)]
+        anchors = ["anchor", *(str(anchor.id) for anchor in asked.site.anchors), *site, *radio, *mqtt]
+        programs = [Program("ether", tuple(ether)), Program("anchors", tuple(anchors))]
+        names = [f"tag{number}" for number in range(1, asked.tags + 1)]
+        for first in range(0, len(names), TAGS_PER_PROCESS):
+            some = names[first : first + TAGS_PER_PROCESS]
+            programs.append(Program("tags", ("tag", *some, *radio, *mqtt, "--method", asked.method)))
+        page = ("dashboard", *mqtt, "--listen", f"{HOST}:{self.page_port}", "--recordings", str(asked.recordings))
+        programs.append(Program("page", (*page, "--site-id", str(asked.site.id))))
+        if asked.record is not None:
+            limit = ("--limit-mb", str(asked.record_limit_mb))
+            programs.append(
+                Program("recorder", ("record", str(asked.record), *mqtt, *limit, "--site-id", str(asked.site.id)))
+            )
+        return programs
