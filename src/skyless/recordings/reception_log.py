@@ -37,6 +37,7 @@ class ReceptionLog:
         self._lease_until_s: dict[str, float] = {}
         self._segments = 0
         self._open = False
+        self._receiver: Receiver | None = None
         self._start: SegmentStart | None = None
         self._first = 0
         self._pending: list[RawReception] = []
@@ -70,6 +71,9 @@ class ReceptionLog:
             self.counters["not-collected"] += len(self._pending)
             self._pending.clear()
             self._open = False
+        if receiver is not self._receiver:  # the radio started anew, and the tag with it
+            self.interrupt()
+            self._receiver = receiver
         if not self._open:
             self._begin(receiver, serial)
         self._pending.append(raw(reception))
