@@ -1,18 +1,26 @@
 """``skyless tag``: one process with one or several tags, each with its own radio and its own MQTT connection."""
 
 import asyncio
+import secrets
 import time
 from collections.abc import Sequence
+from typing import Final
+
+import msgspec
 
 from skyless.nodes.running import HEALTH_S, Say, every, together
 from skyless.nodes.tag import TagNode, TagSettings
 from skyless.nodes.usage import Usage
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
-from skyless.outputs.messages import Counters, FixMessage, TagHealth
-from skyless.outputs.topics import fix_topic, health_topic
+from skyless.outputs.messages import Counters, FixMessage, RequestMessage, TagHealth
+from skyless.outputs.topics import fix_topic, health_topic, receptions_topic, request_topic
 from skyless.radios.radio import Radio
 from skyless.receiver import NOT_DROPS
+from skyless.recordings.reception_log import ReceptionLog, receiver_settings
+
+COLLECT_S: Final = 0.05
+_decode_request: Final = msgspec.json.Decoder(RequestMessage).decode
 
 
 class Tag:
@@ -22,8 +30,10 @@ class Tag:
         self._address = address
         self.link: Link | None = None
         self._link_task: asyncio.Task[None] | None = None
-        self._fix_topic = self._health_topic = ""
-        self.node = TagNode(settings, radio, self._publish, say)
+        self._fix_topic = self._health_topic = self._receptions_topic = ""
+        asked = receiver_settings(settings.method, settings.site, settings.qa, settings.z_bounds_m)
+        self.log = ReceptionLog(radio.name, asked, secrets.token_hex(4))
+        self.node = TagNode(settings, radio, self._publish, say, self.log.hear)
         self._told_fixes = 0
 
     async def run(self) -> None:
@@ -48,7 +58,25 @@ class Tag:
         self.link = Link(self._address, self.node.name, site=site, kind="tag")
         self._fix_topic = fix_topic(site, self.node.name)
         self._health_topic = health_topic(site, "tag", self.node.name)
+        self._receptions_topic = receptions_topic(site, self.node.name)
+        self.link.subscribe(request_topic(site), self._take_request, qos=1)
         self._link_task = asyncio.ensure_future(self.link.run())
+
+    def _take_request(self, _topic: str, payload: bytes) -> None:
+        """Somebody wants raw receptions; what cannot be read is counted."""
+        try:
+            request = _decode_request(payload)
+        except msgspec.MsgspecError:
+            self.log.counters["bad-request"] += 1
+        else:
+            self.log.request(request, time.monotonic())
+
+    def tell_receptions(self) -> None:
+        """Publish what was asked for and is due."""
+        if self.link is None:
+            return
+        while (message := self.log.collect(time.monotonic(), self.node.unix_less_host_s)) is not None:
+            self.link.publish(self._receptions_topic, message, qos=1)
 
     def tell_health(self, cpu: float, memory_bytes: int) -> None:
         """Publish how the tag does."""
@@ -76,7 +104,8 @@ class Tag:
             first_fix_s=node.first_fix_s,
             latency_p50_s=median_s,
             latency_p99_s=late_s,
-            counters={reason: count for reason, count in node.receiver.counters.items() if reason not in NOT_DROPS},
+            counters={reason: count for reason, count in node.receiver.counters.items() if reason not in NOT_DROPS}
+            | self.log.counters,
             mqtt=Counters(0, 0, 0) if self.link is None else self.link.counters,
             cpu=cpu,
             memory_bytes=memory_bytes,
@@ -93,9 +122,14 @@ class Tags:
 
     async def run(self) -> None:
         """Serve until cancelled."""
-        await together(*(tag.run() for tag in self.tags), every(HEALTH_S, self._tell))
+        parts = [tag.run() for tag in self.tags]
+        await together(*parts, every(HEALTH_S, self._tell), every(COLLECT_S, self._tell_receptions))
 
     def _tell(self) -> None:
         share, memory_bytes = self._usage.take()
         for tag in self.tags:
             tag.tell_health(share / len(self.tags), memory_bytes)
+
+    def _tell_receptions(self) -> None:
+        for tag in self.tags:
+            tag.tell_receptions()
