@@ -19,6 +19,13 @@ MAX_AGE_S: Final = 0.5
 """Older messages no longer serve the start, unless superframes are so long; and then only for the rate of the clock, as
 the tag may be elsewhere by now."""
 
+WIDE: Final = 0.05
+"""A start whose standard deviation is above this part of the mean range is too wide for ranges that are taken for linear:
+updates would make the filter sure of a wrong place. More anchors are waited for, ..."""
+
+PATIENCE_S: Final = 0.5
+"""... for so long after the first such start, and four times as long for one wider by four times."""
+
 CONTRADICTIONS: Final = frozenset({NoFixReason.RESIDUALS, NoFixReason.BAD_GEOMETRY, NoFixReason.NOT_CONVERGED})
 """What one lying anchor makes of a start; absurd pseudoranges count as bad geometry."""
 
@@ -58,6 +65,8 @@ class Acquisition:
         self._variance_m2 = stamp_variance_m2
         self._z_bounds_m = z_bounds_m
         self._heard: dict[int, list[Observation]] = {}
+        self._possible_ticks: int | None = None
+        """When a start was first possible."""
 
     def hear(self, observation: Observation) -> Start | NoFixReason:
         """Take one observation; try to start each time an anchor comes around again."""
@@ -76,11 +85,22 @@ class Acquisition:
         if not came_around:
             return NoFixReason.ACQUIRING
         result = self._solve(pairs, now)
-        if isinstance(result, Start) or result not in CONTRADICTIONS:
-            return result
-        if len(pairs) <= needed + 1 or observation is not pairs[0][-1]:
+        if isinstance(result, Start):
+            return self._unless_wide(result)
+        if result not in CONTRADICTIONS or len(pairs) <= needed + 1 or observation is not pairs[0][-1]:
             return result
         return self._solve_without_one(pairs, now)
+
+    def _unless_wide(self, start: Start) -> Start | NoFixReason:
+        """Hold a start back while it is wide and more anchors may come."""
+        if self._possible_ticks is None:
+            self._possible_ticks = start.rx_ticks_tag
+        waited_s = (start.rx_ticks_tag - self._possible_ticks) * TICK_S
+        dim = len(start.solution) - 1
+        ranges_m = [np.linalg.norm(o.anchor_m[:dim] - start.solution[:dim]) for o in start.used]
+        spread = np.sqrt(np.trace(start.covariance[:2, :2])) / np.mean(ranges_m)
+        patience_s = PATIENCE_S * min(spread / WIDE, 4.0) if spread > WIDE else 0.0
+        return start if waited_s >= patience_s else NoFixReason.ACQUIRING
 
     def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
         """Where one anchor alone contradicts all others, do without it; they must still be able to contradict."""
