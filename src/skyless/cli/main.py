@@ -13,6 +13,7 @@ _COMMANDS = (
     # name, where it is (imported only when it is called), what it does
     ("demo", "skyless.cli.demo:app", "Show a site and walking tags in real time."),
     ("broker", "skyless.cli.broker:app", "Run the MQTT broker that comes with Skyless."),
+    ("dashboard", "skyless.cli.dashboard:app", "Show a site live in the browser."),
     ("simulate", "skyless.cli.simulate:app", "Run a site in the simulated world and judge it against the truth."),
     ("replay", "skyless.cli.replay:app", "Turn a recording into fixes and judge them against the truth."),
     ("paper", "skyless.cli.paper:app", "Reproduce the paper's figures and claims in one report."),

@@ -1,0 +1,165 @@
+"""``skyless dashboard``: the live page."""
+
+import contextlib
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+from cyclopts.validators import Number
+
+from skyless.cli.output import print_json
+from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from skyless.dashboard.guard import Rules
+    from skyless.dashboard.serve import Listen
+    from skyless.outputs.messages import SiteMessage
+
+_SHORTEST_TOKEN = 12
+
+app = App(name="dashboard", help_epilogue="Example: skyless dashboard --mqtt mqtt://127.0.0.1:1883")
+
+
+@app.default
+def dashboard(
+    *,
+    mqtt: str = "mqtt://127.0.0.1:1883",
+    mqtt_ca: Path | None = None,
+    site: Path | None = None,
+    site_id: Annotated[int, Parameter(validator=Number(gte=0, lte=65535))] | None = None,
+    listen: str | None = None,
+    recordings: Path | None = None,
+    token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_TOKEN")] = None,
+    json: bool = False,
+) -> None:
+    """Show a site live in the browser; Ctrl-C stops.
+
+    Whoever opens the page may draw zones. On this machine only, it asks for no token; to other machines it speaks plain
+    HTTP, so use it in networks that you trust or behind a proxy with TLS.
+
+    Parameters
+    ----------
+    mqtt
+        The broker, mqtt://HOST[:PORT] or mqtts://[USER@]HOST[:PORT]; the password stands in SKYLESS_MQTT_PASSWORD.
+    mqtt_ca
+        Certificates to trust instead of the system's, a PEM file.
+    site
+        The site file; by default what the broker has retained.
+    site_id
+        Number of the site; by default the first that the broker knows.
+    listen
+        Where the page stands, HOST:PORT; by default 127.0.0.1:8080, or the next free port.
+    recordings
+        Folder of recordings to replay.
+    token
+        What pages must know; made and printed where other machines can reach the page and none is given.
+    json
+        Write the page's address as one JSON object instead of a table.
+    """
+    import asyncio
+
+    from skyless.dashboard.app import Parts
+    from skyless.dashboard.live import Live
+    from skyless.dashboard.overlays import Overlays
+    from skyless.dashboard.playback import Playback
+    from skyless.dashboard.serve import bind, serve
+    from skyless.outputs.address import mqtt_address
+
+    broker = mqtt_address(mqtt, mqtt_ca)
+    broker.tls_context()
+    known, image = (None, None) if site is None else _load(site)
+    if known is not None and site_id is not None and known.site.id != site_id:
+        raise SkylessError(f"--site-id is {site_id}, but {site} is of site {known.site.id}; give one of them")
+    if recordings is not None and not recordings.is_dir():
+        raise SkylessError(f"--recordings is {str(recordings)!r}; it should be a folder")
+    place = _place(listen)
+    sock = bind(place)
+    port = sock.getsockname()[1]
+    rules = _rules(sock.getsockname()[0], place.host, port, token)
+    live = Live(_name(port), str(broker), known)
+    live.floor_plan = image
+    page = _address(place.host, port, rules)
+    if json:
+        print_json({"page": page, "mqtt": str(broker), "token": rules.token})
+        sys.stdout.flush()
+    else:
+        print(f"page    {page}\nbroker  {broker}", flush=True)
+    parts = Parts(live, Overlays(), Playback(recordings))
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(serve(parts, rules, sock, broker, known.site.id if known is not None else site_id))
+
+
+def _name(port: int) -> str:
+    """The dashboard's on MQTT: the same after a restart, so that no old ones pile up there."""
+    import re
+    import socket
+
+    return f"{re.sub(r'[^A-Za-z0-9_.-]', '-', socket.gethostname())}-{port}"
+
+
+def _load(file: Path) -> "tuple[SiteMessage, bytes | None]":
+    """The site of a file and the image of its floor. Raises SkylessError."""
+    import time
+
+    from skyless.outputs.messages import SiteMessage
+    from skyless.site.load import load_site
+
+    site = load_site(file)
+    image = None if site.floor_plan is None else (file.parent / site.floor_plan.image).read_bytes()
+    return SiteMessage(site, simulated=False, unix_s=time.time()), image
+
+
+def _place(listen: str | None) -> "Listen":
+    """Where to listen. Raises SkylessError."""
+    from skyless.dashboard.serve import Listen
+
+    if listen is None:
+        return Listen("127.0.0.1", None)
+    host, colon, port = listen.rpartition(":")
+    if not colon or listen.endswith("]") or (":" in host and not host.startswith("[")):
+        host, port = listen, ""
+    host = host.strip("[]")
+    if not host or (port and not (port.isdecimal() and int(port) <= 65535)):
+        raise SkylessError(f"--listen is {listen!r}; it should be HOST:PORT, as 127.0.0.1:8080 or [::1]:8080")
+    return Listen(host, int(port) if port else None)
+
+
+def _rules(bound: str, host: str, port: int, token: str | None) -> "Rules":
+    """Who may come, by the address that the socket is bound to. Raises SkylessError."""
+    import ipaddress
+    import secrets
+    import socket
+
+    from skyless.dashboard.guard import Rules
+
+    if token is not None and len(token) < _SHORTEST_TOKEN:
+        raise SkylessError(f"--token has {len(token)} characters; it should have {_SHORTEST_TOKEN} or more")
+    elsewhere = not ipaddress.ip_address(bound.partition("%")[0]).is_loopback
+    if elsewhere and token is None:
+        token = secrets.token_urlsafe(18)
+    own = socket.gethostname().lower()
+    names = {host.lower(), own, own.partition(".")[0], f"{own.partition('.')[0]}.local", socket.getfqdn().lower()}
+    return Rules(token, frozenset(names) if elsewhere else frozenset(), elsewhere, f"skyless-{port}")
+
+
+def _address(host: str, port: int, rules: "Rules") -> str:
+    """The page's address, as others reach it, with its token."""
+    from urllib.parse import quote
+
+    shown = _own_address(host) if host in {"0.0.0.0", "::"} else host
+    shown = f"[{shown}]" if ":" in shown else shown
+    return f"http://{shown}:{port}/" + (f"?token={quote(rules.token, safe='')}" if rules.token is not None else "")
+
+
+def _own_address(host: str) -> str:
+    """The address by which this machine reaches others; nothing is sent to find it."""
+    import socket
+
+    family, other = (socket.AF_INET6, "2001:db8::1") if ":" in host else (socket.AF_INET, "192.0.2.1")
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as sock:
+            sock.connect((other, 9))
+            return str(sock.getsockname()[0])
+    except OSError:
+        return socket.gethostname()

@@ -1,0 +1,76 @@
+"""Which site a broker carries, for a dashboard that was not told one."""
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Final
+
+from skyless.outputs import packets
+from skyless.outputs.address import MqttAddress
+from skyless.outputs.connection import Connection, RefusedError, open_connection, trouble_with
+from skyless.outputs.topics import EVERY_SITE, site_topic
+
+_KEEPALIVE_S: Final = 10
+_GATHER_S: Final = 0.2
+"""Retained messages of several sites come one after the other."""
+
+_RETRY_S: Final = 0.5
+_log = logging.getLogger("skyless.dashboard")
+
+
+async def find_site(address: MqttAddress, on_state: Callable[[bool], None]) -> int:
+    """Wait for a site to be on the broker; of several the one with the lowest number.
+
+    ``on_state`` is called with whether the broker is there. A link needs its site from the start, for its last will;
+    so this has a connection of its own.
+    """
+    told = ""
+    while True:
+        try:
+            sites = await _sites(address, on_state)
+        except (OSError, RefusedError) as error:
+            sites = set()
+            trouble = trouble_with(address, error)
+            if trouble != told:
+                told = trouble
+                _log.warning("%s", trouble)
+        on_state(False)
+        if sites:
+            if len(sites) > 1:
+                others = ", ".join(str(site) for site in sorted(sites))
+                _log.warning("the broker carries the sites %s: showing the first; --site-id chooses", others)
+            return min(sites)
+        await asyncio.sleep(_RETRY_S)
+
+
+async def _sites(address: MqttAddress, on_state: Callable[[bool], None]) -> set[int]:
+    """Sites whose messages have come before the connection was lost, or a moment after the first."""
+    sites: set[int] = set()
+    found = asyncio.Event()
+
+    def take(message: packets.Message) -> None:
+        number = message.topic.split("/")[-2]
+        if message.payload and number.isdecimal():
+            sites.add(int(number))
+            found.set()
+
+    greeting = packets.connect(
+        "", clean=True, keepalive_s=_KEEPALIVE_S, user=address.user, password=address.password, will=None
+    )
+
+    def make() -> Connection:
+        return Connection(_KEEPALIVE_S, take, lambda _: None, lambda: None, lambda _, __: None)
+
+    connection = await open_connection(address, address.tls_context(), greeting, make)
+    on_state(True)
+    connection.write(packets.subscribe(1, {site_topic(EVERY_SITE): 0}))
+    waits = [asyncio.create_task(found.wait()), asyncio.create_task(connection.lost.wait())]
+    try:
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        if found.is_set():
+            await asyncio.sleep(_GATHER_S)
+    finally:
+        for wait in waits:
+            wait.cancel()
+        connection.abort("the site is known")
+    return sites

@@ -1,0 +1,158 @@
+"""Recordings for the page: which there are, and what a page would have been told while they were made."""
+
+import logging
+import math
+import os
+import threading
+from collections import OrderedDict
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.dashboard.state import TRUTH_REACH_S, Board
+from skyless.errors import SkylessError
+from skyless.outputs.messages import FixMessage, SiteMessage, TruthMessage, Zone
+from skyless.recordings.mcap_recording import McapRecording
+
+SUFFIX: Final = ".mcap"
+_KEPT_OPEN: Final = 8
+_log = logging.getLogger("skyless.dashboard")
+
+
+class NoRecordingError(Exception):
+    """There is no such recording, or it cannot be read; for the person who asked."""
+
+
+class Listed(Struct, frozen=True):
+    """A recording in the list."""
+
+    name: str
+    bytes: int
+    start_unix_s: float | None
+    duration_s: float
+    complete: bool
+    """False while it is being written, and after it was cut off."""
+
+
+class Summary(Struct, frozen=True):
+    """What a page must know before it plays a recording."""
+
+    name: str
+    site: SiteMessage | None
+    start_unix_s: float
+    end_unix_s: float
+    tags: tuple[str, ...]
+    zones: tuple[Zone, ...]
+
+
+class Playback:
+    """The recordings of one folder. Its methods read files; threads may call them."""
+
+    def __init__(self, folder: Path | None) -> None:
+        """None: there are none."""
+        self._folder = folder
+        self._lock = threading.Lock()
+        self._open: OrderedDict[tuple[str, int], McapRecording] = OrderedDict()
+        self._listed: dict[str, tuple[tuple[int, int, int], Listed]] = {}
+
+    def recordings(self) -> list[Listed]:
+        """All that can be read, the newest first."""
+        if self._folder is None:
+            return []
+        with self._lock:
+            known, self._listed = self._listed, {}
+            for file in self._folder.glob(f"*{SUFFIX}"):
+                try:
+                    self._list(file, known)
+                except (NoRecordingError, OSError) as error:
+                    _log.debug("%s is left out: %s", file, error)
+            found = [listed for _, listed in self._listed.values()]
+        return sorted(found, key=lambda listed: listed.start_unix_s or 0.0, reverse=True)
+
+    def summary(self, name: str) -> Summary:
+        """What a recording holds. Raises NoRecordingError."""
+        with self._lock:
+            recording = self._recording(name)
+            found = recording.summary()
+            if found.start_s is None or found.end_s is None:
+                raise NoRecordingError(f"nothing has been recorded in {name!r} yet")
+            zones = recording.zones.zones if recording.zones is not None else ()
+            return Summary(name, recording.site, found.start_s, found.end_s, found.tags, zones)
+
+    def floor_plan(self, name: str) -> bytes | None:
+        """The image of its floor. Raises NoRecordingError."""
+        with self._lock:
+            return self._recording(name).floor_plan
+
+    def states(self, name: str, begin_s: float, end_s: float, rate_hz: float) -> list[bytes]:
+        """The ``state`` messages from ``begin_s`` on and before ``end_s``, seconds since the recording's start.
+
+        Raises NoRecordingError.
+        """
+        start_s = self.summary(name).start_unix_s
+        with self._lock:
+            recording = self._recording(name)
+            return _states(recording, start_s + begin_s, start_s + end_s, 1.0 / rate_hz)
+
+    def _list(self, file: Path, known: dict[str, tuple[tuple[int, int, int], Listed]]) -> None:
+        """Take a file into the list; it is read only if it has changed since."""
+        stat = file.stat()
+        version = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
+        old = known.get(file.name)
+        if old is None or old[0] != version:
+            found = self._recording(file.name).summary()
+            duration_s = 0.0 if found.start_s is None or found.end_s is None else found.end_s - found.start_s
+            old = version, Listed(file.name, stat.st_size, found.start_s, duration_s, found.finished)
+        self._listed[file.name] = old
+
+    def _recording(self, name: str) -> McapRecording:
+        """The recording, open and up to date. Raises NoRecordingError."""
+        path = self._path(name)
+        try:
+            key = name, path.stat().st_ino
+            recording = self._open.pop(key, None)
+            if recording is None:
+                recording = McapRecording(path)
+            else:
+                recording.refresh()
+        except (SkylessError, OSError) as error:
+            raise NoRecordingError(f"{name!r} cannot be read: {error}") from None
+        self._open[key] = recording
+        while len(self._open) > _KEPT_OPEN:
+            self._open.popitem(last=False)[1].close()
+        return recording
+
+    def _path(self, name: str) -> Path:
+        """A file of the folder itself, by a name that a list could hold. Raises NoRecordingError."""
+        plain = name.endswith(SUFFIX) and not name.startswith(".") and not {"/", "\\", "\0", os.sep} & set(name)
+        if self._folder is not None and plain:
+            path = self._folder / name
+            if path.is_file() and path.resolve().parent == self._folder.resolve():
+                return path
+        raise NoRecordingError(f"there is no recording {name[:100]!r}")
+
+
+def _states(recording: McapRecording, begin_s: float, end_s: float, step_s: float) -> list[bytes]:
+    """What a board would have told every ``step_s``. Unix times."""
+    board = Board()
+    states: list[bytes] = []
+    seen, due_s = 0, begin_s + step_s
+    for found in recording.messages({"fix", "truth"}, begin_s - TRUTH_REACH_S, end_s):
+        if found.time_s >= due_s:
+            seen = _tell(board, seen, due_s, states)
+            due_s += step_s * (1 + math.floor((found.time_s - due_s) / step_s))
+        if isinstance(found.message, TruthMessage):
+            board.truth(found.message)
+        elif isinstance(found.message, FixMessage) and found.time_s >= begin_s:
+            board.fix(found.message, found.time_s)
+    _tell(board, seen, min(due_s, end_s), states)
+    return states
+
+
+def _tell(board: Board, seen: int, unix_s: float, states: list[bytes]) -> int:
+    """Add a state if there is anything new."""
+    if board.serial > seen:
+        board.unix_s = unix_s
+        states.append(board.state_since(seen))
+    return board.serial

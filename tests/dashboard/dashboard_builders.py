@@ -1,0 +1,87 @@
+"""Messages of a small site, and an MQTT that only remembers."""
+
+import msgspec
+
+from skyless.outputs.filters import matches
+from skyless.outputs.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
+from skyless.site.lab import lab_site
+
+SITE = SiteMessage(lab_site(100.0), simulated=True, unix_s=1000.0)
+SITE_ID = SITE.site.id
+SQUARE = Zone("desk", "Desk", ((1.0, 1.0), (3.0, 1.0), (3.0, 3.0), (1.0, 3.0)), "#ff8800")
+
+
+def fix(
+    tag="t1", unix_s=1000.0, position_m=(2.0, 2.0, 1.0), std_m=0.01, velocity_mps=(0.1, 0.0, 0.0), serial=1, **more
+):
+    variance = std_m**2 / 2
+    given = {
+        "tag": tag,
+        "serial": serial,
+        "unix_s": unix_s,
+        "time_s": unix_s,
+        "position_m": position_m,
+        "covariance_m2": (variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, 0.0),
+        "velocity_mps": velocity_mps,
+        "velocity_covariance": None,
+        "std_m": std_m,
+        "gdop": 1.0,
+        "pdop": 1.0,
+        "hdop": 1.0,
+        "vdop": None,
+        "anchors": (1, 2, 3, 4),
+        "chi2": 2.5,
+        "dof": 3,
+        "residual_rms_m": 0.01,
+        "method": "tracker",
+        "height_known": True,
+        "latency_s": 0.001,
+    }
+    return FixMessage(**(given | more))
+
+
+def truth(unix_s=1000.0, tag="t1", position_m=(2.0, 2.0, 1.0), velocity_mps=(0.0, 0.0, 0.0)):
+    payload = {"unix_s": unix_s, "tags": {tag: (position_m, velocity_mps)}}
+    return msgspec.convert(payload, TruthMessage)
+
+
+def status(kind="tag", name="t1", online=True, unix_s=1.0):
+    return StatusMessage(online=online, kind=kind, name=name, unix_s=unix_s)
+
+
+class Times:
+    """Two clocks that stand until they are moved."""
+
+    def __init__(self):
+        self.now_s, self.unix_s = 100.0, 1000.0
+
+    def move(self, seconds):
+        self.now_s += seconds
+        self.unix_s += seconds
+
+
+class Wire:
+    """In the place of a link: keeps what is published, and echoes it as a broker does."""
+
+    def __init__(self):
+        self.published = []
+        self.forgotten = []
+        self.handlers = {}
+
+    def publish(self, topic, message, *, qos=0, retain=False):
+        payload = message if isinstance(message, bytes) else msgspec.json.encode(message)
+        self.published.append((topic, payload, qos, retain))
+
+    def subscribe(self, topic_filter, handler, qos=0):
+        self.handlers[topic_filter] = handler
+
+    def forget(self, topic):
+        self.forgotten.append(topic)
+
+    def deliver(self, topic, message):
+        payload = message if isinstance(message, bytes) else msgspec.json.encode(message)
+        taken = [handler(topic, payload) for name, handler in self.handlers.items() if matches(name, topic)]
+        assert taken, f"nobody listens to {topic}"
+
+    def topics(self):
+        return [topic for topic, *_ in self.published]

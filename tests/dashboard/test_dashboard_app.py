@@ -1,0 +1,233 @@
+"""The server as browsers and others meet it, good and bad."""
+
+import asyncio
+
+import pytest
+from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, fix
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from skyless.dashboard.app import MOST_PAGES, Parts, make_app
+from skyless.dashboard.guard import Rules
+from skyless.dashboard.live import Live
+from skyless.dashboard.overlays import Overlays
+from skyless.dashboard.playback import Playback
+from skyless.outputs import topics
+
+TOKEN = "correct-horse-battery"
+HERE = "http://localhost:8080"
+SOCKET = "ws://localhost:8080/live"
+STRANGE_SOCKET = "ws://192.168.1.5:8080/live"
+
+
+@pytest.fixture
+def live():
+    live = Live("here", "mqtt://broker:1")
+    live.attach(Wire(), SITE_ID)
+    return live
+
+
+@pytest.fixture
+def page(tmp_path):
+    folder = tmp_path / "page"
+    folder.mkdir()
+    (folder / "index.html").write_text("<!doctype html><title>Skyless</title>")
+    (folder / "main.js").write_text("export {};")
+    (tmp_path / "secret.txt").write_text("secret")
+    (folder / "link.txt").symlink_to(tmp_path / "secret.txt")
+    return folder
+
+
+def client(live, page, rules=None, base_url=HERE):
+    return TestClient(make_app(Parts(live, Overlays(), Playback(None)), rules or Rules(), page), base_url=base_url)
+
+
+@pytest.fixture
+def browser(live, page):
+    return client(live, page)
+
+
+@pytest.fixture
+def stranger(live, page):
+    """Somebody on another machine."""
+    rules = Rules(TOKEN, frozenset({"hall.example"}), elsewhere=True, cookie="skyless-8080")
+    return client(live, page, rules, "http://192.168.1.5:8080")
+
+
+def test_the_page_and_its_modules(browser):
+    assert "Skyless" in browser.get("/").text
+    module = browser.get("/page/main.js")
+    assert module.headers["content-type"].startswith("text/javascript")
+    assert module.headers["cache-control"] == "no-cache"
+    assert browser.get("/page/none.js").status_code == 404
+
+
+@pytest.mark.parametrize(
+    "path", ["/page/../secret.txt", "/page/%2e%2e/secret.txt", "/page/link.txt", "/page//etc/passwd"]
+)
+def test_files_outside_the_page_stay_there(browser, path):
+    assert browser.get(path).status_code == 404
+
+
+@pytest.mark.parametrize("path", ["/", "/page/main.js", "/api/recordings", "/nowhere"])
+def test_every_answer_carries_the_security_headers(browser, path):
+    headers = browser.get(path).headers
+    assert headers["content-security-policy"].startswith("default-src 'self'")
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["referrer-policy"] == "no-referrer"
+    assert "set-cookie" not in headers
+
+
+@pytest.mark.parametrize("host", ["localhost:8080", "127.0.0.1", "127.5.5.5:1", "[::1]:8080", "LOCALHOST."])
+def test_the_own_machine_may_call_it_by_any_of_its_names(browser, host):
+    assert browser.get("/", headers={"host": host}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "192.168.1.5", "[::2]", "", "a b", "@"]
+)
+def test_a_rebound_name_is_turned_away(browser, host):
+    assert browser.get("/", headers={"host": host}).status_code == 421
+    with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET, headers={"host": host}):
+        pass
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:9999", "file://", "http://[bad"])
+def test_other_sites_pages_are_turned_away(browser, origin):
+    assert browser.get("/api/recordings", headers={"origin": origin}).status_code == 403
+    assert browser.put("/api/zones", json={"zones": []}, headers={"origin": origin}).status_code == 403
+    with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET, headers={"origin": origin}):
+        pass
+    assert browser.get("/api/recordings", headers={"origin": HERE}).status_code == 200
+
+
+def test_strangers_need_the_token(stranger):
+    for path in ("/", "/page/main.js", "/api/recordings", "/api/floor_plan"):
+        assert stranger.get(path).status_code == 401
+        assert stranger.get(path, params={"token": TOKEN + "x"}).status_code == 401
+        assert stranger.get(path, params={"token": ""}).status_code == 401
+    with pytest.raises(WebSocketDisconnect), stranger.websocket_connect(STRANGE_SOCKET):
+        pass
+    with pytest.raises(WebSocketDisconnect), stranger.websocket_connect(f"{STRANGE_SOCKET}?token=wrong"):
+        pass
+
+
+def test_the_token_in_the_address_becomes_a_cookie_that_scripts_cannot_read(stranger):
+    answer = stranger.get("/", params={"token": TOKEN})
+    cookie = answer.headers["set-cookie"]
+    assert "HttpOnly" in cookie
+    assert "SameSite=Strict" in cookie
+    assert TOKEN not in cookie
+    assert stranger.get("/api/recordings").status_code == 200
+    with stranger.websocket_connect(STRANGE_SOCKET, headers={"origin": "http://192.168.1.5:8080"}) as socket:
+        assert socket.receive_json()["type"] == "hello"
+
+
+def test_a_wrong_cookie_does_not_help(stranger):
+    stranger.cookies.set("skyless-8080", "0" * 64)
+    assert stranger.get("/").status_code == 401
+    stranger.cookies.set("skyless-8080", TOKEN)
+    assert stranger.get("/").status_code == 401
+
+
+def test_programs_may_send_the_token_as_bearers(stranger):
+    assert stranger.get("/api/recordings", headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
+    assert stranger.get("/api/recordings", headers={"authorization": "Bearer no"}).status_code == 401
+    assert stranger.get("/api/recordings", headers={"authorization": f"Basic {TOKEN}"}).status_code == 401
+
+
+@pytest.mark.parametrize(("host", "status"), [("hall.example:8080", 200), ("10.0.0.1", 200), ("evil.example", 421)])
+def test_strangers_may_call_it_by_its_names_only(stranger, host, status):
+    assert stranger.get("/", params={"token": TOKEN}, headers={"host": host}).status_code == status
+
+
+def test_zones_are_stored(browser, live):
+    zone = {"id": "desk", "name": "Desk", "polygon_m": [[0, 0], [1, 0], [1, 1]], "colour": None}
+    answer = browser.put("/api/zones", json={"zones": [zone]})
+    assert answer.status_code == 200
+    assert answer.json() == {"zones": [zone]}
+    assert live.watch.zones[0].id == "desk"
+
+
+def test_wrong_zones_are_refused_and_nothing_changes(browser, live):
+    live.draw_zones((SQUARE,))
+    for body in (b"", b"{}", b'{"zones":[{"id":"a","name":"A","polygon_m":[[0,0],[1,1]]}]}', b"\xff"):
+        answer = browser.put("/api/zones", content=body)
+        assert answer.status_code == 400
+        assert answer.json()["error"]
+    assert browser.put("/api/zones", content=b" " * 1_000_001).status_code == 413
+    assert browser.post("/api/zones", json={"zones": []}).status_code == 405
+    assert live.watch.zones == (SQUARE,)
+
+
+@pytest.mark.parametrize(
+    ("image", "kind"), [(b"\x89PNG\r\n\x1a\nrest", "image/png"), (b"\xff\xd8\xff\xe0rest", "image/jpeg")]
+)
+def test_the_floor_plan(browser, live, image, kind):
+    assert browser.get("/api/floor_plan").status_code == 404
+    live.floor_plan = image
+    answer = browser.get("/api/floor_plan")
+    assert (answer.content, answer.headers["content-type"]) == (image, kind)
+    live.floor_plan = b"<svg onload='alert(1)'>"
+    assert browser.get("/api/floor_plan").status_code == 404
+
+
+def test_overlays_before_the_site_is_known_and_wrong_ones(browser, live):
+    assert browser.get("/api/overlay?kind=pdop").status_code == 404
+    assert browser.get("/api/overlay?kind=magic").status_code == 400
+    for step in ("0", "-1", "nan", "inf", "x", ""):
+        answer = browser.get("/api/overlay", params={"kind": "pdop", "step_m": step})
+        assert answer.status_code == 400
+        assert "step_m" in answer.json()["error"]
+
+
+def test_without_a_folder_there_are_no_recordings(browser):
+    assert browser.get("/api/recordings").json() == []
+    for path in ("/api/recordings/x.mcap", "/api/recordings/x.mcap/states?from_s=0&to_s=1"):
+        assert browser.get(path).status_code == 404
+        assert browser.get(path).json()["error"]
+
+
+def test_the_live_stream(browser, live):
+    with browser, browser.websocket_connect(SOCKET) as socket:
+        assert socket.receive_json()["type"] == "hello"
+        assert socket.receive_json()["type"] == "mqtt"
+        assert socket.receive_json()["type"] == "health"
+        socket.send_text("ping")
+        assert socket.receive_json() == {"type": "pong"}
+        assert len(live.pages) == 1
+        browser.portal.call(_fix_and_tick, live)
+        messages = [socket.receive_json() for _ in range(2)]
+        assert [message["tags"][0][0] for message in messages if message["type"] == "state"] == ["t1"]
+
+
+async def _fix_and_tick(live):
+    live._bus.deliver(topics.fix_topic(SITE_ID, "t1"), fix())
+    live.tick()
+
+
+def test_a_page_that_went_away_is_forgotten(browser, live):
+    with browser:
+        for _ in range(3):
+            with browser.websocket_connect(SOCKET) as socket:
+                socket.receive_json()
+        for _ in range(200):
+            if not live.pages:
+                break
+            browser.portal.call(asyncio.sleep, 0.01)
+    assert not live.pages
+
+
+def test_there_is_an_end_to_the_number_of_pages(browser, live):
+    for _ in range(MOST_PAGES):
+        live.join()
+    with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET):
+        pass
+    assert len(live.pages) == MOST_PAGES
+
+
+def test_hello_tells_the_site(browser, live):
+    live.site = SITE
+    with browser.websocket_connect(SOCKET) as socket:
+        assert socket.receive_json()["site"]["site"]["name"] == SITE.site.name

@@ -1,0 +1,217 @@
+"""Messages from MQTT reach the board, the zones and the pages; wrong ones are counted."""
+
+import asyncio
+import json
+
+import pytest
+from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, fix, status, truth
+from msgspec.structs import replace
+
+from skyless.dashboard.live import Live
+from skyless.dashboard.mailbox import MOST_EVENTS
+from skyless.dashboard.zones import SILENCE_S
+from skyless.outputs import topics
+from skyless.outputs.messages import ZoneEvent, ZonesMessage
+
+FIX = topics.fix_topic(SITE_ID, "t1")
+ZONES = topics.zones_topic(SITE_ID)
+EVENT = topics.zone_event_topic(SITE_ID, "desk")
+
+
+@pytest.fixture
+def times():
+    return Times()
+
+
+@pytest.fixture
+def wire():
+    return Wire()
+
+
+@pytest.fixture
+def live(times, wire):
+    live = Live("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
+    live.attach(wire, SITE_ID)
+    return live
+
+
+def taken(live, page):
+    return [json.loads(message) for message in asyncio.run(asyncio.wait_for(page.take(live.board), 1.0))]
+
+
+def of(kind, messages):
+    return [message for message in messages if message["type"] == kind]
+
+
+def enter_the_desk(live, wire):
+    live.draw_zones((SQUARE,))
+    wire.deliver(FIX, fix())
+    live.tick()
+
+
+def test_a_page_is_greeted_before_anything_else(live, wire):
+    wire.deliver(FIX, fix())
+    greeting = taken(live, live.join())
+    assert greeting[0]["type"] == "hello"
+    assert greeting[0].keys() == {"type", "version", "site", "zones", "events", "mqtt"}
+    assert (greeting[0]["site"], greeting[0]["zones"], greeting[0]["mqtt"]) == (None, [], False)
+    assert of("mqtt", greeting) == [{"type": "mqtt", "connected": False, "broker": "mqtt://broker:1"}]
+    assert of("state", greeting)[0]["tags"][0][0] == "t1"
+
+
+def test_pages_hear_of_the_site_and_of_the_broker(live, wire):
+    page = live.join()
+    taken(live, page)
+    wire.deliver(topics.site_topic(SITE_ID), SITE)
+    live.connection(connected=True)
+    messages = taken(live, page)
+    assert of("site", messages)[0]["site"]["site"]["name"] == SITE.site.name
+    assert of("site", messages)[0]["site"]["simulated"] is True
+    assert of("mqtt", messages)[0]["connected"] is True
+    assert taken(live, live.join())[0]["site"]["site"]["id"] == SITE_ID
+
+
+def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):
+    page = live.join()
+    taken(live, page)
+    for k in range(500):
+        times.move(0.05)
+        wire.deliver(FIX, fix(serial=k, position_m=(k * 0.01, 0.0, 1.0)))
+        wire.deliver(topics.fix_topic(SITE_ID, f"other{k % 7}"), fix(f"other{k % 7}"))
+        live.tick()
+    messages = taken(live, page)
+    (state,) = of("state", messages)
+    assert len(state["tags"]) == 8
+    assert next(row for row in state["tags"] if row[0] == "t1")[1] == 4.99
+    assert len(of("health", messages)) == 1
+
+
+def test_without_anything_new_there_is_no_state(live, wire, times):
+    page = live.join()
+    wire.deliver(FIX, fix())
+    live.tick()
+    assert of("state", taken(live, page))
+    times.move(2.0)
+    live.tick()
+    messages = taken(live, page)
+    assert of("health", messages)
+    assert not of("state", messages)
+
+
+def test_pages_that_left_are_told_nothing(live, wire):
+    page = live.join()
+    live.leave(page)
+    live.leave(page)
+    assert not live.pages
+    live.connection(connected=True)
+
+
+@pytest.mark.parametrize(
+    ("topic", "payload"),
+    [
+        (FIX, b""),
+        (FIX, b"null"),
+        (FIX, b"\xff\xfe\x00"),
+        (FIX, b"[" * 10_000),
+        (FIX, fix("somebody-else")),
+        (topics.site_topic(SITE_ID), replace(SITE, site=replace(SITE.site, id=SITE_ID + 1))),
+        (topics.site_topic(SITE_ID), replace(SITE, site=replace(SITE.site, anchors=()))),
+        (topics.status_topic(SITE_ID, "tag", "t1"), b"{}"),
+        (topics.health_topic(SITE_ID, "tag", "t1"), b'{"tag":1}'),
+        (topics.truth_topic(SITE_ID), b'{"unix_s":"now","tags":{}}'),
+        (ZONES, b'{"zones":[{"id":"a","name":"A","polygon_m":[[0,0],[1,1]]}]}'),
+        (EVENT, b'{"zone":"other"}'),
+    ],
+)
+def test_wrong_messages_are_counted_and_change_nothing(live, wire, topic, payload):
+    wire.deliver(topic, payload)
+    assert live.wrong.total() == 1
+    assert live.board.serial == 0
+    assert live.site is None
+    assert live.watch.zones == ()
+    counted = of("health", taken(live, live.join()))[0]["dropped"]
+    assert counted == {topic.rsplit("/", 1)[-1]: 1}
+
+
+def test_health_of_unknown_kinds_and_cleared_statuses_are_no_fault(live, wire):
+    wire.deliver(topics.health_topic(SITE_ID, "toaster", "1"), b"{}")
+    wire.deliver(topics.status_topic(SITE_ID, "tag", "t1"), b"")
+    assert not live.wrong
+
+
+def test_zones_are_retained_and_events_fly_with_quality_of_service_1(live, wire):
+    page = live.join()
+    enter_the_desk(live, wire)
+    assert [(topic, qos, retain) for topic, _, qos, retain in wire.published] == [(ZONES, 1, True), (EVENT, 1, False)]
+    event = json.loads(wire.published[1][1])
+    assert (event["kind"], event["zone"], event["tag"], event["unix_s"]) == ("enter", "desk", "t1", 1000.0)
+    messages = taken(live, page)
+    assert of("zones", messages)[0]["zones"][0]["id"] == "desk"
+    assert of("zone_event", messages) == [{"type": "zone_event", **event}]
+    assert taken(live, live.join())[0]["events"] == [event]
+
+
+def test_the_echo_of_an_own_event_is_not_told_again(live, wire):
+    enter_the_desk(live, wire)
+    page = live.join()
+    taken(live, page)
+    wire.deliver(EVENT, wire.published[-1][1])
+    wire.deliver(EVENT, ZoneEvent("desk", "Desk", "t9", "enter", 1.0, (0.0, 0.0, 0.0)))
+    assert [event["tag"] for event in of("zone_event", taken(live, page))] == ["t9"]
+
+
+def test_events_of_a_slow_page_are_bounded(live, wire):
+    page = live.join()
+    for k in range(3 * MOST_EVENTS):
+        wire.deliver(EVENT, ZoneEvent("desk", "Desk", f"t{k}", "enter", 1.0, (0.0, 0.0, 0.0)))
+    events = of("zone_event", taken(live, page))
+    assert [event["tag"] for event in events] == [f"t{k}" for k in range(2 * MOST_EVENTS, 3 * MOST_EVENTS)]
+
+
+def test_a_second_dashboard_leaves_the_speaking_to_the_first(live, wire, times):
+    wire.deliver(topics.status_topic(SITE_ID, "dashboard", "here"), status("dashboard", "here", unix_s=5.0))
+    wire.deliver(topics.status_topic(SITE_ID, "dashboard", "elder"), status("dashboard", "elder", unix_s=1.0))
+    enter_the_desk(live, wire)
+    assert EVENT not in wire.topics()
+    times.move(1.1)
+    live.tick()
+    assert EVENT in wire.topics()
+
+
+def test_a_tag_that_falls_silent_or_dies_leaves(live, wire, times):
+    enter_the_desk(live, wire)
+    times.move(SILENCE_S)
+    live.tick()
+    assert json.loads(wire.published[-1][1])["kind"] == "leave"
+    wire.deliver(FIX, fix(unix_s=times.unix_s))
+    live.tick()
+    wire.deliver(topics.status_topic(SITE_ID, "tag", "t1"), status(online=False))
+    live.tick()
+    assert [json.loads(payload)["kind"] for topic, payload, *_ in wire.published if topic == EVENT] == [
+        *("enter", "leave"),
+        *("enter", "leave"),
+    ]
+
+
+def test_older_zones_of_the_broker_do_not_undo_a_drawing_on_its_way(live, wire):
+    live.draw_zones((SQUARE,))
+    wire.deliver(ZONES, ZonesMessage(()))
+    assert live.watch.zones == (SQUARE,)
+    wire.deliver(ZONES, ZonesMessage((SQUARE,)))
+    other = replace(SQUARE, name="Sofa")
+    wire.deliver(ZONES, ZonesMessage((other,)))
+    assert live.watch.zones == (other,)
+    assert wire.forgotten == [ZONES], "another dashboard's zones are newer; ours must not come back after a reconnect"
+
+
+def test_zones_drawn_before_the_site_is_known_are_stored_later(times, wire):
+    live = Live("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
+    live.draw_zones((SQUARE,))
+    live.attach(wire, SITE_ID)
+    assert wire.topics() == [ZONES]
+
+
+def test_the_truth_reaches_the_rows(live, wire):
+    wire.deliver(topics.truth_topic(SITE_ID), truth(position_m=(2.0, 2.03, 1.0)))
+    wire.deliver(FIX, fix(position_m=(2.0, 2.0, 1.0)))
+    assert live.board.rows_since(0)[0][10] == pytest.approx(0.03)

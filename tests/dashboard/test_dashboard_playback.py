@@ -1,0 +1,147 @@
+"""Recordings, written as the recorder writes them, as a page gets them back."""
+
+import json
+
+import msgspec
+import pytest
+from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, fix, truth
+from starlette.testclient import TestClient
+
+from skyless.dashboard.app import Parts, make_app
+from skyless.dashboard.guard import Rules
+from skyless.dashboard.live import Live
+from skyless.dashboard.overlays import Overlays
+from skyless.dashboard.playback import NoRecordingError, Playback
+from skyless.outputs import topics
+from skyless.outputs.messages import ZonesMessage
+from skyless.recordings.mcap_file import McapFile
+from skyless.recordings.mcap_recorder import McapRecorder
+
+START_S = 1_700_000_000.0
+PLAN = b"\x89PNG\r\n\x1a\nplan"
+DURATION_S = 10.0
+
+
+def record(path, *, begin_s=START_S, seconds=DURATION_S, close=True):
+    """Ten fixes a second of a tag that walks along x at 1 m/s and whose fixes lie 3 cm beside it."""
+    recorder = McapRecorder(McapFile(path))
+
+    def take(topic, message, at_s):
+        recorder.take(topic, message if isinstance(message, bytes) else msgspec.json.encode(message), at_s)
+
+    take(topics.site_topic(SITE_ID), SITE, begin_s)
+    take(topics.floor_plan_topic(SITE_ID), PLAN, begin_s)
+    take(topics.zones_topic(SITE_ID), ZonesMessage((SQUARE,)), begin_s)
+    for k in range(round(seconds * 10) + 1):
+        at_s = begin_s + k / 10
+        moving = truth(at_s, position_m=(k / 10, 2.0, 1.0), velocity_mps=(1.0, 0.0, 0.0))
+        take(topics.truth_topic(SITE_ID), moving, at_s)
+        take(topics.fix_topic(SITE_ID, "t1"), fix("t1", at_s, (k / 10, 2.03, 1.0), serial=k), at_s)
+        recorder.file.flush()
+    if close:
+        recorder.file.close()
+    return recorder
+
+
+@pytest.fixture
+def folder(tmp_path):
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    record(folder / "first.mcap")
+    return folder
+
+
+def rows(states):
+    return [row for state in states for row in json.loads(state)["tags"]]
+
+
+def test_the_list_has_the_newest_first_and_leaves_out_what_is_no_recording(folder):
+    record(folder / "second.mcap", begin_s=START_S + 100.0, seconds=2.0, close=False)
+    (folder / "notes.txt").write_text("no")
+    (folder / "broken.mcap").write_text("no")
+    (folder / "folder.mcap").mkdir()
+    playback = Playback(folder)
+    second, first = playback.recordings()
+    assert (second.name, second.start_unix_s, second.complete) == ("second.mcap", START_S + 100.0, False)
+    assert (first.name, first.complete) == ("first.mcap", True)
+    assert first.duration_s == pytest.approx(DURATION_S)
+    assert first.bytes == (folder / "first.mcap").stat().st_size
+    assert playback.recordings() == [second, first]
+
+
+def test_a_recording_that_grows_is_read_to_its_end(folder):
+    recorder = record(folder / "growing.mcap", seconds=1.0, close=False)
+    playback = Playback(folder)
+    assert playback.summary("growing.mcap").end_unix_s == START_S + 1.0
+    late = fix("t9", START_S + 2.0)
+    recorder.take(topics.fix_topic(SITE_ID, "t9"), msgspec.json.encode(late), START_S + 2.0)
+    recorder.file.flush()
+    assert playback.summary("growing.mcap").end_unix_s == START_S + 2.0
+    assert next(r for r in playback.recordings() if r.name == "growing.mcap").duration_s == pytest.approx(2.0)
+    assert rows(playback.states("growing.mcap", 1.5, 3.0, 20.0))[0][0] == "t9"
+
+
+def test_the_summary_says_what_a_page_needs_before_it_plays(folder):
+    found = Playback(folder).summary("first.mcap")
+    assert found.site == SITE
+    assert found.zones == (SQUARE,)
+    assert found.tags == ("t1",)
+    assert (found.start_unix_s, found.end_unix_s) == (START_S, START_S + DURATION_S)
+
+
+def test_windows_one_after_the_other_give_every_fix_once(folder):
+    playback = Playback(folder)
+    windows = [playback.states("first.mcap", k * 2.5, (k + 1) * 2.5, 20.0) for k in range(5)]
+    found = [row for window in windows for row in rows(window)]
+    assert [row[1] for row in found] == pytest.approx([k / 10 for k in range(101)])
+    assert [row[15] for row in found] == pytest.approx([START_S + k / 10 for k in range(101)])
+    assert [row[10] for row in found] == pytest.approx([0.03] * 101)
+    times = [json.loads(state)["unix_s"] for window in windows for state in window]
+    assert times == sorted(times)
+
+
+def test_a_lower_rate_gives_fewer_states(folder):
+    playback = Playback(folder)
+    assert len(playback.states("first.mcap", 0.0, 10.0, 2.0)) == 20
+    assert len(playback.states("first.mcap", 0.0, 10.0, 100.0)) == 100
+    assert playback.states("first.mcap", 20.0, 30.0, 20.0) == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../secret.mcap", "..", ".mcap", "a/b.mcap", "\\x.mcap", "x\0.mcap", "link.mcap", "none.mcap", "/etc/passwd"],
+)
+def test_nothing_outside_the_folder_is_read(folder, name):
+    record(folder.parent / "secret.mcap", seconds=0.1)
+    (folder / "link.mcap").symlink_to(folder.parent / "secret.mcap")
+    for read in (Playback(folder).summary, Playback(folder).floor_plan, Playback(None).summary):
+        with pytest.raises(NoRecordingError):
+            read(name)
+    assert [found.name for found in Playback(folder).recordings()] == ["first.mcap"]
+
+
+def test_a_recording_replaced_by_another_is_read_anew(folder):
+    playback = Playback(folder)
+    playback.summary("first.mcap")
+    record(folder / "new", begin_s=START_S + 50.0, seconds=1.0)
+    (folder / "new").replace(folder / "first.mcap")
+    assert playback.summary("first.mcap").start_unix_s == START_S + 50.0
+
+
+def test_the_server_gives_recordings(folder):
+    live = Live("here", "mqtt://broker:1")
+    live.attach(Wire(), SITE_ID)
+    app = make_app(Parts(live, Overlays(), Playback(folder)), Rules())
+    browser = TestClient(app, base_url="http://localhost")
+    (listed,) = browser.get("/api/recordings").json()
+    assert listed.keys() == {"name", "bytes", "start_unix_s", "duration_s", "complete"}
+    told = browser.get("/api/recordings/first.mcap").json()
+    assert told.keys() == {"name", "site", "start_unix_s", "end_unix_s", "tags", "zones"}
+    assert told["site"]["site"]["id"] == SITE_ID
+    states = browser.get("/api/recordings/first.mcap/states?from_s=1&to_s=2&rate_hz=20").json()["states"]
+    assert [state["type"] for state in states] == ["state"] * 10
+    assert browser.get("/api/recordings/first.mcap/floor_plan").content == PLAN
+    for query in ("from_s=0&to_s=61", "from_s=5&to_s=4", "from_s=-1", "rate_hz=0", "from_s=nan"):
+        assert browser.get(f"/api/recordings/first.mcap/states?{query}").status_code == 400
+    for name in ("none.mcap", "..%2Fsecret.mcap", "%2e%2e", "%2Fetc%2Fpasswd"):
+        assert browser.get(f"/api/recordings/{name}").status_code == 404

@@ -1,0 +1,121 @@
+"""What the page is told, in the contract's shape."""
+
+import json
+
+import pytest
+from dashboard_builders import fix, status, truth
+
+from skyless.dashboard.state import FORGET_S, MOST_NAMES, Board
+from skyless.outputs.messages import AnchorHealth, Counters, EtherHealth
+
+POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
+ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y")
+FIELDS = (*POSITION, *ERRORS, "anchors_used", "chi2", "fix_unix_s", "hpl_m")
+
+
+def rows(board, since=0):
+    return [dict(zip(FIELDS, row, strict=True)) for row in json.loads(board.state_since(since))["tags"]]
+
+
+def test_a_row_is_what_the_contract_says():
+    board = Board()
+    board.unix_s = 1000.0625
+    covariance = (4e-4, 1e-4, 9.0, 1e-4, 2e-4, 9.0, 9.0, 9.0, 9.0)
+    board.fix(fix(position_m=(1.25, 2.5, 0.75), velocity_mps=(0.5, -0.25, 0.1), covariance_m2=covariance), 0.0)
+    message = json.loads(board.state_since(0))
+    assert message["type"] == "state"
+    assert message["unix_s"] == pytest.approx(1000.0625, abs=1e-3)
+    expected = ("t1", 1.25, 2.5, 0.75, 0.5, -0.25, 4e-4, 1e-4, 2e-4, 0.01, None, None, None, 4, 2.5, 1000.0, None)
+    assert message["tags"] == [list(expected)]
+    board.fix(fix(velocity_mps=None), 0.0)
+    assert rows(board)[0]["vx"] is None
+
+
+def test_only_tags_with_a_newer_fix_are_told_and_only_their_last():
+    board = Board()
+    board.fix(fix("a"), 0.0)
+    board.fix(fix("b"), 0.0)
+    seen = board.serial
+    board.fix(fix("b", position_m=(5.0, 5.0, 1.0)), 0.1)
+    board.fix(fix("b", position_m=(6.0, 5.0, 1.0)), 0.2)
+    assert [(row["name"], row["x_m"]) for row in rows(board, seen)] == [("b", 6.0)]
+    assert {row["name"] for row in rows(board)} == {"a", "b"}
+    assert rows(board, board.serial) == []
+
+
+def test_all_who_ask_the_same_get_the_same_bytes():
+    board = Board()
+    board.fix(fix(), 0.0)
+    assert board.state_since(0) is board.state_since(0)
+
+
+def test_the_error_is_against_the_truth_moved_to_the_moment_of_the_fix():
+    board = Board()
+    board.truth(truth(unix_s=999.9, position_m=(0.0, 0.0, 1.0), velocity_mps=(2.0, 1.0, 0.0)))
+    board.truth(truth(unix_s=1000.05, position_m=(9.0, 9.0, 1.0), velocity_mps=(1.0, 0.0, 0.0)))
+    board.truth(truth(unix_s=1000.2, position_m=(50.0, 50.0, 1.0)))
+    board.fix(fix(unix_s=1000.0, position_m=(8.95, 9.04, 7.0)), 0.0)
+    row = rows(board)[0]
+    assert (row["true_x"], row["true_y"]) == (8.95, 9.0)
+    assert row["error_m"] == pytest.approx(0.04)  # horizontal: the height was given
+    board.fix(fix(unix_s=1000.0, position_m=(8.95, 9.04, 1.03), height_known=False), 0.0)
+    assert rows(board)[0]["error_m"] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("late_s", [0.3, -0.3, 100.0])
+def test_a_truth_of_another_time_judges_nothing(late_s):
+    board = Board()
+    board.truth(truth(unix_s=1000.0 + late_s))
+    board.fix(fix(unix_s=1000.0), 0.0)
+    assert rows(board)[0]["error_m"] is None
+    assert rows(board)[0]["true_x"] is None
+
+
+def test_an_ether_that_was_started_anew_is_believed():
+    board = Board()
+    board.truth(truth(unix_s=5000.0))
+    board.truth(truth(unix_s=1000.0, position_m=(2.0, 2.0, 1.0)))
+    board.fix(fix(unix_s=1000.0), 0.0)
+    assert rows(board)[0]["error_m"] == 0.0
+
+
+def anchor_health(anchor):
+    return AnchorHealth(
+        *(anchor, 0.0, 1.0, "anchor", 1, 0, True, 1e-3, 0.5, 0.01, 1, 0, 1, 7, {"1": 0.1}, {}, Counters(0, 0, 0))
+    )
+
+
+def test_health_holds_the_newest_of_every_node():
+    board = Board()
+    assert json.loads(board.health_message({})) == {
+        "type": "health",
+        "anchors": [],
+        "tags": [],
+        "ether": None,
+        "nodes": [],
+        "dropped": {},
+    }
+    board.health("2", anchor_health(1), 0.0)
+    board.health("2", anchor_health(2), 1.0)
+    board.health("air", EtherHealth(0.0, 1.0, 5, 0, {}, {}, 0, 0), 1.0)
+    board.status(status())
+    board.status(status(online=False))
+    message = json.loads(board.health_message({"fix": 3}))
+    assert [anchor["anchor"] for anchor in message["anchors"]] == [2]
+    assert message["ether"]["transmissions"] == 5
+    assert [(node["name"], node["online"]) for node in message["nodes"]] == [("t1", False)]
+    assert message["dropped"] == {"fix": 3}
+
+
+def test_the_silent_are_forgotten_and_made_up_names_fill_no_memory():
+    board = Board()
+    board.fix(fix("old"), 0.0)
+    board.health("1", anchor_health(1), 0.0)
+    for k in range(MOST_NAMES + 50):
+        board.fix(fix(f"t{k}"), 1.0)
+        board.status(status(name=f"t{k}"))
+    assert len(rows(board)) == MOST_NAMES
+    assert len(board.statuses) == MOST_NAMES
+    board.forget(FORGET_S + 0.5)
+    assert "old" not in {row["name"] for row in rows(board)}
+    assert json.loads(board.health_message({}))["anchors"] == []
