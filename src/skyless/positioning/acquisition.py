@@ -20,8 +20,8 @@ MAX_AGE_S: Final = 0.5
 the tag may be elsewhere by now."""
 
 WIDE: Final = 0.05
-"""A start whose standard deviation is above this part of the mean range is too wide for ranges that are taken for linear:
-updates would make the filter sure of a wrong place. More anchors are waited for, ..."""
+"""With a standard deviation above this part of the mean range, ranges are not linear in the state: updates would make
+the filter sure of a wrong place. More anchors are waited for, ..."""
 
 PATIENCE_S: Final = 0.5
 """... for so long after the first such start, and four times as long for one wider by four times."""
