@@ -33,7 +33,7 @@ _OF_A_NODE: Final[dict[str, type[Struct]]] = {
 FLOOR_PLAN: Final = "floor_plan"
 """An image, which has no schema; it is kept as an attachment."""
 
-LASTING: Final = frozenset({"site", "zones", "status"})
+LASTING: Final = frozenset({"site", "zones", "status", FLOOR_PLAN})
 """Kinds that are retained: a repetition says nothing new."""
 
 

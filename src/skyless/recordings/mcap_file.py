@@ -64,6 +64,8 @@ class McapFile:
         """Messages that came after the recording had to end, or were not written any more."""
         self.ended: str | None = None
         """Why nothing is written any more; None while all is well."""
+        self.failed = False
+        """Whether it ended because the disk is full or gone."""
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._newest_ns = 0
@@ -151,6 +153,7 @@ class McapFile:
         return True
 
     def _fail(self, error: OSError) -> None:
+        self.failed = True
         self.ended = f"{self.path} cannot be written any more: {error.strerror}"
         self.lost += self._unflushed
         self.messages -= self._unflushed

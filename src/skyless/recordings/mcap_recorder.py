@@ -4,6 +4,7 @@ from collections import Counter
 from typing import Final
 
 import msgspec
+from msgspec import Struct
 
 from skyless.outputs.messages import FixMessage, SiteMessage
 from skyless.recordings import mcap_foxglove as foxglove
@@ -33,33 +34,36 @@ class McapRecorder:
         self._shown_s: dict[str, float] = {}
         self._georeference: GeoreferenceSite | None = None
 
-    def take(self, topic: str, payload: bytes, unix_s: float) -> None:
-        """Keep a message that came at a time; what is not of this version is counted and dropped."""
+    def take(self, topic: str, payload: bytes, unix_s: float) -> Struct | None:
+        """Keep a message that came at a time, and return it; what is not of this version is counted and dropped."""
         place = place_of(topic)
         if place is None:
             self.drops["unknown-topic"] += 1
-            return
+            return None
         if not payload or self._last.get(topic) == payload:
-            return
+            return None
         if topic not in self._topics and len(self._topics) >= MOST_TOPICS:
             self.drops["too-many-topics"] += 1
-            return
+            return None
         self._topics.add(topic)
+        if place.kind in LASTING:
+            self._last[topic] = payload
         log_ns = round(unix_s * NS)
         if place.payload is None:
-            self._last[topic] = payload
             media_type = "image/png" if payload.startswith(b"\x89PNG") else "image/jpeg"
             self.file.attach(FLOOR_PLAN, media_type, payload, log_ns)
-            return
+            return None
         try:
             message = decoder_of(place.payload).decode(payload)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             self.drops["malformed-message"] += 1
-            return
-        if place.kind in LASTING:
-            self._last[topic] = payload
+            return None
         self.kinds[place.kind] += 1
         self.file.add(topic, schema_of(place.payload), payload, log_ns)
+        self._add_views(message, unix_s, log_ns)
+        return message
+
+    def _add_views(self, message: Struct, unix_s: float, log_ns: int) -> None:
         if isinstance(message, FixMessage):
             try:
                 self._show(message, log_ns)

@@ -1,0 +1,167 @@
+"""The recorder: asks a site's tags for their receptions and writes all that is said there into a file."""
+
+import asyncio
+import fcntl
+import re
+import socket
+import tempfile
+import time
+from itertools import count
+from pathlib import Path
+from typing import IO, Final
+
+from msgspec import Struct
+
+from skyless.nodes.running import Say, every
+from skyless.outputs.address import MqttAddress
+from skyless.outputs.link import Link
+from skyless.outputs.messages import ReceptionsMessage, RequestMessage, StatusMessage
+from skyless.outputs.topics import request_topic, site_topic
+from skyless.recordings.mcap_file import McapFile
+from skyless.recordings.mcap_recorder import McapRecorder
+from skyless.recordings.reception_log import EVERY_TAG
+
+LEASE_S: Final = 15.0
+ASK_S: Final = 5.0
+FLUSH_S: Final = 0.8
+"""A recorder that is killed loses what came since; the rest of a second is the way of a message."""
+
+ASK_ANEW_S: Final = 1.0
+"""After a loss; not more often than this, as each request begins a run with a checkpoint in it."""
+
+
+class RecorderState(Struct, frozen=True):
+    """How a recording goes."""
+
+    seconds: float
+    messages: dict[str, int]
+    receptions: int
+    tags: int
+    bytes: int
+    lost: int
+    drops: dict[str, int]
+    trouble: str | None
+    """Why there is no broker; None while there is one."""
+    ended: str | None
+
+
+class RecorderNode:
+    """Records one site until cancelled, or until the file cannot be written any more."""
+
+    def __init__(self, file: McapFile, address: MqttAddress, site: int, say: Say) -> None:
+        self.file = file
+        self.recorder = McapRecorder(file)
+        self._name, self._lock = _own_name(site)
+        # the broker keeps what this name has subscribed to while it is away, so that its restart loses nothing
+        self.link = Link(address, self._name, site=site, kind="recorder", persistent=True)
+        self.receptions = 0
+        self._site = site
+        self._say = say
+        self._started_s = time.monotonic()
+        self._runs = 0
+        self._asked_anew_s = 0.0
+        self._next: dict[str, tuple[str, int]] = {}
+        """Of each tag: the segment, and the number of its next reception."""
+        self._flushing: asyncio.Future[None] | None = None
+        self.link.subscribe(f"{site_topic(site).removesuffix('site')}#", self._take, qos=1)
+        self.link.on_state.append(self._ask_when_connected)
+
+    async def run(self, duration_s: float | None = None) -> None:
+        """Record; in the end the tags are told, and the file is closed."""
+        link = asyncio.ensure_future(self.link.run())
+        work = [asyncio.ensure_future(every(ASK_S, self._ask)), asyncio.ensure_future(self._write())]
+        try:
+            await asyncio.wait([link, *work], timeout=duration_s, return_when=asyncio.FIRST_COMPLETED)
+            for task in (link, *work):
+                if task.done():
+                    task.result()
+        finally:
+            self.link.publish(request_topic(self._site), RequestMessage(self._by, (), 0.0), qos=1)
+            for task in (link, *work):
+                task.cancel()
+            await asyncio.gather(link, *work, return_exceptions=True)
+            self.file.close()
+            self._lock.close()
+
+    def state(self) -> RecorderState:
+        """How it goes."""
+        return RecorderState(
+            seconds=time.monotonic() - self._started_s,
+            messages=dict(self.recorder.kinds),
+            receptions=self.receptions,
+            tags=len(self._next),
+            bytes=self.file.written_bytes,
+            lost=self.file.lost,
+            drops=dict(self.recorder.drops),
+            trouble=self.link.trouble,
+            ended=self.file.ended,
+        )
+
+    @property
+    def _by(self) -> str:
+        return f"{self._name}-{self._started_s:.3f}-{self._runs}"
+
+    def _ask(self) -> None:
+        self.link.publish(request_topic(self._site), RequestMessage(self._by, (EVERY_TAG,), LEASE_S), qos=1)
+
+    def _ask_when_connected(self, connected: bool) -> None:
+        if connected:
+            self._ask()
+
+    def _ask_anew(self) -> None:
+        """Something was lost: under another name the tags begin another run, with its checkpoint."""
+        now_s = time.monotonic()
+        if now_s - self._asked_anew_s >= ASK_ANEW_S:
+            self._asked_anew_s = now_s
+            self._runs += 1
+            self._ask()
+
+    def _take(self, topic: str, payload: bytes) -> None:
+        message = self.recorder.take(topic, payload, time.time())
+        if isinstance(message, ReceptionsMessage):
+            self._follow(message)
+        elif isinstance(message, StatusMessage) and message.kind == "tag" and message.online:
+            self._ask()
+
+    def _follow(self, message: ReceptionsMessage) -> None:
+        """See that no reception is missing; a message that comes twice, after a broken connection, does no harm."""
+        self.receptions += len(message.receptions)
+        segment, following = self._next.get(message.tag, ("", 0))
+        end = message.first + len(message.receptions)
+        if message.segment == segment:
+            lost = message.first > following
+            end = max(end, following)
+        else:
+            lost = message.start is None
+        self._next[message.tag] = (message.segment, end)
+        if lost:
+            self.recorder.drops["gap-in-receptions"] += 1
+            self._ask_anew()
+
+    async def _write(self) -> None:
+        """Close a chunk now and then, and see that it stands on the disk; until nothing can be written any more."""
+        while True:
+            await asyncio.sleep(FLUSH_S)
+            self.file.flush()
+            if self.file.ended is None:
+                await asyncio.to_thread(self.file.sync)
+            if self.file.ended is not None:
+                self._say(f"the recording has ended: {self.file.ended}")
+                return
+
+
+def _own_name(site: int) -> tuple[str, IO[str]]:
+    """A name on MQTT that no other recorder of this machine has now, and one before it may have had.
+
+    A recorder that was killed has left a session that the broker fills; the next one takes it over and ends it.
+    """
+    host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname())
+    for number in count(1):
+        lock = (Path(tempfile.gettempdir()) / f"skyless-record-{site}-{number}.lock").open("a", encoding="utf-8")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+        else:
+            return f"{host}-{number}", lock
+    raise AssertionError
