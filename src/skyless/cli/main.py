@@ -15,6 +15,7 @@ _COMMANDS = (
     ("broker", "skyless.cli.broker:app", "Run the MQTT broker that comes with Skyless."),
     ("dashboard", "skyless.cli.dashboard:app", "Show a site live in the browser."),
     ("simulate", "skyless.cli.simulate:app", "Run a site in the simulated world and judge it against the truth."),
+    ("record", "skyless.cli.record:app", "Record a running site into a file."),
     ("replay", "skyless.cli.replay:app", "Turn a recording into fixes and judge them against the truth."),
     ("paper", "skyless.cli.paper:app", "Reproduce the paper's figures and claims in one report."),
     ("bench", "skyless.cli.bench:app", "Measure how fast Monte Carlo draws run on this machine."),

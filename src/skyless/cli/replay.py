@@ -9,7 +9,8 @@ from cyclopts import App
 from skyless.cli.options import Finite, NotNegative, Positive, finite_numbers, spare_inputs
 from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
-from skyless.cli.replay_output import fix_writer, show
+from skyless.cli.replay_output import draw_track, fix_writer, see_that_it_can_be_drawn, show
+from skyless.cli.replay_site import Options, is_mcap, replay_site, see_that_they_are_left_out
 from skyless.errors import ConfigurationError, SkylessError
 
 if TYPE_CHECKING:
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from skyless.experiments.judge import Judge
     from skyless.experiments.replay import Replay, ReplayReport
     from skyless.recordings.truth import Truth
-
-PICTURES = (".png", ".svg", ".pdf")
 
 app = App(
     name="replay",
@@ -42,14 +41,19 @@ def replay(
     above: Finite | None = None,
     qa: Positive | None = None,
     tdoa_std: Positive | None = None,
+    tag: str | None = None,
+    method: str | None = None,
     fixes: Path | None = None,
     plot: Path | None = None,
     json: bool = False,
 ) -> None:
     """Turn a recording into fixes; judge them where the truth is known.
 
-    Reads Bitcraze sniffer captures (YAML, binary, text; TDoA2 and TDoA3), tables of time differences, MILUV passive
-    ticks and Avalue receptions; the format is recognised by the content.
+    Reads recordings of skyless record (MCAP), Bitcraze sniffer captures (YAML, binary, text; TDoA2 and TDoA3), tables
+    of time differences, MILUV passive ticks and Avalue receptions; the format is recognised by the content.
+
+    A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
+    below it takes --tag, --method, --settle, --above, --fixes, --plot and --json.
 
     Parameters
     ----------
@@ -78,6 +82,10 @@ def replay(
         Agility that the filter assumes, m²/s³.
     tdoa_std
         Noise of a time difference that the filter assumes, metres.
+    tag
+        Name of the tag, in recordings of skyless record; by default all.
+    method
+        Another method than the tag's own, in recordings of skyless record.
     fixes
         Write every fix into this table.
     plot
@@ -91,7 +99,17 @@ def replay(
 
     spare_inputs("fixes", fixes, file, anchors, site, truth)
     spare_inputs("plot", plot, file, anchors, site, truth, fixes)
-    _see_that_it_can_be_drawn(plot)
+    see_that_it_can_be_drawn(plot)
+    if is_mcap(file):
+        useless = {
+            "--anchors": anchors, "--site": site, "--truth": truth, "--lever-arm": lever_arm, "--format": format,
+            "--listener": listener, "--qa": qa, "--tdoa-std": tdoa_std,
+            "--height": None if height == "auto" else height,
+        }  # fmt: skip
+        see_that_they_are_left_out(useless, "a recording of skyless record brings its own")
+        replay_site(file, Options(tag, method, settle, above, fixes, plot, json))
+        return
+    see_that_they_are_left_out({"--tag": tag, "--method": method}, "they are for recordings of skyless record")
     places, site_height_m = _anchors(anchors, site)
     known = _truth(file, truth, lever_arm, format, listener)
     height_m, note = _height(height, places, site_height_m, known, format_of(file, format).name)
@@ -112,23 +130,13 @@ def replay(
         _see_that_truth_matches(truth, known, judge)
     distances = _distances(file, report.format)
     if plot is not None:
-        _draw(plot, judge, report)
+        draw_track(plot, judge, report)
     if json:
         import msgspec
 
         print_json({**msgspec.to_builtins(report), "height_note": note, "anchor_distances_m": distances})
     else:
         show(report, note, distances)
-
-
-def _see_that_it_can_be_drawn(plot: Path | None) -> None:
-    """Before the long work, not after it."""
-    if plot is None:
-        return
-    if plot.suffix.lower() not in PICTURES:
-        raise SkylessError(f"--plot is {str(plot)!r}; its ending should be one of {', '.join(PICTURES)}")
-    if plot.is_dir() or not plot.parent.is_dir():
-        raise SkylessError(f"--plot is {str(plot)!r}; it should be a file in a folder that exists")
 
 
 def _see_that_it_was_heard(file: Path, listener: str | None, report: "ReplayReport") -> None:
@@ -239,12 +247,3 @@ def _distances(file: Path, name: str) -> dict[str, float]:
     from skyless.recordings.avalue import anchor_distances_m
 
     return {f"{a:X}-{b:X}": metres for (a, b), metres in sorted(anchor_distances_m(file, Counter()).items())}
-
-
-def _draw(path: Path, judge: "Judge", report: "ReplayReport") -> None:
-    from skyless.experiments.replay_plot import draw
-
-    try:
-        draw(path, judge.track.rows, f"{report.format}, {report.fixes} fixes")
-    except (OSError, ValueError) as error:
-        raise SkylessError(f"{path} cannot be drawn: {error}") from None

@@ -1,17 +1,21 @@
 """What ``skyless replay`` writes: a table of fixes row by row, and the report for people."""
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from skyless.cli.options import open_for_writing
 from skyless.cli.output import console
+from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
+    from skyless.experiments.judge import Judge
     from skyless.experiments.replay import ReplayReport
     from skyless.positioning.fix import Fix
+
+PICTURES = (".png", ".svg", ".pdf")
 
 COLUMNS = (
     *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
@@ -25,10 +29,31 @@ def fix_writer(stack: ExitStack, path: Path) -> "Callable[[Fix], None]":
     """Open the table, closed by the stack; the result writes one fix."""
     writer = csv.writer(stack.enter_context(open_for_writing(path)))
     writer.writerow(COLUMNS)
-    return lambda fix: writer.writerow(_row(fix))
+    return lambda fix: writer.writerow(row_of(fix))
 
 
-def _row(fix: "Fix") -> list[str]:
+def see_that_it_can_be_drawn(plot: Path | None) -> None:
+    """Look at the option --plot before the long work, not after it. Raises SkylessError."""
+    if plot is None:
+        return
+    if plot.suffix.lower() not in PICTURES:
+        raise SkylessError(f"--plot is {str(plot)!r}; its ending should be one of {', '.join(PICTURES)}")
+    if plot.is_dir() or not plot.parent.is_dir():
+        raise SkylessError(f"--plot is {str(plot)!r}; it should be a file in a folder that exists")
+
+
+def draw_track(path: Path, judge: "Judge", report: "ReplayReport") -> None:
+    """Draw what --plot asks for. Raises SkylessError."""
+    from skyless.experiments.replay_plot import draw
+
+    try:
+        draw(path, judge.track.rows, f"{report.format}, {report.fixes} fixes")
+    except (OSError, ValueError) as error:
+        raise SkylessError(f"{path} cannot be drawn: {error}") from None
+
+
+def row_of(fix: "Fix") -> list[str]:
+    """A fix as a row of ``COLUMNS``."""
     velocity = ("", "", "") if fix.velocity_mps is None else (f"{value:.5g}" for value in fix.velocity_mps)
     covariance = fix.covariance_m2[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     return [
@@ -43,12 +68,12 @@ def _row(fix: "Fix") -> list[str]:
     ]
 
 
-def show(report: "ReplayReport", note: str, distances: dict[str, float]) -> None:
-    """Show a replay as a table; ``note`` says where the height is from."""
+def show(report: "ReplayReport", note: str, distances: dict[str, float], more: Sequence[tuple[str, str]] = ()) -> None:
+    """Show a replay as a table; ``note`` says where the height is from, ``more`` comes first."""
     from rich.table import Table
 
     table = Table("replay", "", title=f"{report.format}: {report.receptions} receptions", show_header=False)
-    for name, value in _lines(report, note):
+    for name, value in (*more, *_lines(report, note)):
         table.add_row(name, value)
     for reason, count in report.drops.items():
         table.add_row(f"dropped: {reason}", str(count))
