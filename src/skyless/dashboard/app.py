@@ -25,6 +25,9 @@ from skyless.dashboard.zones import BadZonesError, read_zones
 
 PAGE: Final = Path(__file__).parent / "page"
 MOST_PAGES: Final = 50
+DEAD_S: Final = 10.0
+"""A page that takes nothing for so long is given up."""
+
 MOST_STATES_S: Final = 60.01
 _LARGEST_BODY: Final = 1_000_000
 _TRY_LATER: Final = 1013
@@ -198,11 +201,13 @@ async def _live(socket: WebSocket) -> None:
     reading = asyncio.create_task(_read(socket, page.close, lambda: page.put("pong", b'{"type":"pong"}')))
     try:
         while not page.closed:
-            for message in await page.take(live.board):
-                await socket.send_text(message)
+            messages = await page.take(live.board)
+            async with asyncio.timeout(DEAD_S):
+                for message in messages:
+                    await socket.send_text(message)
         await socket.close(1001)
-    except (WebSocketDisconnect, RuntimeError):
-        pass  # the page went away meanwhile
+    except (WebSocketDisconnect, RuntimeError, TimeoutError):
+        pass  # the page went away meanwhile, or is dead
     finally:
         live.leave(page)
         reading.cancel()

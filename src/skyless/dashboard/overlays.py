@@ -20,11 +20,11 @@ DEFAULT_METHOD: Final = "tracker"
 
 _KEPT: Final = 8
 _LONGEST_S: Final = 120.0
-_LEVELS: Final[dict[Kind, dict[str, float]]] = {
-    "pdop": {"good": 1.5, "bad": 6.0},
-    "hdop": {"good": 1.5, "bad": 6.0},
-    "sigma": {"good": 0.02, "bad": 0.3},
-}
+_BAD_SHARE: Final = 0.95
+"""Worse values than that of so many cells look all the same: single ones beside an anchor would take all colours."""
+
+_LEAST_SPAN: Final = 2.0
+"""A scale reaches to twice its best value at least, so that small differences look small."""
 
 Box = tuple[float, float, float, float]
 
@@ -138,5 +138,14 @@ def _answer(task: OverlayTask, kind: Kind, grids: OverlayGrids) -> dict[str, Any
         "rows": task.rows,
         "values": getattr(grids, kind),
         "method": task.method,
-        "levels": _LEVELS[kind],
+        "levels": levels(getattr(grids, kind)),
     }
+
+
+def levels(values: list[float | None]) -> dict[str, float]:
+    """The ends of the scale of colours."""
+    known = sorted(value for value in values if value is not None)
+    if not known:
+        return {"good": 0.0, "bad": 1.0}
+    bad = known[round(_BAD_SHARE * (len(known) - 1))]
+    return {"good": known[0], "bad": max(bad, _LEAST_SPAN * known[0])}

@@ -11,7 +11,7 @@ from typing import Final
 import uvicorn
 from msgspec import Struct
 
-from skyless.dashboard.app import Parts, make_app
+from skyless.dashboard.app import DEAD_S, Parts, make_app
 from skyless.dashboard.find_site import find_site
 from skyless.dashboard.guard import Rules
 from skyless.errors import SkylessError
@@ -21,9 +21,10 @@ from skyless.outputs.link import Link
 PORT: Final = 8080
 _MORE_PORTS: Final = 50
 _PING_S: Final = 5.0
-_DEAD_S: Final = 10.0
 _LARGEST_PING: Final = 1024
 _GRACE_S: Final = 0.4
+_SEND_BUFFER: Final = 262_144
+"""Bytes that wait in the kernel for a slow page, which it gets before anything newer."""
 
 
 class Listen(Struct, frozen=True):
@@ -63,6 +64,9 @@ def _bind(host: str, port: int) -> socket.socket:
         sock = socket.socket(family, kind)
         try:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)  # every page's socket inherits it
+            if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; elsewhere the system's own patience counts
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * DEAD_S))
             sock.bind(address)
             sock.listen(socket.SOMAXCONN)  # two sockets may be bound to one port, but not both listen
         except BaseException:
@@ -89,7 +93,7 @@ async def serve(parts: Parts, rules: Rules, sock: socket.socket, address: MqttAd
         ws="websockets-sansio",
         ws_per_message_deflate=False,  # on the own machine it would only cost time
         ws_ping_interval=_PING_S,
-        ws_ping_timeout=_DEAD_S,
+        ws_ping_timeout=DEAD_S,
         ws_max_size=_LARGEST_PING,
         timeout_graceful_shutdown=1,
     )

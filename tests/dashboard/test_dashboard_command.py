@@ -1,0 +1,96 @@
+"""``skyless dashboard`` before it serves: its options and its port."""
+
+import socket
+
+import pytest
+
+from skyless.cli.dashboard import _address, _place, _rules
+from skyless.cli.main import main
+from skyless.dashboard.serve import PORT, Listen, bind
+from skyless.errors import SkylessError
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port"),
+    [
+        (None, "127.0.0.1", None),
+        ("127.0.0.1:9000", "127.0.0.1", 9000),
+        ("[::1]:9000", "::1", 9000),
+        ("::1", "::1", None),
+        ("[::1]", "::1", None),
+        ("hall.example", "hall.example", None),
+        ("localhost:0", "localhost", 0),
+    ],
+)
+def test_where_to_listen(text, host, port):
+    assert _place(text) == Listen(host, port)
+
+
+@pytest.mark.parametrize("text", ["", ":8080", "127.0.0.1:x", "127.0.0.1:70000", "127.0.0.1:-1", "localhost:8080x"])
+def test_a_wrong_place_is_refused_with_what_would_be_right(text):
+    with pytest.raises(SkylessError, match="HOST:PORT"):
+        _place(text)
+
+
+def test_a_taken_port_is_an_error_when_it_was_asked_for():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(SkylessError, match=f"--listen is '127.0.0.1:{port}'; another program has this port"):
+            bind(Listen("127.0.0.1", port))
+
+
+def test_the_next_free_port_is_taken_when_none_was_asked_for():
+    with bind(Listen("127.0.0.1", None)) as first, bind(Listen("127.0.0.1", None)) as second:
+        assert PORT <= first.getsockname()[1] < second.getsockname()[1]
+
+
+def test_an_address_of_another_machine_is_refused():
+    with pytest.raises(SkylessError, match="cannot listen"):
+        bind(Listen("192.0.2.1", 8080))
+    with pytest.raises(SkylessError, match="cannot listen"):
+        bind(Listen("no such host", 8080))
+
+
+def test_loopback_needs_no_token_and_all_else_gets_one():
+    assert _rules("127.0.0.1", "127.0.0.1", 1, None).token is None
+    assert _rules("::1", "::1", 1, None).token is None
+    assert _rules("127.0.0.1", "127.0.0.1", 1, "a-token-of-my-own").token == "a-token-of-my-own"
+    first, second = (_rules("0.0.0.0", "0.0.0.0", 1, None) for _ in range(2))
+    assert first.elsewhere
+    assert first.token
+    assert first.token != second.token
+    assert _rules("0.0.0.0", "0.0.0.0", 1, "a-token-of-my-own").token == "a-token-of-my-own"
+
+
+def test_the_address_that_is_printed_is_one_that_others_can_open():
+    rules = _rules("0.0.0.0", "0.0.0.0", 8080, "with/slash&and=more")
+    address = _address("0.0.0.0", 8080, rules)
+    assert "0.0.0.0" not in address
+    assert address.endswith(":8080/?token=with%2Fslash%26and%3Dmore")
+    assert _address("::1", 8080, _rules("::1", "::1", 8080, None)) == "http://[::1]:8080/"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--token", "short"], "--token has 5 characters"),
+        (["--mqtt", "http://x"], "--mqtt is"),
+        (["--recordings", "/no/such/folder"], "--recordings is '/no/such/folder'; it should be a folder"),
+        (["--site", "/no/such/site.toml"], "site.toml"),
+        (["--listen", "nonsense:port"], "--listen is"),
+        (["--site-id", "70000"], "65535"),
+    ],
+)
+def test_wrong_options_end_with_2_and_one_line(capsys, arguments, said):
+    assert main(["dashboard", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_the_site_file_and_the_number_must_agree(capsys, tmp_path):
+    assert main(["site", "new", str(tmp_path / "site.toml")]) == 0
+    assert main(["dashboard", "--site", str(tmp_path / "site.toml"), "--site-id", "4711"]) == 2
+    assert "give one of them" in capsys.readouterr().err

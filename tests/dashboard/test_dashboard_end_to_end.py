@@ -1,0 +1,206 @@
+"""The dashboard as a program, over the embedded broker, with pages that read and pages that do not."""
+
+import asyncio
+import contextlib
+import json
+import signal
+import socket
+import sys
+import time
+
+import httpx
+import msgspec
+import pytest
+import websockets
+from dashboard_builders import SITE, SITE_ID, SQUARE, fix, truth
+
+from skyless.nodes.broker import start_broker
+from skyless.nodes.broker_settings import BrokerSettings
+from skyless.outputs import topics
+from skyless.outputs.link import Link
+from skyless.outputs.messages import ZonesMessage
+
+COMMAND = [sys.executable, "-m", "skyless.cli.main", "dashboard", "--json"]
+PATIENCE_S = 20.0
+
+
+def free_port():
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return sock.getsockname()[1]
+
+
+@contextlib.asynccontextmanager
+async def dashboard(*arguments):
+    """A running dashboard, and what it has printed."""
+    process = await asyncio.create_subprocess_exec(*COMMAND, *arguments, stdout=asyncio.subprocess.PIPE)
+    try:
+        yield json.loads(await asyncio.wait_for(process.stdout.readline(), PATIENCE_S)), process
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.wait()
+
+
+@contextlib.asynccontextmanager
+async def site(address):
+    """A node of the site, which has told what the site is."""
+    link = Link(address, "air", site=SITE_ID, kind="ether")
+    running = asyncio.create_task(link.run())
+    link.publish(topics.site_topic(SITE_ID), SITE, qos=1, retain=True)
+    try:
+        yield link
+    finally:
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+
+async def walk(link, tags=1, step_s=0.05):
+    """Fixes and truths for ever; everybody walks through the square and back."""
+    for k in range(1_000_000):
+        x = 2.0 if k // 40 % 2 else 8.0
+        now_s = time.time()
+        for n in range(tags):
+            tag = f"t{n}"
+            link.publish(topics.truth_topic(SITE_ID), truth(now_s, tag, (x, 2.0, 1.0)))
+            link.publish(topics.fix_topic(SITE_ID, tag), fix(tag, now_s, (x, 2.02, 1.0), serial=k))
+        await asyncio.sleep(step_s)
+
+
+def live(told):
+    return websockets.connect(told["page"].replace("http", "ws") + "live", max_size=None)
+
+
+async def next_of(page, kind_of_message, /, **fields):
+    """The next message of a kind, with these fields."""
+    async with asyncio.timeout(PATIENCE_S):
+        async for text in page:
+            message = json.loads(text)
+            if message["type"] == kind_of_message and fields.items() <= message.items():
+                return message
+    raise AssertionError(f"the connection ended before a {kind_of_message}")
+
+
+async def settled(condition):
+    async with asyncio.timeout(PATIENCE_S):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+def test_a_site_is_found_shown_and_watched(tmp_path):
+    asyncio.run(a_site_is_found_shown_and_watched(tmp_path))
+
+
+async def a_site_is_found_shown_and_watched(tmp_path):
+    where = BrokerSettings(port=free_port(), data=tmp_path / "broker")
+    broker = await start_broker(where)
+    events, zones = [], []
+    async with site(broker.address) as link:
+        link.subscribe(topics.zone_event_topic(SITE_ID, "+"), lambda _, payload: events.append(json.loads(payload)), 1)
+        link.subscribe(topics.zones_topic(SITE_ID), lambda _, payload: zones.append(payload), 1)
+        async with dashboard("--mqtt", str(broker.address)) as (told, process), live(told) as page:
+            hello = await next_of(page, "hello")
+            shown = hello["site"] or (await next_of(page, "site"))["site"]
+            assert shown["site"]["id"] == SITE_ID
+            walking = asyncio.create_task(walk(link))
+            row = (await next_of(page, "state"))["tags"][0]
+            assert row[0] == "t0"
+            assert row[10] == pytest.approx(0.02, abs=1e-3)
+            async with httpx.AsyncClient(base_url=told["page"]) as http:
+                answer = await http.put("/api/zones", content=msgspec.json.encode(ZonesMessage((SQUARE,))))
+                assert answer.status_code == 200
+                overlay = await http.get("/api/overlay?kind=sigma&step_m=1", timeout=60.0)
+                assert len(overlay.json()["values"]) == 48
+            event = await next_of(page, "zone_event", kind="enter")
+            assert (event["zone"], event["tag"]) == ("desk", "t0")
+            await settled(lambda: event | {"type": "zone_event"} in [told | {"type": "zone_event"} for told in events])
+            assert json.loads(zones[-1])["zones"][0]["id"] == "desk"
+            await broker.stop()
+            assert (await next_of(page, "mqtt"))["connected"] is False
+            broker = await start_broker(where)
+            assert (await next_of(page, "mqtt"))["connected"] is True
+            await next_of(page, "state")
+            process.send_signal(signal.SIGTERM)
+            assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
+        async with dashboard("--mqtt", str(broker.address), "--site-id", str(SITE_ID)) as (told, _), live(told) as page:
+            greeted = (await next_of(page, "hello"))["zones"]
+            assert (greeted or (await next_of(page, "zones"))["zones"])[0]["id"] == "desk", "zones survive a restart"
+        walking.cancel()
+    await broker.stop()
+
+
+def test_a_page_that_does_not_read_holds_up_nobody(tmp_path):
+    asyncio.run(a_page_that_does_not_read_holds_up_nobody(tmp_path))
+
+
+async def a_page_that_does_not_read_holds_up_nobody(tmp_path):
+    settings = BrokerSettings(port=free_port(), data=tmp_path / "broker")
+    async with (
+        await start_broker(settings) as broker,
+        site(broker.address) as link,
+        dashboard("--mqtt", str(broker.address)) as (told, process),
+    ):
+        walking = asyncio.create_task(walk(link, tags=100))
+        port = int(told["page"].rstrip("/").rsplit(":", 1)[1])
+        deaf = [await never_read(port) for _ in range(3)]
+        async with live(told) as page:
+            await next_of(page, "state")
+            began_s, count = time.monotonic(), 0
+            while time.monotonic() < began_s + 4.0:
+                message = await next_of(page, "state")
+                assert len(message["tags"]) <= 100
+                count += 1
+            assert count >= 40, "20 a second on an idle machine"
+            stopped_s = time.monotonic()
+            process.send_signal(signal.SIGINT)
+            assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
+            assert time.monotonic() - stopped_s < 5.0, "half a second on an idle machine"
+        walking.cancel()
+        for sock in deaf:
+            sock.close()
+
+
+async def never_read(port):
+    """A page whose socket takes little and is never read."""
+    sock = socket.socket()
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    sock.setblocking(False)
+    await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
+    lines = (
+        "GET /live HTTP/1.1",
+        f"Host: 127.0.0.1:{port}",
+        "Connection: Upgrade",
+        "Upgrade: websocket",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+    )
+    await asyncio.get_running_loop().sock_sendall(sock, ("\r\n".join(lines) + "\r\n\r\n").encode())
+    return sock
+
+
+def test_without_a_broker_the_page_stands_and_says_so():
+    async def check():
+        nobody = f"mqtt://127.0.0.1:{free_port()}"
+        async with dashboard("--mqtt", nobody) as (told, _), live(told) as page:
+            assert told["mqtt"] == nobody
+            hello = await next_of(page, "hello")
+            assert (hello["mqtt"], hello["site"]) == (False, None)
+            assert await next_of(page, "mqtt") == {"type": "mqtt", "connected": False, "broker": nobody}
+
+    asyncio.run(check())
+
+
+def test_other_machines_need_the_token_that_is_printed():
+    async def check():
+        async with dashboard("--listen", f"0.0.0.0:{free_port()}") as (told, _):
+            address = httpx.URL(told["page"])
+            assert told["page"].endswith(f"?token={told['token']}")
+            assert len(told["token"]) >= 20
+            async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{address.port}") as http:
+                assert (await http.get("/api/recordings")).status_code == 401
+                assert (await http.get("/api/recordings", params={"token": told["token"]})).status_code == 200
+                assert (await http.get("/api/recordings")).status_code == 200, "by the cookie"
+                assert (await http.get("/", headers={"host": "evil.example"})).status_code == 421
+
+    asyncio.run(check())

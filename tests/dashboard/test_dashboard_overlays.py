@@ -1,0 +1,94 @@
+"""Overlays: their grid, and values against the planner's at the same points."""
+
+import asyncio
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from skyless.dashboard.overlay_process import overlay_grids
+from skyless.dashboard.overlays import MOST_CELLS, NoOverlayError, Overlays, levels, overlay_task
+from skyless.planning.columns import HDOP, PDOP, SIGMA
+from skyless.planning.predict import PlanSettings, Predictor
+from skyless.site.lab import lab_site
+from skyless.site.model import AnchorSite, FloorPlanSite, TagsSite
+
+LAB = lab_site(100.0)
+PNG_2_BY_1 = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\x0dIHDR" + (200).to_bytes(4, "big") + (100).to_bytes(4, "big")
+
+
+def test_the_grid_covers_all_anchors_in_cells_of_the_step():
+    task = overlay_task(LAB, None, "tracker", 0.25)
+    assert (task.columns, task.rows, task.step_m) == (24, 32, 0.25)
+    assert task.box_m == (0.0, 0.0, 6.0, 8.0)
+    assert overlay_task(LAB, None, "tracker", 0.35).columns == 18  # the last cell sticks out
+
+
+def test_the_grid_covers_the_floor_plan_too():
+    site = replace(LAB, floor_plan=FloorPlanSite("plan.png", 20.0, -5.0, -1.0))
+    assert overlay_task(site, PNG_2_BY_1, "tracker", 0.5).box_m == (-5.0, -1.0, 15.0, 9.0)
+    assert overlay_task(site, None, "tracker", 0.5).box_m == (0.0, 0.0, 6.0, 8.0)
+
+
+def test_a_large_hall_gets_a_coarser_grid_and_every_grid_is_bounded():
+    anchors = tuple(replace(anchor, x_m=anchor.x_m * 100.0, y_m=anchor.y_m * 100.0) for anchor in LAB.anchors)
+    task = overlay_task(replace(LAB, anchors=anchors), None, "tracker", 0.25)
+    assert task.columns * task.rows <= MOST_CELLS
+    assert task.step_m == 5.0
+
+
+def test_values_are_the_planners_row_by_row_from_the_lowest_y():
+    task = overlay_task(LAB, None, "weighted", 1.0)
+    grids = overlay_grids(task)
+    predictor = Predictor(LAB, PlanSettings("weighted"))
+    for column, row in ((0, 0), (5, 0), (2, 7), (3, 3)):
+        (expected,) = predictor.at(np.array([[column + 0.5, row + 0.5, LAB.tags.height_m]]))
+        place = row * task.columns + column
+        assert grids.pdop[place] == pytest.approx(expected[PDOP], abs=1e-3)
+        assert grids.hdop[place] == pytest.approx(expected[HDOP], abs=1e-3)
+        assert grids.sigma[place] == pytest.approx(expected[SIGMA], abs=1e-5)
+
+
+def test_where_there_is_no_fix_there_is_no_value():
+    """One anchor a kilometre away: beyond the middle nobody hears three."""
+    far = AnchorSite(id=99, x_m=1000.0, y_m=4.0)
+    task = overlay_task(replace(LAB, anchors=(*LAB.anchors, far)), None, "weighted", 10.0)
+    grids = overlay_grids(task)
+    assert grids.sigma[0] is not None
+    assert grids.sigma[task.columns - 1] is None
+    assert grids.pdop[task.columns - 1] is None
+
+
+def test_a_method_that_does_not_exist_is_taken_for_the_default():
+    task = overlay_task(LAB, None, "magic", 2.0)
+    assert overlay_grids(task).sigma == overlay_grids(replace(task, method="tracker")).sigma
+
+
+def test_the_scale_reaches_from_the_best_to_what_is_bad():
+    assert levels([1.0, 1.1, None, 1.2]) == {"good": 1.0, "bad": 2.0}
+    assert levels([0.02, *[0.5] * 97, 100.0]) == {"good": 0.02, "bad": 0.5}
+    assert levels([None])["good"] < levels([None])["bad"]
+
+
+def get(overlays, *args):
+    return asyncio.run(overlays.get(*args))
+
+
+def test_one_process_answers_all_three_kinds():
+    async def ask():
+        overlays = Overlays()
+        return [await overlays.get(LAB, None, ["weighted"], kind, 1.0) for kind in ("pdop", "hdop", "sigma")]
+
+    pdop, hdop, sigma = asyncio.run(ask())
+    assert (pdop["unit"], hdop["unit"], sigma["unit"]) == ("1", "1", "m")
+    assert (sigma["x_m"], sigma["y_m"], sigma["columns"], sigma["rows"]) == ([0.5, 5.5], [0.5, 7.5], 6, 8)
+    assert len(sigma["values"]) == 48
+    assert sigma["method"] == "weighted"
+    assert sigma["levels"]["good"] < sigma["levels"]["bad"]
+    assert sigma["values"] == overlay_grids(overlay_task(LAB, None, "weighted", 1.0)).sigma
+
+
+def test_a_site_with_too_few_anchors_says_so():
+    site = replace(LAB, anchors=LAB.anchors[:3], tags=TagsSite())
+    with pytest.raises(NoOverlayError, match="4 anchors or more"):
+        get(Overlays(), site, None, [], "pdop", 1.0)
