@@ -1,0 +1,225 @@
+"""Replay of a running site: the same bits as live, whatever the recording lacks or somebody forged."""
+
+import csv
+import json
+
+import msgspec
+import pytest
+from live_site import PLACES, UNIX_S, messages, record
+from msgspec.structs import replace
+
+from skyless.cli.main import main
+from skyless.errors import SkylessError
+from skyless.experiments.replay_site import SiteReplay
+from skyless.outputs.messages import ReceptionsMessage
+from skyless.receiver import METHODS
+from skyless.recordings.mcap_recording import McapRecording
+
+
+def replayed(path, **options):
+    with McapRecording(path) as recording:
+        return SiteReplay(recording, **options).run(None, lambda _: None)
+
+
+def changed(said, change):
+    """Messages with every receptions message replaced by what ``change`` makes of it: a list of them."""
+    out, number = [], 0
+    for s, topic, payload in said:
+        if topic.endswith("/receptions"):
+            message = msgspec.json.decode(payload, type=ReceptionsMessage)
+            out += [(s, topic, msgspec.json.encode(one)) for one in change(number, message)]
+            number += 1
+        else:
+            out.append((s, topic, payload))
+    return out
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("join_s", [0.0, 1.0], ids=["from its start", "from its middle"])
+def test_replay_gives_the_live_fixes_bit_by_bit(tmp_path, method, join_s):
+    path = tmp_path / "live.mcap"
+    said = messages(2.5, ("a",), method, join_s)
+    record(path, said)
+    (report,) = replayed(path)
+    live = [msgspec.json.decode(p) for s, t, p in said if t.endswith("/fix") and s >= UNIX_S + join_s]
+    assert report.identical.compared == report.fixes == len(live) > 60
+    assert report.identical.different == 0
+    assert report.cold_starts == 0
+    assert report.segments == 1
+    assert report.method == method
+    assert report.drops == {}
+
+
+def test_a_recorded_fix_of_other_bits_is_found(tmp_path):
+    path = tmp_path / "other.mcap"
+    said = messages(2.0)
+    last = max(k for k, one in enumerate(said) if one[1].endswith("/fix"))
+    s, topic, payload = said[last]
+    fix = json.loads(payload)
+    fix["position_m"][0] += 1e-15 * max(1.0, abs(fix["position_m"][0]))
+    said[last] = (s, topic, json.dumps(fix).encode())
+    record(path, said)
+    assert replayed(path)[0].identical.different == 1
+
+
+def test_judged_against_the_recorded_truth(tmp_path):
+    path = tmp_path / "live.mcap"
+    record(path, messages(3.0, tuple(PLACES)))
+    for report in replayed(path, settle_s=0.5):
+        assert 0.005 < report.rmse_2d_m < 0.08
+        assert report.median_m[:2] == pytest.approx(PLACES[report.tag][:2], abs=0.05)
+        assert report.height_m == 0.0
+        assert report.rate_hz == pytest.approx(400.0, rel=0.05)
+
+
+def test_messages_that_come_twice_change_nothing(tmp_path):
+    path = tmp_path / "twice.mcap"
+    record(path, changed(messages(2.0), lambda _, m: [m, m]))
+    (report,) = replayed(path)
+    assert report.identical.different == 0
+    assert report.identical.compared > 400
+    assert report.drops == {}
+
+
+def test_a_lost_message_costs_what_follows_until_the_next_segment_and_no_bit(tmp_path):
+    path = tmp_path / "gap.mcap"
+    record(path, changed(messages(2.0), lambda k, m: [] if k == 5 else [m]))
+    (report,) = replayed(path)
+    assert report.identical.different == 0
+    assert 100 < report.identical.compared < 300
+    assert report.drops["receptions-after-a-gap"] > 100
+
+
+def test_a_recording_that_begins_within_a_segment_waits_for_the_next(tmp_path):
+    path = tmp_path / "late.mcap"
+    record(path, changed(messages(2.0), lambda k, m: [replace(m, start=None)]))
+    (report,) = replayed(path)
+    assert report.fixes == 0
+    assert report.drops["receptions-without-beginning"] > 400
+
+
+def forged(path, change):
+    """A recording whose segment begins with another state; its report."""
+    said = messages(2.0)
+    record(path, changed(said, lambda _, m: [m if m.start is None else replace(m, start=change(m.start))]))
+    return replayed(path)[0]
+
+
+def with_node(start, change):
+    state = msgspec.msgpack.decode(start.state)
+    for node in state["nodes"]:
+        change(node)
+    return replace(start, state=msgspec.msgpack.encode(state))
+
+
+def break_attributes(node):
+    """Every method's and tracker's attribute is a text: sound as data, nonsense as a receiver."""
+    if node[0] == "object" and node[2] == "Receiver":
+        node[4] = [node[4][0]] * len(node[4])
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda start: replace(start, state=b"\x80\x04damaged"), "checkpoint-damaged"),
+        (lambda start: replace(start, state=start.state[:-1]), "checkpoint-damaged"),
+        (lambda start: replace(start, state=start.state.replace(b"0.1.0", b"9.1.0")), "checkpoint-of-another-version"),
+        (lambda start: with_node(start, break_attributes), "checkpoint-damaged"),
+        (lambda start: replace(start, state=None), "no-checkpoint"),
+        (lambda start: replace(start, state=b"", settings={"method": "rm -rf"}), "impossible-settings"),
+        (
+            lambda start: replace(start, state=b"", settings={"method": 3.5, "qa": -1, "site": "x"}),
+            "checkpoint-damaged",
+        ),
+    ],
+    ids=["garbage", "cut", "version", "nonsense", "none", "method", "settings"],
+)
+def test_a_bad_checkpoint_is_counted_and_the_replay_begins_cold(tmp_path, change, reason):
+    report = forged(tmp_path / "forged.mcap", change)
+    assert report.drops[reason] >= 1
+    assert report.cold_starts == 1
+    assert report.identical.compared == 0
+    assert report.fixes > 300
+    assert report.rmse_2d_m is None or report.rmse_2d_m < 0.2
+
+
+def test_impossible_receptions_are_counted(tmp_path):
+    said = messages(1.5)
+    last = sum(topic.endswith("/receptions") for _, topic, _ in said) - 1
+
+    def change(k, m):
+        if k != last:
+            return [m]
+        one = m.receptions[-1]
+        wrong = (replace(one, rx_ticks=1 << 62), replace(one, rx_ticks=-1), replace(one, host_s=1e300))
+        return [replace(m, receptions=(*m.receptions, *wrong))]
+
+    path = tmp_path / "impossible.mcap"
+    record(path, changed(said, change))
+    (report,) = replayed(path)
+    assert report.drops["impossible-reception"] == 3
+    assert report.identical.different == 0
+
+
+def test_another_method_begins_cold_and_is_compared_with_nothing(tmp_path):
+    path = tmp_path / "live.mcap"
+    record(path, messages(2.0))
+    (report,) = replayed(path, method="bracketed")
+    assert report.method == "bracketed"
+    assert report.identical is None
+    assert report.cold_starts == 1
+    assert 60 < report.fixes < 200
+
+
+def test_the_command_tells_one_tag_as_other_replays_and_all_in_sums(tmp_path, capsys):
+    path, table, plot = tmp_path / "live.mcap", tmp_path / "fixes.csv", tmp_path / "plot.png"
+    record(path, messages(2.0, ("a", "b"), publish_every=8))
+    assert main(["replay", str(path), "--json", "--fixes", str(table)]) == 0
+    both = json.loads(capsys.readouterr().out)
+    assert both["identical"]["different"] == 0
+    assert both["identical"]["compared"] > 100
+    assert set(both["tags"]) == {"a", "b"}
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert len(rows) == both["fixes"]
+    assert {row["tag"] for row in rows} == {"a", "b"}
+    assert all(0.0 <= float(row["t_s"]) - UNIX_S <= 2.1 for row in rows)
+    assert main(["replay", str(path), "--tag", "b", "--json", "--plot", str(plot)]) == 0
+    one = json.loads(capsys.readouterr().out)
+    assert one["identical"] == both["tags"]["b"]["identical"]
+    assert {"rmse_2d_m", "p95_m", "median_m", "receptions_per_s", "height_note"} <= one.keys()
+    assert plot.stat().st_size > 10_000
+    assert main(["replay", str(path), "--tag", "a"]) == 0
+    assert "identical, all" in capsys.readouterr().out
+
+
+def test_mistakes_are_told_in_one_line(tmp_path, capsys):
+    path = tmp_path / "live.mcap"
+    record(path, messages(1.0, ("a", "b")))
+    bare = tmp_path / "bare.mcap"
+    record(bare, messages(1.0, join_s=9.0))
+    for arguments, words in (
+        ([str(path), "--tag", "x"], "one of a, b"),
+        ([str(path), "--plot", str(tmp_path / "x.png")], "--tag"),
+        ([str(path), "--method", "magic"], "one of"),
+        ([str(path), "--truth", str(bare)], "left out"),
+        ([str(bare)], "raw receptions is missing"),
+    ):
+        assert main(["replay", *arguments]) == 2
+        told = capsys.readouterr().err
+        assert words in told
+        assert told.count("\n") == 1
+
+
+def test_a_recording_without_receptions_says_so(tmp_path):
+    record(tmp_path / "empty.mcap", messages(1.0, join_s=9.0))
+    with pytest.raises(SkylessError, match="raw receptions"):
+        replayed(tmp_path / "empty.mcap")
+
+
+def test_a_fresh_receivers_state_begins_like_any_other(tmp_path):
+    path = tmp_path / "fresh.mcap"
+    said = messages(1.5, join_s=0.0)
+    record(path, changed(said, lambda _, m: [m if m.start is None else replace(m, start=replace(m.start, state=None))]))
+    (report,) = replayed(path)
+    assert report.identical.different == 0
+    assert report.identical.compared == report.fixes > 300
