@@ -133,7 +133,7 @@ async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception
     with contextlib.suppress(OSError):
         log = (data / "nats-server.log").read_text(encoding="utf-8", errors="replace")
         said += [line for line in log.splitlines() if line.startswith(f"[{process.pid}]")]
-    faults = [line for line in said if "[INF]" not in line]
+    faults = [line for line in said if line.strip() and "[INF]" not in line]
     if any("address already in use" in line for line in faults):
         return PortTakenError()
     return SkylessError(f"nats-server does not start: {faults[-1] if faults else f'exit code {process.returncode}'}")

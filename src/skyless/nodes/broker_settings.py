@@ -10,6 +10,8 @@ from skyless.errors import SkylessError
 from skyless.outputs.address import PASSWORD_VARIABLE, MqttAddress
 
 _MOST_PAYLOAD: Final = 8 * 1024 * 1024
+_SEND_AGAIN: Final = "3s"
+"""When a message that a dying subscriber was sent, and has not acknowledged, is sent again; 30 s by default."""
 _MOST_STORED: Final = 4 * 1024**3
 
 
@@ -57,7 +59,7 @@ class BrokerSettings(Struct, frozen=True):
 def configuration(settings: BrokerSettings, port: int, data: Path) -> str:
     """The file for nats-server, whose format takes JSON."""
     host = f"[{settings.listen}]" if ":" in settings.listen else settings.listen
-    mqtt: dict[str, object] = {"listen": f"{host}:{port}"}
+    mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": _SEND_AGAIN}
     if settings.certificate is not None:
         mqtt["tls"] = {"cert_file": str(settings.certificate), "key_file": str(settings.key)}
     whole: dict[str, object] = {

@@ -25,7 +25,8 @@ class RefusedError(Exception):
 class Connection(asyncio.Protocol):
     """Reads packets, answers messages of QoS 1, and finds out when the broker has gone silent.
 
-    ``on_message``, ``on_acknowledged`` and ``on_writable`` are called from the event loop.
+    Its callbacks are called from the event loop: with a message, with the number of a message that the broker has, when
+    the connection takes more again, and with the number of a subscription and a code for each of its filters.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class Connection(asyncio.Protocol):
         on_message: Callable[[Message], None],
         on_acknowledged: Callable[[int], None],
         on_writable: Callable[[], None],
+        on_subscribed: Callable[[int, bytes], None],
     ) -> None:
         self.writable = False
         """Whether the connection takes more; false while a slow broker has its buffers full, and once it is lost."""
@@ -44,6 +46,7 @@ class Connection(asyncio.Protocol):
         self._on_message = on_message
         self._on_acknowledged = on_acknowledged
         self._on_writable = on_writable
+        self._on_subscribed = on_subscribed
         self._splitter = Splitter()
         self._accepted: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._transport: asyncio.Transport | None = None
@@ -137,6 +140,8 @@ class Connection(asyncio.Protocol):
                 self.write(packets.puback(message.packet))
         elif kind == packets.PUBACK:
             self._on_acknowledged(int.from_bytes(body[:2], "big"))
+        elif kind == packets.SUBACK:
+            self._on_subscribed(int.from_bytes(body[:2], "big"), body[2:])
 
     def _answer(self, kind: int, body: bytes) -> None:
         if kind != packets.CONNACK:
@@ -176,7 +181,7 @@ async def open_connection(
         if connection is not None:
             connection.abort("gave up")
         if isinstance(error, TimeoutError) and not error.args:
-            raise TimeoutError(f"no answer within {ANSWER_S:.0f} s") from None
+            raise TimeoutError(f"no answer within {ANSWER_S:g} s") from None
         raise
     return connection
 
@@ -190,7 +195,7 @@ async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) 
     greeting = packets.connect("", clean=True, keepalive_s=60, user=address.user, password=address.password, will=None)
 
     def make() -> Connection:
-        return Connection(60, lambda _: None, lambda _: None, lambda: None)
+        return Connection(60, lambda _: None, lambda _: None, lambda: None, lambda _, __: None)
 
     try:
         connection = await open_connection(address, tls or address.tls_context(), greeting, make)

@@ -19,7 +19,7 @@ from skyless.outputs.address import MqttAddress
 from skyless.outputs.connection import Connection, RefusedError, open_connection, trouble_with
 from skyless.outputs.filters import matches
 from skyless.outputs.messages import Counters, StatusMessage
-from skyless.outputs.outbox import Limits, Outbox
+from skyless.outputs.outbox import LAST_NUMBER, Limits, Outbox
 from skyless.outputs.packets import Message, Will
 from skyless.outputs.topics import status_topic
 
@@ -77,6 +77,7 @@ class Link:
         self._connection: Connection | None = None
         self._handlers: dict[str, tuple[Handler, int]] = {}
         self._routes: dict[str, tuple[Handler, ...]] = {}
+        self._asked: dict[int, tuple[str, ...]] = {}
         self._reconnects = -1
         self._told_dropped = 0
         self._away_since_s = time.monotonic()
@@ -107,19 +108,21 @@ class Link:
     def subscribe(self, topic_filter: str, handler: Handler, qos: int = 0) -> None:
         """Call ``handler`` with every message of a filter, now and after every reconnect.
 
-        A second handler of the same filter takes the place of the first.
+        A second handler of the same filter takes the place of the first. Where filters of one link overlap, some
+        brokers send a message once for each, and all its handlers see it as often.
         """
         self._handlers[topic_filter] = (handler, qos)
         self._routes.clear()
         if self._connection is not None:
-            self._connection.write(packets.subscribe(1, {topic_filter: qos}))
+            self._ask_for(self._connection, {topic_filter: qos})
 
     async def run(self) -> None:
         """Stay connected until cancelled; then send what waits, for a second at most, and say goodbye."""
         failures = 0
         try:
             while True:
-                if await self._one_connection():
+                begin_s = time.monotonic()
+                if await self._one_connection() and time.monotonic() - begin_s > _LONGEST_WAIT_S:
                     failures = 0
                 await asyncio.sleep(self._wait_s(failures))
                 failures += 1
@@ -144,7 +147,7 @@ class Link:
         return True
 
     def _make_connection(self) -> Connection:
-        return Connection(self._keepalive_s, self._receive, self._acknowledged, self._pump)
+        return Connection(self._keepalive_s, self._receive, self._acknowledged, self._pump, self._subscribed)
 
     def _greeting(self) -> bytes:
         return packets.connect(
@@ -162,7 +165,8 @@ class Link:
         self._tell_return()
         self._outbox.restart()
         self._say_online()
-        connection.write(packets.subscribe(1, {name: qos for name, (_, qos) in self._handlers.items()}))
+        self._asked.clear()
+        self._ask_for(connection, {name: qos for name, (_, qos) in self._handlers.items()})
         self._set_state(connected=True, trouble=None)
         self._pump()
 
@@ -202,10 +206,22 @@ class Link:
                 while self._outbox.unacknowledged and not connection.lost.is_set():
                     await asyncio.sleep(0.005)
                 if self._persistent:
-                    connection.write(packets.unsubscribe(2, list(self._handlers)))
+                    connection.write(packets.unsubscribe(LAST_NUMBER + 1, self._handlers))
                 await connection.leave()
         except TimeoutError:
+            _log.warning("stopped; the broker %s has not taken %d messages", self.address, self._outbox.unacknowledged)
+        finally:
             connection.abort("stopped")
+
+    def _ask_for(self, connection: Connection, filters: dict[str, int]) -> None:
+        number = LAST_NUMBER + 2 + len(self._asked)
+        self._asked[number] = tuple(filters)
+        connection.write(packets.subscribe(number, filters))
+
+    def _subscribed(self, number: int, codes: bytes) -> None:
+        for name, code in zip(self._asked.get(number, ()), codes, strict=False):
+            if code == packets.NOT_SUBSCRIBED:
+                _log.warning("the broker %s does not let this user subscribe to %s", self.address, name)
 
     def _pump(self) -> None:
         connection = self._connection

@@ -1,12 +1,18 @@
 """What waits to be sent to a broker: bounded, so that a slow or absent one costs memory only up to a limit."""
 
+import re
 from collections import OrderedDict, deque
+from typing import Final
 
 from msgspec import Struct
 
 from skyless.outputs import packets
 
-_LAST_NUMBER = 65_535
+LAST_NUMBER: Final = 65_000
+"""Of packets with a message; the numbers above are for subscriptions."""
+
+_TOPIC: Final = re.compile(r"[^\s+#\x00-\x1f\x7f]{1,250}")
+"""What every broker takes; nats-server takes no blanks."""
 
 
 class Limits(Struct, frozen=True):
@@ -58,9 +64,9 @@ class Outbox:
         """Messages of QoS 0 given to the connection, and messages of QoS 1 acknowledged."""
 
     def put(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> None:
-        """Add a message."""
+        """Add a message; one that no broker would take is dropped."""
         message = Waiting(topic, payload, qos, retain)
-        if len(payload) > self._limits.payload:
+        if len(payload) > self._limits.payload or not _TOPIC.fullmatch(topic):
             self.dropped += 1
         elif retain:
             self._keep(message)
@@ -129,7 +135,7 @@ class Outbox:
 
     def _next_number(self) -> int:
         while True:
-            self._number = self._number % _LAST_NUMBER + 1
+            self._number = self._number % LAST_NUMBER + 1
             if self._number not in self._flying:
                 return self._number
 

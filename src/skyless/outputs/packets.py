@@ -1,6 +1,6 @@
 """Packets of MQTT 3.1.1 (OASIS standard, 2014), as far as a client of QoS 0 and 1 needs them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 from msgspec import Struct
@@ -12,14 +12,13 @@ PUBACK: Final = 4
 SUBSCRIBE: Final = 8
 SUBACK: Final = 9
 UNSUBSCRIBE: Final = 10
-UNSUBACK: Final = 11
 PINGREQ: Final = 12
-PINGRESP: Final = 13
 DISCONNECT: Final = 14
 
 PING: Final = bytes((PINGREQ << 4, 0))
 GOODBYE: Final = bytes((DISCONNECT << 4, 0))
-LARGEST_BODY: Final = 268_435_455
+
+NOT_SUBSCRIBED: Final = 0x80
 
 _REFUSALS: Final = {
     1: "it does not speak MQTT 3.1.1",
@@ -81,13 +80,13 @@ def puback(packet: int) -> bytes:
     return bytes((PUBACK << 4, 2)) + packet.to_bytes(2, "big")
 
 
-def subscribe(packet: int, filters: dict[str, int]) -> bytes:
+def subscribe(packet: int, filters: Mapping[str, int]) -> bytes:
     """A SUBSCRIBE to topic filters, each with its QoS."""
     body = b"".join(_text(name) + bytes((qos,)) for name, qos in filters.items())
     return _packet(SUBSCRIBE << 4 | 2, packet.to_bytes(2, "big") + body)
 
 
-def unsubscribe(packet: int, filters: list[str]) -> bytes:
+def unsubscribe(packet: int, filters: Iterable[str]) -> bytes:
     """An UNSUBSCRIBE from topic filters."""
     return _packet(UNSUBSCRIBE << 4 | 2, packet.to_bytes(2, "big") + b"".join(map(_text, filters)))
 

@@ -1,0 +1,120 @@
+"""Real brokers for tests, both kinds behind one face."""
+
+import asyncio
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import subprocess
+
+from skyless.nodes.broker import start_broker
+from skyless.nodes.broker_settings import BrokerSettings
+from skyless.outputs.address import MqttAddress
+
+MOSQUITTO = shutil.which("mosquitto", path=os.environ.get("PATH", "") + ":/usr/sbin")
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Embedded:
+    """nats-server as Skyless starts it."""
+
+    def __init__(self, folder, **settings):
+        self.settings = BrokerSettings(port=free_port(), data=folder / "store", **settings)
+        self.address = self.settings.address(self.settings.port)
+        self.broker = None
+
+    async def start(self):
+        self.broker = await start_broker(self.settings)
+
+    async def stop(self):
+        await self.broker.stop()
+
+    async def kill(self):
+        os.kill(self.broker.pid, signal.SIGKILL)
+        await self.broker.stop()
+
+    def signal(self, number):
+        os.kill(self.broker.pid, number)
+
+
+class Mosquitto:
+    """Debian's mosquitto, keeping its store as ``docs/mqtt.md`` advises."""
+
+    def __init__(self, folder, user=None, password=None, certificate=None, key=None):
+        self.port = free_port()
+        self.file = folder / "mosquitto.conf"
+        store = folder / "store"
+        store.mkdir(mode=0o777)
+        lines = [f"listener {self.port} 127.0.0.1", "persistence true", f"persistence_location {store}/"]
+        lines += ["autosave_interval 1", "max_queued_messages 0", "user root"]
+        if user is None:
+            lines.append("allow_anonymous true")
+        else:
+            words = folder / "passwords"
+            subprocess.run(["mosquitto_passwd", "-b", "-c", words, user, password], check=True)
+            lines += ["allow_anonymous false", f"password_file {words}"]
+        if certificate:
+            lines += [f"certfile {certificate}", f"keyfile {key}"]
+        self.file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        self.address = MqttAddress("127.0.0.1", self.port, certificate is not None, user, password)
+        self.process = None
+
+    async def start(self):
+        self.process = await asyncio.create_subprocess_exec(
+            MOSQUITTO, "-c", self.file, stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL
+        )
+        async with asyncio.timeout(10):
+            while True:
+                with contextlib.suppress(OSError):
+                    _, writer = await asyncio.open_connection("127.0.0.1", self.port)
+                    writer.close()
+                    return
+                assert self.process.returncode is None, "mosquitto does not start"
+                await asyncio.sleep(0.02)
+
+    async def stop(self):
+        if self.process.returncode is None:
+            self.process.terminate()
+            await self.process.wait()
+
+    async def kill(self):
+        self.process.kill()
+        await self.process.wait()
+
+    def signal(self, number):
+        self.process.send_signal(number)
+
+
+@contextlib.asynccontextmanager
+async def running(broker, *links):
+    """A started broker, and links that run and are connected."""
+    await broker.start()
+    tasks = [asyncio.ensure_future(link.run()) for link in links]
+    try:
+        for link in links:
+            await until(lambda link=link: link.connected)
+        yield tasks
+    finally:
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+        await broker.stop()
+
+
+async def until(condition, limit_s=20.0):
+    """Wait for something that should come; a test that waits in vain fails."""
+    async with asyncio.timeout(limit_s):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+async def stopped(task):
+    task.cancel()
+    await asyncio.wait([task])
