@@ -1,0 +1,235 @@
+"""``skyless record`` against real brokers and the tags' real program, whose radio plays a simulated tape."""
+
+import asyncio
+import contextlib
+import json
+import os
+import resource
+import signal
+import sys
+import time
+
+import pytest
+from mqtt_brokers import MOSQUITTO, Embedded, Mosquitto, until
+
+from machines.bench import LAB, tape
+from skyless.air.reception import Reception
+from skyless.cli.main import main
+from skyless.experiments.replay_site import SiteReplay
+from skyless.experiments.warm import compile_kernels
+from skyless.nodes.tag import TagSettings
+from skyless.nodes.tags import Tags
+from skyless.outputs.link import Link
+from skyless.outputs.messages import SiteMessage
+from skyless.outputs.topics import site_topic
+from skyless.recordings.mcap_recording import McapRecording
+
+SECONDS = 30.0
+PLACES = ((3.0, 4.0, 0.0), (2.0, 2.0, 0.0))
+
+
+class TapeRadio:
+    """Plays what a simulated tag hears, in real time."""
+
+    def __init__(self, name, position):
+        self.name = name
+        self._tape = tape(LAB, SECONDS, 1, position)
+
+    async def run(self, listener):
+        begun_s = time.monotonic() - self._tape[0].host_s
+        for heard in self._tape:
+            wait_s = begun_s + heard.host_s - time.monotonic()
+            if wait_s > 0.0:
+                await asyncio.sleep(wait_s)
+            listener(Reception(heard.frame, heard.rx_ticks, time.monotonic()))
+        await asyncio.sleep(3600.0)
+
+    def now_ticks(self):
+        return None
+
+    def transmit(self, transmission):
+        raise AssertionError("tags never speak")
+
+
+class Recorder:
+    """``skyless record`` as a process."""
+
+    def __init__(self, address, path, *arguments, limit_bytes=None):
+        self.path = path
+        self._command = [sys.executable, "-m", "skyless.cli.main", "record", path, "--mqtt", str(address), *arguments]
+        self._limit = limit_bytes
+        self.process = None
+
+    def _set_limit(self):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (self._limit, self._limit))
+
+    async def start(self):
+        self.process = await asyncio.create_subprocess_exec(
+            *self._command,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            preexec_fn=self._set_limit if self._limit else None,
+        )
+
+    def size(self):
+        return self.path.stat().st_size if self.path.exists() else 0
+
+    async def grown(self, by=20_000):
+        """Until it has written more."""
+        aim = self.size() + by
+        await until(lambda: self.size() >= aim)
+
+    async def end(self, number=signal.SIGINT):
+        """Its exit code and what it said."""
+        if number is not None:
+            os.kill(self.process.pid, number)
+        async with asyncio.timeout(20):
+            out, err = await self.process.communicate()
+        return self.process.returncode, out.decode(), err.decode()
+
+
+@contextlib.asynccontextmanager
+async def site(broker):
+    """Two tags and one who tells the site, on a broker that runs."""
+    await broker.start()
+    teller = Link(broker.address, "teller", site=LAB.id, kind="ether")
+    teller.publish(site_topic(LAB.id), SiteMessage(LAB, True, time.time()), qos=1, retain=True)
+    radios = [TapeRadio(name, place) for name, place in zip(("one", "two"), PLACES, strict=True)]
+    tags = Tags(TagSettings(), radios, broker.address, lambda _: None)
+    tasks = [asyncio.ensure_future(part) for part in (teller.run(), tags.run())]
+    try:
+        await until(lambda: teller.connected)
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+        await broker.stop()
+
+
+def run(scenario, broker):
+    compile_kernels()
+    for place in PLACES:
+        tape(LAB, SECONDS, 1, place)  # made before the clock runs
+
+    async def staged():
+        async with site(broker):
+            return await scenario()
+
+    return asyncio.run(staged())
+
+
+@pytest.fixture(params=["embedded", "mosquitto"])
+def broker(request, tmp_path):
+    folder = tmp_path / "broker"
+    folder.mkdir()
+    if request.param == "mosquitto" and MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed")
+    return Embedded(folder) if request.param == "embedded" else Mosquitto(folder)
+
+
+def replayed(path):
+    with McapRecording(path) as recording:
+        return SiteReplay(recording).run(None, lambda _: None), recording.summary()
+
+
+def test_a_recording_replays_bit_by_bit_and_ctrl_c_closes_it(broker, tmp_path):
+    recorder = Recorder(broker.address, tmp_path / "live.mcap", "--json")
+
+    async def scenario():
+        await recorder.start()
+        await recorder.grown(100_000)
+        return await recorder.end()
+
+    code, out, _ = run(scenario, broker)
+    assert code == 0
+    told = json.loads(out)
+    reports, summary = replayed(recorder.path)
+    assert summary.finished
+    assert summary.site == LAB.id
+    assert summary.simulated
+    assert told["messages"]["fix"] == summary.messages["fix"]
+    assert told["receptions"] == sum(report.receptions for report in reports)
+    assert told["drops"] == summary.drops == {}
+    for report in reports:
+        assert report.identical.compared > 50
+        assert report.identical.different == 0
+        assert report.segments == 1
+        assert report.cold_starts == 0
+
+
+def test_a_broker_that_dies_and_returns_costs_no_reception(broker, tmp_path):
+    recorder = Recorder(broker.address, tmp_path / "restart.mcap", "--site-id", str(LAB.id), "--json")
+
+    async def scenario():
+        await recorder.start()
+        await recorder.grown(60_000)
+        await broker.kill()
+        await asyncio.sleep(0.5)
+        await broker.start()
+        await recorder.grown(60_000)
+        return await recorder.end()
+
+    code, out, _ = run(scenario, broker)
+    assert code == 0
+    reports, _ = replayed(recorder.path)
+    assert json.loads(out)["drops"] == {}
+    for report in reports:
+        assert report.identical.different == 0
+        assert report.drops.keys() <= {"receptions-without-beginning"}
+        assert report.cold_starts == 0
+    spans_s = [report.receptions / 400.0 for report in reports]
+    assert min(spans_s) > 1.5
+
+
+def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_on(broker, tmp_path):
+    first = Recorder(broker.address, tmp_path / "killed.mcap")
+    second = Recorder(broker.address, tmp_path / "second.mcap", "--duration", "2", "--json")
+
+    async def scenario():
+        await first.start()
+        await first.grown(100_000)
+        killed_s = time.time()
+        await first.end(signal.SIGKILL)
+        await second.start()
+        return killed_s, await second.end(None)
+
+    killed_s, (code, out, _) = run(scenario, broker)
+    reports, summary = replayed(first.path)
+    assert not summary.finished
+    assert killed_s - summary.end_s < 1.0
+    assert all(report.identical.different == 0 and report.identical.compared > 50 for report in reports)
+    assert code == 0
+    assert json.loads(out)["receptions"] > 400
+
+
+def test_a_disk_that_takes_no_more_is_told_once_and_leaves_a_whole_file(broker, tmp_path):
+    recorder = Recorder(broker.address, tmp_path / "full.mcap", limit_bytes=250_000)
+
+    async def scenario():
+        await recorder.start()
+        return await recorder.end(None)
+
+    code, out, err = run(scenario, broker)
+    assert code == 1
+    assert err.count("cannot be written any more: File too large") == 1
+    assert "not written any more" in out
+    _, summary = replayed(recorder.path)
+    assert summary.unread_bytes == 0
+    assert 100_000 < recorder.size() <= 250_000
+
+
+def test_mistakes_are_told_in_one_line(tmp_path, capsys):
+    path = tmp_path / "there.mcap"
+    path.write_text("precious")
+    for arguments, words in (
+        ([str(path)], "is not overwritten"),
+        ([str(tmp_path / "no" / "x.mcap")], "cannot be written"),
+        ([str(tmp_path / "x.mcap"), "--mqtt", "none"], "broker"),
+        ([str(tmp_path / "x.mcap"), "--mqtt", "http://x"], "mqtt://"),
+    ):
+        assert main(["record", *arguments]) == 2
+        told = capsys.readouterr().err
+        assert words in told
+        assert told.count("\n") == 1
+    assert path.read_text() == "precious"
