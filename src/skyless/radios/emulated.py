@@ -79,12 +79,21 @@ class EtherConnection:
         self.radios = tuple(EmulatedRadio(self, node, name) for node, name in enumerate(join.names))
         self._transport: asyncio.Transport | None = None
         self._task: asyncio.Task[None] | None = None
+        self._users = 0
 
     async def keep(self) -> None:
-        """Stay connected until cancelled; all radios share one connection."""
+        """Stay connected until cancelled; all radios share one connection, which ends with the last of them."""
+        self._users += 1
         if self._task is None:
             self._task = asyncio.create_task(self._run())
-        await asyncio.shield(self._task)
+        task = self._task
+        try:
+            await asyncio.shield(task)
+        finally:
+            self._users -= 1
+            if not self._users:
+                self._task = None
+                task.cancel()
 
     def send(self, message: Send) -> bool:
         """Whether the message could be handed to the connection."""
@@ -104,8 +113,11 @@ class EtherConnection:
                 reason = f"no ether at {self._host}:{self._port} ({error.strerror or error})"
             else:
                 transport.write(pack(self._join))
-                reason = await protocol.ended
-                self._lose()
+                try:
+                    reason = await protocol.ended
+                finally:
+                    transport.abort()
+                    self._lose()
             if reason != told:
                 told = reason
                 self._tell_all(Gone(reason))

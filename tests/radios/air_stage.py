@@ -1,0 +1,73 @@
+"""An ether whose time a test moves by hand, and guests without a network."""
+
+import asyncio
+
+from skyless.constants import TICK_RATE_HZ
+from skyless.experiments.scenarios import Request, impairments_of
+from skyless.nodes.ether import Ether
+from skyless.radios.ether_wire import Join, Joined, Send
+from skyless.simulation.trajectory import Static
+from skyless.site.lab import lab_site
+from skyless.ticks import wrap
+
+LAB = lab_site()
+TAGS = {"tag1": Static(2.0, 3.0), "tag2": Static(4.0, 5.0)}
+
+
+def make_ether(clock, seed=1, **faults):
+    return Ether(LAB, TAGS, impairments_of(Request(LAB, **faults), LAB), seed, clock)
+
+
+class Listener:
+    """A guest that writes down what it is told; ``deaf`` refuses it, as a full connection does."""
+
+    def __init__(self):
+        self.told = []
+        self.deaf = False
+
+    def tell(self, message):
+        if not self.deaf:
+            self.told.append(message)
+        return not self.deaf
+
+    def of(self, kind):
+        return [message for message in self.told if isinstance(message, kind)]
+
+
+class Stage:
+    """The lab's ether at a clock of the test's own."""
+
+    def __init__(self, seed=1, **faults):
+        self.now_s = 100.0
+        self.ether = make_ether(lambda: self.now_s, seed, **faults)
+
+    def pass_time(self, seconds, steps=20):
+        for _ in range(steps):
+            self.now_s += seconds / steps
+            self.ether.advance()
+
+    def join(self, kind, *names):
+        """A guest, its seat (or why it has none), and its counters when it joined."""
+        guest = Listener()
+        seat = self.ether.join(guest, Join(kind, names))
+        return guest, seat
+
+    def ticks(self, guest, node, ahead_s):
+        """Counter of a guest's node so far ahead, from what it was told when it joined."""
+        joined = guest.of(Joined)[-1]
+        elapsed_s = self.now_s - joined.host_s + ahead_s
+        return wrap(joined.ticks[node] + round(elapsed_s * TICK_RATE_HZ))
+
+    def send(self, guest, seat, node=0, ahead_s=2e-3, frame=b"a frame" * 10):
+        tx_ticks = self.ticks(guest, node, ahead_s)
+        self.ether.send(seat, Send(node, tx_ticks, frame))
+        return tx_ticks
+
+
+def in_loop(play):
+    """Run a test that needs an event loop, although its time stands still."""
+
+    async def main():
+        return play()
+
+    return asyncio.run(main())

@@ -1,0 +1,105 @@
+"""What processes and the ether say to each other, cut and spoilt in every way."""
+
+import itertools
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyless.radios import ether_wire
+from skyless.radios.ether_wire import (
+    MAX_MESSAGE_BYTES,
+    Arrival,
+    Clocks,
+    Done,
+    HeardRow,
+    Join,
+    Joined,
+    Refused,
+    Send,
+    Unpacker,
+    WireError,
+    from_ether,
+    pack,
+    to_ether,
+)
+
+TICKS = st.integers(0, 2**40 - 1)
+NODES = st.integers(0, 300)
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+TO_ETHER = st.one_of(
+    st.builds(Join, st.sampled_from(["anchor", "tag"]), st.lists(st.text(max_size=20)).map(tuple)),
+    st.builds(Send, NODES, TICKS, st.binary(max_size=127)),
+)
+ROWS = st.builds(HeardRow, NODES, TICKS, FINITE, FINITE, FINITE)
+FROM_ETHER = st.one_of(
+    st.builds(Joined, st.text(max_size=40), FINITE, st.lists(TICKS).map(tuple)),
+    st.builds(Refused, st.text()),
+    st.builds(Clocks, FINITE, st.lists(TICKS).map(tuple)),
+    st.builds(Arrival, st.binary(max_size=127), FINITE, st.lists(ROWS, max_size=5).map(tuple)),
+    st.builds(Done, NODES, TICKS, st.booleans()),
+)
+
+
+def pieces_of(stream, cuts):
+    places = [0, *sorted(cut % (len(stream) + 1) for cut in cuts), len(stream)]
+    return [stream[begin:end] for begin, end in itertools.pairwise(places)]
+
+
+@given(st.lists(TO_ETHER, max_size=8), st.lists(st.integers(0, 10_000), max_size=30))
+def test_what_processes_say_arrives_however_the_stream_is_cut(messages, cuts):
+    unpacker = Unpacker()
+    stream = b"".join(pack(message) for message in messages)
+    bodies = [body for piece in pieces_of(stream, cuts) for body in unpacker.feed(piece)]
+    assert [to_ether.decode(body) for body in bodies] == messages
+
+
+@given(st.lists(FROM_ETHER, max_size=8), st.lists(st.integers(0, 10_000), max_size=30))
+def test_what_the_ether_says_arrives_however_the_stream_is_cut(messages, cuts):
+    unpacker = Unpacker()
+    stream = b"".join(pack(message) for message in messages)
+    bodies = [body for piece in pieces_of(stream, cuts) for body in unpacker.feed(piece)]
+    assert [from_ether.decode(body) for body in bodies] == messages
+
+
+@given(st.binary(max_size=400), st.lists(st.integers(0, 400), max_size=10))
+def test_garbage_raises_nothing_but_what_is_announced(garbage, cuts):
+    unpacker = Unpacker()
+    try:
+        for piece in pieces_of(garbage, cuts):
+            for body in unpacker.feed(piece):
+                to_ether.decode(body)
+    except (WireError, msgspec.MsgspecError):
+        pass
+
+
+@given(TO_ETHER, st.data())
+def test_a_message_that_lacks_its_end_does_not_come_out(message, data):
+    stream = pack(message)
+    assert list(Unpacker().feed(stream[: data.draw(st.integers(0, len(stream) - 1))])) == []
+
+
+def test_a_length_beyond_all_messages_is_refused_before_it_is_waited_for():
+    good = pack(Refused("no"))
+    feed = Unpacker().feed(good + (MAX_MESSAGE_BYTES + 1).to_bytes(4, "little"))
+    assert from_ether.decode(next(feed)) == Refused("no")
+    with pytest.raises(WireError, match=str(MAX_MESSAGE_BYTES)):
+        next(feed)
+    assert list(Unpacker().feed(MAX_MESSAGE_BYTES.to_bytes(4, "little"))) == []
+
+
+def test_the_largest_arrival_of_a_large_site_fits():
+    rows = tuple(HeardRow(node, 2**40 - 1, -80.0, -85.0, 1.5) for node in range(1000))
+    assert len(pack(Arrival(bytes(127), 1.0, rows))) < MAX_MESSAGE_BYTES
+
+
+def test_a_machine_without_a_boot_identifier_shares_its_clock_with_itself_only_by_name(monkeypatch):
+    here = ether_wire.this_machine()
+    assert here == ether_wire.this_machine()
+
+    def missing(*_, **__):
+        raise FileNotFoundError
+
+    monkeypatch.setattr(ether_wire.Path, "read_text", missing)
+    assert ether_wire.this_machine() == ""
