@@ -7,11 +7,12 @@ from typing import Final
 
 import msgspec
 
+from skyless.air.codec import MAX_FRAME_BYTES
 from skyless.air.reception import Transmission
 from skyless.constants import TICK_S
 from skyless.nodes.ether_guests import Guest, Seat
 from skyless.outputs.messages import EtherHealth, TrueMotion, TruthMessage, Vector
-from skyless.radios.ether_wire import Arrival, Clocks, Done, HeardRow, Join, Joined, Send, this_machine
+from skyless.radios.ether_wire import Arrival, Clocks, Done, HeardRow, Join, Joined, Send, WireError, this_machine
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.medium import Delivery, Medium
 from skyless.simulation.stations import TagSpec
@@ -103,7 +104,7 @@ class Ether:
             if node is None:
                 known = ", ".join(name for kind, name in self._nodes if kind == message.kind)
                 return f"the ether's site has no {message.kind} {name}; it has: {known}"
-            if node in self._owners:
+            if node in self._owners or nodes.count(node) > 1:
                 return f"{message.kind} {name} is on the air already"
         self.advance()
         seat = Seat(guest, tuple(node for node in nodes if node is not None))
@@ -121,8 +122,14 @@ class Ether:
             self.medium.switch_off(node)
 
     def send(self, seat: Seat, message: Send) -> None:
-        """Plan a transmission, unless it is too late or the node's radio has one waiting already."""
+        """Plan a transmission, unless it is too late or the node's radio has one waiting already.
+
+        Raises:
+            WireError: no radio of an anchor sends that.
+        """
         node = seat.nodes[message.node]
+        if node >= len(self.site.anchors) or len(message.frame) > MAX_FRAME_BYTES:
+            raise WireError("a transmission by a tag, or of a frame that is too long")
         self.advance()
         taken = node not in self._flying and self.medium.transmit(node, Transmission(message.frame, message.tx_ticks))
         if taken:
@@ -144,6 +151,8 @@ class Ether:
         for seat, heard_rows in rows.items():
             if not seat.tell(Arrival(flight.frame, host_s, tuple(heard_rows))):
                 self.overruns += len(heard_rows)
+        if flight.boot != self.medium.boots[flight.sender]:
+            return  # the process that sent it has gone meanwhile
         sender = self._owners.get(flight.sender)
         tx_ticks = self._flying.pop(flight.sender, None)
         if sender is not None and tx_ticks is not None:
