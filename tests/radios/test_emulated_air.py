@@ -28,7 +28,7 @@ def test_a_frame_reaches_all_that_are_on_the_air_and_its_sender_is_told():
         assert arrival.frame == FRAME
         assert [row.node for row in arrival.rows] == [1, 0]  # as this process numbers them
         assert [row.node for row in others.of(Arrival)[0].rows] == [0, 1]
-        # its end came as long after the RMARKER as the frame lasts; that left when it should, but for 20 ppm and 512 ticks
+        # it ended as long after the RMARKER as it lasts, and that left when it should but for 20 ppm and 512 ticks
         assert arrival.host_s == pytest.approx(sent_s + 2e-3 + after_rmarker_s(len(FRAME)), abs=1e-7)
 
     in_loop(play)
