@@ -7,6 +7,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import time
 
 from skyless.nodes.broker import start_broker
 from skyless.nodes.broker_settings import BrokerSettings
@@ -32,6 +33,9 @@ class Embedded:
     async def start(self):
         self.broker = await start_broker(self.settings)
 
+    async def saved(self):
+        """Until all that it has acknowledged would survive its death; here that is always so."""
+
     async def stop(self):
         await self.broker.stop()
 
@@ -51,6 +55,7 @@ class Mosquitto:
         self.file = folder / "mosquitto.conf"
         store = folder / "store"
         store.mkdir(mode=0o777)
+        self.store = store / "mosquitto.db"
         lines = [f"listener {self.port} 127.0.0.1", "persistence true", f"persistence_location {store}/"]
         lines += ["autosave_interval 1", "max_queued_messages 0", "user root"]
         if user is None:
@@ -77,6 +82,11 @@ class Mosquitto:
                     return
                 assert self.process.returncode is None, "mosquitto does not start"
                 await asyncio.sleep(0.02)
+
+    async def saved(self):
+        """It writes its store down once a second, and then renames it."""
+        begin_s = time.time()
+        await until(lambda: self.store.exists() and self.store.stat().st_mtime > begin_s)
 
     async def stop(self):
         if self.process.returncode is None:

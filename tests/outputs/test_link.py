@@ -192,7 +192,7 @@ def test_no_message_of_qos_1_is_lost_across_a_restart(make_broker, end):
         inbox = Inbox(broker.address, topic, qos=1, persistent=True)
         tag = tag_link(broker.address)
         async with running(broker, inbox.link, tag):
-            await asyncio.sleep(1.5)  # mosquitto writes its sessions down once a second
+            await broker.saved()
             for number in range(300):
                 tag.publish(topic, b"%d" % number, qos=1)
                 await asyncio.sleep(0.005)
@@ -229,7 +229,7 @@ def test_a_persistent_subscriber_gets_what_came_while_it_was_away_and_the_broker
             for number in range(1, 1200):
                 tag.publish(topic, b"%d" % number, qos=1)
             await until(lambda: not tag.unacknowledged)
-            await asyncio.sleep(1.5)  # mosquitto writes its store once a second
+            await broker.saved()
             await broker.kill()
             await broker.start()
             back = Inbox(broker.address, topic, qos=1, persistent=True)

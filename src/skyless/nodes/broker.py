@@ -52,9 +52,7 @@ class Broker:
     async def stop(self) -> None:
         """End it, and keep what it has stored."""
         await _end(self._process)
-        self._lock.close()
-        if self.data.name.startswith(SCRATCH):
-            shutil.rmtree(self.data, ignore_errors=True)
+        _release(self.data, self._lock)
 
     async def __aenter__(self) -> Self:
         return self
@@ -81,7 +79,7 @@ async def start_broker(settings: BrokerSettings | None = None) -> Broker:
                 return await _start(program, settings, port, data, lock)
         raise SkylessError(all_taken(settings))
     except BaseException:
-        lock.close()
+        _release(data, lock)
         raise
 
 
@@ -150,6 +148,13 @@ async def _end(process: asyncio.subprocess.Process) -> None:
     except TimeoutError:
         process.kill()
         await process.wait()
+
+
+def _release(data: Path, lock: IO[str]) -> None:
+    """Leave the folder to the next broker; a temporary one goes."""
+    lock.close()
+    if data.name.startswith(SCRATCH):
+        shutil.rmtree(data, ignore_errors=True)
 
 
 def _program() -> Path:

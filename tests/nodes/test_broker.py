@@ -1,0 +1,186 @@
+"""The embedded broker: its address, its privacy, its end."""
+
+import asyncio
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from skyless.cli.main import main
+from skyless.errors import SkylessError
+from skyless.nodes import broker_place
+from skyless.nodes.broker import start_broker
+from skyless.nodes.broker_settings import BrokerSettings
+from skyless.outputs.connection import check_broker
+from skyless.outputs.link import Link
+
+BROKER = (sys.executable, "-m", "skyless.cli.main", "broker")
+
+
+@pytest.fixture
+def port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture
+def taken():
+    """A port where another program listens."""
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        yield other.getsockname()[1]
+
+
+def start_program(*options):
+    """``skyless broker``, and what it says when it is ready."""
+    program = subprocess.Popen([*BROKER, "--json", *options], stdout=subprocess.PIPE, text=True)
+    return program, json.loads(program.stdout.readline())
+
+
+def lives(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def ends(pid):
+    """Whether a process is gone within ten seconds."""
+    for _ in range(1000):
+        if not lives(pid):
+            return True
+        time.sleep(0.01)
+    return False
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_it_leaves_no_orphan_however_it_ends(number, port, tmp_path):
+    program, ready = start_program("--port", str(port), "--data", str(tmp_path / "store"))
+    assert ready["mqtt"] == f"mqtt://127.0.0.1:{port}"
+    assert lives(ready["pid"])
+    program.send_signal(number)
+    assert program.wait(20) == (-9 if number == signal.SIGKILL else 0)
+    assert ends(ready["pid"])
+
+
+def test_it_is_an_error_when_nats_server_dies(port, tmp_path):
+    program, ready = start_program("--port", str(port), "--data", str(tmp_path / "store"))
+    os.kill(ready["pid"], signal.SIGKILL)
+    assert program.wait(20) == 2
+
+
+def test_its_store_is_private(port, tmp_path):
+    async def check():
+        settings = BrokerSettings(port=port, data=tmp_path / "store", user="ann", password='pä"\\ss#$ word')
+        async with await start_broker(settings) as broker:
+            assert (tmp_path / "store").stat().st_mode & 0o777 == 0o700
+            assert (tmp_path / "store" / "nats-server.conf").stat().st_mode & 0o777 == 0o600
+            assert "ss#" not in str(broker.address)
+            await check_broker(broker.address)
+            with pytest.raises(SkylessError, match="password"):
+                await check_broker(msgspec.structs.replace(broker.address, user=None, password=None))
+            with pytest.raises(SkylessError, match="another broker uses"):
+                await start_broker(BrokerSettings(data=tmp_path / "store"))
+
+    asyncio.run(check())
+
+
+def test_retained_messages_survive_its_death(port, tmp_path):
+    settings = BrokerSettings(port=port, data=tmp_path / "store")
+
+    async def check():
+        broker = await start_broker(settings)
+        link = Link(broker.address, "t1", site=7, kind="tag")
+        task = asyncio.ensure_future(link.run())
+        link.publish("skyless/v1/7/zones", b"kept", qos=1, retain=True)
+        while not link.connected or link.unacknowledged:
+            await asyncio.sleep(0.01)
+        os.kill(broker.pid, signal.SIGKILL)
+        task.cancel()
+        await asyncio.wait([task])
+        await broker.stop()
+        async with await start_broker(settings) as broker, asyncio.timeout(20):
+            reader = Link(broker.address, "t2", site=7, kind="tag")
+            got = asyncio.get_running_loop().create_future()
+            reader.subscribe("skyless/v1/7/zones", lambda _, payload: got.set_result(payload))
+            task = asyncio.ensure_future(reader.run())
+            assert await got == b"kept"
+            task.cancel()
+            await asyncio.wait([task])
+
+    asyncio.run(check())
+
+
+def test_a_taken_port_is_an_error_when_it_was_asked_for(taken, tmp_path, capsys):
+    assert main(["broker", "--port", str(taken), "--data", str(tmp_path)]) == 2
+    assert f"--port is {taken}, where another program listens" in capsys.readouterr().err
+
+
+def test_without_a_port_the_next_free_one_is_taken(taken, tmp_path, monkeypatch):
+    monkeypatch.setattr(broker_place, "FIRST_PORT", taken)
+
+    async def check():
+        async with await start_broker(BrokerSettings(data=tmp_path / "store")) as broker:
+            assert taken < broker.address.port < taken + 100
+
+    asyncio.run(check())
+
+
+def test_a_second_broker_of_the_same_user_gets_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+
+    async def check():
+        async with await start_broker() as first, await start_broker() as second:
+            assert first.data == tmp_path / "skyless" / "broker"
+            assert second.data != first.data
+            assert second.address.port != first.address.port
+        assert first.data.exists()
+        assert not second.data.exists()
+
+    asyncio.run(check())
+
+
+def test_a_home_that_cannot_be_written_costs_nothing(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("in the way", encoding="utf-8")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "file"))
+
+    async def check():
+        async with await start_broker() as broker:
+            assert broker.data.stat().st_mode & 0o777 == 0o700
+
+    asyncio.run(check())
+
+
+@pytest.mark.parametrize(
+    ("options", "right"),
+    [
+        (["--listen", "0.0.0.0"], "it should come with --user and a password in SKYLESS_MQTT_PASSWORD"),
+        (["--user", "ann"], "--user and a password in SKYLESS_MQTT_PASSWORD belong together"),
+        (["--listen", "nowhere.invalid", "--user", "ann"], "belong together"),
+        (["--certificate", "c.pem"], "--certificate and --key belong together"),
+        (["--certificate", "missing.pem", "--key", "missing.pem"], "nats-server does not start: .*missing.pem"),
+        (["--data", "/proc/nothing"], "--data is '/proc/nothing', which cannot be used"),
+    ],
+)
+def test_wrong_options_are_told_with_what_would_be_right(options, right, tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("SKYLESS_MQTT_PASSWORD", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    assert main(["broker", *options]) == 2
+    assert re.search(right, capsys.readouterr().err)
+
+
+def test_an_address_of_another_machine_is_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("SKYLESS_MQTT_PASSWORD", "word")
+    for listen in ("192.0.2.1", "nowhere.invalid"):
+        assert main(["broker", "--listen", listen, "--user", "ann", "--data", str(tmp_path)]) == 2
+        assert f"--listen is '{listen}'; it should be an address of this machine" in capsys.readouterr().err
