@@ -17,13 +17,19 @@ from hypothesis import strategies as st
 from live_site import PLACES, SITE, UNIX_S, messages, record
 
 from skyless.errors import SkylessError
+from skyless.outputs import messages as outputs
 from skyless.outputs.messages import FixMessage
 from skyless.recordings import mcap_file
-from skyless.recordings.mcap_channels import place_of
+from skyless.recordings.mcap_channels import place_of, schema_of
 from skyless.recordings.mcap_file import McapFile
 from skyless.recordings.mcap_foxglove import ellipse_of
 from skyless.recordings.mcap_recording import McapRecording
 
+PAYLOADS = (
+    *(outputs.SiteMessage, outputs.FixMessage, outputs.ReceptionsMessage, outputs.TruthMessage, outputs.ZonesMessage),
+    *(outputs.ZoneEvent, outputs.TagHealth, outputs.AnchorHealth, outputs.EtherHealth, outputs.StatusMessage),
+    outputs.RequestMessage,
+)
 SAID = messages(2.0, tuple(PLACES), publish_every=8)
 
 
@@ -47,7 +53,38 @@ def test_the_official_reader_reads_all_of_it(whole):
     }
     for schema in schemas.values():
         assert schema.encoding == "jsonschema"
-        assert json.loads(schema.data)["type"] == "object"
+        check_schema(json.loads(schema.data))
+
+
+def check_schema(schema):
+    """That Foxglove takes a schema: the rules of its open-source viewer (``packages/mcap-support``)."""
+    assert schema["type"] == "object"
+    for value in schema["properties"].values():
+        part = value["items"] if value["type"] == "array" else value
+        if part["type"] == "object":
+            check_schema(part)
+        else:
+            assert part["type"] in ("boolean", "string", "number", "integer")
+            assert part.get("contentEncoding") in (None, "base64")
+
+
+@pytest.mark.parametrize("payload", PAYLOADS, ids=lambda payload: payload.__name__)
+def test_viewers_take_the_schemas(payload):
+    name, data = schema_of(payload)
+    schema = json.loads(data)
+    check_schema(schema)
+    assert schema["title"] == name
+    told = set(schema["properties"])
+    assert told <= set(payload.__struct_fields__)
+    plain = {field.name for field in msgspec.structs.fields(payload) if field.type in (float, int, str, float | None)}
+    assert plain <= told
+
+
+def test_a_fixs_position_can_be_plotted():
+    properties = json.loads(schema_of(FixMessage)[1])["properties"]
+    for name in ("position_m", "covariance_m2", "velocity_mps"):
+        assert properties[name] == {"type": "array", "items": {"type": "number"}}
+    assert set(properties) == set(FixMessage.__struct_fields__)
 
 
 def fits(schema, value):

@@ -30,6 +30,8 @@ _OF_A_NODE: Final[dict[str, type[Struct]]] = {
     "status": messages.StatusMessage,
     "event": messages.ZoneEvent,
 }
+Schema = dict[str, Any]
+
 FLOOR_PLAN: Final = "floor_plan"
 """An image, which has no schema; it is kept as an attachment."""
 
@@ -67,11 +69,43 @@ def place_of(topic: str) -> Place | None:
 
 @lru_cache(maxsize=64)
 def schema_of(payload: type[Struct]) -> tuple[str, bytes]:
-    """Name and JSON schema of a payload; the outermost type is an object, as viewers of MCAP want it."""
-    name = payload.__name__.removesuffix("Message")
+    """Name and JSON schema of a payload, as far as viewers of MCAP understand one.
+
+    Foxglove takes objects, plain types and arrays of those, without references, alternatives or free keys; what cannot
+    be said so is left out, and what may be null stands as what it is otherwise.
+    """
+    name = f"skyless.{payload.__name__.removesuffix('Message')}"
     schema = msgspec.json.schema(payload)
-    root: dict[str, Any] = schema["$defs"].pop(payload.__name__)
-    return f"skyless.{name}", msgspec.json.encode({**root, "title": f"skyless.{name}", "$defs": schema["$defs"]})
+    root = _viewable(schema["$defs"][payload.__name__], schema["$defs"])
+    return name, msgspec.json.encode({**(root or {}), "title": name})
+
+
+def _viewable(schema: Schema, definitions: Schema) -> Schema | None:
+    """A schema without what viewers do not take; None if nothing is left."""
+    schema = _resolved(schema, definitions)
+    match schema.get("type"):
+        case "boolean" | "integer" | "number" as kind:
+            return {"type": kind}
+        case "string":
+            return {key: schema[key] for key in ("type", "contentEncoding") if key in schema}
+        case "object" if "properties" in schema:
+            parts = {name: _viewable(part, definitions) for name, part in schema["properties"].items()}
+            return {"type": "object", "properties": {name: part for name, part in parts.items() if part is not None}}
+        case "array":
+            items = [_viewable(part, definitions) for part in schema.get("prefixItems") or [schema["items"]]]
+            plain = items[0] is not None and items[0]["type"] != "array" and "contentEncoding" not in items[0]
+            return {"type": "array", "items": items[0]} if plain and all(one == items[0] for one in items) else None
+    return {"type": "string"} if "enum" in schema else None
+
+
+def _resolved(schema: Schema, definitions: Schema) -> Schema:
+    """What a reference means, and what may be null otherwise is; empty if that is more than one thing."""
+    if "$ref" in schema:
+        return _resolved(definitions[schema["$ref"].rpartition("/")[2]], definitions)
+    if "anyOf" in schema:
+        kinds = [kind for kind in schema["anyOf"] if kind.get("type") != "null"]
+        return _resolved(kinds[0], definitions) if len(kinds) == 1 else {}
+    return schema
 
 
 @lru_cache(maxsize=64)
