@@ -4,11 +4,13 @@ import asyncio
 
 import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, fix
+from hypothesis import given
+from hypothesis import strategies as st
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from skyless.dashboard.app import MOST_PAGES, Parts, make_app
-from skyless.dashboard.guard import Rules
+from skyless.dashboard.guard import Guard, Rules
 from skyless.dashboard.live import Live
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import Playback
@@ -231,3 +233,31 @@ def test_hello_tells_the_site(browser, live):
     live.site = SITE
     with browser.websocket_connect(SOCKET) as socket:
         assert socket.receive_json()["site"]["site"]["name"] == SITE.site.name
+
+
+HEADER = st.sampled_from(["host", "origin", "cookie", "authorization", "x-forwarded-host"])
+VALUE = st.binary(max_size=60) | st.sampled_from(
+    [b"192.168.1.5", b"localhost:8080", b"skyless=1", b"Bearer x", b"http://["]
+)
+
+
+@given(st.lists(st.tuples(HEADER, VALUE), max_size=6), st.binary(max_size=40), st.sampled_from(["http", "websocket"]))
+def test_whatever_strangers_send_without_the_token_they_stay_outside(headers, query, kind):
+    """No header or query raises, or gets anybody in."""
+    sent = []
+
+    async def inside(scope, receive, send):
+        raise AssertionError("somebody got in")
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {
+        "type": kind,
+        "path": "/",
+        "query_string": query,
+        "headers": [(b"host", b"192.168.1.5")] + [(name.encode(), value) for name, value in headers],
+    }
+    asyncio.run(Guard(inside, Rules(TOKEN, elsewhere=True))(scope, None, send))
+    assert sent[0].get("status", 403) in {401, 403, 421}
+    assert sent[0]["type"] in {"http.response.start", "websocket.close"}

@@ -80,7 +80,7 @@ def test_the_address_that_is_printed_is_one_that_others_can_open():
         (["--recordings", "/no/such/folder"], "--recordings is '/no/such/folder'; it should be a folder"),
         (["--site", "/no/such/site.toml"], "site.toml"),
         (["--listen", "nonsense:port"], "--listen is"),
-        (["--site-id", "70000"], "65535"),
+        (["--site-id", "70000"], "70000"),
     ],
 )
 def test_wrong_options_end_with_2_and_one_line(capsys, arguments, said):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, site_named
 from skyless.cli.output import print_json
 from skyless.errors import SkylessError
 
@@ -24,10 +25,10 @@ app = App(name="dashboard", help_epilogue="Example: skyless dashboard --mqtt mqt
 @app.default
 def dashboard(
     *,
-    mqtt: str = "mqtt://127.0.0.1:1883",
-    mqtt_ca: Path | None = None,
-    site: Path | None = None,
-    site_id: Annotated[int, Parameter(validator=Number(gte=0, lte=65535))] | None = None,
+    mqtt: Mqtt = DEFAULT_MQTT,
+    mqtt_ca: MqttCa = None,
+    site: str | None = None,
+    site_id: Annotated[int, Parameter(validator=Number(gte=0, lt=0xFFFE))] | None = None,
     listen: str | None = None,
     recordings: Path | None = None,
     token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_TOKEN")] = None,
@@ -45,7 +46,7 @@ def dashboard(
     mqtt_ca
         Certificates to trust instead of the system's, a PEM file.
     site
-        The site file; by default what the broker has retained.
+        The site file, or lab; by default what the broker has retained, which counts more than this.
     site_id
         Number of the site; by default the first that the broker knows.
     listen
@@ -98,15 +99,14 @@ def _name(port: int) -> str:
     return f"{re.sub(r'[^A-Za-z0-9_.-]', '-', socket.gethostname())}-{port}"
 
 
-def _load(file: Path) -> "tuple[SiteMessage, bytes | None]":
-    """The site of a file and the image of its floor. Raises SkylessError."""
+def _load(name: str) -> "tuple[SiteMessage, bytes | None]":
+    """The site and the image of its floor. Raises SkylessError."""
     import time
 
     from skyless.outputs.messages import SiteMessage
-    from skyless.site.load import load_site
 
-    site = load_site(file)
-    image = None if site.floor_plan is None else (file.parent / site.floor_plan.image).read_bytes()
+    site = site_named(name)
+    image = None if site.floor_plan is None else (Path(name).parent / site.floor_plan.image).read_bytes()
     return SiteMessage(site, simulated=False, unix_s=time.time()), image
 
 
@@ -135,12 +135,12 @@ def _rules(bound: str, host: str, port: int, token: str | None) -> "Rules":
 
     if token is not None and len(token) < _SHORTEST_TOKEN:
         raise SkylessError(f"--token has {len(token)} characters; it should have {_SHORTEST_TOKEN} or more")
-    elsewhere = not ipaddress.ip_address(bound.partition("%")[0]).is_loopback
-    if elsewhere and token is None:
-        token = secrets.token_urlsafe(18)
+    cookie = f"skyless-{port}"
+    if ipaddress.ip_address(bound.partition("%")[0]).is_loopback:
+        return Rules(token, cookie=cookie)
     own = socket.gethostname().lower()
     names = {host.lower(), own, own.partition(".")[0], f"{own.partition('.')[0]}.local", socket.getfqdn().lower()}
-    return Rules(token, frozenset(names) if elsewhere else frozenset(), elsewhere, f"skyless-{port}")
+    return Rules(token or secrets.token_urlsafe(18), frozenset(names), elsewhere=True, cookie=cookie)
 
 
 def _address(host: str, port: int, rules: "Rules") -> str:

@@ -84,16 +84,15 @@ class _Watched:
         self.zone = zone
         self.polygon: Polygon = zone.polygon_m
         xs, ys = zip(*zone.polygon_m, strict=True)
-        self.box = min(xs), min(ys), max(xs), max(ys)
+        self.box: tuple[float, float, float, float] = (min(xs), min(ys), max(xs), max(ys))
         # A zone smaller than the error could never be entered by three sigma; half of a disc's radius always can.
         self.most_margin_m = area_m2(self.polygon) / perimeter_m(self.polygon)
 
-    def depth_m(self, x_m: float, y_m: float, enough_m: float) -> float:
-        """As ``polygon.depth_m``; of points farther out than ``enough_m`` only that."""
+    def may_hold(self, position_m: Vector) -> bool:
+        """Whether a position lies in the box around the zone; quick, as most do not."""
         x1, y1, x2, y2 = self.box
-        if max(x1 - x_m, x_m - x2, y1 - y_m, y_m - y2) > enough_m:
-            return -math.inf
-        return depth_m((x_m, y_m), self.polygon)
+        x, y, _ = position_m
+        return x1 < x < x2 and y1 < y < y2
 
 
 class _Seen:
@@ -133,11 +132,13 @@ class ZoneWatch:
         seen = self._tags.setdefault(fix.tag, _Seen())
         seen.heard_s, seen.position_m = now_s, fix.position_m
         margin_m = max(LEAST_MARGIN_M, SIGMAS * _worst_std_m(fix))
-        return [
-            _event(watched.zone, fix.tag, seen, fix.unix_s, entered=zone_id in seen.inside)
-            for zone_id, watched in self._watched.items()
-            if _crossed(seen, zone_id, watched, fix, margin_m)
-        ]
+        events = []
+        for zone_id, watched in self._watched.items():
+            if zone_id not in seen.inside and not watched.may_hold(fix.position_m):
+                seen.beyond_since_s.pop(zone_id, None)
+            elif _crossed(seen, zone_id, watched, fix, margin_m):
+                events.append(_event(watched.zone, fix.tag, seen, fix.unix_s, entered=zone_id in seen.inside))
+        return events
 
     def silent(self, now_s: float, unix_s: float) -> list[ZoneEvent]:
         """Let tags leave that have given no fix for ``SILENCE_S``."""
@@ -161,7 +162,7 @@ def _crossed(seen: _Seen, zone_id: str, watched: _Watched, fix: FixMessage, marg
     """Whether the tag has changed sides; if so, ``seen.inside`` says the new one."""
     margin_m = min(margin_m, watched.most_margin_m)
     was_inside = zone_id in seen.inside
-    depth = watched.depth_m(fix.position_m[0], fix.position_m[1], margin_m)
+    depth = depth_m(fix.position_m[:2], watched.polygon)
     beyond_m = -depth if was_inside else depth
     if beyond_m < 0.5 * margin_m:
         seen.beyond_since_s.pop(zone_id, None)
