@@ -112,10 +112,12 @@ class McapFile:
 
     def sync(self) -> None:
         """See that what was flushed stands on the disk; takes as long as the disk does."""
-        if self._handle >= 0:
-            try:
-                os.fsync(self._handle)
-            except OSError as error:
+        handle = self._handle
+        try:
+            if handle >= 0:
+                os.fsync(handle)
+        except OSError as error:
+            if handle == self._handle:  # else it was closed in the meantime, by another thread
                 self._fail(error)
 
     def close(self) -> None:
