@@ -27,8 +27,8 @@ class TagSettings(Struct, frozen=True):
 
 
 FixListener = Callable[[FixMessage], None]
-_EARLY: Final = 0.1
-"""A fix may be published by this share of the interval early, so that the rate is kept on average."""
+_MADE_UP: Final = 0.5
+"""A fix that is published late by up to this share of the interval does not lower the average rate."""
 
 
 class TagNode:
@@ -95,7 +95,7 @@ class TagNode:
             self.first_fix_s = done_s - self.started_s
         if ended_s >= self._due_s:
             interval_s = 1.0 / self.settings.publish_hz
-            self._due_s = max(self._due_s, ended_s - interval_s) + interval_s * (1.0 - _EARLY)
+            self._due_s = max(self._due_s, ended_s - _MADE_UP * interval_s) + interval_s
             self._publish(self._message(fix, ended_s, done_s))
 
     def _message(self, fix: Fix, ended_s: float, done_s: float) -> FixMessage:
