@@ -82,6 +82,7 @@ class Link:
         self._told_dropped = 0
         self._away_since_s = time.monotonic()
         self._told: tuple[str, float] = ("", 0.0)
+        self._told_fault = False
         self._stopping = False
         self.subscribe(self._status_topic, self._correct_status)
 
@@ -98,7 +99,9 @@ class Link:
     def publish(self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False) -> None:
         """Hand over a message; returns at once, whatever the broker does. A struct becomes JSON."""
         payload = message if isinstance(message, bytes) else _encode(message)
-        self._outbox.put(topic, payload, qos, retain=retain)
+        fault = self._outbox.put(topic, payload, qos, retain=retain)
+        if fault is not None:
+            self._tell_once(fault)
         self._pump()
 
     def forget(self, topic: str) -> None:
@@ -263,6 +266,11 @@ class Link:
         if trouble != self._told[0] or now_s > self._told[1] + _SAME_TROUBLE_S:
             self._told = (trouble, now_s)
             _log.warning("%s", trouble)
+
+    def _tell_once(self, fault: str) -> None:
+        if not self._told_fault:
+            self._told_fault = True
+            _log.warning("not published: %s", fault)
 
     def _tell_return(self) -> None:
         dropped = self._outbox.dropped - self._told_dropped

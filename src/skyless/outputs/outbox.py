@@ -63,12 +63,14 @@ class Outbox:
         self.sent = 0
         """Messages of QoS 0 given to the connection, and messages of QoS 1 acknowledged."""
 
-    def put(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> None:
-        """Add a message; one that no broker would take is dropped."""
-        message = Waiting(topic, payload, qos, retain)
-        if len(payload) > self._limits.payload or not _TOPIC.fullmatch(topic):
+    def put(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> str | None:
+        """Add a message; why not, where no broker would take it."""
+        fault = self._fault(topic, payload)
+        if fault is not None:
             self.dropped += 1
-        elif retain:
+            return fault
+        message = Waiting(topic, payload, qos, retain)
+        if retain:
             self._keep(message)
         elif qos:
             self._queue.append(message)
@@ -76,6 +78,7 @@ class Outbox:
             self._shorten_queue()
         else:
             self._replace(message)
+        return None
 
     def take(self) -> bytes | None:
         """The next packet to send; None when nothing is left, or the window is full."""
@@ -124,6 +127,13 @@ class Outbox:
     def waiting_bytes(self) -> int:
         """Payload of everything in here."""
         return self._newest_bytes + self._queue_bytes + self._kept_bytes
+
+    def _fault(self, topic: str, payload: bytes) -> str | None:
+        if not _TOPIC.fullmatch(topic):
+            return f"the topic {topic!r} is not one that every broker takes"
+        if len(payload) > self._limits.payload:
+            return f"the message for {topic} has {len(payload)} bytes; {self._limits.payload} are the most"
+        return None
 
     def _send(self, message: Waiting) -> bytes:
         if not message.qos:
