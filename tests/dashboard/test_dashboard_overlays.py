@@ -92,3 +92,15 @@ def test_a_site_with_too_few_anchors_says_so():
     site = replace(LAB, anchors=LAB.anchors[:3], tags=TagsSite())
     with pytest.raises(NoOverlayError, match="4 anchors or more"):
         get(Overlays(), site, None, [], "pdop", 1.0)
+
+
+def test_nothing_is_computed_after_the_end():
+    async def ask():
+        overlays = Overlays()
+        began = asyncio.create_task(overlays.get(LAB, None, [], "pdop", 0.05))
+        await asyncio.sleep(0.2)
+        overlays.stop()
+        waited = asyncio.create_task(overlays.get(LAB, None, [], "pdop", 0.1))
+        return await asyncio.gather(began, waited, return_exceptions=True)
+
+    assert all(isinstance(answer, NoOverlayError) for answer in asyncio.run(ask()))

@@ -120,6 +120,13 @@ def test_nothing_outside_the_folder_is_read(folder, name):
     assert [found.name for found in Playback(folder).recordings()] == ["first.mcap"]
 
 
+def test_reading_ends_when_the_server_does(folder):
+    playback = Playback(folder)
+    playback.stop()
+    assert playback.recordings() == []
+    assert playback.states("first.mcap", 0.0, 10.0, 20.0) == []
+
+
 def test_a_recording_replaced_by_another_is_read_anew(folder):
     playback = Playback(folder)
     playback.summary("first.mcap")

@@ -6,12 +6,13 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Final
 
 import msgspec
 from msgspec import Struct
 
 import skyless
+from skyless.dashboard.incoming import Bus, WrongMessageError, expect_name, read_message
 from skyless.dashboard.mailbox import Mailbox
 from skyless.dashboard.state import Board, encode
 from skyless.dashboard.zone_events import EventDesk, place_in_line
@@ -36,25 +37,7 @@ TICK_S: Final = 0.05
 HEALTH_S: Final = 1.0
 
 _HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
-_T = TypeVar("_T")
 _log = logging.getLogger("skyless.dashboard")
-
-
-class Bus(Protocol):
-    """What is needed of ``skyless.outputs.link.Link``."""
-
-    def publish(self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False) -> None:
-        """Hand over a message; returns at once."""
-
-    def subscribe(self, topic_filter: str, handler: Callable[[str, bytes], None], qos: int = 0) -> None:
-        """Call ``handler`` with topic and payload of every message."""
-
-    def forget(self, topic: str) -> None:
-        """Stop repeating a retained message."""
-
-
-class WrongMessageError(ValueError):
-    """A message that is not what its topic says."""
 
 
 class Live:
@@ -125,7 +108,7 @@ class Live:
         return handle
 
     def _take_site(self, _topic: str, payload: bytes) -> None:
-        message = _read(payload, SiteMessage)
+        message = read_message(payload, SiteMessage)
         check_site(message.site, Path("the site on MQTT"))
         if message.site.id != self._site_id:
             raise WrongMessageError(f"it is of site {message.site.id}")
@@ -136,8 +119,8 @@ class Live:
         self.floor_plan = payload or None
 
     def _take_fix(self, topic: str, payload: bytes) -> None:
-        fix = _read(payload, FixMessage)
-        _expect(fix.tag, topic)
+        fix = read_message(payload, FixMessage)
+        expect_name(fix.tag, topic)
         now_s = self._clock()
         self.board.fix(fix, now_s)
         self._hold(self.watch.observe(fix, now_s))
@@ -145,8 +128,8 @@ class Live:
     def _take_status(self, topic: str, payload: bytes) -> None:
         if not payload:
             return  # somebody has cleared a retained status
-        status = _read(payload, StatusMessage)
-        _expect(status.name, topic)
+        status = read_message(payload, StatusMessage)
+        expect_name(status.name, topic)
         self.board.status(status)
         if status.kind == "tag" and not status.online:
             self._hold(self.watch.gone(status.name, self._wall_clock()))
@@ -154,10 +137,10 @@ class Live:
     def _take_health(self, topic: str, payload: bytes) -> None:
         _, kind, name, _ = topic.rsplit("/", 3)
         if kind in _HEALTHS:
-            self.board.health(name, _read(payload, _HEALTHS[kind]), self._clock())  # type: ignore[arg-type]
+            self.board.health(name, read_message(payload, _HEALTHS[kind]), self._clock())  # type: ignore[arg-type]
 
     def _take_truth(self, _topic: str, payload: bytes) -> None:
-        self.board.truth(_read(payload, TruthMessage))
+        self.board.truth(read_message(payload, TruthMessage))
 
     def _take_zones(self, topic: str, payload: bytes) -> None:
         zones = read_zones(payload) if payload else ()
@@ -170,8 +153,8 @@ class Live:
         self._set_zones(zones)
 
     def _take_zone_event(self, topic: str, payload: bytes) -> None:
-        event = _read(payload, ZoneEvent)
-        _expect(event.zone, topic)
+        event = read_message(payload, ZoneEvent)
+        expect_name(event.zone, topic)
         if self.desk.heard(event):
             self._tell_event(event)
 
@@ -265,17 +248,3 @@ class Live:
         message = encode("zone_event", msgspec.structs.asdict(event))
         for page in self.pages:
             page.event(message)
-
-
-def _read(payload: bytes, kind: type[_T]) -> _T:
-    """Raises WrongMessageError."""
-    try:
-        return msgspec.json.decode(payload, type=kind)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise WrongMessageError(str(error)) from None
-
-
-def _expect(name: str, topic: str) -> None:
-    """See that a message is of whom its topic says. Raises WrongMessageError."""
-    if name != topic.rsplit("/", 2)[-2]:
-        raise WrongMessageError(f"it is of {name[:40]!r}")

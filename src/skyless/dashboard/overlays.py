@@ -60,6 +60,14 @@ class Overlays:
     def __init__(self) -> None:
         self._kept: OrderedDict[bytes, OverlayGrids] = OrderedDict()
         self._one = asyncio.Lock()
+        self._process: asyncio.subprocess.Process | None = None
+        self._stopped = False
+
+    def stop(self) -> None:
+        """End what is being computed, for good."""
+        self._stopped = True
+        if self._process is not None and self._process.returncode is None:
+            self._process.kill()
 
     async def get(
         self, site: Site, floor_plan: bytes | None, methods: list[str], kind: Kind, step_m: float
@@ -70,7 +78,7 @@ class Overlays:
         async with self._one:
             grids = self._kept.get(key)
             if grids is None:
-                grids = await _compute(key)
+                grids = await self._compute(key)
                 self._kept[key] = grids
                 while len(self._kept) > _KEPT:
                     self._kept.popitem(last=False)
@@ -78,6 +86,27 @@ class Overlays:
         if grids.error is not None:
             raise NoOverlayError(grids.error)
         return _answer(task, kind, grids)
+
+    async def _compute(self, task: bytes) -> OverlayGrids:
+        if self._stopped:
+            raise NoOverlayError("the dashboard is stopping")
+        self._process = process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "skyless.dashboard.overlay_process"),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for the dashboard, which kills this one itself
+        )
+        try:
+            async with asyncio.timeout(_LONGEST_S):
+                output, _ = await process.communicate(task)
+            return msgspec.json.decode(output, type=OverlayGrids)
+        except TimeoutError:
+            raise NoOverlayError("this overlay takes too long to compute") from None
+        except msgspec.MsgspecError:
+            raise NoOverlayError("this overlay could not be computed; the dashboard's terminal says why") from None
+        finally:
+            if process.returncode is None:
+                process.kill()
 
 
 def overlay_task(site: Site, floor_plan: bytes | None, method: str, step_m: float) -> OverlayTask:
@@ -103,26 +132,6 @@ def _box(site: Site, floor_plan: bytes | None) -> Box:
 
 def _commonest(methods: list[str]) -> str:
     return Counter(methods).most_common(1)[0][0] if methods else DEFAULT_METHOD
-
-
-async def _compute(task: bytes) -> OverlayGrids:
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "skyless.dashboard.overlay_process"),
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C is for the dashboard, which kills this one itself
-    )
-    try:
-        async with asyncio.timeout(_LONGEST_S):
-            output, _ = await process.communicate(task)
-        return msgspec.json.decode(output, type=OverlayGrids)
-    except TimeoutError:
-        raise NoOverlayError("this overlay takes too long to compute") from None
-    except msgspec.MsgspecError:
-        raise NoOverlayError("this overlay could not be computed; the dashboard's terminal says why") from None
-    finally:
-        if process.returncode is None:
-            process.kill()
 
 
 def _answer(task: OverlayTask, kind: Kind, grids: OverlayGrids) -> dict[str, Any]:

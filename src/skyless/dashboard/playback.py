@@ -53,8 +53,13 @@ class Playback:
         """None: there are none."""
         self._folder = folder
         self._lock = threading.Lock()
+        self._stopped = threading.Event()
         self._open: OrderedDict[tuple[str, int], McapRecording] = OrderedDict()
         self._listed: dict[str, tuple[tuple[int, int, int], Listed]] = {}
+
+    def stop(self) -> None:
+        """Let threads that read end soon; what they return then is worth nothing."""
+        self._stopped.set()
 
     def recordings(self) -> list[Listed]:
         """All that can be read, the newest first."""
@@ -63,6 +68,8 @@ class Playback:
         with self._lock:
             known, self._listed = self._listed, {}
             for file in self._folder.glob(f"*{SUFFIX}"):
+                if self._stopped.is_set():
+                    break
                 try:
                     self._list(file, known)
                 except (NoRecordingError, OSError) as error:
@@ -93,7 +100,7 @@ class Playback:
         start_s = self.summary(name).start_unix_s
         with self._lock:
             recording = self._recording(name)
-            return _states(recording, start_s + begin_s, start_s + end_s, 1.0 / rate_hz)
+            return _states(recording, start_s + begin_s, start_s + end_s, 1.0 / rate_hz, self._stopped)
 
     def _list(self, file: Path, known: dict[str, tuple[tuple[int, int, int], Listed]]) -> None:
         """Take a file into the list; it is read only if it has changed since."""
@@ -133,12 +140,16 @@ class Playback:
         raise NoRecordingError(f"there is no recording {name[:100]!r}")
 
 
-def _states(recording: McapRecording, begin_s: float, end_s: float, step_s: float) -> list[bytes]:
+def _states(
+    recording: McapRecording, begin_s: float, end_s: float, step_s: float, stopped: threading.Event
+) -> list[bytes]:
     """What a board would have told every ``step_s``. Unix times."""
     board = Board()
     states: list[bytes] = []
     seen, due_s = 0, begin_s + step_s
     for found in recording.messages({"fix", "truth"}, begin_s - TRUTH_REACH_S, end_s):
+        if stopped.is_set():
+            break
         if found.time_s >= due_s:
             seen = _tell(board, seen, due_s, states)
             due_s += step_s * (1 + math.floor((found.time_s - due_s) / step_s))

@@ -120,6 +120,8 @@ def _stop(server: "_Server", parts: Parts) -> None:
     if not server.should_exit:
         server.should_exit = True
         parts.live.close()
+        parts.playback.stop()
+        parts.overlays.stop()
         asyncio.get_running_loop().call_later(_GRACE_S, server.drop_connections)
 
 
