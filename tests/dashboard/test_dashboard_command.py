@@ -1,6 +1,8 @@
 """``skyless dashboard`` before it serves: its options and its port."""
 
 import socket
+import subprocess
+import sys
 
 import pytest
 
@@ -94,3 +96,11 @@ def test_the_site_file_and_the_number_must_agree(capsys, tmp_path):
     assert main(["site", "new", str(tmp_path / "site.toml")]) == 0
     assert main(["dashboard", "--site", str(tmp_path / "site.toml"), "--site-id", "4711"]) == 2
     assert "give one of them" in capsys.readouterr().err
+
+
+def test_the_server_loads_nothing_heavy():
+    """Overlays have a process of their own; NumPy and Numba in this one would cost its start a second and 150 MB."""
+    look = "import skyless.dashboard.serve, skyless.dashboard.playback, sys; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout.split()
+    assert "skyless.dashboard.app" in loaded
+    assert not {"numpy", "numba", "scipy", "matplotlib"} & set(loaded)
