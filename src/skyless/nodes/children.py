@@ -21,6 +21,10 @@ _SOUND_S: Final = 10.0
 
 _STOP_S: Final = 5.0
 _LINES: Final = 20
+_LINE_BYTES: Final = 500
+
+
+_COMMAND: Final = (sys.executable, "-m", "skyless.cli.main")
 
 
 class Program(Struct, frozen=True):
@@ -40,6 +44,7 @@ class Child:
         """Of its present life."""
         self._say = say
         self._last_words: deque[str] = deque(maxlen=_LINES)
+        self._line = b""
 
     async def run(self) -> None:
         """Keep it alive until cancelled."""
@@ -56,26 +61,52 @@ class Child:
     async def _one_life(self) -> int:
         self.starts += 1
         self._last_words.clear()
-        process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            "skyless.cli.main",
-            *self.program.arguments,
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.DEVNULL,
-            stderr=asyncio.subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C in a terminal is for the one that started it
-            env={**os.environ, CHILD_VARIABLE: str(os.getpid())},
-        )
-        self.pid = process.pid
+        self._line = b""
+        ours, theirs = (
+            os.pipe()
+        )  # of asyncio's own pipes a program's death is only seen when its children close them too
+        os.set_blocking(ours, False)
+        loop = asyncio.get_running_loop()
+        loop.add_reader(ours, self._listen, ours)
         try:
-            assert process.stderr is not None
-            async for line in process.stderr:
-                self._last_words.append(line.decode(errors="replace").rstrip())
-            return await process.wait()
+            process = await self._start(theirs)
+            self.pid = process.pid
+            try:
+                code = await process.wait()
+                self._listen(ours)
+                return code
+            finally:
+                self.pid = None
+                await end(process)
         finally:
-            self.pid = None
-            await end(process)
+            loop.remove_reader(ours)
+            os.close(ours)
+
+    async def _start(self, words: int) -> asyncio.subprocess.Process:
+        """Start the program; standard error goes to a pipe, whose end on this side is closed."""
+        try:
+            return await asyncio.create_subprocess_exec(
+                *_COMMAND,
+                *self.program.arguments,
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.DEVNULL,
+                stderr=words,
+                start_new_session=True,  # Ctrl-C in a terminal is for the one that started it
+                env={**os.environ, CHILD_VARIABLE: str(os.getpid())},
+            )
+        finally:
+            os.close(words)
+
+    def _listen(self, pipe: int) -> None:
+        """Keep the last lines; of a very long one, its end."""
+        with contextlib.suppress(BlockingIOError):
+            while piece := os.read(pipe, _LINE_BYTES):
+                *lines, self._line = (self._line + piece).split(b"\n")
+                self._line = self._line[-_LINE_BYTES:]
+                self._last_words.extend(line.decode(errors="replace").rstrip() for line in lines)
+            asyncio.get_running_loop().remove_reader(pipe)
+            if self._line:
+                self._last_words.append(self._line.decode(errors="replace").rstrip())
 
 
 async def end(process: asyncio.subprocess.Process) -> None:

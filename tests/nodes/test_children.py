@@ -1,0 +1,145 @@
+"""Programs that a program starts: what becomes of them when they die, will not die, or never live."""
+
+import asyncio
+import os
+import re
+import signal
+import socket
+import sys
+
+import pytest
+from mqtt_brokers import free_port, until
+
+from skyless.nodes import children
+from skyless.nodes.children import Child, Program, end, free_ports
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+async def stop(task):
+    task.cancel()
+    await asyncio.wait([task])
+
+
+def test_a_program_that_is_killed_is_started_again_and_said_so():
+    async def main():
+        said = []
+        child = Child(Program("air", ("ether", "--mqtt", "none", "--listen", f"127.0.0.1:{free_port()}")), said.append)
+        task = asyncio.ensure_future(child.run())
+        await until(lambda: child.pid is not None)
+        first = child.pid
+        os.kill(first, signal.SIGKILL)
+        await until(lambda: child.pid is not None and child.pid != first)
+        second = child.pid
+        assert child.starts == 2
+        assert said == ["air ended (signal 9): it said nothing; started again"]
+        assert not alive(first)
+        assert alive(second)
+        await stop(task)
+        assert not alive(second)
+        assert child.pid is None
+
+    asyncio.run(main())
+
+
+def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last_words_are_told(monkeypatch):
+    waits = []
+
+    async def main():
+        said = []
+        child = Child(Program("air", ("ether", "--site", "/nowhere.toml")), said.append)
+        sleep = asyncio.sleep
+
+        async def note(seconds):
+            waits.append(seconds)
+            await sleep(0)
+
+        monkeypatch.setattr(children.asyncio, "sleep", note)
+        task = asyncio.ensure_future(child.run())
+        for _ in range(3000):
+            if len(waits) >= 3:
+                break
+            await sleep(0.01)
+        await stop(task)
+        assert all(
+            re.fullmatch(r"air ended \(exit code 2\): skyless: .*/nowhere.toml.*; started again", s) for s in said
+        )
+
+    asyncio.run(main())
+    assert waits[:3] == sorted(set(waits[:3]))
+    assert waits[0] >= 0.2
+
+
+def test_a_program_whose_own_child_holds_its_words_is_still_seen_to_die(monkeypatch):
+    """A grandchild keeps the pipe of standard error open; the program's death must not go unnoticed."""
+
+    async def main():
+        said = []
+        command = "import subprocess, sys; subprocess.Popen(['sleep', '30']); print('gone', file=sys.stderr)"
+        monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", command))
+        child = Child(Program("page", ()), said.append)
+        task = asyncio.ensure_future(child.run())
+        await until(lambda: said, 10)
+        assert said[0] == "page ended (exit code 0): gone; started again"
+        await stop(task)
+
+    asyncio.run(main())
+
+
+def test_a_program_that_will_not_end_is_made_to(monkeypatch):
+    monkeypatch.setattr(children, "_STOP_S", 0.2)
+
+    async def main():
+        process = await asyncio.create_subprocess_exec(
+            "sh", "-c", "trap '' TERM; echo ready; while :; do sleep 1; done", stdout=asyncio.subprocess.PIPE
+        )
+        await process.stdout.readline()
+        await end(process)
+        assert process.returncode == -signal.SIGKILL
+        await end(process)  # once more does nothing
+
+    asyncio.run(main())
+
+
+def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypatch):
+    async def main():
+        said = []
+        command = "import sys; sys.stderr.write('x' * 1_000_000)"
+        monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", command))
+        child = Child(Program("page", ()), said.append)
+        task = asyncio.ensure_future(child.run())
+        await until(lambda: said or task.done(), 10)
+        assert said
+        assert 500 < len(said[0]) < 1100
+        await stop(task)
+
+    asyncio.run(main())
+
+
+def test_a_port_that_is_taken_is_passed_over():
+    with socket.socket() as one, socket.socket() as two:
+        one.bind(("127.0.0.1", 0))
+        port = one.getsockname()[1]
+        one.listen()
+        assert free_ports("127.0.0.1", (port,))[0] > port
+        first, second = free_ports("127.0.0.1", (port, port))
+        assert len({port, first, second}) == 3
+        two.bind(("127.0.0.1", first))
+        two.listen()
+        assert free_ports("127.0.0.1", (port,))[0] > first
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1"])
+def test_a_port_that_was_just_left_is_free(host):
+    with socket.create_server((host, 0)) as server:
+        port = server.getsockname()[1]
+        with socket.create_connection((host, port)):
+            served, _ = server.accept()
+            served.close()  # the server's side closes first and waits in TIME_WAIT
+    assert free_ports(host, (port,)) == (port,)
