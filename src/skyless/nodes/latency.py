@@ -42,12 +42,14 @@ class PhaseBook:
     def hear(self, frame: bytes, ended_s: float, done_s: float, *, made_fix: bool) -> None:
         """Note one frame: when it ended, and when its processing did, by the host's monotonic clock."""
         beacon = decode_cached(frame)
-        if isinstance(beacon, Malformed) or len(self._present) >= _MOST_PHASES:
+        if isinstance(beacon, Malformed):
             return
         if beacon.superframe != self._superframe:
             self.last = tuple(self._present)
             self._present.clear()
             self._superframe, self._begin_s = beacon.superframe, ended_s
+        if len(self._present) >= _MOST_PHASES:
+            return
         begin_s = self._begin_s
         self._present.append(
             Phase(beacon.superframe, beacon.slot, beacon.anchor, ended_s - begin_s, done_s - begin_s, made_fix)

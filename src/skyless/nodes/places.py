@@ -12,6 +12,8 @@ def data_folder() -> Path:
     home = Path(shared) if shared and Path(shared).is_absolute() else Path("~/.local/share").expanduser()
     folder = home / "skyless"
     try:
+        if home == Path("/.local/share"):
+            raise PermissionError("HOME is empty")
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         folder = Path(tempfile.gettempdir()) / f"skyless-{os.getuid()}"

@@ -1,0 +1,233 @@
+"""The small parts that the programs of a site share."""
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from node_stage import receptions
+
+from skyless.air.codec import decode
+from skyless.nodes.latency import Latencies, PhaseBook
+from skyless.nodes.loop import CHILD_VARIABLE
+from skyless.nodes.places import data_folder, new_recording, recordings_folder
+from skyless.nodes.running import every, together
+from skyless.nodes.usage import Usage, resident_bytes
+
+# Latencies and phases
+
+
+@given(st.lists(st.floats(0.0, 10.0), max_size=300))
+def test_latencies_are_told_once_by_their_order(values):
+    latencies = Latencies()
+    for value in values:
+        latencies.add(value)
+    median_s, late_s, number = latencies.take()
+    assert number == len(values)
+    if values:
+        assert (
+            sum(value < median_s for value in values) <= len(values) / 2 <= sum(value <= median_s for value in values)
+        )
+        assert sum(value > late_s for value in values) <= len(values) / 100
+        assert late_s in values
+    else:
+        assert (median_s, late_s) == (None, None)
+    assert latencies.take() == (None, None, 0)
+
+
+def test_latencies_keep_the_newest_of_many():
+    latencies = Latencies()
+    for value in range(10_000):
+        latencies.add(float(value))
+    median_s, late_s, number = latencies.take()
+    assert number == 4096
+    assert median_s == pytest.approx(10_000 - 2048, abs=2)
+    assert late_s == pytest.approx(10_000 - 41, abs=2)
+
+
+def test_the_book_of_phases_shows_the_last_whole_superframe():
+    book = PhaseBook()
+    heard = receptions(0.2)
+    for number, reception in enumerate(heard):
+        book.hear(reception.frame, reception.host_s, reception.host_s + 1e-4, made_fix=number % 2 == 0)
+        book.hear(b"rubbish", reception.host_s, reception.host_s, made_fix=False)
+    superframes = [decode(reception.frame).superframe for reception in heard]
+    last = sorted(set(superframes))[-2]
+    inside = [reception for reception, superframe in zip(heard, superframes, strict=True) if superframe == last]
+    assert [(phase.superframe, phase.slot) for phase in book.last] == [
+        (last, decode(reception.frame).slot) for reception in inside
+    ]
+    for phase, reception in zip(book.last, inside, strict=True):
+        assert phase.heard_s == pytest.approx(reception.host_s - inside[0].host_s)
+        assert phase.done_s == pytest.approx(phase.heard_s + 1e-4)
+    assert {phase.fix for phase in book.last} == {True, False}
+
+
+def test_the_book_does_not_grow_while_one_superframe_goes_on_for_ever():
+    book = PhaseBook()
+    first, *_ = receptions(0.1)
+    for _ in range(1000):
+        book.hear(first.frame, 0.0, 0.0, made_fix=False)
+    other = next(r for r in receptions(0.2) if decode(r.frame).superframe != decode(first.frame).superframe)
+    book.hear(other.frame, 1.0, 1.0, made_fix=False)
+    assert len(book.last) == 64
+
+
+# Usage
+
+
+def test_a_busy_process_uses_a_core_and_a_sleeping_one_none():
+    usage = Usage()
+    time.sleep(0.3)
+    asleep, _ = usage.take()
+    until_s = time.process_time() + 0.3
+    begin_s = time.monotonic()
+    while time.process_time() < until_s:
+        pass
+    wall_s = time.monotonic() - begin_s
+    busy, memory_bytes = usage.take()
+    assert asleep < 0.2
+    assert busy == pytest.approx(0.3 / wall_s, rel=0.1)
+    assert memory_bytes == pytest.approx(resident_bytes(), rel=0.05)
+
+
+def test_memory_that_is_taken_shows():
+    before = resident_bytes()
+    block = b"x" * 50_000_000
+    assert resident_bytes() - before == pytest.approx(len(block), rel=0.1)
+
+
+# Places
+
+
+def test_recordings_stand_in_the_user_s_data_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    assert recordings_folder() == tmp_path / "data" / "skyless" / "recordings"
+    assert recordings_folder().is_dir()
+    monkeypatch.setenv("XDG_DATA_HOME", "not/absolute")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert data_folder() == tmp_path / "home" / ".local" / "share" / "skyless"
+    name = new_recording(tmp_path, "demo")
+    assert name.parent == tmp_path
+    assert name.name.startswith("demo-")
+    assert name.suffix == ".mcap"
+
+
+@pytest.mark.parametrize("home", ["", "/proc/nowhere", "file"])
+def test_a_home_that_cannot_be_written_is_replaced_by_a_temporary_folder(tmp_path, monkeypatch, home):
+    (tmp_path / "file").write_text("no folder", encoding="ascii")
+    monkeypatch.delenv("XDG_DATA_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path / home) if home == "file" else home)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.chdir(tmp_path)
+    folder = recordings_folder()
+    assert folder.is_relative_to(tmp_path)
+    assert folder.is_dir()
+    (folder / "x").write_bytes(b"x")
+
+
+# Running together
+
+
+def test_parts_stand_and_fall_together():
+    async def main():
+        ended = []
+
+        async def lasting(name):
+            try:
+                await asyncio.Event().wait()
+            finally:
+                ended.append(name)
+
+        async def failing():
+            await asyncio.sleep(0.01)
+            raise ValueError("broken")
+
+        with pytest.raises(ValueError, match="broken"):
+            await together(lasting("a"), failing(), lasting("b"))
+        assert sorted(ended) == ["a", "b"]
+        task = asyncio.ensure_future(together(lasting("c")))
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        task.cancel()
+        await asyncio.wait([task])
+        assert task.cancelled()
+        assert ended[2:] == ["c"]
+
+    asyncio.run(main())
+
+
+def test_something_is_done_again_and_again():
+    async def main():
+        done = []
+        task = asyncio.ensure_future(every(0.01, lambda: done.append(1)))
+        while len(done) < 3:
+            await asyncio.sleep(0.001)
+        task.cancel()
+        await asyncio.wait([task])
+
+    asyncio.run(main())
+
+
+# The loop of a program
+
+PROGRAM = """
+import asyncio, sys
+from skyless.nodes.loop import run
+async def main():
+    try:
+        print("running", flush=True)
+        await asyncio.sleep(60)
+    finally:
+        print("cleaned up", flush=True)
+try:
+    run(main())
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+
+
+def start(program, **environment):
+    return subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **environment},
+    )
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_program_ends_cleanly_when_it_is_asked_to(number, code):
+    with start(PROGRAM) as process:
+        assert process.stdout.readline() == "running\n"
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+    assert (process.returncode, out, err) == (code, "cleaned up\n", "")
+
+
+def test_a_program_ends_with_the_one_that_started_it_however_that_ends():
+    parent = f"""
+import os, subprocess, sys, time
+os.environ[{CHILD_VARIABLE!r}] = str(os.getpid())
+child = subprocess.Popen([sys.executable, "-c", {PROGRAM!r}])
+time.sleep(60)
+"""
+    with start(parent) as process:
+        assert process.stdout.readline() == "running\n"
+        process.kill()
+        assert process.stdout.read() == "cleaned up\n"  # the pipe ends with the last process that holds it
+
+
+def test_a_program_whose_parent_has_gone_already_does_not_begin():
+    with start(PROGRAM, **{CHILD_VARIABLE: "1"}) as process:
+        out, err = process.communicate(timeout=20)
+    assert out == ""
+    assert "has gone" in err
+    assert process.returncode == 1
