@@ -41,8 +41,7 @@ def demo(
     method: str = "tracker",
     mqtt: Annotated[str | None, Parameter(env_var="SKYLESS_MQTT")] = None,
     mqtt_ca: MqttCa = None,
-    record: Path | None = None,
-    no_record: bool = False,
+    record: str | None = None,
     json: bool = False,
 ) -> None:
     """Run a site with walking tags in real time; Ctrl-C stops.
@@ -71,23 +70,19 @@ def demo(
     mqtt_ca
         Certificates (PEM) to trust for mqtts.
     record
-        File for the recording, .mcap; by default one in the folder that the page shows.
-    no_record
-        Record nothing.
+        File for the recording, .mcap, or none; by default one in the folder that the page shows.
     json
         Write one JSON object at the end instead of the tables.
     """
     from skyless.cli.demo_screen import Screen
     from skyless.experiments.warm import compile_kernels
     from skyless.nodes.loop import run
-    from skyless.nodes.places import new_recording, recordings_folder
+    from skyless.nodes.places import recordings_folder
     from skyless.nodes.whole_site import SiteRun, WholeSite
     from skyless.receiver import METHODS
 
     if method not in METHODS:
         raise SkylessError(f"--method is {method!r}; it should be one of {', '.join(METHODS)}")
-    if record is not None and no_record:
-        raise SkylessError("give either --record or --no-record, not both")
     name = f"lab:{noise_ps:g}" if site is None else str(site.absolute())
     folder = recordings_folder()
     asked = SiteRun(
@@ -99,7 +94,7 @@ def demo(
         seed=seed,
         method=method,
         broker=None if mqtt is None else broker(mqtt, mqtt_ca),
-        record=None if no_record else record or new_recording(folder, "demo"),
+        record=_recording(record, folder),
         record_limit_mb=1000.0,
         recordings=folder,
     )
@@ -110,6 +105,18 @@ def demo(
     with screen, contextlib.suppress(KeyboardInterrupt):
         run(_run(whole, asked, screen, duration, json=json))
     _report(screen, json=json)
+
+
+def _recording(asked: str | None, folder: Path) -> Path | None:
+    """Where to record; None: nowhere. Raises SkylessError."""
+    from skyless.nodes.places import new_recording
+
+    if asked == "none":
+        return None
+    file = new_recording(folder, "demo") if asked is None else Path(asked)
+    if file.exists() or not file.parent.is_dir():
+        raise SkylessError(f"--record is {asked!r}; it should be a new file in a folder that exists, or none")
+    return file
 
 
 async def _run(whole: "WholeSite", asked: "SiteRun", screen: "Screen", duration: float | None, *, json: bool) -> None:

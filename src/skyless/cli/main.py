@@ -12,18 +12,18 @@ from skyless.errors import SkylessError
 _COMMANDS = (
     # name, where it is (imported only when it is called), what it does
     ("demo", "skyless.cli.demo:app", "Show a site and walking tags in real time."),
-    ("broker", "skyless.cli.broker:app", "Run the MQTT broker that comes with Skyless."),
-    ("dashboard", "skyless.cli.dashboard:app", "Show a site live in the browser."),
     ("simulate", "skyless.cli.simulate:app", "Run a site in the simulated world and judge it against the truth."),
-    ("record", "skyless.cli.record:app", "Record a running site into a file."),
     ("replay", "skyless.cli.replay:app", "Turn a recording into fixes and judge them against the truth."),
     ("paper", "skyless.cli.paper:app", "Reproduce the paper's figures and claims in one report."),
-    ("bench", "skyless.cli.bench:app", "Measure how fast Monte Carlo draws run on this machine."),
     ("plan", "skyless.cli.plan:app", "Predict a site's errors before it is mounted, and place its anchors."),
+    ("site", "skyless.cli.site:app", "Write and check site files."),
+    ("broker", "skyless.cli.broker:app", "Run the MQTT broker that comes with Skyless."),
     ("ether", "skyless.cli.ether:app", "Emulate a site's air in real time, for the programs of anchors and tags."),
     ("anchor", "skyless.cli.anchor:app", "Run anchors of a site."),
     ("tag", "skyless.cli.tag:app", "Run listening tags."),
-    ("site", "skyless.cli.site:app", "Write and check site files."),
+    ("dashboard", "skyless.cli.dashboard:app", "Show a site live in the browser."),
+    ("record", "skyless.cli.record:app", "Record a running site into a file."),
+    ("bench", "skyless.cli.bench:app", "Measure how fast Monte Carlo draws run on this machine."),
 )
 
 _INTERRUPTED = 130

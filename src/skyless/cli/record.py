@@ -84,7 +84,7 @@ async def _record(
     duration_s: float | None,
     found: "list[RecorderNode]",
 ) -> None:
-    from skyless.dashboard.find_site import find_site
+    from skyless.nodes.find_site import find_site
     from skyless.nodes.record import RecorderNode
 
     end_s = None if duration_s is None else time.monotonic() + duration_s
