@@ -142,6 +142,37 @@ def test_a_stopped_link_says_so_and_sends_what_waits(make_broker):
     asyncio.run(check())
 
 
+def test_a_link_stopped_without_a_broker_ends_at_once_and_says_what_is_lost(caplog):
+    async def check():
+        link = tag_link(MqttAddress("127.0.0.1", free_port()))
+        task = asyncio.ensure_future(link.run())
+        link.publish(receptions_topic(7, "t1"), b"1", qos=1)
+        link.publish("not a topic", b"")
+        await until(lambda: "cannot be reached" in caplog.text)
+        await stopped(task)
+        assert task.cancelled()
+        assert "has not taken 1 messages" in caplog.text
+        assert "'not a topic' is not one that every broker takes" in caplog.text
+        assert link.counters.dropped == 1
+
+    asyncio.run(check())
+
+
+def test_a_link_can_run_again(make_broker):
+    async def check():
+        broker = make_broker()
+        inbox = Inbox(broker.address, status_topic(7, "tag", "+"))
+        tag = tag_link(broker.address)
+        async with running(broker, inbox.link):
+            for _ in range(2):
+                task = asyncio.ensure_future(tag.run())
+                await until(lambda: inbox.online("tag", "t1"))
+                await stopped(task)
+                await until(lambda: inbox.online("tag", "t1") is False)
+
+    asyncio.run(check())
+
+
 def test_a_will_that_comes_late_does_not_tell_a_living_node_offline(make_broker):
     async def check():
         broker = make_broker()

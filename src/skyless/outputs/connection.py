@@ -1,6 +1,7 @@
 """One connection to a broker, from CONNECT until it breaks."""
 
 import asyncio
+import contextlib
 import socket
 import ssl
 from collections.abc import Callable
@@ -13,6 +14,8 @@ from skyless.outputs.packets import Message, PacketError, Splitter
 
 ANSWER_S: Final = 5.0
 """How long a broker may take to accept a connection."""
+
+_GOODBYE_S: Final = 1.0
 
 _SEND_BUFFER: Final = 262_144
 """Bytes that wait in the kernel, and as many in the process: what is older than the newest fix should not be many."""
@@ -129,11 +132,14 @@ class Connection(asyncio.Protocol):
             self._transport.abort()
 
     async def leave(self) -> None:
-        """Say goodbye, and close when all is sent."""
+        """Say goodbye, and close when all is sent, or without it after a second."""
         if self._transport is not None:
             self._transport.write(packets.GOODBYE)
             self._transport.close()
-        await self.lost.wait()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_GOODBYE_S):
+                await self.lost.wait()
+        self.abort("left")
 
     def _handle(self, head: int, body: bytes) -> None:
         kind = head >> 4

@@ -58,6 +58,8 @@ class Link:
     ) -> None:
         """``persistent`` lets the broker keep messages of QoS 1 for this name while it is away, until it is stopped.
 
+        Two persistent links of one name would push each other out.
+
         Raises:
             SkylessError: the address names a file of certificates that cannot be used.
         """
@@ -131,6 +133,8 @@ class Link:
                 failures += 1
         finally:
             self._down("stopped")
+            if self.unacknowledged:
+                _log.warning("stopped; the broker %s has not taken %d messages", self.address, self.unacknowledged)
 
     async def _one_connection(self) -> bool:
         """Whether it came about; returns when it is lost."""
@@ -164,6 +168,7 @@ class Link:
 
     def _up(self, connection: Connection) -> None:
         self._connection = connection
+        self._stopping = False
         self._reconnects += 1
         self._tell_return()
         self._outbox.restart()
@@ -212,7 +217,7 @@ class Link:
                     connection.write(packets.unsubscribe(LAST_NUMBER + 1, self._handlers))
                 await connection.leave()
         except TimeoutError:
-            _log.warning("stopped; the broker %s has not taken %d messages", self.address, self._outbox.unacknowledged)
+            pass
         finally:
             connection.abort("stopped")
 
