@@ -10,9 +10,10 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.dashboard.state import TRUTH_REACH_S, Board
+from skyless.dashboard.state import Board
 from skyless.errors import SkylessError
 from skyless.outputs.messages import FixMessage, SiteMessage, TruthMessage, Zone
+from skyless.outputs.truths import REACH_S
 from skyless.recordings.mcap_recording import McapRecording
 
 SUFFIX: Final = ".mcap"
@@ -147,7 +148,7 @@ def _states(
     board = Board()
     states: list[bytes] = []
     seen, due_s = 0, begin_s + step_s
-    for found in recording.messages({"fix", "truth"}, begin_s - TRUTH_REACH_S, end_s):
+    for found in recording.messages({"fix", "truth"}, begin_s - REACH_S, end_s):
         if stopped.is_set():
             break
         if found.time_s >= due_s:

@@ -12,9 +12,9 @@ import uvicorn
 from msgspec import Struct
 
 from skyless.dashboard.app import DEAD_S, Parts, make_app
-from skyless.nodes.find_site import find_site
 from skyless.dashboard.guard import Rules
 from skyless.errors import SkylessError
+from skyless.nodes.find_site import find_site
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
 

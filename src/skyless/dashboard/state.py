@@ -1,7 +1,6 @@
 """What the page is told of the site, gathered from messages. No I/O; the time is passed in."""
 
 import math
-from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -16,6 +15,7 @@ from skyless.outputs.messages import (
     TruthMessage,
     Vector,
 )
+from skyless.outputs.truths import Truths
 
 MOST_NAMES: Final = 2000
 """Tags, and nodes, that are remembered; a broker that makes up names fills no memory."""
@@ -23,10 +23,6 @@ MOST_NAMES: Final = 2000
 FORGET_S: Final = 600.0
 """A tag or health message is forgotten after so long."""
 
-TRUTH_REACH_S: Final = 0.25
-"""A truth tells where a tag was for so long before and after; a turning tag strays from the line by then."""
-
-_TRUTHS: Final = 64
 _ENCODED: Final = 16
 
 
@@ -51,7 +47,7 @@ class Board:
         self.unix_s = 0.0
         """What a ``state`` says of its time; whoever keeps the board sets it."""
         self._tags: dict[str, _Tag] = {}
-        self._truths: deque[TruthMessage] = deque(maxlen=_TRUTHS)
+        self._truths = Truths()
         self._healths: dict[tuple[str, str], tuple[float, TagHealth | AnchorHealth | EtherHealth]] = {}
         self._encoded: dict[tuple[int, int], bytes] = {}
 
@@ -63,10 +59,8 @@ class Board:
         self._tags[fix.tag] = _Tag(fix, self.serial, now_s)
 
     def truth(self, truth: TruthMessage) -> None:
-        """Take where simulated tags truly are; an older one than the last begins anew (a restarted ether)."""
-        if self._truths and truth.unix_s < self._truths[-1].unix_s:
-            self._truths.clear()
-        self._truths.append(truth)
+        """Take where simulated tags truly are."""
+        self._truths.add(truth)
 
     def status(self, status: StatusMessage) -> None:
         """Take whether a node lives."""
@@ -107,7 +101,7 @@ class Board:
         for tag in self._tags.values():
             if tag.serial > serial:
                 if tag.row is None:
-                    tag.row = _row(tag.fix, self._true_position_m(tag.fix))
+                    tag.row = _row(tag.fix, self._truths.at(tag.fix.tag, tag.fix.unix_s))
                 rows.append(tag.row)
         return rows
 
@@ -124,20 +118,6 @@ class Board:
                 "dropped": dict(wrong),
             },
         )
-
-    def _true_position_m(self, fix: FixMessage) -> Vector | None:
-        """Where the tag truly was at the fix: from the truth nearest in time, along its velocity."""
-        best, ahead_s = None, TRUTH_REACH_S
-        for truth in reversed(self._truths):
-            gap_s = fix.unix_s - truth.unix_s
-            if abs(gap_s) <= abs(ahead_s) and fix.tag in truth.tags:
-                best, ahead_s = truth.tags[fix.tag], gap_s
-            if gap_s > 0.0:
-                break
-        if best is None:
-            return None
-        (x, y, z), (vx, vy, vz) = best.position_m, best.velocity_mps
-        return x + ahead_s * vx, y + ahead_s * vy, z + ahead_s * vz
 
 
 def encode(kind: str, fields: dict[str, Any]) -> bytes:
