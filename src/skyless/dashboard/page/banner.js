@@ -1,0 +1,49 @@
+/** Live, replay or lost: said in words, by a shape, and by a colour; and what can be done. */
+
+import { on, state } from "./store.js";
+import { byId, text } from "./dom.js";
+import { now_s } from "./clock.js";
+import { timeOfDay } from "./format.js";
+import { retryNow } from "./live.js";
+
+const WORDS = { connecting: "Connecting", open: "Live", lost: "Connection lost", replay: "Replay", broker: "No broker" };
+
+/** Begin to tell. */
+export function start() {
+  on(["connection", "mode", "player"], show);
+  setInterval(() => state.connection.phase === "lost" || text(byId("time"), timeOfDay(now_s())), 500);
+  byId("banner-button").addEventListener("click", retryNow);
+  show();
+}
+
+function show() {
+  const { phase } = state.connection;
+  const brokerAway = phase === "open" && state.mqtt && !state.mqtt.connected;
+  const kind = phase === "lost" ? "lost" : state.mode === "replay" ? "replay" : brokerAway ? "broker" : phase;
+  const pill = byId("pill");
+  if (pill.className !== `pill ${kind}`) pill.className = `pill ${kind}`;
+  text(pill, WORDS[kind]);
+  const words = phase === "lost" ? lostWords() : brokerAway ? brokerWords() : "";
+  const banner = byId("banner");
+  banner.hidden = !words;
+  banner.className = phase === "lost" ? "lost" : "broker";
+  byId("banner-button").hidden = phase !== "lost";
+  text(byId("banner-text"), words);
+  document.body.classList.toggle("lost", phase === "lost");
+}
+
+function lostWords() {
+  const { since, reason } = state.connection;
+  const old = state.mode === "live" ? " The map shows what was last known." : "";
+  return `Connection lost ${seconds(since)} ago (${reason}).${old} Trying again.`;
+}
+
+function seconds(since) {
+  const past = Math.floor((performance.now() - since) / 1e3);
+  return past < 120 ? `${past} s` : `${Math.floor(past / 60)} min`;
+}
+
+function brokerWords() {
+  const broker = state.mqtt.broker ? ` ${state.mqtt.broker}` : "";
+  return `The server has lost its broker${broker}: no news of tags and anchors until it is back.`;
+}

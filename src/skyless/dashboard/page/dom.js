@@ -1,0 +1,91 @@
+/** Small helpers to build and update elements. */
+
+const SVG = "http://www.w3.org/2000/svg";
+
+/**
+ * Make an element. `on…` become listeners, `class`, `aria-…`, `data-…` and SVG's attributes; the rest properties.
+ * @param {string} tag
+ */
+export function h(tag, properties = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [key, value] of Object.entries(properties)) {
+    if (value === undefined || value === null) continue;
+    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else if (key in element && !key.startsWith("aria")) element[key] = value;
+    else element.setAttribute(key, value);
+  }
+  element.append(...children.filter((child) => child !== null && child !== undefined));
+  return element;
+}
+
+/** Make an SVG element. */
+export function s(tag, attributes = {}, ...children) {
+  const element = document.createElementNS(SVG, tag);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  element.append(...children);
+  return element;
+}
+
+/** Set a node's text where it differs, so that nothing is laid out anew for nothing. */
+export function text(element, value) {
+  if (element.textContent !== value) element.textContent = value;
+}
+
+/** @returns {any} */
+export function byId(id) {
+  return document.getElementById(id);
+}
+
+/** Keep one row per item: rows are made once, updated, put in order and taken away. */
+export class Rows {
+  constructor(parent, make) {
+    this.parent = parent;
+    this.make = make;
+    this.rows = new Map();
+  }
+
+  /** @param {Array<[any, any]>} items pairs of key and value */
+  show(items) {
+    const keys = new Set(items.map(([key]) => key));
+    for (const [key, row] of this.rows) {
+      if (keys.has(key)) continue;
+      row.element.remove();
+      this.rows.delete(key);
+    }
+    let place = this.parent.firstElementChild;
+    for (const [key, value] of items) {
+      let row = this.rows.get(key);
+      if (!row) this.rows.set(key, (row = this.make(key, value)));
+      row.update?.(value);
+      if (row.element === place) place = place.nextElementSibling;
+      else this.parent.insertBefore(row.element, place);
+    }
+  }
+}
+
+/** Say something for a few seconds; with an action, one can be taken back. */
+export function toast(message, kind = "note", action = null) {
+  const box = h("div", { class: `toast ${kind}`, role: kind === "bad" ? "alert" : "status" }, message);
+  if (action) {
+    box.append(h("button", { type: "button", onclick: () => (box.remove(), action.run()) }, action.name));
+  }
+  byId("toasts").append(box);
+  setTimeout(() => box.remove(), action || kind === "bad" ? 8000 : 4000);
+}
+
+/** At most so often, the last call always. */
+export function slowly(interval_ms, call) {
+  let last = -Infinity;
+  let timer = 0;
+  return () => {
+    if (timer) return;
+    const wait = last + interval_ms - performance.now();
+    const run = () => {
+      timer = 0;
+      last = performance.now();
+      call();
+    };
+    if (wait <= 0) run();
+    else timer = setTimeout(run, wait);
+  };
+}

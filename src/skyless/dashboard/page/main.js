@@ -1,0 +1,37 @@
+/** Puts the page together. */
+
+import { on, state } from "./store.js";
+import * as banner from "./banner.js";
+import * as legend from "./legend.js";
+import * as live from "./live.js";
+import * as map from "./map/map.js";
+import * as replay from "./replay_bar.js";
+import * as tabs from "./tabs.js";
+import * as theme from "./theme.js";
+import * as tools from "./map/tools.js";
+import { live as liveTracks, replayed, shown_s } from "./clock.js";
+import { byId, text } from "./dom.js";
+
+// The token has become a cookie; it need not stand in the address, nor in the history.
+const address = new URL(location.href);
+if (address.searchParams.has("token")) {
+  address.searchParams.delete("token");
+  history.replaceState(null, "", address);
+}
+
+theme.start();
+map.start();
+tools.start();
+legend.start();
+tabs.start();
+replay.start();
+banner.start();
+on(["site"], () => {
+  text(byId("site-name"), state.site?.name ?? "");
+  byId("simulated").hidden = !state.simulated;
+  document.title = state.site ? `${state.site.name} · Skyless` : "Skyless";
+});
+live.start();
+
+/** For tests and for the curious in the console; nothing in the page uses it. */
+window.skyless = { state, live: liveTracks, replayed, shown_s, frames: map.drawnFrames };

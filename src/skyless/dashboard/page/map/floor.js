@@ -1,0 +1,133 @@
+/** What stands still: floor plan, overlay, grid, walls, scale bar. */
+
+import { faint, palette } from "../theme.js";
+import { state } from "../store.js";
+import { px, py, roundLength, toSite, view } from "./view.js";
+
+/** @type {{image: HTMLImageElement, x_m: number, y_m: number, width_m: number, height_m: number}|null} */
+export let floor = null;
+let floorOf = null;
+
+/** Load the site's floor plan, if it has one; calls back when it is there. */
+export function loadFloor(done) {
+  const plan = state.site?.floor_plan ?? null;
+  if (JSON.stringify(plan) === floorOf) return;
+  floorOf = JSON.stringify(plan);
+  floor = null;
+  if (!plan) return;
+  const image = new Image();
+  image.onload = () => {
+    const height_m = (plan.width_m * image.naturalHeight) / image.naturalWidth;
+    floor = { image, x_m: plan.x_m, y_m: plan.y_m, width_m: plan.width_m, height_m };
+    done();
+  };
+  image.onerror = () => (floorOf = null);
+  image.src = new URL("api/floor_plan", document.baseURI).href;
+}
+
+/** Draw the floor plan's image. */
+export function drawFloor(context) {
+  if (!floor) return;
+  context.globalAlpha = 0.75;
+  const width = floor.width_m * view.scale;
+  const height = floor.height_m * view.scale;
+  context.drawImage(floor.image, px(floor.x_m), py(floor.y_m + floor.height_m), width, height);
+  context.globalAlpha = 1;
+}
+
+/** Draw an overlay's picture where it belongs. */
+export function drawOverlay(context) {
+  const { data, picture } = state.overlay;
+  if (!data || !picture) return;
+  const half = data.step_m / 2;
+  const [left, right] = [px(data.x_m[0] - half), px(data.x_m[1] + half)];
+  const [top, bottom] = [py(data.y_m[1] + half), py(data.y_m[0] - half)];
+  context.globalAlpha = 0.62;
+  context.imageSmoothingEnabled = true;
+  context.drawImage(picture, left, top, right - left, bottom - top);
+  context.globalAlpha = 1;
+}
+
+/** Draw the grid with its coordinates along the left and the lower edge. */
+export function drawGrid(context) {
+  const step = roundLength(64);
+  const [left, top] = toSite(0, 0);
+  const [right, bottom] = toSite(view.width, view.height);
+  const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+  context.lineWidth = 1;
+  context.font = "10px system-ui, sans-serif";
+  const lines = (from, to, draw) => {
+    for (let n = Math.ceil(from / step); n * step <= to; n++) draw(n * step, n % 5 === 0);
+  };
+  lines(left, right, (x_m, strong) => {
+    const x = Math.round(px(x_m)) + 0.5;
+    line(context, x, 0, x, view.height, strong ? palette["grid-strong"] : palette.grid);
+  });
+  lines(bottom, top, (y_m, strong) => {
+    const y = Math.round(py(y_m)) + 0.5;
+    line(context, 0, y, view.width, y, strong ? palette["grid-strong"] : palette.grid);
+  });
+  context.fillStyle = palette.muted;
+  context.textAlign = "center";
+  context.textBaseline = "bottom";
+  lines(left, right, (x_m) => {
+    const x = px(x_m);
+    if (x > 40 && x < view.width - 20) context.fillText(write(x_m, digits), x, view.height - 4);
+  });
+  context.textAlign = "left";
+  context.textBaseline = "middle";
+  lines(bottom, top, (y_m) => {
+    const y = py(y_m);
+    if (y > 16 && y < view.height - 24) context.fillText(write(y_m, digits), 5, y);
+  });
+}
+
+function write(value_m, digits) {
+  return (Math.abs(value_m) < 1e-9 ? 0 : value_m).toFixed(digits).replace("-", "−");
+}
+
+function line(context, x1, y1, x2, y2, colour) {
+  context.strokeStyle = colour;
+  context.beginPath();
+  context.moveTo(x1, y1);
+  context.lineTo(x2, y2);
+  context.stroke();
+}
+
+/** Draw the walls. */
+export function drawWalls(context) {
+  context.strokeStyle = palette.wall;
+  context.lineWidth = 3;
+  context.lineCap = "round";
+  context.beginPath();
+  for (const wall of state.site?.walls ?? []) {
+    context.moveTo(px(wall.x1_m), py(wall.y1_m));
+    context.lineTo(px(wall.x2_m), py(wall.y2_m));
+  }
+  context.stroke();
+  context.lineCap = "butt";
+}
+
+/** Draw the scale bar, lower right. */
+export function drawScale(context) {
+  const length_m = roundLength(130);
+  const width = length_m * view.scale;
+  const right = view.width - 16;
+  const y = view.height - 26;
+  const label = length_m >= 1 ? `${length_m} m` : `${Math.round(length_m * 100)} cm`;
+  context.fillStyle = faint(palette.surface, 0.85);
+  context.fillRect(right - width - 10, y - 22, width + 20, 32);
+  context.strokeStyle = palette.text;
+  context.lineWidth = 1.5;
+  context.beginPath();
+  context.moveTo(right - width, y - 5);
+  context.lineTo(right - width, y);
+  context.lineTo(right, y);
+  context.lineTo(right, y - 5);
+  context.stroke();
+  context.fillStyle = palette.text;
+  context.font = "11px system-ui, sans-serif";
+  context.textAlign = "center";
+  context.textBaseline = "bottom";
+  context.fillText(label, right - width / 2, y - 5);
+}

@@ -1,0 +1,152 @@
+/** Mouse, touch and keyboard on the map. */
+
+import { changed, select, state } from "../store.js";
+import { byId, text } from "../dom.js";
+import { length, metres, number } from "../format.js";
+import { addPoint, begin, cancel, editor, finish, moveCorner, setCursor, storeShown, undoPoint } from "./editor.js";
+import { valueAt } from "./overlay.js";
+import { drawn } from "./tags.js";
+import { pan, px, py, toSite, view, zoom } from "./view.js";
+import { inside } from "./zones.js";
+
+const NEAR = 14;
+const STILL = 6;
+/** @type {Map<number, {x: number, y: number}>} */
+const pointers = new Map();
+let travelled = 0;
+let dragged = null;
+
+/** @param {HTMLElement} target the focusable element over the canvases */
+export function listen(target, redraw, fitAll) {
+  const place = (event) => {
+    const box = target.getBoundingClientRect();
+    return { x: event.clientX - box.left, y: event.clientY - box.top };
+  };
+  target.addEventListener("pointerdown", (event) => {
+    if (event.button > 0) return;
+    target.setPointerCapture(event.pointerId);
+    const at = place(event);
+    pointers.set(event.pointerId, at);
+    if (pointers.size > 1) return;
+    travelled = 0;
+    dragged = cornerAt(at);
+    if (dragged) dragged.before = state.zones;
+  });
+  target.addEventListener("pointermove", (event) => {
+    const at = place(event);
+    hover(at, event.pointerType);
+    const before = pointers.get(event.pointerId);
+    if (!before) return;
+    if (pointers.size === 2) pinch(event.pointerId, before, at);
+    else if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
+    else if (travelled + Math.hypot(at.x - before.x, at.y - before.y) >= STILL) pan(at.x - before.x, at.y - before.y);
+    travelled += Math.hypot(at.x - before.x, at.y - before.y);
+    pointers.set(event.pointerId, at);
+    redraw(true);
+  });
+  const release = (event) => {
+    if (!pointers.delete(event.pointerId) || pointers.size) return;
+    if (dragged && travelled >= STILL) storeShown(dragged.before);
+    else if (event.type === "pointerup" && travelled < STILL) tap(place(event));
+    dragged = null;
+  };
+  target.addEventListener("pointerup", release);
+  target.addEventListener("pointercancel", release);
+  target.addEventListener("pointerleave", () => text(byId("readout"), ""));
+  target.addEventListener("dblclick", () => editor.drawing && finish());
+  target.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    const at = place(event);
+    zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), at.x, at.y);
+    redraw(true);
+  }, { passive: false });
+  target.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!(editor.drawing ? drawingKey(event) : mapKey(event, fitAll))) return;
+    event.preventDefault();
+    redraw(true);
+  });
+}
+
+function pinch(moved, before, at) {
+  const other = [...pointers].find(([id]) => id !== moved)[1];
+  const apart = Math.hypot(before.x - other.x, before.y - other.y);
+  const middle = { x: (at.x + other.x) / 2, y: (at.y + other.y) / 2 };
+  pan((at.x - before.x) / 2, (at.y - before.y) / 2);
+  if (apart > 1) zoom(Math.hypot(at.x - other.x, at.y - other.y) / apart, middle.x, middle.y);
+  travelled += STILL;
+}
+
+function tap({ x, y }) {
+  const site = toSite(x, y);
+  if (editor.drawing) {
+    const [first] = editor.points;
+    if (editor.points.length > 2 && near(px(first[0]), py(first[1]), x, y)) return finish();
+    addPoint(site);
+    return setCursor(null);
+  }
+  const tag = drawn.findLast((one) => near(one.x, one.y, x, y));
+  if (tag) return select("tag", tag.name);
+  const anchor = state.site?.anchors.find((one) => near(px(one.x_m), py(one.y_m), x, y));
+  if (anchor) return select("anchor", anchor.id);
+  const zone = state.zones.findLast((one) => inside(one.polygon_m, site[0], site[1]));
+  return zone ? select("zone", zone.id) : select(null);
+}
+
+function near(x1, y1, x2, y2) {
+  return Math.hypot(x1 - x2, y1 - y2) <= NEAR;
+}
+
+function cornerAt({ x, y }) {
+  if (editor.drawing || state.mode !== "live") return null;
+  const zone = state.zones.find((one) => one.id === state.selection.zone);
+  const index = zone?.polygon_m.findIndex(([x_m, y_m]) => near(px(x_m), py(y_m), x, y)) ?? -1;
+  return index < 0 ? null : { id: zone.id, index };
+}
+
+function hover({ x, y }, type) {
+  const [x_m, y_m] = toSite(x, y);
+  if (editor.drawing && type === "mouse") setCursor([x_m, y_m]);
+  const value = valueAt(x_m, y_m);
+  const { data } = state.overlay;
+  const overlay = value === null ? "" : ` · ${data.unit === "m" ? `σ ${length(value)}` : number(value, 2)}`;
+  text(byId("readout"), `x ${metres(x_m)} m · y ${metres(y_m)} m${overlay}`);
+}
+
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+
+function mapKey(event, fitAll) {
+  const arrow = ARROWS[event.key];
+  if (arrow) pan(-60 * arrow[0], 60 * arrow[1]);
+  else if (event.key === "+" || event.key === "=") zoom(1.25);
+  else if (event.key === "-") zoom(0.8);
+  else if (event.key === "0") fitAll();
+  else if (event.key === "z") begin([view.x_m, view.y_m]);
+  else if (event.key === "Escape") select(null);
+  else return false;
+  return true;
+}
+
+function drawingKey(event) {
+  const arrow = ARROWS[event.key];
+  const step = event.shiftKey ? 0.05 : 0.5;
+  const at = editor.cursor ?? [view.x_m, view.y_m];
+  if (arrow) setCursor([at[0] + step * arrow[0], at[1] + step * arrow[1]]);
+  else if (event.key === "Enter" || event.key === " ") enter(at);
+  else if (event.key === "f") finish();
+  else if (event.key === "Backspace") undoPoint();
+  else if (event.key === "Escape") cancel();
+  else return false;
+  const [x_m, y_m] = editor.cursor ?? at;
+  const corners = `${editor.points.length} corner${editor.points.length === 1 ? "" : "s"}`;
+  text(byId("said"), editor.drawing ? `x ${metres(x_m)}, y ${metres(y_m)}, ${corners}` : "Drawing ended");
+  changed("editor");
+  return true;
+}
+
+function enter(at) {
+  const [first] = editor.points;
+  const closed = editor.points.length > 2 && Math.hypot(at[0] - first[0], at[1] - first[1]) < 0.03;
+  if (closed) finish();
+  else addPoint(at);
+}

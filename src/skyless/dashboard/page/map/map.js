@@ -1,0 +1,102 @@
+/** The map: three canvases, drawn anew only where something has changed. */
+
+import { on, state } from "../store.js";
+import { byId } from "../dom.js";
+import { drawAnchors } from "./anchors.js";
+import { drawFloor, drawGrid, drawOverlay, drawScale, drawWalls, floor, loadFloor } from "./floor.js";
+import { listen } from "./input.js";
+import { drawTags, look } from "./tags.js";
+import { drawTrails, due } from "./trails.js";
+import { fit, prepare, view } from "./view.js";
+import { drawDraft, drawZones, flash } from "./zones.js";
+
+/** Frames drawn so far, for tests and measurements. */
+export const drawnFrames = { still: 0, moving: 0 };
+
+let stillDirty = true;
+let movingDirty = true;
+let scheduled = false;
+let trailsDrawn = 0;
+let later = 0;
+let lastEvent = null;
+
+/** Draw again: what stands still too, or only what moves. */
+export function redraw(still = true) {
+  stillDirty ||= still;
+  movingDirty = true;
+  if (scheduled) return;
+  scheduled = true;
+  requestAnimationFrame(frame);
+}
+
+function frame() {
+  scheduled = false;
+  const still = stillDirty;
+  if (stillDirty) {
+    stillDirty = false;
+    drawnFrames.still++;
+    if (drawStill()) setTimeout(redraw, 1600);
+  }
+  if (movingDirty) {
+    movingDirty = false;
+    drawnFrames.moving++;
+    const now = look();
+    if (still || due(performance.now() - trailsDrawn, now.seen.length)) {
+      trailsDrawn = performance.now();
+      const context = prepare(byId("trails"));
+      if (state.options.trails) drawTrails(context, now.seen, now.shown, state.options.trails);
+    }
+    const context = prepare(byId("moving"));
+    drawTags(context, now);
+    drawDraft(context);
+    clearTimeout(later);
+    if (now.moving) redraw(false);
+    else if (now.ageing) later = setTimeout(redraw, 250, false);
+  }
+}
+
+function drawStill() {
+  const context = prepare(byId("still"));
+  drawFloor(context);
+  drawOverlay(context);
+  drawGrid(context);
+  const flashes = drawZones(context);
+  drawWalls(context);
+  drawAnchors(context);
+  drawScale(context);
+  byId("waiting").hidden = state.site !== null;
+  return flashes;
+}
+
+/** Show the whole site. */
+export function fitAll() {
+  fit(state.site, state.zones, floor);
+  redraw();
+}
+
+/** Begin to draw. */
+export function start() {
+  const box = byId("map");
+  new ResizeObserver(() => {
+    view.width = box.clientWidth;
+    view.height = box.clientHeight;
+    view.ratio = Math.min(devicePixelRatio, 2);
+    if (view.touched) redraw();
+    else fitAll();
+  }).observe(box);
+  listen(byId("canvas"), redraw, fitAll);
+  let shown = null;
+  on(["site", "mode"], () => {
+    loadFloor(() => (view.touched ? redraw() : fitAll()));
+    const key = JSON.stringify([state.mode, state.site?.name, state.site?.anchors]);
+    if (key !== shown) fitAll();
+    shown = key;
+  });
+  on(["events"], () => {
+    const newest = state.events[0];
+    if (newest && newest !== lastEvent && lastEvent !== null) flash(newest.zone);
+    lastEvent = newest ?? 0;
+  });
+  on(["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode"], () => redraw(true));
+  on(["tags", "editor", "player"], () => redraw(false));
+}

@@ -1,0 +1,90 @@
+/** Overlays of dilution of precision and predicted sigma: fetched, painted once, explained in the legend. */
+
+import { changed, on, state } from "../store.js";
+import { overlay } from "../api.js";
+import { toast } from "../dom.js";
+
+export const KINDS = {
+  none: "None",
+  hdop: "HDOP (dilution in x and y)",
+  pdop: "PDOP (dilution in x, y and z)",
+  sigma: "Predicted σ",
+};
+
+/** Viridis at eight places (matplotlib's, CC0): equal steps look equal, also to the colour-blind and in grey. */
+const VIRIDIS = [
+  [68, 1, 84], [70, 50, 127], [54, 92, 141], [39, 127, 142], [31, 161, 135], [74, 194, 109], [159, 218, 58],
+  [253, 231, 37],
+];
+const POINTS = 40_000;
+let serial = 0;
+
+/** Colour at a share of the scale from 0 (good) to 1 (bad). */
+export function colourAt(share) {
+  const place = Math.min(Math.max(share, 0), 1) * (VIRIDIS.length - 1);
+  const low = Math.min(Math.floor(place), VIRIDIS.length - 2);
+  return VIRIDIS[low].map((value, part) => value + (place - low) * (VIRIDIS[low + 1][part] - value));
+}
+
+/** Show another overlay, or none. */
+export async function choose(kind) {
+  const mine = ++serial;
+  state.options.overlay = kind;
+  state.overlay = { data: null, picture: null, error: "" };
+  changed("overlay", "options");
+  if (kind === "none") return;
+  try {
+    const data = await overlay(kind, step());
+    if (mine !== serial) return;
+    state.overlay = { data, picture: paint(data), error: "" };
+  } catch (error) {
+    if (mine !== serial) return;
+    state.overlay.error = error.message;
+    toast(`No overlay: ${error.message}`, "bad");
+  }
+  changed("overlay");
+}
+
+/** A step that gives a fine picture of a small site and a quick one of a large site. */
+function step() {
+  const anchors = state.site?.anchors ?? [];
+  const spread = (key) => Math.max(...anchors.map((a) => a[key])) - Math.min(...anchors.map((a) => a[key]));
+  const area = anchors.length ? (spread("x_m") + 2) * (spread("y_m") + 2) : 100;
+  return [0.1, 0.25, 0.5, 1, 2, 5].find((step_m) => area / step_m ** 2 < POINTS / 4) ?? 10;
+}
+
+function paint(data) {
+  const picture = document.createElement("canvas");
+  picture.width = data.columns;
+  picture.height = data.rows;
+  const context = picture.getContext("2d");
+  const image = context.createImageData(data.columns, data.rows);
+  const { good, bad } = data.levels;
+  for (let line = 0; line < data.rows; line++) {
+    for (let column = 0; column < data.columns; column++) {
+      const value = data.values[(data.rows - 1 - line) * data.columns + column];
+      if (value === null) continue;
+      const [red, green, blue] = colourAt((value - good) / (bad - good));
+      image.data.set([red, green, blue, 255], 4 * (line * data.columns + column));
+    }
+  }
+  context.putImageData(image, 0, 0);
+  return picture;
+}
+
+/** The overlay's value at a place, null where there is none. */
+export function valueAt(x_m, y_m) {
+  const data = state.overlay.data;
+  if (!data) return null;
+  const column = Math.round((x_m - data.x_m[0]) / data.step_m);
+  const line = Math.round((y_m - data.y_m[0]) / data.step_m);
+  if (column < 0 || line < 0 || column >= data.columns || line >= data.rows) return null;
+  return data.values[line * data.columns + column];
+}
+
+let shownFor = null;
+on(["site"], () => {
+  const anchors = JSON.stringify(state.site?.anchors ?? null);
+  if (anchors !== shownFor && state.site && state.options.overlay !== "none") choose(state.options.overlay);
+  shownFor = anchors;
+});

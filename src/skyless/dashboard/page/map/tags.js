@@ -1,0 +1,110 @@
+/** Tags on the map: ellipses, true positions, marks and names. */
+
+import { GONE_S, freshness, now_s, shown_s, stillMotion, tracks } from "../clock.js";
+import { faint, palette, tagColour } from "../theme.js";
+import { state } from "../store.js";
+import { CXX, CXY, CYY, TRUE_X, TRUE_Y, X, Y } from "../tracks.js";
+import { label, ring } from "./anchors.js";
+import { drawStub } from "./trails.js";
+import { px, py, view } from "./view.js";
+
+/** √5.991: so many sigmas hold 95 % in two dimensions. */
+const NINETY_FIVE = 2.4477;
+/** Above so many tags only the selected one is named. */
+export const NAMED = 40;
+const MARK = 5;
+const row = new Float64Array(16);
+
+/** What was drawn last, for the pointer: name, pixels. @type {Array<{name: string, x: number, y: number}>} */
+export const drawn = [];
+
+/** What the map shows of the tags now, whether the next frame differs without any news, and whether some later one will. */
+export function look() {
+  const now = now_s();
+  const shown = shown_s();
+  const list = tracks().sorted;
+  const seen = [];
+  let moving = false;
+  let ageing = false;
+  list.forEach((track, index) => {
+    const fresh = freshness(track, now, shown);
+    if (fresh === "gone" || fresh === "never" || !track.at(shown, row, !stillMotion.matches)) return;
+    if (state.mode === "live") {
+      moving ||= track.lastTime > shown;
+      ageing ||= now - track.lastTime < GONE_S + 1;
+    }
+    const colour = fresh === "fresh" ? tagColour(index, list.length) : palette.muted;
+    seen.push({ track, colour, fresh, row: row.slice(), selected: track.name === state.selection.tag });
+  });
+  return { seen, shown, moving, ageing };
+}
+
+/** Draw all tags. */
+export function drawTags(context, { seen, shown }) {
+  const options = state.options;
+  drawn.length = 0;
+  if (options.trails) for (const one of seen) drawStub(context, one, shown);
+  if (options.ellipses) for (const one of seen) ellipse(context, one);
+  if (options.truth && state.simulated) for (const one of seen) truth(context, one);
+  for (const one of seen) mark(context, one);
+  if (options.names) names(context, seen);
+}
+
+function ellipse(context, { row: at, colour, selected }) {
+  const [major, minor, angle] = axes(at[CXX], at[CXY], at[CYY]);
+  const long = NINETY_FIVE * major * view.scale;
+  if (!(long > MARK)) return;
+  context.beginPath();
+  context.ellipse(px(at[X]), py(at[Y]), long, NINETY_FIVE * minor * view.scale, -angle, 0, 2 * Math.PI);
+  context.fillStyle = faint(colour, 0.14);
+  context.fill();
+  context.strokeStyle = faint(colour, selected ? 0.95 : 0.6);
+  context.lineWidth = 1;
+  context.stroke();
+}
+
+/** Half axes of one sigma in m, and the long one's angle from x, of a 2 × 2 covariance. */
+export function axes(xx, xy, yy) {
+  const middle = (xx + yy) / 2;
+  const spread = Math.hypot((xx - yy) / 2, xy);
+  return [Math.sqrt(middle + spread), Math.sqrt(Math.max(middle - spread, 0)), Math.atan2(2 * xy, xx - yy) / 2];
+}
+
+function truth(context, { row: at, colour }) {
+  if (!(at[TRUE_X] === at[TRUE_X])) return;
+  const x = px(at[TRUE_X]);
+  const y = py(at[TRUE_Y]);
+  context.strokeStyle = faint(colour, 0.55);
+  context.lineWidth = 1.25;
+  context.beginPath();
+  context.arc(x, y, MARK + 4, 0, 2 * Math.PI);
+  context.moveTo(px(at[X]), py(at[Y]));
+  context.lineTo(x, y);
+  context.stroke();
+}
+
+function mark(context, { track, row: at, colour, fresh, selected }) {
+  const x = px(at[X]);
+  const y = py(at[Y]);
+  drawn.push({ name: track.name, x, y });
+  context.beginPath();
+  context.arc(x, y, MARK, 0, 2 * Math.PI);
+  context.fillStyle = fresh === "fresh" ? colour : palette.surface;
+  context.fill();
+  context.strokeStyle = fresh === "fresh" ? palette.surface : colour;
+  context.lineWidth = 1.5;
+  context.stroke();
+  if (selected) ring(context, x, y, MARK + 8);
+}
+
+function names(context, seen) {
+  context.font = "11px system-ui, sans-serif";
+  context.textAlign = "left";
+  context.textBaseline = "bottom";
+  for (const { track, row: at, fresh, selected } of seen) {
+    if (seen.length > NAMED && !selected) continue;
+    const quiet = fresh === "fresh" || state.connection.phase === "lost";
+    const words = quiet ? track.name : `${track.name} · no fix`;
+    label(context, words, px(at[X]) + 9, py(at[Y]) - 6, fresh === "fresh" ? palette.text : palette.muted);
+  }
+}

@@ -1,0 +1,41 @@
+/** The map's buttons, and the bar that helps while a zone is drawn. */
+
+import { changed, on } from "../store.js";
+import { byId, text } from "../dom.js";
+import { begin, cancel, editor, finish, undoPoint } from "./editor.js";
+import { fitAll, redraw } from "./map.js";
+import { view, zoom } from "./view.js";
+
+/** Make the buttons work. */
+export function start() {
+  const click = (id, call) => byId(id).addEventListener("click", call);
+  click("zoom-in", () => (zoom(1.25), redraw()));
+  click("zoom-out", () => (zoom(0.8), redraw()));
+  click("fit", fitAll);
+  click("draw", (event) => startDrawing(event.detail === 0));
+  click("drawing-finish", finish);
+  click("drawing-undo", undoPoint);
+  click("drawing-cancel", cancel);
+  on(["editor"], show);
+  on(["mode"], () => {
+    byId("draw").disabled = document.body.classList.contains("replaying");
+    if (editor.drawing) cancel();
+  });
+}
+
+/** Begin a zone; from the keyboard with a cursor in the middle of the map. */
+export function startDrawing(keyboard) {
+  begin(keyboard ? [view.x_m, view.y_m] : null);
+  byId("canvas").focus({ preventScroll: true });
+  changed("editor");
+}
+
+function show() {
+  const corners = editor.points.length;
+  byId("drawing").hidden = !editor.drawing;
+  byId("canvas").classList.toggle("drawing", editor.drawing);
+  byId("drawing-finish").disabled = corners < 3;
+  byId("drawing-undo").disabled = corners < 1;
+  const how = corners < 3 ? "Click or tap the corners" : "Click the first corner to close";
+  text(byId("drawing-help"), `${how}. Keys: arrows (Shift: fine), Enter, F finishes, Esc.`);
+}

@@ -1,0 +1,56 @@
+/**
+ * Trails on a canvas of their own, which is drawn a few times a second: their strokes are what costs most without a
+ * graphics card. What has come since is a short stub that is drawn with the tag.
+ */
+
+import { faint } from "../theme.js";
+import { TIME, X, Y } from "../tracks.js";
+import { px, py } from "./view.js";
+
+/** Time between two drawings: for a few tags, and for more than `CROWD`. */
+const FEW_MS = 100;
+const MANY_MS = 330;
+const CROWD = 40;
+/** Points nearer than this to the last one are left out, in pixels. */
+const NEAR = 2.5;
+/** Over a longer silence no line is drawn. */
+const GAP_S = 1;
+
+let drawn_s = NaN;
+
+/** Whether the trails are due for so many tags. */
+export function due(since_ms, count) {
+  return since_ms > (count > CROWD ? MANY_MS : FEW_MS);
+}
+
+/** Draw all trails up to a moment. */
+export function drawTrails(context, seen, shown, length_s) {
+  drawn_s = shown;
+  for (const one of seen) path(context, one, px(one.row[X]), py(one.row[Y]), shown, shown - length_s);
+}
+
+/** Draw what a trail has grown since `drawTrails`, up to the tag. */
+export function drawStub(context, one, shown) {
+  path(context, one, px(one.row[X]), py(one.row[Y]), shown, Math.min(drawn_s, shown) - 0.15);
+}
+
+function path(context, { track, colour, selected }, x0, y0, shown, from) {
+  const last = track.find(shown);
+  context.strokeStyle = faint(colour, selected ? 0.9 : 0.4);
+  context.lineWidth = selected ? 2 : 1.25;
+  context.beginPath();
+  context.moveTo(x0, y0);
+  let time0 = track.value(last, TIME);
+  for (let index = last; index >= 0; index--) {
+    const time = track.value(index, TIME);
+    if (time < from) break;
+    const x = px(track.value(index, X));
+    const y = py(track.value(index, Y));
+    const gap = time0 - time > GAP_S;
+    if (!gap && index > 0 && Math.abs(x - x0) + Math.abs(y - y0) < NEAR) continue;
+    if (gap) context.moveTo(x, y);
+    else context.lineTo(x, y);
+    [x0, y0, time0] = [x, y, time];
+  }
+  context.stroke();
+}

@@ -1,0 +1,132 @@
+/** The superframe, and when each tag was positioning within it: the paper's oscilloscope picture, from the tags' reports. */
+
+import { on, state } from "../store.js";
+import { byId, h, s, slowly, text } from "../dom.js";
+import { duration, number } from "../format.js";
+import { facts } from "./tag_detail.js";
+
+export const title = "Timing";
+/** Rows of the picture; more could not be told apart. */
+const MOST = 24;
+const ROW = 30;
+const TOP = 38;
+const LEFT = 62;
+let parts = null;
+let isOpen = () => false;
+
+/** Build the tab. */
+export function start(panel, open) {
+  isOpen = open;
+  const about = h("p", { class: "fine" }, "Each tag's last whole superframe. The line is high while the tag works on a message; ",
+    "a dot is a fix. Slots above, with the anchor that spoke.");
+  const picture = h("div", { id: "phases" });
+  const empty = h("p", { class: "empty" }, "No tag has reported its phases yet.");
+  const caption = h("p", { class: "count" });
+  const ether = facts(["Transmissions", "Too late", "Stalls", "Overruns", "Simulated time"]);
+  const etherBox = h("section", { hidden: true }, h("h2", {}, "The emulated air"), ether.element);
+  parts = { picture, empty, caption, ether, etherBox };
+  panel.append(h("h2", {}, "Superframe and positioning phases"), caption, picture, empty, about, etherBox);
+  on(["health", "selection", "theme", "mode"], slowly(200, show));
+  new ResizeObserver(() => show()).observe(panel);
+}
+
+/** Bring the tab up to date, if anybody sees it. */
+export function show() {
+  if (!parts || !isOpen()) return;
+  const all = state.mode === "live" ? [...state.health.tags.values()].filter(({ phases }) => phases?.length).map(read) : [];
+  all.sort((a, b) => a.tag.localeCompare(b.tag, "en", { numeric: true }));
+  const chosen = all.filter((health) => health.tag === state.selection.tag);
+  const shown = [...chosen, ...all.filter((health) => health.tag !== state.selection.tag)].slice(0, MOST);
+  parts.empty.hidden = shown.length > 0;
+  parts.picture.replaceChildren(...(shown.length ? [draw(shown)] : []));
+  text(parts.empty, state.mode === "live" ? "No tag has reported its phases yet." : "Phases are shown live only.");
+  const { slot_s = 0 } = state.site?.schedule ?? {};
+  const slots = slotCount();
+  const more = all.length > shown.length ? ` ${shown.length} of ${all.length} tags.` : "";
+  text(parts.caption, slots ? `${slots} slots of ${duration(slot_s)}: ${duration(slots * slot_s)}.${more}` : "");
+  showEther();
+}
+
+/** A tag's health with its phases by name; on the wire they are arrays. */
+function read(health) {
+  const phases = health.phases.map(([superframe, slot, anchor, heard_s, done_s, fix]) => {
+    return { superframe, slot, anchor, heard_s, done_s, fix };
+  });
+  return { tag: health.tag, phases };
+}
+
+function slotCount() {
+  const site = state.site;
+  return site ? (site.schedule.slots ?? site.anchors.length * site.schedule.frames_per_node) : 0;
+}
+
+function draw(tags) {
+  const width = Math.max(byId("phases").clientWidth || 340, 260);
+  const height = TOP + tags.length * ROW + 8;
+  const slot_s = state.site?.schedule.slot_s ?? 2e-3;
+  const latest = Math.max(...tags.flatMap((health) => health.phases.map((phase) => phase.done_s)));
+  const end_s = Math.max(slotCount() * slot_s, latest);
+  const at = (time_s) => LEFT + ((width - LEFT - 6) * (time_s + 0.1 * slot_s)) / (end_s + 0.1 * slot_s);
+  const label = `Positioning phases of ${tags.map((health) => health.tag).join(", ")} over ${duration(end_s)}`;
+  const picture = s("svg", { width, height, viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": label });
+  picture.append(...slotMarks(tags[0].phases, slot_s, at, height), ...timeMarks(end_s, at));
+  tags.forEach((health, index) => picture.append(trace(health, TOP + index * ROW, at, end_s)));
+  return picture;
+}
+
+function slotMarks(phases, slot_s, at, height) {
+  const marks = [];
+  const first = phases[0].slot;
+  for (const phase of phases) {
+    const x = at((phase.slot - first) * slot_s);
+    const next = at((phase.slot - first + 1) * slot_s);
+    const box = s("rect", { class: "slot", x, y: 18, width: Math.max(next - x - 1, 1), height: height - 24 });
+    const name = s("text", { x: (x + next) / 2, y: 31, class: "slot-name" }, String(phase.anchor));
+    marks.push(box);
+    if (next - x > 11) marks.push(name);
+  }
+  return marks;
+}
+
+function timeMarks(end_s, at) {
+  const wanted = end_s / 4;
+  const power = 10 ** Math.floor(Math.log10(wanted));
+  const step = power * [1, 2, 5].findLast((factor) => factor * power <= wanted);
+  const marks = [s("text", { x: 0, y: 31, class: "row-name" }, "anchor")];
+  for (let n = 0; n * step <= end_s + 1e-9; n++) {
+    marks.push(s("text", { x: at(n * step), y: 11, class: "time" }, number(n * step * 1e3, step < 1e-3 ? 1 : 0, n ? "" : "ms")));
+  }
+  return marks;
+}
+
+function trace(health, top, at, end_s) {
+  const low = top + ROW - 8;
+  const high = top + 8;
+  let line = `M${LEFT} ${low}`;
+  const row = s("g", { class: health.tag === state.selection.tag ? "trace selected" : "trace" });
+  for (const phase of health.phases) {
+    const from = at(phase.heard_s);
+    const to = Math.max(at(phase.done_s), from + 1.5);
+    line += `H${from.toFixed(1)}V${high}H${to.toFixed(1)}V${low}`;
+    const words = `anchor ${phase.anchor}, slot ${phase.slot}: ${duration(phase.done_s - phase.heard_s)}${phase.fix ? ", fix" : ""}`;
+    row.append(s("rect", { class: "busy", x: from, y: high, width: to - from, height: low - high }, s("title", {}, words)));
+    if (phase.fix) row.append(s("circle", { class: "fix", cx: to, cy: high - 1, r: 2.2 }));
+  }
+  row.append(s("path", { class: "pin", d: `${line}H${at(end_s)}` }));
+  const name = health.tag.length > 9 ? `${health.tag.slice(0, 8)}…` : health.tag;
+  row.append(s("text", { x: 0, y: top + 17, class: "row-name" }, name, s("title", {}, health.tag)));
+  return row;
+}
+
+function showEther() {
+  const ether = state.mode === "live" ? state.health.ether : null;
+  parts.etherBox.hidden = !ether;
+  if (!ether) return;
+  parts.ether.show({
+    Transmissions: number(ether.transmissions),
+    "Too late": number(ether.late),
+    Stalls: number(ether.stalls),
+    Overruns: number(ether.overruns),
+    "Simulated time": duration(ether.simulated_s),
+  });
+}

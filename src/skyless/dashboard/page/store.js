@@ -1,0 +1,72 @@
+/**
+ * The one state of the page. Modules change it, say which topic has changed, and are called back at most once a frame.
+ *
+ * Topics: connection, site, zones, events, health, tags, mode, player, recordings, selection, options, overlay, editor,
+ * theme.
+ */
+
+/** @type {Map<string, Set<() => void>>} */
+const listeners = new Map();
+/** @type {Set<string>} */
+const dirty = new Set();
+let scheduled = false;
+
+export const state = {
+  /** @type {{phase: "connecting"|"open"|"lost", since: number, reason: string, retryAt: number}} */
+  connection: { phase: "connecting", since: performance.now(), reason: "", retryAt: 0 },
+  /** @type {{connected: boolean, broker: string}|null} */
+  mqtt: null,
+  version: "",
+  /** @type {any} the site message's `site` */
+  site: null,
+  simulated: false,
+  /** @type {"live"|"replay"} */
+  mode: "live",
+  /** @type {Array<{id: string, name: string, polygon_m: number[][], colour: string|null}>} */
+  zones: [],
+  /** @type {any[]} newest first */
+  events: [],
+  health: { anchors: new Map(), tags: new Map(), ether: null, nodes: [], atMs: 0 },
+  /** @type {any[]|null} */
+  recordings: null,
+  /** @type {any} what `player.js` plays */
+  player: null,
+  selection: { tag: null, anchor: null, zone: null },
+  options: { names: true, trails: 15, ellipses: true, truth: true, overlay: "none" },
+  /** @type {{data: any, picture: HTMLCanvasElement|null, error: string}} */
+  overlay: { data: null, picture: null, error: "" },
+};
+
+/** Call `callback` in the next frame after any of the topics has changed. */
+export function on(topics, callback) {
+  for (const topic of topics) {
+    if (!listeners.has(topic)) listeners.set(topic, new Set());
+    listeners.get(topic).add(callback);
+  }
+}
+
+/** Say what has changed. */
+export function changed(...topics) {
+  for (const topic of topics) dirty.add(topic);
+  if (scheduled) return;
+  scheduled = true;
+  requestAnimationFrame(flush);
+}
+
+function flush() {
+  scheduled = false;
+  const callbacks = new Set();
+  for (const topic of dirty) for (const callback of listeners.get(topic) ?? []) callbacks.add(callback);
+  dirty.clear();
+  for (const callback of callbacks) callback();
+}
+
+/** Select one tag, anchor or zone; the other two are let go. */
+export function select(kind, id) {
+  const next = { tag: null, anchor: null, zone: null };
+  if (kind) next[kind] = id;
+  const now = state.selection;
+  if (now.tag === next.tag && now.anchor === next.anchor && now.zone === next.zone) return;
+  state.selection = next;
+  changed("selection");
+}

@@ -1,0 +1,44 @@
+"""What the page's tests share: one browser, servers of a made-up site, and visits that nothing may go wrong in."""
+
+import contextlib
+from pathlib import Path
+
+import pytest
+from page_browser import CHROMIUM, FLAGS, Visit
+from page_fake_server import FakeServer
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    sync_api = pytest.importorskip("playwright.sync_api")
+    if not Path(CHROMIUM).exists():
+        pytest.skip(f"no Chromium at {CHROMIUM}: apt install chromium")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def serve():
+    """Start a server of a made-up site."""
+    with contextlib.ExitStack() as stack:
+        yield lambda **settings: stack.enter_context(FakeServer(**settings))
+
+
+@pytest.fixture
+def visit(chromium):
+    """Open the page; in the end, nothing has gone wrong in it, and it has asked nobody but its server."""
+    visits = []
+
+    def open_page(server, **context):
+        visits.append(Visit(chromium, server.address, **context))
+        visits[-1].host = server.address.split("/")[2]
+        return visits[-1]
+
+    yield open_page
+    for one in visits:
+        one.context.close()
+    for one in visits:
+        assert one.problems == []
+        assert one.hosts <= {one.host}

@@ -1,0 +1,60 @@
+"""Where Chromium is, how it is started for the page's tests, and a visit to the page."""
+
+import time
+
+CHROMIUM = "/usr/bin/chromium"
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
+def until(page, expression, arg=None, timeout_s=6.0):
+    """Wait for something in the page. Playwright's own waiting needs ``eval``, which the page's policy forbids."""
+    end = time.monotonic() + timeout_s
+    while not page.evaluate(expression, arg):
+        assert time.monotonic() < end, f"never: {expression}"
+        time.sleep(0.03)
+
+
+class Visit:
+    """A page that is open, and what went wrong in it."""
+
+    def __init__(self, browser, address, **context):
+        self.context = browser.new_context(**{"viewport": {"width": 1280, "height": 800}, **context})
+        self.page = self.context.new_page()
+        self.problems, self.hosts = [], set()
+        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
+        self.page.on("console", lambda message: message.type in {"error", "warning"} and self._note(message.text))
+        self.page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
+        self.page.goto(address)
+        until(self.page, "window.skyless?.state.connection.phase === 'open'")
+
+    def _note(self, text):
+        self.problems.append(text)
+
+    def position(self, tag, tracks="live"):
+        """Where the page draws a tag now."""
+        return self.page.evaluate(
+            """([tag, tracks]) => {
+              const row = new Float64Array(16);
+              return skyless[tracks].all.get(tag)?.at(skyless.shown_s(), row) ? [row[0], row[1]] : null;
+            }""",
+            [tag, tracks],
+        )
+
+    def at(self, x_m, y_m):
+        """Pixel of a place of the site, from the window's upper left corner."""
+        return self.page.evaluate(
+            """async ([x, y]) => {
+              const view = await import("/page/map/view.js");
+              const box = document.getElementById("canvas").getBoundingClientRect();
+              return [box.left + view.px(x), box.top + view.py(y)];
+            }""",
+            [x_m, y_m],
+        )

@@ -1,0 +1,220 @@
+"""A server that speaks the page's contract over a made-up site, for its tests and for work on the page.
+
+By hand: ``.venv/bin/python tests/dashboard/page_fake_server.py [tags]``, then open the address that it prints.
+"""
+
+import asyncio
+import contextlib
+import mimetypes
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+
+import page_fake_site as made_up
+import uvicorn
+from starlette.applications import Starlette
+from starlette.responses import FileResponse, JSONResponse
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocketDisconnect
+
+import skyless
+
+PAGE = Path(skyless.__file__).parent / "dashboard" / "page"
+RECORDED_S = 90.0
+DOCK = {"id": "dock", "name": "Dock", "polygon_m": [[14, 2.5], [21, 2.5], [21, 6], [14, 6]], "colour": "#c2763a"}
+
+
+class FakeServer:
+    """Serves on a free port of loopback in a thread of its own; its attributes are the switches of the tests."""
+
+    def __init__(self, tags=3, rate_hz=10.0, zones=(DOCK,), site=True):
+        self.tags, self.rate_hz, self.site = tags, rate_hz, site
+        self.zones = [dict(zone) for zone in zones]
+        self.stored = []
+        self.silent_tags = set()
+        self.refuse = False
+        self.mute = False
+        self.zone_error = None
+        self.started = time.time()
+        self.sockets = {}
+        self.port = _free_port()
+        self._loop = None
+        self._server = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self):
+        self._thread.start()
+        while not (self._server and self._server.started):
+            time.sleep(0.01)
+        return self
+
+    def __exit__(self, *_):
+        self._server.should_exit = True
+        self._thread.join(5)
+
+    @property
+    def address(self):
+        return f"http://127.0.0.1:{self.port}/"
+
+    def cut(self):
+        """Close every live socket and take no new one until ``refuse`` is false again."""
+        self.refuse = True
+        for websocket in list(self.sockets):
+            asyncio.run_coroutine_threadsafe(websocket.close(1012), self._loop).result(5)
+
+    def send(self, message):
+        """Send a message to every page."""
+        for websocket, lock in list(self.sockets.items()):
+            asyncio.run_coroutine_threadsafe(_send(websocket, lock, message), self._loop).result(5)
+
+    def _run(self):
+        config = uvicorn.Config(self._app(), port=self.port, log_level="warning", ws="websockets-sansio")
+        self._server = uvicorn.Server(config)
+        self._server.install_signal_handlers = lambda: None
+        asyncio.run(self._serve())
+
+    async def _serve(self):
+        self._loop = asyncio.get_running_loop()
+        await self._server.serve()
+
+    def _app(self):
+        mimetypes.add_type("text/javascript", ".js")
+
+        async def index(_request):
+            return _guarded(FileResponse(PAGE / "index.html"))
+
+        async def floor_plan(_request):
+            return JSONResponse({"error": "no floor plan"}, status_code=404)
+
+        async def overlay(request):
+            query = request.query_params
+            return JSONResponse(made_up.overlay(query["kind"], float(query["step_m"])))
+
+        async def put_zones(request):
+            body = await request.json()
+            if self.zone_error:
+                return JSONResponse({"error": self.zone_error}, status_code=400)
+            self.stored.append(body)
+            self.zones = body["zones"]
+            return JSONResponse({"zones": self.zones})
+
+        async def recordings(_request):
+            start = {"bytes": 48_300_000, "start_unix_s": 1_780_000_000.0, "complete": True}
+            return JSONResponse([{"name": "walk.mcap", "duration_s": RECORDED_S, **start}])
+
+        async def recording(request):
+            start = 1_780_000_000.0
+            site = made_up.site_message(start)
+            return JSONResponse({
+                "name": request.path_params["name"], "site": site, "start_unix_s": start,
+                "end_unix_s": start + RECORDED_S, "tags": made_up.names(2), "zones": [DOCK],
+            })  # fmt: skip
+
+        async def states(request):
+            query = request.query_params
+            return JSONResponse({"states": _recorded(float(query["from_s"]), float(query["to_s"]), query["rate_hz"])})
+
+        return Starlette(
+            routes=[
+                Route("/", index),
+                Route("/api/floor_plan", floor_plan),
+                Route("/api/overlay", overlay),
+                Route("/api/zones", put_zones, methods=["PUT"]),
+                Route("/api/recordings", recordings),
+                Route("/api/recordings/{name}", recording),
+                Route("/api/recordings/{name}/states", states),
+                WebSocketRoute("/live", self._live),
+                Mount("/page", StaticFiles(directory=PAGE)),
+            ]
+        )
+
+    async def _live(self, websocket):
+        if self.refuse:
+            return await websocket.close()
+        await websocket.accept()
+        lock = asyncio.Lock()
+        await _send(websocket, lock, self._hello())
+        self.sockets[websocket] = lock
+        jobs = [asyncio.create_task(job(websocket, lock)) for job in (self._states, self._health, self._pongs)]
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
+        for job in jobs:
+            job.cancel()
+        await asyncio.gather(*jobs, return_exceptions=True)
+        self.sockets.pop(websocket, None)
+        return None
+
+    def _hello(self):
+        site = made_up.site_message(self.started) if self.site else None
+        return {"type": "hello", "version": "0.1.0", "site": site, "zones": self.zones, "events": [], "mqtt": True}
+
+    async def _states(self, websocket, lock):
+        named = list(enumerate(made_up.names(self.tags)))
+        while True:
+            now = time.time()
+            since = now - self.started
+            rows = [made_up.state_row(name, n, since, now) for n, name in named if name not in self.silent_tags]
+            if not self.mute:
+                await _send(websocket, lock, {"type": "state", "unix_s": now, "tags": rows})
+            await asyncio.sleep(max(0.0, now + 1 / self.rate_hz - time.time()))
+
+    async def _health(self, websocket, lock):
+        while True:
+            if not self.mute:
+                await _send(websocket, lock, self.health(time.time()))
+            await asyncio.sleep(1.0)
+
+    def health(self, now):
+        """A health message: one anchor is not in step, and one has not been heard of for a while."""
+        since = now - self.started
+        anchors = [made_up.anchor_health(n, since, now - (20 if n == 8 else 0), n != 5) for n in range(1, 9)]
+        tags = []
+        for number, name in enumerate(made_up.names(self.tags)):
+            reason = "too-few-anchors" if name in self.silent_tags else None
+            tags.append(made_up.tag_health(name, number, since, now, reason))
+        ether = {"unix_s": now, "simulated_s": since, "transmissions": int(476 * since), "late": 0, "at_anchors": {},
+                 "at_tags": {}, "stalls": 0, "overruns": 0}  # fmt: skip
+        return {"type": "health", "anchors": anchors, "tags": tags, "ether": ether, "nodes": made_up.nodes()}
+
+    async def _pongs(self, websocket, lock):
+        while True:
+            if await websocket.receive_text() == "ping" and not self.mute:
+                await _send(websocket, lock, {"type": "pong"})
+
+
+async def _send(websocket, lock, message):
+    async with lock:
+        await websocket.send_json(message)
+
+
+def _recorded(from_s, to_s, rate_hz):
+    start, step = 1_780_000_000.0, 1 / float(rate_hz)
+    first, last = int(max(0.0, from_s) / step), int(min(to_s, RECORDED_S) / step)
+    times = [n * step for n in range(first, last + 1)]
+    named = list(enumerate(made_up.names(2)))
+    return [
+        {"type": "state", "unix_s": start + t, "tags": [made_up.state_row(name, n, t, start + t) for n, name in named]}
+        for t in times
+    ]
+
+
+def _guarded(response):
+    """What the real server sends: anything from elsewhere is refused by the browser."""
+    response.headers["content-security-policy"] = "default-src 'self'"
+    return response
+
+
+def _free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+if __name__ == "__main__":
+    with FakeServer(tags=int(sys.argv[1]) if len(sys.argv) > 1 else 3) as server:
+        print(server.address)  # noqa: T201 - the address is the program's output
+        while True:
+            time.sleep(3600)

@@ -1,0 +1,118 @@
+"""A made-up site for the page's tests: anchors, walls, tags on given paths, and what they report. No radio in it."""
+
+import math
+
+WIDTH_M, DEPTH_M = 24.0, 14.0
+SLOT_S = 2.1e-3
+SUPERFRAME = 8
+COLUMNS_X = (1.0, 8.5, 15.5, 23.0)
+
+
+def anchor_places():
+    return [(number, x, y) for number, (x, y) in enumerate(((x, y) for y in (1.0, 13.0) for x in COLUMNS_X), start=1)]
+
+
+def site_message(unix_s):
+    walls = ((0, 0, 24, 0), (24, 0, 24, 14), (24, 14, 0, 14), (0, 14, 0, 0), (12, 0, 12, 5), (12, 9, 12, 14))
+    site = {
+        "name": "Hall 7",
+        "id": 7,
+        "master": 2,
+        "anchors": [{"id": n, "x_m": x, "y_m": y, "z_m": 2.8, "slot": None} for n, x, y in anchor_places()],
+        "schedule": {"slot_s": SLOT_S, "slots": None, "frames_per_node": 1, "guard_s": 0.5e-3},
+        "noise": {},
+        "tags": {"height_m": 1.2},
+        "walls": [{"x1_m": a, "y1_m": b, "x2_m": c, "y2_m": d} for a, b, c, d in walls],
+        "floor_plan": None,
+        "georeference": None,
+    }
+    return {"site": site, "simulated": True, "unix_s": unix_s}
+
+
+def names(count):
+    few = ("forklift", "trolley", "robot")
+    return [few[n] if n < 3 and count <= 3 else f"tag-{n + 1:03d}" for n in range(count)]
+
+
+def truth(number, time_s):
+    """Position and velocity of a tag that goes round an ellipse of its own, in m and m/s."""
+    phase, pace = 2.4 * number, 0.25 + 0.05 * (number % 5)
+    across, up = 3.0 + (number * 7) % 7, 2.0 + (number * 3) % 4
+    angle = phase + pace * time_s
+    centre_x = 12.0 + ((number * 5) % 5 - 2)
+    velocity = (-across * pace * math.sin(angle), up * pace * math.cos(angle))
+    return centre_x + across * math.cos(angle), 7.0 + up * math.sin(angle), *velocity
+
+
+def state_row(name, number, time_s, unix_s):
+    """A row of a state message, fields in the order of the contract."""
+    x, y, vx, vy = truth(number, time_s)
+    ease = 1.0 + 0.5 * math.sin(0.3 * time_s + number)
+    dx = 0.05 * ease * math.sin(9.1 * time_s + number)
+    dy = 0.04 * ease * math.cos(7.7 * time_s + 2 * number)
+    xx, xy, yy = (0.14 * ease) ** 2, 0.006 * ease, (0.09 * ease) ** 2
+    used = 8 - (1 if math.sin(0.7 * time_s + number) > 0.6 else 0)
+    chi2 = used * (0.8 + 0.6 * math.sin(5.3 * time_s + number) ** 2)
+    numbers = [x + dx, y + dy, 1.2, vx, vy, xx, xy, yy, math.sqrt(xx + yy), math.hypot(dx, dy), x, y]
+    return [name, *(round(value, 5) for value in numbers), used, round(chi2, 3), unix_s, 0.6 * ease]
+
+
+def mqtt():
+    return {"published": 12_345, "dropped": 0, "reconnects": 0}
+
+
+def phases(number, superframe):
+    """When a tag worked on each message of a superframe: array per message."""
+    rows = []
+    for slot in range(SUPERFRAME):
+        heard = slot * SLOT_S
+        work = (0.00045 if slot < SUPERFRAME - 1 else 0.0009) * (1 + 0.4 * math.sin(number + slot))
+        rows.append([superframe, slot, slot + 1, heard, heard + work + 0.0001 * number % 0.0005, slot >= 3])
+    return rows
+
+
+def tag_health(name, number, time_s, unix_s, reason=None):
+    return {
+        "tag": name, "unix_s": unix_s, "uptime_s": time_s, "method": "tracker", "receptions": int(476 * time_s),
+        "fixes": int(470 * time_s), "updates_per_s": 470 + 5 * math.sin(time_s + number), "reason": reason,
+        "first_fix_s": 0.31, "latency_p50_s": 0.00042, "latency_p99_s": 0.0013 + 0.0002 * math.sin(time_s),
+        "counters": {"late": 3, "foreign": 0}, "mqtt": mqtt(), "cpu": 0.021, "memory_bytes": 143_000_000,
+        "phases": phases(number, int(time_s / (SUPERFRAME * SLOT_S))),
+    }  # fmt: skip
+
+
+def anchor_health(anchor, time_s, unix_s, synchronised=True):
+    rate = 0.4 * (anchor - 4) + 0.01 * math.sin(0.2 * time_s + anchor)
+    return {
+        "anchor": anchor, "unix_s": unix_s, "uptime_s": time_s, "role": "master" if anchor == 2 else "anchor",
+        "master": 2, "term": 1, "synchronised": synchronised,
+        "offset_s": None if anchor == 2 else 0.7 * anchor - 4 + 1e-6 * rate * time_s,
+        "rate_ppm": None if anchor == 2 else rate,
+        "offset_std_m": None if anchor == 2 else 0.006 + 0.002 * math.sin(0.5 * time_s + anchor),
+        "sent": int(59 * time_s), "late": anchor % 3, "heard": int(410 * time_s),
+        "superframe": int(time_s / (SUPERFRAME * SLOT_S)),
+        "heard_age_s": {str(n): 0.004 * n for n in range(1, 9) if n != anchor}, "counters": {}, "mqtt": mqtt(),
+    }  # fmt: skip
+
+
+def nodes():
+    return [
+        {"online": True, "kind": kind, "name": name, "version": "0.1.0", "host": "hall", "pid": 100 + n, "unix_s": 1.0}
+        for n, (kind, name) in enumerate((("ether", "air"), ("dashboard", "page"), ("recorder", "demo")))
+    ]
+
+
+def overlay(kind, step_m):
+    """A smooth bowl, good in the middle; nothing beyond the walls' corners."""
+    columns, rows = int(WIDTH_M / step_m) + 1, int(DEPTH_M / step_m) + 1
+    scale = 0.02 if kind == "sigma" else 1.0
+    values = []
+    for row in range(rows):
+        for column in range(columns):
+            u, v = 2 * column / (columns - 1) - 1, 2 * row / (rows - 1) - 1
+            values.append(None if abs(u) + abs(v) > 1.9 else round(scale * (1 + u * u + 0.7 * v * v), 4))
+    return {
+        "kind": kind, "unit": "m" if kind == "sigma" else "1", "x_m": [0, (columns - 1) * step_m],
+        "y_m": [0, (rows - 1) * step_m], "step_m": step_m, "columns": columns, "rows": rows, "values": values,
+        "method": "tracker", "levels": {"good": scale, "bad": 2.6 * scale},
+    }  # fmt: skip

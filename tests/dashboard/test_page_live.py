@@ -1,0 +1,138 @@
+"""The page shows a live site: tags move, silence and loss are told, and it comes back by itself."""
+
+import time
+
+import page_fake_site as made_up
+import pytest
+from page_browser import until
+
+SHOWN = "document.getElementById('banner').hidden === false"
+
+
+@pytest.fixture
+def hall(serve, visit):
+    server = serve()
+    return server, visit(server)
+
+
+def picture(page):
+    return page.evaluate("document.getElementById('moving').toDataURL()")
+
+
+def test_tags_move_where_they_are(hall):
+    server, visit = hall
+    page = visit.page
+    until(page, "skyless.frames.moving > 10")
+    before, picture_before = visit.position("forklift"), picture(page)
+    now = time.time()
+    x, y = visit.position("forklift")
+    true_x, true_y, *_ = made_up.truth(0, now - server.started)
+    assert (x - true_x) ** 2 + (y - true_y) ** 2 < 1.0  # drawn late, and given errors of up to 0.1 m
+    page.wait_for_timeout(700)
+    assert visit.position("forklift") != before
+    assert picture(page) != picture_before
+    assert page.locator("table.tags tbody tr").count() == 3
+    assert page.locator("#pill").inner_text() == "Live"
+
+
+def test_many_tags_are_drawn(serve, visit):
+    page = visit(serve(tags=200)).page
+    until(page, "skyless.live.sorted.length === 200")
+    frames = page.evaluate("skyless.frames.moving")
+    until(page, "before => skyless.frames.moving > before + 5", arg=frames)
+
+
+def test_nothing_is_drawn_while_nothing_changes(serve, visit):
+    page = visit(serve(tags=0)).page
+    page.wait_for_timeout(500)
+    frames = page.evaluate("skyless.frames.moving")
+    page.wait_for_timeout(2000)
+    assert page.evaluate("skyless.frames.moving") - frames < 12  # health comes once a second
+
+
+def test_a_site_may_come_later(serve, visit):
+    server = serve(site=False, tags=0)
+    page = visit(server).page
+    assert page.locator("#waiting").is_visible()
+    server.send({"type": "site", "site": made_up.site_message(time.time())})
+    page.locator("#waiting").wait_for(state="hidden")
+    assert page.locator("#site-name").inner_text() == "Hall 7"
+
+
+def test_a_silent_tag_turns_grey_and_then_leaves_the_map(hall):
+    server, visit = hall
+    page = visit.page
+    page.wait_for_selector("table.tags tr.fresh:has-text('robot')")
+    server.silent_tags = {"robot"}
+    page.wait_for_selector("table.tags tr.stale:has-text('robot')")
+    kinds = page.evaluate("""async () => {
+      const { freshness, now_s } = await import("/page/clock.js");
+      const track = skyless.live.all.get("robot");
+      return [0.9, 1.1, 9.9, 10.1].map((age) => freshness(track, track.lastTime + age));
+    }""")
+    assert kinds == ["fresh", "stale", "stale", "gone"]
+    page.click("table.tags button:has-text('robot')")
+    page.wait_for_selector("text=No fix: too few anchors")
+
+
+def test_a_cut_connection_is_told_and_comes_back(hall):
+    server, visit = hall
+    page = visit.page
+    until(page, "skyless.frames.moving > 3")
+    server.cut()
+    until(page, SHOWN)
+    assert "Connection lost" in page.locator("#banner").inner_text()
+    assert page.locator("#pill").inner_text() == "Connection lost"
+    server.refuse = False
+    page.locator("#banner").wait_for(state="hidden")
+    before = visit.position("forklift")
+    page.wait_for_timeout(500)
+    assert visit.position("forklift") != before
+    refused = [text for text in visit.problems if "WebSocket connection" in text]
+    assert visit.problems == refused  # the browser's own words for what the server refused
+    visit.problems.clear()
+
+
+def test_silence_is_a_lost_connection(hall):
+    server, visit = hall
+    page = visit.page
+    until(page, "skyless.frames.moving > 3")
+    server.mute = True
+    until(page, SHOWN, timeout_s=8.0)
+    assert "silent" in page.locator("#banner").inner_text()
+    server.mute = False
+    page.locator("#banner").wait_for(state="hidden")
+
+
+def test_a_broker_that_is_away_is_told(hall):
+    server, visit = hall
+    server.send({"type": "mqtt", "connected": False, "broker": "mqtt://hall:1883"})
+    until(visit.page, SHOWN)
+    assert "mqtt://hall:1883" in visit.page.locator("#banner").inner_text()
+    server.send({"type": "mqtt", "connected": True, "broker": "mqtt://hall:1883"})
+    visit.page.locator("#banner").wait_for(state="hidden")
+
+
+def test_health_and_phases_are_shown(hall):
+    page = hall[1].page
+    page.click("#tab-anchors")
+    page.wait_for_selector("#panel-anchors tr.good:has-text('2 master')")
+    assert page.locator("#panel-anchors tr.warn").inner_text().startswith("not in step")
+    assert "8" in page.locator("#panel-anchors tr.bad").inner_text()
+    page.click("#panel-anchors button:has-text('3')")
+    page.wait_for_selector("#panel-anchors .detail canvas")
+    page.click("#tab-timing")
+    page.wait_for_selector("#phases svg")
+    assert page.locator("#phases .busy").count() == 3 * made_up.SUPERFRAME
+    assert page.locator("#phases .fix").count() == 3 * (made_up.SUPERFRAME - 3)
+
+
+def test_an_overlay_is_shown_with_its_scale(hall):
+    page = hall[1].page
+    page.click("#legend summary")
+    page.select_option("#overlay", "sigma")
+    page.wait_for_selector("#ramp-box")
+    assert page.locator("#ramp-good").inner_text() == "2.0 cm good"
+    assert page.locator("#ramp-bad").inner_text() == "5.2 cm bad"
+    page.select_option("#overlay", "none")
+    page.locator("#ramp-box").wait_for(state="hidden")
