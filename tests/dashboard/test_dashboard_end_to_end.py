@@ -8,7 +8,7 @@ import socket
 import sys
 import time
 
-import httpx
+import httpx2 as httpx
 import msgspec
 import pytest
 import websockets
