@@ -15,7 +15,7 @@ from pathlib import Path
 import page_fake_site as made_up
 import uvicorn
 from starlette.applications import Starlette
-from starlette.responses import FileResponse, JSONResponse
+from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocketDisconnect
@@ -30,9 +30,10 @@ DOCK = {"id": "dock", "name": "Dock", "polygon_m": [[14, 2.5], [21, 2.5], [21, 6
 class FakeServer:
     """Serves on a free port of loopback in a thread of its own; its attributes are the switches of the tests."""
 
-    def __init__(self, tags=3, rate_hz=10.0, zones=(DOCK,), site=True):
+    def __init__(self, tags=3, rate_hz=10.0, zones=(DOCK,), site=True, floor_plan=None):
         self.tags, self.rate_hz, self.site = tags, rate_hz, site
         self.zones = [dict(zone) for zone in zones]
+        self.floor_plan = floor_plan
         self.stored = []
         self.silent_tags = set()
         self.refuse = False
@@ -87,7 +88,7 @@ class FakeServer:
             return _guarded(FileResponse(PAGE / "index.html"))
 
         async def floor_plan(_request):
-            return JSONResponse({"error": "no floor plan"}, status_code=404)
+            return Response(self.floor_plan, media_type="image/png")
 
         async def overlay(request):
             query = request.query_params
@@ -148,7 +149,8 @@ class FakeServer:
         return None
 
     def _hello(self):
-        site = made_up.site_message(self.started) if self.site else None
+        plan = {"image": "hall.png", "width_m": 24.0, "x_m": 0.0, "y_m": -1.0} if self.floor_plan else None
+        site = made_up.site_message(self.started, plan) if self.site else None
         return {"type": "hello", "version": "0.1.0", "site": site, "zones": self.zones, "events": [], "mqtt": True}
 
     async def _states(self, websocket, lock):

@@ -12,7 +12,7 @@ def anchor_places():
     return [(number, x, y) for number, (x, y) in enumerate(((x, y) for y in (1.0, 13.0) for x in COLUMNS_X), start=1)]
 
 
-def site_message(unix_s):
+def site_message(unix_s, floor_plan=None):
     walls = ((0, 0, 24, 0), (24, 0, 24, 14), (24, 14, 0, 14), (0, 14, 0, 0), (12, 0, 12, 5), (12, 9, 12, 14))
     site = {
         "name": "Hall 7",
@@ -23,7 +23,7 @@ def site_message(unix_s):
         "noise": {},
         "tags": {"height_m": 1.2},
         "walls": [{"x1_m": a, "y1_m": b, "x2_m": c, "y2_m": d} for a, b, c, d in walls],
-        "floor_plan": None,
+        "floor_plan": floor_plan,
         "georeference": None,
     }
     return {"site": site, "simulated": True, "unix_s": unix_s}
@@ -36,12 +36,12 @@ def names(count):
 
 def truth(number, time_s):
     """Position and velocity of a tag that goes round an ellipse of its own, in m and m/s."""
-    phase, pace = 2.4 * number, 0.25 + 0.05 * (number % 5)
-    across, up = 3.0 + (number * 7) % 7, 2.0 + (number * 3) % 4
+    phase, pace = 2.4 * number, 0.16 + 0.03 * (number % 5)
+    across, up = 2.0 + 5.0 * (0.618 * number % 1), 1.5 + 2.5 * (0.414 * number % 1)
     angle = phase + pace * time_s
-    centre_x = 12.0 + ((number * 5) % 5 - 2)
+    centre_x, centre_y = 12.0 + 4.0 * math.sin(3.1 * number), 7.0 + 2.0 * math.cos(1.7 * number)
     velocity = (-across * pace * math.sin(angle), up * pace * math.cos(angle))
-    return centre_x + across * math.cos(angle), 7.0 + up * math.sin(angle), *velocity
+    return centre_x + across * math.cos(angle), centre_y + up * math.sin(angle), *velocity
 
 
 def state_row(name, number, time_s, unix_s):

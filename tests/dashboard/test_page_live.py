@@ -1,10 +1,12 @@
 """The page shows a live site: tags move, silence and loss are told, and it comes back by itself."""
 
+import io
 import time
 
 import page_fake_site as made_up
 import pytest
 from page_browser import until
+from PIL import Image
 
 SHOWN = "document.getElementById('banner').hidden === false"
 
@@ -125,6 +127,24 @@ def test_health_and_phases_are_shown(hall):
     page.wait_for_selector("#phases svg")
     assert page.locator("#phases .busy").count() == 3 * made_up.SUPERFRAME
     assert page.locator("#phases .fix").count() == 3 * (made_up.SUPERFRAME - 3)
+
+
+def test_a_floor_plan_lies_where_the_site_says(serve, visit):
+    file = io.BytesIO()
+    Image.new("RGB", (480, 300), (200, 30, 30)).save(file, "PNG")
+    shown = visit(serve(tags=0, floor_plan=file.getvalue()))
+    page = shown.page
+    until(page, "import('/page/map/floor.js').then(({ floor }) => floor?.height_m === 15)")
+    reddish = """async ([x, y]) => {
+      const view = await import("/page/map/view.js");
+      const canvas = document.getElementById("still");
+      const [r, g, b] = canvas.getContext("2d").getImageData(view.px(x), view.py(y), 1, 1).data;
+      return r > 100 && g < 90 && b < 90;
+    }"""
+    until(page, reddish, [1.37, -0.71])
+    assert page.evaluate(reddish, [23.37, 13.71])
+    assert not page.evaluate(reddish, [1.37, -1.31])
+    shown.problems.clear()  # a hint that pixels are read slowly
 
 
 def test_an_overlay_is_shown_with_its_scale(hall):

@@ -91,7 +91,7 @@ export class Chart {
       scales: { x: { time: false, range: () => this.window }, y: { range } },
       axes: [
         { ...axis, size: 18, gap: 2, values: (_plot, marks) => marks.map((mark) => `${mark || "now"}`.replace("-", "−")) },
-        { ...axis, size: 44, gap: 4, space: 26, incrs: whole ? [1, 2, 5, 10, 20, 50, 100, 200, 500] : undefined,
+        { ...axis, size: 48, gap: 4, space: 26, incrs: whole ? [1, 2, 5, 10, 20, 50, 100, 200, 500] : undefined,
           values: (_plot, marks) => marks.map((mark) => this.tick(mark)) },
       ],
       series: [

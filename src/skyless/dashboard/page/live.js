@@ -2,6 +2,7 @@
 
 import { changed, state } from "./store.js";
 import { heard, live, newServer } from "./clock.js";
+import { toast } from "./dom.js";
 import { remember } from "./history.js";
 
 const FIRST_RETRY_MS = 500;
@@ -53,6 +54,19 @@ function lost(reason) {
   retryTimer = setTimeout(connect, retry_ms);
   retry_ms = Math.min(retry_ms * 1.6, LAST_RETRY_MS);
   changed("connection");
+  explain(state.connection);
+}
+
+/** A browser does not tell why a socket is refused; an ordinary request does. */
+async function explain(connection) {
+  try {
+    const answer = await fetch(new URL("api/recordings", document.baseURI), { cache: "no-store" });
+    if (answer.status !== 401 && answer.status !== 403) return;
+    connection.reason = "the server wants its token: open the address that it has printed";
+    changed("connection");
+  } catch {
+    // nobody there: the first reason holds
+  }
 }
 
 function watch() {
@@ -85,7 +99,7 @@ const takers = {
     retry_ms = FIRST_RETRY_MS;
     lastMotion = 0;
     state.connection = { phase: "open", since: performance.now(), reason: "", retryAt: 0 };
-    state.version = message.version ?? "";
+    noticeVersion(message.version ?? "");
     state.mqtt = { connected: message.mqtt !== false, broker: state.mqtt?.broker ?? "" };
     state.events = [...(message.events ?? [])].sort((a, b) => b.unix_s - a.unix_s);
     changed("connection", "events");
@@ -93,7 +107,7 @@ const takers = {
     if (message.site) takers.site(message);
   },
   site(message) {
-    liveSite = message.site;
+    site = message.site;
     if (state.mode !== "live") return;
     state.site = message.site.site;
     state.simulated = message.site.simulated;
@@ -134,14 +148,26 @@ const takers = {
   },
 };
 
-let liveSite = null;
+function noticeVersion(version) {
+  if (state.version && version !== state.version) {
+    toast(`The server is version ${version} now.`, "note", { name: "Reload the page", run: () => location.reload() });
+  }
+  state.version = version;
+}
+
+let site = null;
 let liveZones = [];
+
+/** The live site, also while a recording is replayed. */
+export function liveSite() {
+  return site?.site ?? null;
+}
 
 /** Show the live site again after a replay. */
 export function backToLive() {
   state.mode = "live";
-  state.site = liveSite?.site ?? null;
-  state.simulated = liveSite?.simulated ?? false;
+  state.site = site?.site ?? null;
+  state.simulated = site?.simulated ?? false;
   state.zones = liveZones;
   changed("mode", "site", "zones", "tags", "selection");
 }

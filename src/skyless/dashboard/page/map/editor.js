@@ -56,7 +56,7 @@ export async function finish() {
     id: freshId(),
     name: freshName(),
     polygon_m: editor.points,
-    colour: COLOURS[state.zones.length % COLOURS.length],
+    colour: COLOURS.find((colour) => !state.zones.some((one) => one.colour === colour)) ?? COLOURS[0],
   };
   cancel();
   if (await store([...state.zones, zone], `${zone.name} is stored.`)) select("zone", zone.id);

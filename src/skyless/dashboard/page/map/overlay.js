@@ -2,6 +2,7 @@
 
 import { changed, on, state } from "../store.js";
 import { overlay } from "../api.js";
+import { liveSite } from "../live.js";
 import { toast } from "../dom.js";
 
 export const KINDS = {
@@ -33,6 +34,10 @@ export async function choose(kind) {
   state.overlay = { data: null, picture: null, error: "" };
   changed("overlay", "options");
   if (kind === "none") return;
+  if (state.mode === "replay" && JSON.stringify(liveSite()?.anchors) !== JSON.stringify(state.site?.anchors)) {
+    toast("Overlays are computed for the live site; this recording has other anchors.");
+    return choose("none");
+  }
   try {
     const data = await overlay(kind, step());
     if (mine !== serial) return;
@@ -83,8 +88,12 @@ export function valueAt(x_m, y_m) {
 }
 
 let shownFor = null;
-on(["site"], () => {
+on(["site", "mode"], () => {
   const anchors = JSON.stringify(state.site?.anchors ?? null);
-  if (anchors !== shownFor && state.site && state.options.overlay !== "none") choose(state.options.overlay);
+  if (anchors !== shownFor && state.site && state.options.overlay !== "none") {
+    // the server computes for the live site only; a recording may be of another one
+    const same = anchors === JSON.stringify(liveSite()?.anchors ?? null);
+    choose(same ? state.options.overlay : "none");
+  }
   shownFor = anchors;
 });

@@ -36,6 +36,6 @@ function show() {
   byId("canvas").classList.toggle("drawing", editor.drawing);
   byId("drawing-finish").disabled = corners < 3;
   byId("drawing-undo").disabled = corners < 1;
-  const how = corners < 3 ? "Click or tap the corners" : "Click the first corner to close";
-  text(byId("drawing-help"), `${how}. Keys: arrows (Shift: fine), Enter, F finishes, Esc.`);
+  const how = corners < 3 ? "Click or tap the corners" : "The first corner, or Finish, closes it";
+  text(byId("drawing-help"), `${how}.`);
 }

@@ -17,6 +17,7 @@ const NEAR = 2.5;
 const GAP_S = 1;
 
 let drawn_s = NaN;
+let strength = 0.4;
 
 /** Whether the trails are due for so many tags. */
 export function due(since_ms, count) {
@@ -26,6 +27,7 @@ export function due(since_ms, count) {
 /** Draw all trails up to a moment. */
 export function drawTrails(context, seen, shown, length_s) {
   drawn_s = shown;
+  strength = seen.length > CROWD ? 0.22 : 0.4;
   for (const one of seen) path(context, one, px(one.row[X]), py(one.row[Y]), shown, shown - length_s);
 }
 
@@ -36,7 +38,7 @@ export function drawStub(context, one, shown) {
 
 function path(context, { track, colour, selected }, x0, y0, shown, from) {
   const last = track.find(shown);
-  context.strokeStyle = faint(colour, selected ? 0.9 : 0.4);
+  context.strokeStyle = faint(colour, selected ? 0.9 : strength);
   context.lineWidth = selected ? 2 : 1.25;
   context.beginPath();
   context.moveTo(x0, y0);

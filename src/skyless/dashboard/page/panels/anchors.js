@@ -12,6 +12,8 @@ import { facts } from "./tag_detail.js";
 
 export const title = "Anchors";
 const WINDOW_S = 120;
+/** Counters that have a line of their own. */
+const SHOWN = new Set(["sent", "heard", "late"]);
 let parts = null;
 let isOpen = () => false;
 
@@ -22,7 +24,7 @@ export function start(panel, open) {
   const head = h("tr", {}, ...heads.map((words) => h("th", { scope: "col" }, words)));
   head.cells[0].append(h("span", { class: "unseen" }, "State"));
   const body = h("tbody", {});
-  const table = h("table", { class: "list" }, h("thead", {}, head), body);
+  const table = h("table", { class: "list anchors" }, h("thead", {}, head), body);
   const nodes = h("ul", { class: "nodes" });
   const note = h("p", { class: "empty", hidden: true }, "Health is shown live; a recording's states tell nothing of it.");
   parts = { note, rows: new Rows(body, makeRow), detail: makeDetail(), nodes, nodeRows: new Rows(nodes, makeNode) };
@@ -92,7 +94,7 @@ function toggle(id) {
 function makeDetail() {
   const heading = h("h2", {});
   const list = facts(["State", "Follows", "Term", "Superframe", "Sent", "Skipped, too late", "Heard", "Longest unheard", "Uptime",
-    "MQTT", "Dropped"]);
+    "MQTT", "Counted"]);
   const offsets = new Chart("Clock offset, change (µs)", [{ name: "offset", colour: "accent" }], (v) => number(v, 1), { least: 1 });
   const rates = new Chart("Clock rate against the master (ppm)", [{ name: "rate", colour: "warn" }], (v) => number(v, 3), {
     least: 0.01,
@@ -112,16 +114,17 @@ function makeDetail() {
     if (!history || charts.hidden) return;
     const now = history.time.at(-1);
     const times = history.time.map((time) => time - now);
-    offsets.show([times, history.offset_us], WINDOW_S);
-    rates.show([times, history.rate_ppm], WINDOW_S);
-    sigmas.show([times, history.std_mm], WINDOW_S);
+    for (const [chart, values] of [[offsets, history.offset_us], [rates, history.rate_ppm], [sigmas, history.std_mm]]) {
+      chart.element.hidden = values.every((value) => value === null);
+      if (!chart.element.hidden) chart.show([times, values], WINDOW_S);
+    }
   };
   return { element, show: showDetail };
 }
 
 function anchorFacts(id, health) {
   const ages = Object.entries(health.heard_age_s ?? {}).sort((a, b) => b[1] - a[1]);
-  const dropped = Object.entries(health.counters).filter(([, count]) => count);
+  const counted = Object.entries(health.counters).filter(([name, count]) => count && !SHOWN.has(name));
   return {
     State: `${CONDITIONS[condition(id)].words}, ${health.role}`,
     Follows: health.master === null || health.master === id ? null : `anchor ${health.master}`,
@@ -133,7 +136,7 @@ function anchorFacts(id, health) {
     "Longest unheard": ages.length ? `anchor ${ages[0][0]}, ${duration(ages[0][1])}` : null,
     Uptime: duration(health.uptime_s),
     MQTT: `${number(health.mqtt.published)} sent, ${number(health.mqtt.dropped)} given up`,
-    Dropped: dropped.map(([reason, count]) => `${count} ${reason}`).join(", ") || "none",
+    Counted: counted.map(([name, count]) => `${count} ${name.replaceAll("_", " ")}`).join(", ") || null,
   };
 }
 

@@ -18,7 +18,7 @@ let isOpen = () => false;
 export function start(panel, open) {
   isOpen = open;
   const about = h("p", { class: "fine" }, "Each tag's last whole superframe. The line is high while the tag works on a message; ",
-    "a dot is a fix. Slots above, with the anchor that spoke.");
+    "a dot is a fix. Above, the slots and the anchors that were heard in them.");
   const picture = h("div", { id: "phases" });
   const empty = h("p", { class: "empty" }, "No tag has reported its phases yet.");
   const caption = h("p", { class: "count" });
@@ -43,7 +43,9 @@ export function show() {
   const { slot_s = 0 } = state.site?.schedule ?? {};
   const slots = slotCount();
   const more = all.length > shown.length ? ` ${shown.length} of ${all.length} tags.` : "";
-  text(parts.caption, slots ? `${slots} slots of ${duration(slot_s)}: ${duration(slots * slot_s)}.${more}` : "");
+  const superframe = shown[0]?.phases[0].superframe;
+  const latest = superframe === undefined ? "" : `Superframe ${number(superframe)}.`;
+  text(parts.caption, slots ? `${slots} slots of ${duration(slot_s)}: ${duration(slots * slot_s)}. ${latest}${more}` : "");
   showEther();
 }
 
@@ -69,21 +71,22 @@ function draw(tags) {
   const at = (time_s) => LEFT + ((width - LEFT - 6) * (time_s + 0.1 * slot_s)) / (end_s + 0.1 * slot_s);
   const label = `Positioning phases of ${tags.map((health) => health.tag).join(", ")} over ${duration(end_s)}`;
   const picture = s("svg", { width, height, viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": label });
-  picture.append(...slotMarks(tags[0].phases, slot_s, at, height), ...timeMarks(end_s, at));
+  picture.append(...slotMarks(tags, slot_s, at, height), ...timeMarks(end_s, at));
   tags.forEach((health, index) => picture.append(trace(health, TOP + index * ROW, at, end_s)));
   return picture;
 }
 
-function slotMarks(phases, slot_s, at, height) {
+/** Boxes of the slots from the first that was heard, with who spoke; a dot where nobody was heard. */
+function slotMarks(tags, slot_s, at, height) {
+  const speakers = new Map(tags.flatMap(({ phases }) => phases.map(({ slot, anchor }) => [slot, anchor])));
+  const first = tags[0].phases[0].slot;
   const marks = [];
-  const first = phases[0].slot;
-  for (const phase of phases) {
-    const x = at((phase.slot - first) * slot_s);
-    const next = at((phase.slot - first + 1) * slot_s);
-    const box = s("rect", { class: "slot", x, y: 18, width: Math.max(next - x - 1, 1), height: height - 24 });
-    const name = s("text", { x: (x + next) / 2, y: 31, class: "slot-name" }, String(phase.anchor));
-    marks.push(box);
-    if (next - x > 11) marks.push(name);
+  for (let slot = first; slot < Math.max(slotCount(), first + 1); slot++) {
+    const x = at((slot - first) * slot_s);
+    const next = at((slot - first + 1) * slot_s);
+    marks.push(s("rect", { class: "slot", x, y: 18, width: Math.max(next - x - 1, 1), height: height - 24 }));
+    const name = String(speakers.get(slot) ?? "·");
+    if (next - x > 11) marks.push(s("text", { x: (x + next) / 2, y: 31, class: "slot-name" }, name));
   }
   return marks;
 }
