@@ -52,4 +52,4 @@ def anchor(
     radios = open_radios(radio, "anchor", tuple(map(str, ids)))
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
     compile_kernels()
-    run(Anchors(plan, radios, address, say, simulated=is_simulated(radio), floor_plan=image).run())
+    run(Anchors(plan, radios, address, say, simulated=is_simulated(radio), floor_plan=image).run(), punctual=True)

@@ -67,6 +67,6 @@ def ether(
     bodies = {f"tag{number}": path for number, path in enumerate(patrols(plan, tags, speed), start=1)}
     emulated = Ether(plan, bodies, impairments_of(request, plan), seed)
     try:
-        run(Air(emulated, host, port, address, say).run())
+        run(Air(emulated, host, port, address, say).run(), punctual=True)
     except OSError as error:
         raise SkylessError(f"--listen is {listen!r}, which cannot be used: {error.strerror or error}") from None

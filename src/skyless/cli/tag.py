@@ -68,4 +68,4 @@ def tag(
     radios = open_radios(radio, "tag", names)
     compile_kernels(method)
     settings = TagSettings(method=method, qa=qa, site=site_id, publish_hz=publish_hz)
-    run(Tags(settings, radios, address, say).run())
+    run(Tags(settings, radios, address, say).run(), punctual=True)

@@ -17,6 +17,12 @@ from skyless.ticks import difference
 LEAD_S: Final = 1.8e-3
 """How long before its RMARKER a frame is handed to the radio: its preamble, the way there, and a host's timers."""
 
+MAX_LEAD_S: Final = 8e-3
+LEAD_GAIN: Final = 1.25
+LEAD_LOSS: Final = 0.998
+"""A host that is late hands its frames over earlier: by the gain with each late one, up to the maximum, and back by the
+loss with each one sent. What an earlier frame costs is relayed stamps that are older by as much."""
+
 ASK_AGAIN_S: Final = 5e-3
 LOST_ANSWER_S: Final = 0.25
 """A radio that has not said for so long what became of a frame will not say it any more."""
@@ -30,6 +36,8 @@ class AnchorNode:
         self.machine = self._new_machine()
         self.started_s = time.monotonic()
         self.late = 0
+        self.lead_s = LEAD_S
+        """How long before its RMARKER the next frame is made."""
         self.restarts = 0
         self.heard_s: dict[int, float] = {}
         """When each other anchor was last heard, by the host's monotonic clock."""
@@ -53,9 +61,11 @@ class AnchorNode:
             self.machine.hear(event)
             self._note(event)
         elif isinstance(event, Sent):
+            self.lead_s = max(self.lead_s * LEAD_LOSS, LEAD_S)
             self._plan()
         elif isinstance(event, Late):
             self.late += 1
+            self.lead_s = min(self.lead_s * LEAD_GAIN, MAX_LEAD_S)
             self._wait(ASK_AGAIN_S, self._plan)
         elif isinstance(event, Restarted):
             self.restarts += 1
@@ -84,7 +94,7 @@ class AnchorNode:
         if now_ticks is None or tx_ticks is None:
             self._wait(ASK_AGAIN_S, self._plan)
             return
-        ahead_s = difference(tx_ticks, now_ticks) / TICK_RATE_HZ - LEAD_S
+        ahead_s = difference(tx_ticks, now_ticks) / TICK_RATE_HZ - self.lead_s
         self._wait(max(ahead_s, 0.0), lambda: self._speak(tx_ticks))
 
     def _speak(self, tx_ticks: int) -> None:

@@ -8,22 +8,27 @@ import os
 import selectors
 import signal
 import sys
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any, Final
-
-CHILD_VARIABLE: Final = "SKYLESS_CHILD_OF"
-"""Process number of the program that started this one, with which it ends."""
 
 _PR_SET_PDEATHSIG: Final = 1
 
 
-def run(main: Coroutine[Any, Any, None]) -> None:
+PUNCTUAL_NICE: Final = -10
+"""Priority of programs that serve a radio, where the system lets them have it (root, or a limit in limits.conf)."""
+
+
+def run(main: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
     """Run a program until it ends, SIGTERM or Ctrl-C comes; the last two cancel it.
+
+    ``punctual``: ask the system to prefer it to others, because a radio's slots do not wait.
 
     Raises:
         KeyboardInterrupt: it was Ctrl-C.
     """
-    _end_with_parent()
+    if punctual:
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, PUNCTUAL_NICE)
     gc.collect()
     gc.freeze()
     with asyncio.Runner(loop_factory=_new_loop) as runner, contextlib.suppress(asyncio.CancelledError):
@@ -42,12 +47,16 @@ async def _until_terminated(main: Coroutine[Any, Any, None]) -> None:
     await task
 
 
-def _end_with_parent() -> None:
-    """Ask the kernel to end this process with the one that started it, however that one ends (Linux only)."""
-    parent = os.environ.get(CHILD_VARIABLE)
-    if parent is None or not sys.platform.startswith("linux"):
-        return
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
-    if str(os.getppid()) != parent:
-        raise SystemExit("the program that started this one has gone")
+def end_with_parent() -> Callable[[], None] | None:
+    """What a child process does first, so that it ends with the one that started it, however that ends; Linux only."""
+    if not sys.platform.startswith("linux"):
+        return None
+    prctl = ctypes.CDLL(None).prctl
+    parent = os.getpid()
+
+    def ask() -> None:
+        prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+        if os.getppid() != parent:  # it died before the question
+            os._exit(1)
+
+    return ask
