@@ -11,7 +11,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.nodes.loop import CHILD_VARIABLE
+from skyless.nodes.loop import end_with_parent
 from skyless.nodes.running import Say
 
 _AGAIN_S: Final = 0.2
@@ -92,7 +92,7 @@ class Child:
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=words,
                 start_new_session=True,  # Ctrl-C in a terminal is for the one that started it
-                env={**os.environ, CHILD_VARIABLE: str(os.getpid())},
+                preexec_fn=end_with_parent(),
             )
         finally:
             os.close(words)
