@@ -83,6 +83,8 @@ def demo(
 
     if method not in METHODS:
         raise SkylessError(f"--method is {method!r}; it should be one of {', '.join(METHODS)}")
+    if mqtt is None and mqtt_ca is not None:
+        raise SkylessError("--mqtt-ca is for another broker; give it together with --mqtt")
     name = f"lab:{noise_ps:g}" if site is None else str(site.absolute())
     folder = recordings_folder()
     asked = SiteRun(
