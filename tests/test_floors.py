@@ -14,7 +14,7 @@ FLOORS = (
     {"air", "site"},
     {"clocks", "uncertainty"},
     {"positioning"},
-    {"anchor", "receiver"},
+    {"anchor", "receiver", "succession"},
     {"simulation", "radios", "recordings", "outputs"},
     {"experiments", "nodes", "planning"},
     {"cli", "dashboard"},

@@ -1,7 +1,7 @@
 """``Anchor``: the protocol machine of one anchor. Bytes and ticks in, frames and ticks out; no I/O, no clock.
 
-A driver (simulator, daemon) hands it every reception, asks when its next frame is due, and fetches that frame as late
-as its radio allows, so that it carries the latest receptions.
+A driver (simulator, daemon) hands it every reception, asks when its next frame is due, at the latest every 5 ms while
+there is none, and fetches that frame as late as its radio allows, so that it carries the latest receptions.
 """
 
 import math
@@ -12,39 +12,45 @@ from msgspec import Struct
 
 from skyless.air.almanac import Page
 from skyless.air.beacon import Beacon, Heard, MasterTime
+from skyless.air.claim import Claim
 from skyless.air.codec import decode_cached, encode, heard_capacity
 from skyless.air.malformed import Malformed
 from skyless.air.reception import Reception, Transmission
 from skyless.air.rotation import almanac_issue, page_for, pages_of
 from skyless.air.schedule import first_slots, schedule_of
 from skyless.clocks.filter import ClockFilter, clock_noise
-from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, MAX_DRIFT, TICK_M, TICK_RATE_HZ
+from skyless.clocks.site_clock import SiteClock
+from skyless.clocks.site_time import SUBTICKS
+from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ
 from skyless.site.model import AnchorSite, Site
-from skyless.ticks import Unwrapper, nearest, wrap
+from skyless.succession import Role, Succession, Verdict
+from skyless.ticks import Unwrapper, wrap
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
 MAX_OFFSET_STD_M: Final = 0.3
 """An anchor speaks only while its offset is known better than this (``docs/maths.md`` section 6)."""
 
-REJECTIONS_BEFORE_RESTART: Final = 3
-"""So many master beacons in a row that do not fit mean that the master's clock, or the own one, has jumped."""
-
-DRIFT_SLACK_TICKS: Final = 64
+MAX_TAKEOVER_STD_M: Final = 3.0
+"""And takes over the master's role while it is known better than this: so much may the site's time jump on sites whose
+superframes last a second."""
 
 MAX_RELAY_AGE_S: Final = 1.0
 """Older stamps are not relayed: sequence numbers come around after 256 frames, and then name another frame."""
 
-SUBTICKS: Final = 256
-
 
 class Synchronisation(Struct, frozen=True):
-    """How well an anchor knows the master's time."""
+    """How well an anchor knows the site's time, and by whom."""
 
     beacons: int
     """Master beacons taken since the clock filter's last start."""
     rate_ppm: float
     offset_std_m: float
     """After the last beacon, in metres of light."""
+    role: Role = Role.LISTENING
+    master: int | None = None
+    """The master that it follows, itself if it is the master; None before it has heard one."""
+    term: int | None = None
+    """Counts the takeovers of the master's role, modulo 256."""
 
 
 class Anchor:
@@ -63,11 +69,8 @@ class Anchor:
         self._pages: tuple[Page, ...] = pages_of(site)
         self._issue = almanac_issue(self._pages)
         self._own_ticks = Unwrapper()
-        self._clock = _filter_of(site)
-        self._range_to_master_m = _distance_m(self._own, self._anchors[site.master])
-        self._epoch_master: int | None = None
-        self._master_last: tuple[int, int, tuple[int, int]] | None = None
-        self._misfits = 0
+        self._succession = Succession(site, anchor_id, self._schedule)
+        self._clock = SiteClock(_filter_of(site), self._schedule, self.counters)
         self._master_heard: Heard | None = None
         self._heard: dict[int, tuple[Heard, int]] = {}
         self._pending: dict[int, tuple[int, int]] = {}
@@ -75,15 +78,17 @@ class Anchor:
 
     @property
     def is_master(self) -> bool:
-        """Whether this anchor's clock is the site's time."""
-        return self.id == self._site.master
+        """Whether this anchor keeps the site's time at present."""
+        return self._succession.role is Role.MASTER
 
     @property
     def synchronisation(self) -> Synchronisation:
-        """State of the own clock against the master's; exact for the master itself."""
-        if self.is_master:
-            return Synchronisation(0, 0.0, 0.0)
-        return Synchronisation(self._clock.updates, self._clock.rate * 1e6, self._clock.offset_std_m)
+        """State of the own clock against the site's time; exact for the master itself."""
+        claim, clock, role = self._succession.claim, self._clock, self._succession.role
+        master, term = (None, None) if claim is None else (claim.master, claim.term)
+        if role is Role.MASTER:
+            return Synchronisation(0, clock.rate * 1e6, 0.0, role, master, term)
+        return Synchronisation(clock.updates, clock.rate * 1e6, clock.offset_std_m, role, master, term)
 
     def hear(self, reception: Reception) -> None:
         """Take a frame off the air; what does not belong here is counted and dropped."""
@@ -98,60 +103,36 @@ class Anchor:
             self.counters["heard"] += 1
             rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
             heard = Heard(beacon.anchor, beacon.sequence, reception.rx_ticks)
-            if beacon.anchor == self._site.master:
-                self._hear_master(beacon, heard, rx_ticks)
-            else:
-                self._heard.pop(beacon.anchor, None)
-                self._heard[beacon.anchor] = (heard, rx_ticks)
+            self._heard.pop(beacon.anchor, None)
+            self._heard[beacon.anchor] = (heard, rx_ticks)
+            self._hear_of_master(beacon, heard, rx_ticks)
 
-    def _hear_master(self, beacon: Beacon, heard: Heard, rx_ticks: int) -> None:
-        """Follow the master; a beacon that does not fit changes nothing, unless others like it follow."""
-        if self._master_last is not None and (beacon.tx_ticks, beacon.sequence) == self._master_last[2]:
-            self.counters["duplicate"] += 1
+    def _hear_of_master(self, beacon: Beacon, heard: Heard, rx_ticks: int) -> None:
+        """Follow the master that is the newest, and set the clock by its own beacons."""
+        verdict = self._succession.hear(beacon, rx_ticks)
+        if verdict in {Verdict.STALE, Verdict.STRANGE}:
+            self.counters[verdict] += 1
+        if verdict in {Verdict.FROM_NEW_MASTER, Verdict.FROM_FIRST_MASTER}:
+            self._master_heard = None
+            range_m = _distance_m(self._own, self._anchors[beacon.anchor])
+            self._clock.follow(range_m, afresh=verdict is Verdict.FROM_FIRST_MASTER)
+        elif verdict is not Verdict.FROM_MASTER:
             return
-        tx_ticks = self._take_master(beacon, rx_ticks)
-        if tx_ticks is None:
-            self._misfits += 1
-            if self._misfits < REJECTIONS_BEFORE_RESTART:
-                return
-            self.counters["clock-restart"] += 1
-            tx_ticks = beacon.tx_ticks
-            self._clock.restart(tx_ticks, rx_ticks, self._range_to_master_m)
-        self._misfits = 0
-        self._master_last = (tx_ticks, rx_ticks, (beacon.tx_ticks, beacon.sequence))
-        self._master_heard = heard
-        since_epoch = self._schedule.slot_start_ticks(beacon.superframe, beacon.slot)
-        self._epoch_master = tx_ticks - since_epoch
-
-    def _take_master(self, beacon: Beacon, rx_ticks: int) -> int | None:
-        """Give a beacon to the clock filter; its unwrapped TX stamp, or None where it does not fit."""
-        if self._master_last is None:
-            self._clock.restart(beacon.tx_ticks, rx_ticks, self._range_to_master_m)
-            return beacon.tx_ticks
-        last_tx, last_rx, _ = self._master_last
-        elapsed = rx_ticks - last_rx
-        tx_ticks = nearest(beacon.tx_ticks, last_tx + elapsed)
-        if elapsed <= 0 or abs(tx_ticks - last_tx - elapsed) > MAX_DRIFT * elapsed + DRIFT_SLACK_TICKS:
-            self.counters["impossible-stamp"] += 1
-            return None
-        self._clock.hear(tx_ticks, rx_ticks, self._range_to_master_m)
-        if self._clock.rejected:
-            self.counters["clock-outlier"] += 1
-            return None
-        return tx_ticks
+        if self._clock.hear(beacon, rx_ticks):
+            self._master_heard = heard
 
     def next_transmission_ticks(self, now_ticks: int) -> int | None:
         """TX stamp (40-bit, own counter) of the next frame that can still be made; None while the clock is unknown."""
         now = self._own_ticks.unwrap(now_ticks)
+        self._succession.resign_if_silent(now)
+        self._lead_if_due(now)
         earliest = now + self._lead_ticks
-        if self.is_master and self._epoch_master is None:
-            self._epoch_master = earliest
-        if self._epoch_master is None or not self._clock_known(earliest):
+        epoch = self._clock.epoch_ticks
+        if epoch is None or not self._may_speak(earliest):
             return None
-        since_epoch = self._to_master(earliest)[0] - self._epoch_master
+        since_epoch = self._clock.subticks(earliest) // SUBTICKS - epoch
         superframe, slot = self._schedule.next_slot(since_epoch + DELAYED_TX_GRANULARITY_TICKS, self._slots)
-        start_master = self._epoch_master + self._schedule.slot_start_ticks(superframe, slot)
-        tx_ticks = self._on_radio_grid(start_master if self.is_master else self._clock.from_master(start_master))
+        tx_ticks = self._on_radio_grid(self._clock.ticks_own(epoch + self._schedule.slot_start_ticks(superframe, slot)))
         self._pending = {wrap(tx_ticks): (superframe, slot)}
         return wrap(tx_ticks)
 
@@ -162,14 +143,27 @@ class Anchor:
             KeyError: the time is not the one that was given last.
         """
         superframe, slot = self._pending.pop(tx_ticks)
+        unwrapped = self._own_ticks.expect(tx_ticks)
+        self._lead_if_due(unwrapped - self._lead_ticks)
         beacon = self._beacon(tx_ticks, superframe, slot)
+        self._succession.sent(unwrapped)
         self._sequence = (self._sequence + 1) & 0xFF
         self.counters["sent"] += 1
         return Transmission(encode(beacon), tx_ticks)
 
+    def _lead_if_due(self, now: int) -> None:
+        """Take over the master's role if nobody has it: the site's time goes on by the own clock as it is."""
+        good = self._clock.updates > 1 and self._clock.variance_m2(now) < MAX_TAKEOVER_STD_M**2
+        if self._succession.must_lead(now, good):
+            self.counters["takeover"] += self._succession.claim is not None
+            self._succession.lead(now)
+            self._clock.lead(now)
+            self._master_heard = None
+
     def _beacon(self, tx_ticks: int, superframe: int, slot: int) -> Beacon:
         superframe &= 0xFFFFFFFF  # as the frame shows it: whoever reads it can tell the page
         page = page_for(self._pages, superframe, slot)
+        claim = self._succession.claim or Claim(0, self.id)
         room = heard_capacity(master_heard=self._master_heard is not None, master_time=True, page=True)
         return Beacon(
             site=self._site.id,
@@ -179,30 +173,35 @@ class Anchor:
             slot=slot,
             tx_ticks=tx_ticks,
             almanac_issue=self._issue,
-            master=self._site.master,
+            master=claim.master,
+            term=claim.term,
             master_heard=self._master_heard,
-            master_time=self._master_time(tx_ticks),
-            heard=self._relayed(self._own_ticks.expect(tx_ticks))[:room],
+            master_time=self._master_time(self._own_ticks.expect(tx_ticks)),
+            heard=self._relayed(self._own_ticks.expect(tx_ticks), claim.master)[:room],
             page=page,
         )
 
-    def _relayed(self, ticks_own: int) -> tuple[Heard, ...]:
-        """What was heard of late of the other anchors, the most recent first."""
+    def _relayed(self, ticks_own: int, master: int) -> tuple[Heard, ...]:
+        """What was heard of late of the anchors beside the master, the most recent first."""
         oldest = ticks_own - round(MAX_RELAY_AGE_S * TICK_RATE_HZ)
-        return tuple(heard for heard, rx_ticks in reversed(self._heard.values()) if rx_ticks > oldest)
+        return tuple(
+            heard for heard, rx_ticks in reversed(self._heard.values()) if rx_ticks > oldest and heard.anchor != master
+        )
 
-    def _master_time(self, tx_ticks: int) -> MasterTime:
-        ticks, fraction, variance_m2 = self._to_master(self._own_ticks.expect(tx_ticks))
-        subticks = ticks * SUBTICKS + round(fraction * SUBTICKS)
-        return MasterTime(wrap(subticks, 48), math.sqrt(variance_m2) / TICK_M)
+    def _master_time(self, ticks_own: int) -> MasterTime | None:
+        """Site time of a frame; None for one that was due when its sender lost its master."""
+        role = self._succession.role
+        if role is Role.LISTENING or (role is Role.FOLLOWER and self._clock.updates < 2):
+            return None
+        std_ticks = math.sqrt(self._clock.variance_m2(ticks_own)) / TICK_M
+        return MasterTime(wrap(self._clock.subticks(ticks_own), 48), std_ticks)
 
-    def _to_master(self, ticks_own: int) -> tuple[int, float, float]:
-        return (ticks_own, 0.0, 0.0) if self.is_master else self._clock.to_master(ticks_own)
-
-    def _clock_known(self, ticks_own: int) -> bool:
+    def _may_speak(self, ticks_own: int) -> bool:
+        """Whether the own clock is known well enough."""
         if self.is_master:
             return True
-        return self._clock.updates > 1 and self._to_master(ticks_own)[2] < MAX_OFFSET_STD_M**2
+        following = self._succession.role is Role.FOLLOWER and self._clock.updates > 1
+        return following and self._clock.variance_m2(ticks_own) < MAX_OFFSET_STD_M**2
 
     def _on_radio_grid(self, ticks_own: int) -> int:
         """The radio starts on multiples of 512 of its raw counter; the antenna's delay comes on top."""

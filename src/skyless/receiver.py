@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from skyless.air.almanac_book import AlmanacBook
 from skyless.air.beacon import Beacon, Heard
 from skyless.air.codec import decode_cached
+from skyless.air.followed_master import FollowedMaster
 from skyless.air.malformed import Malformed
 from skyless.air.reception import Reception
 from skyless.air.schedule import Schedule, schedule_from_page
@@ -80,6 +81,7 @@ class Receiver:
         self._method: Method | None = None
         self._made_of: object = None
         self._schedule: Schedule | None = None
+        self._followed = FollowedMaster()
         self._master: int | None = None
         self._master_slot = 0
         self._positions: dict[int, NDArray[np.float64]] = {}
@@ -108,9 +110,8 @@ class Receiver:
         if not self._belongs(beacon, rx_ticks):
             return None
         tx_ticks = self._stamps.unwrap(beacon, rx_ticks)
-        if tx_ticks is None:
+        if tx_ticks is None or not self._is_of_this_reign(beacon, rx_ticks):
             return None
-        self._site_heard_ticks = rx_ticks
         self.counters["heard"] += 1
         self._read_almanac(beacon)
         anchor_m = self._positions.get(beacon.anchor)
@@ -141,6 +142,14 @@ class Receiver:
             return False
         return True
 
+    def _is_of_this_reign(self, beacon: Beacon, rx_ticks: int) -> bool:
+        """Whether a beacon goes by the present master, not by one that is no more."""
+        self._site_heard_ticks = rx_ticks
+        if self._followed.hear(beacon, rx_ticks, self._schedule.superframe_ticks if self._schedule else 0):
+            return True
+        self.counters["stale-master"] += 1
+        return False
+
     def _change_site(self, site: int, rx_ticks: int) -> bool:
         """Whether to listen to this site from now on: the first one, or another when the present one is silent."""
         if not self._may_change_site:
@@ -160,33 +169,37 @@ class Receiver:
         self._stamps.forget()
         self._synchronised.clear()
         self._master_scale = None
+        self._followed = FollowedMaster()
         self._method = self._made_of = None
 
     def _read_almanac(self, beacon: Beacon) -> None:
-        """Keep the page; another issue, schedule or noise makes the method anew."""
-        book = self.almanac
+        """Keep the page; another issue, schedule or noise makes the method anew.
+
+        So does another master where the method rests on the master's own stamps; the tracker rides on.
+        """
+        book, master = self.almanac, self._followed.master
         if book.hear(beacon.almanac_issue, beacon.page):
             self._positions = {anchor: np.array(place) for anchor, place in book.anchors_m.items()}
-            self._master_slot = book.master_slot or 0
-        elif self._method is not None:
+        elif self._method is not None and master == self._master:
             return
-        made_of = (book.issue, book.schedule, book.noise)
+        self._master, self._master_slot = master, book.slot_of(master) or 0
+        made_of = (book.issue, book.schedule, book.noise, None if self._method_name == "tracker" else master)
         if made_of != self._made_of:
             self._made_of, self._method = made_of, None
             if book.schedule is not None and book.noise is not None:
                 self._schedule = schedule_from_page(book.schedule)
-                self._master = book.schedule.master
                 self._method = self._new_method()
 
     def _new_method(self) -> Method:
         schedule, noise = self.almanac.schedule, self.almanac.noise
         assert schedule is not None
         assert noise is not None
+        assert self._master is not None
         tx_variance = stamp_variance_m2(noise.tx_stamp_s, rounded=False)
         rx_variance = stamp_variance_m2(noise.rx_stamp_s, rounded=True)
         if self._method_name != "tracker":
             settings = SnapshotSettings(
-                schedule.master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, self._z_bounds_m
+                self._master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, self._z_bounds_m
             )
             return Snapshots(SnapshotMethod(self._method_name), settings, self._time)
         clock = clock_noise(noise.white_fm, noise.random_walk_fm)
@@ -206,7 +219,7 @@ class Receiver:
     def _observation(
         self, beacon: Beacon, schedule: Schedule, anchor_m: NDArray[np.float64], rx_ticks: int, tx_ticks: int
     ) -> Observation:
-        heard = beacon.master_heard
+        heard = beacon.master_heard if beacon.master == self._master else None
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
         return Observation(
             beacon.anchor,

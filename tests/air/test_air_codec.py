@@ -13,7 +13,7 @@ from skyless.air.fcs import fcs
 from skyless.air.malformed import Malformed
 
 BARE = msgspec.structs.replace(FULL, master_heard=None, master_time=None, heard=(), page=None)
-PAYLOAD_AT, VERSION_AT, FLAGS_AT, COUNT_AT = 9, 10, 11, 39
+PAYLOAD_AT, VERSION_AT, FLAGS_AT, COUNT_AT = 9, 10, 11, 40
 
 
 def changed(frame, at, value):
@@ -58,8 +58,8 @@ def test_truncated_frames_with_a_good_fcs_are_dropped_by_reason():
     reasons = [decode(with_body(body[:length])) for length in range(len(body))]
     assert reasons[:3] == [Malformed.TOO_SHORT] * 3
     assert reasons[3:11] == [Malformed.NOT_A_BEACON] * 8
-    assert reasons[11:26] == [Malformed.TOO_SHORT] * 15
-    assert reasons[26:] == [Malformed.BAD_LENGTH] * (len(body) - 26)
+    assert reasons[11:27] == [Malformed.TOO_SHORT] * 16
+    assert reasons[27:] == [Malformed.BAD_LENGTH] * (len(body) - 27)
 
 
 def test_surplus_bytes_are_dropped():

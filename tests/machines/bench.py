@@ -30,14 +30,17 @@ EVERY_METHOD = (*SNAPSHOTS, "tracker")
 
 
 class Stage:
-    """A world whose anchors' machines can be looked at; ``site_of_anchor`` gives some of them another site file."""
+    """A world whose anchors' machines can be looked at; ``site_of_anchor`` gives some of them another site file.
 
-    def __init__(self, site: Site, seed=1, tags=(), site_of_anchor=None, **faults):
+    ``make`` makes the machines.
+    """
+
+    def __init__(self, site: Site, seed=1, tags=(), site_of_anchor=None, make=Anchor, **faults):
         self.site, self.machines, self.made = site, {}, []
         sites = site_of_anchor or {}
 
         def factory(anchor):
-            self.machines[anchor] = Anchor(sites.get(anchor, site), anchor)
+            self.machines[anchor] = make(sites.get(anchor, site), anchor)
             self.made.append(self.machines[anchor])
             return self.machines[anchor]
 

@@ -46,7 +46,7 @@ class Noise:
             other = self.a_body()
             body = body[: self.generator.integers(len(body))] + other[self.generator.integers(len(other)) :]
         else:  # the fields that matter most: stamps, number, issue, master, flags
-            place = int(self.generator.choice([2, 7, 11, 12, 16, 17, 20, 22, 23, 25, 31, 36]))
+            place = int(self.generator.choice([2, 7, 11, 12, 16, 17, 20, 22, 23, 25, 26, 32, 37]))
             body[place : place + 2] = self.generator.bytes(2)
         frame = bytes(body[: MAX_FRAME_BYTES - 2])
         return frame + fcs(frame) if self.generator.random() < 0.9 else frame

@@ -252,7 +252,7 @@ def test_an_anchor_restarts(method, anchor):
     recovered = listen(Receiver(method), heard)
     times = np.array([fix.time_s for fix in fixes])
     assert np.all(np.diff(times) > 0.0)
-    assert times[-1] == pytest.approx(heard[-1].host_s - 0.08, abs=0.05)
+    assert times[-1] == pytest.approx(heard[-1].host_s - 0.125, abs=0.05)
     late = [fix for fix in recovered if fix.time_s > 3.2]
     assert len(late) > 60
     assert all(len(fix.anchors) == 6 for fix in late[30:])
@@ -277,7 +277,7 @@ def test_the_almanac_changes_in_flight(method):
     assert len(after) > 100
     times = [fix.time_s for fix in (*before, *after)]
     assert np.all(np.diff(times) > 0.0)
-    assert times[-1] == pytest.approx(3.93, abs=0.05)
+    assert times[-1] == pytest.approx(3.885, abs=0.05)
 
 
 @pytest.mark.parametrize("method", EVERY_METHOD)
@@ -461,7 +461,7 @@ def test_two_liars_do_not_walk_the_scale_away():
     listen(receiver, [one for one in tape(LAB, 3.0) if one.host_s <= 1.0])
     fixes = listen(receiver, late)
     assert len(fixes) > 0.6 * len(late)
-    assert fixes[-1].time_s == pytest.approx(2.93, abs=0.03)
+    assert fixes[-1].time_s == pytest.approx(2.885, abs=0.03)
 
 
 @pytest.mark.parametrize("method", EVERY_METHOD)

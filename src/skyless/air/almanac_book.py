@@ -59,10 +59,9 @@ class AlmanacBook:
         """Where the site lies on the Earth, once heard; many sites send none."""
         return self._georeference
 
-    @property
-    def master_slot(self) -> int | None:
-        """First slot of the master, once its page and the schedule were heard."""
-        page = self._pages.get(self._schedule.master) if self._schedule is not None else None
+    def slot_of(self, anchor: int | None) -> int | None:
+        """First slot of an anchor, once its page was heard."""
+        page = self._pages.get(anchor)
         return page.slot if isinstance(page, AnchorPage) else None
 
     @property

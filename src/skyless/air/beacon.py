@@ -20,7 +20,7 @@ class MasterTime(Struct, frozen=True, gc=False):
     """The frame's TX time on the master's scale, as the sending anchor's clock filter knows it."""
 
     tx_subticks_master: int
-    """TX time on the master's scale in 1/256 tick, 48 bits."""
+    """TX time on the site's scale, which the master keeps, in 1/256 tick, 48 bits."""
     std_ticks: float
     """Standard deviation of that time in ticks; sent in steps of 1/64 tick up to 1023.98."""
 
@@ -44,6 +44,8 @@ class Beacon(Struct, frozen=True, gc=False):
     """Changes when the almanac changes, 8 bits; a tag then forgets the old one."""
     master: int
     """Identifier of the master that this anchor follows; its own for the master."""
+    term: int
+    """Which reign the sender lives in, 8 bits: counts the takeovers of the master's role, modulo 256."""
     master_heard: Heard | None
     """The last master beacon that this anchor heard (raw stamp), None for the master or when none was heard."""
     master_time: MasterTime | None

@@ -36,7 +36,7 @@ _HAS_PAGE: Final = 0x04
 _HAS_AUTHENTICATION: Final = 0x08
 _RESERVED_FLAGS: Final = 0xF0
 
-_FIXED: Final = struct.Struct("<HBHHHHBIBIBBH")
+_FIXED: Final = struct.Struct("<HBHHHHBIBIBBHB")
 _START: Final = struct.Struct("<HBHHHH")
 _STAMP: Final = struct.Struct("<BIB")
 _TIME: Final = struct.Struct("<IHH")
@@ -119,8 +119,8 @@ def _foreign(frame: bytes) -> Malformed | None:
 
 
 def _decode_version_1(frame: bytes) -> Beacon | Malformed:
-    (_, sequence, site, _, anchor, _, flags, superframe, slot, tx_low, tx_high, issue, master) = _FIXED.unpack_from(
-        frame
+    (_, sequence, site, _, anchor, _, flags, superframe, slot, tx_low, tx_high, issue, master, term) = (
+        _FIXED.unpack_from(frame)
     )
     if flags & _RESERVED_FLAGS:
         return Malformed.BAD_FLAGS
@@ -138,7 +138,7 @@ def _decode_version_1(frame: bytes) -> Beacon | Malformed:
     if isinstance(page, Malformed):
         return page
     return Beacon(
-        site, anchor, sequence, superframe, slot, tx_low | tx_high << 32, issue, master,
+        site, anchor, sequence, superframe, slot, tx_low | tx_high << 32, issue, master, term,
         master_heard, master_time, heard, page,
     )  # fmt: skip
 
@@ -181,6 +181,7 @@ def _body(beacon: Beacon) -> bytes:
         _FIXED.pack(
             _FRAME_CONTROL, beacon.sequence, beacon.site, _BROADCAST, beacon.anchor, _VERSION_1, flags,
             beacon.superframe, beacon.slot, *_split(beacon.tx_ticks), beacon.almanac_issue, beacon.master,
+            beacon.term,
         )
     ]  # fmt: skip
     if master_heard is not None:
@@ -225,6 +226,7 @@ def _first_fault(beacon: Beacon) -> str:
         ("tx_ticks", beacon.tx_ticks, 40),
         ("almanac_issue", beacon.almanac_issue, 8),
         ("master", beacon.master, 16),
+        ("term", beacon.term, 8),
     ]
     if beacon.master_time is not None:
         fields.append(("master_time.tx_subticks_master", beacon.master_time.tx_subticks_master, 48))

@@ -193,6 +193,10 @@ class ClockFilter:
         """Forget all and begin with this beacon."""
         clock_start(self.state, self.whole, tx_ticks_master, rx_ticks_own, range_m, self._variance_m2)
 
+    def doubt(self, factor: float) -> None:
+        """Multiply the covariance: what is followed from now on may differ from what was followed before."""
+        self.state[VAR_OFFSET:] *= factor
+
     def to_master(self, ticks_own: int) -> tuple[int, float, float]:
         """Own time on the master's scale: whole ticks, fraction of a tick, variance in m²."""
         return clock_to_master(self.state, self.whole, ticks_own, self._noise.white, self._noise.walk)
