@@ -111,7 +111,7 @@ class Story:
 
 def quiet(stage):
     """Without the noise of emissions, which is not the site time's."""
-    stage.world._stations["tx_noise_ticks"][:] = 0.0
+    stage.world.medium.stations["tx_noise_ticks"][:] = 0.0
     return stage
 
 

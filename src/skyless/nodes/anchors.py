@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final, Literal
 
 from skyless.nodes.anchor import AnchorNode
 from skyless.nodes.running import HEALTH_S, Say, every, link_of, together
@@ -12,6 +13,13 @@ from skyless.outputs.messages import AnchorHealth, Counters, SiteMessage
 from skyless.outputs.topics import floor_plan_topic, health_topic, site_topic
 from skyless.radios.radio import Radio
 from skyless.site.model import Site
+from skyless.succession import Role
+
+_ROLES: Final[dict[Role, Literal["master", "anchor", "listening"]]] = {
+    Role.MASTER: "master",
+    Role.FOLLOWER: "anchor",
+    Role.LISTENING: "listening",
+}
 
 
 class Anchors:
@@ -61,14 +69,14 @@ def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> 
     """How an anchor does; ``now_s`` is the host's monotonic clock."""
     machine = node.machine
     state = machine.synchronisation
-    known = machine.is_master or state.beacons > 1
+    known = machine.is_master or (state.role is Role.FOLLOWER and state.beacons > 1)
     return AnchorHealth(
         anchor=node.id,
         unix_s=unix_s,
         uptime_s=now_s - node.started_s,
-        role="master" if machine.is_master else "anchor",
-        master=node.site.master,
-        term=0,
+        role=_ROLES[state.role],
+        master=state.master,
+        term=state.term or 0,
         synchronised=known,
         offset_s=None,
         rate_ppm=state.rate_ppm if known else None,
