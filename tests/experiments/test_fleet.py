@@ -139,7 +139,7 @@ def test_half_of_the_messages_lost():
 
 
 def test_a_silent_site_gives_an_empty_report():
-    fleet, summary, judged = run(1.0, outages=(AnchorOutage(1, Outage(0.0)),))
+    fleet, summary, judged = run(1.0, outages=tuple(AnchorOutage(anchor, Outage(0.0)) for anchor in range(1, 7)))
     assert judged == []
     assert (summary.fixes, summary.rmse_m, summary.sigma_m, summary.first_fix_s) == (0, None, None, None)
     assert summary.tags_without_fix == 1
