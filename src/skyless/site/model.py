@@ -87,7 +87,7 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     id: int
     """Identifier on the air, 16 bits."""
     master: int
-    """The anchor whose clock is the site's time."""
+    """The anchor that starts the site's time; when it dies the others succeed in the order of the file."""
     anchors: tuple[AnchorSite, ...]
     schedule: ScheduleSite = ScheduleSite()
     noise: NoiseSite = NoiseSite()
