@@ -122,9 +122,10 @@ def test_deaf_tags_make_no_fix_and_find_themselves_again(run, tmp_path, method):
     assert told["max_m"] < 0.5
 
 
-@pytest.mark.parametrize(
-    ("fault", "end_s"), [(["--deaf", "3"], 63), (["--outage", "1:3"], 63), (["--deaf", "3:70"], 70.5)]
-)
+SITE_OFF = [argument for anchor in range(1, 7) for argument in ("--outage", f"{anchor}:3")]
+
+
+@pytest.mark.parametrize(("fault", "end_s"), [(["--deaf", "3"], 63), (SITE_OFF, 63), (["--deaf", "3:70"], 70.5)])
 def test_a_goal_that_cannot_be_reached_is_given_up(run, fault, end_s):
     told = report(run("--method", "literal", "--position", "3,4", "--fixes", "100", *fault, "--json"))
     assert told["simulated_s"] == pytest.approx(end_s, abs=0.5)
