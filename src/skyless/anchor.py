@@ -21,10 +21,10 @@ from skyless.air.schedule import first_slots, schedule_of
 from skyless.clocks.filter import ClockFilter, clock_noise
 from skyless.clocks.site_clock import SiteClock
 from skyless.clocks.site_time import SUBTICKS
-from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ
+from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.site.model import AnchorSite, Site
 from skyless.succession import Role, Succession, Verdict
-from skyless.ticks import Unwrapper, wrap
+from skyless.ticks import Unwrapper, difference, wrap
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
 MAX_OFFSET_STD_M: Final = 0.3
@@ -89,6 +89,19 @@ class Anchor:
         if role is Role.MASTER:
             return Synchronisation(0, clock.rate * 1e6, 0.0, role, master, term)
         return Synchronisation(clock.updates, clock.rate * 1e6, clock.offset_std_m, role, master, term)
+
+    def site_time(self, now_ticks: int) -> tuple[float, int] | None:
+        """Own counter less the site's time in s, modulo the wrap, and the superframe; None before it is known.
+
+        ``now_ticks`` is the own counter, 40 bits.
+        """
+        clock = self._clock
+        if clock.epoch_ticks is None or not (self.is_master or clock.updates > 1):
+            return None
+        own_ticks = self._own_ticks.expect(now_ticks)
+        site_ticks, fraction = divmod(clock.subticks(own_ticks), SUBTICKS)
+        offset_s = (difference(wrap(own_ticks), wrap(site_ticks)) - fraction / SUBTICKS) * TICK_S
+        return offset_s, (site_ticks - clock.epoch_ticks) // self._schedule.superframe_ticks
 
     def hear(self, reception: Reception) -> None:
         """Take a frame off the air; what does not belong here is counted and dropped."""

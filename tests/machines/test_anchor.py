@@ -355,3 +355,17 @@ def test_pages_rotate_with_the_number_on_the_air_beyond_two_years(ahead):
         beacon = decode(master.transmission(tx_ticks).frame)
         assert beacon.superframe == (ahead + k + 1) % 2**32
         assert beacon.page == decode_page(encode_page(page_for(pages_of(LAB), beacon.superframe, beacon.slot)))
+
+
+def test_an_anchor_tells_its_own_counter_less_the_sites_time():
+    """Against the world's own clocks; the master's offset is nought, the others' are theirs against the master's."""
+    stage = Stage(LAB, 4)
+    assert all(anchor.site_time(0) is None for anchor in (Anchor(LAB, 1), Anchor(LAB, 2)))
+    *_, (broadcast, _) = beacons(stage, 3.0)
+    medium = stage.world.medium
+    counters = {anchor: medium.read_counter(node) for anchor, node in medium.node_of.items()}
+    for anchor, machine in stage.machines.items():
+        offset_s, superframe = machine.site_time(wrap(counters[anchor]))
+        truth_s = difference(wrap(counters[anchor]), wrap(counters[1])) * TICK_S
+        assert offset_s == pytest.approx(truth_s, abs=2e-9)
+        assert superframe in {int(broadcast.end_s / 0.015) - k for k in range(5)}

@@ -39,6 +39,7 @@ def demo(
     seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
     site: Path | None = None,
     method: str = "tracker",
+    apart: bool = False,
     mqtt: Annotated[str | None, Parameter(env_var="SKYLESS_MQTT")] = None,
     mqtt_ca: MqttCa = None,
     record: str | None = None,
@@ -65,6 +66,8 @@ def demo(
         Site file; by default the lab, six anchors on the walls of 6 m × 8 m.
     method
         How positions are computed.
+    apart
+        Run every anchor and every tag as a process of its own, to kill and to freeze.
     mqtt
         Another broker than the embedded one.
     mqtt_ca
@@ -98,6 +101,7 @@ def demo(
         broker=None if mqtt is None else broker(mqtt, mqtt_ca),
         record=_recording(record, folder),
         record_limit_mb=1000.0,
+        apart=apart,
         recordings=folder,
     )
     with status("loading the kernels; the first start compiles them, which takes some ten seconds"):

@@ -69,6 +69,8 @@ def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> 
     """How an anchor does; ``now_s`` is the host's monotonic clock."""
     machine = node.machine
     state = machine.synchronisation
+    now_ticks = node.radio.now_ticks()
+    reading = None if now_ticks is None else machine.site_time(now_ticks)
     known = machine.is_master or (state.role is Role.FOLLOWER and state.beacons > 1)
     return AnchorHealth(
         anchor=node.id,
@@ -78,13 +80,13 @@ def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> 
         master=state.master,
         term=state.term or 0,
         synchronised=known,
-        offset_s=None,
+        offset_s=None if reading is None else reading[0],
         rate_ppm=state.rate_ppm if known else None,
         offset_std_m=state.offset_std_m if known else None,
         sent=machine.counters["sent"],
         late=node.late,
         heard=machine.counters["heard"],
-        superframe=None,
+        superframe=None if reading is None else reading[1],
         heard_age_s={str(anchor): now_s - heard_s for anchor, heard_s in sorted(node.heard_s.items())},
         counters=dict(machine.counters),
         mqtt=mqtt,

@@ -38,6 +38,8 @@ class SiteRun(Struct, frozen=True):
     """None: an embedded one."""
     record: Path | None
     record_limit_mb: float
+    apart: bool
+    """Whether every anchor and every tag is a process of its own."""
     recordings: Path
     """Folder of recordings that the page shows."""
 
@@ -107,12 +109,17 @@ class WholeSite:
         ether += ["--speed", str(asked.speed_mps), "--seed", str(asked.seed)]
         if asked.noise_ps is not None:
             ether += ["--noise-ps", str(asked.noise_ps)]
-        anchors = ["anchor", *(str(anchor.id) for anchor in asked.site.anchors), *site, *radio, *mqtt]
-        programs = [Program("ether", tuple(ether)), Program("anchors", tuple(anchors))]
-        names = [f"tag{number}" for number in range(1, asked.tags + 1)]
-        for first in range(0, len(names), TAGS_PER_PROCESS):
-            some = names[first : first + TAGS_PER_PROCESS]
-            programs.append(Program("tags", ("tag", *some, *radio, *mqtt, "--method", asked.method)))
+        programs = [Program("ether", tuple(ether))]
+        anchors = [str(anchor.id) for anchor in asked.site.anchors]
+        programs += [
+            Program(_named("anchor", some), ("anchor", *some, *site, *radio, *mqtt))
+            for some in _groups(anchors, 1 if asked.apart else len(anchors))
+        ]
+        tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
+        programs += [
+            Program(_named("tag", some), ("tag", *some, *radio, *mqtt, "--method", asked.method))
+            for some in _groups(tags, 1 if asked.apart else TAGS_PER_PROCESS)
+        ]
         page = ("dashboard", *mqtt, "--listen", f"{HOST}:{self.page_port}", "--recordings", str(asked.recordings))
         programs.append(Program("page", (*page, "--site-id", str(asked.site.id))))
         if asked.record is not None:
@@ -121,3 +128,12 @@ class WholeSite:
                 Program("recorder", ("record", str(asked.record), *mqtt, *limit, "--site-id", str(asked.site.id)))
             )
         return programs
+
+
+def _groups(names: list[str], size: int) -> list[list[str]]:
+    return [names[first : first + size] for first in range(0, len(names), size)]
+
+
+def _named(kind: str, names: list[str]) -> str:
+    """What a process is called when something is said of it."""
+    return f"{kind} {names[0]}" if len(names) == 1 else f"{kind}s {names[0]} to {names[-1]}"
