@@ -6,7 +6,13 @@ import { now_s } from "./clock.js";
 import { timeOfDay } from "./format.js";
 import { retryNow } from "./live.js";
 
-const WORDS = { connecting: "Connecting", open: "Live", lost: "Connection lost", replay: "Replay", broker: "No broker" };
+const WORDS = {
+  connecting: "Connecting",
+  open: "Live",
+  lost: "Connection lost",
+  replay: "Replay",
+  broker: "No broker",
+};
 
 /** Begin to tell. */
 export function start() {
@@ -29,21 +35,23 @@ function show() {
   banner.className = phase === "lost" ? "lost" : "broker";
   byId("banner-button").hidden = phase !== "lost";
   text(byId("banner-text"), words);
+  text(byId("banner-age"), phase === "lost" ? age(state.connection.since) : "");
   document.body.classList.toggle("lost", phase === "lost");
 }
 
 function lostWords() {
-  const { since, reason } = state.connection;
+  const { reason } = state.connection;
   const old = state.mode === "live" ? " The map shows what was last known." : "";
-  return `Connection lost ${seconds(since)} ago (${reason}).${old} Trying again.`;
+  return `Connection lost: ${reason}.${old} Trying again.`;
 }
 
-function seconds(since) {
+/** How long ago; apart from the words, so that screen readers are told once only. */
+function age(since) {
   const past = Math.floor((performance.now() - since) / 1e3);
   return past < 120 ? `${past} s` : `${Math.floor(past / 60)} min`;
 }
 
 function brokerWords() {
   const broker = state.mqtt.broker ? ` ${state.mqtt.broker}` : "";
-  return `The server has lost its broker${broker}: no news of tags and anchors until it is back.`;
+  return `The server does not reach its broker${broker}: no news of tags and anchors until it is back.`;
 }

@@ -39,7 +39,8 @@ export class Chart {
     this.window = [-window_s, 0];
     const last = data.slice(1).map((values) => values.findLast((value) => value !== null && !Number.isNaN(value)));
     const parts = last.map((value) => (value === undefined ? DASH : this.write(value)));
-    const words = this.series.length > 1 ? parts.map((part, n) => `${this.series[n].name} ${part}`).join("  ") : parts[0];
+    const words =
+      this.series.length > 1 ? parts.map((part, n) => `${this.series[n].name} ${part}`).join("  ") : parts[0];
     text(this.value, words);
     if (!this.plot && this.box.clientWidth) this.build();
     this.plot?.setData(data);
@@ -90,9 +91,20 @@ export class Chart {
       padding: [6, 14, 0, 0],
       scales: { x: { time: false, range: () => this.window }, y: { range } },
       axes: [
-        { ...axis, size: 18, gap: 2, values: (_plot, marks) => marks.map((mark) => `${mark || "now"}`.replace("-", "−")) },
-        { ...axis, size: 48, gap: 4, space: 26, incrs: whole ? [1, 2, 5, 10, 20, 50, 100, 200, 500] : undefined,
-          values: (_plot, marks) => marks.map((mark) => this.tick(mark)) },
+        {
+          ...axis,
+          size: 18,
+          gap: 2,
+          values: (_plot, marks) => marks.map((mark) => `${mark || "now"}`.replace("-", "−")),
+        },
+        {
+          ...axis,
+          size: 48,
+          gap: 4,
+          space: 26,
+          incrs: whole ? [1, 2, 5, 10, 20, 50, 100, 200, 500] : undefined,
+          values: (_plot, marks) => marks.map((mark) => this.tick(mark)),
+        },
       ],
       series: [
         {},

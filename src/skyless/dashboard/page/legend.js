@@ -56,7 +56,11 @@ function switchFor([key, words]) {
 
 function trails() {
   const lengths = [0, 5, 15, 60];
-  const list = h("select", { id: "trail-length" }, ...lengths.map((value) => h("option", { value }, value ? `${value} s` : "off")));
+  const list = h(
+    "select",
+    { id: "trail-length" },
+    ...lengths.map((value) => h("option", { value }, value ? `${value} s` : "off")),
+  );
   list.value = String(state.options.trails);
   list.addEventListener("change", () => {
     state.options.trails = Number(list.value);
@@ -81,7 +85,7 @@ function scale() {
   const image = context.createImageData(128, 1);
   for (let x = 0; x < 128; x++) image.data.set([...colourAt(x / 127), 255], 4 * x);
   context.putImageData(image, 0, 0);
-  text(byId("ramp-title"), KINDS[data.kind] ?? data.kind);
+  text(byId("ramp-title"), (KINDS[data.kind] ?? data.kind).split(" (")[0]);
   const write = (value) => (data.unit === "m" ? length(value) : number(value, 1));
   text(byId("ramp-good"), `${write(data.levels.good)} good`);
   text(byId("ramp-bad"), `${write(data.levels.bad)} bad`);

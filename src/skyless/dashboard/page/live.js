@@ -42,15 +42,14 @@ function connect() {
   const mine = (socket = new WebSocket(address));
   lastMessage = lastPing = performance.now();
   mine.onmessage = (event) => mine === socket && take(event.data);
-  mine.onclose = () => mine === socket && lost("the server closed it, or cannot be reached");
+  mine.onclose = () => mine === socket && lost("the server does not answer");
 }
 
 function lost(reason) {
   const old = socket;
   socket = null;
   old?.close();
-  const since = state.connection.phase === "lost" ? state.connection.since : performance.now();
-  state.connection = { phase: "lost", since, reason, retryAt: performance.now() + retry_ms };
+  if (state.connection.phase !== "lost") state.connection = { phase: "lost", since: performance.now(), reason };
   retryTimer = setTimeout(connect, retry_ms);
   retry_ms = Math.min(retry_ms * 1.6, LAST_RETRY_MS);
   changed("connection");
@@ -75,7 +74,8 @@ function watch() {
   const now = performance.now();
   const silent = now - lastMessage;
   const moved = lastMessage - lastMotion < 2000;
-  if (silent > (moved ? SILENT_MS : DEAF_MS)) return lost(`silent for ${(silent / 1e3).toFixed(0)} s`);
+  const open = state.connection.phase === "open";
+  if (silent > (moved || !open ? SILENT_MS : DEAF_MS)) return lost(`silent for ${(silent / 1e3).toFixed(0)} s`);
   if (now - lastPing > PING_MS && socket.readyState === WebSocket.OPEN) {
     socket.send("ping");
     lastPing = now;
@@ -98,7 +98,7 @@ const takers = {
     newServer();
     retry_ms = FIRST_RETRY_MS;
     lastMotion = 0;
-    state.connection = { phase: "open", since: performance.now(), reason: "", retryAt: 0 };
+    state.connection = { phase: "open", since: performance.now(), reason: "" };
     noticeVersion(message.version ?? "");
     state.mqtt = { connected: message.mqtt !== false, broker: state.mqtt?.broker ?? "" };
     state.events = [...(message.events ?? [])].sort((a, b) => b.unix_s - a.unix_s);

@@ -10,9 +10,18 @@ const ICONS = { play: "M7 4.5v15l12-7.5z", pause: "M7 5h3.5v14H7zM13.5 5H17v14h-
 /** Build the bar. */
 export function start() {
   const icon = s("path", { d: ICONS.play });
-  const button = h("button", { type: "button", id: "play", class: "icon", onclick: toggle },
-    s("svg", { viewBox: "0 0 24 24", class: "solid", "aria-hidden": "true" }, icon));
-  const slider = h("input", { type: "range", id: "slider", min: "0", step: "0.1", "aria-label": "Time since the recording's start" });
+  const button = h(
+    "button",
+    { type: "button", id: "play", class: "icon", onclick: toggle },
+    s("svg", { viewBox: "0 0 24 24", class: "solid", "aria-hidden": "true" }, icon),
+  );
+  const slider = h("input", {
+    type: "range",
+    id: "slider",
+    min: "0",
+    step: "0.1",
+    "aria-label": "Time since the recording's start",
+  });
   slider.addEventListener("input", () => seek(Number(slider.value)));
   const time = h("output", { id: "play-time" });
   const speeds = h("select", { id: "speed", "aria-label": "Speed" });
@@ -21,8 +30,12 @@ export function start() {
   const name = h("span", { class: "recording-name" });
   const problem = h("span", { class: "problem", role: "alert" });
   const back = h("button", { type: "button", id: "back", onclick: close }, "Back to live");
-  byId("player").append(button, h("div", { class: "along" }, slider, h("div", { class: "under" }, time, name, problem)),
-    speeds, back);
+  byId("player").append(
+    button,
+    h("div", { class: "along" }, slider, h("div", { class: "under" }, time, name, problem)),
+    speeds,
+    back,
+  );
   addEventListener("keydown", playKey);
   let shown = "";
   on(["player", "mode"], () => {

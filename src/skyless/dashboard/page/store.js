@@ -12,8 +12,8 @@ const dirty = new Set();
 let scheduled = false;
 
 export const state = {
-  /** @type {{phase: "connecting"|"open"|"lost", since: number, reason: string, retryAt: number}} */
-  connection: { phase: "connecting", since: performance.now(), reason: "", retryAt: 0 },
+  /** @type {{phase: "connecting"|"open"|"lost", since: number, reason: string}} */
+  connection: { phase: "connecting", since: performance.now(), reason: "" },
   /** @type {{connected: boolean, broker: string}|null} */
   mqtt: null,
   version: "",

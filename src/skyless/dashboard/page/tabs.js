@@ -17,12 +17,23 @@ export let current = "tags";
 /** Build the panel. */
 export function start() {
   for (const [key, tab] of Object.entries(TABS)) {
-    const button = h("button", {
-      type: "button", role: "tab", id: `tab-${key}`, "aria-controls": `panel-${key}`,
-      onclick: () => open(key),
-    }, tab.title);
+    const button = h(
+      "button",
+      {
+        type: "button",
+        role: "tab",
+        id: `tab-${key}`,
+        "aria-controls": `panel-${key}`,
+        onclick: () => open(key),
+      },
+      tab.title,
+    );
     const panel = h("div", {
-      role: "tabpanel", id: `panel-${key}`, class: "tab-panel", "aria-labelledby": `tab-${key}`, tabindex: "0",
+      role: "tabpanel",
+      id: `panel-${key}`,
+      class: "tab-panel",
+      "aria-labelledby": `tab-${key}`,
+      tabindex: "0",
     });
     byId("tabs").append(button);
     byId("panels").append(panel);

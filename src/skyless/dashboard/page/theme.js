@@ -6,7 +6,20 @@ import { byId } from "./dom.js";
 
 const KEY = "skyless-theme";
 const system = matchMedia("(prefers-color-scheme: dark)");
-const NAMES = ["bg", "surface", "line", "grid", "grid-strong", "text", "muted", "accent", "good", "warn", "bad", "wall"];
+const NAMES = [
+  "bg",
+  "surface",
+  "line",
+  "grid",
+  "grid-strong",
+  "text",
+  "muted",
+  "accent",
+  "good",
+  "warn",
+  "bad",
+  "wall",
+];
 const TAGS = 8;
 
 /** Colours by their names in tokens.css, and `tags`, a few hues that can be told apart. @type {any} */

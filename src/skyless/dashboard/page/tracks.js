@@ -9,8 +9,22 @@ const GAP_S = 1.0;
 const CLOCK_S = 0.5;
 
 /** Columns of a track: the fields of a state after the tag's name, in the order of the wire. */
-export const X = 0, Y = 1, Z = 2, VX = 3, VY = 4, CXX = 5, CXY = 6, CYY = 7, STD = 8, ERROR = 9;
-export const TRUE_X = 10, TRUE_Y = 11, ANCHORS = 12, CHI2 = 13, TIME = 14, HPL = 15;
+export const X = 0,
+  Y = 1,
+  Z = 2,
+  VX = 3,
+  VY = 4,
+  CXX = 5,
+  CXY = 6,
+  CYY = 7,
+  STD = 8,
+  ERROR = 9;
+export const TRUE_X = 10,
+  TRUE_Y = 11,
+  ANCHORS = 12,
+  CHI2 = 13,
+  TIME = 14,
+  HPL = 15;
 
 export class Track {
   /** @param {string} name */

@@ -73,7 +73,12 @@ export function drawAnchors(context) {
       context.strokeRect(x - MARK - 4.5, y - MARK - 4.5, 2 * MARK + 9, 2 * MARK + 9);
     }
     if (anchor.id === state.selection.anchor) ring(context, x, y, MARK + 9);
-    label(context, anchor.id === master ? `${anchor.id} master` : String(anchor.id), x, y + MARK + (anchor.id === state.selection.anchor ? 12 : 7));
+    label(
+      context,
+      anchor.id === master ? `${anchor.id} master` : String(anchor.id),
+      x,
+      y + MARK + (anchor.id === state.selection.anchor ? 12 : 7),
+    );
   }
 }
 

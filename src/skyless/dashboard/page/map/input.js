@@ -54,12 +54,16 @@ export function listen(target, redraw, fitAll) {
   target.addEventListener("pointercancel", release);
   target.addEventListener("pointerleave", () => text(byId("readout"), ""));
   target.addEventListener("dblclick", () => editor.drawing && finish());
-  target.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    const at = place(event);
-    zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), at.x, at.y);
-    redraw(true);
-  }, { passive: false });
+  target.addEventListener(
+    "wheel",
+    (event) => {
+      event.preventDefault();
+      const at = place(event);
+      zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), at.x, at.y);
+      redraw(true);
+    },
+    { passive: false },
+  );
   target.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (!(editor.drawing ? drawingKey(event) : mapKey(event, fitAll))) return;

@@ -14,7 +14,13 @@ export const KINDS = {
 
 /** Viridis at eight places (matplotlib's, CC0): equal steps look equal, also to the colour-blind and in grey. */
 const VIRIDIS = [
-  [68, 1, 84], [70, 50, 127], [54, 92, 141], [39, 127, 142], [31, 161, 135], [74, 194, 109], [159, 218, 58],
+  [68, 1, 84],
+  [70, 50, 127],
+  [54, 92, 141],
+  [39, 127, 142],
+  [31, 161, 135],
+  [74, 194, 109],
+  [159, 218, 58],
   [253, 231, 37],
 ];
 const POINTS = 40_000;

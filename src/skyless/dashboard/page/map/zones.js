@@ -82,7 +82,12 @@ function crosshair(context, x, y) {
   context.strokeStyle = palette.text;
   context.lineWidth = 1.5;
   context.beginPath();
-  for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
+  for (const [dx, dy] of [
+    [1, 0],
+    [-1, 0],
+    [0, 1],
+    [0, -1],
+  ]) {
     context.moveTo(x + 4 * dx, y + 4 * dy);
     context.lineTo(x + 14 * dx, y + 14 * dy);
   }

@@ -26,7 +26,11 @@ export function start(panel, open) {
   const body = h("tbody", {});
   const table = h("table", { class: "list anchors" }, h("thead", {}, head), body);
   const nodes = h("ul", { class: "nodes" });
-  const note = h("p", { class: "empty", hidden: true }, "Health is shown live; a recording's states tell nothing of it.");
+  const note = h(
+    "p",
+    { class: "empty", hidden: true },
+    "Health is shown live; a recording's states tell nothing of it.",
+  );
   parts = { note, rows: new Rows(body, makeRow), detail: makeDetail(), nodes, nodeRows: new Rows(nodes, makeNode) };
   parts.box = h("div", { class: "scroll-x" }, table);
   parts.panel = panel;
@@ -93,16 +97,42 @@ function toggle(id) {
 
 function makeDetail() {
   const heading = h("h2", {});
-  const list = facts(["State", "Follows", "Term", "Superframe", "Sent", "Skipped, too late", "Heard", "Longest unheard", "Uptime",
-    "MQTT", "Counted"]);
-  const offsets = new Chart("Clock offset, change (µs)", [{ name: "offset", colour: "accent" }], (v) => number(v, 1), { least: 1 });
-  const rates = new Chart("Clock rate against the master (ppm)", [{ name: "rate", colour: "warn" }], (v) => number(v, 3), {
-    least: 0.01,
+  const list = facts([
+    "State",
+    "Follows",
+    "Term",
+    "Superframe",
+    "Sent",
+    "Skipped, too late",
+    "Heard",
+    "Longest unheard",
+    "Uptime",
+    "MQTT",
+    "Counted",
+  ]);
+  const offsets = new Chart("Clock offset, change (µs)", [{ name: "offset", colour: "accent" }], (v) => number(v, 1), {
+    least: 1,
   });
-  const sigmas = new Chart("σ of the offset (mm)", [{ name: "σ", colour: "good" }], (v) => number(v, 1), { zero: true, least: 1 });
+  const rates = new Chart(
+    "Clock rate against the master (ppm)",
+    [{ name: "rate", colour: "warn" }],
+    (v) => number(v, 3),
+    {
+      least: 0.01,
+    },
+  );
+  const sigmas = new Chart("σ of the offset (mm)", [{ name: "σ", colour: "good" }], (v) => number(v, 1), {
+    zero: true,
+    least: 1,
+  });
   const charts = h("div", {}, offsets.element, rates.element, sigmas.element);
-  const element = h("section", { class: "detail", "aria-label": "The selected anchor", hidden: true }, heading,
-    list.element, charts);
+  const element = h(
+    "section",
+    { class: "detail", "aria-label": "The selected anchor", hidden: true },
+    heading,
+    list.element,
+    charts,
+  );
   const showDetail = (id) => {
     const health = state.mode === "live" ? state.health.anchors.get(id) : null;
     element.hidden = !health;
@@ -114,7 +144,11 @@ function makeDetail() {
     if (!history || charts.hidden) return;
     const now = history.time.at(-1);
     const times = history.time.map((time) => time - now);
-    for (const [chart, values] of [[offsets, history.offset_us], [rates, history.rate_ppm], [sigmas, history.std_mm]]) {
+    for (const [chart, values] of [
+      [offsets, history.offset_us],
+      [rates, history.rate_ppm],
+      [sigmas, history.std_mm],
+    ]) {
       chart.element.hidden = values.every((value) => value === null);
       if (!chart.element.hidden) chart.show([times, values], WINDOW_S);
     }

@@ -19,7 +19,11 @@ export function start(panel, open) {
   const list = h("ul", { class: "recordings" });
   const empty = h("p", { class: "empty" });
   parts = { back, empty, rows: new Rows(list, makeRow) };
-  panel.append(h("div", { class: "above" }, h("p", { class: "count" }, "Recordings, the newest first"), back, again), empty, list);
+  panel.append(
+    h("div", { class: "above" }, h("p", { class: "count" }, "Recordings, the newest first"), back, again),
+    empty,
+    list,
+  );
   on(["recordings", "player", "mode"], show);
 }
 

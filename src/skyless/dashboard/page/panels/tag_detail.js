@@ -15,14 +15,32 @@ export class TagDetail {
   constructor() {
     this.title = h("h2", {});
     this.reason = h("p", { class: "reason", hidden: true });
-    this.facts = facts(["Position", "Speed", "Protection level", "Anchors used", "First fix", "Latency", "Method", "Dropped",
-      "Processor", "Memory"]);
-    this.error = new Chart("Error (true distance) and stated σ", [
-      { name: "error", colour: "bad" },
-      { name: "σ", colour: "accent" },
-    ], length, { zero: true, least: 0.02 });
+    this.facts = facts([
+      "Position",
+      "Speed",
+      "Protection level",
+      "Anchors used",
+      "First fix",
+      "Latency",
+      "Method",
+      "Dropped",
+      "Processor",
+      "Memory",
+    ]);
+    this.error = new Chart(
+      "Error (true distance) and stated σ",
+      [
+        { name: "error", colour: "bad" },
+        { name: "σ", colour: "accent" },
+      ],
+      length,
+      { zero: true, least: 0.02 },
+    );
     this.sigma = new Chart("Stated σ", [{ name: "σ", colour: "accent" }], length, { zero: true, least: 0.02 });
-    this.rate = new Chart("Fixes in a second", [{ name: "rate", colour: "good", steps: true }], number, { zero: true, least: 4 });
+    this.rate = new Chart("Fixes in a second", [{ name: "rate", colour: "good", steps: true }], number, {
+      zero: true,
+      least: 4,
+    });
     const few = { whole: true, zero: true, least: 4 };
     this.used = new Chart("Anchors used", [{ name: "anchors", colour: "accent", steps: true }], number, few);
     this.chi2 = new Chart("Residuals (χ² of each fix)", [{ name: "χ²", colour: "warn" }], (v) => number(v, 1), {
@@ -30,8 +48,15 @@ export class TagDetail {
       least: 1,
     });
     const charts = [this.error, this.sigma, this.rate, this.used, this.chi2].map((chart) => chart.element);
-    this.element = h("section", { class: "detail", "aria-label": "The selected tag" }, this.title, this.reason,
-      this.facts.element, ...charts, h("p", { class: "fine" }, "Charts: the last 60 s."));
+    this.element = h(
+      "section",
+      { class: "detail", "aria-label": "The selected tag" },
+      this.title,
+      this.reason,
+      this.facts.element,
+      ...charts,
+      h("p", { class: "fine" }, "Charts: the last 60 s."),
+    );
     this.element.hidden = true;
   }
 
@@ -57,9 +82,10 @@ export class TagDetail {
       "Protection level": known && row[HPL] >= 0 ? length(row[HPL]) : null,
       "Anchors used": known ? number(row[ANCHORS]) : null,
       "First fix": health?.first_fix_s == null ? null : `after ${duration(health.first_fix_s)}`,
-      Latency: health?.latency_p50_s == null
-        ? null
-        : `${duration(health.latency_p50_s)}, p99 ${duration(health.latency_p99_s)}`,
+      Latency:
+        health?.latency_p50_s == null
+          ? null
+          : `${duration(health.latency_p50_s)}, p99 ${duration(health.latency_p99_s)}`,
       Method: health?.method ?? null,
       Dropped: health ? dropped.map(([reason, count]) => `${count} ${reason}`).join(", ") || "none" : null,
       Processor: health ? `${(100 * health.cpu).toFixed(1)} %` : null,

@@ -21,7 +21,11 @@ let isOpen = () => false;
 export function start(panel, open) {
   isOpen = open;
   const search = h("input", { type: "search", placeholder: "Find a tag", "aria-label": "Find a tag", oninput: show });
-  const head = h("tr", {}, ...["", "Tag", "x", "y", "σ", "Error", "Rate"].map((words) => h("th", { scope: "col" }, words)));
+  const head = h(
+    "tr",
+    {},
+    ...["", "Tag", "x", "y", "σ", "Error", "Rate"].map((words) => h("th", { scope: "col" }, words)),
+  );
   head.cells[0].append(h("span", { class: "unseen" }, "State"));
   head.cells[5].title = "Distance to the true position, where it is known";
   head.cells[6].title = "Fixes in the last second";

@@ -17,8 +17,12 @@ let isOpen = () => false;
 /** Build the tab. */
 export function start(panel, open) {
   isOpen = open;
-  const about = h("p", { class: "fine" }, "Each tag's last whole superframe. The line is high while the tag works on a message; ",
-    "a dot is a fix. Above, the slots and the anchors that were heard in them.");
+  const about = h(
+    "p",
+    { class: "fine" },
+    "Each tag's last whole superframe. The line is high while the tag works on a message; ",
+    "a dot is a fix. Above, the slots and the anchors that were heard in them.",
+  );
   const picture = h("div", { id: "phases" });
   const empty = h("p", { class: "empty" }, "No tag has reported its phases yet.");
   const caption = h("p", { class: "count" });
@@ -33,7 +37,8 @@ export function start(panel, open) {
 /** Bring the tab up to date, if anybody sees it. */
 export function show() {
   if (!parts || !isOpen()) return;
-  const all = state.mode === "live" ? [...state.health.tags.values()].filter(({ phases }) => phases?.length).map(read) : [];
+  const all =
+    state.mode === "live" ? [...state.health.tags.values()].filter(({ phases }) => phases?.length).map(read) : [];
   all.sort((a, b) => a.tag.localeCompare(b.tag, "en", { numeric: true }));
   const chosen = all.filter((health) => health.tag === state.selection.tag);
   const shown = [...chosen, ...all.filter((health) => health.tag !== state.selection.tag)].slice(0, MOST);
@@ -45,7 +50,10 @@ export function show() {
   const more = all.length > shown.length ? ` ${shown.length} of ${all.length} tags.` : "";
   const superframe = shown[0]?.phases[0].superframe;
   const latest = superframe === undefined ? "" : `Superframe ${number(superframe)}.`;
-  text(parts.caption, slots ? `${slots} slots of ${duration(slot_s)}: ${duration(slots * slot_s)}. ${latest}${more}` : "");
+  text(
+    parts.caption,
+    slots ? `${slots} slots of ${duration(slot_s)}: ${duration(slots * slot_s)}. ${latest}${more}` : "",
+  );
   showEther();
 }
 
@@ -97,7 +105,9 @@ function timeMarks(end_s, at) {
   const step = power * [1, 2, 5].findLast((factor) => factor * power <= wanted);
   const marks = [s("text", { x: 0, y: 31, class: "row-name" }, "anchor")];
   for (let n = 0; n * step <= end_s + 1e-9; n++) {
-    marks.push(s("text", { x: at(n * step), y: 11, class: "time" }, number(n * step * 1e3, step < 1e-3 ? 1 : 0, n ? "" : "ms")));
+    marks.push(
+      s("text", { x: at(n * step), y: 11, class: "time" }, number(n * step * 1e3, step < 1e-3 ? 1 : 0, n ? "" : "ms")),
+    );
   }
   return marks;
 }
@@ -112,7 +122,9 @@ function trace(health, top, at, end_s) {
     const to = Math.max(at(phase.done_s), from + 1.5);
     line += `H${from.toFixed(1)}V${high}H${to.toFixed(1)}V${low}`;
     const words = `anchor ${phase.anchor}, slot ${phase.slot}: ${duration(phase.done_s - phase.heard_s)}${phase.fix ? ", fix" : ""}`;
-    row.append(s("rect", { class: "busy", x: from, y: high, width: to - from, height: low - high }, s("title", {}, words)));
+    row.append(
+      s("rect", { class: "busy", x: from, y: high, width: to - from, height: low - high }, s("title", {}, words)),
+    );
     if (phase.fix) row.append(s("circle", { class: "fix", cx: to, cy: high - 1, r: 2.2 }));
   }
   row.append(s("path", { class: "pin", d: `${line}H${at(end_s)}` }));

@@ -20,7 +20,14 @@ export function start(panel, open) {
   const events = h("ol", { class: "events", id: "events", role: "log", "aria-label": "Events" });
   const none = h("p", { class: "empty" }, "No zones yet. Draw one on the map with mouse, finger or keyboard.");
   const silent = h("p", { class: "empty" }, "Nobody has entered or left a zone yet.");
-  parts = { add, none, silent, zones: new Rows(zones, makeZone), events: new Rows(events, makeEvent), eventBox: events };
+  parts = {
+    add,
+    none,
+    silent,
+    zones: new Rows(zones, makeZone),
+    events: new Rows(events, makeEvent),
+    eventBox: events,
+  };
   panel.append(h("div", { class: "above" }, h("p", { class: "count" }), add), none, zones);
   panel.append(h("section", {}, h("h2", {}, "Entered and left"), silent, events));
   on(["zones", "events", "selection", "mode", "editor"], slowly(60, show));
@@ -70,8 +77,13 @@ function makeZone(id, zone) {
 function cornerRows(zone) {
   return zone.polygon_m.map((corner, index) => {
     const inputs = ["x", "y"].map((axis, part) => {
-      const input = h("input", { type: "number", step: "0.05", value: String(corner[part]),
-        "aria-label": `Corner ${index + 1}, ${axis} in metres`, disabled: state.mode !== "live" });
+      const input = h("input", {
+        type: "number",
+        step: "0.05",
+        value: String(corner[part]),
+        "aria-label": `Corner ${index + 1}, ${axis} in metres`,
+        disabled: state.mode !== "live",
+      });
       input.addEventListener("change", () => moveBy(zone.id, index, part, Number(input.value)));
       return h("label", {}, `${axis} `, input);
     });
@@ -83,17 +95,21 @@ function moveBy(id, index, part, value) {
   const zone = state.zones.find((one) => one.id === id);
   if (!zone || !Number.isFinite(value)) return;
   const polygon_m = zone.polygon_m.map((corner, n) =>
-    n === index ? corner.map((old, axis) => (axis === part ? value : old)) : corner);
+    n === index ? corner.map((old, axis) => (axis === part ? value : old)) : corner,
+  );
   change(id, { polygon_m });
 }
 
 function makeEvent(_key, event) {
   const entered = event.kind === "enter";
-  const element = h("li", { class: entered ? "enter" : "leave" },
+  const element = h(
+    "li",
+    { class: entered ? "enter" : "leave" },
     h("span", { class: "when" }, timeOfDay(event.unix_s)),
     h("span", { class: "arrow", "aria-hidden": "true" }, entered ? "→" : "←"),
     h("button", { type: "button", class: "name", onclick: () => select("tag", event.tag) }, event.tag),
-    h("span", {}, ` ${entered ? "entered" : "left"} ${event.name}`));
+    h("span", {}, ` ${entered ? "entered" : "left"} ${event.name}`),
+  );
   return { element };
 }
 
