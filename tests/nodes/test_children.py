@@ -7,11 +7,10 @@ import signal
 import socket
 import sys
 
-import pytest
 from mqtt_brokers import free_port, until
 
 from skyless.nodes import children
-from skyless.nodes.children import Child, Program, end, free_ports
+from skyless.nodes.children import Child, Program, any_port, end, next_port
 
 
 def alive(pid):
@@ -123,23 +122,38 @@ def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypatch):
 
 
 def test_a_port_that_is_taken_is_passed_over():
-    with socket.socket() as one, socket.socket() as two:
+    with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         port = one.getsockname()[1]
         one.listen()
-        assert free_ports("127.0.0.1", (port,))[0] > port
-        first, second = free_ports("127.0.0.1", (port, port))
-        assert len({port, first, second}) == 3
-        two.bind(("127.0.0.1", first))
-        two.listen()
-        assert free_ports("127.0.0.1", (port,))[0] > first
+        assert next_port("127.0.0.1", port) > port
+        assert any_port("127.0.0.1") != port
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1"])
-def test_a_port_that_was_just_left_is_free(host):
-    with socket.create_server((host, 0)) as server:
+def test_a_port_that_was_just_left_is_free():
+    with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        with socket.create_connection((host, port)):
+        with socket.create_connection(("127.0.0.1", port)):
             served, _ = server.accept()
             served.close()  # the server's side closes first and waits in TIME_WAIT
-    assert free_ports(host, (port,)) == (port,)
+    assert next_port("127.0.0.1", port) == port
+
+
+def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_when_it_says_so(monkeypatch, tmp_path):
+    program = Program("recorder", ("record", str(tmp_path / "a.mcap"), "--x"), 1)
+    assert program.start(1) == program.arguments
+    assert program.start(3) == ("record", str(tmp_path / "a-3.mcap"), "--x")
+
+    async def main():
+        said = []
+        monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
+        child = Child(program, said.append)
+        await asyncio.wait_for(child.run(), 10)
+        assert child.starts == 1
+        assert len(said) == 1
+        monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"))
+        task = asyncio.ensure_future(child.run())
+        await until(lambda: child.starts >= 3, 10)
+        await stop(task)
+
+    asyncio.run(main())

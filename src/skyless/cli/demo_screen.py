@@ -44,6 +44,7 @@ class Screen:
         whole = self._whole
         lines = [f"page      {whole.page}", f"broker    {whole.address}"]
         lines.append(f"fixes     mosquitto_sub -p {whole.address.port if whole.address else 1883} -t 'skyless/v1/#' -v")
+        lines.append(f"air       --radio ether:127.0.0.1:{whole.ether_port}, for tags and anchors of your own")
         if asked.record is not None:
             lines.append(f"recording {asked.record}")
         to = sys.stderr if json else sys.stdout

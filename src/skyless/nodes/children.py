@@ -6,7 +6,7 @@ import os
 import socket
 import sys
 from collections import deque
-from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 from msgspec import Struct
@@ -32,6 +32,17 @@ class Program(Struct, frozen=True):
 
     name: str
     arguments: tuple[str, ...]
+    new_file: int | None = None
+    """Place among the arguments of a file that must not exist; later starts get another one, and there are none after
+    an end of its own (a full disk, its limit reached)."""
+
+    def start(self, number: int) -> tuple[str, ...]:
+        """Arguments of its first, second ... start."""
+        if self.new_file is None or number == 1:
+            return self.arguments
+        path = Path(self.arguments[self.new_file])
+        renamed = str(path.with_stem(f"{path.stem}-{number}"))
+        return (*self.arguments[: self.new_file], renamed, *self.arguments[self.new_file + 1 :])
 
 
 class Child:
@@ -47,12 +58,15 @@ class Child:
         self._line = b""
 
     async def run(self) -> None:
-        """Keep it alive until cancelled."""
+        """Keep it alive until cancelled, or until it has ended for good."""
         wait_s = _AGAIN_S
         while True:
             begun_s = asyncio.get_running_loop().time()
             code = await self._one_life()
             words = self._last_words[-1] if self._last_words else "it said nothing"
+            if self.program.new_file is not None and code >= 0:
+                self._say(f"{self.program.name} ended ({_how(code)}): {words}")
+                return
             self._say(f"{self.program.name} ended ({_how(code)}): {words}; started again")
             sound = asyncio.get_running_loop().time() - begun_s > _SOUND_S
             wait_s = _AGAIN_S if sound else min(2.0 * wait_s, _LONGEST_S)
@@ -87,7 +101,7 @@ class Child:
         try:
             return await asyncio.create_subprocess_exec(
                 *_COMMAND,
-                *self.program.arguments,
+                *self.program.start(self.starts),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=words,
@@ -127,15 +141,19 @@ def _how(code: int) -> str:
     return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
-def free_ports(host: str, first: Sequence[int]) -> tuple[int, ...]:
-    """For each port the port itself, or the next one that is free."""
-    taken: list[int] = []
-    for port in first:
-        found = port
-        while found in taken or not _is_free(host, found):
-            found += 1
-        taken.append(found)
-    return tuple(taken)
+def any_port(host: str) -> int:
+    """A port that is free, and that the system gives to nobody else for some time."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind((host, 0))
+        return int(probe.getsockname()[1])
+
+
+def next_port(host: str, first: int) -> int:
+    """The first port that is free from this one on."""
+    port = first
+    while not _is_free(host, port):
+        port += 1
+    return port
 
 
 def _is_free(host: str, port: int) -> bool:

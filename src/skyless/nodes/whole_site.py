@@ -9,12 +9,11 @@ from msgspec.structs import replace
 
 from skyless.nodes.broker import Broker, start_broker
 from skyless.nodes.broker_settings import BrokerSettings
-from skyless.nodes.children import Child, Program, free_ports
+from skyless.nodes.children import Child, Program, any_port, next_port
 from skyless.nodes.running import Say, together
 from skyless.nodes.watch import Watch
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
-from skyless.radios.ether_wire import DEFAULT_PORT
 from skyless.site.model import Site
 
 HOST: Final = "127.0.0.1"
@@ -49,7 +48,7 @@ class WholeSite:
 
     def __init__(self, asked: SiteRun, say: Say) -> None:
         self._asked, self._say = asked, say
-        self.ether_port, self.page_port = free_ports(HOST, (DEFAULT_PORT, PAGE_PORT))
+        self.ether_port, self.page_port = any_port(HOST), next_port(HOST, PAGE_PORT)
         self.address: MqttAddress | None = asked.broker
         self.watch: Watch | None = None
         self.children: list[Child] = []
@@ -125,7 +124,7 @@ class WholeSite:
         if asked.record is not None:
             limit = ("--limit-mb", str(asked.record_limit_mb))
             programs.append(
-                Program("recorder", ("record", str(asked.record), *mqtt, *limit, "--site-id", str(asked.site.id)))
+                Program("recorder", ("record", str(asked.record), *mqtt, *limit, "--site-id", str(asked.site.id)), 1)
             )
         return programs
 
