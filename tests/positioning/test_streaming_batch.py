@@ -102,7 +102,7 @@ def test_pair_differences_in_one_loop(height_m):
     assert np.linalg.norm(two.x[: two.dim] - tag[: two.dim]) < 0.3
 
 
-def positions(until_s=0.2):
+def positions(until_s=0.25):
     """All positions of a tag by three methods, through anchors, ether and receiver."""
     found = {}
     for method in ("literal", "bracketed", "tracker"):
