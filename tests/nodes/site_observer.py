@@ -163,5 +163,9 @@ class Observer:
             if kind == "anchor" and health.role == "master"
         ]
 
+    def term(self):
+        """How often the master's role has gone to another."""
+        return max(health.term for (kind, _), (_, health) in self.health.items() if kind == "anchor")
+
     def ether_stalls(self):
         return self.health["ether", "air"][1].stalls

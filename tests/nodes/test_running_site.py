@@ -40,7 +40,8 @@ class Trial:
         self.keeper = Link(address, "keeper", site=SITE, kind="watch", persistent=True)
         self.numbers_sent, self.numbers_kept = 0, []
         self.keeper.subscribe(NUMBERS, lambda topic, payload: self.numbers_kept.append(int(payload)), qos=1)
-        self.frozen_ether = 0
+        self.inflicted = 0
+        """Stalls of the ether and ends of a master's reign that the faults were to bring about."""
         self.figures = {}
 
     async def count(self):
@@ -52,21 +53,26 @@ class Trial:
             await asyncio.sleep(0.05)
 
     async def hurt(self, fault):
-        """One fault; once more if the machine was so busy that even the observer or the ether stood still."""
+        """One fault; once more if the machine was so busy that processes stood still which nobody had stopped.
+
+        The observer and the ether see that of themselves; of the master the others do, which depose it after 53 ms.
+        """
         for attempt in (1, 2):
-            stalls = len(self.observer.stalls), self.observer.ether_stalls()
-            frozen = self.frozen_ether
+            before = self.stood_still()
             try:
                 await fault(self)
             except (AssertionError, TimeoutError) as error:
                 await asyncio.sleep(1.5)  # the ether's next health message
-                excess = self.observer.ether_stalls() - stalls[1] - (self.frozen_ether - frozen)
-                busy = len(self.observer.stalls) > stalls[0] or excess > 0
+                busy = self.stood_still() > before
                 _log.warning("%s failed (%r); the machine was %sbusy", fault.__name__, error, "" if busy else "not ")
                 if attempt == 2 or not busy:
                     raise
             else:
                 return
+
+    def stood_still(self):
+        """How often processes stood still of their own accord."""
+        return len(self.observer.stalls) + self.observer.ether_stalls() + self.observer.term() - self.inflicted
 
     async def recovers(self, what, since_s, tags=TAGS):
         """Right fixes of these tags within a second."""
@@ -119,6 +125,7 @@ def synchronised(observer, anchor, since_s):
 async def master_killed(trial):
     observer = trial.observer
     (master,) = observer.masters()
+    trial.inflicted += 1
     program = trial.site.anchors[master]
     offsets_s = {tag: observer.clock_offset_s(tag) for tag in TAGS}
     begin_s = time.monotonic()
@@ -133,7 +140,7 @@ async def master_killed(trial):
     await until(lambda: synchronised(observer, master, back_s))
     await asyncio.sleep(SETTLE_S)
     await trial.goes_on("master killed and started", begin_s)
-    assert observer.masters() == [other]
+    assert observer.masters() == [other], f"{observer.masters()} instead of {other}"
     for tag in TAGS:
         assert observer.clock_offset_s(tag) == pytest.approx(offsets_s[tag], abs=1e-3)  # time does not jump
 
@@ -209,17 +216,18 @@ async def anchor_frozen(trial):
 async def master_frozen(trial):
     observer = trial.observer
     (master,) = observer.masters()
+    trial.inflicted += 1
     begin_s = time.monotonic()
     back_s = await frozen(trial.site.anchors[master])
     await until(lambda: synchronised(observer, master, back_s))
     await asyncio.sleep(SETTLE_S)
     await trial.goes_on("master frozen", begin_s)
-    assert len(observer.masters()) == 1
+    assert len(observer.masters()) == 1, observer.masters()
     assert observer.masters() != [master]
 
 
 async def ether_frozen(trial):
-    trial.frozen_ether += 1
+    trial.inflicted += 1
     back_s = await frozen(trial.site.ether)
     await trial.recovers("ether frozen", back_s)
 
@@ -281,9 +289,9 @@ def test_a_site_rides_through_the_death_and_the_freezing_of_every_process(tmp_pa
     trial, codes = asyncio.run(ride(tmp_path))
     observer = trial.observer
     assert not observer.false, observer.false[:5]
-    assert observer.judged > 5000
+    assert observer.judged > 4000
     assert observer.unjudged < 0.02 * observer.judged
     assert codes == [0] * len(trial.site.programs)
     missing = set(range(1, trial.numbers_sent + 1)) - set(trial.numbers_kept)
     assert not missing
-    assert trial.numbers_sent > 400
+    assert trial.numbers_sent > 300
