@@ -85,7 +85,7 @@ class Screen:
         """The table of tags."""
         from rich.table import Table
 
-        columns = ("tag", "x m", "y m", "m/s", "error cm", "sigma cm", "fixes /s", "anchors", "lost", "late ms")
+        columns = ("tag", "x m", "y m", "m/s", "error cm", "sigma cm", "fixes /s", "anch. used", "lost", "late ms")
         table = Table(*columns, title="tags (radio world simulated)")
         for name, tag in self._tags():
             fix, health = tag.fix, tag.health
