@@ -22,8 +22,6 @@ _SOUND_S: Final = 10.0
 _STOP_S: Final = 5.0
 _LINES: Final = 20
 _LINE_BYTES: Final = 500
-
-
 _COMMAND: Final = (sys.executable, "-m", "skyless.cli.main")
 
 
@@ -76,9 +74,8 @@ class Child:
         self.starts += 1
         self._last_words.clear()
         self._line = b""
-        ours, theirs = (
-            os.pipe()
-        )  # of asyncio's own pipes a program's death is only seen when its children close them too
+        # with asyncio's own pipes a program's death is only seen when its children have closed them too
+        ours, theirs = os.pipe()
         os.set_blocking(ours, False)
         loop = asyncio.get_running_loop()
         loop.add_reader(ours, self._listen, ours)
