@@ -20,7 +20,7 @@ import msgspec
 
 from skyless.nodes.broker import start_broker
 from skyless.nodes.broker_settings import BrokerSettings
-from skyless.nodes.children import Child, Program, free_ports
+from skyless.nodes.children import Child, Program, any_port
 from skyless.outputs.link import Link
 from skyless.outputs.messages import AnchorHealth, EtherHealth, TagHealth
 from skyless.outputs.topics import health_topic
@@ -79,7 +79,7 @@ def programs(tags, processes, port, mqtt, publish_hz):
 async def measure(tags, processes, seconds, publish_hz):
     """Run a site of so many tags, and what it took."""
     with tempfile.TemporaryDirectory() as folder:
-        (port,) = free_ports("127.0.0.1", (17_784,))
+        port = any_port("127.0.0.1")
         broker = await start_broker(BrokerSettings(data=Path(folder)))
         link = Link(broker.address, "benchmark", site=SITE.id, kind="watch")
         healths = Healths(link)
