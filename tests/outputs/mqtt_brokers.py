@@ -103,11 +103,15 @@ class Mosquitto:
 
 @contextlib.asynccontextmanager
 async def running(broker, *links):
-    """A started broker, and links that run and are connected."""
+    """A started broker, and links that run and are connected, one after the other.
+
+    Of a message that is retained at the very moment of a subscription, nats-server tells the subscriber nothing.
+    """
     await broker.start()
-    tasks = [asyncio.ensure_future(link.run()) for link in links]
+    tasks = []
     try:
         for link in links:
+            tasks.append(asyncio.ensure_future(link.run()))
             await until(lambda link=link: link.connected)
         yield tasks
     finally:
