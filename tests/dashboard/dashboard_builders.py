@@ -1,8 +1,8 @@
 """Messages of a small site, and an MQTT that only remembers."""
 
 import msgspec
+from paho.mqtt.client import topic_matches_sub
 
-from skyless.outputs.filters import matches
 from skyless.outputs.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
 from skyless.site.lab import lab_site
 
@@ -80,7 +80,7 @@ class Wire:
 
     def deliver(self, topic, message):
         payload = message if isinstance(message, bytes) else msgspec.json.encode(message)
-        taken = [handler(topic, payload) for name, handler in self.handlers.items() if matches(name, topic)]
+        taken = [handler(topic, payload) for name, handler in self.handlers.items() if topic_matches_sub(name, topic)]
         assert taken, f"nobody listens to {topic}"
 
     def topics(self):

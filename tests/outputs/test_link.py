@@ -3,7 +3,9 @@
 import asyncio
 import logging
 import signal
+import socket
 import sys
+import threading
 
 import msgspec
 import pytest
@@ -377,7 +379,7 @@ def certificate(tmp_path):
         (b"", "no answer within 0.2 s"),
         (b"\x00\x00", "does not speak MQTT"),
         (b"HTTP/1.1 400 Bad Request\r\n\r\n" * 9, "does not speak MQTT"),
-        (b"\x20\x02\x00\x00\x30\x01\xff", "a PUBLISH of a wrong form"),
+        (b"\x20\x02\x00\x00\x30\x01\xff", "does not speak MQTT"),
         (b"\x20\x02\x00\x00\x30\x05\x00", "closed the connection"),
     ],
 )
@@ -403,6 +405,53 @@ def test_what_is_no_broker_is_told_and_tried_again(answer, trouble, monkeypatch)
             await until(lambda: len(visits) > seen)
             assert not task.done()
         await stopped(task)
+
+    asyncio.run(check())
+
+
+def test_a_stopped_link_waits_for_no_connection_that_is_on_its_way():
+    """A full backlog leaves later connections without an answer; whoever has given up closes his when it comes."""
+
+    async def check():
+        loop = asyncio.get_running_loop()
+        with socket.socket() as server, socket.socket() as first:
+            server.bind(("127.0.0.1", 0))
+            server.listen(0)
+            server.setblocking(False)
+            first.connect(server.getsockname())
+            task = asyncio.ensure_future(tag_link(MqttAddress(*server.getsockname())).run())
+            await until(connecting)
+            await stopped(task)
+            assert connecting()
+            (await loop.sock_accept(server))[0].close()
+            peer, _ = await loop.sock_accept(server)
+            with peer:
+                async with asyncio.timeout(20):
+                    while await loop.sock_recv(peer, 1000):
+                        pass
+
+    asyncio.run(check())
+
+
+def connecting():
+    return any(thread.name == "MQTT connect" for thread in threading.enumerate())
+
+
+@pytest.mark.parametrize("qos", [0, 1])
+def test_a_flood_through_tls_arrives_completely(make_broker, certificate, qos):
+    """TLS hands over more at once than the socket announces."""
+
+    async def check():
+        broker = make_broker(certificate=certificate[0], key=certificate[1])
+        address = msgspec.structs.replace(broker.address, ca=certificate[0])
+        inbox = Inbox(address, "skyless/v1/7/tag/#", qos=qos, keepalive_s=600)
+        tag = tag_link(address)
+        async with running(broker, inbox.link, tag):
+            await asyncio.sleep(0.2)
+            sizes = [30_000] * 3 + [10] * 2000
+            for size in sizes:
+                tag.publish(fix_topic(7, "t1"), b"." * size, qos=qos)
+            await until(lambda: [len(payload) for payload in inbox.of(fix_topic(7, "t1"))] == sizes)
 
     asyncio.run(check())
 

@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.outputs.outbox import Limits, Outbox
-from skyless.outputs.packets import Splitter, read_message
 
 LIMITS = Limits(topics=3, topic_bytes=60, messages=8, bytes=90, window=4, payload=40)
 
@@ -22,17 +21,17 @@ class Broker:
         self.box = box
         self.flying = []
         self.got = []
+        self.number = 0
 
     def take(self):
-        packet = self.box.take()
-        if packet is None:
+        message = self.box.take()
+        if message is None:
             return None
-        ((head, body),) = Splitter().feed(packet)
-        message = read_message(head, body)
-        self.got.append((message.topic, message.payload, message.packet > 0, bool(head & 1)))
-        if message.packet:
-            assert message.packet not in self.flying
-            self.flying.append(message.packet)
+        self.number += 1
+        self.box.gave(message, self.number)
+        self.got.append((message.topic, message.payload, message.qos > 0, message.retain))
+        if message.qos:
+            self.flying.append(self.number)
         return message
 
     def acknowledge(self):
@@ -140,14 +139,3 @@ def test_a_topic_that_a_broker_would_not_take_is_dropped(topic):
     box.put(topic, b"", 1, retain=False)
     assert box.dropped == 1
     assert box.take() is None
-
-
-def test_packet_numbers_wrap_and_stay_apart():
-    box = Outbox(Limits(window=3))
-    broker = Broker(box)
-    for number in range(70_000):
-        box.put("a", b"%d" % number, 1, retain=False)
-        assert 1 <= broker.take().packet <= 65_000
-        if number % 3 == 2:
-            for _ in range(3):
-                broker.acknowledge()

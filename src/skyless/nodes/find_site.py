@@ -5,9 +5,9 @@ import logging
 from collections.abc import Callable
 from typing import Final
 
-from skyless.outputs import packets
 from skyless.outputs.address import MqttAddress
-from skyless.outputs.connection import Connection, RefusedError, open_connection, trouble_with
+from skyless.outputs.connection import Reactions, RefusedError, open_connection, trouble_with
+from skyless.outputs.paho_client import Introduction
 from skyless.outputs.topics import EVERY_SITE, site_topic
 
 _KEEPALIVE_S: Final = 10
@@ -48,22 +48,16 @@ async def _sites(address: MqttAddress, on_state: Callable[[bool], None]) -> set[
     sites: set[int] = set()
     found = asyncio.Event()
 
-    def take(message: packets.Message) -> None:
-        number = message.topic.split("/")[-2]
-        if message.payload and number.isdecimal():
+    def take(topic: str, payload: bytes) -> None:
+        number = topic.split("/")[-2]
+        if payload and number.isdecimal():
             sites.add(int(number))
             found.set()
 
-    greeting = packets.connect(
-        "", clean=True, keepalive_s=_KEEPALIVE_S, user=address.user, password=address.password, will=None
-    )
-
-    def make() -> Connection:
-        return Connection(_KEEPALIVE_S, take, lambda _: None, lambda: None, lambda _, __: None)
-
-    connection = await open_connection(address, address.tls_context(), greeting, make)
+    who, react = Introduction("", _KEEPALIVE_S), Reactions(message=take)
+    connection = await open_connection(address, address.tls_context(), who, react)
     on_state(True)
-    connection.write(packets.subscribe(1, {site_topic(EVERY_SITE): 0}))
+    connection.subscribe({site_topic(EVERY_SITE): 0})
     waits = [asyncio.create_task(found.wait()), asyncio.create_task(connection.lost.wait())]
     try:
         await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)

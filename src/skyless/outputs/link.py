@@ -12,15 +12,14 @@ from typing import Final
 
 import msgspec
 from msgspec import Struct
+from paho.mqtt.client import topic_matches_sub
 
 import skyless
-from skyless.outputs import packets
 from skyless.outputs.address import MqttAddress
-from skyless.outputs.connection import Connection, RefusedError, open_connection, trouble_with
-from skyless.outputs.filters import matches
+from skyless.outputs.connection import Connection, Reactions, RefusedError, open_connection, trouble_with
 from skyless.outputs.messages import Counters, StatusMessage
-from skyless.outputs.outbox import LAST_NUMBER, Limits, Outbox
-from skyless.outputs.packets import Message, Will
+from skyless.outputs.outbox import Limits, Outbox
+from skyless.outputs.paho_client import Introduction, Will
 from skyless.outputs.topics import status_topic
 
 Handler = Callable[[str, bytes], None]
@@ -76,10 +75,10 @@ class Link:
         self._status_topic = status_topic(site, kind, name)
         self._offline = StatusMessage(online=False, kind=kind, name=str(name))
         self._outbox = Outbox(limits or Limits())
+        self._reactions = Reactions(self._receive, self._acknowledged, self._pump)
         self._connection: Connection | None = None
         self._handlers: dict[str, tuple[Handler, int]] = {}
         self._routes: dict[str, tuple[Handler, ...]] = {}
-        self._asked: dict[int, tuple[str, ...]] = {}
         self._reconnects = -1
         self._told_dropped = 0
         self._away_since_s = time.monotonic()
@@ -119,7 +118,7 @@ class Link:
         self._handlers[topic_filter] = (handler, qos)
         self._routes.clear()
         if self._connection is not None:
-            self._ask_for(self._connection, {topic_filter: qos})
+            self._connection.subscribe({topic_filter: qos})
 
     async def run(self) -> None:
         """Stay connected until cancelled; then send what waits, for a second at most, and say goodbye."""
@@ -139,7 +138,7 @@ class Link:
     async def _one_connection(self) -> bool:
         """Whether it came about; returns when it is lost."""
         try:
-            connection = await open_connection(self.address, self._tls, self._greeting(), self._make_connection)
+            connection = await open_connection(self.address, self._tls, self._introduction(), self._reactions)
         except (OSError, RefusedError) as error:
             self._tell_trouble(trouble_with(self.address, error))
             return False
@@ -153,18 +152,9 @@ class Link:
         _log.warning("lost the broker %s: %s", self.address, connection.reason)
         return True
 
-    def _make_connection(self) -> Connection:
-        return Connection(self._keepalive_s, self._receive, self._acknowledged, self._pump, self._subscribed)
-
-    def _greeting(self) -> bytes:
-        return packets.connect(
-            self._client,
-            clean=not self._persistent,
-            keepalive_s=self._keepalive_s,
-            user=self.address.user,
-            password=self.address.password,
-            will=Will(self._status_topic, _encode(self._offline)),
-        )
+    def _introduction(self) -> Introduction:
+        will = Will(self._status_topic, _encode(self._offline))
+        return Introduction(self._client, self._keepalive_s, self._persistent, will)
 
     def _up(self, connection: Connection) -> None:
         self._connection = connection
@@ -173,8 +163,7 @@ class Link:
         self._tell_return()
         self._outbox.restart()
         self._say_online()
-        self._asked.clear()
-        self._ask_for(connection, {name: qos for name, (_, qos) in self._handlers.items()})
+        connection.subscribe({name: qos for name, (_, qos) in self._handlers.items()})
         self._set_state(connected=True, trouble=None)
         self._pump()
 
@@ -214,49 +203,40 @@ class Link:
                 while self._outbox.unacknowledged and not connection.lost.is_set():
                     await asyncio.sleep(0.005)
                 if self._persistent:
-                    connection.write(packets.unsubscribe(LAST_NUMBER + 1, self._handlers))
+                    connection.unsubscribe(self._handlers)
                 await connection.leave()
         except TimeoutError:
             pass
         finally:
             connection.abort("stopped")
 
-    def _ask_for(self, connection: Connection, filters: dict[str, int]) -> None:
-        number = LAST_NUMBER + 2 + len(self._asked)
-        self._asked[number] = tuple(filters)
-        connection.write(packets.subscribe(number, filters))
-
-    def _subscribed(self, number: int, codes: bytes) -> None:
-        for name, code in zip(self._asked.get(number, ()), codes, strict=False):
-            if code == packets.NOT_SUBSCRIBED:
-                _log.warning("the broker %s does not let this user subscribe to %s", self.address, name)
-
     def _pump(self) -> None:
         connection = self._connection
         while connection is not None and connection.writable:
-            packet = self._outbox.take()
-            if packet is None:
+            message = self._outbox.take()
+            if message is None:
                 return
-            connection.write(packet)
+            number = connection.publish(message.topic, message.payload, message.qos, retain=message.retain)
+            self._outbox.gave(message, number)
 
     def _acknowledged(self, number: int) -> None:
         self._outbox.acknowledge(number)
         self._pump()
 
-    def _receive(self, message: Message) -> None:
-        handlers = self._routes.get(message.topic)
+    def _receive(self, topic: str, payload: bytes) -> None:
+        handlers = self._routes.get(topic)
         if handlers is None:
-            handlers = self._find_handlers(message.topic)
+            handlers = self._find_handlers(topic)
         for handler in handlers:
             try:
-                handler(message.topic, message.payload)
+                handler(topic, payload)
             except Exception:  # noqa: BLE001 - one bad handler must not cost the others the connection
-                _log.exception("a message of %s could not be handled", message.topic)
+                _log.exception("a message of %s could not be handled", topic)
 
     def _find_handlers(self, topic: str) -> tuple[Handler, ...]:
         if len(self._routes) >= _MOST_ROUTES:
             self._routes.clear()
-        found = tuple(handler for name, (handler, _) in self._handlers.items() if matches(name, topic))
+        found = tuple(handler for name, (handler, _) in self._handlers.items() if topic_matches_sub(name, topic))
         self._routes[topic] = found
         return found
 

@@ -6,11 +6,6 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.outputs import packets
-
-LAST_NUMBER: Final = 65_000
-"""Of packets with a message; the numbers above are for subscriptions."""
-
 _TOPIC: Final = re.compile(r"[^\s+#\x00-\x1f\x7f]{1,250}")
 """What every broker takes; nats-server takes no blanks."""
 
@@ -53,12 +48,11 @@ class Outbox:
         self._newest_bytes = 0
         self._queue: deque[Waiting] = deque()
         self._queue_bytes = 0
-        self._again: deque[tuple[int, Waiting]] = deque()
+        self._again: deque[Waiting] = deque()
         self._flying: dict[int, Waiting] = {}
         self._kept: dict[str, Waiting] = {}
         self._kept_bytes = 0
         self._to_keep: dict[str, Waiting] = {}
-        self._number = 0
         self.dropped = 0
         self.sent = 0
         """Messages of QoS 0 given to the connection, and messages of QoS 1 acknowledged."""
@@ -80,25 +74,30 @@ class Outbox:
             self._replace(message)
         return None
 
-    def take(self) -> bytes | None:
-        """The next packet to send; None when nothing is left, or the window is full."""
+    def take(self) -> Waiting | None:
+        """The next message to send; None when nothing is left, or the window is full."""
         open_window = len(self._flying) < self._limits.window
         if self._again:
-            number, message = self._again.popleft()
-            return packets.publish(message.topic, message.payload, packet=number, retain=message.retain, again=True)
+            return self._again.popleft()
         if self._to_keep and (open_window or not next(iter(self._to_keep.values())).qos):
-            return self._send(self._to_keep.pop(next(iter(self._to_keep))))
+            return self._to_keep.pop(next(iter(self._to_keep)))
         if self._queue and open_window:
-            message = self._queue.popleft()
-            return self._send(message)
+            return self._queue.popleft()
         if self._newest:
             message = self._newest.popitem(last=False)[1]
             self._newest_bytes -= len(message.payload)
-            return self._send(message)
+            return message
         return None
 
+    def gave(self, message: Waiting, number: int) -> None:
+        """The connection has what was taken, and knows it by this number."""
+        if message.qos:
+            self._flying[number] = message
+        else:
+            self.sent += 1
+
     def acknowledge(self, number: int) -> None:
-        """The broker has the message of QoS 1 with this packet number."""
+        """The broker has the message of QoS 1 with this number."""
         message = self._flying.pop(number, None)
         if message is None:
             return
@@ -108,8 +107,8 @@ class Outbox:
 
     def restart(self) -> None:
         """A new connection: send again what was not acknowledged, and what the broker should have retained."""
-        self._flying = {number: message for number, message in self._flying.items() if not message.retain}
-        self._again = deque(self._flying.items())
+        self._again.extendleft(message for message in reversed(self._flying.values()) if not message.retain)
+        self._flying.clear()
         self._to_keep = dict(self._kept)
 
     def forget(self, topic: str) -> None:
@@ -121,7 +120,7 @@ class Outbox:
     @property
     def unacknowledged(self) -> int:
         """Messages of QoS 1, and retained ones, that the broker does not have for certain."""
-        return len(self._flying) + len(self._queue) + len(self._to_keep)
+        return len(self._flying) + len(self._again) + len(self._queue) + len(self._to_keep)
 
     @property
     def waiting_bytes(self) -> int:
@@ -135,20 +134,6 @@ class Outbox:
             return f"the message for {topic} has {len(payload)} bytes; {self._limits.payload} are the most"
         return None
 
-    def _send(self, message: Waiting) -> bytes:
-        if not message.qos:
-            self.sent += 1
-            return packets.publish(message.topic, message.payload, retain=message.retain)
-        number = self._next_number()
-        self._flying[number] = message
-        return packets.publish(message.topic, message.payload, packet=number, retain=message.retain)
-
-    def _next_number(self) -> int:
-        while True:
-            self._number = self._number % LAST_NUMBER + 1
-            if self._number not in self._flying:
-                return self._number
-
     def _replace(self, message: Waiting) -> None:
         old = self._newest.get(message.topic)
         if old is not None:
@@ -161,8 +146,9 @@ class Outbox:
             self.dropped += 1
 
     def _shorten_queue(self) -> None:
+        sent = len(self._flying) + len(self._again)
         while self._queue and (
-            len(self._queue) + len(self._flying) > self._limits.messages or self._queue_bytes > self._limits.bytes
+            len(self._queue) + sent > self._limits.messages or self._queue_bytes > self._limits.bytes
         ):
             self._queue_bytes -= len(self._queue.popleft().payload)
             self.dropped += 1
