@@ -159,7 +159,8 @@ def test_programs_that_die_are_started_again_and_ctrl_c_ends_all_with_a_summary(
     for pid in killed.values():
         os.kill(pid, signal.SIGKILL)
     for name in killed:
-        demo.wait_for(lambda name=name: f"{name} ended (signal 9)" in demo.said)
+        ended = re.compile(rf"^{name}.* ended \(signal 9\)", re.MULTILINE)
+        demo.wait_for(lambda ended=ended: ended.search(demo.said))
     demo.wait_until_it_runs()
     assert not killed.values() & demo.children().keys()
     broker = next(pid for pid, words in demo.children().items() if "nats-server" in words[0])
