@@ -3,6 +3,9 @@
 import asyncio
 import selectors
 
+from msgspec.structs import replace
+
+from skyless.air.reception import Reception
 from skyless.anchor import Anchor
 from skyless.constants import TICK_RATE_HZ
 from skyless.experiments.scenarios import Request, impairments_of
@@ -75,9 +78,14 @@ class FakeRadio:
 
 def receptions(seconds, seed=1):
     """What a tag at ``PLACE_M`` hears in the simulated lab."""
-    world = World(LAB, lambda anchor: Anchor(LAB, anchor), [TagSpec(Static(*PLACE_M))], faults(), seed)
-    return [reception for broadcast in world.run(seconds) for _, reception, _ in broadcast.receptions()]
+    return receptions_of(LAB.id, seconds, seed=seed)
 
 
-def faults():
-    return impairments_of(Request(LAB), LAB)
+def receptions_of(site_id, seconds, *, later_s=0.0, seed=1):
+    """The same of a lab with another identifier on the air, and so much later by the host's clock and the counter."""
+    site = replace(LAB, id=site_id)
+    faults = impairments_of(Request(site), site)
+    world = World(site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(*PLACE_M))], faults, seed)
+    heard = [reception for broadcast in world.run(seconds) for _, reception, _ in broadcast.receptions()]
+    later_ticks = round(later_s * TICK_RATE_HZ)
+    return [Reception(r.frame, wrap(r.rx_ticks + later_ticks), r.host_s + later_s, r.diagnostics) for r in heard]

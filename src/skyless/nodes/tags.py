@@ -24,12 +24,13 @@ _decode_request: Final = msgspec.json.Decoder(RequestMessage).decode
 
 
 class Tag:
-    """A tag and its link, which comes about once the tag's site is known."""
+    """A tag and its link, which comes about once the tag's site is known, and anew in another site."""
 
     def __init__(self, settings: TagSettings, radio: Radio, address: MqttAddress | None, say: Say) -> None:
         self._address = address
         self.link: Link | None = None
-        self._link_task: asyncio.Task[None] | None = None
+        self._site: int | None = None
+        self._link_tasks: list[asyncio.Task[None]] = []
         self._fix_topic = self._health_topic = self._receptions_topic = ""
         asked = receiver_settings(settings.method, settings.site, settings.qa, settings.z_bounds_m)
         self.log = ReceptionLog(radio.name, asked, secrets.token_hex(4))
@@ -41,26 +42,30 @@ class Tag:
         try:
             await self.node.run()
         finally:
-            if self._link_task is not None:
-                self._link_task.cancel()
-                await asyncio.gather(self._link_task, return_exceptions=True)
+            for task in self._link_tasks:
+                task.cancel()
+            await asyncio.gather(*self._link_tasks, return_exceptions=True)
 
     def _publish(self, message: FixMessage) -> None:
-        if self.link is None:
-            self._connect()
+        self._connect()
         if self.link is not None:
             self.link.publish(self._fix_topic, message)
 
     def _connect(self) -> None:
+        """See that the link is that of the site to which the tag listens."""
         site = self.node.receiver.site
-        if self._address is None or site is None:
+        if self._address is None or site is None or site == self._site:
             return
+        for task in self._link_tasks:
+            task.cancel()  # it says goodbye to the site that was left
+        self._link_tasks = [task for task in self._link_tasks if not task.done()]
+        self._site = site
         self.link = Link(self._address, self.node.name, site=site, kind="tag")
         self._fix_topic = fix_topic(site, self.node.name)
         self._health_topic = health_topic(site, "tag", self.node.name)
         self._receptions_topic = receptions_topic(site, self.node.name)
         self.link.subscribe(request_topic(site), self._take_request, qos=1)
-        self._link_task = asyncio.ensure_future(self.link.run())
+        self._link_tasks.append(asyncio.ensure_future(self.link.run()))
 
     def _take_request(self, _topic: str, payload: bytes) -> None:
         """Somebody wants raw receptions; what cannot be read is counted."""
@@ -81,8 +86,7 @@ class Tag:
     def tell_health(self, cpu: float, memory_bytes: int) -> None:
         """Publish how the tag does."""
         self.node.unix_less_host_s = time.time() - time.monotonic()
-        if self.link is None:
-            self._connect()
+        self._connect()
         health = self._health(cpu, memory_bytes)
         if self.link is not None:
             self.link.publish(self._health_topic, health)

@@ -1,0 +1,96 @@
+"""Tags and their links: a tag tells its fixes to the site where it is."""
+
+import asyncio
+
+import pytest
+from node_stage import LAB, FakeRadio, receptions_of
+
+from skyless.nodes import tags
+from skyless.nodes.tag import TagSettings
+from skyless.nodes.tags import Tag
+from skyless.outputs.address import MqttAddress
+from skyless.outputs.messages import Counters, FixMessage, TagHealth
+from skyless.radios.radio import Restarted
+
+
+class FakeLink:
+    made = None
+    counters = Counters(0, 0, 0)
+
+    def __init__(self, address, name, *, site, kind, **_):
+        self.name, self.site, self.kind = name, site, kind
+        self.published, self.state = [], "made"
+        FakeLink.made.append(self)
+
+    def subscribe(self, topic, handler, qos=0):
+        pass
+
+    def publish(self, topic, message, **_):
+        self.published.append((topic, message))
+
+    async def run(self):
+        self.state = "running"
+        try:
+            await asyncio.Event().wait()
+        finally:
+            self.state = "left"
+
+
+@pytest.fixture
+def links(monkeypatch):
+    monkeypatch.setattr(tags, "Link", FakeLink)
+    FakeLink.made = []
+    return FakeLink.made
+
+
+async def settled():
+    for _ in range(5):
+        await asyncio.sleep(0)
+
+
+def test_the_link_comes_with_the_site_and_goes_with_it(links):
+    async def main():
+        said = []
+        tag = Tag(TagSettings(), FakeRadio("t1"), MqttAddress("127.0.0.1", 1883), said.append)
+        running = asyncio.ensure_future(tag.run())
+        await settled()
+        tag.tell_health(0.1, 1)
+        assert links == []  # nobody to tell it to
+        for reception in receptions_of(LAB.id, 2.0):
+            tag.node.hear(reception)
+        await settled()
+        (first,) = links
+        assert (first.name, first.site, first.kind, first.state) == ("t1", 1, "tag", "running")
+        assert {topic for topic, _ in first.published} == {"skyless/v1/1/tag/t1/fix"}
+        assert all(isinstance(message, FixMessage) for _, message in first.published)
+        for reception in receptions_of(9, 2.0, later_s=10.0):
+            tag.node.hear(reception)
+        await settled()
+        first, second = links
+        assert (first.state, second.state, second.site) == ("left", "running", 9)
+        assert {topic for topic, _ in second.published} == {"skyless/v1/9/tag/t1/fix"}
+        tag.node.hear(Restarted())  # a new receiver knows no site yet, but the link stays
+        tag.tell_health(0.1, 1)
+        await settled()
+        assert len(links) == 2
+        topic, health = second.published[-1]
+        assert topic == "skyless/v1/9/tag/t1/health"
+        assert isinstance(health, TagHealth)
+        running.cancel()
+        await asyncio.wait([running])
+        assert second.state == "left"
+
+    asyncio.run(main())
+
+
+def test_without_a_broker_it_works_and_tells_nobody(links):
+    async def main():
+        tag = Tag(TagSettings(), FakeRadio("t1"), None, lambda line: None)
+        for reception in receptions_of(LAB.id, 2.0):
+            tag.node.hear(reception)
+        tag.tell_health(0.1, 1)
+        tag.tell_receptions()
+        assert tag.node.serial > 100
+        assert links == []
+
+    asyncio.run(main())
