@@ -5,7 +5,7 @@ import asyncio
 import pytest
 from node_stage import LAB, FakeRadio, receptions_of
 
-from skyless.nodes import tags
+from skyless.nodes import running, tags
 from skyless.nodes.tag import TagSettings
 from skyless.nodes.tags import Tag
 from skyless.outputs.address import MqttAddress
@@ -94,3 +94,27 @@ def test_without_a_broker_it_works_and_tells_nobody(links):
         assert links == []
 
     asyncio.run(main())
+
+
+def test_a_link_that_fails_is_told_of_and_started_again(monkeypatch):
+    monkeypatch.setattr(running, "HEALTH_S", 0.01)
+    said = []
+
+    class Faulty:
+        address = "mqtt://nowhere"
+        runs = 0
+
+        async def run(self):
+            self.runs += 1
+            raise RuntimeError("a fault")
+
+    async def main():
+        link = Faulty()
+        task = asyncio.ensure_future(running.keep(link, said.append))
+        while link.runs < 3:
+            await asyncio.sleep(0.005)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(main())
+    assert "a fault" in said[0]

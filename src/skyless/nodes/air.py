@@ -4,7 +4,7 @@ import time
 from typing import Final
 
 from skyless.nodes.ether import Ether
-from skyless.nodes.running import HEALTH_S, Say, every, link_of, together
+from skyless.nodes.running import HEALTH_S, Say, every, keep, link_of, together
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.topics import health_topic, truth_topic
 
@@ -31,7 +31,11 @@ class Air:
         async with server:
             parts = [self._ether.tell_clocks()]
             if self._link is not None:
-                parts += [self._link.run(), every(TRUTH_S, self._tell_truth), every(HEALTH_S, self._tell_health)]
+                parts += [
+                    keep(self._link, self._say),
+                    every(TRUTH_S, self._tell_truth),
+                    every(HEALTH_S, self._tell_health),
+                ]
             await together(*parts)
 
     def _tell_truth(self) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from skyless.nodes.anchor import AnchorNode
-from skyless.nodes.running import HEALTH_S, Say, every, link_of, together
+from skyless.nodes.running import HEALTH_S, Say, every, keep, link_of, together
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
 from skyless.outputs.messages import AnchorHealth, Counters, SiteMessage
@@ -35,7 +35,7 @@ class Anchors:
         simulated: bool,
         floor_plan: Path | None = None,
     ) -> None:
-        self._site, self._simulated, self._floor_plan = site, simulated, floor_plan
+        self._site, self._simulated, self._floor_plan, self._say = site, simulated, floor_plan, say
         self.nodes = tuple(AnchorNode(site, int(radio.name), radio, say) for radio in radios)
         self._links = tuple(link_of(address, node.id, site=site.id, kind="anchor") for node in self.nodes)
         self._told_site = False
@@ -43,7 +43,7 @@ class Anchors:
     async def run(self) -> None:
         """Serve until cancelled."""
         parts = [node.run() for node in self.nodes]
-        parts += [link.run() for link in self._links if link is not None]
+        parts += [keep(link, self._say) for link in self._links if link is not None]
         await together(*parts, every(HEALTH_S, self._tell))
 
     def _tell(self) -> None:

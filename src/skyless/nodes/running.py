@@ -36,3 +36,13 @@ async def every(seconds: float, act: Callable[[], None]) -> None:
 def link_of(address: MqttAddress | None, name: int | str, *, site: int, kind: str) -> Link | None:
     """The node's connection to the broker; None without one."""
     return None if address is None else Link(address, name, site=site, kind=kind)
+
+
+async def keep(link: Link, say: Say) -> None:
+    """Run a link for ever: a fault in it is told, and costs neither a fix nor a beacon."""
+    while True:
+        try:
+            await link.run()
+        except Exception as error:  # noqa: BLE001 - whatever it is, positioning goes on
+            say(f"the link to {link.address} failed ({error!r}); started again")
+        await asyncio.sleep(HEALTH_S)

@@ -8,7 +8,7 @@ from typing import Final
 
 import msgspec
 
-from skyless.nodes.running import HEALTH_S, Say, every, together
+from skyless.nodes.running import HEALTH_S, Say, every, keep, together
 from skyless.nodes.tag import TagNode, TagSettings
 from skyless.nodes.usage import Usage
 from skyless.outputs.address import MqttAddress
@@ -27,7 +27,7 @@ class Tag:
     """A tag and its link, which comes about once the tag's site is known, and anew in another site."""
 
     def __init__(self, settings: TagSettings, radio: Radio, address: MqttAddress | None, say: Say) -> None:
-        self._address = address
+        self._address, self._say = address, say
         self.link: Link | None = None
         self._site: int | None = None
         self._link_tasks: list[asyncio.Task[None]] = []
@@ -65,7 +65,7 @@ class Tag:
         self._health_topic = health_topic(site, "tag", self.node.name)
         self._receptions_topic = receptions_topic(site, self.node.name)
         self.link.subscribe(request_topic(site), self._take_request, qos=1)
-        self._link_tasks.append(asyncio.ensure_future(self.link.run()))
+        self._link_tasks.append(asyncio.ensure_future(keep(self.link, self._say)))
 
     def _take_request(self, _topic: str, payload: bytes) -> None:
         """Somebody wants raw receptions; what cannot be read is counted."""
