@@ -20,7 +20,8 @@ import msgspec
 
 from skyless.nodes.broker import start_broker
 from skyless.nodes.broker_settings import BrokerSettings
-from skyless.nodes.children import Child, Program, any_port
+from skyless.nodes.children import Child, Program
+from skyless.nodes.ports import any_port
 from skyless.outputs.link import Link
 from skyless.outputs.messages import AnchorHealth, EtherHealth, TagHealth
 from skyless.outputs.topics import health_topic

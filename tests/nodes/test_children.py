@@ -4,13 +4,12 @@ import asyncio
 import os
 import re
 import signal
-import socket
 import sys
 
 from mqtt_brokers import free_port, until
 
 from skyless.nodes import children
-from skyless.nodes.children import Child, Program, any_port, end, next_port
+from skyless.nodes.children import Child, Program, end
 
 
 def alive(pid):
@@ -119,24 +118,6 @@ def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypatch):
         await stop(task)
 
     asyncio.run(main())
-
-
-def test_a_port_that_is_taken_is_passed_over():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        port = one.getsockname()[1]
-        one.listen()
-        assert next_port("127.0.0.1", port) > port
-        assert any_port("127.0.0.1") != port
-
-
-def test_a_port_that_was_just_left_is_free():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-        with socket.create_connection(("127.0.0.1", port)):
-            served, _ = server.accept()
-            served.close()  # the server's side closes first and waits in TIME_WAIT
-    assert next_port("127.0.0.1", port) == port
 
 
 def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_when_it_says_so(monkeypatch, tmp_path):

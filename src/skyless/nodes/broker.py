@@ -2,28 +2,26 @@
 
 import asyncio
 import contextlib
-import ctypes
 import os
 import shutil
 import signal
+import socket
 import ssl
-import sys
 import sysconfig
-from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Final, Self
 
 from skyless.errors import SkylessError
-from skyless.nodes.broker_place import SCRATCH, all_taken, is_free, locked_folder, ports
+from skyless.nodes.broker_place import SCRATCH, all_taken, claimed, locked_folder, ports
 from skyless.nodes.broker_settings import BrokerSettings, configuration
+from skyless.nodes.children import end
+from skyless.nodes.loop import end_with_parent
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.connection import check_broker
 
 _START_S: Final = 20.0
 _LOOK_S: Final = 0.02
-_STOP_S: Final = 5.0
-_PR_SET_PDEATHSIG: Final = 1
 
 
 class PortTakenError(Exception):
@@ -33,12 +31,20 @@ class PortTakenError(Exception):
 class Broker:
     """A running broker; ``async with`` stops it at the end."""
 
-    def __init__(self, address: MqttAddress, data: Path, process: asyncio.subprocess.Process, lock: IO[str]) -> None:
+    def __init__(
+        self,
+        address: MqttAddress,
+        data: Path,
+        process: asyncio.subprocess.Process,
+        lock: IO[str],
+        claim: socket.socket,
+    ) -> None:
         self.address = address
         """Where clients on this machine find it, credentials included."""
         self.data = data
         self._process = process
         self._lock = lock
+        self._claim = claim
 
     @property
     def pid(self) -> int:
@@ -51,7 +57,8 @@ class Broker:
 
     async def stop(self) -> None:
         """End it, and keep what it has stored."""
-        await _end(self._process)
+        await end(self._process)
+        self._claim.close()
         _release(self.data, self._lock)
 
     async def __aenter__(self) -> Self:
@@ -84,8 +91,21 @@ async def start_broker(settings: BrokerSettings | None = None) -> Broker:
 
 
 async def _start(program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str]) -> Broker:
-    if not is_free(settings.listen, port):
+    claim = claimed(settings.listen, port)
+    if claim is None:
         raise PortTakenError
+    try:
+        process = await _spawn(program, settings, port, data, lock)
+    except BaseException:
+        claim.close()
+        raise
+    return Broker(settings.address(port), data, process, lock, claim)
+
+
+async def _spawn(
+    program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str]
+) -> asyncio.subprocess.Process:
+    """nats-server, when it accepts MQTT."""
     file = data / "nats-server.conf"
     _write_private(file, configuration(settings, port, data))
     process = await asyncio.create_subprocess_exec(
@@ -97,14 +117,14 @@ async def _start(program: Path, settings: BrokerSettings, port: int, data: Path,
         stderr=asyncio.subprocess.PIPE,
         start_new_session=True,  # Ctrl-C in a terminal must reach it last, through us
         pass_fds=(lock.fileno(),),  # the folder stays locked for as long as anybody writes there
-        preexec_fn=_die_with_parent(),
+        preexec_fn=end_with_parent(signal.SIGKILL),
     )
     try:
         await _until_ready(process, settings.address(port), data)
     except BaseException:
-        await _end(process)
+        await end(process)
         raise
-    return Broker(settings.address(port), data, process, lock)
+    return process
 
 
 async def _until_ready(process: asyncio.subprocess.Process, address: MqttAddress, data: Path) -> None:
@@ -137,19 +157,6 @@ async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception
     return SkylessError(f"nats-server does not start: {faults[-1] if faults else f'exit code {process.returncode}'}")
 
 
-async def _end(process: asyncio.subprocess.Process) -> None:
-    if process.returncode is not None:
-        return
-    with contextlib.suppress(ProcessLookupError):
-        process.terminate()
-    try:
-        async with asyncio.timeout(_STOP_S):
-            await process.wait()
-    except TimeoutError:
-        process.kill()
-        await process.wait()
-
-
 def _release(data: Path, lock: IO[str]) -> None:
     """Leave the folder to the next broker; a temporary one goes."""
     lock.close()
@@ -169,21 +176,6 @@ def _program() -> Path:
 def _write_private(file: Path, text: str) -> None:
     with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as out:
         out.write(text)
-
-
-def _die_with_parent() -> Callable[[], None] | None:
-    """What the child does before it becomes nats-server, so that a killed parent leaves no orphan; Linux only."""
-    if sys.platform != "linux":
-        return None
-    prctl = ctypes.CDLL(None).prctl
-    parent = os.getpid()
-
-    def ask() -> None:
-        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it died before the question
-            os._exit(1)
-
-    return ask
 
 
 def _unverified() -> ssl.SSLContext:

@@ -1,9 +1,7 @@
 """Where the embedded broker may listen and store."""
 
 import contextlib
-import errno
 import fcntl
-import os
 import socket
 import tempfile
 from collections.abc import Iterator
@@ -12,6 +10,8 @@ from typing import IO, Final
 
 from skyless.errors import SkylessError
 from skyless.nodes.broker_settings import BrokerSettings
+from skyless.nodes.places import data_folder
+from skyless.nodes.ports import claim, is_free
 
 FIRST_PORT: Final = 1883
 _PORTS_TO_TRY: Final = 100
@@ -30,16 +30,10 @@ def locked_folder(settings: BrokerSettings) -> tuple[Path, IO[str]]:
         except OSError as error:
             raise SkylessError(f"--data is {str(settings.data)!r}, which cannot be used: {error.strerror}") from None
     with contextlib.suppress(OSError):
-        usual = _usual_folder()
+        usual = data_folder() / "broker"
         return usual, _lock(usual)
     scratch = Path(tempfile.mkdtemp(prefix=SCRATCH))
     return scratch, _lock(scratch)
-
-
-def _usual_folder() -> Path:
-    shared = os.environ.get("XDG_DATA_HOME")
-    home = Path(shared) if shared and Path(shared).is_absolute() else Path("~/.local/share").expanduser()
-    return home / "skyless" / "broker"
 
 
 def _lock(folder: Path) -> IO[str]:
@@ -71,21 +65,21 @@ def all_taken(settings: BrokerSettings) -> str:
     )
 
 
-def is_free(host: str, port: int) -> bool:
-    """Whether one could listen there.
+def claimed(host: str, port: int) -> socket.socket | None:
+    """What keeps another broker from taking the port at the same moment; None: somebody has it.
 
     Raises:
         SkylessError: the host is no address of this machine, or the port is not ours to take.
     """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except PermissionError:
-            raise SkylessError(f"--port is {port}, which only the system may use; it should be 1024 or more") from None
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                return False
-            raise SkylessError(f"--listen is {host!r}; it should be an address of this machine") from None
-    return True
+    held = claim(host, port)
+    if held is None:
+        return None
+    try:
+        if is_free(host, port):
+            return held
+    except PermissionError:
+        raise SkylessError(f"--port is {port}, which only the system may use; it should be 1024 or more") from None
+    except OSError:
+        raise SkylessError(f"--listen is {host!r}; it should be an address of this machine") from None
+    held.close()
+    return None

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import os
-import socket
 import sys
 from collections import deque
 from pathlib import Path
@@ -136,28 +135,3 @@ async def end(process: asyncio.subprocess.Process) -> None:
 
 def _how(code: int) -> str:
     return f"signal {-code}" if code < 0 else f"exit code {code}"
-
-
-def any_port(host: str) -> int:
-    """A port that is free, and that the system gives to nobody else for some time."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.bind((host, 0))
-        return int(probe.getsockname()[1])
-
-
-def next_port(host: str, first: int) -> int:
-    """The first port that is free from this one on."""
-    port = first
-    while not _is_free(host, port):
-        port += 1
-    return port
-
-
-def _is_free(host: str, port: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError:
-            return False
-    return True

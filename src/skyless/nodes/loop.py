@@ -13,7 +13,6 @@ from typing import Any, Final
 
 _PR_SET_PDEATHSIG: Final = 1
 
-
 PUNCTUAL_NICE: Final = -10
 """Priority of programs that serve a radio, where the system lets them have it (root, or a limit in limits.conf)."""
 
@@ -47,7 +46,7 @@ async def _until_terminated(main: Coroutine[Any, Any, None]) -> None:
     await task
 
 
-def end_with_parent() -> Callable[[], None] | None:
+def end_with_parent(by: signal.Signals = signal.SIGTERM) -> Callable[[], None] | None:
     """What a child process does first, so that it ends with the one that started it, however that ends; Linux only."""
     if not sys.platform.startswith("linux"):
         return None
@@ -55,7 +54,7 @@ def end_with_parent() -> Callable[[], None] | None:
     parent = os.getpid()
 
     def ask() -> None:
-        prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+        prctl(_PR_SET_PDEATHSIG, by, 0, 0, 0)
         if os.getppid() != parent:  # it died before the question
             os._exit(1)
 

@@ -46,3 +46,16 @@ async def keep(link: Link, say: Say) -> None:
         except Exception as error:  # noqa: BLE001 - whatever it is, positioning goes on
             say(f"the link to {link.address} failed ({error!r}); started again")
         await asyncio.sleep(HEALTH_S)
+
+
+async def outlasting(lasting: Coroutine[Any, Any, None], others: Coroutine[Any, Any, None]) -> None:
+    """Run both until one ends or all is cancelled; ``lasting`` is cancelled when the others have ended."""
+    last, first = asyncio.ensure_future(lasting), asyncio.ensure_future(others)
+    try:
+        done, _ = await asyncio.wait((last, first), return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in (first, last):
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)

@@ -9,8 +9,9 @@ from msgspec.structs import replace
 
 from skyless.nodes.broker import Broker, start_broker
 from skyless.nodes.broker_settings import BrokerSettings
-from skyless.nodes.children import Child, Program, any_port, next_port
-from skyless.nodes.running import Say, together
+from skyless.nodes.children import Child, Program
+from skyless.nodes.ports import claim_next, hold_any
+from skyless.nodes.running import Say, outlasting, together
 from skyless.nodes.watch import Watch
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
@@ -48,7 +49,8 @@ class WholeSite:
 
     def __init__(self, asked: SiteRun, say: Say) -> None:
         self._asked, self._say = asked, say
-        self.ether_port, self.page_port = any_port(HOST), next_port(HOST, PAGE_PORT)
+        self.ether_port, self._ether_held = hold_any(HOST)
+        self.page_port, self._page_claim = claim_next(HOST, PAGE_PORT)
         self.address: MqttAddress | None = asked.broker
         self.watch: Watch | None = None
         self.children: list[Child] = []
@@ -66,11 +68,12 @@ class WholeSite:
         Raises:
             SkylessError: the embedded broker cannot be started.
         """
-        if self._asked.broker is not None:
-            await self._run_with(self._asked.broker, None)
-        else:
-            broker = await start_broker()
-            await self._run_with(broker.address, broker)
+        with self._ether_held, self._page_claim:
+            if self._asked.broker is not None:
+                await self._run_with(self._asked.broker, None)
+            else:
+                broker = await start_broker()
+                await self._run_with(broker.address, broker)
 
     async def _run_with(self, address: MqttAddress, broker: Broker | None) -> None:
         self.address = address
@@ -79,10 +82,8 @@ class WholeSite:
         self.watch = Watch(link, site.id, planar=site.tags.height_m is not None)
         self.children = [Child(program, self._say) for program in self._programs(address)]
         self.ready.set()
-        parts = [link.run(), *(child.run() for child in self.children)]
-        if broker is not None:
-            parts.append(self._keep(broker))
-        await together(*parts)
+        nodes = together(link.run(), *(child.run() for child in self.children))
+        await (nodes if broker is None else outlasting(self._keep(broker), nodes))  # they say goodbye to it
 
     async def _keep(self, broker: Broker) -> None:
         """Start the embedded broker again, on the same port and with the same store, whenever it ends."""
