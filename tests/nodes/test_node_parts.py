@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from node_stage import receptions
 
 from skyless.air.codec import decode
+from skyless.errors import SkylessError
 from skyless.nodes.latency import Latencies, PhaseBook
 from skyless.nodes.places import data_folder, new_recording, recordings_folder
+from skyless.nodes.record import _own_name
 from skyless.nodes.running import every, together
 from skyless.nodes.usage import Usage, resident_bytes
 
@@ -128,6 +130,31 @@ def test_a_home_that_cannot_be_written_is_replaced_by_a_temporary_folder(tmp_pat
     assert folder.is_relative_to(tmp_path)
     assert folder.is_dir()
     (folder / "x").write_bytes(b"x")
+
+
+def test_a_user_without_a_home_and_a_folder_that_is_read_only_are_replaced_too(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "mine"))
+    monkeypatch.setattr("os.access", lambda folder, mode: not folder.is_relative_to(tmp_path / "mine"))
+    assert data_folder().is_relative_to(tmp_path / "temporary")
+    monkeypatch.delenv("XDG_DATA_HOME")
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr("os.getuid", lambda: 4_000_000_000)
+    assert data_folder() == tmp_path / "temporary" / "skyless-4000000000"
+
+
+def test_a_recorder_passes_over_names_that_others_have(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "skyless-record-1-1.lock").mkdir()  # as a file of another user's, it cannot be opened
+    second, lock = _own_name(1)
+    third, other = _own_name(1)
+    with lock, other:
+        assert [second[-2:], third[-2:]] == ["-2", "-3"]
+    assert _own_name(1)[0] == second
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "nowhere"))
+    with pytest.raises(SkylessError, match="no name is left"):
+        _own_name(1)
 
 
 # Running together

@@ -9,13 +9,15 @@ from pathlib import Path
 def data_folder() -> Path:
     """``skyless`` in the user's data folder (XDG), or a temporary folder where that cannot be written."""
     shared = os.environ.get("XDG_DATA_HOME")
-    home = Path(shared) if shared and Path(shared).is_absolute() else Path("~/.local/share").expanduser()
-    folder = home / "skyless"
     try:
+        home = Path(shared) if shared and Path(shared).is_absolute() else Path("~/.local/share").expanduser()
+        folder = home / "skyless"
         if home == Path("/.local/share"):
             raise PermissionError("HOME is empty")
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError("it cannot be written")
+    except (OSError, RuntimeError):  # RuntimeError: a user without a home
         folder = Path(tempfile.gettempdir()) / f"skyless-{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)
     return folder

@@ -1,17 +1,18 @@
 """The recorder: asks a site's tags for their receptions and writes all that is said there into a file."""
 
 import asyncio
+import contextlib
 import fcntl
 import re
 import socket
 import tempfile
 import time
-from itertools import count
 from pathlib import Path
 from typing import IO, Final
 
 from msgspec import Struct
 
+from skyless.errors import SkylessError
 from skyless.nodes.running import Say, every
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
@@ -25,6 +26,8 @@ LEASE_S: Final = 15.0
 ASK_S: Final = 5.0
 FLUSH_S: Final = 0.8
 """A recorder that is killed loses what came since; the rest of a second is the way of a message."""
+
+_MOST_RECORDERS: Final = 1000
 
 ASK_ANEW_S: Final = 1.0
 """After a loss; not more often than this, as each request begins a run with a checkpoint in it."""
@@ -153,15 +156,33 @@ class RecorderNode:
 def _own_name(site: int) -> tuple[str, IO[str]]:
     """A name on MQTT that no other recorder of this machine has now, and one before it may have had.
 
-    A recorder that was killed has left a session that the broker fills; the next one takes it over and ends it.
+    A recorder that was killed has left a session that the broker fills; the next one takes it over and ends it. A lock
+    that another user has made cannot be opened, and its name is passed over.
+
+    Raises:
+        SkylessError: there is no folder for temporary files, or too many recorders run.
     """
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname())
-    for number in count(1):
-        lock = (Path(tempfile.gettempdir()) / f"skyless-record-{site}-{number}.lock").open("a", encoding="utf-8")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.close()
-        else:
-            return f"{host}-{number}", lock
-    raise AssertionError
+    folder = _temporary_folder()
+    for number in range(1, _MOST_RECORDERS + 1):
+        with contextlib.suppress(OSError):
+            return f"{host}-{number}", _locked(folder / f"skyless-record-{site}-{number}.lock")
+    raise SkylessError(f"no name is left for a recorder: {folder}/skyless-record-{site}-*.lock cannot be locked")
+
+
+def _temporary_folder() -> Path:
+    try:
+        return Path(tempfile.gettempdir())
+    except OSError as error:
+        raise SkylessError(f"a recorder needs a folder for temporary files: {error.strerror}") from None
+
+
+def _locked(file: Path) -> IO[str]:
+    """The file, locked until it is closed. Raises OSError."""
+    lock = file.open("a", encoding="utf-8")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        raise
+    return lock
