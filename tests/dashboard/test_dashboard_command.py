@@ -22,6 +22,7 @@ from skyless.errors import SkylessError
         ("[::1]", "::1", None),
         ("hall.example", "hall.example", None),
         ("localhost:0", "localhost", 0),
+        ("9000", "127.0.0.1", 9000),
     ],
 )
 def test_where_to_listen(text, host, port):

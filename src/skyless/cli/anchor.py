@@ -45,10 +45,11 @@ def anchor(
 
     plan, address = site_named(site), broker(mqtt, mqtt_ca)
     known = [node.id for node in plan.anchors]
-    for number in ids or (None,):
-        if number not in known or ids.count(number) > 1:
-            listed = ", ".join(map(str, known))
-            raise SkylessError(f"anchor is {number}; it should be one or more of the site's, each once: {listed}")
+    if not ids or len(set(ids)) < len(ids) or not set(ids) <= set(known):
+        given = " ".join(map(str, ids)) or "missing"
+        raise SkylessError(
+            f"IDS is {given}; it should be one or more of the site's, each once: {' '.join(map(str, known))}"
+        )
     radios = open_radios(radio, "anchor", tuple(map(str, ids)))
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
     compile_kernels()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, site_named
+from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, listen_address, site_named
 from skyless.cli.output import print_json
 from skyless.errors import SkylessError
 
@@ -112,17 +112,11 @@ def _load(name: str) -> "tuple[SiteMessage, bytes | None]":
 
 def _place(listen: str | None) -> "Listen":
     """Where to listen. Raises SkylessError."""
-    from skyless.dashboard.serve import Listen
+    from skyless.dashboard.serve import PORT, Listen
 
     if listen is None:
         return Listen("127.0.0.1", None)
-    host, colon, port = listen.rpartition(":")
-    if not colon or listen.endswith("]") or (":" in host and not host.startswith("[")):
-        host, port = listen, ""
-    host = host.strip("[]")
-    if not host or (port and not (port.isdecimal() and int(port) <= 65535)):
-        raise SkylessError(f"--listen is {listen!r}; it should be HOST:PORT, as 127.0.0.1:8080 or [::1]:8080")
-    return Listen(host, int(port) if port else None)
+    return Listen(*listen_address(listen, PORT))
 
 
 def _rules(bound: str, host: str, port: int, token: str | None) -> "Rules":

@@ -86,6 +86,8 @@ def demo(
 
     if method not in METHODS:
         raise SkylessError(f"--method is {method!r}; it should be one of {', '.join(METHODS)}")
+    if mqtt == "none":
+        raise SkylessError("--mqtt is 'none'; the demo needs a broker, and brings one where --mqtt is not given")
     if mqtt is None and mqtt_ca is not None:
         raise SkylessError("--mqtt-ca is for another broker; give it together with --mqtt")
     name = f"lab:{noise_ps:g}" if site is None else str(site.absolute())

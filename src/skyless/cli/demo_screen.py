@@ -131,7 +131,7 @@ class Screen:
             "tags": len(tags),
             "fixes": sum(health.fixes for health in healths),
             **self._errors(),
-            "updates_per_s": sum(rates) / len(rates) if rates else 0.0,
+            "updates_per_s": sum(rates) / len(rates) if rates else None,
             "messages": sum(health.receptions for health in healths),
             "dropped": sum(sum(health.counters.values()) for health in healths),
             "first_fix_s": firsts[len(firsts) // 2] if firsts else None,
@@ -172,8 +172,10 @@ class Screen:
     def closing(self) -> str:
         """The figures, for a person."""
         told = self.summary()
-        if told["rmse_m"] is None:
+        if not told["tags"]:
             return "no fix was made"
+        if told["rmse_m"] is None or told["updates_per_s"] is None:
+            return f"{told['tags']} tags with a fix; too short for errors and updates per second"
         return (
             f"{told['tags']} tags, {told['messages']} messages in {told['duration_s']:.1f} s: "
             f"RMSE {100 * told['rmse_m']:.1f} cm, largest error {100 * told['max_m']:.1f} cm, "

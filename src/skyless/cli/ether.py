@@ -8,6 +8,7 @@ from cyclopts.validators import Number
 from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, broker, listen_address, say, site_named
 from skyless.cli.options import Picoseconds
 from skyless.errors import SkylessError
+from skyless.radios.ether_wire import DEFAULT_PORT
 
 app = App(name="ether", help_epilogue="Example: skyless ether --site lab --tags 3")
 Share = Annotated[float, Parameter(validator=Number(gte=0, lte=1))]
@@ -23,7 +24,7 @@ def ether(
     loss: Share = 0.0,
     nlos: Share = 0.0,
     seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
-    listen: str = "127.0.0.1:7784",
+    listen: str = f"127.0.0.1:{DEFAULT_PORT}",
     mqtt: Mqtt = DEFAULT_MQTT,
     mqtt_ca: MqttCa = None,
 ) -> None:
@@ -61,12 +62,12 @@ def ether(
     from skyless.nodes.loop import run
 
     plan, address = site_named(site), broker(mqtt, mqtt_ca)
-    host, port = listen_address(listen, 7784)
+    host, port = listen_address(listen, DEFAULT_PORT)
     request = Request(plan, noise_ps=noise_ps, loss=loss, nlos=nlos, seed=seed)
     compile_kernels()
     bodies = {f"tag{number}": path for number, path in enumerate(patrols(plan, tags, speed), start=1)}
     emulated = Ether(plan, bodies, impairments_of(request, plan), seed)
     try:
-        run(Air(emulated, host, port, address, say).run(), punctual=True)
+        run(Air(emulated, host, DEFAULT_PORT if port is None else port, address, say).run(), punctual=True)
     except OSError as error:
         raise SkylessError(f"--listen is {listen!r}, which cannot be used: {error.strerror or error}") from None

@@ -37,17 +37,25 @@ def site_named(site: str) -> "Site":
     name, colon, noise_ps = site.partition(":")
     if name != "lab":
         return load_site(Path(site))
-    return lab_site(*finite_numbers("site", noise_ps, (1,))) if colon else lab_site()
+    try:
+        return lab_site(*finite_numbers("site", noise_ps, (1,))) if colon else lab_site()
+    except SkylessError:
+        raise SkylessError(f"--site is {site!r}; it should be a site file, lab, or lab:PICOSECONDS") from None
 
 
-def listen_address(text: str, default_port: int) -> tuple[str, int]:
-    """HOST:PORT, or one of both. Raises SkylessError."""
+def listen_address(text: str, usual_port: int) -> tuple[str, int | None]:
+    """HOST:PORT, or one of both; the port is None where it is not told. Raises SkylessError."""
     host, colon, digits = text.rpartition(":")
-    if not colon:
-        host, digits = ("", text) if text.isdecimal() else (text, str(default_port))
-    if not digits.isdecimal() or not 0 <= int(digits) < 65_536:
-        raise SkylessError(f"--listen is {text!r}; it should be HOST:PORT, such as 127.0.0.1:{default_port}")
-    return host.strip("[]") or "127.0.0.1", int(digits)
+    if text.isdecimal():
+        host = "127.0.0.1"
+    elif not colon or text.endswith("]") or (":" in host and not host.startswith("[")):
+        host, digits = text, ""
+    host = host.strip("[]")
+    if not host or (digits and not (digits.isdecimal() and len(digits) < 6 and int(digits) < 65_536)):
+        raise SkylessError(
+            f"--listen is {text!r}; it should be HOST:PORT, as 127.0.0.1:{usual_port} or [::1]:{usual_port}"
+        )
+    return host, int(digits) if digits else None
 
 
 def say(line: str) -> None:

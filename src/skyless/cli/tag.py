@@ -58,11 +58,11 @@ def tag(
     from skyless.receiver import METHODS
 
     address = broker(mqtt, mqtt_ca)
-    for name in names or ("",):
-        if not _NAME.fullmatch(name) or names.count(name) > 1:
-            raise SkylessError(
-                f"tag is {name!r}; it should be one or more names, each once, of letters, digits, - or _"
-            )
+    if not names or len(set(names)) < len(names) or not all(map(_NAME.fullmatch, names)):
+        given = repr(" ".join(names)) if names else "missing"
+        raise SkylessError(
+            f"NAMES is {given}; it should be one or more names, each once, of 1 to 32 letters, digits, - or _"
+        )
     if method not in METHODS:
         raise SkylessError(f"--method is {method!r}; it should be one of {', '.join(METHODS)}")
     radios = open_radios(radio, "tag", names)

@@ -27,7 +27,7 @@ class Air:
         """
         server = await self._ether.serve(self._host, self._port)
         host, port = server.sockets[0].getsockname()[:2]
-        self._say(f"ether at {host}:{port}")
+        self._say(f"ether at {f'[{host}]' if ':' in host else host}:{port}")
         async with server:
             parts = [self._ether.tell_clocks()]
             if self._link is not None:

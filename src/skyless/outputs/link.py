@@ -33,6 +33,9 @@ _LONGEST_WAIT_S: Final = 5.0
 _LONGEST_WAIT_LOOPBACK_S: Final = 0.5
 _FAREWELL_S: Final = 1.0
 _SAME_TROUBLE_S: Final = 30.0
+_SOON_S: Final = 0.5
+"""A first connection that takes no longer is nothing to speak of."""
+
 _MOST_ROUTES: Final = 10_000
 
 
@@ -259,8 +262,8 @@ class Link:
 
     def _tell_return(self) -> None:
         dropped = self._outbox.dropped - self._told_dropped
-        if self._reconnects or dropped:
-            away_s = time.monotonic() - self._away_since_s
+        away_s = time.monotonic() - self._away_since_s
+        if self._reconnects or (dropped and away_s > _SOON_S):
             _log.warning("connected to %s after %.1f s; %d messages were dropped", self.address, away_s, dropped)
         self._told_dropped += dropped
         self._told = ("", 0.0)
