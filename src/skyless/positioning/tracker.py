@@ -134,7 +134,16 @@ def gated_correct(
     spread: float,
     gate: float,
 ) -> bool:
-    """Correct the state unless the innovation lies beyond the gate; keep the counts, running means and agility.
+    """Correct the state unless the innovation lies beyond the gate (``judge``)."""
+    accepted = judge(whole, statistics, innovation, spread, gate)
+    if accepted:
+        correct(x, P, ph, innovation, spread)
+    return accepted
+
+
+@kernel
+def judge(whole: NDArray[np.int64], statistics: Vector, innovation: float, spread: float, gate: float) -> bool:
+    """Whether an innovation lies within the gate; keeps the counts, running means and agility.
 
     The agility follows accepted messages only: those of a blocked anchor are late by more than the gate, while a tag
     that turns shows in all anchors at once and first within it.
@@ -154,7 +163,6 @@ def gated_correct(
         statistics[AGILITY] = min(statistics[AGILITY] * AGILITY_GAIN, MAX_AGILITY)
     else:
         statistics[AGILITY] = max(statistics[AGILITY] * AGILITY_LOSS, 1.0)
-    correct(x, P, ph, innovation, spread)
     return True
 
 

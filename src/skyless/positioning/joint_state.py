@@ -1,0 +1,218 @@
+"""State of ``joint``: the tag's motion and the clock of every anchor in view, all against the tag's own counter.
+
+States stand in three blocks, each packed, so that rows are worked on whole and only anchors in view cost:
+
+    values  position (dim), then the offset b of each anchor's clock:  tag's reading − anchor's reading, in metres
+    rates   velocity (dim), then the rate of each offset, m/s
+    noises  the noise of an anchor's last TX stamp, in metres, of those anchors whose packets others relay
+
+Values are kept as of the time ``BASE``, a few milliseconds back: at time t a value is ``value + (t − BASE)·rate``. So time
+passes without touching the covariance but for its noise, and the base is moved on now and then. The tag's clock is the
+reference of all offsets; no anchor is special, none is ever changed for another.
+
+The whole ticks of an offset stand in an integer. The caller owns all arrays; their capacity is theirs to extend.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.compiled import kernel
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+EPOCH, BASE, ACCEPTED, REJECTED, REJECTED_IN_ROW, SLOTS, NOISES, RELAYS_USED, RELAYS_REJECTED, RESTARTS = range(10)
+"""Places in ``counts``. The epoch is the tag's reading at the newest message, the base that of the values."""
+
+SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW = range(7)
+"""Places in a row of ``slots``: index in the site's table, whole ticks of the offset, newest packet's stamps (own clock,
+tag's), place among the noises or −1, whether its packets are relayed, rejections in a row."""
+
+PLACE_X, PLACE_Y, PLACE_Z, RANGE, WEIGHT, INNOVATION, SCORE = range(7)
+"""Places in a row of ``anchors``: position, range at its newest packet, factor on the variance of its receptions (1 unless a
+monitor says otherwise), newest innovation and running mean of the normalised ones."""
+
+DIM, QA, WHITE, WALK, TX_VARIANCE, RX_VARIANCE, GATE, HEIGHT, RATE_VARIANCE, DROP_S = range(10)
+"""Places in ``settings``."""
+
+REMEMBERED: Final = 16
+"""Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
+
+SEQUENCE, PACKET_TX, PACKET_RX = range(3)
+"""Places in a remembered packet."""
+
+
+class JointArrays(NamedTuple):
+    """Everything that the kernels work on, for one tag."""
+
+    x: Vector
+    """Shape (states,)."""
+    P: Matrix
+    """Shape (states, states); zero beyond the states in use."""
+    ph: Vector
+    """Scratch, shape (states,)."""
+    counts: Integers
+    statistics: Vector
+    """As the tracker's."""
+    slots: Integers
+    """Shape (capacity, 7)."""
+    anchors: Matrix
+    """Shape (capacity, 7)."""
+    packets: Integers
+    """Shape (capacity, REMEMBERED, 3)."""
+    relayed: Integers
+    """Row i, column j: TX stamp of the newest packet of slot j whose relay by slot i was taken; shape (capacity,)·2."""
+    slot_of: Integers
+    """Slot of each anchor of the site's table, −1 if it is not in view."""
+    settings: Vector
+    site_m: Matrix
+    """Positions of all anchors, shape (anchors of the site, 3)."""
+
+
+NEVER: Final = -(1 << 62)
+"""A time before all others."""
+
+
+def new_arrays(settings: Vector, site_m: Matrix, capacity: int) -> JointArrays:
+    """Empty arrays with room for so many anchors in view."""
+    states = -(-(2 * int(settings[DIM]) + 3 * capacity) // 8) * 8
+    return JointArrays(
+        x=np.zeros(states),
+        P=np.zeros((states, states)),
+        ph=np.zeros(states),
+        counts=np.zeros(10, np.int64),
+        statistics=np.ones(4),
+        slots=np.zeros((capacity, 7), np.int64),
+        anchors=np.zeros((capacity, 7)),
+        packets=np.zeros((capacity, REMEMBERED, 3), np.int64),
+        relayed=np.full((capacity, capacity), NEVER),
+        slot_of=np.full(len(site_m), -1, np.int64),
+        settings=settings,
+        site_m=np.ascontiguousarray(site_m, np.float64),
+    )
+
+
+def extended(old: JointArrays, capacity: int) -> JointArrays:
+    """The same state with room for more anchors."""
+    new = new_arrays(old.settings, old.site_m, capacity)
+    for source, target in zip(old, new, strict=True):
+        if source is not target:
+            target[tuple(slice(length) for length in source.shape)] = source
+    return new
+
+
+@kernel
+def values(s: JointArrays) -> int:
+    """How many values there are; as many rates follow them, then the noises."""
+    return int(s.settings[DIM]) + s.counts[SLOTS]
+
+
+@kernel
+def states(s: JointArrays) -> int:
+    """How many states are in use."""
+    return 2 * (int(s.settings[DIM]) + s.counts[SLOTS]) + s.counts[NOISES]
+
+
+@kernel
+def width(s: JointArrays) -> int:
+    """Columns that loops run over: the states in use and zeros up to a multiple of eight, as processors like them."""
+    return (states(s) + 7) // 8 * 8
+
+
+@kernel
+def _insert(s: JointArrays, n: int, place: int) -> None:
+    """Make room for a state at ``place``, zero and without variance."""
+    x, P = s.x, s.P
+    for row in range(n, place, -1):
+        x[row] = x[row - 1]
+        for column in range(n):
+            P[row, column] = P[row - 1, column]
+    x[place] = 0.0
+    for column in range(n + 1):
+        P[place, column] = 0.0
+    for row in range(n + 1):
+        for column in range(n, place, -1):
+            P[row, column] = P[row, column - 1]
+        P[row, place] = 0.0
+
+
+@kernel
+def _remove(s: JointArrays, n: int, place: int) -> None:
+    """Take a state out; what stood behind it moves up, zeros follow."""
+    x, P = s.x, s.P
+    for row in range(place, n - 1):
+        x[row] = x[row + 1]
+        for column in range(n):
+            P[row, column] = P[row + 1, column]
+    x[n - 1] = 0.0
+    for column in range(n):
+        P[n - 1, column] = 0.0
+    for row in range(n):
+        for column in range(place, n - 1):
+            P[row, column] = P[row, column + 1]
+        P[row, n - 1] = 0.0
+
+
+@kernel
+def has_room(s: JointArrays) -> bool:
+    """Whether one more anchor fits."""
+    return s.counts[SLOTS] < s.slots.shape[0]
+
+
+@kernel
+def add_slot(s: JointArrays, site: int) -> int:
+    """Give an anchor a slot, the last one, with two states of zero; the caller has seen that there is room."""
+    slot = s.counts[SLOTS]
+    n, one_more = states(s), values(s)
+    _insert(s, n, 2 * one_more)
+    _insert(s, n + 1, one_more)
+    s.counts[SLOTS] = slot + 1
+    s.slot_of[site] = slot
+    row = s.slots[slot]
+    row[:] = 0
+    row[SITE], row[NOISE] = site, -1
+    for axis in range(3):
+        s.anchors[slot, axis] = s.site_m[site, axis]
+    s.anchors[slot, RANGE:] = 0.0
+    s.anchors[slot, WEIGHT] = 1.0
+    s.packets[slot, :, :] = NEVER
+    s.relayed[slot, :] = NEVER
+    s.relayed[:, slot] = NEVER
+    return slot
+
+
+@kernel
+def add_noise_state(s: JointArrays, slot: int) -> None:
+    """Give an anchor a state for the noise of its TX stamps (there is room for one of each slot)."""
+    _insert(s, states(s), states(s))
+    s.slots[slot, NOISE] = s.counts[NOISES]
+    s.counts[NOISES] += 1
+
+
+@kernel
+def drop_slot(s: JointArrays, slot: int) -> None:
+    """Forget an anchor and its states."""
+    noise = s.slots[slot, NOISE]
+    if noise >= 0:
+        _remove(s, states(s), 2 * values(s) + noise)
+        s.counts[NOISES] -= 1
+    dim, n, half = int(s.settings[DIM]), states(s), values(s)
+    _remove(s, n, half + dim + slot)
+    _remove(s, n - 1, dim + slot)
+    last = s.counts[SLOTS] - 1
+    s.slot_of[s.slots[slot, SITE]] = -1
+    for k in range(slot, last):
+        s.slots[k, :] = s.slots[k + 1, :]
+        s.anchors[k, :] = s.anchors[k + 1, :]
+        s.packets[k, :, :] = s.packets[k + 1, :, :]
+        s.relayed[k, :] = s.relayed[k + 1, :]
+        s.slot_of[s.slots[k, SITE]] = k
+    for k in range(last):
+        for column in range(slot, last):
+            s.relayed[k, column] = s.relayed[k, column + 1]
+        if s.slots[k, NOISE] > noise >= 0:
+            s.slots[k, NOISE] -= 1
+    s.counts[SLOTS] = last
