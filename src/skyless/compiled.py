@@ -64,15 +64,24 @@ def kernel(function: Function) -> Function:
     return _compile(function, nogil=False)
 
 
+def borrowing_kernel(function: Function) -> Function:
+    """Compile a function that only borrows its arrays: it makes none, not even parts of one.
+
+    References to arrays are then not counted. Kernels that hand a dozen arrays to each other spend most of their time
+    on counting otherwise.
+    """
+    return _compile(function, nogil=True, _nrt=False)
+
+
 def threaded_kernel(function: Function) -> Function:
     """Compile a long loop that runs without the interpreter's lock, so that threads run it side by side."""
     return _compile(function, nogil=True)
 
 
-def _compile(function: Function, *, nogil: bool) -> Function:
+def _compile(function: Function, *, nogil: bool, **options: bool) -> Function:
     callers_folder = _CONFIG.CACHE_DIR
     _CONFIG.CACHE_DIR = _CACHE_FOLDER
     try:
-        return cast("Function", njit(cache=True, error_model="numpy", nogil=nogil)(function))
+        return cast("Function", njit(cache=True, error_model="numpy", nogil=nogil, **options)(function))
     finally:
         _CONFIG.CACHE_DIR = callers_folder

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel, threaded_kernel
+from skyless.compiled import borrowing_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.joint_state import (
     BASE,
@@ -97,13 +97,14 @@ class JointSettings(Struct, frozen=True):
         )
 
 
-@kernel
+@borrowing_kernel
 def joint_hear(
     s: JointArrays, site: int, sequence: int, rx_ticks: int, tx_ticks: int, relays: Integers, first: int, last: int
 ) -> int:
     """Take one packet of the anchor ``site`` (place in the table) and what it relays, in the tag's order of time.
 
-    ``relays[first:last]`` are [place in the table, sequence, RX stamp on the sender's clock]; all stamps unwrapped.
+    Rows ``first`` to ``last`` of ``relays`` are [the anchor that heard, the anchor that was heard, sequence, RX stamp of the
+    former], anchors by their places in the table; all stamps are unwrapped, each on its own clock.
     """
     elapse(s, rx_ticks)
     if s.counts[BASE] == rx_ticks:
@@ -113,53 +114,54 @@ def joint_hear(
         drop_slot(s, slot)
         s.counts[RESTARTS] += 1
         slot = -1
-    if slot < 0:
-        if not has_room(s):
-            return FULL
+    status = FULL
+    if slot >= 0:
+        if s.slots[slot, NOISE] < 0 and s.slots[slot, WANTED] > 0:
+            add_noise_state(s, slot)
+        new_packet(s, slot)
+        status = ACCEPTED if hear_anchor(s, slot, rx_ticks, tx_ticks) else REJECTED
+        _remember(s, slot, sequence, rx_ticks, tx_ticks)
+        for relay in range(first, last):
+            _hear_relayed(s, s.slot_of[relays[relay, 0]], s.slot_of[relays[relay, 1]], relays[relay, 2], relays[relay, 3])
+    elif has_room(s):
         slot = add_slot(s, site)
         join(s, slot, rx_ticks, tx_ticks)
         _remember(s, slot, sequence, rx_ticks, tx_ticks)
-        return JOINED
-    if s.slots[slot, NOISE] < 0 and s.slots[slot, WANTED]:
-        add_noise_state(s, slot)
-    new_packet(s, slot)
-    accepted = hear_anchor(s, slot, rx_ticks, tx_ticks)
-    _remember(s, slot, sequence, rx_ticks, tx_ticks)
-    for relay in range(first, last):
-        _hear_relayed(s, slot, s.slot_of[relays[relay, 0]], relays[relay, 1], relays[relay, 2])
-    return ACCEPTED if accepted else REJECTED
+        status = JOINED
+    return status
 
 
-@kernel
+@borrowing_kernel
 def _remember(s: JointArrays, slot: int, sequence: int, rx_ticks: int, tx_ticks: int) -> None:
-    s.slots[slot, TX], s.slots[slot, RX] = tx_ticks, rx_ticks
-    packet = s.packets[slot, sequence % REMEMBERED]
-    packet[SEQUENCE], packet[PACKET_TX], packet[PACKET_RX] = sequence, tx_ticks, rx_ticks
+    s.slots[slot, TX] = tx_ticks
+    s.slots[slot, RX] = rx_ticks
+    place = sequence % REMEMBERED
+    s.packets[slot, place, SEQUENCE] = sequence
+    s.packets[slot, place, PACKET_TX] = tx_ticks
+    s.packets[slot, place, PACKET_RX] = rx_ticks
 
 
-@kernel
-def _hear_relayed(s: JointArrays, sender: int, slot: int, sequence: int, relayed_rx: int) -> None:
+@borrowing_kernel
+def _hear_relayed(s: JointArrays, listener: int, slot: int, sequence: int, relayed_rx: int) -> None:
     """Take a relayed reception once, if the tag has heard that very packet."""
-    if slot < 0 or slot == sender:
-        return
-    packet = s.packets[slot, sequence % REMEMBERED]
-    if packet[SEQUENCE] != sequence or packet[PACKET_TX] <= s.relayed[sender, slot]:
-        return
-    if (s.counts[EPOCH] - packet[PACKET_RX]) * TICK_S > RELAY_AGE_S:
-        return
-    s.relayed[sender, slot] = packet[PACKET_TX]
-    s.slots[slot, WANTED] = 1
-    hear_relay(s, sender, slot, packet[PACKET_TX], packet[PACKET_RX], relayed_rx)
+    place = sequence % REMEMBERED
+    if slot >= 0 and listener >= 0 and slot != listener and s.packets[slot, place, SEQUENCE] == sequence:
+        tx_ticks = s.packets[slot, place, PACKET_TX]
+        rx_ticks = s.packets[slot, place, PACKET_RX]
+        if tx_ticks > s.relayed[listener, slot] and (s.counts[EPOCH] - rx_ticks) * TICK_S < RELAY_AGE_S:
+            s.relayed[listener, slot] = tx_ticks
+            s.slots[slot, WANTED] = 1
+            hear_relay(s, listener, slot, tx_ticks, rx_ticks, relayed_rx)
 
 
-@kernel
+@borrowing_kernel
 def _drop_silent(s: JointArrays, rx_ticks: int) -> None:
     for slot in range(s.counts[SLOTS] - 1, -1, -1):
         if (rx_ticks - s.slots[slot, RX]) * TICK_S > s.settings[DROP_S]:
             drop_slot(s, slot)
 
 
-@kernel
+@borrowing_kernel
 def joint_motion(s: JointArrays, x: Vector, P: Matrix) -> None:
     """Write position and velocity at the newest message, shape (2·dim,), and their covariance."""
     dim, half = int(s.settings[DIM]), values(s)
@@ -176,7 +178,7 @@ def joint_motion(s: JointArrays, x: Vector, P: Matrix) -> None:
             P[dim + one, dim + other] = rate
 
 
-@threaded_kernel
+@borrowing_kernel
 def joint_track(
     s: JointArrays,
     begin: int,
@@ -203,7 +205,8 @@ def joint_track(
             return k
         if len(motions) > 0:
             joint_motion(s, motion, covariance)
-            motions[k] = motion
+            for one in range(2 * dim):
+                motions[k, one] = motion[one]
             for one in range(dim):
                 for other in range(dim):
                     variances[k, dim * one + other] = covariance[one, other]
@@ -221,12 +224,12 @@ class Messages(Struct, frozen=True):
     tx_ticks: Integers
     """The anchors' own."""
     relays: Integers
-    """[place of the anchor heard, sequence, RX stamp of the relaying anchor], shape (relays, 3)."""
+    """As ``joint_hear`` takes them, shape (relays, 4)."""
     ends: Integers
     """Where the relays of each packet end."""
 
 
-NO_RELAYS: Final = np.empty((0, 3), np.int64)
+NO_RELAYS: Final = np.empty((0, 4), np.int64)
 
 
 class JointFilter:

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import borrowing_kernel
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -64,7 +64,7 @@ class JointArrays(NamedTuple):
     packets: Integers
     """Shape (capacity, REMEMBERED, 3)."""
     relayed: Integers
-    """Row i, column j: TX stamp of the newest packet of slot j whose relay by slot i was taken; shape (capacity,)·2."""
+    """Row i, column j: TX stamp of the newest packet of slot j whose reception by slot i was taken; shape (capacity,)·2."""
     slot_of: Integers
     """Slot of each anchor of the site's table, −1 if it is not in view."""
     settings: Vector
@@ -104,25 +104,25 @@ def extended(old: JointArrays, capacity: int) -> JointArrays:
     return new
 
 
-@kernel
+@borrowing_kernel
 def values(s: JointArrays) -> int:
     """How many values there are; as many rates follow them, then the noises."""
     return int(s.settings[DIM]) + s.counts[SLOTS]
 
 
-@kernel
+@borrowing_kernel
 def states(s: JointArrays) -> int:
     """How many states are in use."""
     return 2 * (int(s.settings[DIM]) + s.counts[SLOTS]) + s.counts[NOISES]
 
 
-@kernel
+@borrowing_kernel
 def width(s: JointArrays) -> int:
     """Columns that loops run over: the states in use and zeros up to a multiple of eight, as processors like them."""
     return (states(s) + 7) // 8 * 8
 
 
-@kernel
+@borrowing_kernel
 def _insert(s: JointArrays, n: int, place: int) -> None:
     """Make room for a state at ``place``, zero and without variance."""
     x, P = s.x, s.P
@@ -139,7 +139,7 @@ def _insert(s: JointArrays, n: int, place: int) -> None:
         P[row, place] = 0.0
 
 
-@kernel
+@borrowing_kernel
 def _remove(s: JointArrays, n: int, place: int) -> None:
     """Take a state out; what stood behind it moves up, zeros follow."""
     x, P = s.x, s.P
@@ -156,13 +156,13 @@ def _remove(s: JointArrays, n: int, place: int) -> None:
         P[row, n - 1] = 0.0
 
 
-@kernel
+@borrowing_kernel
 def has_room(s: JointArrays) -> bool:
     """Whether one more anchor fits."""
     return s.counts[SLOTS] < s.slots.shape[0]
 
 
-@kernel
+@borrowing_kernel
 def add_slot(s: JointArrays, site: int) -> int:
     """Give an anchor a slot, the last one, with two states of zero; the caller has seen that there is room."""
     slot = s.counts[SLOTS]
@@ -171,9 +171,9 @@ def add_slot(s: JointArrays, site: int) -> int:
     _insert(s, n + 1, one_more)
     s.counts[SLOTS] = slot + 1
     s.slot_of[site] = slot
-    row = s.slots[slot]
-    row[:] = 0
-    row[SITE], row[NOISE] = site, -1
+    s.slots[slot, :] = 0
+    s.slots[slot, SITE] = site
+    s.slots[slot, NOISE] = -1
     for axis in range(3):
         s.anchors[slot, axis] = s.site_m[site, axis]
     s.anchors[slot, RANGE:] = 0.0
@@ -184,7 +184,7 @@ def add_slot(s: JointArrays, site: int) -> int:
     return slot
 
 
-@kernel
+@borrowing_kernel
 def add_noise_state(s: JointArrays, slot: int) -> None:
     """Give an anchor a state for the noise of its TX stamps (there is room for one of each slot)."""
     _insert(s, states(s), states(s))
@@ -192,7 +192,7 @@ def add_noise_state(s: JointArrays, slot: int) -> None:
     s.counts[NOISES] += 1
 
 
-@kernel
+@borrowing_kernel
 def drop_slot(s: JointArrays, slot: int) -> None:
     """Forget an anchor and its states."""
     noise = s.slots[slot, NOISE]
@@ -205,10 +205,15 @@ def drop_slot(s: JointArrays, slot: int) -> None:
     last = s.counts[SLOTS] - 1
     s.slot_of[s.slots[slot, SITE]] = -1
     for k in range(slot, last):
-        s.slots[k, :] = s.slots[k + 1, :]
-        s.anchors[k, :] = s.anchors[k + 1, :]
-        s.packets[k, :, :] = s.packets[k + 1, :, :]
-        s.relayed[k, :] = s.relayed[k + 1, :]
+        for column in range(s.slots.shape[1]):
+            s.slots[k, column] = s.slots[k + 1, column]
+        for column in range(s.anchors.shape[1]):
+            s.anchors[k, column] = s.anchors[k + 1, column]
+        for packet in range(REMEMBERED):
+            for column in range(3):
+                s.packets[k, packet, column] = s.packets[k + 1, packet, column]
+        for column in range(last + 1):
+            s.relayed[k, column] = s.relayed[k + 1, column]
         s.slot_of[s.slots[k, SITE]] = k
     for k in range(last):
         for column in range(slot, last):

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import kernel
+from skyless.compiled import borrowing_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.joint_state import (
     ACCEPTED,
@@ -54,7 +54,7 @@ SMALL: Final = 0.1
 """Clock noise above this part of a stamp's variance is no small correction any more."""
 
 
-@kernel
+@borrowing_kernel
 def elapse(s: JointArrays, rx_ticks: int) -> None:
     """Let time pass up to a reading of the tag."""
     dt_s = (rx_ticks - s.counts[EPOCH]) * TICK_S
@@ -88,7 +88,7 @@ def elapse(s: JointArrays, rx_ticks: int) -> None:
         P[half + one, half + one] += rate
 
 
-@kernel
+@borrowing_kernel
 def _noise_at_base(white: float, rate: float, dt_s: float, tau_s: float) -> tuple[float, float]:
     """Covariance with the rate, and variance, of what a value as of the base gains in the last ``dt_s``.
 
@@ -99,7 +99,7 @@ def _noise_at_base(white: float, rate: float, dt_s: float, tau_s: float) -> tupl
     return cross, value
 
 
-@kernel
+@borrowing_kernel
 def _move_base(s: JointArrays, tau_s: float) -> None:
     """Give all values as of a base later by ``tau_s``: F·P·Fᵀ."""
     x, P, half, n = s.x, s.P, values(s), states(s)
@@ -118,7 +118,7 @@ def _move_base(s: JointArrays, tau_s: float) -> None:
             P[column, row] = P[row, column]
 
 
-@kernel
+@borrowing_kernel
 def _take(s: JointArrays, innovation: float, spread: float) -> None:
     """Kalman update with gain ``ph`` / spread."""
     x, P, u, n, columns = s.x, s.P, s.ph, states(s), width(s)
@@ -134,31 +134,30 @@ def _take(s: JointArrays, innovation: float, spread: float) -> None:
             P[row, column] -= factor * u[column]
 
 
-@kernel
+@borrowing_kernel
 def new_packet(s: JointArrays, slot: int) -> None:
     """Forget the noise of an anchor's last TX stamp for that of a new one."""
-    if s.slots[slot, NOISE] < 0:
-        return
-    place = 2 * values(s) + s.slots[slot, NOISE]
-    s.x[place] = 0.0
-    for column in range(width(s)):
-        s.P[place, column] = 0.0
-    for row in range(states(s)):
-        s.P[row, place] = 0.0
-    s.P[place, place] = s.settings[TX_VARIANCE]
+    if s.slots[slot, NOISE] >= 0:
+        place = 2 * values(s) + s.slots[slot, NOISE]
+        s.x[place] = 0.0
+        for column in range(width(s)):
+            s.P[place, column] = 0.0
+        for row in range(states(s)):
+            s.P[row, place] = 0.0
+        s.P[place, place] = s.settings[TX_VARIANCE]
 
 
-@kernel
+@borrowing_kernel
 def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool:
     """Take the tag's reception of a packet; False if it lies beyond the gate.
 
     R − T = |p − a| + b + noise of the TX stamp + noise of the reception.
     """
-    x, P, ph, row = s.x, s.P, s.ph, s.slots[slot]
+    x, P, ph = s.x, s.P, s.ph
     dim, half, columns = int(s.settings[DIM]), values(s), width(s)
     tau_s = (s.counts[EPOCH] - s.counts[BASE]) * TICK_S
     offset, rate = dim + slot, half + dim + slot
-    noise = row[NOISE]
+    noise = s.slots[slot, NOISE]
     variance = s.settings[RX_VARIANCE]
     for column in range(columns):
         ph[column] = P[offset, column] + tau_s * P[rate, column]
@@ -179,22 +178,23 @@ def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool
     if noise >= 0:
         spread += ph[noise]
         expected += x[noise]
-    innovation = (rx_ticks - tx_ticks - row[WHOLE]) * TICK_M - expected
+    innovation = (rx_ticks - tx_ticks - s.slots[slot, WHOLE]) * TICK_M - expected
     s.anchors[slot, RANGE] = range_m
     s.anchors[slot, INNOVATION] = innovation
     s.anchors[slot, SCORE] += SCORE_GAIN * (innovation / np.sqrt(spread) - s.anchors[slot, SCORE])
-    if not judge(s.counts, s.statistics, innovation, spread, s.settings[GATE]):
-        row[IN_ROW] += 1
-        return False
-    row[IN_ROW] = 0
-    _take(s, innovation, spread)
-    steps = int(np.floor(x[offset] / TICK_M))
-    row[WHOLE] += steps
-    x[offset] -= steps * TICK_M
-    return True
+    accepted = judge(s.counts, s.statistics, innovation, spread, s.settings[GATE])
+    if accepted:
+        s.slots[slot, IN_ROW] = 0
+        _take(s, innovation, spread)
+        steps = int(np.floor(x[offset] / TICK_M))
+        s.slots[slot, WHOLE] += steps
+        x[offset] -= steps * TICK_M
+    else:
+        s.slots[slot, IN_ROW] += 1
+    return accepted
 
 
-@kernel
+@borrowing_kernel
 def _add_axis(P: Matrix, ph: Vector, axis: int, rate: int, factor: float, tau_s: float, columns: int) -> None:
     """Add to ``ph`` what the position along one axis has in common with all states."""
     both = factor * tau_s
@@ -202,7 +202,7 @@ def _add_axis(P: Matrix, ph: Vector, axis: int, rate: int, factor: float, tau_s:
         ph[column] += factor * P[axis, column] + both * P[rate, column]
 
 
-@kernel
+@borrowing_kernel
 def _along(ph: Vector, dim: int, half: int, ux: float, uy: float, uz: float, tau_s: float) -> float:
     """The part of hᵀ·P·h that comes of the position."""
     total = ux * (ph[0] + tau_s * ph[half]) + uy * (ph[1] + tau_s * ph[half + 1])
@@ -211,7 +211,7 @@ def _along(ph: Vector, dim: int, half: int, ux: float, uy: float, uz: float, tau
     return total
 
 
-@kernel
+@borrowing_kernel
 def towards(s: JointArrays, slot: int, tau_s: float) -> tuple[float, float, float, float]:
     """Range from the anchor to the tag, and its gradient with the tag's position."""
     x, dim, half = s.x, int(s.settings[DIM]), values(s)
@@ -224,7 +224,7 @@ def towards(s: JointArrays, slot: int, tau_s: float) -> tuple[float, float, floa
     return range_m, dx * scale, dy * scale, dz * scale
 
 
-@kernel
+@borrowing_kernel
 def join(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> None:
     """Begin with an anchor's clock: what its first packet says, whatever is wrong with the position being in it.
 
@@ -254,11 +254,11 @@ def join(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> None:
     s.anchors[slot, RANGE] = range_m
 
 
-@kernel
+@borrowing_kernel
 def hear_relay(
-    s: JointArrays, sender: int, slot: int, packet_tx: int, packet_rx: int, relayed_rx: int
+    s: JointArrays, listener: int, slot: int, packet_tx: int, packet_rx: int, relayed_rx: int
 ) -> bool:
-    """Take the reception, by the anchor ``sender``, of a packet of the anchor ``slot``; False beyond the gate.
+    """Take the reception, by the anchor ``listener``, of a packet of the anchor ``slot``; False beyond the gate.
 
     S − T = |a_i − a_j| + b_j − b_i + noise of the TX stamp + noise of the reception, when the packet reached anchor i.
     Both values go back to that moment by their rates; what their oscillators have done since stands in the covariance, and
@@ -268,11 +268,11 @@ def hear_relay(
     dim, half, columns = int(s.settings[DIM]), values(s), width(s)
     distance_m = 0.0
     for axis in range(3):
-        distance_m += (s.anchors[slot, axis] - s.anchors[sender, axis]) ** 2
+        distance_m += (s.anchors[slot, axis] - s.anchors[listener, axis]) ** 2
     distance_m = np.sqrt(distance_m)
     age_s = (s.counts[EPOCH] - packet_rx) * TICK_S + (s.anchors[slot, RANGE] - distance_m) / SPEED_OF_LIGHT_MPS
     tau_s = (s.counts[EPOCH] - s.counts[BASE]) * TICK_S - age_s
-    one, other = dim + slot, dim + sender
+    one, other = dim + slot, dim + listener
     one_rate, other_rate = half + one, half + other
     for column in range(columns):
         ph[column] = P[one, column] - P[other, column] + tau_s * (P[one_rate, column] - P[other_rate, column])
@@ -301,11 +301,12 @@ def hear_relay(
     spread = ph[one] - ph[other] + tau_s * (ph[one_rate] - ph[other_rate]) + variance
     if noise >= 0:
         spread += ph[noise]
-    whole = s.slots[slot, WHOLE] - s.slots[sender, WHOLE]
+    whole = s.slots[slot, WHOLE] - s.slots[listener, WHOLE]
     innovation = (relayed_rx - packet_tx - whole) * TICK_M - expected
-    if not innovation * innovation <= s.settings[GATE] ** 2 * spread:
+    accepted = innovation * innovation <= s.settings[GATE] * s.settings[GATE] * spread
+    if accepted:
+        s.counts[RELAYS_USED] += 1
+        _take(s, innovation, spread)
+    else:
         s.counts[RELAYS_REJECTED] += 1
-        return False
-    s.counts[RELAYS_USED] += 1
-    _take(s, innovation, spread)
-    return True
+    return accepted

@@ -45,6 +45,8 @@ class BoundSettings(Struct, frozen=True):
     mesh: bool
     """Whether anchors also relay when they heard each other, not only the first anchor."""
     height_known: bool = True
+    at_once: bool = True
+    """Whether anchors' receptions are known at once; else each comes with the listener's next frame, as on the air."""
 
 
 def bound_settings(
@@ -57,6 +59,7 @@ def bound_settings(
     speed_std_mps: float,
     mesh: bool,
     height_known: bool = True,
+    at_once: bool = True,
 ) -> BoundSettings:
     """Settings from a stamp's noise in seconds (TX and RX alike) and oscillator figures as in ``clocks/filter.py``."""
     light2 = SPEED_OF_LIGHT_MPS**2
@@ -71,6 +74,7 @@ def bound_settings(
         speed_std_mps=speed_std_mps,
         mesh=mesh,
         height_known=height_known,
+        at_once=at_once,
     )
 
 
@@ -94,7 +98,8 @@ def tracking_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSetti
         [settings.qa, settings.white, settings.walk, settings.tx_variance_m2, settings.rx_variance_m2, dims]
     )
     P = _diffuse(size, dims, settings.speed_std_mps)
-    _run(anchors, path, settings.slot_s, settings.mesh, array, P, np.empty(size), np.empty(size), bound)
+    scratch = np.empty_like(P), np.empty(size), np.empty(size)
+    _run(anchors, path, settings.slot_s, settings.mesh, settings.at_once, array, P, *scratch, bound)
     return bound
 
 
@@ -141,25 +146,51 @@ def _run(
     path: Array,
     slot_s: float,
     mesh: bool,
+    at_once: bool,
     settings: Array,
     P: Array,
+    known: Array,
     h: Array,
     ph: Array,
     bound: Array,
 ) -> None:
-    """Take frame by frame; the tag hears each of them, and so do the anchors whose stamps are relayed."""
+    """Take superframe by superframe; what of the newest one has not come in yet is left out of its own bound only.
+
+    A frame's reception by an anchor whose turn is earlier in the superframe comes with the next superframe.
+    """
+    dims, n = int(settings[_DIM]), len(anchors)
+    for superframe in range(len(path) // n):
+        if not at_once:
+            known[:] = P
+            _superframe(anchors, path, slot_s, mesh, False, settings, known, h, ph, superframe)
+        _superframe(anchors, path, slot_s, mesh, True, settings, P, h, ph, superframe)
+        bound[superframe] = P[:dims, :dims] if at_once else known[:dims, :dims]
+
+
+@kernel
+def _superframe(
+    anchors: Array,
+    path: Array,
+    slot_s: float,
+    mesh: bool,
+    at_once: bool,
+    settings: Array,
+    P: Array,
+    h: Array,
+    ph: Array,
+    superframe: int,
+) -> None:
+    """Take the frames of a superframe; the tag hears each of them, and so do the anchors whose stamps are relayed."""
     n, dims = len(anchors), int(settings[_DIM])
-    for frame in range(len(path)):
-        sender = frame % n
+    for sender in range(n):
+        frame = superframe * n + sender
         if frame > 0:
             _predict(P, dims, slot_s, settings)
         _new_packet(P, settings[_TX])
         _hear_by_tag(P, h, ph, anchors, sender, path[frame], dims, settings[_RX])
         for listener in range(n):
-            if listener != sender and (mesh or sender == 0):
+            if listener != sender and (mesh or sender == 0) and (at_once or listener > sender):
                 _hear_by_anchor(P, h, ph, sender, listener, dims, settings[_RX])
-        if sender == n - 1:
-            bound[frame // n] = P[:dims, :dims]
 
 
 @kernel
