@@ -21,6 +21,8 @@ from skyless.clocks.stamps import AnchorStamps
 from skyless.constants import MAX_DRIFT, TICK_M
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import SLACK_TICKS, FixTime
+from skyless.positioning.joint import JointSettings
+from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.observation import Method, Observation
 from skyless.positioning.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.positioning.tracker import TrackerSettings
@@ -28,7 +30,8 @@ from skyless.positioning.tracking import Tracking
 from skyless.ticks import Unwrapper, from_seconds, nearest, to_seconds
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
-METHODS: Final = (*(str(method) for method in SnapshotMethod), "tracker")
+FILTERS: Final = ("tracker", "joint")
+METHODS: Final = (*(str(method) for method in SnapshotMethod), *FILTERS)
 """Names of the positioning methods."""
 
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)
@@ -39,6 +42,9 @@ NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump"
 
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
 """Stamps that go back farther than radios and hosts reorder mean that the tag's own counter has started anew."""
+
+DROP_S: Final = 2.0
+"""An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""
 
 MOST_REPEATS: Final = 4
 """Beyond this beacons of an anchor that has lost the master weigh no less: what changes between them is still true."""
@@ -197,11 +203,24 @@ class Receiver:
         assert self._master is not None
         tx_variance = stamp_variance_m2(noise.tx_stamp_s, rounded=False)
         rx_variance = stamp_variance_m2(noise.rx_stamp_s, rounded=True)
-        if self._method_name != "tracker":
+        if self._method_name not in FILTERS:
             settings = SnapshotSettings(
                 self._master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, self._z_bounds_m
             )
             return Snapshots(SnapshotMethod(self._method_name), settings, self._time)
+        superframe_s = to_seconds(schedule.slot_ticks * schedule.slots)
+        if self._method_name == "joint":
+            own = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
+            joint = JointSettings(
+                qa=self._qa,
+                white=own.white,
+                walk=own.walk,
+                tx_variance_m2=tx_variance,
+                rx_variance_m2=rx_variance,
+                height_m=schedule.tag_height_m,
+                drop_s=max(DROP_S, 4.0 * superframe_s),
+            )
+            return JointTracking(joint, self._z_bounds_m, self._time, superframe_s)
         clock = clock_noise(noise.white_fm, noise.random_walk_fm)
         return Tracking(
             TrackerSettings(
@@ -213,7 +232,7 @@ class Receiver:
             ),
             self._z_bounds_m,
             self._time,
-            to_seconds(schedule.slot_ticks * schedule.slots),
+            superframe_s,
         )
 
     def _observation(
@@ -233,6 +252,7 @@ class Receiver:
             ticks_master,
             fraction,
             variance_m2 if heard is None else variance_m2 * self._repeats(beacon.anchor, heard) ** 2,
+            _relays(beacon, tx_ticks) if self._method_name == "joint" else (),
         )
 
     def _repeats(self, anchor: int, heard: Heard) -> int:
@@ -271,3 +291,9 @@ class Receiver:
         if follow:
             self._master_scale = (whole, rx_ticks)
         return whole, fraction / 256.0, (time.std_ticks * TICK_M) ** 2
+
+
+def _relays(beacon: Beacon, tx_ticks: int) -> tuple[tuple[int, int, int], ...]:
+    """When the anchor heard others, as observations have it."""
+    heard = beacon.heard if beacon.master_heard is None else (beacon.master_heard, *beacon.heard)
+    return tuple((one.anchor, one.sequence, nearest(one.rx_ticks, tx_ticks)) for one in heard)

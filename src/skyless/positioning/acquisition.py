@@ -77,8 +77,9 @@ class Acquisition:
         kept = self._heard.setdefault(observation.anchor, [])
         came_around = len(kept) == 2
         self._heard[observation.anchor] = [*kept[-1:], observation]
-        pairs = [kept for kept in self._heard.values() if len(kept) == 2 and _possible(*kept)]
+        pairs = [kept for kept in self._heard.values() if len(kept) == 2]
         pairs = [kept for kept in pairs if (now - kept[-1].rx_ticks_tag) * TICK_S < MAX_AGE_S]
+        pairs = [kept for kept in self._on_one_scale(pairs) if _possible(*kept)]
         needed = 4 if self._height_m is None else 3
         if len(pairs) < needed:
             return NoFixReason.TOO_FEW_ANCHORS
@@ -87,9 +88,13 @@ class Acquisition:
         result = self._solve(pairs, now)
         if isinstance(result, Start):
             return self._unless_wide(result)
-        if result not in CONTRADICTIONS or len(pairs) <= needed + 1 or observation is not pairs[0][-1]:
+        if result not in CONTRADICTIONS or len(pairs) <= needed + 1 or observation.anchor != pairs[0][-1].anchor:
             return result
         return self._solve_without_one(pairs, now)
+
+    def _on_one_scale(self, pairs: list[list[Observation]]) -> list[list[Observation]]:
+        """Messages whose TX times are all on one scale: as they are, on the master's."""
+        return pairs
 
     def _unless_wide(self, start: Start) -> Start | NoFixReason:
         """Hold a start back while it is wide and more anchors may come."""

@@ -21,13 +21,16 @@ from skyless.positioning.joint_state import (
     NOISE,
     PACKET_RX,
     PACKET_TX,
+    QA,
     REJECTED_IN_ROW,
     REMEMBERED,
     RESTARTS,
     RX,
+    RX_VARIANCE,
     SEQUENCE,
     SLOTS,
     TX,
+    TX_VARIANCE,
     WANTED,
     WHOLE,
     Integers,
@@ -236,24 +239,40 @@ class JointFilter:
     """State of one tag."""
 
     def __init__(self, settings: JointSettings, site_m: NDArray[np.float64], capacity: int = 8) -> None:
-        """``site_m``: positions of all anchors, shape (n, 3); ``capacity``: how many are in view, to begin with."""
-        self.arrays = new_arrays(settings.array(), site_m, min(capacity, len(site_m)))
+        """``site_m``: positions of the anchors, shape (n, 3); ``capacity``: how many may be in view, to begin with."""
+        self.arrays = new_arrays(settings.array(), capacity, max(len(site_m), capacity))
+        self.arrays.site_m[: len(site_m)] = site_m
         self.dim = settings.dim
+        self._anchors = len(site_m)
         self._motion = np.zeros(2 * self.dim)
         self._covariance = np.zeros((2 * self.dim, 2 * self.dim))
 
-    def start(
-        self, rx_ticks: int, position_m: Vector, covariance_m2: Matrix, speed_variance: float, velocity: Vector | None = None
-    ) -> None:
-        """Begin at a position, shapes (dim,) and (dim, dim), without any anchor."""
+    def add_anchor(self, anchor_m: Vector) -> int:
+        """Add an anchor to the table; returns its place there."""
+        place, s = self._anchors, self.arrays
+        if place == len(s.site_m):
+            self.arrays = s = extended(s, len(s.slots), 2 * place)
+        s.site_m[place] = anchor_m
+        self._anchors += 1
+        return place
+
+    def move_anchor(self, place: int, anchor_m: Vector) -> None:
+        """Correct an anchor's position."""
+        s = self.arrays
+        s.site_m[place] = anchor_m
+        if s.slot_of[place] >= 0:
+            s.anchors[s.slot_of[place], :3] = anchor_m
+
+    def start(self, rx_ticks: int, position_m: Vector, covariance_m2: Matrix, speed_variance: float) -> None:
+        """Begin at a position, shapes (dim,) and (dim, dim), without any anchor in view."""
         old, dim = self.arrays, self.dim
-        self.arrays = s = new_arrays(old.settings, old.site_m, len(old.slots))
+        self.arrays = s = new_arrays(old.settings, len(old.slots), len(old.site_m))
+        s.site_m[:] = old.site_m
         s.x[:dim] = position_m
-        s.x[dim : 2 * dim] = 0.0 if velocity is None else velocity
         s.P[:dim, :dim] = covariance_m2
         s.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
         s.counts[EPOCH] = s.counts[BASE] = rx_ticks
-        s.statistics[:] = (1.0, s.settings[4] + s.settings[5], 0.0, 1.0)
+        s.statistics[:] = (1.0, s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE], 0.0, 1.0)
 
     def hear(
         self, site: int, sequence: int, rx_ticks: int, tx_ticks: int, relays: Integers = NO_RELAYS
@@ -292,7 +311,7 @@ class JointFilter:
             self._extend()
 
     def _extend(self) -> None:
-        self.arrays = extended(self.arrays, 2 * len(self.arrays.slots))
+        self.arrays = extended(self.arrays, 2 * len(self.arrays.slots), len(self.arrays.site_m))
 
     def motion(self) -> tuple[Vector, Matrix]:
         """Position and velocity at the newest message, and their covariance; overwritten by the next call."""
@@ -309,7 +328,7 @@ class JointFilter:
         """Sum of the variances of x and y so much later, if nothing is heard until then."""
         s = self.arrays
         _, covariance = self.motion()
-        return horizontal_variance(covariance, self.dim, ahead_s, s.settings[1] * s.statistics[AGILITY])
+        return horizontal_variance(covariance, self.dim, ahead_s, s.settings[QA] * s.statistics[AGILITY])
 
     def clock(self, site: int) -> tuple[int, float, float] | None:
         """The tag's clock against that of an anchor in view: whole ticks, the rest in metres, rate in m/s."""

@@ -76,8 +76,8 @@ NEVER: Final = -(1 << 62)
 """A time before all others."""
 
 
-def new_arrays(settings: Vector, site_m: Matrix, capacity: int) -> JointArrays:
-    """Empty arrays with room for so many anchors in view."""
+def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArrays:
+    """Empty arrays with room for so many anchors in view, and in the table."""
     states = -(-(2 * int(settings[DIM]) + 3 * capacity) // 8) * 8
     return JointArrays(
         x=np.zeros(states),
@@ -87,17 +87,17 @@ def new_arrays(settings: Vector, site_m: Matrix, capacity: int) -> JointArrays:
         statistics=np.ones(4),
         slots=np.zeros((capacity, 7), np.int64),
         anchors=np.zeros((capacity, 7)),
-        packets=np.zeros((capacity, REMEMBERED, 3), np.int64),
+        packets=np.full((capacity, REMEMBERED, 3), NEVER),
         relayed=np.full((capacity, capacity), NEVER),
-        slot_of=np.full(len(site_m), -1, np.int64),
+        slot_of=np.full(site_capacity, -1, np.int64),
         settings=settings,
-        site_m=np.ascontiguousarray(site_m, np.float64),
+        site_m=np.zeros((site_capacity, 3)),
     )
 
 
-def extended(old: JointArrays, capacity: int) -> JointArrays:
-    """The same state with room for more anchors."""
-    new = new_arrays(old.settings, old.site_m, capacity)
+def extended(old: JointArrays, capacity: int, site_capacity: int) -> JointArrays:
+    """The same state with more room."""
+    new = new_arrays(old.settings, capacity, site_capacity)
     for source, target in zip(old, new, strict=True):
         if source is not target:
             target[tuple(slice(length) for length in source.shape)] = source

@@ -9,6 +9,7 @@ from skyless.constants import TICK_S
 from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Acquisition, Start
 from skyless.positioning.fix import Fix, NoFixReason, motion_fix
 from skyless.positioning.fix_time import FixTime
+from skyless.positioning.in_use import AnchorsInUse
 from skyless.positioning.observation import Observation
 from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings
 
@@ -33,9 +34,6 @@ HASTE: Final = 4.0
 MAX_SPEED_STD_MPS: Final = 32.0
 """... the next start assumes a speed higher by this factor, up to this."""
 
-IN_USE_S: Final = 0.1
-"""An anchor counts as in use while its last accepted message is younger."""
-
 
 class Tracking:
     """One tag's tracker from the first beacon on."""
@@ -50,7 +48,6 @@ class Tracking:
         """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites."""
         self._settings = settings
         self._superframe_s = superframe_s
-        self._in_use_s = max(IN_USE_S, 1.5 * superframe_s)
         self._max_spread = MAX_SPREAD if superframe_s < SLOW_S else SLOW_SPREAD
         self._z_bounds_m = z_bounds_m
         self._tracker = PseudorangeTracker(settings)
@@ -58,11 +55,7 @@ class Tracking:
         self._started_ticks = 0
         self._acquisition: Acquisition | None = self._new_acquisition()
         self._time = fix_time or FixTime()
-        self._used: dict[int, Observation] = {}
-        self._anchors: tuple[int, ...] = ()
-        self._anchors_m: NDArray[np.float64] = np.empty((0, 3))
-        self._extent_m = 0.0
-        self._checked_ticks = 0
+        self._in_use = AnchorsInUse(superframe_s)
         self._heard_ticks = 0
 
     @property
@@ -100,7 +93,7 @@ class Tracking:
                 self._speed_std_mps = min(HASTE * self._speed_std_mps, MAX_SPEED_STD_MPS) if soon else SPEED_STD_MPS
                 self._acquisition = self._new_acquisition()
             return NoFixReason.RESIDUALS
-        self._use(observation)
+        self._in_use.use(observation)
         return self._fix(observation)
 
     def _new_acquisition(self) -> Acquisition:
@@ -118,21 +111,12 @@ class Tracking:
         if silent_s < SHORT_SILENCE_S:
             return False
         std_m = self._tracker.horizontal_variance_m2(silent_s) ** 0.5
-        return bool(std_m > self._max_spread * self._mean_range_m())
-
-    def _mean_range_m(self) -> float:
-        """From the position to the anchors in use."""
-        dim = self._tracker.dim
-        away = self._anchors_m[:, :dim] - self._tracker.x[:dim]
-        return float(np.linalg.norm(away, axis=1).mean())
+        return bool(std_m > self._max_spread * self._in_use.mean_range_m(self._tracker.x[: self._tracker.dim]))
 
     def _begin(self, start: Start, observation: Observation) -> None:
         self._acquisition = None
         self._heard_ticks = self._started_ticks = observation.rx_ticks_tag
-        self._used.clear()
-        self._extent_m = 0.0
-        for used in start.used:
-            self._use(used)
+        self._in_use.begin(start.used)
         self._tracker.start(
             start.rx_ticks_tag,
             start.whole_offset_ticks,
@@ -143,28 +127,12 @@ class Tracking:
             start.speed_variance,
         )
 
-    def _use(self, observation: Observation) -> None:
-        """Remember which anchors are in use; their list is made anew only when it changes."""
-        now = observation.rx_ticks_tag
-        changed = observation.anchor not in self._used
-        self._used[observation.anchor] = observation
-        if (now - self._checked_ticks) * TICK_S > self._in_use_s:
-            self._checked_ticks = now
-            stale = [a for a, o in self._used.items() if (now - o.rx_ticks_tag) * TICK_S > self._in_use_s]
-            changed = changed or bool(stale)
-            for anchor in stale:
-                del self._used[anchor]
-        if changed:
-            self._anchors = tuple(self._used)
-            self._anchors_m = np.array([o.anchor_m for o in self._used.values()])
-            self._extent_m = max(self._extent_m, float(np.ptp(self._anchors_m, axis=0).max()))
-
     def _fix(self, observation: Observation) -> Fix | NoFixReason:
         assert observation.tx_ticks_master is not None
-        tracker, height_m = self._tracker, self._settings.height_m
-        if height_m is None and tracker.P[2, 2] > self._extent_m**2:
+        tracker, height_m, in_use = self._tracker, self._settings.height_m, self._in_use
+        if height_m is None and tracker.P[2, 2] > in_use.extent_m**2:
             return NoFixReason.BAD_GEOMETRY
         time_s = self._time.time_s(observation.tx_ticks_master, observation.rx_ticks_tag)
         return motion_fix(
-            time_s, tracker.x, tracker.P, height_m, self._anchors, self._anchors_m, tracker.statistics, "tracker"
+            time_s, tracker.x, tracker.P, height_m, in_use.anchors, in_use.anchors_m, tracker.statistics, "tracker"
         )

@@ -1,0 +1,151 @@
+"""``joint`` as a positioning method: cold start, message by message updates, and starting again when lost."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.constants import TICK_S
+from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Start
+from skyless.positioning.fix import Fix, NoFixReason, motion_fix
+from skyless.positioning.fix_time import FixTime
+from skyless.positioning.in_use import AnchorsInUse
+from skyless.positioning.joint import NO_RELAYS, REJECTED, JointFilter, JointSettings
+from skyless.positioning.joint_start import JointStart
+from skyless.positioning.observation import Observation
+from skyless.positioning.tracking import (
+    HASTE,
+    MAX_GAP_S,
+    MAX_SPEED_STD_MPS,
+    MAX_SPREAD,
+    SHORT_SILENCE_S,
+    SLOW_S,
+    SLOW_SPREAD,
+    SOON_S,
+)
+
+LOOSENED: Final = 4.0
+"""The start's covariance is taken so many times larger: the packets that it rests on are then given to the filter as well."""
+
+
+class JointTracking:
+    """One tag's joint filter from the first beacon on."""
+
+    def __init__(
+        self,
+        settings: JointSettings,
+        z_bounds_m: tuple[float, float] | None = None,
+        fix_time: FixTime | None = None,
+        superframe_s: float = 0.0,
+    ) -> None:
+        """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites."""
+        self._settings = settings
+        self._superframe_s = superframe_s
+        self._max_spread = MAX_SPREAD if superframe_s < SLOW_S else SLOW_SPREAD
+        self._z_bounds_m = z_bounds_m
+        self._speed_std_mps = SPEED_STD_MPS
+        self._filter = JointFilter(settings, np.empty((0, 3)))
+        self._place_of: dict[int, int] = {}
+        self._known_m: dict[int, NDArray[np.float64]] = {}
+        self._start: JointStart | None = self._new_start()
+        self._time = fix_time or FixTime()
+        self._in_use = AnchorsInUse(superframe_s)
+        self._master_less_tag_ticks = 0
+        self._started_ticks = 0
+        self._heard_ticks = 0
+
+    @property
+    def filter(self) -> JointFilter:
+        """The filter with all its states."""
+        return self._filter
+
+    def clock(self, anchor: int) -> tuple[int, float, float] | None:
+        """The tag's clock less that of an anchor in view: whole ticks, the rest in metres, rate in m/s."""
+        place = self._place_of.get(anchor)
+        return None if place is None else self._filter.clock(place)
+
+    def hear(self, observation: Observation) -> Fix | NoFixReason:
+        """Take one observation; a fix for every accepted message once started."""
+        if observation.tx_ticks_master is not None:
+            self._master_less_tag_ticks = observation.tx_ticks_master - observation.rx_ticks_tag
+        if self._start is None and self._is_out_of_reach(observation):
+            self._start = self._new_start()
+        if self._start is not None:
+            self._start.learn(observation)
+            start = self._start.hear(observation)
+            if isinstance(start, NoFixReason):
+                return start
+            self._begin(start, self._start.packets())
+            return self._fix(observation)
+        self._heard_ticks = observation.rx_ticks_tag
+        if self._take(observation) == REJECTED:
+            if self._filter.lost:
+                soon = (observation.rx_ticks_tag - self._started_ticks) * TICK_S < SOON_S
+                self._speed_std_mps = min(HASTE * self._speed_std_mps, MAX_SPEED_STD_MPS) if soon else SPEED_STD_MPS
+                self._start = self._new_start()
+            return NoFixReason.RESIDUALS
+        self._in_use.use(observation)
+        return self._fix(observation)
+
+    def _new_start(self) -> JointStart:
+        settings = self._settings
+        max_age_s = max(MAX_AGE_S, 2.5 * self._superframe_s)
+        variance = settings.tx_variance_m2 + settings.rx_variance_m2
+        return JointStart(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps)
+
+    def _is_out_of_reach(self, observation: Observation) -> bool:
+        """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
+        silent_s = (observation.rx_ticks_tag - self._heard_ticks) * TICK_S
+        if not 0.0 <= silent_s <= MAX_GAP_S:
+            return True
+        if silent_s < SHORT_SILENCE_S:
+            return False
+        std_m = self._filter.horizontal_variance_m2(silent_s) ** 0.5
+        position_m = self._filter.motion()[0][: self._filter.dim]
+        return bool(std_m > self._max_spread * self._in_use.mean_range_m(position_m))
+
+    def _begin(self, start: Start, packets: list[Observation]) -> None:
+        """Begin at the start's position, and give the filter the packets that led there."""
+        self._start = None
+        self._heard_ticks = self._started_ticks = packets[-1].rx_ticks_tag
+        self._in_use.begin(start.used)
+        dim, begin_ticks = self._filter.dim, packets[0].rx_ticks_tag
+        age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
+        covariance = LOOSENED * start.covariance[:dim, :dim] + age_s**2 * start.speed_variance * np.eye(dim)
+        self._filter.start(begin_ticks, start.solution[:dim], covariance, start.speed_variance)
+        for packet in packets:
+            self._take(packet)
+
+    def _take(self, observation: Observation) -> int:
+        place = self._place(observation)
+        flat: list[int] = []
+        for anchor, sequence, rx_ticks in observation.relays:
+            heard = self._place_of.get(anchor)
+            if heard is not None:
+                flat += (place, heard, sequence, rx_ticks)
+        relays = np.array(flat, np.int64).reshape(-1, 4) if flat else NO_RELAYS
+        return self._filter.hear(
+            place, observation.sequence, observation.rx_ticks_tag, observation.tx_ticks_anchor, relays
+        )
+
+    def _place(self, observation: Observation) -> int:
+        """Place of the packet's anchor in the filter's table."""
+        anchor, anchor_m = observation.anchor, observation.anchor_m
+        if self._known_m.get(anchor) is not anchor_m:
+            place = self._place_of.get(anchor)
+            if place is None:
+                self._place_of[anchor] = self._filter.add_anchor(anchor_m)
+            else:
+                self._filter.move_anchor(place, anchor_m)
+            self._known_m[anchor] = anchor_m
+        return self._place_of[anchor]
+
+    def _fix(self, observation: Observation) -> Fix | NoFixReason:
+        height_m, in_use = self._settings.height_m, self._in_use
+        x, P = self._filter.motion()
+        if height_m is None and P[2, 2] > in_use.extent_m**2:
+            return NoFixReason.BAD_GEOMETRY
+        rx_ticks = observation.rx_ticks_tag
+        time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
+        statistics = self._filter.arrays.statistics
+        return motion_fix(time_s, x, P, height_m, in_use.anchors, in_use.anchors_m, statistics, "joint")
