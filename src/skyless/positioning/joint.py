@@ -10,7 +10,8 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.compiled import borrowing_kernel
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.positioning.joint_algebra import settle
 from skyless.positioning.joint_state import (
     BASE,
     DIM,
@@ -43,7 +44,6 @@ from skyless.positioning.joint_state import (
     extended,
     has_room,
     new_arrays,
-    states,
     values,
 )
 from skyless.positioning.joint_updates import elapse, hear_anchor, hear_relay, join, new_packet
@@ -106,31 +106,37 @@ def joint_hear(
 ) -> int:
     """Take one packet of the anchor ``site`` (place in the table) and what it relays, in the tag's order of time.
 
-    Rows ``first`` to ``last`` of ``relays`` are [the anchor that heard, the anchor that was heard, sequence, RX stamp of the
-    former], anchors by their places in the table; all stamps are unwrapped, each on its own clock.
+    Rows ``first`` to ``last`` of ``relays`` are [the anchor that heard, the anchor that was heard, sequence, RX stamp
+    of the former], anchors by their places in the table; all stamps are unwrapped, each on its own clock.
     """
     elapse(s, rx_ticks)
     if s.counts[BASE] == rx_ticks:
         _drop_silent(s, rx_ticks)
     slot = s.slot_of[site]
     if slot >= 0 and s.slots[slot, IN_ROW] >= RESTART_IN_ROW and abs(s.anchors[slot, INNOVATION]) > RESTART_M:
+        settle(s)
         drop_slot(s, slot)
         s.counts[RESTARTS] += 1
         slot = -1
     status = FULL
     if slot >= 0:
         if s.slots[slot, NOISE] < 0 and s.slots[slot, WANTED] > 0:
+            settle(s)
             add_noise_state(s, slot)
         new_packet(s, slot)
         status = ACCEPTED if hear_anchor(s, slot, rx_ticks, tx_ticks) else REJECTED
         _remember(s, slot, sequence, rx_ticks, tx_ticks)
         for relay in range(first, last):
-            _hear_relayed(s, s.slot_of[relays[relay, 0]], s.slot_of[relays[relay, 1]], relays[relay, 2], relays[relay, 3])
+            _hear_relayed(
+                s, s.slot_of[relays[relay, 0]], s.slot_of[relays[relay, 1]], relays[relay, 2], relays[relay, 3]
+            )
     elif has_room(s):
+        settle(s)
         slot = add_slot(s, site)
         join(s, slot, rx_ticks, tx_ticks)
         _remember(s, slot, sequence, rx_ticks, tx_ticks)
         status = JOINED
+    settle(s)
     return status
 
 
@@ -161,6 +167,7 @@ def _hear_relayed(s: JointArrays, listener: int, slot: int, sequence: int, relay
 def _drop_silent(s: JointArrays, rx_ticks: int) -> None:
     for slot in range(s.counts[SLOTS] - 1, -1, -1):
         if (rx_ticks - s.slots[slot, RX]) * TICK_S > s.settings[DROP_S]:
+            settle(s)
             drop_slot(s, slot)
 
 
@@ -198,8 +205,8 @@ def joint_track(
 ) -> int:
     """Take packets from ``begin`` on; ``ends[k]`` is where the relays of packet k end. Returns the first not taken.
 
-    Rows k of ``motions`` and ``variances`` become position and velocity after packet k, and the position's covariance; where
-    they have no rows nothing is written.
+    Rows k of ``motions`` and ``variances`` become position and velocity after packet k, and the position's
+    covariance; where they have no rows nothing is written.
     """
     dim = int(s.settings[DIM])
     for k in range(begin, len(sites)):
@@ -274,9 +281,7 @@ class JointFilter:
         s.counts[EPOCH] = s.counts[BASE] = rx_ticks
         s.statistics[:] = (1.0, s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE], 0.0, 1.0)
 
-    def hear(
-        self, site: int, sequence: int, rx_ticks: int, tx_ticks: int, relays: Integers = NO_RELAYS
-    ) -> int:
+    def hear(self, site: int, sequence: int, rx_ticks: int, tx_ticks: int, relays: Integers = NO_RELAYS) -> int:
         """Take one packet (``joint_hear``)."""
         status = joint_hear(self.arrays, site, sequence, rx_ticks, tx_ticks, relays, 0, len(relays))
         if status == FULL:

@@ -1,8 +1,8 @@
 """Cold start of ``joint``: where the tag is, from raw stamps alone.
 
-Wherever anchor i tells when it heard a packet of anchor j that the tag heard as well, the difference of their clocks at
-that moment is known but for noise. Along such links all clocks lead to that of one anchor, which serves as the master does in
-``acquisition.py``; the rest is the same.
+Wherever anchor i tells when it heard a packet of anchor j that the tag heard as well, the difference of their clocks
+at that moment is known but for noise. Along such links all clocks lead to that of one anchor, which serves as the
+master does in ``acquisition.py``; the rest is the same.
 """
 
 from collections import deque
@@ -67,7 +67,7 @@ class JointStart(Acquisition):
                     self._links[observation.anchor, anchor] = link
 
     def _on_one_scale(self, pairs: list[list[Observation]]) -> list[list[Observation]]:
-        """The packets on the scale of the anchor from which most others can be reached, or on the master's if that is more."""
+        """The packets on the scale of the anchor from which most others are reached, or the master's if that is more."""
         with_master = [pair for pair in pairs if all(packet.tx_ticks_master is not None for packet in pair)]
         if not pairs:
             return with_master
@@ -85,7 +85,9 @@ class JointStart(Acquisition):
                     best = reached
         if len(best) < len(with_master):
             return with_master
-        return [[self._convert(packet, best[anchor]) for packet in by_anchor[anchor]] for anchor in rates if anchor in best]
+        return [
+            [self._convert(packet, best[anchor]) for packet in by_anchor[anchor]] for anchor in rates if anchor in best
+        ]
 
     def _reach(self, reference: int, rates: dict[int, float]) -> dict[int, _Scale]:
         """The scale of every anchor to which links lead, by as few of them as can be."""

@@ -6,9 +6,9 @@ States stand in three blocks, each packed, so that rows are worked on whole and 
     rates   velocity (dim), then the rate of each offset, m/s
     noises  the noise of an anchor's last TX stamp, in metres, of those anchors whose packets others relay
 
-Values are kept as of the time ``BASE``, a few milliseconds back: at time t a value is ``value + (t − BASE)·rate``. So time
-passes without touching the covariance but for its noise, and the base is moved on now and then. The tag's clock is the
-reference of all offsets; no anchor is special, none is ever changed for another.
+Values are kept as of the time ``BASE``, a few milliseconds back: at time t a value is ``value + (t − BASE)·rate``. So
+time passes without touching the covariance but for its noise, and the base is moved on now and then. The tag's clock is
+the reference of all offsets; no anchor is special, none is ever changed for another.
 
 The whole ticks of an offset stand in an integer. The caller owns all arrays; their capacity is theirs to extend.
 """
@@ -24,22 +24,39 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-EPOCH, BASE, ACCEPTED, REJECTED, REJECTED_IN_ROW, SLOTS, NOISES, RELAYS_USED, RELAYS_REJECTED, RESTARTS = range(10)
+(
+    EPOCH,
+    BASE,
+    ACCEPTED,
+    REJECTED,
+    REJECTED_IN_ROW,
+    SLOTS,
+    NOISES,
+    RELAYS_USED,
+    RELAYS_REJECTED,
+    RESTARTS,
+    TERMS,
+    PLACES,
+) = range(12)
 """Places in ``counts``. The epoch is the tag's reading at the newest message, the base that of the values."""
 
 SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW = range(7)
-"""Places in a row of ``slots``: index in the site's table, whole ticks of the offset, newest packet's stamps (own clock,
-tag's), place among the noises or −1, whether its packets are relayed, rejections in a row."""
+"""Places in a row of ``slots``: index in the site's table, whole ticks of the offset, newest packet's stamps (own
+clock, tag's), place among the noises or −1, whether its packets are relayed, rejections in a row."""
 
 PLACE_X, PLACE_Y, PLACE_Z, RANGE, WEIGHT, INNOVATION, SCORE = range(7)
-"""Places in a row of ``anchors``: position, range at its newest packet, factor on the variance of its receptions (1 unless a
-monitor says otherwise), newest innovation and running mean of the normalised ones."""
+"""Places in a row of ``anchors``: position, range at its newest packet, factor on the variance of its receptions (1
+unless a monitor says otherwise), newest innovation and running mean of the normalised ones."""
 
 DIM, QA, WHITE, WALK, TX_VARIANCE, RX_VARIANCE, GATE, HEIGHT, RATE_VARIANCE, DROP_S = range(10)
 """Places in ``settings``."""
 
 REMEMBERED: Final = 16
 """Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
+
+MOST_TERMS: Final = 12
+MOST_PLACES: Final = 12
+"""A position and a velocity of three axes, two offsets and rates, a noise, and up to a multiple of four."""
 
 SEQUENCE, PACKET_TX, PACKET_RX = range(3)
 """Places in a remembered packet."""
@@ -52,8 +69,14 @@ class JointArrays(NamedTuple):
     """Shape (states,)."""
     P: Matrix
     """Shape (states, states); zero beyond the states in use."""
-    ph: Vector
-    """Scratch, shape (states,)."""
+    terms: Matrix
+    """Shape (MOST_TERMS, states); what P is still to change by, P += Σ sign·term·termᵀ (``joint_algebra``)."""
+    signs: Vector
+    """Shape (MOST_TERMS,)."""
+    h_places: Integers
+    """Where the measurement at hand is not zero, shape (MOST_PLACES,); as many as ``counts[PLACES]``."""
+    h: Vector
+    """What it is there."""
     counts: Integers
     statistics: Vector
     """As the tracker's."""
@@ -64,7 +87,7 @@ class JointArrays(NamedTuple):
     packets: Integers
     """Shape (capacity, REMEMBERED, 3)."""
     relayed: Integers
-    """Row i, column j: TX stamp of the newest packet of slot j whose reception by slot i was taken; shape (capacity,)·2."""
+    """Row i, column j: TX stamp of the newest packet of slot j whose reception by slot i was taken."""
     slot_of: Integers
     """Slot of each anchor of the site's table, −1 if it is not in view."""
     settings: Vector
@@ -82,8 +105,11 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
     return JointArrays(
         x=np.zeros(states),
         P=np.zeros((states, states)),
-        ph=np.zeros(states),
-        counts=np.zeros(10, np.int64),
+        terms=np.zeros((MOST_TERMS, states)),
+        signs=np.zeros(MOST_TERMS),
+        h_places=np.zeros(MOST_PLACES, np.int64),
+        h=np.zeros(MOST_PLACES),
+        counts=np.zeros(12, np.int64),
         statistics=np.ones(4),
         slots=np.zeros((capacity, 7), np.int64),
         anchors=np.zeros((capacity, 7)),
@@ -107,13 +133,13 @@ def extended(old: JointArrays, capacity: int, site_capacity: int) -> JointArrays
 @borrowing_kernel
 def values(s: JointArrays) -> int:
     """How many values there are; as many rates follow them, then the noises."""
-    return int(s.settings[DIM]) + s.counts[SLOTS]
+    return int(s.settings[DIM] + s.counts[SLOTS])
 
 
 @borrowing_kernel
 def states(s: JointArrays) -> int:
     """How many states are in use."""
-    return 2 * (int(s.settings[DIM]) + s.counts[SLOTS]) + s.counts[NOISES]
+    return int(2 * (s.settings[DIM] + s.counts[SLOTS]) + s.counts[NOISES])
 
 
 @borrowing_kernel
@@ -159,13 +185,13 @@ def _remove(s: JointArrays, n: int, place: int) -> None:
 @borrowing_kernel
 def has_room(s: JointArrays) -> bool:
     """Whether one more anchor fits."""
-    return s.counts[SLOTS] < s.slots.shape[0]
+    return bool(s.counts[SLOTS] < s.slots.shape[0])
 
 
 @borrowing_kernel
 def add_slot(s: JointArrays, site: int) -> int:
     """Give an anchor a slot, the last one, with two states of zero; the caller has seen that there is room."""
-    slot = s.counts[SLOTS]
+    slot: int = s.counts[SLOTS]
     n, one_more = states(s), values(s)
     _insert(s, n, 2 * one_more)
     _insert(s, n + 1, one_more)

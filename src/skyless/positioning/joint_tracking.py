@@ -25,7 +25,7 @@ from skyless.positioning.tracking import (
 )
 
 LOOSENED: Final = 4.0
-"""The start's covariance is taken so many times larger: the packets that it rests on are then given to the filter as well."""
+"""The start's covariance is taken so many times larger, as the filter is then given the packets that it rests on."""
 
 
 class JointTracking:

@@ -1,7 +1,6 @@
 """Inner steps of ``joint``: time passes, an anchor joins, a reception of the tag, a reception that an anchor relays.
 
-The covariance is changed by rank-one steps P − u·uᵀ over whole rows, so that it stays symmetric to the bit. It
-stays positive as every state gains noise all the time (``docs/maths.md`` section 6).
+The covariance stays positive as every state gains noise all the time (``docs/maths.md`` section 6).
 """
 
 from typing import Final
@@ -10,26 +9,25 @@ import numpy as np
 
 from skyless.compiled import borrowing_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.positioning.joint_algebra import along_h, along_x, new_term, project, put, settle, take
 from skyless.positioning.joint_state import (
-    ACCEPTED,
     BASE,
     DIM,
     EPOCH,
     GATE,
     HEIGHT,
-    INNOVATION,
     IN_ROW,
+    INNOVATION,
     NOISE,
+    PLACES,
     QA,
     RANGE,
     RATE_VARIANCE,
-    REJECTED,
     RELAYS_REJECTED,
     RELAYS_USED,
-    RX,
     RX_VARIANCE,
     SCORE,
-    SLOTS,
+    TERMS,
     TX,
     TX_VARIANCE,
     WALK,
@@ -37,8 +35,6 @@ from skyless.positioning.joint_state import (
     WHITE,
     WHOLE,
     JointArrays,
-    Matrix,
-    Vector,
     states,
     values,
     width,
@@ -67,25 +63,14 @@ def elapse(s: JointArrays, rx_ticks: int) -> None:
     dim, half = int(s.settings[DIM]), values(s)
     rate = s.settings[QA] * s.statistics[AGILITY] * dt_s
     cross, value = _noise_at_base(0.0, rate, dt_s, tau_s)
-    P = s.P
-    for axis in range(dim):
-        P[axis, axis] += value
-        P[axis, half + axis] += cross
-        P[half + axis, axis] += cross
-        P[half + axis, half + axis] += rate
+    for place in range(dim):
+        _add_noise(s, place, half + place, value, cross, rate)
     rate = s.settings[WALK] * dt_s
     cross, value = _noise_at_base(s.settings[WHITE] * dt_s, rate, dt_s, tau_s)
-    for one in range(dim, half):
-        for other in range(dim, half):  # the tag's oscillator, which all offsets share
-            P[one, other] += value
-            P[one, half + other] += cross
-        for other in range(dim, half):
-            P[half + one, other] += cross
-            P[half + one, half + other] += rate
-        P[one, one] += value
-        P[one, half + one] += cross
-        P[half + one, one] += cross
-        P[half + one, half + one] += rate
+    for place in range(dim, half):
+        _add_noise(s, place, half + place, value, cross, rate)
+    if value > 0.0:
+        _add_common_noise(s, dim, half, value, cross, rate)
 
 
 @borrowing_kernel
@@ -97,6 +82,34 @@ def _noise_at_base(white: float, rate: float, dt_s: float, tau_s: float) -> tupl
     cross = rate * (0.5 * dt_s - tau_s)
     value = white + rate * (dt_s * dt_s / 3.0 - tau_s * dt_s + tau_s * tau_s)
     return cross, value
+
+
+@borrowing_kernel
+def _add_noise(s: JointArrays, place: int, rate_place: int, value: float, cross: float, rate: float) -> None:
+    s.P[place, place] += value
+    s.P[place, rate_place] += cross
+    s.P[rate_place, place] += cross
+    s.P[rate_place, rate_place] += rate
+
+
+@borrowing_kernel
+def _add_common_noise(s: JointArrays, dim: int, half: int, value: float, cross: float, rate: float) -> None:
+    """Add the noise of the tag's own oscillator, which all offsets share, as two terms."""
+    u, columns = s.terms, width(s)
+    own = np.sqrt(value)
+    shared = cross / own
+    rest = np.sqrt(max(rate - shared * shared, 0.0))
+    one = new_term(s, 1.0)
+    s.counts[TERMS] = one + 1
+    other = new_term(s, 1.0)
+    s.counts[TERMS] = other + 1
+    for column in range(columns):
+        u[one, column] = 0.0
+        u[other, column] = 0.0
+    for place in range(dim, half):
+        u[one, place] = own
+        u[one, half + place] = shared
+        u[other, half + place] = rest
 
 
 @borrowing_kernel
@@ -119,22 +132,6 @@ def _move_base(s: JointArrays, tau_s: float) -> None:
 
 
 @borrowing_kernel
-def _take(s: JointArrays, innovation: float, spread: float) -> None:
-    """Kalman update with gain ``ph`` / spread."""
-    x, P, u, n, columns = s.x, s.P, s.ph, states(s), width(s)
-    scale = 1.0 / np.sqrt(spread)
-    step = innovation * scale
-    for column in range(columns):
-        u[column] *= scale
-    for column in range(columns):
-        x[column] += u[column] * step
-    for row in range(n):
-        factor = u[row]
-        for column in range(columns):
-            P[row, column] -= factor * u[column]
-
-
-@borrowing_kernel
 def new_packet(s: JointArrays, slot: int) -> None:
     """Forget the noise of an anchor's last TX stamp for that of a new one."""
     if s.slots[slot, NOISE] >= 0:
@@ -153,75 +150,55 @@ def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool
 
     R − T = |p − a| + b + noise of the TX stamp + noise of the reception.
     """
-    x, P, ph = s.x, s.P, s.ph
-    dim, half, columns = int(s.settings[DIM]), values(s), width(s)
+    dim, half = int(s.settings[DIM]), values(s)
     tau_s = (s.counts[EPOCH] - s.counts[BASE]) * TICK_S
-    offset, rate = dim + slot, half + dim + slot
-    noise = s.slots[slot, NOISE]
+    offset, noise = dim + slot, s.slots[slot, NOISE]
+    s.counts[PLACES] = 0
+    put(s, offset, 1.0)
+    put(s, half + offset, tau_s)
     variance = s.settings[RX_VARIANCE]
-    for column in range(columns):
-        ph[column] = P[offset, column] + tau_s * P[rate, column]
     if noise >= 0:
-        noise += 2 * half
-        for column in range(columns):
-            ph[column] += P[noise, column]
+        put(s, 2 * half + noise, 1.0)
     else:
         variance += s.settings[TX_VARIANCE]
-    range_m, ux, uy, uz = towards(s, slot, tau_s)
-    _add_axis(P, ph, 0, half, ux, tau_s, columns)
-    _add_axis(P, ph, 1, half + 1, uy, tau_s, columns)
-    if dim == 3:
-        _add_axis(P, ph, 2, half + 2, uz, tau_s, columns)
-    spread = _along(ph, dim, half, ux, uy, uz, tau_s)
-    spread += ph[offset] + tau_s * ph[rate] + variance * s.anchors[slot, WEIGHT]
-    expected = range_m + x[offset] + tau_s * x[rate]
-    if noise >= 0:
-        spread += ph[noise]
-        expected += x[noise]
-    innovation = (rx_ticks - tx_ticks - s.slots[slot, WHOLE]) * TICK_M - expected
+    expected = along_x(s)
+    range_m = put_direction(s, slot, tau_s, 1.0)
+    term = project(s)
+    spread = along_h(s, term) + variance * s.anchors[slot, WEIGHT]
+    innovation = (rx_ticks - tx_ticks - s.slots[slot, WHOLE]) * TICK_M - (range_m + expected)
     s.anchors[slot, RANGE] = range_m
     s.anchors[slot, INNOVATION] = innovation
     s.anchors[slot, SCORE] += SCORE_GAIN * (innovation / np.sqrt(spread) - s.anchors[slot, SCORE])
     accepted = judge(s.counts, s.statistics, innovation, spread, s.settings[GATE])
     if accepted:
         s.slots[slot, IN_ROW] = 0
-        _take(s, innovation, spread)
-        steps = int(np.floor(x[offset] / TICK_M))
+        take(s, term, innovation, spread)
+        steps = int(np.floor(s.x[offset] / TICK_M))
         s.slots[slot, WHOLE] += steps
-        x[offset] -= steps * TICK_M
+        s.x[offset] -= steps * TICK_M
     else:
         s.slots[slot, IN_ROW] += 1
     return accepted
 
 
 @borrowing_kernel
-def _add_axis(P: Matrix, ph: Vector, axis: int, rate: int, factor: float, tau_s: float, columns: int) -> None:
-    """Add to ``ph`` what the position along one axis has in common with all states."""
-    both = factor * tau_s
-    for column in range(columns):
-        ph[column] += factor * P[axis, column] + both * P[rate, column]
-
-
-@borrowing_kernel
-def _along(ph: Vector, dim: int, half: int, ux: float, uy: float, uz: float, tau_s: float) -> float:
-    """The part of hᵀ·P·h that comes of the position."""
-    total = ux * (ph[0] + tau_s * ph[half]) + uy * (ph[1] + tau_s * ph[half + 1])
-    if dim == 3:
-        total += uz * (ph[2] + tau_s * ph[half + 2])
-    return total
-
-
-@borrowing_kernel
-def towards(s: JointArrays, slot: int, tau_s: float) -> tuple[float, float, float, float]:
-    """Range from the anchor to the tag, and its gradient with the tag's position."""
+def put_direction(s: JointArrays, slot: int, tau_s: float, sign: float) -> float:
+    """Add the gradient of the range from the anchor to the tag to the measurement; returns the range."""
     x, dim, half = s.x, int(s.settings[DIM]), values(s)
     dx = x[0] + tau_s * x[half] - s.anchors[slot, 0]
     dy = x[1] + tau_s * x[half + 1] - s.anchors[slot, 1]
     z = x[2] + tau_s * x[half + 2] if dim == 3 else s.settings[HEIGHT]
     dz = z - s.anchors[slot, 2]
-    range_m = np.sqrt(dx * dx + dy * dy + dz * dz)
-    scale = 1.0 / max(range_m, 1e-6)
-    return range_m, dx * scale, dy * scale, dz * scale
+    range_m: float = np.sqrt(dx * dx + dy * dy + dz * dz)
+    scale = sign / max(range_m, 1e-6)
+    put(s, 0, dx * scale)
+    put(s, 1, dy * scale)
+    put(s, half, tau_s * dx * scale)
+    put(s, half + 1, tau_s * dy * scale)
+    if dim == 3:
+        put(s, 2, dz * scale)
+        put(s, half + 2, tau_s * dz * scale)
+    return range_m
 
 
 @borrowing_kernel
@@ -230,83 +207,81 @@ def join(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> None:
 
     This is the limit of an update of an offset of which nothing was known.
     """
-    x, P, ph = s.x, s.P, s.ph
-    dim, half, columns = int(s.settings[DIM]), values(s), width(s)
+    settle(s)
+    P, dim, half = s.P, int(s.settings[DIM]), values(s)
     tau_s = (s.counts[EPOCH] - s.counts[BASE]) * TICK_S
-    range_m, ux, uy, uz = towards(s, slot, tau_s)
     place, rate = dim + slot, half + dim + slot
     P[rate, rate] = s.settings[RATE_VARIANCE]
-    for column in range(columns):
-        ph[column] = -tau_s * P[rate, column]
-    _add_axis(P, ph, 0, half, -ux, tau_s, columns)
-    _add_axis(P, ph, 1, half + 1, -uy, tau_s, columns)
-    if dim == 3:
-        _add_axis(P, ph, 2, half + 2, -uz, tau_s, columns)
-    variance = -_along(ph, dim, half, ux, uy, uz, tau_s) - tau_s * ph[rate]
-    for column in range(columns):
-        P[place, column] = ph[column]
+    s.counts[PLACES] = 0
+    range_m = put_direction(s, slot, tau_s, -1.0)
+    put(s, rate, -tau_s)
+    term = project(s)
+    variance = along_h(s, term) + s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE]
     for row in range(states(s)):
-        P[row, place] = ph[row]
-    P[place, place] = variance + s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE]
+        P[row, place] = s.terms[term, row]
+        P[place, row] = s.terms[term, row]
+    P[place, place] = variance
     whole = rx_ticks - tx_ticks - int(np.floor(range_m / TICK_M))
-    x[place] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m
+    s.x[place] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m
     s.slots[slot, WHOLE] = whole
     s.anchors[slot, RANGE] = range_m
 
 
 @borrowing_kernel
-def hear_relay(
-    s: JointArrays, listener: int, slot: int, packet_tx: int, packet_rx: int, relayed_rx: int
-) -> bool:
+def hear_relay(s: JointArrays, listener: int, slot: int, packet_tx: int, packet_rx: int, relayed_rx: int) -> bool:
     """Take the reception, by the anchor ``listener``, of a packet of the anchor ``slot``; False beyond the gate.
 
     S − T = |a_i − a_j| + b_j − b_i + noise of the TX stamp + noise of the reception, when the packet reached anchor i.
-    Both values go back to that moment by their rates; what their oscillators have done since stands in the covariance, and
-    is taken off the gain again. The tag's oscillator cancels.
+    Both values go back to that moment by their rates; what their oscillators have done since stands in the covariance
+    and is taken off the gain again. The tag's oscillator cancels.
     """
-    x, P, ph = s.x, s.P, s.ph
-    dim, half, columns = int(s.settings[DIM]), values(s), width(s)
+    dim, half = int(s.settings[DIM]), values(s)
     distance_m = 0.0
     for axis in range(3):
         distance_m += (s.anchors[slot, axis] - s.anchors[listener, axis]) ** 2
     distance_m = np.sqrt(distance_m)
     age_s = (s.counts[EPOCH] - packet_rx) * TICK_S + (s.anchors[slot, RANGE] - distance_m) / SPEED_OF_LIGHT_MPS
     tau_s = (s.counts[EPOCH] - s.counts[BASE]) * TICK_S - age_s
-    one, other = dim + slot, dim + listener
-    one_rate, other_rate = half + one, half + other
-    for column in range(columns):
-        ph[column] = P[one, column] - P[other, column] + tau_s * (P[one_rate, column] - P[other_rate, column])
-    expected = distance_m + x[one] - x[other] + tau_s * (x[one_rate] - x[other_rate])
+    one, other, noise = dim + slot, dim + listener, s.slots[slot, NOISE]
+    s.counts[PLACES] = 0
+    put(s, one, 1.0)
+    put(s, other, -1.0)
+    put(s, half + one, tau_s)
+    put(s, half + other, -tau_s)
     variance = s.settings[RX_VARIANCE]
-    noise = s.slots[slot, NOISE]
     if noise >= 0 and s.slots[slot, TX] == packet_tx:
-        noise += 2 * half
-        for column in range(columns):
-            ph[column] += P[noise, column]
-        expected += x[noise]
+        put(s, 2 * half + noise, 1.0)
     else:
-        noise = -1
         variance += s.settings[TX_VARIANCE]
-    drift = s.settings[WALK] * age_s * age_s
-    strayed = age_s * s.settings[WHITE] + drift * age_s / 3.0
-    if strayed < SMALL * s.settings[RX_VARIANCE]:
-        rate_since = -0.5 * drift
-        value_since = strayed - 0.5 * drift * age_s - (tau_s + age_s) * rate_since
-        ph[one] -= value_since
-        ph[other] += value_since
-        ph[one_rate] -= rate_since
-        ph[other_rate] += rate_since
-    else:
-        variance += 2.0 * strayed
-    spread = ph[one] - ph[other] + tau_s * (ph[one_rate] - ph[other_rate]) + variance
-    if noise >= 0:
-        spread += ph[noise]
+    term = project(s)
+    variance += _take_back(s, term, one, other, age_s, tau_s)
+    spread = along_h(s, term) + variance
     whole = s.slots[slot, WHOLE] - s.slots[listener, WHOLE]
-    innovation = (relayed_rx - packet_tx - whole) * TICK_M - expected
+    innovation = (relayed_rx - packet_tx - whole) * TICK_M - distance_m - along_x(s)
     accepted = innovation * innovation <= s.settings[GATE] * s.settings[GATE] * spread
     if accepted:
         s.counts[RELAYS_USED] += 1
-        _take(s, innovation, spread)
+        take(s, term, innovation, spread)
     else:
         s.counts[RELAYS_REJECTED] += 1
-    return accepted
+    return bool(accepted)
+
+
+@borrowing_kernel
+def _take_back(s: JointArrays, term: int, one: int, other: int, age_s: float, tau_s: float) -> float:
+    """Take off the gain what two oscillators have done in the last ``age_s``.
+
+    Where that is much, after updates of which the gain knows as well, it is left and counts as so much more variance.
+    """
+    drift = s.settings[WALK] * age_s * age_s
+    strayed = age_s * (s.settings[WHITE] + drift / 3.0)
+    if strayed > SMALL * s.settings[RX_VARIANCE]:
+        return float(2.0 * strayed)
+    half, u = values(s), s.terms
+    rate = -0.5 * drift
+    value = strayed - 0.5 * drift * age_s - (tau_s + age_s) * rate
+    u[term, one] -= value
+    u[term, other] += value
+    u[term, half + one] -= rate
+    u[term, half + other] += rate
+    return 0.0

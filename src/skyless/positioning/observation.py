@@ -30,7 +30,7 @@ class Observation(Struct, frozen=True, gc=False):
     tx_variance_m2: float
     """Variance of the TX time on the master's scale, from the anchor's clock filter."""
     relays: tuple[tuple[int, int, int], ...] = ()
-    """When the anchor heard others: (anchor, sequence number, RX stamp on its own clock, unwrapped); for ``joint`` only."""
+    """When the anchor heard others: (anchor, sequence number, own RX stamp, unwrapped); for ``joint`` only."""
 
 
 class Method(Protocol):

@@ -1,7 +1,8 @@
 """How near ``joint`` comes to the Cramér–Rao bound: matched constant-velocity episodes in the lab.
 
-Each episode lasts two seconds; errors count after each of its last 20 superframes, as the bound does. The filter assumes
-the very noise that the episodes have. Two bounds are given with mesh: of all receptions, and of those that had come in by then.
+Each episode lasts two seconds; errors count after each of its last 20 superframes, as the bound does. The filter
+assumes the very noise that the episodes have. Two bounds are given with mesh: of all receptions, and of those that had
+come in by then.
 """
 
 from concurrent.futures import Executor, ThreadPoolExecutor

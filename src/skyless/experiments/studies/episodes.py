@@ -1,4 +1,4 @@
-"""Episodes of one tag in the lab, simulated to the stamps alone: quick to draw, and of just the noise that bounds assume.
+"""Episodes of one tag in the lab, simulated to the stamps alone: quick to draw, with just the noise of the bounds.
 
 Every oscillator has white and random-walk frequency noise, every TX stamp an error that all who hear the frame
 share, every RX stamp its own. Stamps are whole ticks.
@@ -44,7 +44,9 @@ class Episode(Struct, frozen=True):
     """Place at each frame, shape (frames, 3)."""
 
 
-def draw_episode(draw: Generator, anchors_m: Array, slot_s: float, case: Case, superframes: int = SUPERFRAMES) -> Episode:
+def draw_episode(
+    draw: Generator, anchors_m: Array, slot_s: float, case: Case, superframes: int = SUPERFRAMES
+) -> Episode:
     """Draw one episode: the tag starts in the middle half of the room, one frame of each anchor in a superframe."""
     n = len(anchors_m)
     frames = superframes * n
