@@ -13,7 +13,7 @@ from skyless.air.codec import decode
 from skyless.anchor import Anchor
 from skyless.constants import TICK_M, TICK_RATE_HZ
 from skyless.positioning.fix import NoFixReason
-from skyless.receiver import METHODS, Receiver
+from skyless.receiver import FILTERS, METHODS, Receiver
 from skyless.simulation.impairments import AnchorOutage, Outage
 from skyless.ticks import wrap
 
@@ -69,7 +69,7 @@ def test_cold_start_from_beacons_alone(method, site):
         decode(heard[-1].frame).superframe - decode(heard[0].frame).superframe
     )
     assert first < 5 * superframe_s
-    rate = len(heard) if method == "tracker" else (2 if site is PAIRS else 1) * 1.5 / superframe_s
+    rate = len(heard) if method in FILTERS else (2 if site is PAIRS else 1) * 1.5 / superframe_s
     assert fixes > 0.95 * rate
     assert drops(receiver) == {}
 
@@ -163,7 +163,7 @@ def test_contents_of_fixes(method, site):
     full = fixes[-1]
     assert len(full.anchors) == len(site.anchors)
     assert all(np.isfinite(value) for value in (full.dops.pdop, full.dops.gdop))
-    if method == "tracker":
+    if method in FILTERS:
         assert np.linalg.norm(full.velocity_mps) < 1.0
         assert np.linalg.eigvalsh(full.velocity_covariance[:dims, :dims]).min() > 0.0
     else:

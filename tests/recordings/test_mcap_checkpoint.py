@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from machines.bench import LAB, PAIRS, ROOM, tape
 from skyless.air.reception import Reception
 from skyless.receiver import METHODS, Receiver
-from skyless.recordings.checkpoint import RefusedError, load, save
+from skyless.recordings.checkpoint import FORMAT, RefusedError, load, save
 from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
 from skyless.recordings.checkpoint_writer import write_graph
 
@@ -82,7 +82,7 @@ def test_pickles_are_not_executed():
 
 def test_another_version_is_refused():
     envelope = msgspec.msgpack.decode(save(Receiver()))
-    for change in ({"version": "0.0.1"}, {"format": 2}):
+    for change in ({"version": "0.0.1"}, {"format": 1}):
         assert refusal(msgspec.msgpack.encode(envelope | change)) == "checkpoint-of-another-version"
 
 
@@ -111,7 +111,7 @@ def test_another_version_is_refused():
     ],
 )
 def test_graphs_of_other_things_are_refused(nodes):
-    envelope = {"format": 1, "version": msgspec.msgpack.decode(save(Receiver()))["version"]}
+    envelope = {"format": FORMAT, "version": msgspec.msgpack.decode(save(Receiver()))["version"]}
     try:
         state = msgspec.msgpack.encode({**envelope, "nodes": nodes})
     except OverflowError:

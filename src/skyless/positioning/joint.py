@@ -3,6 +3,7 @@
 The same kernels serve message by message (``JointFilter.hear``) and over arrays (``JointFilter.track``).
 """
 
+from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
@@ -262,6 +263,10 @@ class JointFilter:
         s.site_m[place] = anchor_m
         self._anchors += 1
         return place
+
+    def has_anchors(self, places: Iterable[int]) -> bool:
+        """Whether these places in the table are taken."""
+        return all(type(place) is int and 0 <= place < self._anchors for place in places)
 
     def move_anchor(self, place: int, anchor_m: Vector) -> None:
         """Correct an anchor's position."""

@@ -67,7 +67,7 @@ class JointStart(Acquisition):
                     self._links[observation.anchor, anchor] = link
 
     def _on_one_scale(self, pairs: list[list[Observation]]) -> list[list[Observation]]:
-        """The packets on the scale of the anchor from which most others are reached, or the master's if that is more."""
+        """The packets on the scale of the anchor that reaches most others, or on the master's if that is more."""
         with_master = [pair for pair in pairs if all(packet.tx_ticks_master is not None for packet in pair)]
         if not pairs:
             return with_master

@@ -13,15 +13,18 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.positioning.acquisition import Start
+from skyless.positioning.in_use import AnchorsInUse
+from skyless.positioning.joint import JointFilter
+from skyless.positioning.joint_soundness import is_sound
+from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.observation import Observation
 from skyless.positioning.tracker import PseudorangeTracker
-from skyless.positioning.tracking import Tracking
 from skyless.receiver import Receiver
 from skyless.recordings.checkpoint_graph import Arrays
 from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
 from skyless.recordings.checkpoint_writer import write_graph
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 MAX_BYTES: Final = 1 << 20
 
 
@@ -95,9 +98,14 @@ def _tracker(value: PseudorangeTracker) -> bool:
     return vectors and whole and _floats(value.P, n, n) and _floats(value.settings, 6) and _floats(value.statistics, 4)
 
 
-def _tracking(value: Tracking) -> bool:
-    anchors_m = vars(value)["_anchors_m"]
-    return _floats(anchors_m, len(vars(value)["_anchors"]), 3)
+def _in_use(value: AnchorsInUse) -> bool:
+    return _floats(value.anchors_m, len(value.anchors), 3)
+
+
+def _joint_tracking(value: JointTracking) -> bool:
+    places = vars(value)["_place_of"].values()
+    known = vars(value)["_known_m"].values()
+    return value.filter.has_anchors(places) and all(_floats(place, 3) for place in known)
 
 
 def _receiver(value: Receiver) -> bool:
@@ -108,7 +116,9 @@ _SOUND: Final[Arrays] = {
     Observation: _observation,
     Start: _start,
     PseudorangeTracker: _tracker,
-    Tracking: _tracking,
+    AnchorsInUse: _in_use,
+    JointFilter: is_sound,
+    JointTracking: _joint_tracking,
     Receiver: _receiver,
 }
 """The classes that hold arrays, and whether one's arrays have the shapes that its kernels count on."""

@@ -97,6 +97,13 @@ class _Reader:
     def _tuple(self, _: int, parts: list[int]) -> tuple[object, ...]:
         return tuple(self._all(parts))
 
+    def _named(self, _: int, module: str, name: str, parts: list[int]) -> tuple[object, ...]:
+        kind = _find(module, name)
+        if not issubclass(kind, tuple) or len(getattr(kind, "_fields", ())) != len(parts):
+            raise DamagedGraphError("no named tuple")
+        made: tuple[object, ...] = tuple.__new__(kind, self._all(parts))
+        return made
+
     def _set(self, _: int, parts: list[int]) -> set[object]:
         return {_key(part) for part in self._all(parts)}
 
@@ -162,6 +169,7 @@ _READERS: Final[dict[str, Callable[..., object]]] = {
     "int": _Reader._int,
     "list": _Reader._list,
     "tuple": _Reader._tuple,
+    "named": _Reader._named,
     "set": _Reader._set,
     "frozenset": _Reader._frozenset,
     "deque": _Reader._deque,

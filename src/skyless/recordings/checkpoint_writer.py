@@ -63,6 +63,8 @@ class _Writer:
 
     def _object(self, value: object) -> Node:
         place = _place(type(value))
+        if isinstance(value, tuple):
+            return ["named", *place, self._all(value)]
         if type(value) not in self._arrays and holds_arrays(value):
             raise TypeError(f"{type(value).__qualname__} holds arrays, but nothing says what must hold of them")
         fields = fields_of(value)
