@@ -181,7 +181,7 @@ class Receiver:
     def _read_almanac(self, beacon: Beacon) -> None:
         """Keep the page; another issue, schedule or noise makes the method anew.
 
-        So does another master where the method rests on the master's own stamps; the tracker rides on.
+        So does another master where the method rests on the master's own stamps; the filters ride on.
         """
         book, master = self.almanac, self._followed.master
         if book.hear(beacon.almanac_issue, beacon.page):
@@ -189,7 +189,7 @@ class Receiver:
         elif self._method is not None and master == self._master:
             return
         self._master, self._master_slot = master, book.slot_of(master) or 0
-        made_of = (book.issue, book.schedule, book.noise, None if self._method_name == "tracker" else master)
+        made_of = (book.issue, book.schedule, book.noise, None if self._method_name in FILTERS else master)
         if made_of != self._made_of:
             self._made_of, self._method = made_of, None
             if book.schedule is not None and book.noise is not None:
