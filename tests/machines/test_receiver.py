@@ -71,7 +71,7 @@ def test_cold_start_from_beacons_alone(method, site):
     assert first < 5 * superframe_s
     rate = len(heard) if method in FILTERS else (2 if site is PAIRS else 1) * 1.5 / superframe_s
     assert fixes > 0.95 * rate
-    assert drops(receiver) == {}
+    assert drops(receiver) in ({}, {"outlier": 1})  # one in 16 000 receptions is beyond four standard deviations
 
 
 def test_reasons_from_silence_to_the_first_fix():
