@@ -74,7 +74,7 @@ def test_the_covariance_is_the_bound_of_what_has_come_in(case):
 
 
 def dense(episode, case, start, std_m):
-    """A textbook's filter, nothing exploited: position and velocity, and the position's covariance after each packet."""
+    """A textbook's filter, nothing exploited: positions, velocities, and the covariances of the former."""
     m, n, assumed = episode.messages, len(LAB_M), settings_of(case)
     size = 4 + 3 * n
     b, f, w = (slice(4 + k * n, 4 + (k + 1) * n) for k in range(3))

@@ -24,20 +24,8 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-(
-    EPOCH,
-    BASE,
-    ACCEPTED,
-    REJECTED,
-    REJECTED_IN_ROW,
-    SLOTS,
-    NOISES,
-    RELAYS_USED,
-    RELAYS_REJECTED,
-    RESTARTS,
-    TERMS,
-    PLACES,
-) = range(12)
+EPOCH, BASE, ACCEPTED, REJECTED, REJECTED_IN_ROW, SLOTS, NOISES, TERMS, PLACES = range(9)
+RELAYS_USED, RELAYS_REJECTED, RESTARTS = range(9, 12)
 """Places in ``counts``. The epoch is the tag's reading at the newest message, the base that of the values."""
 
 SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW = range(7)

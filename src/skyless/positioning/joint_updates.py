@@ -46,9 +46,6 @@ REBASE_S: Final = 0.015
 
 SCORE_GAIN: Final = 0.1
 
-SMALL: Final = 0.1
-"""Clock noise above this part of a stamp's variance is no small correction any more."""
-
 
 @borrowing_kernel
 def elapse(s: JointArrays, rx_ticks: int) -> None:
@@ -228,18 +225,23 @@ def join(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> None:
 
 
 @borrowing_kernel
+def _between(s: JointArrays, one: int, other: int) -> float:
+    squared = 0.0
+    for axis in range(3):
+        squared += (s.anchors[one, axis] - s.anchors[other, axis]) ** 2
+    return float(np.sqrt(squared))
+
+
+@borrowing_kernel
 def hear_relay(s: JointArrays, listener: int, slot: int, packet_tx: int, packet_rx: int, relayed_rx: int) -> bool:
     """Take the reception, by the anchor ``listener``, of a packet of the anchor ``slot``; False beyond the gate.
 
     S − T = |a_i − a_j| + b_j − b_i + noise of the TX stamp + noise of the reception, when the packet reached anchor i.
-    Both values go back to that moment by their rates; what their oscillators have done since stands in the covariance
-    and is taken off the gain again. The tag's oscillator cancels.
+    Both values go back to that moment by their rates. What their oscillators have done since counts as noise of the
+    stamp; the tag's oscillator cancels.
     """
     dim, half = int(s.settings[DIM]), values(s)
-    distance_m = 0.0
-    for axis in range(3):
-        distance_m += (s.anchors[slot, axis] - s.anchors[listener, axis]) ** 2
-    distance_m = np.sqrt(distance_m)
+    distance_m = _between(s, listener, slot)
     age_s = (s.counts[EPOCH] - packet_rx) * TICK_S + (s.anchors[slot, RANGE] - distance_m) / SPEED_OF_LIGHT_MPS
     tau_s = (s.counts[EPOCH] - s.counts[BASE]) * TICK_S - age_s
     one, other, noise = dim + slot, dim + listener, s.slots[slot, NOISE]
@@ -253,8 +255,8 @@ def hear_relay(s: JointArrays, listener: int, slot: int, packet_tx: int, packet_
         put(s, 2 * half + noise, 1.0)
     else:
         variance += s.settings[TX_VARIANCE]
+    variance += 2.0 * age_s * (s.settings[WHITE] + s.settings[WALK] * age_s * age_s / 3.0)
     term = project(s)
-    variance += _take_back(s, term, one, other, age_s, tau_s)
     spread = along_h(s, term) + variance
     whole = s.slots[slot, WHOLE] - s.slots[listener, WHOLE]
     innovation = (relayed_rx - packet_tx - whole) * TICK_M - distance_m - along_x(s)
@@ -265,23 +267,3 @@ def hear_relay(s: JointArrays, listener: int, slot: int, packet_tx: int, packet_
     else:
         s.counts[RELAYS_REJECTED] += 1
     return bool(accepted)
-
-
-@borrowing_kernel
-def _take_back(s: JointArrays, term: int, one: int, other: int, age_s: float, tau_s: float) -> float:
-    """Take off the gain what two oscillators have done in the last ``age_s``.
-
-    Where that is much, after updates of which the gain knows as well, it is left and counts as so much more variance.
-    """
-    drift = s.settings[WALK] * age_s * age_s
-    strayed = age_s * (s.settings[WHITE] + drift / 3.0)
-    if strayed > SMALL * s.settings[RX_VARIANCE]:
-        return float(2.0 * strayed)
-    half, u = values(s), s.terms
-    rate = -0.5 * drift
-    value = strayed - 0.5 * drift * age_s - (tau_s + age_s) * rate
-    u[term, one] -= value
-    u[term, other] += value
-    u[term, half + one] -= rate
-    u[term, half + other] += rate
-    return 0.0
