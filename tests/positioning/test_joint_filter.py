@@ -15,7 +15,8 @@ from joint_builders import LAB_M, ROOM_M, SLOT_S, begun, covariance, episode_of,
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.studies.episodes import Case
-from skyless.positioning.joint import JOINED, JointFilter, JointSettings, Messages
+from skyless.positioning.joint import JointFilter, JointSettings, Messages
+from skyless.positioning.joint_hearing import JOINED
 from skyless.positioning.joint_state import (
     BASE,
     EPOCH,

@@ -10,7 +10,8 @@ from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Start
 from skyless.positioning.fix import Fix, NoFixReason, motion_fix
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.in_use import AnchorsInUse
-from skyless.positioning.joint import NO_RELAYS, REJECTED, JointFilter, JointSettings
+from skyless.positioning.joint import NO_RELAYS, JointFilter, JointSettings
+from skyless.positioning.joint_hearing import REJECTED
 from skyless.positioning.joint_start import JointStart
 from skyless.positioning.observation import Observation
 from skyless.positioning.tracking import (

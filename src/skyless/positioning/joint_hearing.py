@@ -1,0 +1,171 @@
+"""``joint``'s way of taking packets: who joins and leaves, what is remembered, one packet or many in a loop."""
+
+from typing import Final
+
+from skyless.compiled import borrowing_kernel
+from skyless.constants import TICK_S
+from skyless.positioning.joint_algebra import settle
+from skyless.positioning.joint_state import (
+    BASE,
+    DIM,
+    DROP_S,
+    EPOCH,
+    IN_ROW,
+    INNOVATION,
+    NOISE,
+    PACKET_RX,
+    PACKET_TX,
+    REMEMBERED,
+    RESTARTS,
+    RX,
+    SEQUENCE,
+    SLOTS,
+    TX,
+    WANTED,
+    Integers,
+    JointArrays,
+    Matrix,
+    Vector,
+    add_noise_state,
+    add_slot,
+    drop_slot,
+    has_room,
+    values,
+)
+from skyless.positioning.joint_time import elapse
+from skyless.positioning.joint_updates import hear_anchor, hear_relay, join, new_packet
+
+FULL, REJECTED, ACCEPTED, JOINED = range(-1, 3)
+"""What became of a packet: no room for its anchor, beyond the gate, taken, or the first of its anchor."""
+
+RELAY_AGE_S: Final = 1.0
+"""Older packets are not relayed, as sequence numbers come around."""
+
+RESTART_M: Final = 300.0
+"""No path is longer than expected by so much: the anchor's counter has jumped, ..."""
+
+RESTART_IN_ROW: Final = 3
+"""... if so many packets in a row say so."""
+
+
+@borrowing_kernel
+def joint_hear(
+    s: JointArrays, site: int, sequence: int, rx_ticks: int, tx_ticks: int, relays: Integers, first: int, last: int
+) -> int:
+    """Take one packet of the anchor ``site`` (place in the table) and what it relays, in the tag's order of time.
+
+    Rows ``first`` to ``last`` of ``relays`` are [the anchor that heard, the anchor that was heard, sequence, RX stamp
+    of the former], anchors by their places in the table; all stamps are unwrapped, each on its own clock.
+    """
+    elapse(s, rx_ticks)
+    if s.counts[BASE] == rx_ticks:
+        _drop_silent(s, rx_ticks)
+    slot = s.slot_of[site]
+    if slot >= 0 and s.slots[slot, IN_ROW] >= RESTART_IN_ROW and abs(s.anchors[slot, INNOVATION]) > RESTART_M:
+        settle(s)
+        drop_slot(s, slot)
+        s.counts[RESTARTS] += 1
+        slot = -1
+    status = FULL
+    if slot >= 0:
+        if s.slots[slot, NOISE] < 0 and s.slots[slot, WANTED] > 0:
+            settle(s)
+            add_noise_state(s, slot)
+        new_packet(s, slot)
+        status = ACCEPTED if hear_anchor(s, slot, rx_ticks, tx_ticks) else REJECTED
+        _remember(s, slot, sequence, rx_ticks, tx_ticks)
+        for relay in range(first, last):
+            _hear_relayed(
+                s, s.slot_of[relays[relay, 0]], s.slot_of[relays[relay, 1]], relays[relay, 2], relays[relay, 3]
+            )
+    elif has_room(s):
+        settle(s)
+        slot = add_slot(s, site)
+        join(s, slot, rx_ticks, tx_ticks)
+        _remember(s, slot, sequence, rx_ticks, tx_ticks)
+        status = JOINED
+    settle(s)
+    return status
+
+
+@borrowing_kernel
+def _remember(s: JointArrays, slot: int, sequence: int, rx_ticks: int, tx_ticks: int) -> None:
+    s.slots[slot, TX] = tx_ticks
+    s.slots[slot, RX] = rx_ticks
+    place = sequence % REMEMBERED
+    s.packets[slot, place, SEQUENCE] = sequence
+    s.packets[slot, place, PACKET_TX] = tx_ticks
+    s.packets[slot, place, PACKET_RX] = rx_ticks
+
+
+@borrowing_kernel
+def _hear_relayed(s: JointArrays, listener: int, slot: int, sequence: int, relayed_rx: int) -> None:
+    """Take a relayed reception once, if the tag has heard that very packet."""
+    place = sequence % REMEMBERED
+    if slot >= 0 and listener >= 0 and slot != listener and s.packets[slot, place, SEQUENCE] == sequence:
+        tx_ticks = s.packets[slot, place, PACKET_TX]
+        rx_ticks = s.packets[slot, place, PACKET_RX]
+        if tx_ticks > s.relayed[listener, slot] and (s.counts[EPOCH] - rx_ticks) * TICK_S < RELAY_AGE_S:
+            s.relayed[listener, slot] = tx_ticks
+            s.slots[slot, WANTED] = 1
+            hear_relay(s, listener, slot, tx_ticks, rx_ticks, relayed_rx)
+
+
+@borrowing_kernel
+def _drop_silent(s: JointArrays, rx_ticks: int) -> None:
+    for slot in range(s.counts[SLOTS] - 1, -1, -1):
+        if (rx_ticks - s.slots[slot, RX]) * TICK_S > s.settings[DROP_S]:
+            settle(s)
+            drop_slot(s, slot)
+
+
+@borrowing_kernel
+def joint_motion(s: JointArrays, x: Vector, P: Matrix) -> None:
+    """Write position and velocity at the newest message, shape (2·dim,), and their covariance."""
+    dim, half = int(s.settings[DIM]), values(s)
+    tau_s = (s.counts[EPOCH] - s.counts[BASE]) * TICK_S
+    for one in range(dim):
+        x[one] = s.x[one] + tau_s * s.x[half + one]
+        x[dim + one] = s.x[half + one]
+        for other in range(dim):
+            rate = s.P[half + one, half + other]
+            cross = s.P[one, half + other] + tau_s * rate
+            P[one, other] = s.P[one, other] + tau_s * (s.P[half + one, other] + cross)
+            P[one, dim + other] = cross
+            P[dim + other, one] = cross
+            P[dim + one, dim + other] = rate
+
+
+@borrowing_kernel
+def joint_track(
+    s: JointArrays,
+    begin: int,
+    sites: Integers,
+    sequences: Integers,
+    rx_ticks: Integers,
+    tx_ticks: Integers,
+    relays: Integers,
+    ends: Integers,
+    motion: Vector,
+    covariance: Matrix,
+    motions: Matrix,
+    variances: Matrix,
+) -> int:
+    """Take packets from ``begin`` on; ``ends[k]`` is where the relays of packet k end. Returns the first not taken.
+
+    Rows k of ``motions`` and ``variances`` become position and velocity after packet k, and the position's
+    covariance; where they have no rows nothing is written.
+    """
+    dim = int(s.settings[DIM])
+    for k in range(begin, len(sites)):
+        first = ends[k - 1] if k > 0 else 0
+        if joint_hear(s, sites[k], sequences[k], rx_ticks[k], tx_ticks[k], relays, first, ends[k]) == FULL:
+            return k
+        if len(motions) > 0:
+            joint_motion(s, motion, covariance)
+            for one in range(2 * dim):
+                motions[k, one] = motion[one]
+            for one in range(dim):
+                for other in range(dim):
+                    variances[k, dim * one + other] = covariance[one, other]
+    return len(sites)
