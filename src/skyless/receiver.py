@@ -27,7 +27,7 @@ from skyless.positioning.observation import Method, Observation
 from skyless.positioning.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.positioning.tracker import TrackerSettings
 from skyless.positioning.tracking import Tracking
-from skyless.ticks import Unwrapper, from_seconds, nearest, to_seconds
+from skyless.ticks import TICK_MASK, WRAP_TICKS, Unwrapper, from_seconds, nearest, to_seconds
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
 FILTERS: Final = ("tracker", "joint")
@@ -296,4 +296,5 @@ class Receiver:
 def _relays(beacon: Beacon, tx_ticks: int) -> tuple[tuple[int, int, int], ...]:
     """When the anchor heard others, as observations have it."""
     heard = beacon.heard if beacon.master_heard is None else (beacon.master_heard, *beacon.heard)
-    return tuple((one.anchor, one.sequence, nearest(one.rx_ticks, tx_ticks)) for one in heard)
+    least = tx_ticks - WRAP_TICKS // 2
+    return tuple((one.anchor, one.sequence, least + ((one.rx_ticks - least) & TICK_MASK)) for one in heard)

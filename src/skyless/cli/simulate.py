@@ -75,7 +75,7 @@ def simulate(
     site
         A site file instead of a named one.
     method
-        literal, literal-delayed, weighted, bracketed or tracker.
+        literal, literal-delayed, weighted, bracketed, tracker or joint.
         Fixes of all but the tracker hold at the master's message that they refer to, but are judged when made.
     position
         Where a tag lies still, x,y or x,y,z in metres; may be given several times.

@@ -44,8 +44,8 @@ class Efficiency(Struct, frozen=True):
     case: Case
     episodes: int
     rmse_m: float
-    rmse_relative_error: float
-    """Standard error of ``rmse_m`` over itself."""
+    ratio_error: float
+    """Standard error of ``ratio``; both errors and bound vary with the path."""
     said_m: float
     """What the filter's covariance says."""
     bound_m: float
@@ -79,12 +79,13 @@ def efficiency(case: Case, episodes: int, seed: int, pool: Executor | None = Non
         parts = list(pool.map(run_chunk, *zip(*chunks, strict=True)))
     rows = np.concatenate(parts)
     squared, said, bound, arrived, nees = rows.mean(axis=0)
+    excess = rows[:, 0] - squared / arrived * rows[:, 3]
     low, high = chi2.ppf([0.005, 0.995], 2 * episodes) / episodes
     return Efficiency(
         case=case,
         episodes=episodes,
         rmse_m=float(np.sqrt(squared)),
-        rmse_relative_error=float(rows[:, 0].std() / np.sqrt(episodes) / squared / 2.0),
+        ratio_error=float(excess.std() / np.sqrt(episodes) / np.sqrt(squared * arrived) / 2.0),
         said_m=float(np.sqrt(said)),
         bound_m=float(np.sqrt(bound)),
         arrived_bound_m=float(np.sqrt(arrived)),
