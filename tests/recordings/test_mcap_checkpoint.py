@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from machines.bench import LAB, PAIRS, ROOM, tape
 from skyless.air.reception import Reception
+from skyless.positioning.joint_state import DIM, NOISE, NOISES, SITE, SLOTS, TERMS
 from skyless.receiver import METHODS, Receiver
 from skyless.recordings.checkpoint import FORMAT, RefusedError, load, save
 from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
@@ -155,3 +156,35 @@ def test_damaged_bytes_are_refused_or_harmless(data):
             assert type(load(damaged)) is Receiver
         except RefusedError as error:
             assert error.reason.startswith("checkpoint-")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda s: s.counts.__setitem__(SLOTS, 9),
+        lambda s: s.counts.__setitem__(SLOTS, -1),
+        lambda s: s.counts.__setitem__(NOISES, 7),
+        lambda s: s.counts.__setitem__(TERMS, 3),
+        lambda s: s.slot_of.__setitem__(0, 5),
+        lambda s: s.slot_of.__setitem__(7, 1 << 40),
+        lambda s: s.slots.__setitem__((2, NOISE), 99),
+        lambda s: s.slots.__setitem__((2, NOISE), -2),
+        lambda s: s.slots.__setitem__((2, SITE), -5),
+        lambda s: s.settings.__setitem__(DIM, 3.0),
+        lambda s: s._replace(P=s.P[:8, :8].copy()),
+        lambda s: s._replace(P=s.P.astype(np.float32)),
+        lambda s: s._replace(relayed=s.relayed[:1].copy()),
+        lambda s: s._replace(x=np.asfortranarray(s.P)),
+        tuple,
+    ],
+)
+def test_joint_filters_that_would_lead_their_kernels_astray_are_refused(change):
+    receiver = Receiver("joint")
+    for one in tape(LAB, 1.0):
+        receiver.hear(one.reception)
+    assert save(load(save(receiver))) == save(receiver)
+    joint = receiver.method.filter
+    changed = change(joint.arrays)
+    if changed is not None:
+        joint.arrays = changed
+    assert refusal(save(receiver)) == "checkpoint-damaged"
