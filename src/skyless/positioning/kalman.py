@@ -7,13 +7,13 @@ absent. All arrays belong to the caller and nothing is allocated.
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import borrowing_kernel
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
 
-@kernel
+@borrowing_kernel
 def predict_motion(x: Vector, P: Matrix, dim: int, dt_s: float, qa: float) -> None:
     """Advance position and velocity; ``qa`` is the acceleration's spectral density in m²/s³ per axis."""
     for axis in range(dim):
@@ -21,7 +21,7 @@ def predict_motion(x: Vector, P: Matrix, dim: int, dt_s: float, qa: float) -> No
         _add_noise(P, axis, dim + axis, dt_s, 0.0, qa)
 
 
-@kernel
+@borrowing_kernel
 def horizontal_variance(P: Matrix, dim: int, dt_s: float, qa: float) -> float:
     """Sum of the variances of x and y that ``predict_motion`` would give, m²."""
     total = 2.0 * qa * dt_s * dt_s * dt_s / 3.0
@@ -30,14 +30,14 @@ def horizontal_variance(P: Matrix, dim: int, dt_s: float, qa: float) -> float:
     return float(total)
 
 
-@kernel
+@borrowing_kernel
 def predict_clock(x: Vector, P: Matrix, offset: int, dt_s: float, white: float, walk: float) -> None:
     """Advance the clock whose offset (m) and rate (m/s) stand at ``offset`` and ``offset + 1``."""
     _shear(x, P, offset, offset + 1, dt_s)
     _add_noise(P, offset, offset + 1, dt_s, white, walk)
 
 
-@kernel
+@borrowing_kernel
 def _shear(x: Vector, P: Matrix, i: int, j: int, dt_s: float) -> None:
     """x_i += dt·x_j, and P accordingly, as F·P·Fᵀ."""
     x[i] += dt_s * x[j]
@@ -48,7 +48,7 @@ def _shear(x: Vector, P: Matrix, i: int, j: int, dt_s: float) -> None:
         P[row, i] += dt_s * P[row, j]
 
 
-@kernel
+@borrowing_kernel
 def _add_noise(P: Matrix, i: int, j: int, dt_s: float, white: float, walk: float) -> None:
     half = walk * dt_s * dt_s / 2.0
     P[i, i] += white * dt_s + walk * dt_s * dt_s * dt_s / 3.0
@@ -57,7 +57,7 @@ def _add_noise(P: Matrix, i: int, j: int, dt_s: float, white: float, walk: float
     P[j, j] += walk * dt_s
 
 
-@kernel
+@borrowing_kernel
 def innovation_variance(P: Matrix, h: Vector, ph: Vector, variance: float) -> float:
     """Fill ``ph`` with P·h and return hᵀ·P·h + variance."""
     n = h.shape[0]
@@ -71,7 +71,7 @@ def innovation_variance(P: Matrix, h: Vector, ph: Vector, variance: float) -> fl
     return total
 
 
-@kernel
+@borrowing_kernel
 def correct(x: Vector, P: Matrix, ph: Vector, innovation: float, spread: float) -> None:
     """Scalar Kalman update with gain ph / spread; the covariance stays exactly symmetric."""
     n = x.shape[0]
@@ -83,7 +83,7 @@ def correct(x: Vector, P: Matrix, ph: Vector, innovation: float, spread: float) 
             P[column, row] = P[row, column]
 
 
-@kernel
+@borrowing_kernel
 def range_and_direction(x: Vector, dim: int, height_m: float, anchor_m: Vector, h: Vector, sign: float) -> float:
     """Range from the state's position to an anchor; adds ``sign`` times its gradient to ``h``.
 

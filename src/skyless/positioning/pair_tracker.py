@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import borrowing_kernel
 from skyless.positioning.kalman import horizontal_variance, innovation_variance, predict_motion, range_and_direction
 from skyless.positioning.tracker import AGILITY, LOST_SHARE, REJECTED_SHARE, gated_correct
 
@@ -41,7 +41,7 @@ class PairSettings(Struct, frozen=True):
         return np.array([self.qa, self.tdoa_std_m**2, self.gate, height_m])
 
 
-@kernel
+@borrowing_kernel
 def pair_update(
     x: Vector,
     P: Matrix,
@@ -68,7 +68,7 @@ def pair_update(
     return gated_correct(x, P, whole, statistics, ph, innovation, spread, settings[SETTING_GATE])
 
 
-@kernel
+@borrowing_kernel
 def track_pairs(
     x: Vector,
     P: Matrix,
@@ -87,7 +87,8 @@ def track_pairs(
     accepted = 0
     for k in range(tdoa_m.shape[0]):
         accepted += pair_update(x, P, whole, statistics, settings, h, ph, a_m[k], b_m[k], dt_s[k], tdoa_m[k])
-        states[k] = x
+        for place in range(x.shape[0]):
+            states[k, place] = x[place]
     return accepted
 
 

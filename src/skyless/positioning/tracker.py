@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import borrowing_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.kalman import (
     correct,
@@ -77,14 +77,14 @@ class TrackerSettings(Struct, frozen=True):
         return np.array([self.qa, self.white, self.walk, self.stamp_variance_m2, self.gate, height_m])
 
 
-@kernel
+@borrowing_kernel
 def tracker_predict(x: Vector, P: Matrix, dim: int, dt_s: float, settings: Vector, qa: float) -> None:
     """Advance the state by ``dt_s`` of master time; ``qa`` is the agility of the moment."""
     predict_motion(x, P, dim, dt_s, qa)
     predict_clock(x, P, 2 * dim, dt_s, settings[SETTING_WHITE], settings[SETTING_WALK])
 
 
-@kernel
+@borrowing_kernel
 def tracker_update(
     x: Vector,
     P: Matrix,
@@ -123,7 +123,7 @@ def tracker_update(
     return accepted
 
 
-@kernel
+@borrowing_kernel
 def gated_correct(
     x: Vector,
     P: Matrix,
@@ -141,7 +141,7 @@ def gated_correct(
     return accepted
 
 
-@kernel
+@borrowing_kernel
 def judge(whole: NDArray[np.int64], statistics: Vector, innovation: float, spread: float, gate: float) -> bool:
     """Whether an innovation lies within the gate; keeps the counts, running means and agility.
 
@@ -166,7 +166,7 @@ def judge(whole: NDArray[np.int64], statistics: Vector, innovation: float, sprea
     return True
 
 
-@kernel
+@borrowing_kernel
 def _rebase(x: Vector, whole: NDArray[np.int64], clock: int) -> None:
     """Move whole ticks of the clock offset into the integer, so that it keeps its precision for months."""
     steps = int(np.floor(x[clock] / TICK_M))
@@ -174,7 +174,7 @@ def _rebase(x: Vector, whole: NDArray[np.int64], clock: int) -> None:
     x[clock] -= steps * TICK_M
 
 
-@kernel
+@borrowing_kernel
 def track(
     x: Vector,
     P: Matrix,
@@ -211,7 +211,8 @@ def track(
             tx_fraction_ticks[k],
             tx_variance_m2[k],
         )
-        states[k] = x
+        for place in range(x.shape[0]):
+            states[k, place] = x[place]
     return accepted
 
 
