@@ -15,6 +15,7 @@ _COMMANDS = (
     ("simulate", "skyless.cli.simulate:app", "Run a site in the simulated world and judge it against the truth."),
     ("replay", "skyless.cli.replay:app", "Turn a recording into fixes and judge them against the truth."),
     ("paper", "skyless.cli.paper:app", "Reproduce the paper's figures and claims in one report."),
+    ("study", "skyless.cli.study:app", "Measure the receiver's errors over many simulated runs."),
     ("plan", "skyless.cli.plan:app", "Predict a site's errors before it is mounted, and place its anchors."),
     ("site", "skyless.cli.site:app", "Write and check site files."),
     ("broker", "skyless.cli.broker:app", "Run the MQTT broker that comes with Skyless."),

@@ -77,7 +77,12 @@ def efficiency(case: Case, episodes: int, seed: int, pool: Executor | None = Non
             parts = list(own.map(run_chunk, *zip(*chunks, strict=True)))
     else:
         parts = list(pool.map(run_chunk, *zip(*chunks, strict=True)))
-    rows = np.concatenate(parts)
+    return summary(case, np.concatenate(parts))
+
+
+def summary(case: Case, rows: Array) -> Efficiency:
+    """What episodes come to; a row for each of them, as ``run_chunk`` gives it."""
+    episodes = len(rows)
     squared, said, bound, arrived, nees = rows.mean(axis=0)
     excess = rows[:, 0] - squared / arrived * rows[:, 3]
     low, high = chi2.ppf([0.005, 0.995], 2 * episodes) / episodes

@@ -1,0 +1,116 @@
+"""What ``skyless study`` writes: the table, the JSON, pictures and files."""
+
+import csv
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from skyless.cli.output import console, print_json, to_json, write_atomically
+from skyless.cli.replay_output import see_that_it_can_be_drawn
+from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from skyless.experiments.studies.plan import Plan, Row, Study
+
+WIDEST = 160
+"""Columns of a table that is not shown on a terminal."""
+
+
+def see_that_it_can_be_written(plot: Path | None, out: Path | None) -> None:
+    """Look at --plot and --out before the long work, not after it. Raises SkylessError."""
+    see_that_it_can_be_drawn(plot)
+    if out is None:
+        return
+    if out.exists() and not out.is_dir():
+        raise SkylessError(f"--out is {str(out)!r}, which is a file; it should be a folder, or not exist yet")
+    place = next(folder for folder in (out, *out.absolute().parents) if folder.is_dir())
+    if not os.access(place, os.W_OK):
+        raise SkylessError(f"--out is {str(out)!r}, where no folder can be written")
+
+
+def write(study: "Study", rows: "Sequence[Row]", plot: Path | None, out: Path | None) -> None:
+    """Write the files that were asked for, each whole or not at all. Raises SkylessError."""
+    if plot is None and out is None:
+        return
+    from skyless.experiments.figures import picture
+
+    figure = study.draw(rows)
+    files = {} if plot is None else {plot: plot.suffix.removeprefix(".")}
+    try:
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            files |= {out / f"{study.name}.{kind}": kind for kind in ("png", "svg")}
+            write_atomically(out / f"{study.name}.json", to_json(rows).encode())
+            write_atomically(out / f"{study.name}.csv", _csv(rows).encode())
+        for path, kind in files.items():
+            write_atomically(path, picture(figure, kind))
+    except OSError as error:
+        raise SkylessError(f"{error.filename or plot or out} cannot be written: {error.strerror}") from None
+
+
+def _csv(rows: "Sequence[Row]") -> str:
+    text = io.StringIO()
+    table = csv.writer(text)
+    table.writerow(rows[0].__struct_fields__)
+    for row in rows:
+        values = ["" if value is None else value for value in msgspec.structs.astuple(row)]
+        table.writerow([" ".join(map(str, value)) if isinstance(value, tuple) else value for value in values])
+    return text.getvalue()
+
+
+def print_rows(study: "Study", plan: "Plan", rows: "Sequence[Row]", wall_s: float, *, json: bool) -> None:
+    """Tell what came out."""
+    if json:
+        told = {"study": study.name, "simulated": True, **msgspec.to_builtins(plan), "wall_s": wall_s, "rows": rows}
+        print_json(told)
+        return
+    out = console()
+    out.print(_table(study, plan, rows))
+    out.print(
+        "simulated; ± standard errors; NEES per dimension, with the 99 % interval of fixes that tell their errors"
+    )
+
+
+def _table(study: "Study", plan: "Plan", rows: "Sequence[Row]") -> "Table":
+    from rich.table import Table
+
+    table = Table(title=f"{study.title}: {plan.method}, seed {plan.seed}")
+    heads = ("case", "RMSE/cm", "95 %", "max", "said", "NEES", "99 %", "fixes", "ratio", "limit", "CPU/µs")
+    cells = [_cells(row) for row in rows]
+    used = [column for column in range(len(heads)) if any(line[column] for line in cells)]
+    for column in used:
+        table.add_column(heads[column], justify="left" if column == 0 else "right", no_wrap=True)
+    for line in cells:
+        table.add_row(*(line[column] for column in used))
+    return table
+
+
+def _cells(row: "Row") -> tuple[str, ...]:
+    verdict = "" if row.limit is None else f"{row.limit:g} {'held' if row.passed else 'missed'}"
+    interval = "" if row.nees_interval is None else f"{row.nees_interval[0]:.2f}–{row.nees_interval[1]:.2f}"
+    return (
+        row.case,
+        _number(row.rmse_m, 100.0, row.rmse_error_m),
+        _number(row.p95_m, 100.0),
+        _number(row.max_m, 100.0),
+        _number(row.said_m, 100.0),
+        _number(row.nees),
+        interval,
+        "" if row.available is None else f"{100.0 * row.available:.1f} %",
+        _number(row.ratio, 1.0, row.ratio_error, 3),
+        verdict,
+        "" if row.cpu_us_per_message is None else f"{row.cpu_us_per_message:.0f}",
+    )
+
+
+def _number(value: float | None, factor: float = 1.0, error: float | None = None, digits: int = 2) -> str:
+    if value is None:
+        return ""
+    after = "" if error is None else f" ± {factor * error:.{digits}f}"
+    return f"{factor * value:.{digits}f}{after}"

@@ -1,0 +1,47 @@
+"""The studies by name."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Final
+
+from skyless.experiments.studies import efficiency_rows, loss, motion, nlos, scale, sync
+from skyless.experiments.studies.picture import Look, draw
+from skyless.experiments.studies.plan import Cell, Plan, Row, Study
+from skyless.experiments.studies.summary import Case, world_cells, world_rows
+
+
+def _of_worlds(name: str, title: str, cases: Callable[[Plan], list[Case]], look: Look) -> Study:
+    def cells(plan: Plan) -> list[Cell]:
+        return world_cells(cases(plan))
+
+    def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
+        return world_rows(name, plan, cases(plan), results)
+
+    return Study(name, title, cells, rows, partial(draw, look))
+
+
+STUDIES: Final = {
+    study.name: study
+    for study in (
+        Study(
+            "efficiency",
+            "RMSE over the Cramér–Rao bound",
+            efficiency_rows.cells,
+            efficiency_rows.rows,
+            partial(draw, Look("RMSE over the Cramér–Rao bound", ("ratio", "nees"))),
+        ),
+        _of_worlds("loss", "lost messages", loss.cases, Look("Lost messages", ("rmse", "nees"), x="share lost")),
+        _of_worlds("nlos", "late messages", nlos.cases, Look("Late messages", ("rmse", "nees"))),
+        _of_worlds("motion", "motion", motion.cases, Look("Speed and turns at 3 m/s²", ("rmse", "nees"))),
+        _of_worlds(
+            "sync",
+            "synchronisation",
+            sync.cases,
+            Look("Synchronisation", ("rmse", "nees"), x="superframe in ms", log=True),
+        ),
+        _of_worlds(
+            "scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), x="number of", log=True)
+        ),
+    )
+}
+"""``integrity`` belongs here as well when there are protection levels to study."""
