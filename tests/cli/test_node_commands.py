@@ -1,8 +1,13 @@
 """What the commands of a running site say to wrong input, before anything starts."""
 
+from pathlib import Path
+
 import pytest
 
+from skyless.cli.demo_screen import _subscriber
 from skyless.cli.main import main
+from skyless.nodes.ports import any_port
+from skyless.outputs.address import MqttAddress
 
 
 @pytest.mark.parametrize(
@@ -25,3 +30,22 @@ from skyless.cli.main import main
 def test_wrong_input_is_told_with_what_would_be_right(command, right, capsys):
     assert main(command.split()) == 2
     assert right in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        (MqttAddress("127.0.0.1", 1884), "mosquitto_sub -p 1884"),
+        (MqttAddress("hall", 1883, user="a b"), "mosquitto_sub -h hall -p 1883 -u 'a b' -P \"$SKYLESS_MQTT_PASSWORD\""),
+        (MqttAddress("hall", 8883, tls=True, ca=Path("c.pem")), "mosquitto_sub -h hall -p 8883 --cafile c.pem"),
+        (MqttAddress("hall", 8883, tls=True), "mosquitto_sub -h hall -p 8883 --tls-use-os-certs"),
+    ],
+)
+def test_the_demo_tells_how_to_watch_its_broker(address, words):
+    assert _subscriber(address) == words
+
+
+def test_a_recorder_that_found_no_site_says_so_with_its_exit_code(tmp_path, capsys):
+    broker = f"mqtt://127.0.0.1:{any_port('127.0.0.1')}"
+    assert main(["record", str(tmp_path / "a.mcap"), "--mqtt", broker, "--duration", "0.2"]) == 1
+    assert "nothing was recorded" in capsys.readouterr().out

@@ -2,10 +2,12 @@
 
 import sys
 import time
+from shlex import quote
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from skyless.cli.output import console
+from skyless.outputs.address import PASSWORD_VARIABLE
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
 
     from skyless.nodes.watch import Watch, Watched
     from skyless.nodes.whole_site import SiteRun, WholeSite
+    from skyless.outputs.address import MqttAddress
 
 
 class Screen:
@@ -43,7 +46,8 @@ class Screen:
         """Say where to look; on standard error when standard output is for a program."""
         whole = self._whole
         lines = [f"page      {whole.page}", f"broker    {whole.address}"]
-        lines.append(f"fixes     mosquitto_sub -p {whole.address.port if whole.address else 1883} -t 'skyless/v1/#' -v")
+        if whole.address is not None:
+            lines.append(f"fixes     {_subscriber(whole.address)} -t 'skyless/v1/#' -v")
         lines.append(f"air       --radio ether:127.0.0.1:{whole.ether_port}, for tags and anchors of your own")
         if asked.record is not None:
             lines.append(f"recording {asked.record}")
@@ -92,8 +96,8 @@ class Screen:
             speed = None if fix.velocity_mps is None else sum(v * v for v in fix.velocity_mps) ** 0.5
             table.add_row(
                 name,
-                f"{fix.position_m[0]:.3f}",
-                f"{fix.position_m[1]:.3f}",
+                f"{fix.position_m[0]:.2f}",
+                f"{fix.position_m[1]:.2f}",
                 _number(speed, "{:.2f}"),
                 _number(tag.error_m, "{:.1f}", 100.0),
                 f"{100 * fix.std_m:.1f}",
@@ -182,6 +186,19 @@ class Screen:
             f"{told['updates_per_s']:.0f} updates per second and tag, "
             f"99 % of fixes within {1e3 * (told['fix_latency_p99_s'] or 0.0):.1f} ms of the frame"
         )
+
+
+def _subscriber(address: "MqttAddress") -> str:
+    """How to watch this broker with mosquitto's program."""
+    words = ["mosquitto_sub"]
+    if address.host != "127.0.0.1":
+        words.append(f"-h {address.host}")
+    words.append(f"-p {address.port}")
+    if address.user is not None:
+        words.append(f'-u {quote(address.user)} -P "${PASSWORD_VARIABLE}"')
+    if address.tls:
+        words.append("--tls-use-os-certs" if address.ca is None else f"--cafile {quote(str(address.ca))}")
+    return " ".join(words)
 
 
 def _number(value: float | None, form: str, scale: float = 1.0) -> str:

@@ -74,7 +74,7 @@ def record(
         finally:
             out.close()
     _report(path, found[0].state() if found else None, json=json)
-    return 1 if out.failed else 0
+    return 1 if out.failed or not found else 0
 
 
 async def _record(

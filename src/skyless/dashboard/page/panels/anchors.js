@@ -49,7 +49,14 @@ export function show() {
   parts.rows.show([...ids].map((id) => [id, id]));
   parts.detail.show(state.selection.anchor);
   split(parts.panel, parts.box, !parts.detail.element.hidden);
-  parts.nodeRows.show(state.health.nodes.map((node) => [`${node.kind}/${node.name}`, node]));
+  const nodes = [...state.health.nodes].sort(livingFirst);
+  parts.nodeRows.show(nodes.map((node) => [`${node.kind}/${node.name}`, node]));
+}
+
+/** Those that are gone, maybe since long, come last. */
+function livingFirst(a, b) {
+  const order = b.online - a.online || a.kind.localeCompare(b.kind);
+  return order || String(a.name).localeCompare(String(b.name), undefined, { numeric: true });
 }
 
 function makeRow(id) {
