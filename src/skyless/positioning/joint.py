@@ -11,7 +11,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.positioning.joint_hearing import FULL, joint_hear, joint_motion, joint_track
+from skyless.positioning.joint_hearing import FULL, joint_motion, joint_step, joint_track
 from skyless.positioning.joint_state import (
     BASE,
     EPOCH,
@@ -131,12 +131,18 @@ class JointFilter:
         s.statistics[:] = (1.0, s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE], 0.0, 1.0)
 
     def hear(self, site: int, sequence: int, rx_ticks: int, tx_ticks: int, relays: Integers = NO_RELAYS) -> int:
-        """Take one packet (``joint_hear``)."""
-        status = joint_hear(self.arrays, site, sequence, rx_ticks, tx_ticks, relays, 0, len(relays))
+        """Take one packet (``joint_hear``); leaves what ``motion`` returns in ``newest``."""
+        packet = (site, sequence, rx_ticks, tx_ticks, relays, *self.newest)
+        status = joint_step(tuple(self.arrays), *packet)
         if status == FULL:
             self._extend()
-            status = joint_hear(self.arrays, site, sequence, rx_ticks, tx_ticks, relays, 0, len(relays))
+            status = joint_step(tuple(self.arrays), *packet)
         return status
+
+    @property
+    def newest(self) -> tuple[Vector, Matrix]:
+        """What ``motion`` returns, as of the last packet that ``hear`` took."""
+        return self._motion, self._covariance
 
     def track(self, messages: Messages, motions: Matrix | None = None, variances: Matrix | None = None) -> None:
         """Take many packets in one loop; the arithmetic is that of ``hear``, so the states are its, bit for bit.

@@ -1,6 +1,8 @@
 """``joint``'s way of taking packets: who joins and leaves, what is remembered, one packet or many in a loop."""
 
-from typing import Final
+from typing import Any, Final
+
+from numpy.typing import NDArray
 
 from skyless.compiled import borrowing_kernel
 from skyless.constants import TICK_S
@@ -134,6 +136,24 @@ def joint_motion(s: JointArrays, x: Vector, P: Matrix) -> None:
             P[one, dim + other] = cross
             P[dim + other, one] = cross
             P[dim + one, dim + other] = rate
+
+
+@borrowing_kernel
+def joint_step(
+    arrays: tuple[NDArray[Any], ...],
+    site: int,
+    sequence: int,
+    rx_ticks: int,
+    tx_ticks: int,
+    relays: Integers,
+    motion: Vector,
+    covariance: Matrix,
+) -> int:
+    """``joint_hear`` and ``joint_motion`` in one call from Python, which hands over a plain tuple in half the time."""
+    s = JointArrays(*arrays)
+    status = joint_hear(s, site, sequence, rx_ticks, tx_ticks, relays, 0, len(relays))
+    joint_motion(s, motion, covariance)
+    return status
 
 
 @borrowing_kernel

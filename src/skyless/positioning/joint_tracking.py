@@ -143,7 +143,7 @@ class JointTracking:
 
     def _fix(self, observation: Observation) -> Fix | NoFixReason:
         height_m, in_use = self._settings.height_m, self._in_use
-        x, P = self._filter.motion()
+        x, P = self._filter.newest
         if height_m is None and P[2, 2] > in_use.extent_m**2:
             return NoFixReason.BAD_GEOMETRY
         rx_ticks = observation.rx_ticks_tag
