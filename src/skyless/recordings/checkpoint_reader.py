@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import astuple
 
 from skyless.recordings.checkpoint_graph import PLAIN, Arrays, Node, holds_arrays, is_ours
 
@@ -200,8 +201,10 @@ def _dtype(name: str) -> np.dtype[Any]:
 
 
 def _key(value: object) -> object:
-    """A key whose hash takes no time that somebody could abuse: plain, or a tuple of plain values."""
+    """A key whose hash takes no time that somebody could abuse: plain, or a tuple or frozen struct of plain values."""
     parts = value if type(value) is tuple else (value,)
+    if isinstance(value, Struct) and value.__struct_config__.frozen:
+        parts = astuple(value)
     if not all(isinstance(part, _KEYS) for part in parts):
         raise DamagedGraphError("no key")
     return value
