@@ -1,5 +1,8 @@
 """What the commands of a running site say to wrong input, before anything starts."""
 
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -49,3 +52,13 @@ def test_a_recorder_that_found_no_site_says_so_with_its_exit_code(tmp_path, caps
     broker = f"mqtt://127.0.0.1:{any_port('127.0.0.1')}"
     assert main(["record", str(tmp_path / "a.mcap"), "--mqtt", broker, "--duration", "0.2"]) == 1
     assert "nothing was recorded" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_program_that_is_asked_to_end_does_so_as_planned(number):
+    command = (sys.executable, "-m", "skyless.cli.main", "ether", "--mqtt", "none", "--listen", "0")
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as program:
+        assert "ether at" in program.stderr.readline()
+        program.send_signal(number)
+        assert program.wait(timeout=10) == 0
+        assert not program.stderr.read()

@@ -1,5 +1,6 @@
 """``skyless anchor``: anchors as a program."""
 
+import contextlib
 from pathlib import Path
 from typing import Annotated
 
@@ -53,4 +54,5 @@ def anchor(
     radios = open_radios(radio, "anchor", tuple(map(str, ids)))
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
     compile_kernels()
-    run(Anchors(plan, radios, address, say, simulated=is_simulated(radio), floor_plan=image).run(), punctual=True)
+    with contextlib.suppress(KeyboardInterrupt):
+        run(Anchors(plan, radios, address, say, simulated=is_simulated(radio), floor_plan=image).run(), punctual=True)

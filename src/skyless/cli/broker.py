@@ -61,9 +61,10 @@ def broker(
 
 async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
     from skyless.nodes.broker import start_broker
+    from skyless.nodes.loop import ending_signals
 
     stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, *ending_signals()):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     async with await start_broker(settings) as running:
         if json:

@@ -1,5 +1,6 @@
 """``skyless ether``: the emulated air."""
 
+import contextlib
 from typing import Annotated
 
 from cyclopts import App, Parameter
@@ -68,6 +69,7 @@ def ether(
     bodies = {f"tag{number}": path for number, path in enumerate(patrols(plan, tags, speed), start=1)}
     emulated = Ether(plan, bodies, impairments_of(request, plan), seed)
     try:
-        run(Air(emulated, host, DEFAULT_PORT if port is None else port, address, say).run(), punctual=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            run(Air(emulated, host, DEFAULT_PORT if port is None else port, address, say).run(), punctual=True)
     except OSError as error:
         raise SkylessError(f"--listen is {listen!r}, which cannot be used: {error.strerror or error}") from None

@@ -1,5 +1,6 @@
 """``skyless tag``: tags as a program."""
 
+import contextlib
 import re
 from typing import Annotated
 
@@ -68,4 +69,5 @@ def tag(
     radios = open_radios(radio, "tag", names)
     compile_kernels(method)
     settings = TagSettings(method=method, qa=qa, site=site_id, publish_hz=publish_hz)
-    run(Tags(settings, radios, address, say).run(), punctual=True)
+    with contextlib.suppress(KeyboardInterrupt):
+        run(Tags(settings, radios, address, say).run(), punctual=True)

@@ -15,6 +15,7 @@ from skyless.dashboard.app import DEAD_S, Parts, make_app
 from skyless.dashboard.guard import Rules
 from skyless.errors import SkylessError
 from skyless.nodes.find_site import find_site
+from skyless.nodes.loop import ending_signals
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
 
@@ -81,7 +82,7 @@ def _bind(host: str, port: int) -> socket.socket:
 
 
 async def serve(parts: Parts, rules: Rules, sock: socket.socket, address: MqttAddress, site_id: int | None) -> None:
-    """Serve pages until SIGINT or SIGTERM."""
+    """Serve pages until Ctrl-C, SIGTERM or SIGHUP."""
     config = uvicorn.Config(
         make_app(parts, rules),
         lifespan="off",
@@ -100,7 +101,7 @@ async def serve(parts: Parts, rules: Rules, sock: socket.socket, address: MqttAd
     server = _Server(config)
     work = [asyncio.create_task(_follow(parts, address, site_id)), asyncio.create_task(parts.live.run())]
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, *ending_signals()):
         loop.add_signal_handler(number, _stop, server, parts)
     serving = asyncio.create_task(server.serve(sockets=[sock]))
     try:

@@ -18,7 +18,7 @@ PUNCTUAL_NICE: Final = -10
 
 
 def run(main: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
-    """Run a program until it ends, SIGTERM or Ctrl-C comes; the last two cancel it.
+    """Run a program until it ends, SIGTERM, SIGHUP or Ctrl-C comes; these cancel it.
 
     ``punctual``: ask the system to prefer it to others, because a radio's slots do not wait.
 
@@ -42,8 +42,15 @@ def _new_loop() -> asyncio.AbstractEventLoop:
 async def _until_terminated(main: Coroutine[Any, Any, None]) -> None:
     task = asyncio.ensure_future(main)
     with contextlib.suppress(NotImplementedError):
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+        for number in ending_signals():
+            asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     await task
+
+
+def ending_signals() -> tuple[signal.Signals, ...]:
+    """What asks a program to end besides Ctrl-C: SIGTERM, and that of a closed terminal, but under ``nohup``."""
+    left_alone = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return (signal.SIGTERM,) if left_alone else (signal.SIGTERM, signal.SIGHUP)
 
 
 def end_with_parent(by: signal.Signals = signal.SIGTERM) -> Callable[[], None] | None:
