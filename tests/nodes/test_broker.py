@@ -19,8 +19,8 @@ from skyless.errors import SkylessError
 from skyless.nodes import broker_place
 from skyless.nodes.broker import start_broker
 from skyless.nodes.broker_settings import BrokerSettings
-from skyless.outputs.connection import check_broker
 from skyless.outputs.link import Link
+from skyless.outputs.reaching import check_broker
 
 BROKER = (sys.executable, "-m", "skyless.cli.main", "broker")
 

@@ -7,8 +7,8 @@ import pytest
 
 from skyless.errors import SkylessError
 from skyless.outputs.address import MqttAddress
-from skyless.outputs.connection import check_broker, open_connection
 from skyless.outputs.paho_client import Introduction
+from skyless.outputs.reaching import check_broker, open_connection
 
 
 @contextlib.asynccontextmanager

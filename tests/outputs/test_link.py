@@ -14,9 +14,9 @@ from mqtt_brokers import free_port, running, stopped, until
 from skyless.errors import SkylessError
 from skyless.outputs import connection
 from skyless.outputs.address import MqttAddress
-from skyless.outputs.connection import check_broker
 from skyless.outputs.link import Link
 from skyless.outputs.messages import StatusMessage, Zone, ZonesMessage
+from skyless.outputs.reaching import check_broker
 from skyless.outputs.topics import fix_topic, receptions_topic, status_topic, zones_topic
 
 ZONES = ZonesMessage((Zone("z1", "door", ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0))),))

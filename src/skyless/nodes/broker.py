@@ -18,7 +18,7 @@ from skyless.nodes.broker_settings import BrokerSettings, configuration
 from skyless.nodes.children import end
 from skyless.nodes.loop import end_with_parent
 from skyless.outputs.address import MqttAddress
-from skyless.outputs.connection import check_broker
+from skyless.outputs.reaching import check_broker
 
 _START_S: Final = 20.0
 _LOOK_S: Final = 0.02

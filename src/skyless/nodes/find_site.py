@@ -6,8 +6,9 @@ from collections.abc import Callable
 from typing import Final
 
 from skyless.outputs.address import MqttAddress
-from skyless.outputs.connection import Reactions, RefusedError, open_connection, trouble_with
+from skyless.outputs.connection import Reactions, RefusedError
 from skyless.outputs.paho_client import Introduction
+from skyless.outputs.reaching import open_connection, trouble_with
 from skyless.outputs.topics import EVERY_SITE, site_topic
 
 _KEEPALIVE_S: Final = 10

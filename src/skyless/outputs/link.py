@@ -16,10 +16,11 @@ from paho.mqtt.client import topic_matches_sub
 
 import skyless
 from skyless.outputs.address import MqttAddress
-from skyless.outputs.connection import Connection, Reactions, RefusedError, open_connection, trouble_with
+from skyless.outputs.connection import Connection, Reactions, RefusedError
 from skyless.outputs.messages import Counters, StatusMessage
 from skyless.outputs.outbox import Limits, Outbox
 from skyless.outputs.paho_client import Introduction, Will
+from skyless.outputs.reaching import open_connection, trouble_with
 from skyless.outputs.topics import status_topic
 
 Handler = Callable[[str, bytes], None]
