@@ -27,7 +27,7 @@ from skyless.positioning.observation import Method, Observation
 from skyless.positioning.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.positioning.tracker import TrackerSettings
 from skyless.positioning.tracking import Tracking
-from skyless.ticks import TICK_MASK, WRAP_TICKS, Unwrapper, from_seconds, nearest, to_seconds
+from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, Unwrapper, from_seconds, to_seconds
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
 FILTERS: Final = ("tracker", "joint")
@@ -87,6 +87,7 @@ class Receiver:
         self._method: Method | None = None
         self._made_of: object = None
         self._schedule: Schedule | None = None
+        self._superframe_ticks = 0
         self._followed = FollowedMaster()
         self._master: int | None = None
         self._master_slot = 0
@@ -151,7 +152,7 @@ class Receiver:
     def _is_of_this_reign(self, beacon: Beacon, rx_ticks: int) -> bool:
         """Whether a beacon goes by the present master, not by one that is no more."""
         self._site_heard_ticks = rx_ticks
-        if self._followed.hear(beacon, rx_ticks, self._schedule.superframe_ticks if self._schedule else 0):
+        if self._followed.hear(beacon, rx_ticks, self._superframe_ticks):
             return True
         self.counters["stale-master"] += 1
         return False
@@ -194,6 +195,7 @@ class Receiver:
             self._made_of, self._method = made_of, None
             if book.schedule is not None and book.noise is not None:
                 self._schedule = schedule_from_page(book.schedule)
+                self._superframe_ticks = self._schedule.superframe_ticks
                 self._method = self._new_method()
 
     def _new_method(self) -> Method:
@@ -240,6 +242,11 @@ class Receiver:
     ) -> Observation:
         heard = beacon.master_heard if beacon.master == self._master else None
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
+        master_sequence = master_rx_ticks = None
+        if heard is not None:
+            least = tx_ticks - HALF_WRAP_TICKS
+            master_sequence, master_rx_ticks = heard.sequence, least + ((heard.rx_ticks - least) & TICK_MASK)
+            variance_m2 *= self._repeats(beacon.anchor, heard) ** 2
         return Observation(
             beacon.anchor,
             anchor_m,
@@ -247,11 +254,11 @@ class Receiver:
             beacon.sequence,
             rx_ticks,
             tx_ticks,
-            None if heard is None else heard.sequence,
-            None if heard is None else nearest(heard.rx_ticks, tx_ticks),
+            master_sequence,
+            master_rx_ticks,
             ticks_master,
             fraction,
-            variance_m2 if heard is None else variance_m2 * self._repeats(beacon.anchor, heard) ** 2,
+            variance_m2,
             _relays(beacon, tx_ticks) if self._method_name == "joint" else (),
         )
 
@@ -262,14 +269,20 @@ class Receiver:
         of this number (``docs/maths.md`` section 6).
         """
         last, count = self._synchronised.get(anchor, (heard, 0))
-        count = min(count + 1, MOST_REPEATS) if last == heard else 1
+        if last.rx_ticks != heard.rx_ticks or last != heard:
+            count = 1
+        elif count < MOST_REPEATS:
+            count += 1
         self._synchronised[anchor] = (heard, count)
         return count
 
     def _round(self, beacon: Beacon, schedule: Schedule) -> int:
         """Round of a frame, counted from the master's slot: what follows a frame of the master refers to it."""
-        superframe, slot = divmod(beacon.superframe * schedule.slots + beacon.slot - self._master_slot, schedule.slots)
-        return schedule.round_of(superframe, slot)
+        superframe, slot = beacon.superframe, beacon.slot - self._master_slot
+        if not 0 <= slot < schedule.slots:
+            steps, slot = divmod(slot, schedule.slots)
+            superframe += steps
+        return superframe if schedule.frames_per_node == 1 else schedule.round_of(superframe, slot)
 
     def _master_time(self, beacon: Beacon, rx_ticks: int) -> tuple[int | None, float, float]:
         """TX time on the master's scale: unwrapped whole ticks, fraction, variance in m².
@@ -286,7 +299,8 @@ class Receiver:
         else:
             last_whole, last_rx = self._master_scale
             elapsed = rx_ticks - last_rx
-            whole = nearest(whole, last_whole + elapsed)
+            least = last_whole + elapsed - HALF_WRAP_TICKS
+            whole = least + ((whole - least) & TICK_MASK)
             follow = follow or abs(whole - last_whole - elapsed) <= MAX_DRIFT * elapsed + SLACK_TICKS
         if follow:
             self._master_scale = (whole, rx_ticks)
@@ -296,5 +310,5 @@ class Receiver:
 def _relays(beacon: Beacon, tx_ticks: int) -> tuple[tuple[int, int, int], ...]:
     """When the anchor heard others, as observations have it."""
     heard = beacon.heard if beacon.master_heard is None else (beacon.master_heard, *beacon.heard)
-    least = tx_ticks - WRAP_TICKS // 2
-    return tuple((one.anchor, one.sequence, least + ((one.rx_ticks - least) & TICK_MASK)) for one in heard)
+    least = tx_ticks - HALF_WRAP_TICKS
+    return tuple([(one.anchor, one.sequence, least + ((one.rx_ticks - least) & TICK_MASK)) for one in heard])

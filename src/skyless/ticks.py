@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from skyless.constants import TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
 
 WRAP_TICKS: Final = 1 << TICK_BITS
+HALF_WRAP_TICKS: Final = WRAP_TICKS // 2
 TICK_MASK: Final = WRAP_TICKS - 1
 
 
@@ -71,7 +72,8 @@ class Unwrapper:
         if self._last_ticks is None:
             ticks = counter
         else:
-            ticks = nearest(counter, self._last_ticks + self._elapsed_ticks(host_s), self._bits)
+            expected = self._last_ticks if host_s is None else self._last_ticks + self._elapsed_ticks(host_s)
+            ticks = nearest(counter, expected, self._bits)
             if host_s is None and self._last_host_s is not None:
                 host_s = self._last_host_s + to_seconds(ticks - self._last_ticks)
         self._last_ticks = ticks
@@ -82,8 +84,8 @@ class Unwrapper:
         """Unwrapped ticks of a counter value near the last stamp, without taking it as a stamp."""
         return counter if self._last_ticks is None else nearest(counter, self._last_ticks, self._bits)
 
-    def _elapsed_ticks(self, host_s: float | None) -> int:
-        if host_s is None or self._last_host_s is None:
+    def _elapsed_ticks(self, host_s: float) -> int:
+        if self._last_host_s is None:
             return 0
         return from_seconds(host_s - self._last_host_s)
 

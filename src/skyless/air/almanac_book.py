@@ -96,7 +96,7 @@ class AlmanacBook:
     def _enter(self, page: Page) -> bool:
         place: object = page.anchor if isinstance(page, AnchorPage) else type(page)
         held = self._pages.get(place)
-        if held == page:
+        if held is page or held == page:  # pages come from a cache, so mostly the very same
             if self._doubted:
                 self._doubted.pop(place, None)
             return False

@@ -98,30 +98,30 @@ def decode(frame: bytes) -> Beacon | Malformed:
         return Malformed.TOO_LONG if length > MAX_FRAME_BYTES else Malformed.TOO_SHORT
     if not is_intact(frame):
         return Malformed.BAD_FCS
-    foreign = _foreign(frame)
-    return _decode_version_1(frame) if foreign is None else foreign
+    return _foreign(frame) if length < _BARE_BYTES[0] else _decode_version_1(frame)
 
 
 decode_cached = lru_cache(maxsize=256)(decode)
 """``decode`` that remembers the last 256 frames: for a program that runs many tags which hear the same bytes."""
 
 
-def _foreign(frame: bytes) -> Malformed | None:
-    """Why an intact frame is no beacon of version 1, None if it is one."""
+def _foreign(frame: bytes) -> Malformed:
+    """Why an intact frame is no beacon of version 1, where it is none."""
     if len(frame) < _START.size + _FCS_BYTES:
         return Malformed.NOT_A_BEACON
     control, _, _, destination, _, magic = _START.unpack_from(frame)
     if control != _FRAME_CONTROL or destination != _BROADCAST or magic & _MAGIC_MASK != _MAGIC:
         return Malformed.NOT_A_BEACON
-    if magic != _VERSION_1:
-        return Malformed.UNKNOWN_VERSION
-    return Malformed.TOO_SHORT if len(frame) < _BARE_BYTES[0] else None
+    return Malformed.UNKNOWN_VERSION if magic != _VERSION_1 else Malformed.TOO_SHORT
 
 
 def _decode_version_1(frame: bytes) -> Beacon | Malformed:
-    (_, sequence, site, _, anchor, _, flags, superframe, slot, tx_low, tx_high, issue, master, term) = (
-        _FIXED.unpack_from(frame)
-    )
+    (
+        control, sequence, site, destination, anchor, magic, flags, superframe, slot, tx_low, tx_high, issue, master,
+        term,
+    ) = _FIXED.unpack_from(frame)  # fmt: skip
+    if control != _FRAME_CONTROL or destination != _BROADCAST or magic != _VERSION_1:
+        return _foreign(frame)
     if flags & _RESERVED_FLAGS:
         return Malformed.BAD_FLAGS
     heard_bytes = len(frame) - _BARE_BYTES[flags]
@@ -166,11 +166,13 @@ def _heard_fault(anchor: int, master: int, master_heard: Heard | None, heard: tu
             f"master_heard is of anchor {master_heard.anchor}; it must be of another than {anchor}, the master {master}"
         )
     seen = {anchor, master}
-    for entry in heard:
-        if entry.anchor in seen:
-            return f"heard repeats anchor {entry.anchor}, or it is the sender or the master"
-        seen.add(entry.anchor)
-    return None
+    expected = len(seen) + len(heard)
+    seen.update([entry.anchor for entry in heard])
+    if len(seen) == expected:
+        return None
+    told = [anchor, master, *(entry.anchor for entry in heard)]
+    twice = next(one for place, one in enumerate(told) if place > 1 and one in told[:place])
+    return f"heard repeats anchor {twice}, or it is the sender or the master"
 
 
 def _body(beacon: Beacon) -> bytes:

@@ -33,8 +33,12 @@ class FollowedMaster:
         master of the same term counts after a superframe and a half without the present one, an older term after three
         superframes and at least half a second. ``superframe_ticks`` is 0 before the schedule is known.
         """
+        present = self.claim
+        if present is not None and beacon.term == present.term and beacon.master == present.master:
+            self._heard_ticks = rx_ticks
+            return True
         claim = claim_of(beacon)
-        if claim == self.claim or self.claim is None:
+        if self.claim is None:
             self.claim, self._heard_ticks = claim, rx_ticks
             return True
         if is_newer(claim.term, self.claim.term):

@@ -1,11 +1,13 @@
 """What every positioning method returns."""
 
 from enum import StrEnum
+from math import sqrt
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from skyless.compiled import borrowing_kernel
 from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED, RESTLESS_CHI2
 from skyless.uncertainty.dop import Dops, dilution_of_precision
 
@@ -76,28 +78,36 @@ def motion_fix(
     a tag more agile than the filter assumes, the covariances are scaled by its square: most of an innovation is the
     stamps' noise, so the state errs by more than the innovations tell (``docs/maths.md`` section 6).
     """
-    chi2 = float(statistics[CHI2])
+    chi2: float = statistics.item(CHI2)
     scale = chi2**2 if chi2 > RESTLESS_CHI2 else 1.0
-    dim = 3 if height_m is None else 2
-    position, velocity = np.zeros(3), np.zeros(3)
-    covariance, velocity_covariance = np.zeros((3, 3)), np.zeros((3, 3))
-    position[:dim] = x[:dim]
-    velocity[:dim] = x[dim : 2 * dim]
-    covariance[:dim, :dim] = scale * P[:dim, :dim]
-    velocity_covariance[:dim, :dim] = scale * P[dim : 2 * dim, dim : 2 * dim]
-    if height_m is not None:
-        position[2] = height_m
+    rows = np.zeros((8, 3))
+    if height_m is None:
+        _fill(rows, x, P, 3, scale)
+    else:
+        _fill(rows, x, P, 2, scale)
+        rows[0, 2] = height_m
     return Fix(
         time_s=time_s,
-        position_m=position,
-        covariance_m2=covariance,
-        velocity_mps=velocity,
-        velocity_covariance=velocity_covariance,
+        position_m=rows[0],
+        covariance_m2=rows[2:5],
+        velocity_mps=rows[1],
+        velocity_covariance=rows[5:],
         anchors=anchors,
         anchors_m=anchors_m,
         chi2=chi2,
         dof=1,
-        residual_rms_m=float(np.sqrt(statistics[RESIDUAL_SQUARED])),
+        residual_rms_m=sqrt(statistics.item(RESIDUAL_SQUARED)),
         method=method,
         height_known=height_m is not None,
     )
+
+
+@borrowing_kernel
+def _fill(rows: NDArray[np.float64], x: NDArray[np.float64], P: NDArray[np.float64], dim: int, scale: float) -> None:
+    """Write position, velocity and the covariance of either, shape (8, 3): one array costs less than four."""
+    for one in range(dim):
+        rows[0, one] = x[one]
+        rows[1, one] = x[dim + one]
+        for other in range(dim):
+            rows[2 + one, other] = scale * P[one, other]
+            rows[5 + one, other] = scale * P[dim + one, dim + other]
