@@ -8,6 +8,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.compiled import borrowing_kernel
+from skyless.positioning.protection import Alert, Integrity
 from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED, RESTLESS_CHI2
 from skyless.uncertainty.dop import Dops, dilution_of_precision
 
@@ -50,6 +51,14 @@ class Fix(Struct, frozen=True, gc=False):
     method: str
     height_known: bool
     """True for 2-D positioning at a given height."""
+    hpl_m: float | None = None
+    """Horizontal protection level: the error is larger with a probability of at most ``integrity_risk``."""
+    vpl_m: float | None = None
+    """Vertical protection level; None where the height is given."""
+    integrity_risk: float | None = None
+    """None for methods that know no protection levels."""
+    alert: Alert | None = None
+    """Whether the levels can be relied on; None for methods without any."""
 
     @property
     def std_m(self) -> float:
@@ -71,6 +80,7 @@ def motion_fix(
     anchors_m: NDArray[np.float64],
     statistics: NDArray[np.float64],
     method: str,
+    integrity: Integrity | None = None,
 ) -> Fix:
     """Make the fix of a filter whose state begins with position and velocity (2 axes each at a known height).
 
@@ -99,6 +109,10 @@ def motion_fix(
         residual_rms_m=sqrt(statistics.item(RESIDUAL_SQUARED)),
         method=method,
         height_known=height_m is not None,
+        hpl_m=None if integrity is None else integrity.hpl_m,
+        vpl_m=None if integrity is None else integrity.vpl_m,
+        integrity_risk=None if integrity is None else integrity.risk,
+        alert=None if integrity is None else integrity.alert,
     )
 
 

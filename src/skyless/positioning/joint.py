@@ -28,6 +28,8 @@ from skyless.positioning.joint_state import (
     values,
 )
 from skyless.positioning.kalman import horizontal_variance
+from skyless.positioning.protection import RISK, limits_of
+from skyless.positioning.protection_levels import LEVELS
 from skyless.positioning.tracker import AGILITY, LOST_IN_ROW, LOST_SHARE, REJECTED_SHARE
 
 MAX_RATE: Final = 50e-6
@@ -52,6 +54,10 @@ class JointSettings(Struct, frozen=True):
     """Height of the tag where it is given; None to estimate it."""
     drop_s: float = 2.0
     """Anchors that are silent for longer are out of view."""
+    integrity_risk: float = RISK
+    """Probability, for each fix, that an error exceeds its protection level."""
+    alert_limit_m: float | None = None
+    """Fixes with a higher horizontal protection level say so."""
 
     @property
     def dim(self) -> int:
@@ -98,6 +104,8 @@ class JointFilter:
         self._anchors = len(site_m)
         self._motion = np.zeros(2 * self.dim)
         self._covariance = np.zeros((2 * self.dim, 2 * self.dim))
+        self._limits = limits_of(settings.integrity_risk)
+        self._levels = np.zeros(LEVELS)
 
     def add_anchor(self, anchor_m: Vector) -> int:
         """Add an anchor to the table; returns its place there."""
@@ -132,7 +140,7 @@ class JointFilter:
 
     def hear(self, site: int, sequence: int, rx_ticks: int, tx_ticks: int, relays: Integers = NO_RELAYS) -> int:
         """Take one packet (``joint_hear``); leaves what ``motion`` returns in ``newest``."""
-        packet = (site, sequence, rx_ticks, tx_ticks, relays, *self.newest)
+        packet = (site, sequence, rx_ticks, tx_ticks, relays, *self.newest, self._limits, self._levels)
         status = joint_step(tuple(self.arrays), *packet)
         if status == FULL:
             self._extend()
@@ -143,6 +151,11 @@ class JointFilter:
     def newest(self) -> tuple[Vector, Matrix]:
         """What ``motion`` returns, as of the last packet that ``hear`` took."""
         return self._motion, self._covariance
+
+    @property
+    def levels(self) -> Vector:
+        """What ``protect`` said of the last packet that ``hear`` took."""
+        return self._levels
 
     def track(self, messages: Messages, motions: Matrix | None = None, variances: Matrix | None = None) -> None:
         """Take many packets in one loop; the arithmetic is that of ``hear``, so the states are its, bit for bit.

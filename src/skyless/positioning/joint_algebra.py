@@ -8,6 +8,7 @@ import numpy as np
 
 from skyless.compiled import borrowing_kernel
 from skyless.positioning.joint_state import MOST_TERMS, PLACES, TERMS, JointArrays, states, width
+from skyless.positioning.protection_updates import follow_faults
 
 
 @borrowing_kernel
@@ -77,8 +78,11 @@ def along_x(s: JointArrays) -> float:
 
 
 @borrowing_kernel
-def take(s: JointArrays, term: int, innovation: float, spread: float) -> None:
-    """Kalman update with gain (P·h)/spread, P·h being the newest term, which then counts."""
+def take(s: JointArrays, term: int, innovation: float, spread: float, own: int) -> None:
+    """Kalman update with gain (P·h)/spread, P·h being the newest term, which then counts.
+
+    ``own`` is the slot that the tag heard, −1 for a reception of others.
+    """
     x, u, columns = s.x, s.terms, width(s)
     scale = 1.0 / np.sqrt(spread)
     step = innovation * scale
@@ -86,6 +90,7 @@ def take(s: JointArrays, term: int, innovation: float, spread: float) -> None:
         u[term, column] *= scale
     for column in range(columns):
         x[column] += step * u[term, column]
+    follow_faults(s, term, own, innovation, spread)
     s.counts[TERMS] = term + 1
 
 

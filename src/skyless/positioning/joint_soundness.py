@@ -17,6 +17,7 @@ from skyless.positioning.joint_state import (
     JointArrays,
     new_arrays,
 )
+from skyless.positioning.protection_levels import LEVELS, LIMITS
 
 MOST: Final = 4096
 """Anchors, in view or in the table."""
@@ -39,7 +40,12 @@ def is_sound(joint: JointFilter) -> bool:
     n = 2 * joint.dim
     if not alike or motion.shape != (n,) or covariance.shape != (n, n) or not _counts(s):
         return False
-    return bool(0 <= vars(joint)["_anchors"] <= len(s.site_m))
+    return _levels(joint) and bool(0 <= vars(joint)["_anchors"] <= len(s.site_m))
+
+
+def _levels(joint: JointFilter) -> bool:
+    kept = ((vars(joint)["_limits"], LIMITS), (vars(joint)["_levels"], LEVELS))
+    return all(array.shape == (length,) and array.dtype == np.float64 for array, length in kept)
 
 
 def _counts(s: JointArrays) -> bool:

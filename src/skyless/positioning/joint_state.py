@@ -46,6 +46,15 @@ MOST_TERMS: Final = 12
 MOST_PLACES: Final = 12
 """A position and a velocity of three axes, two offsets and rates, a noise, and up to a multiple of four."""
 
+EVIDENCE: Final = 3
+"""Sums of each memory in a row of ``evidence``: Σwsν, Σws², Σw²s² (``protection_updates``); ..."""
+
+REJECTIONS: Final = 2 * EVIDENCE
+"""... behind both memories the packets of the slot that lay beyond the gate."""
+
+PACKETS, RELAYS_TAKEN, RELAYS_REFUSED = range(3)
+"""Places in ``recent``: how many there were lately, older ones counting less."""
+
 SEQUENCE, PACKET_TX, PACKET_RX = range(3)
 """Places in a remembered packet."""
 
@@ -81,6 +90,12 @@ class JointArrays(NamedTuple):
     settings: Vector
     site_m: Matrix
     """Positions of all anchors, shape (anchors of the site, 3)."""
+    sensitivities: Matrix
+    """Shape (capacity, states): the states' errors for each metre by which the tag's receptions of a slot are late."""
+    evidence: Matrix
+    """Shape (capacity, 2·EVIDENCE + 1): what innovations say of such a fault, with a short and a long memory."""
+    recent: Vector
+    """Shape (3,)."""
 
 
 NEVER: Final = -(1 << 62)
@@ -106,6 +121,9 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
         slot_of=np.full(site_capacity, -1, np.int64),
         settings=settings,
         site_m=np.zeros((site_capacity, 3)),
+        sensitivities=np.zeros((capacity, states)),
+        evidence=np.zeros((capacity, 2 * EVIDENCE + 1)),
+        recent=np.zeros(3),
     )
 
 
@@ -151,6 +169,10 @@ def _insert(s: JointArrays, n: int, place: int) -> None:
         for column in range(n, place, -1):
             P[row, column] = P[row, column - 1]
         P[row, place] = 0.0
+    for slot in range(s.counts[SLOTS]):
+        for column in range(n, place, -1):
+            s.sensitivities[slot, column] = s.sensitivities[slot, column - 1]
+        s.sensitivities[slot, place] = 0.0
 
 
 @borrowing_kernel
@@ -168,6 +190,10 @@ def _remove(s: JointArrays, n: int, place: int) -> None:
         for column in range(place, n - 1):
             P[row, column] = P[row, column + 1]
         P[row, n - 1] = 0.0
+    for slot in range(s.counts[SLOTS]):
+        for column in range(place, n - 1):
+            s.sensitivities[slot, column] = s.sensitivities[slot, column + 1]
+        s.sensitivities[slot, n - 1] = 0.0
 
 
 @borrowing_kernel
@@ -192,6 +218,8 @@ def add_slot(s: JointArrays, site: int) -> int:
         s.anchors[slot, axis] = s.site_m[site, axis]
     s.anchors[slot, RANGE:] = 0.0
     s.anchors[slot, WEIGHT] = 1.0
+    s.sensitivities[slot, :] = 0.0
+    s.evidence[slot, :] = 0.0
     s.packets[slot, :, :] = NEVER
     s.relayed[slot, :] = NEVER
     s.relayed[:, slot] = NEVER
@@ -223,6 +251,10 @@ def drop_slot(s: JointArrays, slot: int) -> None:
             s.slots[k, column] = s.slots[k + 1, column]
         for column in range(s.anchors.shape[1]):
             s.anchors[k, column] = s.anchors[k + 1, column]
+        for column in range(s.sensitivities.shape[1]):
+            s.sensitivities[k, column] = s.sensitivities[k + 1, column]
+        for column in range(2 * EVIDENCE + 1):
+            s.evidence[k, column] = s.evidence[k + 1, column]
         for packet in range(REMEMBERED):
             for column in range(3):
                 s.packets[k, packet, column] = s.packets[k + 1, packet, column]

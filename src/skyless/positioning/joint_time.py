@@ -12,6 +12,7 @@ from skyless.positioning.joint_state import (
     DIM,
     EPOCH,
     QA,
+    SLOTS,
     TERMS,
     WALK,
     WHITE,
@@ -20,6 +21,7 @@ from skyless.positioning.joint_state import (
     values,
     width,
 )
+from skyless.positioning.protection_updates import fade_evidence
 from skyless.positioning.tracker import AGILITY
 
 REBASE_S: Final = 0.015
@@ -36,6 +38,7 @@ def elapse(s: JointArrays, rx_ticks: int) -> None:
         s.counts[BASE] = rx_ticks
         tau_s = 0.0
     s.counts[EPOCH] = rx_ticks
+    fade_evidence(s)
     dim, half = int(s.settings[DIM]), values(s)
     rate = s.settings[QA] * s.statistics[AGILITY] * dt_s
     cross, value = _noise_at_base(0.0, rate, dt_s, tau_s)
@@ -94,6 +97,9 @@ def _move_base(s: JointArrays, tau_s: float) -> None:
     x, P, half, n = s.x, s.P, values(s), states(s)
     for place in range(half):
         x[place] += tau_s * x[half + place]
+    for slot in range(s.counts[SLOTS]):
+        for place in range(half):
+            s.sensitivities[slot, place] += tau_s * s.sensitivities[slot, half + place]
     for row in range(half):
         for column in range(n):
             P[row, column] += tau_s * P[half + row, column]

@@ -14,6 +14,7 @@ from skyless.positioning.joint import NO_RELAYS, JointFilter, JointSettings
 from skyless.positioning.joint_hearing import REJECTED
 from skyless.positioning.joint_start import JointStart
 from skyless.positioning.observation import Observation
+from skyless.positioning.protection import integrity_of
 from skyless.positioning.tracking import (
     HASTE,
     MAX_GAP_S,
@@ -149,4 +150,6 @@ class JointTracking:
         rx_ticks = observation.rx_ticks_tag
         time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
         statistics = self._filter.arrays.statistics
-        return motion_fix(time_s, x, P, height_m, in_use.anchors, in_use.anchors_m, statistics, "joint")
+        risk, limit_m = self._settings.integrity_risk, self._settings.alert_limit_m
+        integrity = integrity_of(self._filter.levels, risk, height_m is not None, limit_m)
+        return motion_fix(time_s, x, P, height_m, in_use.anchors, in_use.anchors_m, statistics, "joint", integrity)

@@ -22,10 +22,13 @@ from skyless.positioning.joint_state import (
     PLACES,
     RANGE,
     RATE_VARIANCE,
+    REJECTIONS,
+    RELAYS_REFUSED,
     RELAYS_REJECTED,
     RELAYS_USED,
     RX_VARIANCE,
     SCORE,
+    SLOTS,
     TX,
     TX_VARIANCE,
     WALK,
@@ -37,6 +40,7 @@ from skyless.positioning.joint_state import (
     values,
     width,
 )
+from skyless.positioning.protection_updates import join_faults
 from skyless.positioning.tracker import judge
 
 SCORE_GAIN: Final = 0.1
@@ -53,6 +57,8 @@ def new_packet(s: JointArrays, slot: int) -> None:
         for row in range(states(s)):
             s.P[row, place] = 0.0
         s.P[place, place] = s.settings[TX_VARIANCE]
+        for other in range(s.counts[SLOTS]):
+            s.sensitivities[other, place] = 0.0
 
 
 @borrowing_kernel
@@ -83,12 +89,13 @@ def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool
     accepted = judge(s.counts, s.statistics, innovation, spread, s.settings[GATE])
     if accepted:
         s.slots[slot, IN_ROW] = 0
-        take(s, term, innovation, spread)
+        take(s, term, innovation, spread, slot)
         steps = int(np.floor(s.x[offset] / TICK_M))
         s.slots[slot, WHOLE] += steps
         s.x[offset] -= steps * TICK_M
     else:
         s.slots[slot, IN_ROW] += 1
+        s.evidence[slot, REJECTIONS] += 1.0
     return accepted
 
 
@@ -134,6 +141,7 @@ def join(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> None:
     P[place, place] = variance
     whole = rx_ticks - tx_ticks - int(np.floor(range_m / TICK_M))
     s.x[place] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m
+    join_faults(s, slot, place)
     s.slots[slot, WHOLE] = whole
     s.anchors[slot, RANGE] = range_m
 
@@ -177,7 +185,8 @@ def hear_relay(s: JointArrays, listener: int, slot: int, packet_tx: int, packet_
     accepted = innovation * innovation <= s.settings[GATE] * s.settings[GATE] * spread
     if accepted:
         s.counts[RELAYS_USED] += 1
-        take(s, term, innovation, spread)
+        take(s, term, innovation, spread, -1)
     else:
         s.counts[RELAYS_REJECTED] += 1
+        s.recent[RELAYS_REFUSED] += 1.0
     return bool(accepted)

@@ -1,0 +1,98 @@
+"""Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 7)."""
+
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from scipy.stats import norm
+
+from skyless.compiled import kernel
+from skyless.positioning.joint_hearing import FULL, joint_hear, joint_motion
+from skyless.positioning.joint_state import Integers, JointArrays, Matrix, Vector
+from skyless.positioning.protection_levels import DETECTED, HPL, LEVELS, STATE, VPL, protect
+
+RISK: Final = 1e-4
+FALSE_ALARM: Final = 1e-6
+"""Of each anchor's test in each fix."""
+
+MARGIN: Final = 1.05
+"""On all standard deviations, for errors that are not quite Gaussian and figures that are not quite the filter's."""
+
+
+class Alert(StrEnum):
+    """What a fix says of its integrity."""
+
+    NONE = "none"
+    EXCLUDED = "detected-excluded"
+    NOT_EXCLUDED = "detected-not-excluded"
+    UNAVAILABLE = "unavailable"
+    LIMIT = "alert-limit-exceeded"
+
+
+_ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
+
+
+class Integrity(Struct, frozen=True, gc=False):
+    """How wrong a fix may be."""
+
+    hpl_m: float | None
+    """The horizontal error is larger with a probability of at most ``risk``; None if nothing can be promised."""
+    vpl_m: float | None
+    """As well for the vertical error; None also where the height is given."""
+    risk: float
+    """For each fix and each of the two levels."""
+    alert: Alert
+
+
+def integrity_of(levels: Vector, risk: float, height_known: bool, alert_limit_m: float | None) -> Integrity:
+    """What ``protect`` has filled in, in words; where a fault is still in the fix, nothing can be promised."""
+    hpl_m, vpl_m, state = levels.item(HPL), levels.item(VPL), int(levels.item(STATE))
+    if state >= DETECTED:
+        return Integrity(None, None, risk, _ALERTS[state])
+    exceeded = alert_limit_m is not None and hpl_m > alert_limit_m
+    return Integrity(hpl_m, None if height_known else vpl_m, risk, Alert.LIMIT if exceeded else _ALERTS[state])
+
+
+def limits_of(risk: float = RISK, false_alarm: float = FALSE_ALARM) -> Vector:
+    """What the kernels compare with, for an integrity risk and a probability of false alarm, both of a fix.
+
+    Raises:
+        ValueError: a probability is not between 0 and 0.1.
+    """
+    for name, value in (("risk", risk), ("false_alarm", false_alarm)):
+        if not 0.0 < value <= 0.1:
+            raise ValueError(f"{name} is {value!r}; it should be above 0 and at most 0.1")
+    horizontal = np.sqrt(-2.0 * np.log(risk))
+    vertical = norm.isf(risk / 2.0)
+    return np.array([MARGIN * horizontal, MARGIN * vertical, norm.isf(false_alarm / 2.0)])
+
+
+@kernel
+def protected_track(
+    s: JointArrays,
+    sites: Integers,
+    sequences: Integers,
+    rx_ticks: Integers,
+    tx_ticks: Integers,
+    relays: Integers,
+    ends: Integers,
+    limits: Vector,
+    motion: Vector,
+    covariance: Matrix,
+    motions: Matrix,
+    levels: Matrix,
+) -> None:
+    """``joint_track`` with what is known after every packet; there must be room for all anchors.
+
+    Rows of ``motions``, shape (n, 2·dim), and ``levels``, shape (n, LEVELS + 1), are filled in; the last column says
+    what became of the packet.
+    """
+    for k in range(len(sites)):
+        first = ends[k - 1] if k > 0 else 0
+        status = joint_hear(s, sites[k], sequences[k], rx_ticks[k], tx_ticks[k], relays, first, ends[k])
+        if status != FULL:
+            joint_motion(s, motion, covariance)
+            protect(s, covariance, limits, levels[k])
+            motions[k, :] = motion
+        levels[k, LEVELS] = status

@@ -1,0 +1,112 @@
+"""Protection levels from what ``protection_updates`` follows: ``joint``'s kernels (``docs/maths.md`` section 7)."""
+
+from typing import Final
+
+import numpy as np
+
+from skyless.compiled import borrowing_kernel
+from skyless.constants import TICK_S
+from skyless.positioning.joint_state import (
+    BASE,
+    DIM,
+    EPOCH,
+    EVIDENCE,
+    PACKETS,
+    REJECTIONS,
+    RELAYS_REFUSED,
+    RELAYS_TAKEN,
+    SLOTS,
+    WEIGHT,
+    JointArrays,
+    Matrix,
+    Vector,
+    values,
+)
+from skyless.positioning.protection_updates import LONG
+from skyless.positioning.tracker import CHI2, RESTLESS_CHI2
+
+SETTLED: Final = 0.5
+"""Share of the long memory that must be filled: until then faults that led to the start may still be at work."""
+
+REJECTED_OFTEN: Final = 1.5
+"""Two packets of an anchor beyond the gate lately: with noise alone once in 10⁶ times."""
+
+REFUSED_SHARE: Final = 0.25
+FEW: Final = 4.0
+"""So many of the relayed receptions, and more than so many, beyond the gate: clocks are not what the filter says."""
+
+HORIZONTAL_K, VERTICAL_K, FAULT_T = range(3)
+"""Places in the array of limits."""
+
+LIMITS: Final = 3
+
+HPL, VPL, STATE, WORST_T, WORST_SLOT = range(5)
+"""Places among the levels."""
+
+LEVELS: Final = 5
+
+NOTHING, EXCLUDED, DETECTED, UNAVAILABLE = range(4)
+"""States: no fault, one that was left out, one that is still in the fix, or too early to say."""
+
+
+@borrowing_kernel
+def protect(s: JointArrays, covariance: Matrix, limits: Vector, levels: Vector) -> None:
+    """Fill in ``levels`` for the newest message; ``covariance`` is that of ``joint_motion``."""
+    dim, half = int(s.settings[DIM]), values(s)
+    tau_s = (s.counts[EPOCH] - s.counts[BASE]) * TICK_S
+    chi2 = s.statistics[CHI2]
+    scale = chi2 * chi2 if chi2 > RESTLESS_CHI2 else 1.0
+    xx, xy, yy = scale * covariance[0, 0], scale * covariance[0, 1], scale * covariance[1, 1]
+    zz = scale * covariance[2, 2] if dim == 3 else 0.0
+    hpl = limits[HORIZONTAL_K] * np.sqrt(_major(xx, xy, yy))
+    vpl = limits[VERTICAL_K] * np.sqrt(zz)
+    worst_t, worst_slot = 0.0, -1
+    for slot in range(s.counts[SLOTS]):
+        vx = s.sensitivities[slot, 0] + tau_s * s.sensitivities[slot, half]
+        vy = s.sensitivities[slot, 1] + tau_s * s.sensitivities[slot, half + 1]
+        vz = s.sensitivities[slot, 2] + tau_s * s.sensitivities[slot, half + 2] if dim == 3 else 0.0
+        across = np.sqrt(vx * vx + vy * vy)
+        for memory in range(0, 2 * EVIDENCE, EVIDENCE):
+            information = s.evidence[slot, memory + 1]
+            if information > 0.0:
+                fault_m = abs(s.evidence[slot, memory]) / information
+                variance = scale * s.evidence[slot, memory + 2] / (information * information)
+                major = _major(xx + vx * vx * variance, xy + vx * vy * variance, yy + vy * vy * variance)
+                hpl = max(hpl, across * fault_m + limits[HORIZONTAL_K] * np.sqrt(major))
+                vpl = max(vpl, abs(vz) * fault_m + limits[VERTICAL_K] * np.sqrt(zz + vz * vz * variance))
+                t = fault_m / np.sqrt(variance)
+                if t > worst_t:
+                    worst_t, worst_slot = t, slot
+            elif across > 0.0 or vz != 0.0:
+                hpl, vpl = np.inf, np.inf
+    levels[STATE] = _state(s, worst_t, worst_slot, limits[FAULT_T], hpl)
+    levels[HPL], levels[VPL], levels[WORST_T], levels[WORST_SLOT] = hpl, vpl, worst_t, worst_slot
+
+
+@borrowing_kernel
+def _major(xx: float, xy: float, yy: float) -> float:
+    """Largest eigenvalue of a covariance."""
+    half = 0.5 * (xx - yy)
+    return float(0.5 * (xx + yy) + np.sqrt(half * half + xy * xy))
+
+
+@borrowing_kernel
+def _state(s: JointArrays, worst_t: float, worst_slot: int, most_t: float, hpl: float) -> int:
+    """Whether a fault shows, in the innovations or in what was rejected, and whether it is one that can be left out."""
+    slots = s.counts[SLOTS]
+    if s.recent[PACKETS] < SETTLED * LONG * slots or not np.isfinite(hpl):
+        return UNAVAILABLE
+    refused = s.recent[RELAYS_REFUSED]
+    if refused > FEW and refused > REFUSED_SHARE * (refused + s.recent[RELAYS_TAKEN]):
+        return DETECTED
+    rejected, suspects = -1, 0
+    for slot in range(slots):
+        if s.evidence[slot, REJECTIONS] > REJECTED_OFTEN:
+            rejected = slot
+            suspects += 1
+    if suspects > 1:
+        return DETECTED
+    if worst_t > most_t:
+        left_out = worst_slot == rejected or (suspects == 0 and s.anchors[worst_slot, WEIGHT] != 1.0)
+        return EXCLUDED if left_out else DETECTED
+    return EXCLUDED if suspects == 1 else NOTHING
