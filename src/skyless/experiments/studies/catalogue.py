@@ -39,9 +39,7 @@ STUDIES: Final = {
             sync.cases,
             Look("Synchronisation", ("rmse", "nees"), x="superframe in ms", log=True),
         ),
-        _of_worlds(
-            "scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), x="number of", log=True)
-        ),
+        _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
     )
 }
 """``integrity`` belongs here as well when there are protection levels to study."""

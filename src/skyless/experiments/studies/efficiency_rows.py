@@ -25,10 +25,10 @@ MESHES: Final = ((False, False), (True, False), (True, True))
 
 CASES: Final = tuple(
     Case(noise_ps, walk, qa, mesh, at_once)
+    for mesh, at_once in MESHES
     for noise_ps in NOISES_PS
     for walk in WALKS
     for qa in AGILITIES
-    for mesh, at_once in MESHES
 )
 
 

@@ -22,7 +22,7 @@ class Plan(Struct, frozen=True):
     """Whether anchors also relay when they heard anchors that are not the master."""
     worlds: int = 12
     """Independent worlds of a case; what scatters between them gives the standard errors."""
-    seconds: float = 30.0
+    seconds: float = 20.0
     """True time for which each world is judged."""
     tags: int = 4
     """In each world."""

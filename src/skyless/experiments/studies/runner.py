@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +18,8 @@ from skyless.experiments.studies.plan import Cell
 
 POLL_S: Final = 0.2
 CONNECT_S: Final = 10.0
+
+ADDRESS: Final = re.compile(r"((tcp|tls|ws|wss)://)?[^\s/]+:\d{1,5}")
 
 Reached = Callable[[float], None]
 
@@ -119,6 +122,8 @@ def _start_worker(parent: Connection) -> None:
 
 @contextmanager
 def _cluster(scheduler: str) -> Iterator[Executor]:
+    if not ADDRESS.fullmatch(scheduler):
+        raise SkylessError(f"--scheduler is {scheduler!r}; it should be an address such as tcp://127.0.0.1:8786")
     try:
         from distributed import Client  # noqa: PLC0415 - an extra, and slow to import
     except ImportError:

@@ -134,4 +134,4 @@ def interval(standard_error: float | None, runs: int) -> tuple[float, float] | N
     if standard_error is None:
         return None
     reach = float(student.ppf(0.995, runs - 1)) * standard_error
-    return 1.0 - reach, 1.0 + reach
+    return max(1.0 - reach, 0.0), 1.0 + reach

@@ -1,5 +1,6 @@
 """What the clocks' alignment withstands: masters that die, long superframes, bad crystals, temperature."""
 
+from functools import partial
 from typing import Final
 
 from msgspec.structs import replace
@@ -54,13 +55,15 @@ def _crystals(plan: Plan) -> list[Case]:
         "random walk 1e-10, filters assume 1e-9": walking(plan, wander(1e-10), assumed=lab),
         "random walk 1e-8, filters assume 1e-9": walking(plan, wander(1e-8), assumed=lab),
         "warming up, 1 ppm in 60 s": walking(plan, temperature=True),
-        "draughts, ±0.5 ppm in 60 s": walking(plan, change=_draughty),
+        "draughts, ±0.1 ppm in 60 s": walking(plan, change=partial(_draughty, 1.0)),
+        "draughts, ±0.5 ppm in 60 s": walking(plan, change=partial(_draughty, 5.0)),
     }
     return [Case(name, "crystals", None, worlds, STEADY) for name, worlds in runs.items()]
 
 
-def _draughty(impairments: Impairments) -> Impairments:
-    temperature = Temperature(warm_up_k=0.0, swing_k=5.0, swing_period_s=60.0)
+def _draughty(swing_k: float, impairments: Impairments) -> Impairments:
+    """Temperatures that swing, each node's in a phase of its own."""
+    temperature = Temperature(warm_up_k=0.0, swing_k=swing_k, swing_period_s=60.0)
     return replace(impairments, oscillator=replace(impairments.oscillator, temperature=temperature))
 
 

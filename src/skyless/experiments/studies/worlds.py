@@ -1,5 +1,6 @@
 """One cell of most studies: a site in the simulated world, its tags judged against the truth."""
 
+import math
 import time
 from functools import lru_cache
 from itertools import compress
@@ -87,8 +88,8 @@ class _Judge:
         self._sums = np.zeros(4)
         self._max_m = 0.0
         self._sample = EvenSample(1, SAMPLE_ROWS)
-        superframes = int(run.until_s / self._superframe_s) - int(run.warmup_s / self._superframe_s) + 1
-        self._superframes = superframes * len(run.trajectories)
+        first, end = int(run.warmup_s / self._superframe_s), math.ceil(run.until_s / self._superframe_s - 1e-3)
+        self._superframes = (end - first) * len(run.trajectories)
 
     def add(self, tag: int, time_s: float, fix: Fix, truth_m: NDArray[np.float64]) -> None:
         superframe = int(time_s / self._superframe_s)

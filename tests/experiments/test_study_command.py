@@ -1,0 +1,110 @@
+"""``skyless study`` as its user meets it."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from skyless.cli.main import main
+
+COMMAND = [sys.executable, "-m", "skyless.cli.main", "study"]
+SMALL = ["--method", "tracker", "--quick", "--worlds", "2", "--seconds", "1", "--processes", "1"]
+
+
+@pytest.fixture
+def run(capsys, monkeypatch, tmp_path):
+    """The command in an empty folder: exit code, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        return main(["study", *map(str, arguments)]), *capsys.readouterr()
+
+    return call
+
+
+def test_a_study_tells_its_rows_and_writes_its_files(run, tmp_path):
+    code, out, err = run("loss", *SMALL, "--json", "--out", "deep/folder", "--plot", "loss.svg")
+    assert (code, err, out.count("\n")) == (0, "", 1)
+    told = json.loads(out)
+    assert (told["study"], told["method"], told["seed"], told["simulated"]) == ("loss", "tracker", 1, True)
+    keys = {"method", "mesh", "noise_ps", "case", "rmse_m", "bound_m", "ratio", "limit", "passed", "nees"}
+    assert all(row.keys() >= keys for row in told["rows"])
+    half = next(row for row in told["rows"] if row["case"] == "50 % lost at tags")
+    assert half["passed"] == (half["ratio"] <= half["limit"])
+    folder = tmp_path / "deep" / "folder"
+    assert {file.name for file in folder.iterdir()} == {"loss.json", "loss.csv", "loss.png", "loss.svg"}
+    assert json.loads((folder / "loss.json").read_text()) == told["rows"]
+    with (folder / "loss.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [float(row["rmse_m"]) for row in table] == [row["rmse_m"] for row in told["rows"]]
+    assert (folder / "loss.png").read_bytes().startswith(b"\x89PNG")
+    for picture in (folder / "loss.svg", tmp_path / "loss.svg"):
+        assert ElementTree.fromstring(picture.read_bytes()).tag.endswith("svg")
+
+
+def test_people_get_a_table(run):
+    code, out, err = run("motion", *SMALL)
+    assert (code, err) == (0, "")
+    for words in ("rounds at 5 m/s", "zigzag at 3 m/s", "±", "Simulated."):
+        assert words in out
+
+
+@pytest.mark.parametrize("name", ["nlos", "sync", "scale"])
+def test_every_study_can_be_drawn(name, tmp_path):
+    """From rows as they may be, without simulating: with numbers, without, with a single world."""
+    from skyless.experiments.figures import picture
+    from skyless.experiments.studies.catalogue import STUDIES
+    from skyless.experiments.studies.plan import plan_of
+    from skyless.experiments.studies.worlds import RunResult
+
+    plan = plan_of("tracker", 1, quick=True, worlds=2)
+    study = STUDIES[name]
+    some = RunResult(9, 9, 0.01, 0.01, 9.0, 0, 0.1, np.full(9, 0.03), 9, 1.0, 1e-3)
+    none = RunResult(0, 9, 0.0, 0.0, 0.0, 0, 0.0, np.empty(0), 9, 1.0, 1e-3)
+    for results in ([some], [none], [some, none]):
+        count = len(study.cells(plan))
+        rows = study.rows(plan, (results * count)[:count])
+        assert picture(study.draw(rows), "png", 50.0).startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["lost"], 'Choose from: "efficiency", "loss"'),
+        (["loss", "--episodes", "5"], "--episodes is for the study efficiency"),
+        (["efficiency", "--seconds", "5"], "--seconds is not for the study efficiency"),
+        (["efficiency", "--method", "tracker"], "--method is 'tracker'"),
+        (["loss", "--method", "guess"], "it should be one of literal"),
+        (["loss", "--worlds", "1"], "--worlds"),
+        (["loss", "--seconds", "nan"], "--seconds"),
+        (["loss", "--plot", "loss.doc"], "--plot is 'loss.doc'"),
+        (["loss", "--plot", "nowhere/loss.png"], "a file in a folder that exists"),
+        (["loss", "--out", __file__], "which is a file"),
+        (["loss", "--scheduler", "here"], "it should be an address"),
+        (["loss", "--scheduler", "tcp://127.0.0.1:9", "--processes", "2"], "give either"),
+    ],
+)
+def test_wrong_input_is_one_line(run, arguments, said):
+    code, out, err = run(*arguments)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert said in err
+
+
+def test_an_interrupt_leaves_no_file_and_no_traceback(tmp_path):
+    """As a terminal sends it: to the whole group, workers among them, at the start and in the middle."""
+    for patience_s in (2.0, 12.0):
+        command = [*COMMAND, "loss", "--method", "tracker", "--out", str(tmp_path / "out")]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+        time.sleep(patience_s)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+        assert (process.returncode, out) == (130, b"")
+        assert err in {b"", b"stopped; nothing was written\n"}
+        assert not (tmp_path / "out").exists()
