@@ -14,6 +14,7 @@ _COMMANDS = (
     ("demo", "skyless.cli.demo:app", "Show a site and walking tags in real time."),
     ("simulate", "skyless.cli.simulate:app", "Run a site in the simulated world and judge it against the truth."),
     ("replay", "skyless.cli.replay:app", "Turn a recording into fixes and judge them against the truth."),
+    ("calibrate", "skyless.cli.calibrate:app", "Find wrong antenna delays from a tag whose place is known."),
     ("paper", "skyless.cli.paper:app", "Reproduce the paper's figures and claims in one report."),
     ("study", "skyless.cli.study:app", "Measure the receiver's errors over many simulated runs."),
     ("plan", "skyless.cli.plan:app", "Predict a site's errors before it is mounted, and place its anchors."),

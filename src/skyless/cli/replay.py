@@ -41,6 +41,7 @@ def replay(
     above: Finite | None = None,
     qa: Positive | None = None,
     tdoa_std: Positive | None = None,
+    uncalibrated: bool = False,
     tag: str | None = None,
     method: str | None = None,
     fixes: Path | None = None,
@@ -53,16 +54,17 @@ def replay(
     of time differences, MILUV passive ticks and Avalue receptions; the format is recognised by the content.
 
     A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
-    below it takes --tag, --method, --settle, --above, --fixes, --plot and --json.
+    below it takes --site, --tag, --method, --settle, --above, --fixes, --plot and --json.
 
     Parameters
     ----------
     file
         The recording, plain or gzip.
     anchors
-        Table of anchors: id,x_m,y_m,z_m.
+        Table of anchors: id,x_m,y_m,z_m, with bias_m where skyless calibrate has been; that is then taken off.
     site
-        A site file instead, for its anchors and its tags' height.
+        A site file instead, for its anchors and its tags' height. With a recording of skyless record: replay as if
+        its anchors had had the antenna delays of this file, as skyless calibrate writes them.
     truth
         Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns. MILUV ticks bring their own.
     lever_arm
@@ -82,6 +84,8 @@ def replay(
         Agility that the filter assumes, m²/s³.
     tdoa_std
         Noise of a time difference that the filter assumes, metres.
+    uncalibrated
+        Leave out the calibration that the table of anchors holds.
     tag
         Name of the tag, in recordings of skyless record; by default all.
     method
@@ -95,6 +99,7 @@ def replay(
     """
     from skyless.experiments.judge import Judge
     from skyless.experiments.replay import Replay, ReplayRequest
+    from skyless.recordings.anchors import read_calibration
     from skyless.recordings.formats import format_of
 
     spare_inputs("fixes", fixes, file, anchors, site, truth)
@@ -102,19 +107,19 @@ def replay(
     see_that_it_can_be_drawn(plot)
     if is_mcap(file):
         useless = {
-            "--anchors": anchors, "--site": site, "--truth": truth, "--lever-arm": lever_arm, "--format": format,
+            "--anchors": anchors, "--truth": truth, "--lever-arm": lever_arm, "--format": format,
             "--listener": listener, "--qa": qa, "--tdoa-std": tdoa_std,
-            "--height": None if height == "auto" else height,
+            "--height": None if height == "auto" else height, "--uncalibrated": uncalibrated or None,
         }  # fmt: skip
         see_that_they_are_left_out(useless, "a recording of skyless record brings its own")
-        replay_site(file, Options(tag, method, settle, above, fixes, plot, json))
+        replay_site(file, Options(tag, method, settle, above, site, fixes, plot, json))
         return
     see_that_they_are_left_out({"--tag": tag, "--method": method}, "they are for recordings of skyless record")
-    places, site_height_m = _anchors(anchors, site)
-    known = _truth(file, truth, lever_arm, format, listener)
+    places, site_height_m = known_anchors(anchors, site)
+    known = known_truth(file, truth, lever_arm, format, listener)
     height_m, note = _height(height, places, site_height_m, known, format_of(file, format).name)
     settle_s = settle if settle is not None else (2.0 if known is None else 3.0)
-    judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=_above(above, known))
+    judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=flight_height(above, known))
     request = ReplayRequest(
         path=file,
         anchors_m=places,
@@ -123,6 +128,7 @@ def replay(
         height_m=height_m,
         qa=qa,
         tdoa_std_m=tdoa_std,
+        calibration=None if anchors is None or uncalibrated else read_calibration(anchors),
     )
     report = _run(Replay(request, judge), file, fixes)
     _see_that_it_was_heard(file, listener, report)
@@ -155,7 +161,8 @@ def _see_that_truth_matches(table: Path, truth: "Truth", judge: "Judge") -> None
         raise ConfigurationError(table, "column t_s", span, expected)
 
 
-def _anchors(table: Path | None, site: Path | None) -> "tuple[dict[int, Point], float | None]":
+def known_anchors(table: Path | None, site: Path | None) -> "tuple[dict[int, Point], float | None]":
+    """Places of the anchors, and the tags' height where a site file tells it. Raises SkylessError."""
     from skyless.recordings.anchors import read_anchors
     from skyless.site.load import load_site
 
@@ -169,7 +176,10 @@ def _anchors(table: Path | None, site: Path | None) -> "tuple[dict[int, Point], 
     return {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in known.anchors}, known.tags.height_m
 
 
-def _truth(file: Path, table: Path | None, arm: str | None, name: str | None, listener: str | None) -> "Truth | None":
+def known_truth(
+    file: Path, table: Path | None, arm: str | None, name: str | None, listener: str | None
+) -> "Truth | None":
+    """Where the antenna was, by a table or by the recording itself. Raises SkylessError."""
     from skyless.experiments.judge import antenna_truth
     from skyless.recordings.formats import format_of
     from skyless.recordings.truth import read_truth
@@ -218,7 +228,7 @@ def _metres_of(wish: str) -> float:
         raise SkylessError(f"--height is {wish!r}; it should be metres, or truth, free or auto") from None
 
 
-def _above(wish: float | None, truth: "Truth | None") -> float | None:
+def flight_height(wish: float | None, truth: "Truth | None") -> float | None:
     """Judge flights in the air only: the truth begins on the floor and rises well above it."""
     if wish is not None or truth is None:
         return wish

@@ -26,6 +26,7 @@ class Options(Struct, frozen=True):
     method: str | None
     settle_s: float | None
     above_m: float | None
+    site: Path | None
     fixes: Path | None
     plot: Path | None
     json: bool
@@ -54,13 +55,15 @@ def replay_site(file: Path, options: Options) -> None:
     from skyless.experiments.replay_site import SiteReplay
     from skyless.receiver import METHODS
     from skyless.recordings.mcap_recording import McapRecording
+    from skyless.site.load import load_site
 
     if options.method is not None and options.method not in METHODS:
         raise SkylessError(f"--method is {options.method!r}; it should be one of {', '.join(METHODS)}")
     with McapRecording(file) as recording:
         tags = None if options.tag is None else (options.tag,)
         settle_s = 2.0 if options.settle_s is None else options.settle_s
-        run = SiteReplay(recording, tags, options.method, settle_s, options.above_m)
+        wanted = None if options.site is None else load_site(options.site)
+        run = SiteReplay(recording, tags, options.method, settle_s, options.above_m, wanted)
         if options.plot is not None and len(run.tags) > 1:
             raise SkylessError(f"--plot draws one tag; choose it with --tag, one of {', '.join(run.tags)}")
         summary = recording.summary()

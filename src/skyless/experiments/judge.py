@@ -80,7 +80,8 @@ class Judge:
             return None
         after = min(bisect_right(times, time_s), len(times) - 1)
         before_s, span_s = times[after - 1], times[after] - times[after - 1]
-        if span_s > self._max_gap_s:
+        at_a_row = time_s in (before_s, times[after])
+        if span_s > self._max_gap_s and not at_a_row:
             return None
         part = (time_s - before_s) / span_s if span_s > 0.0 else 0.0
         x, y, z = (self._places[after - 1] + part * (self._places[after] - self._places[after - 1])).tolist()

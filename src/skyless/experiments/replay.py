@@ -14,6 +14,7 @@ from skyless.experiments.judge import Judge, Judgement
 from skyless.experiments.noise import NoiseBook, PairNoise
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.masterless import PairEngine
+from skyless.positioning.pair_calibration import PairCalibration
 from skyless.positioning.pair_tracker import PairSettings
 from skyless.positioning.pair_tracking import PairTracking
 from skyless.recordings.formats import Recording, open_recording
@@ -36,6 +37,7 @@ class ReplayRequest(Struct, frozen=True):
     qa: float | None = None
     tdoa_std_m: float | None = None
     z_bounds_m: tuple[float, float] | None = None
+    calibration: PairCalibration | None = None
 
 
 class ReplayReport(Struct, frozen=True):
@@ -77,7 +79,7 @@ class Replay:
         self._judge = judge
         self.recording: Recording = open_recording(request.path, request.format, request.listener)
         self._settings = self._settings_of(self.recording.format.name)
-        self._tracking = PairTracking(self._settings, request.anchors_m, request.z_bounds_m)
+        self._tracking = PairTracking(self._settings, request.anchors_m, request.z_bounds_m, request.calibration)
         bits = self.recording.format.tx_bits
         self._engine = None if bits is None else PairEngine(bits, anchors_m=request.anchors_m)
         self._noise = NoiseBook(judge, request.anchors_m)

@@ -10,10 +10,12 @@ import numpy as np
 from skyless.errors import ConfigurationError
 from skyless.experiments.judge import Judge
 from skyless.experiments.replay import ReplayReport
+from skyless.experiments.replay_delays import delay_changes
 from skyless.experiments.replay_tag import Identical, Replayed, TagReplay
 from skyless.outputs.messages import FixMessage, ReceptionsMessage
 from skyless.recordings.mcap_recording import McapRecording, Recorded
 from skyless.recordings.truth import Truth
+from skyless.site.model import Site
 
 FORMAT: Final = "skyless-mcap"
 
@@ -41,11 +43,12 @@ class SiteReplay:
         method: str | None = None,
         settle_s: float = 2.0,
         above_m: float | None = None,
+        wanted: Site | None = None,
     ) -> None:
-        """``method`` is used instead of the tags' own.
+        """``method`` is used instead of the tags' own, the antenna delays of ``wanted`` instead of the anchors' own.
 
         Raises:
-            ConfigurationError: the recording has no raw receptions, or none of such a tag.
+            ConfigurationError: the recording has no raw receptions, none of such a tag, or is of another site.
         """
         summary = recording.summary()
         if not summary.raw_tags:
@@ -58,8 +61,11 @@ class SiteReplay:
         site = recording.site
         self.height_m = None if site is None else site.site.tags.height_m
         self._begin_s = summary.start_s or 0.0
-        truth = _truth(recording)
-        self.tags = {tag: TagReplay(tag, method) for tag in tags or summary.raw_tags}
+        truth = recorded_truth(recording)
+        delays = None
+        if wanted is not None:
+            delays = delay_changes(recorded_site(recording, wanted.id), wanted)
+        self.tags = {tag: TagReplay(tag, method, delays) for tag in tags or summary.raw_tags}
         self.judges = {
             tag: Judge(truth.get(tag), planar=self.height_m is not None, settle_s=settle_s, above_m=above_m)
             for tag in self.tags
@@ -127,7 +133,21 @@ class SiteReplay:
         )
 
 
-def _truth(recording: McapRecording) -> dict[str, Truth]:
+def recorded_site(recording: McapRecording, identifier: int | None = None) -> Site:
+    """The site of a recording.
+
+    Raises:
+        ConfigurationError: it does not tell its site, or another one than ``identifier`` is wanted.
+    """
+    told = recording.site
+    if told is None:
+        raise ConfigurationError(recording.summary().path, "the site", None, "told by the recording")
+    if identifier is not None and told.site.id != identifier:
+        raise ConfigurationError(recording.summary().path, "the site's id", told.site.id, f"{identifier}, as in --site")
+    return told.site
+
+
+def recorded_truth(recording: McapRecording) -> dict[str, Truth]:
     """Where each tag truly was, by Unix time; times that go back are left out."""
     rows: dict[str, list[tuple[float, ...]]] = defaultdict(list)
     for moment in recording.truth():

@@ -10,6 +10,7 @@ from msgspec import Struct
 
 from skyless.air.reception import Diagnostics, Reception
 from skyless.constants import TICK_S
+from skyless.experiments.replay_delays import DelayChange, with_delays
 from skyless.nodes.tag import fix_message
 from skyless.outputs.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart
 from skyless.positioning.fix import Fix
@@ -66,8 +67,9 @@ class HostClock:
 class TagReplay:
     """Takes the receptions of one tag in the order of the recording."""
 
-    def __init__(self, tag: str, method: str | None = None) -> None:
-        """``method``: another one than the tag's own, which begins cold."""
+    def __init__(self, tag: str, method: str | None = None, delays: dict[int, DelayChange] | None = None) -> None:
+        """``method``: another one than the tag's own; ``delays``: other antenna delays. Both begin cold."""
+        self._delays = delays
         self.tag = tag
         self.method = method
         """As recorded, once known, or as asked for."""
@@ -90,11 +92,13 @@ class TagReplay:
     def hear(self, message: ReceptionsMessage) -> Iterator[Replayed]:
         """Take a run of receptions; the fixes that they make."""
         for raw in self._unheard(message):
-            reception = _reception(raw)
+            reception = reception_of(raw)
             if reception is None:
                 self.drops["impossible-reception"] += 1
                 continue
             self.receptions += 1
+            if self._delays is not None:
+                reception = with_delays(reception, self._delays)
             fix = self._fix(reception)
             unix_s = self._clock.unix_s(reception, message.unix_less_host_s)
             self.begun_s = unix_s if self.begun_s is None else self.begun_s
@@ -112,8 +116,8 @@ class TagReplay:
 
     @property
     def identical(self) -> Identical | None:
-        """How the fixes compare; None with another method than the tag's own."""
-        return None if self._asked is not None else self._comparison.result()
+        """How the fixes compare; None with another method than the tag's own, or other antenna delays."""
+        return None if self._asked is not None or self._delays is not None else self._comparison.result()
 
     def all_drops(self) -> dict[str, int]:
         """What could not be used, by reason, the receiver's own included."""
@@ -138,7 +142,7 @@ class TagReplay:
     def _begin(self, segment: str, start: SegmentStart) -> None:
         self._segment, self._next = segment, 0
         self.segments += 1
-        if self._asked is not None:
+        if self._asked is not None or self._delays is not None:
             if self._receiver is None:
                 self._start_cold(start)
             return
@@ -223,7 +227,7 @@ def _keep(waiting: OrderedDict[int, _T], serial: int, value: _T) -> None:
         waiting.popitem(last=False)
 
 
-def _reception(raw: RawReception) -> Reception | None:
+def reception_of(raw: RawReception) -> Reception | None:
     """A recorded reception; None for one that no radio gives."""
     if not 0 <= raw.rx_ticks < WRAP_TICKS or (raw.host_s is not None and not abs(raw.host_s) < 1e12):
         return None

@@ -122,6 +122,15 @@ class PairTracker:
         """Whether so many differences do not fit that the state must be wrong."""
         return bool(self.statistics[REJECTED_SHARE] > LOST_SHARE)
 
+    @property
+    def rejected_share(self) -> float:
+        """Part of the last differences, about fifty, that lay beyond the gate."""
+        return float(self.statistics[REJECTED_SHARE])
+
+    def set_gate(self, gate: float) -> None:
+        """Use another gate from now on, in standard deviations."""
+        self.settings[SETTING_GATE] = gate
+
     def horizontal_variance_m2(self, ahead_s: float) -> float:
         """Sum of the variances of x and y so much later, if nothing is heard until then."""
         return horizontal_variance(self.P, self.dim, ahead_s, self.settings[SETTING_QA] * self.statistics[AGILITY])

@@ -5,10 +5,12 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
-from skyless.air.packet import PairTdoa
+from skyless.air.packet import PairTdoa, Point
 from skyless.positioning.fix import Fix, NoFixReason, motion_fix
+from skyless.positioning.pair_calibration import PairCalibration
 from skyless.positioning.pair_tracker import PairSettings, PairTracker
 from skyless.positioning.pairs import against_reference
 from skyless.positioning.solver import NoSolution, Solution, locate
@@ -28,6 +30,9 @@ SPEED_STD_MPS: Final = 1.0
 IN_USE_S: Final = 0.5
 """An anchor counts as in use while its last accepted difference is younger."""
 
+STEADY_S: Final = 2.0
+STEADY_SHARE: Final = 0.4
+"""So long after a start, or while a larger share of the differences lies beyond it, the narrow gate stays open."""
 
 MAX_STD_M: Final = 3.0
 """While the horizontal standard deviation is larger, there is no fix; a silence that makes it so means a new start."""
@@ -50,8 +55,14 @@ class PairTracking:
         settings: PairSettings,
         anchors_m: dict[int, tuple[float, float, float]],
         z_bounds_m: tuple[float, float] | None = None,
+        calibration: PairCalibration | None = None,
     ) -> None:
-        """``anchors_m`` places the anchors; a difference that brings its own positions needs none."""
+        """``anchors_m`` places the anchors; a difference that brings its own positions needs none.
+
+        ``calibration`` is taken off every difference, and narrows the gate while all goes well.
+        """
+        self._calibration = calibration
+        self._narrow_gate = settings.gate if calibration is None else calibration.gate(settings)
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self._settings = settings
@@ -60,7 +71,7 @@ class PairTracking:
         self._tracker = PairTracker(settings)
         self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
         self._started = False
-        self._last_s = 0.0
+        self._started_s = self._last_s = 0.0
         self._heard_s: dict[int, float] = {}
         self._since_try = 0
         self._area_m = (0.0, 0.0, 0.0)
@@ -78,7 +89,7 @@ class PairTracking:
                 self.counters["unknown-anchor"] += 1
                 self.reason = NoFixReason.NO_ALMANAC
             else:
-                used = self._take(pair, *places) or used
+                used = self._take(self._calibrated(pair, *places), *places) or used
         return used and self._started and self._is_sane()
 
     def _places_of(self, pair: PairTdoa) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
@@ -90,6 +101,14 @@ class PairTracking:
         a_m, b_m = places.get(pair.anchor_a), places.get(pair.anchor_b)
         return None if a_m is None or b_m is None else (a_m, b_m)
 
+    def _calibrated(self, pair: PairTdoa, a_m: NDArray[np.float64], b_m: NDArray[np.float64]) -> PairTdoa:
+        """The difference without the anchors' biases, those that change with the range as at the last position."""
+        if self._calibration is None:
+            return pair
+        at_m = self.position_m if self._started else None
+        correction_m = self._calibration.correction_m(pair, _point(a_m), _point(b_m), at_m)
+        return structs.replace(pair, tdoa_m=pair.tdoa_m + correction_m)
+
     def _take(self, pair: PairTdoa, a_m: NDArray[np.float64], b_m: NDArray[np.float64]) -> bool:
         time_s = pair.time_s
         dt_s = time_s - self._last_s
@@ -98,6 +117,7 @@ class PairTracking:
         self._last_s = time_s
         if not self._started:
             return self._try_start(pair)
+        self._tracker.set_gate(self._narrow_gate if self._is_steady(time_s) else self._settings.gate)
         if self._tracker.hear(a_m, b_m, dt_s, pair.tdoa_m):
             self._heard_s[pair.anchor_a] = self._heard_s[pair.anchor_b] = time_s
             return True
@@ -106,6 +126,10 @@ class PairTracking:
         if self._tracker.lost:
             self._stop()
         return False
+
+    def _is_steady(self, time_s: float) -> bool:
+        """Whether the state can be trusted with a narrow gate, behind which a wrong one would stay wrong."""
+        return time_s - self._started_s > STEADY_S and self._tracker.rejected_share < STEADY_SHARE
 
     def _is_out_of_reach(self, dt_s: float) -> bool:
         """Whether the filter cannot predict so far: too long a silence for it, or a clock that went back."""
@@ -165,7 +189,7 @@ class PairTracking:
             return False
         dim = self._tracker.dim
         self._tracker.start(solution.position_m[:dim], solution.covariance_m2[:dim, :dim], SPEED_STD_MPS**2)
-        self._started = True
+        self._started, self._started_s = True, pair.time_s
         self._heard_s = {anchor: pair.time_s for kept in self._window for anchor in (kept.anchor_a, kept.anchor_b)}
         self._window.clear()
         self.counters["start"] += 1
@@ -192,3 +216,8 @@ class PairTracking:
             height_m=self._settings.height_m,
             z_bounds_m=self._z_bounds_m,
         )
+
+
+def _point(place_m: NDArray[np.float64]) -> Point:
+    x_m, y_m, z_m = place_m.tolist()
+    return x_m, y_m, z_m
