@@ -6,60 +6,31 @@ constants can be seen; the zero is their mean, or one anchor.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from skyless.experiments.calibration_fit import Differences, Fit, Vector, fit, moves
 from skyless.positioning.pair_calibration import AnchorCalibration, PairCalibration
 
-Vector = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
-HUBER: Final = 1.345
-"""Standard deviations up to which a residual weighs in full: 95 % of the efficiency on Gaussian noise."""
-
-REJECT: Final = 4.0
 FEWEST: Final = 3
 """Accepted differences below which nothing is said of an anchor."""
 
 MAX_STD_M: Final = 0.1
 """A constant that is known worse does more harm than good."""
 
-BLOCK_S: Final = 5.0
-"""Reflections change while a walker or a drone goes a metre or two: errors within such a time count as one."""
-
-FEWEST_BLOCKS: Final = 10
 STEEPEST_M: Final = 0.12
 """Decawave's table (APS011) is nowhere steeper than 12 mm/dB, 0.105 m while the range grows by the factor e."""
 
 SURE: Final = 3.0
 """The slope is believed from so many of its standard errors on."""
 
-
 MAD_ERROR: Final = 1.17
 """Relative standard error of a 1.4826 MAD of n Gaussian values, times √n."""
 
-LEAST_MOTION: Final = 0.05
-"""How much the logarithms of the ratios must change beyond what constants explain for a slope to be looked for."""
-
 ALIKE: Final = "not used: the places are too much alike to tell it"
-
-
-@dataclass(frozen=True)
-class Differences:
-    """Time differences at known places, n of them."""
-
-    t_s: Vector
-    """Shape (n,), not decreasing."""
-    anchor_a: Indices
-    anchor_b: Indices
-    excess_m: Vector
-    """Measured less what the geometry says."""
-    log_ratio: Vector
-    """ln(range to b / range to a)."""
 
 
 class AnchorEstimate(Struct, frozen=True):
@@ -122,34 +93,16 @@ def estimate(differences: Differences, *, zero: int | None = None, slope: bool =
     found = np.unique(np.concatenate([differences.anchor_a, differences.anchor_b]))
     kept, reasons = _connected(differences, found.tolist(), zero)
     data = _only(differences, kept)
-    fit = _fit(data, np.array(kept, dtype=np.int64), slope=False)
-    steep = _fit(data, fit.anchors, slope=True) if slope and _moves(data, fit) else None
+    plain = fit(data, np.array(kept, dtype=np.int64), slope=False)
+    steep = fit(data, plain.anchors, slope=True) if slope and moves(data, plain) else None
     note = ALIKE if slope else "not asked for"
     if steep is not None:
         note = _slope_note(steep)
-    chosen = steep if steep is not None and not note else fit
+    chosen = steep if steep is not None and not note else plain
     for anchor, count in zip(chosen.anchors.tolist(), chosen.counts.tolist(), strict=True):
         if count < FEWEST:
             reasons[anchor] = f"only {count} differences that can be used; it takes {FEWEST}"
     return _estimate(differences, chosen, steep, note or "used", reasons, zero)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """A regression: m anchors, n differences."""
-
-    anchors: Indices
-    bias_m: Vector
-    """Shape (m,), sum 0."""
-    covariance_m2: NDArray[np.float64]
-    """Shape (m, m), or (m + 1, m + 1) with the slope."""
-    slope_m: float | None
-    residual_m: Vector
-    used: NDArray[np.bool_]
-    scale_m: float
-    a: Indices
-    b: Indices
-    counts: Indices
 
 
 def _connected(differences: Differences, anchors: Sequence[int], zero: int | None) -> tuple[list[int], dict[int, str]]:
@@ -178,147 +131,52 @@ def _only(differences: Differences, anchors: Sequence[int]) -> Differences:
     )
 
 
-def _fit(data: Differences, anchors: Indices, *, slope: bool) -> _Fit:
-    a, b = np.searchsorted(anchors, data.anchor_a), np.searchsorted(anchors, data.anchor_b)
-    x = data.log_ratio if slope else np.zeros(len(a))
-    y = _pair_medians(a, b, data.excess_m, len(anchors))
-    weights = np.ones(len(a))
-    for step in range(50):
-        before = weights
-        solution = _solve(_normal(a, b, x, weights, len(anchors)), _right(a, b, x, weights * y, len(anchors)))
-        residual_m = data.excess_m - _model(solution, a, b, x)
-        scale_m = max(1.4826 * float(np.median(np.abs(residual_m))), 1e-6)
-        share = np.abs(residual_m) / scale_m
-        weights = np.where(share <= REJECT, np.minimum(1.0, HUBER / np.maximum(share, HUBER)), 0.0)
-        y = data.excess_m
-        if step and np.abs(weights - before).max() < 1e-6:
-            break
-    used = share <= REJECT
-    counts = np.bincount(a[used], minlength=len(anchors)) + np.bincount(b[used], minlength=len(anchors))
-    covariance = _covariance(data.t_s, a, b, x, residual_m, scale_m, len(anchors))
-    if not slope:
-        covariance = covariance[:-1, :-1]
-    bias = solution[:-1]
-    return _Fit(
-        anchors, bias, covariance, float(solution[-1]) if slope else None, residual_m, used, scale_m, a, b, counts
-    )
-
-
-def _moves(data: Differences, fit: _Fit) -> bool:
-    """Whether the ranges change enough; at one place a slope looks like constants."""
-    a, b, count, still = fit.a, fit.b, len(fit.anchors), np.zeros(len(fit.a))
-    alike = _solve(_normal(a, b, still, still + 1.0, count), _right(a, b, still, data.log_ratio, count))
-    change = data.log_ratio - _model(alike, a, b, still)
-    return float(np.sqrt(np.mean(change**2))) > LEAST_MOTION
-
-
-def _pair_medians(a: Indices, b: Indices, excess_m: Vector, count: int) -> Vector:
-    """Each difference replaced by the median of its pair: a start that outliers do not touch."""
-    start = np.empty_like(excess_m)
-    pair = a * count + b
-    for one in np.unique(pair):
-        of_pair = pair == one
-        start[of_pair] = np.median(excess_m[of_pair])
-    return start
-
-
-def _solve(normal: NDArray[np.float64], right: Vector) -> Vector:
-    solution: Vector = np.linalg.solve(normal, right).astype(np.float64)
-    return solution
-
-
-def _model(solution: Vector, a: Indices, b: Indices, x: Vector) -> Vector:
-    values: Vector = solution[b] - solution[a] + solution[-1] * x
-    return values
-
-
-def _right(a: Indices, b: Indices, x: Vector, values: Vector, count: int) -> Vector:
-    """Hᵀ times values; the slope is the last column."""
-    right: Vector = (np.bincount(b, values, count + 1) - np.bincount(a, values, count + 1)).astype(np.float64)
-    right[-1] = x @ values
-    return right
-
-
-def _normal(a: Indices, b: Indices, x: Vector, weights: Vector, count: int) -> NDArray[np.float64]:
-    """Hᵀ W H; the sum of the constants is held at zero, and the slope where nothing tells it."""
-    normal = np.zeros((count + 1, count + 1))
-    flat = normal.reshape(-1)
-    for row, column, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
-        flat += sign * np.bincount(row * (count + 1) + column, weights, flat.size)
-    cross = np.bincount(b, weights * x, count + 1) - np.bincount(a, weights * x, count + 1)
-    normal[-1, :] += cross
-    normal[:, -1] += cross
-    normal[-1, -1] = weights @ (x * x)
-    typical = max(float(np.trace(normal[:-1, :-1])) / count, 1e-9)
-    normal[:-1, :-1] += typical / count
-    normal[-1, -1] += 1e-9 * typical
-    return normal
-
-
-def _covariance(
-    t_s: Vector, a: Indices, b: Indices, x: Vector, residual_m: Vector, scale_m: float, count: int
-) -> NDArray[np.float64]:
-    """Errors within a block of time taken as one (sandwich); never less than independent ones would make it."""
-    share = np.abs(residual_m) / scale_m
-    influence = np.where(share <= REJECT, np.clip(residual_m, -HUBER * scale_m, HUBER * scale_m), 0.0)
-    bread = np.linalg.inv(_normal(a, b, x, (share < HUBER).astype(np.float64), count))
-    block_s = min(BLOCK_S, (t_s[-1] - t_s[0]) / FEWEST_BLOCKS)
-    block = ((t_s - t_s[0]) / max(block_s, 1e-9)).astype(np.int64)
-    blocks = [_right(a[here], b[here], x[here], influence[here], count) for here in map(block.__eq__, np.unique(block))]
-    meat = np.array(blocks).T @ np.array(blocks) * len(blocks) / max(len(blocks) - 1, 1)
-    white = _normal(a, b, x, influence**2, count)
-    together, apart = bread @ meat @ bread, bread @ white @ bread
-    grow = np.sqrt(np.maximum(np.diag(apart) / np.maximum(np.diag(together), 1e-30), 1.0))
-    result: NDArray[np.float64] = together * np.outer(grow, grow)
-    return result
-
-
-def _slope_note(fit: _Fit) -> str:
+def _slope_note(found: Fit) -> str:
     """Why the slope is not used; empty if it is."""
-    slope_m, std_m = fit.slope_m or 0.0, float(np.sqrt(fit.covariance_m2[-1, -1]))
+    slope_m, std_m = found.slope_m or 0.0, float(np.sqrt(found.covariance_m2[-1, -1]))
     if std_m > STEEPEST_M / SURE:
         return ALIKE
     if slope_m < SURE * std_m:
         return "not used: it cannot be told from zero"
-    if slope_m > STEEPEST_M + SURE * std_m:
+    if slope_m > STEEPEST_M:
         return "not used: no radio has such a slope, so something else is behind it"
     return ""
 
 
 def _estimate(
     differences: Differences,
-    fit: _Fit,
-    steep: _Fit | None,
+    found: Fit,
+    steep: Fit | None,
     note: str,
     reasons: dict[int, str],
     zero: int | None,
 ) -> CalibrationEstimate:
-    count = len(fit.anchors)
-    good = np.array([anchor not in reasons for anchor in fit.anchors.tolist()])
-    bias_m, std_m = _in_gauge(fit, good, zero)
+    count = len(found.anchors)
+    good = np.array([anchor not in reasons for anchor in found.anchors.tolist()])
+    bias_m, std_m = _in_gauge(found, good, zero)
     for row in np.flatnonzero(good & (std_m > MAX_STD_M)):
-        reasons[int(fit.anchors[row])] = f"its standard error would be {std_m[row]:.2f} m"
-    rows = {anchor: row for row, anchor in enumerate(fit.anchors.tolist())}
+        reasons[int(found.anchors[row])] = f"its standard error would be {std_m[row]:.2f} m"
+    rows = {anchor: row for row, anchor in enumerate(found.anchors.tolist())}
     anchors = []
-    differences_used = int(fit.used.sum())
+    differences_used = int(found.used.sum())
     for anchor in np.unique(np.concatenate([differences.anchor_a, differences.anchor_b])).tolist():
         place = rows.get(anchor)
-        used = 0 if place is None else int(fit.counts[place])
+        used = 0 if place is None else int(found.counts[place])
         if place is None or anchor in reasons:
             anchors.append(AnchorEstimate(anchor, used, None, None, None, reasons[anchor]))
             continue
-        of_anchor = np.abs(fit.residual_m[fit.used & ((fit.a == place) | (fit.b == place))])
-        noise_m = 1.4826 * float(np.median(of_anchor)) * _spent(differences_used, len(fit.anchors))
+        of_anchor = np.abs(found.residual_m[found.used & ((found.a == place) | (found.b == place))])
+        noise_m = 1.4826 * float(np.median(of_anchor)) * _spent(differences_used, len(found.anchors))
         anchors.append(AnchorEstimate(anchor, used, float(bias_m[place]), float(std_m[place]), noise_m, None))
-    pair = fit.a * count + fit.b
-    medians = [float(np.median(fit.residual_m[here])) for here in map(pair.__eq__, np.unique(pair[fit.used]))]
+    pair = found.a * count + found.b
+    medians = [float(np.median(found.residual_m[here])) for here in map(pair.__eq__, np.unique(pair[found.used]))]
     return CalibrationEstimate(
         anchors=tuple(anchors),
         zero="mean" if zero is None else f"anchor {zero}",
-        slope_m=fit.slope_m,
+        slope_m=found.slope_m,
         slope_std_m=None if steep is None else float(np.sqrt(steep.covariance_m2[-1, -1])),
         slope_note=note,
-        noise_m=fit.scale_m * _spent(differences_used, len(fit.anchors)),
+        noise_m=found.scale_m * _spent(differences_used, len(found.anchors)),
         noise_before_m=1.4826 * float(np.median(np.abs(differences.excess_m))),
         loop_m=float(np.sqrt(np.mean(np.square(medians)))),
         used=differences_used,
@@ -331,14 +189,14 @@ def _spent(differences: int, anchors: int) -> float:
     return float(np.sqrt(differences / max(differences - anchors + 1, 1)))
 
 
-def _in_gauge(fit: _Fit, good: NDArray[np.bool_], zero: int | None) -> tuple[Vector, Vector]:
+def _in_gauge(found: Fit, good: NDArray[np.bool_], zero: int | None) -> tuple[Vector, Vector]:
     """Constants and their standard errors with the zero where it should be, each of shape (m,)."""
-    count = len(fit.anchors)
+    count = len(found.anchors)
     place = np.zeros(count)
     if zero is not None:
-        place[fit.anchors == zero] = 1.0
+        place[found.anchors == zero] = 1.0
     else:
         place[good] = 1.0 / max(int(good.sum()), 1)
     shift = np.eye(count) - place
-    covariance = shift @ fit.covariance_m2[:count, :count] @ shift.T
-    return shift @ fit.bias_m, np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    covariance = shift @ found.covariance_m2[:count, :count] @ shift.T
+    return shift @ found.bias_m, np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from skyless.air.packet import Packet, PairTdoa, Point
 from skyless.errors import SkylessError
-from skyless.experiments.calibration import Differences
+from skyless.experiments.calibration_fit import Differences
 from skyless.experiments.judge import Judge
 from skyless.experiments.statistics import EvenSample
 from skyless.positioning.masterless import PairEngine
