@@ -5,19 +5,40 @@ import json
 from skyless.cli.main import main
 
 
-def test_it_measures_the_draws_beside_the_numpy_loop(capsys):
-    assert main(["bench", "--draws", "5000", "--anchors", "3", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])["monte_carlo"]
+def test_it_measures_everything_beside_its_yardsticks(capsys):
+    assert main(["bench", "--quick", "--draws", "5000", "--anchors", "3", "--json"]) == 0
+    everything = json.loads(capsys.readouterr().out.splitlines()[-1])
+    told = everything["monte_carlo"]
     assert told["anchors"] == 3
     rates = [told["numpy_loop_draws_per_s"], told["one_core_draws_per_s"], told["all_cores_draws_per_s"]]
     assert all(rate > 0.0 for rate in rates)
     assert told["ratio"] == rates[1] / rates[0]
+    kernels = everything["kernels"]
+    assert kernels["streaming"]["seconds_per_message"] > 0.0
+    for name in ("tracker", "joint", "joint_mesh"):
+        kernel = kernels[name]
+        assert kernel["ratio"] == kernel["messages_per_s"] / kernel["numpy_messages_per_s"] > 1.0
+        assert kernel["loop_ratio"] == kernel["messages_per_s"] / kernel["loop_messages_per_s"] > 0.0
+    for tags in everything["tags"].values():
+        assert set(tags["ns_per_message"]) == {"1", "100", "10000"}
+        assert tags["all_cores_messages_per_s"] > 0.0
+    assert everything["snapshots"]["ratio"] > 0.0
 
 
 def test_the_table_names_every_way(capsys):
-    assert main(["bench", "--draws", "2000"]) == 0
+    assert main(["bench", "--quick", "--draws", "2000"]) == 0
     told = capsys.readouterr().out
-    assert all(name in told for name in ("NumPy loop, one core", "compiled, one core", "GPU"))
+    assert all(
+        name in told
+        for name in (
+            "joint, mesh",
+            "Receiver, joint",
+            "least_squares",
+            "NumPy loop, one core",
+            "compiled, one core",
+            "GPU",
+        )
+    )
 
 
 def test_too_few_draws_are_a_slip(capsys):

@@ -1,11 +1,17 @@
 """``skyless bench``: how fast the heavy parts run here."""
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-app = App(name="bench", help_epilogue="Example: skyless bench --draws 1000000 --json")
+if TYPE_CHECKING:
+    from skyless.experiments.benchmarks import Speed
+    from skyless.experiments.yardstick import MonteCarloSpeed
+
+QUICK_DRAWS: Final = 100_000
+
+app = App(name="bench", help_epilogue="Example: skyless bench --json")
 
 
 @app.default
@@ -13,35 +19,73 @@ def bench(
     *,
     draws: Annotated[int, Parameter(validator=Number(gte=100, lte=10**9))] = 1_000_000,
     anchors: Annotated[int, Parameter(validator=Number(gte=1, lte=1000))] = 10,
+    quick: bool = False,
     json: bool = False,
 ) -> None:
-    """Measure Monte Carlo draws of the paper's chain beside a plain NumPy loop over the same draws.
+    """Measure filters and Monte Carlo draws beside plain NumPy, filterpy, scipy and plain compiled loops.
+
+    The filters' figures are medians of several short runs on one core, by the time that the core gave them.
 
     Parameters
     ----------
     draws
-        Draws of the compiled chain; the NumPy loop makes a hundredth of them.
+        Draws of the paper's chain, compiled; the NumPy loop makes a hundredth of them.
     anchors
         Anchors in each draw.
+    quick
+        A look in a few seconds, with fewer and shorter runs and at most a tenth of a million draws.
     json
         Write one JSON object instead of a table.
     """
-    from skyless.cli.output import console, print_json
+    from skyless.cli.output import print_json
     from skyless.cli.progress import status
+    from skyless.experiments.benchmarks import FULL, QUICK, measure_all
     from skyless.experiments.yardstick import measure
 
+    draws = min(draws, QUICK_DRAWS) if quick else draws
+    with status("filters"):
+        speed = measure_all(QUICK if quick else FULL)
     with status(f"{draws:,} draws of {anchors} anchors"):
-        speed = measure(draws, anchors)
+        chain = measure(draws, anchors)
     if json:
-        print_json({"monte_carlo": speed})
+        from msgspec.structs import asdict
+
+        print_json({**asdict(speed), "monte_carlo": chain})
         return
-    rows = [
-        ("NumPy loop, one core", speed.numpy_loop_draws_per_s),
-        ("compiled, one core", speed.one_core_draws_per_s),
-        (f"compiled, {speed.cores} cores", speed.all_cores_draws_per_s),
-        ("GPU", speed.gpu_draws_per_s),
-    ]
+    _tell(speed, chain)
+
+
+def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
+    from skyless.cli.output import console
+
     out = console()
+    load = "" if speed.load is None else f", load {speed.load:.1f}"
+    out.print(f"{speed.cores} cores{load}; filters on one core, medians")
+    kernels = speed.kernels
+    for name, kernel in (("tracker", kernels.tracker), ("joint", kernels.joint), ("joint, mesh", kernels.joint_mesh)):
+        ratios = f"{kernel.ratio:.0f} × NumPy, {kernel.loop_ratio:.2f} × a plain compiled loop"
+        if kernel.filterpy_ratio is not None:
+            ratios += f", {kernel.filterpy_ratio:.0f} × filterpy"
+        out.print(f"{name:<24}{kernel.messages_per_s:>14,.0f} messages/s  {ratios}")
+    streaming = kernels.streaming
+    for name, value in (("joint", streaming.seconds_per_message), ("tracker", streaming.tracker_seconds_per_message)):
+        out.print(f"{'Receiver, ' + name:<24}{1e6 * value:>14.1f} µs a message")
+    snapshots = speed.snapshots
+    out.print(
+        f"{'snapshots':<24}{snapshots.fixes_per_s:>14,.0f} fixes/s  {snapshots.ratio:.1f} × scipy's least_squares"
+    )
+    for name, tags in speed.tags.items():
+        each = ", ".join(f"{value:.0f} ns with {count:,}" for count, value in tags.ns_per_message.items())
+        all_cores = f"{tags.all_cores_messages_per_s:,.0f} messages/s on all cores"
+        out.print(f"{'tags at once, ' + name:<24}{each} tags; {all_cores}")
+    if speed.filterpy:
+        out.print(speed.filterpy)
+    rows = [
+        ("NumPy loop, one core", chain.numpy_loop_draws_per_s),
+        ("compiled, one core", chain.one_core_draws_per_s),
+        (f"compiled, {chain.cores} cores", chain.all_cores_draws_per_s),
+        ("GPU", chain.gpu_draws_per_s),
+    ]
     for name, rate in rows:
         out.print(f"{name:<24}" + (f"{rate:>14,.0f} draws/s" if rate is not None else f"{'none here':>14}"))
-    out.print(f"compiled over NumPy loop, one core: {speed.ratio:.1f} times")
+    out.print(f"compiled over NumPy loop, one core: {chain.ratio:.1f} times")

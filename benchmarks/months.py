@@ -1,0 +1,147 @@
+"""Months of messages through a filter: ``python benchmarks/months.py tracker|joint|joint_mesh [MESSAGES]``.
+
+A minute of a tag that stands still, seven nodes, crystals of up to 20 ppm, is drawn once and heard again and again on
+counters that go on. A hundred times on the way the covariance must be symmetric to the bit, positive and as large as
+in the beginning, and the position where the tag is. A line of JSON tells the worst of it; a failure ends the run.
+"""
+
+import json
+import sys
+import time
+
+import numpy as np
+
+from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.positioning.joint import JointFilter, JointSettings, Messages
+from skyless.positioning.joint_state import REJECTED, states
+from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings, track
+
+NODES, SUPERFRAMES, SLOT_TICKS = 7, 2048, round(5e-3 * TICK_RATE_HZ)
+TAG_M = np.array([3.0, 4.0, 0.0])
+ANGLES = 2.0 * np.pi * np.arange(NODES) / NODES
+ANCHORS_M = np.column_stack([3.0 + 4.0 * np.cos(ANGLES), 4.0 + 5.0 * np.sin(ANGLES), np.zeros(NODES)])
+NOISE_M = 0.03
+CHECKS = 100
+
+
+class Minute:
+    """Receptions of 72 s, and how far every counter goes in that time."""
+
+    def __init__(self):
+        self.count = SUPERFRAMES * NODES
+        draw = np.random.default_rng(1)
+        period = self.tag_step = self.count * SLOT_TICKS
+        self.senders = np.arange(self.count) % NODES
+        self.steps = np.array([round(period * (1.0 + ppm * 1e-6)) for ppm in draw.uniform(-20.0, 20.0, NODES)])
+        sent_m, noise_m = draw.normal(0.0, NOISE_M, (2, self.count))
+        ideal = np.arange(self.count) * SLOT_TICKS
+        flight_m = np.linalg.norm(ANCHORS_M - TAG_M, axis=1)
+        self.tx_ticks = np.array([self.reading(k, sender) for k, sender in enumerate(self.senders)])
+        self.rx_ticks = ideal + np.rint((flight_m[self.senders] + sent_m + noise_m) / TICK_M).astype(np.int64)
+        self.way_m = np.linalg.norm(ANCHORS_M[:, None] - ANCHORS_M[None], axis=2)
+        self.arrived_m = sent_m[:, None] + self.way_m[self.senders] + draw.normal(0.0, NOISE_M, (self.count, NODES))
+
+    def reading(self, k, node):
+        """What a node's counter shows when packet k leaves, in ticks (the products do not fit into 64 bits)."""
+        return k * SLOT_TICKS * int(self.steps[node]) // self.tag_step
+
+    def relays(self, mesh):
+        """What each packet tells of the packets since the sender's own last one, and where each packet's share ends."""
+        rows, ends = [], []
+        for k, sender in enumerate(self.senders):
+            for heard in range(max(0, k - NODES + 1), k):
+                if mesh or self.senders[heard] == 0:
+                    stamp = self.reading(heard, sender) + round(self.arrived_m[heard, sender] / TICK_M)
+                    rows.append((sender, self.senders[heard], heard // NODES % 256, stamp))
+            ends.append(len(rows))
+        return np.array(rows, np.int64), np.array(ends)
+
+
+class Joint:
+    def __init__(self, mesh):
+        minute = Minute()
+        relays, ends = minute.relays(mesh)
+        sequences = np.arange(minute.count) // NODES % 256
+        self.minute, self.count = minute, minute.count
+        self.messages = Messages(minute.senders, sequences, minute.rx_ticks, minute.tx_ticks, relays, ends)
+        self.filter = JointFilter(JointSettings(qa=0.3, height_m=0.0), ANCHORS_M)
+        self.filter.start(0, TAG_M[:2], 1e-2 * np.eye(2), 0.01)
+
+    def once(self):
+        m = self.messages
+        self.filter.track(m)
+        m.rx_ticks[:] += self.minute.tag_step
+        m.tx_ticks[:] += self.minute.steps[m.sites]
+        m.relays[:, 3] += self.minute.steps[m.relays[:, 0]]
+
+    def state(self):
+        n = states(self.filter.arrays)
+        return self.filter.arrays.x[:n], self.filter.arrays.P[:n, :n], int(self.filter.arrays.counts[REJECTED])
+
+    def position(self):
+        return self.filter.motion()[0][:2]
+
+
+class Tracker:
+    def __init__(self):
+        minute = Minute()
+        self.minute, self.count = minute, minute.count
+        self.tx = np.array([minute.reading(k, 0) for k in range(self.count)])
+        self.filter = PseudorangeTracker(TrackerSettings(qa=0.3, height_m=0.0))
+        rate = (1.0 - minute.steps[0] / minute.tag_step) * 299_792_458.0
+        self.filter.start(0, 0, np.array([*TAG_M[:2], 0.0]), 0.01 * np.eye(3), rate, 1.0, 0.01)
+        self.rest = (np.zeros(self.count), np.full(self.count, 1e-4), np.empty((self.count, 6)))
+
+    def once(self):
+        t = self.filter
+        arrays = (t.x, t.P, t.whole, t.statistics, t.settings, t.h, t.ph)
+        track(*arrays, ANCHORS_M[self.minute.senders], self.minute.rx_ticks, self.tx, *self.rest)
+        self.minute.rx_ticks += self.minute.tag_step
+        self.tx += self.minute.steps[0]
+
+    def state(self):
+        return self.filter.x, self.filter.P, int(self.filter.whole[REJECTED])
+
+    def position(self):
+        return self.filter.x[:2]
+
+
+def check(run, early):
+    """The smallest eigenvalue of the correlations, the largest change of a variance, the error; raises if unsound."""
+    x, P, _ = run.state()
+    assert np.isfinite(x).all(), "the state is not finite"
+    assert np.isfinite(P).all(), "the covariance is not finite"
+    assert np.array_equal(P, P.T), "the covariance is not symmetric"
+    scale = np.sqrt(np.diag(P))
+    least = np.linalg.eigvalsh(P / np.outer(scale, scale)).min()
+    growth = np.abs(np.diag(P) / early - 1.0).max()
+    error_m = np.linalg.norm(run.position() - TAG_M[:2])
+    assert least > 1e-9, f"the covariance is not positive: {least}"
+    assert growth < 0.05, f"variances have changed by {growth:.0%}"
+    assert error_m < 0.2, f"the position is {error_m:.2f} m off"
+    return least, growth, error_m
+
+
+def main():
+    kind = sys.argv[1]
+    wanted = int(float(sys.argv[2])) if len(sys.argv) > 2 else 10**9
+    run = Tracker() if kind == "tracker" else Joint(kind == "joint_mesh")
+    rounds = -(-wanted // run.count)
+    every = max(1, rounds // CHECKS)
+    started_s, early, found = time.perf_counter(), None, []
+    for number in range(1, rounds + 1):
+        run.once()
+        early = np.diag(run.state()[1]).copy() if early is None else early
+        if number % every == 0 or number == rounds:
+            found.append(check(run, early))
+    least, growth, error_m = np.array(found).T
+    count = rounds * run.count
+    told = {"kernel": kind, "messages": count, "days": round(count * SLOT_TICKS * TICK_S / 86400.0, 1)}
+    told |= {"checks": len(found), "states": len(early), "rejected": run.state()[2], "symmetric_to_the_bit": True}
+    told |= {"least_eigenvalue": least.min(), "largest_change_of_a_variance": growth.max()}
+    told |= {"largest_error_m": error_m.max(), "seconds": round(time.perf_counter() - started_s, 1)}
+    print(json.dumps(told))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,201 @@
+"""The yardsticks of ``skyless bench``: ``tracker`` and ``joint`` in plain NumPy, matrix by matrix, and filterpy's EKF.
+
+They take the same measurements as the kernels and come to the same states (``tests/experiments/test_benchmarks.py``).
+"""
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.positioning.joint import JointSettings
+from skyless.positioning.joint_hearing import RELAY_AGE_S
+from skyless.positioning.tracker import (
+    AGILITY_GAIN,
+    AGILITY_LOSS,
+    FORGETTING,
+    MAX_AGILITY,
+    RESTLESS_CHI2,
+    PseudorangeTracker,
+    TrackerSettings,
+)
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+
+def transition(dim: int, dt_s: float, qa: float, white: float, walk: float) -> tuple[Matrix, Matrix]:
+    """F and Q of [position (dim), velocity (dim), clock offset, rate]."""
+    n = 2 * dim + 2
+    F, Q = np.eye(n), np.zeros((n, n))
+    F[:dim, dim:-2] = dt_s * np.eye(dim)
+    F[-2, -1] = dt_s
+    Q[:dim, :dim] = np.eye(dim) * qa * dt_s**3 / 3
+    Q[:dim, dim:-2] = Q[dim:-2, :dim] = np.eye(dim) * qa * dt_s**2 / 2
+    Q[dim:-2, dim:-2] = np.eye(dim) * qa * dt_s
+    Q[-2:, -2:] = [
+        [white * dt_s + walk * dt_s**3 / 3, walk * dt_s**2 / 2],
+        [walk * dt_s**2 / 2, walk * dt_s],
+    ]
+    return F, Q
+
+
+class PlainTracker:
+    """``tracker`` as one would write it first, beginning where a real one stands; the height is given."""
+
+    def __init__(self, settings: TrackerSettings, begun: PseudorangeTracker) -> None:
+        self._s = settings
+        self.x, self.P = begun.x.copy(), begun.P.copy()
+        self._epoch, self._whole = (int(value) for value in begun.whole[:2])
+        self._chi2, self._agility = 1.0, 1.0
+
+    def elapse(self, rx_ticks: int) -> tuple[Matrix, Matrix]:
+        """F and Q up to a reading of the tag."""
+        dt_s = (rx_ticks - self._epoch) * TICK_S / (1.0 + self.x[-1] / SPEED_OF_LIGHT_MPS)
+        self._epoch = rx_ticks
+        return transition(2, dt_s, self._s.qa * self._agility, self._s.white, self._s.walk)
+
+    def expected(self, x: Vector, anchor_m: Vector) -> tuple[float, Vector]:
+        """The pseudorange that a state expects, in metres, and its gradient."""
+        away = np.append(x[:2], self._s.height_m) - anchor_m
+        range_m = float(np.linalg.norm(away))
+        return range_m + x[-2], np.array([away[0] / range_m, away[1] / range_m, 0.0, 0.0, 1.0, 0.0])
+
+    def measured(self, rx_ticks: int, tx_ticks: int) -> float:
+        """The pseudorange in metres, less whole ticks."""
+        return (rx_ticks - tx_ticks - self._whole) * TICK_M
+
+    def hear(self, anchor_m: Vector, rx_ticks: int, tx_ticks: int, tx_variance_m2: float) -> bool:
+        """Take one beacon; False beyond the gate."""
+        F, Q = self.elapse(rx_ticks)
+        self.x = F @ self.x
+        self.P = F @ self.P @ F.T + Q
+        expected, h = self.expected(self.x, anchor_m)
+        innovation = self.measured(rx_ticks, tx_ticks) - expected
+        spread = h @ self.P @ h + self._s.stamp_variance_m2 + tx_variance_m2
+        normalised = innovation**2 / spread
+        if normalised > self._s.gate**2:
+            return False
+        gain = self.P @ h / spread
+        self.x = self.x + gain * innovation
+        self.P = self.P - np.outer(gain, self.P @ h)
+        self._chi2 += FORGETTING * (normalised - self._chi2)
+        restless = self._chi2 > RESTLESS_CHI2
+        self._agility = (
+            min(self._agility * AGILITY_GAIN, MAX_AGILITY) if restless else max(self._agility * AGILITY_LOSS, 1.0)
+        )
+        return True
+
+
+class FilterpyTracker(PlainTracker):
+    """The same measurements through filterpy's extended Kalman filter, which has no gate and no agility.
+
+    Raises:
+        ImportError: filterpy is not installed.
+    """
+
+    def __init__(self, settings: TrackerSettings, begun: PseudorangeTracker) -> None:
+        super().__init__(settings, begun)
+        self.filter: Any = import_module("filterpy.kalman").ExtendedKalmanFilter(dim_x=6, dim_z=1)
+        self.filter.x, self.filter.P = self.x.reshape(6, 1), self.P
+
+    def hear(self, anchor_m: Vector, rx_ticks: int, tx_ticks: int, tx_variance_m2: float) -> bool:
+        """Take one beacon."""
+        ekf = self.filter
+        ekf.F, ekf.Q = self.elapse(rx_ticks)
+        ekf.predict()
+        ekf.R[0, 0] = self._s.stamp_variance_m2 + tx_variance_m2
+        ekf.update(
+            np.array([[self.measured(rx_ticks, tx_ticks)]]),
+            lambda x: self.expected(x[:, 0], anchor_m)[1].reshape(1, 6),
+            lambda x: np.array([[self.expected(x[:, 0], anchor_m)[0]]]),
+        )
+        self.x, self.P = ekf.x[:, 0], ekf.P
+        return True
+
+
+class PlainJoint:
+    """``joint`` as one would write it first: all anchors from the start, a wide prior, nothing exploited.
+
+    The states are position and velocity (the height is given), then of every anchor the offset of its clock, then the
+    rates, then the noise of each last TX stamp.
+    """
+
+    def __init__(
+        self, settings: JointSettings, anchors_m: Matrix, rx_ticks: int, start_m: Vector, variances: tuple[float, float]
+    ) -> None:
+        """``start_m``: (2,); ``variances``: of position and speed."""
+        n = len(anchors_m)
+        self._s, self._anchors_m, self._n, self._epoch = settings, anchors_m, n, rx_ticks
+        self.x = np.concatenate([start_m, np.zeros(2 + 3 * n)])
+        rate = settings.array()[8]
+        self.P = np.diag([variances[0]] * 2 + [variances[1]] * 2 + [1e8] * n + [rate] * n + [0.0] * n)
+        self._whole: dict[int, int] = {}
+        self._packets: dict[tuple[int, int], tuple[int, int]] = {}
+        self._relayed: dict[tuple[int, int], int] = {}
+        self._newest: dict[int, int] = {}
+        self._range_m: dict[int, float] = {}
+
+    def hear(self, site: int, sequence: int, rx: int, tx: int, relays: NDArray[np.int64]) -> None:
+        """Take one packet, as ``JointFilter.hear`` does."""
+        self._elapse(rx)
+        n, s = self._n, self._s
+        noise = 4 + 2 * n + site
+        self.P[noise, :] = self.P[:, noise] = 0.0
+        self.P[noise, noise], self.x[noise] = s.tx_variance_m2, 0.0
+        away = np.append(self.x[:2], s.height_m) - self._anchors_m[site]
+        range_m = float(np.linalg.norm(away))
+        h = np.zeros(len(self.x))
+        h[:2] = away[:2] / range_m
+        h[4 + site] = h[noise] = 1.0
+        whole = self._whole.setdefault(site, rx - tx)
+        self._update(h, (rx - tx - whole) * TICK_M - range_m - self.x[4 + site], s.rx_variance_m2)
+        self._newest[site], self._range_m[site] = tx, range_m
+        self._packets[site, sequence] = (tx, rx)
+        for listener, of, number, heard in relays.tolist():
+            self._hear_relay(listener, of, number, heard)
+
+    def _elapse(self, rx: int) -> None:
+        n, s = self._n, self._s
+        dt = (rx - self._epoch) * TICK_S
+        self._epoch = rx
+        b, f = slice(4, 4 + n), slice(4 + n, 4 + 2 * n)
+        F, Q = np.eye(len(self.x)), np.zeros_like(self.P)
+        F[0, 2] = F[1, 3] = dt
+        F[b, f] = dt * np.eye(n)
+        Q[:2, :2], Q[2:4, 2:4] = np.eye(2) * s.qa * dt**3 / 3, np.eye(2) * s.qa * dt
+        Q[:2, 2:4] = Q[2:4, :2] = np.eye(2) * s.qa * dt**2 / 2
+        both = np.eye(n) + np.ones((n, n))
+        Q[b, b] = both * (s.white * dt + s.walk * dt**3 / 3)
+        Q[b, f] = Q[f, b] = both * s.walk * dt**2 / 2
+        Q[f, f] = both * s.walk * dt
+        self.x = F @ self.x
+        self.P = F @ self.P @ F.T + Q
+
+    def _hear_relay(self, listener: int, of: int, sequence: int, heard: int) -> None:
+        n, s = self._n, self._s
+        tx, rx = self._packets.get((of, sequence), (0, 0))
+        known = tx > self._relayed.get((listener, of), -1) and listener in self._whole
+        if not known or (self._epoch - rx) * TICK_S >= RELAY_AGE_S:
+            return
+        self._relayed[listener, of] = tx
+        way_m = float(np.linalg.norm(self._anchors_m[listener] - self._anchors_m[of]))
+        age = (self._epoch - rx) * TICK_S + (self._range_m[of] - way_m) / SPEED_OF_LIGHT_MPS
+        h = np.zeros(len(self.x))
+        h[4 + of], h[4 + listener] = 1.0, -1.0
+        h[4 + n + of], h[4 + n + listener] = -age, age
+        variance = s.rx_variance_m2 + 2.0 * age * (s.white + s.walk * age * age / 3.0)
+        if self._newest[of] == tx:
+            h[4 + 2 * n + of] = 1.0
+        else:
+            variance += s.tx_variance_m2
+        measured = (heard - tx - self._whole[of] + self._whole[listener]) * TICK_M - way_m
+        self._update(h, measured - h @ self.x, variance)
+
+    def _update(self, h: Vector, innovation: float, variance: float) -> None:
+        gain = self.P @ h / (h @ self.P @ h + variance)
+        self.x = self.x + gain * innovation
+        keep = np.eye(len(self.x)) - np.outer(gain, h)
+        self.P = keep @ self.P @ keep.T + variance * np.outer(gain, gain)

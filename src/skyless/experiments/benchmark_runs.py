@@ -1,0 +1,147 @@
+"""What ``skyless bench`` lets the filters hear: seven nodes in the lab's room and a tag that stands still."""
+
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
+from skyless.experiments.benchmark_filters import FilterpyTracker, PlainJoint, PlainTracker
+from skyless.experiments.benchmark_loops import joint_filter, scalar_filter
+from skyless.experiments.studies.episodes import Case, draw_episode
+from skyless.positioning.joint import JointFilter, JointSettings, Messages
+from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings, track
+
+Array = NDArray[np.float64]
+Ticks = NDArray[np.int64]
+Run = Callable[[], object]
+"""Prepared before a clock starts, called once while it runs."""
+
+NODES: Final = 7
+SLOT_S: Final = 2.1e-3
+NOISE_M: Final = 100e-12 * SPEED_OF_LIGHT_MPS
+_ANGLES: Final = 2.0 * np.pi * np.arange(NODES) / NODES
+ANCHORS_M: Final = np.column_stack([3.0 + 4.0 * np.cos(_ANGLES), 4.0 + 5.0 * np.sin(_ANGLES), np.zeros(NODES)])
+START_VARIANCES: Final = (0.09, 0.16)
+"""Of a position and of a speed."""
+
+
+class TrackerRuns:
+    """The same measurements for ``tracker``, for plain NumPy, filterpy, and a loop of eight states."""
+
+    def __init__(self, superframes: int) -> None:
+        episode = draw_episode(np.random.default_rng(1), ANCHORS_M, SLOT_S, Case(qa=0.0), superframes)
+        sites, draw = episode.messages.sites, np.random.default_rng(2)
+        self.count = len(sites)
+        self.settings = TrackerSettings(height_m=0.0)
+        self.tag_m = episode.path_m[0]
+        self.anchors_m = ANCHORS_M[sites]
+        self.pseudoranges_m = np.linalg.norm(self.anchors_m - self.tag_m, axis=1)
+        self.pseudoranges_m += draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
+        self.rx_ticks = episode.messages.rx_ticks
+        self.tx_ticks: Ticks = self.rx_ticks - np.rint(self.pseudoranges_m / TICK_M).astype(np.int64)
+        self.variances = np.full(self.count, 1e-4)
+
+    def begun(self) -> PseudorangeTracker:
+        """A tracker that begins where the tag stands."""
+        tracker = PseudorangeTracker(self.settings)
+        start = np.array([*self.tag_m[:2], 0.0])
+        tracker.start(int(self.rx_ticks[0]), 0, start, 0.01 * np.eye(3), 0.0, 1.0, 1.0)
+        return tracker
+
+    def batch(self, t: PseudorangeTracker, part: slice, states: Array) -> None:
+        """Give a tracker some of the messages in one call; rows of ``states`` are filled in."""
+        arrays = (t.x, t.P, t.whole, t.statistics, t.settings, t.h, t.ph)
+        columns = (self.anchors_m[part], self.rx_ticks[part], self.tx_ticks[part])
+        track(*arrays, *columns, np.zeros(len(columns[0])), self.variances[part], states)
+
+    def kernel(self) -> Run:
+        """All messages through the kernel."""
+        tracker, states = self.begun(), np.empty((self.count, 6))
+        return lambda: self.batch(tracker, slice(None), states)
+
+    def plain(self, count: int, kind: type[PlainTracker] = PlainTracker) -> Run:
+        """The first messages through plain NumPy or filterpy."""
+        tracker = kind(self.settings, self.begun())
+        rows = list(zip(self.anchors_m[:count], self.rx_ticks[:count].tolist(), self.tx_ticks.tolist(), strict=False))
+        return lambda: _each(lambda row: tracker.hear(*row, 1e-4), rows)
+
+    def filterpy(self, count: int) -> Run:
+        """The first messages through filterpy."""
+        return self.plain(count, FilterpyTracker)
+
+    def loop(self) -> Run:
+        """All messages through a plain loop of eight states."""
+        x, P = np.zeros(8), np.eye(8)
+        x[:2] = self.tag_m[:2]
+        steps, noise = np.full(self.count, SLOT_S), np.array([self.settings.qa, 7.2e-5, 0.18])
+        return lambda: scalar_filter(x, P, self.anchors_m, steps, self.pseudoranges_m, 2e-3, noise)
+
+
+class JointRuns:
+    """The same messages for ``joint`` and for plain NumPy; a loop of 18 states beside them."""
+
+    def __init__(self, superframes: int, *, mesh: bool) -> None:
+        case = Case(mesh=mesh, qa=0.0)
+        episode = draw_episode(np.random.default_rng(1), ANCHORS_M, SLOT_S, case, superframes)
+        self.messages, self.tag_m = episode.messages, episode.path_m[0]
+        self.count = len(self.messages.sites)
+        self.settings = JointSettings(height_m=0.0)
+
+    def begun(self) -> JointFilter:
+        """A filter that begins where the tag stands, without any anchor in view."""
+        joint = JointFilter(self.settings, ANCHORS_M)
+        position, speed = START_VARIANCES
+        joint.start(int(self.messages.rx_ticks[0]), self.tag_m[:2], position * np.eye(2), speed)
+        return joint
+
+    def part(self, begin: int, end: int) -> Messages:
+        """Some of the messages, with what they relay."""
+        m = self.messages
+        first = int(m.ends[begin - 1]) if begin else 0
+        columns = (m.sites[begin:end], m.sequences[begin:end], m.rx_ticks[begin:end], m.tx_ticks[begin:end])
+        return Messages(*columns, m.relays[first : int(m.ends[end - 1])], m.ends[begin:end] - first)
+
+    def kernel(self) -> Run:
+        """All messages through the kernel."""
+        joint = self.begun()
+        return lambda: joint.track(self.messages)
+
+    def plain(self, count: int) -> Run:
+        """The first messages through plain NumPy."""
+        m = self.messages
+        joint = PlainJoint(self.settings, ANCHORS_M, int(m.rx_ticks[0]), self.tag_m[:2], START_VARIANCES)
+        rows = list(packets_of(m, count))
+        return lambda: _each(lambda row: joint.hear(*row), rows)
+
+    def loop(self) -> Run:
+        """As many messages through a plain loop of 18 states; all clocks run alike."""
+        draw = np.random.default_rng(2)
+        senders = self.messages.sites
+        ranges_m = np.linalg.norm(ANCHORS_M[senders] - self.tag_m, axis=1)
+        pseudoranges_m = ranges_m + draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
+        sync_m = draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
+        x, P = np.zeros(18), np.eye(18)
+        x[:2] = self.tag_m[:2]
+        steps, noise = np.full(self.count, SLOT_S), np.array([self.settings.qa, 3.6e-5, 0.09])
+        return lambda: joint_filter(x, P, ANCHORS_M, senders, steps, pseudoranges_m, sync_m, 2e-3, noise)
+
+
+def packets_of(messages: Messages, count: int) -> Iterable[tuple[int, int, int, int, Ticks]]:
+    """The first packets as ``JointFilter.hear`` takes them."""
+    begin = 0
+    for k, end in enumerate(messages.ends[:count].tolist()):
+        yield (
+            int(messages.sites[k]),
+            int(messages.sequences[k]),
+            int(messages.rx_ticks[k]),
+            int(messages.tx_ticks[k]),
+            messages.relays[begin:end],
+        )
+        begin = end
+
+
+def _each(take: Callable[[Any], object], rows: Iterable[Any]) -> None:
+    for row in rows:
+        take(row)
