@@ -21,6 +21,7 @@ COLUMNS = (
     *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
     *("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2"),
     *("anchors", "anchor_ids", "chi2", "residual_rms_m"),
+    *("hpl_m", "vpl_m", "integrity_risk", "alert"),
 )
 """Columns of the file that --fixes writes."""
 
@@ -65,6 +66,8 @@ def row_of(fix: "Fix") -> list[str]:
         " ".join(map(str, fix.anchors)),
         f"{fix.chi2:.4g}",
         f"{fix.residual_rms_m:.4g}",
+        *("" if level is None else f"{level:.4g}" for level in (fix.hpl_m, fix.vpl_m, fix.integrity_risk)),
+        fix.alert or "",
     ]
 
 

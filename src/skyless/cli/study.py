@@ -15,10 +15,13 @@ from skyless.errors import SkylessError
 if TYPE_CHECKING:
     from skyless.experiments.studies.plan import Plan, Row, Study
 
-_Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "scale"]
+_Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "integrity", "scale"]
 _Count = Annotated[int, Parameter(validator=Number(gte=1, lte=10**6))]
 
 _USUAL_METHOD = "joint"
+
+_OF_EPISODES = ("efficiency", "integrity")
+"""Studies of the filter ``joint`` itself."""
 
 app = App(name="study", help_epilogue="Example: skyless study loss --seed 7 --plot loss.png")
 
@@ -49,13 +52,14 @@ def study(
     ----------
     name
         efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
-        sync: masters that die, superframes, crystals. scale: numbers of tags and anchors.
+        sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
+        scale: numbers of tags and anchors.
     method
         A positioning method, by default the best one.
     seed
         Same seed, same rows, whatever computes them; CPU times apart.
     episodes
-        Episodes of two seconds for each case (efficiency).
+        Episodes of two seconds for each case (efficiency, integrity).
     worlds
         Independent worlds for each case (all others, but for the tags of scale).
     seconds
@@ -106,9 +110,14 @@ def study(
 
 
 def _see_that_it_applies(name: str, episodes: int | None, others: dict[str, float | None]) -> None:
-    if name != "efficiency" and episodes is not None:
-        raise SkylessError(f"--episodes is for the study efficiency; {name} takes --worlds and --seconds")
+    if name not in _OF_EPISODES and episodes is not None:
+        takes = f"{name} takes --worlds and --seconds"
+        raise SkylessError(f"--episodes is for the studies efficiency and integrity; {takes}")
     given = [option for option, value in others.items() if value is not None]
+    if name == "integrity":
+        unfit = [option for option in given if option in {"worlds", "seconds"}]
+        if unfit:
+            raise SkylessError(f"--{unfit[0]} is not for the study integrity; give --episodes")
     if name == "efficiency" and given:
         raise SkylessError(f"--{given[0]} is not for the study efficiency, which has cases of its own; give --episodes")
 

@@ -153,5 +153,5 @@ def _row(fix: FixMessage, true_m: Vector | None) -> list[Any]:
         len(fix.anchors),
         round(fix.chi2, 3),
         round(fix.unix_s, 4),
-        None,  # hpl_m: fixes carry no protection level yet
+        None if fix.hpl_m is None else round(fix.hpl_m, 4),
     ]

@@ -127,6 +127,10 @@ def fix_message(tag: str, serial: int, fix: Fix, unix_s: float, latency_s: float
         method=fix.method,
         height_known=fix.height_known,
         latency_s=latency_s,
+        hpl_m=fix.hpl_m,
+        vpl_m=fix.vpl_m,
+        integrity_risk=fix.integrity_risk,
+        alert=None if fix.alert is None else fix.alert.value,
     )
 
 

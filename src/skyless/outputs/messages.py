@@ -65,6 +65,13 @@ class FixMessage(Struct, frozen=True):
     height_known: bool
     latency_s: float
     """From the end of the last frame to the computed fix."""
+    hpl_m: float | None = None
+    """Horizontal protection level; None where nothing can be promised, or the method has none."""
+    vpl_m: float | None = None
+    integrity_risk: float | None = None
+    """Probability, for each fix, that the error exceeds its level."""
+    alert: str | None = None
+    """As ``skyless.positioning.protection.Alert`` has it."""
 
 
 class Counters(Struct, frozen=True):

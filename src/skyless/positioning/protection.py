@@ -1,4 +1,4 @@
-"""Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 7)."""
+"""Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8)."""
 
 from enum import StrEnum
 from typing import Final
@@ -30,7 +30,7 @@ class Alert(StrEnum):
     LIMIT = "alert-limit-exceeded"
 
 
-_ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
+_ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
 
 
 class Integrity(Struct, frozen=True, gc=False):
@@ -46,7 +46,10 @@ class Integrity(Struct, frozen=True, gc=False):
 
 
 def integrity_of(levels: Vector, risk: float, height_known: bool, alert_limit_m: float | None) -> Integrity:
-    """What ``protect`` has filled in, in words; where a fault is still in the fix, nothing can be promised."""
+    """What ``protect`` has filled in, in words.
+
+    While an anchor's fault is in the fix the levels cover it, up to a size beyond which nothing is promised.
+    """
     hpl_m, vpl_m, state = levels.item(HPL), levels.item(VPL), int(levels.item(STATE))
     if state >= DETECTED:
         return Integrity(None, None, risk, _ALERTS[state])

@@ -1,4 +1,4 @@
-"""Protection levels from what ``protection_updates`` follows: ``joint``'s kernels (``docs/maths.md`` section 7)."""
+"""Protection levels from what ``protection_updates`` follows: ``joint``'s kernels (``docs/maths.md`` section 8)."""
 
 from typing import Final
 
@@ -11,6 +11,7 @@ from skyless.positioning.joint_state import (
     DIM,
     EPOCH,
     EVIDENCE,
+    IN_ROW,
     PACKETS,
     REJECTIONS,
     RELAYS_REFUSED,
@@ -45,8 +46,19 @@ HPL, VPL, STATE, WORST_T, WORST_SLOT = range(5)
 
 LEVELS: Final = 5
 
-NOTHING, EXCLUDED, DETECTED, UNAVAILABLE = range(4)
-"""States: no fault, one that was left out, one that is still in the fix, or too early to say."""
+REJECTED_ONCE: Final = 0.3
+SUSPICIOUS: Final = 0.6
+"""Where a packet of an anchor was rejected lately, the threshold for its fault is lower by this factor."""
+
+OUT_IN_ROW: Final = 3
+"""An anchor is left out while its packets are rejected one after the other, ..."""
+
+MOST_BOUNDED: Final = 2.0
+"""... and one whose fault is still in the fix is covered by the levels while none is rejected, up to this times the
+threshold."""
+
+NOTHING, EXCLUDED, BOUNDED, DETECTED, UNAVAILABLE = range(5)
+"""States: no fault; one that was left out; one in the fix, which the levels cover, or do not; too early to say."""
 
 
 @borrowing_kernel
@@ -93,20 +105,28 @@ def _major(xx: float, xy: float, yy: float) -> float:
 @borrowing_kernel
 def _state(s: JointArrays, worst_t: float, worst_slot: int, most_t: float, hpl: float) -> int:
     """Whether a fault shows, in the innovations or in what was rejected, and whether it is one that can be left out."""
-    slots = s.counts[SLOTS]
-    if s.recent[PACKETS] < SETTLED * LONG * slots or not np.isfinite(hpl):
+    if s.recent[PACKETS] < SETTLED * LONG * s.counts[SLOTS] or not np.isfinite(hpl):
         return UNAVAILABLE
     refused = s.recent[RELAYS_REFUSED]
-    if refused > FEW and refused > REFUSED_SHARE * (refused + s.recent[RELAYS_TAKEN]):
-        return DETECTED
     rejected, suspects = -1, 0
-    for slot in range(slots):
+    for slot in range(s.counts[SLOTS]):
         if s.evidence[slot, REJECTIONS] > REJECTED_OFTEN:
             rejected = slot
             suspects += 1
-    if suspects > 1:
+    clocks_wrong = refused > FEW and refused > REFUSED_SHARE * (refused + s.recent[RELAYS_TAKEN])
+    if suspects > 1 or clocks_wrong:
         return DETECTED
-    if worst_t > most_t:
-        left_out = worst_slot == rejected or (suspects == 0 and s.anchors[worst_slot, WEIGHT] != 1.0)
-        return EXCLUDED if left_out else DETECTED
-    return EXCLUDED if suspects == 1 else NOTHING
+    if suspects == 1:
+        out = s.slots[rejected, IN_ROW] >= OUT_IN_ROW
+        return EXCLUDED if out and (worst_t <= most_t or worst_slot == rejected) else DETECTED
+    return _state_without_rejections(s, worst_t, worst_slot, most_t)
+
+
+@borrowing_kernel
+def _state_without_rejections(s: JointArrays, worst_t: float, worst_slot: int, most_t: float) -> int:
+    touched = worst_slot >= 0 and s.evidence[worst_slot, REJECTIONS] > REJECTED_ONCE
+    if worst_t <= (SUSPICIOUS * most_t if touched else most_t):
+        return NOTHING
+    if s.anchors[worst_slot, WEIGHT] != 1.0:
+        return EXCLUDED
+    return BOUNDED if not touched and worst_t <= MOST_BOUNDED * most_t else DETECTED

@@ -1,4 +1,4 @@
-"""What a persistent fault of one anchor does to ``joint``, followed beside the filter (``docs/maths.md`` section 7).
+"""What a persistent fault of one anchor does to ``joint``, followed beside the filter (``docs/maths.md`` section 8).
 
 Row j of ``sensitivities`` is the error of all states for each metre by which the tag's receptions of slot j are late.
 It obeys the filter's own recursion, with the gains that the filter has used, whatever was rejected or weighted down.

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final
 
-from skyless.experiments.studies import efficiency_rows, loss, motion, nlos, scale, sync
+from skyless.experiments.studies import efficiency_rows, integrity, loss, motion, nlos, scale, sync
 from skyless.experiments.studies.picture import Look, draw
 from skyless.experiments.studies.plan import Cell, Plan, Row, Study
 from skyless.experiments.studies.summary import Case, world_cells, world_rows
@@ -39,7 +39,13 @@ STUDIES: Final = {
             sync.cases,
             Look("Synchronisation", ("rmse", "nees"), x="superframe in ms", log=True),
         ),
+        Study(
+            "integrity",
+            "protection levels with one faulty anchor",
+            integrity.cells,
+            integrity.rows,
+            partial(draw, Look("One faulty anchor", ("rmse",), x="size of the fault in m", log=True)),
+        ),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
     )
 }
-"""``integrity`` belongs here as well when there are protection levels to study."""

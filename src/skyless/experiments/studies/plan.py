@@ -119,6 +119,18 @@ class Row(Struct, frozen=True):
     cpu_us_per_message: float | None = None
     cpu_ms_per_tag_s: float | None = None
     """Of one core, for each second of a tag."""
+    risk: float | None = None
+    """Stated probability that a fix's error exceeds its protection level."""
+    hmi: float | None = None
+    """Share of fixes whose horizontal error does, while they promise a level."""
+    hmi_interval: tuple[float, float] | None = None
+    """Where that share truly lies, with 99 %."""
+    hmi_vertical: float | None = None
+    hpl_m: float | None = None
+    """Median horizontal level of the fixes that promise one; mean of the chunks' medians."""
+    vpl_m: float | None = None
+    smallest_m: float | None = None
+    """Horizontal error that the share ``risk`` of fixes exceeds."""
 
 
 class Study(Struct, frozen=True):
