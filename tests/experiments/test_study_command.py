@@ -78,7 +78,7 @@ def test_every_study_can_be_drawn(name, tmp_path):
     ("arguments", "said"),
     [
         (["lost"], 'Choose from: "efficiency", "loss"'),
-        (["loss", "--episodes", "5"], "--episodes is for the study efficiency"),
+        (["loss", "--episodes", "5"], "--episodes is for the stud"),
         (["efficiency", "--seconds", "5"], "--seconds is not for the study efficiency"),
         (["efficiency", "--method", "tracker"], "--method is 'tracker'"),
         (["loss", "--method", "guess"], "it should be one of literal"),

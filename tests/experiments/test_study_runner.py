@@ -1,5 +1,6 @@
 """Cells over processes and over a Dask cluster: the same results, and what happens when something dies."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
 
 from skyless.errors import SkylessError
 from skyless.experiments.studies import loss
@@ -102,6 +103,28 @@ def test_a_scheduler_without_workers_is_told():
         pytest.raises(SkylessError, match="has no workers"),
     ):
         run_cells_on_dask(cells(double, [1]), lambda share: None, empty.scheduler_address)
+
+
+def test_a_scheduler_that_dies_is_told(tmp_path):
+    dask, told = [sys.executable, "-m", "distributed.cli.dask_scheduler"], tmp_path / "scheduler.json"
+    scheduler = subprocess.Popen([*dask, "--port", "0", "--no-dashboard", "--scheduler-file", str(told)])
+    work = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(told), "--no-nanny"]
+    wait_for(told.exists)
+    worker = subprocess.Popen([*work, "--no-dashboard"])
+    address = wait_for(lambda: json.loads(told.read_text())["address"])
+    try:
+        wait_for(lambda: has_workers(address))
+        with pytest.raises(SkylessError, match="the scheduler has gone"):
+            run_cells_on_dask(cells(time.sleep, [600.0]), lambda share: scheduler.kill(), address)
+    finally:
+        for process in (scheduler, worker):
+            process.kill()
+            process.wait()
+
+
+def has_workers(address):
+    with Client(address, set_as_default=False) as client:
+        return client.scheduler_info()["workers"]
 
 
 def test_an_interrupt_ends_cells_that_would_last_for_minutes():

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from msgspec import Struct
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ Array = NDArray[np.float64]
 WIDTH_IN: Final = 4.7
 BAR_IN: Final = 0.24
 CURVE_IN: Final = 2.6
+WIDE: Final = 15.0
+"""Values that lie farther apart are drawn on a logarithmic axis."""
 
 
 class Look(Struct, frozen=True):
@@ -47,7 +50,7 @@ def _cm(value_m: float | None) -> float | None:
 _PANELS: Final = {
     "rmse": _Panel("RMSE in cm", lambda row: _cm(row.rmse_m), lambda row: _cm(row.rmse_error_m), limits=True),
     "ratio": _Panel("RMSE over bound", lambda row: row.ratio, lambda row: row.ratio_error, 1.0),
-    "nees": _Panel("NEES per dimension (grey: 99 % of honest ones)", lambda row: row.nees, lambda _: None, 1.0),
+    "nees": _Panel("NEES per dimension", lambda row: row.nees, lambda _: None, 1.0),
     "cpu": _Panel("CPU in µs a message", lambda row: row.cpu_us_per_message, lambda _: None),
 }
 
@@ -59,7 +62,8 @@ def draw(look: Look, rows: Sequence[Row]) -> Figure:
         heights = [CURVE_IN if _is_curve(group) else 0.8 + BAR_IN * len(group) for _, group in series]
         figure = Figure(figsize=(WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
         methods = ", ".join(dict.fromkeys(row.method for row in rows))
-        figure.suptitle(f"{look.title}: {methods}, simulated", x=0.01, ha="left", fontsize=11.0)
+        note = "; grey: where 99 % of honest ones lie" if "nees" in look.panels else ""
+        figure.suptitle(f"{look.title}: {methods}, simulated{note}", x=0.01, ha="left", fontsize=11.0)
         grid = figure.subplots(len(series), len(look.panels), squeeze=False, height_ratios=heights)
         for line, (name, group) in zip(grid, series, strict=True):
             for axes, panel in zip(line, look.panels, strict=True):
@@ -81,6 +85,8 @@ def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
     curve = _is_curve(rows)
     if curve:
         _curve(axes, np.array([row.x for row in rows], dtype=np.float64), values, errors, look, rows[0].series)
+        if panel.target is not None:
+            axes.set_ylim(top=max(axes.get_ylim()[1], 1.3 * panel.target))
         axes.set(ylabel=panel.label)
     else:
         _named(axes, rows, values, errors, points=panel.target is not None)
@@ -105,7 +111,17 @@ def _curve(axes: Axes, x: Array, values: Array, errors: Array, look: Look, serie
         axes.set_xticks(x, [f"{value:g}" for value in x])
         axes.set_xticks([], minor=True)
     highest = float(np.nanmax(values + errors, initial=0.0))
-    axes.set_ylim(0.0, 1.15 * max(highest, 1e-9))
+    if highest > WIDE * float(np.nanmin(values, initial=np.inf)):
+        axes.set_yscale("log")
+        _plain_numbers(axes.yaxis)
+    else:
+        axes.set_ylim(0.0, 1.15 * max(highest, 1e-9))
+
+
+def _plain_numbers(axis: Axis) -> None:
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("{x:g}")
+    axis.set_tick_params(which="minor", labelsize=6.0)
 
 
 def _named(axes: Axes, rows: list[Row], values: Array, errors: Array, *, points: bool) -> None:
@@ -116,6 +132,10 @@ def _named(axes: Axes, rows: list[Row], values: Array, errors: Array, *, points:
             axes.errorbar(value, place, xerr=error, fmt="o", color=colour, markersize=5, capsize=2, zorder=3)
         else:
             axes.barh(place, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
+    if np.nanmax(values, initial=0.0) > WIDE * np.nanmin(values, initial=np.inf):
+        axes.set_xscale("log")
+        axes.set_xlim(left=0.6 * float(np.nanmin(values)))
+        _plain_numbers(axes.xaxis)
     axes.set_yticks(places, [row.case for row in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")

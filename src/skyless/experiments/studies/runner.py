@@ -1,5 +1,6 @@
 """Maps cells over all cores of this machine, or over a Dask cluster; the results are the same."""
 
+import logging
 import multiprocessing
 import os
 import re
@@ -53,8 +54,10 @@ def run_cells_on_dask(cells: Sequence[Cell], reached: Reached, scheduler: str) -
         except SkylessError:
             raise
         except (CancelledError, Exception) as error:  # noqa: BLE001 - whatever a worker raised, or the network
-            told = str(error) or type(error).__name__
-            raise SkylessError(f"--scheduler {scheduler}: the cluster failed, nothing was written: {told}") from None
+            told = "the scheduler has gone" if isinstance(error, CancelledError) else str(error) or type(error).__name__
+            raise SkylessError(
+                f"--scheduler {scheduler}: the cluster failed, nothing was written: {' '.join(told.split())}"
+            ) from None
 
 
 def _map(pool: Executor, cells: Sequence[Cell], reached: Reached) -> list[Any]:
@@ -128,18 +131,26 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
         from distributed import Client  # noqa: PLC0415 - an extra, and slow to import
     except ImportError:
         raise SkylessError("--scheduler needs the package distributed: pip install 'skyless[dask]'") from None
+    logging.disable(logging.ERROR)  # what goes wrong is told once, by an exception
     try:
-        client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)  # type: ignore[no-untyped-call]
+        yield from _connected(Client, scheduler)
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+def _connected(connect: Callable[..., Any], scheduler: str) -> Iterator[Executor]:
+    try:
+        client = connect(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise SkylessError(f"--scheduler is {scheduler!r}, where no Dask scheduler answers: {error}") from None
     try:
         if not client.scheduler_info(n_workers=-1)["workers"]:
             raise SkylessError(f"--scheduler is {scheduler!r}, which has no workers; start some: dask worker ADDRESS")
-        executor = client.get_executor(pure=False)  # type: ignore[no-untyped-call]
+        executor = client.get_executor(pure=False)
         try:
             yield executor
         except BaseException:
             executor.shutdown(wait=False)
             raise
     finally:
-        client.close()  # type: ignore[no-untyped-call]
+        client.close()
