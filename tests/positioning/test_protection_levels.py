@@ -84,7 +84,7 @@ def test_statistics_of_clean_data_are_normal():
 
 
 @pytest.mark.parametrize("place", ["lab", "room"])
-@pytest.mark.parametrize(("size_m", "available"), [(0.0, 0.99), (0.05, 0.95), (0.1, 0.2), (2.0, 0.9)])
+@pytest.mark.parametrize(("size_m", "available"), [(0.0, 0.99), (0.05, 0.5), (0.1, 0.2), (2.0, 0.9)])
 def test_levels_hold(place, size_m, available):
     seeds = tuple(np.random.SeedSequence(5).spawn(12))
     epochs, promised, across, above = run_chunk((Case(mesh=True), Fault(place, size_m), seeds)).sums[:4]

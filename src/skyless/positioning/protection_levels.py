@@ -50,6 +50,9 @@ REJECTED_ONCE: Final = 0.3
 SUSPICIOUS: Final = 0.6
 """Where a packet of an anchor was rejected lately, the threshold for its fault is lower by this factor."""
 
+GROWING: Final = 1.5
+"""A fault beyond that lower threshold may be growing faster than its estimate: it counts so many times."""
+
 OUT_IN_ROW: Final = 3
 """An anchor is left out while its packets are rejected one after the other, ..."""
 
@@ -83,12 +86,14 @@ def protect(s: JointArrays, covariance: Matrix, limits: Vector, levels: Vector) 
             if information > 0.0:
                 fault_m = abs(s.evidence[slot, memory]) / information
                 variance = scale * s.evidence[slot, memory + 2] / (information * information)
-                major = _major(xx + vx * vx * variance, xy + vx * vy * variance, yy + vy * vy * variance)
-                hpl = max(hpl, across * fault_m + limits[HORIZONTAL_K] * np.sqrt(major))
-                vpl = max(vpl, abs(vz) * fault_m + limits[VERTICAL_K] * np.sqrt(zz + vz * vz * variance))
                 t = fault_m / np.sqrt(variance)
                 if t > worst_t:
                     worst_t, worst_slot = t, slot
+                if t > SUSPICIOUS * limits[FAULT_T]:
+                    fault_m *= GROWING
+                major = _major(xx + vx * vx * variance, xy + vx * vy * variance, yy + vy * vy * variance)
+                hpl = max(hpl, across * fault_m + limits[HORIZONTAL_K] * np.sqrt(major))
+                vpl = max(vpl, abs(vz) * fault_m + limits[VERTICAL_K] * np.sqrt(zz + vz * vz * variance))
             elif across > 0.0 or vz != 0.0:
                 hpl, vpl = np.inf, np.inf
     levels[STATE] = _state(s, worst_t, worst_slot, limits[FAULT_T], hpl)
