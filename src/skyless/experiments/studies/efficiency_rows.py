@@ -75,6 +75,7 @@ def _row(case: Case, episodes: Array) -> Row:
         runs=told.episodes,
         fixes=told.episodes,
         rmse_m=told.rmse_m,
+        rmse_error_m=float(episodes[:, 0].std() / np.sqrt(len(episodes)) / (2.0 * told.rmse_m)),
         said_m=told.said_m,
         nees=told.nees / 2.0,
         nees_interval=(low / 2.0, high / 2.0),
