@@ -12,12 +12,21 @@ from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.positioning.joint_hearing import FULL, joint_motion, joint_step, joint_track
+from skyless.positioning.joint_monitor import PATIENCE
 from skyless.positioning.joint_state import (
     BASE,
+    CAUTION,
     EPOCH,
+    EXCLUDED,
+    EXCLUSIONS,
+    LATE_SHARE,
+    PARDONED,
     QA,
     REJECTED_IN_ROW,
     RX_VARIANCE,
+    SITE,
+    SLOTS,
+    STALE_IN_ROW,
     TX_VARIANCE,
     WHOLE,
     Integers,
@@ -34,6 +43,9 @@ from skyless.positioning.tracker import AGILITY, LOST_IN_ROW, LOST_SHARE, REJECT
 
 MAX_RATE: Final = 50e-6
 """Two crystals of ±20 ppm, and room."""
+
+DOUBTFUL_SHARE: Final = 0.12
+"""Of messages beyond the gate; in the first second after a start."""
 
 
 class JointSettings(Struct, frozen=True):
@@ -127,8 +139,13 @@ class JointFilter:
         if s.slot_of[place] >= 0:
             s.anchors[s.slot_of[place], :3] = anchor_m
 
-    def start(self, rx_ticks: int, position_m: Vector, covariance_m2: Matrix, speed_variance: float) -> None:
-        """Begin at a position, shapes (dim,) and (dim, dim), without any anchor in view."""
+    def start(
+        self, rx_ticks: int, position_m: Vector, covariance_m2: Matrix, speed_variance: float, caution_m2: float = 0.0
+    ) -> None:
+        """Begin at a position, shapes (dim,) and (dim, dim), without any anchor in view.
+
+        ``caution_m2``: additional variance of the first receptions, where many may be late.
+        """
         old, dim = self.arrays, self.dim
         self.arrays = s = new_arrays(old.settings, len(old.slots), len(old.site_m))
         s.site_m[:] = old.site_m
@@ -136,7 +153,10 @@ class JointFilter:
         s.P[:dim, :dim] = covariance_m2
         s.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
         s.counts[EPOCH] = s.counts[BASE] = rx_ticks
-        s.statistics[:] = (1.0, s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE], 0.0, 1.0)
+        s.counts[PARDONED] = -PATIENCE
+        s.statistics[:] = 0.0
+        s.statistics[CAUTION] = caution_m2
+        s.statistics[:4] = (1.0, s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE], 0.0, 1.0)
 
     def hear(self, site: int, sequence: int, rx_ticks: int, tx_ticks: int, relays: Integers = NO_RELAYS) -> int:
         """Take one packet (``joint_hear``); leaves what ``motion`` returns in ``newest``."""
@@ -194,8 +214,21 @@ class JointFilter:
     @property
     def lost(self) -> bool:
         """Whether so many messages do not fit that the state must be wrong."""
-        in_row = self.arrays.counts[REJECTED_IN_ROW]
-        return bool(self.arrays.statistics[REJECTED_SHARE] > LOST_SHARE or in_row >= LOST_IN_ROW)
+        in_row = self.arrays.counts[REJECTED_IN_ROW] + self.arrays.counts[STALE_IN_ROW]
+        late = min(self.arrays.statistics[LATE_SHARE], 0.45)
+        return bool(self.arrays.statistics[REJECTED_SHARE] > LOST_SHARE or in_row * (1.0 - 2.0 * late) >= LOST_IN_ROW)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether more messages do not fit than a sound start leaves."""
+        s = self.arrays
+        return bool(s.statistics[REJECTED_SHARE] > DOUBTFUL_SHARE or s.counts[EXCLUSIONS] > 0)
+
+    def excluded(self) -> list[int]:
+        """Places in the table of the anchors that are heard but not used."""
+        slots = self.arrays.slots[: self.arrays.counts[SLOTS]]
+        places: list[int] = slots[slots[:, EXCLUDED] != 0, SITE].tolist()
+        return places
 
     def horizontal_variance_m2(self, ahead_s: float) -> float:
         """Sum of the variances of x and y so much later, if nothing is heard until then."""

@@ -5,23 +5,30 @@ from typing import Any, Final
 from numpy.typing import NDArray
 
 from skyless.compiled import borrowing_kernel
-from skyless.constants import TICK_S
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.joint_algebra import settle
+from skyless.positioning.joint_monitor import LATE_ENOUGH
 from skyless.positioning.joint_state import (
     BASE,
     DIM,
     DROP_S,
     EPOCH,
+    IMPOSSIBLE,
     IN_ROW,
-    INNOVATION,
+    JUMPS,
+    LATE_SHARE,
     NOISE,
     PACKET_RX,
     PACKET_TX,
+    REJECTED_IN_ROW,
+    RELAYS_IN_ROW,
     REMEMBERED,
     RESTARTS,
     RX,
     SEQUENCE,
     SLOTS,
+    STALE,
+    STALE_IN_ROW,
     TX,
     WANTED,
     Integers,
@@ -38,8 +45,8 @@ from skyless.positioning.joint_time import elapse
 from skyless.positioning.joint_updates import hear_anchor, hear_relay, join, new_packet
 from skyless.positioning.protection_levels import protect
 
-FULL, REJECTED, ACCEPTED, JOINED = range(-1, 3)
-"""What became of a packet: no room for its anchor, beyond the gate, taken, or the first of its anchor."""
+FULL, REJECTED, ACCEPTED, JOINED, STALE_PACKET = range(-1, 4)
+"""What became of a packet: no room for its anchor, not used, taken, the first of its anchor, older than the newest."""
 
 RELAY_AGE_S: Final = 1.0
 """Older packets are not relayed, as sequence numbers come around."""
@@ -49,6 +56,16 @@ RESTART_M: Final = 300.0
 
 RESTART_IN_ROW: Final = 3
 """... if so many packets in a row say so."""
+
+RELAYS_OFF: Final = 4
+"""A clock that jumps by less shows in so many receptions among anchors in a row as well; a blocked path does not."""
+
+RELAYS_APART: Final = 40
+"""After so many in a row an anchor's clock stands apart from the others', as it began late: it joins anew,
+and what the others heard of it decides."""
+
+MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS
+"""Between two clocks that are still crystals."""
 
 
 @borrowing_kernel
@@ -60,14 +77,30 @@ def joint_hear(
     Rows ``first`` to ``last`` of ``relays`` are [the anchor that heard, the anchor that was heard, sequence, RX stamp
     of the former], anchors by their places in the table; all stamps are unwrapped, each on its own clock.
     """
+    slot = s.slot_of[site]
+    if s.counts[SLOTS] > 0 and rx_ticks < s.counts[EPOCH]:
+        s.counts[STALE] += 1
+        s.counts[STALE_IN_ROW] += 1
+        return STALE_PACKET
+    s.counts[STALE_IN_ROW] = 0
+    if slot >= 0 and (tx_ticks == s.slots[slot, TX] or _has_jumped(s, slot, rx_ticks, tx_ticks)):
+        if tx_ticks == s.slots[slot, TX] or s.slots[slot, IN_ROW] < RESTART_IN_ROW:
+            s.counts[IMPOSSIBLE] += 1
+            return REJECTED
+        s.counts[RESTARTS] += 1
+        drop_slot(s, slot)
+        slot = -1
     elapse(s, rx_ticks)
     if s.counts[BASE] == rx_ticks:
         _drop_silent(s, rx_ticks)
-    slot = s.slot_of[site]
-    if slot >= 0 and s.slots[slot, IN_ROW] >= RESTART_IN_ROW and abs(s.anchors[slot, INNOVATION]) > RESTART_M:
+        slot = s.slot_of[site]
+    if slot >= 0 and s.slots[slot, RELAYS_IN_ROW] >= RELAYS_APART:
+        s.statistics[LATE_SHARE] = max(s.statistics[LATE_SHARE], 2.0 * LATE_ENOUGH)
+    in_row = 0 if slot < 0 or s.slots[slot, RELAYS_IN_ROW] >= RELAYS_APART else RESTART_IN_ROW
+    if slot >= 0 and s.slots[slot, IN_ROW] >= in_row and s.slots[slot, RELAYS_IN_ROW] >= RELAYS_OFF:
         settle(s)
         drop_slot(s, slot)
-        s.counts[RESTARTS] += 1
+        s.counts[JUMPS] += 1
         slot = -1
     status = FULL
     if slot >= 0:
@@ -89,6 +122,18 @@ def joint_hear(
         status = JOINED
     settle(s)
     return status
+
+
+@borrowing_kernel
+def _has_jumped(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool:
+    """Whether no clock can have gone from an anchor's newest packet to this one; such stamps move no time."""
+    elapsed = rx_ticks - s.slots[slot, RX]
+    change_m = abs(elapsed - (tx_ticks - s.slots[slot, TX])) * TICK_M
+    jumped = bool(change_m > RESTART_M + MAX_RATE_MPS * elapsed * TICK_S)
+    if jumped:
+        s.slots[slot, IN_ROW] += 1
+        s.counts[REJECTED_IN_ROW] += 1
+    return jumped
 
 
 @borrowing_kernel

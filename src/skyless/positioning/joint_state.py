@@ -25,16 +25,33 @@ Matrix = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 EPOCH, BASE, ACCEPTED, REJECTED, REJECTED_IN_ROW, SLOTS, NOISES, TERMS, PLACES = range(9)
-RELAYS_USED, RELAYS_REJECTED, RESTARTS = range(9, 12)
+(
+    RELAYS_USED,
+    RELAYS_REJECTED,
+    RESTARTS,
+    EXCLUSIONS,
+    READMISSIONS,
+    OUT,
+    JUMPS,
+    STALE,
+    STALE_IN_ROW,
+    IMPOSSIBLE,
+    PARDONED,
+    PARDONS,
+) = range(9, 21)
 """Places in ``counts``. The epoch is the tag's reading at the newest message, the base that of the values."""
 
-SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW = range(7)
+SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW, EXCLUDED, RELAYS_IN_ROW = range(9)
 """Places in a row of ``slots``: index in the site's table, whole ticks of the offset, newest packet's stamps (own
 clock, tag's), place among the noises or −1, whether its packets are relayed, rejections in a row."""
 
 PLACE_X, PLACE_Y, PLACE_Z, RANGE, WEIGHT, INNOVATION, SCORE = range(7)
 """Places in a row of ``anchors``: position, range at its newest packet, factor on the variance of its receptions (1
 unless a monitor says otherwise), newest innovation and running mean of the normalised ones."""
+
+LATE_SHARE, LAG_SQUARED, CAUTION = range(4, 7)
+LAG: Final = 7
+"""Places in ``statistics`` behind the tracker's: share of late messages, lag; running means, then directions."""
 
 DIM, QA, WHITE, WALK, TX_VARIANCE, RX_VARIANCE, GATE, HEIGHT, RATE_VARIANCE, DROP_S = range(10)
 """Places in ``settings``."""
@@ -78,7 +95,7 @@ class JointArrays(NamedTuple):
     statistics: Vector
     """As the tracker's."""
     slots: Integers
-    """Shape (capacity, 7)."""
+    """Shape (capacity, 9)."""
     anchors: Matrix
     """Shape (capacity, 7)."""
     packets: Integers
@@ -112,9 +129,9 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
         signs=np.zeros(MOST_TERMS),
         h_places=np.zeros(MOST_PLACES, np.int64),
         h=np.zeros(MOST_PLACES),
-        counts=np.zeros(12, np.int64),
-        statistics=np.ones(4),
-        slots=np.zeros((capacity, 7), np.int64),
+        counts=np.zeros(21, np.int64),
+        statistics=np.zeros(13),
+        slots=np.zeros((capacity, 9), np.int64),
         anchors=np.zeros((capacity, 7)),
         packets=np.full((capacity, REMEMBERED, 3), NEVER),
         relayed=np.full((capacity, capacity), NEVER),

@@ -11,7 +11,7 @@ from skyless.positioning.fix import Fix, NoFixReason, motion_fix
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.in_use import AnchorsInUse
 from skyless.positioning.joint import NO_RELAYS, JointFilter, JointSettings
-from skyless.positioning.joint_hearing import REJECTED
+from skyless.positioning.joint_hearing import REJECTED, STALE_PACKET
 from skyless.positioning.joint_start import JointStart
 from skyless.positioning.observation import Observation
 from skyless.positioning.protection import integrity_of
@@ -28,6 +28,12 @@ from skyless.positioning.tracking import (
 
 LOOSENED: Final = 4.0
 """The start's covariance is taken so many times larger, as the filter is then given the packets that it rests on."""
+
+CAUTION_M2: Final = 1.0
+"""Variance that the first receptions have beyond their noise after a start that failed at once: many may be late."""
+
+REORDERED_S: Final = 0.1
+"""Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
 
 
 class JointTracking:
@@ -54,6 +60,7 @@ class JointTracking:
         self._in_use = AnchorsInUse(superframe_s)
         self._master_less_tag_ticks = 0
         self._started_ticks = 0
+        self._caution_m2 = 0.0
         self._heard_ticks = 0
 
     @property
@@ -65,6 +72,12 @@ class JointTracking:
         """The tag's clock less that of an anchor in view: whole ticks, the rest in metres, rate in m/s."""
         place = self._place_of.get(anchor)
         return None if place is None else self._filter.clock(place)
+
+    @property
+    def excluded(self) -> tuple[int, ...]:
+        """Anchors that are not used as they have been wrong for long."""
+        places = set(self._filter.excluded())
+        return tuple(anchor for anchor, place in self._place_of.items() if place in places) if places else ()
 
     def hear(self, observation: Observation) -> Fix | NoFixReason:
         """Take one observation; a fix for every accepted message once started."""
@@ -79,15 +92,23 @@ class JointTracking:
                 return start
             self._begin(start, self._start.packets())
             return self._fix(observation)
-        self._heard_ticks = observation.rx_ticks_tag
-        if self._take(observation) == REJECTED:
-            if self._filter.lost:
-                soon = (observation.rx_ticks_tag - self._started_ticks) * TICK_S < SOON_S
-                self._speed_std_mps = min(HASTE * self._speed_std_mps, MAX_SPEED_STD_MPS) if soon else SPEED_STD_MPS
-                self._start = self._new_start()
+        status = self._take(observation)
+        self._heard_ticks = max(self._heard_ticks, observation.rx_ticks_tag)
+        if status in (REJECTED, STALE_PACKET):
+            self._start_anew_where_lost(observation.rx_ticks_tag)
             return NoFixReason.RESIDUALS
         self._in_use.use(observation)
         return self._fix(observation)
+
+    def _start_anew_where_lost(self, rx_ticks: int) -> None:
+        """A filter that is lost soon after its start has a tag that is faster than assumed, or late messages."""
+        soon = (rx_ticks - self._started_ticks) * TICK_S < SOON_S
+        doubtful = soon and self._caution_m2 == 0.0 and self._filter.is_doubtful
+        if doubtful or self._filter.lost:
+            hasten = soon and not doubtful
+            self._speed_std_mps = min(HASTE * self._speed_std_mps, MAX_SPEED_STD_MPS) if hasten else SPEED_STD_MPS
+            self._caution_m2 = CAUTION_M2 if soon else 0.0
+            self._start = self._new_start()
 
     def _new_start(self) -> JointStart:
         settings = self._settings
@@ -98,7 +119,7 @@ class JointTracking:
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
         silent_s = (observation.rx_ticks_tag - self._heard_ticks) * TICK_S
-        if not 0.0 <= silent_s <= MAX_GAP_S:
+        if not -REORDERED_S <= silent_s <= MAX_GAP_S:
             return True
         if silent_s < SHORT_SILENCE_S:
             return False
@@ -114,7 +135,7 @@ class JointTracking:
         dim, begin_ticks = self._filter.dim, packets[0].rx_ticks_tag
         age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
         covariance = LOOSENED * start.covariance[:dim, :dim] + age_s**2 * start.speed_variance * np.eye(dim)
-        self._filter.start(begin_ticks, start.solution[:dim], covariance, start.speed_variance)
+        self._filter.start(begin_ticks, start.solution[:dim], covariance, start.speed_variance, self._caution_m2)
         for packet in packets:
             self._take(packet)
 

@@ -10,24 +10,27 @@ import numpy as np
 from skyless.compiled import borrowing_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.joint_algebra import along_h, along_x, project, put, settle, take
+from skyless.positioning.joint_monitor import LATE_ENOUGH, believe, follow
 from skyless.positioning.joint_state import (
     BASE,
+    CAUTION,
     DIM,
     EPOCH,
     GATE,
     HEIGHT,
-    IN_ROW,
     INNOVATION,
+    LAG,
+    LATE_SHARE,
     NOISE,
     PLACES,
     RANGE,
     RATE_VARIANCE,
     REJECTIONS,
+    RELAYS_IN_ROW,
     RELAYS_REFUSED,
     RELAYS_REJECTED,
     RELAYS_USED,
     RX_VARIANCE,
-    SCORE,
     SLOTS,
     TX,
     TX_VARIANCE,
@@ -41,9 +44,13 @@ from skyless.positioning.joint_state import (
     width,
 )
 from skyless.positioning.protection_updates import join_faults
-from skyless.positioning.tracker import judge
 
-SCORE_GAIN: Final = 0.1
+CALMING: Final = 0.98
+LEAST_CAUTION_M2: Final = 1e-5
+"""After a start that failed receptions are taken to be so late at first; it fades with each of them, to nothing."""
+
+JOIN_VARIANCE_M2: Final = 1.0
+"""Where messages are late an anchor's first packet may be so too: it decides nothing."""
 
 
 @borrowing_kernel
@@ -81,22 +88,26 @@ def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool
     expected = along_x(s)
     range_m = put_direction(s, slot, tau_s, 1.0)
     term = project(s)
-    spread = along_h(s, term) + variance * s.anchors[slot, WEIGHT]
+    variance *= s.anchors[slot, WEIGHT]
+    if s.statistics[CAUTION] > 0.0:
+        variance += s.statistics[CAUTION]
+        s.statistics[CAUTION] *= CALMING
+        if s.statistics[CAUTION] < LEAST_CAUTION_M2:
+            s.statistics[CAUTION] = 0.0
+    spread = along_h(s, term) + variance
     innovation = (rx_ticks - tx_ticks - s.slots[slot, WHOLE]) * TICK_M - (range_m + expected)
     s.anchors[slot, RANGE] = range_m
     s.anchors[slot, INNOVATION] = innovation
-    s.anchors[slot, SCORE] += SCORE_GAIN * (innovation / np.sqrt(spread) - s.anchors[slot, SCORE])
-    accepted = judge(s.counts, s.statistics, innovation, spread, s.settings[GATE])
-    if accepted:
-        s.slots[slot, IN_ROW] = 0
-        take(s, term, innovation, spread, slot)
+    factor = believe(s, slot, innovation, spread)
+    if factor > 0.0:
+        follow(s, innovation / np.sqrt(spread) / factor)
+        take(s, term, innovation, spread * factor, slot)
         steps = int(np.floor(s.x[offset] / TICK_M))
         s.slots[slot, WHOLE] += steps
         s.x[offset] -= steps * TICK_M
     else:
-        s.slots[slot, IN_ROW] += 1
         s.evidence[slot, REJECTIONS] += 1.0
-    return accepted
+    return bool(factor > 0.0)
 
 
 @borrowing_kernel
@@ -109,6 +120,9 @@ def put_direction(s: JointArrays, slot: int, tau_s: float, sign: float) -> float
     dz = z - s.anchors[slot, 2]
     range_m: float = np.sqrt(dx * dx + dy * dy + dz * dz)
     scale = sign / max(range_m, 1e-6)
+    s.statistics[LAG + 3] = dx * scale
+    s.statistics[LAG + 4] = dy * scale
+    s.statistics[LAG + 5] = dz * scale
     put(s, 0, dx * scale)
     put(s, 1, dy * scale)
     put(s, half, tau_s * dx * scale)
@@ -135,6 +149,8 @@ def join(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> None:
     put(s, rate, -tau_s)
     term = project(s)
     variance = along_h(s, term) + s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE]
+    if s.statistics[CAUTION] > 0.0 or s.statistics[LATE_SHARE] > LATE_ENOUGH:
+        variance += JOIN_VARIANCE_M2
     for row in range(states(s)):
         P[row, place] = s.terms[term, row]
         P[place, row] = s.terms[term, row]
@@ -185,8 +201,11 @@ def hear_relay(s: JointArrays, listener: int, slot: int, packet_tx: int, packet_
     accepted = innovation * innovation <= s.settings[GATE] * s.settings[GATE] * spread
     if accepted:
         s.counts[RELAYS_USED] += 1
+        s.slots[slot, RELAYS_IN_ROW] = s.slots[listener, RELAYS_IN_ROW] = 0
         take(s, term, innovation, spread, -1)
     else:
         s.counts[RELAYS_REJECTED] += 1
         s.recent[RELAYS_REFUSED] += 1.0
+        s.slots[slot, RELAYS_IN_ROW] += 1
+        s.slots[listener, RELAYS_IN_ROW] += 1
     return bool(accepted)

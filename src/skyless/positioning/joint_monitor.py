@@ -1,0 +1,197 @@
+"""Whom ``joint`` believes: single messages by their innovations, anchors by the running mean of theirs.
+
+Late messages are the rule where paths are blocked, early ones are not. How many are late is estimated, and what is
+believed follows: with none, all within the gate counts in full, so that clean data lose nothing (``docs/maths.md`` 6).
+"""
+
+from typing import Final
+
+import numpy as np
+
+from skyless.compiled import borrowing_kernel
+from skyless.positioning.joint_state import (
+    CAUTION,
+    DIM,
+    EXCLUDED,
+    EXCLUSIONS,
+    GATE,
+    IN_ROW,
+    LAG,
+    LAG_SQUARED,
+    LATE_SHARE,
+    OUT,
+    PARDONED,
+    PARDONS,
+    READMISSIONS,
+    SCORE,
+    SLOTS,
+    JointArrays,
+    values,
+)
+from skyless.positioning.tracker import (
+    ACCEPTED,
+    AGILITY,
+    AGILITY_GAIN,
+    AGILITY_LOSS,
+    CHI2,
+    FORGETTING,
+    MAX_AGILITY,
+    REJECTED,
+    REJECTED_IN_ROW,
+    REJECTED_SHARE,
+    RESIDUAL_SQUARED,
+)
+
+LATE_FORGETTING: Final = 0.005
+LATE_DENSITY: Final = 0.05
+"""Probability density of a late message's normalised innovation: a standard deviation of 5 cm, a metre of lateness."""
+
+LATE_ENOUGH: Final = 0.02
+HUBER: Final = 1.5
+"""With more late messages than that, innovations beyond so many standard deviations weigh less."""
+
+SCORE_GAIN: Final = 0.1
+SCORE_CLIP: Final = 2.5
+EXCLUDE_AT: Final = 4.5 * float(np.sqrt(SCORE_GAIN / (2.0 - SCORE_GAIN)))
+"""Of the running mean of an anchor's normalised innovations: 4.5 standard deviations of it."""
+
+READMIT_AT: Final = 0.5 * EXCLUDE_AT
+MOST_EXCLUDED: Final = 2
+CONTAMINATION_M: Final = 0.1
+"""What an anchor that is excluded may have done to the position before, per axis."""
+
+EARLY: Final = 0.85
+"""Weight of an anchor that seems early: paths are late, and one late anchor makes others seem early."""
+
+PATIENCE: Final = 1000
+"""Messages. Where a second anchor seems wrong, or two are excluded of which one seems early as no path is, perhaps the
+first was the wrong one: all are taken back and judged anew, but not more often than that."""
+
+PARDON_VARIANCE_M2: Final = 0.25
+
+LAG_GAIN: Final = 0.05
+LAG_FORGETTING: Final = 0.01
+RESTLESS_LAG: Final = 2.1
+"""Innovations along an axis, averaged over some 40 messages, are as large as noise alone makes them where the mean of
+their squares is 1 (the sum over the axes in the plane); larger ones show a tag more agile than assumed."""
+
+
+@borrowing_kernel
+def gate_of(s: JointArrays) -> float:
+    """Beyond how many standard deviations a message is more likely late than not."""
+    late = s.statistics[LATE_SHARE]
+    odds = late * LATE_DENSITY * 2.5066282746310002 / (1.0 - late)
+    gate = s.settings[GATE]
+    return float(min(gate, np.sqrt(-2.0 * np.log(odds)))) if odds > 1e-6 else float(gate)
+
+
+@borrowing_kernel
+def believe(s: JointArrays, slot: int, innovation: float, spread: float) -> float:
+    """How much more spread a reception of the tag is to be given, as a factor; 0 if it is not to be used.
+
+    Keeps the counts and running means, and those of the anchor.
+    """
+    normalised = innovation / np.sqrt(spread)
+    if not np.isfinite(normalised):
+        return 0.0
+    clipped = min(max(normalised, -SCORE_CLIP), SCORE_CLIP)
+    s.anchors[slot, SCORE] += SCORE_GAIN * (clipped - s.anchors[slot, SCORE])
+    gate = s.settings[GATE]
+    within = -gate <= normalised <= gate
+    _watch(s, slot)
+    s.slots[slot, IN_ROW] = 0 if within and not s.slots[slot, EXCLUDED] else s.slots[slot, IN_ROW] + 1
+    statistics, counts = s.statistics, s.counts
+    if s.slots[slot, EXCLUDED]:
+        counts[OUT] += 1
+        return 0.0
+    statistics[LATE_SHARE] += LATE_FORGETTING * ((0.0 if within else 1.0) - statistics[LATE_SHARE])
+    statistics[REJECTED_SHARE] *= 1.0 - FORGETTING
+    if not within or normalised > gate_of(s):
+        counts[REJECTED] += 1
+        if not within:
+            counts[REJECTED_IN_ROW] += 1
+            statistics[REJECTED_SHARE] += FORGETTING
+        return 0.0
+    counts[ACCEPTED] += 1
+    counts[REJECTED_IN_ROW] = 0
+    statistics[CHI2] += FORGETTING * (normalised * normalised - statistics[CHI2])
+    statistics[RESIDUAL_SQUARED] += FORGETTING * (innovation * innovation - statistics[RESIDUAL_SQUARED])
+    if statistics[LATE_SHARE] > LATE_ENOUGH and abs(normalised) > HUBER:
+        return float(abs(normalised) / HUBER)
+    return 1.0
+
+
+@borrowing_kernel
+def follow(s: JointArrays, normalised: float) -> None:
+    """Adapt the agility: where the position lags, innovations in one direction have one sign for long.
+
+    Sums along the axes show that long before single innovations do, which are mostly the stamps' noise.
+    """
+    statistics, dim = s.statistics, int(s.settings[DIM])
+    squared = 0.0
+    for axis in range(dim):
+        statistics[LAG + axis] += LAG_GAIN * (statistics[LAG + 3 + axis] * normalised - statistics[LAG + axis])
+        squared += statistics[LAG + axis] ** 2
+    squared *= (2.0 - LAG_GAIN) / LAG_GAIN
+    statistics[LAG_SQUARED] += LAG_FORGETTING * (squared - statistics[LAG_SQUARED])
+    if statistics[LAG_SQUARED] > RESTLESS_LAG:
+        statistics[AGILITY] = min(statistics[AGILITY] * AGILITY_GAIN, MAX_AGILITY)
+    else:
+        statistics[AGILITY] = max(statistics[AGILITY] * AGILITY_LOSS, 1.0)
+
+
+@borrowing_kernel
+def _watch(s: JointArrays, slot: int) -> None:
+    """Exclude an anchor whose innovations are off for long, the worst first, or take one back."""
+    score = _weighed(s, slot)
+    excluded, worst = 0, True
+    for other in range(s.counts[SLOTS]):
+        excluded += s.slots[other, EXCLUDED]
+        if not s.slots[other, EXCLUDED] and _weighed(s, other) > score:
+            worst = False
+    patient = s.counts[ACCEPTED] - s.counts[PARDONED] < PATIENCE
+    if s.slots[slot, EXCLUDED]:
+        if abs(s.anchors[slot, SCORE]) < READMIT_AT:
+            s.slots[slot, EXCLUDED] = 0
+            s.counts[READMISSIONS] += 1
+        elif excluded == MOST_EXCLUDED and s.anchors[slot, SCORE] < 0.0 and not patient:
+            _pardon(s)
+    elif score >= EXCLUDE_AT + SCORE_CLIP * s.statistics[LATE_SHARE] and worst:
+        if excluded > 0 and not patient:
+            _pardon(s)
+        elif excluded < MOST_EXCLUDED and s.counts[SLOTS] - excluded > int(s.settings[DIM]) + 1:
+            s.slots[slot, EXCLUDED] = 1
+            s.counts[EXCLUSIONS] += 1
+            _forgive(s, CONTAMINATION_M * CONTAMINATION_M)
+
+
+@borrowing_kernel
+def _weighed(s: JointArrays, slot: int) -> float:
+    """How wrong an anchor seems: rather late than early."""
+    score = s.anchors[slot, SCORE]
+    return float(score if score > 0.0 else -EARLY * score)
+
+
+@borrowing_kernel
+def _pardon(s: JointArrays) -> None:
+    """Take all anchors back and find the position anew among them: perhaps the wrong one was excluded."""
+    s.counts[PARDONED] = s.counts[ACCEPTED]
+    s.counts[PARDONS] += 1
+    s.statistics[CAUTION] = PARDON_VARIANCE_M2
+    for slot in range(s.counts[SLOTS]):
+        s.slots[slot, EXCLUDED] = 0
+    _forgive(s, PARDON_VARIANCE_M2)
+
+
+@borrowing_kernel
+def _forgive(s: JointArrays, variance: float) -> None:
+    """Take back what an anchor may have done to the position and the tag's clock, and what others seemed to be."""
+    dim, half = int(s.settings[DIM]), values(s)
+    for axis in range(dim):
+        s.P[axis, axis] += variance
+    for one in range(dim, half):
+        for other in range(dim, half):
+            s.P[one, other] += variance
+    for other in range(s.counts[SLOTS]):
+        if not s.slots[other, EXCLUDED]:
+            s.anchors[other, SCORE] = 0.0
