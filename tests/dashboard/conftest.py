@@ -8,7 +8,7 @@ from page_browser import CHROMIUM, FLAGS, Visit
 from page_fake_server import FakeServer
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # while it lives its event loop runs, and no other module's test may run its own
 def chromium():
     sync_api = pytest.importorskip("playwright.sync_api")
     if not Path(CHROMIUM).exists():

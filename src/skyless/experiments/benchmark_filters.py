@@ -47,6 +47,7 @@ class PlainTracker:
 
     def __init__(self, settings: TrackerSettings, begun: PseudorangeTracker) -> None:
         self._s = settings
+        self._height_m = settings.height_m or 0.0
         self.x, self.P = begun.x.copy(), begun.P.copy()
         self._epoch, self._whole = (int(value) for value in begun.whole[:2])
         self._chi2, self._agility = 1.0, 1.0
@@ -59,7 +60,7 @@ class PlainTracker:
 
     def expected(self, x: Vector, anchor_m: Vector) -> tuple[float, Vector]:
         """The pseudorange that a state expects, in metres, and its gradient."""
-        away = np.append(x[:2], self._s.height_m) - anchor_m
+        away = np.append(x[:2], self._height_m) - anchor_m
         range_m = float(np.linalg.norm(away))
         return range_m + x[-2], np.array([away[0] / range_m, away[1] / range_m, 0.0, 0.0, 1.0, 0.0])
 
@@ -72,9 +73,9 @@ class PlainTracker:
         F, Q = self.elapse(rx_ticks)
         self.x = F @ self.x
         self.P = F @ self.P @ F.T + Q
-        expected, h = self.expected(self.x, anchor_m)
-        innovation = self.measured(rx_ticks, tx_ticks) - expected
-        spread = h @ self.P @ h + self._s.stamp_variance_m2 + tx_variance_m2
+        expected_m, h = self.expected(self.x, anchor_m)
+        innovation = self.measured(rx_ticks, tx_ticks) - expected_m
+        spread = float(h @ self.P @ h) + self._s.stamp_variance_m2 + tx_variance_m2
         normalised = innovation**2 / spread
         if normalised > self._s.gate**2:
             return False
@@ -145,7 +146,7 @@ class PlainJoint:
         noise = 4 + 2 * n + site
         self.P[noise, :] = self.P[:, noise] = 0.0
         self.P[noise, noise], self.x[noise] = s.tx_variance_m2, 0.0
-        away = np.append(self.x[:2], s.height_m) - self._anchors_m[site]
+        away = np.append(self.x[:2], s.height_m or 0.0) - self._anchors_m[site]
         range_m = float(np.linalg.norm(away))
         h = np.zeros(len(self.x))
         h[:2] = away[:2] / range_m

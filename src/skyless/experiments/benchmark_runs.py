@@ -65,7 +65,7 @@ class TrackerRuns:
         """The first messages through plain NumPy or filterpy."""
         tracker = kind(self.settings, self.begun())
         rows = list(zip(self.anchors_m[:count], self.rx_ticks[:count].tolist(), self.tx_ticks.tolist(), strict=False))
-        return lambda: _each(lambda row: tracker.hear(*row, 1e-4), rows)
+        return lambda: _each(lambda row: tracker.hear(row[0], row[1], row[2], 1e-4), rows)
 
     def filterpy(self, count: int) -> Run:
         """The first messages through filterpy."""

@@ -71,7 +71,7 @@ PARDON_VARIANCE_M2: Final = 0.25
 
 LAG_GAIN: Final = 0.05
 LAG_FORGETTING: Final = 0.01
-RESTLESS_LAG: Final = 2.1
+RESTLESS_LAG: Final = 2.3
 """Innovations along an axis, averaged over some 40 messages, are as large as noise alone makes them where the mean of
 their squares is 1 (the sum over the axes in the plane); larger ones show a tag more agile than assumed."""
 
