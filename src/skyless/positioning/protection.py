@@ -1,11 +1,11 @@
 """Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8)."""
 
 from enum import StrEnum
+from statistics import NormalDist
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from scipy.stats import norm
 
 from skyless.compiled import kernel
 from skyless.positioning.joint_hearing import FULL, joint_hear, joint_motion
@@ -67,8 +67,8 @@ def limits_of(risk: float = RISK, false_alarm: float = FALSE_ALARM) -> Vector:
         if not 0.0 < value <= 0.1:
             raise ValueError(f"{name} is {value!r}; it should be above 0 and at most 0.1")
     horizontal = np.sqrt(-2.0 * np.log(risk))
-    vertical = norm.isf(risk / 2.0)
-    return np.array([MARGIN * horizontal, MARGIN * vertical, norm.isf(false_alarm / 2.0)])
+    vertical = -NormalDist().inv_cdf(risk / 2.0)
+    return np.array([MARGIN * horizontal, MARGIN * vertical, -NormalDist().inv_cdf(false_alarm / 2.0)])
 
 
 @kernel
