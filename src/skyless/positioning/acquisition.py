@@ -65,6 +65,8 @@ class Acquisition:
         self._variance_m2 = stamp_variance_m2
         self._z_bounds_m = z_bounds_m
         self._heard: dict[int, list[Observation]] = {}
+        self._hasty = speed_std_mps > SPEED_STD_MPS
+        """A tag that is taken for fast: its speed makes a start wide, and more anchors do not help."""
         self._possible_ticks: int | None = None
         """When a start was first possible."""
 
@@ -104,7 +106,7 @@ class Acquisition:
         dim = len(start.solution) - 1
         ranges_m = [np.linalg.norm(o.anchor_m[:dim] - start.solution[:dim]) for o in start.used]
         spread = np.sqrt(np.trace(start.covariance[:2, :2])) / np.mean(ranges_m)
-        patience_s = PATIENCE_S * min(spread / WIDE, 4.0) if spread > WIDE else 0.0
+        patience_s = PATIENCE_S * min(spread / WIDE, 4.0) if spread > WIDE and not self._hasty else 0.0
         return start if waited_s >= patience_s else NoFixReason.ACQUIRING
 
     def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
