@@ -32,7 +32,7 @@ class Observer:
     def __init__(self, address, site):
         self.link = Link(address, "observer", site=site, kind="watch")
         self.good = defaultdict(deque)
-        """For each tag: arrival (monotonic) and fix of those found right."""
+        """For each tag: when it was made (monotonic) and fix, of those found right; a busy machine brings them late."""
         self.false = []
         self.judged = self.unjudged = 0
         self.health = {}
@@ -110,17 +110,16 @@ class Observer:
         if error_m > 6.0 * fix.std_m + allowed_m:
             self.false.append((arrived_s, error_m, fix))
         else:
-            self.good[fix.tag].append((arrived_s, fix))
+            self.good[fix.tag].append((fix.unix_s - time.time() + time.monotonic(), fix))
 
     def _nearest_truth(self, unix_s):
         index = bisect.bisect_left(self._truth_s, unix_s)
         near = [truth for truth in self._truths[max(index - 1, 0) : index + 1] if abs(truth.unix_s - unix_s) < NEAR_S]
         return min(near, key=lambda truth: abs(truth.unix_s - unix_s), default=None)
 
-    def arrivals(self, tag, since_s):
-        """When right fixes came that were made since then."""
-        since_unix_s = since_s + time.time() - time.monotonic()
-        return [arrived_s for arrived_s, fix in self.good[tag] if fix.unix_s >= since_unix_s]
+    def made(self, tag, since_s):
+        """When right fixes were made since then."""
+        return [made_s for made_s, _ in self.good[tag] if made_s >= since_s]
 
     async def recovery_s(self, tags, since_s, limit_s=5.0):
         """How long after a time all these tags had right fixes again, made since then, and go on having them.
@@ -135,15 +134,15 @@ class Observer:
         return float("inf")
 
     def _steady_since(self, tag, since_s):
-        arrivals = self.arrivals(tag, since_s)
-        for tenth, begin_s in zip(arrivals[9:], arrivals, strict=False):
+        made = self.made(tag, since_s)
+        for tenth, begin_s in zip(made[9:], made, strict=False):
             if tenth - begin_s <= 0.5:
                 return begin_s
         return None
 
     def longest_silence_s(self, tag, since_s, until_s):
-        """The longest time without a right fix's arrival."""
-        times = [since_s, *(s for s, _ in self.good[tag] if since_s < s < until_s), until_s]
+        """The longest time in which no right fix was made."""
+        times = [since_s, *(s for s in self.made(tag, since_s) if s < until_s), until_s]
         return max(later - earlier for earlier, later in itertools.pairwise(times))
 
     def online(self, kind, name, since_s=0.0):
