@@ -12,9 +12,10 @@ if TYPE_CHECKING:
     from skyless.anchor import Anchor
     from skyless.experiments.fleet import Fleet
     from skyless.experiments.scenarios import Request, fleet_of
+    from skyless.methods import METHODS
     from skyless.positioning.fix import Fix, NoFixReason
     from skyless.positioning.solver import locate
-    from skyless.receiver import METHODS, Receiver
+    from skyless.receiver import Receiver
     from skyless.recordings.formats import open_recording
     from skyless.site.lab import lab_site
     from skyless.site.load import load_site
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _PLACES: Final = {
-    "METHODS": "skyless.receiver",
+    "METHODS": "skyless.methods",
     "Anchor": "skyless.anchor",
     "Fix": "skyless.positioning.fix",
     "Fleet": "skyless.experiments.fleet",

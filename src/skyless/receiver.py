@@ -19,6 +19,7 @@ from skyless.air.schedule import Schedule, schedule_from_page
 from skyless.clocks.filter import clock_noise
 from skyless.clocks.stamps import AnchorStamps
 from skyless.constants import MAX_DRIFT, TICK_M
+from skyless.methods import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import SLACK_TICKS, FixTime
 from skyless.positioning.joint import JointSettings
@@ -29,10 +30,6 @@ from skyless.positioning.tracker import TrackerSettings
 from skyless.positioning.tracking import Tracking
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, Unwrapper, from_seconds, to_seconds
 from skyless.uncertainty.tdoa import stamp_variance_m2
-
-FILTERS: Final = ("tracker", "joint")
-METHODS: Final = (*(str(method) for method in SnapshotMethod), *FILTERS)
-"""Names of the positioning methods."""
 
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)
 """A tag that may choose its site leaves one that is silent for so long when it hears another."""
@@ -55,7 +52,7 @@ class Receiver:
 
     def __init__(
         self,
-        method: str = "tracker",
+        method: str = DEFAULT_METHOD,
         *,
         site: int | None = None,
         qa: float = 0.3,

@@ -5,7 +5,7 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.experiments.scenarios import Request, fleet_of
-from skyless.receiver import FILTERS
+from skyless.methods import FILTERS
 from skyless.site.lab import lab_site
 
 SIDES = 5.0

@@ -12,8 +12,10 @@ from skyless.air.beacon import MasterTime
 from skyless.air.codec import decode
 from skyless.anchor import Anchor
 from skyless.constants import TICK_M, TICK_RATE_HZ
+from skyless.methods import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import NoFixReason
-from skyless.receiver import FILTERS, METHODS, Receiver
+from skyless.positioning.snapshots import SnapshotMethod
+from skyless.receiver import Receiver
 from skyless.simulation.impairments import AnchorOutage, Outage
 from skyless.ticks import wrap
 
@@ -83,6 +85,11 @@ def test_reasons_from_silence_to_the_first_fix():
         reasons[receiver.reason] = None
     expected = [NoFixReason.NO_BEACONS, NoFixReason.NO_ALMANAC, NoFixReason.TOO_FEW_ANCHORS, NoFixReason.ACQUIRING]
     assert list(reasons) == expected
+
+
+def test_every_way_of_snapshots_has_its_name():
+    assert set(METHODS) == {str(method) for method in SnapshotMethod} | set(FILTERS)
+    assert DEFAULT_METHOD in METHODS
 
 
 def test_an_unknown_method_is_refused():

@@ -13,8 +13,9 @@ from msgspec.structs import replace
 from machines.bench import LAB, PAIRS, ROOM, tape
 from skyless.air.codec import decode, encode
 from skyless.air.reception import Reception
+from skyless.methods import METHODS
 from skyless.positioning.joint_state import DIM, NOISE, NOISES, SITE, SLOTS, TERMS
-from skyless.receiver import METHODS, Receiver
+from skyless.receiver import Receiver
 from skyless.recordings.checkpoint import FORMAT, RefusedError, load, save
 from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
 from skyless.recordings.checkpoint_writer import write_graph

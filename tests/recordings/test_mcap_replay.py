@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from skyless.cli.main import main
 from skyless.errors import SkylessError
 from skyless.experiments.replay_site import SiteReplay
+from skyless.methods import METHODS
 from skyless.outputs.messages import ReceptionsMessage
-from skyless.receiver import METHODS
 from skyless.recordings.mcap_recording import McapRecording
 
 

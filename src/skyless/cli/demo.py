@@ -11,10 +11,11 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.nodes import MqttCa, broker, say, site_named
-from skyless.cli.options import Picoseconds, Positive
+from skyless.cli.options import Picoseconds, Positive, known_method
 from skyless.cli.output import console, print_json
 from skyless.cli.progress import status
 from skyless.errors import SkylessError
+from skyless.methods import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.cli.demo_screen import Screen
@@ -38,7 +39,7 @@ def demo(
     noise_ps: Picoseconds = 100.0,
     seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
     site: Path | None = None,
-    method: str = "tracker",
+    method: str = DEFAULT_METHOD,
     apart: bool = False,
     mqtt: Annotated[str | None, Parameter(env_var="SKYLESS_MQTT")] = None,
     mqtt_ca: MqttCa = None,
@@ -82,10 +83,8 @@ def demo(
     from skyless.nodes.loop import run
     from skyless.nodes.places import recordings_folder
     from skyless.nodes.whole_site import SiteRun, WholeSite
-    from skyless.receiver import METHODS
 
-    if method not in METHODS:
-        raise SkylessError(f"--method is {method!r}; it should be one of {', '.join(METHODS)}")
+    known_method(method)
     if mqtt == "none":
         raise SkylessError("--mqtt is 'none'; the demo needs a broker, and brings one where --mqtt is not given")
     if mqtt is None and mqtt_ca is not None:

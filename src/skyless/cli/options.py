@@ -1,6 +1,7 @@
 """Values of options that several commands share."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -8,6 +9,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from skyless.errors import SkylessError
+from skyless.methods import METHODS
 
 Positive = Annotated[float, Parameter(validator=Number(gt=0, lt=math.inf))]
 NotNegative = Annotated[float, Parameter(validator=Number(gte=0, lt=math.inf))]
@@ -15,6 +17,12 @@ Picoseconds = Annotated[float, Parameter(validator=Number(gt=0, lte=1e6))]
 """Noise of a stamp, as far as a site file and the almanac can tell it."""
 
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
+
+
+def known_method(method: str, names: Sequence[str] = METHODS) -> None:
+    """See that a positioning method is one of these. Raises SkylessError."""
+    if method not in names:
+        raise SkylessError(f"--method is {method!r}; it should be one of {', '.join(names)}")
 
 
 def finite_numbers(option: str, text: str, counts: tuple[int, ...], separator: str = ",") -> tuple[float, ...]:

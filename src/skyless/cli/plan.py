@@ -22,6 +22,7 @@ from skyless.cli.plan_input import (
 from skyless.cli.plan_output import report, show
 from skyless.cli.progress import progress_bar
 from skyless.errors import SkylessError
+from skyless.methods import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.planning.floor import Floor
@@ -42,7 +43,7 @@ def plan(
     file: Path,
     /,
     *,
-    method: str = "tracker",
+    method: str = DEFAULT_METHOD,
     noise_ps: Positive | None = None,
     qa: Positive = 0.3,
     range_m: Annotated[Positive | None, Parameter(name="--range")] = None,

@@ -3,8 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skyless.cli.options import finite_numbers, spare_inputs
+from skyless.cli.options import finite_numbers, known_method, spare_inputs
 from skyless.errors import ConfigurationError, SkylessError
+from skyless.methods import METHODS
 
 if TYPE_CHECKING:
     from skyless.planning.floor import Box, Floor, Matrix
@@ -46,12 +47,9 @@ def settings_of(method: str, noise_ps: float | None, qa: float, range_m: float |
     """How tags compute, and how far a frame carries, ``range_m`` None for the link budget's. Raises SkylessError."""
     from skyless.planning.links import with_range
     from skyless.planning.predict import PlanSettings
-    from skyless.receiver import METHODS
     from skyless.simulation.channel import ChannelModel
 
-    predicted = [name for name in METHODS if name != "joint"]
-    if method not in predicted:
-        raise SkylessError(f"--method is {method!r}; it should be one of {', '.join(predicted)}")
+    known_method(method, tuple(name for name in METHODS if name != "joint"))
     channel = ChannelModel() if range_m is None else with_range(ChannelModel(), range_m)
     return PlanSettings(method, noise_ps, qa, channel)
 

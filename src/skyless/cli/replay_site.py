@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
-from skyless.cli.options import open_for_writing
+from skyless.cli.options import known_method, open_for_writing
 from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
 from skyless.cli.replay_output import COLUMNS, draw_track, row_of, show
 from skyless.errors import SkylessError
+from skyless.methods import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.experiments.replay_site import SiteReplay, TagReport
@@ -53,12 +54,11 @@ def see_that_they_are_left_out(options: Mapping[str, object], reason: str) -> No
 def replay_site(file: Path, options: Options) -> None:
     """Replay all tags of a recording, or one. Raises SkylessError."""
     from skyless.experiments.replay_site import SiteReplay
-    from skyless.receiver import METHODS
     from skyless.recordings.mcap_recording import McapRecording
     from skyless.site.load import load_site
 
-    if options.method is not None and options.method not in METHODS:
-        raise SkylessError(f"--method is {options.method!r}; it should be one of {', '.join(METHODS)}")
+    if options.method is not None:
+        known_method(options.method)
     with McapRecording(file) as recording:
         tags = None if options.tag is None else (options.tag,)
         settle_s = 2.0 if options.settle_s is None else options.settle_s
@@ -82,7 +82,7 @@ def _run(run: "SiteReplay", span_s: float, options: Options) -> "list[TagReport]
     from skyless.experiments.warm import compile_kernels
 
     with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
-        compile_kernels(options.method or "tracker")
+        compile_kernels(options.method or DEFAULT_METHOD)
     with ExitStack() as stack:
         bar = stack.enter_context(progress_bar("replaying", span_s))
         on_fix = None if options.fixes is None else _fix_writer(stack, options.fixes)

@@ -15,6 +15,7 @@ from skyless.cli.progress import progress_bar, status
 from skyless.cli.simulate_input import bias_of, delay_errors_of, outage_of, path_of, silence_of, site_of
 from skyless.cli.simulate_output import COLUMNS, row_of, show
 from skyless.errors import SkylessError
+from skyless.methods import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.experiments.fleet import Fleet, FleetReport
@@ -41,7 +42,7 @@ def simulate(
     *,
     scenario: str | None = None,
     site: Path | None = None,
-    method: str = "tracker",
+    method: str = DEFAULT_METHOD,
     position: list[str] | None = None,
     waypoints: list[str] | None = None,
     tags: Annotated[int, Parameter(validator=Number(gte=1, lte=10_000))] | None = None,

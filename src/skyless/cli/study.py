@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import Picoseconds, Positive
+from skyless.cli.options import Picoseconds, Positive, known_method
 from skyless.cli.progress import progress_bar, status
 from skyless.errors import SkylessError
 
@@ -125,10 +125,8 @@ def _see_that_it_applies(name: str, episodes: int | None, others: dict[str, floa
 def _run(chosen: "Study", plan: "Plan", scheduler: str | None, processes: int | None) -> "list[Row]":
     from skyless.experiments.studies.runner import run_cells, run_cells_on_dask
     from skyless.experiments.warm import compile_kernels
-    from skyless.receiver import METHODS
 
-    if plan.method not in METHODS:
-        raise SkylessError(f"--method is {plan.method!r}; it should be one of {', '.join(METHODS)}")
+    known_method(plan.method)
     cells = chosen.cells(plan)
     with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
         compile_kernels(plan.method)

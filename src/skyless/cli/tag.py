@@ -8,8 +8,9 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, broker, say
-from skyless.cli.options import Positive
+from skyless.cli.options import Positive, known_method
 from skyless.errors import SkylessError
+from skyless.methods import DEFAULT_METHOD
 from skyless.radios.open import DEFAULT_RADIO
 
 app = App(name="tag", help_epilogue="Example: skyless tag tag1")
@@ -20,7 +21,7 @@ _NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 def tag(
     *names: Annotated[str, Parameter(name="NAMES")],
     radio: str = DEFAULT_RADIO,
-    method: str = "tracker",
+    method: str = DEFAULT_METHOD,
     qa: Positive = 0.3,
     publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0,
     site_id: Annotated[int | None, Parameter(validator=Number(gte=0, lt=0xFFFE))] = None,
@@ -56,7 +57,6 @@ def tag(
     from skyless.nodes.tag import TagSettings
     from skyless.nodes.tags import Tags
     from skyless.radios.open import open_radios
-    from skyless.receiver import METHODS
 
     address = broker(mqtt, mqtt_ca)
     if not names or len(set(names)) < len(names) or not all(map(_NAME.fullmatch, names)):
@@ -64,8 +64,7 @@ def tag(
         raise SkylessError(
             f"NAMES is {given}; it should be one or more names, each once, of 1 to 32 letters, digits, - or _"
         )
-    if method not in METHODS:
-        raise SkylessError(f"--method is {method!r}; it should be one of {', '.join(METHODS)}")
+    known_method(method)
     radios = open_radios(radio, "tag", names)
     compile_kernels(method)
     settings = TagSettings(method=method, qa=qa, site=site_id, publish_hz=publish_hz)

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from skyless.dashboard.overlays import DEFAULT_METHOD, OverlayGrids, OverlayTask
 from skyless.errors import SkylessError
+from skyless.methods import METHODS
 from skyless.planning.columns import FIX_SHARE, HDOP, PDOP, SIGMA
 from skyless.planning.maps import Grid, plan_map
 from skyless.planning.predict import PlanSettings, Predictor
-from skyless.receiver import METHODS
 
 _NICE: Final = 19
 """Positioning on this machine goes first."""

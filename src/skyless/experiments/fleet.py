@@ -12,6 +12,7 @@ from skyless.air.reception import Reception
 from skyless.air.schedule import schedule_of
 from skyless.anchor import Anchor
 from skyless.experiments.statistics import ErrorStatistics, ErrorSummary
+from skyless.methods import DEFAULT_METHOD
 from skyless.positioning.fix import Fix
 from skyless.receiver import NOT_DROPS, Receiver
 from skyless.simulation.broadcast import Broadcast, Tally
@@ -41,7 +42,7 @@ class JudgedFix(Struct, frozen=True, gc=False):
 class FleetSettings(Struct, frozen=True):
     """How the tags compute, and from when on they are judged."""
 
-    method: str = "tracker"
+    method: str = DEFAULT_METHOD
     qa: float = 0.3
     warmup_s: float = 2.0
     """True time before which no fix counts for the errors; cold starts are told by ``first_fix_s``."""

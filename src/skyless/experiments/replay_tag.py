@@ -11,10 +11,11 @@ from msgspec import Struct
 from skyless.air.reception import Diagnostics, Reception
 from skyless.constants import TICK_S
 from skyless.experiments.replay_delays import DelayChange, with_delays
+from skyless.methods import METHODS
 from skyless.nodes.tag import fix_message
 from skyless.outputs.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart
 from skyless.positioning.fix import Fix
-from skyless.receiver import METHODS, NOT_DROPS, Receiver
+from skyless.receiver import NOT_DROPS, Receiver
 from skyless.recordings.checkpoint import RefusedError, load
 from skyless.recordings.source import Drops
 from skyless.ticks import WRAP_TICKS, Unwrapper

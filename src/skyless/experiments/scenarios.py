@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from skyless.experiments.deaf_receiver import DeafReceiver
 from skyless.experiments.fleet import Fleet, FleetSettings
+from skyless.methods import DEFAULT_METHOD
 from skyless.simulation.channel import ChannelModel
 from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage
 from skyless.simulation.oscillator import OscillatorModel, Temperature
@@ -32,7 +33,7 @@ class Request(Struct, frozen=True):
     """A simulation: what is asked of ``skyless simulate``."""
 
     site: Site
-    method: str = "tracker"
+    method: str = DEFAULT_METHOD
     seed: int = 1
     noise_ps: float | None = None
     """Noise of every TX and RX stamp, and what the filters assume; None for the site's own figures."""

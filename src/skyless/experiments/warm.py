@@ -4,6 +4,7 @@ from math import dist
 
 from skyless.air.packet import PairTdoa
 from skyless.experiments.fleet import Fleet, FleetSettings
+from skyless.methods import DEFAULT_METHOD
 from skyless.positioning.pair_tracker import PairSettings
 from skyless.positioning.pair_tracking import PairTracking
 from skyless.simulation.scenario import lab_impairments
@@ -11,7 +12,7 @@ from skyless.simulation.trajectory import Static
 from skyless.site.lab import lab_site
 
 
-def compile_kernels(method: str = "tracker") -> None:
+def compile_kernels(method: str = DEFAULT_METHOD) -> None:
     """Run a fifth of a second of the lab."""
     fleet = Fleet(lab_site(), [Static(3.0, 4.0)], lab_impairments(100.0), 0, FleetSettings(method, warmup_s=0.0))
     for _ in fleet.run(0.2):

@@ -7,6 +7,7 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.air.reception import Reception
+from skyless.methods import DEFAULT_METHOD
 from skyless.nodes.latency import Latencies, PhaseBook
 from skyless.outputs.messages import FixMessage, Matrix, Vector
 from skyless.positioning.fix import Fix
@@ -17,7 +18,7 @@ from skyless.receiver import Receiver
 class TagSettings(Struct, frozen=True):
     """How a tag computes and what it tells."""
 
-    method: str = "tracker"
+    method: str = DEFAULT_METHOD
     qa: float = 0.3
     site: int | None = None
     """The only site to listen to; None for the first that is heard."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from skyless.clocks.filter import clock_noise
 from skyless.compiled import threaded_kernel
+from skyless.methods import DEFAULT_METHOD
 from skyless.planning.anchor_clocks import anchor_clocks, stamp_variances
 from skyless.planning.columns import COLUMNS, SIGMA
 from skyless.planning.geometry import fill_dops, observe, weighted_pdop
@@ -35,7 +36,7 @@ CHUNK: Final = 2000
 class PlanSettings(Struct, frozen=True):
     """What is assumed beyond the site file."""
 
-    method: str = "tracker"
+    method: str = DEFAULT_METHOD
     noise_ps: float | None = None
     """Noise of every TX and RX stamp; None for the site's own figures."""
     qa: float = 0.3

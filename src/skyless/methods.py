@@ -1,0 +1,9 @@
+"""Names of the positioning methods."""
+
+from typing import Final
+
+SNAPSHOTS: Final = ("literal", "literal-delayed", "weighted", "bracketed")
+FILTERS: Final = ("tracker", "joint")
+METHODS: Final = (*SNAPSHOTS, *FILTERS)
+
+DEFAULT_METHOD: Final = "tracker"
