@@ -13,7 +13,7 @@ import numpy as np
 
 from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.positioning.joint import JointFilter, JointSettings, Messages
-from skyless.positioning.joint_state import REJECTED, states
+from skyless.positioning.joint_state import REJECTED
 from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings, track
 
 NODES, SUPERFRAMES, SLOT_TICKS = 7, 2048, round(5e-3 * TICK_RATE_HZ)
@@ -75,8 +75,8 @@ class Joint:
         m.relays[:, 3] += self.minute.steps[m.relays[:, 0]]
 
     def state(self):
-        n = states(self.filter.arrays)
-        return self.filter.arrays.x[:n], self.filter.arrays.P[:n, :n], int(self.filter.arrays.counts[REJECTED])
+        P = self.filter.covariance()
+        return self.filter.arrays.x[: len(P)], P, int(self.filter.arrays.counts[REJECTED])
 
     def position(self):
         return self.filter.motion()[0][:2]

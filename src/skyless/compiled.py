@@ -33,7 +33,7 @@ def _cache_folder() -> str:
     digest = hashlib.sha1(usedforsecurity=False)
     for source in sorted(_PACKAGE.rglob("*.py")):
         text = source.read_bytes()
-        if b"skyless.compiled" in text or source.name in {"constants.py", "compiled.py"}:
+        if b"skyless.compiled" in text or source.name in {"constants.py", "compiled.py", "eights.py"}:
             digest.update(text)
     folder = _cache_home() / f"kernels-{digest.hexdigest()[:16]}"
     if not folder.exists():

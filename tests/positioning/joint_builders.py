@@ -6,7 +6,6 @@ from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
 from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.studies.episodes import Case, draw_episode
 from skyless.positioning.joint import JointFilter, JointSettings, Messages
-from skyless.positioning.joint_state import states
 from skyless.positioning.observation import Observation
 from skyless.site.lab import lab_site
 
@@ -100,12 +99,6 @@ def ideal(path_m, mesh, seed=1, anchors_m=LAB_M, senders=None):
     relays = np.column_stack([by, senders[owner], sequences[owner], heard])
     ends = np.searchsorted(owner, np.arange(frames), side="right")
     return Messages(senders, sequences, rx_ticks, tx_ticks, relays, ends)
-
-
-def covariance(joint):
-    """The covariance of the states in use."""
-    n = states(joint.arrays)
-    return joint.arrays.P[:n, :n]
 
 
 __all__ = ["Case"]

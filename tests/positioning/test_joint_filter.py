@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from joint_builders import LAB_M, ROOM_M, SLOT_S, begun, covariance, episode_of, ideal, kept, packets_of, settings_of
+from joint_builders import LAB_M, ROOM_M, SLOT_S, begun, episode_of, ideal, kept, packets_of, settings_of
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
@@ -174,7 +174,7 @@ def test_streaming_and_batch_give_identical_bits(case, anchors_m, height_m):
     assert len(one.arrays.slots) == 8
     assert one.arrays.counts[RESTARTS] == 1
     assert one.arrays.counts[SLOTS] == len(anchors_m)
-    assert np.array_equal(covariance(one), covariance(one).T)
+    assert np.array_equal(one.covariance(), one.covariance().T)
     assert np.linalg.norm(motions[-1, :2] - episode.path_m[-1, :2]) < 0.2
 
 
@@ -229,11 +229,11 @@ def test_millions_of_messages_leave_the_covariance_sound(case, millions):
     early = np.empty(0)
     for _ in range(round(millions * 1e6 / len(m.sites))):
         joint.track(m)
-        early = early if len(early) else np.diag(covariance(joint)).copy()
+        early = early if len(early) else np.diag(joint.covariance()).copy()
         m.rx_ticks[:] += step
         m.tx_ticks[:] += step
         m.relays[:, 3] += step
-    P = covariance(joint)
+    P = joint.covariance()
     assert np.array_equal(P, P.T)
     assert np.isfinite(joint.arrays.x).all()
     scale = np.sqrt(np.diag(P))
@@ -300,12 +300,12 @@ def test_an_anchor_that_leaves_takes_nothing_with_it():
     episode = episode_of(MESH, 60)
     joint = begun(episode, settings_of(MESH))
     joint.track(episode.messages)
-    before, motion = covariance(joint).copy(), joint.motion()[0].copy()
+    before, motion = joint.covariance().copy(), joint.motion()[0].copy()
     slot = int(joint.arrays.slot_of[2])
     half, noise = values(joint.arrays), int(joint.arrays.slots[slot, NOISE])
     drop_slot(joint.arrays, slot)
     gone = [2 + slot, half + 2 + slot, 2 * half + noise]
-    np.testing.assert_array_equal(covariance(joint), np.delete(np.delete(before, gone, 0), gone, 1))
+    np.testing.assert_array_equal(joint.covariance(), np.delete(np.delete(before, gone, 0), gone, 1))
     np.testing.assert_array_equal(joint.motion()[0], motion)
 
 

@@ -51,7 +51,7 @@ def test_sensitivities_are_what_a_fault_does_to_the_state(mesh):
     s = clean.arrays
     slot, half = s.slot_of[anchor], values(s)
     tau_s = to_seconds(int(s.counts[EPOCH] - s.counts[BASE]))
-    expected = s.sensitivities[slot, :2] + tau_s * s.sensitivities[slot, half : half + 2]
+    expected = s.sensitivities[:2, slot] + tau_s * s.sensitivities[half : half + 2, slot]
     moved = (faulty.motion()[0][:2].copy() - clean.motion()[0][:2]) / (ticks * TICK_M)
     assert np.linalg.norm(expected) > 0.02
     assert moved == pytest.approx(expected, rel=0.05, abs=0.003)
@@ -63,7 +63,7 @@ def test_evidence_finds_the_size_of_a_fault():
     sizes = []
     for late_ticks in (0, ticks):
         s = tracked(episode, late(episode.messages, anchor, late_ticks), settings).arrays
-        y, a, _ = s.evidence[s.slot_of[anchor], EVIDENCE : 2 * EVIDENCE]
+        y, a, _ = s.evidence[EVIDENCE : 2 * EVIDENCE, s.slot_of[anchor]]
         sizes.append(y / a)
     assert sizes[1] - sizes[0] == pytest.approx(ticks * TICK_M, rel=0.05)
 
@@ -76,7 +76,7 @@ def test_statistics_of_clean_data_are_normal():
         s = begun(episode, settings_of(case), seed=seed + 1000)
         s.track(episode.messages)
         slot = s.arrays.slot_of[seed % len(LAB_M)]
-        rows = s.arrays.evidence[slot, : 2 * EVIDENCE].reshape(2, EVIDENCE)
+        rows = s.arrays.evidence[: 2 * EVIDENCE, slot].reshape(2, EVIDENCE)
         squares.append(np.square(rows[:, 0]) / rows[:, 2])
     total = np.sum(squares, axis=0)
     low, high = chi2.ppf([0.0005, 0.9995], 80)

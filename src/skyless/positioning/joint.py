@@ -11,6 +11,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.positioning.joint_algebra import settle
 from skyless.positioning.joint_hearing import FULL, joint_motion, joint_step, joint_track
 from skyless.positioning.joint_monitor import PATIENCE
 from skyless.positioning.joint_state import (
@@ -34,6 +35,7 @@ from skyless.positioning.joint_state import (
     Vector,
     extended,
     new_arrays,
+    states,
     values,
 )
 from skyless.positioning.kalman import horizontal_variance
@@ -205,6 +207,13 @@ class JointFilter:
 
     def _extend(self) -> None:
         self.arrays = extended(self.arrays, 2 * len(self.arrays.slots), len(self.arrays.site_m))
+
+    def covariance(self) -> Matrix:
+        """Of all states in use, values as of the base."""
+        s = self.arrays._replace(P=self.arrays.P.copy(), noise=self.arrays.noise.copy())
+        settle(s)
+        n = states(s)
+        return s.P[:n, :n]
 
     def motion(self) -> tuple[Vector, Matrix]:
         """Position and velocity at the newest message, and their covariance; overwritten by the next call."""

@@ -1,14 +1,36 @@
-"""The algebra of ``joint``: sparse measurements, and a covariance that changes by terms sign·u·uᵀ.
+"""The algebra of ``joint``: sparse measurements, and a covariance that changes by terms −u·uᵀ.
 
-Terms are collected while a packet is taken and added to the covariance in one go, four at a time; until then whoever
-asks for a product P·h gets theirs as well. As u_i·u_j = u_j·u_i to the bit, the covariance stays symmetric to the bit.
+Terms are collected while a packet is taken and added to the covariance in one go; until then whoever asks for a product
+P·h gets theirs as well. The noise of passing time has few distinct figures and waits even longer, until the base of the
+values moves. As u_i·u_j = u_j·u_i to the bit, the covariance stays symmetric to the bit.
+
+What a fault does to the states (``protection_updates``) is a column beside the covariance and goes the same way: the
+product with h stands beside P·h, and each term has its responses beside u.
 """
 
 import numpy as np
 
 from skyless.compiled import borrowing_kernel
-from skyless.positioning.joint_state import MOST_TERMS, PLACES, TERMS, JointArrays, states, width
-from skyless.positioning.protection_updates import follow_faults
+from skyless.eights import EIGHT, add, load, scaled, store
+from skyless.positioning.joint_state import (
+    CLOCK_CROSS,
+    CLOCK_RATE,
+    CLOCK_VALUE,
+    DIM,
+    MOST_TERMS,
+    MOTION_CROSS,
+    MOTION_RATE,
+    MOTION_VALUE,
+    PLACES,
+    TERMS,
+    JointArrays,
+    Matrix,
+    lanes,
+    states,
+    values,
+    width,
+)
+from skyless.positioning.protection_updates import gather_evidence
 
 
 @borrowing_kernel
@@ -21,42 +43,55 @@ def put(s: JointArrays, place: int, value: float) -> None:
 
 
 @borrowing_kernel
-def new_term(s: JointArrays, sign: float) -> int:
-    """Begin a term; its place among them."""
+def project(s: JointArrays) -> int:
+    """Write P·h of the measurement to a new term, not yet counted among the terms; returns its place."""
     if s.counts[TERMS] == MOST_TERMS:
-        settle(s)
-    term: int = s.counts[TERMS]
-    s.signs[term] = sign
-    return term
+        add_terms(s)
+    new: int = s.counts[TERMS]
+    for term in range(new):
+        s.along[term] = along_h(s, term)
+    _combine(s, s.P, s.terms, new, width(s))
+    _combine(s, s.sensitivities, s.responses, new, lanes(s))
+    _project_noise(s, s.terms, new)
+    return new
 
 
 @borrowing_kernel
-def project(s: JointArrays) -> int:
-    """Write P·h of the measurement to a new term, not yet counted among the terms; returns its place."""
-    new = new_term(s, -1.0)
-    P, h, places, u, columns = s.P, s.h, s.h_places, s.terms, width(s)
-    count = s.counts[PLACES]
-    while count % 4 != 0:  # to whole fours, with nothing
-        places[count] = 0
-        h[count] = 0.0
-        count += 1
-    for k in range(0, count, 4):
-        a, b, c, d = places[k], places[k + 1], places[k + 2], places[k + 3]
-        ha, hb, hc, hd = h[k], h[k + 1], h[k + 2], h[k + 3]
-        if k == 0:
-            for column in range(columns):
-                u[new, column] = ha * P[a, column] + hb * P[b, column] + hc * P[c, column] + hd * P[d, column]
-        else:
-            for column in range(columns):
-                u[new, column] += ha * P[a, column] + hb * P[b, column] + hc * P[c, column] + hd * P[d, column]
-    for term in range(new):
-        along = 0.0
-        for k in range(s.counts[PLACES]):
-            along += h[k] * u[term, places[k]]
-        along *= s.signs[term]
-        for column in range(columns):
-            u[new, column] += along * u[term, column]
-    return new
+def _combine(s: JointArrays, matrix: Matrix, terms: Matrix, new: int, columns: int) -> None:
+    """The combination of the matrix's rows that the measurement makes, as the terms have changed them."""
+    h, places, along, count = s.h, s.h_places, s.along, s.counts[PLACES]
+    for column in range(0, columns, EIGHT):
+        total = scaled(h[0], load(matrix, (places[0], column)))
+        for k in range(1, count):
+            total = add(total, h[k], load(matrix, (places[k], column)))
+        for term in range(new):
+            total = add(total, -along[term], load(terms, (term, column)))
+        store(terms, (new, column), total)
+
+
+@borrowing_kernel
+def _project_noise(s: JointArrays, u: Matrix, new: int) -> None:
+    """Add to a product with h what passing time has brought."""
+    noise, dim, half = s.noise, int(s.settings[DIM]), values(s)
+    offset = rate = 0.0
+    for k in range(s.counts[PLACES]):
+        place, h = s.h_places[k], s.h[k]
+        if place < half:
+            motion = place < dim
+            u[new, place] += h * noise[MOTION_VALUE if motion else CLOCK_VALUE]
+            u[new, half + place] += h * noise[MOTION_CROSS if motion else CLOCK_CROSS]
+            offset += 0.0 if motion else h
+        elif place < 2 * half:
+            motion = place < half + dim
+            u[new, place - half] += h * noise[MOTION_CROSS if motion else CLOCK_CROSS]
+            u[new, place] += h * noise[MOTION_RATE if motion else CLOCK_RATE]
+            rate += 0.0 if motion else h
+    if offset != 0.0 or rate != 0.0:
+        value = offset * noise[CLOCK_VALUE] + rate * noise[CLOCK_CROSS]
+        change = offset * noise[CLOCK_CROSS] + rate * noise[CLOCK_RATE]
+        for place in range(dim, half):
+            u[new, place] += value
+            u[new, half + place] += change
 
 
 @borrowing_kernel
@@ -83,32 +118,64 @@ def take(s: JointArrays, term: int, innovation: float, spread: float, own: int) 
 
     ``own`` is the slot that the tag heard, −1 for a reception of others.
     """
-    x, u, columns = s.x, s.terms, width(s)
+    x, u = s.x, s.terms
     scale = 1.0 / np.sqrt(spread)
     step = innovation * scale
-    for column in range(columns):
-        u[term, column] *= scale
-    for column in range(columns):
-        x[column] += step * u[term, column]
-    follow_faults(s, term, own, innovation, spread)
+    for column in range(0, width(s), EIGHT):
+        one = scaled(scale, load(u, (term, column)))
+        store(u, (term, column), one)
+        store(x, column, add(load(x, column), step, one))
+    gather_evidence(s, term, own, step, scale)
     s.counts[TERMS] = term + 1
 
 
 @borrowing_kernel
-def settle(s: JointArrays) -> None:
-    """Add all terms to the covariance."""
-    P, u, signs, n, columns = s.P, s.terms, s.signs, states(s), width(s)
-    count = s.counts[TERMS]
-    fours = count // 4 * 4
-    for k in range(0, fours, 4):
-        for row in range(n):
-            a, b = signs[k] * u[k, row], signs[k + 1] * u[k + 1, row]
-            c, d = signs[k + 2] * u[k + 2, row], signs[k + 3] * u[k + 3, row]
-            for column in range(columns):
-                P[row, column] += a * u[k, column] + b * u[k + 1, column] + c * u[k + 2, column] + d * u[k + 3, column]
-    for k in range(fours, count):
-        for row in range(n):
-            a = signs[k] * u[k, row]
-            for column in range(columns):
-                P[row, column] += a * u[k, column]
+def add_terms(s: JointArrays) -> None:
+    """Add all terms to the covariance, and to the sensitivities."""
+    _add_terms(s, s.P, s.terms, width(s))
+    _add_terms(s, s.sensitivities, s.responses, lanes(s))
     s.counts[TERMS] = 0
+
+
+@borrowing_kernel
+def _add_terms(s: JointArrays, matrix: Matrix, terms: Matrix, columns: int) -> None:
+    """Four rows at a time, of which the last may be beyond the states in use, where terms are zero."""
+    u, count, n = s.terms, s.counts[TERMS], states(s)
+    for column in range(0, columns, EIGHT):
+        for row in range(0, n, 4):
+            a, b = load(matrix, (row, column)), load(matrix, (row + 1, column))
+            c, d = load(matrix, (row + 2, column)), load(matrix, (row + 3, column))
+            for k in range(count):
+                term = load(terms, (k, column))
+                a, b = add(a, -u[k, row], term), add(b, -u[k, row + 1], term)
+                c, d = add(c, -u[k, row + 2], term), add(d, -u[k, row + 3], term)
+            store(matrix, (row, column), a)
+            store(matrix, (row + 1, column), b)
+            store(matrix, (row + 2, column), c)
+            store(matrix, (row + 3, column), d)
+
+
+@borrowing_kernel
+def settle(s: JointArrays) -> None:
+    """Bring the covariance up to date: all terms, and the noise of the time that has passed."""
+    add_terms(s)
+    P, noise, dim, half = s.P, s.noise, int(s.settings[DIM]), values(s)
+    value, cross, rate = noise[CLOCK_VALUE], noise[CLOCK_CROSS], noise[CLOCK_RATE]
+    for place in range(dim):
+        _add_noise(P, place, half + place, noise[MOTION_VALUE], noise[MOTION_CROSS], noise[MOTION_RATE])
+    for place in range(dim, half):
+        _add_noise(P, place, half + place, value, cross, rate)
+        for other in range(dim, half):  # the tag's own oscillator, which all offsets share
+            P[place, other] += value
+            P[place, half + other] += cross
+            P[half + place, other] += cross
+            P[half + place, half + other] += rate
+    noise[:] = 0.0
+
+
+@borrowing_kernel
+def _add_noise(P: Matrix, place: int, rate_place: int, value: float, cross: float, rate: float) -> None:
+    P[place, place] += value
+    P[place, rate_place] += cross
+    P[rate_place, place] += cross
+    P[rate_place, rate_place] += rate

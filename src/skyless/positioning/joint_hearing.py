@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from skyless.compiled import borrowing_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.positioning.joint_algebra import settle
+from skyless.positioning.joint_algebra import add_terms, settle
 from skyless.positioning.joint_monitor import LATE_ENOUGH
 from skyless.positioning.joint_state import (
     BASE,
@@ -17,6 +17,9 @@ from skyless.positioning.joint_state import (
     IN_ROW,
     JUMPS,
     LATE_SHARE,
+    MOTION_CROSS,
+    MOTION_RATE,
+    MOTION_VALUE,
     NOISE,
     PACKET_RX,
     PACKET_TX,
@@ -120,7 +123,7 @@ def joint_hear(
         join(s, slot, rx_ticks, tx_ticks)
         _remember(s, slot, sequence, rx_ticks, tx_ticks)
         status = JOINED
-    settle(s)
+    add_terms(s)
     return status
 
 
@@ -176,9 +179,11 @@ def joint_motion(s: JointArrays, x: Vector, P: Matrix) -> None:
         x[one] = s.x[one] + tau_s * s.x[half + one]
         x[dim + one] = s.x[half + one]
         for other in range(dim):
-            rate = s.P[half + one, half + other]
-            cross = s.P[one, half + other] + tau_s * rate
-            P[one, other] = s.P[one, other] + tau_s * (s.P[half + one, other] + cross)
+            rate = s.P[half + one, half + other] + (s.noise[MOTION_RATE] if one == other else 0.0)
+            at_base = s.noise[MOTION_CROSS] if one == other else 0.0
+            cross = s.P[one, half + other] + at_base + tau_s * rate
+            value = s.P[one, other] + (s.noise[MOTION_VALUE] if one == other else 0.0)
+            P[one, other] = value + tau_s * (s.P[half + one, other] + at_base + cross)
             P[one, dim + other] = cross
             P[dim + other, one] = cross
             P[dim + one, dim + other] = rate

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.compiled import borrowing_kernel
+from skyless.eights import EIGHT
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -64,10 +65,14 @@ MOST_PLACES: Final = 12
 """A position and a velocity of three axes, two offsets and rates, a noise, and up to a multiple of four."""
 
 EVIDENCE: Final = 3
-"""Sums of each memory in a row of ``evidence``: Σwsν, Σws², Σw²s² (``protection_updates``); ..."""
+"""Rows of ``evidence`` for each memory, sums: Σwsν, Σws², Σw²s² (``protection_updates``); ..."""
 
 REJECTIONS: Final = 2 * EVIDENCE
 """... behind both memories the packets of the slot that lay beyond the gate."""
+
+MOTION_VALUE, MOTION_CROSS, MOTION_RATE, CLOCK_VALUE, CLOCK_CROSS, CLOCK_RATE = range(6)
+"""Places in ``noise``: variance of a value, its covariance with the rate, the rate's variance; of each axis, and of
+each oscillator."""
 
 PACKETS, RELAYS_TAKEN, RELAYS_REFUSED = range(3)
 """Places in ``recent``: how many there were lately, older ones counting less."""
@@ -84,9 +89,11 @@ class JointArrays(NamedTuple):
     P: Matrix
     """Shape (states, states); zero beyond the states in use."""
     terms: Matrix
-    """Shape (MOST_TERMS, states); what P is still to change by, P += Σ sign·term·termᵀ (``joint_algebra``)."""
-    signs: Vector
-    """Shape (MOST_TERMS,)."""
+    """Shape (MOST_TERMS, states); what P is still to change by, −Σ term·termᵀ (``joint_algebra``)."""
+    along: Vector
+    """Shape (MOST_TERMS,): the product of each term with the measurement at hand."""
+    noise: Vector
+    """Shape (6,): what passing time has added to variances but P does not hold yet."""
     h_places: Integers
     """Where the measurement at hand is not zero, shape (MOST_PLACES,); as many as ``counts[PLACES]``."""
     h: Vector
@@ -108,9 +115,11 @@ class JointArrays(NamedTuple):
     site_m: Matrix
     """Positions of all anchors, shape (anchors of the site, 3)."""
     sensitivities: Matrix
-    """Shape (capacity, states): the states' errors for each metre by which the tag's receptions of a slot are late."""
+    """Shape (states, lanes): the states' errors for each metre by which the tag's receptions of a slot are late."""
+    responses: Matrix
+    """Shape (MOST_TERMS, lanes); what sensitivities are still to change by, −Σ term·responsesᵀ."""
     evidence: Matrix
-    """Shape (capacity, 2·EVIDENCE + 1): what innovations say of such a fault, with a short and a long memory."""
+    """Shape (2·EVIDENCE + 1, lanes): what innovations say of such a fault, with a short and a long memory."""
     recent: Vector
     """Shape (3,)."""
 
@@ -119,14 +128,21 @@ NEVER: Final = -(1 << 62)
 """A time before all others."""
 
 
+def in_eights(count: int) -> int:
+    """The next multiple of eight, for ``eights``."""
+    return -(-count // EIGHT) * EIGHT
+
+
 def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArrays:
     """Empty arrays with room for so many anchors in view, and in the table."""
-    states = -(-(2 * int(settings[DIM]) + 3 * capacity) // 8) * 8
+    states = in_eights(2 * int(settings[DIM]) + 3 * capacity)
+    columns = in_eights(capacity)
     return JointArrays(
         x=np.zeros(states),
         P=np.zeros((states, states)),
         terms=np.zeros((MOST_TERMS, states)),
-        signs=np.zeros(MOST_TERMS),
+        along=np.zeros(MOST_TERMS),
+        noise=np.zeros(6),
         h_places=np.zeros(MOST_PLACES, np.int64),
         h=np.zeros(MOST_PLACES),
         counts=np.zeros(21, np.int64),
@@ -138,8 +154,9 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
         slot_of=np.full(site_capacity, -1, np.int64),
         settings=settings,
         site_m=np.zeros((site_capacity, 3)),
-        sensitivities=np.zeros((capacity, states)),
-        evidence=np.zeros((capacity, 2 * EVIDENCE + 1)),
+        sensitivities=np.zeros((states, columns)),
+        responses=np.zeros((MOST_TERMS, columns)),
+        evidence=np.zeros((2 * EVIDENCE + 1, columns)),
         recent=np.zeros(3),
     )
 
@@ -167,8 +184,14 @@ def states(s: JointArrays) -> int:
 
 @borrowing_kernel
 def width(s: JointArrays) -> int:
-    """Columns that loops run over: the states in use and zeros up to a multiple of eight, as processors like them."""
+    """Columns that loops run over: the states in use, and zeros up to a whole number of eights."""
     return (states(s) + 7) // 8 * 8
+
+
+@borrowing_kernel
+def lanes(s: JointArrays) -> int:
+    """As many for the slots."""
+    return int((s.counts[SLOTS] + 7) // 8 * 8)
 
 
 @borrowing_kernel
@@ -186,10 +209,11 @@ def _insert(s: JointArrays, n: int, place: int) -> None:
         for column in range(n, place, -1):
             P[row, column] = P[row, column - 1]
         P[row, place] = 0.0
+    V = s.sensitivities
     for slot in range(s.counts[SLOTS]):
-        for column in range(n, place, -1):
-            s.sensitivities[slot, column] = s.sensitivities[slot, column - 1]
-        s.sensitivities[slot, place] = 0.0
+        for row in range(n, place, -1):
+            V[row, slot] = V[row - 1, slot]
+        V[place, slot] = 0.0
 
 
 @borrowing_kernel
@@ -207,10 +231,11 @@ def _remove(s: JointArrays, n: int, place: int) -> None:
         for column in range(place, n - 1):
             P[row, column] = P[row, column + 1]
         P[row, n - 1] = 0.0
+    V = s.sensitivities
     for slot in range(s.counts[SLOTS]):
-        for column in range(place, n - 1):
-            s.sensitivities[slot, column] = s.sensitivities[slot, column + 1]
-        s.sensitivities[slot, n - 1] = 0.0
+        for row in range(place, n - 1):
+            V[row, slot] = V[row + 1, slot]
+        V[n - 1, slot] = 0.0
 
 
 @borrowing_kernel
@@ -235,8 +260,8 @@ def add_slot(s: JointArrays, site: int) -> int:
         s.anchors[slot, axis] = s.site_m[site, axis]
     s.anchors[slot, RANGE:] = 0.0
     s.anchors[slot, WEIGHT] = 1.0
-    s.sensitivities[slot, :] = 0.0
-    s.evidence[slot, :] = 0.0
+    s.sensitivities[:, slot] = 0.0
+    s.evidence[:, slot] = 0.0
     s.packets[slot, :, :] = NEVER
     s.relayed[slot, :] = NEVER
     s.relayed[:, slot] = NEVER
@@ -268,10 +293,10 @@ def drop_slot(s: JointArrays, slot: int) -> None:
             s.slots[k, column] = s.slots[k + 1, column]
         for column in range(s.anchors.shape[1]):
             s.anchors[k, column] = s.anchors[k + 1, column]
-        for column in range(s.sensitivities.shape[1]):
-            s.sensitivities[k, column] = s.sensitivities[k + 1, column]
-        for column in range(2 * EVIDENCE + 1):
-            s.evidence[k, column] = s.evidence[k + 1, column]
+        for row in range(s.sensitivities.shape[0]):
+            s.sensitivities[row, k] = s.sensitivities[row, k + 1]
+        for row in range(2 * EVIDENCE + 1):
+            s.evidence[row, k] = s.evidence[row, k + 1]
         for packet in range(REMEMBERED):
             for column in range(3):
                 s.packets[k, packet, column] = s.packets[k + 1, packet, column]
@@ -283,4 +308,6 @@ def drop_slot(s: JointArrays, slot: int) -> None:
             s.relayed[k, column] = s.relayed[k, column + 1]
         if s.slots[k, NOISE] > noise >= 0:
             s.slots[k, NOISE] -= 1
+    s.sensitivities[:, last] = 0.0
+    s.evidence[:, last] = 0.0
     s.counts[SLOTS] = last

@@ -2,24 +2,26 @@
 
 from typing import Final
 
-import numpy as np
-
 from skyless.compiled import borrowing_kernel
 from skyless.constants import TICK_S
-from skyless.positioning.joint_algebra import new_term
+from skyless.eights import EIGHT, add, load, store
+from skyless.positioning.joint_algebra import settle
 from skyless.positioning.joint_state import (
     BASE,
-    DIM,
+    CLOCK_CROSS,
+    CLOCK_RATE,
+    CLOCK_VALUE,
     EPOCH,
+    MOTION_CROSS,
+    MOTION_RATE,
+    MOTION_VALUE,
     QA,
-    SLOTS,
-    TERMS,
     WALK,
     WHITE,
     JointArrays,
+    lanes,
     states,
     values,
-    width,
 )
 from skyless.positioning.protection_updates import fade_evidence
 from skyless.positioning.tracker import AGILITY
@@ -39,17 +41,17 @@ def elapse(s: JointArrays, rx_ticks: int) -> None:
         tau_s = 0.0
     s.counts[EPOCH] = rx_ticks
     fade_evidence(s)
-    dim, half = int(s.settings[DIM]), values(s)
+    noise = s.noise
     rate = s.settings[QA] * s.statistics[AGILITY] * dt_s
     cross, value = _noise_at_base(0.0, rate, dt_s, tau_s)
-    for place in range(dim):
-        _add_noise(s, place, half + place, value, cross, rate)
+    noise[MOTION_VALUE] += value
+    noise[MOTION_CROSS] += cross
+    noise[MOTION_RATE] += rate
     rate = s.settings[WALK] * dt_s
     cross, value = _noise_at_base(s.settings[WHITE] * dt_s, rate, dt_s, tau_s)
-    for place in range(dim, half):
-        _add_noise(s, place, half + place, value, cross, rate)
-    if value > 0.0:
-        _add_common_noise(s, dim, half, value, cross, rate)
+    noise[CLOCK_VALUE] += value
+    noise[CLOCK_CROSS] += cross
+    noise[CLOCK_RATE] += rate
 
 
 @borrowing_kernel
@@ -64,42 +66,16 @@ def _noise_at_base(white: float, rate: float, dt_s: float, tau_s: float) -> tupl
 
 
 @borrowing_kernel
-def _add_noise(s: JointArrays, place: int, rate_place: int, value: float, cross: float, rate: float) -> None:
-    s.P[place, place] += value
-    s.P[place, rate_place] += cross
-    s.P[rate_place, place] += cross
-    s.P[rate_place, rate_place] += rate
-
-
-@borrowing_kernel
-def _add_common_noise(s: JointArrays, dim: int, half: int, value: float, cross: float, rate: float) -> None:
-    """Add the noise of the tag's own oscillator, which all offsets share, as two terms."""
-    u, columns = s.terms, width(s)
-    own = np.sqrt(value)
-    shared = cross / own
-    rest = np.sqrt(max(rate - shared * shared, 0.0))
-    one = new_term(s, 1.0)
-    s.counts[TERMS] = one + 1
-    other = new_term(s, 1.0)
-    s.counts[TERMS] = other + 1
-    for column in range(columns):
-        u[one, column] = 0.0
-        u[other, column] = 0.0
-    for place in range(dim, half):
-        u[one, place] = own
-        u[one, half + place] = shared
-        u[other, half + place] = rest
-
-
-@borrowing_kernel
 def _move_base(s: JointArrays, tau_s: float) -> None:
     """Give all values as of a base later by ``tau_s``: F·P·Fᵀ."""
+    settle(s)
     x, P, half, n = s.x, s.P, values(s), states(s)
     for place in range(half):
         x[place] += tau_s * x[half + place]
-    for slot in range(s.counts[SLOTS]):
-        for place in range(half):
-            s.sensitivities[slot, place] += tau_s * s.sensitivities[slot, half + place]
+    V = s.sensitivities
+    for place in range(half):
+        for slots in range(0, lanes(s), EIGHT):
+            store(V, (place, slots), add(load(V, (place, slots)), tau_s, load(V, (half + place, slots))))
     for row in range(half):
         for column in range(n):
             P[row, column] += tau_s * P[half + row, column]

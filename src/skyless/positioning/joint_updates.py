@@ -9,6 +9,7 @@ import numpy as np
 
 from skyless.compiled import borrowing_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.eights import EIGHT, repeated, store
 from skyless.positioning.joint_algebra import along_h, along_x, project, put, settle, take
 from skyless.positioning.joint_monitor import LATE_ENOUGH, believe, follow
 from skyless.positioning.joint_state import (
@@ -31,7 +32,6 @@ from skyless.positioning.joint_state import (
     RELAYS_REJECTED,
     RELAYS_USED,
     RX_VARIANCE,
-    SLOTS,
     TX,
     TX_VARIANCE,
     WALK,
@@ -39,6 +39,7 @@ from skyless.positioning.joint_state import (
     WHITE,
     WHOLE,
     JointArrays,
+    lanes,
     states,
     values,
     width,
@@ -59,13 +60,14 @@ def new_packet(s: JointArrays, slot: int) -> None:
     if s.slots[slot, NOISE] >= 0:
         place = 2 * values(s) + s.slots[slot, NOISE]
         s.x[place] = 0.0
-        for column in range(width(s)):
-            s.P[place, column] = 0.0
+        nothing = repeated(0.0)
+        for column in range(0, width(s), EIGHT):
+            store(s.P, (place, column), nothing)
         for row in range(states(s)):
             s.P[row, place] = 0.0
         s.P[place, place] = s.settings[TX_VARIANCE]
-        for other in range(s.counts[SLOTS]):
-            s.sensitivities[other, place] = 0.0
+        for slots in range(0, lanes(s), EIGHT):
+            store(s.sensitivities, (place, slots), nothing)
 
 
 @borrowing_kernel
@@ -106,7 +108,7 @@ def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool
         s.slots[slot, WHOLE] += steps
         s.x[offset] -= steps * TICK_M
     else:
-        s.evidence[slot, REJECTIONS] += 1.0
+        s.evidence[REJECTIONS, slot] += 1.0
     return bool(factor > 0.0)
 
 

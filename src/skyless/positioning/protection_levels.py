@@ -75,17 +75,17 @@ def protect(s: JointArrays, covariance: Matrix, limits: Vector, levels: Vector) 
     zz = scale * covariance[2, 2] if dim == 3 else 0.0
     hpl = limits[HORIZONTAL_K] * np.sqrt(_major(xx, xy, yy))
     vpl = limits[VERTICAL_K] * np.sqrt(zz)
-    worst_t, worst_slot = 0.0, -1
+    V, worst_t, worst_slot = s.sensitivities, 0.0, -1
     for slot in range(s.counts[SLOTS]):
-        vx = s.sensitivities[slot, 0] + tau_s * s.sensitivities[slot, half]
-        vy = s.sensitivities[slot, 1] + tau_s * s.sensitivities[slot, half + 1]
-        vz = s.sensitivities[slot, 2] + tau_s * s.sensitivities[slot, half + 2] if dim == 3 else 0.0
+        vx = V[0, slot] + tau_s * V[half, slot]
+        vy = V[1, slot] + tau_s * V[half + 1, slot]
+        vz = V[2, slot] + tau_s * V[half + 2, slot] if dim == 3 else 0.0
         across = np.sqrt(vx * vx + vy * vy)
         for memory in range(0, 2 * EVIDENCE, EVIDENCE):
-            information = s.evidence[slot, memory + 1]
+            information = s.evidence[memory + 1, slot]
             if information > 0.0:
-                fault_m = abs(s.evidence[slot, memory]) / information
-                variance = scale * s.evidence[slot, memory + 2] / (information * information)
+                fault_m = abs(s.evidence[memory, slot]) / information
+                variance = scale * s.evidence[memory + 2, slot] / (information * information)
                 t = fault_m / np.sqrt(variance)
                 if t > worst_t:
                     worst_t, worst_slot = t, slot
@@ -115,7 +115,7 @@ def _state(s: JointArrays, worst_t: float, worst_slot: int, most_t: float, hpl: 
     refused = s.recent[RELAYS_REFUSED]
     rejected, suspects = -1, 0
     for slot in range(s.counts[SLOTS]):
-        if s.evidence[slot, REJECTIONS] > REJECTED_OFTEN:
+        if s.evidence[REJECTIONS, slot] > REJECTED_OFTEN:
             rejected = slot
             suspects += 1
     clocks_wrong = refused > FEW and refused > REFUSED_SHARE * (refused + s.recent[RELAYS_TAKEN])
@@ -129,7 +129,7 @@ def _state(s: JointArrays, worst_t: float, worst_slot: int, most_t: float, hpl: 
 
 @borrowing_kernel
 def _state_without_rejections(s: JointArrays, worst_t: float, worst_slot: int, most_t: float) -> int:
-    touched = worst_slot >= 0 and s.evidence[worst_slot, REJECTIONS] > REJECTED_ONCE
+    touched = worst_slot >= 0 and s.evidence[REJECTIONS, worst_slot] > REJECTED_ONCE
     if worst_t <= (SUSPICIOUS * most_t if touched else most_t):
         return NOTHING
     if s.anchors[worst_slot, WEIGHT] != 1.0:

@@ -1,16 +1,16 @@
 """What a persistent fault of one anchor does to ``joint``, followed beside the filter (``docs/maths.md`` section 8).
 
-Row j of ``sensitivities`` is the error of all states for each metre by which the tag's receptions of slot j are late.
-It obeys the filter's own recursion, with the gains that the filter has used, whatever was rejected or weighted down.
-Row j of ``evidence`` holds, for a short and a long memory, the sums from which the size of that fault is estimated,
+Column j of ``sensitivities`` is the error of all states for each metre by which the tag's receptions of slot j are
+late. It obeys the filter's own recursion, with the gains that the filter has used, whatever was rejected or weighted
+down; ``joint_algebra`` keeps it.
+Column j of ``evidence`` holds, for a short and a long memory, the sums from which the size of that fault is estimated,
 after Friedland (1969) and Willsky and Jones (1976).
 """
 
 from typing import Final
 
-import numpy as np
-
 from skyless.compiled import borrowing_kernel
+from skyless.eights import EIGHT, Eight, add, load, scaled, store
 from skyless.positioning.joint_state import (
     EVIDENCE,
     PACKETS,
@@ -20,7 +20,6 @@ from skyless.positioning.joint_state import (
     RELAYS_TAKEN,
     SLOTS,
     JointArrays,
-    width,
 )
 
 SHORT: Final = 6.0
@@ -35,40 +34,48 @@ def fade_evidence(s: JointArrays) -> None:
     if slots == 0:
         return
     short, long = 1.0 - 1.0 / (SHORT * slots), 1.0 - 1.0 / (LONG * slots)
-    for slot in range(slots):
-        s.evidence[slot, 0] *= short
-        s.evidence[slot, 1] *= short
-        s.evidence[slot, 2] *= short * short
-        s.evidence[slot, EVIDENCE] *= long
-        s.evidence[slot, EVIDENCE + 1] *= long
-        s.evidence[slot, EVIDENCE + 2] *= long * long
-        s.evidence[slot, REJECTIONS] *= long
+    for lane in range(0, slots, EIGHT):
+        _fade(s, 0, lane, short)
+        _fade(s, 1, lane, short)
+        _fade(s, 2, lane, short * short)
+        _fade(s, EVIDENCE, lane, long)
+        _fade(s, EVIDENCE + 1, lane, long)
+        _fade(s, EVIDENCE + 2, lane, long * long)
+        _fade(s, REJECTIONS, lane, long)
     s.recent[PACKETS] = s.recent[PACKETS] * long + 1.0
     s.recent[RELAYS_TAKEN] *= long
     s.recent[RELAYS_REFUSED] *= long
 
 
 @borrowing_kernel
-def follow_faults(s: JointArrays, term: int, own: int, innovation: float, spread: float) -> None:
-    """Take what an update did: the term is the gain times √spread; ``own`` is the slot that the tag heard, or −1."""
-    V, u, columns, scale = s.sensitivities, s.terms, width(s), 1.0 / np.sqrt(spread)
-    whitened = innovation * scale
-    for slot in range(s.counts[SLOTS]):
-        response = 1.0 if slot == own else 0.0
-        for k in range(s.counts[PLACES]):
-            response -= s.h[k] * V[slot, s.h_places[k]]
-        response *= scale
-        for column in range(columns):
-            V[slot, column] += response * u[term, column]
-        along, squared = response * whitened, response * response
-        s.evidence[slot, 0] += along
-        s.evidence[slot, 1] += squared
-        s.evidence[slot, 2] += squared
-        s.evidence[slot, EVIDENCE] += along
-        s.evidence[slot, EVIDENCE + 1] += squared
-        s.evidence[slot, EVIDENCE + 2] += squared
-    if own < 0:
+def _fade(s: JointArrays, row: int, lane: int, factor: float) -> None:
+    store(s.evidence, (row, lane), scaled(factor, load(s.evidence, (row, lane))))
+
+
+@borrowing_kernel
+def gather_evidence(s: JointArrays, term: int, own: int, whitened: float, scale: float) -> None:
+    """Take what an update did; ``own`` is the slot that the tag heard, or −1.
+
+    ``whitened`` is the innovation times ``scale``, one over the root of its variance; so is w, but for its sign, what
+    the faults have done to the innovation. The responses hold V·h and become −w.
+    """
+    r = s.responses
+    if own >= 0:
+        r[term, own] -= 1.0
+    else:
         s.recent[RELAYS_TAKEN] += 1.0
+    for lane in range(0, s.counts[SLOTS], EIGHT):
+        response = scaled(scale, load(r, (term, lane)))
+        store(r, (term, lane), response)
+        for memory in range(0, 2 * EVIDENCE, EVIDENCE):
+            _gather(s, memory, lane, -whitened, response)
+            _gather(s, memory + 1, lane, response, response)
+            _gather(s, memory + 2, lane, response, response)
+
+
+@borrowing_kernel
+def _gather(s: JointArrays, row: int, lane: int, factor: float | Eight, response: Eight) -> None:
+    store(s.evidence, (row, lane), add(load(s.evidence, (row, lane)), factor, response))
 
 
 @borrowing_kernel
@@ -78,6 +85,6 @@ def join_faults(s: JointArrays, slot: int, place: int) -> None:
     for other in range(s.counts[SLOTS]):
         error = 0.0
         for k in range(s.counts[PLACES]):
-            error += s.h[k] * V[other, s.h_places[k]]
-        V[other, place] = error
-    V[slot, place] = 1.0
+            error += s.h[k] * V[s.h_places[k], other]
+        V[place, other] = error
+    V[place, slot] = 1.0
