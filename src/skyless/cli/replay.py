@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from skyless.cli.options import Finite, NotNegative, Positive, finite_numbers, spare_inputs
+from skyless.cli.options import Finite, NotNegative, Positive, finite_numbers, known_method, spare_inputs
 from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
 from skyless.cli.replay_output import draw_track, fix_writer, see_that_it_can_be_drawn, show
 from skyless.cli.replay_site import Options, is_mcap, replay_site, see_that_they_are_left_out
 from skyless.errors import ConfigurationError, SkylessError
+from skyless.methods import FILTERS
 
 if TYPE_CHECKING:
     from skyless.air.packet import Point
@@ -83,13 +84,14 @@ def replay(
     qa
         Agility that the filter assumes, m²/s³.
     tdoa_std
-        Noise of a time difference that the filter assumes, metres.
+        Noise of a time difference that the tracker assumes, metres.
     uncalibrated
         Leave out the calibration that the table of anchors holds.
     tag
         Name of the tag, in recordings of skyless record; by default all.
     method
-        Another method than the tag's own, in recordings of skyless record.
+        In recordings of skyless record, another method than the tag's own; else joint, which takes the anchors' packets
+        as they are and is the default for Bitcraze's, or tracker, which takes time differences.
     fixes
         Write every fix into this table.
     plot
@@ -114,7 +116,9 @@ def replay(
         see_that_they_are_left_out(useless, "a recording of skyless record brings its own")
         replay_site(file, Options(tag, method, settle, above, site, fixes, plot, json))
         return
-    see_that_they_are_left_out({"--tag": tag, "--method": method}, "they are for recordings of skyless record")
+    see_that_they_are_left_out({"--tag": tag}, "it is for recordings of skyless record")
+    if method is not None:
+        known_method(method, FILTERS)
     places, site_height_m = known_anchors(anchors, site)
     known = known_truth(file, truth, lever_arm, format, listener)
     height_m, note = _height(height, places, site_height_m, known, format_of(file, format).name)
@@ -129,6 +133,7 @@ def replay(
         qa=qa,
         tdoa_std_m=tdoa_std,
         calibration=None if anchors is None or uncalibrated else read_calibration(anchors),
+        method=method,
     )
     report = _run(Replay(request, judge), file, fixes)
     _see_that_it_was_heard(file, listener, report)
@@ -238,10 +243,13 @@ def flight_height(wish: float | None, truth: "Truth | None") -> float | None:
 
 
 def _run(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
-    from skyless.experiments.warm import compile_pair_kernels
+    from skyless.experiments.warm import compile_packet_kernels, compile_pair_kernels
 
     with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
-        compile_pair_kernels()
+        if run.method == "joint":
+            compile_packet_kernels()
+        else:
+            compile_pair_kernels()
     with ExitStack() as stack:
         bar = stack.enter_context(progress_bar("replaying", file.stat().st_size))
         on_fix = None if fixes is None else fix_writer(stack, fixes)

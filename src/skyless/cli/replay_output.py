@@ -91,6 +91,7 @@ def _lines(report: "ReplayReport", note: str) -> list[tuple[str, str]]:
     truth_known = any(pair.against_truth for pair in report.pairs)
     return [
         ("fixes", fixes),
+        ("method", str(report.method)),
         ("rate", "–" if report.rate_hz is None else f"{report.rate_hz:.1f} Hz"),
         ("height", height),
         ("median position", _triple(report.median_m)),

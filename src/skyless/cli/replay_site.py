@@ -137,7 +137,6 @@ def _more(report: "TagReport") -> list[tuple[str, str]]:
     begun = "as the tag was" if report.cold_starts == 0 else f"{report.cold_starts} of {report.segments} cold"
     return [
         ("tag", report.tag),
-        ("method", str(report.method)),
         ("recorded fixes", same),
         ("beginnings", begun),
     ]

@@ -1,19 +1,23 @@
 """Replay of recordings: records in, fixes out, judged against the truth where there is one."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import closing
+from itertools import islice
 from os import PathLike
 from typing import Final
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, structs
 
-from skyless.air.packet import Packet, PairTdoa, Point
+from skyless.air.packet import Point
+from skyless.errors import SkylessError
 from skyless.experiments.judge import Judge, Judgement
 from skyless.experiments.noise import NoiseBook, PairNoise
+from skyless.experiments.replay_ways import ByPackets, ByPairs, Way
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.masterless import PairEngine
+from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
 from skyless.positioning.pair_calibration import PairCalibration
 from skyless.positioning.pair_tracker import PairSettings
 from skyless.positioning.pair_tracking import PairTracking
@@ -23,6 +27,12 @@ PROFILES: Final[Mapping[str, PairSettings]] = {
     "miluv": PairSettings(qa=0.1, tdoa_std_m=0.5, gate=3.0),
 }
 """Settings for formats whose nature asks for others: MILUV's exchanges come once or twice a second, among obstacles."""
+
+BATCH: Final = 512
+"""Records that are read at a time: reading and filtering by turns take each other's place in the processor's caches."""
+
+PACKETS_TO_JOINT: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
+"""Formats whose packets ``joint`` takes by default; it was better on real captures. Of Avalue's it was not."""
 
 
 class ReplayRequest(Struct, frozen=True):
@@ -38,6 +48,8 @@ class ReplayRequest(Struct, frozen=True):
     tdoa_std_m: float | None = None
     z_bounds_m: tuple[float, float] | None = None
     calibration: PairCalibration | None = None
+    method: str | None = None
+    """One of ``FILTERS``; None: what suits the format."""
 
 
 class ReplayReport(Struct, frozen=True):
@@ -69,6 +81,7 @@ class ReplayReport(Struct, frozen=True):
     pairs: tuple[PairNoise, ...]
     wall_s: float
     receptions_per_s: float
+    method: str | None
 
 
 class Replay:
@@ -78,69 +91,83 @@ class Replay:
         self._request = request
         self._judge = judge
         self.recording: Recording = open_recording(request.path, request.format, request.listener)
-        self._settings = self._settings_of(self.recording.format.name)
-        self._tracking = PairTracking(self._settings, request.anchors_m, request.z_bounds_m, request.calibration)
-        bits = self.recording.format.tx_bits
-        self._engine = None if bits is None else PairEngine(bits, anchors_m=request.anchors_m)
         self._noise = NoiseBook(judge, request.anchors_m)
+        self.method = self._method()
+        self._way: Way = self._by_packets() if self.method == "joint" else self._by_pairs()
         self.receptions = 0
         self.fixes = 0
         self._first_s: float | None = None
         self._last_s = 0.0
         self._first_fix_s: float | None = None
 
-    def _settings_of(self, name: str) -> PairSettings:
-        base = PROFILES.get(name, PairSettings())
+    def _method(self) -> str:
+        """The method that was asked for, or that suits the recording."""
+        request, kind = self._request, self.recording.format
+        if request.method is None:
+            suits = kind.name in PACKETS_TO_JOINT and request.anchors_m and request.tdoa_std_m is None
+            return "joint" if suits else "tracker"
+        if request.method == "joint" and kind.tx_bits is None:
+            raise SkylessError(f"--method is 'joint'; it should be 'tracker': {kind.name} holds no anchors' packets")
+        if request.method == "joint" and request.tdoa_std_m is not None:
+            raise SkylessError("--tdoa-std is the noise of the differences of --method tracker; joint makes none")
+        return request.method
+
+    def _engine(self) -> PairEngine | None:
+        bits = self.recording.format.tx_bits
+        return None if bits is None else PairEngine(bits, anchors_m=self._request.anchors_m)
+
+    def _by_pairs(self) -> ByPairs:
         request = self._request
-        return PairSettings(
+        base = PROFILES.get(self.recording.format.name, PairSettings())
+        settings = PairSettings(
             qa=base.qa if request.qa is None else request.qa,
             tdoa_std_m=base.tdoa_std_m if request.tdoa_std_m is None else request.tdoa_std_m,
             gate=base.gate,
             height_m=request.height_m,
         )
+        tracking = PairTracking(settings, request.anchors_m, request.z_bounds_m, request.calibration)
+        return ByPairs(tracking, self._engine(), self._noise)
+
+    def _by_packets(self) -> ByPackets:
+        request, engine, bits = self._request, self._engine(), self.recording.format.tx_bits
+        assert engine is not None
+        assert bits is not None
+        qa = MASTERLESS.qa if request.qa is None else request.qa
+        settings = structs.replace(MASTERLESS, qa=qa, height_m=request.height_m)
+        tracking = PacketTracking(settings, request.anchors_m, bits, request.z_bounds_m, request.calibration)
+        return ByPackets(tracking, engine, self._noise)
 
     def run(self, on_fix: Callable[[Fix], None] | None, on_progress: Callable[[int], None]) -> ReplayReport:
         """Read to the end; ``on_fix`` gets every fix, ``on_progress`` now and then the bytes read so far."""
         started_s = time.perf_counter()
         with closing(self.recording):
-            for pairs in self._differences():
-                self.receptions += 1
-                if self.receptions % 1024 == 0:
-                    on_progress(self.recording.bytes_read)
-                if pairs:
-                    self._take(pairs, on_fix)
+            records = iter(self.recording)
+            while batch := list(islice(records, BATCH)):
+                for record in batch:
+                    self.receptions += 1
+                    time_s = self._way.hear(record)
+                    if time_s is not None:
+                        self._take(time_s, on_fix)
+                on_progress(self.recording.bytes_read)
         return self._report(time.perf_counter() - started_s)
 
-    def _differences(self) -> Iterator[Sequence[PairTdoa]]:
-        for record in self.recording:
-            if isinstance(record, Packet):
-                assert self._engine is not None
-                yield self._engine.hear(record)
-            else:
-                yield (record,)
-
-    def _take(self, pairs: Sequence[PairTdoa], on_fix: Callable[[Fix], None] | None) -> None:
+    def _take(self, time_s: float, on_fix: Callable[[Fix], None] | None) -> None:
         """Take what one reception gave: one fix at most."""
-        time_s = pairs[0].time_s
         if self._first_s is None:
             self._first_s = time_s
         self._last_s = time_s
-        for pair in pairs:
-            self._noise.add(pair)
-        if not self._tracking.hear(pairs):
+        position_m = self._way.position_m
+        if position_m is None:
             return
         self.fixes += 1
         if self._first_fix_s is None:
             self._first_fix_s = time_s - self._first_s
-        self._judge.add(time_s, time_s - self._first_s, self._tracking.position_m)
+        self._judge.add(time_s, time_s - self._first_s, position_m)
         if on_fix is not None:
-            on_fix(self._tracking.fix())
+            on_fix(self._way.fix())
 
     def _drops(self) -> dict[str, int]:
-        total = self.recording.drops.copy()
-        if self._engine is not None:
-            total.update(self._engine.drops)
-        total.update({name: self._tracking.counters[name] for name in ("outlier", "unknown-anchor")})
+        total = self.recording.drops + self._way.drops
         return {name: count for name, count in sorted(total.items()) if count}
 
     def _report(self, wall_s: float) -> ReplayReport:
@@ -148,7 +175,7 @@ class Replay:
         drops = self._drops()
         pairs = self._noise.pairs()
         span_s = self._last_s - (self._first_s or 0.0)
-        reason = self._tracking.reason if self._request.anchors_m or self.fixes else NoFixReason.NO_ALMANAC
+        reason = self._way.reason if self._request.anchors_m or self.fixes else NoFixReason.NO_ALMANAC
         return ReplayReport(
             format=self.recording.format.name,
             receptions=self.receptions,
@@ -170,4 +197,5 @@ class Replay:
             pairs=pairs,
             wall_s=wall_s,
             receptions_per_s=self.receptions / wall_s if wall_s > 0.0 else 0.0,
+            method=self.method,
         )

@@ -24,7 +24,6 @@ class TagReport(ReplayReport, frozen=True, kw_only=True):
     """What the replay of one tag came to; times are Unix seconds."""
 
     tag: str
-    method: str | None
     identical: Identical | None
     """Against the fixes that the tag published; None with another method than its own."""
     segments: int

@@ -2,14 +2,19 @@
 
 from math import dist
 
-from skyless.air.packet import PairTdoa
+from msgspec import structs
+
+from skyless.air.packet import Packet, PairTdoa, Relay
+from skyless.constants import TICK_M
 from skyless.experiments.fleet import Fleet, FleetSettings
 from skyless.methods import DEFAULT_METHOD
+from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
 from skyless.positioning.pair_tracker import PairSettings
 from skyless.positioning.pair_tracking import PairTracking
 from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import lab_site
+from skyless.ticks import from_seconds, wrap
 
 
 def compile_kernels(method: str = DEFAULT_METHOD) -> None:
@@ -27,3 +32,18 @@ def compile_pair_kernels() -> None:
     for k in range(24):
         a, b = 1 + k % 6, 1 + (k + 1) % 6
         tracking.hear((PairTdoa(0.01 * k, a, b, dist(tag_m, places[b]) - dist(tag_m, places[a])),))
+
+
+def compile_packet_kernels() -> None:
+    """Start ``joint`` on packets of anchors whose clocks agree, each of which heard the one before it."""
+    places = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors}
+    names = list(places)
+    tracking = PacketTracking(structs.replace(MASTERLESS, height_m=0.0), places)
+    heard: tuple[Relay, ...] = ()
+    for k in range(4 * len(names)):
+        anchor, follower = names[k % len(names)], names[(k + 1) % len(names)]
+        sequence, tx_ticks = k // len(names), from_seconds(0.002 * k)
+        rx_ticks = tx_ticks + round(dist((2.0, 3.0, 0.0), places[anchor]) / TICK_M)
+        tracking.hear(Packet(None, anchor, sequence, wrap(tx_ticks, 32), rx_ticks, heard))
+        flight = round(dist(places[anchor], places[follower]) / TICK_M)
+        heard = (Relay(anchor, sequence, wrap(tx_ticks + flight, 32), flight),)

@@ -100,6 +100,10 @@ class JointTracking:
         self._in_use.use(observation)
         return self._fix(observation)
 
+    def coast(self, observation: Observation) -> Fix | NoFixReason:
+        """A fix when a packet came that was not used itself: by all others, and by what was relayed with it."""
+        return NoFixReason.RESIDUALS if self._start is not None else self._fix(observation)
+
     def _start_anew_where_lost(self, rx_ticks: int) -> None:
         """A filter that is lost soon after its start has a tag that is faster than assumed, or late messages."""
         soon = (rx_ticks - self._started_ticks) * TICK_S < SOON_S

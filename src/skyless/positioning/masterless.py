@@ -17,9 +17,8 @@ from typing import Final
 
 from skyless.air.packet import Packet, PairTdoa, Point, Relay
 from skyless.clocks.broadcast import BroadcastClock
-from skyless.clocks.running_median import RunningMedian
-from skyless.clocks.two_way import TwoWayRanging
 from skyless.constants import TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.positioning.anchor_flights import AnchorFlights, distance_ticks
 from skyless.ticks import Unwrapper
 
 MAX_AGE_S: Final = 0.25
@@ -78,8 +77,7 @@ class PairEngine:
         self._told_m: dict[int, Point] = {}
         self._anchors_m = dict(anchors_m or {})
         self._limits_m: dict[Pair, float] = {}
-        self._flights: dict[Pair, RunningMedian] = {}
-        self._ranging = TwoWayRanging(TICK_BITS, window=101)
+        self._flights = AnchorFlights()
 
     def hear(self, packet: Packet) -> list[PairTdoa]:
         """Take one packet; return the TDoAs that it completes, in the order of its relays.
@@ -114,9 +112,7 @@ class PairEngine:
 
     def flight_ticks(self, a: int, b: int) -> float | None:
         """Time of flight between two anchors as far as it was told or measured, antenna delays included."""
-        pair = (a, b) if a < b else (b, a)
-        median = self._flights.get(pair)
-        return median.value if median is not None else self._ranging.flight_ticks(a, b)
+        return self._flights.ticks(a, b)
 
     def _follow(self, sender: _Anchor, packet: Packet, rx_ticks: int) -> bool:
         """Advance the sender's clock; False for a packet that cannot be used."""
@@ -132,7 +128,7 @@ class PairEngine:
         if clock.restarts != restarts:
             self.drops["clock-restarted"] += 1
             sender.packets.clear()
-            self._ranging.forget(packet.anchor)
+            self._flights.forget(packet.anchor)
             sender.remember(packet.sequence, rx_ticks)
         return False
 
@@ -161,19 +157,8 @@ class PairEngine:
 
     def _flight_ticks(self, a: int, b: int, tx_a: int, rx_b: int, told: float | None) -> float | None:
         """Time of flight of a pair: what anchors told, else what two-way ranging gave, else the known distance."""
-        pair = (a, b) if a < b else (b, a)
-        median = self._flights.get(pair)
-        if told is not None:
-            if median is None:
-                median = self._flights[pair] = RunningMedian()
-            return median.add(told)
-        if median is not None:
-            return median.value
-        self._ranging.hear(a, b, tx_a, rx_b)
-        ranged = self._ranging.flight_ticks(a, b)
-        if ranged is None and a in self._anchors_m and b in self._anchors_m:
-            return dist(self._anchors_m[a], self._anchors_m[b]) / TICK_M
-        return ranged
+        flight = self._flights.hear(a, b, tx_a, rx_b, told)
+        return distance_ticks(self._anchors_m, a, b) if flight is None else flight
 
     def _limit_m(self, a: int, b: int) -> float:
         limit = self._limits_m.get((a, b))
