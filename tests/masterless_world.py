@@ -134,7 +134,8 @@ def anchors_csv():
     return "id,x_m,y_m,z_m\n" + "".join(f"{n},{x},{y},{z}\n" for n, (x, y, z) in ANCHORS_M.items())
 
 
-def truth_csv(until_s, speed_mps):
+def truth_csv(until_s, speed_mps, begun_s=0.0):
+    """Times count from the first packet, as a replay's do."""
     times_s = (0.01 * k for k in range(int(100 * until_s) + 100))
-    lines = ("{:.3f},{:.5f},{:.5f},{:.5f}\n".format(t_s, *path_m(t_s, speed_mps)) for t_s in times_s)
+    lines = ("{:.3f},{:.5f},{:.5f},{:.5f}\n".format(t_s, *path_m(t_s + begun_s, speed_mps)) for t_s in times_s)
     return "t_s,x_m,y_m,z_m\n" + "".join(lines)

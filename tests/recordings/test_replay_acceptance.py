@@ -60,13 +60,26 @@ def test_a_static_tag_is_found_in_a_process_of_its_own(recordings):
     assert report["receptions"] == 2753
     assert report["fixes"] > 0.98 * 2753
     assert report["median_m"][:2] == pytest.approx([2.0, 3.0], abs=0.15)
-    assert max(report["std_m"]) <= 0.05
+    assert report["method"] == "joint"
+    assert max(report["std_m"]) <= 0.03
+    assert report["first_fix_s"] < 0.2
     assert report["drops"]["outlier"] > 0
     assert [report[key] for key in ("rmse_2d_m", "rmse_3d_m", "p95_m", "max_m")] == [None] * 4
 
 
-def test_two_anchors_give_no_fix_and_the_reason(recordings, replay):
-    report = replay(*kuipman(recordings, "6af847e_testoutput2"))
+def test_time_differences_of_the_same_packets_scatter_more(recordings, replay):
+    packets, pairs = (
+        replay(*kuipman(recordings, "b34daf0_output20240415"), "--method", m) for m in ("joint", "tracker")
+    )
+    assert (packets["method"], pairs["method"]) == ("joint", "tracker")
+    assert packets["median_m"] == pytest.approx(pairs["median_m"], abs=0.1)
+    assert packets["std_m"][0] < pairs["std_m"][0] <= 0.05
+    assert 0.05 < packets["tdoa_noise_m"] < 0.13
+
+
+@pytest.mark.parametrize("method", ["joint", "tracker"])
+def test_two_anchors_give_no_fix_and_the_reason(recordings, replay, method):
+    report = replay(*kuipman(recordings, "6af847e_testoutput2"), "--method", method)
     assert (report["receptions"], report["fixes"], report["reason"]) == (3309, 0, "too-few-anchors")
     assert (report["median_m"], report["std_m"], report["first_fix_s"]) == (None, None, None)
 

@@ -21,7 +21,7 @@ from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
 from skyless.positioning.pair_calibration import PairCalibration
 from skyless.positioning.pair_tracker import PairSettings
 from skyless.positioning.pair_tracking import PairTracking
-from skyless.recordings.formats import Recording, open_recording
+from skyless.recordings.formats import Recording, format_of, open_recording
 
 PROFILES: Final[Mapping[str, PairSettings]] = {
     "miluv": PairSettings(qa=0.1, tdoa_std_m=0.5, gate=3.0),
@@ -90,9 +90,9 @@ class Replay:
     def __init__(self, request: ReplayRequest, judge: Judge) -> None:
         self._request = request
         self._judge = judge
+        self.method = self._method()
         self.recording: Recording = open_recording(request.path, request.format, request.listener)
         self._noise = NoiseBook(judge, request.anchors_m)
-        self.method = self._method()
         self._way: Way = self._by_packets() if self.method == "joint" else self._by_pairs()
         self.receptions = 0
         self.fixes = 0
@@ -102,7 +102,7 @@ class Replay:
 
     def _method(self) -> str:
         """The method that was asked for, or that suits the recording."""
-        request, kind = self._request, self.recording.format
+        request, kind = self._request, format_of(self._request.path, self._request.format)
         if request.method is None:
             suits = kind.name in PACKETS_TO_JOINT and request.anchors_m and request.tdoa_std_m is None
             return "joint" if suits else "tracker"
