@@ -87,7 +87,7 @@ def test_the_anchors_own_antenna_delays_are_found():
     halves_m = room.delays[: hall.TAG].sum(axis=1) / 2.0 * hall.SPEED_OF_LIGHT_MPS / hall.TICK_RATE_HZ
     found_m = np.array([tracking._delays.own_m[anchor] for anchor in hall.ANCHORS_M])
     assert found_m == pytest.approx(halves_m - halves_m.mean(), abs=0.05)
-    assert rmse_m(rows) < 0.06 < 0.1 < rmse_m(equal)
+    assert rmse_m(rows) < 0.08 < 0.1 < rmse_m(equal)
 
 
 def test_a_calibration_is_taken_off_instead():

@@ -12,11 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-DELAY_STD_M: Final = 0.1
-"""How much the delays of nodes of one kind scatter, ..."""
-
 EXCESS_STD_M: Final = 0.1
-"""... and what else is in the excess of a pair."""
+"""What is in the excess of a pair beside the delays of its nodes: places that are off, strong and weak signals."""
+
+DELAY_STD_M: Final = 0.07
+"""How much the delays of nodes of one kind scatter: two of them as much as all else."""
 
 BLOCKED_M: Final = 0.5
 """A pair whose excess is farther from all others' is blocked or reflected."""
