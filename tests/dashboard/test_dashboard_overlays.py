@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from skyless.dashboard.overlay_process import overlay_grids
 from skyless.dashboard.overlays import MOST_CELLS, NoOverlayError, Overlays, levels, overlay_task
+from skyless.methods import DEFAULT_METHOD, METHODS
 from skyless.planning.columns import HDOP, PDOP, SIGMA
 from skyless.planning.predict import PlanSettings, Predictor
 from skyless.site.lab import lab_site
@@ -61,7 +62,13 @@ def test_where_there_is_no_fix_there_is_no_value():
 
 def test_a_method_that_does_not_exist_is_taken_for_the_default():
     task = overlay_task(LAB, None, "magic", 2.0)
-    assert overlay_grids(task).sigma == overlay_grids(replace(task, method="tracker")).sigma
+    assert overlay_grids(task).sigma == overlay_grids(replace(task, method=DEFAULT_METHOD)).sigma
+
+
+def test_the_methods_of_tags_are_predicted_each_as_itself():
+    sigmas = [overlay_grids(overlay_task(LAB, None, method, 2.0)).sigma for method in METHODS]
+    assert all(None not in sigma for sigma in sigmas)
+    assert len({sigma[5] for sigma in sigmas}) == len(METHODS)
 
 
 def test_the_scale_reaches_from_the_best_to_what_is_bad():

@@ -158,12 +158,13 @@ RUNS = [
     ("wall", "bracketed", 900),
     ("half-heard", "literal", 900),
     *((name, "tracker", 900) for name in SITES),
+    *((name, "joint", 900) for name in SITES),
 ]
 
 
 @pytest.mark.parametrize(("name", "method", "rounds"), RUNS)
 def test_prediction_and_simulation_agree(name, method, rounds):
-    """3 % for snapshots and 10 % for the tracker, and four standard errors of the simulation on top.
+    """3 % for snapshots, 10 % for the tracker, 5 % for joint, and four standard errors of the simulation on top.
 
     Three points at once; their mean is held to a tighter bound.
     """
@@ -175,7 +176,7 @@ def test_prediction_and_simulation_agree(name, method, rounds):
     plan = plan_map(Predictor(site, BRACKETED), grid)
     grid.within[:] &= (plan.column(FIX_SHARE) > 0.85).all(axis=0)
     checked = verify(predictor, random_points(plan, 3, 5), rounds, 9)
-    allowed = 0.1 if method == "tracker" else 0.03
+    allowed = {"tracker": 0.1, "joint": 0.05}.get(method, 0.03)
     for check in checked.points:
         assert check.ratio == pytest.approx(1.0, abs=allowed + 4.0 * check.ratio_error)
         assert check.simulated_fix_share == pytest.approx(check.predicted_fix_share, abs=0.04)

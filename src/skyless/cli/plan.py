@@ -74,11 +74,11 @@ def plan(
     file
         The site file.
     method
-        literal, literal-delayed, weighted, bracketed or tracker.
+        literal, literal-delayed, weighted, bracketed, tracker or joint.
     noise_ps
         Noise of every TX and RX stamp in picoseconds; by default the site's own figures.
     qa
-        Agility that the tracker assumes, m²/s³.
+        Agility that tracker and joint assume, m²/s³.
     range_m
         How far a frame carries in the open, metres: half arrive there; by default what the link budget gives (31 m).
     step

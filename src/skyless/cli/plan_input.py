@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 from skyless.cli.options import finite_numbers, known_method, spare_inputs
 from skyless.errors import ConfigurationError, SkylessError
-from skyless.methods import METHODS
 
 if TYPE_CHECKING:
     from skyless.planning.floor import Box, Floor, Matrix
@@ -49,7 +48,7 @@ def settings_of(method: str, noise_ps: float | None, qa: float, range_m: float |
     from skyless.planning.predict import PlanSettings
     from skyless.simulation.channel import ChannelModel
 
-    known_method(method, tuple(name for name in METHODS if name != "joint"))
+    known_method(method)
     channel = ChannelModel() if range_m is None else with_range(ChannelModel(), range_m)
     return PlanSettings(method, noise_ps, qa, channel)
 

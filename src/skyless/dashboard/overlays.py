@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
+from skyless.methods import DEFAULT_METHOD
 from skyless.site.image import image_size
 from skyless.site.model import Site
 
@@ -16,7 +17,6 @@ Kind = Literal["pdop", "hdop", "sigma"]
 KINDS: Final[tuple[Kind, ...]] = ("pdop", "hdop", "sigma")
 MOST_CELLS: Final = 40_000
 STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-DEFAULT_METHOD: Final = "tracker"
 
 _KEPT: Final = 8
 _LONGEST_S: Final = 120.0

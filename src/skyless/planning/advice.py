@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from skyless.methods import FILTERS
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA
 from skyless.planning.floor import Floor
@@ -41,7 +42,7 @@ def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str
         *_mirrors(predictor, floor, plan),
         *_holes(plan),
         *_weak(plan),
-        *_walls(plan),
+        *_walls(predictor, plan),
     ]
 
 
@@ -75,7 +76,7 @@ def _hears_badly(predictor: Predictor, rows: NDArray[np.int64], what: str) -> st
 
 
 def _order(predictor: Predictor) -> list[str]:
-    if predictor.settings.method == "tracker":
+    if predictor.settings.method in FILTERS:
         return []
     kappa, _ = delays(predictor.site)
     early = [anchor.id for anchor, delay in zip(predictor.site.anchors, kappa, strict=True) if delay < 0.0]
@@ -141,16 +142,18 @@ def _weak(plan: PlanMap) -> list[str]:
     ]
 
 
-def _walls(plan: PlanMap) -> list[str]:
+def _walls(predictor: Predictor, plan: PlanMap) -> list[str]:
     bias, sigma = plan.column(BIAS), plan.column(SIGMA)
     known = np.isfinite(bias) & np.isfinite(sigma)
     worse = known & (bias > sigma)
     if not worse.any():
         return []
     largest = float(bias[known].max())
+    # its monitors are not in the prediction (docs/planning.md)
+    monitors = "; joint leaves anchors out there at times, and positions scatter more than predicted"
     return [
         f"walls' delays shift positions by more than their standard deviation in {worse.sum() / known.sum():.0%} of "
-        f"the region, by {100 * largest:.0f} cm at most"
+        f"the region, by {100 * largest:.0f} cm at most{monitors if predictor.settings.method == 'joint' else ''}"
     ]
 
 

@@ -1,8 +1,8 @@
 """Maps: predictions over a grid of the floor, one slice for each height.
 
-The tracker's points are dear. On large grids it is computed on a coarser one (on the largest the other methods, too),
-and its ratio to the PDOP of anchors weighted by their share of frames, which is smooth, is interpolated; that PDOP is
-computed at every point, so that edges behind walls stay sharp.
+The filters' points are dear. On large grids they are computed on a coarser one (on the largest the other methods,
+too), and their ratio to the PDOP of anchors weighted by their share of frames, which is smooth, is interpolated; that
+PDOP is computed at every point, so that edges behind walls stay sharp.
 """
 
 import math
@@ -38,8 +38,14 @@ STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 10
 TRACKER_BUDGET: Final = 150_000
 """Points of the tracker times what one costs, anchors and a constant."""
 
+JOINT_BUDGET: Final = 1e6
+"""Points of the joint filter times what one costs, the square of the anchors in view and a constant."""
+
+MOST_ASKED: Final = 500
+"""Points that are asked for their anchors in view."""
+
 SNAPSHOT_BUDGET: Final = 20_000_000
-"""The same for the snapshot methods, which only the largest grids exceed."""
+"""The tracker's for the snapshot methods, which only the largest grids exceed."""
 
 
 class Grid(Struct, frozen=True):
@@ -158,7 +164,7 @@ def _slice(
 ) -> tuple[Array, float]:
     points = points_of(grid, height_m)
     table = np.full((*grid.within.shape, len(COLUMNS)), np.nan)
-    stride = _stride(predictor, grid)
+    stride = _stride(predictor, grid, points[grid.within])
     if stride == 1:
         table[grid.within] = predictor.at(points[grid.within], progress)
         return table, grid.step_m
@@ -178,9 +184,14 @@ def points_of(grid: Grid, height_m: float) -> Array:
     return np.stack([x, y, np.full_like(x, height_m)], axis=-1)
 
 
-def _stride(predictor: Predictor, grid: Grid) -> int:
-    budget = TRACKER_BUDGET if predictor.settings.method == "tracker" else SNAPSHOT_BUDGET
-    most = budget / (len(predictor.anchors_m) + 14.0)
+def _stride(predictor: Predictor, grid: Grid, points: Matrix) -> int:
+    """Of how many rows and columns one is computed; ``points``: those of a slice that count, shape (n, 3)."""
+    if predictor.settings.method == "joint":
+        some = points[:: math.ceil(len(points) / MOST_ASKED)]
+        most = JOINT_BUDGET / float(((predictor.geometry_at(some)[:, ANCHORS] + 8.0) ** 2).mean())
+    else:
+        budget = TRACKER_BUDGET if predictor.settings.method == "tracker" else SNAPSHOT_BUDGET
+        most = budget / (len(predictor.anchors_m) + 14.0)
     return max(1, math.ceil(math.sqrt(grid.points / most)))
 
 

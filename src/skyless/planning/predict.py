@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from skyless.clocks.filter import clock_noise
 from skyless.compiled import threaded_kernel
-from skyless.methods import DEFAULT_METHOD
+from skyless.methods import DEFAULT_METHOD, FILTERS
 from skyless.planning.anchor_clocks import anchor_clocks, stamp_variances
 from skyless.planning.columns import COLUMNS, SIGMA
 from skyless.planning.geometry import fill_dops, observe, weighted_pdop
+from skyless.planning.joint_sigma import fill_joint_sigma
 from skyless.planning.links import AnchorLinks, anchor_links, anchor_positions, link_budget
+from skyless.planning.relays import relays_of
 from skyless.planning.rounds import rounds_of
 from skyless.planning.snapshot_sigma import fill_snapshot_sigma
 from skyless.planning.tracker_sigma import fill_tracker_sigma
@@ -30,7 +32,10 @@ Matrix = NDArray[np.float64]
 Fill = Callable[[Matrix, Matrix], None]
 
 CHUNK: Final = 2000
-"""Points that a thread takes at once; fewer for the tracker, whose points are dear."""
+"""Points that a thread takes at once; ..."""
+
+FILTERS_CHUNK: Final = 100
+"""... fewer for the filters, whose points are dear."""
 
 
 class PlanSettings(Struct, frozen=True):
@@ -40,7 +45,7 @@ class PlanSettings(Struct, frozen=True):
     noise_ps: float | None = None
     """Noise of every TX and RX stamp; None for the site's own figures."""
     qa: float = 0.3
-    """Agility that the tracker assumes, m²/s³."""
+    """Agility that the filters assume, m²/s³."""
     channel: ChannelModel = ChannelModel()
 
 
@@ -57,9 +62,12 @@ class Predictor:
         self.links: AnchorLinks = anchor_links(self.anchors_m, self.master, self.budget, self.walls)
         self.clocks = anchor_clocks(self.site, self.links.share)
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
-        tracker = settings.method == "tracker"
-        self._fill = self._tracker() if tracker else self._snapshots(SnapshotMethod(settings.method))
-        self._chunk = 100 if tracker else CHUNK
+        if settings.method in FILTERS:
+            self._fill = self._tracker() if settings.method == "tracker" else self._joint()
+            self._chunk = FILTERS_CHUNK
+        else:
+            self._fill = self._snapshots(SnapshotMethod(settings.method))
+            self._chunk = CHUNK
 
     def _snapshots(self, method: SnapshotMethod) -> Fill:
         rounds = rounds_of(self.site, method)
@@ -107,6 +115,29 @@ class Predictor:
             clocks.with_others,
             clocks.gain,
             clocks.share,
+            self.settings.qa,
+            settings,
+            self.farthest_m,
+            table,
+        )
+
+    def _joint(self) -> Fill:
+        clocks, noise = self.clocks, self.site.noise
+        relays = relays_of(self.anchors_m, self.master, clocks, self.budget, self.walls)
+        one = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
+        settings = np.array([one.white, one.walk, *stamp_variances(self.site)])
+        return lambda points, table: fill_joint_sigma(
+            points,
+            self.dim,
+            self.anchors_m,
+            clocks.speaks,
+            self.budget,
+            self.walls,
+            clocks.sender,
+            clocks.gap_s,
+            relays.ends,
+            relays.heard,
+            relays.values,
             self.settings.qa,
             settings,
             self.farthest_m,

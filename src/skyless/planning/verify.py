@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from skyless.air.schedule import schedule_of
 from skyless.experiments.fleet import Fleet, FleetSettings
 from skyless.experiments.scenarios import Request, impairments_of
+from skyless.methods import FILTERS
 from skyless.planning.columns import CLAIMED, FIX_SHARE, RMSE, SIGMA
 from skyless.planning.maps import PlanMap
 from skyless.planning.predict import Predictor
@@ -38,7 +39,7 @@ class PointCheck(Struct, frozen=True):
     predicted_claim_m: float | None
     predicted_fix_share: float
     simulated_fix_share: float
-    """Of the rounds (snapshots) or messages (tracker) after the warm-up."""
+    """Of the rounds (snapshots) or messages (filters) after the warm-up."""
     fixes: int
 
 
@@ -119,7 +120,7 @@ def verify(
                 batches[judged.tag].add(judged.time_s, judged.error_m)
         if progress is not None:
             progress(now_s / end_s)
-    per_round = len(predictor.clocks.sender) if settings.method == "tracker" else 1
+    per_round = len(predictor.clocks.sender) if settings.method in FILTERS else 1
     rows = predictor.at(points_m)
     checks = [
         _check(point, row, batch, rounds * per_round * _frames(predictor))
@@ -130,7 +131,7 @@ def verify(
 
 def _frames(predictor: Predictor) -> int:
     """Snapshot methods give a fix in every round, of which a superframe has one for each frame of a node."""
-    return 1 if predictor.settings.method == "tracker" else predictor.site.schedule.frames_per_node
+    return 1 if predictor.settings.method in FILTERS else predictor.site.schedule.frames_per_node
 
 
 def _check(point: Matrix, row: Matrix, batch: _Batches, possible: int) -> PointCheck:

@@ -1,0 +1,188 @@
+"""What is predicted of ``joint``: against the Cramér–Rao bound, a textbook's recursion, and closed forms of relays."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from scipy.stats import binom
+
+from skyless.air.schedule import schedule_of
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.planning.anchor_clocks import anchor_clocks, stamp_variances
+from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
+from skyless.planning.joint_script import AGE_S, LATE_M, TOLD
+from skyless.planning.links import anchor_links, anchor_positions, link_budget
+from skyless.planning.predict import PlanSettings, Predictor
+from skyless.planning.relays import relays_of
+from skyless.simulation.channel import ChannelModel, pack_walls
+from skyless.site.lab import lab_site
+from skyless.site.model import AnchorSite, Site, TagsSite, WallSite
+from skyless.uncertainty.bounds import bound_settings, tracking_bound
+
+LAB = lab_site(100.0)
+PLACES = ((0, 0, 0.2), (4, 0, 2.9), (8, 0, 0.4), (8, 5, 2.7), (8, 10, 0.2), (4, 10, 2.9), (0, 10, 0.5), (0, 5, 2.6))
+ROOM = Site("room", 2, 1, tuple(AnchorSite(k + 1, *place) for k, place in enumerate(PLACES)))
+QA = 0.3
+
+
+def relays(site, channel=None):
+    channel = channel or ChannelModel()
+    anchors, budget, walls = anchor_positions(site), link_budget(channel), pack_walls(site.walls)
+    master = [anchor.id for anchor in site.anchors].index(site.master)
+    clocks = anchor_clocks(site, anchor_links(anchors, master, budget, walls).share)
+    return clocks, relays_of(anchors, master, clocks, budget, walls)
+
+
+@pytest.mark.parametrize(("site", "point"), [(LAB, (3.0, 4.0, 0.0)), (LAB, (1.2, 1.6, 0.0)), (ROOM, (3.0, 6.0, 1.3))])
+def test_the_filter_claims_the_bound_of_what_has_come_in(site, point):
+    """Posterior bound of a tag at rest that may accelerate, after so long that nothing of its beginning is left.
+
+    The bound's reference clock is an anchor's, its packets are taken when they fly, it knows no rounding to ticks and
+    its own oscillators' noise between packet and relay: together some 0.3 % (docs/maths.md section 7).
+    """
+    anchors, superframes = anchor_positions(site), 400
+    noise, slot_s = site.noise, schedule_of(site).slot_ticks * TICK_S
+    flat = site.tags.height_m is not None
+    settings = bound_settings(
+        noise.tx_stamp_ps * 1e-12,
+        white_fm=noise.white_fm,
+        random_walk_fm=noise.random_walk_fm,
+        qa=QA,
+        slot_s=slot_s,
+        speed_std_mps=1.0,
+        mesh=True,
+        height_known=flat,
+        at_once=False,
+    )
+    path = np.tile(point, (superframes * len(anchors), 1))
+    # the mean over a superframe's packets: the bound's superframe begins with each anchor in turn
+    turns = []
+    for first in range(len(anchors)):
+        order = np.roll(anchors, -first, axis=0)
+        turns.append(np.trace(tracking_bound(order, path, settings)[-1]))
+    row = Predictor(site, PlanSettings("joint", qa=QA)).at(np.array([point]))[0]
+    assert row[CLAIMED] == pytest.approx(np.sqrt(np.mean(turns)), rel=0.006)
+
+
+def dense(site, point, superframes, shift_m=0.0):
+    """Means over the last superframe: what the filter says, the true mean square of a tag at rest, its mean error.
+
+    Matrices as in a textbook, Joseph's form for the true error; all anchors in view. ``shift_m``: by how much the
+    tag's receptions of anchor 3 are late.
+    """
+    anchors = anchor_positions(site)
+    n, dim = len(anchors), 2 if site.tags.height_m is not None else 3
+    clocks, told = relays(site)
+    tx_var, rx_var = stamp_variances(site)
+    white, walk = (SPEED_OF_LIGHT_MPS * site.noise.white_fm) ** 2, (SPEED_OF_LIGHT_MPS * site.noise.random_walk_fm) ** 2
+    half = dim + n
+    P = np.diag([0.1] * half + [0.1] * half + [tx_var] * n)
+    S, mean = P.copy(), np.zeros(len(P))
+    said = true = shifts = 0.0
+    for superframe in range(superframes):
+        for k, i in enumerate(clocks.sender):
+            dt, F, Q = clocks.gap_s[k], np.eye(len(P)), np.zeros((len(P), len(P)))
+            F[range(half), range(half, 2 * half)] = dt
+            shape = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+            common = np.eye(n) + 1.0
+            rows = np.r_[dim:half, half + dim : 2 * half]
+            Q[np.ix_(rows, rows)] = np.kron(walk * shape + np.diag([white * dt, 0.0]), common)
+            motion = np.zeros_like(Q)
+            rows = np.r_[0:dim, half : half + dim]
+            motion[np.ix_(rows, rows)] = np.kron(QA * shape, np.eye(dim))
+            keep = np.ones(len(P))
+            keep[2 * half + i] = 0.0
+            fresh = np.diag(tx_var * (1.0 - keep))
+            P = np.outer(keep, keep) * (F @ P @ F.T + Q + motion) + fresh
+            S = np.outer(keep, keep) * (F @ S @ F.T + Q) + fresh
+            mean = keep * (F @ mean)
+            towards = (point - anchors[i]) / np.linalg.norm(point - anchors[i])
+            h = np.zeros(len(P))
+            h[:dim], h[dim + i], h[2 * half + i] = towards[:dim], 1.0, 1.0
+            measured = [(h, rx_var, shift_m * (site.anchors[i].id == 3))]
+            for r in range(told.ends[k - 1] if k else 0, told.ends[k]):
+                j, age = told.heard[r], told.values[r, AGE_S]
+                h = np.zeros(len(P))
+                h[dim + j], h[dim + i], h[2 * half + j] = 1.0, -1.0, 1.0
+                h[half + dim + j], h[half + dim + i] = -age, age
+                measured.append((h, rx_var + 2.0 * age * (white + walk * age**2 / 3.0), 0.0))
+            for h, variance, late in measured:
+                gain = P @ h / (h @ P @ h + variance)
+                A = np.eye(len(P)) - np.outer(gain, h)
+                P, S = (A @ X @ A.T + variance * np.outer(gain, gain) for X in (P, S))
+                mean = mean + gain * (late - h @ mean)
+            if superframe == superframes - 1:
+                said += np.trace(P[:dim, :dim]) / len(clocks.sender)
+                true += np.trace(S[:dim, :dim]) / len(clocks.sender)
+                shifts += mean[:dim] @ mean[:dim] / len(clocks.sender)
+    return np.sqrt([said, true, shifts])
+
+
+@pytest.mark.parametrize(("site", "point"), [(LAB, (2.0, 5.5, 0.0)), (ROOM, (6.0, 3.0, 1.0))])
+def test_the_true_error_is_that_of_a_dense_recursion(site, point):
+    row = Predictor(site, PlanSettings("joint", qa=QA)).at(np.array([point]))[0]
+    said, true, _ = dense(site, np.array(point), 150)
+    assert row[CLAIMED] == pytest.approx(said, rel=2e-3)
+    assert row[SIGMA] == pytest.approx(true, rel=4e-3)  # the motion's part is taken at four packets of six or eight
+    assert row[SIGMA] < 0.93 * row[CLAIMED]
+    assert (row[SIGMA_X : SIGMA_Z + 1] ** 2).sum() == pytest.approx(row[SIGMA] ** 2)
+
+
+def test_a_late_anchor_shifts_positions_as_in_a_dense_recursion():
+    """Anchor 3 behind a wall that the others, and the tag's other paths, do not cross."""
+    point = (2.0, 5.5, 0.0)
+    wall = WallSite(4.5, 4.4, 4.5, 4.7, loss_db=0.0, delay_m=0.05)
+    site = replace(LAB, walls=(wall,))
+    _, told = relays(site)
+    assert (told.values[:, LATE_M] == 0.0).all()
+    row = Predictor(site, PlanSettings("joint", qa=QA)).at(np.array([point]))[0]
+    expected = dense(LAB, np.array(point), 150, 0.05)[2]
+    assert row[BIAS] == pytest.approx(expected, rel=0.01)
+    assert row[RMSE] ** 2 == pytest.approx(row[SIGMA] ** 2 + row[BIAS] ** 2)
+
+
+def test_small_sites_relay_everything_once():
+    clocks, told = relays(LAB)
+    assert clocks.sender.tolist() == [0, 1, 2, 3, 4, 5]
+    assert told.ends.tolist() == [5, 10, 15, 20, 25, 30]
+    slot_s = schedule_of(LAB).slot_ticks * TICK_S
+    assert told.heard[5:10].tolist() == [0, 5, 4, 3, 2]
+    assert told.values[5:10, AGE_S] == pytest.approx(slot_s * np.arange(1, 6))
+    assert told.values[:, TOLD] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_large_sites_relay_the_master_and_the_last_receptions_that_fit():
+    """Six beside the master's; with every other frame lost, those that came after fill the room by chance."""
+    anchors = tuple(AnchorSite(k + 1, float(k % 5), float(k // 5)) for k in range(20))
+    site = Site("many", 1, 1, anchors, tags=TagsSite(0.0))
+    _, told = relays(site)
+    last = slice(told.ends[18], told.ends[19])
+    assert told.heard[last].tolist() == [18, 17, 16, 15, 14, 13, 0]
+    assert told.heard[: told.ends[0]].tolist() == [19, 18, 17, 16, 15, 14, 13]  # the master has none to tell first
+    _, told = relays(site, ChannelModel(loss_probability=0.5))
+    heard, share = told.heard[told.ends[18] :], told.values[told.ends[18] :, TOLD]
+    expected = 0.5 * binom.cdf(5, np.arange(18), 0.5)
+    expected = expected[expected >= 0.01]
+    assert heard.tolist() == [*range(18, 18 - len(expected), -1), 0]
+    assert share == pytest.approx([*expected, 0.5], abs=1e-6)
+
+
+def test_silent_anchors_relay_nothing_and_are_not_relayed():
+    site = replace(
+        LAB, walls=(WallSite(5.0, 7.0, 7.0, 7.0, loss_db=300.0), WallSite(5.0, 9.0, 5.0, 7.0, loss_db=300.0))
+    )
+    clocks, told = relays(site)
+    assert clocks.speaks.tolist() == [True, True, True, False, True, True]
+    assert 3 not in told.heard
+    assert len(told.ends) == 5
+
+
+def test_lost_packets_cost_and_fixes_come_with_those_that_arrive():
+    point = np.array([[3.0, 4.0, 0.0]])
+    rows = [
+        Predictor(LAB, PlanSettings("joint", channel=ChannelModel(loss_probability=lost))).at(point)[0]
+        for lost in (0.0, 0.2, 0.5)
+    ]
+    assert [row[FIX_SHARE] for row in rows] == pytest.approx([1.0, 0.8, 0.5], abs=1e-5)
+    assert rows[0][SIGMA] < rows[1][SIGMA] < rows[2][SIGMA]
+    # anchors lose half as well here: more than the 1.39 of tags alone (docs/maths.md section 6)
+    assert 1.39 < rows[2][CLAIMED] / rows[0][CLAIMED] < 1.6
