@@ -33,7 +33,7 @@ def anchor(
     site
         Site file, or lab.
     radio
-        The anchors' radio: ether:HOST:PORT is the emulated air of skyless ether.
+        The anchors' radio: ether:HOST:PORT is the emulated air of skyless ether, serial:PATH a board.
     mqtt
         Broker for health and site, or none.
     mqtt_ca
@@ -43,6 +43,7 @@ def anchor(
     from skyless.nodes.anchors import Anchors
     from skyless.nodes.loop import run
     from skyless.radios.open import is_simulated, open_radios
+    from skyless.radios.radio import AntennaDelays
 
     plan, address = site_named(site), broker(mqtt, mqtt_ca)
     known = [node.id for node in plan.anchors]
@@ -51,7 +52,9 @@ def anchor(
         raise SkylessError(
             f"IDS is {given}; it should be one or more of the site's, each once: {' '.join(map(str, known))}"
         )
-    radios = open_radios(radio, "anchor", tuple(map(str, ids)))
+    placed = {node.id: node for node in plan.anchors}
+    delays = [AntennaDelays(placed[i].tx_antenna_delay_ticks, placed[i].rx_antenna_delay_ticks) for i in ids]
+    radios = open_radios(radio, "anchor", tuple(map(str, ids)), delays)
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
     compile_kernels()
     with contextlib.suppress(KeyboardInterrupt):

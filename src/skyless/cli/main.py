@@ -21,6 +21,7 @@ _COMMANDS = (
     ("site", "skyless.cli.site:app", "Write and check site files."),
     ("broker", "skyless.cli.broker:app", "Run the MQTT broker that comes with Skyless."),
     ("ether", "skyless.cli.ether:app", "Emulate a site's air in real time, for the programs of anchors and tags."),
+    ("board", "skyless.cli.board:app", "Emulate a board with a radio on a serial port, to try programs without one."),
     ("anchor", "skyless.cli.anchor:app", "Run anchors of a site."),
     ("tag", "skyless.cli.tag:app", "Run listening tags."),
     ("dashboard", "skyless.cli.dashboard:app", "Show a site live in the browser."),

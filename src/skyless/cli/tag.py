@@ -38,7 +38,7 @@ def tag(
     names
         Names of one or more tags: letters, digits, - and _.
     radio
-        The tags' radio: ether:HOST:PORT is the emulated air of skyless ether.
+        The tags' radio: ether:HOST:PORT is the emulated air of skyless ether, serial:PATH a board.
     method
         How positions are computed.
     qa

@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import time
+from collections import Counter
 from typing import Final
 
 import msgspec
@@ -36,6 +37,7 @@ class EmulatedRadio:
 
     def __init__(self, connection: "EtherConnection", node: int, name: str) -> None:
         self.name = name
+        self.counters: Counter[str] = Counter()
         self._connection = connection
         self._node = node
         self._listener: Listener = _nobody

@@ -1,22 +1,52 @@
 """Radios by name, as ``--radio`` gives them."""
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Final, Literal
 
 from skyless.errors import SkylessError
 from skyless.radios.emulated import EtherConnection
 from skyless.radios.ether_wire import DEFAULT_PORT, Join
-from skyless.radios.radio import Radio
+from skyless.radios.listener_radio import ListenerRadio
+from skyless.radios.radio import AntennaDelays, Radio
+from skyless.radios.serial_port import check_path
+from skyless.radios.serial_radio import SerialRadio
+from skyless.radios.sniffer_radio import SnifferRadio
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
+SERIAL_BAUD: Final = 1_000_000
+SNIFFER_BAUD: Final = 115_200
+"""Of a real sniffer's USB port no rate matters."""
+
+LISTENER_BAUD: Final = 115_200
+EXPECTED: Final = "ether:HOST[:PORT], serial:PATH[@BAUD], listener:PATH[@BAUD] or sniffer:PATH[@BAUD]"
 
 
 def is_simulated(spec: str) -> bool:
-    """Whether nothing real flies over a radio of that name."""
+    """Whether nothing real flies over a radio of that name; what sits behind a pseudo-terminal is no radio."""
+    port = spec.partition(":")[2].partition(",")[0].partition("@")[0]
+    return is_ether(spec) or str(Path(port).resolve()).startswith("/dev/pts/")
+
+
+def is_ether(spec: str) -> bool:
+    """Whether a radio of that name is one of the emulated air."""
     return spec.split(":", 1)[0] == "ether"
 
 
-def open_radios(spec: str, kind: Literal["anchor", "tag"], names: tuple[str, ...]) -> tuple[Radio, ...]:
+def is_sniffer(spec: str) -> bool:
+    """Whether a radio of that name hears packets of another system, and not beacons."""
+    return spec.split(":", 1)[0] == "sniffer"
+
+
+def open_radios(
+    spec: str,
+    kind: Literal["anchor", "tag"],
+    names: tuple[str, ...],
+    delays: Sequence[AntennaDelays] | None = None,
+) -> tuple[Radio, ...]:
     """Radios for the nodes of one process, in the order of their names; nothing is connected yet.
+
+    ``delays`` are the nodes' antenna delays, for radios that are of hardware.
 
     Raises:
         SkylessError: there is no such radio; the message says what would be right.
@@ -25,7 +55,45 @@ def open_radios(spec: str, kind: Literal["anchor", "tag"], names: tuple[str, ...
     if driver == "ether":
         host, port = host_and_port(spec, place, DEFAULT_PORT)
         return EtherConnection(host, port, Join(kind, names)).radios
-    raise SkylessError(f"--radio is {spec!r}; it should be ether:HOST[:PORT]")
+    if driver == "serial":
+        ports = _ports(spec, place, SERIAL_BAUD, names)
+        settings = delays or [AntennaDelays()] * len(names)
+        return tuple(SerialRadio(*ports[i], name, settings[i]) for i, name in enumerate(names))
+    if driver in ("listener", "sniffer") and kind == "anchor":
+        raise SkylessError(f"--radio is {spec!r}; it should be one that can transmit: a {driver} only listens")
+    if driver == "listener":
+        ports = _ports(spec, place, LISTENER_BAUD, names)
+        return tuple(ListenerRadio(*port, name) for port, name in zip(ports, names, strict=True))
+    raise SkylessError(f"--radio is {spec!r}; it should be {EXPECTED}")
+
+
+def open_sniffers(spec: str, names: tuple[str, ...]) -> tuple[SnifferRadio, ...]:
+    """Sniffers for the tags of one process, in the order of their names. Raises SkylessError."""
+    ports = _ports(spec, spec.partition(":")[2], SNIFFER_BAUD, names)
+    return tuple(SnifferRadio(*port, name) for port, name in zip(ports, names, strict=True))
+
+
+def _ports(spec: str, place: str, usual_baud: int, names: tuple[str, ...]) -> list[tuple[str, int]]:
+    """Path and baud rate of each node's port, from PATH[@BAUD],PATH[@BAUD] and so on. Raises SkylessError."""
+    parts = place.split(",")
+    if len(parts) != len(names) or not all(parts):
+        wanted = "one port" if len(names) == 1 else f"{len(names)} ports, one for each node, with commas"
+        raise SkylessError(f"--radio is {spec!r}; it should name {wanted}, as {spec.partition(':')[0]}:/dev/ttyACM0")
+    ports = [_port(spec, part, usual_baud) for part in parts]
+    if len({path for path, _ in ports}) < len(ports):
+        raise SkylessError(f"--radio is {spec!r}; it should name each port once")
+    for path, _ in ports:
+        check_path(spec, path)
+    return ports
+
+
+def _port(spec: str, part: str, usual_baud: int) -> tuple[str, int]:
+    path, at, digits = part.rpartition("@")
+    if not at:
+        return part, usual_baud
+    if not path or not digits.isdecimal() or len(digits) > 8 or int(digits) < 300:
+        raise SkylessError(f"--radio is {spec!r}; it should be PATH@BAUD with a rate from 300, as /dev/ttyACM0@1000000")
+    return path, int(digits)
 
 
 def host_and_port(spec: str, place: str, default_port: int) -> tuple[str, int]:

@@ -1,11 +1,20 @@
 """What a daemon asks of a radio, and no more."""
 
+from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
 from msgspec import Struct
 
 from skyless.air.reception import Reception, Transmission
+from skyless.constants import DEFAULT_ANTENNA_DELAY_TICKS
+
+
+class AntennaDelays(Struct, frozen=True):
+    """What a radio of hardware is to take off its stamps, in ticks."""
+
+    tx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+    rx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
 
 
 class Sent(Struct, frozen=True, gc=False):
@@ -41,6 +50,10 @@ class Radio(Protocol):
     @property
     def name(self) -> str:
         """What messages call it."""
+
+    @property
+    def counters(self) -> Counter[str]:
+        """What was lost or could not be used on the way from the radio, by reason."""
 
     async def run(self, listener: Listener) -> None:
         """Configure the radio and receive until cancelled; finds a radio that went away again by itself."""

@@ -18,7 +18,6 @@ MAX_PAYLOAD_BYTES: Final = 1014
 _MARK: Final = 0xBC
 _HEADER_BYTES: Final = 10
 _TRAILER_BYTES: Final = 2
-_LONGEST_BYTES: Final = _HEADER_BYTES + MAX_PAYLOAD_BYTES + _TRAILER_BYTES
 
 
 def recognise(head: bytes, name: str) -> bool:
@@ -34,40 +33,64 @@ def recognise(head: bytes, name: str) -> bool:
 
 def read(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
     """Yield the packets of a stream; each stretch of bytes that belongs to no record is counted once."""
-    for record in _records(stream, drops):
-        rx_ticks = int.from_bytes(record[1:6], "little")
-        packet = decode(record[_HEADER_BYTES:-_TRAILER_BYTES], None, record[6], rx_ticks)
-        if isinstance(packet, Packet):
-            yield packet
-        else:
-            drops[packet] += 1
+    cutter = BinaryCutter(drops)
+    for chunk in chunks(stream, drops):
+        yield from cutter.feed(chunk)
+    yield from cutter.finish()
 
 
-def _records(stream: BufferedIOBase, drops: Drops) -> Iterator[bytes]:
-    """Cut the stream into records; while more bytes may come, the longest possible record must be in the buffer."""
-    buffer = b""
-    at = 0
-    lost = False
-    source = chunks(stream, drops)
-    whole = False
-    while not (whole and at >= len(buffer)):
-        if len(buffer) - at < _LONGEST_BYTES and not whole:
-            chunk = next(source, b"")
-            whole = not chunk
-            buffer = buffer[at:] + chunk
-            at = 0
-            continue
-        size = _size(buffer, at)
-        if size:
-            yield buffer[at : at + size]
-            at += size
-            lost = False
-            continue
-        if not lost:
-            drops["bytes-of-no-record"] += 1
-            lost = True
-        following = buffer.find(_MARK, at + 1)
-        at = following if following >= 0 else len(buffer)
+class BinaryCutter:
+    """Cuts a stream that comes in pieces into packets, each as soon as it is whole."""
+
+    def __init__(self, drops: Drops) -> None:
+        self._drops = drops
+        self._buffer = b""
+        self._lost = False
+
+    def feed(self, chunk: bytes) -> Iterator[Packet]:
+        """Packets that are whole with this piece."""
+        return self._packets(chunk, ended=False)
+
+    def finish(self) -> Iterator[Packet]:
+        """Packets behind a false start that promised more than came."""
+        return self._packets(b"", ended=True)
+
+    def _packets(self, chunk: bytes, *, ended: bool) -> Iterator[Packet]:
+        for record in self._records(chunk, ended=ended):
+            rx_ticks = int.from_bytes(record[1:6], "little")
+            packet = decode(record[_HEADER_BYTES:-_TRAILER_BYTES], None, record[6], rx_ticks)
+            if isinstance(packet, Packet):
+                yield packet
+            else:
+                self._drops[packet] += 1
+
+    def _records(self, chunk: bytes, *, ended: bool) -> list[bytes]:
+        buffer, at, records = self._buffer + chunk, 0, []
+        while at < len(buffer) and (ended or not _may_grow(buffer, at)):
+            size = _size(buffer, at)
+            if size:
+                records.append(buffer[at : at + size])
+                at += size
+                self._lost = False
+                continue
+            if not self._lost:
+                self._drops["bytes-of-no-record"] += 1
+                self._lost = True
+            following = buffer.find(_MARK, at + 1)
+            at = following if following >= 0 else len(buffer)
+        self._buffer = buffer[at:]
+        return records
+
+
+def _may_grow(buffer: bytes, at: int) -> bool:
+    """Whether what stands there may be a record of which more is to come."""
+    if buffer[at] != _MARK:
+        return False
+    left = len(buffer) - at
+    if left < _HEADER_BYTES:
+        return True
+    length = buffer[at + 8] | buffer[at + 9] << 8
+    return 1 <= length <= MAX_PAYLOAD_BYTES and left < _HEADER_BYTES + length + _TRAILER_BYTES
 
 
 def _size(buffer: bytes, at: int) -> int:

@@ -21,15 +21,22 @@ def recognise(head: bytes, name: str) -> bool:
 def read(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
     """Yield the packets of a text stream."""
     for line in lines(stream, drops):
-        if not line:
-            continue
-        match = _LINE.fullmatch(line)
-        if match is None:
-            drops["malformed-line"] += 1
-            continue
-        sender, stamp, payload = match.groups()
-        packet = decode(bytes.fromhex(payload.decode()), None, int(sender, 16), int(stamp, 16))
-        if isinstance(packet, Packet):
+        packet = packet_of(line, drops)
+        if packet is not None:
             yield packet
-        else:
-            drops[packet] += 1
+
+
+def packet_of(line: bytes, drops: Drops) -> Packet | None:
+    """Packet of a line; None, and a count, for what is none."""
+    if not line:
+        return None
+    match = _LINE.fullmatch(line)
+    if match is None:
+        drops["malformed-line"] += 1
+        return None
+    sender, stamp, payload = match.groups()
+    packet = decode(bytes.fromhex(payload.decode()), None, int(sender, 16), int(stamp, 16))
+    if isinstance(packet, Packet):
+        return packet
+    drops[packet] += 1
+    return None

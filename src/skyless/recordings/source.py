@@ -83,20 +83,37 @@ def lines(stream: BufferedIOBase, drops: Drops) -> Iterator[bytes]:
 
     A last line without an end is dropped and counted, as a number in it may be cut off; so are overlong lines.
     """
-    rest = b""
-    overlong = False
+    cutter = LineCutter(drops)
     for chunk in chunks(stream, drops):
-        parts = (rest + chunk).split(b"\n")
-        rest = parts.pop()
-        if overlong and parts:
+        yield from cutter.feed(chunk)
+    cutter.finish()
+
+
+class LineCutter:
+    """Cuts a stream that comes in pieces into lines."""
+
+    def __init__(self, drops: Drops) -> None:
+        self._drops = drops
+        self._rest = b""
+        self._overlong = False
+
+    def feed(self, chunk: bytes) -> Iterator[bytes]:
+        """Lines that end in this piece."""
+        parts = (self._rest + chunk).split(b"\n")
+        self._rest = parts.pop()
+        if self._overlong and parts:
             del parts[0]
-            overlong = False
+            self._overlong = False
+        if len(self._rest) > MAX_LINE_BYTES:
+            if not self._overlong:
+                self._drops["overlong-line"] += 1
+            self._overlong = True
+            self._rest = b""
         for line in parts:
             yield line[:-1] if line.endswith(b"\r") else line
-        if len(rest) > MAX_LINE_BYTES:
-            if not overlong:
-                drops["overlong-line"] += 1
-            overlong = True
-            rest = b""
-    if rest:
-        drops["unfinished-line"] += 1
+
+    def finish(self) -> None:
+        """Count what has no end."""
+        if self._rest:
+            self._drops["unfinished-line"] += 1
+            self._rest = b""

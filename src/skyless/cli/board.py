@@ -1,0 +1,62 @@
+"""``skyless board``: an emulated board on a serial port that is none."""
+
+import contextlib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from skyless.cli.nodes import say
+from skyless.cli.output import print_json
+from skyless.errors import SkylessError
+from skyless.radios.open import DEFAULT_RADIO
+
+app = App(name="board", help_epilogue="Example: skyless board tag1 --link /tmp/board")
+
+
+@app.default
+def board(
+    name: Annotated[str, Parameter(name="NAME")],
+    /,
+    *,
+    radio: str = DEFAULT_RADIO,
+    format: Literal["link", "sniffer", "sniffer-text", "listener"] = "link",  # noqa: A002 - the option's natural name
+    link: Path | None = None,
+    json: bool = False,
+) -> None:
+    """Emulate a board with a UWB radio on a pseudo-terminal, until Ctrl-C, to try programs without hardware.
+
+    The board is one node of the emulated air. Programs open it as they would open a real one:
+    skyless tag tag1 --radio serial:PATH.
+
+    Parameters
+    ----------
+    name
+        Whose radio it is: an anchor's number, or a tag of the air (tag1).
+    radio
+        The air: ether:HOST:PORT of skyless ether.
+    format
+        What it speaks: link (Skyless), sniffer or sniffer-text (Bitcraze; beacons become TDoA3 packets), listener
+        (uwb-apps, JSON).
+    link
+        A symbolic link to the pseudo-terminal, which keeps its name when the board is started again.
+    json
+        Tell path and format as one JSON object before it starts.
+    """
+    from skyless.nodes.board import RADIO_OF, Board
+    from skyless.nodes.loop import run
+    from skyless.radios.open import is_ether, open_radios
+
+    if not is_ether(radio):
+        raise SkylessError(f"--radio is {radio!r}; it should be the emulated air, ether:HOST[:PORT]")
+    kind: Literal["anchor", "tag"] = "anchor" if name.isdecimal() else "tag"
+    emulated = Board(open_radios(radio, kind, (name,))[0], kind, format, link, say)
+    place = emulated.pty.place
+    if json:
+        print_json({"board": name, "path": place, "format": format, "radio": f"{RADIO_OF[format]}:{place}"})
+    else:
+        say(f"board {name}: emulated, at {place}")
+        rest = " --anchors anchors.csv" if RADIO_OF[format] == "sniffer" else ""
+        say(f"next: skyless {kind} {name} --radio {RADIO_OF[format]}:{place}{rest}")
+    with contextlib.suppress(KeyboardInterrupt):
+        run(emulated.run(), punctual=True)
