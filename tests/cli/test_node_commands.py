@@ -1,5 +1,6 @@
 """What the commands of a running site say to wrong input, before anything starts."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -23,6 +24,14 @@ from skyless.outputs.address import MqttAddress
         ("tag a a", "NAMES is 'a a'"),
         (f"tag {'x' * 33}", "1 to 32 letters"),
         ("tag t --method magic", "it should be one of literal"),
+        ("tag t --radio serial:", "it should name one port, as serial:/dev/ttyACM0"),
+        ("tag t --radio sniffer:/dev/ttyACM0", "--anchors is missing; a sniffer needs a table"),
+        ("tag t --anchors a.csv", "--anchors and --height are for sniffers"),
+        ("tag t --radio wifi:x", "it should be ether:HOST[:PORT], serial:PATH[@BAUD]"),
+        ("anchor 1 2 --radio serial:/dev/ttyACM0", "it should name 2 ports, one for each node, with commas"),
+        ("anchor 1 --radio listener:/dev/ttyACM0", "it should be one that can transmit: a listener only listens"),
+        ("board tag1 --radio serial:/dev/ttyACM0", "it should be the emulated air, ether:HOST[:PORT]"),
+        ("board tag1 --link /", "--link is '/'; it should be a name that is free, and something stands there"),
         ("ether --site lab:loud", "--site is 'lab:loud'; it should be a site file, lab, or lab:PICOSECONDS"),
         ("ether --listen 127.0.0.1:port", "--listen is '127.0.0.1:port'; it should be HOST:PORT"),
         ("ether --listen 70000", "--listen is '70000'"),
@@ -33,6 +42,15 @@ from skyless.outputs.address import MqttAddress
 def test_wrong_input_is_told_with_what_would_be_right(command, right, capsys):
     assert main(command.split()) == 2
     assert right in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("height", ["high", "nan"])
+def test_a_sniffer_s_height_is_metres_or_a_word(height, tmp_path, capsys):
+    table = tmp_path / "anchors.csv"
+    table.write_text("id,x_m,y_m,z_m\n1,0,0,0\n2,5,0,0\n3,0,5,0\n")
+    command = ["tag", "t", "--radio", "sniffer:/dev/x", "--anchors", str(table), "--height", height]
+    assert main(command) == 2
+    assert f"--height is '{height}'; it should be metres, free or auto" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -62,3 +80,19 @@ def test_a_program_that_is_asked_to_end_does_so_as_planned(number):
         program.send_signal(number)
         assert program.wait(timeout=10) == 0
         assert not program.stderr.read()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_board_tells_where_it_is_and_takes_its_link_with_it(number, tmp_path):
+    place = tmp_path / "board"
+    command = (sys.executable, "-m", "skyless.cli.main", "board", "tag1", "--radio", "ether:127.0.0.1:1", "--json")
+    with subprocess.Popen(
+        (*command, "--link", place), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as program:
+        told = json.loads(program.stdout.readline())
+        assert told == {"board": "tag1", "path": str(place), "format": "link", "radio": f"serial:{place}"}
+        assert "no ether at 127.0.0.1:1" in program.stderr.readline()
+        assert place.resolve().is_char_device()
+        program.send_signal(number)
+        assert program.wait(timeout=10) == 0
+        assert not place.is_symlink()

@@ -2,6 +2,7 @@
 
 import asyncio
 import selectors
+from collections import Counter
 
 from msgspec.structs import replace
 
@@ -49,6 +50,7 @@ class FakeRadio:
 
     def __init__(self, name="1", begin_ticks=2**40 - 10**9):
         self.name = name
+        self.counters = Counter()
         self.ready = True
         self.begin_ticks = begin_ticks
         """The counter at the loop's 1000 s; it soon wraps."""

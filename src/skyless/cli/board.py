@@ -1,6 +1,7 @@
 """``skyless board``: an emulated board on a serial port that is none."""
 
 import contextlib
+import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -54,6 +55,7 @@ def board(
     place = emulated.pty.place
     if json:
         print_json({"board": name, "path": place, "format": format, "radio": f"{RADIO_OF[format]}:{place}"})
+        sys.stdout.flush()
     else:
         say(f"board {name}: emulated, at {place}")
         rest = " --anchors anchors.csv" if RADIO_OF[format] == "sniffer" else ""

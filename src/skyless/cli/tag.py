@@ -2,16 +2,23 @@
 
 import contextlib
 import re
-from typing import Annotated
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, broker, say
-from skyless.cli.options import Positive, known_method
+from skyless.cli.options import Positive, finite_numbers, known_method
 from skyless.errors import SkylessError
 from skyless.methods import DEFAULT_METHOD
-from skyless.radios.open import DEFAULT_RADIO
+from skyless.radios.open import DEFAULT_RADIO, is_sniffer, open_radios, open_sniffers
+
+if TYPE_CHECKING:
+    from skyless.nodes.packet_tags import PacketTagSettings
+    from skyless.nodes.tag import TagSettings
+    from skyless.outputs.address import MqttAddress
 
 app = App(name="tag", help_epilogue="Example: skyless tag tag1")
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
@@ -25,6 +32,8 @@ def tag(
     qa: Positive = 0.3,
     publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0,
     site_id: Annotated[int | None, Parameter(validator=Number(gte=0, lt=0xFFFE))] = None,
+    anchors: Path | None = None,
+    height: str | None = None,
     mqtt: Mqtt = DEFAULT_MQTT,
     mqtt_ca: MqttCa = None,
 ) -> None:
@@ -38,25 +47,30 @@ def tag(
     names
         Names of one or more tags: letters, digits, - and _.
     radio
-        The tags' radio: ether:HOST:PORT is the emulated air of skyless ether, serial:PATH a board.
+        The tags' radio. ether:HOST:PORT: the emulated air of skyless ether. serial:PATH: a board of Skyless.
+        listener:PATH: the listener of uwb-apps. sniffer:PATH: a Bitcraze sniffer, for TDoA2 and TDoA3 systems.
+        Several tags have several paths, with commas; PATH@BAUD gives another rate.
     method
-        How positions are computed.
+        How positions are computed (sniffers: always joint).
     qa
         Agility of the tags in m²/s³ (tracker).
     publish_hz
         Fixes a second and tag on MQTT at most.
     site_id
-        The only site to listen to; by default the first one heard.
+        The only site to listen to; by default the first one heard. For sniffers what topics call the system, by
+        default 0.
+    anchors
+        Sniffers only: table of the system's anchors, id,x_m,y_m,z_m, as skyless replay and calibrate take it.
+    height
+        Sniffers only: the tags' height in metres, free (estimated) or auto, the default: estimated unless the anchors
+        lie too flat, then theirs.
     mqtt
         Broker for fixes and health, or none.
     mqtt_ca
         Certificates (PEM) to trust for mqtts.
     """
-    from skyless.experiments.warm import compile_kernels
     from skyless.nodes.loop import run
     from skyless.nodes.tag import TagSettings
-    from skyless.nodes.tags import Tags
-    from skyless.radios.open import open_radios
 
     address = broker(mqtt, mqtt_ca)
     if not names or len(set(names)) < len(names) or not all(map(_NAME.fullmatch, names)):
@@ -65,8 +79,64 @@ def tag(
             f"NAMES is {given}; it should be one or more names, each once, of 1 to 32 letters, digits, - or _"
         )
     known_method(method)
-    radios = open_radios(radio, "tag", names)
-    compile_kernels(method)
-    settings = TagSettings(method=method, qa=qa, site=site_id, publish_hz=publish_hz)
+    if is_sniffer(radio):
+        serve = _on_sniffers(radio, names, _system(anchors, height, site_id, qa, publish_hz), address)
+    elif anchors is not None or height is not None:
+        raise SkylessError("--anchors and --height are for sniffers; other tags hear from the air where anchors stand")
+    else:
+        serve = _on_radios(radio, names, TagSettings(method, qa, site_id, publish_hz=publish_hz), address)
     with contextlib.suppress(KeyboardInterrupt):
-        run(Tags(settings, radios, address, say).run(), punctual=True)
+        run(serve, punctual=True)
+
+
+def _on_radios(
+    radio: str, names: tuple[str, ...], settings: "TagSettings", address: "MqttAddress | None"
+) -> "Coroutine[Any, Any, None]":
+    """Tags that hear beacons."""
+    from skyless.experiments.warm import compile_kernels
+    from skyless.nodes.tags import Tags
+
+    radios = open_radios(radio, "tag", names)
+    compile_kernels(settings.method)
+    return Tags(settings, radios, address, say).run()
+
+
+def _on_sniffers(
+    radio: str, names: tuple[str, ...], settings: "PacketTagSettings", address: "MqttAddress | None"
+) -> "Coroutine[Any, Any, None]":
+    """Tags that hear the packets of another system."""
+    from skyless.experiments.warm import compile_packet_kernels
+    from skyless.nodes.packet_tags import PacketTags
+
+    radios = open_sniffers(radio, names)
+    compile_packet_kernels()
+    return PacketTags(settings, radios, address, say).run()
+
+
+def _system(
+    table: Path | None, height: str | None, site: int | None, qa: float, publish_hz: float
+) -> "PacketTagSettings":
+    """What sniffers cannot hear. Raises SkylessError."""
+    from skyless.experiments.observability import plane_height_m
+    from skyless.nodes.packet_tags import TDOA_SITE, PacketTagSettings
+    from skyless.recordings.anchors import read_anchors, read_calibration
+
+    if table is None:
+        raise SkylessError("--anchors is missing; a sniffer needs a table of the system's anchors: id,x_m,y_m,z_m")
+    places = read_anchors(table)
+    if height in (None, "auto"):
+        height_m = plane_height_m(places)
+        if height_m is not None:
+            say(f"the anchors lie too flat to tell the height; tags are taken to be at theirs: --height {height_m:.2f}")
+    else:
+        height_m = None if height == "free" else _metres(str(height))
+    return PacketTagSettings(
+        places, TDOA_SITE if site is None else site, qa, height_m, read_calibration(table), publish_hz
+    )
+
+
+def _metres(height: str) -> float:
+    try:
+        return finite_numbers("height", height, (1,))[0]
+    except SkylessError:
+        raise SkylessError(f"--height is {height!r}; it should be metres, free or auto") from None

@@ -88,6 +88,6 @@ def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> 
         heard=machine.counters["heard"],
         superframe=None if reading is None else reading[1],
         heard_age_s={str(anchor): now_s - heard_s for anchor, heard_s in sorted(node.heard_s.items())},
-        counters=dict(machine.counters),
+        counters=machine.counters | node.radio.counters,
         mqtt=mqtt,
     )

@@ -11,7 +11,7 @@ from typing import Final
 
 from skyless.errors import SkylessError
 
-HELD_BYTES: Final = 1 << 16
+HELD_BYTES: Final = 1 << 15
 """What nobody fetches is held up to here, and then dropped, with what the system holds: a UART keeps nothing either."""
 
 

@@ -2,13 +2,13 @@
 
 import time
 from collections.abc import Callable
-from typing import Final
 
 from msgspec import Struct
 
 from skyless.air.reception import Reception
 from skyless.methods import DEFAULT_METHOD
 from skyless.nodes.latency import Latencies, PhaseBook
+from skyless.nodes.pace import Pace
 from skyless.outputs.messages import FixMessage, Matrix, Vector
 from skyless.positioning.fix import Fix
 from skyless.radios.radio import Gone, Radio, RadioEvent, Restarted
@@ -28,8 +28,6 @@ class TagSettings(Struct, frozen=True):
 
 
 FixListener = Callable[[FixMessage], None]
-_MADE_UP: Final = 0.5
-"""A fix that is published late by up to this share of the interval does not lower the average rate."""
 
 
 class TagNode:
@@ -56,7 +54,7 @@ class TagNode:
         self.latencies = Latencies()
         self.phases = PhaseBook()
         self._publish, self._said, self._before = publish, said, before
-        self._due_s = 0.0
+        self._pace = Pace(settings.publish_hz)
 
     def new_receiver(self) -> Receiver:
         """A receiver that knows nothing yet."""
@@ -94,9 +92,7 @@ class TagNode:
         self.latencies.add(done_s - ended_s)
         if self.first_fix_s is None:
             self.first_fix_s = done_s - self.started_s
-        if ended_s >= self._due_s:
-            interval_s = 1.0 / self.settings.publish_hz
-            self._due_s = max(self._due_s, ended_s - _MADE_UP * interval_s) + interval_s
+        if self._pace.is_due(ended_s):
             self._publish(self._message(fix, ended_s, done_s))
 
     def _message(self, fix: Fix, ended_s: float, done_s: float) -> FixMessage:

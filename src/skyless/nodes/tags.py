@@ -109,7 +109,8 @@ class Tag:
             latency_p50_s=median_s,
             latency_p99_s=late_s,
             counters={reason: count for reason, count in node.receiver.counters.items() if reason not in NOT_DROPS}
-            | self.log.counters,
+            | self.log.counters
+            | node.radio.counters,
             mqtt=Counters(0, 0, 0) if self.link is None else self.link.counters,
             cpu=cpu,
             memory_bytes=memory_bytes,

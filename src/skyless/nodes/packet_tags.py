@@ -1,0 +1,161 @@
+"""Tags on sniffers: they hear the packets of a system without a master, and are told where its anchors stand."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+
+from msgspec import Struct, structs
+
+from skyless.air.packet import Packet, Point
+from skyless.nodes.latency import Latencies
+from skyless.nodes.pace import Pace
+from skyless.nodes.running import HEALTH_S, Say, every, keep, link_of, together
+from skyless.nodes.tag import fix_message
+from skyless.nodes.usage import Usage
+from skyless.outputs.address import MqttAddress
+from skyless.outputs.messages import Counters, FixMessage, TagHealth
+from skyless.outputs.topics import fix_topic, health_topic
+from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
+from skyless.positioning.pair_calibration import PairCalibration
+from skyless.radios.radio import Gone, Restarted
+from skyless.radios.sniffer_radio import SnifferRadio
+
+METHOD = "joint"
+TDOA_SITE = 0
+"""What topics call a system that has no site identifier."""
+
+
+class PacketTagSettings(Struct, frozen=True):
+    """What tags of such a system are told."""
+
+    anchors_m: Mapping[int, Point]
+    site: int = TDOA_SITE
+    qa: float = MASTERLESS.qa
+    height_m: float | None = None
+    """Height of the tags where it is known; None to estimate it."""
+    calibration: PairCalibration | None = None
+    publish_hz: float = 50.0
+
+
+class PacketTagNode:
+    """Runs ``PacketTracking`` on a sniffer. ``publish`` is given the fixes that are to be published."""
+
+    def __init__(
+        self, settings: PacketTagSettings, radio: SnifferRadio, publish: Callable[[FixMessage], None], said: Say
+    ) -> None:
+        self.settings, self.radio = settings, radio
+        self.tracking = self._new_tracking()
+        self.started_s = time.monotonic()
+        self.unix_less_host_s = time.time() - time.monotonic()
+        self.packets = self.serial = self.restarts = 0
+        self.first_fix_s: float | None = None
+        self.last_fix_s: float | None = None
+        self.latencies = Latencies()
+        self._drops: Counter[str] = Counter()
+        self._pace = Pace(settings.publish_hz)
+        self._publish, self._said = publish, said
+
+    def _new_tracking(self) -> PacketTracking:
+        asked = self.settings
+        filter_settings = structs.replace(MASTERLESS, qa=asked.qa, height_m=asked.height_m)
+        return PacketTracking(filter_settings, asked.anchors_m, calibration=asked.calibration)
+
+    @property
+    def counters(self) -> Counter[str]:
+        """What could not be used, by reason."""
+        return self._drops + self.tracking.drops + self.radio.counters
+
+    async def run(self) -> None:
+        """Listen until cancelled."""
+        await self.radio.run(self.hear)
+
+    def hear(self, event: Packet | Restarted | Gone) -> None:
+        """Take what the sniffer tells."""
+        if isinstance(event, Packet):
+            self._receive(event)
+        elif isinstance(event, Restarted):
+            self.restarts += 1
+            self._said(f"tag {self.radio.name}: listening" + (" again" if self.restarts > 1 else ""))
+            if self.packets:
+                self._drops += self.tracking.drops
+                self.tracking = self._new_tracking()
+        else:
+            self._said(f"tag {self.radio.name}: {event.reason}; still looking for it")
+
+    def _receive(self, packet: Packet) -> None:
+        self.packets += 1
+        fix = self.tracking.hear(packet)
+        if fix is None:
+            return
+        done_s = time.monotonic()
+        ended_s = done_s if packet.host_s is None else packet.host_s
+        self.serial += 1
+        self.last_fix_s = done_s
+        self.latencies.add(done_s - ended_s)
+        if self.first_fix_s is None:
+            self.first_fix_s = done_s - self.started_s
+        if self._pace.is_due(ended_s):
+            unix_s = ended_s + self.unix_less_host_s
+            self._publish(fix_message(self.radio.name, self.serial, fix, unix_s, done_s - ended_s))
+
+
+class PacketTags:
+    """The tags of one process, each with its sniffer and its MQTT connection."""
+
+    def __init__(
+        self, settings: PacketTagSettings, radios: Sequence[SnifferRadio], address: MqttAddress | None, say: Say
+    ) -> None:
+        self._settings, self._say = settings, say
+        self._links = tuple(link_of(address, radio.name, site=settings.site, kind="tag") for radio in radios)
+        self.nodes = tuple(
+            PacketTagNode(settings, radio, self._publisher(index), say) for index, radio in enumerate(radios)
+        )
+        self._usage = Usage()
+        self._told_fixes = [0] * len(radios)
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        parts = [node.run() for node in self.nodes]
+        parts += [keep(link, self._say) for link in self._links if link is not None]
+        await together(*parts, every(HEALTH_S, self._tell))
+
+    def _publisher(self, index: int) -> Callable[[FixMessage], None]:
+        def publish(message: FixMessage) -> None:
+            link = self._links[index]
+            if link is not None:
+                link.publish(fix_topic(self._settings.site, message.tag), message)
+
+        return publish
+
+    def _tell(self) -> None:
+        share, memory_bytes = self._usage.take()
+        for index, (node, link) in enumerate(zip(self.nodes, self._links, strict=True)):
+            node.unix_less_host_s = time.time() - time.monotonic()
+            mqtt = Counters(0, 0, 0) if link is None else link.counters
+            health = self._health(index, share / len(self.nodes), memory_bytes, mqtt)
+            if link is not None:
+                link.publish(health_topic(self._settings.site, "tag", node.radio.name), health)
+
+    def _health(self, index: int, cpu: float, memory_bytes: int, mqtt: Counters) -> TagHealth:
+        node, now_s = self.nodes[index], time.monotonic()
+        median_s, late_s, _ = node.latencies.take()
+        fixes, self._told_fixes[index] = node.serial - self._told_fixes[index], node.serial
+        silent = node.last_fix_s is None or now_s - node.last_fix_s > HEALTH_S
+        return TagHealth(
+            tag=node.radio.name,
+            unix_s=time.time(),
+            uptime_s=now_s - node.started_s,
+            method=METHOD,
+            receptions=node.packets,
+            fixes=node.serial,
+            updates_per_s=fixes / HEALTH_S,
+            reason=str(node.tracking.reason) if silent else None,
+            first_fix_s=node.first_fix_s,
+            latency_p50_s=median_s,
+            latency_p99_s=late_s,
+            counters=dict(node.counters),
+            mqtt=mqtt,
+            cpu=cpu,
+            memory_bytes=memory_bytes,
+            phases=(),
+        )

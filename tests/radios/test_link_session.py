@@ -1,0 +1,269 @@
+"""A conversation over the serial link with a board that the test plays record by record."""
+
+from collections import Counter
+
+import pytest
+
+from skyless.air.reception import Diagnostics, Reception, Transmission
+from skyless.firmware import link
+from skyless.radios.link_records import quantised
+from skyless.radios.link_session import POLL_S, SILENCE_S, LinkSession
+from skyless.radios.radio import AntennaDelays, Gone, Late, Restarted, Sent
+
+DELAYS = AntennaDelays(16_450, 16_500)
+COUNTS = [7, 1, 3, 2, 0, 5]
+ON = link.IS_CONFIGURED | link.IS_RECEIVING
+T0 = 0xFE_1234_5600
+
+
+def stamp(ticks):
+    return bytearray(ticks.to_bytes(5, "little"))
+
+
+class Talk:
+    """A session whose port is the test."""
+
+    def __init__(self):
+        self.told, self.counters, self.now_s = [], Counter(), 50.0
+        self.commands = []
+        self._reader = link.Reader()
+        self.board = link.Writer()
+        self.session = LinkSession("/dev/board", DELAYS, self._take, self.told.append, self.counters)
+        self.session.begin(self.now_s)
+
+    def _take(self, data):
+        at = 0
+        while at < len(data):
+            at = self._reader.take(bytearray(data), at, len(data))
+            if self._reader.length:
+                self.commands.append(bytes(self._reader.record[: self._reader.length]))
+
+    def kinds(self):
+        """Commands since last asked."""
+        kinds = [command[0] for command in self.commands]
+        self.commands.clear()
+        return kinds
+
+    def say(self, end):
+        self.hear(bytes(self.board.line[:end]))
+
+    def hear(self, data):
+        self.session.hear(data, self.now_s)
+
+    def hello(self):
+        self.say(self.board.hello((1, 2, 3), bytearray(b"board-01"), link.CAN_TRANSMIT))
+
+    def status(self, state=ON, ticks=T0):
+        self.say(self.board.status(stamp(ticks), state, COUNTS, 2150, 3300))
+
+    def ready(self):
+        self.hello()
+        self.status(link.IS_CONFIGURED)
+        self.status()
+        self.kinds()
+        return self
+
+    def poll(self, seconds):
+        """Let time pass; what the session says to it in the end."""
+        said = None
+        for _ in range(round(seconds / POLL_S)):
+            self.now_s += POLL_S
+            said = said or self.session.poll(self.now_s)
+        return said
+
+
+def test_a_board_is_greeted_configured_and_ready():
+    talk = Talk()
+    assert talk.kinds() == [link.ASK_HELLO]
+    talk.hello()
+    (config,) = (command for command in talk.commands if command[0] == link.CONFIG)
+    assert tuple(config[2:8]) == (5, 64, 2, 9, 128, 0)
+    assert [link.unsigned(config, at, 2) for at in (8, 10)] == [16_450, 16_500]
+    assert talk.kinds() == [link.CONFIG, link.RX_ON]
+    talk.status(link.IS_CONFIGURED)
+    assert talk.told == []
+    assert talk.session.clock.read(talk.now_s) is None
+    talk.status()
+    assert talk.told == [Restarted()]
+    assert talk.session.clock.read(talk.now_s) == T0
+    hello, status = talk.session.hello, talk.session.status
+    assert (hello.firmware, hello.device_id, hello.can_transmit) == ((1, 2, 3), b"board-01", True)
+    assert (status.received, status.errors, status.sent, status.late, status.garbled, status.unsent_records) == (
+        *COUNTS,
+    )
+    assert (status.temperature_c, status.supply_v) == (21.5, 3.3)
+    talk.poll(POLL_S)
+    assert talk.kinds() == [link.ASK_STATUS]
+
+
+def test_receptions_come_through_with_their_measurements_in_the_line_s_units():
+    talk = Talk().ready()
+    frame = bytes(range(40))
+    talk.say(talk.board.rx(stamp(2**40 - 1), -7953, -8312, -12_345, bytearray(frame), 40))
+    talk.say(talk.board.rx(stamp(0), link.NOT_TOLD, link.NOT_TOLD, link.NOT_TOLD, bytearray(frame), 1))
+    assert talk.told[1:] == [
+        Reception(frame, 2**40 - 1, talk.now_s, Diagnostics(-79.53, -83.12, -12.345)),
+        Reception(frame[:1], 0, talk.now_s, Diagnostics()),
+    ]
+    told = Diagnostics(-79.5314, None, 40.0)
+    assert quantised(told) == Diagnostics(-79.53, None, None)  # ±32.767 ppm fit
+    assert quantised(quantised(told)) == quantised(told)
+
+
+def test_transmissions_are_asked_for_by_dx_and_their_end_is_told_by_tx_ticks():
+    talk = Talk().ready()
+    tx_ticks = (T0 & ~0x1FF) + DELAYS.tx_ticks
+    for number, frame in enumerate((b"one", b"two")):
+        talk.session.transmit(Transmission(frame, tx_ticks + 512 * number))
+        record = talk.commands[-1]
+        assert (record[0], record[link.TX_FRAME_AT :]) == (link.TX_AT, frame)
+        assert int.from_bytes(record[2:7], "little") == (T0 & ~0x1FF) + 512 * number
+    dx = stamp(T0 & ~0x1FF)
+    talk.say(talk.board.tx_done(dx, stamp(tx_ticks)))
+    talk.say(talk.board.tx_done(dx, stamp(tx_ticks)))  # nobody asked for that one any more
+    talk.say(talk.board.tx_late(stamp((T0 & ~0x1FF) + 512), link.LATE_FOR_RADIO))
+    assert talk.told[1:] == [Sent(tx_ticks), Late(tx_ticks + 512)]
+    assert not +talk.counters
+    talk.session.transmit(Transmission(b"three", tx_ticks))
+    talk.say(talk.board.tx_done(dx, stamp(tx_ticks + 1)))
+    assert talk.counters == {"sent-at-another-time": 1}
+
+
+def test_before_the_board_is_ready_everything_is_late_and_nothing_is_heard():
+    talk = Talk()
+    talk.say(talk.board.rx(stamp(5), 0, 0, 0, bytearray(b"frame"), 5))
+    talk.session.transmit(Transmission(b"one", 77))
+    talk.hello()
+    talk.say(talk.board.rx(stamp(5), 0, 0, 0, bytearray(b"frame"), 5))
+    assert talk.told == [Late(77)]
+
+
+def test_dx_wraps_with_the_counter():
+    talk = Talk().ready()
+    talk.session.transmit(Transmission(b"x", 100))
+    assert int.from_bytes(talk.commands[-1][2:7], "little") == 2**40 + 100 - DELAYS.tx_ticks
+
+
+def test_lost_copied_unknown_malformed_and_garbled_records_are_counted():
+    talk = Talk().ready()
+    frame = bytearray(b"frame")
+    talk.say(talk.board.rx(stamp(1), 0, 0, 0, frame, 5))
+    line = bytes(talk.board.line[: talk.board.rx(stamp(2), 0, 0, 0, frame, 5)])
+    talk.hear(line + line)
+    talk.board.ask(link.RX_ON)  # two that never arrive
+    talk.board.ask(link.RX_ON)
+    talk.say(talk.board.rx(stamp(3), 0, 0, 0, frame, 5))
+    talk.say(talk.board.ask(0x3F))
+    talk.say(talk.board.rx(stamp(3), 0, 0, 0, frame, 0))
+    for kind in (link.TX_DONE, link.TX_LATE, link.STATUS, link.REFUSED, link.HELLO):
+        talk.say(talk.board.ask(kind))
+    talk.hear(b"\x05garbage\0" + line[:10] + b"\0")
+    assert [event.rx_ticks for event in talk.told[1:]] == [1, 2, 3]
+    assert talk.counters == {
+        "copied-record": 1,
+        "lost-record": 2,
+        "unknown-record": 1,
+        "malformed-record": 6,
+        "garbled-record": 2,
+    }
+
+
+def test_records_of_a_later_minor_version_are_read():
+    talk = Talk()
+    board = talk.board
+    board.begin(link.HELLO)
+    board.put_bytes(bytearray([link.MAJOR, 9, 1, 2, 3, *range(8)]), 0, 13)
+    board.put(link.RATE_KHZ, 4)
+    board.put_bytes(bytearray([40, 0xFF, 1, 2, 3]), 0, 5)
+    talk.say(board.end())
+    board.begin(link.STATUS)
+    board.put_bytes(bytearray([*stamp(T0), ON, *bytes(24), 0, 0x80, 0xFF, 0xFF, 9, 9]), 0, 36)
+    talk.say(board.end())
+    assert talk.told == [Restarted()]
+    assert (talk.session.status.temperature_c, talk.session.status.supply_v) == (None, None)
+
+
+def test_a_board_of_another_major_version_is_refused_once_and_taken_when_it_has_changed():
+    talk = Talk()
+    talk.kinds()
+    for _ in range(3):
+        talk.board.begin(link.HELLO)
+        talk.board.put(2, 1)
+        talk.board.put(0, 1)
+        talk.say(talk.board.end())
+        talk.poll(POLL_S)
+    (gone,) = talk.told
+    assert gone == Gone(
+        "the board at /dev/board speaks version 2.0 of the serial link, this program 1.0; bring the board's firmware "
+        "and Skyless to the same release"
+    )
+    assert set(talk.kinds()) == {link.ASK_HELLO}
+    talk.status()
+    assert talk.told == [gone]
+    talk.hello()
+    talk.status()
+    assert talk.told == [gone, Restarted()]
+
+
+def test_a_board_that_refuses_its_configuration_or_counts_otherwise_cannot_be_used():
+    talk = Talk()
+    talk.hello()
+    talk.say(talk.board.refused(link.CONFIG, link.REFUSED_SETTING))
+    talk.say(talk.board.refused(link.TX_AT, link.REFUSED_MALFORMED))
+    assert [type(event) for event in talk.told] == [Gone]
+    assert "refuses its configuration" in talk.told[0].reason
+    assert talk.counters == {"refused-command": 1}
+    talk = Talk()
+    talk.board.begin(link.HELLO)
+    talk.board.put_bytes(bytearray([link.MAJOR, 0, 1, 2, 3, *range(8)]), 0, 13)
+    talk.board.put(1000, 4)
+    talk.board.put_bytes(bytearray([32, 1]), 0, 2)
+    talk.say(talk.board.end())
+    assert "counts 1000 kHz in 32 bits" in talk.told[0].reason
+
+
+def test_a_board_that_starts_anew_is_configured_again_and_its_numbers_begin_anew():
+    talk = Talk().ready()
+    tx_ticks = (T0 & ~0x1FF) + DELAYS.tx_ticks
+    talk.session.transmit(Transmission(b"one", tx_ticks))
+    talk.board = link.Writer()
+    talk.hello()
+    talk.status(0, 5)
+    assert not talk.session.ready
+    assert talk.kinds() == [link.TX_AT, link.ASK_STATUS, link.CONFIG, link.RX_ON]
+    talk.status(ON, 1000)
+    assert talk.told == [Restarted(), Restarted()]
+    assert talk.session.clock.read(talk.now_s) == 1000
+    talk.say(talk.board.tx_done(stamp(T0 & ~0x1FF), stamp(tx_ticks)))  # of its former life
+    assert talk.told == [Restarted(), Restarted()]
+    assert not +talk.counters
+
+
+def test_a_second_answer_to_hello_changes_nothing():
+    talk = Talk().ready()
+    talk.hello()
+    talk.status()
+    assert talk.told == [Restarted()]
+
+
+def test_a_lost_configuration_is_sent_again():
+    talk = Talk()
+    talk.hello()
+    talk.kinds()
+    talk.poll(POLL_S)
+    assert talk.kinds() == [link.CONFIG, link.RX_ON]
+
+
+@pytest.mark.parametrize(
+    ("first", "said"),
+    [
+        (lambda talk: None, "no board answers at /dev/board"),
+        (lambda talk: talk.hear(b"Hello from PANS\r\n" * 9), "no serial link of Skyless (153 bytes); wrong baud rate?"),
+        (Talk.ready, "says nothing any more"),
+    ],
+)
+def test_a_board_that_is_silent_is_given_up(first, said):
+    talk = Talk()
+    first(talk)
+    assert talk.poll(SILENCE_S) is None
+    assert said in talk.poll(1.0)
