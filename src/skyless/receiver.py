@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from skyless.air.almanac_book import AlmanacBook
 from skyless.air.beacon import Beacon, Heard
+from skyless.air.claim import claim_of
 from skyless.air.codec import decode_cached
 from skyless.air.followed_master import FollowedMaster
 from skyless.air.malformed import Malformed
@@ -240,6 +241,7 @@ class Receiver:
         heard = beacon.master_heard if beacon.master == self._master else None
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
         master_sequence = master_rx_ticks = None
+        sync_variance_m2, joint = variance_m2, self._method_name == "joint"
         if heard is not None:
             least = tx_ticks - HALF_WRAP_TICKS
             master_sequence, master_rx_ticks = heard.sequence, least + ((heard.rx_ticks - least) & TICK_MASK)
@@ -256,7 +258,9 @@ class Receiver:
             ticks_master,
             fraction,
             variance_m2,
-            _relays(beacon, tx_ticks) if self._method_name == "joint" else (),
+            _relays(beacon, tx_ticks) if joint else (),
+            claim_of(beacon) if joint and ticks_master is not None else None,
+            sync_variance_m2,
         )
 
     def _repeats(self, anchor: int, heard: Heard) -> int:

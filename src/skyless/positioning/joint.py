@@ -24,6 +24,8 @@ from skyless.positioning.joint_state import (
     PARDONED,
     QA,
     REJECTED_IN_ROW,
+    RELAYS_REFUSED,
+    RELAYS_TAKEN,
     RX_VARIANCE,
     SITE,
     SLOTS,
@@ -38,6 +40,7 @@ from skyless.positioning.joint_state import (
     states,
     values,
 )
+from skyless.positioning.joint_sync import NO_SYNCS
 from skyless.positioning.kalman import horizontal_variance
 from skyless.positioning.protection import RISK, limits_of
 from skyless.positioning.protection_levels import LEVELS
@@ -48,6 +51,10 @@ MAX_RATE: Final = 50e-6
 
 DOUBTFUL_SHARE: Final = 0.12
 """Of messages beyond the gate; in the first second after a start."""
+
+
+CONTRADICTIONS: Final = 4.0
+"""Relayed receptions beyond the gate lately; fewer may be late ones."""
 
 
 class JointSettings(Struct, frozen=True):
@@ -102,6 +109,8 @@ class Messages(Struct, frozen=True):
     """As ``joint_hear`` takes them, shape (relays, 4)."""
     ends: Integers
     """Where the relays of each packet end."""
+    syncs: Matrix = NO_SYNCS
+    """What each packet's anchor says of its clock, as ``joint_hear`` takes it, shape (n, 3), or (0, 3) for nothing."""
 
 
 NO_RELAYS: Final = np.empty((0, 4), np.int64)
@@ -160,9 +169,17 @@ class JointFilter:
         s.statistics[CAUTION] = caution_m2
         s.statistics[:4] = (1.0, s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE], 0.0, 1.0)
 
-    def hear(self, site: int, sequence: int, rx_ticks: int, tx_ticks: int, relays: Integers = NO_RELAYS) -> int:
+    def hear(
+        self,
+        site: int,
+        sequence: int,
+        rx_ticks: int,
+        tx_ticks: int,
+        relays: Integers = NO_RELAYS,
+        syncs: Matrix = NO_SYNCS,
+    ) -> int:
         """Take one packet (``joint_hear``); leaves what ``motion`` returns in ``newest``."""
-        packet = (site, sequence, rx_ticks, tx_ticks, relays, *self.newest, self._limits, self._levels)
+        packet = (site, sequence, rx_ticks, tx_ticks, relays, syncs, *self.newest, self._limits, self._levels)
         status = joint_step(tuple(self.arrays), *packet)
         if status == FULL:
             self._extend()
@@ -196,6 +213,7 @@ class JointFilter:
                 messages.tx_ticks,
                 messages.relays,
                 messages.ends,
+                messages.syncs,
                 self._motion,
                 self._covariance,
                 nothing if motions is None else motions,
@@ -226,6 +244,13 @@ class JointFilter:
         in_row = self.arrays.counts[REJECTED_IN_ROW] + self.arrays.counts[STALE_IN_ROW]
         late = min(self.arrays.statistics[LATE_SHARE], 0.45)
         return bool(self.arrays.statistics[REJECTED_SHARE] > LOST_SHARE or in_row * (1.0 - 2.0 * late) >= LOST_IN_ROW)
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether most of what anchors heard of each other does not fit: a wrong place draws all clocks with it."""
+        recent = self.arrays.recent
+        refused = recent.item(RELAYS_REFUSED)
+        return bool(refused > CONTRADICTIONS and refused > recent.item(RELAYS_TAKEN))
 
     @property
     def is_doubtful(self) -> bool:

@@ -44,6 +44,7 @@ from skyless.positioning.joint_state import (
     has_room,
     values,
 )
+from skyless.positioning.joint_sync import SYNC_VARIANCE, hear_sync
 from skyless.positioning.joint_time import elapse
 from skyless.positioning.joint_updates import hear_anchor, hear_relay, join, new_packet
 from skyless.positioning.protection_levels import protect
@@ -73,12 +74,22 @@ MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS
 
 @borrowing_kernel
 def joint_hear(
-    s: JointArrays, site: int, sequence: int, rx_ticks: int, tx_ticks: int, relays: Integers, first: int, last: int
+    s: JointArrays,
+    site: int,
+    sequence: int,
+    rx_ticks: int,
+    tx_ticks: int,
+    relays: Integers,
+    first: int,
+    last: int,
+    syncs: Matrix,
+    row: int,
 ) -> int:
     """Take one packet of the anchor ``site`` (place in the table) and what it relays, in the tag's order of time.
 
     Rows ``first`` to ``last`` of ``relays`` are [the anchor that heard, the anchor that was heard, sequence, RX stamp
-    of the former], anchors by their places in the table; all stamps are unwrapped, each on its own clock.
+    of the former], anchors by their places in the table; all stamps are unwrapped, each on its own clock. Row ``row``
+    of ``syncs``, if there is one, is what the anchor says of its clock (``joint_sync``).
     """
     slot = s.slot_of[site]
     if s.counts[SLOTS] > 0 and rx_ticks < s.counts[EPOCH]:
@@ -117,6 +128,8 @@ def joint_hear(
             _hear_relayed(
                 s, s.slot_of[relays[relay, 0]], s.slot_of[relays[relay, 1]], relays[relay, 2], relays[relay, 3]
             )
+        if row < len(syncs) and syncs[row, SYNC_VARIANCE] > 0.0:
+            hear_sync(s, slot, syncs, row)
     elif has_room(s):
         settle(s)
         slot = add_slot(s, site)
@@ -197,6 +210,7 @@ def joint_step(
     rx_ticks: int,
     tx_ticks: int,
     relays: Integers,
+    syncs: Matrix,
     motion: Vector,
     covariance: Matrix,
     limits: Vector,
@@ -207,7 +221,7 @@ def joint_step(
     It hands over a plain tuple in half the time that a named one takes.
     """
     s = JointArrays(*arrays)
-    status = joint_hear(s, site, sequence, rx_ticks, tx_ticks, relays, 0, len(relays))
+    status = joint_hear(s, site, sequence, rx_ticks, tx_ticks, relays, 0, len(relays), syncs, 0)
     joint_motion(s, motion, covariance)
     protect(s, covariance, limits, levels)
     return status
@@ -223,6 +237,7 @@ def joint_track(
     tx_ticks: Integers,
     relays: Integers,
     ends: Integers,
+    syncs: Matrix,
     motion: Vector,
     covariance: Matrix,
     motions: Matrix,
@@ -236,7 +251,8 @@ def joint_track(
     dim = int(s.settings[DIM])
     for k in range(begin, len(sites)):
         first = ends[k - 1] if k > 0 else 0
-        if joint_hear(s, sites[k], sequences[k], rx_ticks[k], tx_ticks[k], relays, first, ends[k]) == FULL:
+        packet = (sites[k], sequences[k], rx_ticks[k], tx_ticks[k])
+        if joint_hear(s, *packet, relays, first, ends[k], syncs, k) == FULL:
             return k
         if len(motions) > 0:
             joint_motion(s, motion, covariance)

@@ -39,7 +39,9 @@ EPOCH, BASE, ACCEPTED, REJECTED, REJECTED_IN_ROW, SLOTS, NOISES, TERMS, PLACES =
     IMPOSSIBLE,
     PARDONED,
     PARDONS,
-) = range(9, 21)
+    SYNCS_USED,
+    SYNCS_REFUSED,
+) = range(9, 23)
 """Places in ``counts``. The epoch is the tag's reading at the newest message, the base that of the values."""
 
 SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW, EXCLUDED, RELAYS_IN_ROW = range(9)
@@ -145,7 +147,7 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
         noise=np.zeros(6),
         h_places=np.zeros(MOST_PLACES, np.int64),
         h=np.zeros(MOST_PLACES),
-        counts=np.zeros(21, np.int64),
+        counts=np.zeros(23, np.int64),
         statistics=np.zeros(13),
         slots=np.zeros((capacity, 9), np.int64),
         anchors=np.zeros((capacity, 7)),

@@ -13,6 +13,9 @@ from skyless.positioning.in_use import AnchorsInUse
 from skyless.positioning.joint import NO_RELAYS, JointFilter, JointSettings
 from skyless.positioning.joint_hearing import REJECTED, STALE_PACKET
 from skyless.positioning.joint_start import JointStart
+from skyless.positioning.joint_state import Matrix
+from skyless.positioning.joint_sync import NO_SYNCS
+from skyless.positioning.master_scale import MasterScale
 from skyless.positioning.observation import Observation
 from skyless.positioning.protection import integrity_of
 from skyless.positioning.tracking import (
@@ -62,6 +65,7 @@ class JointTracking:
         self._started_ticks = 0
         self._caution_m2 = 0.0
         self._heard_ticks = 0
+        self._master_scale = MasterScale()
 
     @property
     def filter(self) -> JointFilter:
@@ -83,6 +87,7 @@ class JointTracking:
         """Take one observation; a fix for every accepted message once started."""
         if observation.tx_ticks_master is not None:
             self._master_less_tag_ticks = observation.tx_ticks_master - observation.rx_ticks_tag
+            self._master_scale.hear(observation)
         if self._start is None and self._is_out_of_reach(observation):
             self._start = self._new_start()
         if self._start is not None:
@@ -96,6 +101,9 @@ class JointTracking:
         self._heard_ticks = max(self._heard_ticks, observation.rx_ticks_tag)
         if status in (REJECTED, STALE_PACKET):
             self._start_anew_where_lost(observation.rx_ticks_tag)
+            return NoFixReason.RESIDUALS
+        if self._filter.is_contradicted:
+            self._start = self._new_start()
             return NoFixReason.RESIDUALS
         self._in_use.use(observation)
         return self._fix(observation)
@@ -151,9 +159,17 @@ class JointTracking:
             if heard is not None:
                 flat += (place, heard, sequence, rx_ticks)
         relays = np.array(flat, np.int64).reshape(-1, 4) if flat else NO_RELAYS
-        return self._filter.hear(
-            place, observation.sequence, observation.rx_ticks_tag, observation.tx_ticks_anchor, relays
-        )
+        packet = (place, observation.sequence, observation.rx_ticks_tag, observation.tx_ticks_anchor)
+        return self._filter.hear(*packet, relays, self._sync(observation))
+
+    def _sync(self, observation: Observation) -> Matrix:
+        """What the anchor says of its clock against the master's, as the filter takes it."""
+        if observation.claim is None or observation.sync_variance_m2 <= 0.0:
+            return NO_SYNCS
+        master, difference = self._place_of.get(observation.claim.master), self._master_scale.difference(observation)
+        if master is None or difference is None:
+            return NO_SYNCS
+        return np.array([[master, difference, observation.sync_variance_m2]])
 
     def _place(self, observation: Observation) -> int:
         """Place of the packet's anchor in the filter's table."""

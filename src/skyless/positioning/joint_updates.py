@@ -50,6 +50,9 @@ CALMING: Final = 0.98
 LEAST_CAUTION_M2: Final = 1e-5
 """After a start that failed receptions are taken to be so late at first; it fades with each of them, to nothing."""
 
+BENT: Final = 0.01
+"""Where ranges are so curved that it counts for more than this part of the stamps' variance, it is counted."""
+
 JOIN_VARIANCE_M2: Final = 1.0
 """Where messages are late an anchor's first packet may be so too: it decides nothing."""
 
@@ -89,15 +92,17 @@ def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool
         variance += s.settings[TX_VARIANCE]
     expected = along_x(s)
     range_m = put_direction(s, slot, tau_s, 1.0)
+    bend_m = _bend(s, range_m, variance)
     term = project(s)
     variance *= s.anchors[slot, WEIGHT]
+    variance += 2.0 * bend_m * bend_m
     if s.statistics[CAUTION] > 0.0:
         variance += s.statistics[CAUTION]
         s.statistics[CAUTION] *= CALMING
         if s.statistics[CAUTION] < LEAST_CAUTION_M2:
             s.statistics[CAUTION] = 0.0
     spread = along_h(s, term) + variance
-    innovation = (rx_ticks - tx_ticks - s.slots[slot, WHOLE]) * TICK_M - (range_m + expected)
+    innovation = (rx_ticks - tx_ticks - s.slots[slot, WHOLE]) * TICK_M - (range_m + bend_m + expected)
     s.anchors[slot, RANGE] = range_m
     s.anchors[slot, INNOVATION] = innovation
     factor = believe(s, slot, innovation, spread)
@@ -136,6 +141,26 @@ def put_direction(s: JointArrays, slot: int, tau_s: float, sign: float) -> float
 
 
 @borrowing_kernel
+def _bend(s: JointArrays, range_m: float, variance: float) -> float:
+    """Half the position's variance across the direction, over the range: what the range is longer by on average.
+
+    The second term of its Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 where that is
+    small beside that of the stamps. Without it, updates of wide states become sure of a wrong place.
+    """
+    P, dim = s.P, int(s.settings[DIM])
+    across = 0.0
+    for axis in range(dim):
+        across += P[axis, axis]
+    least = BENT * variance * range_m * range_m
+    if 0.5 * across * across < least:
+        return 0.0
+    for one in range(dim):
+        for other in range(dim):
+            across -= s.statistics[LAG + 3 + one] * P[one, other] * s.statistics[LAG + 3 + other]
+    return float(0.5 * across / max(range_m, 1e-6)) if 0.5 * across * across >= least else 0.0
+
+
+@borrowing_kernel
 def join(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> None:
     """Begin with an anchor's clock: what its first packet says, whatever is wrong with the position being in it.
 
@@ -150,7 +175,9 @@ def join(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> None:
     range_m = put_direction(s, slot, tau_s, -1.0)
     put(s, rate, -tau_s)
     term = project(s)
-    variance = along_h(s, term) + s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE]
+    variance = s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE]
+    bend_m = _bend(s, range_m, variance)
+    variance += along_h(s, term) + 2.0 * bend_m * bend_m
     if s.statistics[CAUTION] > 0.0 or s.statistics[LATE_SHARE] > LATE_ENOUGH:
         variance += JOIN_VARIANCE_M2
     for row in range(states(s)):
@@ -158,7 +185,7 @@ def join(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> None:
         P[place, row] = s.terms[term, row]
     P[place, place] = variance
     whole = rx_ticks - tx_ticks - int(np.floor(range_m / TICK_M))
-    s.x[place] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m
+    s.x[place] = (rx_ticks - tx_ticks - whole) * TICK_M - (range_m + bend_m)
     join_faults(s, slot, place)
     s.slots[slot, WHOLE] = whole
     s.anchors[slot, RANGE] = range_m

@@ -6,6 +6,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from skyless.air.claim import Claim
 from skyless.positioning.fix import Fix, NoFixReason
 
 
@@ -28,9 +29,13 @@ class Observation(Struct, frozen=True, gc=False):
     """TX time on the master's scale, whole ticks; None while the anchor does not know it."""
     tx_fraction_ticks: float
     tx_variance_m2: float
-    """Variance of the TX time on the master's scale, from the anchor's clock filter."""
+    """Variance of the TX time on the master's scale, from the anchor's clock filter; more where errors repeat."""
     relays: tuple[tuple[int, int, int], ...] = ()
     """When the anchor heard others: (anchor, sequence number, own RX stamp, unwrapped); for ``joint`` only."""
+    claim: Claim | None = None
+    """Whose time ``tx_ticks_master`` is; for ``joint`` only, as is ..."""
+    sync_variance_m2: float = 0.0
+    """... what the anchor itself says of its variance."""
 
 
 class Method(Protocol):

@@ -91,9 +91,11 @@ def protected_track(
     Rows of ``motions``, shape (n, 2·dim), and ``levels``, shape (n, LEVELS + 1), are filled in; the last column says
     what became of the packet.
     """
+    no_syncs = np.empty((0, 3))
     for k in range(len(sites)):
         first = ends[k - 1] if k > 0 else 0
-        status = joint_hear(s, sites[k], sequences[k], rx_ticks[k], tx_ticks[k], relays, first, ends[k])
+        packet = (sites[k], sequences[k], rx_ticks[k], tx_ticks[k])
+        status = joint_hear(s, *packet, relays, first, ends[k], no_syncs, 0)
         if status != FULL:
             joint_motion(s, motion, covariance)
             protect(s, covariance, limits, levels[k])
