@@ -1,11 +1,14 @@
 """What tests of the joint filter share: anchors, episodes and settings that fit them, a filter that has begun."""
 
 import numpy as np
+from msgspec.structs import replace
 
+from skyless.clocks.filter import ClockFilter, clock_noise
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
 from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.studies.episodes import Case, draw_episode
 from skyless.positioning.joint import JointFilter, JointSettings, Messages
+from skyless.positioning.joint_sync import SUBTICKS
 from skyless.positioning.observation import Observation
 from skyless.site.lab import lab_site
 
@@ -65,6 +68,7 @@ def kept(messages, keep):
         messages.tx_ticks[keep],
         messages.relays[keep[owner]],
         np.cumsum(lengths[keep]),
+        messages.syncs[keep] if len(messages.syncs) else messages.syncs,
     )
 
 
@@ -75,6 +79,29 @@ def observations_of(episode, anchors_m):
         round_ = k // len(anchors_m)
         stamps = (round_, sequence, rx_ticks, tx_ticks, None, None, None, 0.0, 0.0)
         yield Observation(site, anchors_m[site], *stamps, heard)
+
+
+def with_syncs(messages, case, anchors_m=LAB_M):
+    """The messages with what the anchors' own clock filters say; the first anchor is the master, in at least its case.
+
+    ``messages`` have all that anchors heard of the master, as they have where nothing is lost.
+    """
+    noise = clock_noise(WHITE_FM, case.random_walk_fm)
+    variance = 2.0 * (SPEED_OF_LIGHT_MPS * case.noise_ps * 1e-12) ** 2
+    filters = [ClockFilter(noise, variance) for _ in anchors_m]
+    sent, syncs = {}, np.zeros((len(messages.sites), 3))
+    for k, (site, sequence, _, tx_ticks, relays) in enumerate(packets_of(messages)):
+        if site == 0:
+            sent[sequence] = tx_ticks
+        for listener, sender, number, rx_ticks in relays.tolist():
+            if sender == 0:
+                filters[listener].hear(
+                    sent[number], rx_ticks, float(np.linalg.norm(anchors_m[listener] - anchors_m[0]))
+                )
+        if filters[site].updates > 1:
+            ticks, fraction, said = filters[site].to_master(tx_ticks)
+            syncs[k, 1:] = (tx_ticks - ticks) * SUBTICKS - round(fraction * SUBTICKS) & (1 << 48) - 1, said
+    return replace(messages, syncs=syncs)
 
 
 def ideal(path_m, mesh, seed=1, anchors_m=LAB_M, senders=None):

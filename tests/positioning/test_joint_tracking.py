@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
-from joint_builders import LAB_M, ROOM_M, Case, episode_of, observations_of, settings_of
+from joint_builders import LAB_M, ROOM_M, Case, begun, episode_of, kept, observations_of, settings_of
 
 from skyless.constants import TICK_RATE_HZ
 from skyless.positioning.fix import Fix, NoFixReason
@@ -111,3 +111,39 @@ def test_a_filter_that_is_wrong_starts_anew():
             errors[k] = np.linalg.norm(result.position_m - episode.path_m[k])
     assert max(error for k, error in errors.items() if k < 200 or k > 240) < 0.15
     assert max(errors) == len(episode.path_m) - 1
+
+
+def test_wide_states_stay_honest_near_anchors():
+    """At 0.7 m ranges of a few metres are curved by more than the stamps' noise; taken as straight, NEES is above 2."""
+    nees = []
+    for seed in range(100):
+        episode = episode_of(MESH, 40, seed)
+        keep = np.random.default_rng(seed + 50).random(len(episode.path_m)) >= 0.8
+        keep[:12] = True
+        heard = kept(episode.messages, keep)
+        joint = begun(episode, settings_of(MESH), std_m=0.7, seed=seed)
+        motions, variances = np.empty((len(heard.sites), 4)), np.empty((len(heard.sites), 4))
+        joint.track(heard, motions, variances)
+        errors, said = motions[12:, :2] - episode.path_m[keep][12:, :2], variances[12:].reshape(-1, 2, 2)
+        nees.append(np.einsum("ni,nij,nj->n", errors, np.linalg.inv(said), errors).mean() / 2.0)
+    assert np.mean(nees) < 1.4
+
+
+def test_a_wrong_place_that_the_anchors_contradict_is_left():
+    """With most messages lost, a wrong place makes wrong clocks that fit; what anchors heard of each other does not."""
+    episode = episode_of(MESH, 400, 3)
+    keep = np.random.default_rng(5).random(len(episode.path_m)) >= 0.6
+    tracking, errors = JointTracking(settings_of(MESH)), []
+    for k, observation in enumerate(observations_of(episode, LAB_M)):
+        if k == 600:
+            s = tracking.filter.arrays
+            s.x[:2] += 2.0
+            for slot in range(6):
+                towards = s.x[:2] - LAB_M[slot, :2]
+                s.x[2 + slot] -= np.linalg.norm(towards) - np.linalg.norm(towards - 2.0)
+        if keep[k]:
+            result = tracking.hear(observation)
+            if isinstance(result, Fix) and k > 1200:
+                errors.append(np.linalg.norm(result.position_m - episode.path_m[k]))
+    assert len(errors) > 300
+    assert max(errors) < 0.15

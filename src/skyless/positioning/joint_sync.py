@@ -13,6 +13,9 @@ from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.joint_algebra import along_h, along_x, project, put
 from skyless.positioning.joint_state import (
     BASE,
+    CLOCK_CROSS,
+    CLOCK_RATE,
+    CLOCK_VALUE,
     DIM,
     EPOCH,
     EXCLUDED,
@@ -20,7 +23,6 @@ from skyless.positioning.joint_state import (
     PLACES,
     RANGE,
     RX_VARIANCE,
-    SLOTS,
     SYNCS_REFUSED,
     SYNCS_USED,
     TERMS,
@@ -28,6 +30,7 @@ from skyless.positioning.joint_state import (
     WHOLE,
     JointArrays,
     Matrix,
+    lanes,
     values,
     width,
 )
@@ -93,34 +96,28 @@ def _put_difference(s: JointArrays, master: int, slot: int) -> None:
 
 @borrowing_kernel
 def _variance(s: JointArrays) -> float:
-    """h·P·h, pending terms included: cheaper than ``project`` where nothing follows."""
-    count = s.counts[PLACES]
-    total = 0.0
+    """h·P·h of the difference, pending terms and noise included: cheaper than ``project`` where nothing follows."""
+    count, noise = s.counts[PLACES], s.noise
+    tau_s = s.h[count - 2]
+    total = 2.0 * (noise[CLOCK_VALUE] + tau_s * (2.0 * noise[CLOCK_CROSS] + tau_s * noise[CLOCK_RATE]))
     for one in range(count):
         for other in range(count):
             total += s.h[one] * s.h[other] * s.P[s.h_places[one], s.h_places[other]]
     for term in range(s.counts[TERMS]):
-        along = along_h(s, term)
-        total += s.signs[term] * along * along
-    return total
+        total -= along_h(s, term) ** 2
+    return float(total)
 
 
 @borrowing_kernel
 def _replace(s: JointArrays, term: int, innovation: float, spread: float, variance: float) -> None:
     """Set the measured combination to what was said of it, with that variance; the others follow by regression.
 
-    It says nothing of faults of the tag's receptions, but takes what they have done to the combination away.
+    It tells nothing of faults of the tag's receptions, but takes what they have done to the combination away.
     """
-    u, V, columns = s.terms, s.sensitivities, width(s)
-    for column in range(columns):
+    u, r, known = s.terms, s.responses, np.sqrt(spread - variance)
+    for column in range(width(s)):
         s.x[column] += innovation / spread * u[term, column]
-    for other in range(s.counts[SLOTS]):
-        error = 0.0
-        for k in range(s.counts[PLACES]):
-            error += s.h[k] * V[other, s.h_places[k]]
-        for column in range(columns):
-            V[other, column] -= error / spread * u[term, column]
-    scale = np.sqrt(spread - variance) / spread
-    for column in range(columns):
-        u[term, column] *= scale
+        u[term, column] *= known / spread
+    for other in range(lanes(s)):
+        r[term, other] /= known
     s.counts[TERMS] = term + 1
