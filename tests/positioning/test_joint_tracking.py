@@ -114,7 +114,7 @@ def test_a_filter_that_is_wrong_starts_anew():
 
 
 def test_wide_states_stay_honest_near_anchors():
-    """At 0.7 m ranges of a few metres are curved by more than the stamps' noise; taken as straight, NEES is above 2."""
+    """At 0.7 m ranges of a few metres are curved by more than the stamps' noise; taken as straight, NEES is 1.74."""
     nees = []
     for seed in range(100):
         episode = episode_of(MESH, 40, seed)

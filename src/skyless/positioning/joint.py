@@ -253,6 +253,13 @@ class JointFilter:
         return bool(refused > CONTRADICTIONS and refused > recent.item(RELAYS_TAKEN))
 
     @property
+    def relays_fit(self) -> bool:
+        """Whether most of what anchors heard of each other fits, and that is more than a few receptions."""
+        recent = self.arrays.recent
+        taken = recent.item(RELAYS_TAKEN)
+        return bool(taken > max(CONTRADICTIONS, 4.0 * recent.item(RELAYS_REFUSED)))
+
+    @property
     def is_doubtful(self) -> bool:
         """Whether more messages do not fit than a sound start leaves."""
         s = self.arrays

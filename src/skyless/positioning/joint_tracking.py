@@ -66,6 +66,7 @@ class JointTracking:
         self._caution_m2 = 0.0
         self._heard_ticks = 0
         self._master_scale = MasterScale()
+        self._believes_relays = True
 
     @property
     def filter(self) -> JointFilter:
@@ -102,9 +103,12 @@ class JointTracking:
         if status in (REJECTED, STALE_PACKET):
             self._start_anew_where_lost(observation.rx_ticks_tag)
             return NoFixReason.RESIDUALS
-        if self._filter.is_contradicted:
+        if not self._believes_relays:
+            self._believes_relays = self._filter.relays_fit
+        elif self._filter.is_contradicted:
+            self._believes_relays = False  # if a new start does not help, the anchors are wrong, not the place
             self._start = self._new_start()
-            return NoFixReason.RESIDUALS
+            return NoFixReason.ACQUIRING
         self._in_use.use(observation)
         return self._fix(observation)
 
