@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from joint_builders import LAB_M, Case, begun, covariance, episode_of, kept, packets_of, settings_of, with_syncs
+from joint_builders import LAB_M, Case, begun, episode_of, kept, packets_of, settings_of, with_syncs
 from msgspec.structs import replace
 
 from skyless.air.claim import Claim
@@ -85,7 +85,7 @@ def test_the_step_is_what_the_theory_says():
     tau_s = (int(s.counts[0]) - int(s.counts[1])) * 15.65e-12 - s.anchors[s.slot_of[4], 3] / 299792458.0
     for site, sign in ((0, 1.0), (4, -1.0)):
         h[2 + s.slot_of[site]], h[half + 2 + s.slot_of[site]] = sign, sign * tau_s
-    P, V = covariance(without), s.sensitivities[:n, : len(LAB_M)]
+    P, V = without.covariance(), s.sensitivities[:n, : len(LAB_M)]
     spread = h @ P @ h
     assert spread > WORTH * q
     whole = int(s.slots[s.slot_of[0], 1] - s.slots[s.slot_of[4], 1]) * SUBTICKS
@@ -93,8 +93,8 @@ def test_the_step_is_what_the_theory_says():
     gain = P @ h / spread
     np.testing.assert_allclose(within.arrays.x[:n], s.x[:n] + gain * (off * TICK_M / SUBTICKS - h @ s.x[:n]), atol=1e-9)
     expected = P - np.outer(gain, gain) * (spread - q)
-    np.testing.assert_allclose(covariance(within), expected, rtol=1e-6, atol=1e-9 * np.abs(P).max())
-    assert h @ covariance(within) @ h == pytest.approx(q, rel=1e-3)
+    np.testing.assert_allclose(within.covariance(), expected, rtol=1e-6, atol=1e-9 * np.abs(P).max())
+    assert h @ within.covariance() @ h == pytest.approx(q, rel=1e-3)
     moved = V - np.outer(gain, h @ V)
     np.testing.assert_allclose(within.arrays.sensitivities[:n, : len(LAB_M)], moved, atol=1e-9 * np.abs(V).max())
     assert np.array_equal(within.arrays.evidence, s.evidence)
@@ -107,7 +107,7 @@ def test_where_nothing_is_lost_no_bit_changes(case):
     bare.track(episode.messages)
     told.track(with_syncs(episode.messages, case))
     assert told.arrays.counts[SYNCS_USED] == 0
-    for name in ("x", "P", "sensitivities", "evidence", "statistics", "slots"):
+    for name in ("x", "P", "sensitivities", "evidence", "statistics", "slots", "noise"):
         assert np.array_equal(getattr(bare.arrays, name), getattr(told.arrays, name))
 
 
