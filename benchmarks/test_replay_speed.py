@@ -9,7 +9,8 @@ from plain_filter import PlainFilter
 import synthetic_recordings as synthetic
 from skyless.experiments.judge import Judge
 from skyless.experiments.replay import Replay, ReplayRequest
-from skyless.positioning.pair_tracker import PairSettings, PairTracker, track_pairs
+from skyless.positioning.pair_state import PairSettings
+from skyless.positioning.pair_tracker import PairTracker, track_pairs
 
 ROWS = {"tdoa-table": 100_000, "miluv": 20_000, "avalue": 10_000}
 PACKETS = 20_000
@@ -60,8 +61,8 @@ def test_pair_filter_in_batch(benchmark, plain_per_s):
     def batch():
         tracker = PairTracker(PairSettings())
         tracker.start(np.array(synthetic.place_m(0.0)), np.eye(3), 1.0)
-        arrays = (tracker.x, tracker.P, tracker.whole, tracker.statistics, tracker.settings, tracker.h, tracker.ph)
-        return track_pairs(*arrays, a_m, b_m, dt_s, tdoa_m, states)
+        a, b = (np.array([tracker.slot(row[side]) for row in rows]) for side in (1, 2))
+        return track_pairs(tracker.arrays, a, b, a_m, b_m, dt_s, tdoa_m, states)
 
     assert benchmark.pedantic(batch, rounds=5, warmup_rounds=1) > 0.95 * len(rows)
     per_s = len(rows) / benchmark.stats.stats.min

@@ -7,7 +7,7 @@ import pytest
 
 from skyless.air.packet import PairTdoa
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.pair_tracker import PairSettings
+from skyless.positioning.pair_state import PairSettings
 from skyless.positioning.pair_tracking import PairTracking
 
 SEEN_FROM_ABOVE = ((0.0, 0.0), (8.0, 0.0), (8.0, 6.0), (0.0, 6.0), (4.0, 0.0), (4.0, 6.0))

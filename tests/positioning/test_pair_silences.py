@@ -3,7 +3,7 @@
 import numpy as np
 
 from skyless.air.packet import PairTdoa
-from skyless.positioning.pair_tracker import PairSettings
+from skyless.positioning.pair_state import PairSettings
 from skyless.positioning.pair_tracking import PairTracking
 
 ANCHORS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * (n >> 2)) for n in range(8)}

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from skyless.experiments.scenarios import Request, fleet_of
-from skyless.positioning.pair_tracker import PairSettings, PairTracker, track_pairs
+from skyless.positioning.pair_state import PairSettings
+from skyless.positioning.pair_tracker import PairTracker, track_pairs
 from skyless.positioning.tracker import PseudorangeTracker, track
 from skyless.site.lab import lab_site
 from skyless.site.room import room_site
@@ -81,24 +82,26 @@ def test_pair_differences_in_one_loop(height_m):
     a_m, b_m = corners[pairs[:, 0]], corners[pairs[:, 1]]
     tdoa_m = np.linalg.norm(tag - b_m, axis=1) - np.linalg.norm(tag - a_m, axis=1) + generator.normal(0, 0.2, count)
     tdoa_m[::50] += 5.0  # beyond the gate
+    tdoa_m[(pairs[:, 1] == 3) & (np.arange(count) > 2000)] += 1.0  # an anchor is left out
     dt_s = generator.uniform(0.0, 0.02, count)
     one, two = (PairTracker(PairSettings(height_m=height_m)) for _ in range(2))
     for tracker in (one, two):
         tracker.start(np.array([2.5, 2.0, 1.5])[: tracker.dim], np.eye(tracker.dim), 1.0)
+        for anchor in range(8):
+            assert tracker.slot(anchor) == anchor
     states = np.empty((count, len(one.x)))
     results = []
     streaming = np.empty_like(states)
     for k in range(count):
-        results.append(one.hear(a_m[k], b_m[k], float(dt_s[k]), float(tdoa_m[k])))
+        results.append(one.hear(*pairs[k].tolist(), a_m[k], b_m[k], float(dt_s[k]), float(tdoa_m[k])))
         streaming[k] = one.x
-    accepted = track_pairs(
-        two.x, two.P, two.whole, two.statistics, two.settings, two.h, two.ph, a_m, b_m, dt_s, tdoa_m, states
-    )
+    accepted = track_pairs(two.arrays, pairs[:, 0], pairs[:, 1], a_m, b_m, dt_s, tdoa_m, states)
     assert accepted == sum(results)
     assert count - accepted >= count // 50
     assert np.array_equal(states, streaming)
-    assert np.array_equal(one.P, two.P)
-    assert np.array_equal(one.statistics, two.statistics)
+    for streamed_array, batch_array in zip(one.arrays, two.arrays, strict=True):
+        assert np.array_equal(streamed_array, batch_array)
+    assert one.excluded == two.excluded == (3,)
     assert np.linalg.norm(two.x[: two.dim] - tag[: two.dim]) < 0.3
 
 

@@ -19,7 +19,7 @@ from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.masterless import PairEngine
 from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
 from skyless.positioning.pair_calibration import PairCalibration
-from skyless.positioning.pair_tracker import PairSettings
+from skyless.positioning.pair_state import PairSettings
 from skyless.positioning.pair_tracking import PairTracking
 from skyless.recordings.formats import Recording, format_of, open_recording
 
@@ -118,13 +118,9 @@ class Replay:
 
     def _by_pairs(self) -> ByPairs:
         request = self._request
-        base = PROFILES.get(self.recording.format.name, PairSettings())
-        settings = PairSettings(
-            qa=base.qa if request.qa is None else request.qa,
-            tdoa_std_m=base.tdoa_std_m if request.tdoa_std_m is None else request.tdoa_std_m,
-            gate=base.gate,
-            height_m=request.height_m,
-        )
+        asked = {"qa": request.qa, "tdoa_std_m": request.tdoa_std_m, "height_m": request.height_m}
+        known = {key: value for key, value in asked.items() if value is not None}
+        settings = structs.replace(PROFILES.get(self.recording.format.name, PairSettings()), **known)
         tracking = PairTracking(settings, request.anchors_m, request.z_bounds_m, request.calibration)
         return ByPairs(tracking, self._engine(), self._noise)
 

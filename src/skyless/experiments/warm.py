@@ -9,7 +9,7 @@ from skyless.constants import TICK_M
 from skyless.experiments.fleet import Fleet, FleetSettings
 from skyless.methods import DEFAULT_METHOD
 from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
-from skyless.positioning.pair_tracker import PairSettings
+from skyless.positioning.pair_state import PairSettings
 from skyless.positioning.pair_tracking import PairTracking
 from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.trajectory import Static

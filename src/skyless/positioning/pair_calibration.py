@@ -10,20 +10,24 @@ the slope from the receiver: a DW1000 stamps strong signals early (Decawave APS0
 their zero is arbitrary.
 """
 
-from math import dist, log
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
 
-from skyless.air.packet import PairTdoa, Point
-from skyless.positioning.pair_tracker import PairSettings
+from skyless.air.packet import PairTdoa
 
 LEAST_NOISE_M: Final = 0.05
-"""A quieter calibration does not narrow the gate further: places it has not seen are somewhat different."""
+"""A quieter calibration is not believed further: places it has not seen are somewhat different."""
 
-NEAREST_M: Final = 0.5
-"""Below this range the slope is not followed any more."""
+SHARED: Final = 1.5
+"""Differences that follow each other share receptions and reflections, which the filter counts as new in each."""
+
+TYPICAL_SLOPE_M: Final = 0.05
+"""Of a DW1000 that nobody has calibrated: APS011 says 0.03 to 0.10 m, flights that told it 0.03 to 0.08 m."""
+
+KNOWN_STD_M: Final = 0.03
+"""Of a constant that was calibrated: between recordings of the same anchors it differs by so much."""
 
 
 class AnchorCalibration(Struct, frozen=True):
@@ -36,7 +40,7 @@ class AnchorCalibration(Struct, frozen=True):
     """Standard deviation of the differences that the anchor takes part in, outliers apart."""
 
 
-NOTHING: Final = AnchorCalibration(0.0)
+UNKNOWN: Final = AnchorCalibration(0.0, TYPICAL_SLOPE_M)
 
 
 class PairCalibration(Struct, frozen=True):
@@ -44,29 +48,15 @@ class PairCalibration(Struct, frozen=True):
 
     anchors: dict[int, AnchorCalibration]
 
-    def correction_m(self, pair: PairTdoa, a_m: Point, b_m: Point, position_m: Point | None) -> float:
-        """What to add to a difference; without a position the constants only."""
-        a, b = self.anchors.get(pair.anchor_a, NOTHING), self.anchors.get(pair.anchor_b, NOTHING)
-        correction_m = a.bias_m - b.bias_m
-        if position_m is not None and (a.slope_m or b.slope_m):
-            correction_m += a.slope_m * _log_range(position_m, a_m) - b.slope_m * _log_range(position_m, b_m)
-        return correction_m
+    def of(self, anchor: int) -> AnchorCalibration:
+        """What is known of an anchor, or of any."""
+        return self.anchors.get(anchor, UNKNOWN)
 
-    @property
-    def noise_m(self) -> float | None:
-        """Of a difference, median over the anchors; None where no anchor's is known."""
+    def constant_m(self, pair: PairTdoa) -> float:
+        """By how much a difference is too large for its anchors' constants."""
+        return self.of(pair.anchor_b).bias_m - self.of(pair.anchor_a).bias_m
+
+    def tdoa_std_m(self, otherwise_m: float) -> float:
+        """Of a difference, by the median of what was measured at the anchors, where that is less than otherwise."""
         known = [anchor.noise_m for anchor in self.anchors.values() if anchor.noise_m is not None]
-        return float(np.median(known)) if known else None
-
-    def gate(self, settings: PairSettings) -> float:
-        """The settings' gate for the noise that was measured, in their own standard deviations.
-
-        Those stay what they are in the filter: they stand for errors that last, which a constant does not take off.
-        """
-        if self.noise_m is None:
-            return settings.gate
-        return settings.gate * min(max(self.noise_m, LEAST_NOISE_M) / settings.tdoa_std_m, 1.0)
-
-
-def _log_range(position_m: Point, anchor_m: Point) -> float:
-    return log(max(dist(position_m, anchor_m), NEAREST_M))
+        return min(SHARED * max(float(np.median(known)), LEAST_NOISE_M), otherwise_m) if known else otherwise_m

@@ -5,15 +5,15 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from msgspec import structs
 from numpy.typing import NDArray
 
-from skyless.air.packet import PairTdoa, Point
+from skyless.air.packet import PairTdoa
 from skyless.positioning.fix import Fix, NoFixReason, motion_fix
 from skyless.positioning.pair_calibration import PairCalibration
-from skyless.positioning.pair_tracker import PairSettings, PairTracker
-from skyless.positioning.pairs import against_reference
-from skyless.positioning.solver import NoSolution, Solution, locate
+from skyless.positioning.pair_start import Start, find_start
+from skyless.positioning.pair_state import PairSettings
+from skyless.positioning.pair_tracker import PairTracker
+from skyless.positioning.solver import NoSolution
 
 WINDOW: Final = 60
 """Differences that a start looks at, the newest ones ..."""
@@ -30,10 +30,6 @@ SPEED_STD_MPS: Final = 1.0
 IN_USE_S: Final = 0.5
 """An anchor counts as in use while its last accepted difference is younger."""
 
-STEADY_S: Final = 2.0
-STEADY_SHARE: Final = 0.4
-"""So long after a start, or while a larger share of the differences lies beyond it, the narrow gate stays open."""
-
 MAX_STD_M: Final = 3.0
 """While the horizontal standard deviation is larger, there is no fix; a silence that makes it so means a new start."""
 
@@ -43,8 +39,9 @@ SHORT_SILENCE_S: Final = 0.1
 TRY_EVERY: Final = 6
 """Differences between two attempts at a start."""
 
-NEIGHBOURHOOD: Final = 1.5
-"""A tag farther from the anchors' centre than this part of their figure's diagonal, in x or y, is lost."""
+AFTER_LOSS: Final = 30
+AFTER_LOSS_S: Final = 1.0
+"""Where a state was just wrong, a new start waits for so many differences or so long."""
 
 
 class PairTracking:
@@ -59,23 +56,21 @@ class PairTracking:
     ) -> None:
         """``anchors_m`` places the anchors; a difference that brings its own positions needs none.
 
-        ``calibration`` is taken off every difference, and narrows the gate while all goes well.
+        ``calibration`` is taken off every difference; anchors that are not in it are taken for ordinary ones.
         """
-        self._calibration = calibration
-        self._narrow_gate = settings.gate if calibration is None else calibration.gate(settings)
+        self._calibration = PairCalibration({}) if calibration is None else calibration
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self._settings = settings
         self._places = {anchor: np.array(place) for anchor, place in anchors_m.items()}
         self._z_bounds_m = z_bounds_m
-        self._tracker = PairTracker(settings)
+        self._tracker = PairTracker(settings, self._calibration)
         self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
-        self._started = False
-        self._started_s = self._last_s = 0.0
+        self._last_s = 0.0
         self._heard_s: dict[int, float] = {}
         self._since_try = 0
-        self._area_m = (0.0, 0.0, 0.0)
-        self._extent_m = 0.0
+        self._start: Start | None = None
+        self._was_wrong = False
 
     def hear(self, pairs: Sequence[PairTdoa]) -> bool:
         """Take the differences of one reception, receptions in the order of time.
@@ -89,8 +84,8 @@ class PairTracking:
                 self.counters["unknown-anchor"] += 1
                 self.reason = NoFixReason.NO_ALMANAC
             else:
-                used = self._take(self._calibrated(pair, *places), *places) or used
-        return used and self._started and self._is_sane()
+                used = self._take(pair, *places) or used
+        return used and self._start is not None and self._is_sane()
 
     def _places_of(self, pair: PairTdoa) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         places = self._places
@@ -101,35 +96,24 @@ class PairTracking:
         a_m, b_m = places.get(pair.anchor_a), places.get(pair.anchor_b)
         return None if a_m is None or b_m is None else (a_m, b_m)
 
-    def _calibrated(self, pair: PairTdoa, a_m: NDArray[np.float64], b_m: NDArray[np.float64]) -> PairTdoa:
-        """The difference without the anchors' biases, those that change with the range as at the last position."""
-        if self._calibration is None:
-            return pair
-        at_m = self.position_m if self._started else None
-        correction_m = self._calibration.correction_m(pair, _point(a_m), _point(b_m), at_m)
-        return structs.replace(pair, tdoa_m=pair.tdoa_m + correction_m)
-
     def _take(self, pair: PairTdoa, a_m: NDArray[np.float64], b_m: NDArray[np.float64]) -> bool:
         time_s = pair.time_s
         dt_s = time_s - self._last_s
-        if self._started and self._is_out_of_reach(dt_s):
+        if self._start is not None and self._is_out_of_reach(dt_s):
             self._stop()
         self._last_s = time_s
-        if not self._started:
+        if self._start is None:
             return self._try_start(pair)
-        self._tracker.set_gate(self._narrow_gate if self._is_steady(time_s) else self._settings.gate)
-        if self._tracker.hear(a_m, b_m, dt_s, pair.tdoa_m):
+        used = self._tracker.hear(pair.anchor_a, pair.anchor_b, a_m, b_m, dt_s, pair.tdoa_m)
+        if used:
             self._heard_s[pair.anchor_a] = self._heard_s[pair.anchor_b] = time_s
-            return True
-        self.counters["outlier"] += 1
-        self.reason = NoFixReason.RESIDUALS
+        else:
+            self.counters["outlier"] += 1
+            self.reason = NoFixReason.RESIDUALS
         if self._tracker.lost:
             self._stop()
-        return False
-
-    def _is_steady(self, time_s: float) -> bool:
-        """Whether the state can be trusted with a narrow gate, behind which a wrong one would stay wrong."""
-        return time_s - self._started_s > STEADY_S and self._tracker.rejected_share < STEADY_SHARE
+            self._was_wrong = True
+        return used
 
     def _is_out_of_reach(self, dt_s: float) -> bool:
         """Whether the filter cannot predict so far: too long a silence for it, or a clock that went back."""
@@ -139,16 +123,15 @@ class PairTracking:
 
     def _is_sane(self) -> bool:
         """Whether the state is near the anchors, beyond which differences tell nothing, and known well enough."""
-        x_m, y_m, radius_m = self._area_m
-        x, P = self._tracker.x, self._tracker.P
-        if abs(x[0] - x_m) > radius_m or abs(x[1] - y_m) > radius_m:
+        start, x, P = self._start, self._tracker.x, self._tracker.P
+        if start is None or not start.holds(x[: self._tracker.dim]):
             self.reason = NoFixReason.NOT_CONVERGED
             self._stop()
             return False
         if P[0, 0] + P[1, 1] > MAX_STD_M**2:
             self.reason = NoFixReason.ACQUIRING
             return False
-        if self._tracker.dim == 3 and P[2, 2] > self._extent_m**2:
+        if self._tracker.dim == 3 and P[2, 2] > start.extent_m**2:
             self.reason = NoFixReason.BAD_GEOMETRY
             return False
         return True
@@ -171,7 +154,8 @@ class PairTracking:
     def _stop(self) -> None:
         """Forget the state; a new start is looked for."""
         self.counters["restart"] += 1
-        self._started = False
+        self._start = None
+        self._was_wrong = False
         self._window.clear()
 
     def _try_start(self, pair: PairTdoa) -> bool:
@@ -180,44 +164,22 @@ class PairTracking:
         while pair.time_s - self._window[0].time_s > WINDOW_S:
             self._window.popleft()
         self._since_try += 1
-        if self._since_try < TRY_EVERY:
+        if self._since_try < TRY_EVERY or (self._was_wrong and not self._is_enough_after_loss()):
             return False
         self._since_try = 0
-        solution = self._solve()
-        if isinstance(solution, NoSolution):
-            self.reason = solution.reason
+        start = find_start(self._window, self._places, self._calibration, self._settings.height_m, self._z_bounds_m)
+        if isinstance(start, NoSolution):
+            self.reason = start.reason
             return False
-        dim = self._tracker.dim
+        dim, solution = self._tracker.dim, start.solution
         self._tracker.start(solution.position_m[:dim], solution.covariance_m2[:dim, :dim], SPEED_STD_MPS**2)
-        self._started, self._started_s = True, pair.time_s
+        if start.without is not None:
+            self._tracker.leave_out(start.without)
+        self._start = start
         self._heard_s = {anchor: pair.time_s for kept in self._window for anchor in (kept.anchor_a, kept.anchor_b)}
         self._window.clear()
         self.counters["start"] += 1
         return True
 
-    def _solve(self) -> Solution | NoSolution:
-        grouped: dict[tuple[int, int], list[float]] = {}
-        for pair in self._window:
-            grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(pair.tdoa_m)
-        values = [float(np.median(group)) for group in grouped.values()]
-        variance = self._settings.tdoa_std_m**2
-        joined = against_reference(list(grouped), values, [variance] * len(values))
-        if not joined.anchors:
-            return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
-        anchors_m = np.array([self._places[anchor] for anchor in joined.anchors])
-        self._extent_m = float(np.ptp(anchors_m, axis=0).max())
-        low, high = anchors_m.min(axis=0)[:2], anchors_m.max(axis=0)[:2]
-        x_m, y_m = ((low + high) / 2.0).tolist()
-        self._area_m = (x_m, y_m, NEIGHBOURHOOD * max(float(np.linalg.norm(high - low)), 5.0))
-        return locate(
-            anchors_m,
-            joined.tdoa_m,
-            joined.covariance_m2,
-            height_m=self._settings.height_m,
-            z_bounds_m=self._z_bounds_m,
-        )
-
-
-def _point(place_m: NDArray[np.float64]) -> Point:
-    x_m, y_m, z_m = place_m.tolist()
-    return x_m, y_m, z_m
+    def _is_enough_after_loss(self) -> bool:
+        return len(self._window) >= AFTER_LOSS or self._last_s - self._window[0].time_s >= AFTER_LOSS_S

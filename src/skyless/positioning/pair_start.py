@@ -1,0 +1,106 @@
+"""Where a tag is by a window of time differences of pairs, without a guess, and past one anchor that is wrong."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from skyless.air.packet import PairTdoa
+from skyless.positioning.fix import NoFixReason
+from skyless.positioning.pair_calibration import PairCalibration
+from skyless.positioning.pair_state import START_STD_M
+from skyless.positioning.pairs import against_reference
+from skyless.positioning.solver import NoSolution, Solution, locate
+
+NEIGHBOURHOOD: Final = 1.5
+"""A tag farther from the anchors' centre than this part of their figure's diagonal, in x or y, is lost; ..."""
+
+STOREYS: Final = 0.5
+"""... and so is one farther above or below than this part."""
+
+LEAST_DIAGONAL_M: Final = 5.0
+
+MISFIT: Final = 4.0
+"""A start with so much larger residuals than expected, chi² per degree of freedom, is tried without each anchor."""
+
+FITS: Final = 0.1
+"""Without the wrong anchor no more than this part of the misfit is left."""
+
+
+class Start(Struct, frozen=True):
+    """Where a filter begins."""
+
+    solution: Solution
+    without: int | None
+    """The anchor that does not fit; None where all do."""
+    low_m: NDArray[np.float64]
+    """Corner of the neighbourhood of the anchors, shape (3,); ..."""
+    high_m: NDArray[np.float64]
+    """... and the opposite one."""
+    extent_m: float
+    """Longest edge of the anchors' bounding box."""
+
+    def holds(self, position_m: NDArray[np.float64]) -> bool:
+        """Whether a position, of two or three coordinates, lies in the neighbourhood of the anchors."""
+        return all(self.low_m[axis] <= place <= self.high_m[axis] for axis, place in enumerate(position_m.tolist()))
+
+
+def find_start(
+    window: Sequence[PairTdoa],
+    places_m: Mapping[int, NDArray[np.float64]],
+    calibration: PairCalibration,
+    height_m: float | None,
+    z_bounds_m: tuple[float, float] | None,
+) -> Start | NoSolution:
+    """Solve for the position; medians of each pair keep single outliers out of it.
+
+    Where the residuals are too large, each anchor is left out once: on the floor or behind metal one is often wrong.
+    """
+    grouped: dict[tuple[int, int], list[float]] = {}
+    for pair in window:
+        without_bias_m = pair.tdoa_m - calibration.constant_m(pair)
+        grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(without_bias_m)
+    medians = {pair: float(np.median(group)) for pair, group in grouped.items()}
+    anchors = sorted({anchor for pair in medians for anchor in pair})
+    found = _solve(medians, places_m, height_m, z_bounds_m)
+    best, without = found, None
+    least = np.inf if isinstance(found, NoSolution) else FITS * found.chi2
+    dim = 3 if height_m is None else 2
+    if _is_suspect(found) and len(anchors) > dim + 2:
+        for anchor in anchors:
+            rest = {pair: median for pair, median in medians.items() if anchor not in pair}
+            other = _solve(rest, places_m, height_m, z_bounds_m)
+            if isinstance(other, Solution) and other.dof > 0 and other.chi2 < least:
+                best, without, least = other, anchor, other.chi2
+    if isinstance(best, NoSolution):
+        return best
+    anchors_m = np.array([places_m[anchor] for anchor in anchors])
+    low, high = anchors_m.min(axis=0), anchors_m.max(axis=0)
+    diagonal_m = max(float(np.linalg.norm((high - low)[:2])), LEAST_DIAGONAL_M)
+    reach_m = diagonal_m * np.array([NEIGHBOURHOOD, NEIGHBOURHOOD, STOREYS])
+    centre_m = (low + high) / 2.0
+    start = Start(best, without, centre_m - reach_m, centre_m + reach_m, float((high - low).max()))
+    if not start.holds(best.position_m[:dim]):
+        return NoSolution(NoFixReason.NOT_CONVERGED, "the position lies far from all anchors")
+    return start
+
+
+def _is_suspect(found: Solution | NoSolution) -> bool:
+    if isinstance(found, NoSolution):
+        return found.reason is NoFixReason.RESIDUALS
+    return found.dof > 0 and found.chi2 > MISFIT * found.dof
+
+
+def _solve(
+    medians: Mapping[tuple[int, int], float],
+    places_m: Mapping[int, NDArray[np.float64]],
+    height_m: float | None,
+    z_bounds_m: tuple[float, float] | None,
+) -> Solution | NoSolution:
+    joined = against_reference(list(medians), list(medians.values()), [START_STD_M**2] * len(medians))
+    if not joined.anchors:
+        return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
+    anchors_m = np.array([places_m[anchor] for anchor in joined.anchors])
+    return locate(anchors_m, joined.tdoa_m, joined.covariance_m2, height_m=height_m, z_bounds_m=z_bounds_m)
