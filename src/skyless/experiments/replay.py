@@ -24,7 +24,7 @@ from skyless.positioning.pair_tracking import PairTracking
 from skyless.recordings.formats import Recording, format_of, open_recording
 
 PROFILES: Final[Mapping[str, PairSettings]] = {
-    "miluv": PairSettings(qa=0.1, tdoa_std_m=0.5, gate=3.0),
+    "miluv": PairSettings(qa=0.1, tdoa_std_m=0.5, constant_std_m=0.15, place_std_m=0.15),
 }
 """Settings for formats whose nature asks for others: MILUV's exchanges come once or twice a second, among obstacles."""
 

@@ -53,7 +53,7 @@ CONSTANT_S: Final = 30.0
 """Antenna delays last, but a filter that held them for certain would hold what it took for them as well."""
 
 PLACE_M: Final = 0.5
-PLACE_S: Final = 10.0
+PLACE_S: Final = 100.0
 """What reflections add changes when the tag goes so far, or when people and things have moved for so long."""
 
 NEAREST_M: Final = 0.5
@@ -172,7 +172,8 @@ class PairTracker:
         self.dim = settings.dim
         self._calibration = PairCalibration({}) if calibration is None else calibration
         tdoa_std_m = self._calibration.tdoa_std_m(settings.tdoa_std_m)
-        self.arrays = new_arrays(structs.replace(settings, tdoa_std_m=tdoa_std_m))
+        self.settings = structs.replace(settings, tdoa_std_m=tdoa_std_m)
+        self.arrays = new_arrays(self.settings)
         self.x, self.P, self.statistics = self.arrays.x, self.arrays.P, self.arrays.statistics
         self._constant_std_m = settings.constant_std_m
         self._slot_of: dict[int, int] = {}

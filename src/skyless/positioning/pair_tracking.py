@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from skyless.air.packet import PairTdoa
 from skyless.positioning.fix import Fix, NoFixReason, motion_fix
 from skyless.positioning.pair_calibration import PairCalibration
+from skyless.positioning.pair_rest import Rest
 from skyless.positioning.pair_start import Start, find_start
-from skyless.positioning.pair_state import PairSettings
+from skyless.positioning.pair_state import PairArrays, PairSettings
 from skyless.positioning.pair_tracker import PairTracker
 from skyless.positioning.solver import NoSolution
 
@@ -65,6 +66,7 @@ class PairTracking:
         self._places = {anchor: np.array(place) for anchor, place in anchors_m.items()}
         self._z_bounds_m = z_bounds_m
         self._tracker = PairTracker(settings, self._calibration)
+        self._rest = Rest(self._tracker)
         self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
         self._last_s = 0.0
         self._heard_s: dict[int, float] = {}
@@ -105,6 +107,8 @@ class PairTracking:
         if self._start is None:
             return self._try_start(pair)
         used = self._tracker.hear(pair.anchor_a, pair.anchor_b, a_m, b_m, dt_s, pair.tdoa_m)
+        tracker = self._tracker
+        self._rest.hear(tracker.slot(pair.anchor_a), tracker.slot(pair.anchor_b), a_m, b_m, dt_s, pair.tdoa_m)
         if used:
             self._heard_s[pair.anchor_a] = self._heard_s[pair.anchor_b] = time_s
         else:
@@ -139,17 +143,20 @@ class PairTracking:
     @property
     def position_m(self) -> tuple[float, float, float]:
         """The newest position."""
-        x, _, *z = self._tracker.x[: self._tracker.dim].tolist()
-        return x, float(self._tracker.x[1]), z[0] if z else self._settings.height_m or 0.0
+        x, y, *z = self._believed.x[: self._tracker.dim].tolist()
+        return x, y, z[0] if z else self._settings.height_m or 0.0
+
+    @property
+    def _believed(self) -> PairArrays:
+        """The state that counts: the one at rest while that lasts."""
+        return self._rest.arrays if self._rest.lasts else self._tracker.arrays
 
     def fix(self) -> Fix:
         """The newest position with all that is known of it; only after a ``hear`` that made one."""
         used = [anchor for anchor, when_s in self._heard_s.items() if self._last_s - when_s <= IN_USE_S]
         anchors_m = np.array([self._places[anchor] for anchor in used]).reshape(-1, 3)
-        tracker, height_m = self._tracker, self._settings.height_m
-        return motion_fix(
-            self._last_s, tracker.x, tracker.P, height_m, tuple(used), anchors_m, tracker.statistics, "tracker"
-        )
+        s, height_m = self._believed, self._settings.height_m
+        return motion_fix(self._last_s, s.x, s.P, height_m, tuple(used), anchors_m, s.statistics, "tracker")
 
     def _stop(self) -> None:
         """Forget the state; a new start is looked for."""
@@ -175,6 +182,7 @@ class PairTracking:
         self._tracker.start(solution.position_m[:dim], solution.covariance_m2[:dim, :dim], SPEED_STD_MPS**2)
         if start.without is not None:
             self._tracker.leave_out(start.without)
+        self._rest.begin()
         self._start = start
         self._heard_s = {anchor: pair.time_s for kept in self._window for anchor in (kept.anchor_a, kept.anchor_b)}
         self._window.clear()
