@@ -34,29 +34,29 @@ def trained(skyless, recordings, tmp_path, name):
 
 @pytest.mark.parametrize("trial", [1, 2, 3])
 def test_free_flights_by_each_other(recordings, skyless, tmp_path, trial):
-    """By trial 1 the others are to come to 0.030 and 0.050 m; any other trial that calibrates gives 0.054 at most."""
+    """By trial 1 the others are to come to 0.030 and 0.050 m; any other trial that calibrates gives 0.057 at most."""
     report, anchors = trained(skyless, recordings, tmp_path, f"const1-trial{trial}-tdoa2")
     assert 0.05 < report["slope_m"] < 0.1  # APS011, which is for another channel: 0.03 to 0.10
     for other in {1, 2, 3} - {trial}:
         judged = skyless("replay", *tables(recordings, f"const1-trial{other}-tdoa2"), "--anchors", anchors)
         assert judged["rmse_2d_m"] <= 0.030
-        assert judged["rmse_3d_m"] <= (0.050 if trial == 1 else 0.054)
+        assert judged["rmse_3d_m"] <= (0.050 if trial == 1 else 0.057)
 
 
 def test_free_flights_of_anchors_without_a_schedule(recordings, skyless, tmp_path):
     _, anchors = trained(skyless, recordings, tmp_path, "const1-trial1-tdoa3")
     for other in (2, 3):
         judged = skyless("replay", *tables(recordings, f"const1-trial{other}-tdoa3"), "--anchors", anchors)
-        assert judged["rmse_2d_m"] <= 0.036  # 0.045 to 0.049 before
-        assert judged["rmse_3d_m"] <= 0.075  # 0.107 to 0.119 before
+        assert judged["rmse_2d_m"] <= 0.036  # 0.042 to 0.044 before
+        assert judged["rmse_3d_m"] <= 0.075  # 0.089 to 0.105 before
 
 
 @pytest.mark.parametrize("trial", [3, 5])
 def test_flights_among_obstacles_by_one_without(recordings, skyless, tmp_path, trial):
     _, anchors = trained(skyless, recordings, tmp_path, "const4-trial1-tdoa2-traj1")
     judged = skyless("replay", *tables(recordings, f"const4-trial{trial}-tdoa2-traj1"), "--anchors", anchors)
-    assert judged["rmse_2d_m"] <= 0.080
-    assert judged["rmse_3d_m"] <= 0.18
+    assert judged["rmse_2d_m"] <= 0.072
+    assert judged["rmse_3d_m"] <= 0.15
 
 
 def test_a_calibration_among_obstacles_says_so(recordings, skyless, tmp_path):
@@ -65,19 +65,16 @@ def test_a_calibration_among_obstacles_says_so(recordings, skyless, tmp_path):
 
 
 def test_a_static_listener_by_its_first_thirty_samples(recordings, skyless, tmp_path):
-    """The place that it is found at; single fixes scatter by 0.15 m about it, as 1.4 differences a second come."""
+    """All its fixes: it stands still, and the filter averages for as long as it does. Without calibration 0.21 m."""
     file = recordings / "miluv_passive" / "cirObstaclesOneTag_1_static_0" / "ifo001" / "passive_ticks_u32.csv"
     out = tmp_path / "anchors.csv"
     report = skyless("calibrate", file, "--first", "30", "--out", out)
     assert report["used"] + report["rejected"] == 30
+    before, after = (skyless("replay", file, *more) for more in ((), ("--anchors", out)))
+    assert 0.15 < before["rmse_2d_m"] <= 0.25
+    assert after["rmse_2d_m"] <= 0.09
     truth_m = read_truth(file).position_m.mean(axis=0)[:2]
-    errors = []
-    for more in ((), ("--anchors", out)):
-        judged = skyless("replay", file, *more, "--settle", "30")
-        errors.append((dist(judged["median_m"][:2], truth_m), judged["rmse_2d_m"]))
-    assert errors[0][0] > 0.15
-    assert errors[1][0] <= 0.09
-    assert errors[1][1] < 0.7 * errors[0][1]
+    assert dist(after["median_m"][:2], truth_m) <= 0.05
 
 
 @pytest.mark.parametrize("place", ["truth", "at"])

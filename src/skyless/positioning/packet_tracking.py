@@ -20,7 +20,8 @@ from skyless.positioning.joint_state import RELAYS_REJECTED
 from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.observation import Observation
 from skyless.positioning.pair_calibration import NEAREST_M, NOTHING, PairCalibration
-from skyless.positioning.pair_tracking import MAX_STD_M, NEIGHBOURHOOD
+from skyless.positioning.pair_start import NEIGHBOURHOOD
+from skyless.positioning.pair_tracking import MAX_STD_M
 from skyless.positioning.relay_delays import RelayDelays
 from skyless.ticks import Unwrapper, nearest
 

@@ -20,6 +20,9 @@ from skyless.air.packet import PairTdoa
 LEAST_NOISE_M: Final = 0.05
 """A quieter calibration is not believed further: places it has not seen are somewhat different."""
 
+NEAREST_M: Final = 0.5
+"""Below this range the slope is not followed any more."""
+
 SHARED: Final = 1.5
 """Differences that follow each other share receptions and reflections, which the filter counts as new in each."""
 
@@ -40,6 +43,7 @@ class AnchorCalibration(Struct, frozen=True):
     """Standard deviation of the differences that the anchor takes part in, outliers apart."""
 
 
+NOTHING: Final = AnchorCalibration(0.0)
 UNKNOWN: Final = AnchorCalibration(0.0, TYPICAL_SLOPE_M)
 
 

@@ -3,8 +3,8 @@
 An anchor whose direct path is blocked is late for seconds, often by metres, and a difference does not say which of its
 two anchors is wrong. So for each anchor the filter keeps what the state would err for each metre of lateness since
 lately (``faults``), and with it how well such a fault explains the innovations (the generalised likelihood ratio of
-Willsky and Jones, 1976, with a memory that fades). The anchor that explains them best is left out, what it did to the
-state is taken back, and it comes back when its innovations are ordinary again.
+Willsky and Jones, 1976, with a memory that fades). The anchor that explains them best is left out, the state is doubted
+where the anchor may have moved it, and it comes back when its innovations are ordinary again.
 """
 
 from typing import Final
@@ -75,8 +75,6 @@ READMIT_AT: Final = 2.0
 
 WORTH_GAIN: Final = 0.005
 WORTH_MOST: Final = 9.0
-DOUBT: Final = 0.3
-"""Part of a fault that may remain when it is taken back."""
 
 
 @borrowing_kernel
@@ -154,16 +152,18 @@ def judge_pair(s: PairArrays, innovation: float, spread: float) -> float:
 
 @borrowing_kernel
 def exclude(s: PairArrays, slot: int) -> None:
-    """Leave a faulty anchor out and take back what it did; where none can be spared, the state is beyond repair."""
+    """Leave a faulty anchor out and doubt what it may have done; where none can be spared, the state is beyond repair.
+
+    The state itself stays: while wild innovations were refused, the fault did less than they let think.
+    """
     n = states(s)
     if not _can_be_spared(s):
         s.counts[BEYOND_REPAIR] += 1
         return
     fault_m = s.slots[slot, SUM] / s.slots[slot, INFORMATION]
-    variance = max(1.0 / s.slots[slot, INFORMATION], (DOUBT * fault_m) ** 2)
+    variance = fault_m * fault_m
     for row in range(n):
         error = s.faults[slot, row]
-        s.x[row] -= error * fault_m
         for column in range(n):
             s.P[row, column] += variance * error * s.faults[slot, column]
     s.excluded[slot] = 1

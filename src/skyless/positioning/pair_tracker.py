@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from skyless.compiled import borrowing_kernel
 from skyless.positioning.kalman import horizontal_variance, predict_motion, range_and_direction
-from skyless.positioning.pair_calibration import KNOWN_STD_M, PairCalibration
+from skyless.positioning.pair_calibration import KNOWN_STD_M, NEAREST_M, PairCalibration
 from skyless.positioning.pair_monitor import (
     MISFIT_MOST,
     exclude,
@@ -55,9 +55,6 @@ CONSTANT_S: Final = 30.0
 PLACE_M: Final = 0.5
 PLACE_S: Final = 100.0
 """What reflections add changes when the tag goes so far, or when people and things have moved for so long."""
-
-NEAREST_M: Final = 0.5
-"""Below this range the slope is not followed any more."""
 
 
 @borrowing_kernel
