@@ -37,11 +37,12 @@ class SnifferStream:
         """Packets that are whole with this piece."""
         if self._is_text is None:
             data = self._decide(data)
-        self._in_vain += len(data)
+        else:
+            self._in_vain += len(data)
         for packet in self._packets(data):
             self._in_vain = 0
             yield packet
-        if self._is_text is not None and self._in_vain > UNDECIDED_BYTES:
+        if self._in_vain > UNDECIDED_BYTES:
             self._is_text, self._in_vain = None, 0
 
     def _decide(self, data: bytes) -> bytes:
