@@ -8,6 +8,7 @@ processor, so wherever the same words stand the same bits come out.
 Without the compiler (``NUMBA_DISABLE_JIT=1``) the functions below run as they stand.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -26,6 +27,13 @@ Eight = NDArray[np.float64]
 """Shape (8,)."""
 Place = int | tuple[int, int]
 """Of the first of eight neighbours, in an array of one dimension or, row and column, of two."""
+
+
+def zeros(*shape: int) -> Array:
+    """An array that begins where a line of the processor's cache does, so that no eight lie across two of them."""
+    room = np.zeros(math.prod(shape) + EIGHT)
+    begin = -room.ctypes.data // room.itemsize % EIGHT
+    return room[begin : begin + math.prod(shape)].reshape(shape)
 
 
 def load(array: Array, place: Place) -> Eight:

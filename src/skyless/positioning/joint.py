@@ -11,7 +11,6 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.positioning.joint_algebra import settle
 from skyless.positioning.joint_hearing import FULL, joint_motion, joint_step, joint_track
 from skyless.positioning.joint_monitor import PATIENCE
 from skyless.positioning.joint_state import (
@@ -33,6 +32,7 @@ from skyless.positioning.joint_state import (
     TX_VARIANCE,
     WHOLE,
     Integers,
+    JointArrays,
     Matrix,
     Vector,
     extended,
@@ -41,6 +41,7 @@ from skyless.positioning.joint_state import (
     values,
 )
 from skyless.positioning.joint_sync import NO_SYNCS
+from skyless.positioning.joint_time import move_base
 from skyless.positioning.kalman import horizontal_variance
 from skyless.positioning.protection import RISK, limits_of
 from skyless.positioning.protection_levels import LEVELS
@@ -227,9 +228,9 @@ class JointFilter:
         self.arrays = extended(self.arrays, 2 * len(self.arrays.slots), len(self.arrays.site_m))
 
     def covariance(self) -> Matrix:
-        """Of all states in use, values as of the base."""
-        s = self.arrays._replace(P=self.arrays.P.copy(), noise=self.arrays.noise.copy())
-        settle(s)
+        """Of all states in use, at the newest message."""
+        s = JointArrays._make(array.copy() for array in self.arrays)
+        move_base(s, int(s.counts[EPOCH]))
         n = states(s)
         return s.P[:n, :n]
 

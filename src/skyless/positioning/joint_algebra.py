@@ -11,7 +11,7 @@ product with h stands beside P·h, and each term has its responses beside u.
 import numpy as np
 
 from skyless.compiled import borrowing_kernel
-from skyless.eights import EIGHT, add, load, scaled, store
+from skyless.eights import EIGHT, add, load, repeated, scaled, store
 from skyless.positioning.joint_state import (
     CLOCK_CROSS,
     CLOCK_RATE,
@@ -132,27 +132,48 @@ def take(s: JointArrays, term: int, innovation: float, spread: float, own: int) 
 @borrowing_kernel
 def add_terms(s: JointArrays) -> None:
     """Add all terms to the covariance, and to the sensitivities."""
-    _add_terms(s, s.P, s.terms, width(s))
-    _add_terms(s, s.sensitivities, s.responses, lanes(s))
+    count, u, r = s.counts[TERMS], s.terms, s.responses
+    for k in range(count, _in_terms(count)):  # terms of nothing
+        for column in range(0, width(s), EIGHT):
+            store(u, (k, column), repeated(0.0))
+        for column in range(0, lanes(s), EIGHT):
+            store(r, (k, column), repeated(0.0))
+    k = 0
+    while count - k > 2:
+        _add_four(s, s.P, u, k, width(s))
+        _add_four(s, s.sensitivities, r, k, lanes(s))
+        k += 4
+    if k < count:
+        _add_two(s, s.P, u, k, width(s))
+        _add_two(s, s.sensitivities, r, k, lanes(s))
     s.counts[TERMS] = 0
 
 
 @borrowing_kernel
-def _add_terms(s: JointArrays, matrix: Matrix, terms: Matrix, columns: int) -> None:
-    """Four rows at a time, of which the last may be beyond the states in use, where terms are zero."""
-    u, count, n = s.terms, s.counts[TERMS], states(s)
+def _in_terms(count: int) -> int:
+    """So many terms in whole fours, and two at the end where that is enough."""
+    return (count + 1) // 4 * 4 + (2 if 0 < count % 4 < 3 else 0)
+
+
+@borrowing_kernel
+def _add_four(s: JointArrays, matrix: Matrix, terms: Matrix, k: int, columns: int) -> None:
+    u, n = s.terms, states(s)
     for column in range(0, columns, EIGHT):
-        for row in range(0, n, 4):
-            a, b = load(matrix, (row, column)), load(matrix, (row + 1, column))
-            c, d = load(matrix, (row + 2, column)), load(matrix, (row + 3, column))
-            for k in range(count):
-                term = load(terms, (k, column))
-                a, b = add(a, -u[k, row], term), add(b, -u[k, row + 1], term)
-                c, d = add(c, -u[k, row + 2], term), add(d, -u[k, row + 3], term)
-            store(matrix, (row, column), a)
-            store(matrix, (row + 1, column), b)
-            store(matrix, (row + 2, column), c)
-            store(matrix, (row + 3, column), d)
+        a, b = load(terms, (k, column)), load(terms, (k + 1, column))
+        c, d = load(terms, (k + 2, column)), load(terms, (k + 3, column))
+        for row in range(n):
+            total = add(add(load(matrix, (row, column)), -u[k, row], a), -u[k + 1, row], b)
+            store(matrix, (row, column), add(add(total, -u[k + 2, row], c), -u[k + 3, row], d))
+
+
+@borrowing_kernel
+def _add_two(s: JointArrays, matrix: Matrix, terms: Matrix, k: int, columns: int) -> None:
+    u, n = s.terms, states(s)
+    for column in range(0, columns, EIGHT):
+        a, b = load(terms, (k, column)), load(terms, (k + 1, column))
+        for row in range(n):
+            total = add(load(matrix, (row, column)), -u[k, row], a)
+            store(matrix, (row, column), add(total, -u[k + 1, row], b))
 
 
 @borrowing_kernel

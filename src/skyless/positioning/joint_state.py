@@ -6,7 +6,7 @@ States stand in three blocks, each packed, so that rows are worked on whole and 
     rates   velocity (dim), then the rate of each offset, m/s
     noises  the noise of an anchor's last TX stamp, in metres, of those anchors whose packets others relay
 
-Values are kept as of the time ``BASE``, a few milliseconds back: at time t a value is ``value + (t − BASE)·rate``. So
+Values are kept as of the time ``BASE``, up to 50 ms back: at time t a value is ``value + (t − BASE)·rate``. So
 time passes without touching the covariance but for its noise, and the base is moved on now and then. The tag's clock is
 the reference of all offsets; no anchor is special, none is ever changed for another.
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.compiled import borrowing_kernel
-from skyless.eights import EIGHT
+from skyless.eights import EIGHT, zeros
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -140,9 +140,9 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
     states = in_eights(2 * int(settings[DIM]) + 3 * capacity)
     columns = in_eights(capacity)
     return JointArrays(
-        x=np.zeros(states),
-        P=np.zeros((states, states)),
-        terms=np.zeros((MOST_TERMS, states)),
+        x=zeros(states),
+        P=zeros(states, states),
+        terms=zeros(MOST_TERMS, states),
         along=np.zeros(MOST_TERMS),
         noise=np.zeros(6),
         h_places=np.zeros(MOST_PLACES, np.int64),
@@ -156,9 +156,9 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
         slot_of=np.full(site_capacity, -1, np.int64),
         settings=settings,
         site_m=np.zeros((site_capacity, 3)),
-        sensitivities=np.zeros((states, columns)),
-        responses=np.zeros((MOST_TERMS, columns)),
-        evidence=np.zeros((2 * EVIDENCE + 1, columns)),
+        sensitivities=zeros(states, columns),
+        responses=zeros(MOST_TERMS, columns),
+        evidence=zeros(2 * EVIDENCE + 1, columns),
         recent=np.zeros(3),
     )
 

@@ -26,8 +26,8 @@ from skyless.positioning.joint_state import (
 from skyless.positioning.protection_updates import fade_evidence
 from skyless.positioning.tracker import AGILITY
 
-REBASE_S: Final = 0.015
-"""Age at which the base of the values is moved on; the offsets move by tens of metres until then."""
+REBASE_S: Final = 0.05
+"""Age at which the base of the values is moved on; the offsets move by hundreds of metres until then."""
 
 
 @borrowing_kernel
@@ -36,8 +36,7 @@ def elapse(s: JointArrays, rx_ticks: int) -> None:
     dt_s = (rx_ticks - s.counts[EPOCH]) * TICK_S
     tau_s = (rx_ticks - s.counts[BASE]) * TICK_S
     if tau_s > REBASE_S:
-        _move_base(s, tau_s)
-        s.counts[BASE] = rx_ticks
+        move_base(s, rx_ticks)
         tau_s = 0.0
     s.counts[EPOCH] = rx_ticks
     fade_evidence(s)
@@ -66,9 +65,11 @@ def _noise_at_base(white: float, rate: float, dt_s: float, tau_s: float) -> tupl
 
 
 @borrowing_kernel
-def _move_base(s: JointArrays, tau_s: float) -> None:
-    """Give all values as of a base later by ``tau_s``: F·P·Fᵀ."""
+def move_base(s: JointArrays, rx_ticks: int) -> None:
+    """Give all values as of a later base: F·P·Fᵀ."""
     settle(s)
+    tau_s = (rx_ticks - s.counts[BASE]) * TICK_S
+    s.counts[BASE] = rx_ticks
     x, P, half, n = s.x, s.P, values(s), states(s)
     for place in range(half):
         x[place] += tau_s * x[half + place]
