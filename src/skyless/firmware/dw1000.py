@@ -1,0 +1,720 @@
+"""Driver of the DW1000, for MicroPython and CPython alike: integers only, and nothing is allocated per frame.
+
+Written from the DW1000 User Manual v2.12 ("UM", pages of that version); ``docs/dw1000.md`` says which table was held
+against which other source. It has never run on a chip. What it needs of the hardware is a ``Bus``.
+
+States, in ``DW1000.state``:
+
+    OFF         nothing is known of the chip. ``start`` resets and configures it, and leaves it IDLE.
+    IDLE        the radio does nothing. ``receive`` turns the receiver on.
+    LISTENING   the receiver is on, and stays on: after each frame, after each error, after each transmission.
+    SENDING     a frame waits for its time or is on its way. The receiver is off all that while (one DX_TIME, one
+                transceiver), so ``transmit_at`` is to be called as late as it safely can. Ends with SENT from
+                ``poll``, or with ``cancel``.
+
+``poll`` is to be called when the interrupt line is high, or now and then; it tells what happened as a sum of RECEIVED,
+SENT, FAILED, CLOCK_SLIPPED and LOST, and has already turned the receiver on again. Until the next ``poll``, what was
+received stands in ``rx_ticks``, ``frame[:frame_bytes]``, ``rx_power_cdbm``, ``first_path_cdbm`` and ``offset_ppb``, the
+stamp of what was SENT in ``tx_ticks``. Where SENT does not come 1 ms after its time, ``cancel``. After LOST the chip is
+OFF and counts anew: ``start`` again. Before ``transmit_at`` poll once, or a frame that has just come is lost.
+
+Stamps are raw 40-bit ticks in 5 bytes, the lowest first, as the chip has them; they are never numbers here.
+"""
+
+try:
+    import micropython
+except ImportError:
+
+    class _Plain:
+        """Stands in for MicroPython's module where there is none."""
+
+        @staticmethod
+        def viper(function):  # noqa: ANN001, ANN205 - of any kind
+            """Leave the function as it is."""
+            return function
+
+    micropython = _Plain
+    ptr8 = bytearray
+
+OFF = 0
+IDLE = 1
+LISTENING = 2
+SENDING = 3
+"""States."""
+
+RECEIVED = 1
+SENT = 2
+FAILED = 4
+CLOCK_SLIPPED = 8
+LOST = 16
+"""What ``poll`` tells: a frame has come, ours has left; a reception came to nothing; the clock's PLL was losing lock
+(the stamps around are doubtful); the chip does not answer or was reset."""
+
+QUEUED = 0
+LATE = 1
+BUSY = 2
+NOT_READY = 3
+"""What ``transmit_at`` tells: the frame will leave at its time; or nothing is sent, because it came too late, another
+frame waits, or the chip is OFF."""
+
+NOT_TOLD = -32768
+"""A measured value that there is not."""
+MIN_PSDU_BYTES = 3
+MAX_PSDU_BYTES = 127
+"""FCS included, which the chip makes and checks (UM p. 80)."""
+
+DEVICE_ID = b"\x30\x01\xca\xde"
+"""DEV_ID 0xDECA0130, low byte first (UM 7.2.2)."""
+
+# SYS_STATUS (UM 7.2.17, pp. 86-92), bits 0 to 23 as one number; octets 3 and 4 apart, for numbers stay below 2**30.
+CPLOCK = 1 << 1
+TXFRS = 1 << 7
+LDEDONE = 1 << 10
+RXPHE = 1 << 12
+RXFCG = 1 << 14
+RXFCE = 1 << 15
+RXRFSL = 1 << 16
+RXRFTO = 1 << 17
+LDEERR = 1 << 18
+RXOVRR = 1 << 20
+RXPTO = 1 << 21
+RX_ERRORS = RXPHE | RXFCE | RXRFSL | RXRFTO | LDEERR | RXOVRR | RXPTO
+CLKPLL_LL_3 = 1 << 1
+RXSFDTO_3 = 1 << 2
+HPDWARN_3 = 1 << 3
+AFFREJ_3 = 1 << 5
+RX_ERRORS_3 = RXSFDTO_3 | AFFREJ_3
+TXPUTE_4 = 1 << 2
+UNUSED_4 = 0xF8
+"""Bits of SYS_STATUS; _3 and _4 are within octet 3 and 4."""
+
+CLEARED = b"\xf8\xff\xff\x37\x07"
+"""What is written back to SYS_STATUS at most: not CPLOCK, which says that the chip still runs as it was started, nor
+bits that cannot be written."""
+
+# SYS_CTRL (UM 7.2.15, pp. 80-84)
+TXSTRT_TXDLYS = 0x06
+TRXOFF = 0x40
+RXENAB = 0x0100
+
+SYS_MASK_EVENTS = (TXFRS | RXFCG | RX_ERRORS, CLKPLL_LL_3 | RX_ERRORS_3)
+"""Which events raise the interrupt line: octets 0 to 2, octet 3 (UM 7.2.16)."""
+
+TX_FCTRL = 0x0016_C000
+"""6.8 Mbit/s (TXBR 2), ranging bit, PRF 64 MHz (TXPRF 2), 128 symbols (TXPSR 1, PE 1); the length is added
+(UM 7.2.10, Table 16)."""
+
+TX_POWER = 0x2545_6585
+"""Smart power, channel 5, PRF 64 MHz: the manual's reference values (UM 7.2.31, Tables 19 and 20). A beacon of up to
+67 bytes takes the third octet; the rule behind it is one frame per millisecond."""
+
+CONFIGURATION = (
+    # file, sub-address, octets, value; channel 5, PRF 64 MHz, 6.8 Mbit/s, preamble of 128 symbols with code 9
+    (0x04, 0x00, 4, 0x0000_1200),  # SYS_CFG: IRQ high, one RX buffer, smart power, no filter, no RXAUTR (UM 7.2.6)
+    (0x1F, 0x00, 4, 0x4A48_0055),  # CHAN_CTRL: channels 5, RXPRF 2, codes 9, standard SFD (UM 7.2.32)
+    (0x08, 0x00, 4, TX_FCTRL),
+    (0x23, 0x04, 2, 0x889B),  # AGC_TUNE1 (UM 7.2.36, Table 24)
+    (0x23, 0x0C, 4, 0x2502_A907),  # AGC_TUNE2 (Table 25)
+    (0x23, 0x12, 2, 0x0035),  # AGC_TUNE3 (Table 26)
+    (0x27, 0x02, 2, 0x0001),  # DRX_TUNE0b: 6.8 Mbit/s, standard SFD (UM 7.2.40.2, Table 30)
+    (0x27, 0x04, 2, 0x008D),  # DRX_TUNE1a: PRF 64 (7.2.40.3, Table 31)
+    (0x27, 0x06, 2, 0x0020),  # DRX_TUNE1b: preambles of 128 to 1024 (7.2.40.4, Table 32)
+    (0x27, 0x08, 4, 0x313B_006B),  # DRX_TUNE2: PRF 64, PAC 8 (7.2.40.5, Table 33; PAC 8 for 128 symbols: Table 6)
+    (0x27, 0x20, 2, 129),  # DRX_SFDTOC: preamble + 1 + SFD - PAC = 128 + 1 + 8 - 8; never 0 (7.2.40.7)
+    (0x27, 0x26, 2, 0x0028),  # DRX_TUNE4H: preambles from 128 (7.2.40.10, Table 34)
+    (0x28, 0x0B, 1, 0xD8),  # RF_RXCTRLH: channel 5 (UM 7.2.41, Table 37)
+    (0x28, 0x0C, 4, 0x001E_3FE0),  # RF_TXCTRL: channel 5 (Table 38)
+    (0x2A, 0x0B, 1, 0xC0),  # TC_PGDELAY: channel 5 (UM 7.2.43, Table 40)
+    (0x2B, 0x07, 4, 0x0800_041D),  # FS_PLLCFG: channel 5 (UM 7.2.44, Table 43)
+    (0x2B, 0x0B, 1, 0xBE),  # FS_PLLTUNE: channel 5 (Table 44)
+    (0x2E, 0x0806, 1, 0x6D),  # LDE_CFG1: PMULT 3, NTM 13 (UM 7.2.47.2, 2.5.5.4)
+    (0x2E, 0x1806, 2, 0x0607),  # LDE_CFG2: PRF 64 (7.2.47.6, 2.5.5.5)
+    (0x2E, 0x2804, 2, 0x28F4),  # LDE_REPC: code 9 (7.2.47.7)
+)
+
+# Addresses in the one-time programmable memory (UM 6.3, Table 10)
+OTP_LDOTUNE = 0x04
+OTP_PART_ID = 0x06
+OTP_LOT_ID = 0x07
+OTP_VOLTAGE = 0x08
+OTP_TEMPERATURE = 0x09
+OTP_CRYSTAL_TRIM = 0x1E
+
+RESET_US = 5000
+"""From the release of RSTn until the chip is in INIT (data sheet 5.6: some 3 ms)."""
+LDE_LOAD_US = 300
+"""The microcode's load takes 150 µs (UM 2.5.5.10, Table 4)."""
+LOCK_TRIES = 50
+LDE_TRIES = 10
+"""How often 100 µs for the PLL's lock, and 20 µs for the first path's search, are waited for."""
+
+SFD_ACCUMULATED = 5
+"""Symbols of the standard SFD in RXPACC where it did not saturate (UM 7.2.18, p. 95, Table 18)."""
+POWER_A = 1_217_400
+"""The constant A at PRF 64 MHz, 121.74 dB, in 1e-4 dB (UM 4.7.1, p. 46)."""
+LOG10_2 = 30_103
+COUNT_MASK = 0x3FFF_FFFF
+
+# fmt: off
+_LOG10 = (
+    0, 1336, 2633, 3892, 5115, 6305, 7463, 8591, 9691, 10763, 11810,
+    12832, 13830, 14806, 15761, 16695, 17609, 18505, 19382, 20242, 21085, 21913,
+    22724, 23521, 24304, 25072, 25828, 26570, 27300, 28018, 28724, 29419, 30103,
+)
+# fmt: on
+"""100 000 log10(1 + i/32)."""
+
+_BIAS_MM = (-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86)
+"""How far off a received stamp is at -61, -63 … -95 dBm (Decawave APS011, Table 2: 500 MHz, PRF 64 MHz)."""
+
+
+class ChipError(Exception):
+    """There is no DW1000 on the bus, or it does not start; the message says what was found."""
+
+
+class Bus:
+    """What the driver asks of the hardware. Buffers belong to the driver; nothing may be kept of them."""
+
+    def transfer(self, out: memoryview, into: memoryview) -> None:
+        """One SPI transaction (mode 0) in both directions; both have the same length."""
+        raise NotImplementedError
+
+    def write(self, header: memoryview, data: memoryview) -> None:
+        """One SPI transaction that sends the header and, without a pause of the chip select, the data."""
+        raise NotImplementedError
+
+    def slow(self) -> None:
+        """Clock at most 3 MHz from now on: the chip's PLL has no lock (UM 2.3.2)."""
+        raise NotImplementedError
+
+    def fast(self) -> None:
+        """Clock at most 20 MHz from now on."""
+        raise NotImplementedError
+
+    def reset(self) -> bool:
+        """Pull RSTn low for a moment and let go (never drive it high); False where it is not wired."""
+        return False
+
+    def pause_us(self, microseconds: int) -> None:
+        """Wait at least so long."""
+        raise NotImplementedError
+
+
+def header(is_write: bool, file: int, sub: int) -> bytes:
+    """Header of one to three octets of an SPI transaction (UM 2.2.1.2, pp. 11-13)."""
+    first = file | (0x80 if is_write else 0)
+    if sub == 0:
+        return bytes((first,))
+    if sub < 0x80:
+        return bytes((first | 0x40, sub))
+    return bytes((first | 0x40, 0x80 | (sub & 0x7F), sub >> 7))
+
+
+class _Reading:
+    """A register that is read again and again; ``data`` is what was read."""
+
+    def __init__(self, file: int, sub: int, size: int) -> None:
+        head = header(False, file, sub)
+        self.out = memoryview(bytearray(head + bytes(size)))
+        self.into = memoryview(bytearray(len(head) + size))
+        self.data = self.into[len(head) :]
+
+
+class _Writing:
+    """A register that is written again and again; ``data`` is what will be."""
+
+    def __init__(self, file: int, sub: int, content: bytes) -> None:
+        self.header = memoryview(header(True, file, sub))
+        self.data = memoryview(bytearray(content))
+
+
+@micropython.viper
+def copy(source: ptr8, at: int, end: int, out: ptr8) -> int:
+    """Copy ``source[at:end]`` to the beginning of ``out``; return how much that is."""
+    fill = 0
+    while at < end:
+        out[fill] = source[at]
+        at += 1
+        fill += 1
+    return fill
+
+
+def log10(value: int) -> int:
+    """100 000 log10 of a number from 1 to 2**30 - 1, to 8 of its units."""
+    exponent = 15
+    while value >= 0x10000:
+        value >>= 1
+        exponent += 1
+    while value < 0x8000:
+        value <<= 1
+        exponent -= 1
+    place = (value - 0x8000) >> 10
+    low = _LOG10[place]
+    return exponent * LOG10_2 + low + ((_LOG10[place + 1] - low) * (value & 0x3FF) >> 10)
+
+
+def power_cdbm(cir_power: int, symbols: int) -> int:
+    """Received power in 0.01 dBm from CIR_PWR and the accumulated symbols (UM 4.7.2), or NOT_TOLD."""
+    if cir_power == 0 or symbols <= 0:
+        return NOT_TOLD
+    return (log10(cir_power) + 17 * LOG10_2 - 2 * log10(symbols) - POWER_A + 50) // 100
+
+
+def first_path_cdbm(f1: int, f2: int, f3: int, symbols: int) -> int:
+    """First path's power in 0.01 dBm from three amplitudes of 16 bits and the symbols (UM 4.7.1), or NOT_TOLD."""
+    scale = -2 * LOG10_2
+    while True:
+        scale += 2 * LOG10_2
+        if f1 < 0x4000 and f2 < 0x4000 and f3 < 0x4000:
+            break
+        f1 >>= 1
+        f2 >>= 1
+        f3 >>= 1
+    squares = f1 * f1 + f2 * f2 + f3 * f3
+    if squares == 0 or symbols <= 0:
+        return NOT_TOLD
+    return (log10(squares) + scale - 2 * log10(symbols) - POWER_A + 50) // 100
+
+
+def carrier_offset_ppb(integrator: int) -> int:
+    """The sender's carrier against ours in 1e-9 from DRX_CAR_INT; positive: the sender is fast (UM p. 151, Table 35).
+
+    One step is -1e9 / (6.5 · 2**28) = -0.57311 of them on channel 5. NOT_TOLD beyond 32 767.
+    """
+    if integrator > 57_170 or integrator < -57_170:
+        return NOT_TOLD
+    return (8192 - integrator * 9390) >> 14
+
+
+def clock_offset_ppb(offset: int) -> int:
+    """The sender's clock against ours in 1e-9 from RXTOFS, over RXTTCKI = 0x01FC0000; positive: fast (UM p. 99)."""
+    if offset > 1090 or offset < -1090:
+        return NOT_TOLD
+    return (offset * 30_037 + 500) // 1000
+
+
+def bias_ticks(rx_power_cdbm: int) -> int:
+    """How many ticks late a stamp is at that power: straight lines between the values of APS011, held beyond them."""
+    place = -6100 - rx_power_cdbm
+    place = 0 if place < 0 else 3399 if place > 3399 else place
+    at = place // 200
+    low = _BIAS_MM[at]
+    parts = low * 200 + (_BIAS_MM[at + 1] - low) * (place - at * 200)
+    return (parts * 1000 + 469_176) // 938_353  # a tick is 4.691764 mm
+
+
+def add_ticks(ticks: bytearray | memoryview, change: int) -> None:
+    """Add a number of less than 24 bits to a stamp of 5 bytes, modulo 2**40."""
+    for at in range(5):
+        change += ticks[at]
+        ticks[at] = change & 0xFF
+        change >>= 8
+
+
+def micros_until(now: bytearray | memoryview, then: bytearray | memoryview) -> int:
+    """From one stamp to another in 65 536 ticks (1.026 µs), negative if it was before; at most 8.6 s."""
+    distance = (then[2] | then[3] << 8 | then[4] << 16) - (now[2] | now[3] << 8 | now[4] << 16)
+    distance &= 0xFF_FFFF
+    return distance - 0x100_0000 if distance & 0x80_0000 else distance
+
+
+class DW1000:
+    """One chip. Counts wrap at 30 bits. ``errors`` are those receptions that came to nothing, of any kind."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.state = OFF
+        self.measuring = True
+        """Whether power and carrier offset are read with each frame: two transactions more."""
+        self.correct_bias = False
+        """Whether ``rx_ticks`` are corrected for received power (APS011); needs ``measuring``."""
+        self.received = 0
+        self.errors = 0
+        self.sent = 0
+        self.late = 0
+        self.error_status = 0
+        """SYS_STATUS, octets 0 to 2, of the last error; 0 for a frame that was too short."""
+        self.frame_bytes = 0
+        self.rx_power_cdbm = NOT_TOLD
+        self.first_path_cdbm = NOT_TOLD
+        self.offset_ppb = NOT_TOLD
+        self.carrier_integrator = 0
+        self.temperature_cc = NOT_TOLD
+        self.millivolts = 0
+        """Of the last ``measure``."""
+        self.identity = bytes(8)
+        """Part and lot number, from ``start``."""
+        self._bus = bus
+        self._listening = False
+        self._temperature_23 = 0
+        self._voltage_33 = 0
+        self._make_registers()
+
+    def _make_registers(self) -> None:
+        """All buffers that frames pass through."""
+        self._status = _Reading(0x0F, 0, 5)
+        self._frame_info = _Reading(0x10, 0, 4)
+        self._quality = _Reading(0x12, 0, 8)
+        self._tracking = _Reading(0x14, 0, 3)
+        self._rx_time = _Reading(0x15, 0, 9)
+        self._tx_time = _Reading(0x17, 0, 5)
+        self._time = _Reading(0x06, 0, 5)
+        self._carrier = _Reading(0x27, 0x28, 6)
+        self._rx_buffer = _Reading(0x11, 0, 128)
+        self.rx_ticks = self._rx_time.data[:5]
+        self.tx_ticks = self._tx_time.data
+        self.now_ticks = self._time.data
+        self.frame = self._rx_buffer.data
+        # Slices allocate, so those that frames need are made beforehand, in steps of 8 bytes.
+        self._rx_outs = [self._rx_buffer.out[: 1 + end] for end in range(0, 129, 8)]
+        self._rx_intos = [self._rx_buffer.into[: 1 + end] for end in range(0, 129, 8)]
+        self._tx_buffer = _Writing(0x09, 0, bytes(128))
+        self._tx_parts = [self._tx_buffer.data[:end] for end in range(0, 129, 8)]
+        self._tx_control = _Writing(0x08, 0, TX_FCTRL.to_bytes(4, "little"))
+        self._dx = _Writing(0x0A, 0, bytes(5))
+        self._clear_status = _Writing(0x0F, 0, bytes(5))
+        self._transmit = _Writing(0x0D, 0, bytes((TXSTRT_TXDLYS,)))
+        self._off = _Writing(0x0D, 0, bytes((TRXOFF,)))
+        self._enable = _Writing(0x0D, 0, RXENAB.to_bytes(2, "little"))
+        self._reset_rx = _Writing(0x36, 3, b"\xe0")
+        self._reset_none = _Writing(0x36, 3, b"\xf0")
+
+    # Starting; this may allocate
+
+    def start(
+        self, tx_antenna_delay: int, rx_antenna_delay: int, tx_power: int = TX_POWER, crystal_trim: int = -1
+    ) -> None:
+        """Reset and configure the chip; antenna delays of 16 bits in ticks, crystal trim from OTP unless it is given.
+
+        Raises:
+            ChipError: no DW1000 answers, or its clock does not lock.
+        """
+        self.state = OFF
+        self._listening = False
+        self._bus.slow()
+        if self._bus.reset():
+            self._bus.pause_us(RESET_US)
+        self._identify("")
+        self._soft_reset()
+        self._calibrate(crystal_trim)
+        self._load_microcode()
+        self._wait_for_lock()
+        self._bus.fast()
+        self._identify(" at full speed")
+        for file, sub, size, value in CONFIGURATION:
+            self._put(file, sub, size, value)
+        self._put(0x1E, 0, 4, tx_power)
+        self.set_antenna_delays(tx_antenna_delay, rx_antenna_delay)
+        self._put(0x0E, 0, 4, SYS_MASK_EVENTS[0] | SYS_MASK_EVENTS[1] << 24)
+        self._off_and_clear()
+        self.state = IDLE
+
+    def set_antenna_delays(self, tx_ticks: int, rx_ticks: int) -> None:
+        """TX_ANTD (UM 7.2.26, p. 103) and LDE_RXANTD (7.2.47.5), which the chip takes into all its stamps."""
+        self._put(0x18, 0, 2, tx_ticks)
+        self._put(0x2E, 0x1804, 2, rx_ticks)
+
+    def _put(self, file: int, sub: int, size: int, value: int) -> None:
+        content = bytes([value >> 8 * place & 0xFF for place in range(size)])
+        self._bus.write(memoryview(header(True, file, sub)), memoryview(content))
+
+    def _get(self, file: int, sub: int, size: int) -> bytes:
+        reading = _Reading(file, sub, size)
+        self._bus.transfer(reading.out, reading.into)
+        return bytes(reading.data)
+
+    def _identify(self, when: str) -> None:
+        found = self._get(0x00, 0, 4)
+        if found != DEVICE_ID:
+            number = "".join(["%02X" % found[place] for place in (3, 2, 1, 0)])  # noqa: UP031 - MicroPython too
+            raise ChipError("no DW1000" + when + ": its identifier is DECA0130, read was " + number)
+
+    def _soft_reset(self) -> None:
+        """Crystal clock; nothing to be restored by the always-on block; SOFTRESET (UM 7.2.50.1, 7.2.45)."""
+        self._put(0x36, 0, 2, 0x0201)  # PMSC_CTRL0: SYSCLKS 1
+        self._put(0x2C, 0x00, 2, 0)  # AON_WCFG
+        self._put(0x2C, 0x06, 1, 0)  # AON_CFG0: no sleep
+        self._put(0x2C, 0x02, 1, 0)  # AON_CTRL
+        self._put(0x2C, 0x02, 1, 0x02)  # AON_CTRL: SAVE
+        self._put(0x36, 3, 1, 0x00)
+        self._bus.pause_us(1000)
+        self._put(0x36, 3, 1, 0xF0)
+        self._bus.pause_us(1000)
+        self._put(0x36, 0, 2, 0x0201)
+
+    def _read_otp(self, address: int) -> bytes:
+        """One word of the one-time programmable memory (UM 6.3.2, 7.2.46)."""
+        self._put(0x2D, 0x04, 2, address)
+        self._put(0x2D, 0x06, 1, 0x03)  # OTP_CTRL: OTPRDEN, OTPREAD
+        self._put(0x2D, 0x06, 1, 0x00)
+        return self._get(0x2D, 0x0A, 4)
+
+    def _calibrate(self, crystal_trim: int) -> None:
+        """What was measured when the chip or module was made: supply, crystal, temperature (UM 2.5.5.11, 8.1, 6.4)."""
+        self._put(0x24, 0x00, 4, 0x04)  # EC_CTRL: PLLLDT, without which CPLOCK means nothing (UM 7.2.37.1)
+        if self._read_otp(OTP_LDOTUNE)[0] != 0:
+            self._put(0x2D, 0x12, 1, 0x02)  # OTP_SF: LDO_KICK
+        self._voltage_33 = self._read_otp(OTP_VOLTAGE)[0]
+        self._temperature_23 = self._read_otp(OTP_TEMPERATURE)[0]
+        self.identity = self._read_otp(OTP_PART_ID) + self._read_otp(OTP_LOT_ID)
+        trim = self._read_otp(OTP_CRYSTAL_TRIM)[0] & 0x1F if crystal_trim < 0 else crystal_trim & 0x1F
+        if trim == 0 and crystal_trim < 0:
+            trim = 0x10  # not trimmed: mid-range
+        self._put(0x2B, 0x0E, 1, 0x60 | trim)  # FS_XTALT: the upper three bits are 011 (UM 7.2.44.5)
+
+    def _load_microcode(self) -> None:
+        """The leading-edge search, without which there are no RX stamps (UM 2.5.5.10, Table 4)."""
+        self._put(0x36, 0, 2, 0x0301)
+        self._put(0x2D, 0x06, 2, 0x8000)  # OTP_CTRL: LDELOAD
+        self._bus.pause_us(LDE_LOAD_US)
+
+    def _wait_for_lock(self) -> None:
+        self._put(0x36, 0, 2, 0x0200)  # PMSC_CTRL0: clocks by themselves
+        for _ in range(LOCK_TRIES):
+            self._bus.pause_us(100)
+            if self._get(0x0F, 0, 5)[0] & CPLOCK:
+                return
+        raise ChipError("the DW1000's clock does not lock: is its crystal or supply sound?")
+
+    # Running; nothing of this allocates, but for measure
+
+    def receive(self) -> None:
+        """Listen from now on; a frame that waits to be sent is sent before."""
+        if self.state == OFF:
+            return
+        self._listening = True
+        if self.state == IDLE:
+            self._resume()
+
+    def stop(self) -> None:
+        """Leave LISTENING or SENDING for IDLE, whatever is under way."""
+        if self.state != OFF:
+            self._listening = False
+            self._off_and_clear()
+            self.state = IDLE
+
+    def transmit_at(self, dx: bytearray | memoryview, frame: bytearray | memoryview, at: int, end: int) -> int:
+        """Send the PSDU ``frame[at:end]`` when the counter is at ``dx``; QUEUED, or why not.
+
+        ``dx`` has 5 bytes; its low nine bits count for nothing (UM p. 26). The stamp will be that + the TX antenna
+        delay. The last two bytes are replaced by the FCS, which the chip makes.
+
+        Raises:
+            ValueError: no PSDU has this length.
+        """
+        size = end - at
+        if size < MIN_PSDU_BYTES or size > MAX_PSDU_BYTES:
+            raise ValueError("a PSDU has 3 to 127 bytes")
+        if self.state == OFF:
+            return NOT_READY
+        if self.state == SENDING:
+            return BUSY
+        bus = self._bus
+        copy(frame, at, end - 2, self._tx_buffer.data)
+        bus.write(self._tx_buffer.header, self._tx_parts[(size + 5) >> 3])
+        self._tx_control.data[0] = size
+        bus.write(self._tx_control.header, self._tx_control.data)
+        copy(dx, 0, 5, self._dx.data)
+        self._dx.data[0] = 0
+        self._dx.data[1] &= 0xFE
+        bus.write(self._dx.header, self._dx.data)
+        self._off_and_clear()
+        bus.write(self._transmit.header, self._transmit.data)
+        self.state = SENDING
+        return self._was_in_time()
+
+    def _was_in_time(self) -> int:
+        """Look whether the frame will leave when it should, and take it back if not (UM pp. 27, 91, 92).
+
+        HPDWARN: its time has passed, and it would leave after 17 s. TXPUTE: the transmitter had no time to power up;
+        the stamp would be right, but the preamble is damaged. What is already out when TRXOFF comes counts as sent.
+        """
+        status = self._read_status()
+        if status[0] & TXFRS or not (status[3] & HPDWARN_3 or status[4] & TXPUTE_4):
+            return QUEUED
+        if not self.cancel():
+            return QUEUED
+        self.late = (self.late + 1) & COUNT_MASK
+        return LATE
+
+    def cancel(self) -> bool:
+        """Take back a frame that has not been sent; False where it has, which the next ``poll`` will tell."""
+        if self.state != SENDING:
+            return True
+        self._bus.write(self._off.header, self._off.data)
+        if self._read_status()[0] & TXFRS:
+            return False
+        self._resume()
+        return True
+
+    def poll(self) -> int:
+        """What has happened since: a sum of RECEIVED, SENT, FAILED, CLOCK_SLIPPED, LOST; 0 for nothing."""
+        if self.state == OFF:
+            return LOST
+        status = self._read_status()
+        seen = status[0] | status[1] << 8 | status[2] << 16
+        if (not seen & CPLOCK or status[4] & UNUSED_4) and self._is_lost():
+            self.state = OFF
+            self._listening = False
+            return LOST
+        events = 0
+        if status[3] & CLKPLL_LL_3:
+            events = CLOCK_SLIPPED
+            self._clear_slip()
+        if self.state == SENDING:
+            if seen & TXFRS:
+                events |= self._finish_sending()
+            return events
+        if self.state == LISTENING:
+            if seen & RX_ERRORS or status[3] & RX_ERRORS_3:
+                return events | self._recover(seen)
+            if seen & RXFCG:
+                return events | self._take_frame()
+        return events
+
+    def now(self) -> memoryview:
+        """The counter now, in 5 bytes that the next call overwrites (UM 7.2.8)."""
+        self._bus.transfer(self._time.out, self._time.into)
+        return self.now_ticks
+
+    def track(self) -> int:
+        """Clock offset of the frame's sender by time tracking in 1e-9; before the next frame comes (UM 7.2.22)."""
+        self._bus.transfer(self._tracking.out, self._tracking.into)
+        data = self._tracking.data
+        offset = data[0] | data[1] << 8 | (data[2] & 0x07) << 16
+        return clock_offset_ppb(offset - 0x8_0000 if offset & 0x4_0000 else offset)
+
+    def measure(self) -> bool:
+        """Measure temperature and supply in some 1.1 ms, in which nothing is received (UM 6.4, pp. 158-159)."""
+        if self.state in (OFF, SENDING):
+            return False
+        self._off_and_clear()
+        self._put(0x28, 0x11, 1, 0x80)  # bias of the temperature sensor
+        self._put(0x28, 0x12, 1, 0x0A)  # bias of the converter
+        self._put(0x28, 0x12, 1, 0x0F)  # outputs
+        self._put(0x2A, 0x00, 1, 0x00)  # TC_SARC
+        self._put(0x2A, 0x00, 1, 0x01)
+        self._bus.pause_us(1000)
+        self._convert(self._get(0x2A, 0x03, 1)[0], self._get(0x2A, 0x04, 1)[0])
+        self._put(0x2A, 0x00, 1, 0x00)
+        if self._listening:
+            self._resume()
+        return True
+
+    def _convert(self, voltage: int, temperature: int) -> None:
+        """From the converter's readings; with typical values where the chip brought none of its own."""
+        if self._temperature_23 != 0:
+            self.temperature_cc = (temperature - self._temperature_23) * 114 + 2300
+        else:
+            self.temperature_cc = temperature * 113 - 11_300
+        if self._voltage_33 != 0:
+            self.millivolts = (voltage - self._voltage_33) * 1000 // 173 + 3300
+        else:
+            self.millivolts = voltage * 57 // 10 + 2300
+
+    def _read_status(self) -> memoryview:
+        self._bus.transfer(self._status.out, self._status.into)
+        return self._status.data
+
+    def _clear(self) -> None:
+        """Clear what the last reading of SYS_STATUS has shown; what came since stays."""
+        status = self._status.data
+        data = self._clear_status.data
+        for at in range(5):
+            data[at] = status[at] & CLEARED[at]
+        self._bus.write(self._clear_status.header, data)
+
+    def _clear_slip(self) -> None:
+        """Clear CLKPLL_LL alone: a frame may be coming in."""
+        data = self._clear_status.data
+        for at in range(5):
+            data[at] = CLKPLL_LL_3 if at == 3 else 0
+        self._bus.write(self._clear_status.header, data)
+
+    def _off_and_clear(self) -> None:
+        """Turn the transceiver off and forget all events (UM 7.2.15)."""
+        self._bus.write(self._off.header, self._off.data)
+        data = self._clear_status.data
+        for at in range(5):
+            data[at] = CLEARED[at]
+        self._bus.write(self._clear_status.header, data)
+
+    def _resume(self) -> None:
+        """LISTENING or IDLE again, with all events forgotten."""
+        self._off_and_clear()
+        self._listen_or_idle()
+
+    def _listen_or_idle(self) -> None:
+        if self._listening:
+            self._bus.write(self._enable.header, self._enable.data)
+            self.state = LISTENING
+        else:
+            self.state = IDLE
+
+    def _finish_sending(self) -> int:
+        self._bus.transfer(self._tx_time.out, self._tx_time.into)
+        self.sent = (self.sent + 1) & COUNT_MASK
+        self._clear()
+        self._listen_or_idle()
+        return SENT
+
+    def _recover(self, status: int) -> int:
+        """After an error the receiver must be reset, or the next stamp may be wrong (UM 4.1.6, pp. 34-35)."""
+        self.errors = (self.errors + 1) & COUNT_MASK
+        self.error_status = status
+        self._off_and_clear()
+        self._bus.write(self._reset_rx.header, self._reset_rx.data)
+        self._bus.write(self._reset_none.header, self._reset_none.data)
+        self._listen_or_idle()
+        return FAILED
+
+    def _is_lost(self) -> bool:
+        """Whether the chip has forgotten its configuration: a status that cannot be has been read."""
+        found = self._get(0x1F, 0, 4)
+        return found != CONFIGURATION[1][3].to_bytes(4, "little")
+
+    def _take_frame(self) -> int:
+        """Read a frame and all that was measured of it, and listen on."""
+        bus = self._bus
+        tries = LDE_TRIES
+        while not self._status.data[1] & (LDEDONE >> 8):
+            if tries == 0:
+                return self._recover(RXFCG)
+            tries -= 1
+            bus.pause_us(20)
+            if self._read_status()[2] & (LDEERR >> 16):
+                return self._recover(RXFCG | LDEERR)
+        info = self._frame_info
+        bus.transfer(info.out, info.into)
+        size = info.data[0] & 0x7F
+        if size < MIN_PSDU_BYTES:
+            return self._recover(0)
+        step = (size + 7) >> 3
+        bus.transfer(self._rx_outs[step], self._rx_intos[step])
+        bus.transfer(self._rx_time.out, self._rx_time.into)
+        self.frame_bytes = size
+        if self.measuring:
+            self._read_diagnostics(info.data[2] >> 4 | info.data[3] << 4)
+        self.received = (self.received + 1) & COUNT_MASK
+        self._clear()
+        self._listen_or_idle()
+        return RECEIVED
+
+    def _read_diagnostics(self, symbols: int) -> None:
+        """Powers and carrier offset; ``symbols`` is RXPACC (UM 4.7, 7.2.18, 7.2.20, 7.2.23, 7.2.40.11)."""
+        bus = self._bus
+        bus.transfer(self._quality.out, self._quality.into)
+        bus.transfer(self._carrier.out, self._carrier.into)
+        carrier = self._carrier.data
+        if symbols == (carrier[4] | carrier[5] << 8):
+            symbols -= SFD_ACCUMULATED
+        quality = self._quality.data
+        time = self._rx_time.data
+        self.rx_power_cdbm = power_cdbm(quality[6] | quality[7] << 8, symbols)
+        self.first_path_cdbm = first_path_cdbm(
+            time[7] | time[8] << 8, quality[2] | quality[3] << 8, quality[4] | quality[5] << 8, symbols
+        )
+        integrator = carrier[0] | carrier[1] << 8 | (carrier[2] & 0x1F) << 16
+        self.carrier_integrator = integrator - 0x20_0000 if integrator & 0x10_0000 else integrator
+        self.offset_ppb = carrier_offset_ppb(self.carrier_integrator)
+        if self.correct_bias and self.rx_power_cdbm != NOT_TOLD:
+            add_ticks(self.rx_ticks, -bias_ticks(self.rx_power_cdbm))
