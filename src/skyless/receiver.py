@@ -15,12 +15,13 @@ from skyless.air.claim import claim_of
 from skyless.air.codec import decode_cached
 from skyless.air.followed_master import FollowedMaster
 from skyless.air.malformed import Malformed
-from skyless.air.reception import Reception
+from skyless.air.reception import Diagnostics, Reception
 from skyless.air.schedule import Schedule, schedule_from_page
 from skyless.clocks.filter import clock_noise
 from skyless.clocks.stamps import AnchorStamps
 from skyless.constants import MAX_DRIFT, TICK_M
 from skyless.methods import DEFAULT_METHOD, FILTERS, METHODS
+from skyless.positioning.first_path import variance_factor
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import SLACK_TICKS, FixTime
 from skyless.positioning.joint import JointSettings
@@ -123,7 +124,8 @@ class Receiver:
         if self._method is None or self._schedule is None or anchor_m is None:
             self.reason = NoFixReason.NO_ALMANAC
             return None
-        result = self._method.hear(self._observation(beacon, self._schedule, anchor_m, rx_ticks, tx_ticks))
+        factor = _trust(reception.diagnostics)
+        result = self._method.hear(self._observation(beacon, self._schedule, anchor_m, rx_ticks, tx_ticks, factor))
         if isinstance(result, Fix):
             self.counters["fixes"] += 1
             return result
@@ -236,7 +238,13 @@ class Receiver:
         )
 
     def _observation(
-        self, beacon: Beacon, schedule: Schedule, anchor_m: NDArray[np.float64], rx_ticks: int, tx_ticks: int
+        self,
+        beacon: Beacon,
+        schedule: Schedule,
+        anchor_m: NDArray[np.float64],
+        rx_ticks: int,
+        tx_ticks: int,
+        rx_variance_factor: float,
     ) -> Observation:
         heard = beacon.master_heard if beacon.master == self._master else None
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
@@ -261,6 +269,7 @@ class Receiver:
             _relays(beacon, tx_ticks) if joint else (),
             claim_of(beacon) if joint and ticks_master is not None else None,
             sync_variance_m2,
+            rx_variance_factor,
         )
 
     def _repeats(self, anchor: int, heard: Heard) -> int:
@@ -306,6 +315,11 @@ class Receiver:
         if follow:
             self._master_scale = (whole, rx_ticks)
         return whole, fraction / 256.0, (time.std_ticks * TICK_M) ** 2
+
+
+def _trust(told: Diagnostics | None) -> float:
+    """Factor on the variance of a reception by what the radio told of it."""
+    return 1.0 if told is None else variance_factor(told.rx_power_dbm, told.first_path_power_dbm)
 
 
 def _relays(beacon: Beacon, tx_ticks: int) -> tuple[tuple[int, int, int], ...]:

@@ -59,7 +59,7 @@ def test_a_simulated_stream_in_one_loop(site, request_):
     starts, messages, states, tracker = streamed(site, 18.0, **request_)
     assert len(starts) == 1
     _, x, P, whole, statistics = starts[0]
-    anchors_m, rx, tx, fraction, variance = (np.array(column) for column in zip(*messages, strict=True))
+    anchors_m, rx, tx, fraction, variance, _ = (np.array(column) for column in zip(*messages, strict=True))
     batch = np.empty_like(states)
     accepted = track(
         x, P, whole, statistics, tracker.settings, np.zeros(len(x)), np.zeros(len(x)), anchors_m, rx, tx, fraction,

@@ -53,6 +53,8 @@ class Request(Struct, frozen=True):
     nlos: float = 0.0
     nlos_mean_m: float = 1.0
     power_bias: bool = False
+    diagnostics: bool = False
+    """Whether receptions carry powers, of which the first path's is low where they are late."""
     temperature: bool = False
     biases: tuple[AnchorBias, ...] = ()
     outages: tuple[AnchorOutage, ...] = ()
@@ -101,6 +103,7 @@ def impairments_of(request: Request, site: Site) -> Impairments:
         anchor_biases=request.biases,
         delay_errors=request.delay_errors,
         anchor_outages=request.outages,
+        diagnostics=request.diagnostics,
     )
 
 

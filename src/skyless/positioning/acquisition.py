@@ -124,7 +124,7 @@ class Acquisition:
         newest = [second for _, second in pairs]
         ages_s = np.array([(now - o.rx_ticks_tag) * TICK_S for o in newest])
         pseudoranges = np.array([_pseudorange_m(o, base) for o in newest]) + rate * ages_s
-        variances = self._variance_m2 + np.array([o.tx_variance_m2 for o in newest])
+        variances = np.array([o.rx_variance_factor * self._variance_m2 + o.tx_variance_m2 for o in newest])
         variances += ages_s**2 * (rate_variance / len(pairs) + self._speed_variance)
         result = locate_pseudoranges(
             np.array([o.anchor_m for o in newest]),

@@ -11,7 +11,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.positioning.joint_hearing import FULL, joint_motion, joint_step, joint_track
+from skyless.positioning.joint_hearing import FULL, JOINED, joint_motion, joint_step, joint_track
 from skyless.positioning.joint_monitor import PATIENCE
 from skyless.positioning.joint_state import (
     BASE,
@@ -30,6 +30,7 @@ from skyless.positioning.joint_state import (
     SLOTS,
     STALE_IN_ROW,
     TX_VARIANCE,
+    WEIGHT,
     WHOLE,
     Integers,
     JointArrays,
@@ -178,14 +179,36 @@ class JointFilter:
         tx_ticks: int,
         relays: Integers = NO_RELAYS,
         syncs: Matrix = NO_SYNCS,
+        variance_factor: float = 1.0,
     ) -> int:
-        """Take one packet (``joint_hear``); leaves what ``motion`` returns in ``newest``."""
+        """Take one packet (``joint_hear``); leaves what ``motion`` returns in ``newest``.
+
+        ``variance_factor``: on the variance of the tag's reception of it, not of those that it relays.
+        """
+        if variance_factor != 1.0:
+            self._weigh(site, variance_factor)
         packet = (site, sequence, rx_ticks, tx_ticks, relays, syncs, *self.newest, self._limits, self._levels)
         status = joint_step(tuple(self.arrays), *packet)
         if status == FULL:
             self._extend()
             status = joint_step(tuple(self.arrays), *packet)
+        if variance_factor != 1.0:
+            self._weigh(site, 1.0)
+            if status == JOINED:
+                self._doubt(site, variance_factor)
         return status
+
+    def _weigh(self, site: int, variance_factor: float) -> None:
+        """Set the factor on the variance of the tag's receptions of an anchor, if it is in view."""
+        s = self.arrays
+        if s.slot_of[site] >= 0:
+            s.anchors[s.slot_of[site], WEIGHT] = variance_factor
+
+    def _doubt(self, site: int, variance_factor: float) -> None:
+        """Let the offset of an anchor that has just joined be as uncertain as the reception that it rests on."""
+        s = self.arrays
+        place = self.dim + int(s.slot_of[site])
+        s.P[place, place] += (variance_factor - 1.0) * (s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE])
 
     @property
     def newest(self) -> tuple[Vector, Matrix]:

@@ -25,6 +25,7 @@ from skyless.positioning.joint_state import (
     READMISSIONS,
     SCORE,
     SLOTS,
+    WEIGHT,
     JointArrays,
     values,
 )
@@ -49,6 +50,9 @@ LATE_DENSITY: Final = 0.05
 LATE_ENOUGH: Final = 0.02
 HUBER: Final = 1.5
 """With more late messages than that, innovations beyond so many standard deviations weigh less."""
+
+DOUBTFUL: Final = 2.0
+"""Receptions with at least this factor on their variance are no sign of a filter that is lost if they do not fit."""
 
 SCORE_GAIN: Final = 0.1
 SCORE_CLIP: Final = 2.5
@@ -89,13 +93,15 @@ def gate_of(s: JointArrays) -> float:
 def believe(s: JointArrays, slot: int, innovation: float, spread: float) -> float:
     """How much more spread a reception of the tag is to be given, as a factor; 0 if it is not to be used.
 
-    Keeps the counts and running means, and those of the anchor.
+    Keeps the counts and running means, and those of the anchor. In all means doubtful receptions count less, by
+    their factor: that they are late is known, and tells nothing of the others.
     """
     normalised = innovation / np.sqrt(spread)
     if not np.isfinite(normalised):
         return 0.0
     clipped = min(max(normalised, -SCORE_CLIP), SCORE_CLIP)
-    s.anchors[slot, SCORE] += SCORE_GAIN * (clipped - s.anchors[slot, SCORE])
+    doubt = s.anchors[slot, WEIGHT]
+    s.anchors[slot, SCORE] += SCORE_GAIN / doubt * (clipped - s.anchors[slot, SCORE])
     gate = s.settings[GATE]
     within = -gate <= normalised <= gate
     _watch(s, slot)
@@ -104,17 +110,17 @@ def believe(s: JointArrays, slot: int, innovation: float, spread: float) -> floa
     if s.slots[slot, EXCLUDED]:
         counts[OUT] += 1
         return 0.0
-    statistics[LATE_SHARE] += LATE_FORGETTING * ((0.0 if within else 1.0) - statistics[LATE_SHARE])
-    statistics[REJECTED_SHARE] *= 1.0 - FORGETTING
+    statistics[LATE_SHARE] += LATE_FORGETTING / doubt * ((0.0 if within else 1.0) - statistics[LATE_SHARE])
+    statistics[REJECTED_SHARE] *= 1.0 - FORGETTING / doubt
     if not within or normalised > gate_of(s):
         counts[REJECTED] += 1
         if not within:
-            counts[REJECTED_IN_ROW] += 1
-            statistics[REJECTED_SHARE] += FORGETTING
+            counts[REJECTED_IN_ROW] += 1 if doubt < DOUBTFUL else 0
+            statistics[REJECTED_SHARE] += FORGETTING / doubt
         return 0.0
     counts[ACCEPTED] += 1
     counts[REJECTED_IN_ROW] = 0
-    statistics[CHI2] += FORGETTING * (normalised * normalised - statistics[CHI2])
+    statistics[CHI2] += FORGETTING / doubt * (normalised * normalised - statistics[CHI2])
     statistics[RESIDUAL_SQUARED] += FORGETTING * (innovation * innovation - statistics[RESIDUAL_SQUARED])
     if statistics[LATE_SHARE] > LATE_ENOUGH and abs(normalised) > HUBER:
         return float(abs(normalised) / HUBER)

@@ -49,8 +49,8 @@ SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW, EXCLUDED, RELAYS_IN_ROW = range(9)
 clock, tag's), place among the noises or −1, whether its packets are relayed, rejections in a row."""
 
 PLACE_X, PLACE_Y, PLACE_Z, RANGE, WEIGHT, INNOVATION, SCORE = range(7)
-"""Places in a row of ``anchors``: position, range at its newest packet, factor on the variance of its receptions (1
-unless a monitor says otherwise), newest innovation and running mean of the normalised ones."""
+"""Places in a row of ``anchors``: position, range at its newest packet, factor on the variance of its receptions (of
+the packet at hand, as ``first_path`` says), newest innovation and running mean of the normalised ones."""
 
 LATE_SHARE, LAG_SQUARED, CAUTION = range(4, 7)
 LAG: Final = 7

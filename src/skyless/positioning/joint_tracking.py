@@ -164,7 +164,7 @@ class JointTracking:
                 flat += (place, heard, sequence, rx_ticks)
         relays = np.array(flat, np.int64).reshape(-1, 4) if flat else NO_RELAYS
         packet = (place, observation.sequence, observation.rx_ticks_tag, observation.tx_ticks_anchor)
-        return self._filter.hear(*packet, relays, self._sync(observation))
+        return self._filter.hear(*packet, relays, self._sync(observation), observation.rx_variance_factor)
 
     def _sync(self, observation: Observation) -> Matrix:
         """What the anchor says of its clock against the master's, as the filter takes it."""

@@ -77,7 +77,8 @@ def new_packet(s: JointArrays, slot: int) -> None:
 def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool:
     """Take the tag's reception of a packet; False if it lies beyond the gate.
 
-    R − T = |p − a| + b + noise of the TX stamp + noise of the reception.
+    R − T = |p − a| + b + noise of the TX stamp + noise of the reception. A doubtful one is judged as any other, as it
+    is rather late than noisy, but weighs less if it is taken.
     """
     dim, half = int(s.settings[DIM]), values(s)
     tau_s = (s.counts[EPOCH] - s.counts[BASE]) * TICK_S
@@ -94,7 +95,7 @@ def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool
     range_m = put_direction(s, slot, tau_s, 1.0)
     bend_m = _bend(s, range_m, variance)
     term = project(s)
-    variance *= s.anchors[slot, WEIGHT]
+    doubt = (s.anchors[slot, WEIGHT] - 1.0) * variance
     variance += 2.0 * bend_m * bend_m
     if s.statistics[CAUTION] > 0.0:
         variance += s.statistics[CAUTION]
@@ -107,8 +108,8 @@ def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool
     s.anchors[slot, INNOVATION] = innovation
     factor = believe(s, slot, innovation, spread)
     if factor > 0.0:
-        follow(s, innovation / np.sqrt(spread) / factor)
-        take(s, term, innovation, spread * factor, slot)
+        follow(s, innovation / np.sqrt(spread + doubt) / factor)
+        take(s, term, innovation, spread * factor + doubt, slot)
         steps = int(np.floor(s.x[offset] / TICK_M))
         s.slots[slot, WHOLE] += steps
         s.x[offset] -= steps * TICK_M

@@ -36,6 +36,8 @@ class Observation(Struct, frozen=True, gc=False):
     """Whose time ``tx_ticks_master`` is; for ``joint`` only, as is ..."""
     sync_variance_m2: float = 0.0
     """... what the anchor itself says of its variance."""
+    rx_variance_factor: float = 1.0
+    """On the variance of this reception, at least 1: what the radio's diagnostics say (``first_path``); for filters."""
 
 
 class Method(Protocol):

@@ -17,7 +17,6 @@ from skyless.positioning.joint_state import (
     RELAYS_REFUSED,
     RELAYS_TAKEN,
     SLOTS,
-    WEIGHT,
     JointArrays,
     Matrix,
     Vector,
@@ -132,6 +131,4 @@ def _state_without_rejections(s: JointArrays, worst_t: float, worst_slot: int, m
     touched = worst_slot >= 0 and s.evidence[REJECTIONS, worst_slot] > REJECTED_ONCE
     if worst_t <= (SUSPICIOUS * most_t if touched else most_t):
         return NOTHING
-    if s.anchors[worst_slot, WEIGHT] != 1.0:
-        return EXCLUDED
     return BOUNDED if not touched and worst_t <= MOST_BOUNDED * most_t else DETECTED

@@ -98,11 +98,13 @@ def tracker_update(
     tx_ticks_master: int,
     tx_fraction_ticks: float,
     tx_variance_m2: float,
+    doubt_m2: float,
 ) -> bool:
     """Take one beacon; False if its innovation lies beyond the gate (the state is then only predicted).
 
     Stamps are unwrapped; ``tx_fraction_ticks`` is what the TX time has beyond whole ticks, ``tx_variance_m2`` the
-    variance of the anchor's clock against the master.
+    variance of the anchor's clock against the master, ``doubt_m2`` what the reception's variance is beyond that of its
+    noise: it is judged as any other, as it is rather late than noisy, but weighs less.
     """
     n = x.shape[0]
     dim = (n - 2) // 2
@@ -118,7 +120,9 @@ def tracker_update(
     pseudorange_m = (rx_ticks_tag - tx_ticks_master - whole[WHOLE_OFFSET] - tx_fraction_ticks) * TICK_M
     innovation = pseudorange_m - range_m - x[clock]
     spread = innovation_variance(P, h, ph, settings[SETTING_VARIANCE] + tx_variance_m2)
-    accepted = gated_correct(x, P, whole, statistics, ph, innovation, spread, settings[SETTING_GATE])
+    accepted = judge(whole, statistics, innovation, spread, settings[SETTING_GATE])
+    if accepted:
+        correct(x, P, ph, innovation, spread + doubt_m2)
     _rebase(x, whole, clock)
     return accepted
 
@@ -210,6 +214,7 @@ def track(
             tx_ticks_master[k],
             tx_fraction_ticks[k],
             tx_variance_m2[k],
+            0.0,
         )
         for place in range(x.shape[0]):
             states[k, place] = x[place]
@@ -275,6 +280,7 @@ class PseudorangeTracker:
         tx_ticks_master: int,
         tx_fraction_ticks: float,
         tx_variance_m2: float,
+        doubt_m2: float = 0.0,
     ) -> bool:
         """Take one beacon (``tracker_update``)."""
         return tracker_update(
@@ -290,4 +296,5 @@ class PseudorangeTracker:
             tx_ticks_master,
             tx_fraction_ticks,
             tx_variance_m2,
+            doubt_m2,
         )

@@ -79,12 +79,14 @@ class Tracking:
                 return start
             self._begin(start, observation)
             return self._fix(observation)
+        doubt_m2 = (observation.rx_variance_factor - 1.0) * self._settings.stamp_variance_m2
         accepted = self._tracker.hear(
             observation.anchor_m,
             observation.rx_ticks_tag,
             observation.tx_ticks_master,
             observation.tx_fraction_ticks,
             observation.tx_variance_m2,
+            doubt_m2,
         )
         self._heard_ticks = observation.rx_ticks_tag
         if not accepted:

@@ -22,7 +22,10 @@ LINE_OF_SIGHT_FIRST_PATH_DB: Final = 2.0
 """How far the first path's power lies below the total with a clear line of sight (assumed)."""
 
 BLOCKED_FIRST_PATH_DB: Final = 8.0
-"""And how much further where the message came late or through a wall: past the 6 dB that suggest NLOS."""
+"""And how much further where the message came late or through a wall: as far as metal lowers it."""
+
+FIRST_PATH_SCALE_M: Final = 0.1
+"""Messages that are later by little lower it by less, 1/e short of that at this: 5 cm show nothing."""
 
 _POWER_BIAS_CM: Final = (
     -11.0, -10.5, -10.0, -9.3, -8.2, -6.9, -5.1, -2.7, 0.0, 2.1, 3.5, 4.2, 4.9, 6.2, 7.1, 7.6, 8.1, 8.6,
@@ -104,6 +107,13 @@ def power_bias_m(rx_power_dbm: float) -> float:
     low = min(int(place), _POWER_BIAS_M.shape[0] - 2)
     bias_m: float = _POWER_BIAS_M[low] + (place - low) * (_POWER_BIAS_M[low + 1] - _POWER_BIAS_M[low])
     return bias_m
+
+
+@kernel
+def first_path_loss_db(extra_m: float) -> float:
+    """How far the first path's power lies below the total for a message that comes so much late, or early."""
+    late = 1.0 - math.exp(-max(extra_m, 0.0) / FIRST_PATH_SCALE_M)
+    return LINE_OF_SIGHT_FIRST_PATH_DB + BLOCKED_FIRST_PATH_DB * late
 
 
 @kernel

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from skyless.compiled import kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.simulation.channel import (
-    BLOCKED_FIRST_PATH_DB,
-    LINE_OF_SIGHT_FIRST_PATH_DB,
     cross_walls,
     delivery_probability,
+    first_path_loss_db,
     power_bias_m,
     received_power_dbm,
 )
@@ -188,8 +187,7 @@ def measure(
     """Fill in the diagnostics of a reception from (power in dBm, extra path in m, range rate in m/s)."""
     power_dbm, extra_m, range_rate_mps = observed
     row["rx_power_dbm"] = power_dbm + channel[0]["power_noise_db"] * draw_normal(normals, cursors, node)
-    blocked_db = BLOCKED_FIRST_PATH_DB if extra_m > 0.0 else 0.0
-    row["first_path_power_dbm"] = row["rx_power_dbm"] - LINE_OF_SIGHT_FIRST_PATH_DB - blocked_db
+    row["first_path_power_dbm"] = row["rx_power_dbm"] - first_path_loss_db(extra_m)
     offset = clock_rate(clocks, sender) - clock_rate(clocks, node) - range_rate_mps / SPEED_OF_LIGHT_MPS
     noise_ppm = channel[0]["carrier_noise_ppm"] * draw_normal(normals, cursors, node)
     row["carrier_offset_ppm"] = 1e6 * offset + noise_ppm

@@ -15,6 +15,8 @@ LEAST_S: Final = 3 * BURST_S
 """Judged time in which a burst fits wherever the judging begins."""
 
 CLEAN: Final = "clean"
+TOLD: Final = {"diagnostics": True}
+"""Radios that tell powers: those of the emulated air, where late messages have a weak first path."""
 
 
 def cases(plan: Plan) -> list[Case]:
@@ -29,6 +31,21 @@ def cases(plan: Plan) -> list[Case]:
         ("one anchor +0.3 m", "one anchor", {"biases": partial(_late, plan, 0.3, None)}, LIMIT),
         ("one anchor +1.5 m", "one anchor", {"biases": partial(_late, plan, 1.5, None)}, None),
         ("one anchor +1.5 m in bursts", "one anchor", {"biases": partial(_late, plan, 1.5, BURST_S)}, LIMIT),
+        ("20 % late by exp(1 m), told", "told by the first path", {"nlos": 0.2, **TOLD}, None),
+        ("40 % late by exp(1 m), told", "told by the first path", {"nlos": 0.4, **TOLD}, None),
+        ("20 % late by exp(0.2 m), told", "told by the first path", {"nlos": 0.2, "nlos_mean_m": 0.2, **TOLD}, None),
+        (
+            "one anchor +1.5 m, told",
+            "told by the first path",
+            {"biases": partial(_late, plan, 1.5, None), **TOLD},
+            None,
+        ),
+        (
+            "one anchor +0.3 m, told",
+            "told by the first path",
+            {"biases": partial(_late, plan, 0.3, None), **TOLD},
+            None,
+        ),
     ]
     if plan.quick:
         late = [case for case in late if case[0] == CLEAN or case[3] is not None]
