@@ -215,12 +215,13 @@ def show_refusals():
 
 def show_numbers():
     for value in (1, 2, 3, 1000, 32767, 32768, 65535, 65536, 1 << 29, (1 << 30) - 1):
-        print("log", value, dw1000.log10(value))
+        print("log", value, dw1000.log10(value, dw1000.LOG10_TABLE))
     for power in range(-10500, -5000, 77):
         print("bias", power, dw1000.bias_ticks(power))
     for value in (-60000, -57170, -4096, -1, 0, 1, 35000, 57170):
         print("carrier", value, dw1000.carrier_offset_ppb(value), dw1000.clock_offset_ppb(value // 64))
     print("none", dw1000.power_cdbm(0, 118), dw1000.power_cdbm(9, 0), dw1000.first_path_cdbm(0, 0, 0, 9))
+    print("accumulated", [dw1000.accumulated(symbols) for symbols in (-5, 0, 1, 113, 4095)])
 
 
 class QuietBus(dw1000.Bus):

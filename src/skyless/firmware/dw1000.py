@@ -162,7 +162,8 @@ _LOG10 = (
     22724, 23521, 24304, 25072, 25828, 26570, 27300, 28018, 28724, 29419, 30103,
 )
 # fmt: on
-"""100 000 log10(1 + i/32)."""
+LOG10_TABLE = b"".join([value.to_bytes(2, "little") for value in _LOG10])
+"""100 000 log10(1 + i/32), two bytes each."""
 
 _BIAS_MM = (-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86)
 """How far off a received stamp is at -61, -63 … -95 dBm (Decawave APS011, Table 2: 500 MHz, PRF 64 MHz)."""
@@ -239,8 +240,19 @@ def copy(source: ptr8, at: int, end: int, out: ptr8) -> int:
     return fill
 
 
-def log10(value: int) -> int:
-    """100 000 log10 of a number from 1 to 2**30 - 1, to 8 of its units."""
+@micropython.viper
+def keep(source: ptr8, mask: ptr8, end: int, out: ptr8) -> int:
+    """Copy ``source[:end]`` to ``out``, only the bits that ``mask`` has."""
+    at = 0
+    while at < end:
+        out[at] = source[at] & mask[at]
+        at += 1
+    return end
+
+
+@micropython.viper
+def log10(value: int, table: ptr8) -> int:
+    """100 000 log10 of a number from 1 to 2**30 - 1, to 8 of its units, with ``LOG10_TABLE``."""
     exponent = 15
     while value >= 0x10000:
         value >>= 1
@@ -248,32 +260,39 @@ def log10(value: int) -> int:
     while value < 0x8000:
         value <<= 1
         exponent -= 1
-    place = (value - 0x8000) >> 10
-    low = _LOG10[place]
-    return exponent * LOG10_2 + low + ((_LOG10[place + 1] - low) * (value & 0x3FF) >> 10)
+    at = ((value - 0x8000) >> 10) << 1
+    low = table[at] | (table[at + 1] << 8)
+    high = table[at + 2] | (table[at + 3] << 8)
+    return exponent * 30103 + low + (((high - low) * (value & 0x3FF)) >> 10)
 
 
-def power_cdbm(cir_power: int, symbols: int) -> int:
-    """Received power in 0.01 dBm from CIR_PWR and the accumulated symbols (UM 4.7.2), or NOT_TOLD."""
-    if cir_power == 0 or symbols <= 0:
+def accumulated(symbols: int) -> int:
+    """What the formulas of power take off for RXPACC symbols in 1e-4 dB: A, and 20 log10; 0 where there are none."""
+    return POWER_A + 2 * log10(symbols, LOG10_TABLE) if symbols > 0 else 0
+
+
+def power_cdbm(cir_power: int, level: int) -> int:
+    """Received power in 0.01 dBm from CIR_PWR and what ``accumulated`` gave (UM 4.7.2), or NOT_TOLD."""
+    if cir_power == 0 or level == 0:
         return NOT_TOLD
-    return (log10(cir_power) + 17 * LOG10_2 - 2 * log10(symbols) - POWER_A + 50) // 100
+    power: int = log10(cir_power, LOG10_TABLE) + 17 * LOG10_2 - level
+    return (power + 50) // 100
 
 
-def first_path_cdbm(f1: int, f2: int, f3: int, symbols: int) -> int:
-    """First path's power in 0.01 dBm from three amplitudes of 16 bits and the symbols (UM 4.7.1), or NOT_TOLD."""
-    scale = -2 * LOG10_2
-    while True:
-        scale += 2 * LOG10_2
-        if f1 < 0x4000 and f2 < 0x4000 and f3 < 0x4000:
-            break
+def first_path_cdbm(f1: int, f2: int, f3: int, level: int) -> int:
+    """First path's power in 0.01 dBm from three amplitudes of 16 bits and ``accumulated`` (UM 4.7.1), or NOT_TOLD."""
+    if level == 0:
+        return NOT_TOLD
+    while f1 >= 0x4000 or f2 >= 0x4000 or f3 >= 0x4000:
         f1 >>= 1
         f2 >>= 1
         f3 >>= 1
+        level -= 2 * LOG10_2
     squares = f1 * f1 + f2 * f2 + f3 * f3
-    if squares == 0 or symbols <= 0:
+    if squares == 0:
         return NOT_TOLD
-    return (log10(squares) + scale - 2 * log10(symbols) - POWER_A + 50) // 100
+    power: int = log10(squares, LOG10_TABLE) - level
+    return (power + 50) // 100
 
 
 def carrier_offset_ppb(integrator: int) -> int:
@@ -372,6 +391,8 @@ class DW1000:
         self._tx_control = _Writing(0x08, 0, TX_FCTRL.to_bytes(4, "little"))
         self._dx = _Writing(0x0A, 0, bytes(5))
         self._clear_status = _Writing(0x0F, 0, bytes(5))
+        self._clear_slipped = _Writing(0x0F, 0, bytes((0, 0, 0, CLKPLL_LL_3, 0)))
+        self._clear_all = _Writing(0x0F, 0, CLEARED)
         self._transmit = _Writing(0x0D, 0, bytes((TXSTRT_TXDLYS,)))
         self._off = _Writing(0x0D, 0, bytes((TRXOFF,)))
         self._enable = _Writing(0x0D, 0, RXENAB.to_bytes(2, "little"))
@@ -617,26 +638,17 @@ class DW1000:
 
     def _clear(self) -> None:
         """Clear what the last reading of SYS_STATUS has shown; what came since stays."""
-        status = self._status.data
-        data = self._clear_status.data
-        for at in range(5):
-            data[at] = status[at] & CLEARED[at]
-        self._bus.write(self._clear_status.header, data)
+        keep(self._status.data, CLEARED, 5, self._clear_status.data)
+        self._bus.write(self._clear_status.header, self._clear_status.data)
 
     def _clear_slip(self) -> None:
         """Clear CLKPLL_LL alone: a frame may be coming in."""
-        data = self._clear_status.data
-        for at in range(5):
-            data[at] = CLKPLL_LL_3 if at == 3 else 0
-        self._bus.write(self._clear_status.header, data)
+        self._bus.write(self._clear_slipped.header, self._clear_slipped.data)
 
     def _off_and_clear(self) -> None:
         """Turn the transceiver off and forget all events (UM 7.2.15)."""
         self._bus.write(self._off.header, self._off.data)
-        data = self._clear_status.data
-        for at in range(5):
-            data[at] = CLEARED[at]
-        self._bus.write(self._clear_status.header, data)
+        self._bus.write(self._clear_all.header, self._clear_all.data)
 
     def _resume(self) -> None:
         """LISTENING or IDLE again, with all events forgotten."""
@@ -709,9 +721,10 @@ class DW1000:
             symbols -= SFD_ACCUMULATED
         quality = self._quality.data
         time = self._rx_time.data
-        self.rx_power_cdbm = power_cdbm(quality[6] | quality[7] << 8, symbols)
+        level = accumulated(symbols)
+        self.rx_power_cdbm = power_cdbm(quality[6] | quality[7] << 8, level)
         self.first_path_cdbm = first_path_cdbm(
-            time[7] | time[8] << 8, quality[2] | quality[3] << 8, quality[4] | quality[5] << 8, symbols
+            time[7] | time[8] << 8, quality[2] | quality[3] << 8, quality[4] | quality[5] << 8, level
         )
         integrator = carrier[0] | carrier[1] << 8 | (carrier[2] & 0x1F) << 16
         self.carrier_integrator = integrator - 0x20_0000 if integrator & 0x10_0000 else integrator
