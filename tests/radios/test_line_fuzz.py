@@ -9,20 +9,16 @@ SKYLESS_FUZZ_BYTES sets how many bytes of damage each parser gets.
 import json
 import os
 import random
-import sys
 from collections import Counter
-from pathlib import Path
 
 import pytest
 
+from recordings.capture_makers import binary_record, tdoa3, text_line
 from skyless.firmware import link
 from skyless.radios.link_session import LinkSession
 from skyless.radios.listener_radio import ListenerRadio
 from skyless.radios.radio import AntennaDelays
 from skyless.radios.sniffer_radio import SnifferStream
-
-sys.path.append(str(Path(__file__).parents[1] / "recordings"))
-from capture_makers import binary_record, tdoa3, text_line
 
 BYTES = int(os.environ.get("SKYLESS_FUZZ_BYTES", "300000"))
 ALPHABETS = (

@@ -1,0 +1,89 @@
+"""Tags on sniffers: packets of a simulated TDoA3 system in, fixes and health out."""
+
+import msgspec
+import numpy as np
+import pytest
+
+import masterless_world as hall
+from skyless.air.packet import Packet
+from skyless.nodes import packet_tags
+from skyless.nodes.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
+from skyless.outputs.messages import Counters, FixMessage, TagHealth
+from skyless.radios.open import open_sniffers
+from skyless.radios.radio import Gone, Restarted
+from skyless.recordings.bitcraze_payload import decode
+
+SETTINGS = PacketTagSettings(hall.ANCHORS_M, site=7, publish_hz=1e5)
+
+
+@pytest.fixture(scope="module")
+def packets():
+    """Five seconds of a tag at rest; the host's clock begins at 100 s."""
+    told = hall.tdoa3_capture(hall.MasterlessWorld(3), 5.0)
+    return [decode(payload, 100.0 + t_s, sender, rx_ticks) for t_s, sender, rx_ticks, payload in told]
+
+
+def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_anew(packets):
+    published, said = [], []
+    (radio,) = open_sniffers("sniffer:/dev/nothing", ("drone",))
+    node = PacketTagNode(SETTINGS, radio, published.append, said.append)
+    node.unix_less_host_s = 0.0
+    node.hear(Restarted())
+    first = node.tracking
+    for packet in packets:
+        node.hear(packet)
+    late = [fix for fix in published if fix.unix_s > 102.0]
+    assert len(late) > 400
+    errors_m = np.linalg.norm([np.subtract(fix.position_m, hall.path_m(0.0, 0.0)) for fix in late], axis=1)
+    assert np.sqrt(np.mean(errors_m**2)) < 0.15  # some cm of noise, in three dimensions
+    assert {fix.unix_s for fix in late} <= {packet.host_s for packet in packets}
+    assert [fix.serial for fix in published] == list(range(1, len(published) + 1))
+    assert late[-1].method == "joint"
+    fixes, drops = node.serial, node.counters
+    node.hear(Gone("pulled out"))
+    node.hear(Restarted())
+    assert node.tracking is not first
+    assert node.counters == drops
+    for packet in packets:
+        node.hear(msgspec.structs.replace(packet, rx_ticks=(packet.rx_ticks + 2**39) % 2**40))
+    assert node.serial > fixes + 400
+    assert said == ["tag drone: listening", "tag drone: pulled out; still looking for it", "tag drone: listening again"]
+
+
+class Link:
+    """Takes what is published."""
+
+    def __init__(self):
+        self.counters = Counters(1, 2, 3)
+        self.told = []
+
+    def publish(self, topic, message):
+        self.told.append((topic, message))
+
+
+def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypatch):
+    links = []
+
+    def link_of(address, name, *, site, kind):
+        links.append(Link())
+        assert (name, site, kind) == (("one", "two")[len(links) - 1], 7, "tag")
+        return links[-1]
+
+    monkeypatch.setattr(packet_tags, "link_of", link_of)
+    tags = PacketTags(SETTINGS, open_sniffers("sniffer:/dev/a,/dev/b", ("one", "two")), None, print)
+    one, _ = tags.nodes
+    one.radio.counters["malformed-line"] += 3
+    one.hear(Packet(1.0, 77, 0, 0, 0, ()))
+    for packet in packets:
+        one.hear(packet)
+    tags._tell()
+    (fix_topic, fix), *_, (health_topic, health) = links[0].told
+    assert (fix_topic, health_topic) == ("skyless/v1/7/tag/one/fix", "skyless/v1/7/tag/one/health")
+    assert isinstance(fix, FixMessage)
+    again = msgspec.json.decode(msgspec.json.encode(health), type=TagHealth)
+    assert (again.receptions, again.fixes, again.updates_per_s) == (len(packets) + 1, one.serial, one.serial)
+    assert again.reason is None
+    assert again.counters["malformed-line"] == 3
+    assert again.counters["unknown-anchor"] == 1
+    ((topic, silent),) = links[1].told
+    assert (topic, silent.reason, silent.fixes) == ("skyless/v1/7/tag/two/health", "no-beacons", 0)
