@@ -653,10 +653,16 @@ class DW1000:
     def _resume(self) -> None:
         """LISTENING or IDLE again, with all events forgotten."""
         self._off_and_clear()
-        self._listen_or_idle()
+        self._listen_anew()
 
-    def _listen_or_idle(self) -> None:
+    def _listen_anew(self) -> None:
+        """Listen, or be IDLE, after an error or after the receiver was turned off, perhaps in the middle of a frame.
+
+        It must be reset then, or the next stamp may be wrong (UM 4.1.6, pp. 34-35).
+        """
         if self._listening:
+            self._bus.write(self._reset_rx.header, self._reset_rx.data)
+            self._bus.write(self._reset_none.header, self._reset_none.data)
             self._bus.write(self._enable.header, self._enable.data)
             self.state = LISTENING
         else:
@@ -666,17 +672,14 @@ class DW1000:
         self._bus.transfer(self._tx_time.out, self._tx_time.into)
         self.sent = (self.sent + 1) & COUNT_MASK
         self._clear()
-        self._listen_or_idle()
+        self._listen_anew()
         return SENT
 
     def _recover(self, status: int) -> int:
-        """After an error the receiver must be reset, or the next stamp may be wrong (UM 4.1.6, pp. 34-35)."""
+        """Count an error and listen on."""
         self.errors = (self.errors + 1) & COUNT_MASK
         self.error_status = status
-        self._off_and_clear()
-        self._bus.write(self._reset_rx.header, self._reset_rx.data)
-        self._bus.write(self._reset_none.header, self._reset_none.data)
-        self._listen_or_idle()
+        self._resume()
         return FAILED
 
     def _is_lost(self) -> bool:
@@ -708,7 +711,7 @@ class DW1000:
             self._read_diagnostics(info.data[2] >> 4 | info.data[3] << 4)
         self.received = (self.received + 1) & COUNT_MASK
         self._clear()
-        self._listen_or_idle()
+        self._bus.write(self._enable.header, self._enable.data)
         return RECEIVED
 
     def _read_diagnostics(self, symbols: int) -> None:
