@@ -27,6 +27,7 @@ from skyless.positioning.fix_time import SLACK_TICKS, FixTime
 from skyless.positioning.joint import JointSettings
 from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.observation import Method, Observation
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.positioning.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.positioning.tracker import TrackerSettings
 from skyless.positioning.tracking import Tracking
@@ -59,11 +60,13 @@ class Receiver:
         site: int | None = None,
         qa: float = 0.3,
         z_bounds_m: tuple[float, float] | None = None,
+        integrity: IntegrityRequirement | None = None,
     ) -> None:
         """Make a tag that knows nothing yet.
 
         ``method`` is one of ``METHODS``; ``site`` the only site to listen to, by default the first that is heard;
-        ``qa`` the tag's agility in m²/s³ (``tracker``); ``z_bounds_m`` decides between mirror solutions.
+        ``qa`` the tag's agility in m²/s³ (``tracker``); ``z_bounds_m`` decides between mirror solutions; ``integrity``
+        is asked of the protection levels (``joint``).
 
         Raises:
             ValueError: there is no such method.
@@ -80,6 +83,7 @@ class Receiver:
         self._time = FixTime()
         self._qa = qa
         self._z_bounds_m = z_bounds_m
+        self._integrity = integrity or IntegrityRequirement()
         self._own_ticks = Unwrapper()
         self._stamps = AnchorStamps(self.counters)
         self._master_scale: tuple[int, int] | None = None
@@ -221,6 +225,8 @@ class Receiver:
                 rx_variance_m2=rx_variance,
                 height_m=schedule.tag_height_m,
                 drop_s=max(DROP_S, 4.0 * superframe_s),
+                integrity_risk=self._integrity.risk,
+                alert_limit_m=self._integrity.alert_limit_m,
             )
             return JointTracking(joint, self._z_bounds_m, self._time, superframe_s)
         clock = clock_noise(noise.white_fm, noise.random_walk_fm)

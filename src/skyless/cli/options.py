@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, TextIO
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -11,12 +11,25 @@ from cyclopts.validators import Number
 from skyless.errors import SkylessError
 from skyless.methods import METHODS
 
+if TYPE_CHECKING:
+    from skyless.positioning.protection import IntegrityRequirement
+
 Positive = Annotated[float, Parameter(validator=Number(gt=0, lt=math.inf))]
 NotNegative = Annotated[float, Parameter(validator=Number(gte=0, lt=math.inf))]
 Picoseconds = Annotated[float, Parameter(validator=Number(gt=0, lte=1e6))]
 """Noise of a stamp, as far as a site file and the almanac can tell it."""
 
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
+
+IntegrityRisk = Annotated[float, Parameter(validator=Number(gt=0, lte=0.1))]
+"""Probability, for each fix, that an error exceeds its protection level; 10⁻⁴ where none is given."""
+
+
+def integrity_of(risk: float | None, alert_limit_m: float | None) -> "IntegrityRequirement":
+    """What --integrity-risk and --alert-limit-m ask of protection levels."""
+    from skyless.positioning.protection import RISK, IntegrityRequirement
+
+    return IntegrityRequirement(RISK if risk is None else risk, alert_limit_m)
 
 
 def known_method(method: str, names: Sequence[str] = METHODS) -> None:

@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from skyless.cli.options import Finite, NotNegative, Positive, finite_numbers, known_method, spare_inputs
+from skyless.cli.options import (
+    Finite,
+    IntegrityRisk,
+    NotNegative,
+    Positive,
+    finite_numbers,
+    integrity_of,
+    known_method,
+    spare_inputs,
+)
 from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
 from skyless.cli.replay_output import draw_track, fix_writer, see_that_it_can_be_drawn, show
@@ -45,6 +54,8 @@ def replay(
     uncalibrated: bool = False,
     tag: str | None = None,
     method: str | None = None,
+    integrity_risk: IntegrityRisk | None = None,
+    alert_limit_m: Positive | None = None,
     fixes: Path | None = None,
     plot: Path | None = None,
     json: bool = False,
@@ -55,7 +66,8 @@ def replay(
     of time differences, MILUV passive ticks and Avalue receptions; the format is recognised by the content.
 
     A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
-    below it takes --site, --tag, --method, --settle, --above, --fixes, --plot and --json.
+    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --settle, --above, --fixes, --plot and
+    --json.
 
     Parameters
     ----------
@@ -92,6 +104,11 @@ def replay(
     method
         In recordings of skyless record, another method than the tag's own; else joint, which takes the anchors' packets
         as they are and is the default for Bitcraze's, or tracker, which takes time differences.
+    integrity_risk
+        Another probability than the tag's own that an error exceeds its protection level, in recordings of skyless
+        record (joint).
+    alert_limit_m
+        Another alert limit than the tag's own, in metres; both begin anew, as another method does.
     fixes
         Write every fix into this table.
     plot
@@ -114,9 +131,13 @@ def replay(
             "--height": None if height == "auto" else height, "--uncalibrated": uncalibrated or None,
         }  # fmt: skip
         see_that_they_are_left_out(useless, "a recording of skyless record brings its own")
-        replay_site(file, Options(tag, method, settle, above, site, fixes, plot, json))
+        asked = None
+        if integrity_risk is not None or alert_limit_m is not None:
+            asked = integrity_of(integrity_risk, alert_limit_m)
+        replay_site(file, Options(tag, method, asked, settle, above, site, fixes, plot, json))
         return
-    see_that_they_are_left_out({"--tag": tag}, "it is for recordings of skyless record")
+    of_sites = {"--tag": tag, "--integrity-risk": integrity_risk, "--alert-limit-m": alert_limit_m}
+    see_that_they_are_left_out(of_sites, "it is for recordings of skyless record")
     if method is not None:
         known_method(method, FILTERS)
     places, site_height_m = known_anchors(anchors, site)

@@ -18,6 +18,7 @@ from skyless.methods import DEFAULT_METHOD
 if TYPE_CHECKING:
     from skyless.experiments.replay_site import SiteReplay, TagReport
     from skyless.experiments.replay_tag import Replayed
+    from skyless.positioning.protection import IntegrityRequirement
 
 
 class Options(Struct, frozen=True):
@@ -25,6 +26,8 @@ class Options(Struct, frozen=True):
 
     tag: str | None
     method: str | None
+    integrity: "IntegrityRequirement | None"
+    """Other than what was asked of the tag."""
     settle_s: float | None
     above_m: float | None
     site: Path | None
@@ -63,7 +66,7 @@ def replay_site(file: Path, options: Options) -> None:
         tags = None if options.tag is None else (options.tag,)
         settle_s = 2.0 if options.settle_s is None else options.settle_s
         wanted = None if options.site is None else load_site(options.site)
-        run = SiteReplay(recording, tags, options.method, settle_s, options.above_m, wanted)
+        run = SiteReplay(recording, tags, options.method, settle_s, options.above_m, wanted, options.integrity)
         if options.plot is not None and len(run.tags) > 1:
             raise SkylessError(f"--plot draws one tag; choose it with --tag, one of {', '.join(run.tags)}")
         summary = recording.summary()

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import NotNegative, Picoseconds, Positive, finite_numbers, open_for_writing, spare_inputs
+from skyless.cli.options import (
+    IntegrityRisk,
+    NotNegative,
+    Picoseconds,
+    Positive,
+    finite_numbers,
+    integrity_of,
+    open_for_writing,
+    spare_inputs,
+)
 from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
 from skyless.cli.simulate_input import bias_of, delay_errors_of, outage_of, path_of, silence_of, site_of
@@ -48,6 +57,8 @@ def simulate(
     tags: Annotated[int, Parameter(validator=Number(gte=1, lte=10_000))] | None = None,
     speed: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] | None = None,
     qa: Positive = 0.3,
+    integrity_risk: IntegrityRisk | None = None,
+    alert_limit_m: Positive | None = None,
     noise_ps: Picoseconds | None = None,
     fixes: Annotated[int, Parameter(validator=Number(gte=1))] | None = None,
     duration: Positive | None = None,
@@ -88,6 +99,10 @@ def simulate(
         How fast tags walk, in m/s; 1 by default.
     qa
         Agility that the tracker assumes, m²/s³.
+    integrity_risk
+        Probability, for each fix, that the error exceeds its protection level (joint); 1e-4 by default.
+    alert_limit_m
+        Fixes with a higher protection level than so many metres carry an alert (joint).
     noise_ps
         Noise of every TX and RX stamp in picoseconds, known to the filters; by default the site's own figures.
     fixes
@@ -138,6 +153,7 @@ def simulate(
         tags=1 if tags is None else tags,
         speed_mps=1.0 if speed is None else speed,
         qa=qa,
+        integrity=integrity_of(integrity_risk, alert_limit_m),
         warmup_s=warmup,
         most_fixes=fixes,
         loss=loss,

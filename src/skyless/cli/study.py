@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import Picoseconds, Positive, known_method
+from skyless.cli.options import IntegrityRisk, Picoseconds, Positive, integrity_of, known_method
 from skyless.cli.progress import progress_bar, status
 from skyless.errors import SkylessError
 
@@ -38,6 +38,8 @@ def study(
     seconds: Annotated[float, Parameter(validator=Number(gte=1, lte=1e6))] | None = None,
     noise_ps: Picoseconds | None = None,
     qa: Positive | None = None,
+    integrity_risk: IntegrityRisk | None = None,
+    alert_limit_m: Positive | None = None,
     without_mesh: bool = False,
     quick: bool = False,
     json: bool = False,
@@ -68,6 +70,10 @@ def study(
         Noise of every TX and RX stamp in picoseconds, known to the filters; by default 100.
     qa
         Agility that the filters assume at rest, m²/s³; by default 0.3.
+    integrity_risk
+        Probability, for each fix, that the error exceeds its protection level (integrity); 1e-4 by default.
+    alert_limit_m
+        Fixes with a higher protection level than so many metres count as not available (integrity).
     without_mesh
         Anchors relay only when they heard the master.
     quick
@@ -87,6 +93,9 @@ def study(
     from skyless.experiments.studies.catalogue import STUDIES
     from skyless.experiments.studies.plan import plan_of
 
+    asked = integrity_of(integrity_risk, alert_limit_m)
+    if name != "integrity" and (integrity_risk is not None or alert_limit_m is not None):
+        raise SkylessError("--integrity-risk and --alert-limit-m are for the study integrity")
     _see_that_it_applies(name, episodes, {"worlds": worlds, "seconds": seconds, "noise-ps": noise_ps, "qa": qa})
     if scheduler is not None and processes is not None:
         raise SkylessError("--processes are on this machine, --scheduler is for others; give either")
@@ -101,6 +110,8 @@ def study(
         worlds=worlds,
         seconds=seconds,
         episodes=episodes,
+        integrity_risk=asked.risk,
+        alert_limit_m=asked.alert_limit_m,
     )
     started_s = time.perf_counter()
     chosen = STUDIES[name]

@@ -5,7 +5,7 @@ import io
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -20,6 +20,16 @@ if TYPE_CHECKING:
 
 WIDEST = 160
 """Columns of a table that is not shown on a terminal."""
+
+_OF_ERRORS: Final = (
+    "Simulated. ± standard errors. NEES: per dimension, with the interval where 99 % of honest ones lie.",
+    "Fixes: superframes with one. CPU: of a tag for a message, measured.",
+)
+_OF_LEVELS: Final = (
+    "Simulated. Level: share of fixes with a protection level. HPL, VPL: its median. Misleading, vertical: share of",
+    "fixes whose error exceeds it, in 10⁻⁴, with the interval where it truly lies with 99 %; held unless the risk lies",
+    "below that. Ratio: how many times smaller levels could be on clean data.",
+)
 
 
 def see_that_it_can_be_written(plot: Path | None, out: Path | None) -> None:
@@ -74,8 +84,8 @@ def print_rows(study: "Study", plan: "Plan", rows: "Sequence[Row]", wall_s: floa
     if not out.is_terminal:
         out.width = WIDEST
     out.print(_table(study, plan, rows))
-    out.print("Simulated. ± standard errors. NEES: per dimension, with the interval where 99 % of honest ones lie.")
-    out.print("Fixes: superframes with one. CPU: of a tag for a message, measured.")
+    for line in _OF_LEVELS if rows[0].risk is not None else _OF_ERRORS:
+        out.print(line)
 
 
 def _table(study: "Study", plan: "Plan", rows: "Sequence[Row]") -> "Table":
@@ -83,7 +93,10 @@ def _table(study: "Study", plan: "Plan", rows: "Sequence[Row]") -> "Table":
     from rich.table import Table
 
     table = Table(box=SIMPLE_HEAD, title=f"{study.title}: {plan.method}, seed {plan.seed}")
-    heads = ("case", "RMSE in cm", "95 %", "max", "said", "NEES", "", "fixes", "bound", "ratio", "limit", "CPU in µs")
+    heads = (
+        *("case", "RMSE in cm", "95 %", "max", "said", "NEES", "", "fixes", "bound"),
+        *("level", "HPL in cm", "VPL", "misleading", "", "vertical", "", "ratio", "limit", "CPU in µs"),
+    )
     cells = [_cells(row) for row in rows]
     for column, head in enumerate(heads):
         if any(line[column] for line in cells):
@@ -103,12 +116,33 @@ def _cells(row: "Row") -> tuple[str, ...]:
         _number(row.said_m, 100.0),
         _number(row.nees),
         "" if row.nees_interval is None else "{:.2f}–{:.2f}".format(*row.nees_interval),
-        "" if row.available is None else f"{100.0 * row.available:.1f} %",
+        "" if row.risk is not None else _percent(row.available),
         _number(row.bound_m, 100.0),
+        "" if row.risk is None else _percent(row.available),
+        _number(row.hpl_m, 100.0, digits=1),
+        _number(row.vpl_m, 100.0, digits=1),
+        _number(row.hmi, 1e4),
+        _interval(row.hmi_interval),
+        _number(row.hmi_vertical, 1e4),
+        _interval(row.hmi_vertical_interval),
         _number(row.ratio, 1.0, row.ratio_error, 3),
-        "" if row.limit is None else f"{row.limit:g} {'held' if row.passed else 'missed'}",
+        _limit(row),
         _number(row.cpu_us_per_message, digits=0),
     )
+
+
+def _limit(row: "Row") -> str:
+    """The largest ratio that is accepted, or else the risk of levels, and whether it was held."""
+    limit = row.risk if row.limit is None else row.limit
+    return "" if limit is None else f"{limit:g} {'held' if row.passed else 'missed'}"
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{100.0 * share:.1f} %"
+
+
+def _interval(shares: tuple[float, float] | None) -> str:
+    return "" if shares is None else "{:.2f}–{:.2f}".format(*(1e4 * share for share in shares))
 
 
 def _number(value: float | None, factor: float = 1.0, error: float | None = None, digits: int = 2) -> str:

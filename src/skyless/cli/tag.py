@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, broker, say
-from skyless.cli.options import Positive, finite_numbers, known_method
+from skyless.cli.options import IntegrityRisk, Positive, finite_numbers, integrity_of, known_method
 from skyless.errors import SkylessError
 from skyless.methods import DEFAULT_METHOD
 from skyless.radios.open import DEFAULT_RADIO, is_sniffer, open_radios, open_sniffers
@@ -30,6 +30,8 @@ def tag(
     radio: str = DEFAULT_RADIO,
     method: str = DEFAULT_METHOD,
     qa: Positive = 0.3,
+    integrity_risk: IntegrityRisk | None = None,
+    alert_limit_m: Positive | None = None,
     publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0,
     site_id: Annotated[int | None, Parameter(validator=Number(gte=0, lt=0xFFFE))] = None,
     anchors: Path | None = None,
@@ -54,6 +56,10 @@ def tag(
         How positions are computed (sniffers: always joint).
     qa
         Agility of the tags in m²/s³ (tracker).
+    integrity_risk
+        Probability, for each fix, that the error exceeds its protection level (joint); 1e-4 by default.
+    alert_limit_m
+        Fixes with a higher protection level than so many metres carry an alert (joint).
     publish_hz
         Fixes a second and tag on MQTT at most.
     site_id
@@ -80,11 +86,15 @@ def tag(
         )
     known_method(method)
     if is_sniffer(radio):
+        if integrity_risk is not None or alert_limit_m is not None:
+            raise SkylessError("--integrity-risk and --alert-limit-m are not for sniffers")
         serve = _on_sniffers(radio, names, _system(anchors, height, site_id, qa, publish_hz), address)
     elif anchors is not None or height is not None:
         raise SkylessError("--anchors and --height are for sniffers; other tags hear from the air where anchors stand")
     else:
-        serve = _on_radios(radio, names, TagSettings(method, qa, site_id, publish_hz=publish_hz), address)
+        asked = integrity_of(integrity_risk, alert_limit_m)
+        settings = TagSettings(method, qa, site_id, integrity=asked, publish_hz=publish_hz)
+        serve = _on_radios(radio, names, settings, address)
     with contextlib.suppress(KeyboardInterrupt):
         run(serve, punctual=True)
 

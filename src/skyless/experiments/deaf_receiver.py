@@ -2,6 +2,7 @@
 
 from skyless.air.reception import Reception
 from skyless.positioning.fix import Fix
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import Outage
 
@@ -9,13 +10,15 @@ from skyless.simulation.impairments import Outage
 class DeafReceiver(Receiver):
     """Counts what it would have heard while deaf as dropped; unlike after an outage, its counter has gone on."""
 
-    def __init__(self, method: str, *, qa: float, silences: tuple[Outage, ...]) -> None:
+    def __init__(
+        self, method: str, *, qa: float, integrity: IntegrityRequirement, silences: tuple[Outage, ...]
+    ) -> None:
         """``silences`` are in the time of the host, which in the simulated world is the true one.
 
         Raises:
             ValueError: there is no such method.
         """
-        super().__init__(method, qa=qa)
+        super().__init__(method, qa=qa, integrity=integrity)
         self._silences = silences
 
     def hear(self, reception: Reception) -> Fix | None:

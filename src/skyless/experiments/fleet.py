@@ -14,6 +14,7 @@ from skyless.anchor import Anchor
 from skyless.experiments.statistics import ErrorStatistics, ErrorSummary
 from skyless.methods import DEFAULT_METHOD
 from skyless.positioning.fix import Fix
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.receiver import NOT_DROPS, Receiver
 from skyless.simulation.broadcast import Broadcast, Tally
 from skyless.simulation.impairments import Impairments
@@ -48,6 +49,7 @@ class FleetSettings(Struct, frozen=True):
     """True time before which no fix counts for the errors; cold starts are told by ``first_fix_s``."""
     most_fixes: int | None = None
     """Judged fixes per tag after which no more are judged."""
+    integrity: IntegrityRequirement = IntegrityRequirement()
 
 
 class TagRecord(Struct):
@@ -88,7 +90,7 @@ class Fleet:
         return self.anchors[anchor]
 
     def _new_receiver(self) -> Receiver:
-        return Receiver(self._settings.method, qa=self._settings.qa)
+        return Receiver(self._settings.method, qa=self._settings.qa, integrity=self._settings.integrity)
 
     def run(self, until_s: float) -> Iterator[JudgedFix]:
         """Let true time pass; every fix of every tag, beside the truth."""

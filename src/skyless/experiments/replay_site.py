@@ -13,6 +13,7 @@ from skyless.experiments.replay import ReplayReport
 from skyless.experiments.replay_delays import delay_changes
 from skyless.experiments.replay_tag import Identical, Replayed, TagReplay
 from skyless.outputs.messages import FixMessage, ReceptionsMessage
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.recordings.mcap_recording import McapRecording, Recorded
 from skyless.recordings.truth import Truth
 from skyless.site.model import Site
@@ -43,8 +44,12 @@ class SiteReplay:
         settle_s: float = 2.0,
         above_m: float | None = None,
         wanted: Site | None = None,
+        integrity: IntegrityRequirement | None = None,
     ) -> None:
-        """``method`` is used instead of the tags' own, the antenna delays of ``wanted`` instead of the anchors' own.
+        """Replay as the tags computed, or otherwise.
+
+        ``method`` and ``integrity`` are used instead of the tags' own, the antenna delays of ``wanted`` instead of the
+        anchors' own.
 
         Raises:
             ConfigurationError: the recording has no raw receptions, none of such a tag, or is of another site.
@@ -64,7 +69,7 @@ class SiteReplay:
         delays = None
         if wanted is not None:
             delays = delay_changes(recorded_site(recording, wanted.id), wanted)
-        self.tags = {tag: TagReplay(tag, method, delays) for tag in tags or summary.raw_tags}
+        self.tags = {tag: TagReplay(tag, method, delays, integrity) for tag in tags or summary.raw_tags}
         self.judges = {
             tag: Judge(truth.get(tag), planar=self.height_m is not None, settle_s=settle_s, above_m=above_m)
             for tag in self.tags

@@ -15,6 +15,7 @@ from skyless.methods import METHODS
 from skyless.nodes.tag import fix_message
 from skyless.outputs.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart
 from skyless.positioning.fix import Fix
+from skyless.positioning.protection import RISK, IntegrityRequirement
 from skyless.receiver import NOT_DROPS, Receiver
 from skyless.recordings.checkpoint import RefusedError, load
 from skyless.recordings.source import Drops
@@ -68,9 +69,17 @@ class HostClock:
 class TagReplay:
     """Takes the receptions of one tag in the order of the recording."""
 
-    def __init__(self, tag: str, method: str | None = None, delays: dict[int, DelayChange] | None = None) -> None:
-        """``method``: another one than the tag's own; ``delays``: other antenna delays. Both begin cold."""
+    def __init__(
+        self,
+        tag: str,
+        method: str | None = None,
+        delays: dict[int, DelayChange] | None = None,
+        integrity: IntegrityRequirement | None = None,
+    ) -> None:
+        """``method`` and ``integrity``: others than the tag's own; ``delays``: other antenna delays. All begin cold."""
         self._delays = delays
+        self._integrity = integrity
+        self._is_as_it_was = method is None and delays is None and integrity is None
         self.tag = tag
         self.method = method
         """As recorded, once known, or as asked for."""
@@ -118,7 +127,7 @@ class TagReplay:
     @property
     def identical(self) -> Identical | None:
         """How the fixes compare; None with another method than the tag's own, or other antenna delays."""
-        return None if self._asked is not None or self._delays is not None else self._comparison.result()
+        return self._comparison.result() if self._is_as_it_was else None
 
     def all_drops(self) -> dict[str, int]:
         """What could not be used, by reason, the receiver's own included."""
@@ -143,7 +152,7 @@ class TagReplay:
     def _begin(self, segment: str, start: SegmentStart) -> None:
         self._segment, self._next = segment, 0
         self.segments += 1
-        if self._asked is not None or self._delays is not None:
+        if not self._is_as_it_was:
             if self._receiver is None:
                 self._start_cold(start)
             return
@@ -168,10 +177,10 @@ class TagReplay:
     def _start_cold(self, start: SegmentStart) -> None:
         self.cold_starts += 1
         self._serial, self._restored = None, False
-        receiver = _receiver_of(start, self._asked)
+        receiver = _receiver_of(start, self._asked, self._integrity)
         if receiver is None:
             self.drops["impossible-settings"] += 1
-            receiver = Receiver(self._asked or METHODS[-1])
+            receiver = Receiver(self._asked or METHODS[-1], integrity=self._integrity)
         self._receiver = receiver
         self.method = self._asked or str(start.settings.get("method"))
 
@@ -236,7 +245,7 @@ def reception_of(raw: RawReception) -> Reception | None:
     return Reception(raw.frame, raw.rx_ticks, raw.host_s, None if told == (None, None, None) else Diagnostics(*told))
 
 
-def _receiver_of(start: SegmentStart, method: str | None) -> Receiver | None:
+def _receiver_of(start: SegmentStart, method: str | None, integrity: IntegrityRequirement | None) -> Receiver | None:
     """A receiver that knows nothing, made as the tag's was; None where that makes no sense."""
     told = start.settings
     name, site, qa = method or told.get("method"), told.get("site"), told.get("qa", 0.3)
@@ -247,4 +256,20 @@ def _receiver_of(start: SegmentStart, method: str | None) -> Receiver | None:
         return None
     bounded = isinstance(low_m, int | float) and isinstance(high_m, int | float)
     bounds_m = (float(low_m), float(high_m)) if bounded else None  # type: ignore[arg-type]
-    return Receiver(name, site=site, qa=float(qa), z_bounds_m=bounds_m)
+    try:
+        asked = integrity or _integrity_of(start)
+    except (ValueError, TypeError):
+        return None
+    return Receiver(name, site=site, qa=float(qa), z_bounds_m=bounds_m, integrity=asked)
+
+
+def _integrity_of(start: SegmentStart) -> IntegrityRequirement:
+    """What was asked of the tag's levels; recordings from before it could be asked do not say.
+
+    Raises:
+        ValueError, TypeError: it makes no sense.
+    """
+    return IntegrityRequirement(
+        start.settings.get("integrity_risk", RISK),  # type: ignore[arg-type]
+        start.settings.get("alert_limit_m"),  # type: ignore[arg-type]
+    )

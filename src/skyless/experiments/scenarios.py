@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from skyless.experiments.deaf_receiver import DeafReceiver
 from skyless.experiments.fleet import Fleet, FleetSettings
 from skyless.methods import DEFAULT_METHOD
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.simulation.channel import ChannelModel
 from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage
 from skyless.simulation.oscillator import OscillatorModel, Temperature
@@ -46,6 +47,7 @@ class Request(Struct, frozen=True):
     speed_mps: float = 1.0
     """Speed of the tags that walk."""
     qa: float = 0.3
+    integrity: IntegrityRequirement = IntegrityRequirement()
     warmup_s: float = 2.0
     most_fixes: int | None = None
     """Judged fixes per tag, one per superframe, after which no more are judged."""
@@ -74,11 +76,12 @@ def fleet_of(request: Request) -> Fleet:
     if request.noise_ps is not None:
         noise = replace(site.noise, tx_stamp_ps=request.noise_ps, rx_stamp_ps=request.noise_ps)
         site = replace(site, noise=noise)
-    settings = FleetSettings(request.method, request.qa, request.warmup_s, request.most_fixes)
+    settings = FleetSettings(request.method, request.qa, request.warmup_s, request.most_fixes, request.integrity)
     fleet = Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, settings)
     if request.silences:
         fleet.receivers = [
-            DeafReceiver(request.method, qa=request.qa, silences=request.silences) for _ in fleet.receivers
+            DeafReceiver(request.method, qa=request.qa, integrity=request.integrity, silences=request.silences)
+            for _ in fleet.receivers
         ]
     return fleet
 

@@ -11,6 +11,7 @@ from skyless.nodes.latency import Latencies, PhaseBook
 from skyless.nodes.pace import Pace
 from skyless.outputs.messages import FixMessage, Matrix, Vector
 from skyless.positioning.fix import Fix
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.radios.radio import Gone, Radio, RadioEvent, Restarted
 from skyless.receiver import Receiver
 
@@ -23,6 +24,7 @@ class TagSettings(Struct, frozen=True):
     site: int | None = None
     """The only site to listen to; None for the first that is heard."""
     z_bounds_m: tuple[float, float] | None = None
+    integrity: IntegrityRequirement = IntegrityRequirement()
     publish_hz: float = 50.0
     """Fixes a second on MQTT at most; all of them count."""
 
@@ -59,7 +61,9 @@ class TagNode:
     def new_receiver(self) -> Receiver:
         """A receiver that knows nothing yet."""
         asked = self.settings
-        return Receiver(asked.method, site=asked.site, qa=asked.qa, z_bounds_m=asked.z_bounds_m)
+        return Receiver(
+            asked.method, site=asked.site, qa=asked.qa, z_bounds_m=asked.z_bounds_m, integrity=asked.integrity
+        )
 
     async def run(self) -> None:
         """Listen until cancelled."""

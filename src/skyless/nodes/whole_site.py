@@ -15,6 +15,7 @@ from skyless.nodes.running import Say, outlasting, together
 from skyless.nodes.watch import Watch
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.site.model import Site
 
 HOST: Final = "127.0.0.1"
@@ -34,6 +35,7 @@ class SiteRun(Struct, frozen=True):
     noise_ps: float | None
     seed: int
     method: str
+    integrity: IntegrityRequirement
     broker: MqttAddress | None
     """None: an embedded one."""
     record: Path | None
@@ -115,9 +117,12 @@ class WholeSite:
             Program(_named("anchor", some), ("anchor", *some, *site, *radio, *mqtt))
             for some in _groups(anchors, 1 if asked.apart else len(anchors))
         ]
+        computing = ["--method", asked.method, "--integrity-risk", str(asked.integrity.risk)]
+        if asked.integrity.alert_limit_m is not None:
+            computing += ["--alert-limit-m", str(asked.integrity.alert_limit_m)]
         tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
         programs += [
-            Program(_named("tag", some), ("tag", *some, *radio, *mqtt, "--method", asked.method))
+            Program(_named("tag", some), ("tag", *some, *radio, *mqtt, *computing))
             for some in _groups(tags, 1 if asked.apart else TAGS_PER_PROCESS)
         ]
         page = ("dashboard", *mqtt, "--listen", f"{HOST}:{self.page_port}", "--recordings", str(asked.recordings))

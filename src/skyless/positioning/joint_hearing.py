@@ -48,6 +48,7 @@ from skyless.positioning.joint_sync import SYNC_VARIANCE, hear_sync
 from skyless.positioning.joint_time import elapse
 from skyless.positioning.joint_updates import hear_anchor, hear_relay, join, new_packet
 from skyless.positioning.protection_levels import protect
+from skyless.positioning.protection_updates import unsettle
 
 FULL, REJECTED, ACCEPTED, JOINED, STALE_PACKET = range(-1, 4)
 """What became of a packet: no room for its anchor, not used, taken, the first of its anchor, older than the newest."""
@@ -102,6 +103,7 @@ def joint_hear(
             s.counts[IMPOSSIBLE] += 1
             return REJECTED
         s.counts[RESTARTS] += 1
+        unsettle(s)
         drop_slot(s, slot)
         slot = -1
     elapse(s, rx_ticks)
@@ -113,6 +115,7 @@ def joint_hear(
     in_row = 0 if slot < 0 or s.slots[slot, RELAYS_IN_ROW] >= RELAYS_APART else RESTART_IN_ROW
     if slot >= 0 and s.slots[slot, IN_ROW] >= in_row and s.slots[slot, RELAYS_IN_ROW] >= RELAYS_OFF:
         settle(s)
+        unsettle(s)
         drop_slot(s, slot)
         s.counts[JUMPS] += 1
         slot = -1

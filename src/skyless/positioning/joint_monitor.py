@@ -23,12 +23,14 @@ from skyless.positioning.joint_state import (
     PARDONED,
     PARDONS,
     READMISSIONS,
+    REJECTIONS,
     SCORE,
     SLOTS,
     WEIGHT,
     JointArrays,
     values,
 )
+from skyless.positioning.protection_updates import unsettle
 from skyless.positioning.tracker import (
     ACCEPTED,
     AGILITY,
@@ -159,6 +161,7 @@ def _watch(s: JointArrays, slot: int) -> None:
     if s.slots[slot, EXCLUDED]:
         if abs(s.anchors[slot, SCORE]) < READMIT_AT:
             s.slots[slot, EXCLUDED] = 0
+            s.evidence[REJECTIONS, slot] = 0.0
             s.counts[READMISSIONS] += 1
         elif excluded == MOST_EXCLUDED and s.anchors[slot, SCORE] < 0.0 and not patient:
             _pardon(s)
@@ -186,6 +189,7 @@ def _pardon(s: JointArrays) -> None:
     s.statistics[CAUTION] = PARDON_VARIANCE_M2
     for slot in range(s.counts[SLOTS]):
         s.slots[slot, EXCLUDED] = 0
+    unsettle(s)
     _forgive(s, PARDON_VARIANCE_M2)
 
 

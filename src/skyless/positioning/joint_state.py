@@ -48,9 +48,10 @@ SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW, EXCLUDED, RELAYS_IN_ROW = range(9)
 """Places in a row of ``slots``: index in the site's table, whole ticks of the offset, newest packet's stamps (own
 clock, tag's), place among the noises or −1, whether its packets are relayed, rejections in a row."""
 
-PLACE_X, PLACE_Y, PLACE_Z, RANGE, WEIGHT, INNOVATION, SCORE = range(7)
+PLACE_X, PLACE_Y, PLACE_Z, RANGE, WEIGHT, INNOVATION, SCORE, JOIN_DOUBT = range(8)
 """Places in a row of ``anchors``: position, range at its newest packet, factor on the variance of its receptions (of
-the packet at hand, as ``first_path`` says), newest innovation and running mean of the normalised ones."""
+the packet at hand, as ``first_path`` says), newest innovation and running mean of the normalised ones, and what is left
+of the additional variance that its receptions have after it joined where messages are late."""
 
 LATE_SHARE, LAG_SQUARED, CAUTION = range(4, 7)
 LAG: Final = 7
@@ -106,7 +107,7 @@ class JointArrays(NamedTuple):
     slots: Integers
     """Shape (capacity, 9)."""
     anchors: Matrix
-    """Shape (capacity, 7)."""
+    """Shape (capacity, 8)."""
     packets: Integers
     """Shape (capacity, REMEMBERED, 3)."""
     relayed: Integers
@@ -150,7 +151,7 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
         counts=np.zeros(23, np.int64),
         statistics=np.zeros(13),
         slots=np.zeros((capacity, 9), np.int64),
-        anchors=np.zeros((capacity, 7)),
+        anchors=np.zeros((capacity, 8)),
         packets=np.full((capacity, REMEMBERED, 3), NEVER),
         relayed=np.full((capacity, capacity), NEVER),
         slot_of=np.full(site_capacity, -1, np.int64),

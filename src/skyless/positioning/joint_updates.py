@@ -20,6 +20,7 @@ from skyless.positioning.joint_state import (
     GATE,
     HEIGHT,
     INNOVATION,
+    JOIN_DOUBT,
     LAG,
     LATE_SHARE,
     NOISE,
@@ -54,7 +55,10 @@ BENT: Final = 0.01
 """Where ranges are so curved that it counts for more than this part of the stamps' variance, it is counted."""
 
 JOIN_VARIANCE_M2: Final = 1.0
-"""Where messages are late an anchor's first packet may be so too: it decides nothing."""
+"""Where messages are late an anchor's first packets may be so too: they decide nothing, ..."""
+
+TRUST: Final = 0.5
+"""... and of each further one this share of the additional variance is left."""
 
 
 @borrowing_kernel
@@ -96,6 +100,9 @@ def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool
     bend_m = _bend(s, range_m, variance)
     term = project(s)
     doubt = (s.anchors[slot, WEIGHT] - 1.0) * variance
+    if s.anchors[slot, JOIN_DOUBT] > LEAST_CAUTION_M2:
+        s.anchors[slot, JOIN_DOUBT] *= TRUST
+        variance += s.anchors[slot, JOIN_DOUBT]
     variance += 2.0 * bend_m * bend_m
     if s.statistics[CAUTION] > 0.0:
         variance += s.statistics[CAUTION]
@@ -180,6 +187,7 @@ def join(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> None:
     bend_m = _bend(s, range_m, variance)
     variance += along_h(s, term) + 2.0 * bend_m * bend_m
     if s.statistics[CAUTION] > 0.0 or s.statistics[LATE_SHARE] > LATE_ENOUGH:
+        s.anchors[slot, JOIN_DOUBT] = JOIN_VARIANCE_M2
         variance += JOIN_VARIANCE_M2
     for row in range(states(s)):
         P[row, place] = s.terms[term, row]

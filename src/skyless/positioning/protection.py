@@ -45,6 +45,24 @@ class Integrity(Struct, frozen=True, gc=False):
     alert: Alert
 
 
+class IntegrityRequirement(Struct, frozen=True):
+    """What an application asks of the levels.
+
+    Raises:
+        ValueError: the risk is not between 0 and 0.1, or the limit is not a length.
+    """
+
+    risk: float = RISK
+    """Probability, for each fix, that an error exceeds its protection level."""
+    alert_limit_m: float | None = None
+    """Fixes with a higher horizontal protection level say so."""
+
+    def __post_init__(self) -> None:
+        limits_of(self.risk)
+        if self.alert_limit_m is not None and not 0.0 < self.alert_limit_m < np.inf:
+            raise ValueError(f"alert_limit_m is {self.alert_limit_m!r}; it should be more than 0 m")
+
+
 def integrity_of(levels: Vector, risk: float, height_known: bool, alert_limit_m: float | None) -> Integrity:
     """What ``protect`` has filled in, in words.
 

@@ -11,6 +11,7 @@ from skyless.positioning.joint_state import (
     DIM,
     EPOCH,
     EVIDENCE,
+    EXCLUDED,
     IN_ROW,
     PACKETS,
     REJECTIONS,
@@ -49,18 +50,19 @@ REJECTED_ONCE: Final = 0.3
 SUSPICIOUS: Final = 0.6
 """Where a packet of an anchor was rejected lately, the threshold for its fault is lower by this factor."""
 
+DOUBTFUL: Final = 0.45
 GROWING: Final = 1.5
-"""A fault beyond that lower threshold may be growing faster than its estimate: it counts so many times."""
+"""A fault beyond this share of the threshold may be growing faster than its estimate: it counts so many times."""
 
 OUT_IN_ROW: Final = 3
-"""An anchor is left out while its packets are rejected one after the other, ..."""
+"""An anchor is out while the monitor leaves it out, or its packets are rejected one after the other, ..."""
 
 MOST_BOUNDED: Final = 2.0
 """... and one whose fault is still in the fix is covered by the levels while none is rejected, up to this times the
 threshold."""
 
-NOTHING, EXCLUDED, BOUNDED, DETECTED, UNAVAILABLE = range(5)
-"""States: no fault; one that was left out; one in the fix, which the levels cover, or do not; too early to say."""
+NOTHING, LEFT_OUT, BOUNDED, DETECTED, UNAVAILABLE = range(5)
+"""States: no fault; one whose anchor is out; one in the fix, which the levels cover, or do not; too early to say."""
 
 
 @borrowing_kernel
@@ -86,9 +88,9 @@ def protect(s: JointArrays, covariance: Matrix, limits: Vector, levels: Vector) 
                 fault_m = abs(s.evidence[memory, slot]) / information
                 variance = scale * s.evidence[memory + 2, slot] / (information * information)
                 t = fault_m / np.sqrt(variance)
-                if t > worst_t:
+                if t > worst_t and not s.slots[slot, EXCLUDED]:
                     worst_t, worst_slot = t, slot
-                if t > SUSPICIOUS * limits[FAULT_T]:
+                if t > DOUBTFUL * limits[FAULT_T]:
                     fault_m *= GROWING
                 major = _major(xx + vx * vx * variance, xy + vx * vy * variance, yy + vy * vy * variance)
                 hpl = max(hpl, across * fault_m + limits[HORIZONTAL_K] * np.sqrt(major))
@@ -112,18 +114,26 @@ def _state(s: JointArrays, worst_t: float, worst_slot: int, most_t: float, hpl: 
     if s.recent[PACKETS] < SETTLED * LONG * s.counts[SLOTS] or not np.isfinite(hpl):
         return UNAVAILABLE
     refused = s.recent[RELAYS_REFUSED]
-    rejected, suspects = -1, 0
+    suspect, suspects = -1, 0
     for slot in range(s.counts[SLOTS]):
-        if s.evidence[REJECTIONS, slot] > REJECTED_OFTEN:
-            rejected = slot
+        if s.slots[slot, EXCLUDED] or s.evidence[REJECTIONS, slot] > REJECTED_OFTEN:
+            suspect = slot
             suspects += 1
     clocks_wrong = refused > FEW and refused > REFUSED_SHARE * (refused + s.recent[RELAYS_TAKEN])
     if suspects > 1 or clocks_wrong:
         return DETECTED
     if suspects == 1:
-        out = s.slots[rejected, IN_ROW] >= OUT_IN_ROW
-        return EXCLUDED if out and (worst_t <= most_t or worst_slot == rejected) else DETECTED
+        return _state_with_suspect(s, suspect, worst_t, worst_slot, most_t)
     return _state_without_rejections(s, worst_t, worst_slot, most_t)
+
+
+@borrowing_kernel
+def _state_with_suspect(s: JointArrays, suspect: int, worst_t: float, worst_slot: int, most_t: float) -> int:
+    """While one anchor is out, what shows at the others is what it has done to the state before, or its echo."""
+    if s.slots[suspect, EXCLUDED]:
+        return LEFT_OUT if _is_bounded(s, worst_t, worst_slot, most_t) else DETECTED
+    out = s.slots[suspect, IN_ROW] >= OUT_IN_ROW
+    return LEFT_OUT if out and (worst_t <= most_t or worst_slot == suspect) else DETECTED
 
 
 @borrowing_kernel
@@ -131,4 +141,12 @@ def _state_without_rejections(s: JointArrays, worst_t: float, worst_slot: int, m
     touched = worst_slot >= 0 and s.evidence[REJECTIONS, worst_slot] > REJECTED_ONCE
     if worst_t <= (SUSPICIOUS * most_t if touched else most_t):
         return NOTHING
-    return BOUNDED if not touched and worst_t <= MOST_BOUNDED * most_t else DETECTED
+    return BOUNDED if _is_bounded(s, worst_t, worst_slot, most_t) else DETECTED
+
+
+@borrowing_kernel
+def _is_bounded(s: JointArrays, worst_t: float, worst_slot: int, most_t: float) -> bool:
+    """Whether the levels cover what shows: up to a size, of anchors of which nothing was rejected."""
+    if worst_t <= most_t:
+        return True
+    return bool(s.evidence[REJECTIONS, worst_slot] <= REJECTED_ONCE and worst_t <= MOST_BOUNDED * most_t)

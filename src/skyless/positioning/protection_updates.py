@@ -79,6 +79,12 @@ def _gather(s: JointArrays, row: int, lane: int, factor: float | Eight, response
 
 
 @borrowing_kernel
+def unsettle(s: JointArrays) -> None:
+    """Begin to count packets anew: until there are enough of them nothing is promised."""
+    s.recent[PACKETS] = 0.0
+
+
+@borrowing_kernel
 def join_faults(s: JointArrays, slot: int, place: int) -> None:
     """An offset begins at what a first packet says: at minus the errors of the range, and at its own fault."""
     V = s.sensitivities

@@ -9,6 +9,7 @@ from typing import Final
 
 from skyless.air.reception import Reception
 from skyless.outputs.messages import RawReception, ReceptionsMessage, RequestMessage, SegmentStart
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.receiver import Receiver
 from skyless.recordings.checkpoint import save
 
@@ -132,11 +133,16 @@ class ReceptionLog:
 
 
 def receiver_settings(
-    method: str, site: int | None = None, qa: float = 0.3, z_bounds_m: tuple[float, float] | None = None
+    method: str,
+    site: int | None = None,
+    qa: float = 0.3,
+    z_bounds_m: tuple[float, float] | None = None,
+    integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
 ) -> Settings:
     """How a receiver is made, as a segment tells it."""
     low_m, high_m = (None, None) if z_bounds_m is None else z_bounds_m
-    return {"method": method, "site": site, "qa": qa, "z_low_m": low_m, "z_high_m": high_m}
+    asked = {"integrity_risk": integrity.risk, "alert_limit_m": integrity.alert_limit_m}
+    return {"method": method, "site": site, "qa": qa, "z_low_m": low_m, "z_high_m": high_m, **asked}
 
 
 def raw(reception: Reception) -> RawReception:

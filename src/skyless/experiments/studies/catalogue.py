@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final
 
-from skyless.experiments.studies import efficiency_rows, integrity, loss, motion, nlos, scale, sync
+from skyless.experiments.studies import efficiency_rows, integrity, integrity_picture, loss, motion, nlos, scale, sync
 from skyless.experiments.studies.picture import Look, draw
 from skyless.experiments.studies.plan import Cell, Plan, Row, Study
 from skyless.experiments.studies.summary import Case, world_cells, world_rows
@@ -44,7 +44,7 @@ STUDIES: Final = {
             "protection levels with one faulty anchor",
             integrity.cells,
             integrity.rows,
-            partial(draw, Look("One faulty anchor", ("rmse",), x="size of the fault in m", log=True)),
+            integrity_picture.draw,
         ),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
     )

@@ -1,7 +1,8 @@
 """The study ``integrity``: whether ``joint``'s protection levels hold while one anchor's messages are late.
 
 Matched episodes of the filter itself, as in ``efficiency``. In the middle of each, the tag's receptions of one anchor
-drawn by chance become late: at once (step) or growing for a second (ramp). Every fix from then on is an epoch.
+drawn by chance become late, at once or more and more, or go wrong in other ways (``integrity_faults``). Every fix from
+then on is an epoch.
 Misleading is an epoch whose error exceeds the level that the fix gives; available is one that gives a level.
 """
 
@@ -10,25 +11,25 @@ from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 from numpy.random import Generator, SeedSequence, default_rng
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.errors import SkylessError
 from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
-from skyless.experiments.studies.episodes import Case, Episode, draw_episode
+from skyless.experiments.studies.episodes import Case, draw_episode
+from skyless.experiments.studies.integrity_faults import FAULTS, Fault, faulty
 from skyless.experiments.studies.plan import Cell, Plan, Row
-from skyless.experiments.studies.summary import jackknife
-from skyless.positioning.joint import JointFilter, JointSettings
+from skyless.experiments.studies.rare import rare_interval
+from skyless.positioning.joint import JointFilter, JointSettings, Messages
 from skyless.positioning.joint_hearing import REJECTED
-from skyless.positioning.protection import RISK, limits_of, protected_track
+from skyless.positioning.protection import limits_of, protected_track
 from skyless.positioning.protection_levels import DETECTED, HPL, LEVELS, STATE, VPL
 from skyless.site.lab import lab_site
 
 Array = NDArray[np.float64]
 
-SIZES_M: Final = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
-RAMP_S: Final = 1.0
 SUPERFRAMES: Final = 134
 ONSETS: Final = (40, 67)
 """Superframes between which the fault begins; the filter has settled long before."""
@@ -39,44 +40,35 @@ EPISODE_S: Final = 0.008
 """About what an episode takes."""
 
 TOP: Final = 100
-"""Largest errors over their levels that a chunk tells: far more than the share ``RISK`` of its epochs."""
+"""So many of the largest errors a chunk tells at least, and ten times the share of its epochs that the risk is."""
 
 MOST_RATIO: Final = 1.5
-Z99: Final = 2.576
+ALL: Final = "all faults"
 
 _CORNERS_M: Final = ((0, 0), (4, 0), (8, 0), (8, 3), (8, 6), (4, 6), (0, 6), (0, 3))
 
 
-class Fault(Struct, frozen=True):
-    """What is wrong in all episodes of a case."""
+class Setting(Struct, frozen=True):
+    """What all episodes of a row have in common."""
 
-    place: str
-    """``lab``, with the height given, or ``room``, where it is a state."""
-    size_m: float = 0.0
-    ramp: bool = False
-
-    @property
-    def name(self) -> str:
-        """What rows call it."""
-        if self.size_m == 0.0:
-            return f"{self.place}, clean"
-        return f"{self.place}, {'ramp to' if self.ramp else 'step'} {self.size_m:g} m"
-
-
-FAULTS: Final = tuple(
-    fault
-    for place in ("lab", "room")
-    for fault in (Fault(place), *(Fault(place, size_m, ramp) for ramp in (False, True) for size_m in SIZES_M))
-)
+    case: Case
+    fault: Fault
+    risk: float
+    alert_limit_m: float | None = None
+    """Fixes with a higher level count as not available."""
 
 
 class Chunk(Struct, frozen=True):
     """What the episodes of a chunk came to."""
 
-    sums: Array
-    """Fixes, those with a level, misleading ones (horizontal, vertical), squared errors, and medians of both levels."""
+    counts: Array
+    """Of each episode the fixes, those with a level, misleading ones (horizontal, vertical), shape (episodes, 4)."""
+    squared_m2: float
+    """Sum of the squared horizontal errors."""
+    medians_m: tuple[float, float] | None
+    """Of both levels; None where no fix has one."""
     top: Array
-    """The largest horizontal errors over their levels, shape (TOP,)."""
+    """The largest horizontal errors over their levels."""
     errors_m: Array
     """The largest horizontal errors."""
 
@@ -98,67 +90,55 @@ def cells(plan: Plan) -> list[Cell]:
         raise SkylessError(f"--method is {plan.method!r}; protection levels are given by joint")
     case = Case(plan.noise_ps, qa=plan.qa, mesh=plan.mesh)
     seeds = SeedSequence(plan.seed).spawn(len(FAULTS))
-    return [
-        Cell(fault.name, run_chunk, (case, fault, tuple(own[first : first + CHUNK])), EPISODE_S * CHUNK)
-        for fault, seed in zip(FAULTS, seeds, strict=True)
-        for own in [seed.spawn(plan.episodes)]
-        for first in range(0, plan.episodes, CHUNK)
-    ]
+    found = []
+    for fault, seed in zip(FAULTS, seeds, strict=True):
+        setting = Setting(case, fault, plan.integrity_risk, plan.alert_limit_m)
+        own = tuple(seed.spawn(plan.episodes))
+        parts = [own[first : first + CHUNK] for first in range(0, plan.episodes, CHUNK)]
+        found += [Cell(fault.name, run_chunk, (setting, part), EPISODE_S * len(part)) for part in parts]
+    return found
 
 
-def run_chunk(argument: tuple[Case, Fault, tuple[SeedSequence, ...]]) -> Chunk:
+def run_chunk(argument: tuple[Setting, tuple[SeedSequence, ...]]) -> Chunk:
     """Run some episodes."""
-    case, fault, seeds = argument
-    episodes = [_run(case, fault, default_rng(seed)) for seed in seeds]
-    across, above, hpl, vpl, promised = (np.concatenate(part) for part in zip(*episodes, strict=True))
-    some = bool(promised.any())
-    sums = [
-        len(across),
-        promised.sum(),
-        (promised & (across > hpl)).sum(),
-        (promised & (above > vpl)).sum(),
-        float(across @ across),
-        1.0 if some else 0.0,
-        float(np.median(hpl[promised])) if some else 0.0,
-        float(np.median(vpl[promised])) if some else 0.0,
+    setting, seeds = argument
+    episodes = [_run(setting, default_rng(seed)) for seed in seeds]
+    counts = [
+        (len(across), promised.sum(), (promised & (across > hpl)).sum(), (promised & (above > vpl)).sum())
+        for across, above, hpl, vpl, promised in episodes
     ]
-    return Chunk(np.array(sums, float), _largest(across[promised] / hpl[promised]), _largest(across))
+    across, _, hpl, vpl, promised = (np.concatenate(part) for part in zip(*episodes, strict=True))
+    most = max(TOP, int(10.0 * setting.risk * len(across)))
+    return Chunk(
+        counts=np.array(counts, float),
+        squared_m2=float(across @ across),
+        medians_m=(float(np.median(hpl[promised])), float(np.median(vpl[promised]))) if promised.any() else None,
+        top=np.sort(across[promised] / hpl[promised])[-most:],
+        errors_m=np.sort(across)[-most:],
+    )
 
 
-def _largest(values: Array) -> Array:
-    return np.sort(np.concatenate([values, np.zeros(TOP)]))[-TOP:]
-
-
-def _run(case: Case, fault: Fault, draw: Generator) -> tuple[NDArray[Any], ...]:
+def _run(setting: Setting, draw: Generator) -> tuple[NDArray[Any], ...]:
     """Horizontal and vertical errors, both levels, and whether they are promised, of all fixes since the onset."""
-    anchors_m = anchors_of(fault.place)
-    slot_s = lab_site().schedule.slot_s
-    episode = draw_episode(draw, anchors_m, slot_s, case, SUPERFRAMES)
+    anchors_m, slot_s = anchors_of(setting.fault.place), lab_site().schedule.slot_s
+    episode = draw_episode(draw, anchors_m, slot_s, setting.case, SUPERFRAMES)
     onset = int(draw.integers(*ONSETS)) * len(anchors_m)
-    rx_ticks = _late(episode, fault, int(draw.integers(len(anchors_m))), onset, slot_s)
-    motions, levels = _filtered(case, fault, anchors_m, episode, rx_ticks, draw)
+    messages = faulty(episode, setting.fault, int(draw.integers(len(anchors_m))), onset, slot_s)
+    motions, levels = _filtered(setting, anchors_m, messages, episode.path_m[0] + draw.normal(0.0, START_STD_M, 3))
     fixes = np.flatnonzero(levels[onset:, LEVELS] != REJECTED) + onset
-    errors = np.zeros((len(fixes), 3))
+    errors, told = np.zeros((len(fixes), 3)), levels[fixes]
     dim = motions.shape[1] // 2
     errors[:, :dim] = motions[fixes, :dim] - episode.path_m[fixes, :dim]
-    across = np.hypot(errors[:, 0], errors[:, 1])
-    told = levels[fixes]
     vpl = told[:, VPL] if dim == 3 else np.full(len(fixes), np.inf)
-    return across, np.abs(errors[:, 2]), told[:, HPL], vpl, told[:, STATE] < DETECTED
+    promised = told[:, STATE] < DETECTED
+    if setting.alert_limit_m is not None:
+        promised &= told[:, HPL] <= setting.alert_limit_m
+    return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2]), told[:, HPL], vpl, promised
 
 
-def _late(episode: Episode, fault: Fault, anchor: int, onset: int, slot_s: float) -> NDArray[np.int64]:
-    messages = episode.messages
-    since_s = (np.arange(len(messages.sites)) - onset) * slot_s
-    share = np.clip(since_s / RAMP_S, 0.0, 1.0) if fault.ramp else (since_s >= 0.0)
-    late_m = np.where(messages.sites == anchor, fault.size_m * share, 0.0)
-    return messages.rx_ticks + np.rint(late_m / TICK_M).astype(np.int64)
-
-
-def _filtered(
-    case: Case, fault: Fault, anchors_m: Array, episode: Episode, rx_ticks: NDArray[np.int64], draw: Generator
-) -> tuple[Array, Array]:
-    light2 = SPEED_OF_LIGHT_MPS**2
+def _filtered(setting: Setting, anchors_m: Array, messages: Messages, start_m: Array) -> tuple[Array, Array]:
+    """Motions and levels after every packet."""
+    light2, case = SPEED_OF_LIGHT_MPS**2, setting.case
     stamp = light2 * (case.noise_ps * 1e-12) ** 2
     settings = JointSettings(
         qa=case.qa,
@@ -166,22 +146,21 @@ def _filtered(
         walk=light2 * case.random_walk_fm**2,
         tx_variance_m2=stamp,
         rx_variance_m2=stamp + TICK_M**2 / 12.0,
-        height_m=0.0 if fault.place == "lab" else None,
+        height_m=0.0 if setting.fault.place == "lab" else None,
     )
-    joint, messages = JointFilter(settings, anchors_m), episode.messages
-    dim, n = joint.dim, len(rx_ticks)
-    start = episode.path_m[0, :dim] + draw.normal(0.0, START_STD_M, dim)
-    joint.start(int(rx_ticks[0]), start, START_STD_M**2 * np.eye(dim), SPEED_STD_MPS**2)
+    joint = JointFilter(settings, anchors_m)
+    dim, n = joint.dim, len(messages.sites)
+    joint.start(int(messages.rx_ticks[0]), start_m[:dim], START_STD_M**2 * np.eye(dim), SPEED_STD_MPS**2)
     motions, levels = np.empty((n, 2 * dim)), np.empty((n, LEVELS + 1))
     protected_track(
         joint.arrays,
         messages.sites,
         messages.sequences,
-        rx_ticks,
+        messages.rx_ticks,
         messages.tx_ticks,
         messages.relays,
         messages.ends,
-        limits_of(RISK),
+        limits_of(setting.risk),
         np.empty(2 * dim),
         np.empty((2 * dim, 2 * dim)),
         motions,
@@ -191,53 +170,58 @@ def _filtered(
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
-    """A row for each fault; the results stand in the order of ``cells``."""
+    """A row for each fault, and one for all together; the results stand in the order of ``cells``."""
     each = -(-plan.episodes // CHUNK)
-    return [_row(plan, fault, results[each * number : each * (number + 1)]) for number, fault in enumerate(FAULTS)]
+    parts = [results[each * number : each * (number + 1)] for number in range(len(FAULTS))]
+    single = [_row(plan, fault, chunks) for fault, chunks in zip(FAULTS, parts, strict=True)]
+    wrong = [chunk for fault, chunks in zip(FAULTS, parts, strict=True) if fault.size_m > 0.0 for chunk in chunks]
+    return [*single, _pooled(plan, ALL, ALL, None, wrong)]
 
 
 def _row(plan: Plan, fault: Fault, chunks: Sequence[Chunk]) -> Row:
-    sums = np.array([chunk.sums for chunk in chunks])
-    epochs, promised, _, _, squared_m2, counted, hpl_m, vpl_m = sums.sum(axis=0).tolist()
-    hmi, error = jackknife(sums, lambda rows: _share(rows, 2))
-    beyond = Z99 * (error or 0.0)
-    passed = bool(hmi <= RISK)
-    ratio = None
-    if fault.size_m == 0.0:
-        ratio = 1.0 / _quantile([chunk.top for chunk in chunks], promised)
-        passed = passed and ratio <= MOST_RATIO
+    row = _pooled(plan, fault.name, fault.series, fault.size_m, chunks, vertical=fault.place == "room")
+    if fault.size_m > 0.0:
+        return row
+    ratio = 1.0 / _quantile([chunk.top for chunk in chunks], plan.integrity_risk, row.fixes)
+    passed = bool(row.passed) and ratio <= MOST_RATIO
+    return replace(row, ratio=ratio, limit=MOST_RATIO, passed=passed)
+
+
+def _pooled(
+    plan: Plan, case: str, series: str, x: float | None, chunks: Sequence[Chunk], *, vertical: bool = False
+) -> Row:
+    """What some chunks came to; it passes unless the risk lies below the interval."""
+    counts = np.concatenate([chunk.counts for chunk in chunks])
+    epochs, promised = int(counts[:, 0].sum()), float(counts[:, 1].sum())
+    intervals = [rare_interval(counts[:, column], epochs) for column in (2, 3)]
+    medians = np.array([chunk.medians_m for chunk in chunks if chunk.medians_m is not None])
+    hpl_m, vpl_m = medians.mean(axis=0).tolist() if len(medians) else (None, None)
     return Row(
         study="integrity",
         method=plan.method,
-        case=fault.name,
-        series=f"{fault.place}, {'ramp' if fault.ramp else 'step'}",
-        x=fault.size_m,
+        case=case,
+        series=series,
+        x=x,
         mesh=plan.mesh,
         noise_ps=plan.noise_ps,
-        runs=plan.episodes,
-        fixes=int(epochs),
-        rmse_m=float(np.sqrt(squared_m2 / epochs)),
+        runs=len(counts),
+        fixes=epochs,
+        rmse_m=float(np.sqrt(sum(chunk.squared_m2 for chunk in chunks) / epochs)),
         max_m=float(max(chunk.errors_m[-1] for chunk in chunks)),
         available=promised / epochs,
-        ratio=ratio,
-        limit=None if ratio is None else MOST_RATIO,
-        passed=passed,
-        risk=RISK,
-        hmi=hmi,
-        hmi_interval=(max(hmi - beyond, 0.0), hmi + beyond),
-        hmi_vertical=_share(sums, 3) if fault.place == "room" else None,
-        hpl_m=hpl_m / counted if counted else None,
-        vpl_m=vpl_m / counted if counted and fault.place == "room" else None,
-        smallest_m=_quantile([chunk.errors_m for chunk in chunks], epochs),
+        passed=all(low <= plan.integrity_risk for low, _ in intervals),
+        risk=plan.integrity_risk,
+        hmi=float(counts[:, 2].sum()) / epochs,
+        hmi_interval=intervals[0],
+        hmi_vertical=float(counts[:, 3].sum()) / epochs if vertical else None,
+        hmi_vertical_interval=intervals[1] if vertical else None,
+        hpl_m=hpl_m,
+        vpl_m=vpl_m if vertical else None,
+        smallest_m=_quantile([chunk.errors_m for chunk in chunks], plan.integrity_risk, epochs),
     )
 
 
-def _share(sums: Array, column: int) -> float:
-    """Misleading epochs over all."""
-    return float(sums[:, column].sum() / sums[:, 0].sum())
-
-
-def _quantile(largest: Sequence[Array], count: float) -> float:
-    """What the share ``RISK`` of so many values exceeds, from the largest of each chunk."""
+def _quantile(largest: Sequence[Array], risk: float, count: float) -> float:
+    """What the share ``risk`` of so many values exceeds, from the largest of each chunk."""
     values = np.sort(np.concatenate(largest))
-    return float(values[-max(int(np.ceil(RISK * count)), 1)])
+    return float(values[-max(int(np.ceil(risk * count)), 1)])

@@ -7,6 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from msgspec import Struct
 
+from skyless.positioning.protection import RISK
+
 
 class Plan(Struct, frozen=True):
     """How much is simulated, and with what."""
@@ -27,7 +29,11 @@ class Plan(Struct, frozen=True):
     tags: int = 4
     """In each world."""
     episodes: int = 2000
-    """Of a case of the study ``efficiency``."""
+    """Of a case of the studies ``efficiency`` and ``integrity``."""
+    integrity_risk: float = RISK
+    """Stated probability that a fix's error exceeds its protection level (``integrity``)."""
+    alert_limit_m: float | None = None
+    """Fixes with a higher level count as not available (``integrity``)."""
 
 
 def plan_of(
@@ -41,6 +47,8 @@ def plan_of(
     worlds: int | None = None,
     seconds: float | None = None,
     episodes: int | None = None,
+    integrity_risk: float = RISK,
+    alert_limit_m: float | None = None,
 ) -> Plan:
     """The usual amounts, or with ``quick`` few, where none are given."""
     usual = Plan()
@@ -57,6 +65,8 @@ def plan_of(
         seconds=seconds or usual.seconds,
         tags=usual.tags,
         episodes=episodes or usual.episodes,
+        integrity_risk=integrity_risk,
+        alert_limit_m=alert_limit_m,
     )
 
 
@@ -126,11 +136,12 @@ class Row(Struct, frozen=True):
     hmi_interval: tuple[float, float] | None = None
     """Where that share truly lies, with 99 %."""
     hmi_vertical: float | None = None
+    hmi_vertical_interval: tuple[float, float] | None = None
     hpl_m: float | None = None
     """Median horizontal level of the fixes that promise one; mean of the chunks' medians."""
     vpl_m: float | None = None
     smallest_m: float | None = None
-    """Horizontal error that the share ``risk`` of fixes exceeds."""
+    """Horizontal error that the share ``risk`` of fixes exceeds, with or without a level."""
 
 
 class Study(Struct, frozen=True):
