@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 COLUMNS: Final = (
     *("t_s", "tag"),
     *("x_m", "y_m", "z_m", "var_x_m2", "var_y_m2", "var_z_m2", "truth_x_m", "truth_y_m", "truth_z_m", "anchors"),
+    *("hpl_m", "vpl_m", "integrity_risk", "alert"),
 )
 """Columns of the file that --fixes-csv writes."""
 
@@ -19,7 +20,11 @@ def row_of(judged: "JudgedFix") -> tuple[object, ...]:
     fix = judged.fix
     numbers = [*fix.position_m, *fix.covariance_m2.diagonal(), *judged.truth_m]
     anchors = " ".join(map(str, fix.anchors))
-    return (f"{judged.time_s:.6f}", judged.tag, *(f"{number:.6g}" for number in numbers), anchors)
+    levels = (
+        *("" if one is None else f"{one:.4g}" for one in (fix.hpl_m, fix.vpl_m, fix.integrity_risk)),
+        fix.alert or "",
+    )
+    return (f"{judged.time_s:.6f}", judged.tag, *(f"{number:.6g}" for number in numbers), anchors, *levels)
 
 
 def show(result: "FleetReport") -> None:
@@ -38,11 +43,24 @@ def show(result: "FleetReport") -> None:
         ("95 %", _centimetres(result.p95_m)),
         ("largest", _centimetres(result.max_m)),
     )
-    for name, value in lines:
+    for name, value in (*lines, *_levels(result)):
         table.add_row(name, value)
     for reason, count in result.drops.items():
         table.add_row(f"dropped: {reason}", str(count))
     console().print(table)
+
+
+def _levels(result: "FleetReport") -> list[tuple[str, str]]:
+    """How the protection levels did, where the method gives some."""
+    levels = result.levels
+    if levels is None:
+        return []
+    alerts = ", ".join(f"{alert} {count}" for alert, count in levels.alerts.items() if alert != "none")
+    return [
+        ("protection level", f"median {_centimetres(levels.hpl_m)}, for {100 * levels.available:.1f} % of the fixes"),
+        ("errors beyond it", f"{levels.misleading} (stated risk {levels.integrity_risk:g})"),
+        ("alerts", alerts or "none"),
+    ]
 
 
 def _centimetres(value_m: float | None) -> str:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from skyless.air.reception import Reception
 from skyless.air.schedule import schedule_of
 from skyless.anchor import Anchor
+from skyless.experiments.level_tally import LevelReport, LevelTally
 from skyless.experiments.statistics import ErrorStatistics, ErrorSummary
 from skyless.methods import DEFAULT_METHOD
 from skyless.positioning.fix import Fix
@@ -84,6 +85,7 @@ class Fleet:
         self._superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
         self.errors = ErrorStatistics(planar=site.tags.height_m is not None)
         self.sigma_squared_sum = 0.0
+        self.levels = LevelTally()
 
     def _new_anchor(self, anchor: int) -> Anchor:
         self.anchors[anchor] = Anchor(self.site, anchor)
@@ -126,6 +128,7 @@ class Fleet:
         self._judged_round[judged.tag] = superframe
         record.judged += 1
         error = judged.error_m
+        self.levels.add(judged.fix, error)
         self.errors.add(float(error[0]), float(error[1]), float(error[2]))
         self.sigma_squared_sum += float(np.trace(judged.fix.covariance_m2))
 
@@ -160,6 +163,8 @@ class FleetReport(Struct, frozen=True):
     first_fix_s: float | None
     """Median over the tags of the true time of the first fix, from a cold start of the whole site."""
     tags_without_fix: int
+    levels: LevelReport | None
+    """How the protection levels did; None for methods that give none."""
     drops: dict[str, int]
     air: Tally
     simulated_s: float
@@ -192,6 +197,7 @@ def report(fleet: Fleet, method: str, started_s: float) -> FleetReport:
         bias_m=summary.bias_m,
         first_fix_s=float(np.median(firsts)) if firsts else None,
         tags_without_fix=len(fleet.records) - len(firsts),
+        levels=fleet.levels.report(),
         drops=fleet.drops,
         air=fleet.world.tally,
         simulated_s=simulated_s,

@@ -24,6 +24,7 @@ from skyless.positioning.joint_state import (
     PACKET_RX,
     PACKET_TX,
     REJECTED_IN_ROW,
+    REJOINED,
     RELAYS_IN_ROW,
     REMEMBERED,
     RESTARTS,
@@ -47,7 +48,7 @@ from skyless.positioning.joint_state import (
 from skyless.positioning.joint_sync import SYNC_VARIANCE, hear_sync
 from skyless.positioning.joint_time import elapse
 from skyless.positioning.joint_updates import hear_anchor, hear_relay, join, new_packet
-from skyless.positioning.protection_levels import protect
+from skyless.positioning.protection_levels import RELAYS_OFF, protect
 from skyless.positioning.protection_updates import unsettle
 
 FULL, REJECTED, ACCEPTED, JOINED, STALE_PACKET = range(-1, 4)
@@ -62,12 +63,13 @@ RESTART_M: Final = 300.0
 RESTART_IN_ROW: Final = 3
 """... if so many packets in a row say so."""
 
-RELAYS_OFF: Final = 4
-"""A clock that jumps by less shows in so many receptions among anchors in a row as well; a blocked path does not."""
-
 RELAYS_APART: Final = 40
-"""After so many in a row an anchor's clock stands apart from the others', as it began late: it joins anew,
+"""A clock that jumps by less shows in receptions among anchors as well (``RELAYS_OFF`` in a row); a blocked path does
+not. After so many in a row an anchor's clock stands apart from the others', as it began late: it joins anew,
 and what the others heard of it decides."""
+
+REJOIN_S: Final = 5.0
+"""Where joining anew has not helped, as the anchor's stamps contradict one another, it is left alone for so long."""
 
 MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS
 """Between two clocks that are still crystals."""
@@ -112,10 +114,11 @@ def joint_hear(
         slot = s.slot_of[site]
     if slot >= 0 and s.slots[slot, RELAYS_IN_ROW] >= RELAYS_APART:
         s.statistics[LATE_SHARE] = max(s.statistics[LATE_SHARE], 2.0 * LATE_ENOUGH)
-    in_row = 0 if slot < 0 or s.slots[slot, RELAYS_IN_ROW] >= RELAYS_APART else RESTART_IN_ROW
-    if slot >= 0 and s.slots[slot, IN_ROW] >= in_row and s.slots[slot, RELAYS_IN_ROW] >= RELAYS_OFF:
+    rejoins = slot >= 0 and _rejoins(s, slot, rx_ticks)
+    if rejoins:
+        if s.slots[slot, IN_ROW] >= RESTART_IN_ROW:
+            unsettle(s)
         settle(s)
-        unsettle(s)
         drop_slot(s, slot)
         s.counts[JUMPS] += 1
         slot = -1
@@ -137,10 +140,22 @@ def joint_hear(
         settle(s)
         slot = add_slot(s, site)
         join(s, slot, rx_ticks, tx_ticks)
+        if rejoins:
+            s.slots[slot, REJOINED] = rx_ticks
         _remember(s, slot, sequence, rx_ticks, tx_ticks)
         status = JOINED
     add_terms(s)
     return status
+
+
+@borrowing_kernel
+def _rejoins(s: JointArrays, slot: int, rx_ticks: int) -> bool:
+    """Whether an anchor's clock is so far from what the filter says that the anchor had better join anew."""
+    in_row = 0 if s.slots[slot, RELAYS_IN_ROW] >= RELAYS_APART else RESTART_IN_ROW
+    if s.slots[slot, IN_ROW] < in_row or s.slots[slot, RELAYS_IN_ROW] < RELAYS_OFF:
+        return False
+    rejoined = s.slots[slot, REJOINED]
+    return bool(rejoined == 0 or (rx_ticks - rejoined) * TICK_S > REJOIN_S)
 
 
 @borrowing_kernel

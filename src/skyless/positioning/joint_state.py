@@ -44,9 +44,10 @@ EPOCH, BASE, ACCEPTED, REJECTED, REJECTED_IN_ROW, SLOTS, NOISES, TERMS, PLACES =
 ) = range(9, 23)
 """Places in ``counts``. The epoch is the tag's reading at the newest message, the base that of the values."""
 
-SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW, EXCLUDED, RELAYS_IN_ROW = range(9)
+SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW, EXCLUDED, RELAYS_IN_ROW, REJOINED = range(10)
 """Places in a row of ``slots``: index in the site's table, whole ticks of the offset, newest packet's stamps (own
-clock, tag's), place among the noises or −1, whether its packets are relayed, rejections in a row."""
+clock, tag's), place among the noises or −1, whether its packets are relayed, rejections in a row, whether it is
+left out, refused relays in a row, and when it joined again after a jump (tag's clock; 0: never)."""
 
 PLACE_X, PLACE_Y, PLACE_Z, RANGE, WEIGHT, INNOVATION, SCORE, JOIN_DOUBT = range(8)
 """Places in a row of ``anchors``: position, range at its newest packet, factor on the variance of its receptions (of
@@ -105,7 +106,7 @@ class JointArrays(NamedTuple):
     statistics: Vector
     """As the tracker's."""
     slots: Integers
-    """Shape (capacity, 9)."""
+    """Shape (capacity, 10)."""
     anchors: Matrix
     """Shape (capacity, 8)."""
     packets: Integers
@@ -150,7 +151,7 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
         h=np.zeros(MOST_PLACES),
         counts=np.zeros(23, np.int64),
         statistics=np.zeros(13),
-        slots=np.zeros((capacity, 9), np.int64),
+        slots=np.zeros((capacity, 10), np.int64),
         anchors=np.zeros((capacity, 8)),
         packets=np.full((capacity, REMEMBERED, 3), NEVER),
         relayed=np.full((capacity, capacity), NEVER),

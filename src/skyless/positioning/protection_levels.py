@@ -15,6 +15,7 @@ from skyless.positioning.joint_state import (
     IN_ROW,
     PACKETS,
     REJECTIONS,
+    RELAYS_IN_ROW,
     RELAYS_REFUSED,
     RELAYS_TAKEN,
     SLOTS,
@@ -32,9 +33,12 @@ SETTLED: Final = 0.5
 REJECTED_OFTEN: Final = 1.5
 """Two packets of an anchor beyond the gate lately: with noise alone once in 10⁶ times."""
 
+RELAYS_OFF: Final = 4
+"""So many receptions among anchors in a row beyond the gate are due to the clock of one of them, ..."""
+
 REFUSED_SHARE: Final = 0.25
 FEW: Final = 4.0
-"""So many of the relayed receptions, and more than so many, beyond the gate: clocks are not what the filter says."""
+"""... and this share of all, and more than so many, to clocks that are not what the filter says."""
 
 HORIZONTAL_K, VERTICAL_K, FAULT_T = range(3)
 """Places in the array of limits."""
@@ -116,21 +120,27 @@ def _state(s: JointArrays, worst_t: float, worst_slot: int, most_t: float, hpl: 
     refused = s.recent[RELAYS_REFUSED]
     suspect, suspects = -1, 0
     for slot in range(s.counts[SLOTS]):
-        if s.slots[slot, EXCLUDED] or s.evidence[REJECTIONS, slot] > REJECTED_OFTEN:
+        if _is_out(s, slot) or s.evidence[REJECTIONS, slot] > REJECTED_OFTEN:
             suspect = slot
             suspects += 1
+    if suspects == 1:
+        return _state_with_suspect(s, suspect, worst_t, worst_slot, most_t)
     clocks_wrong = refused > FEW and refused > REFUSED_SHARE * (refused + s.recent[RELAYS_TAKEN])
     if suspects > 1 or clocks_wrong:
         return DETECTED
-    if suspects == 1:
-        return _state_with_suspect(s, suspect, worst_t, worst_slot, most_t)
     return _state_without_rejections(s, worst_t, worst_slot, most_t)
+
+
+@borrowing_kernel
+def _is_out(s: JointArrays, slot: int) -> bool:
+    """Whether the monitor leaves an anchor out, or its clock is what its own packets say as relays no longer fit."""
+    return bool(s.slots[slot, EXCLUDED] or s.slots[slot, RELAYS_IN_ROW] >= RELAYS_OFF)
 
 
 @borrowing_kernel
 def _state_with_suspect(s: JointArrays, suspect: int, worst_t: float, worst_slot: int, most_t: float) -> int:
     """While one anchor is out, what shows at the others is what it has done to the state before, or its echo."""
-    if s.slots[suspect, EXCLUDED]:
+    if _is_out(s, suspect):
         return LEFT_OUT if _is_bounded(s, worst_t, worst_slot, most_t) else DETECTED
     out = s.slots[suspect, IN_ROW] >= OUT_IN_ROW
     return LEFT_OUT if out and (worst_t <= most_t or worst_slot == suspect) else DETECTED
