@@ -112,15 +112,9 @@ def joint_hear(
     if s.counts[BASE] == rx_ticks:
         _drop_silent(s, rx_ticks)
         slot = s.slot_of[site]
-    if slot >= 0 and s.slots[slot, RELAYS_IN_ROW] >= RELAYS_APART:
-        s.statistics[LATE_SHARE] = max(s.statistics[LATE_SHARE], 2.0 * LATE_ENOUGH)
     rejoins = slot >= 0 and _rejoins(s, slot, rx_ticks)
     if rejoins:
-        if s.slots[slot, IN_ROW] >= RESTART_IN_ROW:
-            unsettle(s)
-        settle(s)
-        drop_slot(s, slot)
-        s.counts[JUMPS] += 1
+        _forget_jumped(s, slot)
         slot = -1
     status = FULL
     if slot >= 0:
@@ -146,6 +140,18 @@ def joint_hear(
         status = JOINED
     add_terms(s)
     return status
+
+
+@borrowing_kernel
+def _forget_jumped(s: JointArrays, slot: int) -> None:
+    """Make room for an anchor's clock to join anew; where its relays alone did not fit, as if messages were late."""
+    if s.slots[slot, RELAYS_IN_ROW] >= RELAYS_APART:
+        s.statistics[LATE_SHARE] = max(s.statistics[LATE_SHARE], 2.0 * LATE_ENOUGH)
+    if s.slots[slot, IN_ROW] >= RESTART_IN_ROW:
+        unsettle(s)
+    settle(s)
+    drop_slot(s, slot)
+    s.counts[JUMPS] += 1
 
 
 @borrowing_kernel
