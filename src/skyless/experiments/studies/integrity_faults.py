@@ -11,7 +11,7 @@ from skyless.constants import TICK_M
 from skyless.experiments.studies.episodes import Episode
 from skyless.positioning.joint import Messages
 
-Kind = Literal["step", "ramp", "early", "bursts", "always", "delay"]
+Kind = Literal["step", "ramp", "early", "bursts", "delay"]
 
 SIZES_M: Final = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
 FEW_SIZES_M: Final = (0.1, 0.3, 1.5)
@@ -24,7 +24,6 @@ _WORDS: Final[dict[Kind, str]] = {
     "ramp": "ramp to",
     "early": "early by",
     "bursts": "bursts of",
-    "always": "always",
     "delay": "TX delay",
 }
 
@@ -36,9 +35,8 @@ class Fault(Struct, frozen=True):
     """``lab``, with the height given, or ``room``, where it is a state."""
     size_m: float = 0.0
     kind: Kind = "step"
-    """Receptions of the tag are late from the onset on (step), more and more for a second (ramp), early, every other
-    quarter of a second (bursts), or since long before it (always); or all who hear the anchor do so late, as its
-    antenna delay is wrong (delay)."""
+    """From the onset on the tag's receptions are late (step), more and more for a second (ramp), early, or late in every
+    other quarter of a second (bursts); or all who hear the anchor do so late, as its antenna delay is wrong (delay)."""
 
     @property
     def name(self) -> str:
@@ -57,7 +55,7 @@ FAULTS: Final = tuple(
     for fault in (
         Fault(place),
         *(Fault(place, size_m, kind) for kind in ("step", "ramp") for size_m in SIZES_M),
-        *(Fault(place, size_m, kind) for kind in ("early", "bursts", "always", "delay") for size_m in FEW_SIZES_M),
+        *(Fault(place, size_m, kind) for kind in ("early", "bursts", "delay") for size_m in FEW_SIZES_M),
     )
 )
 
@@ -70,15 +68,15 @@ def faulty(episode: Episode, fault: Fault, anchor: int, onset: int, slot_s: floa
     late = np.where(messages.sites == anchor, np.rint(size * share), 0.0).astype(np.int64)
     relays = messages.relays
     if fault.kind == "delay":
+        begun = messages.sequences[onset]  # an episode is shorter than sequence numbers take to come around
+        heard_late = (relays[:, 1] == anchor) & (relays[:, 2] >= begun)
         relays = relays.copy()
-        relays[relays[:, 1] == anchor, 3] += round(size)
+        relays[heard_late, 3] += round(size)
     return replace(messages, rx_ticks=messages.rx_ticks + late, relays=relays)
 
 
 def _share(since_s: NDArray[np.floating[Any]], kind: Kind) -> NDArray[np.float64]:
     """How much of the fault there is, from −1 to 1."""
-    if kind in {"always", "delay"}:
-        return np.ones(len(since_s))
     if kind == "ramp":
         return np.asarray(np.clip(since_s / RAMP_S, 0.0, 1.0), np.float64)
     on = since_s >= 0.0
