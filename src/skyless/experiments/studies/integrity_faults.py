@@ -35,7 +35,7 @@ class Fault(Struct, frozen=True):
     """``lab``, with the height given, or ``room``, where it is a state."""
     size_m: float = 0.0
     kind: Kind = "step"
-    """From the onset on the tag's receptions are late (step), more and more for a second (ramp), early, or late in every
+    """From the onset on the tag's receptions are late (step), more and more for a second (ramp), early, or late every
     other quarter of a second (bursts); or all who hear the anchor do so late, as its antenna delay is wrong (delay)."""
 
     @property
