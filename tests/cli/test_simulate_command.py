@@ -56,6 +56,27 @@ def test_a_run_tells_what_was_asked_of_it(run):
     assert told["dropped"] == sum(told["drops"].values())
 
 
+def test_protection_levels_are_told_and_hold_with_a_late_anchor(run, tmp_path):
+    asked = ["--method", "joint", "--duration", "6", "--bias", "2:0.5", "--integrity-risk", "1e-3", "--json"]
+    told = report(run(*asked, "--alert-limit-m", "0.07", "--fixes-csv", "fixes.csv"))
+    levels = told["levels"]
+    assert (levels["integrity_risk"], levels["misleading"]) == (1e-3, 0)
+    assert levels["available"] > 0.95
+    assert sum(levels["alerts"].values()) == told["fixes"]
+    assert set(levels["alerts"]) <= {"detected-excluded", "alert-limit-exceeded", "detected-not-excluded"}
+    assert min(levels["alerts"].get(alert, 0) for alert in ("detected-excluded", "alert-limit-exceeded")) > 0
+    with (tmp_path / "fixes.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert {row["integrity_risk"] for row in table} == {"0.001"}
+    exceeded = [float(row["hpl_m"]) > 0.07 for row in table if row["hpl_m"]]
+    assert exceeded == [row["alert"] == "alert-limit-exceeded" for row in table if row["hpl_m"]]
+    assert table[0]["alert"] == "unavailable"
+    assert report(run("--method", "weighted", "--duration", "3", "--json"))["levels"] is None
+    code, out, _ = run("--method", "joint", "--duration", "3")
+    assert code == 0
+    assert "stated risk 0.0001" in out
+
+
 def test_the_same_seed_gives_the_same_run(run):
     arguments = ["--duration", "2.5", "--tags", "2", "--json"]
     first, again, other = (report(run(*arguments, "--seed", seed)) for seed in (5, 5, 6))
@@ -162,6 +183,9 @@ def test_a_table_for_people_has_no_control_characters(run):
     [
         (["--scenario", "moon"], ["--scenario", "moon", "lab"]),
         (["--scenario", "lab", "--site", "lab.toml"], ["--scenario", "--site", "not both"]),
+        (["--integrity-risk", "0"], ["--integrity-risk"]),
+        (["--integrity-risk", "1"], ["--integrity-risk"]),
+        (["--alert-limit-m", "0"], ["--alert-limit-m"]),
         (["--position", "1,2", "--tags", "5"], ["--position", "--tags", "either"]),
         (["--position", "1,2", "--speed", "2"], ["--position", "--speed", "either"]),
         (["--waypoints", "1,1;5,1", "--tags", "2"], ["--waypoints", "--tags", "either"]),

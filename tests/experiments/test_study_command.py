@@ -56,6 +56,13 @@ def test_people_get_a_table(run):
         assert words in out
 
 
+def test_the_study_of_levels_tells_how_often_they_mislead(run):
+    code, out, err = run("integrity", "--episodes", "1", "--integrity-risk", "0.01", "--processes", "1")
+    assert (code, err) == (0, "")
+    for words in ("misleading", "HPL in cm", "room, ramp to 0.5 m", "all faults", "0.01 held", "in 10⁻⁴"):
+        assert words in out
+
+
 @pytest.mark.parametrize("name", ["nlos", "sync", "scale"])
 def test_every_study_can_be_drawn(name, tmp_path):
     """From rows as they may be, without simulating: with numbers, without, with a single world."""
@@ -81,6 +88,11 @@ def test_every_study_can_be_drawn(name, tmp_path):
         (["loss", "--episodes", "5"], "--episodes is for the stud"),
         (["efficiency", "--seconds", "5"], "--seconds is not for the study efficiency"),
         (["efficiency", "--method", "tracker"], "--method is 'tracker'"),
+        (["loss", "--integrity-risk", "1e-3"], "are for the study integrity"),
+        (["loss", "--alert-limit-m", "1"], "are for the study integrity"),
+        (["integrity", "--integrity-risk", "0"], "--integrity-risk"),
+        (["integrity", "--alert-limit-m", "nan"], "--alert-limit-m"),
+        (["integrity", "--method", "tracker"], "protection levels are given by joint"),
         (["loss", "--method", "guess"], "it should be one of literal"),
         (["loss", "--worlds", "1"], "--worlds"),
         (["loss", "--seconds", "nan"], "--seconds"),

@@ -7,6 +7,7 @@ from machines.bench import LAB, tape
 from skyless.nodes.tag import fix_message
 from skyless.outputs import topics
 from skyless.outputs.messages import RequestMessage, SiteMessage, TrueMotion, TruthMessage
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.receiver import Receiver
 from skyless.recordings.mcap_file import McapFile
 from skyless.recordings.mcap_recorder import McapRecorder
@@ -15,22 +16,24 @@ from skyless.site.model import GeoreferenceSite
 
 SITE = replace(LAB, georeference=GeoreferenceSite(52.5, 13.4, 34.0, 30.0))
 UNIX_S = 1.8e9
+USUAL = IntegrityRequirement()
 PLACES = {"a": (3.0, 4.0, 0.0), "b": (2.0, 2.0, 0.0), "c": (5.0, 3.0, 0.0)}
 
 
-def messages(seconds=2.0, tags=("a",), method="tracker", join_s=0.5, publish_every=1):
+def messages(seconds=2.0, tags=("a",), method="tracker", join_s=0.5, publish_every=1, integrity=USUAL):
     """(unix_s, topic, payload) of a site; somebody asks for receptions from ``join_s`` on."""
     said = [(UNIX_S, topics.site_topic(SITE.id), SiteMessage(SITE, True, UNIX_S))]
     for tag in tags:
-        said += list(_of_tag(tag, seconds, method, join_s, publish_every))
+        said += list(_of_tag(tag, seconds, method, join_s, publish_every, integrity))
     moments = (0.1 * k for k in range(int(10 * seconds)))
     motion = {tag: TrueMotion(PLACES[tag], (0.0, 0.0, 0.0)) for tag in tags}
     said += [(UNIX_S + s, topics.truth_topic(SITE.id), TruthMessage(UNIX_S + s, motion)) for s in moments]
     return [(s, topic, msgspec.json.encode(message)) for s, topic, message in sorted(said, key=lambda one: one[0])]
 
 
-def _of_tag(tag, seconds, method, join_s, publish_every):
-    log, receiver, serial = ReceptionLog(tag, receiver_settings(method), "run"), Receiver(method), 0
+def _of_tag(tag, seconds, method, join_s, publish_every, integrity):
+    log = ReceptionLog(tag, receiver_settings(method, integrity=integrity), "run")
+    receiver, serial = Receiver(method, integrity=integrity), 0
     for one in tape(LAB, seconds, 1, PLACES[tag]):
         host_s = one.host_s
         if host_s >= join_s:

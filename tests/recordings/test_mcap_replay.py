@@ -13,6 +13,7 @@ from skyless.errors import SkylessError
 from skyless.experiments.replay_site import SiteReplay
 from skyless.methods import METHODS
 from skyless.outputs.messages import ReceptionsMessage
+from skyless.positioning.protection import Alert, IntegrityRequirement
 from skyless.recordings.mcap_recording import McapRecording
 
 
@@ -48,6 +49,56 @@ def test_replay_gives_the_live_fixes_bit_by_bit(tmp_path, method, join_s):
     assert report.segments == 1
     assert report.method == method
     assert report.drops == {}
+
+
+@pytest.mark.parametrize("join_s", [0.0, 1.0], ids=["from its start", "from its middle"])
+@pytest.mark.parametrize("with_state", [True, False])
+def test_what_was_asked_of_levels_is_replayed(tmp_path, join_s, with_state):
+    path, asked = tmp_path / "live.mcap", IntegrityRequirement(1e-6, 0.02)
+    said = messages(2.0, ("a",), "joint", join_s, integrity=asked)
+    if not with_state:
+        said = changed(said, lambda _, m: [m if m.start is None else replace(m, start=replace(m.start, state=None))])
+    record(path, said)
+    (report,) = replayed(path)
+    if with_state or join_s == 0.0:
+        assert report.identical.different == 0
+        assert report.identical.compared == report.fixes > 60
+    fixes = []
+    with McapRecording(path) as recording:
+        SiteReplay(recording).run(lambda _, made: fixes.append(made.fix), lambda _: None)
+    assert {fix.integrity_risk for fix in fixes} == {1e-6}
+    assert {fix.alert for fix in fixes if fix.hpl_m is not None} == {Alert.LIMIT}
+
+
+def test_levels_of_another_risk_are_larger_and_no_longer_compared(tmp_path):
+    path = tmp_path / "live.mcap"
+    record(path, messages(2.0, ("a",), "joint", 0.0))
+    last = []
+    for integrity in (None, IntegrityRequirement(1e-7)):
+        fixes = []
+        with McapRecording(path) as recording:
+            (report,) = SiteReplay(recording, integrity=integrity).run(
+                lambda _, made, fixes=fixes: fixes.append(made.fix), lambda _: None
+            )
+        assert (report.identical is None) == (integrity is not None)
+        last.append(fixes[-1])
+    assert last[0].position_m == pytest.approx(last[1].position_m)
+    assert last[1].hpl_m > 1.15 * last[0].hpl_m
+
+
+@pytest.mark.parametrize(("risk", "limit_m"), [(0.0, None), ("high", None), (1e-4, -1.0), (1e-4, "far")])
+def test_levels_that_nobody_can_ask_for_are_counted(tmp_path, risk, limit_m):
+    path = tmp_path / "forged.mcap"
+    forged = {"integrity_risk": risk, "alert_limit_m": limit_m}
+
+    def forge(_, m):
+        if m.start is None:
+            return [m]
+        return [replace(m, start=replace(m.start, state=None, settings={**m.start.settings, **forged}))]
+
+    record(path, changed(messages(1.5, ("a",), "joint", 0.0), forge))
+    (report,) = replayed(path)
+    assert report.drops["impossible-settings"] == 1
 
 
 def test_a_recorded_fix_of_other_bits_is_found(tmp_path):
@@ -202,6 +253,8 @@ def test_mistakes_are_told_in_one_line(tmp_path, capsys):
         ([str(path), "--plot", str(tmp_path / "x.png")], "--tag"),
         ([str(path), "--method", "magic"], "one of"),
         ([str(path), "--truth", str(bare)], "left out"),
+        ([str(path), "--integrity-risk", "2"], "--integrity-risk"),
+        ([str(path), "--alert-limit-m", "0"], "--alert-limit-m"),
         ([str(bare)], "raw receptions is missing"),
     ):
         assert main(["replay", *arguments]) == 2
