@@ -489,6 +489,7 @@ class DW1000:
         self._bus.pause_us(LDE_LOAD_US)
 
     def _wait_for_lock(self) -> None:
+        """Let the PLL lock, without a transaction while the clock changes, which would garble it (UM 2.3.2)."""
         self._put(0x36, 0, 2, 0x0200)  # PMSC_CTRL0: clocks by themselves
         for _ in range(LOCK_TRIES):
             self._bus.pause_us(100)
