@@ -150,6 +150,7 @@ def show_frames():
     bus.take()
     script_frame(bus, bytes(range(9)))
     print("short", chip.poll(), bus.take())
+    print("untold", chip.rx_power_cdbm, chip.first_path_cdbm, chip.offset_ppb)
 
 
 def show_transmissions():
@@ -230,6 +231,7 @@ class QuietBus(dw1000.Bus):
     def __init__(self):
         self.status = 0x02
         self.status_1 = 0
+        self.status_3 = 0
         self.transactions = 0
         self.octets = 0
 
@@ -239,6 +241,7 @@ class QuietBus(dw1000.Bus):
         if out[0] == 0x0F:
             into[1] = self.status
             into[2] = self.status_1
+            into[4] = self.status_3
         elif out[0] == 0x10:
             into[1] = 100
             into[3] = 0x60
@@ -260,7 +263,7 @@ class QuietBus(dw1000.Bus):
 
 
 def pass_frames(chip, bus, dx, frame, now, rounds):
-    """Frames received and sent, one late, one lost to an error."""
+    """Frames received and sent, late, taken back, and lost to an error; a clock that slips."""
     total = 0
     for _ in range(rounds):
         bus.status, bus.status_1 = 0x03, 0x6F
@@ -274,6 +277,11 @@ def pass_frames(chip, bus, dx, frame, now, rounds):
         total += chip.poll()
         bus.status = 0x02
         total += chip.transmit_at(dx, frame, 0, 127) + chip.cancel()
+        bus.status_3 = 0x08
+        total += chip.transmit_at(dx, frame, 0, 3)
+        bus.status_3 = 0x02
+        total += chip.poll()
+        bus.status_3 = 0
     return total
 
 
@@ -284,7 +292,7 @@ def show_no_allocation():
     chip.receive()
     chip.correct_bias = True
     dx, frame, now = bytearray(b"\0\xff\x80\xff\xff"), bytearray(range(127)), chip.now()
-    print("passed", pass_frames(chip, bus, dx, frame, now, 3), chip.received, chip.sent, chip.errors)
+    print("passed", pass_frames(chip, bus, dx, frame, now, 3), chip.received, chip.sent, chip.errors, chip.late)
     bus.transactions = bus.octets = 0
     bus.status, bus.status_1 = 0x03, 0x6F
     chip.poll()

@@ -49,6 +49,8 @@ def test_micropython_says_the_same_and_allocates_nothing_per_frame():
     lines, said = run(MICROPYTHON)
     assert lines == run(sys.executable)[0]
     assert "allocated 0" in said
+    passed = next(line for line in lines if line.startswith("passed"))
+    assert passed.split()[2:] == ["3", "3", "3", "3"]  # received, sent, errors, late: all of it was run
 
 
 def test_headers_are_those_of_the_manuals_examples():
@@ -131,6 +133,7 @@ def test_a_frame_is_read_whole_before_the_receiver_goes_on(here):
     ]  # fmt: skip
     assert second[2] == "r 11 128"
     assert here["quiet"] == ["0 ['r 0f 5']"]
+    assert here["untold"] == ["-32768 -32768 -32768"]
     assert here["short"] == ["1 ['r 0f 5', 'r 10 4', 'r 11 16', 'r 15 9', 'w 8f 006f000000', 'w 8d 0001']"]
 
 

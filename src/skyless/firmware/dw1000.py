@@ -343,7 +343,7 @@ class DW1000:
     def __init__(self, bus: Bus) -> None:
         self.state = OFF
         self.measuring = True
-        """Whether power and carrier offset are read with each frame: two transactions more."""
+        """Whether powers and carrier offset are read with each frame, in two transactions more; else they are NOT_TOLD."""
         self.correct_bias = False
         """Whether ``rx_ticks`` are corrected for received power (APS011); needs ``measuring``."""
         self.received = 0
@@ -710,6 +710,8 @@ class DW1000:
         self.frame_bytes = size
         if self.measuring:
             self._read_diagnostics(info.data[2] >> 4 | info.data[3] << 4)
+        else:
+            self.rx_power_cdbm = self.first_path_cdbm = self.offset_ppb = NOT_TOLD
         self.received = (self.received + 1) & COUNT_MASK
         self._clear()
         self._bus.write(self._enable.header, self._enable.data)
