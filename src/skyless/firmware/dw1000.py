@@ -343,7 +343,7 @@ class DW1000:
     def __init__(self, bus: Bus) -> None:
         self.state = OFF
         self.measuring = True
-        """Whether powers and carrier offset are read with each frame, in two transactions more; else they are NOT_TOLD."""
+        """Whether powers and carrier offset are read with each frame, in two transactions more; else NOT_TOLD."""
         self.correct_bias = False
         """Whether ``rx_ticks`` are corrected for received power (APS011); needs ``measuring``."""
         self.received = 0
