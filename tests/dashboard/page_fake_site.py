@@ -54,7 +54,7 @@ def state_row(name, number, time_s, unix_s):
     used = 8 - (1 if math.sin(0.7 * time_s + number) > 0.6 else 0)
     chi2 = used * (0.8 + 0.6 * math.sin(5.3 * time_s + number) ** 2)
     numbers = [x + dx, y + dy, 1.2, vx, vy, xx, xy, yy, math.sqrt(xx + yy), math.hypot(dx, dy), x, y]
-    return [name, *(round(value, 5) for value in numbers), used, round(chi2, 3), unix_s, 0.6 * ease]
+    return [name, *(round(value, 5) for value in numbers), used, round(chi2, 3), unix_s, 0.6 * ease, number % 5]
 
 
 def mqtt():

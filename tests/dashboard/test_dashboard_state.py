@@ -10,7 +10,7 @@ from skyless.outputs.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
 ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y")
-FIELDS = (*POSITION, *ERRORS, "anchors_used", "chi2", "fix_unix_s", "hpl_m")
+FIELDS = (*POSITION, *ERRORS, "anchors_used", "chi2", "fix_unix_s", "hpl_m", "alert")
 
 
 def rows(board, since=0):
@@ -25,10 +25,17 @@ def test_a_row_is_what_the_contract_says():
     message = json.loads(board.state_since(0))
     assert message["type"] == "state"
     assert message["unix_s"] == pytest.approx(1000.0625, abs=1e-3)
-    expected = ("t1", 1.25, 2.5, 0.75, 0.5, -0.25, 4e-4, 1e-4, 2e-4, 0.01, None, None, None, 4, 2.5, 1000.0, None)
+    expected = ("t1", 1.25, 2.5, 0.75, 0.5, -0.25, 4e-4, 1e-4, 2e-4, 0.01, None, None, None, 4, 2.5, 1000.0, None, None)
     assert message["tags"] == [list(expected)]
     board.fix(fix(velocity_mps=None), 0.0)
     assert rows(board)[0]["vx"] is None
+
+
+def test_levels_and_alerts_are_told():
+    board = Board()
+    for alert, number in (("none", 0), ("detected-excluded", 1), ("unavailable", 3), (None, None), ("new", None)):
+        board.fix(fix(hpl_m=0.123456, alert=alert), 0.0)
+        assert (rows(board)[0]["hpl_m"], rows(board)[0]["alert"]) == (0.1235, number)
 
 
 def test_only_tags_with_a_newer_fix_are_told_and_only_their_last():

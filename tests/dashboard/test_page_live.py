@@ -8,6 +8,8 @@ import pytest
 from page_browser import until
 from PIL import Image
 
+from skyless.positioning.protection import Alert
+
 SHOWN = "document.getElementById('banner').hidden === false"
 
 
@@ -75,6 +77,31 @@ def test_a_silent_tag_turns_grey_and_then_leaves_the_map(hall):
     assert kinds == ["fresh", "stale", "stale", "gone"]
     page.click("table.tags button:has-text('robot')")
     page.wait_for_selector("text=No fix: too few anchors")
+
+
+def test_protection_levels_and_alerts_are_shown(hall):
+    _, visit = hall
+    page = visit.page
+    for name, words in (("forklift", "none"), ("trolley", "a faulty anchor is left out")):
+        page.click(f"table.tags button:has-text('{name}')")
+        page.wait_for_selector(f".detail dd:text-is('{words}')")
+    assert page.evaluate("async () => (await import('/page/tracks.js')).ALERTS.length") == len(Alert)
+    circles = page.evaluate("""async () => {
+      const { drawTags, look } = await import("/page/map/tags.js");
+      const count = () => {
+        let dashed = 0;
+        const context = document.createElement("canvas").getContext("2d");
+        const dash = context.setLineDash.bind(context);
+        context.setLineDash = (list) => ((dashed += list.length > 0), dash(list));
+        drawTags(context, look());
+        return dashed;
+      };
+      const { state } = await import("/page/store.js");
+      const shown = count();
+      state.options.levels = false;
+      return [shown, count()];
+    }""")
+    assert circles == [3, 0]
 
 
 def test_a_cut_connection_is_told_and_comes_back(hall):

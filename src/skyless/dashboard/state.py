@@ -16,6 +16,7 @@ from skyless.outputs.messages import (
     Vector,
 )
 from skyless.outputs.truths import Truths
+from skyless.positioning.protection import Alert
 
 MOST_NAMES: Final = 2000
 """Tags, and nodes, that are remembered; a broker that makes up names fills no memory."""
@@ -131,6 +132,10 @@ def error_m(fix: FixMessage, true_m: Vector) -> float:
     return math.dist(fix.position_m[:axes], true_m[:axes])
 
 
+_ALERTS: Final = [alert.value for alert in Alert]
+"""Rows tell an alert by its number."""
+
+
 def _row(fix: FixMessage, true_m: Vector | None) -> list[Any]:
     """One tag in a ``state``, rounded to what a page can show, which halves its bytes."""
     x, y, z = fix.position_m
@@ -154,4 +159,5 @@ def _row(fix: FixMessage, true_m: Vector | None) -> list[Any]:
         round(fix.chi2, 3),
         round(fix.unix_s, 4),
         None if fix.hpl_m is None else round(fix.hpl_m, 4),
+        _ALERTS.index(fix.alert) if fix.alert in _ALERTS else None,
     ]

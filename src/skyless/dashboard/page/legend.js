@@ -13,6 +13,7 @@ const KEY = "skyless-legend";
 const SWITCHES = {
   names: `Names (in a crowd of more than ${NAMED}, the selected one)`,
   ellipses: "Ellipse that holds 95 % of the errors, as the tag states them",
+  levels: "Protection level, a dashed circle: the tag is outside with the stated risk at most",
   truth: "True position, a faint ring (simulated)",
 };
 

@@ -32,7 +32,7 @@ export const state = {
   /** @type {any} what `player.js` plays */
   player: null,
   selection: { tag: null, anchor: null, zone: null },
-  options: { names: true, trails: 15, ellipses: true, truth: true, overlay: "none" },
+  options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none" },
   /** @type {{data: any, picture: HTMLCanvasElement|null, error: string}} */
   overlay: { data: null, picture: null, error: "" },
 };

@@ -1,6 +1,6 @@
 /** What is known of each tag over time: a ring of states, and the position between two of them. */
 
-const STRIDE = 16;
+const STRIDE = 17;
 const FIRST = 64;
 const MOST = 2048;
 /** Between states further apart than this nothing is known, and nothing is interpolated. */
@@ -24,7 +24,16 @@ export const TRUE_X = 10,
   ANCHORS = 12,
   CHI2 = 13,
   TIME = 14,
-  HPL = 15;
+  HPL = 15,
+  ALERT = 16;
+/** What the numbers of alerts mean, in the order of the wire. */
+export const ALERTS = [
+  "none",
+  "a faulty anchor is left out",
+  "a fault that cannot be left out: no level",
+  "too early to say",
+  "the level exceeds its limit",
+];
 
 export class Track {
   /** @param {string} name */
@@ -84,7 +93,7 @@ export class Track {
    * Write the columns as they are at a time into `out`: between two states in a straight line, after the last one as it
    * was. Returns false before the first one.
    * @param {number} time
-   * @param {Float64Array} out at least 16 long
+   * @param {Float64Array} out at least 17 long
    * @param {boolean} between whether to interpolate
    */
   at(time, out, between = true) {

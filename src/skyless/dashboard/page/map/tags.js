@@ -1,9 +1,9 @@
-/** Tags on the map: ellipses, true positions, marks and names. */
+/** Tags on the map: ellipses, protection levels, true positions, marks and names. */
 
 import { GONE_S, freshness, now_s, shown_s, stillMotion, tracks } from "../clock.js";
 import { faint, palette, tagColour } from "../theme.js";
 import { state } from "../store.js";
-import { CXX, CXY, CYY, TRUE_X, TRUE_Y, X, Y } from "../tracks.js";
+import { CXX, CXY, CYY, HPL, TRUE_X, TRUE_Y, X, Y } from "../tracks.js";
 import { label, ring } from "./anchors.js";
 import { drawStub } from "./trails.js";
 import { px, py, view } from "./view.js";
@@ -13,7 +13,7 @@ const NINETY_FIVE = 2.4477;
 /** Above so many tags only the selected one is named. */
 export const NAMED = 40;
 const MARK = 5;
-const row = new Float64Array(16);
+const row = new Float64Array(17);
 
 /** What was drawn last, for the pointer: name, pixels. @type {Array<{name: string, x: number, y: number}>} */
 export const drawn = [];
@@ -45,6 +45,7 @@ export function drawTags(context, { seen, shown }) {
   drawn.length = 0;
   if (options.trails) for (const one of seen) drawStub(context, one, shown);
   if (options.ellipses) for (const one of seen) ellipse(context, one);
+  if (options.levels) for (const one of seen) if (seen.length <= NAMED || one.selected) level(context, one);
   if (options.truth && state.simulated) for (const one of seen) truth(context, one);
   for (const one of seen) mark(context, one);
   if (options.names) names(context, seen);
@@ -61,6 +62,19 @@ function ellipse(context, { row: at, colour, selected }) {
   context.strokeStyle = faint(colour, selected ? 0.95 : 0.6);
   context.lineWidth = 1;
   context.stroke();
+}
+
+/** The circle beyond which a tag is hardly ever. */
+function level(context, { row: at, colour, selected }) {
+  const radius = at[HPL] * view.scale;
+  if (!(radius > MARK)) return;
+  context.beginPath();
+  context.arc(px(at[X]), py(at[Y]), radius, 0, 2 * Math.PI);
+  context.setLineDash([3, 3]);
+  context.strokeStyle = faint(colour, selected ? 0.95 : 0.6);
+  context.lineWidth = 1;
+  context.stroke();
+  context.setLineDash([]);
 }
 
 /** Half axes of one sigma in m, and the long one's angle from x, of a 2 × 2 covariance. */

@@ -6,10 +6,10 @@ import { Chart } from "../chart.js";
 import { h, text } from "../dom.js";
 import { bytes, duration, length, metres, number } from "../format.js";
 import { tags as past } from "../history.js";
-import { ANCHORS, CHI2, ERROR, HPL, STD, TIME, VX, VY, X, Y, Z } from "../tracks.js";
+import { ALERT, ALERTS, ANCHORS, CHI2, ERROR, HPL, STD, TIME, VX, VY, X, Y, Z } from "../tracks.js";
 
 const WINDOW_S = 60;
-const row = new Float64Array(16);
+const row = new Float64Array(17);
 
 export class TagDetail {
   constructor() {
@@ -19,6 +19,7 @@ export class TagDetail {
       "Position",
       "Speed",
       "Protection level",
+      "Integrity alert",
       "Anchors used",
       "First fix",
       "Latency",
@@ -80,6 +81,7 @@ export class TagDetail {
       Position: known ? `${metres(row[X], 3)}, ${metres(row[Y], 3)}, ${metres(row[Z], 3)} m` : null,
       Speed: known && speed >= 0 ? `${speed.toFixed(2)} m/s` : null,
       "Protection level": known && row[HPL] >= 0 ? length(row[HPL]) : null,
+      "Integrity alert": known && row[ALERT] >= 0 ? ALERTS[row[ALERT]] : null,
       "Anchors used": known ? number(row[ANCHORS]) : null,
       "First fix": health?.first_fix_s == null ? null : `after ${duration(health.first_fix_s)}`,
       Latency:

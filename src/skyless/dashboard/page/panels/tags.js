@@ -13,7 +13,7 @@ export const title = "Tags";
 const MARKS = { fresh: "●", stale: "○", gone: "✕", never: "–" };
 const WORDS = { fresh: "has a fix", stale: "no fix for a second", gone: "lost", never: "no fix yet" };
 const SEARCHED = 12;
-const row = new Float64Array(16);
+const row = new Float64Array(17);
 let parts = null;
 let isOpen = () => false;
 
