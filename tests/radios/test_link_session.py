@@ -23,12 +23,12 @@ def stamp(ticks):
 class Talk:
     """A session whose port is the test."""
 
-    def __init__(self):
+    def __init__(self, **needs):
         self.told, self.counters, self.now_s = [], Counter(), 50.0
         self.commands = []
         self._reader = link.Reader()
         self.board = link.Writer()
-        self.session = LinkSession("/dev/board", DELAYS, self._take, self.told.append, self.counters)
+        self.session = LinkSession("/dev/board", DELAYS, self._take, self.told.append, self.counters, **needs)
         self.session.begin(self.now_s)
 
     def _take(self, data):
@@ -220,6 +220,17 @@ def test_a_board_that_refuses_its_configuration_or_counts_otherwise_cannot_be_us
     talk.board.put_bytes(bytearray([32, 1]), 0, 2)
     talk.say(talk.board.end())
     assert "counts 1000 kHz in 32 bits" in talk.told[0].reason
+
+
+def test_an_anchor_needs_a_board_that_can_transmit():
+    talk = Talk(transmits=True)
+    talk.say(talk.board.hello((1, 2, 3), bytearray(8), 0))
+    talk.status()
+    assert talk.told == [Gone("the board at /dev/board only listens; an anchor needs one that can transmit")]
+    talk = Talk(transmits=True)
+    talk.hello()
+    talk.status()
+    assert talk.told == [Restarted()]
 
 
 def test_a_board_that_starts_anew_is_configured_again_and_its_numbers_begin_anew():

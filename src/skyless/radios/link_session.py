@@ -19,9 +19,16 @@ class LinkSession:
     """What is said and heard since the port was opened."""
 
     def __init__(
-        self, place: str, delays: AntennaDelays, send: Callable[[bytes], None], tell: Listener, counters: Counter[str]
+        self,
+        place: str,
+        delays: AntennaDelays,
+        send: Callable[[bytes], None],
+        tell: Listener,
+        counters: Counter[str],
+        *,
+        transmits: bool = False,
     ) -> None:
-        """``place`` is what messages call the port."""
+        """``place`` is what messages call the port; ``transmits``: a board that only listens is of no use."""
         self.clock = BoardClock()
         self.ready = False
         self.hello: Hello | None = None
@@ -33,11 +40,12 @@ class LinkSession:
         self._pending: dict[int, int] = {}
         self._bytes = 0
         self._refused = ""
-        self._begun_s = self._heard_s = 0.0
+        self._transmits = transmits
+        self._heard_s = 0.0
 
     def begin(self, host_s: float) -> None:
         """Say the first words."""
-        self._begun_s = self._heard_s = host_s
+        self._heard_s = host_s
         self._send(b"\0")
         self._say(self._writer.ask(link.ASK_HELLO))
 
@@ -148,6 +156,8 @@ class LinkSession:
                 f"the board at {self._place} counts {hello.rate_khz} kHz in {hello.counter_bits} bits, not "
                 f"{link.RATE_KHZ} in {link.COUNTER_BITS}: its radio is none that Skyless knows"
             )
+        elif self._transmits and not hello.can_transmit:
+            self._refuse(f"the board at {self._place} only listens; an anchor needs one that can transmit")
         else:
             self._refused = ""
             if greeted:

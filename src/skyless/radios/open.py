@@ -58,7 +58,8 @@ def open_radios(
     if driver == "serial":
         ports = _ports(spec, place, SERIAL_BAUD, names)
         settings = delays or [AntennaDelays()] * len(names)
-        return tuple(SerialRadio(*ports[i], name, settings[i]) for i, name in enumerate(names))
+        transmits = kind == "anchor"
+        return tuple(SerialRadio(*ports[i], name, settings[i], transmits=transmits) for i, name in enumerate(names))
     if driver in ("listener", "sniffer") and kind == "anchor":
         raise SkylessError(f"--radio is {spec!r}; it should be one that can transmit: a {driver} only listens")
     if driver == "listener":

@@ -14,10 +14,14 @@ from skyless.radios.serial_port import SerialPort
 class SerialRadio:
     """One node's board (``skyless.radios.radio.Radio``)."""
 
-    def __init__(self, path: str, baud: int, name: str, delays: AntennaDelays | None = None) -> None:
+    def __init__(
+        self, path: str, baud: int, name: str, delays: AntennaDelays | None = None, *, transmits: bool = False
+    ) -> None:
+        """``transmits``: only a board that can do so will do."""
         self.name = name
         self.counters: Counter[str] = Counter()
         self._delays = AntennaDelays() if delays is None else delays
+        self._transmits = transmits
         self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
         self._listener: Listener = _nobody
         self._session: LinkSession | None = None
@@ -48,7 +52,8 @@ class SerialRadio:
 
     def begin(self, send: Callable[[bytes], None]) -> None:
         """Greet the board."""
-        self._session = LinkSession(self._port.path, self._delays, send, self._tell, self.counters)
+        place, told = self._port.path, self._tell
+        self._session = LinkSession(place, self._delays, send, told, self.counters, transmits=self._transmits)
         self._session.begin(time.monotonic())
 
     def hear(self, data: bytes) -> None:
