@@ -8,7 +8,7 @@ import masterless_world as hall
 from skyless.air.packet import Packet
 from skyless.nodes import packet_tags
 from skyless.nodes.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
-from skyless.outputs.messages import Counters, FixMessage, TagHealth
+from skyless.outputs.messages import Counters, FixMessage, SiteMessage, TagHealth
 from skyless.radios.open import open_sniffers
 from skyless.radios.radio import Gone, Restarted
 from skyless.recordings.bitcraze_payload import decode
@@ -57,7 +57,8 @@ class Link:
         self.counters = Counters(1, 2, 3)
         self.told = []
 
-    def publish(self, topic, message):
+    def publish(self, topic, message, qos=0, retain=False):
+        assert retain is isinstance(message, SiteMessage)
         self.told.append((topic, message))
 
 
@@ -77,7 +78,9 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     for packet in packets:
         one.hear(packet)
     tags._tell()
-    (fix_topic, fix), *_, (health_topic, health) = links[0].told
+    (fix_topic, fix), *_, (site_topic, told), (health_topic, health) = links[0].told
+    assert (site_topic, told.site.id, told.simulated) == ("skyless/v1/7/site", 7, False)
+    assert {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in told.site.anchors} == hall.ANCHORS_M
     assert (fix_topic, health_topic) == ("skyless/v1/7/tag/one/fix", "skyless/v1/7/tag/one/health")
     assert isinstance(fix, FixMessage)
     again = msgspec.json.decode(msgspec.json.encode(health), type=TagHealth)
@@ -85,5 +88,9 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     assert again.reason is None
     assert again.counters["malformed-line"] == 3
     assert again.counters["unknown-anchor"] == 1
-    ((topic, silent),) = links[1].told
+    ((topic, silent),) = links[1].told  # the site is told once
     assert (topic, silent.reason, silent.fixes) == ("skyless/v1/7/tag/two/health", "no-beacons", 0)
+
+
+def test_a_table_that_no_site_can_have_is_not_told():
+    assert packet_tags.site_of(PacketTagSettings({1: (0.0, 0.0, 0.0), 99_999: (1.0, 2.0, 0.0)})) is None

@@ -13,7 +13,7 @@ from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, broker, say
 from skyless.cli.options import IntegrityRisk, Positive, finite_numbers, integrity_of, known_method
 from skyless.errors import SkylessError
 from skyless.methods import DEFAULT_METHOD
-from skyless.radios.open import DEFAULT_RADIO, is_sniffer, open_radios, open_sniffers
+from skyless.radios.open import DEFAULT_RADIO, is_simulated, is_sniffer, open_radios, open_sniffers
 
 if TYPE_CHECKING:
     from skyless.nodes.packet_tags import PacketTagSettings
@@ -64,7 +64,7 @@ def tag(
         Fixes a second and tag on MQTT at most.
     site_id
         The only site to listen to; by default the first one heard. For sniffers what topics call the system, by
-        default 0.
+        default 0; it should be no other site's.
     anchors
         Sniffers only: table of the system's anchors, id,x_m,y_m,z_m, as skyless replay and calibrate take it.
     height
@@ -88,7 +88,7 @@ def tag(
     if is_sniffer(radio):
         if integrity_risk is not None or alert_limit_m is not None:
             raise SkylessError("--integrity-risk and --alert-limit-m are not for sniffers")
-        serve = _on_sniffers(radio, names, _system(anchors, height, site_id, qa, publish_hz), address)
+        serve = _on_sniffers(radio, names, _system(radio, anchors, height, site_id, qa, publish_hz), address)
     elif anchors is not None or height is not None:
         raise SkylessError("--anchors and --height are for sniffers; other tags hear from the air where anchors stand")
     else:
@@ -124,7 +124,7 @@ def _on_sniffers(
 
 
 def _system(
-    table: Path | None, height: str | None, site: int | None, qa: float, publish_hz: float
+    radio: str, table: Path | None, height: str | None, site: int | None, qa: float, publish_hz: float
 ) -> "PacketTagSettings":
     """What sniffers cannot hear. Raises SkylessError."""
     from skyless.experiments.observability import plane_height_m
@@ -141,7 +141,13 @@ def _system(
     else:
         height_m = None if height == "free" else _metres(str(height))
     return PacketTagSettings(
-        places, TDOA_SITE if site is None else site, qa, height_m, read_calibration(table), publish_hz
+        places,
+        site=TDOA_SITE if site is None else site,
+        qa=qa,
+        height_m=height_m,
+        calibration=read_calibration(table),
+        publish_hz=publish_hz,
+        simulated=is_simulated(radio),
     )
 
 

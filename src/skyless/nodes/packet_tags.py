@@ -3,22 +3,27 @@
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 from msgspec import Struct, structs
 
 from skyless.air.packet import Packet, Point
+from skyless.errors import ConfigurationError
 from skyless.nodes.latency import Latencies
 from skyless.nodes.pace import Pace
 from skyless.nodes.running import HEALTH_S, Say, every, keep, link_of, together
 from skyless.nodes.tag import fix_message
 from skyless.nodes.usage import Usage
 from skyless.outputs.address import MqttAddress
-from skyless.outputs.messages import Counters, FixMessage, TagHealth
-from skyless.outputs.topics import fix_topic, health_topic
+from skyless.outputs.link import Link
+from skyless.outputs.messages import Counters, FixMessage, SiteMessage, TagHealth
+from skyless.outputs.topics import fix_topic, health_topic, site_topic
 from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
 from skyless.positioning.pair_calibration import PairCalibration
 from skyless.radios.radio import Gone, Restarted
 from skyless.radios.sniffer_radio import SnifferRadio
+from skyless.site.check import check_site
+from skyless.site.model import AnchorSite, Site, TagsSite
 
 METHOD = "joint"
 TDOA_SITE = 0
@@ -35,6 +40,20 @@ class PacketTagSettings(Struct, frozen=True):
     """Height of the tags where it is known; None to estimate it."""
     calibration: PairCalibration | None = None
     publish_hz: float = 50.0
+    simulated: bool = False
+    """Whether the sniffers are emulated."""
+
+
+def site_of(settings: PacketTagSettings) -> Site | None:
+    """The system as a site that a page can draw; None for a table of anchors that no site can have."""
+    anchors = tuple(AnchorSite(anchor, *place_m) for anchor, place_m in settings.anchors_m.items())
+    tags = TagsSite(height_m=settings.height_m)
+    site = Site("TDoA system", settings.site, anchors[0].id, anchors, tags=tags)
+    try:
+        check_site(site, Path("the table of anchors"))
+    except ConfigurationError:
+        return None
+    return site
 
 
 class PacketTagNode:
@@ -112,6 +131,7 @@ class PacketTags:
         )
         self._usage = Usage()
         self._told_fixes = [0] * len(radios)
+        self._site: Site | None = site_of(settings)
 
     async def run(self) -> None:
         """Serve until cancelled."""
@@ -134,7 +154,15 @@ class PacketTags:
             mqtt = Counters(0, 0, 0) if link is None else link.counters
             health = self._health(index, share / len(self.nodes), memory_bytes, mqtt)
             if link is not None:
+                self._tell_site(link)
                 link.publish(health_topic(self._settings.site, "tag", node.radio.name), health)
+
+    def _tell_site(self, link: Link) -> None:
+        """Once, where the anchors stand; retained, so that a page that comes later knows it at once."""
+        if self._site is not None:
+            message = SiteMessage(self._site, self._settings.simulated, time.time())
+            link.publish(site_topic(self._site.id), message, qos=1, retain=True)
+            self._site = None
 
     def _health(self, index: int, cpu: float, memory_bytes: int, mqtt: Counters) -> TagHealth:
         node, now_s = self.nodes[index], time.monotonic()
