@@ -7,9 +7,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import borrowing_kernel
+from skyless.positioning.motion_rows import MOTION_ROWS, fill_motion
 from skyless.positioning.protection import Alert, Integrity
-from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED, RESTLESS_CHI2
+from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED
 from skyless.uncertainty.dop import Dops, dilution_of_precision
 
 
@@ -80,48 +80,31 @@ def motion_fix(
     anchors_m: NDArray[np.float64],
     statistics: NDArray[np.float64],
     method: str,
+) -> Fix:
+    """Make the fix of a filter whose state begins with position and velocity (``fill_motion``).
+
+    ``statistics`` holds the running means of the normalised and of the plain squared innovation.
+    """
+    rows, known = np.zeros((MOTION_ROWS, 3)), height_m is not None
+    fill_motion(rows, x, P, 2 if known else 3, statistics.item(CHI2), height_m or 0.0)
+    return fix_of(time_s, rows, known, anchors, anchors_m, statistics, method)
+
+
+def fix_of(
+    time_s: float,
+    rows: NDArray[np.float64],
+    height_known: bool,
+    anchors: tuple[int, ...],
+    anchors_m: NDArray[np.float64],
+    statistics: NDArray[np.float64],
+    method: str,
     integrity: Integrity | None = None,
 ) -> Fix:
-    """Make the fix of a filter whose state begins with position and velocity (2 axes each at a known height).
-
-    ``statistics`` holds the running means of the normalised and of the plain squared innovation. While the former shows
-    a tag more agile than the filter assumes, the covariances are scaled by its square: most of an innovation is the
-    stamps' noise, so the state errs by more than the innovations tell (``docs/maths.md`` section 6).
-    """
+    """Make the fix of what ``fill_motion`` has written; the fix keeps ``rows``."""
     chi2: float = statistics.item(CHI2)
-    scale = chi2**2 if chi2 > RESTLESS_CHI2 else 1.0
-    rows = np.zeros((8, 3))
-    if height_m is None:
-        _fill(rows, x, P, 3, scale)
-    else:
-        _fill(rows, x, P, 2, scale)
-        rows[0, 2] = height_m
-    return Fix(
-        time_s=time_s,
-        position_m=rows[0],
-        covariance_m2=rows[2:5],
-        velocity_mps=rows[1],
-        velocity_covariance=rows[5:],
-        anchors=anchors,
-        anchors_m=anchors_m,
-        chi2=chi2,
-        dof=1,
-        residual_rms_m=sqrt(statistics.item(RESIDUAL_SQUARED)),
-        method=method,
-        height_known=height_m is not None,
-        hpl_m=None if integrity is None else integrity.hpl_m,
-        vpl_m=None if integrity is None else integrity.vpl_m,
-        integrity_risk=None if integrity is None else integrity.risk,
-        alert=None if integrity is None else integrity.alert,
-    )
-
-
-@borrowing_kernel
-def _fill(rows: NDArray[np.float64], x: NDArray[np.float64], P: NDArray[np.float64], dim: int, scale: float) -> None:
-    """Write position, velocity and the covariance of either, shape (8, 3): one array costs less than four."""
-    for one in range(dim):
-        rows[0, one] = x[one]
-        rows[1, one] = x[dim + one]
-        for other in range(dim):
-            rows[2 + one, other] = scale * P[one, other]
-            rows[5 + one, other] = scale * P[dim + one, dim + other]
+    rms_m = sqrt(statistics.item(RESIDUAL_SQUARED))
+    # in the order of the fields: with their names it takes as long as all the rest
+    told = (time_s, rows[0], rows[2:5], rows[1], rows[5:], anchors, anchors_m, chi2, 1, rms_m, method, height_known)
+    if integrity is None:
+        return Fix(*told)
+    return Fix(*told, integrity.hpl_m, integrity.vpl_m, integrity.risk, integrity.alert)

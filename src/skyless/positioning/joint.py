@@ -3,7 +3,9 @@
 The same kernels serve message by message (``JointFilter.hear``) and over arrays (``JointFilter.track``).
 """
 
-from collections.abc import Iterable
+import struct
+from collections.abc import Callable, Iterable
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -44,6 +46,7 @@ from skyless.positioning.joint_state import (
 from skyless.positioning.joint_sync import NO_SYNCS
 from skyless.positioning.joint_time import move_base
 from skyless.positioning.kalman import horizontal_variance
+from skyless.positioning.motion_rows import MOTION_ROWS
 from skyless.positioning.protection import RISK, limits_of
 from skyless.positioning.protection_levels import LEVELS
 from skyless.positioning.tracker import AGILITY, LOST_IN_ROW, LOST_SHARE, REJECTED_SHARE
@@ -118,6 +121,18 @@ class Messages(Struct, frozen=True):
 NO_RELAYS: Final = np.empty((0, 4), np.int64)
 
 
+MOST_RELAYS: Final = 16
+"""In a packet, for a start."""
+
+
+_pack_sync: Final[Callable[..., None]] = struct.Struct("3d").pack_into
+
+
+@cache
+def _packing(count: int) -> Callable[..., None]:
+    return struct.Struct(f"{count}q").pack_into
+
+
 class JointFilter:
     """State of one tag."""
 
@@ -131,6 +146,10 @@ class JointFilter:
         self._covariance = np.zeros((2 * self.dim, 2 * self.dim))
         self._limits = limits_of(settings.integrity_risk)
         self._levels = np.zeros(LEVELS)
+        self._relays = np.zeros((MOST_RELAYS, 4), np.int64)
+        self._sync = np.zeros((1, 3))
+        self.rows = np.zeros((MOTION_ROWS, 3))
+        """What ``fill_motion`` has written of the last packet that ``hear`` took."""
 
     def add_anchor(self, anchor_m: Vector) -> int:
         """Add an anchor to the table; returns its place there."""
@@ -185,17 +204,44 @@ class JointFilter:
 
         ``variance_factor``: on the variance of the tag's reception of it, not of those that it relays.
         """
-        if variance_factor != 1.0:
-            self._weigh(site, variance_factor)
-        packet = (site, sequence, rx_ticks, tx_ticks, relays, syncs, *self.newest, self._limits, self._levels)
-        status = joint_step(tuple(self.arrays), *packet)
+        return self._hear((site, sequence, rx_ticks, tx_ticks, relays, len(relays), syncs), variance_factor)
+
+    def hear_listed(
+        self,
+        site: int,
+        sequence: int,
+        rx_ticks: int,
+        tx_ticks: int,
+        relays: list[int],
+        sync: tuple[float, float, float] | None = None,
+        variance_factor: float = 1.0,
+    ) -> int:
+        """As ``hear``, rows of relays one after the other in a list: that spares an array for each packet."""
+        count = len(relays)
+        if count > self._relays.size:
+            self._relays = np.zeros((count // 4, 4), np.int64)
+        _packing(count)(self._relays, 0, *relays)
+        if sync is not None:
+            _pack_sync(self._sync, 0, *sync)
+        syncs = NO_SYNCS if sync is None else self._sync
+        return self._hear((site, sequence, rx_ticks, tx_ticks, self._relays, count // 4, syncs), variance_factor)
+
+    def _hear(self, packet: tuple[int, int, int, int, Integers, int, Matrix], variance_factor: float) -> int:
+        if variance_factor == 1.0:
+            return self._step(packet)
+        self._weigh(packet[0], variance_factor)
+        status = self._step(packet)
+        self._weigh(packet[0], 1.0)
+        if status == JOINED:
+            self._doubt(packet[0], variance_factor)
+        return status
+
+    def _step(self, packet: tuple[int, int, int, int, Integers, int, Matrix]) -> int:
+        outcome = (self._motion, self._covariance, self.rows, self._limits, self._levels)
+        status = joint_step(*self.arrays, *packet, *outcome)
         if status == FULL:
             self._extend()
-            status = joint_step(tuple(self.arrays), *packet)
-        if variance_factor != 1.0:
-            self._weigh(site, 1.0)
-            if status == JOINED:
-                self._doubt(site, variance_factor)
+            status = joint_step(*self.arrays, *packet, *outcome)
         return status
 
     def _weigh(self, site: int, variance_factor: float) -> None:

@@ -17,6 +17,7 @@ from skyless.positioning.joint_state import (
     JointArrays,
     new_arrays,
 )
+from skyless.positioning.motion_rows import MOTION_ROWS
 from skyless.positioning.protection_levels import LEVELS, LIMITS
 
 MOST: Final = 4096
@@ -40,12 +41,16 @@ def is_sound(joint: JointFilter) -> bool:
     n = 2 * joint.dim
     if not alike or motion.shape != (n,) or covariance.shape != (n, n) or not _counts(s):
         return False
-    return _levels(joint) and bool(0 <= vars(joint)["_anchors"] <= len(s.site_m))
+    return _exchanged(joint) and bool(0 <= vars(joint)["_anchors"] <= len(s.site_m))
 
 
-def _levels(joint: JointFilter) -> bool:
-    kept = ((vars(joint)["_limits"], LIMITS), (vars(joint)["_levels"], LEVELS))
-    return all(array.shape == (length,) and array.dtype == np.float64 for array, length in kept)
+def _exchanged(joint: JointFilter) -> bool:
+    relays, shapes = vars(joint)["_relays"], {"_limits": (LIMITS,), "_levels": (LEVELS,), "_sync": (1, 3)}
+    shapes["rows"] = (MOTION_ROWS, 3)
+    if relays.dtype != np.int64 or relays.ndim != 2 or relays.shape[1] != 4 or not relays.flags.c_contiguous:
+        return False
+    kept = ((vars(joint)[name], shape) for name, shape in shapes.items())
+    return all(a.shape == shape and a.dtype == np.float64 and a.flags.c_contiguous for a, shape in kept)
 
 
 def _counts(s: JointArrays) -> bool:

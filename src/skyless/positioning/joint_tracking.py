@@ -7,14 +7,12 @@ from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
 from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Start
-from skyless.positioning.fix import Fix, NoFixReason, motion_fix
+from skyless.positioning.fix import Fix, NoFixReason, fix_of
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.in_use import AnchorsInUse
-from skyless.positioning.joint import NO_RELAYS, JointFilter, JointSettings
+from skyless.positioning.joint import JointFilter, JointSettings
 from skyless.positioning.joint_hearing import REJECTED, STALE_PACKET
 from skyless.positioning.joint_start import JointStart
-from skyless.positioning.joint_state import Matrix
-from skyless.positioning.joint_sync import NO_SYNCS
 from skyless.positioning.master_scale import MasterScale
 from skyless.positioning.observation import Observation
 from skyless.positioning.protection import integrity_of
@@ -162,18 +160,17 @@ class JointTracking:
             heard = self._place_of.get(anchor)
             if heard is not None:
                 flat += (place, heard, sequence, rx_ticks)
-        relays = np.array(flat, np.int64).reshape(-1, 4) if flat else NO_RELAYS
         packet = (place, observation.sequence, observation.rx_ticks_tag, observation.tx_ticks_anchor)
-        return self._filter.hear(*packet, relays, self._sync(observation), observation.rx_variance_factor)
+        return self._filter.hear_listed(*packet, flat, self._sync(observation), observation.rx_variance_factor)
 
-    def _sync(self, observation: Observation) -> Matrix:
+    def _sync(self, observation: Observation) -> tuple[float, float, float] | None:
         """What the anchor says of its clock against the master's, as the filter takes it."""
         if observation.claim is None or observation.sync_variance_m2 <= 0.0:
-            return NO_SYNCS
+            return None
         master, difference = self._place_of.get(observation.claim.master), self._master_scale.difference(observation)
         if master is None or difference is None:
-            return NO_SYNCS
-        return np.array([[master, difference, observation.sync_variance_m2]])
+            return None
+        return master, difference, observation.sync_variance_m2
 
     def _place(self, observation: Observation) -> int:
         """Place of the packet's anchor in the filter's table."""
@@ -189,12 +186,12 @@ class JointTracking:
 
     def _fix(self, observation: Observation) -> Fix | NoFixReason:
         height_m, in_use = self._settings.height_m, self._in_use
-        x, P = self._filter.newest
-        if height_m is None and P[2, 2] > in_use.extent_m**2:
+        if height_m is None and self._filter.newest[1][2, 2] > in_use.extent_m**2:
             return NoFixReason.BAD_GEOMETRY
         rx_ticks = observation.rx_ticks_tag
         time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
-        statistics = self._filter.arrays.statistics
+        statistics, rows = self._filter.arrays.statistics, self._filter.rows.copy()
         risk, limit_m = self._settings.integrity_risk, self._settings.alert_limit_m
-        integrity = integrity_of(self._filter.levels, risk, height_m is not None, limit_m)
-        return motion_fix(time_s, x, P, height_m, in_use.anchors, in_use.anchors_m, statistics, "joint", integrity)
+        known = height_m is not None
+        integrity = integrity_of(self._filter.levels, risk, known, limit_m)
+        return fix_of(time_s, rows, known, in_use.anchors, in_use.anchors_m, statistics, "joint", integrity)

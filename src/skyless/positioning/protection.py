@@ -68,11 +68,12 @@ def integrity_of(levels: Vector, risk: float, height_known: bool, alert_limit_m:
 
     While an anchor's fault is in the fix the levels cover it, up to a size beyond which nothing is promised.
     """
-    hpl_m, vpl_m, state = levels.item(HPL), levels.item(VPL), int(levels.item(STATE))
+    state = int(levels.item(STATE))
     if state >= DETECTED:
         return Integrity(None, None, risk, _ALERTS[state])
+    hpl_m, vpl_m = levels.item(HPL), None if height_known else levels.item(VPL)
     exceeded = alert_limit_m is not None and hpl_m > alert_limit_m
-    return Integrity(hpl_m, None if height_known else vpl_m, risk, Alert.LIMIT if exceeded else _ALERTS[state])
+    return Integrity(hpl_m, vpl_m, risk, Alert.LIMIT if exceeded else _ALERTS[state])
 
 
 def limits_of(risk: float = RISK, false_alarm: float = FALSE_ALARM) -> Vector:
