@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from joint_builders import LAB_M, Case, begun, episode_of, kept, packets_of, settings_of, with_syncs
+from joint_builders import LAB_M, SLOT_S, Case, begun, episode_of, kept, packets_of, settings_of, with_syncs
 from msgspec.structs import replace
 
 from skyless.air.claim import Claim
 from skyless.constants import TICK_M
+from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.studies.plan import Plan
 from skyless.experiments.studies.stage import walking
 from skyless.experiments.studies.worlds import run_world
@@ -14,6 +15,8 @@ from skyless.positioning.joint_state import EXCLUDED, SYNCS_REFUSED, SYNCS_USED,
 from skyless.positioning.joint_sync import SUBTICKS, WORTH
 from skyless.positioning.master_scale import MasterScale
 from skyless.positioning.observation import Observation
+from skyless.uncertainty.bounds import bound_settings
+from skyless.uncertainty.loss_bound import received_bound
 
 PLAIN, MESH = Case(qa=0.3), Case(qa=0.3, mesh=True)
 MODULO = SUBTICKS << 40
@@ -209,3 +212,21 @@ def test_tags_that_miss_nine_tenths_are_honest():
         assert fixes > 2000
         assert sum(result.squared_m2 for result in results) < most_m**2 * fixes
         assert 0.6 < sum(result.nees for result in results) / fixes < 1.3
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_little_more_could_be_made_of_what_is_on_the_air(share):
+    """The filter's covariance against the bound of all that anchors hear of the master, and of what was relayed."""
+    ratios = []
+    for seed in range(6):
+        episode, messages, keep = lost(MESH, share, seed, 300)
+        _, said, _ = errors_of(messages, episode, keep, MESH)
+        frame, listener = np.arange(len(keep))[:, None], np.arange(6)
+        telling = frame + (listener - frame) % 6  # the listener's next packet
+        told = keep[np.minimum(telling, len(keep) - 1)] & keep[:, None]
+        known = np.column_stack([(told | (frame % 6 == 0)) & (frame % 6 != listener), keep])
+        noise = {"white_fm": WHITE_FM, "random_walk_fm": MESH.random_walk_fm, "qa": MESH.qa}
+        settings = bound_settings(1e-10, **noise, slot_s=SLOT_S, speed_std_mps=SPEED_STD_MPS, mesh=True)
+        bound = np.trace(received_bound(LAB_M, episode.path_m, settings, known)[keep], axis1=1, axis2=2)
+        ratios.append(np.sqrt(np.trace(said, axis1=1, axis2=2)[-60:].mean() / bound[40:][-60:].mean()))
+    assert 0.99 < np.mean(ratios) < 1.09

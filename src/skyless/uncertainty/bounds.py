@@ -24,7 +24,7 @@ OFFSET_STD_M: Final = 1e4
 RATE_STD_MPS: Final = 10e-6 * SPEED_OF_LIGHT_MPS
 """What is known before the first frame, next to nothing: 30 m, 33 µs, ±10 ppm."""
 
-_QA, _WHITE, _WALK, _TX, _RX, _DIM = range(6)
+QA, WHITE, WALK, TX, RX, DIM = range(6)
 """Places of the kernels' settings."""
 
 
@@ -94,10 +94,8 @@ def tracking_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSetti
     dims = 2 if settings.height_known else 3
     bound = np.empty((len(path) // len(anchors), dims, dims))
     size = 2 * dims + 2 * len(anchors) + 1
-    array = np.array(
-        [settings.qa, settings.white, settings.walk, settings.tx_variance_m2, settings.rx_variance_m2, dims]
-    )
-    P = _diffuse(size, dims, settings.speed_std_mps)
+    array = kernel_settings(settings)
+    P = diffuse(size, dims, settings.speed_std_mps)
     scratch = np.empty_like(P), np.empty(size), np.empty(size)
     _run(anchors, path, settings.slot_s, settings.mesh, settings.at_once, array, P, *scratch, bound)
     return bound
@@ -133,7 +131,13 @@ def snapshot_bound(
     return bound
 
 
-def _diffuse(size: int, dims: int, speed_std_mps: float) -> Array:
+def kernel_settings(settings: BoundSettings) -> Array:
+    """The settings as the kernels take them."""
+    noise = (settings.qa, settings.white, settings.walk, settings.tx_variance_m2, settings.rx_variance_m2)
+    return np.array([*noise, 2 if settings.height_known else 3])
+
+
+def diffuse(size: int, dims: int, speed_std_mps: float) -> Array:
     """Covariance before the first frame: [p, v, offsets and rates of the tag and all anchors but one, TX noise]."""
     clocks = (size - 1 - 2 * dims) // 2
     clock = [OFFSET_STD_M, RATE_STD_MPS] * clocks
@@ -158,7 +162,7 @@ def _run(
 
     A frame's reception by an anchor whose turn is earlier in the superframe comes with the next superframe.
     """
-    dims, n = int(settings[_DIM]), len(anchors)
+    dims, n = int(settings[DIM]), len(anchors)
     for superframe in range(len(path) // n):
         if not at_once:
             known[:] = P
@@ -181,30 +185,30 @@ def _superframe(
     superframe: int,
 ) -> None:
     """Take the frames of a superframe; the tag hears each of them, and so do the anchors whose stamps are relayed."""
-    n, dims = len(anchors), int(settings[_DIM])
+    n, dims = len(anchors), int(settings[DIM])
     for sender in range(n):
         frame = superframe * n + sender
         if frame > 0:
-            _predict(P, dims, slot_s, settings)
-        _new_packet(P, settings[_TX])
-        _hear_by_tag(P, h, ph, anchors, sender, path[frame], dims, settings[_RX])
+            predict(P, dims, slot_s, settings)
+        new_packet(P, settings[TX])
+        hear_by_tag(P, h, ph, anchors, sender, path[frame], dims, settings[RX])
         for listener in range(n):
             if listener != sender and (mesh or sender == 0) and (at_once or listener > sender):
-                _hear_by_anchor(P, h, ph, sender, listener, dims, settings[_RX])
+                hear_by_anchor(P, h, ph, sender, listener, dims, settings[RX])
 
 
 @kernel
-def _predict(P: Array, dims: int, dt_s: float, settings: Array) -> None:
+def predict(P: Array, dims: int, dt_s: float, settings: Array) -> None:
     """Advance by ``dt_s``: constant velocity, and clocks whose differences all hold the first anchor's oscillator."""
     for axis in range(dims):
         _advance(P, axis, dims + axis, dt_s)
-        _add_noise(P, axis, dims + axis, axis, dims + axis, dt_s, 0.0, settings[_QA])
+        _add_noise(P, axis, dims + axis, axis, dims + axis, dt_s, 0.0, settings[QA])
     for i in range(2 * dims, len(P) - 1, 2):
         _advance(P, i, i + 1, dt_s)
     for i in range(2 * dims, len(P) - 1, 2):
         for j in range(2 * dims, len(P) - 1, 2):
             share = 2.0 if i == j else 1.0
-            _add_noise(P, i, i + 1, j, j + 1, dt_s, share * settings[_WHITE], share * settings[_WALK])
+            _add_noise(P, i, i + 1, j, j + 1, dt_s, share * settings[WHITE], share * settings[WALK])
 
 
 @kernel
@@ -226,7 +230,7 @@ def _add_noise(P: Array, a: int, a_rate: int, b: int, b_rate: int, dt_s: float, 
 
 
 @kernel
-def _new_packet(P: Array, variance: float) -> None:
+def new_packet(P: Array, variance: float) -> None:
     """Forget the last frame's TX noise, the last state, for that of a new one."""
     last = len(P) - 1
     P[last, :] = 0.0
@@ -235,7 +239,7 @@ def _new_packet(P: Array, variance: float) -> None:
 
 
 @kernel
-def _hear_by_tag(
+def hear_by_tag(
     P: Array, h: Array, ph: Array, anchors: Array, sender: int, place: Array, dims: int, variance: float
 ) -> None:
     """The tag's stamp less the frame's: range, its clock, less the sender's clock, less the TX noise."""
@@ -249,7 +253,7 @@ def _hear_by_tag(
 
 
 @kernel
-def _hear_by_anchor(P: Array, h: Array, ph: Array, sender: int, listener: int, dims: int, variance: float) -> None:
+def hear_by_anchor(P: Array, h: Array, ph: Array, sender: int, listener: int, dims: int, variance: float) -> None:
     """An anchor's stamp less the frame's; the distance is known."""
     h[:] = 0.0
     if listener > 0:

@@ -4,6 +4,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final
 
+from msgspec.structs import replace
+
 from skyless.experiments.studies import efficiency_rows, integrity, integrity_picture, loss, motion, nlos, scale, sync
 from skyless.experiments.studies.picture import Look, draw
 from skyless.experiments.studies.plan import Cell, Plan, Row, Study
@@ -30,7 +32,10 @@ STUDIES: Final = {
             efficiency_rows.rows,
             partial(draw, Look("RMSE over the Cramér–Rao bound", ("ratio", "nees"))),
         ),
-        _of_worlds("loss", "lost messages", loss.cases, Look("Lost messages", ("rmse", "nees"), x="share lost")),
+        replace(
+            _of_worlds("loss", "lost messages", loss.cases, Look("Lost messages", ("rmse", "nees"), x="share lost")),
+            rows=loss.rows,
+        ),
         _of_worlds("nlos", "late messages", nlos.cases, Look("Late messages", ("rmse", "nees"))),
         _of_worlds("motion", "motion", motion.cases, Look("Speed and turns at 3 m/s²", ("rmse", "nees"))),
         _of_worlds(
