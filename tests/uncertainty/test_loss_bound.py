@@ -49,7 +49,7 @@ def test_its_shapes_are_checked():
 
 
 def test_the_limits_of_the_study_lie_below_the_bound():
-    """With mesh 1.40 and 3.46 at tags, 1.46 and 4.10 everywhere; limits are 1.3 and 2.5."""
+    """With mesh 1.40 and 3.26 at tags, 1.46 and 3.9 everywhere; limits are 1.3 and 2.5."""
     plan = Plan(seed=1, worlds=4)
     bounds = {
         (case.series, case.x): loss.bound_m(case.runs, plan) for case in loss.cases(plan) if case.x in (0, 0.5, 0.9)

@@ -39,8 +39,8 @@ def _name(share: float, kind: str) -> str:
 
 BOUND_S: Final = 9.0
 BOUND_FROM_S: Final = 3.0
-BOUND_WORLDS: Final = 16
-"""Of the bound: how long tags are followed, from when on it counts, and in how many worlds at most."""
+BOUND_EPISODES: Final = 24
+"""Of the bound: how long tags are followed, from when on it counts, and how many of them."""
 
 SPEED_STD_MPS: Final = 1.0
 
@@ -48,17 +48,17 @@ SPEED_STD_MPS: Final = 1.0
 def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
     """A row for each case, with the bound of what is on the air in such worlds."""
     each = cases(plan)
-    bounds = {case.name: bound_m(case.runs[:BOUND_WORLDS], plan) for case in each}
+    bounds = {case.name: bound_m(case.runs, plan) for case in each}
     return [replace(row, bound_m=bounds[row.case]) for row in world_rows("loss", plan, each, results)]
 
 
 def bound_m(runs: Sequence[Run], plan: Plan) -> float | None:
     """Root mean square of the posterior bound when the tags make the fixes that are judged.
 
-    Of tags that accelerate at random with the agility that filters assume, at the places where the first tags of the
-    worlds walk: these themselves keep their speed, which filters do not know.
+    Of tags that accelerate at random with the agility that filters assume, at the places where tags of the worlds
+    walk: these themselves keep their speed, which filters do not know.
     """
-    variances = [_variances(run, plan, number) for number, run in enumerate(runs)]
+    variances = [_variances(runs[number % len(runs)], plan, number) for number in range(BOUND_EPISODES)]
     judged = np.concatenate(variances)
     return float(np.sqrt(judged.mean())) if len(judged) else None
 
@@ -69,8 +69,9 @@ def _variances(run: Run, plan: Plan, number: int) -> np.ndarray[Any, np.dtype[np
     anchors_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     n, slot_s = len(anchors_m), site.schedule.slot_s
     superframes = int(BOUND_S / (n * slot_s))
+    tag = run.trajectories[number % len(run.trajectories)]
     times = run.warmup_s + slot_s * np.arange(n * superframes)
-    path_m = np.array([run.trajectories[0].position(float(t)) for t in times])
+    path_m = np.array([tag.position(float(t)) for t in times])
     everywhere = run.impairments.channel.loss_probability
     known = known_receptions(
         np.random.default_rng(seed_of(plan.seed, number, _BOUND_KEY)),
