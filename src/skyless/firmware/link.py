@@ -69,6 +69,7 @@ LATE_NOT_READY = 3
 
 REFUSED_SETTING = 1
 REFUSED_MALFORMED = 2
+REFUSED_RADIO = 3
 """Why a command was not followed."""
 
 RATE_KHZ = 63_897_600
@@ -158,6 +159,17 @@ def copy_to_zero(source: ptr8, at: int, end: int, out: ptr8, fill: int) -> int:
     return at
 
 
+@micropython.viper
+def place(value: int, size: int, out: ptr8, fill: int) -> int:
+    """Write a number of up to 32 bits to ``out[fill:]``, little-endian; return where it ends there."""
+    while size > 0:
+        out[fill] = value & 0xFF
+        fill += 1
+        value >>= 8
+        size -= 1
+    return fill
+
+
 def unsigned(record: bytearray, at: int, size: int) -> int:
     """Little-endian number of so many bytes."""
     value = 0
@@ -191,13 +203,9 @@ class Writer:
 
     def put(self, value: int, size: int) -> None:
         """Append a number, negative ones as their complement."""
-        while size > 0:
-            self._record[self._fill] = value & 0xFF
-            self._fill += 1
-            value >>= 8
-            size -= 1
+        self._fill = place(value, size, self._record, self._fill)
 
-    def put_bytes(self, source: bytearray, at: int, end: int) -> None:
+    def put_bytes(self, source: bytearray | memoryview, at: int, end: int) -> None:
         """Append ``source[at:end]``."""
         self._fill = copy(source, at, end, self._record, self._fill)
 
@@ -224,11 +232,11 @@ class Writer:
 
     def rx(
         self,
-        ticks: bytearray,
+        ticks: bytearray | memoryview,
         rx_power_cdbm: int,
         first_path_cdbm: int,
         offset_ppb: int,
-        frame: bytearray,
+        frame: bytearray | memoryview,
         frame_end: int,
     ) -> int:
         """A frame ``frame[:frame_end]``, its stamp, powers in 0.01 dBm, the sender's carrier offset in 1e-9."""
@@ -240,7 +248,7 @@ class Writer:
         self.put_bytes(frame, 0, frame_end)
         return self.end()
 
-    def tx_done(self, dx: bytearray, ticks: bytearray) -> int:
+    def tx_done(self, dx: bytearray, ticks: bytearray | memoryview) -> int:
         """The frame of ``dx`` has left with this 5-byte TX stamp."""
         self.begin(TX_DONE)
         self.put_bytes(dx, 0, 5)
@@ -256,7 +264,7 @@ class Writer:
 
     def status(
         self,
-        ticks: bytearray,
+        ticks: bytearray | memoryview,
         state: int,
         counts: list[int],
         temperature_cc: int = NOT_TOLD,
