@@ -78,8 +78,8 @@ def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
         each = ", ".join(f"{value:.0f} ns with {count:,}" for count, value in tags.ns_per_message.items())
         all_cores = f"{tags.all_cores_messages_per_s:,.0f} messages/s on all cores"
         out.print(f"{'tags at once, ' + name:<24}{each} tags; {all_cores}")
-    if speed.filterpy:
-        out.print(speed.filterpy)
+    if speed.filterpy_missing:
+        out.print(speed.filterpy_missing)
     rows = [
         ("NumPy loop, one core", chain.numpy_loop_draws_per_s),
         ("compiled, one core", chain.one_core_draws_per_s),

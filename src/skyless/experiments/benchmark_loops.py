@@ -97,13 +97,14 @@ def _elapse(x: Vector, P: Matrix, dim: int, clocks: int, dt: float, noise: Vecto
 @threaded_kernel
 def _update(x: Vector, P: Matrix, h: Vector, ph: Vector, innovation: float, variance: float) -> None:
     n = len(x)
+    ph[:] = 0.0
+    for row in range(n):
+        if h[row] != 0.0:  # of P, symmetric, the few rows that count
+            for column in range(n):
+                ph[column] += h[row] * P[row, column]
     spread = variance
     for row in range(n):
-        total = 0.0
-        for column in range(n):
-            total += P[row, column] * h[column]
-        ph[row] = total
-        spread += h[row] * total
+        spread += h[row] * ph[row]
     for row in range(n):
         gain = ph[row] / spread
         x[row] += gain * innovation

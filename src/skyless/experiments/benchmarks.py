@@ -93,7 +93,7 @@ class Speed(Struct, frozen=True):
     load: float | None
     """Programs that wanted a core in the last minute."""
     cores: int
-    filterpy: str | None
+    filterpy_missing: str | None
     """Why filterpy was not measured, None if it was."""
 
 
