@@ -1,0 +1,1 @@
+"""A register-level model of the DW1000 behind its SPI, on the emulated air."""

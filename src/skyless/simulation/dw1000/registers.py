@@ -1,0 +1,128 @@
+"""Registers of the DW1000 as the model has them, from the User Manual v2.12 ("UM"): section 7.2 and the tables of 2.5.
+
+The driver has a table of its own; ``tests/simulation/test_dw1000_tables.py`` holds both against a third.
+"""
+
+from typing import Final
+
+from msgspec import Struct
+
+
+class Register(Struct, frozen=True):
+    """A register file or sub-register."""
+
+    file: int
+    sub: int
+    length: int
+    """Octets."""
+    reset: int = 0
+    """Value after a reset; of tuning registers only those that section 2.5 tells to change are known exactly."""
+    access: str = "RW"
+    """RW; RO, which writing does not change; WO, which reads as zeros."""
+
+
+# Identity and configuration (UM 7.2.2 to 7.2.14)
+DEV_ID: Final = Register(0x00, 0x00, 4, 0xDECA0130, "RO")  # 7.2.2
+EUI: Final = Register(0x01, 0x00, 8, 0xFFFFFFFF00000000)  # 7.2.3
+PANADR: Final = Register(0x03, 0x00, 4, 0xFFFFFFFF)  # 7.2.5
+SYS_CFG: Final = Register(0x04, 0x00, 4, 0x00001200)  # 7.2.6
+SYS_TIME: Final = Register(0x06, 0x00, 5, 0, "RO")  # 7.2.8
+TX_FCTRL: Final = Register(0x08, 0x00, 5, 0x0015400C)  # 7.2.10, pp. 73-77
+TX_BUFFER: Final = Register(0x09, 0x00, 1024, 0, "WO")  # 7.2.11, p. 77
+DX_TIME: Final = Register(0x0A, 0x00, 5)  # 7.2.12
+RX_FWTO: Final = Register(0x0C, 0x00, 2)  # 7.2.14, p. 79
+SYS_CTRL: Final = Register(0x0D, 0x00, 4)  # 7.2.15, pp. 80-84
+SYS_MASK: Final = Register(0x0E, 0x00, 4)  # 7.2.16
+SYS_STATUS: Final = Register(0x0F, 0x00, 5)  # 7.2.17, pp. 86-93
+
+# What was received and sent (UM 7.2.18 to 7.2.26, pp. 94-103)
+RX_FINFO: Final = Register(0x10, 0x00, 4, 0, "RO")
+RX_BUFFER: Final = Register(0x11, 0x00, 1024, 0, "RO")
+RX_FQUAL: Final = Register(0x12, 0x00, 8, 0, "RO")
+STD_NOISE: Final = Register(0x12, 0x00, 2, 0, "RO")
+FP_AMPL2: Final = Register(0x12, 0x02, 2, 0, "RO")
+FP_AMPL3: Final = Register(0x12, 0x04, 2, 0, "RO")
+CIR_PWR: Final = Register(0x12, 0x06, 2, 0, "RO")
+RX_TTCKI: Final = Register(0x13, 0x00, 4, 0, "RO")
+RX_TTCKO: Final = Register(0x14, 0x00, 5, 0, "RO")
+RX_TIME: Final = Register(0x15, 0x00, 14, 0, "RO")
+RX_STAMP: Final = Register(0x15, 0x00, 5, 0, "RO")
+FP_INDEX: Final = Register(0x15, 0x05, 2, 0, "RO")
+FP_AMPL1: Final = Register(0x15, 0x07, 2, 0, "RO")
+RX_RAWST: Final = Register(0x15, 0x09, 5, 0, "RO")
+TX_TIME: Final = Register(0x17, 0x00, 10, 0, "RO")
+TX_STAMP: Final = Register(0x17, 0x00, 5, 0, "RO")
+TX_RAWST: Final = Register(0x17, 0x05, 5, 0, "RO")
+TX_ANTD: Final = Register(0x18, 0x00, 2)
+SYS_STATE: Final = Register(0x19, 0x00, 5, 0, "RO")
+ACK_RESP_T: Final = Register(0x1A, 0x00, 4)  # 7.2.28, p. 103
+RX_SNIFF: Final = Register(0x1D, 0x00, 4)  # 7.2.30
+TX_POWER: Final = Register(0x1E, 0x00, 4, 0x1E080222)  # 7.2.31
+CHAN_CTRL: Final = Register(0x1F, 0x00, 4, 0x21040055)  # 7.2.32; channel 5, PRF 16 MHz, code 4 (2.5.2)
+USR_SFD: Final = Register(0x21, 0x00, 41)  # 7.2.34
+
+# Tuning (UM 7.2.36 to 7.2.44, 7.2.47)
+AGC_CTRL: Final = Register(0x23, 0x00, 33)
+AGC_CTRL1: Final = Register(0x23, 0x02, 2, 0x0001)
+AGC_TUNE1: Final = Register(0x23, 0x04, 2, 0x889B)
+AGC_TUNE2: Final = Register(0x23, 0x0C, 4)
+AGC_TUNE3: Final = Register(0x23, 0x12, 2)
+EXT_SYNC: Final = Register(0x24, 0x00, 12)
+EC_CTRL: Final = Register(0x24, 0x00, 4)
+GPIO_CTRL: Final = Register(0x26, 0x00, 44)
+DRX_CONF: Final = Register(0x27, 0x00, 46)
+DRX_TUNE0B: Final = Register(0x27, 0x02, 2)
+DRX_TUNE1A: Final = Register(0x27, 0x04, 2, 0x0087)
+DRX_TUNE1B: Final = Register(0x27, 0x06, 2)
+DRX_TUNE2: Final = Register(0x27, 0x08, 4, 0x311E0035)
+DRX_SFDTOC: Final = Register(0x27, 0x20, 2, 4161)
+DRX_PRETOC: Final = Register(0x27, 0x24, 2)
+DRX_TUNE4H: Final = Register(0x27, 0x26, 2)
+DRX_CAR_INT: Final = Register(0x27, 0x28, 3, 0, "RO")  # p. 151
+RXPACC_NOSAT: Final = Register(0x27, 0x2C, 2, 0, "RO")
+RF_CONF: Final = Register(0x28, 0x00, 58)
+RF_RXCTRLH: Final = Register(0x28, 0x0B, 1, 0xD8)
+RF_TXCTRL: Final = Register(0x28, 0x0C, 4, 0x001E3DE0)
+RF_SENSOR_1: Final = Register(0x28, 0x11, 1)  # UM 6.4: without a name, for temperature and supply
+RF_SENSOR_2: Final = Register(0x28, 0x12, 1)
+RF_STATUS: Final = Register(0x28, 0x2C, 4, 0, "RO")
+LDOTUNE: Final = Register(0x28, 0x30, 5, 0x8888888888)
+TX_CAL: Final = Register(0x2A, 0x00, 52)
+TC_SARC: Final = Register(0x2A, 0x00, 2)  # p. 158
+TC_SARL: Final = Register(0x2A, 0x03, 3, 0, "RO")  # pp. 158-159
+TC_SARW: Final = Register(0x2A, 0x06, 2, 0, "RO")
+TC_PGDELAY: Final = Register(0x2A, 0x0B, 1, 0xC5)
+TC_PGTEST: Final = Register(0x2A, 0x0C, 1)
+FS_CTRL: Final = Register(0x2B, 0x00, 21)
+FS_PLLCFG: Final = Register(0x2B, 0x07, 4, 0x0800041D)
+FS_PLLTUNE: Final = Register(0x2B, 0x0B, 1, 0x46)
+FS_XTALT: Final = Register(0x2B, 0x0E, 1, 0x60)
+AON: Final = Register(0x2C, 0x00, 12)
+AON_WCFG: Final = Register(0x2C, 0x00, 2)
+AON_CTRL: Final = Register(0x2C, 0x02, 1)
+AON_CFG0: Final = Register(0x2C, 0x06, 4)
+AON_CFG1: Final = Register(0x2C, 0x0A, 2)
+OTP_IF: Final = Register(0x2D, 0x00, 19)
+OTP_ADDR: Final = Register(0x2D, 0x04, 2)
+OTP_CTRL: Final = Register(0x2D, 0x06, 2)
+OTP_RDAT: Final = Register(0x2D, 0x0A, 4, 0, "RO")
+OTP_SF: Final = Register(0x2D, 0x12, 1)
+LDE_IF: Final = Register(0x2E, 0x0000, 0x2806)
+LDE_THRESH: Final = Register(0x2E, 0x0000, 2, 0, "RO")
+LDE_CFG1: Final = Register(0x2E, 0x0806, 1, 0x6C)
+LDE_PPINDX: Final = Register(0x2E, 0x1000, 2, 0, "RO")
+LDE_PPAMPL: Final = Register(0x2E, 0x1002, 2, 0, "RO")
+LDE_RXANTD: Final = Register(0x2E, 0x1804, 2)
+LDE_CFG2: Final = Register(0x2E, 0x1806, 2)
+LDE_REPC: Final = Register(0x2E, 0x2804, 2)
+DIG_DIAG: Final = Register(0x2F, 0x00, 41)
+PMSC: Final = Register(0x36, 0x00, 44)
+PMSC_CTRL0: Final = Register(0x36, 0x00, 4, 0xF0300200)  # 7.2.50.1
+PMSC_CTRL1: Final = Register(0x36, 0x04, 4, 0x81020738)  # 7.2.50.2
+PMSC_LEDC: Final = Register(0x36, 0x28, 4)
+
+ALL: Final = {name: value for name, value in globals().items() if isinstance(value, Register)}
+FILE_LENGTHS: Final = {
+    file: max(one.sub + one.length for one in ALL.values() if one.file == file)
+    for file in {one.file for one in ALL.values()}
+}
