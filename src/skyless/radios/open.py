@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Final, Literal
 
 from skyless.errors import SkylessError
+from skyless.radios.chip_ports import ModelPort, SpiPort
+from skyless.radios.dw1000_radio import Dw1000Radio
 from skyless.radios.emulated import EtherConnection
 from skyless.radios.ether_wire import DEFAULT_PORT, Join
 from skyless.radios.listener_radio import ListenerRadio
@@ -12,6 +14,7 @@ from skyless.radios.radio import AntennaDelays, Radio
 from skyless.radios.serial_port import check_path
 from skyless.radios.serial_radio import SerialRadio
 from skyless.radios.sniffer_radio import SnifferRadio
+from skyless.radios.spi_bus import DEFAULT_CHIP, DEFAULT_FAST_HZ, SpiBus
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
 SERIAL_BAUD: Final = 1_000_000
@@ -19,13 +22,16 @@ SNIFFER_BAUD: Final = 115_200
 """Of a real sniffer's USB port no rate matters."""
 
 LISTENER_BAUD: Final = 115_200
-EXPECTED: Final = "ether:HOST[:PORT], serial:PATH[@BAUD], listener:PATH[@BAUD] or sniffer:PATH[@BAUD]"
+EXPECTED: Final = (
+    "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN], model:HOST[:PORT], "
+    "listener:PATH[@BAUD] or sniffer:PATH[@BAUD]"
+)
 
 
 def is_simulated(spec: str) -> bool:
     """Whether nothing real flies over a radio of that name; what sits behind a pseudo-terminal is no radio."""
     port = spec.partition(":")[2].partition(",")[0].partition("@")[0]
-    return is_ether(spec) or str(Path(port).resolve()).startswith("/dev/pts/")
+    return spec.split(":", 1)[0] in ("ether", "model") or str(Path(port).resolve()).startswith("/dev/pts/")
 
 
 def is_ether(spec: str) -> bool:
@@ -55,9 +61,19 @@ def open_radios(
     if driver == "ether":
         host, port = host_and_port(spec, place, DEFAULT_PORT)
         return EtherConnection(host, port, Join(kind, names)).radios
+    settings = delays or [AntennaDelays()] * len(names)
+    if driver == "model":
+        host, port = host_and_port(spec, place, DEFAULT_PORT)
+        nodes = EtherConnection(host, port, Join(kind, names)).radios
+        return tuple(
+            Dw1000Radio(ModelPort(node, own), node.name, own) for node, own in zip(nodes, settings, strict=True)
+        )
+    if driver == "spi":
+        if len(names) != 1:
+            raise SkylessError(f"--radio is {spec!r}; a chip on SPI carries one node, not {len(names)}")
+        return (Dw1000Radio(spi_port(spec, place), names[0], settings[0]),)
     if driver == "serial":
         ports = _ports(spec, place, SERIAL_BAUD, names)
-        settings = delays or [AntennaDelays()] * len(names)
         transmits = kind == "anchor"
         return tuple(SerialRadio(*ports[i], name, settings[i], transmits=transmits) for i, name in enumerate(names))
     if driver in ("listener", "sniffer") and kind == "anchor":
@@ -86,6 +102,29 @@ def _ports(spec: str, place: str, usual_baud: int, names: tuple[str, ...]) -> li
     for path, _ in ports:
         check_path(spec, path)
     return ports
+
+
+def spi_port(spec: str, place: str) -> SpiPort:
+    """The chip of BUS.DEVICE[,irq=PIN][,reset=PIN][,hz=RATE][,chip=PATH]. Raises SkylessError."""
+    wires, _, rest = place.partition(",")
+    bus, dot, device = wires.partition(".")
+    given = dict(part.partition("=")[::2] for part in rest.split(",") if part)
+    chip = given.pop("chip", DEFAULT_CHIP)
+    numbers = {key: int(value) if value.isdecimal() and len(value) < 10 else -1 for key, value in given.items()}
+    right = dot and bus.isdecimal() and device.isdecimal() and chip.startswith("/")
+    if not right or not numbers.keys() <= {"irq", "reset", "hz"} or min(numbers.values(), default=0) < 0:
+        raise SkylessError(f"--radio is {spec!r}; it should be spi:BUS.DEVICE, as spi:0.0,irq=25,reset=24,hz=8000000")
+    return SpiPort(
+        f"/dev/spidev{bus}.{device}",
+        lambda: SpiBus(
+            int(bus),
+            int(device),
+            irq_pin=numbers.get("irq"),
+            reset_pin=numbers.get("reset"),
+            fast_hz=numbers.get("hz", DEFAULT_FAST_HZ),
+            gpio_chip=chip,
+        ),
+    )
 
 
 def _port(spec: str, part: str, usual_baud: int) -> tuple[str, int]:

@@ -6,6 +6,7 @@ from typing import Final
 
 from msgspec import Struct
 
+from skyless.firmware.dw1000 import Bus
 from skyless.simulation.dw1000.chip import Chip
 
 SLOW_HZ: Final = 2_000_000
@@ -31,8 +32,8 @@ class HostLatency(Struct, frozen=True):
         return generator.uniform(self.least_s, self.most_s)
 
 
-class ModelBus:
-    """What the driver asks of its hardware (``skyless.firmware.dw1000.Bus``), on a model.
+class ModelBus(Bus):
+    """What the driver asks of its hardware, on a model.
 
     ``spend`` lets the host's time pass; a transfer reaches the chip when its time is over.
     """

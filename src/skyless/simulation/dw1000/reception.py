@@ -30,7 +30,7 @@ SFD_COUNTED: Final = 5
 """Symbols of the delimiter that RXPACC counts where it equals RXPACC_NOSAT, for the standard one (UM table 18)."""
 
 SUSPECT_TICKS: Final = 1024
-"""By how much the stamp is wrong after an error without a reset of the receiver (assumed; UM 4.1.6 tells that it is)."""
+"""How wrong the stamp is after an error without a reset of the receiver (assumed; UM 4.1.6 tells that it may be)."""
 
 
 def arrive(
@@ -47,13 +47,9 @@ def arrive(
 
     ``antenna_ticks`` counts the antenna delay in, as the chip's own stamp does before LDE_RXANTD is taken off.
     """
-    since = transceiver.listening_since
-    if since is None:
-        return "receiver-off"
-    if difference(wrap(antenna_ticks - PREAMBLE_TICKS + _MISSABLE_TICKS), since) < 0:
-        return "preamble-missed"
-    if why_deaf(memory) is not None:
-        return "deaf"
+    reason = _why_unheard(memory, transceiver, antenna_ticks)
+    if reason is not None:
+        return reason
     if fault in ("header", "parity", "delimiter"):
         _end(memory, transceiver, FAULT_EVENTS[fault], is_error=True)
         return "spoilt"
@@ -76,6 +72,15 @@ def arrive(
     return "suspect" if transceiver.suspect else "heard"
 
 
+def _why_unheard(memory: Memory, transceiver: Transceiver, antenna_ticks: int) -> str | None:
+    since = transceiver.listening_since
+    if since is None:
+        return "receiver-off"
+    if difference(wrap(antenna_ticks - PREAMBLE_TICKS + _MISSABLE_TICKS), since) < 0:
+        return "preamble-missed"
+    return None if why_deaf(memory) is None else "deaf"
+
+
 def _end(memory: Memory, transceiver: Transceiver, events: int, *, is_error: bool) -> None:
     """The receiver turns itself off, but after an error with RXAUTR (UM 7.2.6)."""
     if is_error:
@@ -87,7 +92,9 @@ def _end(memory: Memory, transceiver: Transceiver, events: int, *, is_error: boo
 
 def _fill(memory: Memory, frame: bytes, measured: Measured) -> None:
     """RX_FINFO, the frame, and what was measured of it."""
-    length_and_kind = len(frame) | 0b01 << 11 | 0b10 << 13 | 1 << 15 | 0b10 << 16 | 0b01 << 18  # 128 symbols, 6.8 Mbit/s
+    length_and_kind = (
+        len(frame) | 0b01 << 11 | 0b10 << 13 | 1 << 15 | 0b10 << 16 | 0b01 << 18
+    )  # 128 symbols, 6.8 Mbit/s
     whole = measured.symbols == SYMBOLS  # then symbols of the delimiter were counted, too (UM 7.2.18, table 18)
     counted = measured.symbols + (SFD_COUNTED if whole else 0)
     memory.put(r.RX_FINFO, length_and_kind | counted << 20)

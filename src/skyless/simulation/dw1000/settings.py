@@ -1,4 +1,4 @@
-"""Whether the chip is set up for the air that Skyless emulates: channel 5, PRF 64 MHz, 6.8 Mbit/s, preamble of 128, code 9.
+"""Whether the chip is set up for the emulated air: channel 5, PRF 64 MHz, 6.8 Mbit/s, a preamble of 128, code 9.
 
 A chip with another setting hears nothing and is not heard. Tuning registers count as well: a real receiver that is
 tuned otherwise would still hear something, but a driver with a wrong value is to show.

@@ -1,6 +1,7 @@
 """The chip's transmitter and receiver (DW1000 User Manual v2.12, sections 3 and 4).
 
-Not modelled: double buffering, frame filtering, automatic acknowledgement, sniffing, sleep, long frames, preamble timeout.
+Not modelled: double buffering, frame filtering, automatic acknowledgement, sniffing, sleep, long frames, and the
+preamble timeout.
 """
 
 from collections import Counter
@@ -21,7 +22,7 @@ from skyless.ticks import difference, from_seconds, wrap
 DX_MASK: Final = ~(DELAYED_TX_GRANULARITY_TICKS - 1)
 PREAMBLE_TICKS: Final = from_seconds(preamble_s())
 POWER_UP_TICKS: Final = from_seconds(10e-6)
-"""What the transmitter needs to power up before the preamble; less is a TXPUTE (assumed, the manual tells no figure)."""
+"""What the transmitter needs to power up before the preamble; less gives TXPUTE (assumed: the manual tells none)."""
 AT_ONCE_TICKS: Final = from_seconds(0.5e-3)
 """When a frame without a time leaves: soon enough for the emulated air, which wants to know of it before."""
 TIMEOUT_TICKS: Final = 512 * 128

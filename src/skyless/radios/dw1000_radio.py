@@ -1,0 +1,109 @@
+"""A DW1000 on SPI, or a model of one, driven by this process."""
+
+import asyncio
+import time
+from collections import Counter
+
+from skyless.air.reception import Transmission
+from skyless.constants import TICK_S
+from skyless.firmware.dw1000 import Bus
+from skyless.radios.chip_ports import Port
+from skyless.radios.chip_session import ChipSession
+from skyless.radios.radio import AntennaDelays, Gone, Late, Listener, RadioEvent, Restarted
+from skyless.ticks import difference
+
+
+class Dw1000Radio:
+    """One node's chip (``skyless.radios.radio.Radio``)."""
+
+    def __init__(self, port: Port, name: str, delays: AntennaDelays) -> None:
+        self.name = name
+        self.counters: Counter[str] = Counter()
+        self._port, self._delays = port, delays
+        self._listener: Listener = _nobody
+        self._session: ChipSession | None = None
+        self._told = ""
+        self._timer: asyncio.TimerHandle | None = None
+
+    async def run(self, listener: Listener) -> None:
+        """Receive until cancelled; a chip that does not answer is looked for."""
+        self._listener = listener
+        try:
+            await self._port.keep(self)
+        finally:
+            self._forget()
+
+    def now_ticks(self) -> int | None:
+        """The chip's counter, read over the bus; None while it is not ready."""
+        try:
+            return None if self._session is None else self._session.read_ticks()
+        except OSError:
+            return None
+
+    def transmit(self, transmission: Transmission) -> None:
+        """Send a frame; without a chip it is late."""
+        session = self._session
+        if session is None:
+            self._listener(Late(transmission.tx_ticks))
+            return
+        try:
+            session.transmit(transmission, time.monotonic())
+            self._watch(session)
+        except OSError:
+            self._listener(Late(transmission.tx_ticks))
+
+    def _watch(self, session: ChipSession) -> None:
+        """Look after a frame whose end is not told."""
+        overdue, now = session.overdue_ticks, session.read_ticks()
+        if overdue is not None and now is not None:
+            if self._timer is not None:
+                self._timer.cancel()
+            wait_s = max(difference(overdue, now) * TICK_S, 0.0)
+            self._timer = asyncio.get_running_loop().call_later(wait_s, self._give_up, session)
+
+    def _give_up(self, session: ChipSession) -> None:
+        overdue, now = session.overdue_ticks, self.now_ticks()
+        if session is self._session and overdue is not None and now is not None and difference(now, overdue) >= 0:
+            session.give_up()
+
+    # What the port calls
+
+    def begin(self, bus: Bus) -> None:
+        """Start the chip. Raises OSError and ChipError."""
+        self._forget()
+        session = ChipSession(bus, self._delays, self._hear, self.counters)
+        session.start()
+        self._session, self._told = session, ""
+        self._listener(Restarted())
+
+    def wake(self) -> None:
+        """Take what it has to tell; start a chip again that has lost its settings. Raises OSError and ChipError."""
+        session = self._session
+        if session is not None and not session.serve(time.monotonic()):
+            self._lose("the DW1000 has lost its configuration; is its supply good?")
+            session.start()
+            self._session = session
+            self._listener(Restarted())
+
+    def end(self, reason: str) -> None:
+        """It is out of reach; each reason is told once."""
+        self._forget()
+        self._lose(reason)
+
+    def _lose(self, reason: str) -> None:
+        self._session = None
+        if reason != self._told:
+            self._told = reason
+            self._listener(Gone(reason))
+
+    def _forget(self) -> None:
+        self._session = None
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _hear(self, event: RadioEvent) -> None:
+        self._listener(event)
+
+
+def _nobody(event: RadioEvent) -> None:
+    pass
