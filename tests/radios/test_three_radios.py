@@ -117,7 +117,6 @@ def test_what_the_chip_measures_is_what_the_air_tells_but_for_rounding(ways):
 def test_three_radios_give_the_same_fixes_bit_for_bit(ways, method):
     _, rounded, serial, chip, _, _ = ways
     here = fixes_of(rounded, method)
-    assert sum(fix is not None for fix in here[0]) > 500
+    assert sum(fix is not None for fix in here[0]) > 150
     assert fixes_of(serial, method) == here
-    # host times are the ether's here and there: the board's are the pseudo-terminal's
     assert fixes_of(chip, method) == here

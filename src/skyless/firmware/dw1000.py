@@ -78,6 +78,7 @@ RXRFTO = 1 << 17
 LDEERR = 1 << 18
 RXOVRR = 1 << 20
 RXPTO = 1 << 21
+SLP2INIT = 1 << 23
 RX_ERRORS = RXPHE | RXFCE | RXRFSL | RXRFTO | LDEERR | RXOVRR | RXPTO
 CLKPLL_LL_3 = 1 << 1
 RXSFDTO_3 = 1 << 2
@@ -574,9 +575,7 @@ class DW1000:
             return LOST
         status = self._read_status()
         seen = status[0] | status[1] << 8 | status[2] << 16
-        if (not seen & CPLOCK or status[4] & UNUSED_4) and self._is_lost():
-            self.state = OFF
-            self._listening = False
+        if (not seen & CPLOCK or seen & SLP2INIT or status[4] & UNUSED_4) and not self.check():
             return LOST
         events = 0
         if status[3] & CLKPLL_LL_3:
@@ -592,6 +591,20 @@ class DW1000:
             if seen & RXFCG:
                 return events | self._take_frame()
         return events
+
+    def check(self) -> bool:
+        """Whether the chip still has its configuration; if not it is OFF.
+
+        ``poll`` asks when SYS_STATUS looks strange. A chip whose supply failed may lock again unseen and say nothing
+        for ever, so this is to be asked now and then where nothing has come for long.
+        """
+        if self.state == OFF:
+            return False
+        if self._get(0x1F, 0, 4) == CONFIGURATION[1][3].to_bytes(4, "little"):
+            return True
+        self.state = OFF
+        self._listening = False
+        return False
 
     def now(self) -> memoryview:
         """The counter now, in 5 bytes that the next call overwrites (UM 7.2.8)."""
@@ -682,11 +695,6 @@ class DW1000:
         self.error_status = status
         self._resume()
         return FAILED
-
-    def _is_lost(self) -> bool:
-        """Whether the chip has forgotten its configuration: a status that cannot be has been read."""
-        found = self._get(0x1F, 0, 4)
-        return found != CONFIGURATION[1][3].to_bytes(4, "little")
 
     def _take_frame(self) -> int:
         """Read a frame and all that was measured of it, and listen on."""

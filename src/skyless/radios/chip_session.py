@@ -71,6 +71,12 @@ class ChipSession:
             self._tell(Reception(frame, _ticks(driver.rx_ticks), host_s, self._diagnostics()))
         return True
 
+    def is_alive(self) -> bool:
+        """Ask a chip from which nothing has come for long whether it still has its settings."""
+        alive = self.driver.check()
+        self._counters["chip-lost"] += not alive
+        return alive
+
     def _sent(self) -> None:
         tx_ticks, self._pending = self._pending, None
         if tx_ticks is None:

@@ -3,14 +3,18 @@
 import asyncio
 import time
 from collections import Counter
+from typing import Final
 
 from skyless.air.reception import Transmission
 from skyless.constants import TICK_S
-from skyless.firmware.dw1000 import Bus
+from skyless.firmware.dw1000 import Bus, ChipError
 from skyless.radios.chip_ports import Port
 from skyless.radios.chip_session import ChipSession
 from skyless.radios.radio import AntennaDelays, Gone, Late, Listener, RadioEvent, Restarted
 from skyless.ticks import difference
+
+CARE_S: Final = 1.0
+"""After so long a chip from which nothing came is asked whether it still has its settings."""
 
 
 class Dw1000Radio:
@@ -23,14 +27,17 @@ class Dw1000Radio:
         self._listener: Listener = _nobody
         self._session: ChipSession | None = None
         self._told = ""
+        self._heard = False
         self._timer: asyncio.TimerHandle | None = None
 
     async def run(self, listener: Listener) -> None:
         """Receive until cancelled; a chip that does not answer is looked for."""
         self._listener = listener
+        care = asyncio.ensure_future(self._care())
         try:
             await self._port.keep(self)
         finally:
+            care.cancel()
             self._forget()
 
     def now_ticks(self) -> int | None:
@@ -80,10 +87,24 @@ class Dw1000Radio:
         """Take what it has to tell; start a chip again that has lost its settings. Raises OSError and ChipError."""
         session = self._session
         if session is not None and not session.serve(time.monotonic()):
-            self._lose("the DW1000 has lost its configuration; is its supply good?")
-            session.start()
-            self._session = session
-            self._listener(Restarted())
+            self._revive(session)
+
+    def _revive(self, session: ChipSession) -> None:
+        self._lose("the DW1000 has lost its configuration; is its supply good?")
+        session.start()
+        self._session = session
+        self._listener(Restarted())
+
+    async def _care(self) -> None:
+        """Look after a chip that says nothing: one whose supply failed may have come up again unseen."""
+        while True:
+            await asyncio.sleep(CARE_S)
+            session, self._heard = self._session if not self._heard else None, False
+            try:
+                if session is not None and not session.is_alive():
+                    self._revive(session)
+            except (OSError, ChipError) as error:
+                self.end(str(error))
 
     def end(self, reason: str) -> None:
         """It is out of reach; each reason is told once."""
@@ -102,6 +123,7 @@ class Dw1000Radio:
             self._timer.cancel()
 
     def _hear(self, event: RadioEvent) -> None:
+        self._heard = True
         self._listener(event)
 
 

@@ -1,0 +1,157 @@
+"""A DW1000 as a radio: on the emulated air by its model, and on an SPI that the test plays."""
+
+import asyncio
+
+import pytest
+from air_stage import LAB, make_ether
+from chip_stage import HandClock, TimedNode
+from serial_stage import ears
+
+from skyless.air.reception import Diagnostics, Reception, Transmission
+from skyless.constants import TICK_RATE_HZ
+from skyless.errors import SkylessError
+from skyless.experiments.warm import compile_kernels
+from skyless.radios import chip_ports
+from skyless.radios.chip_ports import SpiPort
+from skyless.radios.dw1000_radio import Dw1000Radio
+from skyless.radios.open import is_simulated, open_radios
+from skyless.radios.radio import AntennaDelays, Gone, Late, Restarted, Sent
+from skyless.simulation.dw1000.bus import ModelBus
+from skyless.ticks import difference, wrap
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    compile_kernels()
+
+
+@pytest.mark.usefixtures("compiled")
+def test_frames_fly_between_models_on_the_emulated_air_and_late_ones_do_not():
+    async def play():
+        ether = make_ether(asyncio.get_running_loop().time)
+        server = await ether.serve("127.0.0.1", 0)
+        place = f"model:127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        (anchor,) = open_radios(place, "anchor", (str(LAB.anchors[0].id),), [AntennaDelays()])
+        (tag,) = open_radios(place, "tag", ("tag1",))
+        async with ears(anchor) as sender, ears(tag) as listener:
+            await sender.until(Restarted)
+            await listener.until(Restarted)
+            for number in range(20):
+                now_ticks = anchor.now_ticks()
+                tx_ticks = wrap((now_ticks + round(0.02 * TICK_RATE_HZ)) & ~0x1FF) + 16_436
+                body = b"frame %d  " % number
+                anchor.transmit(Transmission(body, wrap(tx_ticks)))
+                async with asyncio.timeout(10):
+                    while len(sender.of(Sent)) + len(sender.of(Late)) <= number:
+                        await asyncio.sleep(0.002)
+            assert len(sender.of(Sent)) > 5
+            await listener.until(Reception)
+            assert listener.of(Reception)[0].frame.startswith(b"frame ")
+            late = len(sender.of(Late))
+            anchor.transmit(Transmission(b"too late", anchor.now_ticks()))
+            assert len(sender.of(Late)) == late + 1
+            assert not +tag._port.chip.misuse
+            assert not +anchor._port.chip.misuse
+        server.close()
+        ether._timer.cancel()
+
+    asyncio.run(play())
+
+
+class PlayedSpi(ModelBus):
+    """A bus as spidev gives it, to a model in an air that the test plays."""
+
+    def __init__(self, node):
+        super().__init__(node.chip, node.pause)
+        self.closed = self.broken = False
+
+    def _exchange(self, out):
+        if self.broken:
+            raise OSError(5, "Input/output error")
+        return super()._exchange(out)
+
+    def fileno(self):
+        return None
+
+    def close(self):
+        self.closed = True
+
+
+def spi_radio(monkeypatch):
+    monkeypatch.setattr(chip_ports, "RETRY_S", 0.01)
+    node, buses = TimedNode(HandClock()), []
+
+    def open_bus():
+        buses.append(PlayedSpi(node))
+        return buses[-1]
+
+    return Dw1000Radio(SpiPort("/dev/spidev0.0", open_bus), "tag1", AntennaDelays()), node, buses
+
+
+def test_a_chip_on_spi_is_asked_where_it_has_no_interrupt_line_and_found_again(monkeypatch):
+    radio, node, buses = spi_radio(monkeypatch)
+
+    async def play():
+        async with ears(radio) as host:
+            await host.until(Restarted)
+            assert abs(difference(radio.now_ticks(), node.air.now_ticks())) < 512
+            node.air.pass_s(1e-3)
+            node.chip.hear(b"\x01\x02\x03\x2a\x14", node.air.now_ticks(), Diagnostics(-80.0))
+            buses[0].broken = True
+            assert "Input/output error" in (await host.until(Gone)).reason
+            assert radio.now_ticks() is None
+            radio.transmit(Transmission(b"frame", 1))
+            assert host.told[-1] == Late(1)
+            await host.until(Restarted, 2)
+            assert buses[0].closed
+        assert buses[-1].closed
+
+    asyncio.run(play())
+
+
+def test_a_chip_whose_supply_failed_is_started_again_even_where_it_says_nothing(monkeypatch):
+    radio, node, _ = spi_radio(monkeypatch)
+    monkeypatch.setattr("skyless.radios.dw1000_radio.CARE_S", 0.01)
+
+    async def play():
+        async with ears(radio) as host:
+            for time_s in (1, 2):
+                await host.until(Restarted, time_s)
+                if time_s == 1:
+                    node.chip.pull_reset()
+                    node.air.pass_s(1e-3)
+            assert "lost its configuration" in host.of(Gone)[0].reason
+            assert radio.counters["chip-lost"] == 1
+
+    asyncio.run(play())
+
+
+def test_what_answers_but_is_no_dw1000_is_told_in_words(monkeypatch):
+    radio, node, _ = spi_radio(monkeypatch)
+    monkeypatch.setattr(node.chip, "transfer", lambda out, _hz: b"\xff" * len(out))
+
+    async def play():
+        async with ears(radio) as host:
+            assert "/dev/spidev0.0" in (await host.until(Gone)).reason
+            await asyncio.sleep(0.05)
+            assert len(host.told) == 1
+
+    asyncio.run(play())
+
+
+@pytest.mark.parametrize(
+    "spec",
+    ["spi:", "spi:0", "spi:a.b", "spi:0.0,irq", "spi:0.0,irq=x", "spi:0.0,pin=3", "spi:0.0,chip=gpiochip0"],
+)
+def test_names_of_chips_that_cannot_be(spec):
+    with pytest.raises(SkylessError, match="it should be spi:BUS.DEVICE, as spi:0.0,irq=25,reset=24,hz=8000000"):
+        open_radios(spec, "tag", ("tag1",))
+
+
+def test_names_of_chips():
+    (one,) = open_radios("spi:0.1,irq=25,reset=24,hz=4000000,chip=/dev/gpiochip4", "anchor", ("3",), [AntennaDelays(1, 2)])
+    assert (one.name, one._delays, one._port._place) == ("3", AntennaDelays(1, 2), "/dev/spidev0.1")
+    with pytest.raises(SkylessError, match="carries one node, not 2"):
+        open_radios("spi:0.0", "anchor", ("1", "2"))
+    assert is_simulated("model:127.0.0.1")
+    assert not is_simulated("spi:0.0")

@@ -1,0 +1,401 @@
+"""The register model of the DW1000, told octet by octet what the manual tells; no driver here."""
+
+import math
+
+import pytest
+
+from skyless.air.airtime import after_rmarker_s, preamble_s
+from skyless.air.fcs import fcs
+from skyless.air.reception import Diagnostics
+from skyless.constants import TICK_RATE_HZ
+from skyless.simulation.dw1000 import bits
+from skyless.simulation.dw1000 import registers as r
+from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.dw1000.measures import HZ_PER_STEP, Senses
+from skyless.simulation.dw1000.memory import Access, decode_header
+from skyless.ticks import wrap
+
+TX_DELAY, RX_DELAY = 16_000, 17_000
+SLOW, FAST = 3_000_000, 20_000_000
+BODY = b"what is sent"
+FRAME = BODY + fcs(BODY)
+
+
+class Bench:
+    """A chip, its air, and hands at its pins."""
+
+    def __init__(self, begin_ticks=2**40 - 10**9, senses=None):
+        self.begin_ticks, self.now_s, self.sent, self.withdrawn, self.in_time = begin_ticks, 0.0, [], 0, True
+        self.chip = Chip(self, TX_DELAY, RX_DELAY, lambda: self.now_s, senses)
+
+    def now_ticks(self):
+        return wrap(self.begin_ticks + round(self.now_s * TICK_RATE_HZ))
+
+    def transmit(self, frame, leaves_ticks):
+        if self.in_time:
+            self.sent.append((frame, leaves_ticks))
+        return self.in_time
+
+    def withdraw(self):
+        self.withdrawn += 1
+
+    def write(self, register, value, *, hz=SLOW, length=None):
+        header = self.header(register, is_write=True)
+        self.chip.transfer(header + value.to_bytes(length or register.length, "little"), hz)
+
+    def read(self, register, *, hz=SLOW):
+        header = self.header(register, is_write=False)
+        reply = self.chip.transfer(header + bytes(register.length), hz)
+        return int.from_bytes(reply[len(header) :], "little")
+
+    def header(self, register, *, is_write):
+        first = is_write << 7 | register.file
+        if not register.sub:
+            return bytes((first,))
+        if register.sub < 128:
+            return bytes((first | 0x40, register.sub))
+        return bytes((first | 0x40, 0x80 | register.sub & 0x7F, register.sub >> 7))
+
+    def configure(self, microcode=True):
+        """As section 2.5.5 tells, for the emulated air."""
+        self.now_s += 1e-3
+        if microcode:
+            self.write(r.PMSC_CTRL0, bits.PMSC_FOR_LDE, length=2)
+            self.write(r.OTP_CTRL, bits.LDELOAD)
+            self.now_s += 200e-6
+            self.write(r.PMSC_CTRL0, 0x0200, length=2)
+        for register, value in (*bits.TUNED.values(), *bits.TUNED_TO_SEND.values()):
+            self.write(register, value)
+        self.write(r.CHAN_CTRL, 5 | 5 << 4 | 2 << 18 | 9 << 22 | 9 << 27)
+        self.write(r.TX_ANTD, TX_DELAY)
+        self.write(r.LDE_RXANTD, RX_DELAY)
+        self.write(r.SYS_MASK, bits.RXFCG | bits.TXFRS)
+
+    def send(self, ahead_s, frame=FRAME):
+        """Start a delayed transmission so far ahead; the DX_TIME."""
+        dx = wrap(self.now_ticks() + round(ahead_s * TICK_RATE_HZ))
+        self.write(r.TX_BUFFER, int.from_bytes(frame, "little"), length=len(frame))
+        self.write(r.TX_FCTRL, len(frame) | 2 << 13 | 2 << 16 | 1 << 18 | 1 << 20)
+        self.write(r.DX_TIME, dx)
+        self.write(r.SYS_CTRL, bits.TXSTRT | bits.TXDLYS)
+        return dx
+
+    def listen(self):
+        self.write(r.SYS_CTRL, bits.RXENAB)
+        self.now_s += 1e-3
+
+    def hear(self, frame=FRAME, told=None, fault=None):
+        """A frame ends now; its stamp and what became of it."""
+        stamp = wrap(self.now_ticks() - round(after_rmarker_s(len(frame)) * TICK_RATE_HZ))
+        return stamp, self.chip.hear(frame, stamp, told or Diagnostics(-80.0, -84.0, 2.0), fault)
+
+
+@pytest.fixture
+def bench():
+    made = Bench()
+    made.configure()
+    return made
+
+
+def test_the_manual_s_examples_of_headers():
+    """Figures 3, 5 and 7 (UM pp. 12-13)."""
+    assert decode_header(bytes((0x00, 0, 0, 0, 0))) == Access(False, 0x00, 0, 1)
+    assert decode_header(bytes((0x40, 0x02, 0, 0))) == Access(False, 0x00, 2, 2)
+    assert decode_header(bytes((0xC9, 0xB6, 0x02, 0xFF))) == Access(True, 0x09, 310, 3)
+    assert [decode_header(cut) for cut in (b"", b"\x40", b"\x49\x80")] == [None] * 3
+
+
+def test_identity_and_reset_values():
+    bench = Bench()
+    assert bench.read(r.DEV_ID) == 0xDECA0130
+    assert bench.read(r.TX_FCTRL) == 0x0015400C
+    assert bench.read(r.CHAN_CTRL) == 0x21040055
+    bench.write(r.DEV_ID, 0)
+    assert bench.read(r.DEV_ID) == 0xDECA0130
+
+
+def test_spi_is_limited_to_3_mhz_until_the_pll_has_locked():
+    bench = Bench()
+    assert bench.read(r.DEV_ID, hz=FAST) != 0xDECA0130
+    bench.write(r.PANADR, 0x12345678, hz=FAST)
+    assert bench.read(r.PANADR) == 0xFFFFFFFF
+    assert bench.chip.misuse["spi-too-fast"] == 2
+    assert not bench.read(r.SYS_STATUS) & bits.CPLOCK
+    bench.now_s += 1e-4
+    assert bench.read(r.DEV_ID, hz=FAST) == 0xDECA0130
+    assert bench.read(r.SYS_STATUS) & bits.CPLOCK
+    assert bench.read(r.DEV_ID, hz=FAST + 1) != 0xDECA0130
+    bench.write(r.PMSC_CTRL0, bits.SYSCLKS_XTI, length=1)
+    assert bench.read(r.DEV_ID, hz=FAST) != 0xDECA0130
+
+
+def test_status_is_cleared_by_ones_but_for_what_is_read_only(bench):
+    bench.listen()
+    bench.hear()
+    status = bench.read(r.SYS_STATUS)
+    assert status & (bits.RXFCG | bits.RXDFR | bits.LDEDONE) == bits.RXFCG | bits.RXDFR | bits.LDEDONE
+    bench.write(r.SYS_STATUS, bits.RXFCG)
+    assert bench.read(r.SYS_STATUS) == status & ~(bits.RXFCG | bits.IRQS)
+    bench.send(100e-6)
+    bench.write(r.SYS_STATUS, (1 << 40) - 1)
+    assert bench.read(r.SYS_STATUS) == bits.HPDWARN
+
+
+def test_the_interrupt_line_follows_status_and_mask_with_the_polarity_that_is_set(bench):
+    assert not bench.chip.irq
+    bench.listen()
+    bench.hear()
+    assert bench.chip.irq
+    assert bench.read(r.SYS_STATUS) & bits.IRQS
+    bench.write(r.SYS_MASK, bits.TXFRS)
+    assert not bench.chip.irq
+    bench.write(r.SYS_CFG, 0x1000)
+    assert bench.chip.irq
+
+
+def test_system_time_steps_by_512_ticks_and_wraps(bench):
+    readings = []
+    for _ in range(2000):
+        bench.now_s += 20e-6
+        readings.append(bench.read(r.SYS_TIME))
+    assert all(reading % 512 == 0 for reading in readings)
+    assert min(readings) < 2**38 < 2**39 < max(readings)  # begun 16 ms before the wrap
+
+
+def test_a_delayed_frame_leaves_at_dx_time_without_its_low_bits_and_is_stamped_so(bench):
+    dx = bench.send(2e-3)
+    ((frame, leaves),) = bench.sent
+    assert frame == FRAME
+    assert leaves == wrap((dx & ~0x1FF) + TX_DELAY)
+    assert not bench.read(r.SYS_STATUS) & bits.OF_SENDING
+    bench.now_s += 2e-3 - preamble_s() + 1e-6
+    assert bench.read(r.SYS_STATUS) & bits.OF_SENDING == bits.TXFRB
+    bench.now_s += preamble_s()
+    assert bench.read(r.SYS_STATUS) & bits.OF_SENDING == bits.TXFRB | bits.TXPRS
+    bench.now_s += after_rmarker_s(len(FRAME))
+    assert bench.chip.irq
+    assert bench.read(r.TX_STAMP) == leaves
+    assert bench.read(r.TX_RAWST) == dx & ~0x1FF
+    assert bench.read(r.SYS_STATUS) & bits.TXFRS
+
+
+def test_the_chip_makes_the_fcs_unless_it_is_told_not_to(bench):
+    bench.send(2e-3, BODY + b"??")
+    assert bench.sent[-1][0] == FRAME
+    bench.write(r.SYS_CTRL, bits.TRXOFF)
+    bench.write(r.SYS_CTRL, bits.TXSTRT | bits.TXDLYS | bits.SFCST)
+    assert bench.sent[-1][0] == BODY + b"??"
+
+
+def test_the_warning_of_half_a_period_is_judged_on_the_preamble_s_start(bench):
+    edge_s = preamble_s()
+    for ahead_s, late in ((edge_s + 20e-6, False), (edge_s - 20e-6, True), (-1e-3, True), (8.5, False), (8.7, True)):
+        begun = len(bench.sent)
+        bench.send(ahead_s)
+        assert bool(bench.read(r.SYS_STATUS) & bits.HPDWARN) is late, ahead_s
+        assert len(bench.sent) == begun + (not late)
+        bench.write(r.SYS_CTRL, bits.TRXOFF)
+        assert not bench.read(r.SYS_STATUS) & bits.HPDWARN
+    bench.send(edge_s + 3e-6)
+    assert bench.read(r.SYS_STATUS) & bits.TXPUTE
+    assert not +bench.chip.misuse
+
+
+def test_what_the_air_refuses_is_late_too_and_what_is_turned_off_is_withdrawn(bench):
+    bench.in_time = False
+    bench.send(2e-3)
+    assert bench.read(r.SYS_STATUS) & bits.HPDWARN
+    bench.write(r.SYS_CTRL, bits.TRXOFF)
+    bench.in_time = True
+    bench.send(2e-3)
+    bench.write(r.SYS_CTRL, bits.TRXOFF)
+    assert bench.withdrawn == 2
+    bench.now_s += 5e-3
+    assert not bench.read(r.SYS_STATUS) & bits.TXFRS
+
+
+def test_a_received_frame_its_stamp_and_what_was_measured(bench):
+    bench.listen()
+    told = Diagnostics(-81.0, -86.5, -3.25)
+    stamp, outcome = bench.hear(told=told)
+    assert outcome == "heard"
+    info = bench.read(r.RX_FINFO)
+    assert bench.chip.memory.octets(r.RX_BUFFER)[: info & 0x7F] == FRAME
+    assert bench.read(r.RX_STAMP) == stamp
+    counted = info >> 20
+    symbols = counted - 5 if counted == bench.read(r.RXPACC_NOSAT) else counted
+    power_db = 10.0 * math.log10(bench.read(r.CIR_PWR) * 2**17 / symbols**2) - 121.74
+    squares = sum(bench.read(f) ** 2 for f in (r.FP_AMPL1, r.FP_AMPL2, r.FP_AMPL3))
+    assert power_db == pytest.approx(told.rx_power_dbm, abs=0.01)
+    assert 10.0 * math.log10(squares / symbols**2) - 121.74 == pytest.approx(told.first_path_power_dbm, abs=0.01)
+    integrator = bench.read(r.DRX_CAR_INT)
+    hertz = (integrator - (integrator >> 20 << 21)) * HZ_PER_STEP
+    assert -hertz / 6489.6 == pytest.approx(told.carrier_offset_ppm, abs=0.0003)
+    assert bench.read(r.RX_TTCKI) == 0x01FC0000
+    offset = bench.read(r.RX_TTCKO) & 0x7FFFF
+    assert (offset - (offset >> 18 << 19)) / 0x01FC0000 == pytest.approx(told.carrier_offset_ppm * 1e-6, abs=2e-8)
+
+
+def test_the_stamp_is_less_the_antenna_delay_that_is_set(bench):
+    bench.write(r.LDE_RXANTD, RX_DELAY - 100)
+    bench.listen()
+    stamp, _ = bench.hear()
+    assert bench.read(r.RX_STAMP) == wrap(stamp + 100)
+
+
+def test_one_buffer_one_frame_until_the_receiver_is_turned_on_again(bench):
+    assert bench.hear()[1] == "receiver-off"
+    bench.write(r.SYS_CTRL, bits.RXENAB)
+    assert bench.hear()[1] == "preamble-missed"
+    bench.now_s += 1e-3
+    first, _ = bench.hear()
+    bench.now_s += 1e-3
+    assert bench.hear()[1] == "receiver-off"
+    assert bench.read(r.RX_STAMP) == first
+    bench.listen()
+    assert not bench.read(r.SYS_STATUS) & bits.OF_RECEIVING
+    assert bench.hear()[1] == "heard"
+
+
+def test_without_the_microcode_there_is_no_stamp_and_without_its_run_bit_none_is_looked_for():
+    bench = Bench()
+    bench.configure(microcode=False)
+    bench.listen()
+    assert bench.hear()[1] == "without-microcode"
+    assert not bench.read(r.SYS_STATUS) & (bits.RXFCG | bits.LDEDONE)
+    bench.write(r.PMSC_CTRL1, r.PMSC_CTRL1.reset & ~bits.LDERUNE)
+    bench.listen()
+    assert bench.hear()[1] == "heard"
+    assert bench.read(r.SYS_STATUS) & (bits.RXFCG | bits.LDEDONE) == bits.RXFCG
+    assert bench.read(r.RX_STAMP) == 0
+    bench.write(r.OTP_CTRL, bits.LDELOAD)
+    assert bench.chip.misuse == {"microcode-without-its-clock": 1}
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "why"),
+    [
+        (r.CHAN_CTRL, 2 | 2 << 4 | 2 << 18 | 9 << 22 | 9 << 27, "channel"),
+        (r.CHAN_CTRL, 5 | 5 << 4 | 1 << 18 | 9 << 22 | 9 << 27, "prf"),
+        (r.CHAN_CTRL, 5 | 5 << 4 | 2 << 18 | 10 << 22 | 10 << 27, "code"),
+        (r.SYS_CFG, 0x1200 | bits.RXM110K, "rate"),
+        (r.DRX_TUNE2, 0x311A002D, "tuning"),
+        (r.FS_PLLTUNE, 0x46, "tuning"),
+    ],
+)
+def test_with_another_setting_it_hears_nothing_and_is_not_heard(bench, register, value, why):
+    bench.write(register, value)
+    bench.listen()
+    assert bench.hear()[1] == "deaf"
+    assert not bench.chip.irq
+    bench.write(r.SYS_CTRL, bits.TRXOFF)
+    bench.send(2e-3)
+    assert len(bench.sent) == (why in ("rate", "prf") or register is r.DRX_TUNE2)  # these concern the receiver alone
+
+
+@pytest.mark.parametrize(
+    ("fault", "event"),
+    [("header", bits.RXPHE), ("parity", bits.RXRFSL), ("delimiter", bits.RXSFDTO), ("first-path", bits.LDEERR)],
+)
+def test_errors_show_and_want_a_reset_of_the_receiver(bench, fault, event):
+    bench.listen()
+    bench.hear(fault=fault)
+    assert bench.read(r.SYS_STATUS) & event
+    assert not (bench.read(r.SYS_STATUS) & bits.LDEDONE)
+    if fault == "first-path":
+        return
+    bench.listen()
+    stamp, outcome = bench.hear()
+    assert outcome == "suspect"
+    assert bench.read(r.RX_STAMP) != stamp
+    bench.chip.transfer(bytes((0xF6, 0x03, 0xE0)), SLOW)
+    bench.chip.transfer(bytes((0xF6, 0x03, 0xF0)), SLOW)
+    bench.listen()
+    stamp, outcome = bench.hear()
+    assert (outcome, bench.read(r.RX_STAMP)) == ("heard", stamp)
+
+
+def test_a_wrong_fcs_is_told_and_with_auto_re_enable_the_receiver_stays_on(bench):
+    bench.write(r.SYS_CFG, 0x1200 | bits.RXAUTR)
+    bench.listen()
+    bench.hear(BODY + b"??")
+    assert bench.read(r.SYS_STATUS) & (bits.RXFCE | bits.RXFCG) == bits.RXFCE
+    bench.now_s += 1e-3
+    assert bench.hear()[1] == "suspect"
+
+
+def test_a_soft_reset_forgets_everything_but_the_counter(bench):
+    bench.listen()
+    before = bench.read(r.SYS_TIME)
+    bench.write(r.PMSC_CTRL0, bits.SYSCLKS_XTI, length=1)
+    bench.chip.transfer(bytes((0xF6, 0x03, 0x00)), SLOW)
+    bench.write(r.PANADR, 1)
+    assert bench.chip.misuse["write-in-reset"] == 1
+    bench.chip.transfer(bytes((0xF6, 0x03, 0xF0)), SLOW)
+    assert bench.read(r.CHAN_CTRL) == r.CHAN_CTRL.reset
+    assert not bench.chip.clocking.microcode_loaded
+    assert bench.read(r.SYS_TIME) == before
+    bench.now_s += 1e-3
+    assert bench.read(r.SYS_STATUS) == bits.CPLOCK | bits.SLP2INIT
+    assert bench.hear()[1] == "receiver-off"
+
+
+def test_waiting_for_a_response_turns_the_receiver_on_after_the_frame(bench):
+    bench.write(r.ACK_RESP_T, 500)
+    dx = bench.send(2e-3)
+    bench.write(r.SYS_CTRL, bits.TRXOFF)
+    bench.write(r.DX_TIME, dx)
+    bench.write(r.SYS_CTRL, bits.TXSTRT | bits.TXDLYS | bits.WAIT4RESP)
+    bench.now_s += 2e-3 + after_rmarker_s(len(FRAME)) + 1e-6
+    assert bench.read(r.SYS_STATUS) & bits.TXFRS
+    assert bench.hear()[1] == "preamble-missed"
+    bench.now_s += 1e-3
+    assert bench.hear()[1] == "heard"
+
+
+def test_the_receiver_s_timeout(bench):
+    bench.write(r.SYS_CFG, 0x1200 | bits.RXWTOE)
+    bench.write(r.RX_FWTO, 2000)
+    bench.listen()
+    assert not bench.read(r.SYS_STATUS) & bits.RXRFTO
+    bench.now_s += 1.1e-3
+    assert bench.read(r.SYS_STATUS) & bits.RXRFTO
+    assert bench.hear()[1] == "receiver-off"
+
+
+def test_temperature_and_supply_need_their_switches_and_refer_to_what_is_in_the_otp():
+    bench = Bench(senses=Senses(temperature_c=45.8, supply_v=3.0))
+    bench.write(r.TC_SARC, 1)
+    assert bench.read(r.TC_SARL) == 0
+    bench.write(r.TC_SARC, 0)
+    bench.write(r.RF_SENSOR_1, 0x80)
+    bench.write(r.RF_SENSOR_2, 0x0A)
+    bench.write(r.RF_SENSOR_2, 0x0F)
+    bench.write(r.TC_SARC, 1)
+    reading = bench.read(r.TC_SARL)
+    references = []
+    for address in (0x08, 0x09):
+        bench.write(r.OTP_ADDR, address)
+        bench.write(r.OTP_CTRL, bits.OTPREAD | bits.OTPRDEN)
+        references.append(bench.read(r.OTP_RDAT) & 0xFF)
+    assert ((reading >> 8 & 0xFF) - references[1]) * 1.14 + 23.0 == pytest.approx(45.8, abs=0.6)
+    assert ((reading & 0xFF) - references[0]) / 173 + 3.3 == pytest.approx(3.0, abs=0.003)
+
+
+def test_what_the_manual_forbids_is_counted(bench):
+    bench.chip.transfer(b"", SLOW)
+    bench.write(r.TX_ANTD, 0, length=3)
+    bench.read(r.TX_BUFFER)
+    bench.send(5e-3)
+    bench.send(5e-3)
+    bench.listen()
+    bench.write(r.PMSC_CTRL0, bits.SYSCLKS_XTI, length=1)
+    bench.write(r.SYS_CTRL, bits.RXENAB)
+    assert bench.chip.misuse == {
+        "transaction-without-header": 1,
+        "write-beyond-register": 1,
+        "tx-buffer-read": 1,
+        "txstrt-while-busy": 1,
+        "rxenab-while-busy": 1,
+        "radio-without-pll": 1,
+    }

@@ -1,0 +1,173 @@
+"""Three tables of the DW1000's registers, made apart: the model's, the driver's, and a published one."""
+
+import dw1000_published as published
+import pytest
+
+from skyless.air.fcs import fcs
+from skyless.firmware import dw1000
+from skyless.simulation.dw1000 import bits, measures
+from skyless.simulation.dw1000 import registers as r
+from skyless.simulation.dw1000.bus import ModelBus
+from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.dw1000.memory import decode_header
+from skyless.ticks import wrap
+
+NOT_PUBLISHED = {"TC_SARL", "LDOTUNE", "RF_SENSOR_1", "RF_SENSOR_2", "AGC_TUNE3", "STD_NOISE", "FP_AMPL2", "FP_AMPL3"} | {
+    "CIR_PWR", "AGC_CTRL", "EXT_SYNC", "DRX_CONF", "TX_CAL", "FS_CTRL", "AON", "OTP_IF", "LDE_IF", "DIG_DIAG", "PMSC"
+}  # fmt: skip
+"""Names of the model that have no line of their own there: parts of RX_FQUAL (see below), whole files, and the manual's."""
+
+
+@pytest.mark.parametrize("name", sorted(r.ALL.keys() - NOT_PUBLISHED))
+def test_the_model_s_registers_are_where_they_are_published(name):
+    one = r.ALL[name]
+    assert (one.file, one.sub, one.length) == published.REGISTERS[name]
+
+
+def test_the_parts_of_the_frame_quality_lie_as_their_masks_say():
+    shifts = {"STD_NOISE": 0, "FP_AMPL2": 16, "FP_AMPL3": 32, "CIR_PWR": 48}
+    assert {name: 8 * r.ALL[name].sub for name in shifts} == shifts
+    assert {r.ALL[name].length for name in shifts} == {2}
+
+
+@pytest.mark.parametrize(
+    ("name", "mask"),
+    [*published.STATUS.items(), *published.CONTROL.items(), *published.CONFIG.items(), *published.OTHER_BITS.items()],
+)
+def test_the_model_s_bits_are_the_published_ones(name, mask):
+    assert getattr(bits, name) == mask
+
+
+def test_the_model_wants_the_published_tuning():
+    for name, (register, value) in {**bits.TUNED, **bits.TUNED_TO_SEND}.items():
+        assert register is r.ALL[name]
+        assert value == published.VALUES[name], name
+    assert r.DEV_ID.reset == published.DEVICE_ID
+    assert measures.PRF_64_DB == published.POWER_A_DB
+    assert {value >> 4 for value in published.RESETS.values()} == {
+        bits.SOFTRESET_ALL, bits.SOFTRESET_RX, bits.SOFTRESET_NONE
+    }  # fmt: skip
+    assert measures.Senses().otp().keys() <= set(published.OTP.values())
+
+
+# The driver: by what it does on the bus, so that constants without a name count as well
+
+
+class Tapped(ModelBus):
+    """Writes down all transactions."""
+
+    def __init__(self, chip, spend):
+        super().__init__(chip, spend)
+        self.seen = []
+
+    def _exchange(self, out):
+        access = decode_header(out)
+        self.seen.append((access, out[access.octets :]))
+        return super()._exchange(out)
+
+
+class Air:
+    def __init__(self):
+        self.now = 0.0
+
+    def now_ticks(self):
+        return wrap(round(self.now * 63.8976e9))
+
+    def transmit(self, frame, leaves_ticks):
+        return True
+
+    def withdraw(self):
+        pass
+
+    def spend(self, seconds):
+        self.now += seconds
+
+
+@pytest.fixture(scope="module")
+def life():
+    """All that a driver says in its life on the air: start, reception, errors, transmission, late one, measurement."""
+    air = Air()
+    chip = Chip(air, 0, 0, lambda: air.now)
+    bus = Tapped(chip, air.spend)
+    driver = dw1000.DW1000(bus)
+    driver.start(0x1234, 0x4321)
+    started = {name: chip.memory.get(register) for name, register in r.ALL.items()}
+    driver.receive()
+    frame = b"some frame"
+    frame += fcs(frame)
+    for fault in (None, "header", "delimiter", None, "first-path"):
+        air.spend(1e-3)
+        chip.hear(frame, air.now_ticks(), measures.Diagnostics(-80.0, -82.0, 1.0), fault)
+        driver.poll()
+        driver.track()
+    for ahead_s in (2e-3, 0.1e-3):
+        dx = bytearray(wrap(air.now_ticks() + round(ahead_s * 63.8976e9)).to_bytes(5, "little"))
+        driver.transmit_at(dx, bytearray(frame), 0, len(frame))
+        air.spend(3e-3)
+        driver.poll()
+    driver.now()
+    driver.measure()
+    driver.stop()
+    assert not +chip.misuse
+    return bus.seen, started, chip
+
+
+def test_all_that_the_driver_touches_is_a_published_register_or_the_manual_s(life):
+    seen, _, _ = life
+    places = [*published.REGISTERS.values(), *((one.file, one.sub, one.length) for one in r.ALL.values())]
+    touched = set()
+    for access, data in seen:
+        fits = [
+            place for place in places if place[0] == access.file and place[1] <= access.sub
+            and access.sub + len(data) <= place[1] + place[2]
+        ]  # fmt: skip
+        assert fits, f"{access.file:02x}:{access.sub:04x} has no {len(data)} octets"
+        touched.add((access.file, access.sub))
+    assert len(touched) > 35
+
+
+def test_the_driver_sets_the_published_values(life):
+    _, started, _ = life
+    for name, value in published.VALUES.items():
+        assert started[name] == value, name
+    assert started["TX_FCTRL"] & 0xFFFFFC00 == published.TX_FCTRL
+    assert (started["TX_ANTD"], started["LDE_RXANTD"]) == (0x1234, 0x4321)
+    assert started["FS_XTALT"] == 0x60 | measures.Senses().crystal_trim  # bits 7 to 5: 011 (UM 7.2.44.5)
+    assert started["DRX_SFDTOC"] == 128 + 1 + 8 - 8  # UM 7.2.40.7
+    configured = {(file, sub, size) for file, sub, size, _ in dw1000.CONFIGURATION}
+    known = {published.REGISTERS.get(name, (r.ALL[name].file, r.ALL[name].sub, r.ALL[name].length)) for name in r.ALL}
+    assert configured - known == {(0x08, 0x00, 4)}  # TX_FCTRL without its fifth octet
+
+
+def test_the_driver_s_names_are_the_published_bits():
+    octet = {"_3": 24, "_4": 32}
+    named = 0
+    for name, value in vars(dw1000).items():
+        suffix = name[-2:] if name[-2:] in octet else ""
+        if name.removesuffix(suffix) in published.STATUS:
+            assert value << octet.get(suffix, 0) == published.STATUS[name.removesuffix(suffix)], name
+            named += 1
+    assert named >= 13
+    assert dw1000.TXSTRT_TXDLYS == published.CONTROL["TXSTRT"] | published.CONTROL["TXDLYS"]
+    assert dw1000.TRXOFF == published.CONTROL["TRXOFF"]
+    assert dw1000.RXENAB == published.CONTROL["RXENAB"]
+    assert int.from_bytes(dw1000.DEVICE_ID, "little") == published.DEVICE_ID
+    for name, address in published.OTP.items():
+        assert getattr(dw1000, f"OTP_{name}") == address
+    assert dw1000.POWER_A / 1e4 == published.POWER_A_DB
+    cleared = int.from_bytes(dw1000.CLEARED, "little")
+    assert not cleared & (published.STATUS["IRQS"] | published.STATUS["CPLOCK"] | published.STATUS["HPDWARN"])
+
+
+def test_the_driver_resets_as_published(life):
+    seen, _, _ = life
+    written = [data[0] for access, data in seen if access.is_write and (access.file, access.sub) == (0x36, 3)]
+    assert set(written) == set(published.RESETS.values())
+
+
+def test_the_interrupt_mask_has_what_the_driver_looks_at(life):
+    _, started, _ = life
+    wanted = ("TXFRS", "RXFCG", "RXPHE", "RXRFSL", "RXSFDTO", "RXFCE", "LDEERR")
+    assert all(started["SYS_MASK"] & published.STATUS[name] for name in wanted)
+    known = sum(published.STATUS.values())
+    assert not started["SYS_MASK"] & ~known
