@@ -86,7 +86,11 @@ class Fire(RuleBasedStateMachine):
         assert self.node.session.serve()
         self.fetched()
 
-    @rule(us=st.one_of(st.integers(-3000, 20_000), st.integers(0, 1000)), size=st.integers(1, 120), refuses=st.integers(0, 9))
+    @rule(
+        us=st.one_of(st.integers(-3000, 20_000), st.integers(0, 1000)),
+        size=st.integers(1, 120),
+        refuses=st.integers(0, 9),
+    )
     def transmit(self, us, size, refuses):
         self.serial += 1
         body = self.serial.to_bytes(4, "big") + bytes(size)

@@ -144,12 +144,14 @@ def test_what_answers_but_is_no_dw1000_is_told_in_words(monkeypatch):
     ["spi:", "spi:0", "spi:a.b", "spi:0.0,irq", "spi:0.0,irq=x", "spi:0.0,pin=3", "spi:0.0,chip=gpiochip0"],
 )
 def test_names_of_chips_that_cannot_be(spec):
-    with pytest.raises(SkylessError, match="it should be spi:BUS.DEVICE, as spi:0.0,irq=25,reset=24,hz=8000000"):
+    with pytest.raises(SkylessError, match=r"it should be spi:BUS\.DEVICE, as spi:0\.0,irq=25"):
         open_radios(spec, "tag", ("tag1",))
 
 
 def test_names_of_chips():
-    (one,) = open_radios("spi:0.1,irq=25,reset=24,hz=4000000,chip=/dev/gpiochip4", "anchor", ("3",), [AntennaDelays(1, 2)])
+    (one,) = open_radios(
+        "spi:0.1,irq=25,reset=24,hz=4000000,chip=/dev/gpiochip4", "anchor", ("3",), [AntennaDelays(1, 2)]
+    )
     assert (one.name, one._delays, one._port._place) == ("3", AntennaDelays(1, 2), "/dev/spidev0.1")
     with pytest.raises(SkylessError, match="carries one node, not 2"):
         open_radios("spi:0.0", "anchor", ("1", "2"))

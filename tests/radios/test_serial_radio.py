@@ -280,7 +280,7 @@ def test_a_link_keeps_its_name_and_goes_with_the_board(tmp_path):
         ("serial:/", "/ is a folder"),
         (f"serial:{__file__}", "is a file"),
         ("listener:", "it should name one port"),
-        ("usb:/dev/a", "ether:HOST[:PORT], serial:PATH[@BAUD], listener:PATH[@BAUD] or sniffer:PATH[@BAUD]"),
+        ("usb:/dev/a", "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN]"),
     ],
 )
 def test_ports_that_cannot_be_are_told_at_once(spec, right):

@@ -33,7 +33,8 @@ def anchor(
     site
         Site file, or lab.
     radio
-        The anchors' radio: ether:HOST:PORT is the emulated air of skyless ether, serial:PATH a board.
+        The anchors' radio: ether:HOST:PORT is the emulated air of skyless ether, serial:PATH a board,
+        spi:BUS.DEVICE,irq=PIN,reset=PIN a DW1000 on this computer's SPI, model:HOST:PORT a model of one on that air.
     mqtt
         Broker for health and site, or none.
     mqtt_ca

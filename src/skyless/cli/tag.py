@@ -50,6 +50,7 @@ def tag(
         Names of one or more tags: letters, digits, - and _.
     radio
         The tags' radio. ether:HOST:PORT: the emulated air of skyless ether. serial:PATH: a board of Skyless.
+        spi:BUS.DEVICE,irq=PIN,reset=PIN: a DW1000 on this computer's SPI. model:HOST:PORT: a model of one on that air.
         listener:PATH: the listener of uwb-apps. sniffer:PATH: a Bitcraze sniffer, for TDoA2 and TDoA3 systems.
         Several tags have several paths, with commas; PATH@BAUD gives another rate.
     method
