@@ -99,7 +99,13 @@ class Board:
         interrupt: "Pin | None" = None,
         lead_us: int = LEAD_US,
     ) -> None:
-        """``identity`` has 8 bytes; without an interrupt line the chip is asked in every turn."""
+        """Without an interrupt line the chip is asked in every turn.
+
+        Raises:
+            ValueError: ``identity`` has not 8 bytes.
+        """
+        if len(identity) != 8:
+            raise ValueError("a board's identity has 8 bytes")
         self.unsent = 0
         """Records that found no room."""
         self.chores = 0
