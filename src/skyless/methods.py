@@ -6,4 +6,4 @@ SNAPSHOTS: Final = ("literal", "literal-delayed", "weighted", "bracketed")
 FILTERS: Final = ("tracker", "joint")
 METHODS: Final = (*SNAPSHOTS, *FILTERS)
 
-DEFAULT_METHOD: Final = "tracker"
+DEFAULT_METHOD: Final = "joint"

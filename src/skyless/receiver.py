@@ -46,6 +46,10 @@ COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
 DROP_S: Final = 2.0
 """An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""
 
+LONGEST_FOR_JOINT_S: Final = 2.0
+"""In longer superframes a tag may be metres away when it hears an anchor again: the tracker serves instead, which needs
+no clock of an anchor for longer than a superframe."""
+
 MOST_REPEATS: Final = 4
 """Beyond this beacons of an anchor that has lost the master weigh no less: what changes between them is still true."""
 
@@ -215,7 +219,7 @@ class Receiver:
             )
             return Snapshots(SnapshotMethod(self._method_name), settings, self._time)
         superframe_s = to_seconds(schedule.slot_ticks * schedule.slots)
-        if self._method_name == "joint":
+        if self._method_name == "joint" and superframe_s <= LONGEST_FOR_JOINT_S:
             own = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
             joint = JointSettings(
                 qa=self._qa,

@@ -46,7 +46,7 @@ def report(result):
 
 def test_a_run_tells_what_was_asked_of_it(run):
     told = report(run("--noise-ps", "100", "--position", "3,4", "--duration", "8", "--seed", "3", "--json"))
-    assert (told["method"], told["tags"], told["site"], told["seed"]) == ("tracker", 1, "lab", 3)
+    assert (told["method"], told["tags"], told["site"], told["seed"]) == ("joint", 1, "lab", 3)
     assert told["simulated_s"] == 8.0
     assert told["messages"] == pytest.approx(8.0 * 400, rel=0.02)
     assert told["fixes"] == pytest.approx((8.0 - 2.0) / 0.015, abs=2)  # one a superframe after the warm-up

@@ -445,18 +445,18 @@ def lie(seconds):
 @pytest.mark.parametrize("seconds", [1e-6, -1e-6, 1e-3, 5.0, -8.0])
 @pytest.mark.parametrize("from_s", [0.0, 1.0], ids=["from the cold start", "later"])
 def test_an_anchor_lies_about_the_masters_time(seconds, from_s):
-    """From the start or later, it costs the tracker that anchor and nothing else."""
+    """From the start or later, it costs the tracker that anchor and nothing else; joint goes by raw stamps as well."""
     honest = [one for one in tape() if one.host_s > 0.3]
     heard = [
         a if a.host_s < from_s else b
         for a, b in zip(honest, tampered(honest, 4, master_time=lie(seconds)), strict=True)
     ]
-    receiver = Receiver()
+    receiver = Receiver("tracker")
     fixes = listen(receiver, heard)
     assert len(fixes) > 0.75 * len(honest)
     assert 4 not in fixes[-1].anchors
     assert set(drops(receiver)) == {"outlier"}
-    for method in SNAPSHOTS:  # they go by raw stamps
+    for method in (*SNAPSHOTS, "joint"):  # they go by raw stamps
         assert len(listen(Receiver(method), heard)) == len(listen(Receiver(method), honest))
 
 
@@ -495,7 +495,7 @@ def test_two_liars_at_the_start_give_no_wrong_fix():
     """Three honest anchors and the master are left, but which ones cannot be told with certainty at once."""
     honest = [one for one in tape() if one.host_s > 0.3]
     heard = tampered(tampered(honest, 4, master_time=lie(1e-6)), 5, master_time=lie(2e-6))
-    receiver = Receiver()
+    receiver = Receiver("tracker")
     listen(receiver, heard)
     assert receiver.reason == NoFixReason.RESIDUALS
     assert receiver.counters["outlier"] > 300
@@ -591,8 +591,11 @@ def test_beacons_that_rest_on_one_beacon_of_the_master_count_less_and_less():
 
 
 @pytest.mark.parametrize("loss", [0.5, 0.9])
-def test_fixes_know_what_lossy_links_between_anchors_cost_them(loss):
-    """Mean NEES of a tag at rest: 1.3 and 2.6 with repeated errors taken for independent.
+@pytest.mark.parametrize(("method", "least"), [("tracker", 0.85), ("joint", 0.65)])
+def test_fixes_know_what_lossy_links_between_anchors_cost_them(method, least, loss):
+    """Mean NEES of a tag at rest: 1.3 and 2.6 for the tracker with repeated errors taken for independent.
+
+    A tag at rest errs less than both allow for, as it might walk off; 0.75 is joint's with nothing lost.
 
     Errors last for a gap between the master's beacons that an anchor hears, 0.15 s at most on average, so 4 x 28 s hold
     750 independent ones of two components: one sigma is 0.026 where all errors are of one size.
@@ -606,11 +609,11 @@ def test_fixes_know_what_lossy_links_between_anchors_cost_them(loss):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Anchor, "hear", hear)
         for seed in range(4):
-            receiver = Receiver()
+            receiver = Receiver(method)
             for one in tape.__wrapped__(LAB, 30.0, seed):
                 fix = receiver.hear(one.reception)
                 if fix is not None and one.host_s > 2.0 and one.anchor == 1:
                     error = (fix.position_m - one.truth_m)[:2]
                     normalised.append(error @ np.linalg.solve(fix.covariance_m2[:2, :2], error) / 2.0)
     assert len(normalised) > 7000
-    assert 0.85 < np.mean(normalised) < 1.2
+    assert least < np.mean(normalised) < 1.2
