@@ -156,6 +156,7 @@ def test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated(t
 def test_programs_that_die_are_started_again_and_ctrl_c_ends_all_with_a_summary(tmp_path):
     demo = Demo(tmp_path, "--json")
     demo.wait_until_it_runs()
+    begin_s = time.monotonic()
     killed = {name: demo.child(word) for name, word in (("tags", "tag"), ("page", "dashboard"), ("anchors", "anchor"))}
     for pid in killed.values():
         os.kill(pid, signal.SIGKILL)
@@ -168,6 +169,7 @@ def test_programs_that_die_are_started_again_and_ctrl_c_ends_all_with_a_summary(
     os.kill(broker, signal.SIGKILL)
     demo.wait_for(lambda: "broker ended" in demo.said)
     demo.wait_until_it_runs()
+    lived_s = time.monotonic() - begin_s
     code, out = demo.end(signal.SIGINT)
     assert code == 0
     assert "stopped" in demo.said
@@ -175,7 +177,7 @@ def test_programs_that_die_are_started_again_and_ctrl_c_ends_all_with_a_summary(
     told = json.loads(out)
     assert told["restarts"] == 3
     assert told["tags"] == 3
-    assert told["duration_s"] > 5.0
+    assert told["duration_s"] > lived_s - 0.5
 
 
 def test_a_demo_that_is_killed_leaves_no_program_behind(tmp_path):

@@ -87,7 +87,7 @@ def test_chi2_of_weighted_fixes_is_chi2():
 
 def test_the_tracker_keeps_two_centimetres():
     """The maths give 1.97 cm. Errors last about 0.3 s, so 5 runs of 10 s are 170 independent ones: 4.5 % per sigma."""
-    reports = [run(12.0, seed=seed)[1] for seed in (11, 12, 13, 14, 15)]
+    reports = [run(12.0, seed=seed, method="tracker")[1] for seed in (11, 12, 13, 14, 15)]
     rmse_m = math.sqrt(np.mean([one.rmse_m**2 for one in reports]))
     assert 0.8 * 0.0197 < rmse_m < 0.020 * (1.0 + 3 * 0.045)
     assert all(one.max_m < 0.08 for one in reports)

@@ -16,7 +16,7 @@ from skyless.outputs.messages import (
     Vector,
 )
 from skyless.outputs.truths import Truths
-from skyless.positioning.protection import Alert
+from skyless.positioning.alert import Alert
 
 MOST_NAMES: Final = 2000
 """Tags, and nodes, that are remembered; a broker that makes up names fills no memory."""

@@ -7,8 +7,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from skyless.positioning.alert import Alert
 from skyless.positioning.motion_rows import MOTION_ROWS, fill_motion
-from skyless.positioning.protection import Alert, Integrity
+from skyless.positioning.protection import Integrity
 from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED
 from skyless.uncertainty.dop import Dops, dilution_of_precision
 

@@ -1,6 +1,5 @@
 """Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8)."""
 
-from enum import StrEnum
 from statistics import NormalDist
 from typing import Final
 
@@ -8,6 +7,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.compiled import kernel
+from skyless.positioning.alert import Alert
 from skyless.positioning.joint_hearing import FULL, joint_hear, joint_motion
 from skyless.positioning.joint_state import Integers, JointArrays, Matrix, Vector
 from skyless.positioning.protection_levels import DETECTED, HPL, LEVELS, STATE, VPL, protect
@@ -18,16 +18,6 @@ FALSE_ALARM: Final = 1e-6
 
 MARGIN: Final = 1.05
 """On all standard deviations, for errors that are not quite Gaussian and figures that are not quite the filter's."""
-
-
-class Alert(StrEnum):
-    """What a fix says of its integrity."""
-
-    NONE = "none"
-    EXCLUDED = "detected-excluded"
-    NOT_EXCLUDED = "detected-not-excluded"
-    UNAVAILABLE = "unavailable"
-    LIMIT = "alert-limit-exceeded"
 
 
 _ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
