@@ -94,6 +94,7 @@ class ChipBus(dw1000.Bus):
         self.status = bytearray(5)
         self.frame = bytearray(130)
         self.frame_bytes = 0
+        self.channel = bytearray(4)
         self.rx_stamp = bytearray(5)
         self.tx_stamp = bytearray(5)
         self.sent = bytearray(130)
@@ -159,6 +160,8 @@ class ChipBus(dw1000.Bus):
             into[8], into[9] = 0x08, 0x25
         elif file == 0x17:
             self.give(self.tx_stamp, into, 5)
+        elif file == 0x1F:
+            self.give(self.channel, into, 4)
         elif file == 0x27:
             into[2 + 1], into[2 + 2] = 0xF0, 0xFF
 
@@ -177,6 +180,8 @@ class ChipBus(dw1000.Bus):
             self.sent_bytes = link.copy(data, 0, len(data), self.sent, 0)
         elif file == 0x08 and len(data) == 4:
             self.length = data[0] & 0x7F
+        elif file == 0x1F:
+            link.copy(data, 0, 4, self.channel, 0)
         elif file == 0x0A:
             self.dx = 0
             for at in range(5):
@@ -208,6 +213,7 @@ class ChipBus(dw1000.Bus):
     def reset(self):
         for at in range(5):
             self.status[at] = 0
+        link.copy(self.status, 0, 4, self.channel, 0)
         self.listening = False
         self.leaves_us = -1
         return True

@@ -227,6 +227,16 @@ def test_a_chip_that_was_reset_is_told_of_and_can_be_configured_again():
     assert isinstance(said(made)[-1], Heard)
 
 
+def test_a_chip_that_looks_well_and_has_lost_its_settings_is_found_out():
+    made = bench()
+    made.bus.channel[0] = 0
+    made.clock.us += board.MEASURE_US
+    told = said(made, 400)
+    assert [type(one) for one in told] == [Hello]
+    made.say(made.host.ask(link.ASK_STATUS))
+    assert not said(made)[0].configured
+
+
 def test_a_board_without_a_chip_says_so_and_goes_on():
     made = vectors.Bench()
     made.bus.present = False

@@ -1,102 +1,12 @@
 """A site on emulated boards: ether, anchors and tags in one loop, with pseudo-terminals between them and radios."""
 
 import asyncio
-import contextlib
 import time
 
-import numpy as np
 import pytest
+from live_site import PLACES, LiveSite, are_right
 
-from skyless.experiments.scenarios import Request, impairments_of
 from skyless.experiments.warm import compile_kernels, compile_packet_kernels
-from skyless.nodes.anchor import AnchorNode
-from skyless.nodes.board import Board
-from skyless.nodes.ether import Ether
-from skyless.nodes.packet_tags import PacketTagNode, PacketTagSettings
-from skyless.nodes.tag import TagNode, TagSettings
-from skyless.radios.open import open_radios, open_sniffers
-from skyless.radios.radio import AntennaDelays
-from skyless.simulation.trajectory import Static
-from skyless.site.lab import lab_site
-
-LAB = lab_site()
-PLACE_M = (2.0, 3.0, LAB.tags.height_m)
-PLACES = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in LAB.anchors}
-TAGS = ("tag1", "tag2", "tag3", "tag4")
-
-
-class LiveSite:
-    """What runs until the context ends; ``on_boards`` are anchors behind serial ports."""
-
-    def __init__(self, folder):
-        self.folder, self.said, self.published, self._tasks = folder, [], {}, {}
-        standing = {name: Static(*PLACE_M[:2]) for name in TAGS}
-        self.ether = Ether(LAB, standing, impairments_of(Request(LAB), LAB), 1)
-
-    async def __aenter__(self):
-        server = await self.ether.serve("127.0.0.1", 0)
-        self.air = f"ether:127.0.0.1:{server.sockets[0].getsockname()[1]}"
-        self.start("ether", self.ether.tell_clocks())
-        return self
-
-    async def __aexit__(self, *_):
-        await asyncio.gather(*(self.stop(name) for name in list(self._tasks)))
-        self.ether._timer.cancel()
-
-    def start(self, name, work):
-        self._tasks[name] = asyncio.ensure_future(work)
-
-    async def stop(self, name):
-        task = self._tasks.pop(name)
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-    def plug_in(self, name, speaks="link"):
-        """A board; where its port is."""
-        kind = "anchor" if name.isdecimal() else "tag"
-        place = self.folder / name
-        (radio,) = open_radios(self.air, kind, (name,))
-        board = Board(radio, kind, speaks, place, self.said.append)
-        self.start(f"board {name}", board.run())
-        return board
-
-    def anchor(self, number, radio):
-        (one,) = open_radios(radio, "anchor", (str(number),), [AntennaDelays()])
-        node = AnchorNode(LAB, number, one, self.said.append)
-        self.start(f"anchor {number}", node.run())
-        return node
-
-    def tag(self, name, radio):
-        fixes = self.published[name] = []
-        if radio.startswith("sniffer"):
-            settings = PacketTagSettings(PLACES, height_m=PLACE_M[2], publish_hz=1000.0)
-            node = PacketTagNode(settings, open_sniffers(radio, (name,))[0], fixes.append, self.said.append)
-        else:
-            node = TagNode(
-                TagSettings(publish_hz=1000.0), open_radios(radio, "tag", (name,))[0], fixes.append, self.said.append
-            )
-        self.start(name, node.run())
-        return node
-
-    async def until(self, true):
-        async with asyncio.timeout(90):
-            while not true():
-                await asyncio.sleep(0.02)
-
-    async def fixes(self, name, count):
-        """So many further fixes; all but those of the first half second after the first."""
-        fixes = self.published[name]
-        begun = len(fixes)
-        await self.until(lambda: len(fixes) >= begun + count and fixes[-1].unix_s > fixes[begun].unix_s + 1.0)
-        return [fix for fix in fixes[begun:] if fix.unix_s > fixes[begun].unix_s + 0.5]
-
-
-def are_right(fixes):
-    """Fixes of a tag at rest: 2 cm each, so an rms of less than 6 cm; and none lies about it by ten deviations."""
-    errors_m = np.linalg.norm([np.subtract(fix.position_m, PLACE_M) for fix in fixes], axis=1)
-    stds_m = np.array([fix.std_m for fix in fixes])
-    return len(fixes) > 20 and np.sqrt(np.mean(errors_m**2)) < 0.06 and (errors_m < 10.0 * stds_m).all()
 
 
 @pytest.fixture(scope="module", autouse=True)

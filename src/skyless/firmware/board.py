@@ -27,8 +27,9 @@ QUIET_US = 2400
 """So long a silence is an empty slot of 2.1 ms, with 1.6 ms left of it."""
 APART_US = 5000
 """Nothing long is begun in such a time before a frame is due."""
-MEASURE_US = 30_000_000
-"""How often temperature and supply are measured, which takes 1.1 ms without the receiver."""
+MEASURE_US = 10_000_000
+"""How often temperature and supply are measured, which takes 1.1 ms without the receiver, and the chip is asked whether
+it still has its settings: one whose supply failed may hear nothing for ever and look well."""
 GARBLED_IN_A_ROW = 20
 """After so many the UART is started anew: it may have lost count."""
 READ_BYTES = 64
@@ -350,15 +351,19 @@ class Board:
         return self._own_slot or clock.ticks_diff(now_us, self._busy_us) >= QUIET_US
 
     def _do_chore(self, now_us: int) -> None:
-        """Collect garbage, or measure, which leaves some."""
+        """Collect garbage, or look after the chip, which leaves some."""
         self.chores += 1
         if self._litter:
             self._litter = False
             self._collector.collect()
             return
         self._measured_us = now_us
-        if self._configured and self._chip.measure():
-            self._litter = True
+        if not self._configured:
+            return
+        self._litter = True
+        if not self._chip.check():
+            self._lose()
+        elif self._chip.measure():
             self._temperature_cc, self._millivolts = self._chip.temperature_cc, self._chip.millivolts
 
 
