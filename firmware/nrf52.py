@@ -117,6 +117,18 @@ def take(ring: ptr8, at: int, size: int, out: ptr8) -> int:  # noqa: F821
 
 
 @micropython.viper
+def join(header: ptr8, begin: int, data: ptr8, end: int, out: ptr8):  # noqa: ANN201, F821
+    """Header of so many bytes, and behind it data up to ``end``."""
+    at = 0
+    while at < begin:
+        out[at] = header[at]
+        at += 1
+    while at < end:
+        out[at] = data[at - begin]
+        at += 1
+
+
+@micropython.viper
 def send(uarte: ptr32, data: ptr8, at: int, size: int):  # noqa: ANN201, F821
     """Begin to send ``data[at:at + size]``, which must stay as it is until ``is_sent``."""
     uarte[_ENDTX] = 0
@@ -151,7 +163,8 @@ class Uarte:
 
     def read(self, into):  # noqa: ANN001, ANN201
         """Take what has come, and keep sending. What was overwritten is left out, which the records' check shows."""
-        self._pump()
+        if self._held > 0:
+            self._pump()
         fresh = (received(self._timer) - self._taken) & COUNT_MASK
         if fresh == 0:
             return 0
@@ -167,13 +180,13 @@ class Uarte:
 
     def write(self, line, end):  # noqa: ANN001, ANN201
         """Queue ``line[:end]``; False where there is no room."""
-        self._pump()
         if end > OUT_BYTES - self._held:
             return False
         fill = (self._begin + self._held) % OUT_BYTES
         first = min(OUT_BYTES - fill, end)
         link.copy(line, 0, first, self._out, fill)
-        link.copy(line, first, end, self._out, 0)
+        if first < end:
+            link.copy(line, first, end, self._out, 0)
         self._held += end
         self._pump()
         return True
@@ -205,25 +218,27 @@ class SpiBus(dw1000.Bus):
     def __init__(self, spi, select, reset_pin, pause_us):  # noqa: ANN001, ANN204
         """Pins are ``machine.Pin``; the reset's must not drive the line yet."""
         self._spi, self._select, self._reset, self.pause_us = spi, select, reset_pin, pause_us
+        self._exchange = spi.write_readinto
         self._out, self._into = bytearray(MOST_WRITTEN), bytearray(MOST_WRITTEN)
         self._outs, self._intos = [None] * (MOST_WRITTEN + 1), [None] * (MOST_WRITTEN + 1)
 
     def transfer(self, out, into):  # noqa: ANN001, ANN201
         """Both directions at once."""
         self._select(0)
-        self._spi.write_readinto(out, into)
+        self._exchange(out, into)
         self._select(1)
 
     def write(self, header, data):  # noqa: ANN001, ANN201
         """What comes back goes where nobody looks. Slices are made when a length is first used, and kept."""
-        begin, size = len(header), len(header) + len(data)
-        link.copy(header, 0, begin, self._out, 0)
-        link.copy(data, 0, len(data), self._out, begin)
-        if self._outs[size] is None:
-            self._outs[size] = memoryview(self._out)[:size]
-            self._intos[size] = memoryview(self._into)[:size]
+        begin = len(header)
+        end = begin + len(data)
+        join(header, begin, data, end, self._out)
+        out = self._outs[end]
+        if out is None:
+            out = self._outs[end] = memoryview(self._out)[:end]
+            self._intos[end] = memoryview(self._into)[:end]
         self._select(0)
-        self._spi.write_readinto(self._outs[size], self._intos[size])
+        self._exchange(out, self._intos[end])
         self._select(1)
 
     def slow(self):  # noqa: ANN201

@@ -2,15 +2,17 @@
 
 import importlib.util
 import sys
+import types
 from pathlib import Path
 
 from cobs import cobs
 
-from skyless.firmware import board
+from skyless.firmware import board, dw1000, link
 from skyless.radios.link_records import decode
 
 VECTORS = Path(__file__).with_name("board_vectors.py")
 FOLDER = Path(board.__file__).parent
+NRF52 = Path(__file__).parents[2] / "firmware" / "nrf52.py"
 
 
 def module_of_vectors():
@@ -38,3 +40,68 @@ def records(said):
 
 def values(said):
     return [decode(record) for record in records(said)]
+
+
+class Nrf52Line:
+    """What the functions of ``nrf52.py`` that boards compile do for a ``Wire``; the UART sends at once."""
+
+    def __init__(self, wire):
+        self.wire, self.taken = wire, 0
+
+    def received(self, timer):
+        return self.taken + self.wire.in_end - self.wire.in_at
+
+    def take(self, ring, at, size, out):
+        into = bytearray(size)
+        self.taken += self.wire.read(into)
+        out[:size] = into
+        return (at + size) % 255
+
+    def join(self, header, begin, data, end, out):
+        out[:end] = bytes(header) + bytes(data)
+
+    def send(self, uarte, data, at, size):
+        assert self.wire.write(data[at : at + size], size)
+
+    def is_sent(self, uarte):
+        return True
+
+
+class Nrf52Spi:
+    """``machine.SPI`` to the chip that the vectors play."""
+
+    def __init__(self, chip):
+        self.chip, self.octets = chip, 0
+
+    def write_readinto(self, out, into):
+        self.octets += len(out)
+        if out[0] & 0x80:
+            size = 1 if not out[0] & 0x40 else 2 if not out[1] & 0x80 else 3
+            self.chip.write(out[:size], out[size:])
+        else:
+            self.chip.transfer(out, into)
+
+    def init(self, baudrate, polarity, phase):
+        pass
+
+
+def on_nrf52(bench):
+    """Put ``nrf52.py`` between a bench's board and its wire and chip; the SPI, and all files that boards run."""
+    line = Nrf52Line(bench.wire)
+    plain = types.ModuleType("micropython")
+    plain.const = lambda value: value
+    plain.viper = lambda function: getattr(line, function.__name__, lambda *_: None)
+    namespace = {"ptr8": object, "ptr32": object, "__name__": "nrf52"}
+    modules = {"micropython": plain, "dw1000": dw1000, "link": link}
+    before = {name: sys.modules.get(name) for name in modules}
+    sys.modules.update(modules)
+    try:
+        exec(compile(NRF52.read_text(encoding="utf-8"), str(NRF52), "exec"), namespace)
+    finally:
+        for name, module in before.items():
+            sys.modules.pop(name) if module is None else sys.modules.update({name: module})
+    spi = Nrf52Spi(bench.bus)
+    pin = types.SimpleNamespace(init=lambda *_, **__: None, OUT=1, IN=0)
+    bench.chip._bus = namespace["SpiBus"](spi, lambda value: None, pin, bench.bus.pause_us)
+    bench.board._uart = namespace["Uarte"](lambda us: None)
+    return spi, {module.__file__ for module in (board, dw1000, link)} | {str(NRF52)}

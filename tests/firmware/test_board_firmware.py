@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from board_bench import FOLDER, VECTORS, values, vectors
+from board_bench import FOLDER, VECTORS, on_nrf52, values, vectors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -381,14 +381,14 @@ COMPILED_ON_BOARDS = {"copy", "keep", "log10", "crc16", "stuff", "unstuff", "cop
 FILES = {module.__file__ for module in (board, dw1000, link)}
 
 
-def operations(act):
-    """How many bytecodes CPython runs for it in the firmware's files, but for what boards run as machine code."""
+def operations(act, files):
+    """How many bytecodes CPython runs for it in those files, but for what boards run as machine code."""
     count = 0
 
     def trace(frame, event, argument):
         nonlocal count
         code = frame.f_code
-        if code.co_filename not in FILES or code.co_name in COMPILED_ON_BOARDS:
+        if code.co_filename not in files or code.co_name in COMPILED_ON_BOARDS:
             return None
         frame.f_trace_opcodes, frame.f_trace_lines = True, False
         count += event == "opcode"
@@ -403,25 +403,38 @@ def operations(act):
     return count
 
 
-def test_bytecodes_per_frame_keep_a_slot():
-    """CPython's, which are much the same as MicroPython's; docs/hardware.md makes microseconds of these bounds."""
-    made = bench()
-    assert 40 < operations(made.turn) <= 100  # nothing to do
+def test_bytecodes_and_octets_per_frame_keep_a_slot():
+    """All that a board runs. The bytecodes are CPython's, much like MicroPython's; docs/hardware.md has what they take."""
+    made = vectors.Bench()
+    spi, files = on_nrf52(made)
+    made.ready().turn(200)
+    cost = []
+
+    def measure(turns=1):
+        made.bus.transactions = spi.octets = 0
+        count = operations(lambda: made.turn(turns), files)
+        cost.append((count, made.bus.transactions, spi.octets))
+
+    measure()  # nothing to do
     made.bus.hear(FRAME, 100, 5)
-    made.bus.transactions = 0
-    assert 300 < operations(made.turn) <= 900
-    assert made.bus.transactions == 8
+    measure()  # a reception
     made.tx_at(made.clock.us + 9000, FRAME, 100)
-    assert 300 < operations(lambda: made.turn(2)) <= 700  # taken from the line, 64 bytes in a turn
+    measure(2)  # a frame is taken from the line, 64 bytes in a turn
     made.clock.us += 7900
-    made.bus.transactions = 0
-    assert 300 < operations(made.turn) <= 560  # handed to the chip
-    assert (made.bus.transactions, made.chip.state) == (9, dw1000.SENDING)
+    measure()  # and handed to the chip
     made.clock.us += 1200
-    assert 300 < operations(made.turn) <= 500
-    assert made.chip.sent == 1
+    measure()  # and has left
     made.say(made.host.ask(link.ASK_STATUS))
-    assert 300 < operations(made.turn) <= 800
+    measure()
+    assert (made.chip.received, made.chip.sent, made.chip.state) == (1, 1, dw1000.LISTENING)
+    assert [transfers for _, transfers, _ in cost] == [0, 8, 1, 8, 6, 1]
+    assert all(octets <= bound for (_, _, octets), bound in zip(cost, (0, 152, 6, 138, 27, 6), strict=True))
+    for (count, _, _), bound in zip(cost, BOUNDS, strict=True):
+        assert bound / 2 < count <= bound
+
+
+BOUNDS = (110, 1250, 800, 850, 900, 900)
+"""For nothing, a reception, a frame from the line, to the chip, its end, a status."""
 
 
 def test_what_boards_compile_is_marked_so():

@@ -83,7 +83,7 @@ def test_boards_that_speak_other_people_s_formats_give_right_fixes(speaks, tmp_p
             node = site.tag("tag2", f"{driver}:{tmp_path / 'tag2'}")
             fixes = await site.fixes("tag2", 400)
             assert are_right(fixes)
-            assert {fix.method for fix in fixes} == {"tracker" if driver == "listener" else "joint"}
+            assert {fix.method for fix in fixes} == {"joint"}
             if driver == "sniffer":
                 assert node.radio._stream._is_text is (speaks == "sniffer-text")
             await site.stop("board tag2")

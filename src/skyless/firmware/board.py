@@ -227,9 +227,10 @@ class Board:
             self._hand_over()
 
     def _hand_over(self) -> None:
-        self._look()  # or a frame that has just come would be lost
-        if self._stage != HELD:
-            return
+        if self._interrupt is None or self._interrupt.value():
+            self._look()  # or a frame that has just come would be lost
+            if self._stage != HELD:
+                return
         told = self._chip.transmit_at(self._dx, self._frame, 0, self._frame_end)
         if told == dw1000.QUEUED:
             self._stage = SENDING
