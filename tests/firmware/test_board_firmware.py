@@ -404,7 +404,7 @@ def operations(act, files):
 
 
 def test_bytecodes_and_octets_per_frame_keep_a_slot():
-    """All that a board runs. The bytecodes are CPython's, much like MicroPython's; docs/hardware.md has what they take."""
+    """All that a board runs. Bytecodes are CPython's, much like MicroPython's; docs/hardware.md has what they take."""
     made = vectors.Bench()
     spi, files = on_nrf52(made)
     made.ready().turn(200)
