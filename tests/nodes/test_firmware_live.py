@@ -8,6 +8,7 @@ from firmware_board import FirmwareBoard
 from live_site import LiveSite, are_right
 
 from skyless.experiments.warm import compile_kernels
+from skyless.firmware.board import NONE
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -51,7 +52,8 @@ def test_anchor_and_tag_on_the_firmware_make_right_fixes_and_survive_noise_and_p
             assert node.restarts == 2
 
             await site.stop("anchor 4")  # the host vanishes, and comes back
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(0.5)
+            await site.until(lambda: anchor_board.board._stage == NONE)
             sent = anchor_board.board._chip.sent
             await asyncio.sleep(0.3)
             assert anchor_board.board._chip.sent == sent
