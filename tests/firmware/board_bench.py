@@ -1,6 +1,9 @@
 """The vectors' board, chip and wire for tests in CPython, and what a board said as values."""
 
+import bisect
 import importlib.util
+import re
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -105,3 +108,22 @@ def on_nrf52(bench):
     bench.chip._bus = namespace["SpiBus"](spi, lambda value: None, pin, bench.bus.pause_us)
     bench.board._uart = namespace["Uarte"](lambda us: None)
     return spi, {module.__file__ for module in (board, dw1000, link)} | {str(NRF52)}
+
+
+def bytecodes_of_lines(micropython, file):
+    """How many bytecodes MicroPython's compiler makes of each line of a file, from what it dumps."""
+    program = f"import sys; sys.path[0:0] = {[str(FOLDER), str(NRF52.parent)]}; import {Path(file).stem}"
+    dump = subprocess.run(
+        [micropython, *3 * ["-v"], "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    counts, begins, lines, is_wanted = {}, [], [], False
+    for row in dump.stdout.splitlines():
+        if block := re.match(r"File (\S+), code block", row):
+            is_wanted, begins, lines = Path(block[1]).name == Path(file).name, [], []
+        elif is_wanted and (mark := re.match(r"  bc=(\d+) line=(\d+)", row)):
+            begins.append(int(mark[1]))
+            lines.append(int(mark[2]))
+        elif is_wanted and (code := re.match(r"(\d+) [A-Z_]+", row)):
+            line = lines[bisect.bisect_right(begins, int(code[1])) - 1]
+            counts[line] = counts.get(line, 0) + 1
+    return counts
