@@ -11,6 +11,7 @@ import link
 import micropython
 from micropython import const
 
+CLOCK = 0x4000_0000
 UARTE0 = 0x4000_2000
 TIMER3 = 0x4001_A000
 PPI = 0x4001_F000
@@ -27,7 +28,9 @@ SLOW_HZ = 2_000_000
 MOST_WRITTEN = 131
 """Header and data of the longest write."""
 
-# Offsets in words of 32 bits. UARTE:
+# Offsets in words of 32 bits. CLOCK:
+_HFCLKSTART = const(0x000 // 4)
+# UARTE:
 _STARTRX = const(0x000 // 4)
 _STOPRX = const(0x004 // 4)
 _STARTTX = const(0x008 // 4)
@@ -73,8 +76,9 @@ def stop(uarte: ptr32, timer: ptr32, ppi: ptr32):  # noqa: ANN201, F821 - viper'
 
 
 @micropython.viper
-def start(uarte: ptr32, timer: ptr32, ppi: ptr32, ring: ptr8):  # noqa: ANN201, F821
-    """1 Mbaud, 8N1, no flow control, receiving into the ring, every byte counted."""
+def start(uarte: ptr32, timer: ptr32, ppi: ptr32, ring: ptr8, clock: ptr32):  # noqa: ANN201, F821
+    """1 Mbaud by the crystal, 8N1, no flow control, receiving into the ring, every byte counted."""
+    clock[_HFCLKSTART] = 1
     uarte[_ENABLE] = 0
     uarte[_PSEL_RTS] = -1
     uarte[_PSEL_CTS] = -1
@@ -146,9 +150,9 @@ def is_sent(uarte: ptr32) -> bool:  # noqa: F821
 class Uarte:
     """The serial port (``board.Uart``); registers are given by their addresses."""
 
-    def __init__(self, pause_us, uarte=UARTE0, timer=TIMER3, ppi=PPI):  # noqa: ANN001, ANN204
+    def __init__(self, pause_us, uarte=UARTE0, timer=TIMER3, ppi=PPI, clock=CLOCK):  # noqa: ANN001, ANN204
         self.overruns = 0
-        self._uarte, self._timer, self._ppi, self._pause_us = uarte, timer, ppi, pause_us
+        self._uarte, self._timer, self._ppi, self._clock, self._pause_us = uarte, timer, ppi, clock, pause_us
         self._ring, self._out = bytearray(RING_BYTES), bytearray(OUT_BYTES)
         self._begin, self._held, self._sending = 0, 0, 0
         self.restart()
@@ -157,7 +161,7 @@ class Uarte:
         """Start anew; what was being sent is cut off, and what waits is sent behind it."""
         stop(self._uarte, self._timer, self._ppi)
         self._pause_us(200)
-        start(self._uarte, self._timer, self._ppi, self._ring)
+        start(self._uarte, self._timer, self._ppi, self._ring, self._clock)
         self._taken, self._at = received(self._timer), 0
         self._drop(self._sending)
 

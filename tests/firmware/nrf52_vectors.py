@@ -10,7 +10,7 @@ import micropython
 import nrf52
 import uctypes
 
-uarte, timer, ppi = (array.array("I", [0] * 0x200) for _ in range(3))
+uarte, timer, ppi, clock = (array.array("I", [0] * 0x200) for _ in range(4))
 pauses = []
 
 
@@ -22,7 +22,8 @@ def address(buffer):
     return uctypes.addressof(buffer) & 0xFFFF_FFFF
 
 
-uart = nrf52.Uarte(pauses.append, uarte, timer, ppi)
+uart = nrf52.Uarte(pauses.append, uarte, timer, ppi, clock)
+print("crystal", clock[0], sum(clock))
 print("pins", word(uarte, 0x50C), word(uarte, 0x514), hex(word(uarte, 0x508)), hex(word(uarte, 0x510)))
 print("line", hex(word(uarte, 0x524)), word(uarte, 0x56C), word(uarte, 0x500), hex(word(uarte, 0x308)))
 print("ring", word(uarte, 0x534) == address(uart._ring), word(uarte, 0x538), word(uarte, 0x200), word(uarte, 0x000))

@@ -37,6 +37,7 @@ def test_the_uart_is_set_up_for_dma_at_one_megabaud(told):
     assert told["pins"] == "5 11 0xffffffff 0xffffffff"
     assert told["line"] == "0x10000000 0 8 0xffffffff"
     assert told["ring"] == f"True 255 {1 << 5} 1"
+    assert told["crystal"] == "1 1"
     assert told["timer"] == "1 3 1 1"
     assert told["route"] == f"True True {1 << 7}"
 
