@@ -447,6 +447,31 @@ def test_bytecodes_and_octets_per_frame_keep_a_slot():
             assert there <= bound
 
 
+def test_no_number_needs_memory_on_a_board_of_32_bits():
+    """MicroPython there holds 31 bits in a word, which the unix port cannot show: locals and results are looked at."""
+    made, seen = bench(), 0
+
+    def look(frame, event, argument):
+        nonlocal seen
+        if frame.f_code.co_filename not in FILES:
+            return None
+        numbers = [value for value in (argument, *frame.f_locals.values()) if isinstance(value, int)]
+        assert all(-(2**30) <= number < 2**30 for number in numbers), (frame.f_code.co_name, frame.f_locals)
+        seen += len(numbers)
+        return look
+
+    made.clock.us = 2**30 - 5_000  # the clock comes round
+    before = sys.gettrace()
+    sys.settrace(look)
+    try:
+        vectors.slots(made, FRAME, 12)
+    finally:
+        sys.settrace(before)
+    assert (made.chip.received, made.chip.sent) == (12, 4)
+    assert made.clock.us > 2**30
+    assert seen > 10_000
+
+
 def test_what_boards_compile_is_marked_so():
     """The names above are those that are marked for machine code."""
     marked = set()
