@@ -209,7 +209,7 @@ def test_what_the_air_refuses_is_late_too_and_what_is_turned_off_is_withdrawn(be
     bench.in_time = True
     bench.send(2e-3)
     bench.write(r.SYS_CTRL, bits.TRXOFF)
-    assert bench.withdrawn == 2
+    assert bench.withdrawn == 1
     bench.now_s += 5e-3
     assert not bench.read(r.SYS_STATUS) & bits.TXFRS
 

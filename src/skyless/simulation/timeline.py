@@ -12,7 +12,7 @@ class Timeline(Generic[Told]):
 
     def __init__(self) -> None:
         self.now_ticks = 0
-        self._serial = 0
+        self._serial = self._until_ticks = 0
         self._events: list[tuple[int, int, Callable[[], Told | None]]] = []
 
     @property
@@ -25,8 +25,16 @@ class Timeline(Generic[Told]):
         self._serial += 1
         heapq.heappush(self._events, (max(ticks, self.now_ticks), self._serial, happen))
 
+    def pass_to(self, ticks: int) -> bool:
+        """Let time pass up to ``ticks`` at once if nothing is to happen before, nor ``run`` to end; whether it did."""
+        if ticks > self._until_ticks or (self._events and self._events[0][0] <= ticks):
+            return False
+        self.now_ticks = max(self.now_ticks, ticks)
+        return True
+
     def run(self, until_ticks: int) -> Iterator[Told]:
         """Let everything happen up to a time, and give what the events have to tell."""
+        self._until_ticks = until_ticks
         while self._events and self._events[0][0] <= until_ticks:
             self.now_ticks, _, happen = heapq.heappop(self._events)
             told = happen()

@@ -24,6 +24,13 @@ class HostLatency(Struct, frozen=True):
     spike_probability: float = 2e-4
     """Chance that a transfer takes up to ``spike_s``: another process, a page fault."""
     spike_s: float = 5e-3
+    work_s: float = 0.2e-3
+    """What Python takes to understand a frame, or to make one (assumed)."""
+
+    @classmethod
+    def none(cls) -> "HostLatency":
+        """A host that takes no time but for the bits."""
+        return cls(0.0, 0.0, 0.0, 0.0, 0.0)
 
     def draw(self, generator: random.Random) -> float:
         """One transfer's time."""

@@ -70,8 +70,7 @@ class Transceiver:
 
     def reset(self) -> None:
         """Everything off."""
-        if self.sending is not None:
-            self._air.withdraw()
+        self._withdraw()
         self.sending, self.listening_since, self.suspect = None, None, False
 
     # Status
@@ -99,11 +98,14 @@ class Transceiver:
 
     def off(self) -> None:
         """TRXOFF: abort whatever is under way; HPDWARN goes with what it warned of (UM p. 91)."""
-        if self.sending is not None:
-            self._air.withdraw()
-            self.counts["withdrawn"] += 1
+        self._withdraw()
         self.sending, self.listening_since = None, None
         self.drop_bits(bits.HPDWARN)
+
+    def _withdraw(self) -> None:
+        if self.sending is not None and not self.sending.never:
+            self._air.withdraw()
+            self.counts["withdrawn"] += 1
 
     def _start(self, control: int) -> None:
         """TXSTRT, with TXDLYS at DX_TIME, whose low nine bits do not count (UM p. 26)."""
