@@ -6,9 +6,9 @@ from skyless.experiments.host_latency import run_hosts
 from skyless.simulation.dw1000.bus import HostLatency
 
 MOST_RATIO = 2.0
-"""Error over bound: 1.2 for hosts without latency, which are not told of all relays at once as the bound is, and whose
-tag turns corners; errors are correlated over half a second, of which a run has eight: rms within a third. Four times 8 s give 1.27 with
-and 1.31 without latency at 2.5 ms, 1.37 and 1.32 at 2.1 ms (``benchmarks/host_latency.py``)."""
+"""Error over bound. Four runs of 11 s give 1.27 with latency and 1.32 without it at 5 ms, 1.37 and 1.32 at 2.1 ms: the
+bound knows of all relays at once, and the tag turns corners. Errors are alike over half a second, of which a run has
+eight: its rms lies within a third."""
 
 
 @pytest.mark.parametrize("slot_s", [5e-3, 2.1e-3])
