@@ -7,7 +7,7 @@ import pytest
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.firmware import link
 from skyless.radios.link_records import quantised
-from skyless.radios.link_session import POLL_S, SILENCE_S, LinkSession
+from skyless.radios.link_session import PENDING, POLL_S, SILENCE_S, LinkSession
 from skyless.radios.radio import AntennaDelays, Gone, Late, Restarted, Sent
 
 DELAYS = AntennaDelays(16_450, 16_500)
@@ -220,6 +220,31 @@ def test_a_board_that_refuses_its_configuration_or_counts_otherwise_cannot_be_us
     talk.board.put_bytes(bytearray([32, 1]), 0, 2)
     talk.say(talk.board.end())
     assert "counts 1000 kHz in 32 bits" in talk.told[0].reason
+
+
+def test_a_board_whose_radio_does_not_start_is_told_of_once_and_taken_when_it_does():
+    talk = Talk()
+    for _ in range(4):
+        talk.hello()
+        talk.say(talk.board.refused(link.CONFIG, link.REFUSED_RADIO))
+        talk.poll(POLL_S)
+    gone = Gone("the board at /dev/board refuses its configuration: its radio does not answer or start")
+    assert talk.told == [gone]
+    talk.hello()
+    talk.status()
+    assert talk.told == [gone, Restarted()]
+    talk.say(talk.board.refused(link.CONFIG, link.REFUSED_RADIO))
+    assert talk.told == [gone, Restarted(), gone]
+
+
+def test_frames_whose_answer_was_lost_on_the_line_are_not_kept_for_ever():
+    talk = Talk().ready()
+    for number in range(1000):
+        talk.session.transmit(Transmission(b"frame", (number << 9) + DELAYS.tx_ticks))
+    assert len(talk.session._pending) == PENDING
+    told = len(talk.told)
+    talk.say(talk.board.tx_done(stamp(999 << 9), stamp((999 << 9) + DELAYS.tx_ticks)))
+    assert talk.told[told:] == [Sent((999 << 9) + DELAYS.tx_ticks)]
 
 
 def test_an_anchor_needs_a_board_that_can_transmit():

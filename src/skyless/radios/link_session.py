@@ -13,6 +13,14 @@ from skyless.ticks import wrap
 
 POLL_S: Final = 0.5
 SILENCE_S: Final = 3.0
+PENDING: Final = 16
+"""Frames whose end the board has not told; a board holds one, so of older ones the answer was lost on the line."""
+
+_REASONS: Final = {
+    link.REFUSED_SETTING: "it has not these settings",
+    link.REFUSED_MALFORMED: "it did not understand it",
+    link.REFUSED_RADIO: "its radio does not answer or start",
+}
 
 
 class LinkSession:
@@ -39,7 +47,7 @@ class LinkSession:
         self._expected: int | None = None
         self._pending: dict[int, int] = {}
         self._bytes = 0
-        self._refused = ""
+        self._refused = self._told = ""
         self._transmits = transmits
         self._heard_s = 0.0
 
@@ -75,6 +83,8 @@ class LinkSession:
             return
         dx_ticks = wrap(transmission.tx_ticks - self._delays.tx_ticks)
         self._pending[dx_ticks] = transmission.tx_ticks
+        if len(self._pending) > PENDING:
+            del self._pending[next(iter(self._pending))]
         dx, frame = dx_ticks.to_bytes(5, "little"), transmission.frame
         self._say(self._writer.tx_at(bytearray(dx), bytearray(frame), len(frame)))
 
@@ -166,15 +176,18 @@ class LinkSession:
                 self._configure()
 
     def _refuse(self, reason: str) -> None:
+        """Each reason is told once until the board is ready, for one that is asked again refuses again."""
         self._lose()
-        if reason != self._refused:
-            self._refused = reason
+        self._refused = reason
+        if reason != self._told:
+            self._told = reason
             self._tell(Gone(reason))
 
     def _complain(self, refusal: NotDone) -> None:
         """A board that does not take its configuration cannot be used; other refusals are counted."""
         if refusal.command == link.CONFIG:
-            self._refuse(f"the board at {self._place} refuses its configuration (reason {refusal.reason})")
+            why = _REASONS.get(refusal.reason, f"reason {refusal.reason}")
+            self._refuse(f"the board at {self._place} refuses its configuration: {why}")
         else:
             self.counters["refused-command"] += 1
 
@@ -195,7 +208,7 @@ class LinkSession:
             self.clock.forget()
         self.clock.hear(status.ticks, host_s)
         if not self.ready:
-            self.ready = True
+            self.ready, self._told = True, ""
             self._tell(Restarted())
 
     def _lose(self) -> None:
