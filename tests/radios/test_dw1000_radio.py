@@ -126,6 +126,42 @@ def test_a_chip_whose_supply_failed_is_started_again_even_where_it_says_nothing(
     asyncio.run(play())
 
 
+def test_a_chip_that_is_missed_by_the_looks_after_it_is_found_again(monkeypatch):
+    radio, _, buses = spi_radio(monkeypatch)
+    monkeypatch.setattr("skyless.radios.dw1000_radio.CARE_S", 0.01)
+    monkeypatch.setattr(chip_ports, "ASK_S", 0.2)  # so that the look after it comes first
+
+    async def play():
+        async with ears(radio) as host:
+            await host.until(Restarted)
+            buses[0].broken = True
+            await host.until(Restarted, 2)
+            assert [gone.reason for gone in host.of(Gone)] == ["/dev/spidev0.0: [Errno 5] Input/output error"]
+            assert buses[0].closed
+
+    asyncio.run(play())
+
+
+def test_a_bus_that_fails_while_a_frame_is_overdue_is_opened_anew(monkeypatch):
+    radio, node, _ = spi_radio(monkeypatch)
+    faults = []
+
+    async def play():
+        asyncio.get_running_loop().set_exception_handler(lambda _loop, context: faults.append(context))
+        async with ears(radio) as host:
+            await host.until(Restarted)
+            session = radio._session
+            radio.transmit(Transmission(b"frame", wrap((node.air.now_ticks() + (1 << 26) & ~0x1FF) + 16_436)))
+            monkeypatch.setattr(session, "give_up", lambda: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+            node.air.pass_s(5e-3)
+            radio._give_up(session)
+            await host.until(Restarted, 2)
+            assert len(host.of(Gone)) == 1
+        assert not faults
+
+    asyncio.run(play())
+
+
 def test_what_answers_but_is_no_dw1000_is_told_in_words(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
     monkeypatch.setattr(node.chip, "transfer", lambda out, _hz: b"\xff" * len(out))

@@ -132,7 +132,10 @@ class ModelPort:
         else:
             chip.transceiver.fail()
         if not isinstance(event, Gone) and chip.irq:
-            served.wake()
+            try:
+                served.wake()
+            except ChipError as error:
+                served.end(str(error))
 
     # The chip's air
 

@@ -28,6 +28,7 @@ class Dw1000Radio:
         self._session: ChipSession | None = None
         self._told = ""
         self._heard = False
+        self._trouble: Exception | None = None
         self._timer: asyncio.TimerHandle | None = None
 
     async def run(self, listener: Listener) -> None:
@@ -71,13 +72,21 @@ class Dw1000Radio:
     def _give_up(self, session: ChipSession) -> None:
         overdue, now = session.overdue_ticks, self.now_ticks()
         if session is self._session and overdue is not None and now is not None and difference(now, overdue) >= 0:
-            session.give_up()
+            try:
+                session.give_up()
+            except OSError as error:
+                self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        """Have the port, which does not know it yet, look for the chip anew."""
+        self._session, self._trouble = None, error
 
     # What the port calls
 
     def begin(self, bus: Bus) -> None:
         """Start the chip. Raises OSError and ChipError."""
         self._forget()
+        self._trouble = None
         session = ChipSession(bus, self._delays, self._hear, self.counters)
         session.start()
         self._session, self._told = session, ""
@@ -85,6 +94,9 @@ class Dw1000Radio:
 
     def wake(self) -> None:
         """Take what it has to tell; start a chip again that has lost its settings. Raises OSError and ChipError."""
+        trouble, self._trouble = self._trouble, None
+        if trouble is not None:
+            raise trouble
         session = self._session
         if session is not None and not session.serve(time.monotonic()):
             self._revive(session)
@@ -104,7 +116,7 @@ class Dw1000Radio:
                 if session is not None and not session.is_alive():
                     self._revive(session)
             except (OSError, ChipError) as error:
-                self.end(str(error))
+                self._fail(error)
 
     def end(self, reason: str) -> None:
         """It is out of reach; each reason is told once."""
