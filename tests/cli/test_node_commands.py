@@ -87,6 +87,12 @@ def test_a_program_that_is_asked_to_end_does_so_as_planned(number):
         assert not program.stderr.read()
 
 
+@pytest.mark.parametrize("speaks", ["listener", "sniffer", "sniffer-text"])
+def test_an_anchor_has_no_board_that_only_listens(speaks, capsys):
+    assert main(["board", "6", "--format", speaks]) == 2
+    assert "it should be link for an anchor" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_board_tells_where_it_is_and_takes_its_link_with_it(number, tmp_path):
     place = tmp_path / "board"

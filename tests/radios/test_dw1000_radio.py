@@ -184,6 +184,17 @@ def test_names_of_chips_that_cannot_be(spec):
         open_radios(spec, "tag", ("tag1",))
 
 
+@pytest.mark.parametrize("rate", [1, 1_999_999, 20_000_001])
+def test_a_speed_that_no_chip_takes_is_named_at_once(rate):
+    with pytest.raises(SkylessError, match="hz from 2000000 to 20000000"):
+        open_radios(f"spi:0.0,hz={rate}", "tag", ("tag1",))
+
+
+def test_a_model_of_a_wrong_port_is_called_a_model():
+    with pytest.raises(SkylessError, match=r"it should be model:HOST\[:PORT\] with a port from 1 to 65535"):
+        open_radios("model:127.0.0.1:99999", "tag", ("tag1",))
+
+
 def test_names_of_chips():
     (one,) = open_radios(
         "spi:0.1,irq=25,reset=24,hz=4000000,chip=/dev/gpiochip4", "anchor", ("3",), [AntennaDelays(1, 2)]

@@ -51,6 +51,10 @@ def board(
     if not is_ether(radio):
         raise SkylessError(f"--radio is {radio!r}; it should be the emulated air, ether:HOST[:PORT]")
     kind: Literal["anchor", "tag"] = "anchor" if name.isdecimal() else "tag"
+    if kind == "anchor" and format != "link":
+        raise SkylessError(
+            f"--format is {format!r}; it should be link for an anchor, as boards of other formats only listen"
+        )
     emulated = Board(open_radios(radio, kind, (name,))[0], kind, format, link, say)
     place = emulated.pty.place
     if json:

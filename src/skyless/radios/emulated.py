@@ -1,6 +1,7 @@
 """Emulated radios: the nodes of one process on the air of ``skyless ether``, over one TCP connection."""
 
 import asyncio
+import os
 import socket
 import time
 from collections import Counter
@@ -112,7 +113,7 @@ class EtherConnection:
                 endpoint = _connect(self._host, self._port)
                 transport, protocol = await loop.create_connection(lambda: _Client(self), sock=await endpoint)
             except OSError as error:
-                reason = f"no ether at {self._host}:{self._port} ({error.strerror or error})"
+                reason = f"no ether at {self._host}:{self._port} ({_why(error)})"
             else:
                 transport.write(pack(self._join))
                 try:
@@ -201,6 +202,12 @@ class _Client(asyncio.Protocol):
             self.ended.set_result(reason)
         if self._transport is not None:
             self._transport.abort()
+
+
+def _why(error: OSError) -> str:
+    """In words; what asyncio says of a failed connection repeats the address and leaves the cause out."""
+    known = error.errno is not None and error.errno > 0
+    return os.strerror(error.errno) if known else error.strerror or str(error)  # type: ignore[arg-type]
 
 
 async def _connect(host: str, port: int) -> socket.socket:

@@ -14,7 +14,7 @@ from skyless.radios.radio import AntennaDelays, Radio
 from skyless.radios.serial_port import check_path
 from skyless.radios.serial_radio import SerialRadio
 from skyless.radios.sniffer_radio import SnifferRadio
-from skyless.radios.spi_bus import DEFAULT_CHIP, DEFAULT_FAST_HZ, SpiBus
+from skyless.radios.spi_bus import DEFAULT_CHIP, DEFAULT_FAST_HZ, MAX_FAST_HZ, SLOW_HZ, SpiBus
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
 SERIAL_BAUD: Final = 1_000_000
@@ -114,6 +114,8 @@ def spi_port(spec: str, place: str) -> SpiPort:
     right = dot and bus.isdecimal() and device.isdecimal() and chip.startswith("/")
     if not right or not numbers.keys() <= {"irq", "reset", "hz"} or min(numbers.values(), default=0) < 0:
         raise SkylessError(f"--radio is {spec!r}; it should be spi:BUS.DEVICE, as spi:0.0,irq=25,reset=24,hz=8000000")
+    if not SLOW_HZ <= numbers.get("hz", DEFAULT_FAST_HZ) <= MAX_FAST_HZ:
+        raise SkylessError(f"--radio is {spec!r}; it should have hz from {SLOW_HZ} to {MAX_FAST_HZ}")
     return SpiPort(
         f"/dev/spidev{bus}.{device}",
         lambda: SpiBus(
@@ -141,5 +143,6 @@ def host_and_port(spec: str, place: str, default_port: int) -> tuple[str, int]:
     host, colon, digits = place.rpartition(":") if place.count(":") != 0 else (place, "", "")
     port = int(digits) if digits.isdecimal() and len(digits) < 6 else 0
     if colon and not 0 < port < 65_536:
-        raise SkylessError(f"--radio is {spec!r}; it should be ether:HOST[:PORT] with a port from 1 to 65535")
+        driver = spec.partition(":")[0]
+        raise SkylessError(f"--radio is {spec!r}; it should be {driver}:HOST[:PORT] with a port from 1 to 65535")
     return host.strip("[]") or "127.0.0.1", port or default_port

@@ -138,4 +138,5 @@ def _trouble(path: str, error: Exception) -> str:
         return f"{path} is used by another program"
     if number in (errno.ENOTTY, errno.EINVAL):
         return f"{path} is no serial port, or has not this baud rate"
-    return f"{path} cannot be opened ({error})"
+    why = error.strerror if isinstance(error, OSError) and error.strerror else error
+    return f"{path} cannot be opened ({why})"
