@@ -33,6 +33,7 @@ class TapeRadio:
 
     def __init__(self, name, position):
         self.name = name
+        self.counters = {}
         self._tape = tape(LAB, SECONDS, 1, position)
 
     async def run(self, listener):

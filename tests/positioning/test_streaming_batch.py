@@ -39,7 +39,7 @@ def streamed(site, until_s, **request):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PseudorangeTracker, "start", spy_start)
         patch.setattr(PseudorangeTracker, "hear", spy_hear)
-        fleet = fleet_of(Request(site, **request))
+        fleet = fleet_of(Request(site, method="tracker", **request))
         for _ in fleet.run(until_s):
             pass
     return starts, messages, np.array(states), fleet.receivers[0].method._tracker

@@ -37,19 +37,18 @@ def is_sound(joint: JointFilter) -> bool:
     alike = all(
         a.shape == b.shape and a.dtype == b.dtype and a.flags.c_contiguous for a, b in zip(s, like, strict=True)
     )
-    motion, covariance = vars(joint)["_motion"], vars(joint)["_covariance"]
-    n = 2 * joint.dim
-    if not alike or motion.shape != (n,) or covariance.shape != (n, n) or not _counts(s):
-        return False
-    return _exchanged(joint) and bool(0 <= vars(joint)["_anchors"] <= len(s.site_m))
+    return alike and _counts(s) and _exchanged(joint) and bool(0 <= vars(joint)["_anchors"] <= len(s.site_m))
 
 
 def _exchanged(joint: JointFilter) -> bool:
-    relays, shapes = vars(joint)["_relays"], {"_limits": (LIMITS,), "_levels": (LEVELS,), "_sync": (1, 3)}
-    shapes["rows"] = (MOTION_ROWS, 3)
+    own, n = vars(joint), 2 * joint.dim
+    relays, shapes = own["_relays"], {"_limits": (LIMITS,), "_levels": (LEVELS,), "_sync": (1, 3)}
+    shapes |= {"rows": (MOTION_ROWS, 3), "_motion": (n,), "_covariance": (n, n)}
+    if not all(isinstance(own[name], np.ndarray) for name in ("_relays", *shapes)):
+        return False
     if relays.dtype != np.int64 or relays.ndim != 2 or relays.shape[1] != 4 or not relays.flags.c_contiguous:
         return False
-    kept = ((vars(joint)[name], shape) for name, shape in shapes.items())
+    kept = ((own[name], shape) for name, shape in shapes.items())
     return all(a.shape == shape and a.dtype == np.float64 and a.flags.c_contiguous for a, shape in kept)
 
 
