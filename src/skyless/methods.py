@@ -7,3 +7,5 @@ FILTERS: Final = ("tracker", "joint")
 METHODS: Final = (*SNAPSHOTS, *FILTERS)
 
 DEFAULT_METHOD: Final = "joint"
+PROTECTED: Final = "joint"
+"""The one whose fixes have protection levels."""

@@ -34,6 +34,8 @@ from skyless.outputs.address import MqttAddress
         ("board tag1 --link /", "--link is '/'; it should be a name that is free, and something stands there"),
         ("tag t --integrity-risk 0", "--integrity-risk"),
         ("tag t --integrity-risk 0.2", "--integrity-risk"),
+        ("tag t --method tracker --alert-limit-m 0.5", "tracker gives no protection levels"),
+        ("demo --method weighted --integrity-risk 1e-5", "--integrity-risk is 1e-05; it should be left out"),
         ("tag t --alert-limit-m -1", "--alert-limit-m"),
         ("demo --integrity-risk high", "--integrity-risk"),
         ("demo --alert-limit-m inf", "--alert-limit-m"),

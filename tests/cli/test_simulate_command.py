@@ -186,6 +186,7 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--integrity-risk", "0"], ["--integrity-risk"]),
         (["--integrity-risk", "1"], ["--integrity-risk"]),
         (["--alert-limit-m", "0"], ["--alert-limit-m"]),
+        (["--alert-limit-m", "0.1", "--method", "tracker"], ["--alert-limit-m", "0.1", "tracker"]),
         (["--position", "1,2", "--tags", "5"], ["--position", "--tags", "either"]),
         (["--position", "1,2", "--speed", "2"], ["--position", "--speed", "either"]),
         (["--waypoints", "1,1;5,1", "--tags", "2"], ["--waypoints", "--tags", "either"]),

@@ -105,7 +105,7 @@ def demo(
         noise_ps=noise_ps,
         seed=seed,
         method=method,
-        integrity=integrity_of(integrity_risk, alert_limit_m),
+        integrity=integrity_of(integrity_risk, alert_limit_m, method),
         broker=None if mqtt is None else broker(mqtt, mqtt_ca),
         record=_recording(record, folder),
         record_limit_mb=1000.0,

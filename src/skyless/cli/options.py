@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from skyless.errors import SkylessError
-from skyless.methods import METHODS
+from skyless.methods import METHODS, PROTECTED
 
 if TYPE_CHECKING:
     from skyless.positioning.protection import IntegrityRequirement
@@ -25,9 +25,20 @@ IntegrityRisk = Annotated[float, Parameter(validator=Number(gt=0, lte=0.1))]
 """Probability, for each fix, that an error exceeds its protection level; 10⁻⁴ where none is given."""
 
 
-def integrity_of(risk: float | None, alert_limit_m: float | None) -> "IntegrityRequirement":
-    """What --integrity-risk and --alert-limit-m ask of protection levels."""
+def integrity_of(risk: float | None, alert_limit_m: float | None, method: str | None = None) -> "IntegrityRequirement":
+    """What --integrity-risk and --alert-limit-m ask of protection levels.
+
+    Raises:
+        SkylessError: the method gives none, so that a limit would be watched by nobody.
+    """
     from skyless.positioning.protection import RISK, IntegrityRequirement
+
+    if method in METHODS and method != PROTECTED:
+        for option, value in (("integrity-risk", risk), ("alert-limit-m", alert_limit_m)):
+            if value is not None:
+                raise SkylessError(
+                    f"--{option} is {value:g}; it should be left out: {method} gives no protection levels"
+                )
 
     return IntegrityRequirement(RISK if risk is None else risk, alert_limit_m)
 

@@ -133,7 +133,7 @@ def replay(
         see_that_they_are_left_out(useless, "a recording of skyless record brings its own")
         asked = None
         if integrity_risk is not None or alert_limit_m is not None:
-            asked = integrity_of(integrity_risk, alert_limit_m)
+            asked = integrity_of(integrity_risk, alert_limit_m, method)
         replay_site(file, Options(tag, method, asked, settle, above, site, fixes, plot, json))
         return
     of_sites = {"--tag": tag, "--integrity-risk": integrity_risk, "--alert-limit-m": alert_limit_m}

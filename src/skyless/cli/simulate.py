@@ -153,7 +153,7 @@ def simulate(
         tags=1 if tags is None else tags,
         speed_mps=1.0 if speed is None else speed,
         qa=qa,
-        integrity=integrity_of(integrity_risk, alert_limit_m),
+        integrity=integrity_of(integrity_risk, alert_limit_m, method),
         warmup_s=warmup,
         most_fixes=fixes,
         loss=loss,

@@ -93,7 +93,7 @@ def tag(
     elif anchors is not None or height is not None:
         raise SkylessError("--anchors and --height are for sniffers; other tags hear from the air where anchors stand")
     else:
-        asked = integrity_of(integrity_risk, alert_limit_m)
+        asked = integrity_of(integrity_risk, alert_limit_m, method)
         settings = TagSettings(method, qa, site_id, integrity=asked, publish_hz=publish_hz)
         serve = _on_radios(radio, names, settings, address)
     with contextlib.suppress(KeyboardInterrupt):

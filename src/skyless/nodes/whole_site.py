@@ -15,7 +15,7 @@ from skyless.nodes.running import Say, outlasting, together
 from skyless.nodes.watch import Watch
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
-from skyless.positioning.protection import IntegrityRequirement
+from skyless.positioning.protection import RISK, IntegrityRequirement
 from skyless.site.model import Site
 
 HOST: Final = "127.0.0.1"
@@ -117,7 +117,9 @@ class WholeSite:
             Program(_named("anchor", some), ("anchor", *some, *site, *radio, *mqtt))
             for some in _groups(anchors, 1 if asked.apart else len(anchors))
         ]
-        computing = ["--method", asked.method, "--integrity-risk", str(asked.integrity.risk)]
+        computing = ["--method", asked.method]
+        if asked.integrity.risk != RISK:
+            computing += ["--integrity-risk", str(asked.integrity.risk)]
         if asked.integrity.alert_limit_m is not None:
             computing += ["--alert-limit-m", str(asked.integrity.alert_limit_m)]
         tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
