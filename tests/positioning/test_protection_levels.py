@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from joint_builders import LAB_M, Case, begun, episode_of, observations_of, packets_of, settings_of
+from joint_builders import LAB_M, ROOM_M, Case, begun, episode_of, observations_of, packets_of, settings_of
 from msgspec.structs import replace
 from scipy.stats import chi2
 
@@ -15,7 +15,8 @@ from skyless.positioning.joint_soundness import is_sound
 from skyless.positioning.joint_state import BASE, EPOCH, EVIDENCE, EXCLUDED, JUMPS, PACKETS, PARDONS, values
 from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.protection import Alert, IntegrityRequirement, integrity_of, limits_of
-from skyless.positioning.protection_levels import LEVELS
+from skyless.positioning.protection_levels import HPL, LEVELS, VPL, protect
+from skyless.positioning.protection_updates import SHORT
 from skyless.ticks import to_seconds
 
 RISK = 1e-4
@@ -155,6 +156,27 @@ def test_an_anchor_that_is_left_out_is_told_and_one_that_is_taken_back_no_more()
     assert out[-1] < 620  # taken back soon after its messages were in time again
     assert told[-1][0].alert is Alert.NONE
     assert told[-1][0].hpl_m == pytest.approx(told[150][0].hpl_m, rel=0.5)
+
+
+@pytest.mark.parametrize("packets", [10_000, 20_000, 40_000])
+def test_what_an_anchor_did_that_is_out_for_long_spoils_no_level(packets):
+    """Sensitivities and evidence fade until floating point has no number so small, the squares of sums first."""
+    case, anchor = Case(mesh=True), 1
+    episode, settings = episode_of(case, 100, anchors_m=ROOM_M), settings_of(case, height_m=None)
+    messages = late(episode.messages, anchor, 1000, since=300)
+    joint = begun(episode, settings, ROOM_M)
+    for packet in packets_of(messages):
+        joint.hear(*packet)
+    before = joint.levels.copy()
+    s, (motion, covariance) = joint.arrays, joint.motion()
+    slot, fading = s.slot_of[anchor], 1.0 - 1.0 / (SHORT * len(ROOM_M))
+    assert s.slots[slot, EXCLUDED]
+    s.sensitivities[:, slot] *= 1e-6 ** (packets / 1000)
+    s.evidence[:2, slot] *= fading**packets
+    s.evidence[2, slot] *= fading ** (2 * packets)
+    protect(s, covariance, limits_of(RISK), joint.levels)
+    assert np.isfinite(joint.levels).all()
+    assert joint.levels[[HPL, VPL]] == pytest.approx(before[[HPL, VPL]], rel=0.05)
 
 
 def test_two_that_are_left_out_leave_nothing_to_promise():

@@ -50,6 +50,13 @@ HPL, VPL, STATE, WORST_T, WORST_SLOT = range(5)
 
 LEVELS: Final = 5
 
+LEAST_INFORMATION: Final = 1e-12
+"""Of a fault's size, 1/m²: with less nothing is known of it, ..."""
+
+NEGLIGIBLE: Final = 1e-6
+"""... which harms where more than this part of it is in the position. What an anchor did that has been out for half a
+minute is neither; after a few more the sums would be too small for floating point."""
+
 REJECTED_ONCE: Final = 0.3
 SUSPICIOUS: Final = 0.6
 """Where a packet of an anchor was rejected lately, the threshold for its fault is lower by this factor."""
@@ -88,7 +95,7 @@ def protect(s: JointArrays, covariance: Matrix, limits: Vector, levels: Vector) 
         across = np.sqrt(vx * vx + vy * vy)
         for memory in range(0, 2 * EVIDENCE, EVIDENCE):
             information = s.evidence[memory + 1, slot]
-            if information > 0.0:
+            if information > LEAST_INFORMATION:
                 fault_m = abs(s.evidence[memory, slot]) / information
                 variance = scale * s.evidence[memory + 2, slot] / (information * information)
                 t = fault_m / np.sqrt(variance)
@@ -99,7 +106,7 @@ def protect(s: JointArrays, covariance: Matrix, limits: Vector, levels: Vector) 
                 major = _major(xx + vx * vx * variance, xy + vx * vy * variance, yy + vy * vy * variance)
                 hpl = max(hpl, across * fault_m + limits[HORIZONTAL_K] * np.sqrt(major))
                 vpl = max(vpl, abs(vz) * fault_m + limits[VERTICAL_K] * np.sqrt(zz + vz * vz * variance))
-            elif across > 0.0 or vz != 0.0:
+            elif across > NEGLIGIBLE or abs(vz) > NEGLIGIBLE:
                 hpl, vpl = np.inf, np.inf
     levels[STATE] = _state(s, worst_t, worst_slot, limits[FAULT_T], hpl)
     levels[HPL], levels[VPL], levels[WORST_T], levels[WORST_SLOT] = hpl, vpl, worst_t, worst_slot
