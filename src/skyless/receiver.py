@@ -31,7 +31,7 @@ from skyless.positioning.protection import IntegrityRequirement
 from skyless.positioning.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.positioning.tracker import TrackerSettings
 from skyless.positioning.tracking import Tracking
-from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, Unwrapper, from_seconds, to_seconds
+from skyless.ticks import HALF_WRAP_TICKS, LAST_TICKS, TICK_MASK, Unwrapper, from_seconds, to_seconds
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)
@@ -121,6 +121,11 @@ class Receiver:
             self.counters[beacon] += 1
             return None
         rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
+        if abs(rx_ticks) > LAST_TICKS:
+            self.counters["impossible-host-time"] += 1
+            self._own_ticks, self._site_heard_ticks = Unwrapper(), 0
+            self._forget_stamps()
+            return None
         if not self._belongs(beacon, rx_ticks):
             return None
         tx_ticks = self._stamps.unwrap(beacon, rx_ticks)

@@ -15,6 +15,9 @@ WRAP_TICKS: Final = 1 << TICK_BITS
 HALF_WRAP_TICKS: Final = WRAP_TICKS // 2
 TICK_MASK: Final = WRAP_TICKS - 1
 
+LAST_TICKS: Final = 1 << 61
+"""A year of ticks, of which 64 bits hold the differences; a host's clock that jumps by more was set."""
+
 
 def wrap(ticks: int, bits: int = TICK_BITS) -> int:
     """Return an unwrapped time as the counter of that many bits shows it, in [0, 2**bits)."""

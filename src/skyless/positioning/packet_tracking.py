@@ -23,7 +23,7 @@ from skyless.positioning.pair_calibration import NEAREST_M, NOTHING, PairCalibra
 from skyless.positioning.pair_start import NEIGHBOURHOOD
 from skyless.positioning.pair_tracking import MAX_STD_M
 from skyless.positioning.relay_delays import RelayDelays
-from skyless.ticks import Unwrapper, nearest
+from skyless.ticks import LAST_TICKS, Unwrapper, nearest
 
 RANDOM_WALK_FM: Final = 5e-9
 """Of the oscillators, 1/√s. Between 1e-9 and 7e-9 on the captures of TDoA3 anchors; too much of it costs little."""
@@ -51,10 +51,6 @@ RESTART_IN_ROW: Final = 3
 
 BACK_IN_ROW: Final = 8
 """... so many packets in a row before the newest, that the tag's did."""
-
-
-LAST_TICKS: Final = 1 << 61
-"""A year of ticks, which 64 bits hold; a host's clock that jumps by more was set."""
 
 
 class _Anchor:
