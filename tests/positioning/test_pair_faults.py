@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from skyless.air.packet import PairTdoa
-from skyless.positioning.pair_state import MOST_SLOTS, PairSettings
+from skyless.positioning.pair_calibration import AnchorCalibration, PairCalibration
+from skyless.positioning.pair_rest import Rest
+from skyless.positioning.pair_state import BIAS, MOST_SLOTS, PairSettings
+from skyless.positioning.pair_tracker import PairTracker
 from skyless.positioning.pair_tracking import PairTracking
 
 ANCHORS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * ((n ^ n >> 1 ^ n >> 2) & 1)) for n in range(4)}
@@ -110,3 +113,16 @@ def test_more_anchors_than_the_filter_has_room_for():
     assert len(rows) > 0.95 * 4.0 / STEP_S
     assert rmse_m(rows) < 0.15
     assert tracking.counters["restart"] == 0
+
+
+def test_a_filter_at_rest_knows_whose_slot_was_taken():
+    """Another anchor's constant in the slot of one that has gone would pull the position at rest away."""
+    known = PairCalibration({n: AnchorCalibration(0.01 * n) for n in range(MOST_SLOTS + 1)})
+    tracker = PairTracker(PairSettings(), known)
+    rest, dt_s, a_m = Rest(tracker), 0.01, np.array([-1.0, 0.0, 0.0])
+    for b in range(1, MOST_SLOTS + 1):
+        told = a_m, np.array([b, 0.0, 0.0]), dt_s, b - 1.0 + 0.01 * b
+        tracker.hear(0, b, *told)
+        rest.hear(tracker.slot(0), tracker.slot(b), *told)
+    assert tracker.arrays.slots[tracker.slot(MOST_SLOTS), BIAS] == 0.01 * MOST_SLOTS
+    assert rest.arrays.slots[:, BIAS] == pytest.approx(tracker.arrays.slots[:, BIAS])

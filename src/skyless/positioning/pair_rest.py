@@ -8,7 +8,7 @@ the tag moves, and it begins anew from where the other one is.
 from typing import Final
 
 from skyless.positioning.joint_monitor import RESTLESS_LAG
-from skyless.positioning.pair_state import LAG_SQUARED, QA, SLOTS, Vector, new_arrays
+from skyless.positioning.pair_state import LAG_SQUARED, QA, Vector, new_arrays
 from skyless.positioning.pair_tracker import PairTracker, pair_update
 from skyless.positioning.tracker import REJECTED_IN_ROW
 
@@ -31,6 +31,7 @@ class Rest:
         self.since_s = 0.0
         self.count = 0
         """How long the tag has stood still, and how many differences."""
+        self._slots_given = 0
 
     @property
     def lasts(self) -> bool:
@@ -48,11 +49,12 @@ class Rest:
         self.arrays.P[:, dim : 2 * dim] = 0.0
         self.arrays.statistics[LAG_SQUARED:] = 0.0
         self.since_s, self.count = 0.0, 0
+        self._slots_given = self._tracker.slots_given
 
     def hear(self, a: int, b: int, a_m: Vector, b_m: Vector, dt_s: float, tdoa_m: float) -> None:
         """Take what the tracker has just taken."""
         s = self.arrays
-        if s.counts[SLOTS] != self._tracker.arrays.counts[SLOTS]:
+        if self._slots_given != self._tracker.slots_given:
             self.begin()
             return
         pair_update(s, a, b, a_m, b_m, dt_s, tdoa_m)

@@ -175,6 +175,8 @@ class PairTracker:
         self._constant_std_m = settings.constant_std_m
         self._slot_of: dict[int, int] = {}
         self._anchor_of: dict[int, int] = {}
+        self.slots_given = 0
+        """How often an anchor got a slot, a free one or another's."""
 
     def start(self, position_m: Vector, covariance_m2: Matrix, speed_variance: float) -> None:
         """Begin at a solved position, shapes (dim,) and (dim, dim); nothing is held against any anchor."""
@@ -216,6 +218,7 @@ class PairTracker:
         s.slots[slot] = (known.bias_m, known.slope_m, std_m**2, 0.0, 0.0, 0.0, 0.0)
         forget_slot(s, slot)
         self._slot_of[anchor], self._anchor_of[slot] = slot, anchor
+        self.slots_given += 1
         return slot
 
     @property
