@@ -120,13 +120,8 @@ class Receiver:
         if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
             return None
-        rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
-        if abs(rx_ticks) > LAST_TICKS:
-            self.counters["impossible-host-time"] += 1
-            self._own_ticks, self._site_heard_ticks = Unwrapper(), 0
-            self._forget_stamps()
-            return None
-        if not self._belongs(beacon, rx_ticks):
+        rx_ticks = self._unwrap(reception)
+        if rx_ticks is None or not self._belongs(beacon, rx_ticks):
             return None
         tx_ticks = self._stamps.unwrap(beacon, rx_ticks)
         if tx_ticks is None or not self._is_of_this_reign(beacon, rx_ticks):
@@ -145,6 +140,16 @@ class Receiver:
         self.reason = result
         if result is NoFixReason.RESIDUALS:
             self.counters["outlier"] += 1
+        return None
+
+    def _unwrap(self, reception: Reception) -> int | None:
+        """The tag's own stamp, unwrapped; None, and a new beginning, where the host's clock was set by ages."""
+        rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
+        if abs(rx_ticks) <= LAST_TICKS:
+            return rx_ticks
+        self.counters["impossible-host-time"] += 1
+        self._own_ticks, self._site_heard_ticks = Unwrapper(), 0
+        self._forget_stamps()
         return None
 
     def _belongs(self, beacon: Beacon, rx_ticks: int) -> bool:

@@ -168,7 +168,7 @@ def test_what_an_anchor_did_that_is_out_for_long_spoils_no_level(packets):
     for packet in packets_of(messages):
         joint.hear(*packet)
     before = joint.levels.copy()
-    s, (motion, covariance) = joint.arrays, joint.motion()
+    s, covariance = joint.arrays, joint.motion()[1]
     slot, fading = s.slot_of[anchor], 1.0 - 1.0 / (SHORT * len(ROOM_M))
     assert s.slots[slot, EXCLUDED]
     s.sensitivities[:, slot] *= 1e-6 ** (packets / 1000)
