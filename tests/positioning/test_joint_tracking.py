@@ -147,3 +147,14 @@ def test_a_wrong_place_that_the_anchors_contradict_is_left():
                 errors.append(np.linalg.norm(result.position_m - episode.path_m[k]))
     assert len(errors) > 300
     assert max(errors) < 0.15
+
+
+def test_a_covariance_that_is_none_any_more_leads_to_a_new_start():
+    episode = episode_of(MESH, 60)
+    tracking, observations = JointTracking(settings_of(MESH)), list(observations_of(episode, LAB_M))
+    half = len(observations) // 2
+    assert list(fixes_of(tracking, observations[:half], episode.path_m))
+    tracking.filter.arrays.P[0, 0] = np.nan
+    errors_m = [np.linalg.norm(error) for _, _, error in fixes_of(tracking, observations[half:], episode.path_m[half:])]
+    assert len(errors_m) > half // 2
+    assert max(errors_m) < 0.2

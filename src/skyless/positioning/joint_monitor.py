@@ -99,7 +99,9 @@ def believe(s: JointArrays, slot: int, innovation: float, spread: float) -> floa
     their factor: that they are late is known, and tells nothing of the others.
     """
     normalised = innovation / np.sqrt(spread)
-    if not np.isfinite(normalised):
+    if not np.isfinite(normalised):  # the state is no number any more: a few in a row begin anew
+        s.counts[REJECTED] += 1
+        s.counts[REJECTED_IN_ROW] += 1
         return 0.0
     clipped = min(max(normalised, -SCORE_CLIP), SCORE_CLIP)
     doubt = s.anchors[slot, WEIGHT]
