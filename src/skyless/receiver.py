@@ -69,7 +69,7 @@ class Receiver:
         """Make a tag that knows nothing yet.
 
         ``method`` is one of ``METHODS``; ``site`` the only site to listen to, by default the first that is heard;
-        ``qa`` the tag's agility in m²/s³ (``tracker``); ``z_bounds_m`` decides between mirror solutions; ``integrity``
+        ``qa`` the tag's agility in m²/s³ (filters); ``z_bounds_m`` decides between mirror solutions; ``integrity``
         is asked of the protection levels (``joint``).
 
         Raises:

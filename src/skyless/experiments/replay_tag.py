@@ -11,7 +11,7 @@ from msgspec import Struct
 from skyless.air.reception import Diagnostics, Reception
 from skyless.constants import TICK_S
 from skyless.experiments.replay_delays import DelayChange, with_delays
-from skyless.methods import METHODS
+from skyless.methods import DEFAULT_METHOD, METHODS
 from skyless.nodes.tag import fix_message
 from skyless.outputs.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart
 from skyless.positioning.fix import Fix
@@ -180,7 +180,7 @@ class TagReplay:
         receiver = _receiver_of(start, self._asked, self._integrity)
         if receiver is None:
             self.drops["impossible-settings"] += 1
-            receiver = Receiver(self._asked or METHODS[-1], integrity=self._integrity)
+            receiver = Receiver(self._asked or DEFAULT_METHOD, integrity=self._integrity)
         self._receiver = receiver
         self.method = self._asked or str(start.settings.get("method"))
 
