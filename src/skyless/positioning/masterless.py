@@ -52,26 +52,26 @@ class _Anchor:
         self.packets: dict[int, tuple[int, int]] = {}
         """Sequence number → unwrapped (tx_ticks of the anchor, rx_ticks of the tag)."""
 
-    def remember(self, sequence: int, rx_ticks: int) -> None:
-        """Keep the packet that the clock has just taken."""
-        packets = self.packets
-        packets.pop(sequence, None)
-        if len(packets) >= REMEMBERED:
-            del packets[next(iter(packets))]
-        packets[sequence] = (self.clock.tx_ticks, rx_ticks)
+
+def remember(packets: dict[int, tuple[int, int]], sequence: int, tx_ticks: int, rx_ticks: int) -> None:
+    """Keep an anchor's packet, by its sequence number, for relays to come."""
+    packets.pop(sequence, None)
+    if len(packets) >= REMEMBERED:
+        del packets[next(iter(packets))]
+    packets[sequence] = (tx_ticks, rx_ticks)
 
 
 class PairEngine:
     """From the packets that one tag hears to TDoAs of pairs of anchors. No I/O; whatever is unusable is counted.
 
-    ``tx_bits`` is the width of the anchors' TX and relay stamps, ``rx_bits`` that of the tag's stamps. ``anchors_m``
+    ``tx_bits`` is the width of the anchors' TX and relay stamps; the tag's have 40 bits. ``anchors_m``
     (identifier → x, y, z) arms the physical gate; positions that packets carry serve where it has none.
     """
 
-    def __init__(self, tx_bits: int = 32, rx_bits: int = TICK_BITS, anchors_m: dict[int, Point] | None = None) -> None:
+    def __init__(self, tx_bits: int = 32, anchors_m: dict[int, Point] | None = None) -> None:
         self.drops: Counter[str] = Counter()
         self._tx_bits = tx_bits
-        self._tag_clock = Unwrapper(rx_bits)
+        self._tag_clock = Unwrapper(TICK_BITS)
         self._first_ticks: int | None = None
         self._anchors: dict[int, _Anchor] = {}
         self._told_m: dict[int, Point] = {}
@@ -99,7 +99,7 @@ class PairEngine:
             sender = self._anchors[packet.anchor] = _Anchor(clock)
         elif not self._follow(sender, packet, rx_ticks):
             return []
-        sender.remember(packet.sequence, rx_ticks)
+        remember(sender.packets, packet.sequence, sender.clock.tx_ticks, rx_ticks)
         tdoas = []
         time_s = (rx_ticks - self._first_ticks) * TICK_S
         for relay in packet.relays:
@@ -129,7 +129,7 @@ class PairEngine:
             self.drops["clock-restarted"] += 1
             sender.packets.clear()
             self._flights.forget(packet.anchor)
-            sender.remember(packet.sequence, rx_ticks)
+            remember(sender.packets, packet.sequence, clock.tx_ticks, rx_ticks)
         return False
 
     def _tdoa_m(self, b: int, clock: BroadcastClock, relay: Relay, rx_b: int) -> float | str:

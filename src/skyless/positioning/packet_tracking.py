@@ -12,12 +12,14 @@ from typing import Final
 import numpy as np
 
 from skyless.air.packet import Packet, Point, Relay
+from skyless.clocks.stamps import NOISE_TICKS
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.joint import JointSettings
 from skyless.positioning.joint_state import RELAYS_REJECTED
 from skyless.positioning.joint_tracking import JointTracking
+from skyless.positioning.masterless import MOST_ANCHORS, remember
 from skyless.positioning.observation import Observation
 from skyless.positioning.pair_calibration import NEAREST_M, NOTHING, PairCalibration
 from skyless.positioning.pair_start import NEIGHBOURHOOD
@@ -36,15 +38,6 @@ PERIOD_S: Final = 0.15
 
 MAX_AGE_S: Final = 0.5
 """How long ago a relayed packet may have been heard; a 7-bit sequence number recurs."""
-
-REMEMBERED: Final = 64
-"""Packets of one anchor that are kept for relays to come."""
-
-MOST_ANCHORS: Final = 256
-"""Further identifiers are ignored, so that memory stays bounded whatever is on the air."""
-
-NOISE_TICKS: Final = 64
-"""0.3 m allow for the noise of two stamps."""
 
 RESTART_IN_ROW: Final = 3
 """So many impossible stamps of one anchor in a row mean that its counter began anew; ..."""
@@ -75,14 +68,6 @@ class _Anchor:
             return False
         self.tx_ticks, self.rx_ticks, self.impossible = tx_ticks, rx_ticks, 0
         return True
-
-    def remember(self, sequence: int) -> None:
-        """Keep the newest packet for relays to come."""
-        heard = self.heard
-        heard.pop(sequence, None)
-        if len(heard) >= REMEMBERED:
-            del heard[next(iter(heard))]
-        heard[sequence] = (self.tx_ticks, self.rx_ticks)
 
 
 class PacketTracking:
@@ -225,7 +210,7 @@ class PacketTracking:
             anchor.place, anchor.anchor_m = place, np.array(place)
             self._learn_area()
         self._newest_rx_ticks = rx_ticks
-        anchor.remember(packet.sequence)
+        remember(anchor.heard, packet.sequence, anchor.tx_ticks, rx_ticks)
         return anchor
 
     def _has_new_counter(self, packet: Packet, rx_ticks: int) -> bool:

@@ -128,24 +128,6 @@ def tracker_update(
 
 
 @borrowing_kernel
-def gated_correct(
-    x: Vector,
-    P: Matrix,
-    whole: NDArray[np.int64],
-    statistics: Vector,
-    ph: Vector,
-    innovation: float,
-    spread: float,
-    gate: float,
-) -> bool:
-    """Correct the state unless the innovation lies beyond the gate (``judge``)."""
-    accepted = judge(whole, statistics, innovation, spread, gate)
-    if accepted:
-        correct(x, P, ph, innovation, spread)
-    return accepted
-
-
-@borrowing_kernel
 def judge(whole: NDArray[np.int64], statistics: Vector, innovation: float, spread: float, gate: float) -> bool:
     """Whether an innovation lies within the gate; keeps the counts, running means and agility.
 

@@ -19,7 +19,7 @@ from skyless.outputs.messages import (
     ZonesMessage,
 )
 from skyless.recordings.mcap_channels import FLOOR_PLAN, Place, decoder_of, place_of
-from skyless.recordings.mcap_scan import MAGIC, ChunkPlace, McapScan
+from skyless.recordings.mcap_scan import ChunkPlace, McapScan
 from skyless.recordings.source import Drops
 
 NS: Final = 1_000_000_000
@@ -54,11 +54,6 @@ class Recorded(Struct, frozen=True):
     place: Place
     topic: str
     message: Struct
-
-
-def recognise_mcap(head: bytes) -> bool:
-    """Whether a file begins so."""
-    return head.startswith(MAGIC)
 
 
 class McapRecording:

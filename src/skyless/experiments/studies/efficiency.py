@@ -62,11 +62,6 @@ class Efficiency(Struct, frozen=True):
         """RMSE over the bound of what the tag knew."""
         return self.rmse_m / self.arrived_bound_m
 
-    @property
-    def ratio_to_all(self) -> float:
-        """RMSE over the bound of all receptions."""
-        return self.rmse_m / self.bound_m
-
 
 def efficiency(case: Case, episodes: int, seed: int, pool: Executor | None = None) -> Efficiency:
     """Run the episodes of a case; they depend on the seed and their number alone."""
