@@ -156,6 +156,7 @@ def test_without_anchors_there_is_no_fix_and_a_reason(run):
     code, out, err = run("tdoa-table")
     assert (code, err) == (0, "")
     assert "none: no-almanac" in out
+    assert "--anchors" in out
 
 
 BAD_FILES = {

@@ -85,6 +85,9 @@ def test_protection_levels_and_alerts_are_shown(hall):
     for name, words in (("forklift", "none"), ("trolley", "a faulty anchor is left out")):
         page.click(f"table.tags button:has-text('{name}')")
         page.wait_for_selector(f".detail dd:text-is('{words}')")
+    assert page.locator(".detail dd.warn").all_inner_texts() == ["a faulty anchor is left out"]
+    page.click("table.tags button:has-text('robot')")
+    page.wait_for_selector(".detail dd.bad:text-is('a fault that cannot be left out: no level')")
     assert page.evaluate("async () => (await import('/page/tracks.js')).ALERTS.length") == len(Alert)
     circles = page.evaluate("""async () => {
       const { drawTags, look } = await import("/page/map/tags.js");

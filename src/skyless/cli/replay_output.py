@@ -87,6 +87,8 @@ def show(report: "ReplayReport", note: str, distances: dict[str, float], more: S
 
 def _lines(report: "ReplayReport", note: str) -> list[tuple[str, str]]:
     fixes = str(report.fixes) if report.reason is None else f"none: {report.reason}"
+    if report.reason == "no-almanac":
+        fixes += " (give a table of the anchors' places with --anchors, or --site)"
     height = note if report.height_m is None else f"{report.height_m:.3f} m, {note}"
     truth_known = any(pair.against_truth for pair in report.pairs)
     return [

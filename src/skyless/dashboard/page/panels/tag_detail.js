@@ -10,6 +10,8 @@ import { ALERT, ALERTS, ANCHORS, CHI2, ERROR, HPL, STD, TIME, VX, VY, X, Y, Z } 
 
 const WINDOW_S = 60;
 const row = new Float64Array(17);
+/** How grave each of ALERTS is. */
+const GRAVITY = ["", "warn", "bad", "", "bad"];
 
 export class TagDetail {
   constructor() {
@@ -93,6 +95,7 @@ export class TagDetail {
       Processor: health ? `${(100 * health.cpu).toFixed(1)} %` : null,
       Memory: health ? bytes(health.memory_bytes) : null,
     });
+    this.facts.grade("Integrity alert", GRAVITY[row[ALERT]] ?? "");
   }
 
   showCharts(track) {
@@ -150,5 +153,7 @@ export function facts(names) {
       if (!box.hidden) text(value, values[name]);
     }
   };
-  return { element: list, show };
+  /** Have a fact stand out: "warn", "bad", or as the others. */
+  const grade = (name, how) => void (places.get(name).value.className = how);
+  return { element: list, show, grade };
 }
