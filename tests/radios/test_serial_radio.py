@@ -290,6 +290,20 @@ def test_ports_that_cannot_be_are_told_at_once(spec, right):
     assert spec in str(told.value)
 
 
+def test_ports_that_nobody_can_look_at_are_opened_to_be_told_why(tmp_path, monkeypatch):
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+
+    def forbidden(_path):
+        raise PermissionError(13, "Permission denied")
+
+    for place in (str(tmp_path / "loop"), "/x" * 3000):
+        spec = f"serial:{place}"
+        assert open_radios(spec, "tag", ("tag1",))
+        assert not is_simulated(spec)
+    monkeypatch.setattr("pathlib.Path.exists", forbidden)
+    assert open_radios("serial:/root/board", "tag", ("tag1",))
+
+
 def test_names_of_ports():
     (one,) = open_radios("serial:/dev/nothing@2000000", "tag", ("tag1",))
     assert (one._port.path, one._port.baud, one._delays) == ("/dev/nothing", 2_000_000, AntennaDelays())

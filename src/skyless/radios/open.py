@@ -1,7 +1,7 @@
 """Radios by name, as ``--radio`` gives them."""
 
+import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Final, Literal
 
 from skyless.errors import SkylessError
@@ -31,7 +31,7 @@ EXPECTED: Final = (
 def is_simulated(spec: str) -> bool:
     """Whether nothing real flies over a radio of that name; what sits behind a pseudo-terminal is no radio."""
     port = spec.partition(":")[2].partition(",")[0].partition("@")[0]
-    return spec.split(":", 1)[0] in ("ether", "model") or str(Path(port).resolve()).startswith("/dev/pts/")
+    return spec.split(":", 1)[0] in ("ether", "model") or os.path.realpath(port).startswith("/dev/pts/")
 
 
 def is_ether(spec: str) -> bool:

@@ -119,8 +119,11 @@ def check_path(spec: str, path: str) -> None:
         SkylessError: it never will be one.
     """
     place = Path(path)
-    if place.exists() and not place.is_char_device():
-        kind = "a folder" if place.is_dir() else "a file"
+    try:
+        kind = "a port" if not place.exists() or place.is_char_device() else "a folder" if place.is_dir() else "a file"
+    except OSError:  # nobody may look there, or no file has such a name; opening it will tell
+        return
+    if kind != "a port":
         raise SkylessError(f"--radio is {spec!r}; it should name a serial port, as /dev/ttyACM0, and {path} is {kind}")
 
 
