@@ -199,8 +199,10 @@ class ClockFilter:
 
     def to_master(self, ticks_own: int) -> tuple[int, float, float]:
         """Own time on the master's scale: whole ticks, fraction of a tick, variance in m²."""
-        return clock_to_master(self.state, self.whole, ticks_own, self._noise.white, self._noise.walk)
+        white, walk = self._noise.white, self._noise.walk
+        ticks, fraction_ticks, variance_m2 = clock_to_master(self.state, self.whole, ticks_own, white, walk)
+        return int(ticks), fraction_ticks, variance_m2  # uncompiled it is NumPy's, which overflows in the site's time
 
     def from_master(self, ticks_master: int) -> int:
         """Nearest own tick of a time on the master's scale."""
-        return clock_from_master(self.state, self.whole, ticks_master)
+        return int(clock_from_master(self.state, self.whole, ticks_master))
