@@ -292,3 +292,11 @@ def test_arrays_of_another_length_are_not_sound():
     assert is_sound(joint)
     joint._levels = np.zeros(LEVELS - 1)
     assert not is_sound(joint)
+
+
+def test_settings_of_another_kind_are_not_sound():
+    case = Case()
+    episode = episode_of(case, 5)
+    joint = heard(episode, episode.messages, settings_of(case))
+    joint.arrays = joint.arrays._replace(settings=joint.arrays.settings.astype(np.float32))
+    assert not is_sound(joint)
