@@ -139,7 +139,7 @@ def test_a_recording_replays_bit_by_bit_and_ctrl_c_closes_it(broker, tmp_path):
 
     async def scenario():
         await recorder.start()
-        await recorder.grown(100_000)
+        await recorder.grown(200_000)
         return await recorder.end()
 
     code, out, _ = run(scenario, broker)
@@ -164,11 +164,11 @@ def test_a_broker_that_dies_and_returns_costs_no_reception_that_it_kept(broker, 
 
     async def scenario():
         await recorder.start()
-        await recorder.grown(60_000)
+        await recorder.grown(150_000)
         await broker.kill()
         await asyncio.sleep(0.5)
         await broker.start()
-        await recorder.grown(60_000)
+        await recorder.grown(150_000)
         return await recorder.end()
 
     code, out, _ = run(scenario, broker)
@@ -193,7 +193,7 @@ def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_o
 
     async def scenario():
         await first.start()
-        await first.grown(100_000)
+        await first.grown(200_000)
         killed_s = time.time()
         await first.end(signal.SIGKILL)
         await second.start()
