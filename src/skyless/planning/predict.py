@@ -96,10 +96,14 @@ class Predictor:
             table,
         )
 
-    def _tracker(self) -> Fill:
-        clocks, noise = self.clocks, self.site.noise
+    def _noises(self) -> Vector:
+        """Of one oscillator, white and random walk, and of a TX and an RX stamp: for the filters' predictions."""
+        noise = self.site.noise
         one = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
-        settings = np.array([one.white, one.walk, *stamp_variances(self.site)])
+        return np.array([one.white, one.walk, *stamp_variances(self.site)])
+
+    def _tracker(self) -> Fill:
+        clocks, settings = self.clocks, self._noises()
         return lambda points, table: fill_tracker_sigma(
             points,
             self.dim,
@@ -122,10 +126,8 @@ class Predictor:
         )
 
     def _joint(self) -> Fill:
-        clocks, noise = self.clocks, self.site.noise
+        clocks, settings = self.clocks, self._noises()
         relays = relays_of(self.anchors_m, self.master, clocks, self.budget, self.walls)
-        one = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
-        settings = np.array([one.white, one.walk, *stamp_variances(self.site)])
         return lambda points, table: fill_joint_sigma(
             points,
             self.dim,
