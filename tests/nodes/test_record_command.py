@@ -17,6 +17,7 @@ from skyless.air.reception import Reception
 from skyless.cli.main import main
 from skyless.experiments.replay_site import SiteReplay
 from skyless.experiments.warm import compile_kernels
+from skyless.nodes.loop import end_with_parent
 from skyless.nodes.tag import TagSettings
 from skyless.nodes.tags import Tags
 from skyless.outputs.link import Link
@@ -59,17 +60,20 @@ class Recorder:
         self.path = path
         self._command = [sys.executable, "-m", "skyless.cli.main", "record", path, "--mqtt", str(address), *arguments]
         self._limit = limit_bytes
+        self._end_with_test = end_with_parent()
         self.process = None
 
-    def _set_limit(self):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (self._limit, self._limit))
+    def _prepare(self):
+        self._end_with_test()
+        if self._limit:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (self._limit, self._limit))
 
     async def start(self):
         self.process = await asyncio.create_subprocess_exec(
             *self._command,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
-            preexec_fn=self._set_limit if self._limit else None,
+            preexec_fn=self._prepare,
         )
 
     def size(self):
