@@ -184,6 +184,12 @@ def test_names_of_chips_that_cannot_be(spec):
         open_radios(spec, "tag", ("tag1",))
 
 
+@pytest.mark.parametrize(("options", "key"), [("irq=1,irq=2", "irq"), ("irq=1,chip=/dev/a,chip=/dev/a", "chip")])
+def test_an_option_of_a_chip_is_given_once(options, key):
+    with pytest.raises(SkylessError, match=f"it should give {key} once"):
+        open_radios(f"spi:0.0,{options}", "tag", ("tag1",))
+
+
 @pytest.mark.parametrize("rate", [1, 1_999_999, 20_000_001])
 def test_a_speed_that_no_chip_takes_is_named_at_once(rate):
     with pytest.raises(SkylessError, match="hz from 2000000 to 20000000"):
@@ -193,6 +199,12 @@ def test_a_speed_that_no_chip_takes_is_named_at_once(rate):
 def test_a_model_of_a_wrong_port_is_called_a_model():
     with pytest.raises(SkylessError, match=r"it should be model:HOST\[:PORT\] with a port from 1 to 65535"):
         open_radios("model:127.0.0.1:99999", "tag", ("tag1",))
+
+
+@pytest.mark.parametrize("driver", ["model", "ether"])
+def test_an_address_is_no_host_of_an_ether(driver):
+    with pytest.raises(SkylessError, match=r"it should be .*:HOST\[:PORT\], and socket://here is no host"):
+        open_radios(f"{driver}:socket://here:7784", "tag", ("tag1",))
 
 
 def test_names_of_chips():

@@ -279,6 +279,12 @@ def test_a_link_keeps_its_name_and_goes_with_the_board(tmp_path):
         ("serial:/dev/a@1", "PATH@BAUD"),
         ("serial:/", "/ is a folder"),
         (f"serial:{__file__}", "is a file"),
+        (
+            "serial:socket://board.local:4000",
+            "a serial port of this computer, as /dev/ttyACM0, and socket://board.local",
+        ),
+        ("listener:socket://10.0.0.1:4000@115200", "a serial port of this computer"),
+        ("serial:rfc2217://10.0.0.1:4000", "a serial port of this computer"),
         ("listener:", "it should name one port"),
         ("usb:/dev/a", "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN]"),
     ],
@@ -288,6 +294,11 @@ def test_ports_that_cannot_be_are_told_at_once(spec, right):
         open_radios(spec, "tag", ("tag1",))
     assert right in str(told.value)
     assert spec in str(told.value)
+
+
+def test_a_sniffer_s_port_is_one_of_this_computer_too():
+    with pytest.raises(SkylessError, match="a serial port of this computer"):
+        open_sniffers("sniffer:socket://10.0.0.1:4000", ("drone",))
 
 
 def test_ports_that_nobody_can_look_at_are_opened_to_be_told_why(tmp_path, monkeypatch):

@@ -108,7 +108,11 @@ def spi_port(spec: str, place: str) -> SpiPort:
     """The chip of BUS.DEVICE[,irq=PIN][,reset=PIN][,hz=RATE][,chip=PATH]. Raises SkylessError."""
     wires, _, rest = place.partition(",")
     bus, dot, device = wires.partition(".")
-    given = dict(part.partition("=")[::2] for part in rest.split(",") if part)
+    options = [part.partition("=")[::2] for part in rest.split(",") if part]
+    given = dict(options)
+    for key in given:
+        if sum(key == other for other, _ in options) > 1:
+            raise SkylessError(f"--radio is {spec!r}; it should give {key} once")
     chip = given.pop("chip", DEFAULT_CHIP)
     numbers = {key: int(value) if value.isdecimal() and len(value) < 10 else -1 for key, value in given.items()}
     right = dot and bus.isdecimal() and device.isdecimal() and chip.startswith("/")
@@ -145,4 +149,7 @@ def host_and_port(spec: str, place: str, default_port: int) -> tuple[str, int]:
     if colon and not 0 < port < 65_536:
         driver = spec.partition(":")[0]
         raise SkylessError(f"--radio is {spec!r}; it should be {driver}:HOST[:PORT] with a port from 1 to 65535")
+    if "/" in host:
+        driver = spec.partition(":")[0]
+        raise SkylessError(f"--radio is {spec!r}; it should be {driver}:HOST[:PORT], and {host} is no host")
     return host.strip("[]") or "127.0.0.1", port or default_port

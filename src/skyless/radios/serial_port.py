@@ -118,6 +118,11 @@ def check_path(spec: str, path: str) -> None:
     Raises:
         SkylessError: it never will be one.
     """
+    if "://" in path:
+        raise SkylessError(
+            f"--radio is {spec!r}; it should name a serial port of this computer, as /dev/ttyACM0, and {path} is an "
+            "address: run the program where the board is"
+        )
     place = Path(path)
     try:
         kind = "a port" if not place.exists() or place.is_char_device() else "a folder" if place.is_dir() else "a file"
