@@ -1,6 +1,8 @@
 """A DW1000 as a radio: on the emulated air by its model, and on an SPI that the test plays."""
 
 import asyncio
+import sys
+from types import ModuleType
 
 import pytest
 from air_stage import LAB, make_ether
@@ -11,7 +13,7 @@ from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_RATE_HZ
 from skyless.errors import SkylessError
 from skyless.experiments.warm import compile_kernels
-from skyless.radios import chip_ports
+from skyless.radios import chip_ports, spi_bus
 from skyless.radios.chip_ports import SpiPort
 from skyless.radios.dw1000_radio import Dw1000Radio
 from skyless.radios.open import is_simulated, open_radios
@@ -207,6 +209,79 @@ def test_an_address_is_no_host_of_an_ether(driver):
         open_radios(f"{driver}:socket://here:7784", "tag", ("tag1",))
 
 
+@pytest.fixture
+def pi(monkeypatch):
+    """A computer with both packages and all device files, which tests take away."""
+    files = {"/dev/spidev0.0", "/dev/spidev0.1", "/dev/gpiochip0", "/dev/gpiochip4"}
+    monkeypatch.setattr(spi_bus.os.path, "exists", files.__contains__)
+    monkeypatch.setattr(spi_bus.os, "access", lambda path, mode: True)
+    for name in ("spidev", "gpiod", "gpiod.line"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    return files
+
+
+@pytest.mark.parametrize(
+    ("package", "spec", "refused"),
+    [
+        ("spidev", "spi:0.0", True),
+        ("gpiod", "spi:0.0,irq=25", True),
+        ("gpiod.line", "spi:0.0,reset=24", True),  # version 1 of the package has none
+        ("gpiod", "spi:0.0", False),
+    ],
+)
+@pytest.mark.usefixtures("pi")
+def test_a_package_that_is_missing_is_told_at_the_start(monkeypatch, package, spec, refused):
+    monkeypatch.setitem(sys.modules, package, None)
+    if not refused:
+        assert open_radios(spec, "tag", ("tag1",))
+        return
+    words = rf"--radio is '{spec}'; .*package {package.partition('.')[0]}: pip install 'skyless\[pi\]'"
+    with pytest.raises(SkylessError, match=words):
+        open_radios(spec, "tag", ("tag1",))
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        ("spi:9.0", r"there is no /dev/spidev9\.0 .*SPI should be switched on"),
+        ("spi:0.0,irq=25,chip=/dev/gpiochip7", r"there is no /dev/gpiochip7 .*chip= should name"),
+    ],
+)
+@pytest.mark.usefixtures("pi")
+def test_a_device_file_that_is_missing_is_told_at_the_start(spec, words):
+    with pytest.raises(SkylessError, match=f"--radio is '{spec}'; {words}"):
+        open_radios(spec, "tag", ("tag1",))
+
+
+@pytest.mark.parametrize(("path", "group"), [("/dev/spidev0.0", "spi"), ("/dev/gpiochip0", "gpio")])
+@pytest.mark.usefixtures("pi")
+def test_a_device_file_that_may_not_be_opened_is_told_at_the_start(monkeypatch, path, group):
+    monkeypatch.setattr(spi_bus.os, "access", lambda asked, mode: asked != path)
+    with pytest.raises(SkylessError, match=f"{path} may not be opened: its group, usually {group}"):
+        open_radios("spi:0.0,irq=25", "tag", ("tag1",))
+
+
+def test_what_fails_once_it_has_started_is_tried_again(monkeypatch):
+    radio, _, buses = spi_radio(monkeypatch)
+    whole, failures = radio._port._open_bus, []
+
+    def open_bus():
+        if len(failures) < 3:
+            failures.append(SkylessError("GPIO lines 25 (irq) cannot be had"))
+            raise failures[-1]
+        return whole()
+
+    radio._port._open_bus = open_bus
+
+    async def play():
+        async with ears(radio) as host:
+            await host.until(Restarted)
+            assert (len(host.of(Gone)), len(failures), len(buses)) == (1, 3, 1)
+
+    asyncio.run(play())
+
+
+@pytest.mark.usefixtures("pi")
 def test_names_of_chips():
     (one,) = open_radios(
         "spi:0.1,irq=25,reset=24,hz=4000000,chip=/dev/gpiochip4", "anchor", ("3",), [AntennaDelays(1, 2)]

@@ -14,7 +14,7 @@ from skyless.radios.radio import AntennaDelays, Radio
 from skyless.radios.serial_port import check_path
 from skyless.radios.serial_radio import SerialRadio
 from skyless.radios.sniffer_radio import SnifferRadio
-from skyless.radios.spi_bus import DEFAULT_CHIP, DEFAULT_FAST_HZ, MAX_FAST_HZ, SLOW_HZ, SpiBus
+from skyless.radios.spi_bus import DEFAULT_CHIP, DEFAULT_FAST_HZ, MAX_FAST_HZ, SLOW_HZ, SpiBus, check_place
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
 SERIAL_BAUD: Final = 1_000_000
@@ -105,7 +105,7 @@ def _ports(spec: str, place: str, usual_baud: int, names: tuple[str, ...]) -> li
 
 
 def spi_port(spec: str, place: str) -> SpiPort:
-    """The chip of BUS.DEVICE[,irq=PIN][,reset=PIN][,hz=RATE][,chip=PATH]. Raises SkylessError."""
+    """The chip of BUS.DEVICE[,irq=PIN][,reset=PIN][,hz=RATE][,chip=PATH], if it could be there. Raises SkylessError."""
     wires, _, rest = place.partition(",")
     bus, dot, device = wires.partition(".")
     options = [part.partition("=")[::2] for part in rest.split(",") if part]
@@ -120,6 +120,8 @@ def spi_port(spec: str, place: str) -> SpiPort:
         raise SkylessError(f"--radio is {spec!r}; it should be spi:BUS.DEVICE, as spi:0.0,irq=25,reset=24,hz=8000000")
     if not SLOW_HZ <= numbers.get("hz", DEFAULT_FAST_HZ) <= MAX_FAST_HZ:
         raise SkylessError(f"--radio is {spec!r}; it should have hz from {SLOW_HZ} to {MAX_FAST_HZ}")
+    has_lines = not numbers.keys().isdisjoint({"irq", "reset"})
+    check_place(spec, int(bus), int(device), chip if has_lines else None)
     return SpiPort(
         f"/dev/spidev{bus}.{device}",
         lambda: SpiBus(

@@ -1,7 +1,9 @@
 """A DW1000 on the pins of a Raspberry Pi or another Linux board: ``/dev/spidev*`` and GPIO lines (extra ``pi``)."""
 
 import importlib
+import os
 import time
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
@@ -133,6 +135,37 @@ class SpiBus(Bus):
         if self._spi is not None:
             self._spi.close()
             self._spi = None
+
+
+def check_place(spec: str, bus: int, device: int, gpio_chip: str | None) -> None:
+    """See that packages and device files are there and may be used; what fails later may pass by itself.
+
+    ``gpio_chip`` is None where no lines are wanted.
+
+    Raises:
+        SkylessError: nothing will come of this until somebody mends it; naming what.
+    """
+    try:
+        for package in ("spidev",) if gpio_chip is None else ("spidev", "gpiod", "gpiod.line"):
+            _package(package)
+    except SkylessError as error:
+        raise SkylessError(f"--radio is {spec!r}; {error}") from None
+    mend = "SPI should be switched on (Raspberry Pi: dtparam=spi=on in config.txt), spi:BUS.DEVICE name one"
+    _check_file(spec, f"/dev/spidev{bus}.{device}", "spi", mend)
+    if gpio_chip is not None:
+        _check_file(spec, gpio_chip, "gpio", "chip= should name the GPIO chip of irq and reset")
+
+
+def _check_file(spec: str, path: str, group: str, mend: str) -> None:
+    if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises where nobody may look
+        kind = path.rstrip("0123456789.")
+        there = ", ".join(map(str, sorted(Path(kind).parent.glob(f"{Path(kind).name}*")))) or "none"
+        raise SkylessError(f"--radio is {spec!r}; there is no {path} (here: {there}); {mend}")
+    if not os.access(path, os.R_OK | os.W_OK):
+        raise SkylessError(
+            f"--radio is {spec!r}; {path} may not be opened: its group, usually {group}, must be one of yours "
+            "(sudo usermod -aG ...)"
+        )
 
 
 def _package(name: str) -> ModuleType:
