@@ -1,7 +1,10 @@
 """A DW1000 as a radio: on the emulated air by its model, and on an SPI that the test plays."""
 
 import asyncio
+import contextlib
+import os
 import sys
+import time
 from types import ModuleType
 
 import pytest
@@ -9,6 +12,7 @@ from air_stage import LAB, make_ether
 from chip_stage import HandClock, TimedNode
 from serial_stage import ears
 
+from skyless.air.fcs import fcs
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_RATE_HZ
 from skyless.errors import SkylessError
@@ -17,7 +21,7 @@ from skyless.radios import chip_ports, spi_bus
 from skyless.radios.chip_ports import SpiPort
 from skyless.radios.dw1000_radio import Dw1000Radio
 from skyless.radios.open import is_simulated, open_radios
-from skyless.radios.radio import AntennaDelays, Gone, Late, Restarted, Sent
+from skyless.radios.radio import AntennaDelays, Gone, Hint, Late, Restarted, Sent
 from skyless.simulation.dw1000.bus import ModelBus
 from skyless.ticks import difference, wrap
 
@@ -79,12 +83,12 @@ class PlayedSpi(ModelBus):
         self.closed = True
 
 
-def spi_radio(monkeypatch):
+def spi_radio(monkeypatch, bus=PlayedSpi):
     monkeypatch.setattr(chip_ports, "RETRY_S", 0.01)
     node, buses = TimedNode(HandClock()), []
 
     def open_bus():
-        buses.append(PlayedSpi(node))
+        buses.append(bus(node))
         return buses[-1]
 
     return Dw1000Radio(SpiPort("/dev/spidev0.0", open_bus), "tag1", AntennaDelays()), node, buses
@@ -160,6 +164,110 @@ def test_a_bus_that_fails_while_a_frame_is_overdue_is_opened_anew(monkeypatch):
             await host.until(Restarted, 2)
             assert len(host.of(Gone)) == 1
         assert not faults
+
+    asyncio.run(play())
+
+
+class LinedSpi(PlayedSpi):
+    """The same with an interrupt line, which a pipe plays.
+
+    ``stuck`` holds it high whatever the chip says, ``noisy`` lets it rise all the time.
+    """
+
+    def __init__(self, node):
+        super().__init__(node)
+        self.read, self.write_end = os.pipe()
+        os.set_blocking(self.read, False)
+        self.stuck, self.noisy, self.looks = False, False, 0
+
+    def fileno(self):
+        return self.read
+
+    def is_raised(self):
+        self.looks += 1
+        return self.stuck or self.chip.irq
+
+    def forget_edges(self):
+        if not self.noisy:
+            with contextlib.suppress(BlockingIOError):
+                os.read(self.read, 4096)
+
+    def rise(self):
+        os.write(self.write_end, b"!")
+
+    def close(self):
+        super().close()
+        os.close(self.read)
+        os.close(self.write_end)
+
+
+def hear(node, data):
+    """A good frame comes in."""
+    node.air.pass_s(1e-3)
+    node.chip.hear(data + fcs(data), node.air.now_ticks(), Diagnostics(-80.0))
+
+
+def test_an_interrupt_line_that_is_stuck_is_told_once_and_the_chip_is_asked_at_intervals(monkeypatch):
+    """Without a bound every turn of the loop asks the chip: thousands of times in these 0.2 s."""
+    radio, node, buses = spi_radio(monkeypatch, LinedSpi)
+    monkeypatch.setattr(chip_ports, "ASK_S", 0.02)
+
+    async def play():
+        async with ears(radio) as host:
+            await host.until(Restarted)
+            buses[0].stuck = True
+            hint = await host.until(Hint)
+            assert "the interrupt line of /dev/spidev0.0 calls though" in hint.text
+            looks, begun_s = buses[0].looks, time.monotonic()
+            await asyncio.sleep(0.2)
+            assert buses[0].looks - looks <= (time.monotonic() - begun_s) / 0.02 + 1
+            hear(node, b"it is heard all the same")
+            assert (await host.until(Reception)).frame.startswith(b"it is heard")
+            buses[0].stuck = False
+            looks = buses[0].looks
+            async with asyncio.timeout(30):
+                while buses[0].looks < looks + 3:  # back to waiting for the line
+                    await asyncio.sleep(0.002)
+            buses[0].stuck = True
+            async with asyncio.timeout(30):
+                while radio.counters["irq-in-vain"] < 2:
+                    await asyncio.sleep(0.002)
+            assert len(host.of(Hint)) == 1
+            assert len(host.of(Restarted)) == 1
+
+    asyncio.run(play())
+
+
+def test_an_interrupt_line_that_picks_up_noise_is_told_and_does_not_make_the_program_spin(monkeypatch):
+    radio, _, buses = spi_radio(monkeypatch, LinedSpi)
+    monkeypatch.setattr(chip_ports, "ASK_S", 0.02)
+
+    async def play():
+        async with ears(radio) as host:
+            await host.until(Restarted)
+            buses[0].noisy = True
+            buses[0].rise()
+            await host.until(Hint)
+            looks, begun_s = buses[0].looks, time.monotonic()
+            await asyncio.sleep(0.2)
+            assert buses[0].looks - looks <= (time.monotonic() - begun_s) / 0.02 + 1
+            assert radio.counters["irq-in-vain"] == 1
+
+    asyncio.run(play())
+
+
+def test_an_interrupt_line_that_is_high_for_good_reason_is_not_called_stuck(monkeypatch):
+    radio, node, buses = spi_radio(monkeypatch, LinedSpi)
+
+    async def play():
+        async with ears(radio) as host:
+            await host.until(Restarted)
+            for number in range(3 * chip_ports.VAIN_WAKES):
+                hear(node, b"frame %d" % number)
+                buses[0].rise()
+                await host.until(Reception, number + 1)
+            assert not +radio.counters
+            assert host.of(Hint) == []
 
     asyncio.run(play())
 

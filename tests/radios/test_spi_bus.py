@@ -126,6 +126,13 @@ def test_the_interrupt_line_can_be_waited_for(log):
     assert log[-2:] == [("release",), ("close",)]
 
 
+def test_a_line_that_rises_faster_than_it_is_read_is_not_waited_for(log):
+    bus = SpiBus(0, 0, irq_pin=25)
+    bus._irq.edges = 10**9
+    bus.forget_edges()
+    assert bus._irq.edges > 10**9 - 100
+
+
 def test_without_an_interrupt_line_the_chip_is_always_asked(log):
     bus = SpiBus(0, 0)
     assert bus.fileno() is None

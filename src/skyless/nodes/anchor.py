@@ -10,7 +10,7 @@ from skyless.air.codec import decode_cached
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
 from skyless.constants import TICK_RATE_HZ
-from skyless.radios.radio import Gone, Late, Radio, RadioEvent, Restarted, Sent
+from skyless.radios.radio import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.site.model import Site
 from skyless.ticks import difference
 
@@ -75,6 +75,8 @@ class AnchorNode:
         elif isinstance(event, Gone):
             self._said(f"anchor {self.id}: {event.reason}; still looking for it")
             self._wait(None, self._plan)
+        elif isinstance(event, Hint):
+            self._said(f"anchor {self.id}: {event.text}")
 
     def _note(self, reception: Reception) -> None:
         beacon = decode_cached(reception.frame)

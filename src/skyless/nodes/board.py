@@ -6,7 +6,7 @@ from typing import Final, Literal
 from skyless.nodes.board_speech import LinkSpeech, ListenerSpeech, SnifferSpeech, Speech
 from skyless.nodes.pty import Pty
 from skyless.nodes.running import Say
-from skyless.radios.radio import Gone, Radio, RadioEvent, Restarted
+from skyless.radios.radio import Gone, Hint, Radio, RadioEvent, Restarted
 
 BoardFormat = Literal["link", "sniffer", "sniffer-text", "listener"]
 RADIO_OF: Final[dict[BoardFormat, str]] = {
@@ -48,4 +48,6 @@ class Board:
             self._say(f"board {self.radio.name}: on the air")
         elif isinstance(event, Gone):
             self._say(f"board {self.radio.name}: {event.reason}; still looking for it")
+        elif isinstance(event, Hint):
+            self._say(f"board {self.radio.name}: {event.text}")
         self.speech.hear_radio(event)

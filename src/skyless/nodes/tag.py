@@ -12,7 +12,7 @@ from skyless.nodes.pace import Pace
 from skyless.outputs.messages import FixMessage, Matrix, Vector
 from skyless.positioning.fix import Fix
 from skyless.positioning.protection import IntegrityRequirement
-from skyless.radios.radio import Gone, Radio, RadioEvent, Restarted
+from skyless.radios.radio import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.receiver import Receiver
 
 
@@ -80,6 +80,8 @@ class TagNode:
                 self.receiver = self.new_receiver()
         elif isinstance(event, Gone):
             self._said(f"tag {self.name}: {event.reason}; still looking for it")
+        elif isinstance(event, Hint):
+            self._said(f"tag {self.name}: {event.text}")
 
     def _receive(self, reception: Reception) -> None:
         if self._before is not None:

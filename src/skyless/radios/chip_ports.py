@@ -10,7 +10,7 @@ from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.errors import SkylessError
 from skyless.firmware.dw1000 import Bus, ChipError
 from skyless.radios.emulated import EmulatedRadio
-from skyless.radios.radio import AntennaDelays, Gone, RadioEvent, Restarted, Sent
+from skyless.radios.radio import AntennaDelays, Gone, Late, RadioEvent, Restarted, Sent
 from skyless.radios.spi_bus import SpiBus
 from skyless.simulation.dw1000.bus import ModelBus
 from skyless.simulation.dw1000.chip import Chip
@@ -26,7 +26,16 @@ LOOK_S: Final = 0.02
 ETHER_LEAD_TICKS: Final = PREAMBLE_TICKS + from_seconds(0.3e-3)
 """How long before its RMARKER the emulated air, and the way there, want a frame."""
 
+VAIN_WAKES: Final = 8
+"""After so many interrupts in a row for nothing the line does not tell the truth."""
+
 _SLEPT_S: Final = 100e-6
+
+
+_IN_VAIN: Final = (
+    "calls though the chip has nothing to tell: is irq= the right pin, the wire sound? "
+    "It is asked every 0.5 ms meanwhile"
+)
 
 
 class Port(Protocol):
@@ -42,8 +51,11 @@ class Served(Protocol):
     def begin(self, bus: Bus) -> None:
         """There is a chip, which is to be started; raises OSError and ChipError."""
 
-    def wake(self) -> None:
-        """Its interrupt line is high; raises OSError."""
+    def wake(self) -> bool:
+        """Its interrupt line is high; False when there was nothing for which it should be. Raises OSError."""
+
+    def remark(self, counter: str, text: str) -> None:
+        """Something is wrong with its wires: one more for this counter, and in words what to look at."""
 
     def end(self, reason: str) -> None:
         """It is out of reach."""
@@ -75,30 +87,42 @@ class SpiPort:
         """Follow the interrupt line; without one the chip is asked again and again."""
         served.begin(bus)
         loop, line = asyncio.get_running_loop(), bus.fileno()
-        risen = asyncio.Event()
-        if line is not None:
-            loop.add_reader(line, risen.set)
-        try:
+        if line is None:
             while True:
-                if line is None:
-                    await asyncio.sleep(ASK_S)
-                else:
-                    await _wait(risen, LOOK_S)
-                    bus.forget_edges()
-                    risen.clear()
+                await asyncio.sleep(ASK_S)
                 served.wake()
-                while line is not None and bus.is_raised():
-                    served.wake()
-                    await asyncio.sleep(0)
+        risen = asyncio.Event()
+        loop.add_reader(line, risen.set)
+        try:
+            await self._follow(bus, served, risen)
         finally:
-            if line is not None:
-                loop.remove_reader(line)
+            loop.remove_reader(line)
+
+    async def _follow(self, bus: SpiBus, served: Served, risen: asyncio.Event) -> None:
+        """Serve the chip when its line has risen and until it is low; one that calls for nothing is as good as none."""
+        vain = 0
+        while True:
+            called = await _is_set(risen, LOOK_S)
+            bus.forget_edges()
+            risen.clear()
+            while True:
+                vain = 0 if served.wake() or not called else vain + 1
+                if vain == VAIN_WAKES:
+                    served.remark("irq-in-vain", f"the interrupt line of {self._place} {_IN_VAIN}")
+                if vain >= VAIN_WAKES:
+                    await asyncio.sleep(ASK_S)
+                called = bus.is_raised()
+                if not called:
+                    break
+                await asyncio.sleep(0)
 
 
-async def _wait(event: asyncio.Event, seconds: float) -> None:
+async def _is_set(event: asyncio.Event, seconds: float) -> bool:
+    """Whether it was set within that time."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await event.wait()
+    return event.is_set()
 
 
 class ModelPort:
@@ -129,7 +153,7 @@ class ModelPort:
             chip.hear(event.frame, event.rx_ticks, event.diagnostics or Diagnostics())
         elif isinstance(event, Sent):
             chip.transceiver.finish()
-        else:
+        elif isinstance(event, Late):
             chip.transceiver.fail()
         if not isinstance(event, Gone) and chip.irq:
             try:

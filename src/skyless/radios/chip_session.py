@@ -21,6 +21,8 @@ class ChipSession:
         self.driver = DW1000(bus)
         self._delays, self._tell, self._counters = delays, tell, counters
         self._pending: int | None = None
+        self.idle = False
+        """Whether the chip had nothing to tell when it was last served."""
 
     def start(self) -> None:
         """Reset and configure the chip, and listen.
@@ -58,6 +60,7 @@ class ChipSession:
         """
         driver = self.driver
         events = driver.poll()
+        self.idle = events == 0
         if events & dw1000.LOST:
             self._counters["chip-lost"] += 1
             return False

@@ -10,7 +10,7 @@ from skyless.constants import TICK_S
 from skyless.firmware.dw1000 import Bus, ChipError
 from skyless.radios.chip_ports import Port
 from skyless.radios.chip_session import ChipSession
-from skyless.radios.radio import AntennaDelays, Gone, Late, Listener, RadioEvent, Restarted
+from skyless.radios.radio import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted
 from skyless.ticks import difference
 
 CARE_S: Final = 1.0
@@ -28,6 +28,7 @@ class Dw1000Radio:
         self._session: ChipSession | None = None
         self._told = ""
         self._heard = False
+        self._remarked: set[str] = set()
         self._trouble: Exception | None = None
         self._timer: asyncio.TimerHandle | None = None
 
@@ -92,14 +93,25 @@ class Dw1000Radio:
         self._session, self._told = session, ""
         self._listener(Restarted())
 
-    def wake(self) -> None:
-        """Take what it has to tell; start a chip again that has lost its settings. Raises OSError and ChipError."""
+    def wake(self) -> bool:
+        """Take what it has to tell, False for nothing; start a chip again that has lost its settings.
+
+        Raises OSError and ChipError.
+        """
         trouble, self._trouble = self._trouble, None
         if trouble is not None:
             raise trouble
         session = self._session
         if session is not None and not session.serve(time.monotonic()):
             self._revive(session)
+        return session is not None and not session.idle
+
+    def remark(self, counter: str, text: str) -> None:
+        """Count what is wrong with its wires, and say so once until the chip is started anew."""
+        self.counters[counter] += 1
+        if counter not in self._remarked:
+            self._remarked.add(counter)
+            self._listener(Hint(text))
 
     def _revive(self, session: ChipSession) -> None:
         self._lose("the DW1000 has lost its configuration; is its supply good?")

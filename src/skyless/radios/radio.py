@@ -39,7 +39,13 @@ class Gone(Struct, frozen=True, gc=False):
     reason: str
 
 
-RadioEvent = Reception | Sent | Late | Restarted | Gone
+class Hint(Struct, frozen=True):
+    """The radio goes on, but a person should look at something."""
+
+    text: str
+
+
+RadioEvent = Reception | Sent | Late | Restarted | Gone | Hint
 Listener = Callable[[RadioEvent], None]
 """Called from the event loop as soon as something happens; must return quickly and not raise."""
 

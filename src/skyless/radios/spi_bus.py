@@ -16,6 +16,8 @@ DEFAULT_FAST_HZ: Final = 8_000_000
 MAX_FAST_HZ: Final = 20_000_000
 """Wires of a hand's length carry some 8 MHz; the chip takes 20."""
 RESET_S: Final = 0.001
+MOST_EDGE_READS: Final = 8
+"""Each takes all that the kernel keeps; a line that rises faster than it is read is not waited for."""
 DEFAULT_CHIP: Final = "/dev/gpiochip0"
 
 
@@ -123,7 +125,9 @@ class SpiBus(Bus):
 
     def forget_edges(self) -> None:
         """Make ``fileno`` unreadable until the line rises again; look at ``is_raised`` after it."""
-        while self._irq is not None and self._irq.wait_edge_events(0):
+        for _ in range(MOST_EDGE_READS):
+            if self._irq is None or not self._irq.wait_edge_events(0):
+                return
             self._irq.read_edge_events()
 
     def close(self) -> None:
