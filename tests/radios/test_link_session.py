@@ -8,7 +8,7 @@ from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.firmware import link
 from skyless.radios.link_records import quantised
 from skyless.radios.link_session import PENDING, POLL_S, SILENCE_S, LinkSession
-from skyless.radios.radio import AntennaDelays, Gone, Late, Restarted, Sent
+from skyless.radios.radio import AntennaDelays, Gone, Hint, Late, Restarted, Sent
 
 DELAYS = AntennaDelays(16_450, 16_500)
 COUNTS = [7, 1, 3, 2, 0, 5]
@@ -272,7 +272,51 @@ def test_a_board_that_starts_anew_is_configured_again_and_its_numbers_begin_anew
     assert talk.session.clock.read(talk.now_s) == 1000
     talk.say(talk.board.tx_done(stamp(T0 & ~0x1FF), stamp(tx_ticks)))  # of its former life
     assert talk.told == [Restarted(), Restarted()]
-    assert not +talk.counters
+    assert talk.counters == {"board-restart": 1}
+
+
+def test_a_board_that_starts_again_and_again_is_counted_and_told_once():
+    """It falls over its configuration each time, is never ready, and is never silent."""
+    talk = Talk()
+    talk.hello()
+    for _ in range(6):
+        talk.poll(2.0)
+        talk.board = link.Writer()
+        talk.hello()
+        talk.status(0)
+    (hint,) = talk.told
+    assert isinstance(hint, Hint)
+    assert "the board at /dev/board starts again and again (3 times within 4 s)" in hint.text
+    assert talk.counters == {"board-restart": 6}
+
+
+def test_a_board_that_works_and_starts_again_now_and_then_is_counted_and_said_nothing_of():
+    talk = Talk().ready()
+    for _ in range(5):
+        for _ in range(31):
+            talk.poll(1.0)
+            talk.status()
+        talk.board = link.Writer()
+        talk.hello()
+        talk.status(0)
+        talk.status()
+    assert talk.told == [Restarted()] * 6
+    assert talk.counters == {"board-restart": 5}
+
+
+def test_a_loop_that_comes_back_after_a_calm_time_is_told_again():
+    talk = Talk().ready()
+    for calm_s in (0, 90):
+        for _ in range(calm_s):
+            talk.poll(1.0)
+            talk.status()
+        for _ in range(4):
+            talk.poll(2.0)
+            talk.board = link.Writer()
+            talk.hello()
+            talk.status(0)
+            talk.status()
+    assert sum(isinstance(event, Hint) for event in talk.told) == 2
 
 
 def test_a_second_answer_to_hello_changes_nothing():

@@ -1,6 +1,6 @@
 """One conversation with a board over the serial link, from HELLO on (``docs/serial.md``). No I/O, no clock."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
 
@@ -8,13 +8,19 @@ from skyless.air.reception import Reception, Transmission
 from skyless.firmware import link
 from skyless.radios.board_clock import BoardClock
 from skyless.radios.link_records import Done, Heard, Hello, NotDone, Record, Status, TooLate, decode
-from skyless.radios.radio import AntennaDelays, Gone, Late, Listener, Restarted, Sent
+from skyless.radios.radio import AntennaDelays, Gone, Hint, Late, Listener, Restarted, Sent
 from skyless.ticks import wrap
 
 POLL_S: Final = 0.5
 SILENCE_S: Final = 3.0
 PENDING: Final = 16
 """Frames whose end the board has not told; a board holds one, so of older ones the answer was lost on the line."""
+
+ANSWER_S: Final = 1.0
+"""A HELLO that comes so long after it was asked for was not asked for: the board has started."""
+STARTS: Final = 3
+STARTS_S: Final = 60.0
+"""A board that starts so often within so long does not start because somebody wants it to."""
 
 _REASONS: Final = {
     link.REFUSED_SETTING: "it has not these settings",
@@ -49,25 +55,31 @@ class LinkSession:
         self._bytes = 0
         self._refused = self._told = ""
         self._transmits = transmits
-        self._heard_s = 0.0
+        self._heard_s = self._asked_s = 0.0
+        self._starts: deque[float] = deque(maxlen=STARTS)
+        self._told_starts = False
 
     def begin(self, host_s: float) -> None:
         """Say the first words."""
         self._heard_s = host_s
         self._send(b"\0")
-        self._say(self._writer.ask(link.ASK_HELLO))
+        self._ask_hello(host_s)
 
     def poll(self, host_s: float) -> str | None:
         """To be called every ``POLL_S``; tells why the board is to be given up, None while it is not."""
         if host_s - self._heard_s > SILENCE_S:
             return self._silence()
         if self.hello is None or self._refused:
-            self._say(self._writer.ask(link.ASK_HELLO))
+            self._ask_hello(host_s)
         elif self.ready:
             self._say(self._writer.ask(link.ASK_STATUS))
         else:
             self._configure()
         return None
+
+    def _ask_hello(self, host_s: float) -> None:
+        self._asked_s = host_s
+        self._say(self._writer.ask(link.ASK_HELLO))
 
     def _silence(self) -> str:
         if self.hello is not None:
@@ -141,7 +153,7 @@ class LinkSession:
         elif isinstance(record, Status):
             self._learn(record, host_s)
         elif isinstance(record, Hello):
-            self._greet(record)
+            self._greet(record, host_s)
         else:
             self._complain(record)
 
@@ -153,8 +165,10 @@ class LinkSession:
             self.counters["sent-at-another-time"] += 1
         self._tell(Sent(tx_ticks))
 
-    def _greet(self, hello: Hello) -> None:
+    def _greet(self, hello: Hello, host_s: float) -> None:
         """Configure a board of this version; one that has greeted before may have started anew, its state will tell."""
+        if self.hello is not None and host_s - self._asked_s > ANSWER_S:
+            self._note_start(host_s)
         greeted, self.hello = self.hello is not None and not self._refused, hello
         if hello.major != link.MAJOR:
             self._refuse(
@@ -174,6 +188,19 @@ class LinkSession:
                 self._say(self._writer.ask(link.ASK_STATUS))
             else:
                 self._configure()
+
+    def _note_start(self, host_s: float) -> None:
+        """Count that the board has started anew, and say so once when it does again and again."""
+        self.counters["board-restart"] += 1
+        starts = self._starts
+        if starts and host_s - starts[-1] > STARTS_S:
+            self._told_starts = False
+        starts.append(host_s)
+        within_s = host_s - starts[0]
+        if len(starts) == STARTS and within_s <= STARTS_S and not self._told_starts:
+            self._told_starts = True
+            often = f"starts again and again ({STARTS} times within {within_s:.0f} s)"
+            self._tell(Hint(f"the board at {self._place} {often}: is its supply good, does its firmware fail?"))
 
     def _refuse(self, reason: str) -> None:
         """Each reason is told once until the board is ready, for one that is asked again refuses again."""
@@ -201,6 +228,10 @@ class LinkSession:
             return
         if not status.receiving:
             if self.ready:  # it has started anew
+                if (
+                    not self._starts or host_s - self._starts[-1] > ANSWER_S
+                ):  # and its HELLO was lost, or taken for an answer
+                    self._note_start(host_s)
                 self._lose()
                 self._configure()
             return
