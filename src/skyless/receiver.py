@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skyless.air.almanac_book import AlmanacBook
 from skyless.air.beacon import Beacon, Heard
 from skyless.air.claim import claim_of
-from skyless.air.codec import decode_cached
+from skyless.air.codec import decode_cached, packed_relays
 from skyless.air.followed_master import FollowedMaster
 from skyless.air.malformed import Malformed
 from skyless.air.reception import Diagnostics, Reception
@@ -132,8 +132,9 @@ class Receiver:
         if self._method is None or self._schedule is None or anchor_m is None:
             self.reason = NoFixReason.NO_ALMANAC
             return None
-        factor = _trust(reception.diagnostics)
-        result = self._method.hear(self._observation(beacon, self._schedule, anchor_m, rx_ticks, tx_ticks, factor))
+        frame, factor = reception.frame, _trust(reception.diagnostics)
+        told = self._observation(frame, beacon, self._schedule, anchor_m, rx_ticks, tx_ticks, factor)
+        result = self._method.hear(told)
         if isinstance(result, Fix):
             self.counters["fixes"] += 1
             return result
@@ -259,6 +260,7 @@ class Receiver:
 
     def _observation(
         self,
+        frame: bytes,
         beacon: Beacon,
         schedule: Schedule,
         anchor_m: NDArray[np.float64],
@@ -286,10 +288,11 @@ class Receiver:
             ticks_master,
             fraction,
             variance_m2,
-            _relays(beacon, tx_ticks) if joint else (),
+            (),
             claim_of(beacon) if joint and ticks_master is not None else None,
             sync_variance_m2,
             rx_variance_factor,
+            packed_relays(frame, beacon) if joint else b"",
         )
 
     def _repeats(self, anchor: int, heard: Heard) -> int:
@@ -340,10 +343,3 @@ class Receiver:
 def _trust(told: Diagnostics | None) -> float:
     """Factor on the variance of a reception by what the radio told of it."""
     return 1.0 if told is None else variance_factor(told.rx_power_dbm, told.first_path_power_dbm)
-
-
-def _relays(beacon: Beacon, tx_ticks: int) -> tuple[tuple[int, int, int], ...]:
-    """When the anchor heard others, as observations have it."""
-    heard = beacon.heard if beacon.master_heard is None else (beacon.master_heard, *beacon.heard)
-    least = tx_ticks - HALF_WRAP_TICKS
-    return tuple([(one.anchor, one.sequence, least + ((one.rx_ticks - least) & TICK_MASK)) for one in heard])

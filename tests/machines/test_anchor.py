@@ -164,7 +164,7 @@ def test_what_is_heard_is_relayed():
             assert {e.anchor: (e.sequence, e.rx_ticks) for e in beacon.heard} == {
                 anchor: stamp for anchor, stamp in expected.items() if anchor != 1
             }
-            assert beacon.heard[0].anchor == (6 if beacon.anchor == 2 else beacon.anchor - 1)
+            assert next(iter(beacon.heard)).anchor == (6 if beacon.anchor == 2 else beacon.anchor - 1)
 
 
 def test_all_pages_come_around():

@@ -1,8 +1,15 @@
 """The beacon: what every anchor broadcasts in its slots (``docs/protocol.md``)."""
 
+import struct
+from collections.abc import Iterator
+from typing import Final
+
 from msgspec import Struct
 
 from skyless.air.almanac import Page
+
+HEARD: Final = struct.Struct("<HBIB")
+"""One ``heard`` entry in a frame: anchor, sequence number, low word and high byte of the RX stamp."""
 
 
 class Heard(Struct, frozen=True, gc=False):
@@ -14,6 +21,28 @@ class Heard(Struct, frozen=True, gc=False):
     """Sequence number (8 bits) of the frame that was heard."""
     rx_ticks: int
     """RX stamp in the relaying anchor's clock, 40 bits."""
+
+
+class PackedHeard(Struct, frozen=True, gc=False, eq=False):
+    """``heard`` entries as they stand in a frame, taken apart when looked at; equal to a tuple of them."""
+
+    packed: bytes
+
+    def __len__(self) -> int:
+        return len(self.packed) // HEARD.size
+
+    def __iter__(self) -> Iterator[Heard]:
+        for anchor, sequence, low, high in HEARD.iter_unpack(self.packed):
+            yield Heard(anchor, sequence, low | high << 32)
+
+    def __contains__(self, entry: object) -> bool:
+        return entry in tuple(self)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, tuple | PackedHeard) and tuple(self) == tuple(other)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self))
 
 
 class MasterTime(Struct, frozen=True, gc=False):
@@ -50,7 +79,7 @@ class Beacon(Struct, frozen=True, gc=False):
     """The last master beacon that this anchor heard (raw stamp), None for the master or when none was heard."""
     master_time: MasterTime | None
     """None until the sender's clock is known against the master; exact (std 0) for the master itself."""
-    heard: tuple[Heard, ...]
+    heard: tuple[Heard, ...] | PackedHeard
     """The other anchors, the master excluded, in the order of the most recent first; as many as fit."""
     page: Page | None
     """One page of the almanac."""

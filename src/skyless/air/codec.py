@@ -6,11 +6,12 @@ a high byte, 48-bit ones as a low word and a high half-word.
 
 import math
 import struct
+from collections.abc import Collection
 from functools import lru_cache
 from operator import index
 from typing import Final, SupportsIndex
 
-from skyless.air.beacon import Beacon, Heard, MasterTime
+from skyless.air.beacon import HEARD, Beacon, Heard, MasterTime, PackedHeard
 from skyless.air.fcs import fcs, is_intact
 from skyless.air.malformed import Malformed
 from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
@@ -40,7 +41,6 @@ _FIXED: Final = struct.Struct("<HBHHHHBIBIBBHB")
 _START: Final = struct.Struct("<HBHHHH")
 _STAMP: Final = struct.Struct("<BIB")
 _TIME: Final = struct.Struct("<IHH")
-_HEARD: Final = struct.Struct("<HBIB")
 _FCS_BYTES: Final = 2
 _SHORTEST_MAC_FRAME_BYTES: Final = 5
 
@@ -61,8 +61,11 @@ def _bare_bytes(flags: int) -> int:
 _BARE_BYTES: Final = tuple(_bare_bytes(flags) for flags in range(16))
 _COUNT_AT: Final = tuple(_bare_bytes(flags & (_HAS_MASTER_HEARD | _HAS_MASTER_TIME)) - 3 for flags in range(16))
 _CAPACITY: Final = tuple(
-    (MAX_FRAME_BYTES - _bare_bytes(flags | _HAS_AUTHENTICATION)) // _HEARD.size for flags in range(16)
+    (MAX_FRAME_BYTES - _bare_bytes(flags | _HAS_AUTHENTICATION)) // HEARD.size for flags in range(16)
 )
+_HEARD_ANCHORS: Final = tuple(struct.Struct("<" + count * "H6x") for count in range(MAX_FRAME_BYTES // HEARD.size))
+"""The anchors alone of so many ``heard`` entries."""
+_MASTER_AT: Final = _FIXED.size - 3
 
 
 def heard_capacity(master_heard: bool, master_time: bool, page: bool) -> int:
@@ -124,23 +127,34 @@ def _decode_version_1(frame: bytes) -> Beacon | Malformed:
         return _foreign(frame)
     if flags & _RESERVED_FLAGS:
         return Malformed.BAD_FLAGS
-    heard_bytes = len(frame) - _BARE_BYTES[flags]
-    count_at = _COUNT_AT[flags]
-    if heard_bytes < 0 or heard_bytes != frame[count_at] * _HEARD.size:
+    heard_bytes, count_at = len(frame) - _BARE_BYTES[flags], _COUNT_AT[flags]
+    count = heard_bytes // HEARD.size
+    if heard_bytes < 0 or heard_bytes != frame[count_at] * HEARD.size:
         return Malformed.BAD_LENGTH
-    master_heard = _master_heard(frame, master) if flags & _HAS_MASTER_HEARD else None
+    relays_master, is_master = flags & _HAS_MASTER_HEARD, anchor == master
+    told = {anchor, master, *_HEARD_ANCHORS[count].unpack_from(frame, count_at + 1)}
+    if len(told) + is_master != count + 2 or (relays_master and is_master):
+        return Malformed.BAD_HEARD
+    master_heard = _master_heard(frame, master) if relays_master else None
     master_time = _master_time(frame, count_at - _TIME.size) if flags & _HAS_MASTER_TIME else None
     page_at = count_at + 1 + heard_bytes
-    heard = _heard(frame[count_at + 1 : page_at])
-    if _heard_fault(anchor, master, master_heard, heard):
-        return Malformed.BAD_HEARD
     page = decode_page(frame[page_at : page_at + PAGE_BYTES]) if flags & _HAS_PAGE else None
     if isinstance(page, Malformed):
         return page
     return Beacon(
         site, anchor, sequence, superframe, slot, tx_low | tx_high << 32, issue, master, term,
-        master_heard, master_time, heard, page,
+        master_heard, master_time, PackedHeard(frame[count_at + 1 : page_at]), page,
     )  # fmt: skip
+
+
+def packed_relays(frame: bytes, beacon: Beacon) -> bytes:
+    """All receptions that a beacon tells, ``HEARD`` after ``HEARD``, the master's first; ``frame`` is its bytes."""
+    heard = beacon.heard
+    assert isinstance(heard, PackedHeard)
+    if beacon.master_heard is None:
+        return heard.packed
+    stamp_at = _FIXED.size
+    return frame[_MASTER_AT : _MASTER_AT + 2] + frame[stamp_at : stamp_at + _STAMP.size] + heard.packed
 
 
 def _master_heard(frame: bytes, master: int) -> Heard:
@@ -153,13 +167,7 @@ def _master_time(frame: bytes, at: int) -> MasterTime:
     return MasterTime(low | high << 32, std_steps / STD_STEPS_PER_TICK)
 
 
-def _heard(entries: bytes) -> tuple[Heard, ...]:
-    return tuple(
-        [Heard(anchor, sequence, low | high << 32) for anchor, sequence, low, high in _HEARD.iter_unpack(entries)]
-    )
-
-
-def _heard_fault(anchor: int, master: int, master_heard: Heard | None, heard: tuple[Heard, ...]) -> str | None:
+def _heard_fault(anchor: int, master: int, master_heard: Heard | None, heard: Collection[Heard]) -> str | None:
     """What is impossible among the stamps that a beacon relays, None if nothing is."""
     if master_heard is not None and (anchor == master or master_heard.anchor != master):
         return (
@@ -191,7 +199,7 @@ def _body(beacon: Beacon) -> bytes:
     if master_time is not None:
         parts.append(_TIME.pack(*_split(master_time.tx_subticks_master), _std_steps(master_time.std_ticks)))
     parts.append(bytes((len(beacon.heard),)))
-    parts += [_HEARD.pack(entry.anchor, entry.sequence, *_split(entry.rx_ticks)) for entry in beacon.heard]
+    parts += [HEARD.pack(entry.anchor, entry.sequence, *_split(entry.rx_ticks)) for entry in beacon.heard]
     if page is not None:
         parts.append(encode_page(page))
     return b"".join(parts)

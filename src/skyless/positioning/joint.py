@@ -12,8 +12,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from skyless.air.beacon import HEARD
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.positioning.joint_hearing import FULL, JOINED, joint_motion, joint_step, joint_track
+from skyless.positioning.joint_hearing import FULL, JOINED, joint_motion, joint_track
 from skyless.positioning.joint_monitor import PATIENCE
 from skyless.positioning.joint_state import (
     BASE,
@@ -43,6 +44,7 @@ from skyless.positioning.joint_state import (
     states,
     values,
 )
+from skyless.positioning.joint_step import MOST_PACKED, PACKET, joint_step
 from skyless.positioning.joint_sync import NO_SYNCS
 from skyless.positioning.joint_time import move_base
 from skyless.positioning.kalman import horizontal_variance
@@ -118,13 +120,12 @@ class Messages(Struct, frozen=True):
     """What each packet's anchor says of its clock, as ``joint_hear`` takes it, shape (n, 3), or (0, 3) for nothing."""
 
 
+LAST_NAME: Final = 0xFFFF
+
 NO_RELAYS: Final = np.empty((0, 4), np.int64)
 
 
-MOST_RELAYS: Final = 16
-"""In a packet, for a start."""
-
-
+_pack_packet: Final[Callable[..., None]] = PACKET.pack_into
 _pack_sync: Final[Callable[..., None]] = struct.Struct("3d").pack_into
 
 
@@ -146,17 +147,21 @@ class JointFilter:
         self._covariance = np.zeros((2 * self.dim, 2 * self.dim))
         self._limits = limits_of(settings.integrity_risk)
         self._levels = np.zeros(LEVELS)
-        self._relays = np.zeros((MOST_RELAYS, 4), np.int64)
+        self._names = np.full(len(self.arrays.site_m), -1)
+        self._packet = np.zeros(PACKET.size // 8, np.int64)
+        self._relays = np.zeros((MOST_PACKED, 4), np.int64)
         self._sync = np.zeros((1, 3))
         self.rows = np.zeros((MOTION_ROWS, 3))
         """What ``fill_motion`` has written of the last packet that ``hear`` took."""
 
-    def add_anchor(self, anchor_m: Vector) -> int:
-        """Add an anchor to the table; returns its place there."""
+    def add_anchor(self, anchor_m: Vector, name: int = -1) -> int:
+        """Add an anchor to the table; returns its place there. ``name``: by which packed relays call it, 16 bits."""
         place, s = self._anchors, self.arrays
         if place == len(s.site_m):
             self.arrays = s = extended(s, len(s.slots), 2 * place)
+            self._names = np.append(self._names, np.full(place, -1))
         s.site_m[place] = anchor_m
+        self._names[place] = name if 0 <= name <= LAST_NAME else -1
         self._anchors += 1
         return place
 
@@ -204,7 +209,8 @@ class JointFilter:
 
         ``variance_factor``: on the variance of the tag's reception of it, not of those that it relays.
         """
-        return self._hear((site, sequence, rx_ticks, tx_ticks, relays, len(relays), syncs), variance_factor)
+        _pack_packet(self._packet, 0, site, sequence, rx_ticks, tx_ticks, len(relays), 0, b"")
+        return self._hear(site, relays, syncs, variance_factor)
 
     def hear_listed(
         self,
@@ -213,35 +219,43 @@ class JointFilter:
         rx_ticks: int,
         tx_ticks: int,
         relays: list[int],
+        packed: bytes = b"",
         sync: tuple[float, float, float] | None = None,
         variance_factor: float = 1.0,
     ) -> int:
-        """As ``hear``, rows of relays one after the other in a list: that spares an array for each packet."""
-        count = len(relays)
-        if count > self._relays.size:
-            self._relays = np.zeros((count // 4, 4), np.int64)
-        _packing(count)(self._relays, 0, *relays)
+        """As ``hear``, rows of relays one after the other in a list, or packed: that spares an array for each packet.
+
+        ``packed`` has the relays as frames carry them (``codec.packed_relays``), anchors by the names that
+        ``add_anchor`` was given.
+        """
+        count = len(relays) // 4
+        if relays:
+            if count + MOST_PACKED > len(self._relays):
+                self._relays = np.zeros((count + MOST_PACKED, 4), np.int64)
+            _packing(len(relays))(self._relays, 0, *relays)
         if sync is not None:
             _pack_sync(self._sync, 0, *sync)
-        syncs = NO_SYNCS if sync is None else self._sync
-        return self._hear((site, sequence, rx_ticks, tx_ticks, self._relays, count // 4, syncs), variance_factor)
+        _pack_packet(self._packet, 0, site, sequence, rx_ticks, tx_ticks, count, len(packed) // HEARD.size, packed)
+        return self._hear(site, self._relays, NO_SYNCS if sync is None else self._sync, variance_factor)
 
-    def _hear(self, packet: tuple[int, int, int, int, Integers, int, Matrix], variance_factor: float) -> int:
+    def _hear(self, site: int, relays: Integers, syncs: Matrix, variance_factor: float) -> int:
+        """Take the packet that stands in ``_packet``."""
         if variance_factor == 1.0:
-            return self._step(packet)
-        self._weigh(packet[0], variance_factor)
-        status = self._step(packet)
-        self._weigh(packet[0], 1.0)
+            return self._step(relays, syncs)
+        self._weigh(site, variance_factor)
+        status = self._step(relays, syncs)
+        self._weigh(site, 1.0)
         if status == JOINED:
-            self._doubt(packet[0], variance_factor)
+            self._doubt(site, variance_factor)
         return status
 
-    def _step(self, packet: tuple[int, int, int, int, Integers, int, Matrix]) -> int:
+    def _step(self, relays: Integers, syncs: Matrix) -> int:
+        told = (self._packet, relays, self._names, syncs)
         outcome = (self._motion, self._covariance, self.rows, self._limits, self._levels)
-        status = joint_step(*self.arrays, *packet, *outcome)
+        status = joint_step(*self.arrays, *told, *outcome)
         if status == FULL:
             self._extend()
-            status = joint_step(*self.arrays, *packet, *outcome)
+            status = joint_step(*self.arrays, *told, *outcome)
         return status
 
     def _weigh(self, site: int, variance_factor: float) -> None:

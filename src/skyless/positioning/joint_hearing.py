@@ -11,7 +11,6 @@ from skyless.positioning.joint_state import (
     DIM,
     DROP_S,
     EPOCH,
-    HEIGHT,
     IMPOSSIBLE,
     IN_ROW,
     JUMPS,
@@ -47,10 +46,8 @@ from skyless.positioning.joint_state import (
 from skyless.positioning.joint_sync import SYNC_VARIANCE, hear_sync
 from skyless.positioning.joint_time import elapse
 from skyless.positioning.joint_updates import hear_anchor, hear_relay, join, new_packet
-from skyless.positioning.motion_rows import fill_motion
-from skyless.positioning.protection_levels import RELAYS_OFF, protect
+from skyless.positioning.protection_levels import RELAYS_OFF
 from skyless.positioning.protection_updates import unsettle
-from skyless.positioning.tracker import CHI2
 
 FULL, REJECTED, ACCEPTED, JOINED, STALE_PACKET = range(-1, 4)
 """What became of a packet: no room for its anchor, not used, taken, the first of its anchor, older than the newest."""
@@ -225,75 +222,6 @@ def joint_motion(s: JointArrays, x: Vector, P: Matrix) -> None:
             P[one, dim + other] = cross
             P[dim + other, one] = cross
             P[dim + one, dim + other] = rate
-
-
-@borrowing_kernel
-def joint_step(
-    x: Vector,
-    P: Matrix,
-    terms: Matrix,
-    along: Vector,
-    noise: Vector,
-    h_places: Integers,
-    h: Vector,
-    counts: Integers,
-    statistics: Vector,
-    slots: Integers,
-    anchors: Matrix,
-    packets: Integers,
-    relayed: Integers,
-    slot_of: Integers,
-    settings: Vector,
-    site_m: Matrix,
-    sensitivities: Matrix,
-    responses: Matrix,
-    evidence: Matrix,
-    recent: Vector,
-    site: int,
-    number: int,
-    rx_ticks: int,
-    tx_ticks: int,
-    relays: Integers,
-    count: int,
-    syncs: Matrix,
-    motion: Vector,
-    covariance: Matrix,
-    rows: Matrix,
-    limits: Vector,
-    levels: Vector,
-) -> int:
-    """``joint_hear``, ``joint_motion``, ``fill_motion`` and ``protect`` in one call from Python.
-
-    The fields of ``JointArrays`` come one by one: a tuple of them would take Numba twice as long to look at. ``number``
-    is the packet's sequence number; the first ``count`` rows of ``relays`` count.
-    """
-    s = JointArrays(
-        x,
-        P,
-        terms,
-        along,
-        noise,
-        h_places,
-        h,
-        counts,
-        statistics,
-        slots,
-        anchors,
-        packets,
-        relayed,
-        slot_of,
-        settings,
-        site_m,
-        sensitivities,
-        responses,
-        evidence,
-        recent,
-    )
-    status = joint_hear(s, site, number, rx_ticks, tx_ticks, relays, 0, count, syncs, 0)
-    joint_motion(s, motion, covariance)
-    fill_motion(rows, motion, covariance, int(s.settings[DIM]), s.statistics[CHI2], s.settings[HEIGHT])
-    protect(s, covariance, limits, levels)
-    return status
 
 
 @borrowing_kernel

@@ -17,6 +17,7 @@ from skyless.positioning.joint_state import (
     JointArrays,
     new_arrays,
 )
+from skyless.positioning.joint_step import MOST_PACKED, PACKET
 from skyless.positioning.motion_rows import MOTION_ROWS
 from skyless.positioning.protection_levels import LEVELS, LIMITS
 
@@ -44,12 +45,17 @@ def _exchanged(joint: JointFilter) -> bool:
     own, n = vars(joint), 2 * joint.dim
     relays, shapes = own["_relays"], {"_limits": (LIMITS,), "_levels": (LEVELS,), "_sync": (1, 3)}
     shapes |= {"rows": (MOTION_ROWS, 3), "_motion": (n,), "_covariance": (n, n)}
-    if not all(isinstance(own[name], np.ndarray) for name in ("_relays", *shapes)):
+    integers: dict[str, tuple[int, ...]] = {"_names": (len(joint.arrays.site_m),), "_packet": (PACKET.size // 8,)}
+    if not isinstance(relays, np.ndarray) or relays.ndim != 2 or len(relays) < MOST_PACKED:
         return False
-    if relays.dtype != np.int64 or relays.ndim != 2 or relays.shape[1] != 4 or not relays.flags.c_contiguous:
-        return False
-    kept = ((own[name], shape) for name, shape in shapes.items())
-    return all(a.shape == shape and a.dtype == np.float64 and a.flags.c_contiguous for a, shape in kept)
+    integers["_relays"] = (len(relays), 4)
+    return all(_is_array(own[name], shape, np.float64) for name, shape in shapes.items()) and all(
+        _is_array(own[name], shape, np.int64) for name, shape in integers.items()
+    )
+
+
+def _is_array(value: object, shape: tuple[int, ...], kind: type) -> bool:
+    return isinstance(value, np.ndarray) and value.shape == shape and value.dtype == kind and value.flags.c_contiguous
 
 
 def _counts(s: JointArrays) -> bool:

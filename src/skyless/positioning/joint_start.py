@@ -59,7 +59,7 @@ class JointStart(Acquisition):
 
     def learn(self, observation: Observation) -> None:
         """Keep what an anchor relays; to be called before ``hear``."""
-        for anchor, sequence, rx_ticks in observation.relays:
+        for anchor, sequence, rx_ticks in observation.all_relays():
             for packet in self._heard.get(anchor, ()):
                 if packet.sequence == sequence:
                     range_ticks = float(np.linalg.norm(observation.anchor_m - packet.anchor_m)) / TICK_M

@@ -36,6 +36,8 @@ CAUTION_M2: Final = 1.0
 REORDERED_S: Final = 0.1
 """Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
 
+NOTHING: Final[list[int]] = []
+
 
 class JointTracking:
     """One tag's joint filter from the first beacon on."""
@@ -155,13 +157,21 @@ class JointTracking:
 
     def _take(self, observation: Observation) -> int:
         place = self._place(observation)
+        packet = (place, observation.sequence, observation.rx_ticks_tag, observation.tx_ticks_anchor)
+        relays = self._listed(place, observation) if observation.relays else NOTHING
+        sync = self._sync(observation)
+        return self._filter.hear_listed(
+            *packet, relays, observation.packed_relays, sync, observation.rx_variance_factor
+        )
+
+    def _listed(self, place: int, observation: Observation) -> list[int]:
+        """Relays of anchors that are known, as the filter takes them."""
         flat: list[int] = []
         for anchor, sequence, rx_ticks in observation.relays:
             heard = self._place_of.get(anchor)
             if heard is not None:
                 flat += (place, heard, sequence, rx_ticks)
-        packet = (place, observation.sequence, observation.rx_ticks_tag, observation.tx_ticks_anchor)
-        return self._filter.hear_listed(*packet, flat, self._sync(observation), observation.rx_variance_factor)
+        return flat
 
     def _sync(self, observation: Observation) -> tuple[float, float, float] | None:
         """What the anchor says of its clock against the master's, as the filter takes it."""
@@ -178,7 +188,7 @@ class JointTracking:
         if self._known_m.get(anchor) is not anchor_m:
             place = self._place_of.get(anchor)
             if place is None:
-                self._place_of[anchor] = self._filter.add_anchor(anchor_m)
+                self._place_of[anchor] = self._filter.add_anchor(anchor_m, anchor)
             else:
                 self._filter.move_anchor(place, anchor_m)
             self._known_m[anchor] = anchor_m

@@ -1,13 +1,16 @@
 """One beacon as the positioning methods see it: every stamp unwrapped on its own clock."""
 
+from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from skyless.air.beacon import HEARD
 from skyless.air.claim import Claim
 from skyless.positioning.fix import Fix, NoFixReason
+from skyless.ticks import nearest
 
 
 class Observation(Struct, frozen=True, gc=False):
@@ -38,6 +41,14 @@ class Observation(Struct, frozen=True, gc=False):
     """... what the anchor itself says of its variance."""
     rx_variance_factor: float = 1.0
     """On the variance of this reception, at least 1: what the radio's diagnostics say (``first_path``); for filters."""
+    packed_relays: bytes = b""
+    """Relays beside ``relays``, as frames carry them (``codec.packed_relays``)."""
+
+    def all_relays(self) -> Iterator[tuple[int, int, int]]:
+        """``relays`` and ``packed_relays``."""
+        yield from self.relays
+        for anchor, sequence, low, high in HEARD.iter_unpack(self.packed_relays):
+            yield anchor, sequence, nearest(low | high << 32, self.tx_ticks_anchor)
 
 
 class Method(Protocol):
