@@ -63,6 +63,9 @@ class FakeRadio:
         self.listener = listener
         await asyncio.Event().wait()
 
+    def advice(self):
+        return "the radio says where to look"
+
     def now_ticks(self):
         if not self.ready:
             return None

@@ -8,6 +8,7 @@ import resource
 import signal
 import sys
 import time
+from collections import Counter
 
 import pytest
 from mqtt_brokers import MOSQUITTO, Embedded, Mosquitto, until
@@ -34,7 +35,7 @@ class TapeRadio:
 
     def __init__(self, name, position):
         self.name = name
-        self.counters = {}
+        self.counters = Counter()
         self._tape = tape(LAB, SECONDS, 1, position)
 
     async def run(self, listener):
@@ -45,6 +46,9 @@ class TapeRadio:
                 await asyncio.sleep(wait_s)
             listener(Reception(heard.frame, heard.rx_ticks, time.monotonic()))
         await asyncio.sleep(3600.0)
+
+    def advice(self):
+        return "the tape has ended"
 
     def now_ticks(self):
         return None

@@ -319,6 +319,13 @@ def test_a_loop_that_comes_back_after_a_calm_time_is_told_again():
     assert sum(isinstance(event, Hint) for event in talk.told) == 2
 
 
+def test_receptions_with_errors_that_the_board_tells_of_are_counted_since_the_first_status():
+    talk = Talk().ready()
+    for errors in (1, 5, 9, 2):  # the last one after a start
+        talk.say(talk.board.status(stamp(T0), ON, [7, errors, 0, 0, 0, 0], 2150, 3300))
+    assert talk.counters == {"rx-error": 8}
+
+
 def test_a_second_answer_to_hello_changes_nothing():
     talk = Talk().ready()
     talk.hello()

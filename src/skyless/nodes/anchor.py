@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
@@ -10,6 +11,7 @@ from skyless.air.codec import decode_cached
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
 from skyless.constants import TICK_RATE_HZ
+from skyless.nodes.hearing import Hearing
 from skyless.radios.radio import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.site.model import Site
 from skyless.ticks import difference
@@ -27,6 +29,8 @@ ASK_AGAIN_S: Final = 5e-3
 LOST_ANSWER_S: Final = 0.25
 """A radio that has not said for so long what became of a frame will not say it any more."""
 
+_NOT_DROPS: Final = frozenset({"heard", "sent", "takeover"})
+
 
 class AnchorNode:
     """Runs ``Anchor`` on a radio. ``said`` is told in words what a person should know."""
@@ -42,6 +46,8 @@ class AnchorNode:
         self.heard_s: dict[int, float] = {}
         """When each other anchor was last heard, by the host's monotonic clock."""
         self._said = said
+        self._came = 0
+        self._hearing = Hearing(f"anchor {self.id}", said, radio.advice)
         self._timer: asyncio.TimerHandle | None = None
 
     def _new_machine(self) -> Anchor:
@@ -58,6 +64,7 @@ class AnchorNode:
     def hear(self, event: RadioEvent) -> None:
         """Take what the radio tells."""
         if isinstance(event, Reception):
+            self._came += 1
             self.machine.hear(event)
             self._note(event)
         elif isinstance(event, Sent):
@@ -69,14 +76,22 @@ class AnchorNode:
             self._wait(ASK_AGAIN_S, self._plan)
         elif isinstance(event, Restarted):
             self.restarts += 1
+            self._hearing.begin()
             self._said(f"anchor {self.id}: on the air" + (" again" if self.restarts > 1 else ""))
             self.machine = self._new_machine()
             self._plan()
         elif isinstance(event, Gone):
+            self._hearing.end()
             self._said(f"anchor {self.id}: {event.reason}; still looking for it")
             self._wait(None, self._plan)
         elif isinstance(event, Hint):
             self._said(f"anchor {self.id}: {event.text}")
+
+    def look(self, now_s: float) -> None:
+        """Say where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
+        counters = self.machine.counters
+        drops = Counter({reason: count for reason, count in counters.items() if reason not in _NOT_DROPS})
+        self._hearing.look(now_s, self._came, counters["heard"], drops + self.radio.counters)
 
     def _note(self, reception: Reception) -> None:
         beacon = decode_cached(reception.frame)

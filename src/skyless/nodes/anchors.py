@@ -49,6 +49,7 @@ class Anchors:
     def _tell(self) -> None:
         unix_s, now_s = time.time(), time.monotonic()
         for node, link in zip(self.nodes, self._links, strict=True):
+            node.look(now_s)
             if link is not None:
                 if node.machine.is_master and not self._told_site:
                     self._tell_site(link, unix_s)

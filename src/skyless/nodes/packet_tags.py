@@ -9,6 +9,7 @@ from msgspec import Struct, structs
 
 from skyless.air.packet import Packet, Point
 from skyless.errors import ConfigurationError
+from skyless.nodes.hearing import Hearing
 from skyless.nodes.latency import Latencies
 from skyless.nodes.pace import Pace
 from skyless.nodes.running import HEALTH_S, Say, every, keep, link_of, together
@@ -73,6 +74,9 @@ class PacketTagNode:
         self._drops: Counter[str] = Counter()
         self._pace = Pace(settings.publish_hz)
         self._publish, self._said = publish, said
+        self._known = 0
+        """Packets of anchors that stand in the table."""
+        self._hearing = Hearing(f"tag {radio.name}", said, radio.advice)
 
     def _new_tracking(self) -> PacketTracking:
         asked = self.settings
@@ -84,6 +88,10 @@ class PacketTagNode:
         """What could not be used, by reason."""
         return self._drops + self.tracking.drops + self.radio.counters
 
+    def look(self, now_s: float) -> None:
+        """Say where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
+        self._hearing.look(now_s, self.packets, self._known, self.counters)
+
     async def run(self) -> None:
         """Listen until cancelled."""
         await self.radio.run(self.hear)
@@ -94,15 +102,18 @@ class PacketTagNode:
             self._receive(event)
         elif isinstance(event, Restarted):
             self.restarts += 1
+            self._hearing.begin()
             self._said(f"tag {self.radio.name}: listening" + (" again" if self.restarts > 1 else ""))
             if self.packets:
                 self._drops += self.tracking.drops
                 self.tracking = self._new_tracking()
         else:
+            self._hearing.end()
             self._said(f"tag {self.radio.name}: {event.reason}; still looking for it")
 
     def _receive(self, packet: Packet) -> None:
         self.packets += 1
+        self._known += packet.anchor in self.settings.anchors_m
         fix = self.tracking.hear(packet)
         if fix is None:
             return
@@ -151,6 +162,7 @@ class PacketTags:
         share, memory_bytes = self._usage.take()
         for index, (node, link) in enumerate(zip(self.nodes, self._links, strict=True)):
             node.unix_less_host_s = time.time() - time.monotonic()
+            node.look(time.monotonic())
             mqtt = Counters(0, 0, 0) if link is None else link.counters
             health = self._health(index, share / len(self.nodes), memory_bytes, mqtt)
             if link is not None:

@@ -1,19 +1,21 @@
 """One tag as a program: its receiver on a radio, its fixes and health on MQTT."""
 
 import time
+from collections import Counter
 from collections.abc import Callable
 
 from msgspec import Struct
 
 from skyless.air.reception import Reception
 from skyless.methods import DEFAULT_METHOD
+from skyless.nodes.hearing import Hearing
 from skyless.nodes.latency import Latencies, PhaseBook
 from skyless.nodes.pace import Pace
 from skyless.outputs.messages import FixMessage, Matrix, Vector
 from skyless.positioning.fix import Fix
 from skyless.positioning.protection import IntegrityRequirement
 from skyless.radios.radio import Gone, Hint, Radio, RadioEvent, Restarted
-from skyless.receiver import Receiver
+from skyless.receiver import NOT_DROPS, Receiver
 
 
 class TagSettings(Struct, frozen=True):
@@ -57,6 +59,7 @@ class TagNode:
         self.phases = PhaseBook()
         self._publish, self._said, self._before = publish, said, before
         self._pace = Pace(settings.publish_hz)
+        self._hearing = Hearing(f"tag {self.name}", said, radio.advice)
 
     def new_receiver(self) -> Receiver:
         """A receiver that knows nothing yet."""
@@ -64,6 +67,16 @@ class TagNode:
         return Receiver(
             asked.method, site=asked.site, qa=asked.qa, z_bounds_m=asked.z_bounds_m, integrity=asked.integrity
         )
+
+    @property
+    def drops(self) -> Counter[str]:
+        """What could not be used, by reason."""
+        heard = self.receiver.counters.items()
+        return Counter({reason: count for reason, count in heard if reason not in NOT_DROPS}) + self.radio.counters
+
+    def look(self, now_s: float) -> None:
+        """Say where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
+        self._hearing.look(now_s, self.receptions, self.receiver.counters["heard"], self.drops)
 
     async def run(self) -> None:
         """Listen until cancelled."""
@@ -75,10 +88,12 @@ class TagNode:
             self._receive(event)
         elif isinstance(event, Restarted):
             self.restarts += 1
+            self._hearing.begin()
             self._said(f"tag {self.name}: listening" + (" again" if self.restarts > 1 else ""))
             if self.receptions:
                 self.receiver = self.new_receiver()
         elif isinstance(event, Gone):
+            self._hearing.end()
             self._said(f"tag {self.name}: {event.reason}; still looking for it")
         elif isinstance(event, Hint):
             self._said(f"tag {self.name}: {event.text}")

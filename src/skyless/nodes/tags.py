@@ -16,7 +16,6 @@ from skyless.outputs.link import Link
 from skyless.outputs.messages import Counters, FixMessage, RequestMessage, TagHealth
 from skyless.outputs.topics import fix_topic, health_topic, receptions_topic, request_topic
 from skyless.radios.radio import Radio
-from skyless.receiver import NOT_DROPS
 from skyless.recordings.reception_log import ReceptionLog, receiver_settings
 
 COLLECT_S: Final = 0.05
@@ -87,6 +86,7 @@ class Tag:
         """Publish how the tag does."""
         self.node.unix_less_host_s = time.time() - time.monotonic()
         self._connect()
+        self.node.look(time.monotonic())
         health = self._health(cpu, memory_bytes)
         if self.link is not None:
             self.link.publish(self._health_topic, health)
@@ -108,9 +108,7 @@ class Tag:
             first_fix_s=node.first_fix_s,
             latency_p50_s=median_s,
             latency_p99_s=late_s,
-            counters={reason: count for reason, count in node.receiver.counters.items() if reason not in NOT_DROPS}
-            | self.log.counters
-            | node.radio.counters,
+            counters=node.drops | self.log.counters,
             mqtt=Counters(0, 0, 0) if self.link is None else self.link.counters,
             cpu=cpu,
             memory_bytes=memory_bytes,

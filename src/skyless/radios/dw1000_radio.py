@@ -42,6 +42,10 @@ class Dw1000Radio:
             care.cancel()
             self._forget()
 
+    def advice(self) -> str:
+        """Where to look when nothing comes though the chip answers."""
+        return "the DW1000 answers, but hears no frame: are anchors on the air, is its antenna free?"
+
     def now_ticks(self) -> int | None:
         """The chip's counter, read over the bus; None while it is not ready."""
         try:

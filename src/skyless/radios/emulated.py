@@ -50,6 +50,10 @@ class EmulatedRadio:
         self._listener = listener
         await self._connection.keep()
 
+    def advice(self) -> str:
+        """Where to look when nothing comes."""
+        return "no frame on the emulated air: are anchors running?"
+
     def now_ticks(self) -> int | None:
         """The node's counter, extrapolated from when the ether last told it."""
         if self._ticks is None:

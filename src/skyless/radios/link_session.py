@@ -223,6 +223,8 @@ class LinkSession:
         self._say(self._writer.ask(link.RX_ON))
 
     def _learn(self, status: Status, host_s: float) -> None:
+        if self.status is not None:
+            self._count("rx-error", max(status.errors - self.status.errors, 0))
         self.status = status
         if self._refused:
             return

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from skyless.air.reception import Transmission
 from skyless.radios.board_clock import BoardClock
 from skyless.radios.radio import Gone, Late, Listener, RadioEvent, Restarted
-from skyless.radios.serial_port import SerialPort
+from skyless.radios.serial_port import SerialPort, line_advice
 from skyless.recordings.listener_lines import reception_of
 from skyless.recordings.source import LineCutter
 
@@ -23,11 +23,16 @@ class ListenerRadio:
         self._clock = BoardClock()
         self._lines = LineCutter(self.counters)
         self._whole = False
+        self._silent = True
 
     async def run(self, listener: Listener) -> None:
         """Receive until cancelled; a board that is pulled out is looked for."""
         self._listener = listener
         await self._port.keep(self)
+
+    def advice(self) -> str:
+        """Where to look when nothing comes: the line, or who speaks on it."""
+        return line_advice(self._port.path, self._port.baud, "the listener of uwb-apps", silent=self._silent)
 
     def now_ticks(self) -> int | None:
         """The board's counter, extrapolated from its newest stamps; None before the first."""
@@ -43,13 +48,14 @@ class ListenerRadio:
         """Listen from the next line on."""
         self._clock.forget()
         self._lines = LineCutter(self.counters)
-        self._whole = False
+        self._whole, self._silent = False, True
         self._port.forget_told()
         self._listener(Restarted())
 
     def hear(self, data: bytes) -> None:
         """Take what the board says; the first line may be the end of one."""
         host_s = time.monotonic()
+        self._silent = False
         for line in self._lines.feed(data):
             drops = self.counters if self._whole else Counter()
             self._whole = True
@@ -57,6 +63,7 @@ class ListenerRadio:
             if reception is not None:
                 self._clock.hear(reception.rx_ticks, host_s)
                 self._listener(reception)
+                self._silent = True
 
     def end(self) -> None:
         """The board has gone."""

@@ -64,6 +64,9 @@ class Radio(Protocol):
     async def run(self, listener: Listener) -> None:
         """Configure the radio and receive until cancelled; finds a radio that went away again by itself."""
 
+    def advice(self) -> str:
+        """Where to look when nothing has come from it for some seconds; without numbers that change."""
+
     def now_ticks(self) -> int | None:
         """The radio's 40-bit counter now, to about 0.1 ms; None while the radio is not ready."""
 

@@ -112,6 +112,13 @@ class _Line(asyncio.Protocol):
             self.ended.set_result(reason)
 
 
+def line_advice(path: str, baud: int, speaker: str, *, silent: bool) -> str:
+    """Where to look when nothing of use comes from ``speaker`` on a port that is open."""
+    if silent:
+        return f"nothing at all comes from {path} at {baud} baud: nothing on the air, another port, or not {speaker}?"
+    return f"what comes from {path} at {baud} baud is not from {speaker}: another rate or other firmware?"
+
+
 def check_path(spec: str, path: str) -> None:
     """See that a path could be a serial port; one that does not exist yet may come.
 

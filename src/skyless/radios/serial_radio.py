@@ -36,6 +36,12 @@ class SerialRadio:
             poll.cancel()
             await asyncio.gather(poll, return_exceptions=True)
 
+    def advice(self) -> str:
+        """Where to look when nothing comes though the board answers."""
+        return (
+            f"the board at {self._port.path} answers, but hears no frame: are anchors on the air, is its antenna free?"
+        )
+
     def now_ticks(self) -> int | None:
         """The board's counter, extrapolated from its newest stamps; None while it is not ready."""
         session = self._session

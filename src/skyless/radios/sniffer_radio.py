@@ -9,7 +9,7 @@ from msgspec import structs
 
 from skyless.air.packet import Packet
 from skyless.radios.radio import Gone, Restarted
-from skyless.radios.serial_port import SerialPort
+from skyless.radios.serial_port import SerialPort, line_advice
 from skyless.recordings import sniffer_binary, sniffer_text
 from skyless.recordings.source import LineCutter
 
@@ -79,17 +79,23 @@ class SnifferRadio:
         self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
         self._listener: PacketListener = _nobody
         self._stream = SnifferStream(self.counters)
+        self._silent = True
 
     async def run(self, listener: PacketListener) -> None:
         """Receive until cancelled; packets carry the host's monotonic time of their arrival."""
         self._listener = listener
         await self._port.keep(self)
 
+    def advice(self) -> str:
+        """Where to look when nothing comes: the line, or who speaks on it."""
+        return line_advice(self._port.path, self._port.baud, "a Bitcraze sniffer", silent=self._silent)
+
     # What the port calls
 
     def begin(self, send: Callable[[bytes], None]) -> None:
         """Ask for the binary form."""
         self._stream = SnifferStream(self.counters)
+        self._silent = True
         self._port.forget_told()
         send(ASK_BINARY)
         self._listener(Restarted())
@@ -97,8 +103,10 @@ class SnifferRadio:
     def hear(self, data: bytes) -> None:
         """Take what the sniffer says."""
         host_s = time.monotonic()
+        self._silent = False
         for packet in self._stream.feed(data):
             self._listener(structs.replace(packet, host_s=host_s))
+            self._silent = True
 
     def end(self) -> None:
         """The sniffer has gone."""
