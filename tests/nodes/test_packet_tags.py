@@ -9,7 +9,7 @@ from skyless.air.packet import Packet
 from skyless.nodes import packet_tags
 from skyless.nodes.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
 from skyless.outputs.messages import Counters, FixMessage, SiteMessage, TagHealth
-from skyless.radios.open import open_sniffers
+from skyless.radios.open import is_simulated, open_sniffers
 from skyless.radios.radio import Gone, Restarted
 from skyless.recordings.bitcraze_payload import decode
 
@@ -71,7 +71,9 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
         return links[-1]
 
     monkeypatch.setattr(packet_tags, "link_of", link_of)
-    tags = PacketTags(SETTINGS, open_sniffers("sniffer:/dev/a,/dev/b", ("one", "two")), None, print)
+    tags = PacketTags(
+        SETTINGS, open_sniffers("sniffer:/dev/a,/dev/b", ("one", "two")), None, print, simulated=lambda: False
+    )
     one, _ = tags.nodes
     one.radio.counters["malformed-line"] += 3
     one.hear(Packet(1.0, 77, 0, 0, 0, ()))
@@ -90,6 +92,25 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     assert again.counters["unknown-anchor"] == 1
     ((topic, silent),) = links[1].told  # the site is told once
     assert (topic, silent.reason, silent.fixes) == ("skyless/v1/7/tag/two/health", "no-beacons", 0)
+
+
+def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_told_as_such(monkeypatch, tmp_path):
+    links, path = [], tmp_path / "sniffer"
+    monkeypatch.setattr(packet_tags, "link_of", lambda *_, **__: links.append(Link()) or links[-1])
+    spec = f"sniffer:{path}"
+    tags = PacketTags(SETTINGS, open_sniffers(spec, ("one",)), None, print, simulated=lambda: is_simulated(spec))
+    tags._tell()  # nothing is plugged in yet
+    path.symlink_to("/dev/pts/7")
+    tags.nodes[0].hear(Restarted())
+    for _ in range(3):
+        tags._tell()
+    path.unlink()
+    path.symlink_to("/dev/ttyACM0")
+    tags.nodes[0].hear(Gone("pulled out"))
+    tags.nodes[0].hear(Restarted())
+    tags._tell()
+    sites = [message for _, message in links[0].told if isinstance(message, SiteMessage)]
+    assert [site.simulated for site in sites] == [False, True, False]
 
 
 def test_a_table_that_no_site_can_have_is_not_told():

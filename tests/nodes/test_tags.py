@@ -5,11 +5,11 @@ import asyncio
 import pytest
 from node_stage import LAB, FakeRadio, receptions_of
 
-from skyless.nodes import running, tags
+from skyless.nodes import anchors, running, tags
 from skyless.nodes.tag import TagSettings
 from skyless.nodes.tags import Tag
 from skyless.outputs.address import MqttAddress
-from skyless.outputs.messages import Counters, FixMessage, TagHealth
+from skyless.outputs.messages import Counters, FixMessage, SiteMessage, TagHealth
 from skyless.radios.radio import Restarted
 
 
@@ -34,6 +34,39 @@ class FakeLink:
             await asyncio.Event().wait()
         finally:
             self.state = "left"
+
+
+def test_anchors_behind_a_port_that_leads_elsewhere_tell_again_whether_they_are_simulated(monkeypatch):
+    told, answers = [], [False, True]
+
+    class SiteLink(FakeLink):
+        def publish(self, topic, message, **_):
+            if isinstance(message, SiteMessage):
+                told.append(message.simulated)
+
+    FakeLink.made = []
+    monkeypatch.setattr(anchors, "link_of", SiteLink)
+    radio = FakeRadio(str(LAB.master))
+    radio.ready = False
+    both = anchors.Anchors(LAB, [radio], None, print, simulated=lambda: answers.pop(0))
+    (node,) = both.nodes
+    node._wait = lambda seconds, then: None  # it has no loop
+
+    class Leading:
+        is_master = True
+
+    monkeypatch.setattr(anchors, "health_of", lambda *_: None)
+    node._new_machine = Leading
+    node._plan = lambda: None
+    node.look = lambda now_s: None
+    node.machine = Leading()
+    both._tell()
+    both._tell()
+    node.hear(Restarted())
+    both._tell()
+    both._tell()
+    assert told == [False, True]
+    assert answers == []  # asked once for each start
 
 
 @pytest.fixture

@@ -59,4 +59,5 @@ def anchor(
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
     compile_kernels()
     with contextlib.suppress(KeyboardInterrupt):
-        run(Anchors(plan, radios, address, say, simulated=is_simulated(radio), floor_plan=image).run(), punctual=True)
+        nodes = Anchors(plan, radios, address, say, simulated=lambda: is_simulated(radio), floor_plan=image)
+        run(nodes.run(), punctual=True)

@@ -89,7 +89,7 @@ def tag(
     if is_sniffer(radio):
         if integrity_risk is not None or alert_limit_m is not None:
             raise SkylessError("--integrity-risk and --alert-limit-m are not for sniffers")
-        serve = _on_sniffers(radio, names, _system(radio, anchors, height, site_id, qa, publish_hz), address)
+        serve = _on_sniffers(radio, names, _system(anchors, height, site_id, qa, publish_hz), address)
     elif anchors is not None or height is not None:
         raise SkylessError("--anchors and --height are for sniffers; other tags hear from the air where anchors stand")
     else:
@@ -121,11 +121,11 @@ def _on_sniffers(
 
     radios = open_sniffers(radio, names)
     compile_packet_kernels()
-    return PacketTags(settings, radios, address, say).run()
+    return PacketTags(settings, radios, address, say, simulated=lambda: is_simulated(radio)).run()
 
 
 def _system(
-    radio: str, table: Path | None, height: str | None, site: int | None, qa: float, publish_hz: float
+    table: Path | None, height: str | None, site: int | None, qa: float, publish_hz: float
 ) -> "PacketTagSettings":
     """What sniffers cannot hear. Raises SkylessError."""
     from skyless.experiments.observability import plane_height_m
@@ -148,7 +148,6 @@ def _system(
         height_m=height_m,
         calibration=read_calibration(table),
         publish_hz=publish_hz,
-        simulated=is_simulated(radio),
     )
 
 

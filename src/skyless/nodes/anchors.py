@@ -1,12 +1,12 @@
 """``skyless anchor``: one process with one or several anchors, each with its own radio and its own MQTT connection."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
 from skyless.nodes.anchor import AnchorNode
-from skyless.nodes.running import HEALTH_S, Say, every, keep, link_of, together
+from skyless.nodes.running import HEALTH_S, AskedAgain, Say, every, keep, link_of, together
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
 from skyless.outputs.messages import AnchorHealth, Counters, SiteMessage
@@ -32,13 +32,15 @@ class Anchors:
         address: MqttAddress | None,
         say: Say,
         *,
-        simulated: bool,
+        simulated: Callable[[], bool],
         floor_plan: Path | None = None,
     ) -> None:
-        self._site, self._simulated, self._floor_plan, self._say = site, simulated, floor_plan, say
+        """``simulated`` is asked again when a radio has come back: something else may stand behind its port."""
+        self._site, self._floor_plan, self._say = site, floor_plan, say
+        self._simulated = AskedAgain(simulated)
         self.nodes = tuple(AnchorNode(site, int(radio.name), radio, say) for radio in radios)
         self._links = tuple(link_of(address, node.id, site=site.id, kind="anchor") for node in self.nodes)
-        self._told_site = False
+        self._told_simulated: bool | None = None
 
     async def run(self) -> None:
         """Serve until cancelled."""
@@ -48,19 +50,20 @@ class Anchors:
 
     def _tell(self) -> None:
         unix_s, now_s = time.time(), time.monotonic()
+        simulated = self._simulated.at(sum(node.restarts for node in self.nodes))
         for node, link in zip(self.nodes, self._links, strict=True):
             node.look(now_s)
             if link is not None:
-                if node.machine.is_master and not self._told_site:
-                    self._tell_site(link, unix_s)
+                if node.machine.is_master and simulated is not self._told_simulated:
+                    self._tell_site(link, simulated, unix_s)
                 link.publish(
                     health_topic(self._site.id, "anchor", node.id), health_of(node, link.counters, unix_s, now_s)
                 )
 
-    def _tell_site(self, link: Link, unix_s: float) -> None:
+    def _tell_site(self, link: Link, simulated: bool, unix_s: float) -> None:
         """The master tells the site; retained, so that whoever comes later knows it at once."""
-        self._told_site = True
-        message = SiteMessage(self._site, self._simulated, unix_s)
+        self._told_simulated = simulated
+        message = SiteMessage(self._site, simulated, unix_s)
         link.publish(site_topic(self._site.id), message, qos=1, retain=True)
         if self._floor_plan is not None:
             link.publish(floor_plan_topic(self._site.id), self._floor_plan.read_bytes(), qos=1, retain=True)

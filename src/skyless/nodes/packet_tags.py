@@ -12,7 +12,7 @@ from skyless.errors import ConfigurationError
 from skyless.nodes.hearing import Hearing
 from skyless.nodes.latency import Latencies
 from skyless.nodes.pace import Pace
-from skyless.nodes.running import HEALTH_S, Say, every, keep, link_of, together
+from skyless.nodes.running import HEALTH_S, AskedAgain, Say, every, keep, link_of, together
 from skyless.nodes.tag import fix_message
 from skyless.nodes.usage import Usage
 from skyless.outputs.address import MqttAddress
@@ -41,8 +41,6 @@ class PacketTagSettings(Struct, frozen=True):
     """Height of the tags where it is known; None to estimate it."""
     calibration: PairCalibration | None = None
     publish_hz: float = 50.0
-    simulated: bool = False
-    """Whether the sniffers are emulated."""
 
 
 def site_of(settings: PacketTagSettings) -> Site | None:
@@ -133,9 +131,18 @@ class PacketTags:
     """The tags of one process, each with its sniffer and its MQTT connection."""
 
     def __init__(
-        self, settings: PacketTagSettings, radios: Sequence[SnifferRadio], address: MqttAddress | None, say: Say
+        self,
+        settings: PacketTagSettings,
+        radios: Sequence[SnifferRadio],
+        address: MqttAddress | None,
+        say: Say,
+        *,
+        simulated: Callable[[], bool],
     ) -> None:
+        """``simulated`` is asked again when a sniffer has come back: something else may stand behind its port."""
         self._settings, self._say = settings, say
+        self._simulated = AskedAgain(simulated)
+        self._told_simulated: bool | None = None
         self._links = tuple(link_of(address, radio.name, site=settings.site, kind="tag") for radio in radios)
         self.nodes = tuple(
             PacketTagNode(settings, radio, self._publisher(index), say) for index, radio in enumerate(radios)
@@ -170,11 +177,12 @@ class PacketTags:
                 link.publish(health_topic(self._settings.site, "tag", node.radio.name), health)
 
     def _tell_site(self, link: Link) -> None:
-        """Once, where the anchors stand; retained, so that a page that comes later knows it at once."""
-        if self._site is not None:
-            message = SiteMessage(self._site, self._settings.simulated, time.time())
+        """Where the anchors stand; retained, so that a page that comes later knows it at once."""
+        simulated = self._simulated.at(sum(node.restarts for node in self.nodes))
+        if self._site is not None and simulated is not self._told_simulated:
+            self._told_simulated = simulated
+            message = SiteMessage(self._site, simulated, time.time())
             link.publish(site_topic(self._site.id), message, qos=1, retain=True)
-            self._site = None
 
     def _health(self, index: int, cpu: float, memory_bytes: int, mqtt: Counters) -> TagHealth:
         node, now_s = self.nodes[index], time.monotonic()

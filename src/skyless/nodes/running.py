@@ -13,6 +13,21 @@ Say = Callable[[str], None]
 """Takes one line for a person."""
 
 
+class AskedAgain:
+    """An answer that holds until something has happened again."""
+
+    def __init__(self, ask: Callable[[], bool]) -> None:
+        self._ask = ask
+        self._times: int | None = None
+        self._answer = False
+
+    def at(self, times: int) -> bool:
+        """The answer when it has happened so many times."""
+        if times != self._times:
+            self._times, self._answer = times, self._ask()
+        return self._answer
+
+
 async def together(*parts: Coroutine[Any, Any, None]) -> None:
     """Run until one part fails or all are cancelled; a failure cancels the others and is raised as itself."""
     tasks = [asyncio.ensure_future(part) for part in parts]

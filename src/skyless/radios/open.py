@@ -29,7 +29,10 @@ EXPECTED: Final = (
 
 
 def is_simulated(spec: str) -> bool:
-    """Whether nothing real flies over a radio of that name; what sits behind a pseudo-terminal is no radio."""
+    """Whether nothing real flies over a radio of that name; what sits behind a pseudo-terminal is no radio.
+
+    To be asked again when a radio has come back: a path may lead elsewhere by then.
+    """
     port = spec.partition(":")[2].partition(",")[0].partition("@")[0]
     return spec.split(":", 1)[0] in ("ether", "model") or os.path.realpath(port).startswith("/dev/pts/")
 
