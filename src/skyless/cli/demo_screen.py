@@ -4,18 +4,29 @@ import sys
 import time
 from shlex import quote
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from skyless.cli.output import console
 from skyless.outputs.address import PASSWORD_VARIABLE
+from skyless.positioning.alert import Alert
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rich.console import RenderableType
     from rich.live import Live
 
     from skyless.nodes.watch import Watch, Watched
     from skyless.nodes.whole_site import SiteRun, WholeSite
     from skyless.outputs.address import MqttAddress
+    from skyless.outputs.messages import FixMessage
+
+
+MOST_ALERTS: Final = 3
+"""So many tags are named, that the tables stay in view."""
+SPEAKING_S: Final = 3.0
+_STYLES: Final = {Alert.EXCLUDED.value: "yellow", Alert.NOT_EXCLUDED.value: "red", Alert.LIMIT.value: "red"}
+"""As grave as the page has them."""
 
 
 class Screen:
@@ -71,7 +82,7 @@ class Screen:
         if self._live is not None:
             from rich.console import Group
 
-            self._live.update(Group(self._line(), self.tags(), self._anchors()), refresh=True)
+            self._live.update(Group(self._line(), self.tags(), *self.alerts(), self._anchors()), refresh=True)
 
     @property
     def _watch(self) -> "Watch | None":
@@ -108,6 +119,32 @@ class Screen:
             )
         return table
 
+    def alerts(self) -> "list[RenderableType]":
+        """A line that says whose newest fix carries an alert, and how many did so far; none for methods without any."""
+        from rich.text import Text
+
+        watch = self._watch
+        if watch is None or not watch.alerts:
+            return []
+        line, shown = Text("alerts: "), [(name, tag.fix) for name, tag in self._tags() if _is_alert(tag.fix.alert)]
+        for name, fix in shown[:MOST_ALERTS]:
+            without = self._without(fix)
+            line.append(f"{name} {fix.alert}{without}", style=_STYLES.get(fix.alert or "", ""))
+            line.append(", ")
+        line.append("none now" if not shown else f"{len(shown)} of {len(watch.tags)} tags now")
+        so_far = _counts(watch.alerts)
+        line.append(f"; so far {so_far}" if so_far else "; none so far")
+        return [line]
+
+    def _without(self, fix: "FixMessage") -> str:
+        """Which anchors on the air an exclusion leaves out of a fix."""
+        if fix.alert != Alert.EXCLUDED or self._watch is None:
+            return ""
+        now_s = time.time()
+        speaking = {n for n, health in self._watch.anchors.items() if now_s - health.unix_s < SPEAKING_S}
+        out = sorted(speaking.difference(fix.anchors))
+        return f" (without {', '.join(map(str, out))})" if out else ""
+
     def _anchors(self) -> "RenderableType":
         from rich.table import Table
 
@@ -139,6 +176,7 @@ class Screen:
             "messages": sum(health.receptions for health in healths),
             "dropped": sum(sum(health.counters.values()) for health in healths),
             "first_fix_s": firsts[len(firsts) // 2] if firsts else None,
+            "alerts": {} if self._watch is None else dict(sorted(self._watch.alerts.items())),
             **self._latencies(),
             "late_transmissions": sum(health.late for health in self._watch.anchors.values()) if self._watch else 0,
             "restarts": sum(max(0, child.starts - 1) for child in self._whole.children),
@@ -185,7 +223,18 @@ class Screen:
             f"RMSE {100 * told['rmse_m']:.1f} cm, largest error {100 * told['max_m']:.1f} cm, "
             f"{told['updates_per_s']:.0f} updates per second and tag, "
             f"99 % of fixes within {1e3 * (told['fix_latency_p99_s'] or 0.0):.1f} ms of the frame"
+            + (f"; alerts: {_counts(told['alerts']) or 'none'}" if told["alerts"] else "")
         )
+
+
+def _is_alert(alert: str | None) -> bool:
+    from skyless.nodes.watch import ALERTS
+
+    return alert in ALERTS and alert != Alert.NONE
+
+
+def _counts(alerts: "Mapping[str, int]") -> str:
+    return ", ".join(f"{alert} {count}" for alert, count in sorted(alerts.items()) if _is_alert(alert))
 
 
 def _subscriber(address: "MqttAddress") -> str:

@@ -1,6 +1,7 @@
 """Watching a running site over MQTT: fixes beside the truth, health, and how late everything comes."""
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
@@ -13,9 +14,12 @@ from skyless.outputs.link import Link
 from skyless.outputs.messages import AnchorHealth, EtherHealth, FixMessage, TagHealth, TruthMessage, Vector
 from skyless.outputs.topics import EVERY_NODE, fix_topic, health_topic, truth_topic
 from skyless.outputs.truths import Truths
+from skyless.positioning.alert import Alert
 
 WARMUP_S: Final = 1.0
 """Fixes of a tag count for the errors from so long after its first."""
+
+ALERTS: Final = frozenset(alert.value for alert in Alert)
 
 
 class Watched(Struct):
@@ -46,6 +50,8 @@ class Watch:
         self.errors = ErrorStatistics(planar=planar)
         self.variance_sum_m2 = 0.0
         self.judged = 0
+        self.alerts: Counter[str] = Counter()
+        """What the fixes said of their integrity, of methods that say something."""
         self.arrivals = Latencies()
         """From the end of a fix's last frame to its arrival here."""
         self.latencies = Latencies()
@@ -80,6 +86,8 @@ class Watch:
         if tag is None:
             tag = self.tags[fix.tag] = Watched(fix.unix_s, fix)
         tag.fix = fix
+        if fix.alert in ALERTS:
+            self.alerts[fix.alert] += 1
         true_m = self._truths.at(fix.tag, fix.unix_s)
         tag.error_m = None
         if true_m is not None:

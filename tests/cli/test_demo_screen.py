@@ -1,0 +1,99 @@
+"""What the demo shows of alerts: a line that is always there for methods that give any, and counts at the end."""
+
+import time
+from types import SimpleNamespace
+
+import msgspec
+import pytest
+from rich.console import Console
+
+from skyless.cli.demo_screen import MOST_ALERTS, Screen
+from skyless.nodes.watch import Watch
+from skyless.outputs.messages import AnchorHealth, Counters, FixMessage
+from skyless.positioning.alert import Alert
+
+UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class NoLink:
+    def subscribe(self, topic, handler, qos=0):
+        pass
+
+
+@pytest.fixture
+def stage():
+    """A screen, and the watch that it shows: six anchors, of which the last has stopped."""
+    watch = Watch(NoLink(), 7, planar=True)
+    for number in range(1, 7):
+        unix_s = time.time() - (60.0 if number == 6 else 0.0)
+        watch._take_anchor(
+            AnchorHealth(
+                number, unix_s, 1.0, "anchor", 1, 0, True, 0.0, 0.0, 0.0, 1, 0, 1, 1, {}, {}, Counters(0, 0, 0)
+            )
+        )
+    whole = SimpleNamespace(watch=watch, page="http://here", address=None, children=[])
+    return Screen(whole, show=False), watch
+
+
+def fix(tag, alert, anchors=(1, 2, 3, 4, 5)):
+    made = FixMessage(
+        tag, 1, time.time(), 0.0, (1.0, 2.0, 0.0), UNIT, None, None, 0.1, None, None, None, None, anchors, 0.0, 2, 0.0,
+        "joint", True, 1e-3,
+    )  # fmt: skip
+    return msgspec.structs.replace(made, alert=alert)
+
+
+def drawn(screen):
+    """The line on a terminal of 80 columns."""
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
+    for part in screen.alerts():
+        console.print(part)
+    return " ".join(console.export_text().split())
+
+
+def test_methods_without_alerts_have_no_line(stage):
+    screen, watch = stage
+    watch._take_fix(fix("t1", None))
+    assert screen.alerts() == []
+    assert screen.summary()["alerts"] == {}
+    assert "alerts" not in screen.closing()
+
+
+def test_words_that_are_no_alerts_are_not_shown(stage):
+    screen, watch = stage
+    watch._take_fix(fix("t1", "none"))
+    watch._take_fix(fix("t1", "\x1b[2Jboo"))
+    assert drawn(screen) == "alerts: none now; none so far"
+
+
+def test_the_line_is_there_before_there_is_an_alert_so_that_tables_do_not_jump(stage):
+    screen, watch = stage
+    watch._take_fix(fix("t1", "none"))
+    assert drawn(screen) == "alerts: none now; none so far"
+
+
+def test_alerts_of_the_newest_fixes_are_named_with_the_anchors_left_out_and_all_are_counted(stage):
+    screen, watch = stage
+    for _ in range(3):
+        watch._take_fix(fix("t1", "unavailable"))
+    watch._take_fix(fix("t1", "none"))
+    watch._take_fix(fix("t2", "detected-excluded", (1, 2, 3, 5)))
+    assert drawn(screen) == (
+        "alerts: t2 detected-excluded (without 4), 1 of 2 tags now; so far detected-excluded 1, unavailable 3"
+    )
+    watch._take_fix(fix("t2", "none"))
+    assert drawn(screen) == "alerts: none now; so far detected-excluded 1, unavailable 3"
+    assert screen.summary()["alerts"] == {"detected-excluded": 1, "none": 2, "unavailable": 3}
+
+
+@pytest.mark.parametrize("alert", [alert.value for alert in Alert if alert is not Alert.NONE])
+def test_many_alerts_take_no_more_than_four_lines(stage, alert):
+    screen, watch = stage
+    for number in range(200):
+        watch._take_fix(fix(f"t{number}", alert, (1, 2)))
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
+    console.print(*screen.alerts())
+    text = console.export_text()
+    assert text.count(alert) == MOST_ALERTS + 1
+    assert "200 of 200 tags now" in " ".join(text.split())
+    assert text.count("\n") <= 4
