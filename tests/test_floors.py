@@ -10,7 +10,7 @@ import skyless
 SOURCE = Path(skyless.__file__).parent
 
 FLOORS = (
-    {"constants", "errors", "methods", "ticks", "compiled", "eights", "firmware"},
+    {"constants", "errors", "methods", "ticks", "compiled", "eights", "addresses", "firmware"},
     {"air", "site"},
     {"clocks", "uncertainty"},
     {"positioning"},

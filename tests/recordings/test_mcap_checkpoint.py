@@ -205,5 +205,13 @@ def test_joint_filters_that_would_lead_their_kernels_astray_are_refused(change):
     joint = receiver.method.filter
     changed = change(joint.arrays)
     if changed is not None:
-        joint.arrays = changed
+        vars(joint)["_arrays"] = changed
+    assert refusal(save(receiver)) == "checkpoint-damaged"
+
+
+def test_addresses_in_a_checkpoint_are_refused():
+    receiver = Receiver("joint")
+    for one in tape(LAB, 1.0):
+        receiver.hear(one.reception)
+    vars(receiver.method.filter)["_addresses"] = (1, 2)
     assert refusal(save(receiver)) == "checkpoint-damaged"

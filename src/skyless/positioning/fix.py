@@ -2,6 +2,7 @@
 
 from enum import StrEnum
 from math import sqrt
+from typing import Final
 
 import numpy as np
 from msgspec import Struct
@@ -72,6 +73,10 @@ class Fix(Struct, frozen=True, gc=False):
         return dilution_of_precision(self.anchors_m, self.position_m, height_known=self.height_known)
 
 
+_OF_POSITION: Final = slice(2, 5)
+_OF_VELOCITY: Final = slice(5, MOTION_ROWS)
+
+
 def motion_fix(
     time_s: float,
     x: NDArray[np.float64],
@@ -87,8 +92,9 @@ def motion_fix(
     ``statistics`` holds the running means of the normalised and of the plain squared innovation.
     """
     rows, known = np.zeros((MOTION_ROWS, 3)), height_m is not None
-    fill_motion(rows, x, P, 2 if known else 3, statistics.item(CHI2), height_m or 0.0)
-    return fix_of(time_s, rows, known, anchors, anchors_m, statistics, method)
+    chi2 = statistics.item(CHI2)
+    fill_motion(rows, x, P, 2 if known else 3, chi2, height_m or 0.0)
+    return fix_of(time_s, rows, known, anchors, anchors_m, chi2, statistics.item(RESIDUAL_SQUARED), method)
 
 
 def fix_of(
@@ -97,15 +103,25 @@ def fix_of(
     height_known: bool,
     anchors: tuple[int, ...],
     anchors_m: NDArray[np.float64],
-    statistics: NDArray[np.float64],
+    chi2: float,
+    squared_m2: float,
     method: str,
     integrity: Integrity | None = None,
 ) -> Fix:
-    """Make the fix of what ``fill_motion`` has written; the fix keeps ``rows``."""
-    chi2: float = statistics.item(CHI2)
-    rms_m = sqrt(statistics.item(RESIDUAL_SQUARED))
+    """Make the fix of what ``fill_motion`` has written; the fix keeps ``rows``.
+
+    ``chi2`` and ``squared_m2`` are the running means of the normalised and of the plain squared innovation.
+    """
+    position_m, velocity_mps = rows[0], rows[1]
+    covariance_m2, velocity_covariance = rows[_OF_POSITION], rows[_OF_VELOCITY]
     # in the order of the fields: with their names it takes as long as all the rest
-    told = (time_s, rows[0], rows[2:5], rows[1], rows[5:], anchors, anchors_m, chi2, 1, rms_m, method, height_known)
     if integrity is None:
-        return Fix(*told)
-    return Fix(*told, integrity.hpl_m, integrity.vpl_m, integrity.risk, integrity.alert)
+        return Fix(
+            time_s, position_m, covariance_m2, velocity_mps, velocity_covariance,
+            anchors, anchors_m, chi2, 1, sqrt(squared_m2), method, height_known,
+        )  # fmt: skip
+    return Fix(
+        time_s, position_m, covariance_m2, velocity_mps, velocity_covariance,
+        anchors, anchors_m, chi2, 1, sqrt(squared_m2), method, height_known,
+        integrity.hpl_m, integrity.vpl_m, integrity.risk, integrity.alert,
+    )  # fmt: skip

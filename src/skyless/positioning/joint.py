@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from skyless.addresses import Addresses
 from skyless.air.beacon import HEARD
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.positioning.joint_hearing import FULL, JOINED, joint_motion, joint_track
@@ -44,7 +45,7 @@ from skyless.positioning.joint_state import (
     states,
     values,
 )
-from skyless.positioning.joint_step import MOST_PACKED, PACKET, joint_step
+from skyless.positioning.joint_step import MOST_PACKED, PACKET, TOLD, Exchanged, joint_step
 from skyless.positioning.joint_sync import NO_SYNCS
 from skyless.positioning.joint_time import move_base
 from skyless.positioning.kalman import horizontal_variance
@@ -126,6 +127,7 @@ NO_RELAYS: Final = np.empty((0, 4), np.int64)
 
 
 _pack_packet: Final[Callable[..., None]] = PACKET.pack_into
+_unpack_told: Final[Callable[..., tuple[float, ...]]] = struct.Struct(f"{TOLD}d").unpack_from
 _pack_sync: Final[Callable[..., None]] = struct.Struct("3d").pack_into
 
 
@@ -139,31 +141,43 @@ class JointFilter:
 
     def __init__(self, settings: JointSettings, site_m: NDArray[np.float64], capacity: int = 8) -> None:
         """``site_m``: positions of the anchors, shape (n, 3); ``capacity``: how many may be in view, to begin with."""
-        self.arrays = new_arrays(settings.array(), capacity, max(len(site_m), capacity))
-        self.arrays.site_m[: len(site_m)] = site_m
+        self._arrays = new_arrays(settings.array(), capacity, max(len(site_m), capacity))
+        self._arrays.site_m[: len(site_m)] = site_m
         self.dim = settings.dim
         self._anchors = len(site_m)
-        self._motion = np.zeros(2 * self.dim)
-        self._covariance = np.zeros((2 * self.dim, 2 * self.dim))
-        self._limits = limits_of(settings.integrity_risk)
-        self._levels = np.zeros(LEVELS)
-        self._names = np.full(len(self.arrays.site_m), -1)
-        self._packet = np.zeros(PACKET.size // 8, np.int64)
-        self._relays = np.zeros((MOST_PACKED, 4), np.int64)
-        self._sync = np.zeros((1, 3))
-        self.rows = np.zeros((MOTION_ROWS, 3))
-        """What ``fill_motion`` has written of the last packet that ``hear`` took."""
+        self._exchanged = Exchanged(
+            packet=np.zeros(PACKET.size // 8, np.int64),
+            names=np.full(len(self.arrays.site_m), -1),
+            relays=np.zeros((MOST_PACKED, 4), np.int64),
+            sync=np.zeros((1, 3)),
+            motion=np.zeros(2 * self.dim),
+            covariance=np.zeros((2 * self.dim, 2 * self.dim)),
+            rows=np.zeros((MOTION_ROWS, 3)),
+            limits=limits_of(settings.integrity_risk),
+            told=np.zeros(TOLD),
+        )
+        self._addresses: Addresses | None = None
 
     def add_anchor(self, anchor_m: Vector, name: int = -1) -> int:
         """Add an anchor to the table; returns its place there. ``name``: by which packed relays call it, 16 bits."""
         place, s = self._anchors, self.arrays
         if place == len(s.site_m):
-            self.arrays = s = extended(s, len(s.slots), 2 * place)
-            self._names = np.append(self._names, np.full(place, -1))
+            s = extended(s, len(s.slots), 2 * place)
+            names = np.append(self._exchanged.names, np.full(place, -1))
+            self._use(s, self._exchanged._replace(names=names))
         s.site_m[place] = anchor_m
-        self._names[place] = name if 0 <= name <= LAST_NAME else -1
+        self._exchanged.names[place] = name if 0 <= name <= LAST_NAME else -1
         self._anchors += 1
         return place
+
+    @property
+    def arrays(self) -> JointArrays:
+        """All states, and what the kernels remember; others after a start, and when there are more anchors."""
+        return self._arrays
+
+    def _use(self, arrays: JointArrays, exchanged: Exchanged) -> None:
+        """Use other arrays from now on."""
+        self._arrays, self._exchanged, self._addresses = arrays, exchanged, None
 
     def has_anchors(self, places: Iterable[int]) -> bool:
         """Whether these places in the table are taken."""
@@ -184,7 +198,8 @@ class JointFilter:
         ``caution_m2``: additional variance of the first receptions, where many may be late.
         """
         old, dim = self.arrays, self.dim
-        self.arrays = s = new_arrays(old.settings, len(old.slots), len(old.site_m))
+        s = new_arrays(old.settings, len(old.slots), len(old.site_m))
+        self._use(s, self._exchanged)
         s.site_m[:] = old.site_m
         s.x[:dim] = position_m
         s.P[:dim, :dim] = covariance_m2
@@ -209,8 +224,17 @@ class JointFilter:
 
         ``variance_factor``: on the variance of the tag's reception of it, not of those that it relays.
         """
-        _pack_packet(self._packet, 0, site, sequence, rx_ticks, tx_ticks, len(relays), 0, b"")
-        return self._hear(site, relays, syncs, variance_factor)
+        self._make_room(len(relays))
+        told = self._exchanged
+        told.relays[: len(relays)] = relays
+        told.sync[: len(syncs)] = syncs
+        _pack_packet(told.packet, 0, site, sequence, rx_ticks, tx_ticks, len(syncs), len(relays), 0, b"")
+        return self._step() if variance_factor == 1.0 else self._weighed_step(site, variance_factor)
+
+    def _make_room(self, relays: int) -> None:
+        if relays + MOST_PACKED > len(self._exchanged.relays):
+            rows = np.zeros((relays + MOST_PACKED, 4), np.int64)
+            self._use(self._arrays, self._exchanged._replace(relays=rows))
 
     def hear_listed(
         self,
@@ -228,34 +252,32 @@ class JointFilter:
         ``packed`` has the relays as frames carry them (``codec.packed_relays``), anchors by the names that
         ``add_anchor`` was given.
         """
-        count = len(relays) // 4
+        count, synced = len(relays) // 4, sync is not None
         if relays:
-            if count + MOST_PACKED > len(self._relays):
-                self._relays = np.zeros((count + MOST_PACKED, 4), np.int64)
-            _packing(len(relays))(self._relays, 0, *relays)
+            self._make_room(count)
+            _packing(len(relays))(self._exchanged.relays, 0, *relays)
         if sync is not None:
-            _pack_sync(self._sync, 0, *sync)
-        _pack_packet(self._packet, 0, site, sequence, rx_ticks, tx_ticks, count, len(packed) // HEARD.size, packed)
-        return self._hear(site, self._relays, NO_SYNCS if sync is None else self._sync, variance_factor)
+            _pack_sync(self._exchanged.sync, 0, *sync)
+        words, packet = len(packed) // HEARD.size, self._exchanged.packet
+        _pack_packet(packet, 0, site, sequence, rx_ticks, tx_ticks, synced, count, words, packed)
+        return self._step() if variance_factor == 1.0 else self._weighed_step(site, variance_factor)
 
-    def _hear(self, site: int, relays: Integers, syncs: Matrix, variance_factor: float) -> int:
-        """Take the packet that stands in ``_packet``."""
-        if variance_factor == 1.0:
-            return self._step(relays, syncs)
+    def _step(self) -> int:
+        """Take the packet that has been written."""
+        if self._addresses is None:
+            self._addresses = Addresses((*self._arrays, *self._exchanged))
+        status = joint_step(self._addresses.table)
+        if status == FULL:
+            self._extend()
+            return self._step()
+        return status
+
+    def _weighed_step(self, site: int, variance_factor: float) -> int:
         self._weigh(site, variance_factor)
-        status = self._step(relays, syncs)
+        status = self._step()
         self._weigh(site, 1.0)
         if status == JOINED:
             self._doubt(site, variance_factor)
-        return status
-
-    def _step(self, relays: Integers, syncs: Matrix) -> int:
-        told = (self._packet, relays, self._names, syncs)
-        outcome = (self._motion, self._covariance, self.rows, self._limits, self._levels)
-        status = joint_step(*self.arrays, *told, *outcome)
-        if status == FULL:
-            self._extend()
-            status = joint_step(*self.arrays, *told, *outcome)
         return status
 
     def _weigh(self, site: int, variance_factor: float) -> None:
@@ -273,12 +295,21 @@ class JointFilter:
     @property
     def newest(self) -> tuple[Vector, Matrix]:
         """What ``motion`` returns, as of the last packet that ``hear`` took."""
-        return self._motion, self._covariance
+        return self._exchanged.motion, self._exchanged.covariance
+
+    @property
+    def rows(self) -> Matrix:
+        """What ``fill_motion`` has written of the last packet that ``hear`` took."""
+        return self._exchanged.rows
+
+    def told(self) -> tuple[float, ...]:
+        """Levels and running means as of the last packet that ``hear`` took, shape (TOLD,)."""
+        return _unpack_told(self._exchanged.told)
 
     @property
     def levels(self) -> Vector:
         """What ``protect`` said of the last packet that ``hear`` took."""
-        return self._levels
+        return self._exchanged.told[:LEVELS]
 
     def track(self, messages: Messages, motions: Matrix | None = None, variances: Matrix | None = None) -> None:
         """Take many packets in one loop; the arithmetic is that of ``hear``, so the states are its, bit for bit.
@@ -298,8 +329,8 @@ class JointFilter:
                 messages.relays,
                 messages.ends,
                 messages.syncs,
-                self._motion,
-                self._covariance,
+                self._exchanged.motion,
+                self._exchanged.covariance,
                 nothing if motions is None else motions,
                 nothing if variances is None else variances,
             )
@@ -308,7 +339,8 @@ class JointFilter:
             self._extend()
 
     def _extend(self) -> None:
-        self.arrays = extended(self.arrays, 2 * len(self.arrays.slots), len(self.arrays.site_m))
+        old = self._arrays
+        self._use(extended(old, 2 * len(old.slots), len(old.site_m)), self._exchanged)
 
     def covariance(self) -> Matrix:
         """Of all states in use, at the newest message."""
@@ -319,8 +351,8 @@ class JointFilter:
 
     def motion(self) -> tuple[Vector, Matrix]:
         """Position and velocity at the newest message, and their covariance; overwritten by the next call."""
-        joint_motion(self.arrays, self._motion, self._covariance)
-        return self._motion, self._covariance
+        joint_motion(self.arrays, *self.newest)
+        return self.newest
 
     @property
     def lost(self) -> bool:
@@ -332,14 +364,14 @@ class JointFilter:
     @property
     def is_contradicted(self) -> bool:
         """Whether most of what anchors heard of each other does not fit: a wrong place draws all clocks with it."""
-        recent = self.arrays.recent
+        recent = self._arrays.recent
         refused = recent.item(RELAYS_REFUSED)
         return bool(refused > CONTRADICTIONS and refused > recent.item(RELAYS_TAKEN))
 
     @property
     def relays_fit(self) -> bool:
         """Whether most of what anchors heard of each other fits, and that is more than a few receptions."""
-        recent = self.arrays.recent
+        recent = self._arrays.recent
         taken = recent.item(RELAYS_TAKEN)
         return bool(taken > max(CONTRADICTIONS, 4.0 * recent.item(RELAYS_REFUSED)))
 

@@ -17,9 +17,9 @@ from skyless.positioning.joint_state import (
     JointArrays,
     new_arrays,
 )
-from skyless.positioning.joint_step import MOST_PACKED, PACKET
+from skyless.positioning.joint_step import MOST_PACKED, PACKET, TOLD, Exchanged
 from skyless.positioning.motion_rows import MOTION_ROWS
-from skyless.positioning.protection_levels import LEVELS, LIMITS
+from skyless.positioning.protection_levels import LIMITS
 
 MOST: Final = 4096
 """Anchors, in view or in the table."""
@@ -42,16 +42,15 @@ def is_sound(joint: JointFilter) -> bool:
 
 
 def _exchanged(joint: JointFilter) -> bool:
-    own, n = vars(joint), 2 * joint.dim
-    relays, shapes = own["_relays"], {"_limits": (LIMITS,), "_levels": (LEVELS,), "_sync": (1, 3)}
-    shapes |= {"rows": (MOTION_ROWS, 3), "_motion": (n,), "_covariance": (n, n)}
-    integers: dict[str, tuple[int, ...]] = {"_names": (len(joint.arrays.site_m),), "_packet": (PACKET.size // 8,)}
-    if not isinstance(relays, np.ndarray) or relays.ndim != 2 or len(relays) < MOST_PACKED:
+    told, n = vars(joint)["_exchanged"], 2 * joint.dim
+    if vars(joint)["_addresses"] is not None or not isinstance(told, Exchanged):
         return False
-    integers["_relays"] = (len(relays), 4)
-    return all(_is_array(own[name], shape, np.float64) for name, shape in shapes.items()) and all(
-        _is_array(own[name], shape, np.int64) for name, shape in integers.items()
-    )
+    if not isinstance(told.relays, np.ndarray) or told.relays.ndim != 2 or len(told.relays) < MOST_PACKED:
+        return False
+    integers = ((PACKET.size // 8,), (len(joint.arrays.site_m),), (len(told.relays), 4))
+    shapes = (*integers, (1, 3), (n,), (n, n), (MOTION_ROWS, 3), (LIMITS,), (TOLD,))
+    kinds = (np.int64,) * 3 + (np.float64,) * 6
+    return all(_is_array(*one) for one in zip(told, shapes, kinds, strict=True))
 
 
 def _is_array(value: object, shape: tuple[int, ...], kind: type) -> bool:

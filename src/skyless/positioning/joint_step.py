@@ -1,8 +1,9 @@
 """One packet from Python: its numbers in one array, and all that is made of it in one call."""
 
 import struct
-from typing import Final
+from typing import Final, NamedTuple
 
+from skyless.addresses import Table, integer_blocks, integer_matrix, integers, matrix, vector
 from skyless.compiled import borrowing_kernel
 from skyless.positioning.joint_hearing import joint_hear, joint_motion
 from skyless.positioning.joint_state import (
@@ -16,26 +17,52 @@ from skyless.positioning.joint_state import (
     Vector,
 )
 from skyless.positioning.motion_rows import fill_motion
-from skyless.positioning.protection_levels import protect
-from skyless.positioning.tracker import CHI2
+from skyless.positioning.protection_levels import LEVELS, protect
+from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
-PLACE, NUMBER, RX_TICKS, TX_TICKS, LISTED, PACKED, WORDS = range(7)
-"""Places in a packet: the anchor's in the table, sequence number, the tag's and the anchor's stamps, how many relays
-stand listed in rows, how many packed, and the first of those: 64-bit words of anchor, sequence and RX stamp."""
+PLACE, NUMBER, RX_TICKS, TX_TICKS, SYNCED, LISTED, PACKED, WORDS = range(8)
+"""Places in a packet: the anchor's in the table, sequence number, the tag's and the anchor's stamps, 1 if there is a
+sync, how many relays stand listed in rows, how many packed, and the first of those: 64-bit words of anchor, sequence
+and RX stamp."""
 
 MOST_PACKED: Final = 16
 """Relays in a frame; 13 fit."""
 
 PACKET: Final = struct.Struct(f"{WORDS}q{8 * MOST_PACKED}s")
 
+RUNNING_CHI2, RUNNING_SQUARED = LEVELS, LEVELS + 1
+"""Places in what is told, behind the levels."""
+
+TOLD: Final = LEVELS + 2
+
+FIELDS: Final = len(JointArrays._fields)
+
+
+class Exchanged(NamedTuple):
+    """What passes between Python and ``joint_step``."""
+
+    packet: Integers
+    """Shape (PACKET.size // 8,)."""
+    names: Integers
+    """Identifier of each anchor of the table, -1 for one without."""
+    relays: Integers
+    """Those that are listed, as ``joint_hear`` takes them, and room for ``MOST_PACKED``; shape (rows, 4)."""
+    sync: Matrix
+    """As ``joint_hear`` takes it, shape (1, 3)."""
+    motion: Vector
+    covariance: Matrix
+    """As ``joint_motion`` writes them."""
+    rows: Matrix
+    """As ``fill_motion`` does."""
+    limits: Vector
+    told: Vector
+    """Levels (``protect``), then running means; shape (TOLD,)."""
+
 
 @borrowing_kernel
 def _unpack(s: JointArrays, packet: Integers, names: Integers, relays: Integers) -> int:
-    """Add the packed relays of anchors in view to those listed, unwrapped; returns how many rows there are.
-
-    ``names`` has the identifier of each anchor of the table.
-    """
+    """Add the packed relays of anchors in view to those listed, unwrapped; returns how many rows there are."""
     rows: int = packet[LISTED]
     least = packet[TX_TICKS] - HALF_WRAP_TICKS
     for k in range(WORDS, WORDS + min(packet[PACKED], MOST_PACKED)):
@@ -61,68 +88,46 @@ def _in_view(s: JointArrays, names: Integers, name: int) -> int:
 
 
 @borrowing_kernel
-def joint_step(
-    x: Vector,
-    P: Matrix,
-    terms: Matrix,
-    along: Vector,
-    noise: Vector,
-    h_places: Integers,
-    h: Vector,
-    counts: Integers,
-    statistics: Vector,
-    slots: Integers,
-    anchors: Matrix,
-    packets: Integers,
-    relayed: Integers,
-    slot_of: Integers,
-    settings: Vector,
-    site_m: Matrix,
-    sensitivities: Matrix,
-    responses: Matrix,
-    evidence: Matrix,
-    recent: Vector,
-    packet: Integers,
-    relays: Integers,
-    names: Integers,
-    syncs: Matrix,
-    motion: Vector,
-    covariance: Matrix,
-    rows: Matrix,
-    limits: Vector,
-    levels: Vector,
-) -> int:
+def _arrays(table: Table) -> JointArrays:
+    """The first rows of a table are the fields in their order."""
+    return JointArrays(
+        vector(table, 0),
+        matrix(table, 1),
+        matrix(table, 2),
+        vector(table, 3),
+        vector(table, 4),
+        integers(table, 5),
+        vector(table, 6),
+        integers(table, 7),
+        vector(table, 8),
+        integer_matrix(table, 9),
+        matrix(table, 10),
+        integer_blocks(table, 11),
+        integer_matrix(table, 12),
+        integers(table, 13),
+        vector(table, 14),
+        matrix(table, 15),
+        matrix(table, 16),
+        matrix(table, 17),
+        matrix(table, 18),
+        vector(table, 19),
+    )
+
+
+@borrowing_kernel
+def joint_step(table: Table) -> int:
     """``joint_hear``, ``joint_motion``, ``fill_motion`` and ``protect`` in one call from Python.
 
-    The fields of ``JointArrays`` come one by one: a tuple of them would take Numba twice as long to look at. There is
-    room for ``MOST_PACKED`` relays behind those listed, if any are packed.
+    ``table`` has the addresses of the fields of ``JointArrays`` and of ``Exchanged``.
     """
-    s = JointArrays(
-        x,
-        P,
-        terms,
-        along,
-        noise,
-        h_places,
-        h,
-        counts,
-        statistics,
-        slots,
-        anchors,
-        packets,
-        relayed,
-        slot_of,
-        settings,
-        site_m,
-        sensitivities,
-        responses,
-        evidence,
-        recent,
-    )
-    count = _unpack(s, packet, names, relays)
+    s, packet, told = _arrays(table), integers(table, FIELDS), vector(table, FIELDS + 8)
+    relays, motion, covariance = integer_matrix(table, FIELDS + 2), vector(table, FIELDS + 4), matrix(table, FIELDS + 5)
+    count = _unpack(s, packet, integers(table, FIELDS + 1), relays)
     stamps = (packet[PLACE], packet[NUMBER], packet[RX_TICKS], packet[TX_TICKS])
-    status = joint_hear(s, *stamps, relays, 0, count, syncs, 0)
+    status = joint_hear(s, *stamps, relays, 0, count, matrix(table, FIELDS + 3), 1 - packet[SYNCED])
     joint_motion(s, motion, covariance)
+    rows = matrix(table, FIELDS + 6)
     fill_motion(rows, motion, covariance, int(s.settings[DIM]), s.statistics[CHI2], s.settings[HEIGHT])
-    protect(s, covariance, limits, levels)
+    protect(s, covariance, vector(table, FIELDS + 7), told)
+    told[RUNNING_CHI2], told[RUNNING_SQUARED] = s.statistics[CHI2], s.statistics[RESIDUAL_SQUARED]
     return status

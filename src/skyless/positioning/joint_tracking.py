@@ -157,11 +157,15 @@ class JointTracking:
 
     def _take(self, observation: Observation) -> int:
         place = self._place(observation)
-        packet = (place, observation.sequence, observation.rx_ticks_tag, observation.tx_ticks_anchor)
-        relays = self._listed(place, observation) if observation.relays else NOTHING
-        sync = self._sync(observation)
         return self._filter.hear_listed(
-            *packet, relays, observation.packed_relays, sync, observation.rx_variance_factor
+            place,
+            observation.sequence,
+            observation.rx_ticks_tag,
+            observation.tx_ticks_anchor,
+            self._listed(place, observation) if observation.relays else NOTHING,
+            observation.packed_relays,
+            self._sync(observation),
+            observation.rx_variance_factor,
         )
 
     def _listed(self, place: int, observation: Observation) -> list[int]:
@@ -195,13 +199,13 @@ class JointTracking:
         return self._place_of[anchor]
 
     def _fix(self, observation: Observation) -> Fix | NoFixReason:
-        height_m, in_use = self._settings.height_m, self._in_use
-        if height_m is None and self._filter.newest[1][2, 2] > in_use.extent_m**2:
+        in_use, known, told = self._in_use, self._settings.height_m is not None, self._filter
+        if not known and told.newest[1][2, 2] > in_use.extent_m**2:
             return NoFixReason.BAD_GEOMETRY
         rx_ticks = observation.rx_ticks_tag
         time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
-        statistics, rows = self._filter.arrays.statistics, self._filter.rows.copy()
+        *levels, chi2, squared = told.told()
         risk, limit_m = self._settings.integrity_risk, self._settings.alert_limit_m
-        known = height_m is not None
-        integrity = integrity_of(self._filter.levels, risk, known, limit_m)
-        return fix_of(time_s, rows, known, in_use.anchors, in_use.anchors_m, statistics, "joint", integrity)
+        integrity = integrity_of(levels, risk, known, limit_m)
+        rows = told.rows.copy()
+        return fix_of(time_s, rows, known, in_use.anchors, in_use.anchors_m, chi2, squared, "joint", integrity)

@@ -1,5 +1,6 @@
 """Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8)."""
 
+from collections.abc import Sequence
 from statistics import NormalDist
 from typing import Final
 
@@ -53,15 +54,15 @@ class IntegrityRequirement(Struct, frozen=True):
             raise ValueError(f"alert_limit_m is {self.alert_limit_m!r}; it should be more than 0 m")
 
 
-def integrity_of(levels: Vector, risk: float, height_known: bool, alert_limit_m: float | None) -> Integrity:
+def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert_limit_m: float | None) -> Integrity:
     """What ``protect`` has filled in, in words.
 
     While an anchor's fault is in the fix the levels cover it, up to a size beyond which nothing is promised.
     """
-    state = int(levels.item(STATE))
+    state = int(levels[STATE])
     if state >= DETECTED:
         return Integrity(None, None, risk, _ALERTS[state])
-    hpl_m, vpl_m = levels.item(HPL), None if height_known else levels.item(VPL)
+    hpl_m, vpl_m = levels[HPL], None if height_known else levels[VPL]
     exceeded = alert_limit_m is not None and hpl_m > alert_limit_m
     return Integrity(hpl_m, vpl_m, risk, Alert.LIMIT if exceeded else _ALERTS[state])
 

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from skyless.addresses import Addresses
 from skyless.recordings.checkpoint_graph import PLAIN, Arrays, Node, fields_of, holds_arrays, is_ours
 
 _INT64: Final = 1 << 63
@@ -70,6 +71,9 @@ class _Writer:
         fields = fields_of(value)
         return ["object", *place, list(fields), self._all(fields.values())]
 
+    def _nothing(self, _: Addresses) -> Node:
+        return ["=", None]
+
     def _int(self, value: int) -> Node:
         return ["=", value] if -_INT64 <= value < _INT64 else ["int", str(value)]
 
@@ -117,6 +121,7 @@ _WRITERS: Final[dict[type, Callable[[_Writer, Any], Node]]] = {
     dict: _Writer._dict,
     Counter: _Writer._counter,
     np.ndarray: _Writer._array,
+    Addresses: _Writer._nothing,
 }
 
 
