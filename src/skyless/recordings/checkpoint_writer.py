@@ -36,7 +36,9 @@ class _Writer:
         return self._nodes
 
     def _of(self, value: object) -> int:
-        """Number of the value's node."""
+        """Number of the value's node; addresses are nothing to others."""
+        if type(value) is Addresses:
+            value = None
         number = self._number.get(id(value))
         if number is None:
             number = self._number[id(value)] = len(self._nodes)
@@ -70,9 +72,6 @@ class _Writer:
             raise TypeError(f"{type(value).__qualname__} holds arrays, but nothing says what must hold of them")
         fields = fields_of(value)
         return ["object", *place, list(fields), self._all(fields.values())]
-
-    def _nothing(self, _: Addresses) -> Node:
-        return ["=", None]
 
     def _int(self, value: int) -> Node:
         return ["=", value] if -_INT64 <= value < _INT64 else ["int", str(value)]
@@ -121,7 +120,6 @@ _WRITERS: Final[dict[type, Callable[[_Writer, Any], Node]]] = {
     dict: _Writer._dict,
     Counter: _Writer._counter,
     np.ndarray: _Writer._array,
-    Addresses: _Writer._nothing,
 }
 
 
