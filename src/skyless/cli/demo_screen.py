@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 MOST_ALERTS: Final = 3
 """So many tags are named, that the tables stay in view."""
+SHOWN_S: Final = 1.0
+"""So long an alert is seen, be it of one fix: some come and go with each message of a faulty anchor."""
 SPEAKING_S: Final = 3.0
 _STYLES: Final = {Alert.EXCLUDED.value: "yellow", Alert.NOT_EXCLUDED.value: "red", Alert.LIMIT.value: "red"}
 """As grave as the page has them."""
@@ -120,13 +122,14 @@ class Screen:
         return table
 
     def alerts(self) -> "list[RenderableType]":
-        """A line that says whose newest fix carries an alert, and how many did so far; none for methods without any."""
+        """A line that says whose fixes carry an alert, and how many did so far; none for methods without any."""
         from rich.text import Text
 
         watch = self._watch
         if watch is None or not watch.alerts:
             return []
-        line, shown = Text("alerts: "), [(name, tag.fix) for name, tag in self._tags() if _is_alert(tag.fix.alert)]
+        line, since_s = Text("alerts: "), time.monotonic() - SHOWN_S
+        shown = [(name, tag.alerted) for name, tag in self._tags() if tag.alerted and tag.alerted_s >= since_s]
         for name, fix in shown[:MOST_ALERTS]:
             without = self._without(fix)
             line.append(f"{name} {fix.alert}{without}", style=_STYLES.get(fix.alert or "", ""))
@@ -227,14 +230,8 @@ class Screen:
         )
 
 
-def _is_alert(alert: str | None) -> bool:
-    from skyless.nodes.watch import ALERTS
-
-    return alert in ALERTS and alert != Alert.NONE
-
-
 def _counts(alerts: "Mapping[str, int]") -> str:
-    return ", ".join(f"{alert} {count}" for alert, count in sorted(alerts.items()) if _is_alert(alert))
+    return ", ".join(f"{alert} {count}" for alert, count in sorted(alerts.items()) if alert != Alert.NONE)
 
 
 def _subscriber(address: "MqttAddress") -> str:

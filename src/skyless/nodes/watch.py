@@ -28,6 +28,10 @@ class Watched(Struct):
     first_unix_s: float
     fix: FixMessage
     error_m: float | None = None
+    alerted: FixMessage | None = None
+    """The newest fix that carried an alert."""
+    alerted_s: float = 0.0
+    """When it came, by the host's monotonic clock."""
     health: TagHealth | None = None
     began: tuple[float, int] | None = None
     """Time and number of fixes of the first health message that counts."""
@@ -88,6 +92,8 @@ class Watch:
         tag.fix = fix
         if fix.alert in ALERTS:
             self.alerts[fix.alert] += 1
+            if fix.alert != Alert.NONE:
+                tag.alerted, tag.alerted_s = fix, time.monotonic()
         true_m = self._truths.at(fix.tag, fix.unix_s)
         tag.error_m = None
         if true_m is not None:
