@@ -290,6 +290,18 @@ def test_a_board_that_starts_again_and_again_is_counted_and_told_once():
     assert talk.counters == {"board-restart": 6}
 
 
+def test_a_board_that_answers_and_never_listens_is_told_once():
+    talk = Talk()
+    talk.hello()
+    for _ in range(30):
+        talk.poll(1.0)
+        talk.status(link.IS_CONFIGURED)
+    assert talk.told == [Hint("the board at /dev/board answers, but does not start to receive: does its radio work?")]
+    assert talk.session.hello is not None
+    talk.status()
+    assert talk.told[1:] == [Restarted()]
+
+
 def test_a_board_that_works_and_starts_again_now_and_then_is_counted_and_said_nothing_of():
     talk = Talk().ready()
     for _ in range(5):

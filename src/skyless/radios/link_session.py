@@ -18,6 +18,8 @@ PENDING: Final = 16
 
 ANSWER_S: Final = 1.0
 """A HELLO that comes so long after it was asked for was not asked for: the board has started."""
+IDLE_S: Final = 5.0
+"""A board that has been configured for so long and does not listen will not."""
 STARTS: Final = 3
 STARTS_S: Final = 60.0
 """A board that starts so often within so long does not start because somebody wants it to."""
@@ -57,7 +59,8 @@ class LinkSession:
         self._transmits = transmits
         self._heard_s = self._asked_s = 0.0
         self._starts: deque[float] = deque(maxlen=STARTS)
-        self._told_starts = False
+        self._told_starts = self._told_idle = False
+        self._idle_polls = 0
 
     def begin(self, host_s: float) -> None:
         """Say the first words."""
@@ -75,7 +78,15 @@ class LinkSession:
             self._say(self._writer.ask(link.ASK_STATUS))
         else:
             self._configure()
+            self._note_idle()
         return None
+
+    def _note_idle(self) -> None:
+        """Say once that a board answers and yet does not listen, whatever it is told."""
+        self._idle_polls += 1
+        if self._idle_polls * POLL_S >= IDLE_S and not self._told_idle:
+            self._told_idle = True
+            self._tell(Hint(f"the board at {self._place} answers, but does not start to receive: does its radio work?"))
 
     def _ask_hello(self, host_s: float) -> None:
         self._asked_s = host_s
@@ -192,6 +203,7 @@ class LinkSession:
     def _note_start(self, host_s: float) -> None:
         """Count that the board has started anew, and say so once when it does again and again."""
         self.counters["board-restart"] += 1
+        self._idle_polls = 0
         starts = self._starts
         if starts and host_s - starts[-1] > STARTS_S:
             self._told_starts = False
@@ -242,6 +254,7 @@ class LinkSession:
         self.clock.hear(status.ticks, host_s)
         if not self.ready:
             self.ready, self._told = True, ""
+            self._idle_polls, self._told_idle = 0, False
             self._tell(Restarted())
 
     def _lose(self) -> None:
