@@ -132,7 +132,8 @@ class Receiver:
         if self._method is None or self._schedule is None or anchor_m is None:
             self.reason = NoFixReason.NO_ALMANAC
             return None
-        frame, factor = reception.frame, _trust(reception.diagnostics)
+        frame, diagnostics = reception.frame, reception.diagnostics
+        factor = 1.0 if diagnostics is None else _trust(diagnostics)
         told = self._observation(frame, beacon, self._schedule, anchor_m, rx_ticks, tx_ticks, factor)
         result = self._method.hear(told)
         if isinstance(result, Fix):
@@ -203,7 +204,8 @@ class Receiver:
 
         So does another master where the method rests on the master's own stamps; the filters ride on.
         """
-        book, master = self.almanac, self._followed.master
+        book, claim = self.almanac, self._followed.claim
+        master = None if claim is None else claim.master
         if book.hear(beacon.almanac_issue, beacon.page):
             self._positions = {anchor: np.array(place) for anchor, place in book.anchors_m.items()}
         elif self._method is not None and master == self._master:
@@ -273,9 +275,9 @@ class Receiver:
         master_sequence = master_rx_ticks = None
         sync_variance_m2, joint = variance_m2, self._method_name == "joint"
         if heard is not None:
-            least = tx_ticks - HALF_WRAP_TICKS
+            least, repeats = tx_ticks - HALF_WRAP_TICKS, self._repeats(beacon.anchor, heard)
             master_sequence, master_rx_ticks = heard.sequence, least + ((heard.rx_ticks - least) & TICK_MASK)
-            variance_m2 *= self._repeats(beacon.anchor, heard) ** 2
+            variance_m2 *= repeats * repeats
         return Observation(
             beacon.anchor,
             anchor_m,
@@ -340,6 +342,6 @@ class Receiver:
         return whole, fraction / 256.0, (time.std_ticks * TICK_M) ** 2
 
 
-def _trust(told: Diagnostics | None) -> float:
+def _trust(told: Diagnostics) -> float:
     """Factor on the variance of a reception by what the radio told of it."""
-    return 1.0 if told is None else variance_factor(told.rx_power_dbm, told.first_path_power_dbm)
+    return variance_factor(told.rx_power_dbm, told.first_path_power_dbm)

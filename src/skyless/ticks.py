@@ -64,6 +64,7 @@ class Unwrapper:
 
     def __init__(self, bits: int = TICK_BITS) -> None:
         self._bits = bits
+        self._half_wrap, self._mask = 1 << (bits - 1), (1 << bits) - 1
         self._last_ticks: int | None = None
         self._last_host_s: float | None = None
 
@@ -72,25 +73,22 @@ class Unwrapper:
 
         A stamp out of order is placed where it belongs, before the ones already seen.
         """
-        if self._last_ticks is None:
+        last, last_host_s = self._last_ticks, self._last_host_s
+        if last is None:
             ticks = counter
         else:
-            expected = self._last_ticks if host_s is None else self._last_ticks + self._elapsed_ticks(host_s)
-            ticks = nearest(counter, expected, self._bits)
-            if host_s is None and self._last_host_s is not None:
-                host_s = self._last_host_s + to_seconds(ticks - self._last_ticks)
-        self._last_ticks = ticks
-        self._last_host_s = host_s
+            least = last - self._half_wrap
+            if host_s is not None and last_host_s is not None:
+                least += round((host_s - last_host_s) * TICK_RATE_HZ)
+            ticks = least + ((counter - least) & self._mask)
+            if host_s is None and last_host_s is not None:
+                host_s = last_host_s + to_seconds(ticks - last)
+        self._last_ticks, self._last_host_s = ticks, host_s
         return ticks
 
     def expect(self, counter: int) -> int:
         """Unwrapped ticks of a counter value near the last stamp, without taking it as a stamp."""
         return counter if self._last_ticks is None else nearest(counter, self._last_ticks, self._bits)
-
-    def _elapsed_ticks(self, host_s: float) -> int:
-        if self._last_host_s is None:
-            return 0
-        return from_seconds(host_s - self._last_host_s)
 
 
 def unwrap_array(counters: NDArray[np.int64], bits: int = TICK_BITS) -> NDArray[np.int64]:

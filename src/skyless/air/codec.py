@@ -38,6 +38,7 @@ _HAS_AUTHENTICATION: Final = 0x08
 _RESERVED_FLAGS: Final = 0xF0
 
 _FIXED: Final = struct.Struct("<HBHHHHBIBIBBHB")
+_FLAGS_AT: Final = 11
 _START: Final = struct.Struct("<HBHHHH")
 _STAMP: Final = struct.Struct("<BIB")
 _TIME: Final = struct.Struct("<IHH")
@@ -65,7 +66,8 @@ _CAPACITY: Final = tuple(
 )
 _HEARD_ANCHORS: Final = tuple(struct.Struct("<" + count * "H6x") for count in range(MAX_FRAME_BYTES // HEARD.size))
 """The anchors alone of so many ``heard`` entries."""
-_MASTER_AT: Final = _FIXED.size - 3
+_MASTER: Final = slice(_FIXED.size - 3, _FIXED.size - 1)
+_MASTERS_STAMP: Final = slice(_FIXED.size, _FIXED.size + _STAMP.size)
 
 
 def heard_capacity(master_heard: bool, master_time: bool, page: bool) -> int:
@@ -119,24 +121,30 @@ def _foreign(frame: bytes) -> Malformed:
 
 
 def _decode_version_1(frame: bytes) -> Beacon | Malformed:
+    flags = frame[_FLAGS_AT]
+    if flags & _RESERVED_FLAGS:
+        return _foreign_or(Malformed.BAD_FLAGS, frame)
+    heard_bytes, count_at = len(frame) - _BARE_BYTES[flags], _COUNT_AT[flags]
+    count = heard_bytes // HEARD.size
+    if heard_bytes < 0 or heard_bytes != frame[count_at] * HEARD.size:
+        return _foreign_or(Malformed.BAD_LENGTH, frame)
     (
-        control, sequence, site, destination, anchor, magic, flags, superframe, slot, tx_low, tx_high, issue, master,
+        control, sequence, site, destination, anchor, magic, _, superframe, slot, tx_low, tx_high, issue, master,
         term,
     ) = _FIXED.unpack_from(frame)  # fmt: skip
     if control != _FRAME_CONTROL or destination != _BROADCAST or magic != _VERSION_1:
         return _foreign(frame)
-    if flags & _RESERVED_FLAGS:
-        return Malformed.BAD_FLAGS
-    heard_bytes, count_at = len(frame) - _BARE_BYTES[flags], _COUNT_AT[flags]
-    count = heard_bytes // HEARD.size
-    if heard_bytes < 0 or heard_bytes != frame[count_at] * HEARD.size:
-        return Malformed.BAD_LENGTH
     relays_master, is_master = flags & _HAS_MASTER_HEARD, anchor == master
     told = {anchor, master, *_HEARD_ANCHORS[count].unpack_from(frame, count_at + 1)}
     if len(told) + is_master != count + 2 or (relays_master and is_master):
         return Malformed.BAD_HEARD
-    master_heard = _master_heard(frame, master) if relays_master else None
-    master_time = _master_time(frame, count_at - _TIME.size) if flags & _HAS_MASTER_TIME else None
+    master_heard = master_time = None
+    if relays_master:
+        number, low, high = _STAMP.unpack_from(frame, _FIXED.size)
+        master_heard = Heard(master, number, low | high << 32)
+    if flags & _HAS_MASTER_TIME:
+        low, high, std_steps = _TIME.unpack_from(frame, count_at - _TIME.size)
+        master_time = MasterTime(low | high << 32, std_steps / STD_STEPS_PER_TICK)
     page_at = count_at + 1 + heard_bytes
     page = decode_page(frame[page_at : page_at + PAGE_BYTES]) if flags & _HAS_PAGE else None
     if isinstance(page, Malformed):
@@ -147,24 +155,16 @@ def _decode_version_1(frame: bytes) -> Beacon | Malformed:
     )  # fmt: skip
 
 
+def _foreign_or(fault: Malformed, frame: bytes) -> Malformed:
+    """What is wrong with a frame of this fault, which means nothing in one of another kind."""
+    foreign = _foreign(frame)
+    return fault if foreign is Malformed.TOO_SHORT else foreign
+
+
 def packed_relays(frame: bytes, beacon: Beacon) -> bytes:
     """All receptions that a beacon tells, ``HEARD`` after ``HEARD``, the master's first; ``frame`` is its bytes."""
-    heard = beacon.heard
-    assert isinstance(heard, PackedHeard)
-    if beacon.master_heard is None:
-        return heard.packed
-    stamp_at = _FIXED.size
-    return frame[_MASTER_AT : _MASTER_AT + 2] + frame[stamp_at : stamp_at + _STAMP.size] + heard.packed
-
-
-def _master_heard(frame: bytes, master: int) -> Heard:
-    sequence, low, high = _STAMP.unpack_from(frame, _FIXED.size)
-    return Heard(master, sequence, low | high << 32)
-
-
-def _master_time(frame: bytes, at: int) -> MasterTime:
-    low, high, std_steps = _TIME.unpack_from(frame, at)
-    return MasterTime(low | high << 32, std_steps / STD_STEPS_PER_TICK)
+    packed: bytes = beacon.heard.packed  # type: ignore[union-attr]  # it is of a frame
+    return packed if beacon.master_heard is None else frame[_MASTER] + frame[_MASTERS_STAMP] + packed
 
 
 def _heard_fault(anchor: int, master: int, master_heard: Heard | None, heard: Collection[Heard]) -> str | None:

@@ -7,7 +7,7 @@ from msgspec import Struct
 
 from skyless.air.beacon import Beacon
 from skyless.constants import MAX_DRIFT
-from skyless.ticks import nearest, wrap
+from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, wrap
 
 STAMPS_BEFORE_RESTART: Final = 3
 """So many impossible stamps of one anchor in a row mean that its counter has started anew."""
@@ -47,8 +47,8 @@ class AnchorStamps:
 
         ``rx_ticks`` is the tag's own reading, unwrapped. An anchor's first stamp keeps its own value.
         """
-        track = self._tracks.get(beacon.anchor)
-        if self.newest_rx_ticks is not None and rx_ticks <= self.newest_rx_ticks:
+        track, newest = self._tracks.get(beacon.anchor), self.newest_rx_ticks
+        if newest is not None and rx_ticks <= newest:
             repeated = track is not None and _is_repeated(beacon, track)
             self._counters["duplicate" if repeated else "out-of-order"] += 1
             return None
@@ -56,11 +56,13 @@ class AnchorStamps:
         if track is None:
             return self._begin(beacon, rx_ticks)
         elapsed = rx_ticks - track.rx_ticks_tag
-        tx_ticks = nearest(beacon.tx_ticks, track.tx_ticks + elapsed)
-        if abs(tx_ticks - track.tx_ticks - elapsed) > MAX_DRIFT * elapsed + NOISE_TICKS:
+        least = track.tx_ticks + elapsed - HALF_WRAP_TICKS
+        off = ((beacon.tx_ticks - least) & TICK_MASK) - HALF_WRAP_TICKS
+        if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
             self._refuse(beacon, track)
             return None
-        track.rx_ticks_tag, track.tx_ticks = rx_ticks, tx_ticks
+        track.rx_ticks_tag = rx_ticks
+        track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
         track.sequence, track.impossible = beacon.sequence, 0
         return tx_ticks
 

@@ -36,6 +36,8 @@ CAUTION_M2: Final = 1.0
 REORDERED_S: Final = 0.1
 """Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
 
+NOT_USED: Final = frozenset({REJECTED, STALE_PACKET})
+
 NOTHING: Final[list[int]] = []
 
 
@@ -86,9 +88,11 @@ class JointTracking:
 
     def hear(self, observation: Observation) -> Fix | NoFixReason:
         """Take one observation; a fix for every accepted message once started."""
-        if observation.tx_ticks_master is not None:
-            self._master_less_tag_ticks = observation.tx_ticks_master - observation.rx_ticks_tag
-            self._master_scale.hear(observation)
+        ticks_master, rx_ticks, claim = observation.tx_ticks_master, observation.rx_ticks_tag, observation.claim
+        if ticks_master is not None:
+            self._master_less_tag_ticks = ticks_master - rx_ticks
+            if claim is not None and claim.master == observation.anchor:
+                self._master_scale.hear(observation)
         if self._start is None and self._is_out_of_reach(observation):
             self._start = self._new_start()
         if self._start is not None:
@@ -99,9 +103,9 @@ class JointTracking:
             self._begin(start, self._start.packets())
             return self._fix(observation)
         status = self._take(observation)
-        self._heard_ticks = max(self._heard_ticks, observation.rx_ticks_tag)
-        if status in (REJECTED, STALE_PACKET):
-            self._start_anew_where_lost(observation.rx_ticks_tag)
+        self._heard_ticks = max(self._heard_ticks, rx_ticks)
+        if status in NOT_USED:
+            self._start_anew_where_lost(rx_ticks)
             return NoFixReason.RESIDUALS
         if not self._believes_relays:
             self._believes_relays = self._filter.relays_fit
@@ -179,12 +183,11 @@ class JointTracking:
 
     def _sync(self, observation: Observation) -> tuple[float, float, float] | None:
         """What the anchor says of its clock against the master's, as the filter takes it."""
-        if observation.claim is None or observation.sync_variance_m2 <= 0.0:
+        claim, variance_m2 = observation.claim, observation.sync_variance_m2
+        if claim is None or variance_m2 <= 0.0:
             return None
-        master, difference = self._place_of.get(observation.claim.master), self._master_scale.difference(observation)
-        if master is None or difference is None:
-            return None
-        return master, difference, observation.sync_variance_m2
+        master, difference = self._place_of.get(claim.master), self._master_scale.difference(observation)
+        return None if master is None or difference is None else (master, difference, variance_m2)
 
     def _place(self, observation: Observation) -> int:
         """Place of the packet's anchor in the filter's table."""

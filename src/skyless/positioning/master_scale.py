@@ -12,6 +12,8 @@ FARTHEST: Final = 16
 MISFIT_SUBTICKS: Final = 64
 """By which a master's packets may lie off the line: roundings, carried so far."""
 
+SUBTICKS_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
+
 
 class MasterScale:
     """The master's own counter against the site's time, which it may lead on at another rate than its own."""
@@ -36,20 +38,20 @@ class MasterScale:
 
     def difference(self, observation: Observation) -> int | None:
         """The sender's reading less the master's at its TX stamp, in subticks modulo 2⁴⁸; None while not known."""
-        if observation.claim is None or observation.claim != self._claim:
+        claim, ticks = observation.claim, observation.tx_ticks_master
+        if claim is None or ticks is None or claim != self._claim:
             return None
-        site, own_lead = _site_time(observation)
+        site = ticks * SUBTICKS + round(observation.tx_fraction_ticks * SUBTICKS)
         lead = self._lead(site)
-        return None if lead is None else (lead - own_lead) & (SUBTICKS * (TICK_MASK + 1) - 1)
+        return None if lead is None else (lead - site + observation.tx_ticks_anchor * SUBTICKS) & SUBTICKS_MASK
 
     def _lead(self, site: int) -> int | None:
         """Lead of the site's time on the master's counter, on a straight line; None too far from what is known."""
         if len(self._points) < 2:
             return None
         (first, before), (last, lead) = self._points
-        if not 0 <= site - last <= FARTHEST * (last - first):
-            return None
-        return lead + (lead - before) * (site - last) // (last - first)
+        length, beyond = last - first, site - last
+        return lead + (lead - before) * beyond // length if 0 <= beyond <= FARTHEST * length else None
 
 
 def _site_time(observation: Observation) -> tuple[int, int]:
