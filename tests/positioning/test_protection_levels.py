@@ -289,8 +289,9 @@ def test_arrays_of_another_length_are_not_sound():
     case = Case()
     episode = episode_of(case, 5)
     joint = heard(episode, episode.messages, settings_of(case))
+    joint._addresses = None
     assert is_sound(joint)
-    joint._levels = np.zeros(LEVELS - 1)
+    joint._exchanged = joint._exchanged._replace(told=np.zeros(LEVELS - 1))
     assert not is_sound(joint)
 
 
@@ -298,5 +299,6 @@ def test_settings_of_another_kind_are_not_sound():
     case = Case()
     episode = episode_of(case, 5)
     joint = heard(episode, episode.messages, settings_of(case))
-    joint.arrays = joint.arrays._replace(settings=joint.arrays.settings.astype(np.float32))
+    joint._addresses = None
+    joint._arrays = joint.arrays._replace(settings=joint.arrays.settings.astype(np.float32))
     assert not is_sound(joint)

@@ -45,7 +45,7 @@ from skyless.positioning.joint_state import (
     states,
     values,
 )
-from skyless.positioning.joint_step import MOST_PACKED, PACKET, TOLD, Exchanged, joint_step
+from skyless.positioning.joint_step import MOST_PACKED, PACKET, TOLD, Exchanged, joint_rest, joint_step
 from skyless.positioning.joint_sync import NO_SYNCS
 from skyless.positioning.joint_time import move_base
 from skyless.positioning.kalman import horizontal_variance
@@ -121,6 +121,8 @@ class Messages(Struct, frozen=True):
     """What each packet's anchor says of its clock, as ``joint_hear`` takes it, shape (n, 3), or (0, 3) for nothing."""
 
 
+NO_SYNC: Final = (0.0, 0.0, 0.0)
+
 LAST_NAME: Final = 0xFFFF
 
 NO_RELAYS: Final = np.empty((0, 4), np.int64)
@@ -128,7 +130,6 @@ NO_RELAYS: Final = np.empty((0, 4), np.int64)
 
 _pack_packet: Final[Callable[..., None]] = PACKET.pack_into
 _unpack_told: Final[Callable[..., tuple[float, ...]]] = struct.Struct(f"{TOLD}d").unpack_from
-_pack_sync: Final[Callable[..., None]] = struct.Struct("3d").pack_into
 
 
 @cache
@@ -228,7 +229,7 @@ class JointFilter:
         told = self._exchanged
         told.relays[: len(relays)] = relays
         told.sync[: len(syncs)] = syncs
-        _pack_packet(told.packet, 0, site, sequence, rx_ticks, tx_ticks, len(syncs), len(relays), 0, b"")
+        _pack_packet(told.packet, 0, site, sequence, rx_ticks, tx_ticks, len(syncs), len(relays), 0, 0, 0, 0.0, b"")
         return self._step() if variance_factor == 1.0 else self._weighed_step(site, variance_factor)
 
     def _make_room(self, relays: int) -> None:
@@ -244,23 +245,29 @@ class JointFilter:
         tx_ticks: int,
         relays: list[int],
         packed: bytes = b"",
-        sync: tuple[float, float, float] | None = None,
+        master: int = 0,
+        sync_variance_m2: float = 0.0,
         variance_factor: float = 1.0,
     ) -> int:
         """As ``hear``, rows of relays one after the other in a list, or packed: that spares an array for each packet.
 
         ``packed`` has the relays as frames carry them (``codec.packed_relays``), anchors by the names that
-        ``add_anchor`` was given.
+        ``add_anchor`` was given; ``master`` is one, whose clock the packet's anchor knows with ``sync_variance_m2``.
+        What it says of that clock is asked for with ``SYNC_WANTED``: then ``synchronise`` must follow.
         """
-        count, synced = len(relays) // 4, sync is not None
+        count = len(relays) // 4
         if relays:
             self._make_room(count)
             _packing(len(relays))(self._exchanged.relays, 0, *relays)
-        if sync is not None:
-            _pack_sync(self._exchanged.sync, 0, *sync)
-        words, packet = len(packed) // HEARD.size, self._exchanged.packet
-        _pack_packet(packet, 0, site, sequence, rx_ticks, tx_ticks, synced, count, words, packed)
+        told = (0, count, len(packed) // HEARD.size, master, 0, sync_variance_m2, packed)
+        _pack_packet(self._exchanged.packet, 0, site, sequence, rx_ticks, tx_ticks, *told)
         return self._step() if variance_factor == 1.0 else self._weighed_step(site, variance_factor)
+
+    def synchronise(self, sync: tuple[float, float, float] | None) -> int:
+        """Take what an anchor says of its clock, a row of ``Messages.syncs``, or None; returns what ``hear`` does."""
+        assert self._addresses is not None
+        self._exchanged.sync[0] = NO_SYNC if sync is None else sync
+        return joint_rest(self._addresses.table)
 
     def _step(self) -> int:
         """Take the packet that has been written."""

@@ -52,6 +52,9 @@ from skyless.positioning.protection_updates import unsettle
 FULL, REJECTED, ACCEPTED, JOINED, STALE_PACKET = range(-1, 4)
 """What became of a packet: no room for its anchor, not used, taken, the first of its anchor, older than the newest."""
 
+SYNC_WANTED: Final = 8
+"""Added to what became of a packet."""
+
 RELAY_AGE_S: Final = 1.0
 """Older packets are not relayed, as sequence numbers come around."""
 
@@ -90,7 +93,8 @@ def joint_hear(
 
     Rows ``first`` to ``last`` of ``relays`` are [the anchor that heard, the anchor that was heard, sequence, RX stamp
     of the former], anchors by their places in the table; all stamps are unwrapped, each on its own clock. Row ``row``
-    of ``syncs``, if there is one, is what the anchor says of its clock (``joint_sync``).
+    of ``syncs``, if there is one, is what the anchor says of its clock (``joint_sync``). Where that is to be asked for,
+    ``SYNC_WANTED`` is added to what is returned, and ``end_packet`` must follow.
     """
     slot = s.slot_of[site]
     if s.counts[SLOTS] > 0 and rx_ticks < s.counts[EPOCH]:
@@ -126,8 +130,9 @@ def joint_hear(
             _hear_relayed(
                 s, s.slot_of[relays[relay, 0]], s.slot_of[relays[relay, 1]], relays[relay, 2], relays[relay, 3]
             )
-        if row < len(syncs) and syncs[row, SYNC_VARIANCE] > 0.0:
-            hear_sync(s, slot, syncs, row)
+        told = row < len(syncs) and syncs[row, SYNC_VARIANCE] > 0.0
+        if told and hear_sync(s, slot, syncs, row):
+            return SYNC_WANTED + status
     elif has_room(s):
         settle(s)
         slot = add_slot(s, site)
@@ -138,6 +143,14 @@ def joint_hear(
         status = JOINED
     add_terms(s)
     return status
+
+
+@borrowing_kernel
+def end_packet(s: JointArrays, site: int, syncs: Matrix) -> None:
+    """What ``joint_hear`` has left to do once it is told what an anchor says of its clock; variance 0 says nothing."""
+    if syncs[0, SYNC_VARIANCE] > 0.0:
+        hear_sync(s, s.slot_of[site], syncs, 0)
+    add_terms(s)
 
 
 @borrowing_kernel

@@ -3,9 +3,11 @@
 import struct
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from skyless.addresses import Table, integer_blocks, integer_matrix, integers, matrix, vector
 from skyless.compiled import borrowing_kernel
-from skyless.positioning.joint_hearing import joint_hear, joint_motion
+from skyless.positioning.joint_hearing import SYNC_WANTED, end_packet, joint_hear, joint_motion
 from skyless.positioning.joint_state import (
     DIM,
     HEIGHT,
@@ -16,20 +18,22 @@ from skyless.positioning.joint_state import (
     Matrix,
     Vector,
 )
+from skyless.positioning.joint_sync import SYNC_MASTER, SYNC_SUBTICKS, SYNC_VARIANCE
 from skyless.positioning.motion_rows import fill_motion
 from skyless.positioning.protection_levels import LEVELS, protect
 from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
-PLACE, NUMBER, RX_TICKS, TX_TICKS, SYNCED, LISTED, PACKED, WORDS = range(8)
+PLACE, NUMBER, RX_TICKS, TX_TICKS, SYNCED, LISTED, PACKED, MASTER, STATUS, VARIANCE, WORDS = range(11)
 """Places in a packet: the anchor's in the table, sequence number, the tag's and the anchor's stamps, 1 if there is a
-sync, how many relays stand listed in rows, how many packed, and the first of those: 64-bit words of anchor, sequence
-and RX stamp."""
+sync, how many relays stand listed in rows, how many packed, whose time the anchor tells, what became of the packet so
+far, the variance of that time (a float; 0 where it tells none), and the first of the packed relays: 64-bit words of
+anchor, sequence and RX stamp."""
 
 MOST_PACKED: Final = 16
 """Relays in a frame; 13 fit."""
 
-PACKET: Final = struct.Struct(f"{WORDS}q{8 * MOST_PACKED}s")
+PACKET: Final = struct.Struct(f"{VARIANCE}qd{8 * MOST_PACKED}s")
 
 RUNNING_CHI2, RUNNING_SQUARED = LEVELS, LEVELS + 1
 """Places in what is told, behind the levels."""
@@ -118,16 +122,40 @@ def _arrays(table: Table) -> JointArrays:
 def joint_step(table: Table) -> int:
     """``joint_hear``, ``joint_motion``, ``fill_motion`` and ``protect`` in one call from Python.
 
-    ``table`` has the addresses of the fields of ``JointArrays`` and of ``Exchanged``.
+    ``table`` has the addresses of the fields of ``JointArrays`` and of ``Exchanged``. Where ``SYNC_WANTED`` is in what
+    is returned, ``joint_rest`` must follow, with a row of syncs: it is rarely needed, and costs the caller.
     """
-    s, packet, told = _arrays(table), integers(table, FIELDS), vector(table, FIELDS + 8)
-    relays, motion, covariance = integer_matrix(table, FIELDS + 2), vector(table, FIELDS + 4), matrix(table, FIELDS + 5)
-    count = _unpack(s, packet, integers(table, FIELDS + 1), relays)
+    s, packet, relays = _arrays(table), integers(table, FIELDS), integer_matrix(table, FIELDS + 2)
+    names, sync = integers(table, FIELDS + 1), matrix(table, FIELDS + 3)
+    if not packet[SYNCED]:
+        master = _in_view(s, names, packet[MASTER])
+        sync[0, SYNC_MASTER], sync[0, SYNC_SUBTICKS] = master, np.nan
+        sync[0, SYNC_VARIANCE] = vector(table, FIELDS)[VARIANCE] if master >= 0 else 0.0
+    count = _unpack(s, packet, names, relays)
     stamps = (packet[PLACE], packet[NUMBER], packet[RX_TICKS], packet[TX_TICKS])
-    status = joint_hear(s, *stamps, relays, 0, count, matrix(table, FIELDS + 3), 1 - packet[SYNCED])
+    status = joint_hear(s, *stamps, relays, 0, count, sync, 0)
+    if status >= SYNC_WANTED:
+        packet[STATUS] = status - SYNC_WANTED
+        return status
+    _tell(s, table)
+    return status
+
+
+@borrowing_kernel
+def joint_rest(table: Table) -> int:
+    """The rest of a ``joint_step`` that wanted to know what the anchor says of its clock."""
+    s, packet = _arrays(table), integers(table, FIELDS)
+    end_packet(s, packet[PLACE], matrix(table, FIELDS + 3))
+    _tell(s, table)
+    return int(packet[STATUS])
+
+
+@borrowing_kernel
+def _tell(s: JointArrays, table: Table) -> None:
+    """Write what is known after the packet."""
+    motion, covariance, rows = vector(table, FIELDS + 4), matrix(table, FIELDS + 5), matrix(table, FIELDS + 6)
+    told = vector(table, FIELDS + 8)
     joint_motion(s, motion, covariance)
-    rows = matrix(table, FIELDS + 6)
     fill_motion(rows, motion, covariance, int(s.settings[DIM]), s.statistics[CHI2], s.settings[HEIGHT])
     protect(s, covariance, vector(table, FIELDS + 7), told)
     told[RUNNING_CHI2], told[RUNNING_SQUARED] = s.statistics[CHI2], s.statistics[RESIDUAL_SQUARED]
-    return status

@@ -41,7 +41,7 @@ SUBTICKS: Final = 256
 
 SYNC_MASTER, SYNC_SUBTICKS, SYNC_VARIANCE = range(3)
 """Places in a row of syncs: the master's place in the table of anchors; the sender's reading less the master's at the
-packet's TX stamp, in subticks modulo 2⁴⁸; its variance in m², 0 for none."""
+packet's TX stamp, in subticks modulo 2⁴⁸, NaN where one is to ask; its variance in m², 0 for none."""
 
 NO_SYNCS: Final[Matrix] = np.empty((0, 3))
 
@@ -53,21 +53,24 @@ LEAST_VARIANCE: Final = 0.1
 
 
 @borrowing_kernel
-def hear_sync(s: JointArrays, slot: int, syncs: Matrix, row: int) -> None:
+def hear_sync(s: JointArrays, slot: int, syncs: Matrix, row: int) -> bool:
     """Let what an anchor says of its clock against the master's replace what the filter says, where that is worse.
 
     The anchor has heard all of the master's packets that were relayed to the tag, and more. So its error is
     uncorrelated with the difference of both estimates, of variance P − q (P: the filter's, q: the anchor's), and the
     other states follow by P_xd/P times that difference: the difference of the clocks becomes what the anchor says.
+    Returns whether that would count but is not known (NaN): nothing has happened then.
     """
     master = s.slot_of[int(syncs[row, SYNC_MASTER])]
     least = LEAST_VARIANCE * (s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE])
     variance = max(syncs[row, SYNC_VARIANCE], least)
     if master < 0 or master == slot or s.slots[slot, EXCLUDED]:
-        return
+        return False
     _put_difference(s, master, slot)
     if _variance(s) <= WORTH * variance:
-        return
+        return False
+    if np.isnan(syncs[row, SYNC_SUBTICKS]):
+        return True
     whole = (s.slots[master, WHOLE] - s.slots[slot, WHOLE]) & TICK_MASK
     off = (np.int64(syncs[row, SYNC_SUBTICKS]) - SUBTICKS * whole) & (SUBTICKS * (TICK_MASK + 1) - 1)
     if off >= SUBTICKS * (TICK_MASK + 1) // 2:
@@ -80,6 +83,7 @@ def hear_sync(s: JointArrays, slot: int, syncs: Matrix, row: int) -> None:
         _replace(s, term, innovation, spread, variance)
     else:
         s.counts[SYNCS_REFUSED] += 1
+    return False
 
 
 @borrowing_kernel

@@ -11,7 +11,7 @@ from skyless.positioning.fix import Fix, NoFixReason, fix_of
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.in_use import AnchorsInUse
 from skyless.positioning.joint import JointFilter, JointSettings
-from skyless.positioning.joint_hearing import REJECTED, STALE_PACKET
+from skyless.positioning.joint_hearing import REJECTED, STALE_PACKET, SYNC_WANTED
 from skyless.positioning.joint_start import JointStart
 from skyless.positioning.master_scale import MasterScale
 from skyless.positioning.observation import Observation
@@ -37,6 +37,8 @@ REORDERED_S: Final = 0.1
 """Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
 
 NOT_USED: Final = frozenset({REJECTED, STALE_PACKET})
+
+NOBODY: Final = -1
 
 NOTHING: Final[list[int]] = []
 
@@ -161,16 +163,19 @@ class JointTracking:
 
     def _take(self, observation: Observation) -> int:
         place = self._place(observation)
-        return self._filter.hear_listed(
+        claim = observation.claim
+        status = self._filter.hear_listed(
             place,
             observation.sequence,
             observation.rx_ticks_tag,
             observation.tx_ticks_anchor,
             self._listed(place, observation) if observation.relays else NOTHING,
             observation.packed_relays,
-            self._sync(observation),
+            NOBODY if claim is None else claim.master,
+            0.0 if claim is None else observation.sync_variance_m2,
             observation.rx_variance_factor,
         )
+        return self._filter.synchronise(self._sync(observation)) if status >= SYNC_WANTED else status
 
     def _listed(self, place: int, observation: Observation) -> list[int]:
         """Relays of anchors that are known, as the filter takes them."""
