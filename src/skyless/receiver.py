@@ -14,7 +14,6 @@ from skyless.air.beacon import Beacon, Heard
 from skyless.air.claim import claim_of
 from skyless.air.codec import decode_cached, packed_relays
 from skyless.air.followed_master import FollowedMaster
-from skyless.air.malformed import Malformed
 from skyless.air.reception import Diagnostics, Reception
 from skyless.air.schedule import Schedule, schedule_from_page
 from skyless.clocks.filter import clock_noise
@@ -117,7 +116,7 @@ class Receiver:
         What does not belong here is counted in ``counters`` and dropped; nothing on the air raises.
         """
         beacon = decode_cached(reception.frame)
-        if isinstance(beacon, Malformed):
+        if not isinstance(beacon, Beacon):
             self.counters[beacon] += 1
             return None
         rx_ticks = self._unwrap(reception)
@@ -327,7 +326,8 @@ class Receiver:
         time = beacon.master_time
         if time is None:
             return None, 0.0, 0.0
-        whole, fraction = divmod(time.tx_subticks_master, 256)
+        subticks, std_m = time.tx_subticks_master, time.std_ticks * TICK_M
+        whole, fraction = subticks >> 8, subticks & 0xFF
         follow = beacon.anchor == self._master
         if self._master_scale is None:
             follow = True
@@ -339,7 +339,7 @@ class Receiver:
             follow = follow or abs(whole - last_whole - elapsed) <= MAX_DRIFT * elapsed + SLACK_TICKS
         if follow:
             self._master_scale = (whole, rx_ticks)
-        return whole, fraction / 256.0, (time.std_ticks * TICK_M) ** 2
+        return whole, fraction / 256.0, std_m**2
 
 
 def _trust(told: Diagnostics) -> float:

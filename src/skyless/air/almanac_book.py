@@ -72,12 +72,17 @@ class AlmanacBook:
 
     def hear(self, issue: int, page: Page | None) -> bool:
         """Take in the issue and the page (if any) of one beacon; return whether the book changed."""
-        if self._issue is None:
-            self._issue = issue
         if issue != self._issue:
-            return self._hear_rival(issue, page)
+            if self._issue is not None:
+                return self._hear_rival(issue, page)
+            self._issue = issue
         self._rival_issue = None
-        return page is not None and self._enter(page)
+        if page is None:
+            return False
+        place = _place(page)
+        if self._pages.get(place) is page and not self._doubted:  # pages come from a cache, so mostly the very same
+            return False
+        return self._enter(place, page)
 
     def _hear_rival(self, issue: int, page: Page | None) -> bool:
         if issue != self._rival_issue:
@@ -90,13 +95,12 @@ class AlmanacBook:
         self._clear()
         self._issue, self._rival_issue = issue, None
         for rival_page in self._rival_pages:
-            self._enter(rival_page)
+            self._enter(_place(rival_page), rival_page)
         return True
 
-    def _enter(self, page: Page) -> bool:
-        place: object = page.anchor if isinstance(page, AnchorPage) else type(page)
+    def _enter(self, place: object, page: Page) -> bool:
         held = self._pages.get(place)
-        if held is page or held == page:  # pages come from a cache, so mostly the very same
+        if held == page:
             if self._doubted:
                 self._doubted.pop(place, None)
             return False
@@ -117,3 +121,8 @@ class AlmanacBook:
             case GeoreferencePage():
                 self._georeference = page
         return True
+
+
+def _place(page: Page) -> object:
+    """What a page is kept by: another of the same place replaces it."""
+    return page.anchor if type(page) is AnchorPage else type(page)

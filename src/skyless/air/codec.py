@@ -147,7 +147,7 @@ def _decode_version_1(frame: bytes) -> Beacon | Malformed:
         master_time = MasterTime(low | high << 32, std_steps / STD_STEPS_PER_TICK)
     page_at = count_at + 1 + heard_bytes
     page = decode_page(frame[page_at : page_at + PAGE_BYTES]) if flags & _HAS_PAGE else None
-    if isinstance(page, Malformed):
+    if page is Malformed.BAD_PAGE:
         return page
     return Beacon(
         site, anchor, sequence, superframe, slot, tx_low | tx_high << 32, issue, master, term,

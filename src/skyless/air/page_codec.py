@@ -2,7 +2,7 @@
 
 import struct
 from functools import lru_cache
-from typing import Final
+from typing import Final, Literal
 
 from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
 from skyless.air.malformed import Malformed
@@ -53,7 +53,7 @@ def encode_page(page: Page) -> bytes:
 
 
 @lru_cache(maxsize=1024)
-def decode_page(data: bytes) -> Page | Malformed | None:
+def decode_page(data: bytes) -> Page | Literal[Malformed.BAD_PAGE] | None:
     """Return the page in 17 bytes, ``BAD_PAGE`` where a value is absurd, None for a type not known here."""
     decode = _DECODERS.get(data[0])
     if decode is None:

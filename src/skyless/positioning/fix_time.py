@@ -23,8 +23,8 @@ class FixTime:
             self._first_ticks_master = ticks_master
         else:
             elapsed = rx_ticks_tag - self._last_rx_ticks_tag
-            step = ticks_master - self._last_ticks_master
-            if elapsed <= 0 or abs(step - elapsed) > MAX_DRIFT * elapsed + SLACK_TICKS:
-                self._first_ticks_master += step - max(elapsed, 1)
+            off = ticks_master - self._last_ticks_master - elapsed
+            if elapsed <= 0 or (abs(off) > SLACK_TICKS and abs(off) > MAX_DRIFT * elapsed + SLACK_TICKS):
+                self._first_ticks_master += off + elapsed - max(elapsed, 1)
         self._last_ticks_master, self._last_rx_ticks_tag = ticks_master, rx_ticks_tag
         return (ticks_master - self._first_ticks_master) * TICK_S

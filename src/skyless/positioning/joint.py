@@ -259,8 +259,10 @@ class JointFilter:
         if relays:
             self._make_room(count)
             _packing(len(relays))(self._exchanged.relays, 0, *relays)
-        told = (0, count, len(packed) // HEARD.size, master, 0, sync_variance_m2, packed)
-        _pack_packet(self._exchanged.packet, 0, site, sequence, rx_ticks, tx_ticks, *told)
+        packet, words = self._exchanged.packet, len(packed) // HEARD.size
+        _pack_packet(
+            packet, 0, site, sequence, rx_ticks, tx_ticks, 0, count, words, master, 0, sync_variance_m2, packed
+        )  # fmt: skip
         return self._step() if variance_factor == 1.0 else self._weighed_step(site, variance_factor)
 
     def synchronise(self, sync: tuple[float, float, float] | None) -> int:
@@ -372,8 +374,8 @@ class JointFilter:
     def is_contradicted(self) -> bool:
         """Whether most of what anchors heard of each other does not fit: a wrong place draws all clocks with it."""
         recent = self._arrays.recent
-        refused = recent.item(RELAYS_REFUSED)
-        return bool(refused > CONTRADICTIONS and refused > recent.item(RELAYS_TAKEN))
+        refused: float = recent.item(RELAYS_REFUSED)
+        return refused > CONTRADICTIONS and refused > float(recent.item(RELAYS_TAKEN))
 
     @property
     def relays_fit(self) -> bool:

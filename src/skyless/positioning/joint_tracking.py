@@ -13,6 +13,7 @@ from skyless.positioning.in_use import AnchorsInUse
 from skyless.positioning.joint import JointFilter, JointSettings
 from skyless.positioning.joint_hearing import REJECTED, STALE_PACKET, SYNC_WANTED
 from skyless.positioning.joint_start import JointStart
+from skyless.positioning.joint_step import RUNNING_CHI2, RUNNING_SQUARED
 from skyless.positioning.master_scale import MasterScale
 from skyless.positioning.observation import Observation
 from skyless.positioning.protection import integrity_of
@@ -207,13 +208,21 @@ class JointTracking:
         return self._place_of[anchor]
 
     def _fix(self, observation: Observation) -> Fix | NoFixReason:
-        in_use, known, told = self._in_use, self._settings.height_m is not None, self._filter
-        if not known and told.newest[1][2, 2] > in_use.extent_m**2:
+        in_use, settings, joint = self._in_use, self._settings, self._filter
+        known = settings.height_m is not None
+        if not known and joint.newest[1][2, 2] > in_use.extent_m**2:
             return NoFixReason.BAD_GEOMETRY
-        rx_ticks = observation.rx_ticks_tag
+        rx_ticks, told = observation.rx_ticks_tag, joint.told()
         time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
-        *levels, chi2, squared = told.told()
-        risk, limit_m = self._settings.integrity_risk, self._settings.alert_limit_m
-        integrity = integrity_of(levels, risk, known, limit_m)
-        rows = told.rows.copy()
-        return fix_of(time_s, rows, known, in_use.anchors, in_use.anchors_m, chi2, squared, "joint", integrity)
+        integrity = integrity_of(told, settings.integrity_risk, known, settings.alert_limit_m)
+        return fix_of(
+            time_s,
+            joint.rows.copy(),
+            known,
+            in_use.anchors,
+            in_use.anchors_m,
+            told[RUNNING_CHI2],
+            told[RUNNING_SQUARED],
+            "joint",
+            integrity,
+        )
