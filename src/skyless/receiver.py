@@ -30,7 +30,7 @@ from skyless.positioning.protection import IntegrityRequirement
 from skyless.positioning.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.positioning.tracker import TrackerSettings
 from skyless.positioning.tracking import Tracking
-from skyless.ticks import HALF_WRAP_TICKS, LAST_TICKS, TICK_MASK, Unwrapper, from_seconds, to_seconds
+from skyless.ticks import HALF_WRAP_TICKS, LAST_TICKS, TICK_MASK, Unwrapper, from_seconds, nearest, to_seconds
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)
@@ -271,16 +271,17 @@ class Receiver:
     ) -> Observation:
         heard = beacon.master_heard if beacon.master == self._master else None
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
-        master_sequence = master_rx_ticks = None
         sync_variance_m2, joint = variance_m2, self._method_name == "joint"
         if heard is not None:
-            least, repeats = tx_ticks - HALF_WRAP_TICKS, self._repeats(beacon.anchor, heard)
-            master_sequence, master_rx_ticks = heard.sequence, least + ((heard.rx_ticks - least) & TICK_MASK)
+            repeats = self._repeats(beacon.anchor, heard)
             variance_m2 *= repeats * repeats
+        count, master_sequence, master_rx_ticks = 0, None, None
+        if self._method_name not in FILTERS:
+            count, (master_sequence, master_rx_ticks) = self._round(beacon, schedule), _stamp_of(heard, tx_ticks)
         return Observation(
             beacon.anchor,
             anchor_m,
-            self._round(beacon, schedule),
+            count,
             beacon.sequence,
             rx_ticks,
             tx_ticks,
@@ -345,3 +346,8 @@ class Receiver:
 def _trust(told: Diagnostics) -> float:
     """Factor on the variance of a reception by what the radio told of it."""
     return variance_factor(told.rx_power_dbm, told.first_path_power_dbm)
+
+
+def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[None, None]:
+    """Sequence number and unwrapped RX stamp of what the sender of a beacon heard before that."""
+    return (None, None) if heard is None else (heard.sequence, nearest(heard.rx_ticks, tx_ticks))

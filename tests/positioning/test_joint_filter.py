@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from joint_builders import LAB_M, ROOM_M, SLOT_S, begun, episode_of, ideal, kept, packets_of, settings_of
 
+from skyless.air.beacon import HEARD
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.studies.episodes import Case
@@ -176,6 +177,26 @@ def test_streaming_and_batch_give_identical_bits(case, anchors_m, height_m):
     assert one.arrays.counts[SLOTS] == len(anchors_m)
     assert np.array_equal(one.covariance(), one.covariance().T)
     assert np.linalg.norm(motions[-1, :2] - episode.path_m[-1, :2]) < 0.2
+
+
+def test_packed_relays_are_those_listed():
+    episode, names = episode_of(MESH, 20), 300 + np.arange(len(LAB_M))
+    listed = begun(episode, settings_of(MESH))
+    packed = begun(episode, settings_of(MESH), np.empty((0, 3)))
+    for name, anchor_m in zip(names.tolist(), LAB_M, strict=True):
+        packed.add_anchor(anchor_m, name)
+    for site, sequence, rx_ticks, tx_ticks, relays in packets_of(episode.messages):
+        told = b"".join(
+            HEARD.pack(name, number & 0xFF, stamp & 0xFFFFFFFF, stamp >> 32 & 0xFF)
+            for name, number, stamp in [(9, 1, 5), *zip(names[relays[:, 1]], *relays[:, 2:].T, strict=True)]
+        )
+        assert listed.hear(site, sequence, rx_ticks, tx_ticks, relays) == packed.hear_listed(
+            site, sequence, rx_ticks, tx_ticks, [], told
+        )
+    assert listed.arrays.counts[RELAYS_USED] > 100
+    for one, other in zip(listed.arrays, packed.arrays, strict=True):
+        if one is not listed.arrays.slot_of and one is not listed.arrays.site_m:
+            assert np.array_equal(one, other)
 
 
 def streamed_positions():

@@ -11,6 +11,7 @@ from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.studies.plan import Plan
 from skyless.experiments.studies.stage import walking
 from skyless.experiments.studies.worlds import run_world
+from skyless.positioning.joint_hearing import SYNC_WANTED
 from skyless.positioning.joint_state import EXCLUDED, SYNCS_REFUSED, SYNCS_USED, states, values
 from skyless.positioning.joint_sync import SUBTICKS, WORTH
 from skyless.positioning.master_scale import MasterScale
@@ -169,13 +170,20 @@ def test_anchors_that_are_left_out_say_nothing():
 def test_streaming_is_batch():
     episode, messages, keep = lost(MESH, 0.8, 9)
     heard = kept(messages, keep)
-    batch, stream = (begun(episode, settings_of(MESH), capacity=4) for _ in range(2))
+    batch, stream, asked = (begun(episode, settings_of(MESH), capacity=4) for _ in range(3))
+    asked._exchanged.names[: len(LAB_M)] = range(len(LAB_M))
     batch.track(heard)
+    questions = 0
     for packet, sync in zip(packets_of(heard), heard.syncs, strict=True):
-        stream.hear(*packet, sync[None])
-    assert batch.arrays.counts[SYNCS_USED] > 5
-    for one, other in zip(batch.arrays, stream.arrays, strict=True):
-        assert np.array_equal(one, other)
+        became = stream.hear(*packet, sync[None])
+        status = asked.hear_listed(*packet[:4], packet[4].ravel().tolist(), b"", int(sync[0]), float(sync[2]))
+        if status >= SYNC_WANTED:
+            questions += 1
+            status = asked.synchronise(tuple(sync))
+        assert status == became
+    assert len(heard.sites) / 2 > questions >= batch.arrays.counts[SYNCS_USED] > 5
+    for arrays in (stream.arrays, asked.arrays):
+        assert all(np.array_equal(one, other) for one, other in zip(batch.arrays, arrays, strict=True))
 
 
 def packet(anchor, own_ticks, site_subticks, claim):

@@ -20,14 +20,15 @@ class Observation(Struct, frozen=True, gc=False):
     anchor_m: NDArray[np.float64]
     """Shape (3,)."""
     round: int
-    """Counts the frames that each node sends: the superframe, or a fraction of it with several frames per node."""
+    """Counts the frames that each node sends: the superframe, or a fraction of it with several frames per node; for
+    snapshots only, as are ..."""
     sequence: int
     rx_ticks_tag: int
     tx_ticks_anchor: int
     master_sequence: int | None
-    """Sequence number of the last master beacon that the anchor heard."""
+    """... the sequence number of the last master beacon that the anchor heard, ..."""
     master_rx_ticks_anchor: int | None
-    """The anchor's RX stamp of it."""
+    """... and the anchor's RX stamp of it."""
     tx_ticks_master: int | None
     """TX time on the master's scale, whole ticks; None while the anchor does not know it."""
     tx_fraction_ticks: float
