@@ -18,6 +18,7 @@ from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.studies.episodes import Case
 from skyless.positioning.joint import JointFilter, JointSettings, Messages
 from skyless.positioning.joint_hearing import JOINED
+from skyless.positioning.joint_slots import add_noise_state, add_slot, drop_slot
 from skyless.positioning.joint_state import (
     BASE,
     EPOCH,
@@ -30,9 +31,6 @@ from skyless.positioning.joint_state import (
     SITE,
     SLOTS,
     WHOLE,
-    add_noise_state,
-    add_slot,
-    drop_slot,
     new_arrays,
     states,
     values,

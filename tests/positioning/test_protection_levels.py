@@ -10,9 +10,8 @@ from skyless.constants import TICK_M
 from skyless.experiments.studies.integrity import Setting, run_chunk
 from skyless.experiments.studies.integrity_faults import Fault
 from skyless.positioning.fix import Fix
-from skyless.positioning.joint_monitor import _pardon
 from skyless.positioning.joint_soundness import is_sound
-from skyless.positioning.joint_state import BASE, EPOCH, EVIDENCE, EXCLUDED, JUMPS, PACKETS, PARDONS, values
+from skyless.positioning.joint_state import BASE, EPOCH, EVIDENCE, EXCLUDED, JUMPS, values
 from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.protection import Alert, IntegrityRequirement, integrity_of, limits_of
 from skyless.positioning.protection_levels import HPL, LEVELS, VPL, protect
@@ -186,16 +185,6 @@ def test_two_that_are_left_out_leave_nothing_to_promise():
     twice = [told for told, excluded in alerts_and_slots(episode, messages, settings_of(case)) if len(excluded) == 2]
     assert twice
     assert {(one.alert, one.hpl_m) for one in twice} == {(Alert.NOT_EXCLUDED, None)}
-
-
-def test_a_pardon_unsettles():
-    case = Case(mesh=True)
-    episode = episode_of(case, 60)
-    s = heard(episode, episode.messages, settings_of(case)).arrays
-    s.slots[2, EXCLUDED] = 1
-    assert s.recent[PACKETS] > 0.0
-    _pardon(s)
-    assert (s.recent[PACKETS], s.slots[2, EXCLUDED], s.counts[PARDONS]) == (0.0, 0, 1)
 
 
 def test_nothing_is_promised_until_the_filter_has_settled_after_an_anchor_restarts():

@@ -16,7 +16,6 @@ from skyless.addresses import Addresses
 from skyless.air.beacon import HEARD
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.positioning.joint_hearing import FULL, JOINED, joint_motion, joint_track
-from skyless.positioning.joint_monitor import PATIENCE
 from skyless.positioning.joint_state import (
     BASE,
     CAUTION,
@@ -24,7 +23,6 @@ from skyless.positioning.joint_state import (
     EXCLUDED,
     EXCLUSIONS,
     LATE_SHARE,
-    PARDONED,
     QA,
     REJECTED_IN_ROW,
     RELAYS_REFUSED,
@@ -206,7 +204,6 @@ class JointFilter:
         s.P[:dim, :dim] = covariance_m2
         s.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
         s.counts[EPOCH] = s.counts[BASE] = rx_ticks
-        s.counts[PARDONED] = -PATIENCE
         s.statistics[:] = 0.0
         s.statistics[CAUTION] = caution_m2
         s.statistics[:4] = (1.0, s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE], 0.0, 1.0)

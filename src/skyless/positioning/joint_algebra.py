@@ -22,6 +22,7 @@ from skyless.positioning.joint_state import (
     MOTION_RATE,
     MOTION_VALUE,
     PLACES,
+    SLOTS,
     TERMS,
     JointArrays,
     Matrix,
@@ -131,7 +132,7 @@ def take(s: JointArrays, term: int, innovation: float, spread: float, own: int) 
 
 @borrowing_kernel
 def add_terms(s: JointArrays) -> None:
-    """Add all terms to the covariance, and to the sensitivities."""
+    """Add all terms to the covariance, to the sensitivities and to what slots share."""
     count, u, r = s.counts[TERMS], s.terms, s.responses
     for k in range(count, _in_terms(count)):  # terms of nothing
         for column in range(0, width(s), EIGHT):
@@ -140,12 +141,14 @@ def add_terms(s: JointArrays) -> None:
             store(r, (k, column), repeated(0.0))
     k = 0
     while count - k > 2:
-        _add_four(s, s.P, u, k, width(s))
-        _add_four(s, s.sensitivities, r, k, lanes(s))
+        _add_four(s.P, u, u, k, states(s), width(s))
+        _add_four(s.sensitivities, u, r, k, states(s), lanes(s))
+        _add_four(s.shared, r, r, k, s.counts[SLOTS], lanes(s))
         k += 4
     if k < count:
-        _add_two(s, s.P, u, k, width(s))
-        _add_two(s, s.sensitivities, r, k, lanes(s))
+        _add_two(s.P, u, u, k, states(s), width(s))
+        _add_two(s.sensitivities, u, r, k, states(s), lanes(s))
+        _add_two(s.shared, r, r, k, s.counts[SLOTS], lanes(s))
     s.counts[TERMS] = 0
 
 
@@ -156,22 +159,20 @@ def _in_terms(count: int) -> int:
 
 
 @borrowing_kernel
-def _add_four(s: JointArrays, matrix: Matrix, terms: Matrix, k: int, columns: int) -> None:
-    u, n = s.terms, states(s)
+def _add_four(matrix: Matrix, u: Matrix, terms: Matrix, k: int, rows: int, columns: int) -> None:
     for column in range(0, columns, EIGHT):
         a, b = load(terms, (k, column)), load(terms, (k + 1, column))
         c, d = load(terms, (k + 2, column)), load(terms, (k + 3, column))
-        for row in range(n):
+        for row in range(rows):
             total = add(add(load(matrix, (row, column)), -u[k, row], a), -u[k + 1, row], b)
             store(matrix, (row, column), add(add(total, -u[k + 2, row], c), -u[k + 3, row], d))
 
 
 @borrowing_kernel
-def _add_two(s: JointArrays, matrix: Matrix, terms: Matrix, k: int, columns: int) -> None:
-    u, n = s.terms, states(s)
+def _add_two(matrix: Matrix, u: Matrix, terms: Matrix, k: int, rows: int, columns: int) -> None:
     for column in range(0, columns, EIGHT):
         a, b = load(terms, (k, column)), load(terms, (k + 1, column))
-        for row in range(n):
+        for row in range(rows):
             total = add(load(matrix, (row, column)), -u[k, row], a)
             store(matrix, (row, column), add(total, -u[k + 1, row], b))
 

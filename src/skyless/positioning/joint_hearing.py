@@ -6,6 +6,7 @@ from skyless.compiled import borrowing_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.joint_algebra import add_terms, settle
 from skyless.positioning.joint_monitor import LATE_ENOUGH
+from skyless.positioning.joint_slots import add_noise_state, add_slot, drop_slot, has_room
 from skyless.positioning.joint_state import (
     BASE,
     DIM,
@@ -37,10 +38,6 @@ from skyless.positioning.joint_state import (
     JointArrays,
     Matrix,
     Vector,
-    add_noise_state,
-    add_slot,
-    drop_slot,
-    has_room,
     values,
 )
 from skyless.positioning.joint_sync import SYNC_VARIANCE, hear_sync

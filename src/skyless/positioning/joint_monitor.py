@@ -9,28 +9,22 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import borrowing_kernel
+from skyless.positioning.joint_faults import CHANGE, exclude_likeliest, take_back
 from skyless.positioning.joint_state import (
-    CAUTION,
     DIM,
     EXCLUDED,
-    EXCLUSIONS,
     GATE,
     IN_ROW,
     LAG,
     LAG_SQUARED,
     LATE_SHARE,
     OUT,
-    PARDONED,
-    PARDONS,
-    READMISSIONS,
-    REJECTIONS,
     SCORE,
     SLOTS,
     WEIGHT,
     JointArrays,
     values,
 )
-from skyless.positioning.protection_updates import unsettle
 from skyless.positioning.tracker import (
     ACCEPTED,
     AGILITY,
@@ -62,18 +56,11 @@ EXCLUDE_AT: Final = 4.5 * float(np.sqrt(SCORE_GAIN / (2.0 - SCORE_GAIN)))
 """Of the running mean of an anchor's normalised innovations: 4.5 standard deviations of it."""
 
 READMIT_AT: Final = 0.5 * EXCLUDE_AT
-MOST_EXCLUDED: Final = 2
+READMIT_AFTER: Final = 20
+"""Packets of it: where the position had given way to a liar, its innovations look ordinary at first."""
+
 CONTAMINATION_M: Final = 0.1
 """What an anchor that is excluded may have done to the position before, per axis."""
-
-EARLY: Final = 0.85
-"""Weight of an anchor that seems early: paths are late, and one late anchor makes others seem early."""
-
-PATIENCE: Final = 1000
-"""Messages. Where a second anchor seems wrong, or two are excluded of which one seems early as no path is, perhaps the
-first was the wrong one: all are taken back and judged anew, but not more often than that."""
-
-PARDON_VARIANCE_M2: Final = 0.25
 
 LAG_GAIN: Final = 0.05
 LAG_FORGETTING: Final = 0.01
@@ -152,53 +139,20 @@ def follow(s: JointArrays, normalised: float) -> None:
 
 @borrowing_kernel
 def _watch(s: JointArrays, slot: int) -> None:
-    """Exclude an anchor whose innovations are off for long, the worst first, or take one back."""
-    score = _weighed(s, slot)
-    excluded, worst = 0, True
-    for other in range(s.counts[SLOTS]):
-        excluded += s.slots[other, EXCLUDED]
-        if not s.slots[other, EXCLUDED] and _weighed(s, other) > score:
-            worst = False
-    patient = s.counts[ACCEPTED] - s.counts[PARDONED] < PATIENCE
-    if s.slots[slot, EXCLUDED]:
-        if abs(s.anchors[slot, SCORE]) < READMIT_AT:
-            s.slots[slot, EXCLUDED] = 0
-            s.evidence[REJECTIONS, slot] = 0.0
-            s.counts[READMISSIONS] += 1
-        elif excluded == MOST_EXCLUDED and s.anchors[slot, SCORE] < 0.0 and not patient:
-            _pardon(s)
-    elif score >= EXCLUDE_AT + SCORE_CLIP * s.statistics[LATE_SHARE] and worst:
-        if excluded > 0 and not patient:
-            _pardon(s)
-        elif excluded < MOST_EXCLUDED and s.counts[SLOTS] - excluded > int(s.settings[DIM]) + 1:
-            s.slots[slot, EXCLUDED] = 1
-            s.counts[EXCLUSIONS] += 1
-            _forgive(s, CONTAMINATION_M * CONTAMINATION_M)
+    """Take an anchor back whose innovations are ordinary; where they are off for long, see who is wrong."""
+    score, out = abs(s.anchors[slot, SCORE]), s.slots[slot, EXCLUDED] != 0
+    if out and score < READMIT_AT and s.slots[slot, IN_ROW] >= READMIT_AFTER:
+        take_back(s, slot)
+        return
+    off = score >= EXCLUDE_AT + SCORE_CLIP * s.statistics[LATE_SHARE]
+    if (out or off) and exclude_likeliest(s, CHANGE if out else 0.0):
+        _doubt(s)
 
 
 @borrowing_kernel
-def _weighed(s: JointArrays, slot: int) -> float:
-    """How wrong an anchor seems: rather late than early."""
-    score = s.anchors[slot, SCORE]
-    return float(score if score > 0.0 else -EARLY * score)
-
-
-@borrowing_kernel
-def _pardon(s: JointArrays) -> None:
-    """Take all anchors back and find the position anew among them: perhaps the wrong one was excluded."""
-    s.counts[PARDONED] = s.counts[ACCEPTED]
-    s.counts[PARDONS] += 1
-    s.statistics[CAUTION] = PARDON_VARIANCE_M2
-    for slot in range(s.counts[SLOTS]):
-        s.slots[slot, EXCLUDED] = 0
-    unsettle(s)
-    _forgive(s, PARDON_VARIANCE_M2)
-
-
-@borrowing_kernel
-def _forgive(s: JointArrays, variance: float) -> None:
+def _doubt(s: JointArrays) -> None:
     """Take back what an anchor may have done to the position and the tag's clock, and what others seemed to be."""
-    dim, half = int(s.settings[DIM]), values(s)
+    dim, half, variance = int(s.settings[DIM]), values(s), CONTAMINATION_M * CONTAMINATION_M
     for axis in range(dim):
         s.P[axis, axis] += variance
     for one in range(dim, half):

@@ -37,11 +37,9 @@ EPOCH, BASE, ACCEPTED, REJECTED, REJECTED_IN_ROW, SLOTS, NOISES, TERMS, PLACES =
     STALE,
     STALE_IN_ROW,
     IMPOSSIBLE,
-    PARDONED,
-    PARDONS,
     SYNCS_USED,
     SYNCS_REFUSED,
-) = range(9, 23)
+) = range(9, 21)
 """Places in ``counts``. The epoch is the tag's reading at the newest message, the base that of the values."""
 
 SITE, WHOLE, TX, RX, NOISE, WANTED, IN_ROW, EXCLUDED, RELAYS_IN_ROW, REJOINED = range(10)
@@ -72,7 +70,10 @@ EVIDENCE: Final = 3
 """Rows of ``evidence`` for each memory, sums: Σwsν, Σws², Σw²s² (``protection_updates``); ..."""
 
 REJECTIONS: Final = 2 * EVIDENCE
-"""... behind both memories the packets of the slot that lay beyond the gate."""
+"""... behind both memories the packets of the slot that lay beyond the gate, ..."""
+
+REFUSED: Final = REJECTIONS + 1
+"""... and what Σwsν, of the long memory, lacks of innovations that were not used."""
 
 MOTION_VALUE, MOTION_CROSS, MOTION_RATE, CLOCK_VALUE, CLOCK_CROSS, CLOCK_RATE = range(6)
 """Places in ``noise``: variance of a value, its covariance with the rate, the rate's variance; of each axis, and of
@@ -123,7 +124,9 @@ class JointArrays(NamedTuple):
     responses: Matrix
     """Shape (MOST_TERMS, lanes); what sensitivities are still to change by, −Σ term·responsesᵀ."""
     evidence: Matrix
-    """Shape (2·EVIDENCE + 1, lanes): what innovations say of such a fault, with a short and a long memory."""
+    """Shape (REFUSED + 1, lanes): what innovations say of such a fault, with a short and a long memory."""
+    shared: Matrix
+    """Shape (lanes, lanes): −Σwss' of any two slots, with the long memory and of refused innovations as well."""
     recent: Vector
     """Shape (3,)."""
 
@@ -149,7 +152,7 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
         noise=np.zeros(6),
         h_places=np.zeros(MOST_PLACES, np.int64),
         h=np.zeros(MOST_PLACES),
-        counts=np.zeros(23, np.int64),
+        counts=np.zeros(21, np.int64),
         statistics=np.zeros(13),
         slots=np.zeros((capacity, 10), np.int64),
         anchors=np.zeros((capacity, 8)),
@@ -160,7 +163,8 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
         site_m=np.zeros((site_capacity, 3)),
         sensitivities=zeros(states, columns),
         responses=zeros(MOST_TERMS, columns),
-        evidence=zeros(2 * EVIDENCE + 1, columns),
+        evidence=zeros(REFUSED + 1, columns),
+        shared=zeros(columns, columns),
         recent=np.zeros(3),
     )
 
@@ -196,122 +200,3 @@ def width(s: JointArrays) -> int:
 def lanes(s: JointArrays) -> int:
     """As many for the slots."""
     return int((s.counts[SLOTS] + 7) // 8 * 8)
-
-
-@borrowing_kernel
-def _insert(s: JointArrays, n: int, place: int) -> None:
-    """Make room for a state at ``place``, zero and without variance."""
-    x, P = s.x, s.P
-    for row in range(n, place, -1):
-        x[row] = x[row - 1]
-        for column in range(n):
-            P[row, column] = P[row - 1, column]
-    x[place] = 0.0
-    for column in range(n + 1):
-        P[place, column] = 0.0
-    for row in range(n + 1):
-        for column in range(n, place, -1):
-            P[row, column] = P[row, column - 1]
-        P[row, place] = 0.0
-    V = s.sensitivities
-    for slot in range(s.counts[SLOTS]):
-        for row in range(n, place, -1):
-            V[row, slot] = V[row - 1, slot]
-        V[place, slot] = 0.0
-
-
-@borrowing_kernel
-def _remove(s: JointArrays, n: int, place: int) -> None:
-    """Take a state out; what stood behind it moves up, zeros follow."""
-    x, P = s.x, s.P
-    for row in range(place, n - 1):
-        x[row] = x[row + 1]
-        for column in range(n):
-            P[row, column] = P[row + 1, column]
-    x[n - 1] = 0.0
-    for column in range(n):
-        P[n - 1, column] = 0.0
-    for row in range(n):
-        for column in range(place, n - 1):
-            P[row, column] = P[row, column + 1]
-        P[row, n - 1] = 0.0
-    V = s.sensitivities
-    for slot in range(s.counts[SLOTS]):
-        for row in range(place, n - 1):
-            V[row, slot] = V[row + 1, slot]
-        V[n - 1, slot] = 0.0
-
-
-@borrowing_kernel
-def has_room(s: JointArrays) -> bool:
-    """Whether one more anchor fits."""
-    return bool(s.counts[SLOTS] < s.slots.shape[0])
-
-
-@borrowing_kernel
-def add_slot(s: JointArrays, site: int) -> int:
-    """Give an anchor a slot, the last one, with two states of zero; the caller has seen that there is room."""
-    slot: int = s.counts[SLOTS]
-    n, one_more = states(s), values(s)
-    _insert(s, n, 2 * one_more)
-    _insert(s, n + 1, one_more)
-    s.counts[SLOTS] = slot + 1
-    s.slot_of[site] = slot
-    s.slots[slot, :] = 0
-    s.slots[slot, SITE] = site
-    s.slots[slot, NOISE] = -1
-    for axis in range(3):
-        s.anchors[slot, axis] = s.site_m[site, axis]
-    s.anchors[slot, RANGE:] = 0.0
-    s.anchors[slot, WEIGHT] = 1.0
-    s.sensitivities[:, slot] = 0.0
-    s.evidence[:, slot] = 0.0
-    s.packets[slot, :, :] = NEVER
-    s.relayed[slot, :] = NEVER
-    s.relayed[:, slot] = NEVER
-    return slot
-
-
-@borrowing_kernel
-def add_noise_state(s: JointArrays, slot: int) -> None:
-    """Give an anchor a state for the noise of its TX stamps (there is room for one of each slot)."""
-    _insert(s, states(s), states(s))
-    s.slots[slot, NOISE] = s.counts[NOISES]
-    s.counts[NOISES] += 1
-
-
-@borrowing_kernel
-def drop_slot(s: JointArrays, slot: int) -> None:
-    """Forget an anchor and its states."""
-    noise = s.slots[slot, NOISE]
-    if noise >= 0:
-        _remove(s, states(s), 2 * values(s) + noise)
-        s.counts[NOISES] -= 1
-    dim, n, half = int(s.settings[DIM]), states(s), values(s)
-    _remove(s, n, half + dim + slot)
-    _remove(s, n - 1, dim + slot)
-    last = s.counts[SLOTS] - 1
-    s.slot_of[s.slots[slot, SITE]] = -1
-    for k in range(slot, last):
-        for column in range(s.slots.shape[1]):
-            s.slots[k, column] = s.slots[k + 1, column]
-        for column in range(s.anchors.shape[1]):
-            s.anchors[k, column] = s.anchors[k + 1, column]
-        for row in range(s.sensitivities.shape[0]):
-            s.sensitivities[row, k] = s.sensitivities[row, k + 1]
-        for row in range(2 * EVIDENCE + 1):
-            s.evidence[row, k] = s.evidence[row, k + 1]
-        for packet in range(REMEMBERED):
-            for column in range(3):
-                s.packets[k, packet, column] = s.packets[k + 1, packet, column]
-        for column in range(last + 1):
-            s.relayed[k, column] = s.relayed[k + 1, column]
-        s.slot_of[s.slots[k, SITE]] = k
-    for k in range(last):
-        for column in range(slot, last):
-            s.relayed[k, column] = s.relayed[k, column + 1]
-        if s.slots[k, NOISE] > noise >= 0:
-            s.slots[k, NOISE] -= 1
-    s.sensitivities[:, last] = 0.0
-    s.evidence[:, last] = 0.0
-    s.counts[SLOTS] = last

@@ -114,7 +114,8 @@ def _arrays(table: Table) -> JointArrays:
         matrix(table, 16),
         matrix(table, 17),
         matrix(table, 18),
-        vector(table, 19),
+        matrix(table, 19),
+        vector(table, 20),
     )
 
 

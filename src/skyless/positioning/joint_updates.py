@@ -45,7 +45,7 @@ from skyless.positioning.joint_state import (
     values,
     width,
 )
-from skyless.positioning.protection_updates import join_faults
+from skyless.positioning.protection_updates import gather_refused, join_faults
 
 CALMING: Final = 0.98
 LEAST_CAUTION_M2: Final = 1e-5
@@ -122,6 +122,7 @@ def hear_anchor(s: JointArrays, slot: int, rx_ticks: int, tx_ticks: int) -> bool
         s.x[offset] -= steps * TICK_M
     else:
         s.evidence[REJECTIONS, slot] += 1.0
+        gather_refused(s, term, slot, innovation, spread)
     return bool(factor > 0.0)
 
 

@@ -9,22 +9,29 @@ after Friedland (1969) and Willsky and Jones (1976).
 
 from typing import Final
 
+import numpy as np
+
 from skyless.compiled import borrowing_kernel
 from skyless.eights import EIGHT, Eight, add, load, scaled, store
 from skyless.positioning.joint_state import (
     EVIDENCE,
     PACKETS,
     PLACES,
+    REFUSED,
     REJECTIONS,
     RELAYS_REFUSED,
     RELAYS_TAKEN,
     SLOTS,
     JointArrays,
+    Matrix,
 )
 
 SHORT: Final = 6.0
 LONG: Final = 24.0
 """Memories of the evidence, in packets of each anchor in view."""
+
+REFUSED_CLIP: Final = 5.0
+"""So many standard deviations an innovation that was not used counts at most as evidence."""
 
 
 @borrowing_kernel
@@ -35,21 +42,24 @@ def fade_evidence(s: JointArrays) -> None:
         return
     short, long = 1.0 - 1.0 / (SHORT * slots), 1.0 - 1.0 / (LONG * slots)
     for lane in range(0, slots, EIGHT):
-        _fade(s, 0, lane, short)
-        _fade(s, 1, lane, short)
-        _fade(s, 2, lane, short * short)
-        _fade(s, EVIDENCE, lane, long)
-        _fade(s, EVIDENCE + 1, lane, long)
-        _fade(s, EVIDENCE + 2, lane, long * long)
-        _fade(s, REJECTIONS, lane, long)
+        _fade(s.evidence, 0, lane, short)
+        _fade(s.evidence, 1, lane, short)
+        _fade(s.evidence, 2, lane, short * short)
+        _fade(s.evidence, EVIDENCE, lane, long)
+        _fade(s.evidence, EVIDENCE + 1, lane, long)
+        _fade(s.evidence, EVIDENCE + 2, lane, long * long)
+        _fade(s.evidence, REJECTIONS, lane, long)
+        _fade(s.evidence, REFUSED, lane, long)
+        for slot in range(slots):
+            _fade(s.shared, slot, lane, long)
     s.recent[PACKETS] = s.recent[PACKETS] * long + 1.0
     s.recent[RELAYS_TAKEN] *= long
     s.recent[RELAYS_REFUSED] *= long
 
 
 @borrowing_kernel
-def _fade(s: JointArrays, row: int, lane: int, factor: float) -> None:
-    store(s.evidence, (row, lane), scaled(factor, load(s.evidence, (row, lane))))
+def _fade(sums: Matrix, row: int, lane: int, factor: float) -> None:
+    store(sums, (row, lane), scaled(factor, load(sums, (row, lane))))
 
 
 @borrowing_kernel
@@ -76,6 +86,22 @@ def gather_evidence(s: JointArrays, term: int, own: int, whitened: float, scale:
 @borrowing_kernel
 def _gather(s: JointArrays, row: int, lane: int, factor: float | Eight, response: Eight) -> None:
     store(s.evidence, (row, lane), add(load(s.evidence, (row, lane)), factor, response))
+
+
+@borrowing_kernel
+def gather_refused(s: JointArrays, term: int, own: int, innovation: float, spread: float) -> None:
+    """Take an innovation that was not used as evidence for the monitor alone: it may be anything."""
+    r, scale = s.responses, 1.0 / np.sqrt(spread)
+    r[term, own] -= 1.0
+    clipped = min(max(innovation * scale, -REFUSED_CLIP), REFUSED_CLIP)
+    if not np.isfinite(clipped):
+        return
+    for lane in range(0, s.counts[SLOTS], EIGHT):
+        response = scaled(scale, load(r, (term, lane)))
+        _gather(s, REFUSED, lane, -clipped, response)
+        for slot in range(s.counts[SLOTS]):
+            share = add(load(s.shared, (slot, lane)), -scale * r[term, slot], response)
+            store(s.shared, (slot, lane), share)
 
 
 @borrowing_kernel
