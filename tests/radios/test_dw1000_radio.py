@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 from air_stage import LAB, make_ether
 from chip_stage import HandClock, TimedNode
-from serial_stage import ears
+from radio_ears import ears
 
 from skyless.air.fcs import fcs
 from skyless.air.reception import Diagnostics, Reception, Transmission

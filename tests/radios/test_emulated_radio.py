@@ -7,6 +7,7 @@ import time
 
 import pytest
 from air_stage import make_ether
+from radio_ears import ears
 
 from skyless.air.reception import Reception, Transmission
 from skyless.constants import TICK_RATE_HZ
@@ -48,35 +49,11 @@ class OpenAir:
         self.ether._timer.cancel()
 
 
-class Node:
-    """A radio that runs, and all that it has told."""
-
-    def __init__(self, radio):
-        self.radio, self.told = radio, []
-        self.task = asyncio.ensure_future(radio.run(self.told.append))
-
-    def of(self, kind):
-        return [event for event in self.told if isinstance(event, kind)]
-
-    async def until(self, kind, count=1):
-        async with asyncio.timeout(20):
-            while len(self.of(kind)) < count:
-                await asyncio.sleep(0.001)
-        return self.of(kind)[-1]
-
-    async def stop(self):
-        self.task.cancel()
-        await asyncio.wait([self.task])
-
-
 @contextlib.asynccontextmanager
 async def nodes(port, kind, *names):
-    made = [Node(radio) for radio in open_radios(f"ether:{HOST}:{port}", kind, names)]
-    try:
-        yield made
-    finally:
-        for node in made:
-            await node.stop()
+    async with contextlib.AsyncExitStack() as stack:
+        radios = open_radios(f"ether:{HOST}:{port}", kind, names)
+        yield [await stack.enter_async_context(ears(radio)) for radio in radios]
 
 
 def ahead(radio, seconds):

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from serial_stage import PlayedBoard, ears, linked
+from radio_ears import ears
+from serial_stage import PlayedBoard, linked
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.anchor import Anchor

@@ -9,7 +9,8 @@ import asyncio
 import msgspec
 import pytest
 from chip_stage import ChipAnchor, TimedNode, WorldAir
-from serial_stage import PlayedBoard, ears
+from radio_ears import ears
+from serial_stage import PlayedBoard
 
 from skyless.anchor import Anchor
 from skyless.experiments.scenarios import Request, impairments_of
