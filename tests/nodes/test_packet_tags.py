@@ -27,7 +27,7 @@ def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_anew(packets)
     published, said = [], []
     (radio,) = open_sniffers("sniffer:/dev/nothing", ("drone",))
     node = PacketTagNode(SETTINGS, radio, published.append, said.append)
-    node.unix_less_host_s = 0.0
+    node.book.unix_less_host_s = 0.0
     node.hear(Restarted())
     first = node.tracking
     for packet in packets:
@@ -39,14 +39,14 @@ def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_anew(packets)
     assert {fix.unix_s for fix in late} <= {packet.host_s for packet in packets}
     assert [fix.serial for fix in published] == list(range(1, len(published) + 1))
     assert late[-1].method == "joint"
-    fixes, drops = node.serial, node.counters
+    fixes, drops = node.book.serial, node.counters
     node.hear(Gone("pulled out"))
     node.hear(Restarted())
     assert node.tracking is not first
     assert node.counters == drops
     for packet in packets:
         node.hear(msgspec.structs.replace(packet, rx_ticks=(packet.rx_ticks + 2**39) % 2**40))
-    assert node.serial > fixes + 400
+    assert node.book.serial > fixes + 400
     assert said == ["tag drone: listening", "tag drone: pulled out; still looking for it", "tag drone: listening again"]
 
 
@@ -86,7 +86,7 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     assert (fix_topic, health_topic) == ("skyless/v1/7/tag/one/fix", "skyless/v1/7/tag/one/health")
     assert isinstance(fix, FixMessage)
     again = msgspec.json.decode(msgspec.json.encode(health), type=TagHealth)
-    assert (again.receptions, again.fixes, again.updates_per_s) == (len(packets) + 1, one.serial, one.serial)
+    assert (again.receptions, again.fixes, again.updates_per_s) == (len(packets) + 1, one.book.serial, one.book.serial)
     assert again.reason is None
     assert again.counters["malformed-line"] == 3
     assert again.counters["unknown-anchor"] == 1

@@ -123,7 +123,7 @@ def test_without_a_broker_it_works_and_tells_nobody(links):
             tag.node.hear(reception)
         tag.tell_health(0.1, 1)
         tag.tell_receptions()
-        assert tag.node.serial > 100
+        assert tag.node.book.serial > 100
         assert links == []
 
     asyncio.run(main())

@@ -4,7 +4,7 @@ import msgspec
 from msgspec.structs import replace
 
 from machines.bench import LAB, tape
-from skyless.nodes.tag import fix_message
+from skyless.nodes.fix_book import fix_message
 from skyless.outputs import topics
 from skyless.outputs.messages import RequestMessage, SiteMessage, TrueMotion, TruthMessage
 from skyless.positioning.protection import IntegrityRequirement

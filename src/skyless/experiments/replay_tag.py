@@ -12,7 +12,7 @@ from skyless.air.reception import Diagnostics, Reception
 from skyless.constants import TICK_S
 from skyless.experiments.replay_delays import DelayChange, with_delays
 from skyless.methods import DEFAULT_METHOD, METHODS
-from skyless.nodes.tag import fix_message
+from skyless.nodes.fix_book import fix_message
 from skyless.outputs.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart
 from skyless.positioning.fix import Fix
 from skyless.positioning.protection import RISK, IntegrityRequirement

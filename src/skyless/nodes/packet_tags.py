@@ -9,15 +9,13 @@ from msgspec import Struct, structs
 
 from skyless.air.packet import Packet, Point
 from skyless.errors import ConfigurationError
+from skyless.nodes.fix_book import FixBook, FixListener
 from skyless.nodes.hearing import Hearing
-from skyless.nodes.latency import Latencies
-from skyless.nodes.pace import Pace
 from skyless.nodes.running import HEALTH_S, AskedAgain, Say, every, keep, link_of, together
-from skyless.nodes.tag import fix_message
 from skyless.nodes.usage import Usage
 from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
-from skyless.outputs.messages import Counters, FixMessage, SiteMessage, TagHealth
+from skyless.outputs.messages import Counters, FixMessage, SiteMessage
 from skyless.outputs.topics import fix_topic, health_topic, site_topic
 from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
 from skyless.positioning.pair_calibration import PairCalibration
@@ -58,20 +56,13 @@ def site_of(settings: PacketTagSettings) -> Site | None:
 class PacketTagNode:
     """Runs ``PacketTracking`` on a sniffer. ``publish`` is given the fixes that are to be published."""
 
-    def __init__(
-        self, settings: PacketTagSettings, radio: SnifferRadio, publish: Callable[[FixMessage], None], said: Say
-    ) -> None:
+    def __init__(self, settings: PacketTagSettings, radio: SnifferRadio, publish: FixListener, said: Say) -> None:
         self.settings, self.radio = settings, radio
         self.tracking = self._new_tracking()
-        self.started_s = time.monotonic()
-        self.unix_less_host_s = time.time() - time.monotonic()
-        self.packets = self.serial = self.restarts = 0
-        self.first_fix_s: float | None = None
-        self.last_fix_s: float | None = None
-        self.latencies = Latencies()
+        self.packets = self.restarts = 0
+        self.book = FixBook(radio.name, publish, settings.publish_hz)
         self._drops: Counter[str] = Counter()
-        self._pace = Pace(settings.publish_hz)
-        self._publish, self._said = publish, said
+        self._said = said
         self._known = 0
         """Packets of anchors that stand in the table."""
         self._hearing = Hearing(f"tag {radio.name}", said, radio.advice)
@@ -113,18 +104,9 @@ class PacketTagNode:
         self.packets += 1
         self._known += packet.anchor in self.settings.anchors_m
         fix = self.tracking.hear(packet)
-        if fix is None:
-            return
-        done_s = time.monotonic()
-        ended_s = done_s if packet.host_s is None else packet.host_s
-        self.serial += 1
-        self.last_fix_s = done_s
-        self.latencies.add(done_s - ended_s)
-        if self.first_fix_s is None:
-            self.first_fix_s = done_s - self.started_s
-        if self._pace.is_due(ended_s):
-            unix_s = ended_s + self.unix_less_host_s
-            self._publish(fix_message(self.radio.name, self.serial, fix, unix_s, done_s - ended_s))
+        if fix is not None:
+            done_s = time.monotonic()
+            self.book.take(fix, done_s if packet.host_s is None else packet.host_s, done_s)
 
 
 class PacketTags:
@@ -148,7 +130,6 @@ class PacketTags:
             PacketTagNode(settings, radio, self._publisher(index), say) for index, radio in enumerate(radios)
         )
         self._usage = Usage()
-        self._told_fixes = [0] * len(radios)
         self._site: Site | None = site_of(settings)
 
     async def run(self) -> None:
@@ -157,7 +138,7 @@ class PacketTags:
         parts += [keep(link, self._say) for link in self._links if link is not None]
         await together(*parts, every(HEALTH_S, self._tell))
 
-    def _publisher(self, index: int) -> Callable[[FixMessage], None]:
+    def _publisher(self, index: int) -> FixListener:
         def publish(message: FixMessage) -> None:
             link = self._links[index]
             if link is not None:
@@ -167,11 +148,18 @@ class PacketTags:
 
     def _tell(self) -> None:
         share, memory_bytes = self._usage.take()
-        for index, (node, link) in enumerate(zip(self.nodes, self._links, strict=True)):
-            node.unix_less_host_s = time.time() - time.monotonic()
+        for node, link in zip(self.nodes, self._links, strict=True):
+            node.book.tie_clocks()
             node.look(time.monotonic())
-            mqtt = Counters(0, 0, 0) if link is None else link.counters
-            health = self._health(index, share / len(self.nodes), memory_bytes, mqtt)
+            health = node.book.health(
+                method=METHOD,
+                receptions=node.packets,
+                reason=str(node.tracking.reason),
+                counters=node.counters,
+                mqtt=Counters(0, 0, 0) if link is None else link.counters,
+                cpu=share / len(self.nodes),
+                memory_bytes=memory_bytes,
+            )
             if link is not None:
                 self._tell_site(link)
                 link.publish(health_topic(self._settings.site, "tag", node.radio.name), health)
@@ -183,27 +171,3 @@ class PacketTags:
             self._told_simulated = simulated
             message = SiteMessage(self._site, simulated, time.time())
             link.publish(site_topic(self._site.id), message, qos=1, retain=True)
-
-    def _health(self, index: int, cpu: float, memory_bytes: int, mqtt: Counters) -> TagHealth:
-        node, now_s = self.nodes[index], time.monotonic()
-        median_s, late_s, _ = node.latencies.take()
-        fixes, self._told_fixes[index] = node.serial - self._told_fixes[index], node.serial
-        silent = node.last_fix_s is None or now_s - node.last_fix_s > HEALTH_S
-        return TagHealth(
-            tag=node.radio.name,
-            unix_s=time.time(),
-            uptime_s=now_s - node.started_s,
-            method=METHOD,
-            receptions=node.packets,
-            fixes=node.serial,
-            updates_per_s=fixes / HEALTH_S,
-            reason=str(node.tracking.reason) if silent else None,
-            first_fix_s=node.first_fix_s,
-            latency_p50_s=median_s,
-            latency_p99_s=late_s,
-            counters=dict(node.counters),
-            mqtt=mqtt,
-            cpu=cpu,
-            memory_bytes=memory_bytes,
-            phases=(),
-        )

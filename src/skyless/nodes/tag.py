@@ -8,11 +8,9 @@ from msgspec import Struct
 
 from skyless.air.reception import Reception
 from skyless.methods import DEFAULT_METHOD
+from skyless.nodes.fix_book import FixBook, FixListener
 from skyless.nodes.hearing import Hearing
-from skyless.nodes.latency import Latencies, PhaseBook
-from skyless.nodes.pace import Pace
-from skyless.outputs.messages import FixMessage, Matrix, Vector
-from skyless.positioning.fix import Fix
+from skyless.nodes.latency import PhaseBook
 from skyless.positioning.protection import IntegrityRequirement
 from skyless.radios.radio import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.receiver import NOT_DROPS, Receiver
@@ -31,9 +29,6 @@ class TagSettings(Struct, frozen=True):
     """Fixes a second on MQTT at most; all of them count."""
 
 
-FixListener = Callable[[FixMessage], None]
-
-
 class TagNode:
     """Runs ``Receiver`` on a radio. ``publish`` is given the fixes that are to be published."""
 
@@ -49,16 +44,10 @@ class TagNode:
         self.settings, self.radio = settings, radio
         self.name = radio.name
         self.receiver = self.new_receiver()
-        self.started_s = time.monotonic()
-        self.unix_less_host_s = time.time() - time.monotonic()
-        self.receptions = self.serial = self.restarts = 0
-        self.first_fix_s: float | None = None
-        self.last_fix_s: float | None = None
-        """When the last fix was made, by the host's monotonic clock."""
-        self.latencies = Latencies()
+        self.receptions = self.restarts = 0
+        self.book = FixBook(self.name, publish, settings.publish_hz)
         self.phases = PhaseBook()
-        self._publish, self._said, self._before = publish, said, before
-        self._pace = Pace(settings.publish_hz)
+        self._said, self._before = said, before
         self._hearing = Hearing(f"tag {self.name}", said, radio.advice)
 
     def new_receiver(self) -> Receiver:
@@ -100,63 +89,11 @@ class TagNode:
 
     def _receive(self, reception: Reception) -> None:
         if self._before is not None:
-            self._before(self.receiver, reception, self.serial)
+            self._before(self.receiver, reception, self.book.serial)
         self.receptions += 1
         fix = self.receiver.hear(reception)
         done_s = time.monotonic()
         ended_s = done_s if reception.host_s is None else reception.host_s
         self.phases.hear(reception.frame, ended_s, done_s, made_fix=fix is not None)
-        if fix is None:
-            return
-        self.serial += 1
-        self.last_fix_s = done_s
-        self.latencies.add(done_s - ended_s)
-        if self.first_fix_s is None:
-            self.first_fix_s = done_s - self.started_s
-        if self._pace.is_due(ended_s):
-            self._publish(self._message(fix, ended_s, done_s))
-
-    def _message(self, fix: Fix, ended_s: float, done_s: float) -> FixMessage:
-        return fix_message(self.name, self.serial, fix, ended_s + self.unix_less_host_s, done_s - ended_s)
-
-
-def fix_message(tag: str, serial: int, fix: Fix, unix_s: float, latency_s: float) -> FixMessage:
-    """What a fix says on MQTT; ``unix_s`` is the end of its last frame."""
-    dops = fix.dops
-    moving = fix.velocity_mps is not None and fix.velocity_covariance is not None
-    return FixMessage(
-        tag=tag,
-        serial=serial,
-        unix_s=unix_s,
-        time_s=fix.time_s,
-        position_m=_vector(fix.position_m.tolist()),
-        covariance_m2=_matrix(fix.covariance_m2.ravel().tolist()),
-        velocity_mps=_vector(fix.velocity_mps.tolist()) if moving else None,  # type: ignore[union-attr]
-        velocity_covariance=_matrix(fix.velocity_covariance.ravel().tolist()) if moving else None,  # type: ignore[union-attr]
-        std_m=fix.std_m,
-        gdop=dops.gdop,
-        pdop=dops.pdop,
-        hdop=dops.hdop,
-        vdop=dops.vdop,
-        anchors=fix.anchors,
-        chi2=fix.chi2,
-        dof=fix.dof,
-        residual_rms_m=fix.residual_rms_m,
-        method=fix.method,
-        height_known=fix.height_known,
-        latency_s=latency_s,
-        hpl_m=fix.hpl_m,
-        vpl_m=fix.vpl_m,
-        integrity_risk=fix.integrity_risk,
-        alert=None if fix.alert is None else fix.alert.value,
-    )
-
-
-def _vector(values: list[float]) -> Vector:
-    x, y, z = values
-    return x, y, z
-
-
-def _matrix(values: list[float]) -> Matrix:
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = values
-    return xx, xy, xz, yx, yy, yz, zx, zy, zz
+        if fix is not None:
+            self.book.take(fix, ended_s, done_s)

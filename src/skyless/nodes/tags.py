@@ -34,7 +34,6 @@ class Tag:
         asked = receiver_settings(settings.method, settings.site, settings.qa, settings.z_bounds_m, settings.integrity)
         self.log = ReceptionLog(radio.name, asked, secrets.token_hex(4))
         self.node = TagNode(settings, radio, self._publish, say, self.log.hear)
-        self._told_fixes = 0
 
     async def run(self) -> None:
         """Serve until cancelled."""
@@ -79,12 +78,12 @@ class Tag:
         """Publish what was asked for and is due."""
         if self.link is None:
             return
-        while (message := self.log.collect(time.monotonic(), self.node.unix_less_host_s)) is not None:
+        while (message := self.log.collect(time.monotonic(), self.node.book.unix_less_host_s)) is not None:
             self.link.publish(self._receptions_topic, message, qos=1)
 
     def tell_health(self, cpu: float, memory_bytes: int) -> None:
         """Publish how the tag does."""
-        self.node.unix_less_host_s = time.time() - time.monotonic()
+        self.node.book.tie_clocks()
         self._connect()
         self.node.look(time.monotonic())
         health = self._health(cpu, memory_bytes)
@@ -92,22 +91,11 @@ class Tag:
             self.link.publish(self._health_topic, health)
 
     def _health(self, cpu: float, memory_bytes: int) -> TagHealth:
-        node, now_s = self.node, time.monotonic()
-        median_s, late_s, _ = node.latencies.take()
-        fixes, self._told_fixes = node.serial - self._told_fixes, node.serial
-        silent = node.last_fix_s is None or now_s - node.last_fix_s > HEALTH_S
-        return TagHealth(
-            tag=node.name,
-            unix_s=time.time(),
-            uptime_s=now_s - node.started_s,
+        node = self.node
+        return node.book.health(
             method=node.settings.method,
             receptions=node.receptions,
-            fixes=node.serial,
-            updates_per_s=fixes / HEALTH_S,
-            reason=str(node.receiver.reason) if silent else None,
-            first_fix_s=node.first_fix_s,
-            latency_p50_s=median_s,
-            latency_p99_s=late_s,
+            reason=str(node.receiver.reason),
             counters=node.drops | self.log.counters,
             mqtt=Counters(0, 0, 0) if self.link is None else self.link.counters,
             cpu=cpu,
