@@ -23,20 +23,18 @@ from skyless.positioning.joint_state import (
     SLOTS,
     WEIGHT,
     JointArrays,
+    Vector,
     values,
 )
 from skyless.positioning.tracker import (
     ACCEPTED,
-    AGILITY,
-    AGILITY_GAIN,
-    AGILITY_LOSS,
     CHI2,
     FORGETTING,
-    MAX_AGILITY,
     REJECTED,
     REJECTED_IN_ROW,
     REJECTED_SHARE,
     RESIDUAL_SQUARED,
+    adapt_agility,
 )
 
 LATE_FORGETTING: Final = 0.005
@@ -129,12 +127,15 @@ def follow(s: JointArrays, normalised: float) -> None:
     for axis in range(dim):
         statistics[LAG + axis] += LAG_GAIN * (statistics[LAG + 3 + axis] * normalised - statistics[LAG + axis])
         squared += statistics[LAG + axis] ** 2
+    follow_lag(statistics, LAG_SQUARED, squared)
+
+
+@borrowing_kernel
+def follow_lag(statistics: Vector, place: int, squared: float) -> None:
+    """Adapt the agility to the squares of the lag along the axes, whose running mean stands at ``place``."""
     squared *= (2.0 - LAG_GAIN) / LAG_GAIN
-    statistics[LAG_SQUARED] += LAG_FORGETTING * (squared - statistics[LAG_SQUARED])
-    if statistics[LAG_SQUARED] > RESTLESS_LAG:
-        statistics[AGILITY] = min(statistics[AGILITY] * AGILITY_GAIN, MAX_AGILITY)
-    else:
-        statistics[AGILITY] = max(statistics[AGILITY] * AGILITY_LOSS, 1.0)
+    statistics[place] += LAG_FORGETTING * (squared - statistics[place])
+    adapt_agility(statistics, statistics[place] > RESTLESS_LAG)
 
 
 @borrowing_kernel

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import borrowing_kernel
-from skyless.positioning.joint_monitor import LAG_FORGETTING, LAG_GAIN, RESTLESS_LAG
+from skyless.positioning.joint_monitor import HUBER, LAG_GAIN, follow_lag
 from skyless.positioning.pair_state import (
     AGE_S,
     BEYOND_REPAIR,
@@ -36,12 +36,8 @@ from skyless.positioning.pair_state import (
 )
 from skyless.positioning.tracker import (
     ACCEPTED,
-    AGILITY,
-    AGILITY_GAIN,
-    AGILITY_LOSS,
     CHI2,
     FORGETTING,
-    MAX_AGILITY,
     REJECTED,
     REJECTED_IN_ROW,
     REJECTED_SHARE,
@@ -59,9 +55,6 @@ EARLY: Final = 0.8
 
 CLIP: Final = 3.0
 """Standard deviations that one innovation counts at most as evidence."""
-
-HUBER: Final = 1.5
-"""Innovations beyond so many standard deviations weigh less."""
 
 MOST_EXCLUDED: Final = 2
 SPARE: Final = 2
@@ -202,9 +195,4 @@ def follow_motion(s: PairArrays, normalised: float) -> None:
         toward = s.h[axis] / np.sqrt(length) * normalised
         statistics[LAG + axis] += LAG_GAIN * (toward - statistics[LAG + axis])
         squared += statistics[LAG + axis] ** 2
-    squared *= (2.0 - LAG_GAIN) / LAG_GAIN
-    statistics[LAG_SQUARED] += LAG_FORGETTING * (squared - statistics[LAG_SQUARED])
-    if statistics[LAG_SQUARED] > RESTLESS_LAG:
-        statistics[AGILITY] = min(statistics[AGILITY] * AGILITY_GAIN, MAX_AGILITY)
-    else:
-        statistics[AGILITY] = max(statistics[AGILITY] * AGILITY_LOSS, 1.0)
+    follow_lag(statistics, LAG_SQUARED, squared)

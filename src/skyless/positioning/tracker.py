@@ -145,11 +145,17 @@ def judge(whole: NDArray[np.int64], statistics: Vector, innovation: float, sprea
     whole[REJECTED_IN_ROW] = 0
     statistics[CHI2] += FORGETTING * (normalised - statistics[CHI2])
     statistics[RESIDUAL_SQUARED] += FORGETTING * (innovation * innovation - statistics[RESIDUAL_SQUARED])
-    if statistics[CHI2] > RESTLESS_CHI2:
+    adapt_agility(statistics, statistics[CHI2] > RESTLESS_CHI2)
+    return True
+
+
+@borrowing_kernel
+def adapt_agility(statistics: Vector, restless: bool) -> None:
+    """Take the tag for more agile while it shows that it is, and else ever less, down to what was assumed."""
+    if restless:
         statistics[AGILITY] = min(statistics[AGILITY] * AGILITY_GAIN, MAX_AGILITY)
     else:
         statistics[AGILITY] = max(statistics[AGILITY] * AGILITY_LOSS, 1.0)
-    return True
 
 
 @borrowing_kernel
