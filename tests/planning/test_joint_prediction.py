@@ -9,10 +9,9 @@ from skyless.air.schedule import schedule_of
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.planning.anchor_clocks import anchor_clocks, stamp_variances
 from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
-from skyless.planning.joint_script import AGE_S, LATE_M, TOLD
 from skyless.planning.links import anchor_links, anchor_positions, link_budget
 from skyless.planning.predict import PlanSettings, Predictor
-from skyless.planning.relays import relays_of
+from skyless.planning.relays import AGE_S, LATE_M, TOLD, relays_of
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import lab_site
 from skyless.site.model import AnchorSite, Site, TagsSite, WallSite

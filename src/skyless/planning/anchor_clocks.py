@@ -5,10 +5,9 @@ and the master's crystal and emission noise are common to all. Both matter: the 
 covariance, 2 × 2 blocks [offset, rate] for every pair of anchors, through one superframe.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.air.schedule import first_slots, schedule_of
@@ -28,7 +27,7 @@ _LONGEST: Final = 20_000
 """Superframes after which a filter counts as settled in any case."""
 
 
-class AnchorClocks(Struct, frozen=True):
+class AnchorClocks(NamedTuple):
     """One superframe of a site, message by message: who sends, when, and what its clock is worth."""
 
     speaks: NDArray[np.bool_]

@@ -1,6 +1,7 @@
 """What the anchors in view make of a point: shares, delays, directions and DOPs, for the kernels of the methods."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,25 +16,31 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
 
+class Scene(NamedTuple):
+    """Anchors, and what stands between them and points."""
+
+    anchors: Matrix
+    """Positions, shape (anchors, 3)."""
+    speaks: NDArray[np.bool_]
+    """Those that send at all, shape (anchors,)."""
+    budget: Vector
+    """``link_budget``."""
+    walls: Matrix
+    """``pack_walls``."""
+
+
 @kernel
-def observe(
-    anchors: Matrix,
-    speaks: NDArray[np.bool_],
-    budget: Vector,
-    walls: Matrix,
-    point: Vector,
-    share: Vector,
-    sight: Matrix,
-) -> None:
+def observe(scene: Scene, point: Vector, share: Vector, sight: Matrix) -> None:
     """Fill ``share`` with the part of each anchor's frames that arrives and ``sight`` with unit vectors and delays.
 
     ``sight`` has shape (anchors, 4): the direction from the anchor to the point, and the walls' delay in metres.
     """
+    anchors = scene.anchors
     for i in range(len(anchors)):
         share[i] = 0.0
-        if not speaks[i]:
+        if not scene.speaks[i]:
             continue
-        share[i], sight[i, 3] = hears(budget, walls, anchors[i], point)
+        share[i], sight[i, 3] = hears(scene.budget, scene.walls, anchors[i], point)
         x, y, z = point[0] - anchors[i, 0], point[1] - anchors[i, 1], point[2] - anchors[i, 2]
         distance = max(math.sqrt(x * x + y * y + z * z), 1e-6)
         sight[i, 0], sight[i, 1], sight[i, 2] = x / distance, y / distance, z / distance

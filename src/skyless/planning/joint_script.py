@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.compiled import kernel
+from skyless.planning.anchor_clocks import AnchorClocks
+from skyless.planning.relays import AGE_S, LATE_M, TOLD, Relays
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -13,9 +15,6 @@ Integers = NDArray[np.int64]
 
 RARELY: Final = 0.1
 """An anchor of whose frames fewer arrive does not help the tag."""
-
-AGE_S, TOLD, LATE_M = range(3)
-"""Places in a row of a site's relays: how long ago the packet was sent, how often it is told of, its delay by walls."""
 
 
 class Script(NamedTuple):
@@ -67,13 +66,11 @@ def write_script(
     script: Script,
     share: Vector,
     sight: Matrix,
-    sender: Integers,
-    gap_s: Vector,
-    ends: Integers,
-    heard: Integers,
-    relays: Matrix,
+    clocks: AnchorClocks,
+    relays: Relays,
 ) -> None:
     """Fill in what a point hears: ``share`` and ``sight`` as ``observe`` leaves them, the rest of the site."""
+    sender, ends = clocks.sender, relays.ends
     anchors, packets, told, waited_s = 0, 0, 0, 0.0
     for i in range(len(share)):
         script.place[i] = -1
@@ -83,16 +80,16 @@ def write_script(
             anchors += 1
     for k in range(len(sender)):
         i = sender[k]
-        waited_s += gap_s[k]
+        waited_s += clocks.gap_s[k]
         if script.place[i] < 0:
             continue
         for r in range(ends[k - 1] if k > 0 else 0, ends[k]):
-            j = heard[r]
+            j = relays.heard[r]
             if script.place[j] >= 0:
                 script.heard[told] = script.place[j]
-                script.age_s[told] = relays[r, AGE_S]
-                script.part[told] = share[i] * share[j] * relays[r, TOLD]
-                script.late_m[told] = relays[r, LATE_M]
+                script.age_s[told] = relays.values[r, AGE_S]
+                script.part[told] = share[i] * share[j] * relays.values[r, TOLD]
+                script.late_m[told] = relays.values[r, LATE_M]
                 told += 1
         script.sender[packets], script.end[packets] = script.place[i], told
         script.since_s[packets], script.share[packets] = waited_s, share[i]

@@ -16,13 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.compiled import kernel, threaded_kernel
+from skyless.planning.anchor_clocks import AnchorClocks
 from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
-from skyless.planning.geometry import fill_dops, observe
+from skyless.planning.geometry import Scene, fill_dops, observe
 from skyless.planning.joint_script import Script, new_script, write_script
 from skyless.planning.joint_steps import (
     MOST_PLACES,
     RX_VAR,
     TX_VAR,
+    Work,
     advance,
     back_in_time,
     back_through,
@@ -33,6 +35,7 @@ from skyless.planning.joint_steps import (
     relay_variance,
     shift_by,
 )
+from skyless.planning.relays import Relays
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -69,11 +72,9 @@ def begin(P: Matrix, half: int, tx_var: float) -> None:
 
 
 @kernel
-def _superframe(
-    P: Matrix, dim: int, script: Script, settings: Vector, qa: float, gains: Matrix, places: Integers, h: Vector,
-    ph: Vector, row: Vector,
-) -> None:  # fmt: skip
+def _superframe(work: Work, dim: int, script: Script, settings: Vector, qa: float, row: Vector) -> None:
     """Take the packets of one superframe; leaves every gain, and sums of the position's variances in ``row``."""
+    P, gains, places, h, ph = work
     half, update, relay = dim + script.counts[0], 0, 0
     row[SIGMA_X : SIGMA_Z + 1], row[FIX_SHARE] = 0.0, 0.0
     for k in range(script.counts[1]):
@@ -96,13 +97,12 @@ def _superframe(
 
 @kernel
 def settle_joint(
-    P: Matrix, dim: int, script: Script, settings: Vector, qa: float, superframe_s: float, gains: Matrix,
-    places: Integers, h: Vector, ph: Vector, row: Vector,
-) -> int:  # fmt: skip
+    work: Work, dim: int, script: Script, settings: Vector, qa: float, superframe_s: float, row: Vector
+) -> int:
     """Run superframes until they repeat; returns how many."""
     before, settled, count = 0.0, 0, 0
     while settled < SETTLED_IN_A_ROW and (count * superframe_s < LONGEST_S or count < LONGEST):
-        _superframe(P, dim, script, settings, qa, gains, places, h, ph, row)
+        _superframe(work, dim, script, settings, qa, row)
         now = row[SIGMA_X : SIGMA_X + dim].sum()
         settled = settled + 1 if abs(now - before) <= SETTLED * now else 0
         before = now
@@ -112,11 +112,11 @@ def settle_joint(
 
 @kernel
 def _by_motion(
-    adjoint: Matrix, phase: int, dim: int, script: Script, qa: float, most: int, gains: Matrix, places: Integers,
-    h: Vector, caused: Vector,
-) -> None:  # fmt: skip
+    work: Work, adjoint: Matrix, phase: int, dim: int, script: Script, qa: float, most: int, caused: Vector
+) -> None:
     """Fill ``caused`` with the variances, after packet ``phase``, that the filter's accelerations have."""
     half, packets, relays = dim + script.counts[0], script.counts[1], script.counts[2]
+    _, gains, places, h, _ = work
     adjoint[:], caused[:], before = 0.0, 0.0, 0.0
     for axis in range(dim):
         adjoint[axis, axis] = 1.0
@@ -144,11 +144,10 @@ def _by_motion(
 
 
 @kernel
-def _by_walls(
-    shift: Vector, dim: int, script: Script, most: int, gains: Matrix, places: Integers, h: Vector, row: Vector
-) -> None:
+def _by_walls(work: Work, dim: int, script: Script, most: int, row: Vector) -> None:
     """Carry the mean error that delays make through the superframes; leaves the sum of its squares in ``row``."""
     half, before = dim + script.counts[0], 0.0
+    _, gains, places, h, shift = work
     shift[:] = 0.0
     for _ in range(most):
         update, relay = 0, 0
@@ -189,23 +188,26 @@ def _finish(row: Vector, dim: int, motion: Vector) -> None:
 
 
 @kernel
-def _fill_point(
-    dim: int, script: Script, settings: Vector, qa: float, superframe_s: float, places: Integers, h: Vector, row: Vector
-) -> None:
+def _fill_point(dim: int, script: Script, settings: Vector, qa: float, superframe_s: float, row: Vector) -> None:
     """Predict for one point; ``FIX_SHARE`` becomes the number of fixes in a superframe."""
     half, packets = dim + script.counts[0], script.counts[1]
     states = half + half + script.counts[0]
-    P, vector, adjoint = np.zeros((states, states)), np.zeros(states), np.zeros((dim, states))
-    gains = np.zeros((packets + script.counts[2], states))
-    motion, caused = np.zeros(dim), np.zeros(dim)
-    begin(P, half, settings[TX_VAR])
-    most = AS_LONG * settle_joint(P, dim, script, settings, qa, superframe_s, gains, places, h, vector, row)
+    work = Work(
+        P=np.zeros((states, states)),
+        gains=np.zeros((packets + script.counts[2], states)),
+        places=np.zeros(MOST_PLACES, np.int64),
+        h=np.zeros(MOST_PLACES),
+        vector=np.zeros(states),
+    )
+    adjoint, motion, caused = np.zeros((dim, states)), np.zeros(dim), np.zeros(dim)
+    begin(work.P, half, settings[TX_VAR])
+    most = AS_LONG * settle_joint(work, dim, script, settings, qa, superframe_s, row)
     phases = min(PHASES, packets)
     for phase in range(phases):
         last = (phase + 1) * packets // phases - 1
-        _by_motion(adjoint, last, dim, script, qa, most, gains, places, h, caused)
+        _by_motion(work, adjoint, last, dim, script, qa, most, caused)
         motion += caused / phases
-    _by_walls(vector, dim, script, most, gains, places, h, row)
+    _by_walls(work, dim, script, most, row)
     _finish(row, dim, motion)
 
 
@@ -213,36 +215,29 @@ def _fill_point(
 def fill_joint_sigma(
     points: Matrix,
     dim: int,
-    anchors: Matrix,
-    speaks: NDArray[np.bool_],
-    budget: Vector,
-    walls: Matrix,
-    sender: Integers,
-    gap_s: Vector,
-    ends: Integers,
-    heard: Integers,
-    relays: Matrix,
+    scene: Scene,
+    clocks: AnchorClocks,
+    relays: Relays,
     qa: float,
     settings: Vector,
     farthest: float,
     table: Matrix,
 ) -> None:
     """Fill ``table`` (points, columns) for the points, shape (m, 3)."""
-    n, superframe_s = len(anchors), gap_s.sum()
+    n, superframe_s = len(scene.anchors), clocks.gap_s.sum()
     share, sight = np.zeros(n), np.zeros((n, 4))
     seen, normal, inverse = np.zeros((n, 3)), np.zeros((4, 4)), np.zeros((4, 4))
-    script = new_script(n, len(sender), len(heard))
-    places, h = np.zeros(MOST_PLACES, np.int64), np.zeros(MOST_PLACES)
+    script = new_script(n, len(clocks.sender), len(relays.heard))
     for m in range(len(points)):
         row = table[m]
-        observe(anchors, speaks, budget, walls, points[m], share, sight)
-        fill_dops(anchors, share, points[m], dim, seen, normal, inverse, row)
-        write_script(script, share, sight, sender, gap_s, ends, heard, relays)
+        observe(scene, points[m], share, sight)
+        fill_dops(scene.anchors, share, points[m], dim, seen, normal, inverse, row)
+        write_script(script, share, sight, clocks, relays)
         row[SIGMA:] = math.inf
         row[FIX_SHARE] = 0.0
         if script.counts[0] > dim:
-            _fill_point(dim, script, settings, qa, superframe_s, places, h, row)
-            row[FIX_SHARE] /= len(sender)
+            _fill_point(dim, script, settings, qa, superframe_s, row)
+            row[FIX_SHARE] /= len(clocks.sender)
             if not row[SIGMA] < farthest:
                 row[SIGMA:] = math.inf
                 row[FIX_SHARE] = 0.0

@@ -4,12 +4,12 @@ States stand as in the filter (``positioning/joint_state``), all as of now: posi
 clocks, then the rates of all these, then the noise of each anchor's last TX stamp.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import borrowing_kernel
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -22,7 +22,22 @@ MOST_PLACES: Final = 5
 """States that a measurement is about."""
 
 
-@kernel
+class Work(NamedTuple):
+    """The covariance of a point, and what its updates need."""
+
+    P: Matrix
+    """Shape (states, states)."""
+    gains: Matrix
+    """Of all updates of a superframe, shape (packets + relays, states)."""
+    places: Integers
+    """Where the measurement at hand is not zero, ..."""
+    h: Vector
+    """... and what it is there; shapes (MOST_PLACES,)."""
+    vector: Vector
+    """Room for a product with P, or for a mean error; shape (states,)."""
+
+
+@borrowing_kernel
 def advance(P: Matrix, dim: int, half: int, dt_s: float, qa: float, settings: Vector) -> None:
     """Let time pass; the tag's own oscillator is in all offsets."""
     n = len(P)
@@ -40,7 +55,7 @@ def advance(P: Matrix, dim: int, half: int, dt_s: float, qa: float, settings: Ve
             _add_noise(P, one, other, half, dt_s, times * settings[WHITE], times * settings[WALK])
 
 
-@kernel
+@borrowing_kernel
 def _add_noise(P: Matrix, one: int, other: int, half: int, dt_s: float, white: float, walk: float) -> None:
     """Noise that two values and their rates have in common."""
     cross = walk * dt_s * dt_s / 2.0
@@ -50,7 +65,7 @@ def _add_noise(P: Matrix, one: int, other: int, half: int, dt_s: float, white: f
     P[half + one, half + other] += walk * dt_s
 
 
-@kernel
+@borrowing_kernel
 def new_packet(P: Matrix, place: int, variance: float) -> None:
     """Forget the noise of an anchor's last TX stamp for that of a new one."""
     P[place, :] = 0.0
@@ -58,7 +73,7 @@ def new_packet(P: Matrix, place: int, variance: float) -> None:
     P[place, place] = variance
 
 
-@kernel
+@borrowing_kernel
 def by_tag(sight: Vector, dim: int, half: int, place: int, places: Integers, h: Vector) -> int:
     """The tag's reception of the anchor in this place of the list: R − T = range + b + w; how many states it is of."""
     for axis in range(dim):
@@ -68,7 +83,7 @@ def by_tag(sight: Vector, dim: int, half: int, place: int, places: Integers, h: 
     return dim + 2
 
 
-@kernel
+@borrowing_kernel
 def by_anchor(dim: int, half: int, listener: int, heard: int, age_s: float, places: Integers, h: Vector) -> int:
     """An anchor's reception of another, so long ago: S − T = distance + b_heard − b_listener + w_heard."""
     places[0], h[0] = dim + heard, 1.0
@@ -79,13 +94,13 @@ def by_anchor(dim: int, half: int, listener: int, heard: int, age_s: float, plac
     return MOST_PLACES
 
 
-@kernel
+@borrowing_kernel
 def relay_variance(age_s: float, settings: Vector) -> float:
     """Of a relayed reception: its stamp, and what two oscillators have done since."""
     return float(settings[RX_VAR] + 2.0 * age_s * (settings[WHITE] + settings[WALK] * age_s * age_s / 3.0))
 
 
-@kernel
+@borrowing_kernel
 def correct(P: Matrix, places: Integers, h: Vector, count: int, variance: float, ph: Vector, gain: Vector) -> None:
     """Take a measurement of so many states; fill ``gain`` with its gain."""
     n = len(P)
@@ -105,7 +120,7 @@ def correct(P: Matrix, places: Integers, h: Vector, count: int, variance: float,
             P[row, column] -= factor * ph[column]
 
 
-@kernel
+@borrowing_kernel
 def back_through(adjoint: Matrix, places: Integers, h: Vector, count: int, gain: Vector) -> None:
     """Carry what errors will matter, rows of ``adjoint``, back through a measurement: λ(I − K·hᵀ)."""
     for row in range(len(adjoint)):
@@ -116,7 +131,7 @@ def back_through(adjoint: Matrix, places: Integers, h: Vector, count: int, gain:
             adjoint[row, places[k]] -= along * h[k]
 
 
-@kernel
+@borrowing_kernel
 def back_in_time(adjoint: Matrix, dim: int, half: int, dt_s: float, qa: float, caused: Vector) -> None:
     """Carry the rows of ``adjoint`` back in time; adds to ``caused`` the variances that accelerations then cause."""
     cube, square = qa * dt_s * dt_s * dt_s / 3.0, qa * dt_s * dt_s
@@ -128,7 +143,7 @@ def back_in_time(adjoint: Matrix, dim: int, half: int, dt_s: float, qa: float, c
             adjoint[row, half + value] += dt_s * adjoint[row, value]
 
 
-@kernel
+@borrowing_kernel
 def shift_by(shift: Vector, places: Integers, h: Vector, count: int, late_m: float, gain: Vector) -> None:
     """What a measurement that is late by so much does to the mean error."""
     seen = late_m

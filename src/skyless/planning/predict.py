@@ -16,7 +16,7 @@ from skyless.compiled import threaded_kernel
 from skyless.methods import DEFAULT_METHOD, FILTERS
 from skyless.planning.anchor_clocks import anchor_clocks, stamp_variances
 from skyless.planning.columns import COLUMNS, SIGMA
-from skyless.planning.geometry import fill_dops, observe, weighted_pdop
+from skyless.planning.geometry import Scene, fill_dops, observe, weighted_pdop
 from skyless.planning.joint_sigma import fill_joint_sigma
 from skyless.planning.links import AnchorLinks, anchor_links, anchor_positions, link_budget
 from skyless.planning.relays import relays_of
@@ -61,6 +61,7 @@ class Predictor:
         self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls)
         self.links: AnchorLinks = anchor_links(self.anchors_m, self.master, self.budget, self.walls)
         self.clocks = anchor_clocks(self.site, self.links.share)
+        self._scene = Scene(self.anchors_m, self.clocks.speaks, self.budget, self.walls)
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
         if settings.method in FILTERS:
             self._fill = self._tracker() if settings.method == "tracker" else self._joint()
@@ -79,10 +80,7 @@ class Predictor:
         return lambda points, table: fill_snapshot_sigma(
             points,
             self.dim,
-            self.anchors_m,
-            self.clocks.speaks,
-            self.budget,
-            self.walls,
+            self._scene,
             self.master,
             in_step,
             self.links.delay_m,
@@ -103,22 +101,14 @@ class Predictor:
         return np.array([one.white, one.walk, *stamp_variances(self.site)])
 
     def _tracker(self) -> Fill:
-        clocks, settings = self.clocks, self._noises()
+        settings = self._noises()
         return lambda points, table: fill_tracker_sigma(
             points,
             self.dim,
-            self.anchors_m,
-            clocks.speaks,
-            self.budget,
-            self.walls,
+            self._scene,
             self.master,
             self.links.delay_m,
-            clocks.sender,
-            clocks.gap_s,
-            clocks.variance_m2,
-            clocks.with_others,
-            clocks.gain,
-            clocks.share,
+            self.clocks,
             self.settings.qa,
             settings,
             self.farthest_m,
@@ -126,20 +116,14 @@ class Predictor:
         )
 
     def _joint(self) -> Fill:
-        clocks, settings = self.clocks, self._noises()
-        relays = relays_of(self.anchors_m, self.master, clocks, self.budget, self.walls)
+        settings = self._noises()
+        relays = relays_of(self.anchors_m, self.master, self.clocks, self.budget, self.walls)
         return lambda points, table: fill_joint_sigma(
             points,
             self.dim,
-            self.anchors_m,
-            clocks.speaks,
-            self.budget,
-            self.walls,
-            clocks.sender,
-            clocks.gap_s,
-            relays.ends,
-            relays.heard,
-            relays.values,
+            self._scene,
+            self.clocks,
+            relays,
             self.settings.qa,
             settings,
             self.farthest_m,
@@ -152,26 +136,18 @@ class Predictor:
 
     def geometry_at(self, points_m: Matrix) -> Matrix:
         """The same table with anchors in view and DOPs only; in the place of ``sigma_m`` the weighted PDOP."""
-        fill = partial(_fill_geometry, self.dim, self.anchors_m, self.clocks.speaks, self.budget, self.walls)
+        fill = partial(_fill_geometry, self.dim, self._scene)
         return in_threads(fill, np.ascontiguousarray(points_m, np.float64), CHUNK)
 
 
 @threaded_kernel
-def _fill_geometry(
-    dim: int,
-    anchors: Matrix,
-    speaks: NDArray[np.bool_],
-    budget: Vector,
-    walls: Matrix,
-    points: Matrix,
-    table: Matrix,
-) -> None:
-    n = len(anchors)
+def _fill_geometry(dim: int, scene: Scene, points: Matrix, table: Matrix) -> None:
+    n = len(scene.anchors)
     share, sight, seen = np.zeros(n), np.zeros((n, 4)), np.zeros((n, 3))
     normal, inverse = np.zeros((4, 4)), np.zeros((4, 4))
     for m in range(len(points)):
-        observe(anchors, speaks, budget, walls, points[m], share, sight)
-        fill_dops(anchors, share, points[m], dim, seen, normal, inverse, table[m])
+        observe(scene, points[m], share, sight)
+        fill_dops(scene.anchors, share, points[m], dim, seen, normal, inverse, table[m])
         table[m, SIGMA] = weighted_pdop(share, sight, dim, normal, inverse)
 
 

@@ -1,15 +1,13 @@
 """What anchors relay of each other, as ``joint`` meets it: who tells whose packet, how old it is then, how often."""
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.air.codec import heard_capacity
 from skyless.compiled import kernel
 from skyless.planning.anchor_clocks import AnchorClocks
-from skyless.planning.joint_script import AGE_S, LATE_M, TOLD
 from skyless.planning.links import hears
 
 Vector = NDArray[np.float64]
@@ -19,8 +17,11 @@ Integers = NDArray[np.int64]
 LEAST_TOLD: Final = 0.01
 """A reception that is relayed more rarely does not count."""
 
+AGE_S, TOLD, LATE_M = range(3)
+"""Places in a row of ``values``."""
 
-class Relays(Struct, frozen=True):
+
+class Relays(NamedTuple):
     """Receptions that the messages of a superframe relay, one after the other."""
 
     ends: Integers

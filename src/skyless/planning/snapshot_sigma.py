@@ -20,7 +20,7 @@ from skyless.planning.columns import (
     SIGMA_X,
     SIGMA_Z,
 )
-from skyless.planning.geometry import fill_dops, observe
+from skyless.planning.geometry import Scene, fill_dops, observe
 from skyless.uncertainty.cholesky import factorise, invert
 
 Vector = NDArray[np.float64]
@@ -134,10 +134,7 @@ def sort_doubtful(part: Vector, master: int, doubtful: NDArray[np.int64], chosen
 def fill_snapshot_sigma(
     points: Matrix,
     dim: int,
-    anchors: Matrix,
-    speaks: NDArray[np.bool_],
-    budget: Vector,
-    walls: Matrix,
+    scene: Scene,
     master: int,
     in_step: Vector,
     sync_delay: Vector,
@@ -155,7 +152,7 @@ def fill_snapshot_sigma(
     ``in_step``: share of the rounds in which an anchor can be used at all; ``sync_delay``: by how much its time lags.
     Sets of anchors whose error would exceed ``farthest`` metres give no fix.
     """
-    n = len(anchors)
+    n = len(scene.anchors)
     share, part, sight = np.zeros(n), np.zeros(n), np.zeros((n, 4))
     seen, gain = np.zeros((n, 3)), np.zeros((n + 1, 3))
     normal, inverse = np.zeros((4, 4)), np.zeros((4, 4))
@@ -164,8 +161,8 @@ def fill_snapshot_sigma(
     chosen, doubtful = np.zeros(n, np.int64), np.zeros(MOST_DOUBTFUL + 1, np.int64)
     for m in range(len(points)):
         row = table[m]
-        observe(anchors, speaks, budget, walls, points[m], share, sight)
-        fill_dops(anchors, share, points[m], dim, seen, normal, inverse, row)
+        observe(scene, points[m], share, sight)
+        fill_dops(scene.anchors, share, points[m], dim, seen, normal, inverse, row)
         for i in range(n):
             part[i] = share[i] * share[i] * in_step[i]
         doubts, sure = sort_doubtful(part, master, doubtful, chosen)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.compiled import kernel, threaded_kernel
+from skyless.planning.anchor_clocks import AnchorClocks
 from skyless.planning.columns import (
     BIAS,
     CLAIMED,
@@ -22,13 +23,15 @@ from skyless.planning.columns import (
     SIGMA_X,
     SIGMA_Z,
 )
-from skyless.planning.geometry import fill_dops, observe
+from skyless.planning.geometry import Scene, fill_dops, observe
 from skyless.planning.tracker_steps import (
+    Work,
     advance,
     anchors_hear,
     assumed_correct,
     choose_active,
     innovation,
+    new_work,
     true_correct,
 )
 from skyless.positioning.tracker import FORGETTING, MAX_AGILITY, RESTLESS_CHI2
@@ -58,55 +61,46 @@ RARELY: Final = 0.1
 
 @kernel
 def _superframe(
+    work: Work,
     dim: int,
     share: Vector,
     sight: Matrix,
-    sender: NDArray[np.int64],
-    gap_s: Vector,
-    told: Vector,
-    with_others: Matrix,
-    anchor_gain: Matrix,
-    anchor_share: Vector,
+    clocks: AnchorClocks,
     sync_delay: Vector,
     master: int,
     settings: Vector,
-    work: tuple[Matrix, Matrix, Matrix],
-    vectors: tuple[Vector, Vector, Vector, Vector, Vector],
-    lists: tuple[NDArray[np.int64], NDArray[np.int64]],
     count: int,
     qa: float,
     sums: Vector,
     row: Vector,
 ) -> None:
     """Run one superframe; leave sums over its messages in ``row`` and ``sums`` (updates, chi2, its variance, rest)."""
-    P, S, X = work
-    h, _, K, g, shift = vectors
+    P, S, shift = work.P, work.S, work.shift
     stamps, tx_var = settings[2] + settings[3], settings[2]
     row[SIGMA_X : SIGMA_Z + 1] = 0.0
     row[CLAIMED], row[BIAS], sums[:3] = 0.0, 0.0, 0.0
-    for k in range(len(sender)):
-        i = sender[k]
+    for k in range(len(clocks.sender)):
+        i = clocks.sender[k]
         part = share[i]
-        sums[3] += gap_s[k]
+        sums[3] += clocks.gap_s[k]
         if part == 0.0 and i != master:
             continue
-        advance(dim, sums[3], qa, settings, work, vectors, count)
+        advance(work, dim, count, sums[3], qa, settings)
         sums[3] = 0.0
-        K[:] = 0.0
+        work.K[:] = 0.0
         if part > 0.0:
             delay_m = sight[i, 3] + sync_delay[i]
-            spread, off = innovation(dim, sight[i], stamps + told[k], delay_m, work, vectors)
-            own, others = lists[1][i], with_others[k]
+            spread, off = innovation(work, dim, sight[i], stamps + clocks.variance_m2[k], delay_m)
             passed, first, second, fourth, _ = true_correct(
-                S, X, K, h, part, stamps, own, lists[0], count, others, g, off, spread
+                work, part, stamps, work.place[i], count, clocks.with_others[k], off, spread
             )
             part *= passed
-            assumed_correct(P, vectors, part, share[i] * first * math.sqrt(spread))
+            assumed_correct(work, part, share[i] * first * math.sqrt(spread))
             sums[0] += part
             sums[1] += share[i] * second
             sums[2] += share[i] * (fourth - second * second / max(passed, 1e-9))
         if i == master:
-            anchors_hear(X, K, share[i], lists[0], count, anchor_share, anchor_gain, tx_var)
+            anchors_hear(work, share[i], count, clocks.share, clocks.gain, tx_var)
         for a in range(dim):
             row[SIGMA_X + a] += part * S[a, a]
             row[CLAIMED] += part * P[a, a]
@@ -115,21 +109,14 @@ def _superframe(
 
 @kernel
 def settle_tracker(
+    work: Work,
     dim: int,
     share: Vector,
     sight: Matrix,
-    sender: NDArray[np.int64],
-    gap_s: Vector,
-    told: Vector,
-    with_others: Matrix,
-    anchor_gain: Matrix,
-    anchor_share: Vector,
+    clocks: AnchorClocks,
     sync_delay: Vector,
     master: int,
     settings: Vector,
-    work: tuple[Matrix, Matrix, Matrix],
-    vectors: tuple[Vector, Vector, Vector, Vector, Vector],
-    lists: tuple[NDArray[np.int64], NDArray[np.int64]],
     qa: float,
     farthest: float,
     row: Vector,
@@ -139,14 +126,11 @@ def settle_tracker(
     ``settings``: white and walk (m²/s, m²/s³) of one clock, tx and rx variance in m². Returns how high the running mean
     of the normalised squared innovations reaches, ``RESTLESS_SIGMAS`` above its mean.
     """
-    count = choose_active(share, anchor_share, lists[0], lists[1])
-    superframe_s, passed_s, before_p, before_s, settled = gap_s.sum(), 0.0, 0.0, 0.0, 0
+    count = choose_active(work, share, clocks.share)
+    superframe_s, passed_s, before_p, before_s, settled = clocks.gap_s.sum(), 0.0, 0.0, 0.0, 0
     sums = np.zeros(4)
     while passed_s < LONGEST_S + 20.0 * superframe_s:
-        _superframe(
-            dim, share, sight, sender, gap_s, told, with_others, anchor_gain, anchor_share, sync_delay, master,
-            settings, work, vectors, lists, count, qa, sums, row,
-        )  # fmt: skip
+        _superframe(work, dim, share, sight, clocks, sync_delay, master, settings, count, qa, sums, row)
         passed_s += superframe_s
         told_p, true_s = row[CLAIMED], row[SIGMA_X] + row[SIGMA_X + 1] + row[SIGMA_Z]
         is_settled = abs(told_p - before_p) <= SETTLED * told_p and abs(true_s - before_s) <= SETTLED * true_s
@@ -157,7 +141,7 @@ def settle_tracker(
             break
         before_p, before_s = told_p, true_s
     _finish(row, dim, sums[0])
-    row[FIX_SHARE] = sums[0] / len(sender)
+    row[FIX_SHARE] = sums[0] / len(clocks.sender)
     scatter = math.sqrt(sums[2] / sums[0] * FORGETTING / (2.0 - FORGETTING))
     return float(sums[1] / sums[0] + RESTLESS_SIGMAS * scatter)
 
@@ -176,11 +160,11 @@ def _finish(row: Vector, dim: int, updates: float) -> None:
 
 
 @kernel
-def begin(dim: int, work: tuple[Matrix, Matrix, Matrix], shift: Vector) -> None:
+def begin(work: Work, dim: int) -> None:
     """Start both covariances somewhere sensible; the steady state does not depend on it."""
-    P, S, X = work
+    P, S = work.P, work.S
     clock = 2 * dim
-    P[:], S[:], X[:], shift[:] = 0.0, 0.0, 0.0, 0.0
+    P[:], S[:], work.X[:], work.shift[:] = 0.0, 0.0, 0.0, 0.0
     for axis in range(dim):
         P[axis, axis] = S[axis, axis] = 0.01
         P[dim + axis, dim + axis] = S[dim + axis, dim + axis] = 0.05
@@ -192,49 +176,37 @@ def begin(dim: int, work: tuple[Matrix, Matrix, Matrix], shift: Vector) -> None:
 def fill_tracker_sigma(
     points: Matrix,
     dim: int,
-    anchors: Matrix,
-    speaks: NDArray[np.bool_],
-    budget: Vector,
-    walls: Matrix,
+    scene: Scene,
     master: int,
     sync_delay: Vector,
-    sender: NDArray[np.int64],
-    gap_s: Vector,
-    told: Vector,
-    with_others: Matrix,
-    anchor_gain: Matrix,
-    anchor_share: Vector,
+    clocks: AnchorClocks,
     qa: float,
     settings: Vector,
     farthest: float,
     table: Matrix,
 ) -> None:
     """Fill ``table`` (points, columns) for the points, shape (m, 3)."""
-    n, states = len(anchors), 2 * dim + 2
+    n, states = len(scene.anchors), 2 * dim + 2
     share, sight = np.zeros(n), np.zeros((n, 4))
     seen, normal, inverse = np.zeros((n, 3)), np.zeros((4, 4)), np.zeros((4, 4))
-    work = (np.zeros((states, states)), np.zeros((states, states)), np.zeros((states, 2 * n)))
-    vectors = (
-        np.zeros(states), np.zeros(states), np.zeros(states), np.zeros(states), np.zeros(states),
-    )  # fmt: skip
-    lists = (np.zeros(n, np.int64), np.zeros(n, np.int64))
+    work = new_work(n, states)
     for m in range(len(points)):
         row = table[m]
-        observe(anchors, speaks, budget, walls, points[m], share, sight)
-        fill_dops(anchors, share, points[m], dim, seen, normal, inverse, row)
+        observe(scene, points[m], share, sight)
+        fill_dops(scene.anchors, share, points[m], dim, seen, normal, inverse, row)
         heard = 0
         for i in range(n):
             heard += share[i] >= RARELY
         row[SIGMA:] = math.inf
         row[FIX_SHARE] = 0.0
         if heard > dim:
-            begin(dim, work, vectors[4])
+            begin(work, dim)
             low, high, factor = 0.0, math.log(MAX_AGILITY), 0.0
             for trial in range(8):
+                agile = qa * math.exp(factor)
                 restless = settle_tracker(
-                    dim, share, sight, sender, gap_s, told, with_others, anchor_gain, anchor_share, sync_delay, master,
-                    settings, work, vectors, lists, qa * math.exp(factor), farthest, row,
-                )  # fmt: skip
+                    work, dim, share, sight, clocks, sync_delay, master, settings, agile, farthest, row
+                )
                 if trial == 0 and restless <= RESTLESS_CHI2:
                     break
                 low, high = (factor, high) if restless > RESTLESS_CHI2 else (low, factor)

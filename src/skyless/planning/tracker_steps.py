@@ -4,23 +4,54 @@ P is the filter's own covariance, S that of the true error, X that of the true e
 """
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import borrowing_kernel, kernel
 from skyless.positioning.kalman import innovation_variance, predict_clock, predict_motion
 from skyless.positioning.tracker import TrackerSettings
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 GATE: Final = TrackerSettings().gate
 """Innovations beyond so many standard deviations are not used."""
 
 
+class Work(NamedTuple):
+    """The covariances of a point, and what its updates need."""
+
+    P: Matrix
+    S: Matrix
+    """Shapes (states, states)."""
+    X: Matrix
+    """Shape (states, 2·anchors)."""
+    h: Vector
+    ph: Vector
+    K: Vector
+    """Of the message at hand: its gradient, P·h and the gain; shapes (states,)."""
+    g: Vector
+    """Its true covariance with the state."""
+    shift: Vector
+    """Mean error, shape (states,)."""
+    active: Integers
+    """Anchors in view, the master apart: as many as ``choose_active`` says, ..."""
+    place: Integers
+    """... and where each stands among them, or −1; shapes (anchors,)."""
+
+
 @kernel
+def new_work(anchors: int, states: int) -> Work:
+    """Room for a point, and for one after the other."""
+    P, S, X = np.zeros((states, states)), np.zeros((states, states)), np.zeros((states, 2 * anchors))
+    h, ph, K, g, shift = np.zeros(states), np.zeros(states), np.zeros(states), np.zeros(states), np.zeros(states)
+    return Work(P, S, X, h, ph, K, g, shift, np.zeros(anchors, np.int64), np.zeros(anchors, np.int64))
+
+
+@borrowing_kernel
 def _with_anchors_predict(X: Matrix, dim: int, count: int, dt_s: float, white: float, walk: float) -> None:
     """Advance the covariance of the tag's error with the anchors'; the master's noise is common to its clocks."""
     clock = 2 * dim
@@ -60,16 +91,16 @@ def gated(mean: float, variance: float) -> tuple[float, float, float, float, flo
     return share, first, second, fourth, share - GATE * (top + bottom)
 
 
-@kernel
+@borrowing_kernel
 def true_correct(
-    S: Matrix, X: Matrix, K: Vector, h: Vector, part: float, noise: float, own: int, active: NDArray[np.int64],
-    count: int, with_others: Vector, g: Vector, off: float, assumed: float,
-) -> tuple[float, float, float, float, float]:  # fmt: skip
+    work: Work, part: float, noise: float, own: int, count: int, with_others: Vector, off: float, assumed: float
+) -> tuple[float, float, float, float, float]:
     """Σ and X after a message that arrives with probability ``part``: error x − K(hx − v), v with its clock error.
 
     ``own`` is the sender's place among the active anchors, −1 for the master; ``off`` the innovation's mean. What the
     gate does to it is taken in the mean (statistical linearisation). Returns the moments of ``gated``.
     """
+    S, X, K, h, g, active = work.S, work.X, work.K, work.h, work.g, work.active
     n = S.shape[0]
     spread = noise
     for row in range(n):
@@ -98,22 +129,22 @@ def true_correct(
     return moments
 
 
-@kernel
-def anchors_hear(
-    X: Matrix, K: Vector, part: float, active: NDArray[np.int64], count: int, share: Vector, gain: Matrix, tx_var: float
-) -> None:
+@borrowing_kernel
+def anchors_hear(work: Work, part: float, count: int, share: Vector, gain: Matrix, tx_var: float) -> None:
     """X after the master's message, which the anchors hear too, with the same emission noise."""
+    X, K = work.X, work.K
     for c in range(count):
-        i = active[c]
+        i = work.active[c]
         for row in range(X.shape[0]):
             own = X[row, 2 * c] - part * K[row] * tx_var
             X[row, 2 * c] -= share[i] * gain[i, 0] * own
             X[row, 2 * c + 1] -= share[i] * gain[i, 1] * own
 
 
-@kernel
-def choose_active(share: Vector, anchor_share: Vector, active: NDArray[np.int64], place: NDArray[np.int64]) -> int:
-    """List the anchors, the master apart, that a point hears; ``place`` is where each stands in the list, or −1."""
+@borrowing_kernel
+def choose_active(work: Work, share: Vector, anchor_share: Vector) -> int:
+    """List the anchors, the master apart, that a point hears; how many they are."""
+    active, place = work.active, work.place
     count = 0
     for i in range(len(share)):
         place[i] = -1
@@ -124,57 +155,38 @@ def choose_active(share: Vector, anchor_share: Vector, active: NDArray[np.int64]
     return count
 
 
-@kernel
-def advance(
-    dim: int,
-    dt_s: float,
-    qa: float,
-    settings: Vector,
-    work: tuple[Matrix, Matrix, Matrix],
-    vectors: tuple[Vector, Vector, Vector, Vector, Vector],
-    count: int,
-) -> None:
+@borrowing_kernel
+def advance(work: Work, dim: int, count: int, dt_s: float, qa: float, settings: Vector) -> None:
     """Let time pass: the filter allows for motion, the tag rests."""
-    P, S, X = work
-    idle, _, _, _, shift = vectors
+    P, S, idle, shift = work.P, work.S, work.h, work.shift
     white, walk = settings[0], settings[1]
     predict_motion(idle, P, dim, dt_s, qa)
     predict_clock(idle, P, 2 * dim, dt_s, 2.0 * white, 2.0 * walk)
     predict_motion(shift, S, dim, dt_s, 0.0)
     predict_clock(shift, S, 2 * dim, dt_s, 2.0 * white, 2.0 * walk)
-    _with_anchors_predict(X, dim, count, dt_s, white, walk)
+    _with_anchors_predict(work.X, dim, count, dt_s, white, walk)
 
 
-@kernel
-def innovation(
-    dim: int,
-    direction: Vector,
-    noise: float,
-    delay_m: float,
-    work: tuple[Matrix, Matrix, Matrix],
-    vectors: tuple[Vector, Vector, Vector, Vector, Vector],
-) -> tuple[float, float]:
+@borrowing_kernel
+def innovation(work: Work, dim: int, direction: Vector, noise: float, delay_m: float) -> tuple[float, float]:
     """Fill h, P·h and the gain for a message; the innovation's variance as assumed, and its true mean."""
-    P, _, _ = work
-    h, ph, K, _, shift = vectors
+    h, ph, K = work.h, work.ph, work.K
     h[:] = 0.0
     for a in range(dim):
         h[a] = direction[a]
     h[2 * dim] = 1.0
-    spread, off = innovation_variance(P, h, ph, noise), delay_m
+    spread, off = innovation_variance(work.P, h, ph, noise), delay_m
     for a in range(len(h)):
         K[a] = ph[a] / spread
-        off -= h[a] * shift[a]
+        off -= h[a] * work.shift[a]
     return spread, off
 
 
-@kernel
-def assumed_correct(
-    P: Matrix, vectors: tuple[Vector, Vector, Vector, Vector, Vector], accepted: float, moved_m: float
-) -> None:
+@borrowing_kernel
+def assumed_correct(work: Work, accepted: float, moved_m: float) -> None:
     """The filter's own P, and the mean error, after a message that is accepted with this probability."""
-    _, ph, K, _, shift = vectors
+    P, K = work.P, work.K
     for a in range(len(K)):
-        shift[a] += K[a] * moved_m
+        work.shift[a] += K[a] * moved_m
         for b in range(len(K)):
-            P[a, b] -= accepted * K[a] * ph[b]
+            P[a, b] -= accepted * K[a] * work.ph[b]
