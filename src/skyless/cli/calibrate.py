@@ -9,7 +9,7 @@ from skyless.cli.calibrate_output import report_of, see_that_it_can_be_written, 
 from skyless.cli.options import Finite, finite_numbers, spare_inputs
 from skyless.cli.output import print_json
 from skyless.cli.progress import status
-from skyless.cli.replay import flight_height, known_anchors, known_truth
+from skyless.cli.replay_input import flight_height, known_anchors, known_truth
 from skyless.cli.replay_site import is_mcap, see_that_they_are_left_out
 from skyless.errors import SkylessError
 

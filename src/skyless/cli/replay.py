@@ -11,20 +11,19 @@ from skyless.cli.options import (
     IntegrityRisk,
     NotNegative,
     Positive,
-    finite_numbers,
     integrity_of,
     known_method,
     spare_inputs,
 )
 from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
+from skyless.cli.replay_input import flight_height, height_to_hold, known_anchors, known_truth
 from skyless.cli.replay_output import draw_track, fix_writer, see_that_it_can_be_drawn, show
 from skyless.cli.replay_site import Options, is_mcap, replay_site, see_that_they_are_left_out
-from skyless.errors import ConfigurationError, SkylessError
+from skyless.errors import ConfigurationError
 from skyless.methods import FILTERS
 
 if TYPE_CHECKING:
-    from skyless.air.packet import Point
     from skyless.experiments.judge import Judge
     from skyless.experiments.replay import Replay, ReplayReport
     from skyless.recordings.truth import Truth
@@ -142,7 +141,7 @@ def replay(
         known_method(method, FILTERS)
     places, site_height_m = known_anchors(anchors, site)
     known = known_truth(file, truth, lever_arm, format, listener)
-    height_m, note = _height(height, places, site_height_m, known, format_of(file, format).name)
+    height_m, note = height_to_hold(height, places, site_height_m, known, format_of(file, format).name)
     settle_s = settle if settle is not None else (2.0 if known is None else 3.0)
     judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=flight_height(above, known))
     request = ReplayRequest(
@@ -185,82 +184,6 @@ def _see_that_truth_matches(table: Path, truth: "Truth", judge: "Judge") -> None
         span = f"{truth.t_s[0]:.3f} to {truth.t_s[-1]:.3f}"
         expected = f"in the time of the recording, whose fixes are from {times_s.min():.3f} to {times_s.max():.3f}"
         raise ConfigurationError(table, "column t_s", span, expected)
-
-
-def known_anchors(table: Path | None, site: Path | None) -> "tuple[dict[int, Point], float | None]":
-    """Places of the anchors, and the tags' height where a site file tells it. Raises SkylessError."""
-    from skyless.recordings.anchors import read_anchors
-    from skyless.site.load import load_site
-
-    if table is not None and site is not None:
-        raise SkylessError("give either --anchors or --site, not both")
-    if table is not None:
-        return read_anchors(table), None
-    if site is None:
-        return {}, None
-    known = load_site(site)
-    return {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in known.anchors}, known.tags.height_m
-
-
-def known_truth(
-    file: Path, table: Path | None, arm: str | None, name: str | None, listener: str | None
-) -> "Truth | None":
-    """Where the antenna was, by a table or by the recording itself. Raises SkylessError."""
-    from skyless.experiments.judge import antenna_truth
-    from skyless.recordings.formats import format_of
-    from skyless.recordings.truth import read_truth
-
-    if table is None and format_of(file, name).name == "miluv":
-        table = file
-    if table is None:
-        if arm is not None:
-            raise SkylessError("--lever-arm moves the truth, which --truth must give")
-        return None
-    truth = read_truth(table, listener)
-    if arm is None:
-        return truth
-    x, y, z = finite_numbers("lever-arm", arm, (3,))
-    return antenna_truth(truth, (x, y, z))
-
-
-def _height(
-    wish: str, places: "dict[int, Point]", site_m: float | None, truth: "Truth | None", format_name: str
-) -> tuple[float | None, str]:
-    """Height to hold, and what to tell the user about it."""
-    import numpy as np
-
-    from skyless.experiments.observability import plane_height_m
-
-    if wish == "free":
-        return None, "estimated"
-    if wish == "truth" or (wish == "auto" and truth is not None and format_name == "miluv"):
-        if truth is None:
-            raise SkylessError("--height truth takes the height from the truth, which --truth must give")
-        return float(np.median(truth.position_m[:, 2])), "the truth's median"
-    if wish != "auto":
-        return _metres_of(wish), "given"
-    if site_m is not None:
-        return site_m, "from the site file"
-    plane_m = plane_height_m(places)
-    if plane_m is None:
-        return None, "estimated"
-    return plane_m, "the anchors' mean: they lie too flat to tell the height (--height free estimates it all the same)"
-
-
-def _metres_of(wish: str) -> float:
-    try:
-        return finite_numbers("height", wish, (1,))[0]
-    except SkylessError:
-        raise SkylessError(f"--height is {wish!r}; it should be metres, or truth, free or auto") from None
-
-
-def flight_height(wish: float | None, truth: "Truth | None") -> float | None:
-    """Judge flights in the air only: the truth begins on the floor and rises well above it."""
-    if wish is not None or truth is None:
-        return wish
-    from skyless.experiments.observability import FLIGHT_M, flies
-
-    return FLIGHT_M if flies(truth) else None
 
 
 def _run(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":

@@ -1,0 +1,87 @@
+"""What ``skyless replay`` and ``skyless calibrate`` are told beside a recording: anchors, truth and heights."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from skyless.cli.options import finite_numbers
+from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from skyless.air.packet import Point
+    from skyless.recordings.truth import Truth
+
+
+def known_anchors(table: Path | None, site: Path | None) -> "tuple[dict[int, Point], float | None]":
+    """Places of the anchors, and the tags' height where a site file tells it. Raises SkylessError."""
+    from skyless.recordings.anchors import read_anchors
+    from skyless.site.load import load_site
+
+    if table is not None and site is not None:
+        raise SkylessError("give either --anchors or --site, not both")
+    if table is not None:
+        return read_anchors(table), None
+    if site is None:
+        return {}, None
+    known = load_site(site)
+    return {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in known.anchors}, known.tags.height_m
+
+
+def known_truth(
+    file: Path, table: Path | None, arm: str | None, name: str | None, listener: str | None
+) -> "Truth | None":
+    """Where the antenna was, by a table or by the recording itself. Raises SkylessError."""
+    from skyless.experiments.judge import antenna_truth
+    from skyless.recordings.formats import format_of
+    from skyless.recordings.truth import read_truth
+
+    if table is None and format_of(file, name).name == "miluv":
+        table = file
+    if table is None:
+        if arm is not None:
+            raise SkylessError("--lever-arm moves the truth, which --truth must give")
+        return None
+    truth = read_truth(table, listener)
+    if arm is None:
+        return truth
+    x, y, z = finite_numbers("lever-arm", arm, (3,))
+    return antenna_truth(truth, (x, y, z))
+
+
+def height_to_hold(
+    wish: str, places: "dict[int, Point]", site_m: float | None, truth: "Truth | None", format_name: str
+) -> tuple[float | None, str]:
+    """Height to hold, and what to tell the user about it."""
+    import numpy as np
+
+    from skyless.experiments.observability import plane_height_m
+
+    if wish == "free":
+        return None, "estimated"
+    if wish == "truth" or (wish == "auto" and truth is not None and format_name == "miluv"):
+        if truth is None:
+            raise SkylessError("--height truth takes the height from the truth, which --truth must give")
+        return float(np.median(truth.position_m[:, 2])), "the truth's median"
+    if wish != "auto":
+        return _metres_of(wish), "given"
+    if site_m is not None:
+        return site_m, "from the site file"
+    plane_m = plane_height_m(places)
+    if plane_m is None:
+        return None, "estimated"
+    return plane_m, "the anchors' mean: they lie too flat to tell the height (--height free estimates it all the same)"
+
+
+def _metres_of(wish: str) -> float:
+    try:
+        return finite_numbers("height", wish, (1,))[0]
+    except SkylessError:
+        raise SkylessError(f"--height is {wish!r}; it should be metres, or truth, free or auto") from None
+
+
+def flight_height(wish: float | None, truth: "Truth | None") -> float | None:
+    """Judge flights in the air only: the truth begins on the floor and rises well above it."""
+    if wish is not None or truth is None:
+        return wish
+    from skyless.experiments.observability import FLIGHT_M, flies
+
+    return FLIGHT_M if flies(truth) else None
