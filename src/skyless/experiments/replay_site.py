@@ -10,8 +10,9 @@ import numpy as np
 from skyless.errors import ConfigurationError
 from skyless.experiments.judge import Judge
 from skyless.experiments.replay import ReplayReport
+from skyless.experiments.replay_comparison import Identical
 from skyless.experiments.replay_delays import delay_changes
-from skyless.experiments.replay_tag import Identical, Replayed, TagReplay
+from skyless.experiments.replay_tag import Replayed, TagReplay
 from skyless.outputs.messages import FixMessage, ReceptionsMessage
 from skyless.positioning.protection import IntegrityRequirement
 from skyless.recordings.mcap_recording import McapRecording, Recorded

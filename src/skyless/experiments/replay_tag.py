@@ -1,18 +1,17 @@
 """One tag of a recording once more: its receptions through its receiver, bit by bit as it was."""
 
 import math
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Iterator
-from typing import Final, TypeVar
+from typing import Final
 
-import msgspec
 from msgspec import Struct
 
 from skyless.air.reception import Diagnostics, Reception
 from skyless.constants import TICK_S
+from skyless.experiments.replay_comparison import Comparison, Identical
 from skyless.experiments.replay_delays import DelayChange, with_delays
 from skyless.methods import DEFAULT_METHOD, METHODS
-from skyless.nodes.fix_book import fix_message
 from skyless.outputs.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart
 from skyless.positioning.fix import Fix
 from skyless.positioning.protection import RISK, IntegrityRequirement
@@ -21,23 +20,8 @@ from skyless.recordings.checkpoint import RefusedError, load
 from skyless.recordings.source import Drops
 from skyless.ticks import WRAP_TICKS, Unwrapper
 
-_T = TypeVar("_T")
-
-MOST_PENDING: Final = 20_000
-"""Fixes that wait for their counterpart; those that the recording lacks never get one."""
-
-SAME_FIX_S: Final = 2.0
-"""Serial numbers begin anew with the tag; fixes of one number that are farther apart are different ones."""
-
 HOST_DRIFT: Final = 1e-4
 """By how much a host's clock and a tag's may differ in rate."""
-
-
-class Identical(Struct, frozen=True):
-    """Recorded fixes against those of the replay, bit by bit."""
-
-    compared: int
-    different: int
 
 
 class Replayed(Struct, frozen=True):
@@ -97,7 +81,7 @@ class TagReplay:
         self._segment = ""
         self._next = 0
         self._clock = HostClock()
-        self._comparison = _Comparison(tag)
+        self._comparison = Comparison(tag)
 
     def hear(self, message: ReceptionsMessage) -> Iterator[Replayed]:
         """Take a run of receptions; the fixes that they make."""
@@ -197,44 +181,6 @@ class TagReplay:
                 return None
         self.reason = str(self._receiver.reason)
         return fix
-
-
-class _Comparison:
-    """Pairs of a recorded and a replayed fix, matched by serial number and time, whichever comes first."""
-
-    def __init__(self, tag: str) -> None:
-        self._tag = tag
-        self._recorded: OrderedDict[int, FixMessage] = OrderedDict()
-        self._replayed: OrderedDict[int, tuple[Fix, float]] = OrderedDict()
-        self._compared = self._different = 0
-
-    def result(self) -> Identical:
-        return Identical(self._compared, self._different)
-
-    def recorded(self, message: FixMessage) -> None:
-        found = self._replayed.pop(message.serial, None)
-        if found is None or abs(found[1] - message.unix_s) > SAME_FIX_S:
-            _keep(self._recorded, message.serial, message)
-        else:
-            self._judge(found[0], message)
-
-    def replayed(self, serial: int, fix: Fix, unix_s: float) -> None:
-        found = self._recorded.pop(serial, None)
-        if found is None or abs(found.unix_s - unix_s) > SAME_FIX_S:
-            _keep(self._replayed, serial, (fix, unix_s))
-        else:
-            self._judge(fix, found)
-
-    def _judge(self, fix: Fix, message: FixMessage) -> None:
-        again = fix_message(self._tag, message.serial, fix, message.unix_s, message.latency_s)
-        self._compared += 1
-        self._different += msgspec.json.encode(again) != msgspec.json.encode(message)
-
-
-def _keep(waiting: OrderedDict[int, _T], serial: int, value: _T) -> None:
-    waiting[serial] = value
-    if len(waiting) > MOST_PENDING:
-        waiting.popitem(last=False)
 
 
 def reception_of(raw: RawReception) -> Reception | None:
