@@ -13,11 +13,10 @@ from msgspec import Struct
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.experiments.lab_bound import LAST, SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.monte_carlo import cores
-from skyless.experiments.studies.episodes import Case, Episode, draw_episode
-from skyless.positioning.joint import JointFilter, JointSettings
+from skyless.experiments.studies.episodes import Case, Episode, draw_episode, settings_of
+from skyless.positioning.joint import JointFilter
 from skyless.site.lab import lab_site
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
@@ -118,17 +117,7 @@ def _run(case: Case, draw: np.random.Generator) -> list[float]:
 
 
 def _filtered(case: Case, anchors: Array, episode: Episode, draw: np.random.Generator) -> tuple[Array, Array]:
-    light2 = SPEED_OF_LIGHT_MPS**2
-    stamp = light2 * (case.noise_ps * 1e-12) ** 2
-    settings = JointSettings(
-        qa=case.qa,
-        white=light2 * WHITE_FM**2,
-        walk=light2 * case.random_walk_fm**2,
-        tx_variance_m2=stamp,
-        rx_variance_m2=stamp + TICK_M**2 / 12.0,
-        height_m=0.0,
-    )
-    joint = JointFilter(settings, anchors)
+    joint = JointFilter(settings_of(case, height_m=0.0), anchors)
     start = episode.path_m[0, :2] + draw.normal(0.0, START_STD_M, 2)
     joint.start(int(episode.messages.rx_ticks[0]), start, START_STD_M**2 * np.eye(2), SPEED_STD_MPS**2)
     frames = len(episode.path_m)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.experiments.lab_bound import SUPERFRAMES, WHITE_FM, random_path
-from skyless.positioning.joint import Messages
+from skyless.positioning.joint import JointSettings, Messages
 
 Array = NDArray[np.float64]
 Ticks = NDArray[np.int64]
@@ -66,6 +66,20 @@ def draw_episode(
     relays, ends = _relays(rx_ticks, senders, n, case)
     messages = Messages(senders, np.arange(frames) // n % 256, rx_ticks[:, n].copy(), tx_ticks, relays, ends)
     return Episode(messages, path_m)
+
+
+def settings_of(case: Case, height_m: float | None) -> JointSettings:
+    """What a filter has to assume for an episode to be just what it assumes."""
+    light2 = SPEED_OF_LIGHT_MPS**2
+    stamp = light2 * (case.noise_ps * 1e-12) ** 2
+    return JointSettings(
+        qa=case.qa,
+        white=light2 * WHITE_FM**2,
+        walk=light2 * case.random_walk_fm**2,
+        tx_variance_m2=stamp,
+        rx_variance_m2=stamp + TICK_M**2 / 12.0,
+        height_m=height_m,
+    )
 
 
 def _ticks(metres: Array) -> Ticks:

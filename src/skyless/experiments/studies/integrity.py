@@ -15,14 +15,13 @@ from msgspec.structs import replace
 from numpy.random import Generator, SeedSequence, default_rng
 from numpy.typing import NDArray
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.errors import SkylessError
-from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
-from skyless.experiments.studies.episodes import Case, draw_episode
+from skyless.experiments.lab_bound import SPEED_STD_MPS
+from skyless.experiments.studies.episodes import Case, draw_episode, settings_of
 from skyless.experiments.studies.integrity_faults import FAULTS, Fault, faulty
 from skyless.experiments.studies.plan import Cell, Plan, Row
 from skyless.experiments.studies.rare import rare_interval
-from skyless.positioning.joint import JointFilter, JointSettings, Messages
+from skyless.positioning.joint import JointFilter, Messages
 from skyless.positioning.joint_hearing import REJECTED
 from skyless.positioning.protection import limits_of, protected_track
 from skyless.positioning.protection_levels import DETECTED, HPL, LEVELS, STATE, VPL
@@ -138,17 +137,8 @@ def _run(setting: Setting, draw: Generator) -> tuple[NDArray[Any], ...]:
 
 def _filtered(setting: Setting, anchors_m: Array, messages: Messages, start_m: Array) -> tuple[Array, Array]:
     """Motions and levels after every packet."""
-    light2, case = SPEED_OF_LIGHT_MPS**2, setting.case
-    stamp = light2 * (case.noise_ps * 1e-12) ** 2
-    settings = JointSettings(
-        qa=case.qa,
-        white=light2 * WHITE_FM**2,
-        walk=light2 * case.random_walk_fm**2,
-        tx_variance_m2=stamp,
-        rx_variance_m2=stamp + TICK_M**2 / 12.0,
-        height_m=0.0 if setting.fault.place == "lab" else None,
-    )
-    joint = JointFilter(settings, anchors_m)
+    height_m = 0.0 if setting.fault.place == "lab" else None
+    joint = JointFilter(settings_of(setting.case, height_m), anchors_m)
     dim, n = joint.dim, len(messages.sites)
     joint.start(int(messages.rx_ticks[0]), start_m[:dim], START_STD_M**2 * np.eye(dim), SPEED_STD_MPS**2)
     motions, levels = np.empty((n, 2 * dim)), np.empty((n, LEVELS + 1))
