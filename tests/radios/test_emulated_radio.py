@@ -56,6 +56,19 @@ async def nodes(port, kind, *names):
         yield [await stack.enter_async_context(ears(radio)) for radio in radios]
 
 
+@contextlib.asynccontextmanager
+async def anchor_and_tag(name):
+    """An ether, and an anchor and a tag on the air."""
+    async with (
+        OpenAir() as air,
+        nodes(air.port, "anchor", name) as (anchor,),
+        nodes(air.port, "tag", "tag1") as (tag,),
+    ):
+        await anchor.until(Restarted)
+        await tag.until(Restarted)
+        yield air, anchor, tag
+
+
 def ahead(radio, seconds):
     return wrap(radio.now_ticks() + round(seconds * TICK_RATE_HZ))
 
@@ -115,13 +128,7 @@ def test_a_counter_goes_with_its_crystal():
 
 def test_a_late_frame_is_said_to_be_late_and_the_radio_goes_on():
     async def play():
-        async with (
-            OpenAir() as air,
-            nodes(air.port, "anchor", "1") as (anchor,),
-            nodes(air.port, "tag", "tag1") as (tag,),
-        ):
-            await anchor.until(Restarted)
-            await tag.until(Restarted)
+        async with anchor_and_tag("1") as (air, anchor, tag):
             tx_ticks = ahead(anchor.radio, -1e-3)
             anchor.radio.transmit(Transmission(WORD, tx_ticks))
             assert await anchor.until(Late) == Late(tx_ticks)
@@ -221,13 +228,7 @@ JOIN = pack(Join("anchor", ("1",)))
 )
 def test_a_stranger_is_sent_away_and_the_others_do_not_notice(said):
     async def play():
-        async with (
-            OpenAir() as air,
-            nodes(air.port, "anchor", "2") as (anchor,),
-            nodes(air.port, "tag", "tag1") as (tag,),
-        ):
-            await anchor.until(Restarted)
-            await tag.until(Restarted)
+        async with anchor_and_tag("2") as (air, anchor, tag):
             reader, writer = await asyncio.open_connection(HOST, air.port)
             writer.write(said)
             async with asyncio.timeout(20):
@@ -247,13 +248,7 @@ def test_a_stranger_is_sent_away_and_the_others_do_not_notice(said):
 @pytest.mark.parametrize("ticks", [-1, -(2**63), 2**40, 2**63, 2**64 - 1])
 def test_a_stamp_that_no_radio_has_hurts_nobody(ticks):
     async def play():
-        async with (
-            OpenAir() as air,
-            nodes(air.port, "anchor", "2") as (anchor,),
-            nodes(air.port, "tag", "tag1") as (tag,),
-        ):
-            await anchor.until(Restarted)
-            await tag.until(Restarted)
+        async with anchor_and_tag("2") as (air, anchor, tag):
             _, writer = await asyncio.open_connection(HOST, air.port)
             writer.write(JOIN + pack(Send(0, ticks, b"")))
             await asyncio.sleep(0.05)
@@ -265,13 +260,7 @@ def test_a_stamp_that_no_radio_has_hurts_nobody(ticks):
 
 def test_a_process_that_does_not_read_loses_frames_which_are_counted_and_the_others_none():
     async def play():
-        async with (
-            OpenAir() as air,
-            nodes(air.port, "anchor", "2") as (anchor,),
-            nodes(air.port, "tag", "tag1") as (tag,),
-        ):
-            await anchor.until(Restarted)
-            await tag.until(Restarted)
+        async with anchor_and_tag("2") as (air, anchor, tag):
             loop = asyncio.get_running_loop()
             reader, writer = await asyncio.open_connection(HOST, air.port, limit=1)
             writer.write(pack(Join("tag", ("tag2",))))
