@@ -12,7 +12,6 @@ from typing import Final
 
 import msgspec
 from msgspec import Struct
-from paho.mqtt.client import topic_matches_sub
 
 import skyless
 from skyless.outputs.address import MqttAddress
@@ -21,10 +20,8 @@ from skyless.outputs.messages import Counters, StatusMessage
 from skyless.outputs.outbox import Limits, Outbox
 from skyless.outputs.paho_client import Introduction, Will
 from skyless.outputs.reaching import open_connection, trouble_with
+from skyless.outputs.routes import Handler, Routes
 from skyless.outputs.topics import status_topic
-
-Handler = Callable[[str, bytes], None]
-"""Called from the event loop with topic and payload; must return quickly."""
 
 _log = logging.getLogger("skyless.mqtt")
 _encode: Final = msgspec.json.Encoder().encode
@@ -36,8 +33,6 @@ _FAREWELL_S: Final = 1.0
 _SAME_TROUBLE_S: Final = 30.0
 _SOON_S: Final = 0.5
 """A first connection that takes no longer is nothing to speak of."""
-
-_MOST_ROUTES: Final = 10_000
 
 
 class Link:
@@ -79,10 +74,9 @@ class Link:
         self._status_topic = status_topic(site, kind, name)
         self._offline = StatusMessage(online=False, kind=kind, name=str(name))
         self._outbox = Outbox(limits or Limits())
-        self._reactions = Reactions(self._receive, self._acknowledged, self._pump)
+        self._routes = Routes()
+        self._reactions = Reactions(self._routes.receive, self._acknowledged, self._pump)
         self._connection: Connection | None = None
-        self._handlers: dict[str, tuple[Handler, int]] = {}
-        self._routes: dict[str, tuple[Handler, ...]] = {}
         self._reconnects = -1
         self._told_dropped = 0
         self._away_since_s = time.monotonic()
@@ -119,8 +113,7 @@ class Link:
         A second handler of the same filter takes the place of the first. Where filters of one link overlap, some
         brokers send a message once for each, and all its handlers see it as often.
         """
-        self._handlers[topic_filter] = (handler, qos)
-        self._routes.clear()
+        self._routes.add(topic_filter, handler, qos)
         if self._connection is not None:
             self._connection.subscribe({topic_filter: qos})
 
@@ -167,7 +160,7 @@ class Link:
         self._tell_return()
         self._outbox.restart()
         self._say_online()
-        connection.subscribe({name: qos for name, (_, qos) in self._handlers.items()})
+        connection.subscribe(self._routes.filters)
         self._set_state(connected=True, trouble=None)
         self._pump()
 
@@ -207,7 +200,7 @@ class Link:
                 while self._outbox.unacknowledged and not connection.lost.is_set():
                     await asyncio.sleep(0.005)
                 if self._persistent:
-                    connection.unsubscribe(self._handlers)
+                    connection.unsubscribe(self._routes.filters)
                 await connection.leave()
         except TimeoutError:
             pass
@@ -226,23 +219,6 @@ class Link:
     def _acknowledged(self, number: int) -> None:
         self._outbox.acknowledge(number)
         self._pump()
-
-    def _receive(self, topic: str, payload: bytes) -> None:
-        handlers = self._routes.get(topic)
-        if handlers is None:
-            handlers = self._find_handlers(topic)
-        for handler in handlers:
-            try:
-                handler(topic, payload)
-            except Exception:  # noqa: BLE001 - one bad handler must not cost the others the connection
-                _log.exception("a message of %s could not be handled", topic)
-
-    def _find_handlers(self, topic: str) -> tuple[Handler, ...]:
-        if len(self._routes) >= _MOST_ROUTES:
-            self._routes.clear()
-        found = tuple(handler for name, (handler, _) in self._handlers.items() if topic_matches_sub(name, topic))
-        self._routes[topic] = found
-        return found
 
     def _wait_s(self, failures: int) -> float:
         longest_s = _LONGEST_WAIT_LOOPBACK_S if self.address.loopback else _LONGEST_WAIT_S
