@@ -280,7 +280,7 @@ def test_arrays_of_another_length_are_not_sound():
     joint = heard(episode, episode.messages, settings_of(case))
     joint._addresses = None
     assert is_sound(joint)
-    joint._exchanged = joint._exchanged._replace(told=np.zeros(LEVELS - 1))
+    joint._exchanged = joint._exchanged._replace(levels=np.zeros(LEVELS - 1))
     assert not is_sound(joint)
 
 

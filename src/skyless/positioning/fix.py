@@ -2,6 +2,7 @@
 
 from enum import StrEnum
 from math import sqrt
+from struct import Struct as Format
 from typing import Final
 
 import numpy as np
@@ -9,8 +10,8 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.positioning.alert import Alert
-from skyless.positioning.motion_rows import MOTION_ROWS, fill_motion
-from skyless.positioning.protection import Integrity
+from skyless.positioning.fix_rows import MOTION_ROWS, POSITION, PROTECTION, QUALITY, VELOCITY, fill_motion
+from skyless.positioning.protection import Integrity, IntegrityRequirement, integrity_of
 from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED
 from skyless.uncertainty.dop import Dops, dilution_of_precision
 
@@ -29,38 +30,93 @@ class NoFixReason(StrEnum):
 
 
 class Fix(Struct, frozen=True, gc=False):
-    """One position with all that is known of its quality. SI units, site frame."""
+    """One position with all that is known of its quality. SI units, site frame.
+
+    It keeps what the method wrote as it is, and takes it apart when it is asked: arrays are read-only views.
+    """
 
     time_s: float
     """Master time at which the position holds, since the receiver's first fix."""
-    position_m: NDArray[np.float64]
-    """Shape (3,)."""
-    covariance_m2: NDArray[np.float64]
-    """Of the position, shape (3, 3); a coordinate that was given (2-D, known height) has zeros."""
-    velocity_mps: NDArray[np.float64] | None
-    """Shape (3,), None where the method knows none."""
-    velocity_covariance: NDArray[np.float64] | None
-    """Shape (3, 3) in (m/s)²."""
+    rows: bytes
+    """Rows of float64 (``fix_rows``), without those of which the method knows nothing."""
     anchors: tuple[int, ...]
     """Identifiers of the anchors in use, the reference first."""
     anchors_m: NDArray[np.float64]
     """Their positions, shape (len(anchors), 3)."""
-    chi2: float
-    """Sum of squared normalised residuals (snapshots) or its running mean per message (filters)."""
-    dof: int
-    """Degrees of freedom of ``chi2``; 1 for the running mean of a filter."""
-    residual_rms_m: float
     method: str
     height_known: bool
     """True for 2-D positioning at a given height."""
-    hpl_m: float | None = None
-    """Horizontal protection level: the error is larger with a probability of at most ``integrity_risk``."""
-    vpl_m: float | None = None
-    """Vertical protection level; None where the height is given."""
-    integrity_risk: float | None = None
-    """None for methods that know no protection levels."""
-    alert: Alert | None = None
-    """Whether the levels can be relied on; None for methods without any."""
+    dof: int = 1
+    """Degrees of freedom of ``chi2``; 1 for the running mean of a filter."""
+    asked: IntegrityRequirement | None = None
+    """What the protection levels answer; None for methods that know none."""
+
+    def __repr__(self) -> str:
+        return (
+            f"Fix(time_s={self.time_s}, position_m={self.position_m.tolist()}, std_m={self.std_m}, "
+            f"anchors={self.anchors}, method={self.method!r}, hpl_m={self.hpl_m}, alert={self.alert})"
+        )
+
+    @property
+    def position_m(self) -> NDArray[np.float64]:
+        """Shape (3,)."""
+        return _vector(self.rows, POSITION)
+
+    @property
+    def covariance_m2(self) -> NDArray[np.float64]:
+        """Of the position, shape (3, 3); a coordinate that was given (2-D, known height) has zeros."""
+        return _matrix(self.rows, POSITION + 1)
+
+    @property
+    def velocity_mps(self) -> NDArray[np.float64] | None:
+        """Shape (3,), None where the method knows none."""
+        return _vector(self.rows, VELOCITY) if len(self.rows) > VELOCITY * ROW_BYTES else None
+
+    @property
+    def velocity_covariance(self) -> NDArray[np.float64] | None:
+        """Shape (3, 3) in (m/s)²."""
+        return _matrix(self.rows, VELOCITY + 1) if len(self.rows) > VELOCITY * ROW_BYTES else None
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squared normalised residuals (snapshots) or its running mean per message (filters)."""
+        return _row(self.rows, QUALITY)[0]
+
+    @property
+    def residual_rms_m(self) -> float:
+        """Root of the mean (filters: running mean) squared residual."""
+        return sqrt(_row(self.rows, QUALITY)[1])
+
+    @property
+    def integrity(self) -> Integrity | None:
+        """Protection levels, and whether they can be relied on; None for methods that know none."""
+        asked = self.asked
+        if asked is None:
+            return None
+        return integrity_of(_row(self.rows, PROTECTION), asked.risk, self.height_known, asked.alert_limit_m)
+
+    @property
+    def hpl_m(self) -> float | None:
+        """Horizontal protection level: the error is larger with a probability of at most ``integrity_risk``."""
+        integrity = self.integrity
+        return None if integrity is None else integrity.hpl_m
+
+    @property
+    def vpl_m(self) -> float | None:
+        """Vertical protection level; None where the height is given."""
+        integrity = self.integrity
+        return None if integrity is None else integrity.vpl_m
+
+    @property
+    def integrity_risk(self) -> float | None:
+        """None for methods that know no protection levels."""
+        return None if self.asked is None else self.asked.risk
+
+    @property
+    def alert(self) -> Alert | None:
+        """Whether the levels can be relied on; None for methods without any."""
+        integrity = self.integrity
+        return None if integrity is None else integrity.alert
 
     @property
     def std_m(self) -> float:
@@ -73,8 +129,21 @@ class Fix(Struct, frozen=True, gc=False):
         return dilution_of_precision(self.anchors_m, self.position_m, height_known=self.height_known)
 
 
-_OF_POSITION: Final = slice(2, 5)
-_OF_VELOCITY: Final = slice(5, MOTION_ROWS)
+_ROW: Final = Format("3d")
+
+ROW_BYTES: Final = _ROW.size
+
+
+def _row(rows: bytes, place: int) -> tuple[float, ...]:
+    return _ROW.unpack_from(rows, place * ROW_BYTES)
+
+
+def _vector(rows: bytes, place: int) -> NDArray[np.float64]:
+    return np.frombuffer(rows, count=3, offset=place * ROW_BYTES)
+
+
+def _matrix(rows: bytes, place: int) -> NDArray[np.float64]:
+    return np.frombuffer(rows, count=9, offset=place * ROW_BYTES).reshape(3, 3)
 
 
 def motion_fix(
@@ -92,36 +161,6 @@ def motion_fix(
     ``statistics`` holds the running means of the normalised and of the plain squared innovation.
     """
     rows, known = np.zeros((MOTION_ROWS, 3)), height_m is not None
-    chi2 = statistics.item(CHI2)
-    fill_motion(rows, x, P, 2 if known else 3, chi2, height_m or 0.0)
-    return fix_of(time_s, rows, known, anchors, anchors_m, chi2, statistics.item(RESIDUAL_SQUARED), method)
-
-
-def fix_of(
-    time_s: float,
-    rows: NDArray[np.float64],
-    height_known: bool,
-    anchors: tuple[int, ...],
-    anchors_m: NDArray[np.float64],
-    chi2: float,
-    squared_m2: float,
-    method: str,
-    integrity: Integrity | None = None,
-) -> Fix:
-    """Make the fix of what ``fill_motion`` has written; the fix keeps ``rows``.
-
-    ``chi2`` and ``squared_m2`` are the running means of the normalised and of the plain squared innovation.
-    """
-    position_m, velocity_mps = rows[0], rows[1]
-    covariance_m2, velocity_covariance = rows[_OF_POSITION], rows[_OF_VELOCITY]
-    # in the order of the fields: with their names it takes as long as all the rest
-    if integrity is None:
-        return Fix(
-            time_s, position_m, covariance_m2, velocity_mps, velocity_covariance,
-            anchors, anchors_m, chi2, 1, sqrt(squared_m2), method, height_known,
-        )  # fmt: skip
-    return Fix(
-        time_s, position_m, covariance_m2, velocity_mps, velocity_covariance,
-        anchors, anchors_m, chi2, 1, sqrt(squared_m2), method, height_known,
-        integrity.hpl_m, integrity.vpl_m, integrity.risk, integrity.alert,
-    )  # fmt: skip
+    chi2, squared_m2 = statistics.item(CHI2), statistics.item(RESIDUAL_SQUARED)
+    fill_motion(rows, x, P, 2 if known else 3, chi2, squared_m2, height_m or 0.0)
+    return Fix(time_s, rows.tobytes(), anchors, anchors_m, method, known)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from skyless.addresses import Addresses
 from skyless.air.beacon import HEARD
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.positioning.fix_rows import PROTECTED_ROWS
 from skyless.positioning.joint_hearing import FULL, JOINED, joint_motion, joint_track
 from skyless.positioning.joint_state import (
     BASE,
@@ -43,11 +44,10 @@ from skyless.positioning.joint_state import (
     states,
     values,
 )
-from skyless.positioning.joint_step import MOST_PACKED, PACKET, TOLD, Exchanged, joint_rest, joint_step
+from skyless.positioning.joint_step import MOST_PACKED, PACKET, Exchanged, joint_rest, joint_step
 from skyless.positioning.joint_sync import NO_SYNCS
 from skyless.positioning.joint_time import move_base
 from skyless.positioning.kalman import horizontal_variance
-from skyless.positioning.motion_rows import MOTION_ROWS
 from skyless.positioning.protection import RISK, limits_of
 from skyless.positioning.protection_levels import LEVELS
 from skyless.positioning.tracker import AGILITY, LOST_IN_ROW, LOST_SHARE, REJECTED_SHARE
@@ -127,7 +127,6 @@ NO_RELAYS: Final = np.empty((0, 4), np.int64)
 
 
 _pack_packet: Final[Callable[..., None]] = PACKET.pack_into
-_unpack_told: Final[Callable[..., tuple[float, ...]]] = struct.Struct(f"{TOLD}d").unpack_from
 
 
 @cache
@@ -151,9 +150,9 @@ class JointFilter:
             sync=np.zeros((1, 3)),
             motion=np.zeros(2 * self.dim),
             covariance=np.zeros((2 * self.dim, 2 * self.dim)),
-            rows=np.zeros((MOTION_ROWS, 3)),
+            rows=np.zeros((PROTECTED_ROWS, 3)),
             limits=limits_of(settings.integrity_risk),
-            told=np.zeros(TOLD),
+            levels=np.zeros(LEVELS),
         )
         self._addresses: Addresses | None = None
 
@@ -305,17 +304,13 @@ class JointFilter:
 
     @property
     def rows(self) -> Matrix:
-        """What ``fill_motion`` has written of the last packet that ``hear`` took."""
+        """What fixes carry (``fix_rows``), as of the last packet that ``hear`` took."""
         return self._exchanged.rows
-
-    def told(self) -> tuple[float, ...]:
-        """Levels and running means as of the last packet that ``hear`` took, shape (TOLD,)."""
-        return _unpack_told(self._exchanged.told)
 
     @property
     def levels(self) -> Vector:
         """What ``protect`` said of the last packet that ``hear`` took."""
-        return self._exchanged.told[:LEVELS]
+        return self._exchanged.levels
 
     def track(self, messages: Messages, motions: Matrix | None = None, variances: Matrix | None = None) -> None:
         """Take many packets in one loop; the arithmetic is that of ``hear``, so the states are its, bit for bit.

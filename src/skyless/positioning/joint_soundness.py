@@ -4,6 +4,7 @@ from typing import Final
 
 import numpy as np
 
+from skyless.positioning.fix_rows import PROTECTED_ROWS
 from skyless.positioning.joint import JointFilter
 from skyless.positioning.joint_state import (
     DIM,
@@ -17,9 +18,8 @@ from skyless.positioning.joint_state import (
     JointArrays,
     new_arrays,
 )
-from skyless.positioning.joint_step import MOST_PACKED, PACKET, TOLD, Exchanged
-from skyless.positioning.motion_rows import MOTION_ROWS
-from skyless.positioning.protection_levels import LIMITS
+from skyless.positioning.joint_step import MOST_PACKED, PACKET, Exchanged
+from skyless.positioning.protection_levels import LEVELS, LIMITS
 
 MOST: Final = 4096
 """Anchors, in view or in the table."""
@@ -48,7 +48,7 @@ def _exchanged(joint: JointFilter) -> bool:
     if not isinstance(told.relays, np.ndarray) or told.relays.ndim != 2 or len(told.relays) < MOST_PACKED:
         return False
     integers = ((PACKET.size // 8,), (len(joint.arrays.site_m),), (len(told.relays), 4))
-    shapes = (*integers, (1, 3), (n,), (n, n), (MOTION_ROWS, 3), (LIMITS,), (TOLD,))
+    shapes = (*integers, (1, 3), (n,), (n, n), (PROTECTED_ROWS, 3), (LIMITS,), (LEVELS,))
     kinds = (np.int64,) * 3 + (np.float64,) * 6
     return all(_is_array(*one) for one in zip(told, shapes, kinds, strict=True))
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from skyless.addresses import Table, integer_blocks, integer_matrix, integers, matrix, vector
 from skyless.compiled import borrowing_kernel
+from skyless.positioning.fix_rows import PROTECTION, fill_motion
 from skyless.positioning.joint_hearing import SYNC_WANTED, end_packet, joint_hear, joint_motion
 from skyless.positioning.joint_state import (
     DIM,
@@ -19,8 +20,7 @@ from skyless.positioning.joint_state import (
     Vector,
 )
 from skyless.positioning.joint_sync import SYNC_MASTER, SYNC_SUBTICKS, SYNC_VARIANCE
-from skyless.positioning.motion_rows import fill_motion
-from skyless.positioning.protection_levels import LEVELS, protect
+from skyless.positioning.protection_levels import HPL, STATE, VPL, protect
 from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
@@ -34,11 +34,6 @@ MOST_PACKED: Final = 16
 """Relays in a frame; 13 fit."""
 
 PACKET: Final = struct.Struct(f"{VARIANCE}qd{8 * MOST_PACKED}s")
-
-RUNNING_CHI2, RUNNING_SQUARED = LEVELS, LEVELS + 1
-"""Places in what is told, behind the levels."""
-
-TOLD: Final = LEVELS + 2
 
 FIELDS: Final = len(JointArrays._fields)
 
@@ -58,10 +53,10 @@ class Exchanged(NamedTuple):
     covariance: Matrix
     """As ``joint_motion`` writes them."""
     rows: Matrix
-    """As ``fill_motion`` does."""
+    """What a fix carries, shape (PROTECTED_ROWS, 3)."""
     limits: Vector
-    told: Vector
-    """Levels (``protect``), then running means; shape (TOLD,)."""
+    levels: Vector
+    """As ``protect`` takes and writes them."""
 
 
 @borrowing_kernel
@@ -155,8 +150,9 @@ def joint_rest(table: Table) -> int:
 def _tell(s: JointArrays, table: Table) -> None:
     """Write what is known after the packet."""
     motion, covariance, rows = vector(table, FIELDS + 4), matrix(table, FIELDS + 5), matrix(table, FIELDS + 6)
-    told = vector(table, FIELDS + 8)
+    levels, means = vector(table, FIELDS + 8), s.statistics
     joint_motion(s, motion, covariance)
-    fill_motion(rows, motion, covariance, int(s.settings[DIM]), s.statistics[CHI2], s.settings[HEIGHT])
-    protect(s, covariance, vector(table, FIELDS + 7), told)
-    told[RUNNING_CHI2], told[RUNNING_SQUARED] = s.statistics[CHI2], s.statistics[RESIDUAL_SQUARED]
+    dim, height_m = int(s.settings[DIM]), s.settings[HEIGHT]
+    fill_motion(rows, motion, covariance, dim, means[CHI2], means[RESIDUAL_SQUARED], height_m)
+    protect(s, covariance, vector(table, FIELDS + 7), levels)
+    rows[PROTECTION, HPL], rows[PROTECTION, VPL], rows[PROTECTION, STATE] = levels[HPL], levels[VPL], levels[STATE]

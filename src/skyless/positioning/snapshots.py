@@ -131,19 +131,15 @@ class Snapshots:
         first_message = self._method in {SnapshotMethod.LITERAL, SnapshotMethod.WEIGHTED}
         message = reference[0 if first_message else 1]
         residuals = solution.residuals_m
+        quality = np.array((solution.chi2, residuals @ residuals / len(residuals), 0.0))
         return Fix(
             time_s=self._time.time_s(message.tx_ticks_anchor, message.rx_ticks_tag),
-            position_m=solution.position_m,
-            covariance_m2=solution.covariance_m2,
-            velocity_mps=None,
-            velocity_covariance=None,
+            rows=np.vstack((solution.position_m, solution.covariance_m2, quality)).tobytes(),
             anchors=anchors,
             anchors_m=anchors_m,
-            chi2=solution.chi2,
-            dof=solution.dof,
-            residual_rms_m=float(np.sqrt(residuals @ residuals / len(residuals))),
             method=str(self._method),
             height_known=self._settings.height_m is not None,
+            dof=solution.dof,
         )
 
 
