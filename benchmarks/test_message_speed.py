@@ -8,8 +8,9 @@ import pytest
 from skyless.air.codec import decode, encode
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.methods import METHODS
 from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings, track
-from skyless.receiver import METHODS, Receiver
+from skyless.receiver import Receiver
 from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static

@@ -571,7 +571,7 @@ def test_stamps_in_the_middle_of_a_wrap():
 
 def test_beacons_that_rest_on_one_beacon_of_the_master_count_less_and_less():
     """Their common clock error is no better known for being sent again; the master's own time has none."""
-    receiver, told = Receiver(), {}
+    receiver, told = Receiver("tracker"), {}
     listen(receiver, [one for one in tape() if one.host_s < 1.0])
     hear = receiver.method.hear
 

@@ -79,7 +79,7 @@ class AlmanacBook:
         self._rival_issue = None
         if page is None:
             return False
-        place = _place(page)
+        place = page.anchor if type(page) is AnchorPage else type(page)  # as _place does, here for every beacon
         if self._pages.get(place) is page and not self._doubted:  # pages come from a cache, so mostly the very same
             return False
         return self._enter(place, page)

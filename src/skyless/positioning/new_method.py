@@ -1,0 +1,87 @@
+"""A tag's positioning method as an almanac asks for it."""
+
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.air.almanac import NoisePage, SchedulePage
+from skyless.clocks.filter import clock_noise
+from skyless.methods import FILTERS
+from skyless.positioning.fix_time import FixTime
+from skyless.positioning.joint import JointSettings
+from skyless.positioning.joint_tracking import JointTracking
+from skyless.positioning.observation import Method
+from skyless.positioning.protection import IntegrityRequirement
+from skyless.positioning.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
+from skyless.positioning.tracker import TrackerSettings
+from skyless.positioning.tracking import Tracking
+from skyless.ticks import to_seconds
+from skyless.uncertainty.tdoa import stamp_variance_m2
+
+DROP_S: Final = 2.0
+"""An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""
+
+LONGEST_FOR_JOINT_S: Final = 2.0
+"""In longer superframes a tag may be metres away when it hears an anchor again: the tracker serves instead, which needs
+no clock of an anchor for longer than a superframe."""
+
+
+class Wanted(Struct, frozen=True):
+    """What the tag's owner asks for."""
+
+    method: str
+    """One of ``METHODS``."""
+    qa: float
+    """The tag's agility in m²/s³ (filters)."""
+    z_bounds_m: tuple[float, float] | None
+    """Decides between mirror solutions."""
+    integrity: IntegrityRequirement
+    """What is asked of the protection levels (``joint``)."""
+
+
+def new_method(wanted: Wanted, master: int, schedule: SchedulePage, noise: NoisePage, time: FixTime) -> Method:
+    """Make the method for a site with this schedule and noise, where that anchor is the master."""
+    superframe_s = to_seconds(schedule.slot_ticks * schedule.slots)
+    if wanted.method not in FILTERS:
+        tx_variance, rx_variance = _stamp_variances(noise)
+        settings = SnapshotSettings(
+            master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, wanted.z_bounds_m
+        )
+        return Snapshots(SnapshotMethod(wanted.method), settings, time)
+    if wanted.method == "joint" and superframe_s <= LONGEST_FOR_JOINT_S:
+        joint = _joint_settings(wanted, schedule, noise, superframe_s)
+        return JointTracking(joint, wanted.z_bounds_m, time, superframe_s)
+    return Tracking(_tracker_settings(wanted, schedule, noise), wanted.z_bounds_m, time, superframe_s)
+
+
+def _stamp_variances(noise: NoisePage) -> tuple[float, float]:
+    """Of a TX and of an RX stamp, m²."""
+    return stamp_variance_m2(noise.tx_stamp_s, rounded=False), stamp_variance_m2(noise.rx_stamp_s, rounded=True)
+
+
+def _joint_settings(wanted: Wanted, schedule: SchedulePage, noise: NoisePage, superframe_s: float) -> JointSettings:
+    tx_variance, rx_variance = _stamp_variances(noise)
+    own = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
+    return JointSettings(
+        qa=wanted.qa,
+        white=own.white,
+        walk=own.walk,
+        tx_variance_m2=tx_variance,
+        rx_variance_m2=rx_variance,
+        height_m=schedule.tag_height_m,
+        drop_s=max(DROP_S, 4.0 * superframe_s),
+        integrity_risk=wanted.integrity.risk,
+        alert_limit_m=wanted.integrity.alert_limit_m,
+    )
+
+
+def _tracker_settings(wanted: Wanted, schedule: SchedulePage, noise: NoisePage) -> TrackerSettings:
+    tx_variance, rx_variance = _stamp_variances(noise)
+    clock = clock_noise(noise.white_fm, noise.random_walk_fm)
+    return TrackerSettings(
+        qa=wanted.qa,
+        white=clock.white,
+        walk=clock.walk,
+        stamp_variance_m2=tx_variance + rx_variance,
+        height_m=schedule.tag_height_m,
+    )
