@@ -12,7 +12,10 @@ import time
 import numpy as np
 
 from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.positioning.joint import JointFilter, JointSettings, Messages
+from skyless.positioning.joint import JointFilter
+from skyless.positioning.joint_messages import Messages
+from skyless.positioning.joint_report import covariance_of
+from skyless.positioning.joint_settings import JointSettings
 from skyless.positioning.joint_state import REJECTED
 from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings, track
 
@@ -75,7 +78,7 @@ class Joint:
         m.relays[:, 3] += self.minute.steps[m.relays[:, 0]]
 
     def state(self):
-        P = self.filter.covariance()
+        P = covariance_of(self.filter.arrays)
         return self.filter.arrays.x[: len(P)], P, int(self.filter.arrays.counts[REJECTED])
 
     def position(self):

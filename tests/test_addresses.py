@@ -6,7 +6,8 @@ import pytest
 
 from skyless.addresses import Addresses, integer_blocks, integer_matrix, integers, matrix, vector
 from skyless.compiled import kernel
-from skyless.positioning.joint import JointFilter, JointSettings
+from skyless.positioning.joint import JointFilter
+from skyless.positioning.joint_settings import JointSettings
 
 ARRAYS = (
     np.arange(3.0),

@@ -7,7 +7,9 @@ from skyless.clocks.filter import ClockFilter, clock_noise
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
 from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.studies.episodes import Case, draw_episode
-from skyless.positioning.joint import JointFilter, JointSettings, Messages
+from skyless.positioning.joint import JointFilter
+from skyless.positioning.joint_messages import Messages
+from skyless.positioning.joint_settings import JointSettings
 from skyless.positioning.joint_sync import SUBTICKS
 from skyless.positioning.observation import Observation
 from skyless.site.lab import lab_site

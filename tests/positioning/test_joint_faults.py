@@ -12,6 +12,7 @@ from skyless.experiments.studies import nlos
 from skyless.experiments.studies.plan import Plan
 from skyless.experiments.studies.worlds import run_world
 from skyless.positioning.joint_faults import EARLY, FAULTY, SECOND, exclude_likeliest
+from skyless.positioning.joint_report import places_excluded
 from skyless.positioning.joint_state import EVIDENCE, EXCLUDED, EXCLUSIONS, READMISSIONS, REFUSED, SLOTS
 
 CASE = Case(qa=0.02, mesh=True)
@@ -90,7 +91,7 @@ def test_two_that_are_always_off_are_left_out(late_m):
         episode = episode_of(CASE, 300, seed)
         joint = begun(episode, settings_of(replace(CASE, qa=0.3)))
         joint.track(late(episode.messages, biases))
-        assert tuple(sorted(joint.excluded())) == liars
+        assert tuple(sorted(places_excluded(joint.arrays))) == liars
 
 
 def test_a_wrong_choice_is_mended():
@@ -103,7 +104,7 @@ def test_a_wrong_choice_is_mended():
         if k == 20:
             assert s.slots[0, EXCLUDED] == 0
             s.slots[0, EXCLUDED] = 1
-    assert joint.excluded() == [2]
+    assert places_excluded(joint.arrays) == [2]
     assert (s.counts[EXCLUSIONS], s.counts[READMISSIONS]) == (1, 1)
     assert np.linalg.norm(joint.motion()[0][:2] - episode.path_m[-1, :2]) < 0.1
 

@@ -16,8 +16,11 @@ from skyless.air.beacon import HEARD
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.studies.episodes import Case
-from skyless.positioning.joint import JointFilter, JointSettings, Messages
+from skyless.positioning.joint import JointFilter
 from skyless.positioning.joint_hearing import JOINED
+from skyless.positioning.joint_messages import Messages
+from skyless.positioning.joint_report import clock_of, covariance_of, is_lost
+from skyless.positioning.joint_settings import JointSettings
 from skyless.positioning.joint_slots import add_noise_state, add_slot, drop_slot
 from skyless.positioning.joint_state import (
     BASE,
@@ -173,7 +176,7 @@ def test_streaming_and_batch_give_identical_bits(case, anchors_m, height_m):
     assert len(one.arrays.slots) == 8
     assert one.arrays.counts[RESTARTS] == 1
     assert one.arrays.counts[SLOTS] == len(anchors_m)
-    assert np.array_equal(one.covariance(), one.covariance().T)
+    assert np.array_equal(covariance_of(one.arrays), covariance_of(one.arrays).T)
     assert np.linalg.norm(motions[-1, :2] - episode.path_m[-1, :2]) < 0.2
 
 
@@ -248,11 +251,11 @@ def test_millions_of_messages_leave_the_covariance_sound(case, millions):
     early = np.empty(0)
     for _ in range(round(millions * 1e6 / len(m.sites))):
         joint.track(m)
-        early = early if len(early) else np.diag(joint.covariance()).copy()
+        early = early if len(early) else np.diag(covariance_of(joint.arrays)).copy()
         m.rx_ticks[:] += step
         m.tx_ticks[:] += step
         m.relays[:, 3] += step
-    P = joint.covariance()
+    P = covariance_of(joint.arrays)
     assert np.array_equal(P, P.T)
     assert np.isfinite(joint.arrays.x).all()
     scale = np.sqrt(np.diag(P))
@@ -319,12 +322,12 @@ def test_an_anchor_that_leaves_takes_nothing_with_it():
     episode = episode_of(MESH, 60)
     joint = begun(episode, settings_of(MESH))
     joint.track(episode.messages)
-    before, motion = joint.covariance().copy(), joint.motion()[0].copy()
+    before, motion = covariance_of(joint.arrays).copy(), joint.motion()[0].copy()
     slot = int(joint.arrays.slot_of[2])
     half, noise = values(joint.arrays), int(joint.arrays.slots[slot, NOISE])
     drop_slot(joint.arrays, slot)
     gone = [2 + slot, half + 2 + slot, 2 * half + noise]
-    np.testing.assert_array_equal(joint.covariance(), np.delete(np.delete(before, gone, 0), gone, 1))
+    np.testing.assert_array_equal(covariance_of(joint.arrays), np.delete(np.delete(before, gone, 0), gone, 1))
     np.testing.assert_array_equal(joint.motion()[0], motion)
 
 
@@ -456,7 +459,7 @@ def test_standing_still_costs_nothing_and_hard_turns_are_followed():
     assert np.sqrt(np.mean(np.square(errors[200:1900]))) < 0.02
     assert max(errors) < 0.2
     assert np.sqrt(np.mean(np.square(errors[2200:]))) < 0.06
-    assert not joint.lost
+    assert not is_lost(joint.arrays)
 
 
 def test_a_new_anchor_is_heard_of_first():
@@ -465,7 +468,7 @@ def test_a_new_anchor_is_heard_of_first():
     places = [joint.add_anchor(place) for place in LAB_M]
     assert places == list(range(6))
     assert joint.hear(0, 0, 100, 50) == JOINED
-    assert joint.clock(0) is not None
-    assert joint.clock(1) is None
+    assert clock_of(joint.arrays, joint.dim, 0) is not None
+    assert clock_of(joint.arrays, joint.dim, 1) is None
     assert joint.arrays.packets.max() == 100
     assert joint.arrays.relayed.max() == NEVER

@@ -9,6 +9,7 @@ from skyless.constants import TICK_M
 from skyless.positioning.fix import Fix
 from skyless.positioning.joint import JointFilter
 from skyless.positioning.joint_hearing import ACCEPTED, REJECTED, STALE_PACKET
+from skyless.positioning.joint_report import is_doubtful, places_excluded
 from skyless.positioning.joint_state import EXCLUSIONS, IMPOSSIBLE, JUMPS, READMISSIONS, STALE
 from skyless.positioning.joint_tracking import JointTracking
 
@@ -62,7 +63,7 @@ def test_clean_messages_are_believed(case):
         episode = episode_of(case, SUPERFRAMES, seed)
         _, _, joint = tracked(episode, episode.messages, case)
         assert joint.arrays.counts[EXCLUSIONS] == joint.arrays.counts[JUMPS] == joint.arrays.counts[IMPOSSIBLE] == 0
-        assert not joint.is_doubtful
+        assert not is_doubtful(joint.arrays)
 
 
 @CASES
@@ -83,7 +84,7 @@ def test_an_anchor_that_is_always_off_is_left_out(case, bias_m):
     ratio, nees, filters = compared(case, lambda m, seed: np.where(m.sites == seed, bias_m, 0.0), caution_m2=1.0)
     assert ratio < 1.3
     assert 0.4 < nees < 1.3
-    assert [joint.excluded() for joint in filters] == [[0], [1], [2], [3]]
+    assert [places_excluded(joint.arrays) for joint in filters] == [[0], [1], [2], [3]]
 
 
 @CASES
@@ -95,7 +96,7 @@ def test_an_anchor_is_left_out_while_it_is_off_and_taken_back(case):
     ratio, _, filters = compared(case, burst)
     assert ratio < 1.3
     for joint in filters:
-        assert joint.excluded() == []
+        assert places_excluded(joint.arrays) == []
         assert joint.arrays.counts[EXCLUSIONS] == joint.arrays.counts[READMISSIONS] == 1
 
 
@@ -138,7 +139,7 @@ def test_a_clock_that_jumps_is_taken_up_again(jump_m):
     relays[(relays[:, 0] == 4) & jumped[owner], 3] += ticks
     errors, _, joint = tracked(episode, msgspec.structs.replace(m, tx_ticks=tx_ticks, relays=relays), MESH)
     assert joint.arrays.counts[JUMPS] == 1
-    assert joint.excluded() == []
+    assert places_excluded(joint.arrays) == []
     assert np.linalg.norm(errors[300:], axis=1).max() < 0.15
 
 

@@ -12,6 +12,7 @@ from skyless.experiments.studies.plan import Plan
 from skyless.experiments.studies.stage import walking
 from skyless.experiments.studies.worlds import run_world
 from skyless.positioning.joint_hearing import SYNC_WANTED
+from skyless.positioning.joint_report import covariance_of
 from skyless.positioning.joint_state import EXCLUDED, SYNCS_REFUSED, SYNCS_USED, states, values
 from skyless.positioning.joint_sync import SUBTICKS, WORTH
 from skyless.positioning.master_scale import MasterScale
@@ -89,7 +90,7 @@ def test_the_step_is_what_the_theory_says():
     tau_s = (int(s.counts[0]) - int(s.counts[1])) * 15.65e-12 - s.anchors[s.slot_of[4], 3] / 299792458.0
     for site, sign in ((0, 1.0), (4, -1.0)):
         h[2 + s.slot_of[site]], h[half + 2 + s.slot_of[site]] = sign, sign * tau_s
-    P, V = without.covariance(), s.sensitivities[:n, : len(LAB_M)]
+    P, V = covariance_of(without.arrays), s.sensitivities[:n, : len(LAB_M)]
     spread = h @ P @ h
     assert spread > WORTH * q
     whole = int(s.slots[s.slot_of[0], 1] - s.slots[s.slot_of[4], 1]) * SUBTICKS
@@ -97,8 +98,8 @@ def test_the_step_is_what_the_theory_says():
     gain = P @ h / spread
     np.testing.assert_allclose(within.arrays.x[:n], s.x[:n] + gain * (off * TICK_M / SUBTICKS - h @ s.x[:n]), atol=1e-9)
     expected = P - np.outer(gain, gain) * (spread - q)
-    np.testing.assert_allclose(within.covariance(), expected, rtol=1e-6, atol=1e-9 * np.abs(P).max())
-    assert h @ within.covariance() @ h == pytest.approx(q, rel=1e-3)
+    np.testing.assert_allclose(covariance_of(within.arrays), expected, rtol=1e-6, atol=1e-9 * np.abs(P).max())
+    assert h @ covariance_of(within.arrays) @ h == pytest.approx(q, rel=1e-3)
     moved = V - np.outer(gain, h @ V)
     np.testing.assert_allclose(within.arrays.sensitivities[:n, : len(LAB_M)], moved, atol=1e-9 * np.abs(V).max())
     assert np.array_equal(within.arrays.evidence, s.evidence)

@@ -10,6 +10,7 @@ from skyless.constants import TICK_M
 from skyless.experiments.studies.integrity import Setting, run_chunk
 from skyless.experiments.studies.integrity_faults import Fault
 from skyless.positioning.fix import Fix
+from skyless.positioning.joint_report import places_excluded
 from skyless.positioning.joint_soundness import is_sound
 from skyless.positioning.joint_state import BASE, EPOCH, EVIDENCE, EXCLUDED, JUMPS, values
 from skyless.positioning.joint_tracking import JointTracking
@@ -137,7 +138,7 @@ def alerts_and_slots(episode, messages, settings):
     joint, told = begun(episode, settings), []
     for packet in packets_of(messages):
         joint.hear(*packet)
-        told.append((integrity(joint), tuple(joint.excluded())))
+        told.append((integrity(joint), tuple(places_excluded(joint.arrays))))
     return told
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.positioning.joint import JointSettings
 from skyless.positioning.joint_hearing import RELAY_AGE_S
+from skyless.positioning.joint_settings import JointSettings
 from skyless.positioning.tracker import (
     AGILITY_GAIN,
     AGILITY_LOSS,

@@ -10,7 +10,9 @@ from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.experiments.benchmark_filters import FilterpyTracker, PlainJoint, PlainTracker
 from skyless.experiments.benchmark_loops import joint_filter, scalar_filter
 from skyless.experiments.studies.episodes import Case, draw_episode
-from skyless.positioning.joint import JointFilter, JointSettings, Messages
+from skyless.positioning.joint import JointFilter
+from skyless.positioning.joint_messages import Messages
+from skyless.positioning.joint_settings import JointSettings
 from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings, track
 
 Array = NDArray[np.float64]

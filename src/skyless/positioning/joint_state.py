@@ -178,6 +178,34 @@ def extended(old: JointArrays, capacity: int, site_capacity: int) -> JointArrays
     return new
 
 
+def started(
+    old: JointArrays, rx_ticks: int, position_m: Vector, covariance_m2: Matrix, speed_variance: float, caution_m2: float
+) -> JointArrays:
+    """Another state with the same settings and anchors, none of them in view, that begins at a position."""
+    s, dim = new_arrays(old.settings, len(old.slots), len(old.site_m)), len(position_m)
+    s.site_m[:] = old.site_m
+    s.x[:dim] = position_m
+    s.P[:dim, :dim] = covariance_m2
+    s.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
+    s.counts[EPOCH] = s.counts[BASE] = rx_ticks
+    s.statistics[:] = 0.0
+    s.statistics[CAUTION] = caution_m2
+    s.statistics[:4] = (1.0, s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE], 0.0, 1.0)
+    return s
+
+
+def weigh(s: JointArrays, site: int, variance_factor: float) -> None:
+    """Set the factor on the variance of the tag's receptions of an anchor, if it is in view."""
+    if s.slot_of[site] >= 0:
+        s.anchors[s.slot_of[site], WEIGHT] = variance_factor
+
+
+def doubt(s: JointArrays, site: int, variance_factor: float) -> None:
+    """Let the offset of an anchor that has just joined be as uncertain as the reception that it rests on."""
+    place = int(s.settings[DIM]) + int(s.slot_of[site])
+    s.P[place, place] += (variance_factor - 1.0) * (s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE])
+
+
 @borrowing_kernel
 def values(s: JointArrays) -> int:
     """How many values there are; as many rates follow them, then the noises."""

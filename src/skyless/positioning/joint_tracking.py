@@ -10,8 +10,17 @@ from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Start
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.in_use import AnchorsInUse
-from skyless.positioning.joint import JointFilter, JointSettings
+from skyless.positioning.joint import JointFilter
 from skyless.positioning.joint_hearing import REJECTED, STALE_PACKET, SYNC_WANTED
+from skyless.positioning.joint_report import (
+    clock_of,
+    is_contradicted,
+    is_doubtful,
+    is_lost,
+    places_excluded,
+    relays_fit,
+)
+from skyless.positioning.joint_settings import JointSettings
 from skyless.positioning.joint_start import JointStart
 from skyless.positioning.master_scale import MasterScale
 from skyless.positioning.observation import Observation
@@ -26,6 +35,7 @@ from skyless.positioning.tracking import (
     SLOW_SPREAD,
     SOON_S,
 )
+from skyless.ticks import from_seconds
 
 LOOSENED: Final = 4.0
 """The start's covariance is taken so many times larger, as the filter is then given the packets that it rests on."""
@@ -35,6 +45,9 @@ CAUTION_M2: Final = 1.0
 
 REORDERED_S: Final = 0.1
 """Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
+
+SURELY_IN_REACH_TICKS: Final = from_seconds(SHORT_SILENCE_S) - 1
+"""After such a silence a filter need not be asked."""
 
 NOT_USED: Final = frozenset({REJECTED, STALE_PACKET})
 
@@ -82,12 +95,13 @@ class JointTracking:
     def clock(self, anchor: int) -> tuple[int, float, float] | None:
         """The tag's clock less that of an anchor in view: whole ticks, the rest in metres, rate in m/s."""
         place = self._place_of.get(anchor)
-        return None if place is None else self._filter.clock(place)
+        joint = self._filter
+        return None if place is None else clock_of(joint.arrays, joint.dim, place)
 
     @property
     def excluded(self) -> tuple[int, ...]:
         """Anchors that are not used as they have been wrong for long."""
-        places = set(self._filter.excluded())
+        places = set(places_excluded(self._filter.arrays))
         return tuple(anchor for anchor, place in self._place_of.items() if place in places) if places else ()
 
     def hear(self, observation: Observation) -> Fix | NoFixReason:
@@ -97,7 +111,11 @@ class JointTracking:
             self._master_less_tag_ticks = ticks_master - rx_ticks
             if claim is not None and claim.master == observation.anchor:
                 self._master_scale.hear(observation)
-        if self._start is None and self._is_out_of_reach(observation):
+        if (
+            self._start is None
+            and not 0 <= rx_ticks - self._heard_ticks < SURELY_IN_REACH_TICKS
+            and self._is_out_of_reach(observation)
+        ):
             self._start = self._new_start()
         if self._start is not None:
             self._start.learn(observation)
@@ -112,8 +130,8 @@ class JointTracking:
             self._start_anew_where_lost(rx_ticks)
             return NoFixReason.RESIDUALS
         if not self._believes_relays:
-            self._believes_relays = self._filter.relays_fit
-        elif self._filter.is_contradicted:
+            self._believes_relays = relays_fit(self._filter.arrays)
+        elif is_contradicted(self._filter.arrays):
             self._believes_relays = False  # if a new start does not help, the anchors are wrong, not the place
             self._start = self._new_start()
             return NoFixReason.ACQUIRING
@@ -127,8 +145,8 @@ class JointTracking:
     def _start_anew_where_lost(self, rx_ticks: int) -> None:
         """A filter that is lost soon after its start has a tag that is faster than assumed, or late messages."""
         soon = (rx_ticks - self._started_ticks) * TICK_S < SOON_S
-        doubtful = soon and self._caution_m2 == 0.0 and self._filter.is_doubtful
-        if doubtful or self._filter.lost:
+        doubtful = soon and self._caution_m2 == 0.0 and is_doubtful(self._filter.arrays)
+        if doubtful or is_lost(self._filter.arrays):
             hasten = soon and not doubtful
             self._speed_std_mps = min(HASTE * self._speed_std_mps, MAX_SPEED_STD_MPS) if hasten else SPEED_STD_MPS
             self._caution_m2 = CAUTION_M2 if soon else 0.0

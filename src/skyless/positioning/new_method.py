@@ -8,7 +8,7 @@ from skyless.air.almanac import NoisePage, SchedulePage
 from skyless.clocks.filter import clock_noise
 from skyless.methods import FILTERS
 from skyless.positioning.fix_time import FixTime
-from skyless.positioning.joint import JointSettings
+from skyless.positioning.joint_settings import JointSettings
 from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.observation import Method
 from skyless.positioning.protection import IntegrityRequirement

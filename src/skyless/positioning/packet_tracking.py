@@ -16,7 +16,7 @@ from skyless.clocks.stamps import NOISE_TICKS
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import FixTime
-from skyless.positioning.joint import JointSettings
+from skyless.positioning.joint_settings import JointSettings
 from skyless.positioning.joint_state import RELAYS_REJECTED
 from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.masterless import MOST_ANCHORS, remember

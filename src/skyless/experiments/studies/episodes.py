@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.experiments.lab_bound import SUPERFRAMES, WHITE_FM, random_path
-from skyless.positioning.joint import JointSettings, Messages
+from skyless.positioning.joint_messages import Messages
+from skyless.positioning.joint_settings import JointSettings
 
 Array = NDArray[np.float64]
 Ticks = NDArray[np.int64]

@@ -21,8 +21,9 @@ from skyless.experiments.studies.episodes import Case, draw_episode, settings_of
 from skyless.experiments.studies.integrity_faults import FAULTS, Fault, faulty
 from skyless.experiments.studies.plan import Cell, Plan, Row
 from skyless.experiments.studies.rare import rare_interval
-from skyless.positioning.joint import JointFilter, Messages
+from skyless.positioning.joint import JointFilter
 from skyless.positioning.joint_hearing import REJECTED
+from skyless.positioning.joint_messages import Messages
 from skyless.positioning.protection import limits_of, protected_track
 from skyless.positioning.protection_levels import DETECTED, HPL, LEVELS, STATE, VPL
 from skyless.site.lab import lab_site

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skyless.constants import TICK_M
 from skyless.experiments.studies.episodes import Episode
-from skyless.positioning.joint import Messages
+from skyless.positioning.joint_messages import Messages
 
 Kind = Literal["step", "ramp", "early", "bursts", "delay"]
 
