@@ -201,6 +201,18 @@ def test_duplicates_and_frames_out_of_order_change_nothing(method):
     assert [(f.time_s, *f.position_m) for f in fixes] == [(f.time_s, *f.position_m) for f in clean]
 
 
+@pytest.mark.parametrize("seconds", [0.05, 0.3, 0.9])
+def test_one_stamp_of_the_tag_from_the_future_costs_one_fix(seconds):
+    heard = tape()
+    middle = len(heard) // 2
+    spoiled = [later(one, seconds) if number == middle else one for number, one in enumerate(heard)]
+    spoiled[middle] = replace_heard(spoiled[middle], host_s=heard[middle].host_s)
+    clean, receiver = listen(Receiver(), heard), Receiver()
+    fixes = listen(receiver, spoiled)
+    assert drops(receiver) == {"impossible-stamp": 1}
+    assert len(fixes) == len(clean) - 1
+
+
 def test_bit_flips_are_counted_by_the_fcs():
     generator = np.random.default_rng(5)
     receiver, flipped, fixes = Receiver(), 0, 0

@@ -35,7 +35,7 @@ class AnchorStamps:
         self._counters = counters
         self._tracks: dict[int, _Track] = {}
         self.newest_rx_ticks: int | None = None
-        """RX stamp of the newest frame that was not out of order, unwrapped."""
+        """RX stamp of the newest frame that was taken, unwrapped: one impossible stamp must not make others late."""
 
     def forget(self) -> None:
         """Start anew."""
@@ -52,8 +52,8 @@ class AnchorStamps:
             repeated = track is not None and _is_repeated(beacon, track)
             self._counters["duplicate" if repeated else "out-of-order"] += 1
             return None
-        self.newest_rx_ticks = rx_ticks
         if track is None:
+            self.newest_rx_ticks = rx_ticks
             return self._begin(beacon, rx_ticks)
         elapsed = rx_ticks - track.rx_ticks_tag
         least = track.tx_ticks + elapsed - HALF_WRAP_TICKS
@@ -61,7 +61,7 @@ class AnchorStamps:
         if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
             self._refuse(beacon, track)
             return None
-        track.rx_ticks_tag = rx_ticks
+        track.rx_ticks_tag = self.newest_rx_ticks = rx_ticks
         track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
         track.sequence, track.impossible = beacon.sequence, 0
         return tx_ticks
