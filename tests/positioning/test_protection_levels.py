@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from joint_builders import LAB_M, ROOM_M, Case, begun, episode_of, observations_of, packets_of, settings_of
+from joint_builders import LAB_M, ROOM_M, Case, begun, episode_of, kept, observations_of, packets_of, settings_of
 from msgspec.structs import replace
 from scipy.stats import chi2
 
@@ -12,7 +12,7 @@ from skyless.experiments.studies.integrity_faults import Fault
 from skyless.positioning.fix import Fix
 from skyless.positioning.joint_report import places_excluded
 from skyless.positioning.joint_soundness import is_sound
-from skyless.positioning.joint_state import BASE, EPOCH, EVIDENCE, EXCLUDED, JUMPS, values
+from skyless.positioning.joint_state import BASE, EPOCH, EVIDENCE, EXCLUDED, JUMPS, SLOTS, values
 from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.protection import Alert, IntegrityRequirement, integrity_of, limits_of
 from skyless.positioning.protection_levels import HPL, LEVELS, VPL, protect
@@ -186,6 +186,19 @@ def test_two_that_are_left_out_leave_nothing_to_promise():
     twice = [told for told, excluded in alerts_and_slots(episode, messages, settings_of(case)) if len(excluded) == 2]
     assert twice
     assert {(one.alert, one.hpl_m) for one in twice} == {(Alert.NOT_EXCLUDED, None)}
+
+
+def test_too_few_anchors_for_a_position_leave_nothing_to_promise():
+    """What two ranges do not see in the plane, none tells: neither that the tag turns, nor how far it is off."""
+    case, since = Case(mesh=True), 300
+    episode = episode_of(case, 134)
+    for left, alert in ((3, Alert.NONE), (2, Alert.UNAVAILABLE)):
+        m = episode.messages
+        messages = kept(m, (np.arange(len(m.sites)) < since) | (m.sites < left))
+        joint = heard(episode, messages, settings_of(case, drop_s=0.1))
+        assert joint.arrays.counts[SLOTS] == left
+        assert integrity(joint).alert is alert
+        assert (integrity(joint).hpl_m is None) == (left == 2)
 
 
 def test_nothing_is_promised_until_the_filter_has_settled_after_an_anchor_restarts():

@@ -124,6 +124,8 @@ def _state(s: JointArrays, worst_t: float, worst_slot: int, most_t: float, hpl: 
     """Whether a fault shows, in the innovations or in what was rejected, and whether it is one that can be left out."""
     if s.recent[PACKETS] < SETTLED * LONG * s.counts[SLOTS] or not np.isfinite(hpl):
         return UNAVAILABLE
+    if not _is_determined(s):
+        return UNAVAILABLE
     refused = s.recent[RELAYS_REFUSED]
     suspect, suspects = -1, 0
     for slot in range(s.counts[SLOTS]):
@@ -136,6 +138,15 @@ def _state(s: JointArrays, worst_t: float, worst_slot: int, most_t: float, hpl: 
     if suspects > 1 or clocks_wrong:
         return DETECTED
     return _state_without_rejections(s, worst_t, worst_slot, most_t)
+
+
+@borrowing_kernel
+def _is_determined(s: JointArrays) -> bool:
+    """Whether there are anchors enough for a position: what is not seen moves as it likes, unlike what P assumes."""
+    used = 0
+    for slot in range(s.counts[SLOTS]):
+        used += 0 if s.slots[slot, EXCLUDED] or s.slots[slot, IN_ROW] >= OUT_IN_ROW else 1
+    return bool(used > int(s.settings[DIM]))
 
 
 @borrowing_kernel
