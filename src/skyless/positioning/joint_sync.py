@@ -23,6 +23,7 @@ from skyless.positioning.joint_state import (
     PLACES,
     RANGE,
     RX_VARIANCE,
+    SLOTS,
     SYNCS_REFUSED,
     SYNCS_USED,
     TERMS,
@@ -124,4 +125,7 @@ def _replace(s: JointArrays, term: int, innovation: float, spread: float, varian
         u[term, column] *= known / spread
     for other in range(lanes(s)):
         r[term, other] /= known
+    for one in range(s.counts[SLOTS]):  # ``add_terms`` will take it off, but there is no innovation behind it
+        for other in range(s.counts[SLOTS]):
+            s.shared[one, other] += r[term, one] * r[term, other]
     s.counts[TERMS] = term + 1
