@@ -56,6 +56,9 @@ LATE_SHARE, LAG_SQUARED, CAUTION = range(4, 7)
 LAG: Final = 7
 """Places in ``statistics`` behind the tracker's: share of late messages, lag; running means, then directions."""
 
+CLOCK_SHARE, CLOCK_AGILITY = 13, 14
+"""Share of receptions beyond one standard deviation, and the factor on the oscillators' random walk."""
+
 DIM, QA, WHITE, WALK, TX_VARIANCE, RX_VARIANCE, GATE, HEIGHT, RATE_VARIANCE, DROP_S = range(10)
 """Places in ``settings``."""
 
@@ -153,7 +156,7 @@ def new_arrays(settings: Vector, capacity: int, site_capacity: int) -> JointArra
         h_places=np.zeros(MOST_PLACES, np.int64),
         h=np.zeros(MOST_PLACES),
         counts=np.zeros(21, np.int64),
-        statistics=np.zeros(13),
+        statistics=np.zeros(15),
         slots=np.zeros((capacity, 10), np.int64),
         anchors=np.zeros((capacity, 8)),
         packets=np.full((capacity, REMEMBERED, 3), NEVER),
@@ -190,6 +193,7 @@ def started(
     s.counts[EPOCH] = s.counts[BASE] = rx_ticks
     s.statistics[:] = 0.0
     s.statistics[CAUTION] = caution_m2
+    s.statistics[CLOCK_AGILITY] = 1.0
     s.statistics[:4] = (1.0, s.settings[TX_VARIANCE] + s.settings[RX_VARIANCE], 0.0, 1.0)
     return s
 

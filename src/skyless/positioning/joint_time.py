@@ -8,6 +8,7 @@ from skyless.eights import EIGHT, add, load, store
 from skyless.positioning.joint_algebra import settle
 from skyless.positioning.joint_state import (
     BASE,
+    CLOCK_AGILITY,
     CLOCK_CROSS,
     CLOCK_RATE,
     CLOCK_VALUE,
@@ -46,7 +47,7 @@ def elapse(s: JointArrays, rx_ticks: int) -> None:
     noise[MOTION_VALUE] += value
     noise[MOTION_CROSS] += cross
     noise[MOTION_RATE] += rate
-    rate = s.settings[WALK] * dt_s
+    rate = s.settings[WALK] * s.statistics[CLOCK_AGILITY] * dt_s
     cross, value = _noise_at_base(s.settings[WHITE] * dt_s, rate, dt_s, tau_s)
     noise[CLOCK_VALUE] += value
     noise[CLOCK_CROSS] += cross

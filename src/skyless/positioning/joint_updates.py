@@ -11,10 +11,11 @@ from skyless.compiled import borrowing_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.eights import EIGHT, repeated, store
 from skyless.positioning.joint_algebra import along_h, along_x, project, put, settle, take
-from skyless.positioning.joint_monitor import LATE_ENOUGH, believe, follow
+from skyless.positioning.joint_monitor import LATE_ENOUGH, believe, follow, follow_clocks
 from skyless.positioning.joint_state import (
     BASE,
     CAUTION,
+    CLOCK_AGILITY,
     DIM,
     EPOCH,
     GATE,
@@ -232,11 +233,13 @@ def hear_relay(s: JointArrays, listener: int, slot: int, packet_tx: int, packet_
         put(s, 2 * half + noise, 1.0)
     else:
         variance += s.settings[TX_VARIANCE]
-    variance += 2.0 * age_s * (s.settings[WHITE] + s.settings[WALK] * age_s * age_s / 3.0)
+    walk = s.settings[WALK] * s.statistics[CLOCK_AGILITY]
+    variance += 2.0 * age_s * (s.settings[WHITE] + walk * age_s * age_s / 3.0)
     term = project(s)
     spread = along_h(s, term) + variance
     whole = s.slots[slot, WHOLE] - s.slots[listener, WHOLE]
     innovation = (relayed_rx - packet_tx - whole) * TICK_M - distance_m - along_x(s)
+    follow_clocks(s, 1.0 if innovation * innovation > spread else 0.0)
     accepted = innovation * innovation <= s.settings[GATE] * s.settings[GATE] * spread
     if accepted:
         s.counts[RELAYS_USED] += 1
