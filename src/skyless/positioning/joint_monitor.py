@@ -20,6 +20,7 @@ from skyless.positioning.joint_state import (
     LAG,
     LAG_SQUARED,
     LATE_SHARE,
+    MOST_CLOCK_AGILITY,
     OUT,
     SCORE,
     SLOTS,
@@ -74,7 +75,6 @@ RESTLESS_CLOCKS: Final = 0.45
 
 CLOCK_GAIN: Final = 1.02
 CLOCK_LOSS: Final = 0.999
-MOST_CLOCK_AGILITY: Final = 1e4
 
 
 @borrowing_kernel
@@ -159,7 +159,7 @@ def follow_clocks(s: JointArrays, beyond: float) -> None:
     statistics = s.statistics
     statistics[CLOCK_SHARE] += CLOCK_FORGETTING * (beyond - statistics[CLOCK_SHARE])
     if statistics[CLOCK_SHARE] > RESTLESS_CLOCKS:
-        statistics[CLOCK_AGILITY] = min(statistics[CLOCK_AGILITY] * CLOCK_GAIN, MOST_CLOCK_AGILITY)
+        statistics[CLOCK_AGILITY] = min(statistics[CLOCK_AGILITY] * CLOCK_GAIN, s.settings[MOST_CLOCK_AGILITY])
     else:
         statistics[CLOCK_AGILITY] = max(statistics[CLOCK_AGILITY] * CLOCK_LOSS, 1.0)
 

@@ -31,6 +31,8 @@ class JointSettings(Struct, frozen=True):
     """Height of the tag where it is given; None to estimate it."""
     drop_s: float = 2.0
     """Anchors that are silent for longer are out of view."""
+    most_clock_agility: float = 1e4
+    """At most so many times ``walk`` counts where innovations show that oscillators wander more."""
     integrity_risk: float = RISK
     """Probability, for each fix, that an error exceeds its protection level."""
     alert_limit_m: float | None = None
@@ -46,6 +48,6 @@ class JointSettings(Struct, frozen=True):
         height_m = 0.0 if self.height_m is None else self.height_m
         rate_variance = (MAX_RATE * SPEED_OF_LIGHT_MPS) ** 2
         stamps = (self.tx_variance_m2, self.rx_variance_m2)
-        return np.array(
-            [self.dim, self.qa, self.white, self.walk, *stamps, self.gate, height_m, rate_variance, self.drop_s]
-        )
+        noises = (self.qa, self.white, self.walk, *stamps)
+        rest = (self.gate, height_m, rate_variance, self.drop_s, self.most_clock_agility)
+        return np.array([self.dim, *noises, *rest])

@@ -30,7 +30,7 @@ def is_sound(joint: JointFilter) -> bool:
     s = joint.arrays
     if joint.dim not in (2, 3) or not isinstance(s, JointArrays) or not all(isinstance(a, np.ndarray) for a in s):
         return False
-    if s.slots.ndim != 2 or s.slot_of.ndim != 1 or s.settings.shape != (10,) or s.settings.dtype != np.float64:
+    if s.slots.ndim != 2 or s.slot_of.ndim != 1 or s.settings.shape != (11,) or s.settings.dtype != np.float64:
         return False
     if s.settings[DIM] != joint.dim or not (0 < len(s.slots) <= MOST and len(s.slot_of) <= MOST):
         return False

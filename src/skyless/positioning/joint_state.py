@@ -59,7 +59,7 @@ LAG: Final = 7
 CLOCK_SHARE, CLOCK_AGILITY = 13, 14
 """Share of receptions beyond one standard deviation, and the factor on the oscillators' random walk."""
 
-DIM, QA, WHITE, WALK, TX_VARIANCE, RX_VARIANCE, GATE, HEIGHT, RATE_VARIANCE, DROP_S = range(10)
+DIM, QA, WHITE, WALK, TX_VARIANCE, RX_VARIANCE, GATE, HEIGHT, RATE_VARIANCE, DROP_S, MOST_CLOCK_AGILITY = range(11)
 """Places in ``settings``."""
 
 REMEMBERED: Final = 16

@@ -24,7 +24,7 @@ from skyless.recordings.checkpoint_graph import Arrays
 from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
 from skyless.recordings.checkpoint_writer import write_graph
 
-FORMAT: Final = 10
+FORMAT: Final = 11
 MAX_BYTES: Final = 1 << 20
 
 
