@@ -6,10 +6,10 @@ from msgspec.structs import replace
 from skyless.clocks.filter import ClockFilter, clock_noise
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
 from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
+from skyless.experiments.studies import episodes
 from skyless.experiments.studies.episodes import Case, draw_episode
 from skyless.positioning.joint import JointFilter
 from skyless.positioning.joint_messages import Messages
-from skyless.positioning.joint_settings import JointSettings
 from skyless.positioning.joint_sync import SUBTICKS
 from skyless.positioning.observation import Observation
 from skyless.site.lab import lab_site
@@ -23,17 +23,7 @@ ROOM_M = np.array([(x, y, 2.5 if k % 2 else 0.5) for k, (x, y) in enumerate(CORN
 
 def settings_of(case, height_m=0.0, **others):
     """Settings of the very noise that a case's episodes have."""
-    light2 = SPEED_OF_LIGHT_MPS**2
-    stamp = light2 * (case.noise_ps * 1e-12) ** 2
-    return JointSettings(
-        qa=case.qa,
-        white=light2 * WHITE_FM**2,
-        walk=light2 * case.random_walk_fm**2,
-        tx_variance_m2=stamp,
-        rx_variance_m2=stamp + TICK_M**2 / 12.0,
-        height_m=height_m,
-        **others,
-    )
+    return replace(episodes.settings_of(case, height_m), **others)
 
 
 def episode_of(case, superframes=40, seed=1, anchors_m=LAB_M):

@@ -1,4 +1,4 @@
-"""Whom ``joint`` believes: single messages by their innovations, anchors by the running mean of theirs.
+"""Whom ``joint`` believes: single messages by their innovations, anchors by what those add up to (``joint_faults``).
 
 Late messages are the rule where paths are blocked, early ones are not. How many are late is estimated, and what is
 believed follows: with none, all within the gate counts in full, so that clean data lose nothing (``docs/maths.md`` 6).
@@ -54,7 +54,7 @@ DOUBTFUL: Final = 2.0
 SCORE_GAIN: Final = 0.1
 SCORE_CLIP: Final = 2.5
 EXCLUDE_AT: Final = 4.5 * float(np.sqrt(SCORE_GAIN / (2.0 - SCORE_GAIN)))
-"""Of the running mean of an anchor's normalised innovations: 4.5 standard deviations of it."""
+"""Of the running mean of an anchor's normalised innovations, 4.5 standard deviations of it: some anchor is wrong."""
 
 READMIT_AT: Final = 0.5 * EXCLUDE_AT
 READMIT_AFTER: Final = 20
