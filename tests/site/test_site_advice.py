@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from skyless.site.advice import warnings_of
 from skyless.site.lab import lab_site
-from skyless.site.model import AnchorSite, ScheduleSite, TagsSite
+from skyless.site.model import EXACT, AccuracySite, AnchorSite, ScheduleSite, TagsSite
 
 
 def site_of(points, height_m=None):
@@ -79,3 +79,10 @@ def test_short_guard():
     site = replace(site_of(CUBE), schedule=ScheduleSite(slot_s=2.5e-3, guard_s=1e-4))
     (warning,) = warnings_of(site)
     assert "guard of 100 µs" in warning
+
+
+def test_survey_and_ranges_without_error():
+    (warning,) = warnings_of(replace(site_of(CUBE), accuracy=EXACT))
+    assert "says that survey and ranges are exact; no real site is" in warning
+    for accuracy in (AccuracySite(survey_std_m=0.0), AccuracySite(range_std_m=0.0)):
+        assert warnings_of(replace(site_of(CUBE), accuracy=accuracy)) == []

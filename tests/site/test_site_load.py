@@ -11,6 +11,7 @@ from skyless.errors import ConfigurationError
 from skyless.site.lab import lab_site
 from skyless.site.limits import LIMITS
 from skyless.site.load import load_site
+from skyless.site.model import AccuracySite
 from skyless.site.template import site_template
 
 LAB = site_template(lab_site())
@@ -52,6 +53,7 @@ def test_least_file(load):
     assert [a.id for a in site.anchors] == [1, 2, 7]
     assert site.anchors[2].y_m == 8.0
     assert site.tags.height_m is None
+    assert site.accuracy == AccuracySite(0.02, 0.03, 0.05, 0.03, 1.0, 100.0)
 
 
 def test_every_table(load, tmp_path):
@@ -60,12 +62,15 @@ def test_every_table(load, tmp_path):
         HEAD
         + "[schedule]\nslot_s = 0.001\nslots = 9\nframes_per_node = 2\nguard_s = 0.0004\n"
         + "[noise]\ntx_stamp_ps = 5\nrx_stamp_ps = 150\nwhite_fm = 1e-11\nrandom_walk_fm = 1e-10\n"
+        + "[accuracy]\nsurvey_std_m = 0\nrange_std_m = 6.5\nslope_std_m = 0.1\nplace_std_m = 0.2\n"
+        + "place_distance_m = 650\nplace_time_s = 6000\n"
         + "[tags]\nheight_m = -1.5\n[floor_plan]\nimage = 'floor.png'\nwidth_m = 12\n"
         + "[georeference]\nlatitude_deg = -33.9\nlongitude_deg = 151\nheading_deg = -90\n"
         + "[[walls]]\nx1_m = 0\ny1_m = 0\nx2_m = 6\ny2_m = 0\n"
         + THREE
     )
     assert (site.schedule.slots, site.noise.rx_stamp_ps, site.tags.height_m) == (9, 150.0, -1.5)
+    assert site.accuracy == AccuracySite(0.0, 6.5, 0.1, 0.2, 650.0, 6000.0)
     assert (site.floor_plan.width_m, site.georeference.longitude_deg, site.walls[0].loss_db) == (12.0, 151.0, 6.0)
 
 
@@ -147,6 +152,34 @@ def test_a_mistake_is_named(refused, text, key, value, right):
     error = refused(text)
     assert (error.key, error.value) == (key, value)
     assert right in error.expected
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "right"),
+    [
+        ("survey_std_m", -0.001, "a number of metres from 0 to 6.5"),
+        ("survey_std_m", 6.6, "to 6.5"),
+        ("range_std_m", -0.001, "from 0 to 6.5"),
+        ("range_std_m", 20.0, "to 6.5"),
+        ("slope_std_m", -0.001, "from 0 to 6.5"),
+        ("slope_std_m", 6.51, "to 6.5"),
+        ("place_std_m", -1.0, "from 0 to 6.5"),
+        ("place_std_m", 7.0, "to 6.5"),
+        ("place_distance_m", 0.0, "a number of metres above 0 and up to 650"),
+        ("place_distance_m", 651.0, "up to 650"),
+        ("place_time_s", 0.0, "a number of seconds above 0 and up to 6000"),
+        ("place_time_s", 6001.0, "up to 6000"),
+    ],
+)
+def test_limits_of_accuracy(refused, key, value, right):
+    error = refused(HEAD + f"[accuracy]\n{key} = {value}\n" + THREE)
+    assert (error.key, error.value) == (f"accuracy.{key}", value)
+    assert right in error.expected
+
+
+def test_accuracy_says_which_keys_it_has(refused):
+    error = refused(HEAD + "[accuracy]\nsurvey_m = 0.1\n" + THREE)
+    assert (error.key, error.expected) == ("accuracy.survey_m", "called survey_std_m")
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import pytest
 from skyless.errors import ConfigurationError
 from skyless.site.lab import lab_site
 from skyless.site.load import load_site
+from skyless.site.model import AccuracySite
 from skyless.site.rewrite import with_tx_delays
 from skyless.site.template import site_template
 
@@ -60,9 +61,10 @@ def test_a_last_line_without_its_end():
 
 def test_a_template_stays_a_valid_site(tmp_path):
     path = tmp_path / "lab.toml"
-    site = lab_site()
+    site = lab_site(accuracy=AccuracySite(survey_std_m=0.004, place_time_s=30.0))
     delays = {anchor.id: 16400 + anchor.id for anchor in site.anchors}
     path.write_text(with_tx_delays(site_template(site), delays, path))
+    assert load_site(path).accuracy == site.accuracy
     assert {anchor.id: anchor.tx_antenna_delay_ticks for anchor in load_site(path).anchors} == delays
 
 

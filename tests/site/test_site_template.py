@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from skyless.site.advice import warnings_of
 from skyless.site.lab import lab_site
 from skyless.site.load import load_site
-from skyless.site.model import Site
+from skyless.site.model import EXACT, AccuracySite, Site
 from skyless.site.room import room_site
 from skyless.site.template import site_template
 
@@ -24,6 +24,23 @@ def reload(tmp_path, site):
 
 def test_the_template_of_the_lab_is_the_lab(tmp_path):
     assert reload(tmp_path, lab_site()) == lab_site()
+
+
+@given(
+    st.builds(
+        AccuracySite,
+        *[st.floats(0.0, 6.5)] * 4,
+        st.floats(0.0, 650.0, exclude_min=True),
+        st.floats(0.0, 6000.0, exclude_min=True),
+    )
+)
+def test_accuracy_is_written_as_it_is(tmp_path_factory, accuracy):
+    site = lab_site(accuracy=accuracy)
+    assert reload(tmp_path_factory.getbasetemp(), site) == site
+
+
+def test_the_exact_lab_is_written_as_it_is(tmp_path):
+    assert reload(tmp_path, lab_site(accuracy=EXACT)).accuracy == EXACT
 
 
 def test_the_lab_is_the_published_one():

@@ -38,7 +38,7 @@ def site_named(site: str) -> "Site":
     if name != "lab":
         return load_site(Path(site))
     try:
-        return lab_site(*finite_numbers("site", noise_ps, (1,))) if colon else lab_site()
+        return lab_site(finite_numbers("site", noise_ps, (1,))[0]) if colon else lab_site()
     except SkylessError:
         raise SkylessError(f"--site is {site!r}; it should be a site file, lab, or lab:PICOSECONDS") from None
 

@@ -18,7 +18,7 @@ _SHORTEST_GUARD_S: Final = 0.35e-3
 
 def warnings_of(site: Site) -> list[str]:
     """Soft problems of a valid site, each a sentence; empty when there is none."""
-    return [*_count(site), *_geometry(site), *_reach(site), *_guard(site)]
+    return [*_count(site), *_geometry(site), *_reach(site), *_guard(site), *_accuracy(site)]
 
 
 def _count(site: Site) -> list[str]:
@@ -68,6 +68,15 @@ def _guard(site: Site) -> list[str]:
     return [
         f"a guard of {guard_s * 1e6:.0f} µs is shorter than a radio's host needs between two frames "
         f"({_SHORTEST_GUARD_S * 1e6:.0f} µs)"
+    ]
+
+
+def _accuracy(site: Site) -> list[str]:
+    if site.accuracy.survey_std_m > 0.0 or site.accuracy.range_std_m > 0.0:
+        return []
+    return [
+        "[accuracy] says that survey and ranges are exact; no real site is: tags will claim to know their positions "
+        "better than they do; set survey_std_m and range_std_m"
     ]
 
 

@@ -1,14 +1,18 @@
 """The lab: the named scenario that the figures of ``docs/maths.md`` section 5 belong to."""
 
-from skyless.site.model import AnchorSite, NoiseSite, ScheduleSite, Site, TagsSite
+from typing import Final
 
+from skyless.site.model import AccuracySite, AnchorSite, NoiseSite, ScheduleSite, Site, TagsSite
+
+_ROOM: Final = AccuracySite()
 _PLACES = ((0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (6.0, 8.0), (0.0, 8.0), (0.0, 4.0))
 
 
-def lab_site(noise_ps: float = 100.0) -> Site:
+def lab_site(noise_ps: float = 100.0, accuracy: AccuracySite = _ROOM) -> Site:
     """Six anchors on the walls of 6 m × 8 m, the first one the master; tags at the anchors' height (2-D).
 
-    ``noise_ps``: noise of every TX and RX stamp that the filters assume.
+    ``noise_ps``: noise of every TX and RX stamp that the filters assume. ``accuracy``: errors of survey and ranges
+    that they assume; by default those of a real room. The ideal world of the studies has none and passes ``EXACT``.
     """
     return Site(
         name="lab",
@@ -18,4 +22,5 @@ def lab_site(noise_ps: float = 100.0) -> Site:
         noise=NoiseSite(tx_stamp_ps=noise_ps, rx_stamp_ps=noise_ps),
         schedule=ScheduleSite(slot_s=2.5e-3),
         tags=TagsSite(height_m=0.0),
+        accuracy=accuracy,
     )

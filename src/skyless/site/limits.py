@@ -36,6 +36,8 @@ class Limits(Struct, frozen=True):
 
 _ADDRESS = Limits(0, ANY_ADDRESS, whole=True)
 _COORDINATE = Limits(-FARTHEST_M, FARTHEST_M, "metres")
+_STD = Limits(0, 6.5, "metres")
+"""Travels as a 16-bit number of 0.1 mm (``docs/protocol.md``, "Pages")."""
 _DELAY = Limits(0, 65_535, "ticks (15.65 ps)", whole=True)
 
 LIMITS: Final = {
@@ -56,6 +58,12 @@ LIMITS: Final = {
     "noise.rx_stamp_ps": Limits(0, 1e6, "picoseconds", above=True),
     "noise.white_fm": Limits(0, 1e-6, above=True),
     "noise.random_walk_fm": Limits(0, 1e-6, "1/√s", above=True),
+    "accuracy.survey_std_m": _STD,
+    "accuracy.range_std_m": _STD,
+    "accuracy.slope_std_m": _STD,
+    "accuracy.place_std_m": _STD,
+    "accuracy.place_distance_m": Limits(0, 650, "metres", above=True),
+    "accuracy.place_time_s": Limits(0, 6000, "seconds", above=True),
     "tags.height_m": _COORDINATE,
     "walls.x1_m": _COORDINATE,
     "walls.y1_m": _COORDINATE,

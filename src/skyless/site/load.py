@@ -13,6 +13,7 @@ from skyless.errors import ConfigurationError
 from skyless.site.check import check_floor_plan, check_site, with_anchor
 from skyless.site.limits import expected
 from skyless.site.model import (
+    AccuracySite,
     AnchorSite,
     FloorPlanSite,
     GeoreferenceSite,
@@ -26,6 +27,7 @@ from skyless.site.model import (
 _TABLES: Final[dict[str, type[Struct]]] = {
     "schedule": ScheduleSite,
     "noise": NoiseSite,
+    "accuracy": AccuracySite,
     "tags": TagsSite,
     "floor_plan": FloorPlanSite,
     "georeference": GeoreferenceSite,

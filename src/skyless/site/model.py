@@ -1,5 +1,7 @@
 """The values of a site file, already validated (``skyless.site.load`` makes them)."""
 
+from typing import Final
+
 from msgspec import Struct
 
 from skyless.constants import DEFAULT_ANTENNA_DELAY_TICKS
@@ -38,6 +40,28 @@ class NoiseSite(Struct, frozen=True, forbid_unknown_fields=True):
     rx_stamp_ps: float = 100.0
     white_fm: float = 2e-11
     random_walk_fm: float = 1e-9
+
+
+class AccuracySite(Struct, frozen=True, forbid_unknown_fields=True):
+    """How good the survey and a tag's ranges are, beyond the noise of single stamps; each std is one sigma."""
+
+    survey_std_m: float = 0.02
+    """How well each anchor's position was measured, per axis."""
+    range_std_m: float = 0.03
+    """Constant error of a tag's ranges, another one for each anchor."""
+    slope_std_m: float = 0.05
+    """Range error that depends on the received power: it is a constant times clip((d - 4 m) / 4 m, -1, 1) at a
+    distance d, and this is the constant's standard deviation."""
+    place_std_m: float = 0.03
+    """Part of a range's error that changes as the tag moves (reflections)."""
+    place_distance_m: float = 1.0
+    """Distance moved over which that part changes."""
+    place_time_s: float = 100.0
+    """Time over which that part changes while the tag is at rest."""
+
+
+EXACT: Final = AccuracySite(survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0)
+"""Survey and ranges without error, as in simulated ideal air."""
 
 
 class TagsSite(Struct, frozen=True, forbid_unknown_fields=True):
@@ -92,6 +116,7 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     schedule: ScheduleSite = ScheduleSite()
     noise: NoiseSite = NoiseSite()
     tags: TagsSite = TagsSite()
+    accuracy: AccuracySite = AccuracySite()
     walls: tuple[WallSite, ...] = ()
     floor_plan: FloorPlanSite | None = None
     georeference: GeoreferenceSite | None = None

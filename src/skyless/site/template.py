@@ -25,6 +25,16 @@ tx_stamp_ps = {tx_ps}             # standard deviation of a transmit stamp in pi
 rx_stamp_ps = {rx_ps}             # of a receive stamp; a DW1000 has 100 to 150
 white_fm = {white}                # crystals' white frequency noise: Allan deviation at 1 s
 random_walk_fm = {walk}          # crystals' random-walk frequency noise in 1/√s
+
+# Errors that do not average out, as standard deviations; 0 means exact. Too small costs honesty: tags then claim to
+# know their positions better than they do. Too large costs accuracy.
+[accuracy]
+survey_std_m = {survey_std_m}             # how well each anchor's position was measured, in each of x, y and z
+range_std_m = {range_std_m}              # constant error of the distances to an anchor, another one for each anchor
+slope_std_m = {slope_std_m}              # error that grows with the distance: none at 4 m, this much from 8 m on
+place_std_m = {place_std_m}              # error of the distances that changes as a tag moves (reflections)
+place_distance_m = {place_distance_m}          # how far a tag moves until that error is a different one
+place_time_s = {place_time_s}            # after how many seconds it is a different one while the tag is at rest
 """
 
 _KNOWN_HEIGHT = """
@@ -117,6 +127,7 @@ def site_template(site: Site) -> str:
         rx_ps=noise.rx_stamp_ps,
         white=noise.white_fm,
         walk=noise.random_walk_fm,
+        **structs.asdict(site.accuracy),
     )
     height = site.tags.height_m
     tags = _ESTIMATED_HEIGHT if height is None else _KNOWN_HEIGHT.format(height=height)
