@@ -171,7 +171,7 @@ class Receiver:
         self._method = self._made_of = None
 
     def _read_almanac(self, beacon: Beacon) -> None:
-        """Keep the page; another issue, schedule or noise makes the method anew.
+        """Keep the page; another issue, schedule, noise or accuracy makes the method anew.
 
         So does another master where the method rests on the master's own stamps; the filters ride on.
         """
@@ -183,7 +183,8 @@ class Receiver:
             return
         self._master = master
         self._observer.follow(master, book.slot_of(master) or 0)
-        made_of = (book.issue, book.schedule, book.noise, None if self._wanted.method in FILTERS else master)
+        method_master = None if self._wanted.method in FILTERS else master
+        made_of = (book.issue, book.schedule, book.noise, book.accuracy, method_master)
         if made_of != self._made_of:
             self._made_of, self._method = made_of, None
             if master is not None and book.schedule is not None and book.noise is not None:

@@ -2,7 +2,7 @@
 
 from hypothesis import strategies as st
 
-from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, SchedulePage
+from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.air.beacon import Beacon, Heard, MasterTime
 from skyless.air.codec import heard_capacity
 from skyless.air.page_codec import MAX_NOISE, MAX_SUPERFRAME_TICKS
@@ -28,6 +28,16 @@ georeference_pages = st.builds(
     coordinates_m,
     st.integers(0, 3_599_999_999).map(lambda step: step / 1e7),
 )
+stds_m = unsigned(16).map(lambda step: step / 10_000)
+accuracy_pages = st.builds(
+    AccuracyPage,
+    stds_m,
+    stds_m,
+    stds_m,
+    stds_m,
+    st.integers(1, 0xFFFF).map(lambda step: step / 100),
+    st.integers(1, 0xFFFF).map(lambda step: step / 10),
+)
 
 
 @st.composite
@@ -40,7 +50,7 @@ def schedule_pages(draw):
     return SchedulePage(slot_ticks, slots, frames_per_node, draw(unsigned(16)), anchors, height_m)
 
 
-pages = st.one_of(anchor_pages, schedule_pages(), noise_pages, georeference_pages)
+pages = st.one_of(anchor_pages, schedule_pages(), noise_pages, georeference_pages, accuracy_pages)
 master_times = st.builds(MasterTime, unsigned(48), unsigned(16).map(lambda step: step / 64))
 
 

@@ -1,11 +1,14 @@
 import msgspec
 import pytest
 
-from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, SchedulePage
+from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.air.almanac_book import AlmanacBook
+from skyless.site.model import AccuracySite
 
 SCHEDULE = SchedulePage(2**27, 3, 1, 1, 3, 1.2)
 NOISE = NoisePage(1e-10, 1e-10, 2e-11, 1e-9)
+ROOM = AccuracyPage(**msgspec.structs.asdict(AccuracySite()))
+SURVEYED = AccuracyPage(0.001, 0.02, 0.0, 0.03, 1.0, 50.0)
 EARTH = GeoreferencePage(52.0, 4.0, 3.0, 90.0)
 ANCHORS = tuple(AnchorPage(number, float(number), 0.5, 2.5, number - 1) for number in (1, 2, 3))
 PAGES = (SCHEDULE, NOISE, *ANCHORS)
@@ -96,3 +99,26 @@ def test_book_that_began_with_a_corrupt_frame_heals():
             book.hear(7, page)
     assert book.complete
     assert book.anchors_m[2] == (2.0, 0.5, 2.5)
+
+
+def test_accuracy_is_the_rooms_until_it_is_heard(book):
+    assert book.complete
+    assert AlmanacBook().accuracy == book.accuracy == ROOM
+    assert book.hear(7, SURVEYED)
+    assert book.accuracy == SURVEYED
+    assert not book.hear(7, SURVEYED)
+
+
+def test_accuracy_changes_as_other_pages_do(book):
+    book.hear(7, SURVEYED)
+    assert not book.hear(7, ROOM)
+    assert book.accuracy == SURVEYED
+    assert book.hear(7, ROOM)
+    assert book.accuracy == ROOM
+
+
+def test_accuracy_goes_with_its_issue(book):
+    book.hear(7, SURVEYED)
+    book.hear(8, None)
+    book.hear(8, None)
+    assert book.accuracy == ROOM

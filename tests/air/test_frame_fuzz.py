@@ -7,7 +7,7 @@ import random
 import msgspec
 from beacon_strategies import FULL
 
-from skyless.air.almanac import GeoreferencePage, NoisePage, SchedulePage
+from skyless.air.almanac import AccuracyPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode, encode, heard_capacity
 from skyless.air.fcs import fcs
@@ -18,6 +18,7 @@ PAGES = (
     FULL.page,
     SchedulePage(2**27, 7, 1, 1, 7, 1.25),
     NoisePage(1e-10, 1e-10, 2e-11, 1e-9),
+    AccuracyPage(0.02, 0.03, 0.05, 0.03, 1.0, 100.0),
     GeoreferencePage(52.0, 4.0, 3.0, 90.0),
     None,
 )

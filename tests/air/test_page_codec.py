@@ -6,7 +6,7 @@ from beacon_strategies import pages
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, SchedulePage
+from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.air.malformed import Malformed
 from skyless.air.page_codec import decode_page, encode_page
 
@@ -52,6 +52,23 @@ def test_noise_is_a_float32(figures):
     assert sent == struct.unpack("<ffff", struct.pack("<ffff", *figures))
 
 
+@given(*[st.floats(0.0, 6.5)] * 4, st.floats(0.0, 650.0), st.floats(0.0, 6000.0))
+def test_accuracy_keeps_its_steps(survey_m, range_m, slope_m, place_m, distance_m, time_s):
+    page = decode_page(encode_page(AccuracyPage(survey_m, range_m, slope_m, place_m, distance_m, time_s)))
+    sent_m = (page.survey_std_m, page.range_std_m, page.slope_std_m, page.place_std_m)
+    assert sent_m == pytest.approx((survey_m, range_m, slope_m, place_m), abs=0.5e-4 + 1e-12)
+    assert page.place_distance_m == pytest.approx(max(distance_m, 0.01), abs=0.5e-2 + 1e-9)
+    assert page.place_time_s == pytest.approx(max(time_s, 0.1), abs=0.05 + 1e-9)
+
+
+def test_bytes_of_accuracy():
+    """The table in docs/protocol.md."""
+    page = AccuracyPage(0.0201, 0.0302, 0.05, 6.5535, 1.23, 100.4)
+    data = encode_page(page)
+    assert data == bytes.fromhex("05 c900 2e01 f401 ffff 7b00 ec03 00000000")
+    assert decode_page(data[:13] + b"\1\2\3\4") == page  # reserved bytes are not looked at
+
+
 @pytest.mark.parametrize(
     ("page", "named"),
     [
@@ -71,6 +88,12 @@ def test_noise_is_a_float32(figures):
         (NoisePage(1e-3, 0.0, 0.0, 0.0), "NoisePage.tx_stamp_s is 0.001"),
         (NoisePage(0.0, -1e-12, 0.0, 0.0), "NoisePage.rx_stamp_s is -1e-12"),
         (NoisePage(0.0, 0.0, 0.0, 0.1), "NoisePage.random_walk_fm is 0.1"),
+        (AccuracyPage(-1e-3, 0.0, 0.0, 0.0, 1.0, 1.0), "AccuracyPage.survey_std_m is -0.001"),
+        (AccuracyPage(0.0, 6.6, 0.0, 0.0, 1.0, 1.0), "AccuracyPage.range_std_m is 6.6; .* to 6.5535"),
+        (AccuracyPage(0.0, 0.0, math.inf, 0.0, 1.0, 1.0), "AccuracyPage.slope_std_m is inf"),
+        (AccuracyPage(0.0, 0.0, 0.0, math.nan, 1.0, 1.0), "AccuracyPage.place_std_m is nan"),
+        (AccuracyPage(0.0, 0.0, 0.0, 0.0, 655.4, 1.0), "AccuracyPage.place_distance_m is 655.4; .* to 655.35"),
+        (AccuracyPage(0.0, 0.0, 0.0, 0.0, 1.0, 6554.0), "AccuracyPage.place_time_s is 6554.0; .* to 6553.5"),
         (GeoreferencePage(90.1, 0.0, 0.0, 0.0), "GeoreferencePage.latitude_deg is 90.1"),
         (GeoreferencePage(0.0, -180.5, 0.0, 0.0), "GeoreferencePage.longitude_deg is -180.5"),
         (GeoreferencePage(0.0, 0.0, 0.0, -1.0), "GeoreferencePage.heading_deg is -1.0"),
@@ -101,6 +124,8 @@ def test_errors_name_the_field(page, named):
         ("<BiiiI", (4, 0, -1_800_000_001, 0, 0)),
         ("<BiiiI", (4, 0, 0, 1_000_000_001, 0)),
         ("<BiiiI", (4, 0, 0, 0, 3_600_000_000)),
+        ("<BHHHHHH4x", (5, 200, 300, 500, 300, 0, 1000)),
+        ("<BHHHHHH4x", (5, 200, 300, 500, 300, 100, 0)),
     ],
 )
 def test_absurd_pages_are_bad(layout, values):
@@ -114,6 +139,6 @@ def test_what_decodes_encodes_again(data):
         assert decode_page(encode_page(page)) == page
 
 
-@pytest.mark.parametrize("kind", [0, 5, 255])
+@pytest.mark.parametrize("kind", [0, 6, 255])
 def test_unknown_types_are_not_errors(kind):
     assert decode_page(bytes((kind,)) + bytes(16)) is None

@@ -62,8 +62,8 @@ def test_rows_give_the_same_values_as_the_beacon():
 def test_example_carries_the_page_of_its_turn():
     anchors = tuple(AnchorSite(number, 6.0, 4.125, 2.5) for number in range(1, 8))
     pages = pages_of(Site("lab", 42, 1, anchors))
-    assert len(pages) == 9
-    assert page_for(pages, STATED["superframe"], STATED["slot"]) == AnchorPage(4, 6.0, 4.125, 2.5, 3) == pages[5]
+    assert len(pages) == 10
+    assert page_for(pages, STATED["superframe"], STATED["slot"]) == AnchorPage(4, 6.0, 4.125, 2.5, 3) == pages[6]
 
 
 @pytest.mark.parametrize("reason", Malformed)
@@ -76,5 +76,5 @@ def test_rotation_formula_of_the_document():
         pages = tuple(range(count))
         positions = next(p for p in range(max(count, 2), 200) if all(p % d for d in range(2, p)))
         stride = round(positions * 0.618034)
-        for superframe, slot in ((0, 0), (12344, 2), (999_999, 254)):
+        for superframe, slot in ((0, 0), (12345, 2), (999_999, 254)):
             assert page_for(pages, superframe, slot) == (superframe + stride * slot) % positions % count

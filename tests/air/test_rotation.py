@@ -6,11 +6,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, SchedulePage
+from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.air.page_codec import decode_page, encode_page
 from skyless.air.rotation import almanac_issue, page_for, pages_of
 from skyless.site.limits import LIMITS
-from skyless.site.model import AnchorSite, GeoreferenceSite, NoiseSite, ScheduleSite, Site, TagsSite
+from skyless.site.model import (
+    EXACT,
+    AccuracySite,
+    AnchorSite,
+    GeoreferenceSite,
+    NoiseSite,
+    ScheduleSite,
+    Site,
+    TagsSite,
+)
 
 
 def site(anchors=7, **changes):
@@ -42,11 +51,12 @@ def test_pages_of_a_site():
     assert pages == (
         SchedulePage(2**27, 5, 1, 1, 2, 1.2),
         NoisePage(pytest.approx(100e-12), pytest.approx(100e-12), 2e-11, 1e-9),
+        AccuracyPage(0.02, 0.03, 0.05, 0.03, 1.0, 100.0),
         AnchorPage(1, 0.1, 1.0, 2.5, 0),
         AnchorPage(2, 0.2, 1.0, 2.5, 1),
         GeoreferencePage(52.0, 4.0, 3.0, 270.0),
     )
-    assert len(pages_of(site(2))) == 4
+    assert len(pages_of(site(2))) == 5
 
 
 @given(st.integers(1, 60), st.integers(0, 254), st.integers(0, 2**32 - 500), st.integers(1, 500))
@@ -70,10 +80,11 @@ def test_slots_of_one_superframe_bring_different_pages(count, superframe):
 
 
 @pytest.mark.parametrize("anchors", range(3, 33))
-def test_all_anchors_heard_fill_the_almanac_in_three_superframes(anchors):
-    pages = pages_of(site(anchors, georeference=GeoreferenceSite(52.0, 4.0)))
+@pytest.mark.parametrize(("earth", "superframes"), [(None, 3), (GeoreferenceSite(52.0, 4.0), 4)])
+def test_all_anchors_heard_fill_the_almanac_in_a_few_superframes(anchors, earth, superframes):
+    pages = pages_of(site(anchors, georeference=earth))
     for start in range(50):
-        heard = ((start + number // anchors, number % anchors) for number in range(3 * anchors))
+        heard = ((start + number // anchors, number % anchors) for number in range(superframes * anchors))
         assert receptions_until_complete(pages, heard) is not None
 
 
@@ -93,6 +104,7 @@ def test_whatever_a_site_file_may_say_fits_the_pages(end):
 
     places = at_end("anchors.id", "anchors.x_m", "anchors.y_m", "anchors.z_m")
     noise = at_end("noise.tx_stamp_ps", "noise.rx_stamp_ps", "noise.white_fm", "noise.random_walk_fm")
+    accuracy = at_end(*(f"accuracy.{field}" for field in AccuracySite.__struct_fields__))
     earth = at_end(*(f"georeference.{field}" for field in GeoreferenceSite.__struct_fields__))
     extreme = Site(
         "lab",
@@ -101,10 +113,18 @@ def test_whatever_a_site_file_may_say_fits_the_pages(end):
         ScheduleSite(slots=255),
         NoiseSite(*noise),
         TagsSite(*at_end("tags.height_m")),
+        AccuracySite(*accuracy),
         georeference=GeoreferenceSite(*earth),
     )
     for page in pages_of(extreme):
         assert type(decode_page(encode_page(page))) is type(page)
+
+
+def test_accuracy_of_a_site_file_comes_back_as_it_was():
+    for accuracy in (AccuracySite(), EXACT, AccuracySite(0.0153, 0.1, 0.0007, 1.2345, 0.35, 12.3)):
+        (page,) = (page for page in pages_of(site(accuracy=accuracy)) if isinstance(page, AccuracyPage))
+        heard = decode_page(encode_page(page))
+        assert AccuracySite(**msgspec.structs.asdict(heard)) == accuracy
 
 
 def test_issue_is_the_same_for_the_same_contents():
@@ -129,6 +149,8 @@ def changed_field(page):
             return {"z_m": page.z_m + 0.001}
         case SchedulePage():
             return {"slots": page.slots + 1}
+        case AccuracyPage():
+            return {"survey_std_m": page.survey_std_m + 0.001}
         case _:
             return {"white_fm": page.white_fm * 2}
 

@@ -7,7 +7,7 @@ import pytest
 from bench import EVERY_METHOD, LAB, LOFT, PAIRS, ROOM, SNAPSHOTS, Heard, Stage, assert_honest, changed, listen, tape
 from msgspec.structs import replace
 
-from skyless.air.almanac import AnchorPage, NoisePage, SchedulePage
+from skyless.air.almanac import AccuracyPage, AnchorPage, NoisePage, SchedulePage
 from skyless.air.beacon import MasterTime
 from skyless.air.codec import decode
 from skyless.anchor import Anchor
@@ -325,6 +325,24 @@ def test_a_page_may_change_under_the_same_issue():
             frame = changed(one.frame, page=page) if isinstance(other, AnchorPage) and other.anchor == 3 else one.frame
             receiver.hear(replace_heard(one, frame=frame).reception)
     assert receiver.almanac.anchors_m[3] == (6.25, 4.0, 0.0)
+
+
+def test_only_another_accuracy_than_the_rooms_makes_the_method_anew():
+    receiver, methods = Receiver(), []
+    for one in tape():
+        receiver.hear(one.reception)
+        if receiver.method is not None and receiver.method not in methods:
+            methods.append(receiver.method)
+    assert len(methods) == 1
+    page = AccuracyPage(0.005, 0.02, 0.0, 0.03, 1.0, 100.0)
+    for one in tape(LAB, 3.0):
+        if one.host_s > 2.0:
+            other = decode(one.frame).page
+            frame = changed(one.frame, page=page) if isinstance(other, AccuracyPage) else one.frame
+            receiver.hear(replace_heard(one, frame=frame).reception)
+    assert receiver.almanac.accuracy == page
+    assert receiver.method is not None
+    assert receiver.method not in methods
 
 
 @pytest.mark.parametrize("method", EVERY_METHOD)

@@ -38,6 +38,17 @@ class NoisePage(Struct, frozen=True, gc=False, tag="noise"):
     """Oscillators' random-walk frequency noise in 1/√s: standard deviation of the rate gained in 1 s."""
 
 
+class AccuracyPage(Struct, frozen=True, gc=False, tag="accuracy"):
+    """How good the site's survey and a tag's ranges are, for its filters (``skyless.site.model.AccuracySite``)."""
+
+    survey_std_m: float
+    range_std_m: float
+    slope_std_m: float
+    place_std_m: float
+    place_distance_m: float
+    place_time_s: float
+
+
 class GeoreferencePage(Struct, frozen=True, gc=False, tag="georeference"):
     """Where the site's origin lies on the Earth (WGS 84) and how its x axis points."""
 
@@ -48,4 +59,4 @@ class GeoreferencePage(Struct, frozen=True, gc=False, tag="georeference"):
     """Azimuth of the site's y axis, clockwise from true north."""
 
 
-Page = AnchorPage | SchedulePage | NoisePage | GeoreferencePage
+Page = AnchorPage | SchedulePage | NoisePage | AccuracyPage | GeoreferencePage

@@ -2,13 +2,18 @@
 
 from typing import Final
 
-from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
+from msgspec.structs import asdict
+
+from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
+from skyless.site.model import AccuracySite
 
 _SIGHTINGS: Final = 2
 """A frame corrupted on the air passes its FCS once in 65,536 times; the same error twice in a row is not expected."""
 
 _MOST_ANCHORS: Final = 255
 """As many as a site can have; forged pages beyond that take no memory."""
+
+_ASSUMED_ACCURACY: Final = AccuracyPage(**asdict(AccuracySite()))
 
 
 class AlmanacBook:
@@ -32,6 +37,7 @@ class AlmanacBook:
         self._anchors_m: dict[int, tuple[float, float, float]] = {}
         self._schedule: SchedulePage | None = None
         self._noise: NoisePage | None = None
+        self._accuracy = _ASSUMED_ACCURACY
         self._georeference: GeoreferencePage | None = None
 
     @property
@@ -53,6 +59,11 @@ class AlmanacBook:
     def noise(self) -> NoisePage | None:
         """The site's noise figures, once heard."""
         return self._noise
+
+    @property
+    def accuracy(self) -> AccuracyPage:
+        """How good survey and ranges are; the defaults of ``AccuracySite`` until it is heard, for some sites never."""
+        return self._accuracy
 
     @property
     def georeference(self) -> GeoreferencePage | None:
@@ -118,6 +129,8 @@ class AlmanacBook:
                 self._schedule = page
             case NoisePage():
                 self._noise = page
+            case AccuracyPage():
+                self._accuracy = page
             case GeoreferencePage():
                 self._georeference = page
         return True

@@ -4,7 +4,7 @@ import struct
 from functools import lru_cache
 from typing import Final, Literal
 
-from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
+from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
 from skyless.air.malformed import Malformed
 
 PAGE_BYTES: Final = 17
@@ -20,14 +20,19 @@ _ANCHOR: Final = struct.Struct("<BHiiiBx")
 _SCHEDULE: Final = struct.Struct("<BIBBHBBixx")
 _NOISE: Final = struct.Struct("<Bffff")
 _GEOREFERENCE: Final = struct.Struct("<BiiiI")
+_ACCURACY: Final = struct.Struct("<BHHHHHH4x")
 
 _ANCHOR_TYPE: Final = 1
 _SCHEDULE_TYPE: Final = 2
 _NOISE_TYPE: Final = 3
 _GEOREFERENCE_TYPE: Final = 4
+_ACCURACY_TYPE: Final = 5
 
 _HEIGHT_GIVEN: Final = 0x01
 _MAX_COORDINATE_MM: Final = round(MAX_COORDINATE_M * 1000)
+_STD_STEPS_PER_M: Final = 10_000
+_DISTANCE_STEPS_PER_M: Final = 100
+_TIME_STEPS_PER_S: Final = 10
 _CIRCLE: Final = 3_600_000_000
 """A whole turn in steps of 1e-7 degree."""
 
@@ -37,6 +42,8 @@ def encode_page(page: Page) -> bytes:
     """Return the 17 bytes of a page.
 
     Coordinates are rounded to 1 mm, angles to 1e-7 degree (at most 5.6 mm on the ground), noise to float32.
+    Of accuracy, standard deviations are rounded to 0.1 mm, the distance to 1 cm and the time to 0.1 s; neither of
+    the latter two to 0.
 
     Raises:
         ValueError: a field is out of its range; the message names it.
@@ -50,6 +57,8 @@ def encode_page(page: Page) -> bytes:
             return _encode_noise(page)
         case GeoreferencePage():
             return _encode_georeference(page)
+        case AccuracyPage():
+            return _encode_accuracy(page)
 
 
 @lru_cache(maxsize=1024)
@@ -76,6 +85,10 @@ def _real(name: str, value: float, low: float, high: float) -> float:
 
 def _millimetres(name: str, value_m: float) -> int:
     return round(_real(name, value_m, -MAX_COORDINATE_M, MAX_COORDINATE_M) * 1000)
+
+
+def _steps(name: str, value: float, per_unit: int, least: int = 0) -> int:
+    return max(least, round(_real(name, value, 0.0, 0xFFFF / per_unit) * per_unit))
 
 
 def _encode_anchor(page: AnchorPage) -> bytes:
@@ -126,6 +139,18 @@ def _encode_georeference(page: GeoreferencePage) -> bytes:
     )
 
 
+def _encode_accuracy(page: AccuracyPage) -> bytes:
+    return _ACCURACY.pack(
+        _ACCURACY_TYPE,
+        _steps("AccuracyPage.survey_std_m", page.survey_std_m, _STD_STEPS_PER_M),
+        _steps("AccuracyPage.range_std_m", page.range_std_m, _STD_STEPS_PER_M),
+        _steps("AccuracyPage.slope_std_m", page.slope_std_m, _STD_STEPS_PER_M),
+        _steps("AccuracyPage.place_std_m", page.place_std_m, _STD_STEPS_PER_M),
+        _steps("AccuracyPage.place_distance_m", page.place_distance_m, _DISTANCE_STEPS_PER_M, least=1),
+        _steps("AccuracyPage.place_time_s", page.place_time_s, _TIME_STEPS_PER_S, least=1),
+    )
+
+
 def _decode_anchor(data: bytes) -> AnchorPage | None:
     _, anchor, x_mm, y_mm, z_mm, slot = _ANCHOR.unpack(data)
     if max(abs(x_mm), abs(y_mm), abs(z_mm)) > _MAX_COORDINATE_MM:
@@ -162,9 +187,19 @@ def _decode_georeference(data: bytes) -> GeoreferencePage | None:
     return GeoreferencePage(latitude / 1e7, longitude / 1e7, height_mm / 1000, heading / 1e7)
 
 
+def _decode_accuracy(data: bytes) -> AccuracyPage | None:
+    _, *stds, distance, time = _ACCURACY.unpack(data)
+    if distance == 0 or time == 0:
+        return None
+    survey_m, range_m, slope_m, place_m = (std / _STD_STEPS_PER_M for std in stds)
+    distance_m, time_s = distance / _DISTANCE_STEPS_PER_M, time / _TIME_STEPS_PER_S
+    return AccuracyPage(survey_m, range_m, slope_m, place_m, distance_m, time_s)
+
+
 _DECODERS: Final = {
     _ANCHOR_TYPE: _decode_anchor,
     _SCHEDULE_TYPE: _decode_schedule,
     _NOISE_TYPE: _decode_noise,
     _GEOREFERENCE_TYPE: _decode_georeference,
+    _ACCURACY_TYPE: _decode_accuracy,
 }

@@ -3,14 +3,16 @@
 from functools import lru_cache
 from zlib import crc32
 
-from skyless.air.almanac import AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
+from msgspec.structs import asdict
+
+from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
 from skyless.air.page_codec import encode_page
 from skyless.air.schedule import first_slots, schedule_of
 from skyless.site.model import Site
 
 
 def pages_of(site: Site) -> tuple[Page, ...]:
-    """Return all pages of a validated site: schedule, noise, the anchors in the order of the file, georeference.
+    """Return all pages of a validated site: schedule, noise, accuracy, anchors in the order of the file, georeference.
 
     Raises:
         ValueError: two anchors would share a slot (see ``first_slots``).
@@ -26,6 +28,7 @@ def pages_of(site: Site) -> tuple[Page, ...]:
             site.tags.height_m,
         ),
         NoisePage(noise.tx_stamp_ps * 1e-12, noise.rx_stamp_ps * 1e-12, noise.white_fm, noise.random_walk_fm),
+        AccuracyPage(**asdict(site.accuracy)),
     ]
     pages += [AnchorPage(node.id, node.x_m, node.y_m, node.z_m, slots[node.id]) for node in site.anchors]
     if earth is not None:
