@@ -134,10 +134,10 @@ class Fixes:
         self._rows, self._alerts = [], []
 
     def add(self, fix):
-        covariance = fix.covariance_m2
-        levels = (np.nan if level is None else level for level in (fix.hpl_m, fix.vpl_m))
+        covariance, *levels, alert = (getattr(fix, name, None) for name in ("covariance_m2", "hpl_m", "vpl_m", "alert"))
+        levels = (np.nan if level is None else level for level in levels)
         self._rows.append((*fix.position_m, *(np.full(9, np.nan) if covariance is None else covariance.flat), *levels))
-        self._alerts.append(fix.alert is not None and str(fix.alert) != "none")
+        self._alerts.append(alert is not None and str(alert) != "none")
 
     def arrays(self):
         """Positions (n, 3), covariances (n, 3, 3), levels (n, 2), and whether each carries an alert (n,)."""
@@ -153,6 +153,7 @@ def score(times_s, error_m, covariance_m2, levels_m, alerted):
     covariance_m2 = covariance_m2[:, :dim, :dim]
     squared_m2 = (error_m**2).sum(axis=1)
     told = np.isfinite(covariance_m2).all(axis=(1, 2))
+    told[told] = np.linalg.det(covariance_m2[told]) > 0.0
     whitened = np.linalg.solve(covariance_m2[told], error_m[told][..., None])[..., 0]
     nees = (error_m[told] * whitened).sum(axis=1)
     beyond = nees > chi2.ppf(INSIDE, dim)
