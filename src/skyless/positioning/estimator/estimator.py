@@ -1,0 +1,467 @@
+"""The estimator at work: packet by packet (``process``), or many in one compiled loop (``track``), with the same bits.
+
+Anchors join and leave between packets, in NumPy; everything else is one kernel a packet.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from skyless.air.beacon import HEARD
+from skyless.compiled import kernel
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.positioning.estimator.kalman import fade_recent_faults, predict
+from skyless.positioning.estimator.kinds import CLOCK_JUMPED, first_reception, own_reception, relay, report
+from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LEVELS, RECENT_CHI2, VPL, protect
+from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import (
+    NEVER,
+    OFFSET,
+    RATE,
+    REMEMBERED,
+    EstimatorState,
+    Integers,
+    Matrix,
+    Vector,
+    anchor_state,
+    new_state,
+    with_anchor,
+    with_table,
+    without_anchor,
+)
+from skyless.positioning.fix_rows import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
+from skyless.positioning.protection import limits_of
+from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
+
+REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = range(7)
+"""What became of a packet; the last three ask for an anchor to join or leave, and for the packet again."""
+
+RELAY_AGE_S: Final = 1.0
+"""Older packets are not relayed, as sequence numbers come around."""
+
+RESTART_M: Final = 300.0
+"""No path is longer than expected by so much: the anchor's counter has jumped, ..."""
+
+RESTART_IN_ROW: Final = 3
+"""... if so many packets in a row say so."""
+
+MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS
+"""Between two clocks that are still crystals."""
+
+UNCOVERED_CHI2: Final = 240.0
+"""A test of faults beyond this shows one that the levels may not cover."""
+
+FADING: Final = 0.95
+"""What a packet leaves of the counts of relays lately."""
+
+SOUND, OBSTRUCTED, UNUSED, CONTRADICTED, UNAVAILABLE = range(5)
+"""What can be said of a fix, as ``protection.integrity_of`` takes it."""
+
+MOST_PACKED: Final = 16
+"""Relays in a frame; 13 fit."""
+
+FIRST_PACKETS: Final = 3
+"""Of each anchor, before which nothing is promised."""
+
+
+class Report(NamedTuple):
+    """What an anchor says of its clock."""
+
+    master: int
+    """The master's index in the table; −1 where nothing is said."""
+    subticks: int
+    """The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸."""
+    variance_m2: float
+
+
+NO_REPORT: Final = Report(-1, 0, 0.0)
+
+
+class Packets(Struct, frozen=True):
+    """Packets in the order in which the tag received them, all stamps unwrapped."""
+
+    anchors: Integers
+    """Index of each packet's anchor in the table, shape (n,)."""
+    sequences: Integers
+    rx_ticks: Integers
+    """The tag's stamps."""
+    tx_ticks: Integers
+    """The anchors' own."""
+    relays: Integers
+    """[the anchor that received, the one that was received, sequence, RX stamp of the former], shape (relays, 4)."""
+    ends: Integers
+    """Where the relays of each packet end."""
+
+
+@kernel
+def _silent_anchor(s: EstimatorState, rx_ticks: int) -> int:
+    """An anchor that has been silent for too long, or −1."""
+    longest = s.settings[0]["drop_s"]
+    for anchor in range(len(s.anchors)):
+        a = s.anchors[anchor]
+        if a["packets"] > 0 and (rx_ticks - a["rx_ticks"]) * TICK_S > longest:
+            return anchor
+    return -1
+
+
+@kernel
+def _is_impossible(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> bool:
+    """Whether no clock can have gone from an anchor's newest packet to this one."""
+    a = s.anchors[anchor]
+    elapsed = rx_ticks - a["rx_ticks"]
+    change_m = abs(elapsed - (tx_ticks - a["tx_ticks"])) * TICK_M
+    return bool(change_m > RESTART_M + MAX_RATE_MPS * elapsed * TICK_S)
+
+
+@kernel
+def _process(
+    s: EstimatorState,
+    table_index: int,
+    sequence: int,
+    rx_ticks: int,
+    tx_ticks: int,
+    relays: Integers,
+    first: int,
+    last: int,
+    master: int,
+    subticks: int,
+    report_variance_m2: float,
+    variance_factor: float,
+) -> int:
+    """Process one packet and what it relays, rows ``first`` to ``last``; what became of it."""
+    status = s.status[0]
+    if status["packets"] > 0 and rx_ticks < status["epoch_ticks"]:
+        status["stale"] += 1
+        status["stale_in_row"] += 1
+        return STALE
+    anchor = s.index_of[table_index]
+    if anchor < 0:
+        return NEW_ANCHOR
+    if _silent_anchor(s, rx_ticks) >= 0:
+        return SILENT_ANCHOR
+    a = s.anchors[anchor]
+    joins = a["packets"] == 0
+    if not joins and (tx_ticks == a["tx_ticks"] or _is_impossible(s, anchor, rx_ticks, tx_ticks)):
+        if tx_ticks != a["tx_ticks"]:
+            a["outliers_in_row"] += 1
+            status["rejected_in_row"] += 1
+            if a["outliers_in_row"] >= RESTART_IN_ROW:
+                return RESTARTED_CLOCK
+        status["impossible"] += 1
+        return REJECTED
+    status["stale_in_row"] = 0
+    predict(s, rx_ticks)
+    fade_recent_faults(s)
+    outcome = JOINED
+    if joins:
+        first_reception(s, anchor, rx_ticks, tx_ticks)
+    else:
+        result = own_reception(s, anchor, rx_ticks, tx_ticks, variance_factor)
+        if result == CLOCK_JUMPED:
+            return RESTARTED_CLOCK
+        outcome = ACCEPTED if result == 1 else REJECTED
+    status["packets"] += 1
+    a["packets"] += 1
+    a["tx_ticks"], a["rx_ticks"], a["walked_m"] = tx_ticks, rx_ticks, status["walked_m"]
+    packet = s.packets[anchor, sequence % REMEMBERED]
+    packet["sequence"], packet["tx_ticks"], packet["rx_ticks"] = sequence, tx_ticks, rx_ticks
+    if not joins:
+        status["relays_taken"] *= FADING
+        status["relays_refused"] *= FADING
+        for row in range(first, last):
+            _relayed(s, s.index_of[relays[row, 0]], s.index_of[relays[row, 1]], relays[row, 2], relays[row, 3])
+        if report_variance_m2 > 0.0 and master >= 0:
+            report(s, anchor, s.index_of[master], subticks, report_variance_m2)
+    return outcome
+
+
+@kernel
+def _relayed(s: EstimatorState, listener: int, sender: int, sequence: int, rx_ticks: int) -> None:
+    """Process a relayed reception once, if the tag has received that very packet."""
+    if listener < 0 or sender < 0 or listener == sender:
+        return
+    packet = s.packets[sender, sequence % REMEMBERED]
+    link = s.links[listener, sender]
+    young = (s.status[0]["epoch_ticks"] - packet["rx_ticks"]) * TICK_S < RELAY_AGE_S
+    if packet["sequence"] == sequence and packet["tx_ticks"] > link["tx_ticks"] and young:
+        link["tx_ticks"] = packet["tx_ticks"]
+        s.anchors[sender]["is_relayed"] = 1
+        relay(s, listener, sender, packet["tx_ticks"], packet["rx_ticks"], rx_ticks)
+
+
+@kernel
+def _track(
+    s: EstimatorState,
+    begin: int,
+    anchors: Integers,
+    sequences: Integers,
+    rx_ticks: Integers,
+    tx_ticks: Integers,
+    relays: Integers,
+    ends: Integers,
+    k: Vector,
+    work: Matrix,
+    motions: Matrix,
+    covariances: Matrix,
+    levels: Matrix,
+) -> int:
+    """Process packets from ``begin`` on; returns the first that asks for an anchor to join or leave, or their number.
+
+    Rows of ``motions``, ``covariances`` and ``levels`` are filled in, where there are any.
+    """
+    dim = s.settings[0]["dim"]
+    for n in range(begin, len(anchors)):
+        first = ends[n - 1] if n > 0 else 0
+        outcome = _process(
+            s, anchors[n], sequences[n], rx_ticks[n], tx_ticks[n], relays, first, ends[n], -1, 0, 0.0, 1.0
+        )
+        if outcome >= NEW_ANCHOR:
+            return n
+        if len(motions) > 0:
+            for one in range(2 * dim):
+                motions[n, one] = s.x[one]
+            for one in range(dim):
+                for other in range(dim):
+                    covariances[n, dim * one + other] = s.P[one, other]
+        if len(levels) > 0:
+            protect(s, k[0], k[1], work, levels[n])
+            levels[n, LEVELS] = outcome
+            levels[n, LEVELS + 1] = _soundness(s, levels[n])
+    return len(anchors)
+
+
+@kernel
+def _soundness(s: EstimatorState, levels: Vector) -> int:
+    """What can be said of a position with these levels."""
+    count, status = len(s.anchors), s.status[0]
+    if count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count:
+        return UNAVAILABLE
+    if max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > UNCOVERED_CHI2:
+        return CONTRADICTED
+    for anchor in range(count):
+        if s.anchors[anchor]["is_obstructed"]:
+            return OBSTRUCTED
+    return SOUND
+
+
+@kernel
+def _process_frame(
+    s: EstimatorState,
+    identifiers: Integers,
+    packed: NDArray[np.uint8],
+    packed_bytes: int,
+    listed: Integers,
+    listed_rows: int,
+    table_index: int,
+    sequence: int,
+    rx_ticks: int,
+    tx_ticks: int,
+    master: int,
+    subticks: int,
+    report_variance_m2: float,
+    variance_factor: float,
+    k: Vector,
+    work: Matrix,
+    levels: Vector,
+    rows: Matrix,
+) -> int:
+    """``_process`` for a packet whose relays are bytes of its frame, and all that a fix carries (``fix_rows``)."""
+    count = listed_rows
+    for begin in range(0, packed_bytes, 8):
+        identifier = np.int64(packed[begin]) | np.int64(packed[begin + 1]) << 8
+        stamp = np.int64(0)
+        for byte in range(5):
+            stamp |= np.int64(packed[begin + 3 + byte]) << (8 * byte)
+        for anchor in range(len(s.anchors)):
+            index = s.anchors[anchor]["table_index"]
+            if identifiers[index] == identifier:
+                listed[count, 0], listed[count, 1], listed[count, 2] = table_index, index, packed[begin + 2]
+                least = tx_ticks - HALF_WRAP_TICKS
+                listed[count, 3] = least + ((stamp - least) & TICK_MASK)
+                count += 1
+                break
+    outcome = _process(
+        s,
+        table_index,
+        sequence,
+        rx_ticks,
+        tx_ticks,
+        listed,
+        0,
+        count,
+        master,
+        subticks,
+        report_variance_m2,
+        variance_factor,
+    )
+    if outcome >= NEW_ANCHOR:
+        return outcome
+    dim = s.settings[0]["dim"]
+    for one in range(dim):
+        rows[POSITION, one], rows[VELOCITY, one] = s.x[one], s.x[dim + one]
+        for other in range(dim):
+            rows[POSITION + 1 + one, other] = s.P[one, other]
+            rows[VELOCITY + 1 + one, other] = s.P[dim + one, dim + other]
+    if dim == 2:
+        rows[POSITION, 2] = s.settings[0]["height_m"]
+    rows[QUALITY, 0], rows[QUALITY, 1] = s.status[0]["mean_nis"], s.status[0]["mean_square_m2"]
+    protect(s, k[0], k[1], work, levels)
+    rows[PROTECTION, 0], rows[PROTECTION, 1], rows[PROTECTION, 2] = levels[HPL], levels[VPL], _soundness(s, levels)
+    return outcome
+
+
+class Estimator:
+    """The filter of one tag."""
+
+    def __init__(self, settings: EstimatorSettings, table_m: Matrix | None = None) -> None:
+        """``table_m``: positions of the site's anchors, shape (n, 3); more can be added."""
+        self.settings = settings
+        self.dim = settings.dim
+        self._table_m: list[Vector] = [] if table_m is None else [np.array(row, np.float64) for row in table_m]
+        self._identifiers = np.full(len(self._table_m), -1)
+        self._k = limits_of(settings.integrity_risk)[:2]
+        self._levels = np.zeros(LEVELS)
+        self._rows = np.zeros((PROTECTED_ROWS, 3))
+        self._packed = np.zeros(MOST_PACKED * HEARD.size, np.uint8)
+        self._listed = np.zeros((MOST_PACKED, 4), np.int64)
+        self._use(new_state(settings, len(self._table_m)))
+
+    def _use(self, state: EstimatorState) -> None:
+        self._state = state
+        count = len(state.anchors)
+        self._work = np.zeros((count + 1 + self.dim, max(count, 1)))
+
+    @property
+    def state(self) -> EstimatorState:
+        """All states and counters; others after an anchor has joined or left."""
+        return self._state
+
+    @property
+    def rows(self) -> Matrix:
+        """What a fix carries (``fix_rows``), as of the newest packet."""
+        return self._rows
+
+    def add_anchor(self, position_m: Vector, identifier: int = -1) -> int:
+        """Add an anchor to the table; returns its index. ``identifier``: by which relays in frames call it."""
+        self._table_m.append(np.array(position_m, np.float64))
+        self._identifiers = np.append(self._identifiers, identifier)
+        self._use(with_table(self._state, len(self._table_m)))
+        return len(self._table_m) - 1
+
+    def move_anchor(self, table_index: int, position_m: Vector) -> None:
+        """Correct an anchor's position."""
+        self._table_m[table_index] = np.array(position_m, np.float64)
+        anchor = self._state.index_of[table_index]
+        if anchor >= 0:
+            self._state.anchors[anchor]["position_m"] = position_m
+
+    def start(
+        self,
+        rx_ticks: int,
+        position_m: Vector,
+        covariance_m2: Matrix,
+        speed_variance: float,
+        range_std_m: float | None = None,
+    ) -> None:
+        """Begin at a position, shapes (dim,) and (dim, dim), without any anchor.
+
+        ``range_std_m``: of the constant errors of ranges, where the settings' are contradicted.
+        """
+        settings, dim = self.settings, self.dim
+        state = new_state(settings, len(self._table_m))
+        if range_std_m is not None:
+            state.settings["range_std_m"] = range_std_m
+        state.x[:dim] = position_m
+        state.P[:dim, :dim] = covariance_m2
+        state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
+        state.status["epoch_ticks"] = rx_ticks
+        self._use(state)
+
+    def process(
+        self,
+        table_index: int,
+        sequence: int,
+        rx_ticks: int,
+        tx_ticks: int,
+        relays: Integers | list[list[int]] = (),  # type: ignore[assignment]
+        *,
+        packed: bytes = b"",
+        report: Report = NO_REPORT,
+        variance_factor: float = 1.0,
+    ) -> int:
+        """Process one packet; returns what became of it (``ACCEPTED`` …) and leaves ``rows``.
+
+        ``relays``: rows as in ``Packets``; ``packed``: relays as frames carry them (``codec.packed_relays``), anchors by
+        the identifiers that ``add_anchor`` was given; ``variance_factor``: on the variance of the tag's reception.
+        """
+        listed = len(relays)
+        if listed:
+            if listed + MOST_PACKED > len(self._listed):
+                self._listed = np.zeros((listed + MOST_PACKED, 4), np.int64)
+            self._listed[:listed] = relays
+        if packed:
+            self._packed[: len(packed)] = np.frombuffer(packed, np.uint8)
+        while True:
+            outcome = _process_frame(
+                self._state, self._identifiers, self._packed, len(packed), self._listed, listed,
+                table_index, sequence, rx_ticks, tx_ticks, report[0], report[1], report[2], variance_factor,
+                self._k, self._work, self._levels, self._rows,
+            )  # fmt: skip
+            if outcome < NEW_ANCHOR:
+                return outcome
+            self._resize(outcome, table_index, rx_ticks)
+
+    def track(
+        self,
+        packets: Packets,
+        motions: Matrix | None = None,
+        covariances: Matrix | None = None,
+        levels: Matrix | None = None,
+    ) -> None:
+        """Process many packets in one loop.
+
+        Rows of ``motions``, shape (n, 2·dim), ``covariances``, shape (n, dim·dim), and ``levels``, shape
+        (n, LEVELS + 2), are filled in after each packet; the last two columns of the levels are what became of the packet
+        and what can be said of the position.
+        """
+        nothing, done = np.empty((0, 0)), 0
+        motions = nothing if motions is None else motions
+        covariances = nothing if covariances is None else covariances
+        levels = nothing if levels is None else levels
+        columns = (packets.anchors, packets.sequences, packets.rx_ticks, packets.tx_ticks, packets.relays, packets.ends)
+        while True:
+            done = _track(self._state, done, *columns, self._k, self._work, motions, covariances, levels)
+            if done == len(packets.anchors):
+                return
+            index, rx_ticks = int(packets.anchors[done]), int(packets.rx_ticks[done])
+            joins = self._state.index_of[index] < 0
+            silent = not joins and _silent_anchor(self._state, rx_ticks) >= 0
+            self._resize(NEW_ANCHOR if joins else SILENT_ANCHOR if silent else RESTARTED_CLOCK, index, rx_ticks)
+
+    def _resize(self, outcome: int, table_index: int, rx_ticks: int) -> None:
+        """Let an anchor join or leave, as a packet asks for."""
+        state = self._state
+        if outcome == NEW_ANCHOR:
+            self._use(with_anchor(state, table_index, self._table_m[table_index]))
+            return
+        if outcome == RESTARTED_CLOCK:
+            state.status["clock_restarts"] += 1
+            leaving = int(state.index_of[table_index])
+        else:
+            leaving = _silent_anchor(state, rx_ticks)
+        self._use(without_anchor(state, leaving))
+
+    def motion(self) -> tuple[Vector, Matrix]:
+        """Position and velocity at the newest packet, shape (2·dim,), and their covariance."""
+        n = 2 * self.dim
+        return self._state.x[:n].copy(), self._state.P[:n, :n].copy()
+
+    def clock(self, table_index: int) -> tuple[int, float, float] | None:
+        """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""
+        anchor = int(self._state.index_of[table_index])
+        if anchor < 0 or self._state.anchors[anchor]["rx_ticks"] == NEVER:
+            return None
+        first, x = anchor_state(self.dim, anchor), self._state.x
+        return int(self._state.anchors[anchor]["offset_ticks"]), float(x[first + OFFSET]), float(x[first + RATE])

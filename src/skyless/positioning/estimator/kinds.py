@@ -1,0 +1,350 @@
+"""The kinds of measurements. Each is linearised at the state, judged, and processed by one scalar update.
+
+    own reception    R − T  =  |p − a| + b + w + range errors + noise                  (the tag receives an anchor)
+    relay            S − T  =  |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + pair's constant + noise      (anchor i received anchor j)
+    report           bₘ − bᵢ as anchor i knows it                                       (its clock against the master's)
+    difference       |p − b| − |p − a| + range errors + noise                           (ready-made, of a pair)
+    height           z                                                                  (a sensor, or known roughly)
+    zero velocity    v                                                                  (the tag stands still)
+
+with offsets b, TX noise w, all in metres. ``docs/maths.md`` section 6 derives them.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from skyless.compiled import kernel
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.positioning.estimator.kalman import (
+    OBSTRUCTED_STD_M,
+    compute_fault_input,
+    compute_ph,
+    dynamic_states,
+    gather_evidence,
+    relax_range_error,
+    reset_state,
+    update,
+)
+from skyless.positioning.estimator.monitor import (
+    adapt_clock_noise,
+    adapt_process_noise,
+    has_jumped,
+    is_warm,
+    open_range_error,
+    variance_scale,
+)
+from skyless.positioning.estimator.state import (
+    CHANGE,
+    CONSTANT,
+    OFFSET,
+    RATE,
+    TX_NOISE,
+    EstimatorState,
+    anchor_state,
+    slope_state,
+    survey_state,
+)
+from skyless.ticks import TICK_MASK
+
+SUBTICKS: Final = 256
+"""Of a tick; the air's unit of the site's time, of which it tells 48 bits."""
+
+SLOPE_FROM_M: Final = 4.0
+"""Where the errors that grow with distance pass through zero, and by which range they change once (APS011)."""
+
+BEND_SHARE: Final = 0.01
+"""Where ranges are so curved that it counts for more than this part of the stamps' variance, it is counted."""
+
+CLOCK_JUMP_RELAYS: Final = 4
+"""Relays of an anchor in a row beyond the gate, while its receptions jump, are a clock that has jumped."""
+
+PAIR_OUTLIERS: Final = 4
+"""Relays of a pair in a row beyond the gate are another path between the two."""
+
+PAIR_JUMP_M2: Final = 0.25
+
+REPORT_GAIN: Final = 1.25
+"""A report is used where the filter's own variance is so many times larger."""
+
+LEAST_REPORT_VARIANCE: Final = 0.1
+"""Of that of a pair of stamps: no anchor knows its clock better, whatever it says."""
+
+CLOCK_JUMPED: Final = 2
+
+
+@kernel
+def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> float:
+    """Put the unit vector from an anchor to the tag into the measurement; returns their distance.
+
+    The anchor's survey error follows with the opposite sign: ``2·dim`` terms in all.
+    """
+    dim, count, x = s.settings[0]["dim"], len(s.anchors), s.x
+    a = s.anchors[anchor]
+    survey = survey_state(dim, count, anchor)
+    squared = 0.0
+    for axis in range(dim):
+        step_m = x[axis] - a["position_m"][axis] - x[survey + axis]
+        s.h[term + axis] = step_m
+        squared += step_m * step_m
+    if dim == 2:
+        squared += (s.settings[0]["height_m"] - a["position_m"][2]) ** 2
+    range_m = max(np.sqrt(squared), 1e-6)
+    for axis in range(dim):
+        towards = sign * s.h[term + axis] / range_m
+        s.h[term + axis], s.h_index[term + axis] = towards, axis
+        s.h[term + dim + axis], s.h_index[term + dim + axis] = -towards, survey + axis
+    return float(range_m)
+
+
+@kernel
+def _set_term(s: EstimatorState, term: int, state: int, weight: float) -> int:
+    s.h[term], s.h_index[term] = weight, state
+    return term + 1
+
+
+@kernel
+def _range_error_terms(s: EstimatorState, term: int, anchor: int, range_m: float, sign: float) -> int:
+    """Range errors of an anchor: the part that changes, the part that stays, and the slope."""
+    dim = s.settings[0]["dim"]
+    first = anchor_state(dim, anchor)
+    term = _set_term(s, term, first + CHANGE, sign)
+    term = _set_term(s, term, first + CONSTANT, sign)
+    far = min(max((range_m - SLOPE_FROM_M) / SLOPE_FROM_M, -1.0), 1.0)
+    return int(_set_term(s, term, slope_state(dim, len(s.anchors)), sign * far))
+
+
+@kernel
+def _along(s: EstimatorState, begin: int, end: int) -> float:
+    """h·x of terms from ``begin`` to ``end``."""
+    total = 0.0
+    for term in range(begin, end):
+        total += s.h[term] * s.x[s.h_index[term]]
+    return total
+
+
+@kernel
+def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
+    """Half the position's variance across the direction, over the range: what the range is longer by on average.
+
+    The second term of its Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 where that is
+    small beside that of the stamps. The direction stands in the first terms of the measurement.
+    """
+    dim, P, h = s.settings[0]["dim"], s.P, s.h
+    across = 0.0
+    for axis in range(dim):
+        across += P[axis, axis]
+    least = BEND_SHARE * variance * range_m * range_m
+    if 0.5 * across * across < least:
+        return 0.0
+    for one in range(dim):
+        for other in range(dim):
+            across -= h[one] * P[one, other] * h[other]
+    return float(0.5 * across / range_m) if 0.5 * across * across >= least else 0.0
+
+
+# The tag receives an anchor
+
+
+@kernel
+def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, variance_factor: float) -> int:
+    """Process the tag's reception of an anchor's packet: 1 if it was used, 0 if not, ``CLOCK_JUMPED`` to join anew.
+
+    R − T = |p − a − δa| + b + w + change + constant + slope·far + noise. A reception whose path looks blocked has
+    its variance multiplied; it is judged as any other, as it is late rather than noisy.
+    """
+    settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
+    dim = settings["dim"]
+    first = anchor_state(dim, anchor)
+    elapsed_s = (rx_ticks - a["rx_ticks"]) * TICK_S
+    relax_range_error(s, anchor, elapsed_s, status["walked_m"] - a["walked_m"])
+    range_m = _add_direction(s, 0, anchor, 1.0)
+    term = _set_term(s, 2 * dim, first + OFFSET, 1.0)
+    term = _set_term(s, term, first + TX_NOISE, 1.0)
+    terms = _range_error_terms(s, term, anchor, range_m, 1.0)
+    reset_state(s, first + TX_NOISE, settings["tx_variance_m2"])
+    rx_variance = settings["rx_variance_m2"]
+    bend_m = _bend_m(s, range_m, rx_variance)
+    rx_variance += 2.0 * bend_m * bend_m
+    innovation = (rx_ticks - tx_ticks - a["offset_ticks"]) * TICK_M - range_m - bend_m - _along(s, 2 * dim, terms)
+    innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
+    a["range_m"] = range_m
+    if is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
+        if a["relay_outliers_in_row"] >= CLOCK_JUMP_RELAYS:
+            return CLOCK_JUMPED
+        innovation = _jump(s, anchor, innovation, terms, rx_variance)
+        innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
+    scale = variance_scale(s, innovation, innovation_variance)
+    if scale == 0.0:
+        return 0
+    normalised = innovation / np.sqrt(innovation_variance)
+    if is_warm(s):
+        adapt_process_noise(s, normalised / scale)
+    used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]
+    compute_fault_input(s, terms, anchor)
+    gather_evidence(s, innovation, used_variance)
+    update(s, terms, innovation, used_variance, 1.0, len(s.x))
+    steps = int(np.floor(s.x[first + OFFSET] / TICK_M))
+    a["offset_ticks"] += steps
+    s.x[first + OFFSET] -= steps * TICK_M
+    return 1
+
+
+@kernel
+def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_variance: float) -> float:
+    """An anchor's range error has jumped: back to what it was before it was obstructed, or to something new.
+
+    Returns the innovation that is left.
+    """
+    a, status, settings = s.anchors[anchor], s.status[0], s.settings[0]
+    change = anchor_state(settings["dim"], anchor) + CHANGE
+    if a["is_obstructed"] and innovation < 0.0:
+        innovation += s.x[change]
+        share = min(status["obstruction"], 1.0)
+        reset_state(s, change, settings["place_std_m"] ** 2 + share * OBSTRUCTED_STD_M**2)
+        a["is_obstructed"] = a["outliers_in_row"] = 0
+        status["ends_of_obstructions"] += 1
+        left = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
+        if innovation * innovation <= settings["gate"] ** 2 * left:
+            return innovation
+    open_range_error(s, anchor, innovation)
+    return innovation
+
+
+@kernel
+def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> None:
+    """Begin with an anchor's clock: the limit of an update of an offset of which nothing was known.
+
+    Whatever is wrong with the position and with the range is then in the offset.
+    """
+    settings, a, P = s.settings[0], s.anchors[anchor], s.P
+    dim, n = settings["dim"], len(s.x)
+    offset = anchor_state(dim, anchor) + OFFSET
+    noise, rate = offset - OFFSET + TX_NOISE, offset - OFFSET + RATE
+    reset_state(s, noise, settings["tx_variance_m2"])
+    reset_state(s, rate, settings["clock_rate_variance"])
+    reset_state(s, offset, 0.0)
+    range_m = _add_direction(s, 0, anchor, 1.0)
+    terms = _range_error_terms(s, _set_term(s, 2 * dim, noise, 1.0), anchor, range_m, 1.0)
+    variance = settings["rx_variance_m2"]
+    bend_m = _bend_m(s, range_m, variance)
+    variance += 2.0 * bend_m * bend_m + compute_ph(P, s.h, s.h_index, terms, s.ph)
+    compute_fault_input(s, terms, anchor)
+    for state in range(n):
+        P[state, offset] = -s.ph[state]
+        P[offset, state] = -s.ph[state]
+    P[offset, offset] = variance
+    for fault in range(s.V.shape[1]):
+        s.V[offset, fault] = s.fault_input[fault]
+    whole = rx_ticks - tx_ticks - int(np.floor(range_m / TICK_M))
+    a["offset_ticks"] = whole
+    s.x[offset] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m - bend_m - _along(s, 2 * dim, terms)
+    a["range_m"] = range_m
+
+
+# An anchor received another
+
+
+@kernel
+def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_rx_ticks: int, rx_ticks: int) -> None:
+    """Process the reception, by the anchor ``listener``, of a packet of ``sender`` that the tag has received as well.
+
+    S − T = |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + constant of the pair + noise, when the packet reached anchor i. Both offsets go
+    back to that moment by their rates; what their oscillators have done since counts as noise. The pair's constant,
+    in which the survey is, is followed beside the filter: as both directions of a pair hold it with the same sign
+    and the offsets with opposite ones, neither leans on the other.
+    """
+    settings, status = s.settings[0], s.status[0]
+    i, j = s.anchors[listener], s.anchors[sender]
+    dim = settings["dim"]
+    squared = 0.0
+    for axis in range(3):
+        squared += (i["position_m"][axis] - j["position_m"][axis]) ** 2
+    distance_m = np.sqrt(squared)
+    age_s = (status["epoch_ticks"] - packet_rx_ticks) * TICK_S + (j["range_m"] - distance_m) / SPEED_OF_LIGHT_MPS
+    of_i, of_j = anchor_state(dim, listener), anchor_state(dim, sender)
+    term = _set_term(s, 0, of_j + OFFSET, 1.0)
+    term = _set_term(s, term, of_i + OFFSET, -1.0)
+    term = _set_term(s, term, of_j + RATE, -age_s)
+    term = _set_term(s, term, of_i + RATE, age_s)
+    walk = settings["walk"] * max(i["walk_scale"], j["walk_scale"])
+    variance = settings["rx_variance_m2"] + 2.0 * age_s * (settings["white"] + walk * age_s * age_s / 3.0)
+    if j["tx_ticks"] == tx_ticks:
+        term = _set_term(s, term, of_j + TX_NOISE, 1.0)
+    else:
+        variance += settings["tx_variance_m2"]
+    link = s.links[min(listener, sender), max(listener, sender)]
+    whole = j["offset_ticks"] - i["offset_ticks"]
+    innovation = (rx_ticks - tx_ticks - whole) * TICK_M - distance_m - link["constant_m"] - _along(s, 0, term)
+    pair_variance = link["variance_m2"]
+    innovation_variance = compute_ph(s.P, s.h, s.h_index, term, s.ph) + variance + pair_variance
+    normalised = innovation / np.sqrt(innovation_variance)
+    if is_warm(s):
+        clipped = min(max(normalised, -settings["gate"]), settings["gate"])
+        adapt_clock_noise(s, sender, clipped)
+        adapt_clock_noise(s, listener, -clipped)
+    if not -settings["gate"] <= normalised <= settings["gate"]:
+        status["relays_rejected"] += 1
+        status["relays_refused"] += 1.0
+        i["relay_outliers_in_row"] += 1
+        j["relay_outliers_in_row"] += 1
+        link["outliers_in_row"] += 1
+        if link["outliers_in_row"] >= PAIR_OUTLIERS:
+            link["outliers_in_row"] = 0
+            link["variance_m2"] += PAIR_JUMP_M2
+        return
+    status["relays_used"] += 1
+    status["relays_taken"] += 1.0
+    i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = link["outliers_in_row"] = 0
+    share = pair_variance / innovation_variance
+    link["constant_m"] += share * innovation
+    link["variance_m2"] -= share * pair_variance
+    compute_fault_input(s, term, -1)
+    gather_evidence(s, innovation, innovation_variance)
+    update(s, term, innovation, innovation_variance, 1.0, dynamic_states(s))
+
+
+# An anchor tells what its clock reads against the master's
+
+
+@kernel
+def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_m2: float) -> None:
+    """Let what an anchor knows of its clock against the master's replace what the filter knows, where that is worse.
+
+    The anchor has received all packets of the master that were relayed to the tag, and more, so its error is
+    uncorrelated with the difference of both estimates, of variance P − q (P: the filter's, q: the anchor's), and the
+    other states follow by P_xd/P times that difference. ``subticks``: the anchor's reading less the master's at the
+    packet's TX stamp, modulo 2⁴⁸.
+    """
+    settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
+    if master < 0 or master == anchor:
+        return
+    dim, n = settings["dim"], dynamic_states(s)
+    variance = max(variance_m2, LEAST_REPORT_VARIANCE * (settings["tx_variance_m2"] + settings["rx_variance_m2"]))
+    back_s = a["range_m"] / SPEED_OF_LIGHT_MPS
+    of_m, of_i = anchor_state(dim, master), anchor_state(dim, anchor)
+    term = _set_term(s, 0, of_m + OFFSET, 1.0)
+    term = _set_term(s, term, of_i + OFFSET, -1.0)
+    term = _set_term(s, term, of_m + RATE, -back_s)
+    term = _set_term(s, term, of_i + RATE, back_s)
+    own_variance = 0.0
+    for one in range(term):
+        for other in range(term):
+            own_variance += s.h[one] * s.h[other] * s.P[s.h_index[one], s.h_index[other]]
+    if own_variance <= REPORT_GAIN * variance:
+        return
+    whole = (s.anchors[master]["offset_ticks"] - a["offset_ticks"]) & TICK_MASK
+    wrap = SUBTICKS * (TICK_MASK + 1)
+    off = (subticks - SUBTICKS * whole) & (wrap - 1)
+    if off >= wrap // 2:
+        off -= wrap
+    innovation = off * (TICK_M / SUBTICKS) - _along(s, 0, term)
+    if innovation * innovation > settings["gate"] ** 2 * (own_variance + variance):
+        status["reports_rejected"] += 1
+        return
+    status["reports_used"] += 1
+    compute_ph(s.P, s.h, s.h_index, term, s.ph)
+    compute_fault_input(s, term, -1)
+    # K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q)
+    whole_s = own_variance * own_variance / (own_variance - variance)
+    update(s, term, innovation, whole_s, whole_s / own_variance, n)

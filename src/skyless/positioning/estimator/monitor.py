@@ -1,0 +1,168 @@
+"""Which measurements are used, and how process noise follows what innovations show.
+
+Late receptions are the rule where paths are blocked, early ones are not. A single late one is left out; where those
+that follow agree with it, the range error has jumped, and is estimated anew from there. What is systematic in the
+innovations along an axis is motion, what all anchors have in common is the tag's clock, and what relays say of one
+anchor's clock is that clock.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from skyless.compiled import kernel
+from skyless.positioning.estimator.state import CHANGE, EstimatorState, anchor_state
+
+FORGETTING: Final = 0.02
+"""Weight of the newest innovation in the running means, about the last 50."""
+
+SUSPECT: Final = 3.0
+"""Innovations beyond so many standard deviations, ..."""
+
+IN_ROW: Final = 2
+"""... so many of an anchor in a row, are a jump of its range error, ..."""
+
+IN_ROW_WHERE_LATE: Final = 5
+"""... or so many where single receptions are late often, ..."""
+
+OFTEN_LATE: Final = 0.02
+"""... which is a larger share of them than this, ..."""
+
+AGREEMENT: Final = 3.0
+"""... if they agree within so many standard deviations of two receptions."""
+
+JUMP_STD_M: Final = 0.3
+"""Of a range error that has jumped, beyond what it was, unless it has jumped by more."""
+
+JUMP_RISE: Final = 0.5
+"""By so much of its full size a jump raises the process noise of all range errors."""
+
+LATE_FORGETTING: Final = 0.005
+LATE_DENSITY: Final = 0.05
+"""Probability density of a late reception's normalised innovation: a standard deviation of 5 cm, a metre late."""
+
+HUBER: Final = 1.5
+"""Where receptions are late often, innovations beyond so many standard deviations weigh less."""
+
+LAG_GAIN: Final = 0.05
+LAG_FORGETTING: Final = 0.01
+LAG_LIMIT: Final = 2.3
+"""Of the mean square of the innovations' running means along the axes, 1 where the filter is right."""
+
+Q_SCALE_GAIN: Final = 1.03
+Q_SCALE_LOSS: Final = 0.99
+MAX_Q_SCALE: Final = 300.0
+
+COMMON_GAIN: Final = 0.05
+COMMON_LIMIT: Final = 6.25
+"""Of the square of the running mean of all innovations, 1 where the filter is right; those of the tag's clock."""
+
+WALK_GAIN: Final = 1.1
+WALK_LOSS: Final = 0.99
+RELAY_GAIN: Final = 0.02
+RELAY_LIMIT: Final = 9.0
+RELAY_WALK_GAIN: Final = 1.05
+RELAY_WALK_LOSS: Final = 0.995
+MAX_WALK_SCALE: Final = 1e4
+
+
+@kernel
+def gate_of(s: EstimatorState) -> float:
+    """Beyond how many standard deviations a reception is more likely late than not."""
+    late = min(s.status[0]["late_share"], 0.9)
+    odds = late * LATE_DENSITY * 2.5066282746310002 / (1.0 - late)
+    gate = s.settings[0]["gate"]
+    return float(min(gate, np.sqrt(-2.0 * np.log(odds)))) if odds > 1e-6 else float(gate)
+
+
+@kernel
+def is_warm(s: EstimatorState) -> bool:
+    """Whether two packets of each anchor have been processed since the start."""
+    return bool(s.status[0]["packets"] > 2 * len(s.anchors))
+
+
+@kernel
+def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_variance: float) -> bool:
+    """Whether this reception and those before it show that an anchor's range error has jumped."""
+    a, status = s.anchors[anchor], s.status[0]
+    if innovation * innovation <= SUSPECT * SUSPECT * innovation_variance:
+        a["outliers_in_row"] = 0
+        return False
+    settings = s.settings[0]
+    stamps = 2.0 * (settings["tx_variance_m2"] + settings["rx_variance_m2"])
+    apart = innovation - a["outlier_m"]
+    agrees = a["outliers_in_row"] > 0 and apart * apart <= AGREEMENT * AGREEMENT * stamps
+    a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
+    a["outlier_m"] = innovation
+    needed = IN_ROW_WHERE_LATE if status["late_share"] > OFTEN_LATE else IN_ROW
+    return bool(a["outliers_in_row"] >= needed)
+
+
+@kernel
+def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
+    """Let an anchor's range error be estimated anew from a jump on."""
+    status, change = s.status[0], anchor_state(s.settings[0]["dim"], anchor) + CHANGE
+    a = s.anchors[anchor]
+    a["outliers_in_row"] = 0
+    a["is_obstructed"] = 1
+    status["obstructions"] += 1
+    status["obstruction"] = min(status["obstruction"] + JUMP_RISE, 2.0)
+    s.P[change, change] += max(JUMP_STD_M**2, innovation * innovation)
+
+
+@kernel
+def variance_scale(s: EstimatorState, innovation: float, innovation_variance: float) -> float:
+    """Factor on the innovation's variance of a reception of the tag; 0 if it is not to be used. Counts it."""
+    status, settings = s.status[0], s.settings[0]
+    normalised = innovation / np.sqrt(innovation_variance)
+    within = -settings["gate"] <= normalised <= settings["gate"]
+    status["late_share"] += LATE_FORGETTING * ((0.0 if within else 1.0) - status["late_share"])
+    status["rejected_share"] *= 1.0 - FORGETTING
+    if not within or normalised > gate_of(s):
+        status["rejected"] += 1
+        if not within:
+            status["rejected_in_row"] += 1
+            status["rejected_share"] += FORGETTING
+        return 0.0
+    status["accepted"] += 1
+    status["rejected_in_row"] = 0
+    status["mean_nis"] += FORGETTING * (normalised * normalised - status["mean_nis"])
+    status["mean_square_m2"] += FORGETTING * (innovation * innovation - status["mean_square_m2"])
+    if status["late_share"] > OFTEN_LATE and abs(normalised) > HUBER:
+        return float(abs(normalised) / HUBER)
+    return 1.0
+
+
+@kernel
+def adapt_process_noise(s: EstimatorState, normalised: float) -> None:
+    """Raise the motion's and the tag clock's process noise where innovations stay on one side, else lower it.
+
+    The direction to the anchor stands in ``h``, the first of the measurement's terms.
+    """
+    status, dim = s.status[0], s.settings[0]["dim"]
+    square = 0.0
+    for axis in range(dim):
+        status["lag"][axis] += LAG_GAIN * (s.h[axis] * normalised - status["lag"][axis])
+        square += status["lag"][axis] ** 2
+    square *= (2.0 - LAG_GAIN) / LAG_GAIN
+    status["lag_square"] += LAG_FORGETTING * (square - status["lag_square"])
+    if status["lag_square"] > LAG_LIMIT:
+        status["q_scale"] = min(status["q_scale"] * Q_SCALE_GAIN, MAX_Q_SCALE)
+    else:
+        status["q_scale"] = max(status["q_scale"] * Q_SCALE_LOSS, 1.0)
+    status["common_mean"] += COMMON_GAIN * (normalised - status["common_mean"])
+    if status["common_mean"] ** 2 * (2.0 - COMMON_GAIN) / COMMON_GAIN > COMMON_LIMIT:
+        status["walk_scale"] = min(status["walk_scale"] * WALK_GAIN, MAX_WALK_SCALE)
+    else:
+        status["walk_scale"] = max(status["walk_scale"] * WALK_LOSS, 1.0)
+
+
+@kernel
+def adapt_clock_noise(s: EstimatorState, anchor: int, normalised: float) -> None:
+    """Raise the process noise of an anchor's clock where what relays say of it stays on one side, else lower it."""
+    a = s.anchors[anchor]
+    a["relay_mean"] += RELAY_GAIN * (normalised - a["relay_mean"])
+    if a["relay_mean"] ** 2 * (2.0 - RELAY_GAIN) / RELAY_GAIN > RELAY_LIMIT:
+        a["walk_scale"] = min(a["walk_scale"] * RELAY_WALK_GAIN, MAX_WALK_SCALE)
+    else:
+        a["walk_scale"] = max(a["walk_scale"] * RELAY_WALK_LOSS, 1.0)

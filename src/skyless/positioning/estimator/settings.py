@@ -1,0 +1,97 @@
+"""What the estimator assumes of tag, clocks, stamps, survey and ranges."""
+
+from typing import Final
+
+import numpy as np
+from msgspec import Struct, structs
+from numpy.typing import NDArray
+
+from skyless.constants import SPEED_OF_LIGHT_MPS
+
+MAX_CLOCK_RATE: Final = 50e-6
+"""Two crystals of ±20 ppm, and margin."""
+
+RISK: Final = 1e-4
+"""Probability, for each fix, that an error exceeds its protection level."""
+
+
+class EstimatorSettings(Struct, frozen=True):
+    """What the filter assumes; standard deviations are one sigma."""
+
+    qa: float = 0.5
+    """Spectral density of the tag's acceleration, m²/s³ per axis."""
+    white: float = 3.6e-5
+    """White frequency noise of each oscillator, m²/s."""
+    walk: float = 0.09
+    """Random walk of each oscillator's rate, m²/s³."""
+    tx_variance_m2: float = 9e-4
+    rx_variance_m2: float = 9e-4
+    """Of one stamp each."""
+    gate: float = 4.0
+    """Innovations beyond so many standard deviations are not used."""
+    height_m: float | None = None
+    """Height of the tag where it is given; None to estimate it."""
+    drop_s: float = 2.0
+    """Anchors that are silent for longer leave the state."""
+    survey_std_m: float = 0.02
+    """Of each coordinate of an anchor."""
+    range_std_m: float = 0.03
+    """Of the constant error of a tag's ranges to one anchor."""
+    slope_std_m: float = 0.05
+    """By how much ranges lengthen for each unit of clip((range − 4 m)/4 m, −1, 1)."""
+    place_std_m: float = 0.005
+    """Of the part of a range's error that changes along the way."""
+    place_distance_m: float = 1.0
+    """Distance over which that part changes, ..."""
+    place_time_s: float = 100.0
+    """... and time over which it changes at rest."""
+    max_acceleration_mps2: float = 0.0
+    """The tag's largest acceleration, as far as levels are to cover it beyond ``qa``."""
+    integrity_risk: float = RISK
+    alert_limit_m: float | None = None
+    """Fixes with a higher horizontal protection level say so."""
+
+    @property
+    def dim(self) -> int:
+        """Dimensions of the position that are estimated."""
+        return 3 if self.height_m is None else 2
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether survey and ranges are taken for exact."""
+        return self.survey_std_m == self.range_std_m == self.slope_std_m == self.place_std_m == 0.0
+
+    def record(self) -> NDArray[np.void]:
+        """The settings as the kernels take them, shape (1,)."""
+        record = np.zeros(1, SETTINGS)
+        for name, value in structs.asdict(self).items():
+            if name in _NAMES:
+                record[name] = 0.0 if value is None else value
+        record["dim"] = self.dim
+        record["clock_rate_variance"] = (MAX_CLOCK_RATE * SPEED_OF_LIGHT_MPS) ** 2
+        return record
+
+
+_NAMES: Final = (
+    "qa",
+    "white",
+    "walk",
+    "tx_variance_m2",
+    "rx_variance_m2",
+    "gate",
+    "height_m",
+    "drop_s",
+    "survey_std_m",
+    "range_std_m",
+    "slope_std_m",
+    "place_std_m",
+    "place_distance_m",
+    "place_time_s",
+    "max_acceleration_mps2",
+    "integrity_risk",
+)
+
+SETTINGS: Final = np.dtype(
+    [("dim", np.int64), *((name, np.float64) for name in _NAMES), ("clock_rate_variance", np.float64)], align=True
+)
+"""``EstimatorSettings`` for the kernels."""

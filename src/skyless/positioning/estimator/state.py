@@ -1,0 +1,279 @@
+"""The estimator's state: what is estimated, what is kept of each anchor, and how anchors join and leave.
+
+The state vector, all clocks against the tag's own counter, in metres and m/s:
+
+    position            (dim)
+    velocity            (dim)
+    for each anchor     offset     tag's reading − anchor's reading (its whole ticks stand in ``ANCHOR``)
+                        rate       of that offset
+                        tx_noise   noise of the anchor's newest TX stamp, which all who heard it share
+                        change     error of the tag's ranges to it, the part that changes along the way
+                        constant   the part that stays
+    slope               how ranges lengthen with distance
+    for each anchor     survey     (dim) true position − told position
+
+Everything before ``slope`` is updated by all measurements; what follows is updated by the tag's own receptions only
+and is a consider parameter (Schmidt 1966) of the others, which say next to nothing of it.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.compiled import kernel
+from skyless.positioning.estimator.settings import EstimatorSettings
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Records = NDArray[np.void]
+
+OFFSET, RATE, TX_NOISE, CHANGE, CONSTANT = range(5)
+"""Within an anchor's states."""
+
+PER_ANCHOR: Final = 5
+
+REMEMBERED: Final = 16
+"""Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
+
+NEVER: Final = -(1 << 62)
+"""A time before all others."""
+
+ANCHOR: Final = np.dtype(
+    [
+        ("table_index", np.int64),
+        ("position_m", np.float64, (3,)),
+        ("tx_ticks", np.int64),  # newest packet: its own clock, ...
+        ("rx_ticks", np.int64),  # ... and the tag's
+        ("offset_ticks", np.int64),  # whole ticks of the offset
+        ("range_m", np.float64),  # at its newest packet
+        ("walked_m", np.float64),  # the tag's way at its newest packet
+        ("is_relayed", np.int64),  # whether others relay its packets
+        ("packets", np.int64),
+        ("outliers_in_row", np.int64),
+        ("outlier_m", np.float64),  # the newest of them
+        ("is_obstructed", np.int64),  # whether its range error has jumped and not come back
+        ("relay_outliers_in_row", np.int64),
+        ("relay_mean", np.float64),  # running mean of what relays say of its clock, normalised
+        ("walk_scale", np.float64),  # factor on its oscillator's random walk
+    ],
+    align=True,
+)
+"""What is kept of an anchor beside its states."""
+
+PACKET: Final = np.dtype([("sequence", np.int64), ("tx_ticks", np.int64), ("rx_ticks", np.int64)], align=True)
+"""A packet that others may relay."""
+
+LINK: Final = np.dtype(
+    [
+        ("tx_ticks", np.int64),  # newest packet of the sender whose reception by the listener was processed
+        ("constant_m", np.float64),  # of the pair, in the row of the lower index; its estimate ...
+        ("variance_m2", np.float64),  # ... and variance
+        ("outliers_in_row", np.int64),
+    ],
+    align=True,
+)
+"""A pair of anchors, listener and sender."""
+
+STATUS: Final = np.dtype(
+    [
+        ("epoch_ticks", np.int64),  # the tag's reading at the newest packet
+        ("packets", np.int64),
+        ("accepted", np.int64),
+        ("rejected", np.int64),
+        ("rejected_in_row", np.int64),
+        ("stale", np.int64),
+        ("stale_in_row", np.int64),
+        ("impossible", np.int64),
+        ("relays_used", np.int64),
+        ("relays_rejected", np.int64),
+        ("reports_used", np.int64),
+        ("reports_rejected", np.int64),
+        ("clock_restarts", np.int64),
+        ("obstructions", np.int64),
+        ("ends_of_obstructions", np.int64),
+        ("mean_nis", np.float64),
+        ("mean_square_m2", np.float64),  # of innovations
+        ("rejected_share", np.float64),
+        ("late_share", np.float64),
+        ("relays_taken", np.float64),  # lately, older ones counting less
+        ("relays_refused", np.float64),
+        ("lag", np.float64, (3,)),  # running mean of innovations along each axis
+        ("lag_square", np.float64),
+        ("q_scale", np.float64),  # factor on qa
+        ("common_mean", np.float64),  # running mean of all innovations: the tag's own clock
+        ("walk_scale", np.float64),  # factor on its random walk
+        ("obstruction", np.float64),  # 1 where range errors have jumped lately, 0 where they do not
+        ("walked_m", np.float64),
+    ],
+    align=True,
+)
+"""The estimator's counters and running means."""
+
+
+class EstimatorState(NamedTuple):
+    """Everything that the kernels work on, for one tag with n states and so many anchors."""
+
+    x: Vector
+    """Shape (n,)."""
+    P: Matrix
+    """Shape (n, n), symmetric to the bit."""
+    V: Matrix
+    """What faults do to x, shape (n, 2·anchors + dim): for each metre by which the tag's receptions of an anchor have
+    been late since it joined, the same lately, and for each m/s² of acceleration along an axis."""
+    information: Matrix
+    """Of both kinds of faults of all anchors in the innovations, shape (2, anchors, anchors)."""
+    evidence: Matrix
+    """What innovations say of them, shape (2, anchors)."""
+    anchors: Records
+    """``ANCHOR``, shape (anchors,)."""
+    packets: Records
+    """``PACKET``, shape (anchors, REMEMBERED)."""
+    links: Records
+    """``LINK``, shape (anchors, anchors), listener and sender."""
+    status: Records
+    """``STATUS``, shape (1,)."""
+    settings: Records
+    """``SETTINGS``, shape (1,)."""
+    index_of: Integers
+    """Index among ``anchors`` of each anchor of the site's table, −1 for those that are not in the state."""
+    h: Vector
+    """The measurement at hand where it is not zero, at the places in ``h_index``."""
+    h_index: Integers
+    ph: Vector
+    """P·h of the measurement at hand, shape (n,)."""
+    fault_input: Vector
+    """By how much each fault is in the innovation at hand, shape (2·anchors + dim,)."""
+
+
+@kernel
+def anchor_state(dim: int, anchor: int) -> int:
+    """Where an anchor's states begin."""
+    return 2 * dim + PER_ANCHOR * anchor
+
+
+@kernel
+def slope_state(dim: int, anchors: int) -> int:
+    """Where the slope stands: all states before it are updated by all measurements."""
+    return 2 * dim + PER_ANCHOR * anchors
+
+
+@kernel
+def survey_state(dim: int, anchors: int, anchor: int) -> int:
+    """Where an anchor's survey error begins."""
+    return 2 * dim + PER_ANCHOR * anchors + 1 + dim * anchor
+
+
+def new_state(settings: EstimatorSettings, table_size: int) -> EstimatorState:
+    """A state without anchors at the origin, for a table of so many."""
+    dim = settings.dim
+    n = 2 * dim + 1
+    status = np.zeros(1, STATUS)
+    status["q_scale"] = status["mean_nis"] = 1.0
+    status["walk_scale"] = START_WALK_SCALE
+    status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
+    P = np.zeros((n, n))
+    P[2 * dim, 2 * dim] = settings.slope_std_m**2
+    return EstimatorState(
+        x=np.zeros(n),
+        P=P,
+        V=np.zeros((n, dim)),
+        information=np.zeros((2, 0, 0)),
+        evidence=np.zeros((2, 0)),
+        anchors=np.zeros(0, ANCHOR),
+        packets=np.zeros((0, REMEMBERED), PACKET),
+        links=np.zeros((0, 0), LINK),
+        status=status,
+        settings=settings.record(),
+        index_of=np.full(table_size, -1, np.int64),
+        h=np.zeros(3 * dim + 8),
+        h_index=np.zeros(3 * dim + 8, np.int64),
+        ph=np.zeros(n),
+        fault_input=np.zeros(dim),
+    )
+
+
+START_WALK_SCALE: Final = 100.0
+"""Of the tag's oscillator, which warms up after it was switched on."""
+
+PAIR_STD_M: Final = 0.05
+"""Of the constant of a pair of anchors beside what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
+
+
+def with_anchor(s: EstimatorState, table_index: int, position_m: Vector) -> EstimatorState:
+    """The state with one more anchor, nothing known of its clock."""
+    settings, count = s.settings[0], len(s.anchors)
+    grown = _selected(s, [*range(count), -1])
+    dim, last = int(settings["dim"]), grown.anchors[count]
+    last["table_index"], last["position_m"] = table_index, position_m
+    last["tx_ticks"] = last["rx_ticks"] = NEVER
+    last["walk_scale"] = 1.0
+    grown.packets[count] = (NEVER, NEVER, NEVER)
+    pair_variance = 0.0
+    if settings["range_std_m"] > 0.0 or settings["survey_std_m"] > 0.0:
+        pair_variance = PAIR_STD_M**2
+    for link in (grown.links[count], grown.links[:, count]):
+        link["tx_ticks"], link["variance_m2"] = NEVER, pair_variance
+    first = anchor_state(dim, count)
+    grown.P[first + CHANGE, first + CHANGE] = settings["place_std_m"] ** 2
+    grown.P[first + CONSTANT, first + CONSTANT] = settings["range_std_m"] ** 2
+    survey = survey_state(dim, count + 1, count)
+    for axis in range(dim):
+        grown.P[survey + axis, survey + axis] = settings["survey_std_m"] ** 2
+    grown.index_of[table_index] = count
+    return grown
+
+
+def without_anchor(s: EstimatorState, anchor: int) -> EstimatorState:
+    """The state without one of its anchors."""
+    return _selected(s, [index for index in range(len(s.anchors)) if index != anchor])
+
+
+def with_table(s: EstimatorState, table_size: int) -> EstimatorState:
+    """The same state for a longer table of anchors."""
+    index_of = np.full(table_size, -1, np.int64)
+    index_of[: len(s.index_of)] = s.index_of
+    return s._replace(index_of=index_of)
+
+
+def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
+    """The state with these of its anchors, in this order; −1 stands for a new one, all zeros."""
+    dim, old, new = int(s.settings[0]["dim"]), len(s.anchors), len(kept)
+    states = list(range(2 * dim))
+    for anchor in kept:
+        first = anchor_state(dim, anchor)
+        states += [-1] * PER_ANCHOR if anchor < 0 else range(first, first + PER_ANCHOR)
+    states.append(slope_state(dim, old))
+    for anchor in kept:
+        first = survey_state(dim, old, anchor)
+        states += [-1] * dim if anchor < 0 else range(first, first + dim)
+    columns = [*kept, *(old + anchor if anchor >= 0 else -1 for anchor in kept), *range(2 * old, 2 * old + dim)]
+    n = len(states)
+    index_of = np.full_like(s.index_of, -1)
+    result = s._replace(
+        x=_take(s.x, states),
+        P=_take(s.P, states, states),
+        V=_take(s.V, states, columns),
+        information=np.stack([_take(part, kept, kept) for part in s.information]),
+        evidence=np.stack([_take(part, kept) for part in s.evidence]),
+        anchors=_take(s.anchors, kept),
+        packets=_take(s.packets, kept),
+        links=_take(s.links, kept, kept),
+        index_of=index_of,
+        ph=np.zeros(n),
+        fault_input=np.zeros(2 * new + dim),
+    )
+    for index, anchor in enumerate(result.anchors):
+        if kept[index] >= 0:
+            index_of[anchor["table_index"]] = index
+    return result
+
+
+def _take(source: NDArray[np.generic], *indices: list[int]) -> NDArray[np.generic]:  # type: ignore[type-var]
+    """Rows (and columns) of an array; zeros for an index of −1."""
+    wanted = [np.array(index, np.int64) for index in indices]
+    result = np.zeros([len(index) for index in indices] + list(source.shape[len(indices) :]), source.dtype)
+    there = np.ix_(*(np.flatnonzero(index >= 0) for index in wanted))
+    result[there] = source[np.ix_(*(index[index >= 0] for index in wanted))]
+    return result
