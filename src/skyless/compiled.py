@@ -14,6 +14,7 @@ from typing import Any, Final, TypeVar, cast
 
 import numba
 from numba import njit
+from numba.extending import register_jitable
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -62,6 +63,11 @@ def kernel(function: Function) -> Function:
     Fast-math stays off: streaming and batch must give identical bits.
     """
     return _compile(function, nogil=False)
+
+
+def jitted(function: Function) -> Function:
+    """A small function that kernels may call, and that stays plain Python elsewhere: nothing is compiled for it alone."""
+    return cast("Function", register_jitable(function))
 
 
 def borrowing_kernel(function: Function) -> Function:

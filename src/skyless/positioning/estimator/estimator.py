@@ -18,14 +18,12 @@ from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LEVELS, RECE
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.estimator.state import (
     NEVER,
-    OFFSET,
-    RATE,
     REMEMBERED,
     EstimatorState,
     Integers,
     Matrix,
     Vector,
-    anchor_state,
+    layout,
     new_state,
     with_anchor,
     with_table,
@@ -187,8 +185,8 @@ def _relayed(s: EstimatorState, listener: int, sender: int, sequence: int, rx_ti
     young = (s.status[0]["epoch_ticks"] - packet["rx_ticks"]) * TICK_S < RELAY_AGE_S
     if packet["sequence"] == sequence and packet["tx_ticks"] > link["tx_ticks"] and young:
         link["tx_ticks"] = packet["tx_ticks"]
-        s.anchors[sender]["is_relayed"] = 1
         relay(s, listener, sender, packet["tx_ticks"], packet["rx_ticks"], rx_ticks)
+        s.anchors[sender]["is_relayed"] = 1
 
 
 @kernel
@@ -463,5 +461,6 @@ class Estimator:
         anchor = int(self._state.index_of[table_index])
         if anchor < 0 or self._state.anchors[anchor]["rx_ticks"] == NEVER:
             return None
-        first, x = anchor_state(self.dim, anchor), self._state.x
-        return int(self._state.anchors[anchor]["offset_ticks"]), float(x[first + OFFSET]), float(x[first + RATE])
+        where, x = layout(self.dim, len(self._state.anchors)), self._state.x
+        rate = float(x[where.rate + anchor])
+        return int(self._state.anchors[anchor]["offset_ticks"]), float(x[where.offset + anchor]), rate

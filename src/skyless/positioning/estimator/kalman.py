@@ -14,18 +14,7 @@ import numpy as np
 
 from skyless.compiled import kernel
 from skyless.constants import TICK_S
-from skyless.positioning.estimator.state import (
-    CHANGE,
-    CONSTANT,
-    OFFSET,
-    RATE,
-    EstimatorState,
-    Integers,
-    Matrix,
-    Vector,
-    anchor_state,
-    slope_state,
-)
+from skyless.positioning.estimator.state import EstimatorState, Integers, Matrix, Vector, layout
 
 RECENT_PACKETS: Final = 24.0
 """Faults of so many packets of each anchor are recent."""
@@ -51,47 +40,53 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
     status, settings = s.status[0], s.settings[0]
     x, P, V = s.x, s.P, s.V
     dim, count = settings["dim"], len(s.anchors)
+    where = layout(dim, count)
     dt = (rx_ticks - status["epoch_ticks"]) * TICK_S
     status["epoch_ticks"] = rx_ticks
     speed_squared = 0.0
     for axis in range(dim):
-        speed_squared += x[dim + axis] ** 2
+        speed_squared += x[where.velocity + axis] ** 2
     status["walked_m"] += np.sqrt(speed_squared) * dt
     status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
+    _advance(x, P, V, where.velocity, dt)
     motion = settings["qa"] * status["q_scale"]
     for axis in range(dim):
-        _advance(x, P, V, axis, dim + axis, dt, 0.0, motion)
-    first_acceleration = 2 * count
-    for axis in range(dim):  # an acceleration that the filter does not know of
-        V[axis, first_acceleration + axis] -= 0.5 * dt * dt
-        V[dim + axis, first_acceleration + axis] -= dt
+        _add_noise(P, axis, where.velocity + axis, dt, 0.0, motion)
+        V[2 * count + axis, axis] -= 0.5 * dt * dt  # an acceleration that the filter does not know of
+        V[2 * count + axis, where.velocity + axis] -= dt
     walk = settings["walk"]
     for anchor in range(count):
-        offset = anchor_state(dim, anchor) + OFFSET
         scale = s.anchors[anchor]["walk_scale"]
-        _advance(x, P, V, offset, offset - OFFSET + RATE, dt, settings["white"], walk * scale)
+        _add_noise(P, where.offset + anchor, where.rate + anchor, dt, settings["white"], walk * scale)
     common = walk * status["walk_scale"]
     value, cross, rate = settings["white"] * dt + common * dt**3 / 3.0, common * dt**2 / 2.0, common * dt
-    for one in range(count):
-        i = anchor_state(dim, one)
-        for other in range(count):
-            j = anchor_state(dim, other)
-            P[i + OFFSET, j + OFFSET] += value
-            P[i + OFFSET, j + RATE] += cross
-            P[i + RATE, j + OFFSET] += cross
-            P[i + RATE, j + RATE] += rate
+    for i in range(where.offset, where.offset + count):
+        for j in range(where.offset, where.offset + count):
+            P[i, j] += value
+            P[i, where.velocity + j] += cross
+            P[where.velocity + i, j] += cross
+            P[where.velocity + i, where.velocity + j] += rate
 
 
 @kernel
-def _advance(x: Vector, P: Matrix, V: Matrix, value: int, rate: int, dt: float, white: float, walk: float) -> None:
-    """State ``value`` gains dt·(state ``rate``), and both their process noise."""
-    x[value] += dt * x[rate]
-    for column in range(P.shape[1]):
-        P[value, column] += dt * P[rate, column]
-    for row in range(P.shape[0]):
-        P[row, value] += dt * P[row, rate]
-    for column in range(V.shape[1]):
-        V[value, column] += dt * V[rate, column]
+def _advance(x: Vector, P: Matrix, V: Matrix, values: int, dt: float) -> None:
+    """The first states gain dt·(their rates), which follow them."""
+    n = P.shape[0]
+    for value in range(values):
+        x[value] += dt * x[values + value]
+        for column in range(n):
+            P[value, column] += dt * P[values + value, column]
+    for row in range(n):
+        for value in range(values):
+            P[row, value] += dt * P[row, values + value]
+    for fault in range(V.shape[0]):
+        for value in range(values):
+            V[fault, value] += dt * V[fault, values + value]
+
+
+@kernel
+def _add_noise(P: Matrix, value: int, rate: int, dt: float, white: float, walk: float) -> None:
+    """Process noise of a value and its rate."""
     P[value, value] += white * dt + walk * dt**3 / 3.0
     P[value, rate] += walk * dt**2 / 2.0
     P[rate, value] += walk * dt**2 / 2.0
@@ -106,8 +101,8 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
     within seconds; one that has jumped itself wanders from where it is.
     """
     status, settings = s.status[0], s.settings[0]
-    first, share = anchor_state(settings["dim"], anchor), min(status["obstruction"], 1.0)
-    change, constant = first + CHANGE, first + CONSTANT
+    where, share = layout(settings["dim"], len(s.anchors)), min(status["obstruction"], 1.0)
+    change, constant = where.change + anchor, where.constant + anchor
     obstructed = share * dt / OBSTRUCTED_S
     if s.anchors[anchor]["is_obstructed"]:
         s.P[change, change] += OBSTRUCTED_WALK * dt
@@ -130,8 +125,8 @@ def _decay(s: EstimatorState, state: int, kept: float, variance: float) -> None:
     for row in range(P.shape[0]):
         P[row, state] = P[state, row]
     P[state, state] = kept * P[state, state] + (1.0 - kept * kept) * variance
-    for column in range(V.shape[1]):
-        V[state, column] *= kept
+    for fault in range(V.shape[0]):
+        V[fault, state] *= kept
 
 
 @kernel
@@ -144,8 +139,8 @@ def reset_state(s: EstimatorState, state: int, variance: float) -> None:
     for row in range(P.shape[0]):
         P[row, state] = 0.0
     P[state, state] = variance
-    for column in range(V.shape[1]):
-        V[state, column] = 0.0
+    for fault in range(V.shape[0]):
+        V[fault, state] = 0.0
 
 
 @kernel
@@ -165,16 +160,14 @@ def compute_ph(P: Matrix, h: Vector, h_index: Integers, terms: int, ph: Vector) 
 
 
 @kernel
-def update(
-    s: EstimatorState, terms: int, innovation: float, innovation_variance: float, gain_scale: float, updated: int
-) -> None:
+def update(s: EstimatorState, innovation: float, innovation_variance: float, gain_scale: float, updated: int) -> None:
     """Scalar update of the first ``updated`` states by the measurement in ``h`` with P·h in ``ph``.
 
     K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
     follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit.
     """
     x, P, V, u, fault_input = s.x, s.P, s.V, s.ph, s.fault_input
-    n, faults = P.shape[0], V.shape[1]
+    n = P.shape[0]
     root = np.sqrt(innovation_variance)
     step = gain_scale * innovation / root
     for state in range(n):
@@ -184,59 +177,62 @@ def update(
         x[state] += factor * step
         for column in range(n):
             P[state, column] -= factor * u[column]
-        gain = gain_scale * factor / root
-        for fault in range(faults):
-            V[state, fault] += gain * fault_input[fault]
     for state in range(updated, n):
         factor = u[state]
         for column in range(updated):
             P[state, column] -= factor * u[column]
+    for fault in range(V.shape[0]):
+        gain = gain_scale * fault_input[fault] / root
+        for state in range(updated):
+            V[fault, state] += gain * u[state]
 
 
 @kernel
 def compute_fault_input(s: EstimatorState, terms: int, own: int) -> None:
     """S = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1."""
     V, fault_input, h, h_index = s.V, s.fault_input, s.h, s.h_index
-    faults, count = V.shape[1], len(s.anchors)
-    for fault in range(faults):
-        fault_input[fault] = 0.0
+    count = len(s.anchors)
+    for fault in range(V.shape[0]):
+        total = 0.0
+        for term in range(terms):
+            total -= h[term] * V[fault, h_index[term]]
+        fault_input[fault] = total
     if own >= 0:
-        fault_input[own] = 1.0
-        fault_input[count + own] = 1.0
-    for term in range(terms):
-        row, weight = h_index[term], h[term]
-        for fault in range(faults):
-            fault_input[fault] -= weight * V[row, fault]
+        fault_input[own] += 1.0
+        fault_input[count + own] += 1.0
 
 
 @kernel
 def gather_evidence(s: EstimatorState, innovation: float, innovation_variance: float) -> None:
     """What an innovation says of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S."""
-    count = len(s.anchors)
+    evidence, information, fault_input, count = s.evidence, s.information, s.fault_input, len(s.anchors)
     for bank in range(2):
+        begin = bank * count
         for one in range(count):
-            weight = s.fault_input[bank * count + one] / innovation_variance
-            s.evidence[bank, one] += weight * innovation
+            weight = fault_input[begin + one] / innovation_variance
+            evidence[bank, one] += weight * innovation
             for other in range(count):
-                s.information[bank, one, other] += weight * s.fault_input[bank * count + other]
+                information[bank, one, other] += weight * fault_input[begin + other]
 
 
 @kernel
 def fade_recent_faults(s: EstimatorState) -> None:
-    """Forget a share of what recent faults have done, and of the evidence for them, with every packet."""
+    """Forget a share of what recent faults have done, and of the evidence for them, once in a round of packets."""
     count = len(s.anchors)
-    kept = 1.0 - 1.0 / (RECENT_PACKETS * count)
-    V = s.V
-    for state in range(V.shape[0]):
-        for fault in range(count, 2 * count):
-            V[state, fault] *= kept
+    if s.status[0]["packets"] % count != 0:
+        return
+    kept = 1.0 - 1.0 / RECENT_PACKETS
+    V, evidence, information = s.V, s.evidence, s.information
+    for fault in range(count, 2 * count):
+        for state in range(V.shape[1]):
+            V[fault, state] *= kept
     for one in range(count):
-        s.evidence[1, one] *= kept
+        evidence[1, one] *= kept
         for other in range(count):
-            s.information[1, one, other] *= kept
+            information[1, one, other] *= kept
 
 
 @kernel
 def dynamic_states(s: EstimatorState) -> int:
     """How many states all measurements update; those that follow only the tag's own receptions do."""
-    return slope_state(s.settings[0]["dim"], len(s.anchors))
+    return layout(s.settings[0]["dim"], len(s.anchors)).slope

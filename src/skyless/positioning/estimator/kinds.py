@@ -34,17 +34,7 @@ from skyless.positioning.estimator.monitor import (
     open_range_error,
     variance_scale,
 )
-from skyless.positioning.estimator.state import (
-    CHANGE,
-    CONSTANT,
-    OFFSET,
-    RATE,
-    TX_NOISE,
-    EstimatorState,
-    anchor_state,
-    slope_state,
-    survey_state,
-)
+from skyless.positioning.estimator.state import EstimatorState, layout
 from skyless.ticks import TICK_MASK
 
 SUBTICKS: Final = 256
@@ -81,7 +71,7 @@ def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> fl
     """
     dim, count, x = s.settings[0]["dim"], len(s.anchors), s.x
     a = s.anchors[anchor]
-    survey = survey_state(dim, count, anchor)
+    survey = layout(dim, count).survey + dim * anchor
     squared = 0.0
     for axis in range(dim):
         step_m = x[axis] - a["position_m"][axis] - x[survey + axis]
@@ -106,12 +96,11 @@ def _set_term(s: EstimatorState, term: int, state: int, weight: float) -> int:
 @kernel
 def _range_error_terms(s: EstimatorState, term: int, anchor: int, range_m: float, sign: float) -> int:
     """Range errors of an anchor: the part that changes, the part that stays, and the slope."""
-    dim = s.settings[0]["dim"]
-    first = anchor_state(dim, anchor)
-    term = _set_term(s, term, first + CHANGE, sign)
-    term = _set_term(s, term, first + CONSTANT, sign)
+    where = layout(s.settings[0]["dim"], len(s.anchors))
+    term = _set_term(s, term, where.change + anchor, sign)
+    term = _set_term(s, term, where.constant + anchor, sign)
     far = min(max((range_m - SLOPE_FROM_M) / SLOPE_FROM_M, -1.0), 1.0)
-    return int(_set_term(s, term, slope_state(dim, len(s.anchors)), sign * far))
+    return int(_set_term(s, term, where.slope, sign * far))
 
 
 @kernel
@@ -155,15 +144,20 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     """
     settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
     dim = settings["dim"]
-    first = anchor_state(dim, anchor)
+    where = layout(dim, len(s.anchors))
+    offset = where.offset + anchor
     elapsed_s = (rx_ticks - a["rx_ticks"]) * TICK_S
     relax_range_error(s, anchor, elapsed_s, status["walked_m"] - a["walked_m"])
     range_m = _add_direction(s, 0, anchor, 1.0)
-    term = _set_term(s, 2 * dim, first + OFFSET, 1.0)
-    term = _set_term(s, term, first + TX_NOISE, 1.0)
-    terms = _range_error_terms(s, term, anchor, range_m, 1.0)
-    reset_state(s, first + TX_NOISE, settings["tx_variance_m2"])
+    term = _set_term(s, 2 * dim, offset, 1.0)
     rx_variance = settings["rx_variance_m2"]
+    a["has_tx_noise"] = a["is_relayed"]
+    if a["is_relayed"]:
+        reset_state(s, where.tx_noise + anchor, settings["tx_variance_m2"])
+        term = _set_term(s, term, where.tx_noise + anchor, 1.0)
+    else:
+        rx_variance += settings["tx_variance_m2"]
+    terms = _range_error_terms(s, term, anchor, range_m, 1.0)
     bend_m = _bend_m(s, range_m, rx_variance)
     rx_variance += 2.0 * bend_m * bend_m
     innovation = (rx_ticks - tx_ticks - a["offset_ticks"]) * TICK_M - range_m - bend_m - _along(s, 2 * dim, terms)
@@ -183,10 +177,10 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]
     compute_fault_input(s, terms, anchor)
     gather_evidence(s, innovation, used_variance)
-    update(s, terms, innovation, used_variance, 1.0, len(s.x))
-    steps = int(np.floor(s.x[first + OFFSET] / TICK_M))
+    update(s, innovation, used_variance, 1.0, len(s.x))
+    steps = int(np.floor(s.x[offset] / TICK_M))
     a["offset_ticks"] += steps
-    s.x[first + OFFSET] -= steps * TICK_M
+    s.x[offset] -= steps * TICK_M
     return 1
 
 
@@ -197,7 +191,7 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
     Returns the innovation that is left.
     """
     a, status, settings = s.anchors[anchor], s.status[0], s.settings[0]
-    change = anchor_state(settings["dim"], anchor) + CHANGE
+    change = layout(settings["dim"], len(s.anchors)).change + anchor
     if a["is_obstructed"] and innovation < 0.0:
         innovation += s.x[change]
         share = min(status["obstruction"], 1.0)
@@ -219,8 +213,8 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     """
     settings, a, P = s.settings[0], s.anchors[anchor], s.P
     dim, n = settings["dim"], len(s.x)
-    offset = anchor_state(dim, anchor) + OFFSET
-    noise, rate = offset - OFFSET + TX_NOISE, offset - OFFSET + RATE
+    where = layout(dim, len(s.anchors))
+    offset, noise, rate = where.offset + anchor, where.tx_noise + anchor, where.rate + anchor
     reset_state(s, noise, settings["tx_variance_m2"])
     reset_state(s, rate, settings["clock_rate_variance"])
     reset_state(s, offset, 0.0)
@@ -234,10 +228,10 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
         P[state, offset] = -s.ph[state]
         P[offset, state] = -s.ph[state]
     P[offset, offset] = variance
-    for fault in range(s.V.shape[1]):
-        s.V[offset, fault] = s.fault_input[fault]
+    for fault in range(s.V.shape[0]):
+        s.V[fault, offset] = s.fault_input[fault]
     whole = rx_ticks - tx_ticks - int(np.floor(range_m / TICK_M))
-    a["offset_ticks"] = whole
+    a["offset_ticks"], a["has_tx_noise"] = whole, 1
     s.x[offset] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m - bend_m - _along(s, 2 * dim, terms)
     a["range_m"] = range_m
 
@@ -262,15 +256,15 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         squared += (i["position_m"][axis] - j["position_m"][axis]) ** 2
     distance_m = np.sqrt(squared)
     age_s = (status["epoch_ticks"] - packet_rx_ticks) * TICK_S + (j["range_m"] - distance_m) / SPEED_OF_LIGHT_MPS
-    of_i, of_j = anchor_state(dim, listener), anchor_state(dim, sender)
-    term = _set_term(s, 0, of_j + OFFSET, 1.0)
-    term = _set_term(s, term, of_i + OFFSET, -1.0)
-    term = _set_term(s, term, of_j + RATE, -age_s)
-    term = _set_term(s, term, of_i + RATE, age_s)
+    where = layout(dim, len(s.anchors))
+    term = _set_term(s, 0, where.offset + sender, 1.0)
+    term = _set_term(s, term, where.offset + listener, -1.0)
+    term = _set_term(s, term, where.rate + sender, -age_s)
+    term = _set_term(s, term, where.rate + listener, age_s)
     walk = settings["walk"] * max(i["walk_scale"], j["walk_scale"])
     variance = settings["rx_variance_m2"] + 2.0 * age_s * (settings["white"] + walk * age_s * age_s / 3.0)
-    if j["tx_ticks"] == tx_ticks:
-        term = _set_term(s, term, of_j + TX_NOISE, 1.0)
+    if j["tx_ticks"] == tx_ticks and j["has_tx_noise"]:
+        term = _set_term(s, term, where.tx_noise + sender, 1.0)
     else:
         variance += settings["tx_variance_m2"]
     link = s.links[min(listener, sender), max(listener, sender)]
@@ -301,7 +295,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
     link["variance_m2"] -= share * pair_variance
     compute_fault_input(s, term, -1)
     gather_evidence(s, innovation, innovation_variance)
-    update(s, term, innovation, innovation_variance, 1.0, dynamic_states(s))
+    update(s, innovation, innovation_variance, 1.0, dynamic_states(s))
 
 
 # An anchor tells what its clock reads against the master's
@@ -322,11 +316,11 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     dim, n = settings["dim"], dynamic_states(s)
     variance = max(variance_m2, LEAST_REPORT_VARIANCE * (settings["tx_variance_m2"] + settings["rx_variance_m2"]))
     back_s = a["range_m"] / SPEED_OF_LIGHT_MPS
-    of_m, of_i = anchor_state(dim, master), anchor_state(dim, anchor)
-    term = _set_term(s, 0, of_m + OFFSET, 1.0)
-    term = _set_term(s, term, of_i + OFFSET, -1.0)
-    term = _set_term(s, term, of_m + RATE, -back_s)
-    term = _set_term(s, term, of_i + RATE, back_s)
+    where = layout(dim, len(s.anchors))
+    term = _set_term(s, 0, where.offset + master, 1.0)
+    term = _set_term(s, term, where.offset + anchor, -1.0)
+    term = _set_term(s, term, where.rate + master, -back_s)
+    term = _set_term(s, term, where.rate + anchor, back_s)
     own_variance = 0.0
     for one in range(term):
         for other in range(term):
@@ -347,4 +341,4 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     compute_fault_input(s, term, -1)
     # K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q)
     whole_s = own_variance * own_variance / (own_variance - variance)
-    update(s, term, innovation, whole_s, whole_s / own_variance, n)
+    update(s, innovation, whole_s, whole_s / own_variance, n)

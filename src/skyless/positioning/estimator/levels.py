@@ -47,22 +47,22 @@ def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, work: Mat
             work[one, one] += 1.0 / (std_m * std_m)
             work[count, one] = s.evidence[bank, one]
             for axis in range(dim):
-                work[count + 1 + axis, one] = V[axis, begin + one]
+                work[count + 1 + axis, one] = V[begin + one, axis]
         _solve(work, count, 1 + dim)
         chi2, shift_x, shift_y, shift_z = 0.0, 0.0, 0.0, 0.0
         xx, xy, yy, zz = P[0, 0], P[0, 1], P[1, 1], 0.0
         for one in range(count):
             fault_m = work[count, one]
             chi2 += s.evidence[bank, one] * fault_m
-            vx, vy = V[0, begin + one], V[1, begin + one]
+            vx, vy = V[begin + one, 0], V[begin + one, 1]
             shift_x += vx * fault_m
             shift_y += vy * fault_m
             xx += vx * work[count + 1, one]
             xy += vx * work[count + 2, one]
             yy += vy * work[count + 2, one]
             if dim == 3:
-                shift_z += V[2, begin + one] * fault_m
-                zz += V[2, begin + one] * work[count + 3, one]
+                shift_z += V[begin + one, 2] * fault_m
+                zz += V[begin + one, 2] * work[count + 3, one]
         largest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
         levels[HPL] = max(levels[HPL], np.hypot(shift_x, shift_y) + horizontal_k * np.sqrt(largest))
         if dim == 3:
@@ -72,9 +72,9 @@ def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, work: Mat
     if acceleration > 0.0:
         squared, up = 0.0, 0.0
         for column in range(2 * count, 2 * count + dim):
-            squared += V[0, column] ** 2 + V[1, column] ** 2
+            squared += V[column, 0] ** 2 + V[column, 1] ** 2
             if dim == 3:
-                up += V[2, column] ** 2
+                up += V[column, 2] ** 2
         levels[HPL] += acceleration * np.sqrt(squared)
         levels[VPL] += acceleration * np.sqrt(up)
 

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import kernel
-from skyless.positioning.estimator.state import CHANGE, EstimatorState, anchor_state
+from skyless.positioning.estimator.state import EstimatorState, layout
 
 FORGETTING: Final = 0.02
 """Weight of the newest innovation in the running means, about the last 50."""
@@ -101,7 +101,7 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
 @kernel
 def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
     """Let an anchor's range error be estimated anew from a jump on."""
-    status, change = s.status[0], anchor_state(s.settings[0]["dim"], anchor) + CHANGE
+    status, change = s.status[0], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
     a = s.anchors[anchor]
     a["outliers_in_row"] = 0
     a["is_obstructed"] = 1

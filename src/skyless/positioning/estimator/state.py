@@ -2,15 +2,14 @@
 
 The state vector, all clocks against the tag's own counter, in metres and m/s:
 
-    position            (dim)
-    velocity            (dim)
-    for each anchor     offset     tag's reading − anchor's reading (its whole ticks stand in ``ANCHOR``)
-                        rate       of that offset
-                        tx_noise   noise of the anchor's newest TX stamp, which all who heard it share
-                        change     error of the tag's ranges to it, the part that changes along the way
-                        constant   the part that stays
-    slope               how ranges lengthen with distance
-    for each anchor     survey     (dim) true position − told position
+    values      position (dim), then for each anchor the offset of its clock: tag's reading − anchor's reading (its
+                whole ticks stand in ``ANCHOR``)
+    rates       velocity (dim), then the rate of each offset
+    tx noises   of each anchor's newest TX stamp, which all who received it share
+    changes     for each anchor the part of the tag's range error to it that changes along the way
+    constants   the part that stays
+    slope       how ranges lengthen with distance
+    surveys     for each anchor (dim) its true position − its told position
 
 Everything before ``slope`` is updated by all measurements; what follows is updated by the tag's own receptions only
 and is a consider parameter (Schmidt 1966) of the others, which say next to nothing of it.
@@ -21,18 +20,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import jitted
 from skyless.positioning.estimator.settings import EstimatorSettings
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Records = NDArray[np.void]
-
-OFFSET, RATE, TX_NOISE, CHANGE, CONSTANT = range(5)
-"""Within an anchor's states."""
-
-PER_ANCHOR: Final = 5
 
 REMEMBERED: Final = 16
 """Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
@@ -50,6 +44,7 @@ ANCHOR: Final = np.dtype(
         ("range_m", np.float64),  # at its newest packet
         ("walked_m", np.float64),  # the tag's way at its newest packet
         ("is_relayed", np.int64),  # whether others relay its packets
+        ("has_tx_noise", np.int64),  # whether its newest packet's TX noise is a state
         ("packets", np.int64),
         ("outliers_in_row", np.int64),
         ("outlier_m", np.float64),  # the newest of them
@@ -120,7 +115,7 @@ class EstimatorState(NamedTuple):
     P: Matrix
     """Shape (n, n), symmetric to the bit."""
     V: Matrix
-    """What faults do to x, shape (n, 2·anchors + dim): for each metre by which the tag's receptions of an anchor have
+    """What faults do to x, shape (2·anchors + dim, n): for each metre by which the tag's receptions of an anchor have
     been late since it joined, the same lately, and for each m/s² of acceleration along an axis."""
     information: Matrix
     """Of both kinds of faults of all anchors in the innovations, shape (2, anchors, anchors)."""
@@ -147,38 +142,50 @@ class EstimatorState(NamedTuple):
     """By how much each fault is in the innovation at hand, shape (2·anchors + dim,)."""
 
 
-@kernel
-def anchor_state(dim: int, anchor: int) -> int:
-    """Where an anchor's states begin."""
-    return 2 * dim + PER_ANCHOR * anchor
+class Layout(NamedTuple):
+    """Where the states of n anchors stand."""
+
+    offset: int
+    """Of the first anchor's offset; the others' follow, as in all blocks."""
+    velocity: int
+    rate: int
+    tx_noise: int
+    change: int
+    constant: int
+    slope: int
+    """States before it are updated by all measurements."""
+    survey: int
+    """``dim`` states for each anchor."""
+    end: int
 
 
-@kernel
-def slope_state(dim: int, anchors: int) -> int:
-    """Where the slope stands: all states before it are updated by all measurements."""
-    return 2 * dim + PER_ANCHOR * anchors
-
-
-@kernel
-def survey_state(dim: int, anchors: int, anchor: int) -> int:
-    """Where an anchor's survey error begins."""
-    return 2 * dim + PER_ANCHOR * anchors + 1 + dim * anchor
+@jitted
+def layout(dim: int, anchors: int) -> Layout:
+    """Where what stands."""
+    values = dim + anchors
+    behind = 2 * values
+    slope = behind + 3 * anchors
+    return Layout(
+        dim, values, values + dim, behind, behind + anchors, behind + 2 * anchors, slope, slope + 1,
+        slope + 1 + dim * anchors,
+    )  # fmt: skip
 
 
 def new_state(settings: EstimatorSettings, table_size: int) -> EstimatorState:
     """A state without anchors at the origin, for a table of so many."""
     dim = settings.dim
-    n = 2 * dim + 1
+    where = layout(dim, 0)
+    n = where.end
     status = np.zeros(1, STATUS)
     status["q_scale"] = status["mean_nis"] = 1.0
     status["walk_scale"] = START_WALK_SCALE
     status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
     P = np.zeros((n, n))
-    P[2 * dim, 2 * dim] = settings.slope_std_m**2
+    P[where.slope, where.slope] = settings.slope_std_m**2
     return EstimatorState(
         x=np.zeros(n),
         P=P,
-        V=np.zeros((n, dim)),
+        V=np.zeros((dim, n)),
         information=np.zeros((2, 0, 0)),
         evidence=np.zeros((2, 0)),
         anchors=np.zeros(0, ANCHOR),
@@ -215,10 +222,10 @@ def with_anchor(s: EstimatorState, table_index: int, position_m: Vector) -> Esti
         pair_variance = PAIR_STD_M**2
     for link in (grown.links[count], grown.links[:, count]):
         link["tx_ticks"], link["variance_m2"] = NEVER, pair_variance
-    first = anchor_state(dim, count)
-    grown.P[first + CHANGE, first + CHANGE] = settings["place_std_m"] ** 2
-    grown.P[first + CONSTANT, first + CONSTANT] = settings["range_std_m"] ** 2
-    survey = survey_state(dim, count + 1, count)
+    where = layout(dim, count + 1)
+    grown.P[where.change + count, where.change + count] = settings["place_std_m"] ** 2
+    grown.P[where.constant + count, where.constant + count] = settings["range_std_m"] ** 2
+    survey = where.survey + dim * count
     for axis in range(dim):
         grown.P[survey + axis, survey + axis] = settings["survey_std_m"] ** 2
     grown.index_of[table_index] = count
@@ -240,21 +247,23 @@ def with_table(s: EstimatorState, table_size: int) -> EstimatorState:
 def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
     """The state with these of its anchors, in this order; −1 stands for a new one, all zeros."""
     dim, old, new = int(s.settings[0]["dim"]), len(s.anchors), len(kept)
-    states = list(range(2 * dim))
+    was = layout(dim, old)
+    states = list(range(dim))
+    states += [was.offset + anchor if anchor >= 0 else -1 for anchor in kept]
+    states += range(was.velocity, was.velocity + dim)
+    for block in (was.rate, was.tx_noise, was.change, was.constant):
+        states += [block + anchor if anchor >= 0 else -1 for anchor in kept]
+    states.append(was.slope)
     for anchor in kept:
-        first = anchor_state(dim, anchor)
-        states += [-1] * PER_ANCHOR if anchor < 0 else range(first, first + PER_ANCHOR)
-    states.append(slope_state(dim, old))
-    for anchor in kept:
-        first = survey_state(dim, old, anchor)
+        first = was.survey + dim * anchor
         states += [-1] * dim if anchor < 0 else range(first, first + dim)
-    columns = [*kept, *(old + anchor if anchor >= 0 else -1 for anchor in kept), *range(2 * old, 2 * old + dim)]
+    faults = [*kept, *(old + anchor if anchor >= 0 else -1 for anchor in kept), *range(2 * old, 2 * old + dim)]
     n = len(states)
     index_of = np.full_like(s.index_of, -1)
     result = s._replace(
         x=_take(s.x, states),
         P=_take(s.P, states, states),
-        V=_take(s.V, states, columns),
+        V=_take(s.V, faults, states),
         information=np.stack([_take(part, kept, kept) for part in s.information]),
         evidence=np.stack([_take(part, kept) for part in s.evidence]),
         anchors=_take(s.anchors, kept),
