@@ -129,6 +129,16 @@ def test_faults_show_in_the_figures(run):
     assert silent["messages"] == pytest.approx(clean["messages"] * (1 - 4 / 6 / 6), rel=0.02)
 
 
+def test_the_room_is_the_lab_with_the_errors_of_rooms(run):
+    """The same seed again gives the same room; paths may be given there, with their speed."""
+    base = ["--method", "tracker", "--tags", "3", "--duration", "5", "--json"]
+    lab, room, again = (report(run("--scenario", name, *base)) for name in ("lab", "room", "room"))
+    assert (lab["site"], room["site"], room["tags"]) == ("lab", "room", 3)
+    assert room["rmse_m"] == again["rmse_m"] > 1.5 * lab["rmse_m"]
+    walk = ["--waypoints", "1,1;5,1;5,7", "--speed", "2", "--duration", "3", "--json"]
+    assert report(run("--scenario", "room", *walk))["tags"] == 1
+
+
 @pytest.mark.parametrize("method", ["weighted", "tracker"])
 def test_deaf_tags_make_no_fix_and_find_themselves_again(run, tmp_path, method):
     base = ["--method", method, "--duration", "8", "--fixes-csv", "fixes.csv", "--json"]
@@ -181,7 +191,9 @@ def test_a_table_for_people_has_no_control_characters(run):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--scenario", "moon"], ["--scenario", "moon", "lab"]),
+        (["--scenario", "moon"], ["--scenario", "moon", "lab or room"]),
+        (["--scenario", "room", "--site", "lab.toml"], ["--scenario", "--site", "not both"]),
+        (["--scenario", "room", "--speed", "2"], ["--speed", "--scenario room", "--waypoints"]),
         (["--scenario", "lab", "--site", "lab.toml"], ["--scenario", "--site", "not both"]),
         (["--integrity-risk", "0"], ["--integrity-risk"]),
         (["--integrity-risk", "1"], ["--integrity-risk"]),

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from skyless.simulation.trajectory import RandomWalk, Static, Waypoints
+from skyless.simulation.trajectory import RandomWalk, Roaming, Static, Waypoints
 
 SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0)]
 
@@ -113,3 +113,34 @@ def test_damped_walk_settles_at_its_speed():
         speeds.append(walk.velocity(20.0))
     low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * count) / (3 * count)
     assert low < np.mean(np.square(speeds)) / (qa * damping_s / 2.0) < high
+
+
+def test_roaming_keeps_its_spread_and_speed_from_the_start_on():
+    """Over 400 paths, at the start and much later; and velocities gain what a constant-velocity model says."""
+    count, qa, damping_s = 400, 0.3, 3.0
+    middle, spread = np.array([3.0, 4.0, 1.0]), np.array([0.8, 1.2, 0.3])
+    paths = [Roaming(middle, spread, qa_m2ps3=qa, damping_s=damping_s, seed=seed) for seed in range(count)]
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], count) / count
+    for t_s in (0.0, 12.35):
+        places = np.array([path.position(t_s) for path in paths])
+        motions = np.array([path.velocity(t_s) for path in paths])
+        for values, squared in ((places - middle, spread**2), (motions, np.full(3, 0.5 * qa * damping_s))):
+            shares = np.mean(values**2, axis=0) / squared
+            assert (shares > low).all()
+            assert (shares < high).all()
+    gained = np.array([path.velocity(12.45) for path in paths]) - motions
+    drawn = gained + 0.1 * ((0.5 * qa * damping_s / spread**2) * (places - middle) + motions / damping_s)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * count) / (3 * count)
+    assert low < np.mean(drawn[:, :2] ** 2) / (qa * 0.1) < 1.1 * high
+
+
+def test_roaming_is_smooth_and_a_function_of_time():
+    path, again = (Roaming((3, 4, 0), (0.8, 1.2, 0.0), seed=7) for _ in range(2))
+    times = [12.0, 3.5, 0.0, 30.0, 12.0]
+    assert [path.position(t).tolist() for t in times] == [again.position(t).tolist() for t in times]
+    assert path.position(3.0).tolist() != Roaming((3, 4, 0), (0.8, 1.2, 0.0), seed=8).position(3.0).tolist()
+    track = np.array([path.position(0.001 * k) for k in range(10_000)])
+    motion = np.array([path.velocity(0.001 * k) for k in range(10_000)])
+    assert np.abs(np.diff(track, axis=0) / 0.001 - motion[:-1]).max() < 0.01
+    assert np.abs(np.diff(motion, axis=0)).max() < 0.001 * (5.0 * math.sqrt(0.3 / 0.05) + 5.0)
+    assert not track[:, 2].any()

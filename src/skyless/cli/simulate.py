@@ -21,7 +21,7 @@ from skyless.cli.options import (
 )
 from skyless.cli.output import print_json
 from skyless.cli.progress import progress_bar, status
-from skyless.cli.simulate_input import bias_of, delay_errors_of, outage_of, path_of, silence_of, site_of
+from skyless.cli.simulate_input import ROOM, bias_of, delay_errors_of, outage_of, path_of, silence_of, site_of
 from skyless.cli.simulate_output import COLUMNS, row_of, show
 from skyless.errors import SkylessError
 from skyless.methods import DEFAULT_METHOD
@@ -83,7 +83,8 @@ def simulate(
     Parameters
     ----------
     scenario
-        A named site: lab (six anchors on the walls of 6 m × 8 m, 2-D), the default.
+        A named site: lab (six anchors on the walls of 6 m × 8 m, 2-D), the default; room (the lab as real rooms are:
+        anchors 2 cm off per axis, ranges 5 cm off, and more with the distance, tags with random acceleration).
     site
         A site file instead of a named one.
     method
@@ -96,7 +97,7 @@ def simulate(
     tags
         How many tags walk about where neither --position nor --waypoints is given; 1 by default.
     speed
-        How fast tags walk, in m/s; 1 by default.
+        How fast tags walk, in m/s; 1 by default. In the room only for --waypoints.
     qa
         Agility that the tracker assumes, m²/s³.
     integrity_risk
@@ -136,6 +137,7 @@ def simulate(
     json
         Write one JSON object instead of the table.
     """
+    from skyless.experiments.room import Room
     from skyless.experiments.scenarios import Request
 
     spare_inputs("fixes-csv", fixes_csv, site)
@@ -143,6 +145,11 @@ def simulate(
         raise SkylessError("--position is for tags that lie still, --tags and --speed for tags that walk; give either")
     if waypoints and tags is not None:
         raise SkylessError("--waypoints is the path of one tag, --tags a number of tags that walk about; give either")
+    if scenario == ROOM and speed is not None and not waypoints:
+        raise SkylessError(
+            "--speed is for tags that walk from point to point; those of --scenario room accelerate at "
+            "random, or give --waypoints"
+        )
     request = Request(
         site=site_of(scenario, site),
         method=method,
@@ -165,6 +172,7 @@ def simulate(
         outages=tuple(outage_of(text) for text in outage or ()),
         delay_errors=delay_errors_of(delay_error or []),
         silences=tuple(silence_of(text) for text in deaf or ()),
+        room=Room() if scenario == ROOM else None,
     )
     until_s = duration if duration is not None else (math.inf if fixes is not None else _USUAL_S)
     if warmup >= until_s:

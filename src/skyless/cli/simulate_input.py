@@ -23,8 +23,13 @@ _LONGEST_DELAY_NS: Final = 1000.0
 """Of an antenna, as far as a site file can tell it."""
 
 
+ROOM: Final = "room"
+
+
 def site_of(scenario: str | None, file: Path | None) -> "Site":
     """The site of that name, or in that file; the lab by default. Raises SkylessError."""
+    from msgspec.structs import replace
+
     from skyless.site.lab import lab_site
     from skyless.site.load import load_site
 
@@ -32,9 +37,9 @@ def site_of(scenario: str | None, file: Path | None) -> "Site":
         if scenario is not None:
             raise SkylessError("give either --scenario or --site, not both")
         return load_site(file)
-    if scenario not in {None, "lab"}:
-        raise SkylessError(f"--scenario is {scenario!r}; it should be lab (or give a site file with --site)")
-    return lab_site()
+    if scenario not in {None, "lab", ROOM}:
+        raise SkylessError(f"--scenario is {scenario!r}; it should be lab or room (or give a site file with --site)")
+    return replace(lab_site(), name=ROOM) if scenario == ROOM else lab_site()
 
 
 def path_of(text: str) -> tuple[tuple[float, ...], ...]:

@@ -10,11 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from skyless.experiments.deaf_receiver import DeafReceiver
 from skyless.experiments.fleet import Fleet, FleetSettings
+from skyless.experiments.room import Room, displacements, wanderer
 from skyless.methods import DEFAULT_METHOD
 from skyless.positioning.protection import IntegrityRequirement
 from skyless.simulation.channel import ChannelModel
-from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage
+from skyless.simulation.impairments import AnchorBias, AnchorOutage, Body, DelayError, Impairments, Outage, WarmUp
 from skyless.simulation.oscillator import OscillatorModel, Temperature
+from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Static, Trajectory, Waypoints
 from skyless.site.model import Site
 
@@ -45,7 +47,7 @@ class Request(Struct, frozen=True):
     tags: int = 1
     """How many tags walk about where neither positions nor paths are given."""
     speed_mps: float = 1.0
-    """Speed of the tags that walk."""
+    """Speed of the tags that walk; those of a room wander with random acceleration instead."""
     qa: float = 0.3
     integrity: IntegrityRequirement = IntegrityRequirement()
     warmup_s: float = 2.0
@@ -64,6 +66,11 @@ class Request(Struct, frozen=True):
     """Antenna delays that the site file has wrong, one entry an anchor at most."""
     silences: tuple[Outage, ...] = ()
     """When all tags' radios are deaf; their counters go on."""
+    room: Room | None = None
+    """Errors of survey and ranges; None for anchors that stand where the site file says and ranges without errors."""
+    body: Body | None = None
+    warm_ups: tuple[WarmUp, ...] = ()
+    walls_between_anchors: bool = True
 
 
 def fleet_of(request: Request) -> Fleet:
@@ -88,7 +95,7 @@ def fleet_of(request: Request) -> Fleet:
 
 def impairments_of(request: Request, site: Site) -> Impairments:
     """Noise and faults: the site's noise figures are taken for true."""
-    noise = site.noise
+    noise, room = site.noise, request.room
     return Impairments(
         tx_stamp_ps=noise.tx_stamp_ps,
         rx_stamp_ps=noise.rx_stamp_ps,
@@ -101,21 +108,37 @@ def impairments_of(request: Request, site: Site) -> Impairments:
             loss_probability=request.loss,
             nlos_probability=request.nlos,
             nlos_mean_m=request.nlos_mean_m,
+            walls_between_anchors=request.walls_between_anchors,
             power_bias=request.power_bias,
         ),
         anchor_biases=request.biases,
         delay_errors=request.delay_errors,
         anchor_outages=request.outages,
+        anchor_displacements=() if room is None else displacements(room, site, request.seed),
+        range_errors=RangeErrorModel() if room is None else room.ranges,
+        body=request.body,
+        warm_ups=request.warm_ups,
         diagnostics=request.diagnostics,
     )
 
 
 def trajectories_of(request: Request) -> list[Trajectory]:
-    """Tags at the given positions and on the given paths, else walking about inside the box around the anchors."""
+    """Tags at the given positions and on the given paths, else walking about inside the box around the anchors.
+
+    Those of a room wander with random acceleration.
+    """
     height_m = request.site.tags.height_m or 0.0
     given: list[Trajectory] = [Static(*_with_height(point, height_m)) for point in request.positions_m]
     given += [_path([_with_height(p, height_m) for p in path], request.speed_mps) for path in request.paths_m]
-    return given or [_walk(request, index) for index in range(request.tags)]
+    if given or request.room is None:
+        return given or [_walk(request, index) for index in range(request.tags)]
+    return wanderers(request.site, request.tags, request.seed)
+
+
+def wanderers(site: Site, tags: int, seed: int) -> list[Trajectory]:
+    """Tags that wander with random acceleration inside the box around the anchors."""
+    low, high = _walkable_box(site)
+    return [wanderer(low, high, seed, tag) for tag in range(tags)]
 
 
 def _with_height(point: tuple[float, ...], height_m: float) -> tuple[float, float, float]:

@@ -54,6 +54,8 @@ class ChannelModel(Struct, frozen=True, forbid_unknown_fields=True):
     """Mean of the exponential delay of such a message."""
     nlos_between_anchors: bool = False
     """Whether anchors, too, hear each other late."""
+    walls_between_anchors: bool = True
+    """Whether walls make anchors, too, hear each other late; they weaken all messages either way."""
     power_bias: bool = False
     """Whether RX stamps carry the power-dependent bias (APS011, 500 MHz, PRF 64 MHz)."""
     power_noise_db: float = 0.5

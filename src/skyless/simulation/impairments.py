@@ -6,6 +6,7 @@ from msgspec import Struct
 
 from skyless.simulation.channel import ChannelModel
 from skyless.simulation.oscillator import OscillatorModel
+from skyless.simulation.range_errors import RangeErrorModel
 
 
 class AnchorBias(Struct, frozen=True, forbid_unknown_fields=True):
@@ -17,9 +18,14 @@ class AnchorBias(Struct, frozen=True, forbid_unknown_fields=True):
     """Length of a burst; None for a bias that is always there."""
     pause_s: float = 5.0
     """Time between bursts; the first burst begins after one pause."""
+    from_s: float = 0.0
+    to_s: float = math.inf
+    """With ``from_s``: the true time in which there is a bias, or bursts of it, at all."""
 
     def active_m(self, t_s: float) -> float:
         """Bias at a true time, 0 between bursts."""
+        if not self.from_s <= t_s < self.to_s:
+            return 0.0
         if self.burst_s is None or t_s % (self.burst_s + self.pause_s) >= self.pause_s:
             return self.bias_m
         return 0.0
@@ -31,6 +37,43 @@ class DelayError(Struct, frozen=True, forbid_unknown_fields=True):
     anchor: int
     tx_ticks: float = 0.0
     rx_ticks: float = 0.0
+
+
+class AnchorDisplacement(Struct, frozen=True, forbid_unknown_fields=True):
+    """True minus told position of an anchor: frames fly from and to the true one, machines know the told one."""
+
+    anchor: int
+    x_m: float = 0.0
+    y_m: float = 0.0
+    z_m: float = 0.0
+
+
+class WarmUp(Struct, frozen=True, forbid_unknown_fields=True):
+    """A crystal whose frequency changes, beside all else, by ppm·(1 − exp(−(t − start_s)/tau_s)) from a time on.
+
+    Raises:
+        ValueError: the time constant is not more than 0.
+    """
+
+    ppm: float
+    tau_s: float
+    start_s: float = 0.0
+    anchor: int | None = None
+    """Whose crystal; None for those of all tags. A second one of the same crystal takes the place of the first."""
+
+    def __post_init__(self) -> None:
+        if not self.tau_s > 0.0:
+            raise ValueError(f"a crystal warms up with tau_s {self.tau_s:g}; it should be more than 0 s")
+
+
+class Body(Struct, frozen=True, forbid_unknown_fields=True):
+    """Whoever carries a tag: late at every tag are the anchors in a sector that turns with the tag's motion."""
+
+    delay_m: float = 0.2
+    sector_rad: float = math.radians(100.0)
+    """Full width of the sector, on the floor plan."""
+    direction_rad: float = math.pi
+    """Middle of the sector, from the direction of motion; by default behind the tag. A tag at rest faces along x."""
 
 
 class Outage(Struct, frozen=True, forbid_unknown_fields=True):
@@ -59,5 +102,9 @@ class Impairments(Struct, frozen=True, forbid_unknown_fields=True):
     anchor_biases: tuple[AnchorBias, ...] = ()
     delay_errors: tuple[DelayError, ...] = ()
     anchor_outages: tuple[AnchorOutage, ...] = ()
+    anchor_displacements: tuple[AnchorDisplacement, ...] = ()
+    range_errors: RangeErrorModel = RangeErrorModel()
+    body: Body | None = None
+    warm_ups: tuple[WarmUp, ...] = ()
     diagnostics: bool = False
     """Whether receptions carry power and carrier offset."""

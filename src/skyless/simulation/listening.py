@@ -22,7 +22,8 @@ from skyless.simulation.channel import (
 )
 from skyless.simulation.ether import OUTCOMES, Outcome
 from skyless.simulation.oscillator import advance, clock_rate
-from skyless.simulation.stations import coordinate_m, velocity_mps
+from skyless.simulation.range_errors import slope_error_m
+from skyless.simulation.stations import body_m, coordinate_m, velocity_mps
 from skyless.simulation.streams import draw_normal, draw_uniform
 from skyless.ticks import TICK_MASK
 
@@ -72,6 +73,8 @@ def link(
             coordinate_m(stations, listener, 0, t_s),
             coordinate_m(stations, listener, 1, t_s),
         )
+        if stations[listener]["is_tag"] == 0 and channel[0]["walls_between_anchors"] == 0.0:
+            delay_m = 0.0
     power_dbm = received_power_dbm(channel[0]["tx_power_dbm"], distance_m, loss_db)
     return distance_m, delay_m, power_dbm, product / max(distance_m, 1e-9)
 
@@ -207,13 +210,16 @@ def hear(
     emission_fraction: float,
     span_s: tuple[float, float],
     bias_m: float,
+    range_errors_m: NDArray[np.float64],
+    slope_m: float,
     diagnostics: bool,
     heard: NDArray[np.void],
     tally: NDArray[np.int64],
 ) -> tuple[int, int, int]:
     """Let every node that is on listen to one frame.
 
-    ``span_s`` is the frame's begin and end from its RMARKER, ``others`` as from ``OnAir.others``. Fills ``heard``
+    ``span_s`` is the frame's begin and end from its RMARKER, ``others`` as from ``OnAir.others``, ``range_errors_m``
+    has shape (nodes, anchors), and ``slope_m`` is that of ``RangeErrorModel``. Fills ``heard``
     (``RECEIVED``, one row a node that heard it) and counts into ``tally``, shape (2, outcomes), anchors and tags.
     Returns how many anchors and how many nodes heard it, and the highest cursor.
     """
@@ -233,8 +239,11 @@ def hear(
         if outcome == _HEARD:
             row = heard[count]
             place(stations, node, t_s, row)
-            extra_m += late_m(stations, channel, normals, cursors, node, bias_m)
-            arrival_ticks = emission_fraction + (distance_m + extra_m) / TICK_M
+            extra_m += late_m(stations, channel, normals, cursors, node, bias_m) + body_m(stations, sender, node, t_s)
+            error_m = range_errors_m[node, sender]
+            if station["is_tag"] != 0:
+                error_m += slope_error_m(slope_m, distance_m)
+            arrival_ticks = emission_fraction + (distance_m + extra_m + error_m) / TICK_M
             if diagnostics:
                 measure(clocks, channel, normals, cursors, sender, node, (power_dbm, extra_m, range_rate_mps), row)
             error_ticks = station["rx_error_ticks"] + channel[0]["power_bias"] * power_bias_m(power_dbm) / TICK_M

@@ -22,7 +22,8 @@ from skyless.simulation.channel import pack_channel, pack_walls
 from skyless.simulation.ether import OUTCOMES, Flight, OnAir
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.listening import RECEIVED, hear
-from skyless.simulation.oscillator import advance, emit, foresee, make_clocks, restart_counter
+from skyless.simulation.oscillator import advance, emit, foresee, make_clocks, restart_counter, warm_up
+from skyless.simulation.range_errors import RangeErrors
 from skyless.simulation.stations import TagSpec, make_stations, set_piece
 from skyless.simulation.streams import ANCHOR_KEY, TAG_KEY, Streams, stream
 from skyless.simulation.timeline import Timeline
@@ -78,7 +79,11 @@ class Medium(Generic[Told]):
         self._setups = [stream(seed, *key, purpose=1) for key in keys]
         self._streams = Streams([stream(seed, *key) for key in keys])
         self.clocks = make_clocks(impairments.oscillator, self._setups)
+        self._warm_up()
         self.stations = make_stations(site.anchors, self._tags, impairments)
+        self.range_errors = RangeErrors(
+            impairments.range_errors, [tag.range_errors_m for tag in self._tags], len(site.anchors), seed
+        )
         self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
         self._piece_ends_s = np.full(len(self._tags), -math.inf)
         self.boots = [0] * len(keys)
@@ -118,6 +123,13 @@ class Medium(Generic[Told]):
             restart_counter(self.clocks, node, self._setups[node])
 
     # Clocks
+
+    def _warm_up(self) -> None:
+        """Let crystals warm up, those of all tags where no anchor is named."""
+        every_tag = range(len(self._anchors), len(self.clocks))
+        for one in self._impairments.warm_ups:
+            for node in every_tag if one.anchor is None else (self.node_of[one.anchor],):
+                warm_up(self.clocks, node, one.ppm, one.start_s, one.tau_s)
 
     def read_counter(self, node: int) -> int:
         """Bring a node to the present and return its unwrapped counter."""
@@ -172,6 +184,7 @@ class Medium(Generic[Told]):
         flight.emission_ticks, flight.emission_fraction = ticks, fraction
         t_s = ticks * TICK_S
         self._move_tags(t_s)
+        self.range_errors.pass_to(t_s, self.stations)
         anchors, count, highest = hear(
             self.clocks,
             normals,
@@ -185,6 +198,8 @@ class Medium(Generic[Told]):
             fraction,
             ((flight.begin_ticks - flight.marker_ticks) * TICK_S, (flight.end_ticks - flight.marker_ticks) * TICK_S),
             self._bias_m(node, t_s),
+            self.range_errors.present_m,
+            self._impairments.range_errors.slope_m,
             self._impairments.diagnostics,
             self._heard,
             self._counts,
@@ -204,8 +219,10 @@ def _check_names(faults: Impairments, node_of: dict[int, int]) -> None:
         ("anchor_biases", faults.anchor_biases),
         ("delay_errors", faults.delay_errors),
         ("anchor_outages", faults.anchor_outages),
+        ("anchor_displacements", faults.anchor_displacements),
+        ("warm_ups", faults.warm_ups),
     ):
-        unknown = {value.anchor for value in values} - node_of.keys()
+        unknown = {value.anchor for value in values if value.anchor is not None} - node_of.keys()
         if unknown:
             known = ", ".join(map(str, node_of))
             raise ValueError(f"{name} names anchor {min(unknown)}; it should be one of the site's: {known}")

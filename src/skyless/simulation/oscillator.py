@@ -36,6 +36,9 @@ CLOCK: Final = np.dtype(
         ("swing_k", np.float64),
         ("swing_rad_per_s", np.float64),
         ("swing_phase_rad", np.float64),
+        ("drift", np.float64),  # fractional frequency that a warm-up adds in the end
+        ("drift_start_s", np.float64),
+        ("drift_tau_s", np.float64),
     ],
     align=True,
 )
@@ -93,6 +96,13 @@ def _set_temperature(clock: np.void, temperature: Temperature | None, phase_rad:
     clock["swing_phase_rad"] = phase_rad
 
 
+def warm_up(clocks: NDArray[np.void], node: int, ppm: float, start_s: float, tau_s: float) -> None:
+    """Let a node's crystal warm up from ``start_s`` on, with the time constant ``tau_s``, by ``ppm`` in the end."""
+    clocks[node]["drift"] = ppm * 1e-6
+    clocks[node]["drift_start_s"] = start_s
+    clocks[node]["drift_tau_s"] = tau_s
+
+
 def restart_counter(clocks: NDArray[np.void], node: int, generator: np.random.Generator) -> None:
     """Give a node that was switched on again a new counter; its crystal stays what it was."""
     clocks[node]["local_ticks"] = generator.integers(WRAP_TICKS)
@@ -109,6 +119,9 @@ def clock_rate(clocks: NDArray[np.void], node: int) -> float:
         warm_up_k = clock["warm_up_k"] * (1.0 - math.exp(-t_s / clock["warm_up_s"]))
         swing_k = clock["swing_k"] * math.sin(clock["swing_rad_per_s"] * t_s + clock["swing_phase_rad"])
         rate += clock["per_kelvin"] * (warm_up_k + swing_k)
+    if clock["drift"] != 0.0:
+        since_s = max(clock["true_ticks"] * TICK_S - clock["drift_start_s"], 0.0)
+        rate += clock["drift"] * (1.0 - math.exp(-since_s / clock["drift_tau_s"]))
     return rate
 
 
@@ -123,6 +136,18 @@ def temperature_phase_s(clocks: NDArray[np.void], node: int, from_s: float, to_s
     if omega != 0.0:
         swing = (math.cos(omega * from_s + phase) - math.cos(omega * to_s + phase)) / omega
     phase_s: float = clock["per_kelvin"] * (clock["warm_up_k"] * warm_up + clock["swing_k"] * swing)
+    return phase_s
+
+
+@kernel
+def drift_phase_s(clocks: NDArray[np.void], node: int, from_s: float, to_s: float) -> float:
+    """Phase in seconds that a warm-up adds between two true times: its rate, integrated in closed form."""
+    clock = clocks[node]
+    start_s, tau_s = clock["drift_start_s"], clock["drift_tau_s"]
+    since_s, until_s = max(from_s - start_s, 0.0), max(to_s - start_s, 0.0)
+    warmed_s = until_s - since_s
+    bent_s = tau_s * math.exp(-since_s / tau_s) * math.expm1(-warmed_s / tau_s)
+    phase_s: float = clock["drift"] * (warmed_s + bent_s)
     return phase_s
 
 
@@ -147,6 +172,9 @@ def advance(
     if clock["per_kelvin"] != 0.0:
         from_s = clock["true_ticks"] * TICK_S
         gain += temperature_phase_s(clocks, node, from_s, from_s + dt_s) * TICK_RATE_HZ
+    if clock["drift"] != 0.0:
+        from_s = clock["true_ticks"] * TICK_S
+        gain += drift_phase_s(clocks, node, from_s, from_s + dt_s) * TICK_RATE_HZ
     if dt_s > 0.0:
         white, walk = clock["white_fm"], clock["random_walk_fm"]
         rate_gain = walk * math.sqrt(dt_s) * draw_normal(normals, cursors, node)

@@ -1,5 +1,6 @@
 """Where the nodes of a world are and how good their radios are, as the kernels see it."""
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -21,6 +22,8 @@ class TagSpec(Struct, frozen=True):
     rx_delay_error_ticks: float = 0.0
     """True minus configured antenna delay."""
     outages: tuple[Outage, ...] = ()
+    range_errors_m: tuple[float, ...] = ()
+    """By how much it hears each anchor late at all times, in the order of the site file; () for not at all."""
 
 
 STATION: Final = np.dtype(
@@ -35,6 +38,9 @@ STATION: Final = np.dtype(
         ("rx_noise_ticks", np.float64),
         ("tx_error_ticks", np.float64),  # true minus configured antenna delay
         ("rx_error_ticks", np.float64),
+        ("body_m", np.float64),  # delay through whoever carries the tag, 0 for nobody
+        ("body_direction_rad", np.float64),
+        ("body_cosine", np.float64),  # of half the sector's width
     ],
     align=True,
 )
@@ -48,9 +54,15 @@ def make_stations(anchors: Sequence[AnchorSite], tags: Sequence[TagSpec], impair
     stations["rx_noise_ticks"] = impairments.rx_stamp_ps * 1e-12 / TICK_S
     stations["is_tag"][len(anchors) :] = 1
     stations["rx_error_ticks"][len(anchors) :] = [tag.rx_delay_error_ticks for tag in tags]
+    body = impairments.body
+    if body is not None:
+        carried = stations[len(anchors) :]
+        carried["body_m"], carried["body_direction_rad"] = body.delay_m, body.direction_rad
+        carried["body_cosine"] = math.cos(0.5 * body.sector_rad)
     errors = {error.anchor: error for error in impairments.delay_errors}
+    shifts_m = {shift.anchor: (shift.x_m, shift.y_m, shift.z_m) for shift in impairments.anchor_displacements}
     for station, anchor in zip(stations, anchors, strict=False):
-        station["position_m"] = (anchor.x_m, anchor.y_m, anchor.z_m)
+        station["position_m"] = np.add((anchor.x_m, anchor.y_m, anchor.z_m), shifts_m.get(anchor.id, (0.0, 0.0, 0.0)))
         if anchor.id in errors:
             station["tx_error_ticks"] = errors[anchor.id].tx_ticks
             station["rx_error_ticks"] = errors[anchor.id].rx_ticks
@@ -81,3 +93,18 @@ def velocity_mps(stations: NDArray[np.void], node: int, axis: int, t_s: float) -
     s = stations[node]
     velocity: float = s["velocity_mps"][axis] + (t_s - s["origin_s"]) * s["acceleration_mps2"][axis]
     return velocity
+
+
+@kernel
+def body_m(stations: NDArray[np.void], sender: int, node: int, t_s: float) -> float:
+    """Delay of a sender's messages through the body that carries a listener, 0 where that does not stand between."""
+    s = stations[node]
+    delay_m: float = s["body_m"]
+    if delay_m == 0.0:
+        return 0.0
+    east_m = coordinate_m(stations, sender, 0, t_s) - coordinate_m(stations, node, 0, t_s)
+    north_m = coordinate_m(stations, sender, 1, t_s) - coordinate_m(stations, node, 1, t_s)
+    heading = math.atan2(velocity_mps(stations, node, 1, t_s), velocity_mps(stations, node, 0, t_s))
+    towards = heading + s["body_direction_rad"]
+    along_m = east_m * math.cos(towards) + north_m * math.sin(towards)
+    return delay_m if along_m >= s["body_cosine"] * math.hypot(east_m, north_m) else 0.0

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from skyless.simulation.streams import stream
 
 _WALK_KEY: Final = 2
+_ROAM_KEY: Final = 5
 
 
 class Piece(NamedTuple):
@@ -234,6 +235,59 @@ class RandomWalk(Trajectory):
                 if hit_s < first_s:
                     axis_hit, first_s = axis, hit_s
         return axis_hit, first_s
+
+
+class Roaming(Trajectory):
+    """Wandering about a place: random accelerations as of ``RandomWalk``, with nothing that turns a tag at once.
+
+    Damping and a spring hold it: each coordinate is normal about the middle, with ``spread_m``, and its velocity with a
+    standard deviation of √(qa·damping_s/2), from the start on. An axis whose spread is 0 does not move.
+    """
+
+    def __init__(
+        self,
+        middle_m: ArrayLike,
+        spread_m: ArrayLike,
+        *,
+        qa_m2ps3: float = 0.3,
+        damping_s: float = 3.0,
+        step_s: float = 0.05,
+        seed: int = 0,
+    ) -> None:
+        """``middle_m`` and ``spread_m`` have shape (3,); accelerations change every ``step_s``."""
+        self._middle_m, self._spread_m = np.array(middle_m, dtype=np.float64), np.array(spread_m, dtype=np.float64)
+        self._free = self._spread_m > 0.0
+        self._speed_mps = math.sqrt(0.5 * qa_m2ps3 * damping_s)
+        self._kick_mps2 = math.sqrt(qa_m2ps3 / step_s)
+        self._pull_per_s2 = np.square(self._speed_mps / np.where(self._free, self._spread_m, 1.0))
+        self._damping_s, self._step_s, self._seed = damping_s, step_s, seed
+        self._begin()
+
+    def piece(self, t_s: float) -> Piece:
+        """See ``Trajectory``; going back in time wanders again from the start."""
+        if t_s < self._piece.start_s:
+            self._begin()
+        while t_s >= self._piece.end_s:
+            last = self._piece
+            dt_s = last.end_s - last.origin_s
+            velocity = last.velocity_mps + dt_s * last.acceleration_mps2
+            position = last.position_m + dt_s * (last.velocity_mps + 0.5 * dt_s * last.acceleration_mps2)
+            self._push(position, velocity)
+        return self._piece
+
+    def _begin(self) -> None:
+        self._generator, self._steps = stream(self._seed, _ROAM_KEY, 0), 0
+        place, motion = self._generator.standard_normal((2, 3))
+        self._push(self._middle_m + self._spread_m * place, np.where(self._free, self._speed_mps * motion, 0.0))
+
+    def _push(self, position_m: NDArray[np.float64], velocity_mps: NDArray[np.float64]) -> None:
+        """Append a piece with an acceleration of its own."""
+        away_m = position_m + 0.5 * self._step_s * velocity_mps - self._middle_m  # halfway through the piece
+        held = -self._pull_per_s2 * away_m - velocity_mps / self._damping_s
+        push = np.where(self._free, held + self._kick_mps2 * self._generator.standard_normal(3), 0.0)
+        start_s = self._steps * self._step_s
+        self._steps += 1
+        self._piece = Piece(start_s, self._steps * self._step_s, start_s, position_m, velocity_mps, push)
 
 
 def _time_to_wall(gap_m: float, speed_mps: float, acceleration_mps2: float) -> float:
