@@ -62,7 +62,16 @@ def kernel(function: Function) -> Function:
     ``error_model="numpy"`` makes a division by zero an infinity instead of an exception, as in NumPy.
     Fast-math stays off: streaming and batch must give identical bits.
     """
-    return _compile(function, nogil=False)
+    return _compile(function, {})
+
+
+def part(function: Function) -> Function:
+    """Compile a small function only as lines of its callers, and by itself only where Python calls it.
+
+    A kernel of its own costs a twentieth of a second at the first start, however short it is, and its callers then
+    compile its instructions once more. What is long and has several callers is better a kernel.
+    """
+    return _compile(function, {"inline": "always"})
 
 
 def jitted(function: Function) -> Function:
@@ -76,19 +85,18 @@ def borrowing_kernel(function: Function) -> Function:
     References to arrays are not counted, nor their headers copied from call to call. With a dozen arrays both would
     take several times as long as the arithmetic.
     """
-    return _compile(function, nogil=True, borrowing=True)
+    return _compile(function, {"nogil": True, "_nrt": False, "forceinline": True})
 
 
 def threaded_kernel(function: Function) -> Function:
     """Compile a long loop that runs without the interpreter's lock, so that threads run it side by side."""
-    return _compile(function, nogil=True)
+    return _compile(function, {"nogil": True})
 
 
-def _compile(function: Function, *, nogil: bool, borrowing: bool = False) -> Function:
-    options: Any = {"_nrt": False, "forceinline": True} if borrowing else {}
+def _compile(function: Function, options: dict[str, Any]) -> Function:
     callers_folder = _CONFIG.CACHE_DIR
     _CONFIG.CACHE_DIR = _CACHE_FOLDER
     try:
-        return cast("Function", njit(cache=True, error_model="numpy", nogil=nogil, **options)(function))
+        return cast("Function", njit(cache=True, error_model="numpy", **options)(function))
     finally:
         _CONFIG.CACHE_DIR = callers_folder

@@ -7,7 +7,7 @@ the first synchronisation message, which leaves the method as it stands and its 
 
 from dataclasses import dataclass
 
-from skyless.compiled import kernel
+from skyless.compiled import part
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,19 +23,19 @@ class LinearClock:
         return self.offset_ticks + self.rate * true_ticks
 
 
-@kernel
+@part
 def relative_rate(rx_interval_anchor: float, tx_interval_master: float) -> float:
     """Relative rate ν̄_{i,m} of an anchor against the master from two messages (``eq:Synchro``)."""
     return rx_interval_anchor / tx_interval_master
 
 
-@kernel
+@part
 def relative_offset(rx_anchor: float, tx_master: float, rate: float, tof_ticks: float) -> float:
     """Relative offset ō_{i,m} of one synchronisation message, in ticks (``eq:SynchroOffset``)."""
     return rx_anchor - rate * tx_master - tof_ticks
 
 
-@kernel
+@part
 def averaged_offset(first: float, delayed: float) -> float:
     """Mean of the offsets of the two messages (``eq:AverageRelOff``).
 
@@ -44,13 +44,13 @@ def averaged_offset(first: float, delayed: float) -> float:
     return (first + delayed) / 2.0
 
 
-@kernel
+@part
 def to_master(ticks_anchor: float, rate: float, offset: float) -> float:
     """An anchor's reading on the master's scale (``eq:AnchorSync``), in ticks."""
     return (ticks_anchor - offset) / rate
 
 
-@kernel
+@part
 def synchronise(
     tx1_master: int, tx2_master: int, rx1_anchor: int, rx2_anchor: int, tof_ticks: float
 ) -> tuple[float, float]:

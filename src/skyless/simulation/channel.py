@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Struct, structs
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import kernel, part
 from skyless.constants import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS
 from skyless.site.model import WallSite
 
@@ -95,13 +95,13 @@ def cross_walls(walls: NDArray[np.float64], ax_m: float, ay_m: float, bx_m: floa
     return loss_db, delay_m
 
 
-@kernel
+@part
 def received_power_dbm(tx_power_dbm: float, distance_m: float, loss_db: float) -> float:
     """Power after free space and walls; nearer than 1 cm counts as 1 cm."""
     return tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 20.0 * math.log10(max(distance_m, 0.01)) - loss_db
 
 
-@kernel
+@part
 def power_bias_m(rx_power_dbm: float) -> float:
     """Range bias of an RX stamp by received power (APS011 in docs/radio.md): straight lines, held beyond the ends."""
     place = (_POWER_BIAS_FIRST_DBM - rx_power_dbm) / _POWER_BIAS_STEP_DB
@@ -111,14 +111,14 @@ def power_bias_m(rx_power_dbm: float) -> float:
     return bias_m
 
 
-@kernel
+@part
 def first_path_loss_db(extra_m: float) -> float:
     """How far the first path's power lies below the total for a message that comes so much late, or early."""
     late = 1.0 - math.exp(-max(extra_m, 0.0) / FIRST_PATH_SCALE_M)
     return LINE_OF_SIGHT_FIRST_PATH_DB + BLOCKED_FIRST_PATH_DB * late
 
 
-@kernel
+@part
 def delivery_probability(rx_power_dbm: float, sensitivity_dbm: float, width_db: float) -> float:
     """Chance that a frame of that power is received: logistic, 1/2 at the sensitivity."""
     return 1.0 / (1.0 + math.exp(min((sensitivity_dbm - rx_power_dbm) / width_db, 700.0)))

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import kernel, part
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.simulation.channel import (
     cross_walls,
@@ -79,7 +79,7 @@ def link(
     return distance_m, delay_m, power_dbm, product / max(distance_m, 1e-9)
 
 
-@kernel
+@part
 def overlapped(
     stations: NDArray[np.void],
     channel: NDArray[np.void],
@@ -109,7 +109,7 @@ def overlapped(
     return outcome
 
 
-@kernel
+@part
 def received(
     channel: NDArray[np.void], normals: NDArray[np.float64], cursors: NDArray[np.int64], node: int, power_dbm: float
 ) -> int:
@@ -128,7 +128,7 @@ def received(
     return _HEARD
 
 
-@kernel
+@part
 def late_m(
     stations: NDArray[np.void],
     channel: NDArray[np.void],
@@ -147,7 +147,7 @@ def late_m(
     return extra_m
 
 
-@kernel
+@part
 def stamp(
     clocks: NDArray[np.void],
     normals: NDArray[np.float64],
@@ -167,7 +167,7 @@ def stamp(
     return rx_ticks
 
 
-@kernel
+@part
 def place(stations: NDArray[np.void], node: int, t_s: float, row: np.void) -> None:
     """Fill in where a listener truly was and how it moved."""
     row["node"] = node
@@ -176,7 +176,7 @@ def place(stations: NDArray[np.void], node: int, t_s: float, row: np.void) -> No
         row["velocity_mps"][axis] = velocity_mps(stations, node, axis, t_s)
 
 
-@kernel
+@part
 def measure(
     clocks: NDArray[np.void],
     channel: NDArray[np.void],

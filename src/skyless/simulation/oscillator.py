@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import kernel, part
 from skyless.constants import TICK_RATE_HZ, TICK_S
 from skyless.simulation.streams import draw_normal
 from skyless.ticks import WRAP_TICKS
@@ -109,7 +109,7 @@ def restart_counter(clocks: NDArray[np.void], node: int, generator: np.random.Ge
     clocks[node]["local_fraction"] = generator.random()
 
 
-@kernel
+@part
 def clock_rate(clocks: NDArray[np.void], node: int) -> float:
     """Fractional frequency of the node's counter at its last instant, temperature included, dimensionless."""
     clock = clocks[node]
@@ -125,7 +125,7 @@ def clock_rate(clocks: NDArray[np.void], node: int) -> float:
     return rate
 
 
-@kernel
+@part
 def temperature_phase_s(clocks: NDArray[np.void], node: int, from_s: float, to_s: float) -> float:
     """Phase in seconds that the temperature adds between two true times: its rate, integrated in closed form."""
     clock = clocks[node]

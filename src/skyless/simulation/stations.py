@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import part
 from skyless.constants import TICK_S
 from skyless.simulation.impairments import Impairments, Outage
 from skyless.simulation.trajectory import Piece, Trajectory
@@ -77,7 +77,7 @@ def set_piece(stations: NDArray[np.void], node: int, piece: Piece) -> None:
     stations[node]["acceleration_mps2"] = piece.acceleration_mps2
 
 
-@kernel
+@part
 def coordinate_m(stations: NDArray[np.void], node: int, axis: int, t_s: float) -> float:
     """One coordinate of a node at a true time."""
     s = stations[node]
@@ -87,7 +87,7 @@ def coordinate_m(stations: NDArray[np.void], node: int, axis: int, t_s: float) -
     return coordinate
 
 
-@kernel
+@part
 def velocity_mps(stations: NDArray[np.void], node: int, axis: int, t_s: float) -> float:
     """One component of a node's velocity at a true time."""
     s = stations[node]

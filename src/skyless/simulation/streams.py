@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import part
 
 BLOCK: Final = 1024
 """Normals drawn ahead for each node."""
@@ -48,7 +48,7 @@ class Streams:
         self.cursors[node] = 0
 
 
-@kernel
+@part
 def draw_normal(normals: NDArray[np.float64], cursors: NDArray[np.int64], node: int) -> float:
     """Next standard normal of the node."""
     value: float = normals[node, cursors[node]]
@@ -56,7 +56,7 @@ def draw_normal(normals: NDArray[np.float64], cursors: NDArray[np.int64], node: 
     return value
 
 
-@kernel
+@part
 def draw_uniform(normals: NDArray[np.float64], cursors: NDArray[np.int64], node: int) -> float:
     """Next uniform number of the node in (0, 1): a normal through its own distribution function."""
     return 0.5 * math.erfc(-draw_normal(normals, cursors, node) / math.sqrt(2.0))
