@@ -47,12 +47,13 @@ class Receiver:
         qa: float = 0.3,
         z_bounds_m: tuple[float, float] | None = None,
         integrity: IntegrityRequirement | None = None,
+        max_acceleration_mps2: float = 0.0,
     ) -> None:
         """Make a tag that knows nothing yet.
 
         ``method`` is one of ``METHODS``; ``site`` the only site to listen to, by default the first that is heard;
         ``qa`` the tag's agility in m²/s³ (filters); ``z_bounds_m`` decides between mirror solutions; ``integrity``
-        is asked of the protection levels (``joint``).
+        is asked of the protection levels (``joint``), which cover accelerations up to ``max_acceleration_mps2``.
 
         Raises:
             ValueError: there is no such method.
@@ -62,7 +63,7 @@ class Receiver:
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self.almanac = AlmanacBook()
-        self._wanted = Wanted(method, qa, z_bounds_m, integrity or IntegrityRequirement())
+        self._wanted = Wanted(method, qa, z_bounds_m, integrity or IntegrityRequirement(), max_acceleration_mps2)
         self._site = site
         self._may_change_site = site is None
         self._site_heard_ticks = 0
@@ -190,7 +191,7 @@ class Receiver:
             if master is not None and book.schedule is not None and book.noise is not None:
                 schedule = schedule_from_page(book.schedule)
                 self._superframe_ticks = schedule.superframe_ticks
-                self._method = new_method(self._wanted, master, book.schedule, book.noise, self._time)
+                self._method = new_method(self._wanted, master, book.schedule, book.noise, book.accuracy, self._time)
                 self._observer.serve(self._method, schedule)
 
 

@@ -30,7 +30,7 @@ def site_of(scenario: str | None, file: Path | None) -> "Site":
     """The site of that name, or in that file; the lab by default. Raises SkylessError."""
     from msgspec.structs import replace
 
-    from skyless.site.lab import lab_site
+    from skyless.site.lab import ideal_lab_site, lab_site
     from skyless.site.load import load_site
 
     if file is not None:
@@ -39,7 +39,7 @@ def site_of(scenario: str | None, file: Path | None) -> "Site":
         return load_site(file)
     if scenario not in {None, "lab", ROOM}:
         raise SkylessError(f"--scenario is {scenario!r}; it should be lab or room (or give a site file with --site)")
-    return replace(lab_site(), name=ROOM) if scenario == ROOM else lab_site()
+    return replace(lab_site(), name=ROOM) if scenario == ROOM else ideal_lab_site()
 
 
 def path_of(text: str) -> tuple[tuple[float, ...], ...]:

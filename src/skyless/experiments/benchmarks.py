@@ -24,7 +24,7 @@ from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 NO_FILTERPY: Final = "filterpy is not installed; pip install 'skyless[bench]' adds it"
 WARM_S: Final = 2.0
@@ -138,7 +138,7 @@ def _joint(effort: Effort, *, mesh: bool) -> KernelSpeed:
 
 
 def _streaming(effort: Effort) -> StreamingSpeed:
-    site = lab_site()
+    site = ideal_lab_site()
     world = World(site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(3.0, 4.0))], lab_impairments(100.0), 1)
     heard = [reception for sent in world.run(WARM_S + effort.streaming_s) for _, reception, _ in sent.receptions()]
     warm = round(len(heard) * WARM_S / (WARM_S + effort.streaming_s))

@@ -21,7 +21,7 @@ from skyless.simulation.broadcast import diagnostics_of
 from skyless.simulation.dw1000.bus import HostLatency
 from skyless.simulation.medium import Delivery, Medium
 from skyless.simulation.stations import TagSpec
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.site.model import ScheduleSite, Site
 from skyless.ticks import wrap
 from skyless.uncertainty.bounds import bound_settings
@@ -66,7 +66,7 @@ class LatencyWorld:
     """The lab with another slot length on such hosts, deterministic by its seed."""
 
     def __init__(self, slot_s: float, latency: HostLatency, seed: int = 1) -> None:
-        lab = lab_site()
+        lab = ideal_lab_site()
         self.site = replace(lab, schedule=ScheduleSite(slot_s=slot_s))
         request = Request(self.site, seed=seed)
         self.trajectory = trajectories_of(request)[0]

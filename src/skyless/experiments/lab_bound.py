@@ -8,7 +8,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from skyless.experiments.monte_carlo import cores
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ def lab_tracking_bound_m(
     Tags start in the middle half of the room, each component of their velocity normal with 0.4 m/s, and accelerate
     at random (``qa``). ``mesh``: anchors also relay when they heard each other.
     """
-    site = lab_site()
+    site = ideal_lab_site()
     anchors = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     slot_s = site.schedule.slot_s
     settings = bound_settings(

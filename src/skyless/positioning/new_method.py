@@ -4,12 +4,12 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.air.almanac import NoisePage, SchedulePage
+from skyless.air.almanac import AccuracyPage, NoisePage, SchedulePage
 from skyless.clocks.filter import clock_noise
 from skyless.methods import FILTERS
+from skyless.positioning.estimation import Estimation
+from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.fix_time import FixTime
-from skyless.positioning.joint_settings import JointSettings
-from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.observation import Method
 from skyless.positioning.protection import IntegrityRequirement
 from skyless.positioning.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
@@ -20,10 +20,6 @@ from skyless.uncertainty.tdoa import stamp_variance_m2
 
 DROP_S: Final = 2.0
 """An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""
-
-LONGEST_FOR_JOINT_S: Final = 2.0
-"""In longer superframes a tag may be metres away when it hears an anchor again: the tracker serves instead, which needs
-no clock of an anchor for longer than a superframe."""
 
 
 class Wanted(Struct, frozen=True):
@@ -37,9 +33,13 @@ class Wanted(Struct, frozen=True):
     """Decides between mirror solutions."""
     integrity: IntegrityRequirement
     """What is asked of the protection levels (``joint``)."""
+    max_acceleration_mps2: float = 0.0
+    """The tag's largest acceleration, which the levels cover."""
 
 
-def new_method(wanted: Wanted, master: int, schedule: SchedulePage, noise: NoisePage, time: FixTime) -> Method:
+def new_method(
+    wanted: Wanted, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage, time: FixTime
+) -> Method:
     """Make the method for a site with this schedule and noise, where that anchor is the master."""
     superframe_s = to_seconds(schedule.slot_ticks * schedule.slots)
     if wanted.method not in FILTERS:
@@ -48,9 +48,9 @@ def new_method(wanted: Wanted, master: int, schedule: SchedulePage, noise: Noise
             master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, wanted.z_bounds_m
         )
         return Snapshots(SnapshotMethod(wanted.method), settings, time)
-    if wanted.method == "joint" and superframe_s <= LONGEST_FOR_JOINT_S:
-        joint = _joint_settings(wanted, schedule, noise, superframe_s)
-        return JointTracking(joint, wanted.z_bounds_m, time, superframe_s)
+    if wanted.method == "joint":
+        settings = _estimator_settings(wanted, schedule, noise, accuracy, superframe_s)
+        return Estimation(settings, wanted.z_bounds_m, time, superframe_s)
     return Tracking(_tracker_settings(wanted, schedule, noise), wanted.z_bounds_m, time, superframe_s)
 
 
@@ -59,10 +59,12 @@ def _stamp_variances(noise: NoisePage) -> tuple[float, float]:
     return stamp_variance_m2(noise.tx_stamp_s, rounded=False), stamp_variance_m2(noise.rx_stamp_s, rounded=True)
 
 
-def _joint_settings(wanted: Wanted, schedule: SchedulePage, noise: NoisePage, superframe_s: float) -> JointSettings:
+def _estimator_settings(
+    wanted: Wanted, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage, superframe_s: float
+) -> EstimatorSettings:
     tx_variance, rx_variance = _stamp_variances(noise)
     own = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
-    return JointSettings(
+    return EstimatorSettings(
         qa=wanted.qa,
         white=own.white,
         walk=own.walk,
@@ -70,6 +72,13 @@ def _joint_settings(wanted: Wanted, schedule: SchedulePage, noise: NoisePage, su
         rx_variance_m2=rx_variance,
         height_m=schedule.tag_height_m,
         drop_s=max(DROP_S, 4.0 * superframe_s),
+        survey_std_m=accuracy.survey_std_m,
+        range_std_m=accuracy.range_std_m,
+        slope_std_m=accuracy.slope_std_m,
+        place_std_m=accuracy.place_std_m,
+        place_distance_m=accuracy.place_distance_m,
+        place_time_s=accuracy.place_time_s,
+        max_acceleration_mps2=wanted.max_acceleration_mps2,
         integrity_risk=wanted.integrity.risk,
         alert_limit_m=wanted.integrity.alert_limit_m,
     )

@@ -10,8 +10,8 @@ from skyless.air.claim import Claim, claim_of
 from skyless.air.codec import packed_relays
 from skyless.air.schedule import Schedule
 from skyless.constants import MAX_DRIFT, TICK_M
+from skyless.positioning.estimation import Estimation
 from skyless.positioning.fix_time import SLACK_TICKS
-from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.observation import Method, Observation
 from skyless.positioning.snapshots import Snapshots
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, nearest
@@ -44,7 +44,7 @@ class Observer:
     def serve(self, method: Method, schedule: Schedule) -> None:
         """Make what this method asks for."""
         self._schedule = schedule
-        self._for_joint, self._for_snapshots = isinstance(method, JointTracking), isinstance(method, Snapshots)
+        self._for_joint, self._for_snapshots = isinstance(method, Estimation), isinstance(method, Snapshots)
 
     def observe(
         self,

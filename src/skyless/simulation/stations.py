@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import part
+from skyless.compiled import kernel, part
 from skyless.constants import TICK_S
 from skyless.simulation.impairments import Impairments, Outage
 from skyless.simulation.trajectory import Piece, Trajectory

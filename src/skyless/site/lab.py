@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from skyless.site.model import AccuracySite, AnchorSite, NoiseSite, ScheduleSite, Site, TagsSite
+from skyless.site.model import EXACT, AccuracySite, AnchorSite, NoiseSite, ScheduleSite, Site, TagsSite
 
 _ROOM: Final = AccuracySite()
 _PLACES = ((0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (6.0, 8.0), (0.0, 8.0), (0.0, 4.0))
@@ -12,7 +12,7 @@ def lab_site(noise_ps: float = 100.0, accuracy: AccuracySite = _ROOM) -> Site:
     """Six anchors on the walls of 6 m × 8 m, the first one the master; tags at the anchors' height (2-D).
 
     ``noise_ps``: noise of every TX and RX stamp that the filters assume. ``accuracy``: errors of survey and ranges
-    that they assume; by default those of a real room. The ideal world of the studies has none and passes ``EXACT``.
+    that they assume; by default those of a real room.
     """
     return Site(
         name="lab",
@@ -24,3 +24,8 @@ def lab_site(noise_ps: float = 100.0, accuracy: AccuracySite = _ROOM) -> Site:
         tags=TagsSite(height_m=0.0),
         accuracy=accuracy,
     )
+
+
+def ideal_lab_site(noise_ps: float = 100.0) -> Site:
+    """The lab with exact survey and ranges, as the simulated world has them where nothing else is asked for."""
+    return lab_site(noise_ps, EXACT)

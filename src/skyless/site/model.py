@@ -52,7 +52,7 @@ class AccuracySite(Struct, frozen=True, forbid_unknown_fields=True):
     slope_std_m: float = 0.05
     """Range error that depends on the received power: it is a constant times clip((d - 4 m) / 4 m, -1, 1) at a
     distance d, and this is the constant's standard deviation."""
-    place_std_m: float = 0.03
+    place_std_m: float = 0.005
     """Part of a range's error that changes as the tag moves (reflections)."""
     place_distance_m: float = 1.0
     """Distance moved over which that part changes."""

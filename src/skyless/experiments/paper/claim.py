@@ -12,7 +12,7 @@ from skyless.experiments.paper.section import Panel, Section, Verdict, grouped
 from skyless.experiments.paper.style import GREEN, INK, METHOD_COLOURS, MUTED, panel
 from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.trajectory import Static
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 METHODS: Final = ("literal", "weighted", "bracketed", "tracker")
 CLAIM_FIXES: Final = 30_000
@@ -62,7 +62,7 @@ def seed_of(plan: Plan, noise_ps: float) -> int:
 
 def run_world(progress: Progress, noise_ps: float, seed: int, fixes: int) -> list[Worst]:
     """One tag at P1, heard by all methods."""
-    site, impairments = lab_site(noise_ps), lab_impairments(noise_ps)
+    site, impairments = ideal_lab_site(noise_ps), lab_impairments(noise_ps)
     (tracks,) = listen(site, [Static(*P1)], METHODS, impairments, seed, progress, fixes=fixes)
     return [worst_of(method, noise_ps, seed, tracks[method].error_m) for method in METHODS]
 

@@ -9,11 +9,11 @@ from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.experiments.paper.plan import P1, P2, RADIO_PS, Plan, Results, Task
 from skyless.experiments.paper.section import Panel, Section, Verdict
 from skyless.experiments.paper.style import MAP, WHITE, floor, panel
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.uncertainty.dop import dops_at
 from skyless.uncertainty.tdoa import literal_covariance
 
-ANCHORS_M: Final = np.array([(anchor.x_m, anchor.y_m) for anchor in lab_site().anchors])
+ANCHORS_M: Final = np.array([(anchor.x_m, anchor.y_m) for anchor in ideal_lab_site().anchors])
 """The lab's anchors, shape (6, 2), the master first, in the order in which they speak."""
 
 STEP_M: Final = 0.1

@@ -16,7 +16,7 @@ from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, ScheduleSite, Site
 
 METHODS: Final = ("literal", "tracker")
@@ -44,7 +44,7 @@ class Count(Struct, frozen=True):
 
 def sites() -> dict[str, Site]:
     """The lab with its six slots of 2.5 ms, and seven nodes in slots of 2²⁷ ticks (2.1 ms), as short as the paper's."""
-    lab = lab_site(RADIO_PS)
+    lab = ideal_lab_site(RADIO_PS)
     seventh = AnchorSite(id=7, x_m=3.0, y_m=8.0)
     seven = replace(lab, anchors=(*lab.anchors, seventh), schedule=ScheduleSite())
     return {"six nodes, 2.5 ms": lab, "seven nodes, 2.1 ms": seven}

@@ -18,7 +18,7 @@ from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 FROM_S: Final = 0.6
 UNTIL_S: Final = 1.2
@@ -65,7 +65,7 @@ def tasks(plan: Plan) -> list[Task]:
 
 def run_world(progress: Progress, tags: int, seed: int) -> FleetResult:
     """Tags at P1 with radios and clocks of their own; places would only mix geometry into the comparison."""
-    site = lab_site(RADIO_PS)
+    site = ideal_lab_site(RADIO_PS)
     world = World(
         site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(*P1))] * tags, lab_impairments(RADIO_PS), seed
     )
@@ -207,7 +207,7 @@ def _rates(fleets: list[FleetResult]) -> Panel:
     figure = _logarithmic("Updates of each tag", fleets).figure
     (axes,) = figure.axes
     tags = np.array([fleet.tags for fleet in fleets], dtype=float)
-    slots_hz = 1.0 / (lab_site().schedule.slot_s)
+    slots_hz = 1.0 / (ideal_lab_site().schedule.slot_s)
     axes.set_yscale("log")
     axes.plot(tags, [fleet.fixes_per_s for fleet in fleets], "o-", color=BLUE, label="downlink: simulated")
     axes.plot(tags, slots_hz / tags, "--", color=ORANGE, label="uplink, one slot per blink")

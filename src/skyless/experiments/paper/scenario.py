@@ -10,7 +10,7 @@ from skyless.experiments.paper.plan import P1, P2, Plan, Progress, Results, Task
 from skyless.experiments.paper.section import Panel, Section, Verdict
 from skyless.experiments.paper.style import BLUE, GREEN, ORANGE, PAPER, RED, floor, panel
 from skyless.experiments.scenarios import Request, fleet_of
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 TAGS_M: Final = ((2.0, 2.4), (4.1, 5.9), (1.6, 5.6))
 SECONDS: Final = 1.0
@@ -27,7 +27,7 @@ def tasks(plan: Plan) -> list[Task]:
 
 def count_frames(progress: Progress, tags: int, seed: int) -> dict[str, int]:
     """Frames on the air by sender, and frames that tags heard."""
-    fleet = fleet_of(Request(site=lab_site(), tags=tags, seed=seed))
+    fleet = fleet_of(Request(site=ideal_lab_site(), tags=tags, seed=seed))
     senders: set[int] = set()
     for broadcast in fleet.world.run(SECONDS):
         senders.add(broadcast.anchor)

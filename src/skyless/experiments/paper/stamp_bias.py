@@ -11,7 +11,7 @@ from skyless.experiments.paper.plan import RADIO_PS, Place
 from skyless.simulation.channel import ChannelModel, power_bias_m, received_power_dbm
 from skyless.simulation.impairments import DelayError, Impairments
 from skyless.simulation.scenario import lab_impairments
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 DELAY_STD_M: Final = 0.05
 """Spread of the antenna delays that the biased world's anchors are wrong by, TX and RX each (assumed)."""
@@ -27,7 +27,7 @@ def impairments_of(name: str, seed: int) -> Impairments:
 
 def delay_errors(seed: int) -> tuple[DelayError, ...]:
     """Antenna delays that nobody calibrated: normal, ``DELAY_STD_M`` for TX and for RX of every anchor."""
-    anchors = lab_site().anchors
+    anchors = ideal_lab_site().anchors
     errors = np.random.default_rng([seed, 4]).normal(0.0, DELAY_STD_M / TICK_M, (len(anchors), 2)).tolist()
     return tuple(DelayError(anchor.id, tx, rx) for anchor, (tx, rx) in zip(anchors, errors, strict=True))
 
@@ -39,7 +39,7 @@ def expected_bias_m(name: str, place: Place, seed: int) -> NDArray[np.float64]:
     master is late (its offset carries that on), plus the anchor's own TX delay; the master's TX delay cancels. The
     unweighted least squares make (JᵀJ)⁻¹Jᵀ of it.
     """
-    anchors_m = np.array([(anchor.x_m, anchor.y_m) for anchor in lab_site().anchors])
+    anchors_m = np.array([(anchor.x_m, anchor.y_m) for anchor in ideal_lab_site().anchors])
     away = np.array(place) - anchors_m
     ranges_m = np.linalg.norm(away, axis=1)
     late_m = np.zeros(len(anchors_m))

@@ -14,7 +14,7 @@ from skyless.experiments.paper.section import Panel, Section, Verdict, grouped
 from skyless.experiments.paper.stamp_bias import DELAY_STD_M, expected_bias_m, impairments_of
 from skyless.experiments.paper.style import INK, METHOD_COLOURS, MUTED, RED, panel
 from skyless.simulation.trajectory import Static
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 METHODS: Final = ("literal", "tracker")
 PLACES: Final = {"P1": P1, "P2": P2}
@@ -55,7 +55,7 @@ def tasks(plan: Plan) -> list[Task]:
 def run_world(progress: Progress, name: str, seed: int, fixes: int) -> list[dict[str, Track]]:
     """Two tags at rest, heard by ``METHODS``."""
     paths = [Static(*place) for place in PLACES.values()]
-    return listen(lab_site(RADIO_PS), paths, METHODS, impairments_of(name, seed), seed, progress, fixes=fixes)
+    return listen(ideal_lab_site(RADIO_PS), paths, METHODS, impairments_of(name, seed), seed, progress, fixes=fixes)
 
 
 def moments_of(error_m: NDArray[np.float64]) -> Moments:

@@ -20,7 +20,7 @@ from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 PLACES: Final = ((3.0, 4.0), (1.2, 1.6), (4.6, 6.3))
 SWITCHED_ON_S: Final = (0.5, 0.512, 0.512)
@@ -66,7 +66,7 @@ def tasks(plan: Plan) -> list[Task]:
 
 def run_world(progress: Progress, seed: int, until_s: float) -> list[Heard]:
     """What each receiver heard, when, and when it had a fix."""
-    site = lab_site(RADIO_PS)
+    site = ideal_lab_site(RADIO_PS)
     specs = [
         TagSpec(Static(*place), outages=(Outage(0.0, on_s),)) for place, on_s in zip(PLACES, SWITCHED_ON_S, strict=True)
     ]
@@ -117,7 +117,7 @@ def section(plan: Plan, results: Results) -> Section:
     """The figure with its verdict."""
     heard: list[Heard] = results["timeline"]
     phases = phases_of(heard)
-    superframe_s = 1.0 / schedule_of(lab_site()).superframe_rate_hz
+    superframe_s = 1.0 / schedule_of(ideal_lab_site()).superframe_rate_hz
     firsts_s = [min(p.end_s for p in phases if p.tag == tag) for tag in range(len(PLACES))]
     until_s = heard[-1].end_s
     settled = [phase for phase in phases if phase.end_s > MEASURED_S]

@@ -13,7 +13,7 @@ from skyless.experiments.paper.section import Panel, Section, Verdict, grouped
 from skyless.experiments.paper.style import INK, METHOD_COLOURS, RED, floor, panel
 from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.trajectory import Waypoints
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.uncertainty.dop import dops_at
 
 METHODS: Final = ("literal", "tracker")
@@ -53,7 +53,9 @@ def run_world(progress: Progress, seed: int, laps: int) -> dict[str, Track]:
     """The tag walks round its rectangle, clockwise of the sun's way, heard by ``METHODS``."""
     path = Waypoints(CORNERS_M, SPEED_MPS, loop=True, corner_s=CORNER_S)
     until_s = (laps + 0.5) * LAP_S
-    (tracks,) = listen(lab_site(RADIO_PS), [path], METHODS, lab_impairments(RADIO_PS), seed, progress, until_s=until_s)
+    (tracks,) = listen(
+        ideal_lab_site(RADIO_PS), [path], METHODS, lab_impairments(RADIO_PS), seed, progress, until_s=until_s
+    )
     return tracks
 
 

@@ -17,7 +17,7 @@ from skyless.experiments.lab_bound import LAST, SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.monte_carlo import cores
 from skyless.experiments.studies.episodes import Case, Episode, draw_episode, settings_of
 from skyless.positioning.joint import JointFilter
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
 Array = NDArray[np.float64]
@@ -99,7 +99,7 @@ def run_chunk(case: Case, seeds: list[np.random.SeedSequence]) -> Array:
 
 
 def _run(case: Case, draw: np.random.Generator) -> list[float]:
-    site = lab_site()
+    site = ideal_lab_site()
     anchors = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     episode = draw_episode(draw, anchors, site.schedule.slot_s, case)
     motions, variances = _filtered(case, anchors, episode, draw)

@@ -26,7 +26,7 @@ from skyless.positioning.joint_hearing import REJECTED
 from skyless.positioning.joint_messages import Messages
 from skyless.positioning.protection import limits_of, protected_track
 from skyless.positioning.protection_levels import DETECTED, HPL, LEVELS, STATE, VPL
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 Array = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class Chunk(Struct, frozen=True):
 def anchors_of(place: str) -> Array:
     """Positions, shape (n, 3), in a frame in which tags walk at height 0."""
     if place == "lab":
-        return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors])
+        return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in ideal_lab_site().anchors])
     return np.array([(x, y, 1.3 if k % 2 else -0.7) for k, (x, y) in enumerate(_CORNERS_M)], float)
 
 
@@ -120,7 +120,7 @@ def run_chunk(argument: tuple[Setting, tuple[SeedSequence, ...]]) -> Chunk:
 
 def _run(setting: Setting, draw: Generator) -> tuple[NDArray[Any], ...]:
     """Horizontal and vertical errors, both levels, and whether they are promised, of all fixes since the onset."""
-    anchors_m, slot_s = anchors_of(setting.fault.place), lab_site().schedule.slot_s
+    anchors_m, slot_s = anchors_of(setting.fault.place), ideal_lab_site().schedule.slot_s
     episode = draw_episode(draw, anchors_m, slot_s, setting.case, SUPERFRAMES)
     onset = int(draw.integers(*ONSETS)) * len(anchors_m)
     messages = faulty(episode, setting.fault, int(draw.integers(len(anchors_m))), onset, slot_s)

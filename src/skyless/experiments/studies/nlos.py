@@ -7,7 +7,7 @@ from skyless.experiments.studies.plan import Plan
 from skyless.experiments.studies.stage import anchor_of, walking
 from skyless.experiments.studies.summary import Case
 from skyless.simulation.impairments import AnchorBias
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 LIMIT: Final = 1.3
 BURST_S: Final = 5.0
@@ -57,4 +57,4 @@ def cases(plan: Plan) -> list[Case]:
 
 
 def _late(plan: Plan, bias_m: float, burst_s: float | None, number: int) -> tuple[AnchorBias, ...]:
-    return (AnchorBias(anchor_of(lab_site(plan.noise_ps), number).id, bias_m, burst_s),)
+    return (AnchorBias(anchor_of(ideal_lab_site(plan.noise_ps), number).id, bias_m, burst_s),)

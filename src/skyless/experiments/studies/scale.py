@@ -12,7 +12,7 @@ from skyless.experiments.studies.plan import Plan
 from skyless.experiments.studies.stage import box, worlds
 from skyless.experiments.studies.summary import Case
 from skyless.simulation.trajectory import Trajectory
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, Site
 
 FROM_S: Final = 1.0
@@ -34,7 +34,7 @@ def cases(plan: Plan) -> list[Case]:
 
 
 def _fleets(plan: Plan) -> list[Case]:
-    lab = lab_site(plan.noise_ps)
+    lab = ideal_lab_site(plan.noise_ps)
     return [
         Case(
             f"{tags} tag{'s' if tags > 1 else ''}",
@@ -67,7 +67,7 @@ def _places(site: Site, tags: int, seed: int) -> Sequence[Trajectory]:
 
 def ring(plan: Plan, count: int) -> Site:
     """A site of ``count`` anchors, all in radio range of each other, evenly spread on an ellipse."""
-    lab = lab_site(plan.noise_ps)
+    lab = ideal_lab_site(plan.noise_ps)
     angles = 2.0 * np.pi * (np.arange(count) + 0.5) / count
     places = ((1.0 + np.column_stack([np.cos(angles), np.sin(angles)])) * np.array(ROOM_M) / 2.0).tolist()
     anchors = tuple(AnchorSite(id=number, x_m=x, y_m=y) for number, (x, y) in enumerate(places, start=1))

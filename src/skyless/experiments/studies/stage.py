@@ -12,7 +12,7 @@ from skyless.experiments.studies.plan import Plan, seed_of
 from skyless.experiments.studies.worlds import Run
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.trajectory import Trajectory
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, Site
 
 Array = NDArray[np.float64]
@@ -25,14 +25,14 @@ HALL_SCALE: Final = 2.5
 
 def hall_site(noise_ps: float) -> Site:
     """The lab at 15 m × 20 m: room for 5 m/s, and the same dilution of precision at the corresponding places."""
-    lab = lab_site(noise_ps)
+    lab = ideal_lab_site(noise_ps)
     anchors = tuple(replace(one, x_m=HALL_SCALE * one.x_m, y_m=HALL_SCALE * one.y_m) for one in lab.anchors)
     return replace(lab, name="hall", anchors=anchors)
 
 
 def walking(plan: Plan, site: Site | None = None, **options: Any) -> tuple[Run, ...]:  # noqa: ANN401 - of ``worlds``
     """Worlds of the lab, or another site, with tags that walk at 1 m/s from point to point."""
-    place = site or lab_site(plan.noise_ps)
+    place = site or ideal_lab_site(plan.noise_ps)
 
     def paths(seed: int) -> Sequence[Trajectory]:
         return trajectories_of(Request(place, seed=seed, tags=plan.tags))

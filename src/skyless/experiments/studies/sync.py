@@ -11,7 +11,7 @@ from skyless.experiments.studies.summary import Case
 from skyless.experiments.studies.worlds import Run
 from skyless.simulation.impairments import AnchorOutage, Impairments, Outage
 from skyless.simulation.oscillator import Temperature
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.site.model import Site
 
 STEADY: Final = "steady"
@@ -27,7 +27,7 @@ def cases(plan: Plan) -> list[Case]:
 
 def _outages(plan: Plan) -> list[Case]:
     every_s = 5.0
-    lab = lab_site(plan.noise_ps)
+    lab = ideal_lab_site(plan.noise_ps)
     rounds = int(plan.seconds / every_s)
     masters = tuple(_off(lab, number, WARMUP_S + 1.0 + every_s * number, 2.0) for number in range(rounds or 1))
     last = tuple(_off(lab, 5, WARMUP_S + 1.0 + every_s * number, 2.0) for number in range(rounds or 1))
@@ -44,7 +44,7 @@ def _off(site: Site, number: int, off_s: float, length_s: float) -> AnchorOutage
 
 
 def _crystals(plan: Plan) -> list[Case]:
-    lab = lab_site(plan.noise_ps)
+    lab = ideal_lab_site(plan.noise_ps)
 
     def wander(walk: float) -> Site:
         return replace(lab, noise=replace(lab.noise, random_walk_fm=walk))
@@ -77,7 +77,7 @@ def _superframes(plan: Plan) -> list[Case]:
 
 def _slow(plan: Plan, superframe_s: float) -> Site:
     """The lab with its anchors evenly spread over a superframe."""
-    lab = lab_site(plan.noise_ps)
+    lab = ideal_lab_site(plan.noise_ps)
     apart = 1
     while superframe_s / (apart * len(lab.anchors)) > LONGEST_SLOT_S:
         apart += 1

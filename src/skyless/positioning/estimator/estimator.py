@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from skyless.air.beacon import HEARD
 from skyless.compiled import kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.positioning.estimator.kalman import fade_recent_faults, predict
+from skyless.positioning.estimator.faults import fade_recent_faults, open_lasting_faults
+from skyless.positioning.estimator.kalman import predict
 from skyless.positioning.estimator.kinds import CLOCK_JUMPED, first_reception, own_reception, relay, report
 from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LEVELS, RECENT_CHI2, VPL, protect
 from skyless.positioning.estimator.settings import EstimatorSettings
@@ -30,6 +31,7 @@ from skyless.positioning.estimator.state import (
     without_anchor,
 )
 from skyless.positioning.fix_rows import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
+from skyless.positioning.kalman import horizontal_variance
 from skyless.positioning.protection import limits_of
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
@@ -50,6 +52,15 @@ MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS
 
 UNCOVERED_CHI2: Final = 240.0
 """A test of faults beyond this shows one that the levels may not cover."""
+
+LOST_IN_ROW: Final = 8
+"""So many packets beyond the gate in a row, of more anchors than can all be blocked, mean a wrong state, ..."""
+
+LOST_SHARE: Final = 0.5
+"""... as does a larger share of them."""
+
+MOST_REFUSED: Final = 4.0
+"""Relays beyond the gate lately; fewer may be late ones."""
 
 FADING: Final = 0.95
 """What a packet leaves of the counts of relays lately."""
@@ -218,13 +229,15 @@ def _track(
         if outcome >= NEW_ANCHOR:
             return n
         if len(motions) > 0:
-            for one in range(2 * dim):
-                motions[n, one] = s.x[one]
+            for one in range(dim):
+                motions[n, one], motions[n, dim + one] = s.x[one], s.x[dim + len(s.anchors) + one]
             for one in range(dim):
                 for other in range(dim):
                     covariances[n, dim * one + other] = s.P[one, other]
         if len(levels) > 0:
             protect(s, k[0], k[1], work, levels[n])
+            if open_lasting_faults(s, levels[n, LASTING_CHI2]) > 0:
+                protect(s, k[0], k[1], work, levels[n])
             levels[n, LEVELS] = outcome
             levels[n, LEVELS + 1] = _soundness(s, levels[n])
     return len(anchors)
@@ -296,18 +309,28 @@ def _process_frame(
     )
     if outcome >= NEW_ANCHOR:
         return outcome
-    dim = s.settings[0]["dim"]
-    for one in range(dim):
-        rows[POSITION, one], rows[VELOCITY, one] = s.x[one], s.x[dim + one]
-        for other in range(dim):
-            rows[POSITION + 1 + one, other] = s.P[one, other]
-            rows[VELOCITY + 1 + one, other] = s.P[dim + one, dim + other]
-    if dim == 2:
-        rows[POSITION, 2] = s.settings[0]["height_m"]
+    fill_motion(s, rows)
     rows[QUALITY, 0], rows[QUALITY, 1] = s.status[0]["mean_nis"], s.status[0]["mean_square_m2"]
     protect(s, k[0], k[1], work, levels)
+    if open_lasting_faults(s, levels[LASTING_CHI2]) > 0:
+        protect(s, k[0], k[1], work, levels)
+        fill_motion(s, rows)
+    rows[QUALITY, 2] = max(levels[LASTING_CHI2], levels[RECENT_CHI2])
     rows[PROTECTION, 0], rows[PROTECTION, 1], rows[PROTECTION, 2] = levels[HPL], levels[VPL], _soundness(s, levels)
     return outcome
+
+
+@kernel
+def fill_motion(s: EstimatorState, rows: Matrix) -> None:
+    """Write position, velocity and their covariances as a fix carries them."""
+    dim, velocity = s.settings[0]["dim"], layout(s.settings[0]["dim"], len(s.anchors)).velocity
+    for one in range(dim):
+        rows[POSITION, one], rows[VELOCITY, one] = s.x[one], s.x[velocity + one]
+        for other in range(dim):
+            rows[POSITION + 1 + one, other] = s.P[one, other]
+            rows[VELOCITY + 1 + one, other] = s.P[velocity + one, velocity + other]
+    if dim == 2:
+        rows[POSITION, 2] = s.settings[0]["height_m"]
 
 
 class Estimator:
@@ -451,10 +474,48 @@ class Estimator:
             leaving = _silent_anchor(state, rx_ticks)
         self._use(without_anchor(state, leaving))
 
+    @property
+    def fault_test(self) -> float:
+        """The larger test of faults, χ² with as many degrees of freedom as there are anchors if there are none."""
+        return float(max(self._levels[LASTING_CHI2], self._levels[RECENT_CHI2]))
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether so many packets do not fit that the state must be wrong."""
+        status = self._state.status[0]
+        in_row = int(status["rejected_in_row"]) + int(status["stale_in_row"])
+        late = min(float(status["late_share"]), 0.45)
+        return bool(status["rejected_share"] > LOST_SHARE or in_row * (1.0 - 2.0 * late) >= LOST_IN_ROW)
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether most of what anchors received of each other does not fit: a wrong place draws all clocks with it."""
+        status = self._state.status[0]
+        return bool(status["relays_refused"] > max(MOST_REFUSED, float(status["relays_taken"])))
+
+    @property
+    def relays_fit(self) -> bool:
+        """Whether most of what anchors received of each other fits, and that is more than a few receptions."""
+        status = self._state.status[0]
+        return bool(status["relays_taken"] > max(MOST_REFUSED, 4.0 * float(status["relays_refused"])))
+
+    @property
+    def obstructed(self) -> tuple[int, ...]:
+        """Indices in the table of the anchors whose range error has jumped and not come back."""
+        anchors = self._state.anchors
+        return tuple(anchors["table_index"][anchors["is_obstructed"] != 0].tolist())
+
+    def horizontal_variance_m2(self, ahead_s: float) -> float:
+        """Sum of the variances of x and y so much later, if nothing is received until then."""
+        _, covariance = self.motion()
+        status = self._state.status[0]
+        return horizontal_variance(covariance, self.dim, ahead_s, self.settings.qa * float(status["q_scale"]))
+
     def motion(self) -> tuple[Vector, Matrix]:
         """Position and velocity at the newest packet, shape (2·dim,), and their covariance."""
-        n = 2 * self.dim
-        return self._state.x[:n].copy(), self._state.P[:n, :n].copy()
+        dim, velocity = self.dim, layout(self.dim, len(self._state.anchors)).velocity
+        states = [*range(dim), *range(velocity, velocity + dim)]
+        return self._state.x[states], self._state.P[np.ix_(states, states)]
 
     def clock(self, table_index: int) -> tuple[int, float, float] | None:
         """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""

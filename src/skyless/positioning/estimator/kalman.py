@@ -1,12 +1,4 @@
-"""The filter itself: time update, scalar measurement update, and what faults that nobody sees do to the state.
-
-Faults follow the recursion of Friedland (1969): where all that the tag receives of anchor j is late by b metres, the
-estimate errs by V_j·b besides, and the innovation of a measurement h holds s_j·b,
-
-    s = [own reception of j] − h·V        V ← F·V  (time)        V ← V + K·s  (update)
-
-so that b can be estimated from the innovations, and levels can be given whatever b is (``levels``).
-"""
+"""The filter itself: time update and scalar measurement update of state, covariance and fault sensitivities."""
 
 from typing import Final
 
@@ -15,9 +7,6 @@ import numpy as np
 from skyless.compiled import kernel
 from skyless.constants import TICK_S
 from skyless.positioning.estimator.state import EstimatorState, Integers, Matrix, Vector, layout
-
-RECENT_PACKETS: Final = 24.0
-"""Faults of so many packets of each anchor are recent."""
 
 OBSTRUCTED_STD_M: Final = 0.08
 """Where range errors jump, those of all anchors change with this standard deviation, ..."""
@@ -185,51 +174,6 @@ def update(s: EstimatorState, innovation: float, innovation_variance: float, gai
         gain = gain_scale * fault_input[fault] / root
         for state in range(updated):
             V[fault, state] += gain * u[state]
-
-
-@kernel
-def compute_fault_input(s: EstimatorState, terms: int, own: int) -> None:
-    """S = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1."""
-    V, fault_input, h, h_index = s.V, s.fault_input, s.h, s.h_index
-    count = len(s.anchors)
-    for fault in range(V.shape[0]):
-        total = 0.0
-        for term in range(terms):
-            total -= h[term] * V[fault, h_index[term]]
-        fault_input[fault] = total
-    if own >= 0:
-        fault_input[own] += 1.0
-        fault_input[count + own] += 1.0
-
-
-@kernel
-def gather_evidence(s: EstimatorState, innovation: float, innovation_variance: float) -> None:
-    """What an innovation says of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S."""
-    evidence, information, fault_input, count = s.evidence, s.information, s.fault_input, len(s.anchors)
-    for bank in range(2):
-        begin = bank * count
-        for one in range(count):
-            weight = fault_input[begin + one] / innovation_variance
-            evidence[bank, one] += weight * innovation
-            for other in range(count):
-                information[bank, one, other] += weight * fault_input[begin + other]
-
-
-@kernel
-def fade_recent_faults(s: EstimatorState) -> None:
-    """Forget a share of what recent faults have done, and of the evidence for them, once in a round of packets."""
-    count = len(s.anchors)
-    if s.status[0]["packets"] % count != 0:
-        return
-    kept = 1.0 - 1.0 / RECENT_PACKETS
-    V, evidence, information = s.V, s.evidence, s.information
-    for fault in range(count, 2 * count):
-        for state in range(V.shape[1]):
-            V[fault, state] *= kept
-    for one in range(count):
-        evidence[1, one] *= kept
-        for other in range(count):
-            information[1, one, other] *= kept
 
 
 @kernel

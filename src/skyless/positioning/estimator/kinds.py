@@ -16,12 +16,11 @@ import numpy as np
 
 from skyless.compiled import kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.positioning.estimator.faults import compute_fault_input, gather_evidence
 from skyless.positioning.estimator.kalman import (
     OBSTRUCTED_STD_M,
-    compute_fault_input,
     compute_ph,
     dynamic_states,
-    gather_evidence,
     relax_range_error,
     reset_state,
     update,

@@ -1,10 +1,9 @@
 """Protection levels: how wrong a position may be, whatever is late (``docs/maths.md`` section 8).
 
-Hypothesis: the tag's receptions of every anchor are late (or early) by a constant of its own, all at once. With V the
-errors that this does to the state (``kalman``), y and M what the innovations say of it and σ_f² I its variance
-beforehand, the estimate under the hypothesis and its covariance are
+Hypothesis: the tag's receptions of every anchor are late (or early) by a constant of its own, all at once. With the
+faults b̂ and their sensitivities V (``faults``) the estimate under the hypothesis and its covariance are
 
-    b̂ = (M + I/σ_f²)⁻¹·y        x + V·b̂        P + V·(M + I/σ_f²)⁻¹·Vᵀ
+    x + V·b̂        P + V·(M + I/σ_f²)⁻¹·Vᵀ
 
 so the error exceeds |V·b̂| + k·σ with the stated risk only, whichever anchors are at fault. Two kinds are looked at:
 constants since an anchor joined, and what has begun lately. What is larger than σ_f shows, as a jump or in
@@ -16,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import kernel
+from skyless.positioning.estimator.faults import solve
 from skyless.positioning.estimator.state import EstimatorState, Matrix, Vector
 
 LASTING_STD_M: Final = 0.3
@@ -48,7 +48,7 @@ def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, work: Mat
             work[count, one] = s.evidence[bank, one]
             for axis in range(dim):
                 work[count + 1 + axis, one] = V[begin + one, axis]
-        _solve(work, count, 1 + dim)
+        solve(work, count, 1 + dim)
         chi2, shift_x, shift_y, shift_z = 0.0, 0.0, 0.0, 0.0
         xx, xy, yy, zz = P[0, 0], P[0, 1], P[1, 1], 0.0
         for one in range(count):
@@ -77,25 +77,3 @@ def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, work: Mat
                 up += V[column, 2] ** 2
         levels[HPL] += acceleration * np.sqrt(squared)
         levels[VPL] += acceleration * np.sqrt(up)
-
-
-@kernel
-def _solve(work: Matrix, count: int, columns: int) -> None:
-    """Solve for the right-hand sides in the rows behind a symmetric matrix, in place, by Cholesky factors."""
-    for column in range(count):
-        for row in range(column, count):
-            total = work[row, column]
-            for k in range(column):
-                total -= work[row, k] * work[column, k]
-            work[row, column] = np.sqrt(max(total, 1e-30)) if row == column else total / work[column, column]
-    for right in range(count, count + columns):
-        for row in range(count):
-            total = work[right, row]
-            for k in range(row):
-                total -= work[row, k] * work[right, k]
-            work[right, row] = total / work[row, row]
-        for row in range(count - 1, -1, -1):
-            total = work[right, row]
-            for k in range(row + 1, count):
-                total -= work[k, row] * work[right, k]
-            work[right, row] = total / work[row, row]

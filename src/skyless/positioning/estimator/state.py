@@ -88,6 +88,7 @@ STATUS: Final = np.dtype(
         ("clock_restarts", np.int64),
         ("obstructions", np.int64),
         ("ends_of_obstructions", np.int64),
+        ("faults_opened", np.int64),
         ("mean_nis", np.float64),
         ("mean_square_m2", np.float64),  # of innovations
         ("rejected_share", np.float64),

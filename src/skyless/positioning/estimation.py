@@ -1,0 +1,250 @@
+"""``joint``: the estimator as a positioning method: cold start, packet by packet updates, and starting again when lost."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.constants import TICK_S
+from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Start
+from skyless.positioning.estimator.estimator import (
+    NO_REPORT,
+    REJECTED,
+    STALE,
+    UNCOVERED_CHI2,
+    Estimator,
+    Report,
+)
+from skyless.positioning.estimator.faults import SURE_CHI2
+from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.fix import Fix, NoFixReason
+from skyless.positioning.fix_rows import QUALITY
+from skyless.positioning.fix_time import FixTime
+from skyless.positioning.in_use import AnchorsInUse
+from skyless.positioning.joint_start import JointStart
+from skyless.positioning.master_scale import MasterScale
+from skyless.positioning.observation import Observation
+from skyless.positioning.protection import IntegrityRequirement
+from skyless.ticks import from_seconds
+
+COVARIANCE_MARGIN: Final = 4.0
+"""The start's covariance is taken so many times larger, as the filter is then given the packets that it rests on."""
+
+MAX_GAP_S: Final = 5.0
+"""After a longer silence the state says less than a new start would."""
+
+MAX_SPREAD: Final = 0.05
+"""With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
+state: updates would make it confident of a wrong place, so a new start is better."""
+
+SLOW_S: Final = 0.2
+SLOW_SPREAD: Final = 0.2
+"""Borne in longer superframes, where a new start takes seconds."""
+
+SHORT_SILENCE_S: Final = 0.1
+"""Over shorter silences no state grows much wider."""
+
+EARLY_S: Final = 1.0
+"""A filter that is lost so soon after its start may have a tag that is faster than assumed; ..."""
+
+SPEED_STD_GROWTH: Final = 4.0
+MAX_SPEED_STD_MPS: Final = 32.0
+"""... the next start assumes a speed higher by this factor, up to this."""
+
+OPEN_RANGE_STD_M: Final = 1.0
+"""Constant errors of ranges that a start has to expect whose faults contradicted the one before."""
+
+CAUTION_S: Final = 5.0
+"""A start that expects them is not repeated for so long."""
+
+REORDERED_S: Final = 0.1
+"""Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
+
+SURELY_IN_REACH_TICKS: Final = from_seconds(SHORT_SILENCE_S) - 1
+"""After such a silence a filter need not be asked."""
+
+
+class Estimation:
+    """One tag's estimator from the first beacon on."""
+
+    def __init__(
+        self,
+        settings: EstimatorSettings,
+        z_bounds_m: tuple[float, float] | None = None,
+        fix_time: FixTime | None = None,
+        superframe_s: float = 0.0,
+    ) -> None:
+        """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites."""
+        self._settings = settings
+        self._height_known = settings.height_m is not None
+        self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit_m)
+        self._superframe_s = superframe_s
+        self._max_spread = MAX_SPREAD if superframe_s < SLOW_S else SLOW_SPREAD
+        self._z_bounds_m = z_bounds_m
+        self._speed_std_mps = SPEED_STD_MPS
+        self._estimator = Estimator(settings)
+        self._index_of: dict[int, int] = {}
+        self._known_m: dict[int, NDArray[np.float64]] = {}
+        self._start: JointStart | None = self._new_start()
+        self._range_std_m: float | None = None
+        self._time = fix_time or FixTime()
+        self._in_use = AnchorsInUse(superframe_s)
+        self._master_less_tag_ticks = 0
+        self._started_ticks = 0
+        self._newest_ticks = 0
+        self._master_scale = MasterScale()
+        self._relays_may_contradict = True
+
+    @property
+    def estimator(self) -> Estimator:
+        """The filter with all its states."""
+        return self._estimator
+
+    def clock(self, anchor: int) -> tuple[int, float, float] | None:
+        """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""
+        index = self._index_of.get(anchor)
+        return None if index is None else self._estimator.clock(index)
+
+    @property
+    def excluded(self) -> tuple[int, ...]:
+        """Anchors whose range error has jumped and not come back."""
+        obstructed = self._estimator.obstructed
+        return tuple(anchor for anchor, index in self._index_of.items() if index in obstructed) if obstructed else ()
+
+    def hear(self, observation: Observation) -> Fix | NoFixReason:
+        """Take one observation; a fix for every accepted packet once started."""
+        ticks_master, rx_ticks, claim = observation.tx_ticks_master, observation.rx_ticks_tag, observation.claim
+        if ticks_master is not None:
+            self._master_less_tag_ticks = ticks_master - rx_ticks
+            if claim is not None and claim.master == observation.anchor:
+                self._master_scale.hear(observation)
+        if (
+            self._start is None
+            and not 0 <= rx_ticks - self._newest_ticks < SURELY_IN_REACH_TICKS
+            and self._is_out_of_reach(observation)
+        ):
+            self._start = self._new_start()
+        if self._start is not None:
+            self._start.learn(observation)
+            start = self._start.hear(observation)
+            if isinstance(start, NoFixReason):
+                return start
+            self._begin(start, self._start.packets())
+            return self._fix(observation)
+        outcome = self._process(observation)
+        self._newest_ticks = max(self._newest_ticks, rx_ticks)
+        if outcome in {REJECTED, STALE}:
+            if self._estimator.is_lost:
+                early = (rx_ticks - self._started_ticks) * TICK_S < EARLY_S
+                faster = min(SPEED_STD_GROWTH * self._speed_std_mps, MAX_SPEED_STD_MPS)
+                self._speed_std_mps = faster if early else SPEED_STD_MPS
+                self._start = self._new_start()
+            return NoFixReason.RESIDUALS
+        if self._is_contradicted(rx_ticks):
+            self._start = self._new_start()
+            return NoFixReason.ACQUIRING
+        self._in_use.use(observation)
+        return self._fix(observation)
+
+    def coast(self, observation: Observation) -> Fix | NoFixReason:
+        """A fix when a packet came that was not used itself: by all others, and by what was relayed with it."""
+        return NoFixReason.RESIDUALS if self._start is not None else self._fix(observation)
+
+    def _is_contradicted(self, rx_ticks: int) -> bool:
+        """Whether a new start is needed, as relays or faults contradict this one; says what that has to expect."""
+        if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
+            age_s = (rx_ticks - self._started_ticks) * TICK_S
+            cautious = self._range_std_m is not None
+            limit = 2.0 * SURE_CHI2 if age_s < EARLY_S and not cautious else UNCOVERED_CHI2
+            if self._estimator.fault_test > limit and (not cautious or age_s > CAUTION_S):
+                self._range_std_m = OPEN_RANGE_STD_M
+                return True
+        if not self._relays_may_contradict:
+            self._relays_may_contradict = self._estimator.relays_fit
+        elif self._estimator.is_contradicted:
+            self._relays_may_contradict = False  # if a new start does not help, the anchors are wrong, not the place
+            return True
+        return False
+
+    def _new_start(self) -> JointStart:
+        settings = self._settings
+        max_age_s = max(MAX_AGE_S, 2.5 * self._superframe_s)
+        variance = settings.tx_variance_m2 + settings.rx_variance_m2
+        return JointStart(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps)
+
+    def _is_out_of_reach(self, observation: Observation) -> bool:
+        """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
+        silent_s = (observation.rx_ticks_tag - self._newest_ticks) * TICK_S
+        if not -REORDERED_S <= silent_s <= MAX_GAP_S:
+            return True
+        if silent_s < SHORT_SILENCE_S:
+            return False
+        std_m = self._estimator.horizontal_variance_m2(silent_s) ** 0.5
+        position_m = self._estimator.state.x[: self._estimator.dim]
+        return bool(std_m > self._max_spread * self._in_use.mean_range_m(position_m))
+
+    def _begin(self, start: Start, packets: list[Observation]) -> None:
+        """Begin at the start's position, and give the filter the packets that led there."""
+        self._start = None
+        self._newest_ticks = self._started_ticks = packets[-1].rx_ticks_tag
+        self._in_use.begin(start.used)
+        dim, begin_ticks = self._estimator.dim, packets[0].rx_ticks_tag
+        age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
+        error = self._settings.range_std_m if self._range_std_m is None else self._range_std_m
+        inflation = COVARIANCE_MARGIN * (
+            1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
+        )
+        covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * start.speed_variance * np.eye(dim)
+        self._estimator.start(begin_ticks, start.solution[:dim], covariance, start.speed_variance, self._range_std_m)
+        for packet in packets:
+            self._process(packet)
+
+    def _process(self, observation: Observation) -> int:
+        return self._estimator.process(
+            self._index(observation),
+            observation.sequence,
+            observation.rx_ticks_tag,
+            observation.tx_ticks_anchor,
+            self._listed(observation) if observation.relays else (),
+            packed=observation.packed_relays,
+            report=self._report(observation),
+            variance_factor=observation.rx_variance_factor,
+        )
+
+    def _listed(self, observation: Observation) -> list[list[int]]:
+        """Relays of anchors that are known, as the estimator takes them."""
+        index, rows = self._index_of[observation.anchor], []
+        for anchor, sequence, rx_ticks in observation.relays:
+            sender = self._index_of.get(anchor)
+            if sender is not None:
+                rows.append([index, sender, sequence, rx_ticks])
+        return rows
+
+    def _report(self, observation: Observation) -> Report:
+        """What the anchor says of its clock against the master's."""
+        claim, variance_m2 = observation.claim, observation.sync_variance_m2
+        if claim is None or variance_m2 <= 0.0:
+            return NO_REPORT
+        master, subticks = self._index_of.get(claim.master), self._master_scale.difference(observation)
+        return NO_REPORT if master is None or subticks is None else Report(master, subticks, variance_m2)
+
+    def _index(self, observation: Observation) -> int:
+        """Index of the packet's anchor in the estimator's table."""
+        anchor, anchor_m = observation.anchor, observation.anchor_m
+        if self._known_m.get(anchor) is not anchor_m:
+            index = self._index_of.get(anchor)
+            if index is None:
+                self._index_of[anchor] = self._estimator.add_anchor(anchor_m, anchor)
+            else:
+                self._estimator.move_anchor(index, anchor_m)
+            self._known_m[anchor] = anchor_m
+        return self._index_of[anchor]
+
+    def _fix(self, observation: Observation) -> Fix | NoFixReason:
+        in_use, estimator, known = self._in_use, self._estimator, self._height_known
+        if not known and estimator.state.P.item(2, 2) > in_use.extent_m**2:
+            return NoFixReason.BAD_GEOMETRY
+        rx_ticks = observation.rx_ticks_tag
+        time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
+        # in the order of the fields: with their names it takes as long as all the rest
+        return Fix(time_s, estimator.rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", known, 1, self._asked)

@@ -1,0 +1,184 @@
+"""Faults that the state does not hold: what they do to it, what innovations say of them, and taking them into it.
+
+Where all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b besides, and the
+innovation of a measurement h holds s_j·b (Friedland 1969):
+
+    s = [own reception of j] − h·V        V ← F·V  (time)        V ← V + K·s  (update)
+
+With y = Σ s·ν/S and M = Σ s·sᵀ/S over the innovations ν of variance S, and σ_f²·I the faults' variance beforehand, all
+anchors' faults are b̂ = (M + I/σ_f²)⁻¹·y with the covariance (M + I/σ_f²)⁻¹, and yᵀ·(M + I/σ_f²)⁻¹·y tests whether there
+are any. A fault that is sure is taken into the anchor's constant range error, which gives the state that the filter
+would have, had that error been open from the beginning.
+"""
+
+from typing import Final
+
+from skyless.compiled import kernel
+from skyless.positioning.estimator.state import EstimatorState, Matrix, layout
+
+RECENT_PACKETS: Final = 24.0
+"""Faults of so many packets of each anchor are recent."""
+
+OPENED_STD_M: Final = 1.0
+"""Of a fault that is taken into the state, beforehand."""
+
+SURE_CHI2: Final = 50.0
+"""A test beyond this shows a lasting fault: χ² of eight degrees of freedom is larger with a probability of 4·10⁻⁸."""
+
+EXPLAINED_CHI2: Final = 20.0
+"""What is left of it where the anchors with faults are known."""
+
+RIVAL_CHI2: Final = 20.0
+"""So much less any other anchors have to explain."""
+
+MOST_FAULTS: Final = 2
+"""At most so many anchors are singled out."""
+
+
+@kernel
+def compute_fault_input(s: EstimatorState, terms: int, own: int) -> None:
+    """S = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1."""
+    V, fault_input, h, h_index = s.V, s.fault_input, s.h, s.h_index
+    count = len(s.anchors)
+    for fault in range(V.shape[0]):
+        total = 0.0
+        for term in range(terms):
+            total -= h[term] * V[fault, h_index[term]]
+        fault_input[fault] = total
+    if own >= 0:
+        fault_input[own] += 1.0
+        fault_input[count + own] += 1.0
+
+
+@kernel
+def gather_evidence(s: EstimatorState, innovation: float, innovation_variance: float) -> None:
+    """What an innovation says of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S."""
+    evidence, information, fault_input, count = s.evidence, s.information, s.fault_input, len(s.anchors)
+    for bank in range(2):
+        begin = bank * count
+        for one in range(count):
+            weight = fault_input[begin + one] / innovation_variance
+            evidence[bank, one] += weight * innovation
+            for other in range(count):
+                information[bank, one, other] += weight * fault_input[begin + other]
+
+
+@kernel
+def fade_recent_faults(s: EstimatorState) -> None:
+    """Forget a share of what recent faults have done, and of the evidence for them, once in a round of packets."""
+    count = len(s.anchors)
+    if s.status[0]["packets"] % count != 0:
+        return
+    kept = 1.0 - 1.0 / RECENT_PACKETS
+    V, evidence, information = s.V, s.evidence, s.information
+    for fault in range(count, 2 * count):
+        for state in range(V.shape[1]):
+            V[fault, state] *= kept
+    for one in range(count):
+        evidence[1, one] *= kept
+        for other in range(count):
+            information[1, one, other] *= kept
+
+
+@kernel
+def solve(work: Matrix, count: int, columns: int) -> None:
+    """Solve for the right-hand sides in the rows behind a symmetric matrix, in place, by Cholesky factors."""
+    for column in range(count):
+        for row in range(column, count):
+            total = work[row, column]
+            for k in range(column):
+                total -= work[row, k] * work[column, k]
+            work[row, column] = max(total, 1e-30) ** 0.5 if row == column else total / work[column, column]
+    for right in range(count, count + columns):
+        for row in range(count):
+            total = work[right, row]
+            for k in range(row):
+                total -= work[row, k] * work[right, k]
+            work[right, row] = total / work[row, row]
+        for row in range(count - 1, -1, -1):
+            total = work[right, row]
+            for k in range(row + 1, count):
+                total -= work[k, row] * work[right, k]
+            work[right, row] = total / work[row, row]
+
+
+@kernel
+def explained_chi2(s: EstimatorState, one: int, other: int) -> float:
+    """How much of the test of all lasting faults those of two anchors explain, or of one where both are the same."""
+    y, M, weight = s.evidence[0], s.information[0], 1.0 / OPENED_STD_M**2
+    a, b, both = M[one, one] + weight, M[other, other] + weight, M[one, other]
+    if one == other:
+        return float(y[one] * y[one] / a)
+    return float((b * y[one] ** 2 - 2.0 * both * y[one] * y[other] + a * y[other] ** 2) / (a * b - both * both))
+
+
+@kernel
+def open_lasting_faults(s: EstimatorState, chi2: float) -> int:
+    """Take lasting faults into the state where the test ``chi2`` of all of them is sure; how many anchors have one.
+
+    They are the one or two anchors whose faults explain the test, and no others as well; none where there are none such.
+    """
+    count, dim = len(s.anchors), s.settings[0]["dim"]
+    if chi2 <= SURE_CHI2:
+        return 0
+    for faults in range(1, min(MOST_FAULTS, count - dim - 2) + 1):
+        first, second, most, rival = -1, -1, 0.0, 0.0
+        for one in range(count):
+            for other in range(one + 1):
+                if (one == other) == (faults == 1):
+                    explained = explained_chi2(s, one, other)
+                    if explained > most:
+                        first, second, most, rival = one, other, explained, most
+                    elif explained > rival:
+                        rival = explained
+        if chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_CHI2:
+            _open_lasting_fault(s, first)
+            if second != first:
+                _open_lasting_fault(s, second)
+            forget_recent_faults(s)
+            return faults
+    return 0
+
+
+@kernel
+def forget_recent_faults(s: EstimatorState) -> None:
+    """Judge recent faults from here on."""
+    V, evidence, information, count = s.V, s.evidence, s.information, len(s.anchors)
+    for fault in range(count):
+        evidence[1, fault] = 0.0
+        for other in range(count):
+            information[1, fault, other] = 0.0
+        for state in range(V.shape[1]):
+            V[count + fault, state] = 0.0
+
+
+@kernel
+def _open_lasting_fault(s: EstimatorState, anchor: int) -> None:
+    """Take one anchor's fault into its constant range error; the other hypotheses are conditioned on it."""
+    x, P, V, y, M = s.x, s.P, s.V, s.evidence[0], s.information[0]
+    count, n = len(s.anchors), len(x)
+    gain = 1.0 / (M[anchor, anchor] + 1.0 / OPENED_STD_M**2)
+    fault_m = gain * y[anchor]
+    opened = V[anchor]  # what it adds to each state: 1 − V for the range error, −V for all others
+    for state in range(n):
+        opened[state] = -opened[state]
+    opened[layout(s.settings[0]["dim"], count).constant + anchor] += 1.0
+    for row in range(n):
+        x[row] += opened[row] * fault_m
+        for column in range(n):
+            P[row, column] += opened[row] * opened[column] * gain
+    for other in range(count):
+        if other != anchor:
+            share = M[other, anchor] * gain
+            y[other] -= share * y[anchor]
+            for third in range(count):
+                if third != anchor:
+                    M[other, third] -= share * M[third, anchor]
+            for state in range(n):
+                V[other, state] += share * opened[state]
+    y[anchor] = 0.0
+    for other in range(count):
+        M[anchor, other] = M[other, anchor] = 0.0
+    for state in range(n):
+        opened[state] = 0.0
+    s.status[0]["faults_opened"] += 1
