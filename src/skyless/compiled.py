@@ -34,7 +34,7 @@ def _cache_folder() -> str:
     digest = hashlib.sha1(usedforsecurity=False)
     for source in sorted(_PACKAGE.rglob("*.py")):
         text = source.read_bytes()
-        if b"skyless.compiled" in text or source.name in {"constants.py", "compiled.py", "eights.py"}:
+        if b"skyless.compiled" in text or source.name in {"constants.py", "compiled.py"}:
             digest.update(text)
     folder = _cache_home() / f"kernels-{digest.hexdigest()[:16]}"
     if not folder.exists():
@@ -75,7 +75,7 @@ def part(function: Function) -> Function:
 
 
 def jitted(function: Function) -> Function:
-    """A small function that kernels may call, and that stays plain Python elsewhere: nothing is compiled for it alone."""
+    """A small function that kernels may call, and that stays plain Python elsewhere."""
     return cast("Function", register_jitable(function))
 
 

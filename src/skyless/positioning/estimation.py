@@ -1,4 +1,4 @@
-"""``joint``: the estimator as a positioning method: cold start, packet by packet updates, and starting again when lost."""
+"""``joint``: the estimator as a positioning method: cold start, packet by packet updates, new starts when lost."""
 
 from typing import Final
 

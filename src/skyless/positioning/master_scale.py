@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from skyless.positioning.joint_sync import SUBTICKS
+from skyless.positioning.estimator.kinds import SUBTICKS
 from skyless.positioning.observation import Observation
 from skyless.ticks import TICK_MASK
 

@@ -49,8 +49,8 @@ def new_method(
         )
         return Snapshots(SnapshotMethod(wanted.method), settings, time)
     if wanted.method == "joint":
-        settings = _estimator_settings(wanted, schedule, noise, accuracy, superframe_s)
-        return Estimation(settings, wanted.z_bounds_m, time, superframe_s)
+        assumed = _estimator_settings(wanted, schedule, noise, accuracy, superframe_s)
+        return Estimation(assumed, wanted.z_bounds_m, time, superframe_s)
     return Tracking(_tracker_settings(wanted, schedule, noise), wanted.z_bounds_m, time, superframe_s)
 
 

@@ -14,11 +14,10 @@ import numpy as np
 from skyless.air.packet import Packet, Point, Relay
 from skyless.clocks.stamps import NOISE_TICKS
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
+from skyless.positioning.estimation import Estimation
+from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import FixTime
-from skyless.positioning.joint_settings import JointSettings
-from skyless.positioning.joint_state import RELAYS_REJECTED
-from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.masterless import MOST_ANCHORS, remember
 from skyless.positioning.observation import Observation
 from skyless.positioning.pair_calibration import NEAREST_M, NOTHING, PairCalibration
@@ -30,7 +29,7 @@ from skyless.ticks import LAST_TICKS, Unwrapper, nearest
 RANDOM_WALK_FM: Final = 5e-9
 """Of the oscillators, 1/√s. Between 1e-9 and 7e-9 on the captures of TDoA3 anchors; too much of it costs little."""
 
-MASTERLESS: Final = JointSettings(walk=(RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2, most_clock_agility=1.0)
+MASTERLESS: Final = EstimatorSettings(walk=(RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2)
 """The stamps of those captures are no noisier than others, 85 ps each where nothing is in the way."""
 
 PERIOD_S: Final = 0.15
@@ -75,7 +74,7 @@ class PacketTracking:
 
     def __init__(
         self,
-        settings: JointSettings,
+        settings: EstimatorSettings,
         anchors_m: Mapping[int, Point],
         tx_bits: int = 32,
         z_bounds_m: tuple[float, float] | None = None,
@@ -109,7 +108,7 @@ class PacketTracking:
         self._refused_before = self._refused_now = 0
 
     @property
-    def tracking(self) -> JointTracking:
+    def tracking(self) -> Estimation:
         """The filter behind."""
         return self._tracking
 
@@ -158,8 +157,8 @@ class PacketTracking:
                     fix = self._tracking.coast(observation)
         return self._sane(fix)
 
-    def _new_tracking(self) -> JointTracking:
-        return JointTracking(self._settings, self._z_bounds_m, self._time, PERIOD_S)
+    def _new_tracking(self) -> Estimation:
+        return Estimation(self._settings, self._z_bounds_m, self._time, PERIOD_S)
 
     def _sane(self, fix: Fix | NoFixReason) -> Fix | None:
         """A fix near the anchors, beyond which time differences tell nothing, that is known well enough."""
@@ -273,7 +272,7 @@ class PacketTracking:
 
     def _count_relays(self) -> None:
         """Add up what filters refused: each start, before which there are packets without a fix, counts from zero."""
-        refused = int(self._tracking.filter.arrays.counts[RELAYS_REJECTED])
+        refused = int(self._tracking.estimator.state.status[0]["relays_rejected"])
         if refused < self._refused_now:
             self._refused_before += self._refused_now
         self._refused_now = refused

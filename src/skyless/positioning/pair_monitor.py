@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import borrowing_kernel
-from skyless.positioning.joint_monitor import HUBER, LAG_GAIN, follow_lag
+from skyless.positioning.estimator.monitor import HUBER, LAG_FORGETTING, LAG_GAIN, LAG_LIMIT
 from skyless.positioning.pair_state import (
     AGE_S,
     BEYOND_REPAIR,
@@ -196,3 +196,11 @@ def follow_motion(s: PairArrays, normalised: float) -> None:
         statistics[LAG + axis] += LAG_GAIN * (toward - statistics[LAG + axis])
         squared += statistics[LAG + axis] ** 2
     follow_lag(statistics, LAG_SQUARED, squared)
+
+
+@borrowing_kernel
+def follow_lag(statistics: Vector, place: int, squared: float) -> None:
+    """Adapt the agility to the squares of the lag along the axes, whose running mean stands at ``place``."""
+    squared *= (2.0 - LAG_GAIN) / LAG_GAIN
+    statistics[place] += LAG_FORGETTING * (squared - statistics[place])
+    adapt_agility(statistics, statistics[place] > LAG_LIMIT)

@@ -7,7 +7,7 @@ the tag moves, and it begins anew from where the other one is.
 
 from typing import Final
 
-from skyless.positioning.joint_monitor import RESTLESS_LAG
+from skyless.positioning.estimator.monitor import LAG_LIMIT
 from skyless.positioning.pair_state import LAG_SQUARED, QA, Vector, new_arrays
 from skyless.positioning.pair_tracker import PairTracker, pair_update
 from skyless.positioning.tracker import REJECTED_IN_ROW
@@ -60,5 +60,5 @@ class Rest:
         pair_update(s, a, b, a_m, b_m, dt_s, tdoa_m)
         self.since_s += dt_s
         self.count += 1
-        if s.statistics[LAG_SQUARED] > RESTLESS_LAG or s.counts[REJECTED_IN_ROW] >= ASTRAY_IN_ROW:
+        if s.statistics[LAG_SQUARED] > LAG_LIMIT or s.counts[REJECTED_IN_ROW] >= ASTRAY_IN_ROW:
             self.begin()

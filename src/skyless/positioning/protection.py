@@ -6,12 +6,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
-from skyless.compiled import kernel
 from skyless.positioning.alert import Alert
-from skyless.positioning.joint_hearing import FULL, joint_hear, joint_motion
-from skyless.positioning.joint_state import Integers, JointArrays, Matrix, Vector
-from skyless.positioning.protection_levels import DETECTED, HPL, LEVELS, STATE, VPL, protect
 
 RISK: Final = 1e-4
 FALSE_ALARM: Final = 1e-6
@@ -20,6 +17,13 @@ FALSE_ALARM: Final = 1e-6
 MARGIN: Final = 1.05
 """On all standard deviations, for errors that are not quite Gaussian and figures that are not quite the filter's."""
 
+
+HPL, VPL, STATE = range(3)
+"""What a fix carries of its levels; the state is one of ..."""
+
+SOUND, OBSTRUCTED, UNUSED, CONTRADICTED, UNAVAILABLE = range(5)
+"""... a position without known faults, with anchors whose range error has jumped, (no longer used), with a fault that
+the levels may not cover, and one of which nothing can be promised."""
 
 _ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
 
@@ -60,14 +64,14 @@ def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert
     While an anchor's fault is in the fix the levels cover it, up to a size beyond which nothing is promised.
     """
     state = int(levels[STATE])
-    if state >= DETECTED:
+    if state >= CONTRADICTED:
         return Integrity(None, None, risk, _ALERTS[state])
     hpl_m, vpl_m = levels[HPL], None if height_known else levels[VPL]
     exceeded = alert_limit_m is not None and hpl_m > alert_limit_m
     return Integrity(hpl_m, vpl_m, risk, Alert.LIMIT if exceeded else _ALERTS[state])
 
 
-def limits_of(risk: float = RISK, false_alarm: float = FALSE_ALARM) -> Vector:
+def limits_of(risk: float = RISK, false_alarm: float = FALSE_ALARM) -> NDArray[np.float64]:
     """What the kernels compare with, for an integrity risk and a probability of false alarm, both of a fix.
 
     Raises:
@@ -79,35 +83,3 @@ def limits_of(risk: float = RISK, false_alarm: float = FALSE_ALARM) -> Vector:
     horizontal = np.sqrt(-2.0 * np.log(risk))
     vertical = -NormalDist().inv_cdf(risk / 2.0)
     return np.array([MARGIN * horizontal, MARGIN * vertical, -NormalDist().inv_cdf(false_alarm / 2.0)])
-
-
-@kernel
-def protected_track(
-    s: JointArrays,
-    sites: Integers,
-    sequences: Integers,
-    rx_ticks: Integers,
-    tx_ticks: Integers,
-    relays: Integers,
-    ends: Integers,
-    limits: Vector,
-    motion: Vector,
-    covariance: Matrix,
-    motions: Matrix,
-    levels: Matrix,
-) -> None:
-    """``joint_track`` with what is known after every packet; there must be room for all anchors.
-
-    Rows of ``motions``, shape (n, 2·dim), and ``levels``, shape (n, LEVELS + 1), are filled in; the last column says
-    what became of the packet.
-    """
-    no_syncs = np.empty((0, 3))
-    for k in range(len(sites)):
-        first = ends[k - 1] if k > 0 else 0
-        packet = (sites[k], sequences[k], rx_ticks[k], tx_ticks[k])
-        status = joint_hear(s, *packet, relays, first, ends[k], no_syncs, 0)
-        if status != FULL:
-            joint_motion(s, motion, covariance)
-            protect(s, covariance, limits, levels[k])
-            motions[k, :] = motion
-        levels[k, LEVELS] = status

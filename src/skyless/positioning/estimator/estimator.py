@@ -3,6 +3,7 @@
 Anchors join and leave between packets, in NumPy; everything else is one kernel a packet.
 """
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -32,7 +33,7 @@ from skyless.positioning.estimator.state import (
 )
 from skyless.positioning.fix_rows import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
 from skyless.positioning.kalman import horizontal_variance
-from skyless.positioning.protection import limits_of
+from skyless.positioning.protection import CONTRADICTED, OBSTRUCTED, SOUND, UNAVAILABLE, limits_of
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
 REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = range(7)
@@ -64,9 +65,6 @@ MOST_REFUSED: Final = 4.0
 
 FADING: Final = 0.95
 """What a packet leaves of the counts of relays lately."""
-
-SOUND, OBSTRUCTED, UNUSED, CONTRADICTED, UNAVAILABLE = range(5)
-"""What can be said of a fix, as ``protection.integrity_of`` takes it."""
 
 MOST_PACKED: Final = 16
 """Relays in a frame; 13 fit."""
@@ -125,7 +123,7 @@ def _is_impossible(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int)
 
 
 @kernel
-def _process(
+def _process(  # noqa: PLR0911 - each outcome where it is known
     s: EstimatorState,
     table_index: int,
     sequence: int,
@@ -406,7 +404,7 @@ class Estimator:
         sequence: int,
         rx_ticks: int,
         tx_ticks: int,
-        relays: Integers | list[list[int]] = (),  # type: ignore[assignment]
+        relays: Integers | Sequence[Sequence[int]] = (),
         *,
         packed: bytes = b"",
         report: Report = NO_REPORT,
@@ -414,8 +412,8 @@ class Estimator:
     ) -> int:
         """Process one packet; returns what became of it (``ACCEPTED`` …) and leaves ``rows``.
 
-        ``relays``: rows as in ``Packets``; ``packed``: relays as frames carry them (``codec.packed_relays``), anchors by
-        the identifiers that ``add_anchor`` was given; ``variance_factor``: on the variance of the tag's reception.
+        ``relays``: rows as in ``Packets``; ``packed``: relays as frames carry them (``codec.packed_relays``), anchors
+        by the identifiers that ``add_anchor`` was given; ``variance_factor``: on the variance of the tag's reception.
         """
         listed = len(relays)
         if listed:
@@ -444,8 +442,8 @@ class Estimator:
         """Process many packets in one loop.
 
         Rows of ``motions``, shape (n, 2·dim), ``covariances``, shape (n, dim·dim), and ``levels``, shape
-        (n, LEVELS + 2), are filled in after each packet; the last two columns of the levels are what became of the packet
-        and what can be said of the position.
+        (n, LEVELS + 2), are filled in after each packet; the last two columns of the levels are what became of the
+        packet and what can be said of the position.
         """
         nothing, done = np.empty((0, 0)), 0
         motions = nothing if motions is None else motions

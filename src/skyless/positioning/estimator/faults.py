@@ -116,7 +116,7 @@ def explained_chi2(s: EstimatorState, one: int, other: int) -> float:
 def open_lasting_faults(s: EstimatorState, chi2: float) -> int:
     """Take lasting faults into the state where the test ``chi2`` of all of them is sure; how many anchors have one.
 
-    They are the one or two anchors whose faults explain the test, and no others as well; none where there are none such.
+    They are the one or two anchors whose faults explain the test while no others do as well, or none.
     """
     count, dim = len(s.anchors), s.settings[0]["dim"]
     if chi2 <= SURE_CHI2:

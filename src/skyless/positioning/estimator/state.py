@@ -15,7 +15,7 @@ Everything before ``slope`` is updated by all measurements; what follows is upda
 and is a consider parameter (Schmidt 1966) of the others, which say next to nothing of it.
 """
 
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Records = NDArray[np.void]
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 REMEMBERED: Final = 16
 """Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
@@ -280,7 +281,7 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
     return result
 
 
-def _take(source: NDArray[np.generic], *indices: list[int]) -> NDArray[np.generic]:  # type: ignore[type-var]
+def _take(source: NDArray[Scalar], *indices: list[int]) -> NDArray[Scalar]:
     """Rows (and columns) of an array; zeros for an index of −1."""
     wanted = [np.array(index, np.int64) for index in indices]
     result = np.zeros([len(index) for index in indices] + list(source.shape[len(indices) :]), source.dtype)
