@@ -76,7 +76,7 @@ def part(function: Function) -> Function:
 
 def jitted(function: Function) -> Function:
     """A small function that kernels may call, and that stays plain Python elsewhere."""
-    return cast("Function", register_jitable(function))
+    return register_jitable(function)
 
 
 def borrowing_kernel(function: Function) -> Function:

@@ -42,6 +42,8 @@ from skyless.positioning.tracker import (
     REJECTED_IN_ROW,
     REJECTED_SHARE,
     RESIDUAL_SQUARED,
+    Vector,
+    adapt_agility,
 )
 
 MEMORY_S: Final = 0.5
