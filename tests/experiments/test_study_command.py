@@ -63,7 +63,28 @@ def test_the_study_of_levels_tells_how_often_they_mislead(run):
         assert words in out
 
 
-@pytest.mark.parametrize("name", ["nlos", "sync", "scale"])
+def test_the_study_of_the_room_tells_levels_and_what_is_missed(run, tmp_path):
+    """In worlds that are too small to find anything."""
+    small = ["--quick", "--worlds", "2", "--seconds", "1", "--processes", "1"]
+    code, out, err = run("room", *small, "--json", "--out", "folder")
+    assert (code, err, out.count("\n")) == (0, "", 1)
+    rows = json.loads(out)["rows"]
+    assert len(rows) == 37
+    first = rows[0]
+    assert (first["case"], first["method"], first["runs"]) == ("the room", "joint", 2)
+    assert {limit["figure"] for limit in first["limits"]} == {"rmse_m", "nees", "level", "exceeded", "hpl_m"}
+    assert first["passed"] == (not first["missed"])
+    for row in rows:
+        assert 0.0 <= row["level"] <= 1.0
+        assert (row["exceeded"] is None) == (row["level"] == 0.0)
+        assert row["said_m"] > 0.0
+    with (tmp_path / "folder" / "room.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert table[0]["limits"].split()[:2] == ["rmse_m:..0.029", "nees:0.7..1.3"]
+    assert ElementTree.fromstring((tmp_path / "folder" / "room.svg").read_bytes()).tag.endswith("svg")
+
+
+@pytest.mark.parametrize("name", ["nlos", "sync", "room", "scale"])
 def test_every_study_can_be_drawn(name, tmp_path):
     """From rows as they may be, without simulating: with numbers, without, with a single world."""
     from skyless.experiments.figures import picture
@@ -86,6 +107,9 @@ def test_every_study_can_be_drawn(name, tmp_path):
     [
         (["lost"], 'Choose from: "efficiency", "loss"'),
         (["loss", "--episodes", "5"], "--episodes is for the stud"),
+        (["room", "--episodes", "5"], "room takes --worlds and --seconds"),
+        (["room", "--integrity-risk", "1e-3"], "are for the study integrity"),
+        (["room", "--method", "guess"], "it should be one of literal"),
         (["efficiency", "--seconds", "5"], "--seconds is not for the study efficiency"),
         (["efficiency", "--method", "tracker"], "--method is 'tracker'"),
         (["loss", "--integrity-risk", "1e-3"], "are for the study integrity"),

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from skyless.air.codec import decode_cached
 from skyless.anchor import Anchor
-from skyless.experiments.studies import efficiency_rows, loss, motion, motions, nlos, scale, sync
+from skyless.experiments.studies import efficiency_rows, loss, motion, motions, nlos, room, scale, sync
 from skyless.experiments.studies.efficiency import efficiency
 from skyless.experiments.studies.plan import Plan, plan_of, seed_of
 from skyless.experiments.studies.stage import box, hall_site, walking
@@ -135,7 +135,7 @@ def test_worlds_of_one_number_are_the_same_in_all_cases():
 
 
 @pytest.mark.parametrize("quick", [False, True])
-@pytest.mark.parametrize("module", [loss, nlos, motion, sync, scale])
+@pytest.mark.parametrize("module", [loss, nlos, motion, sync, room, scale])
 def test_cases_can_be_told_apart_and_compared(module, quick):
     plan = plan_of("tracker", 1, quick=quick, worlds=2)
     cases = module.cases(plan)

@@ -15,7 +15,7 @@ from skyless.errors import SkylessError
 if TYPE_CHECKING:
     from skyless.experiments.studies.plan import Plan, Row, Study
 
-_Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "integrity", "scale"]
+_Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "scale"]
 _Count = Annotated[int, Parameter(validator=Number(gte=1, lte=10**6))]
 
 _USUAL_METHOD = "joint"
@@ -55,7 +55,7 @@ def study(
     name
         efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
         sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
-        scale: numbers of tags and anchors.
+        room: the errors of real rooms, and what goes wrong in them. scale: numbers of tags and anchors.
     method
         A positioning method, by default the best one.
     seed
@@ -63,7 +63,7 @@ def study(
     episodes
         Episodes of two seconds for each case (efficiency, integrity).
     worlds
-        Independent worlds for each case (all others, but for the tags of scale).
+        Independent worlds for each case (all others, but for the tags of scale; room: a quarter but for its first).
     seconds
         Simulated seconds for which each world is judged.
     noise_ps
@@ -103,6 +103,7 @@ def study(
     plan = plan_of(
         method or _USUAL_METHOD,
         seed,
+        study=name,
         quick=quick,
         noise_ps=noise_ps or 100.0,
         qa=qa or 0.3,

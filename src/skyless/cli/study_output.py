@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from skyless.experiments.studies.plan import Plan, Row, Study
 
-WIDEST = 160
+WIDEST = 220
 """Columns of a table that is not shown on a terminal."""
 
 _OF_ERRORS: Final = (
@@ -30,6 +30,24 @@ _OF_LEVELS: Final = (
     "fixes whose error exceeds it, in 10⁻⁴, with the interval where it truly lies with 99 %; held unless the risk lies",
     "below that. Ratio: how many times smaller levels could be on clean data.",
 )
+
+
+_OF_THE_ROOM: Final = (
+    "Simulated. ± standard errors. NEES: per dimension. Fixes: superframes with one.",
+    "Level: share of fixes with a protection level. HPL: its median. Exceeded: share of those whose error is larger,",
+    "in 10⁻⁴, with the interval where it truly lies with 99 % (tags as units); unwarned: those without an alert.",
+)
+_LEGENDS: Final = {"integrity": _OF_LEVELS, "room": _OF_THE_ROOM}
+
+_FIGURES: Final = {
+    "rmse_m": "RMSE",
+    "nees": "NEES",
+    "level": "level",
+    "exceeded": "exceeded",
+    "hpl_m": "HPL",
+    "ratio": "ratio",
+}
+"""What the table calls what may have limits."""
 
 
 def see_that_it_can_be_written(plot: Path | None, out: Path | None) -> None:
@@ -84,7 +102,7 @@ def print_rows(study: "Study", plan: "Plan", rows: "Sequence[Row]", wall_s: floa
     if not out.is_terminal:
         out.width = WIDEST
     out.print(_table(study, plan, rows))
-    for line in _OF_LEVELS if rows[0].risk is not None else _OF_ERRORS:
+    for line in _LEGENDS.get(study.name, _OF_ERRORS):
         out.print(line)
 
 
@@ -95,7 +113,8 @@ def _table(study: "Study", plan: "Plan", rows: "Sequence[Row]") -> "Table":
     table = Table(box=SIMPLE_HEAD, title=f"{study.title}: {plan.method}, seed {plan.seed}")
     heads = (
         *("case", "RMSE in cm", "95 %", "max", "said", "NEES", "", "fixes", "bound"),
-        *("level", "HPL in cm", "VPL", "misleading", "", "vertical", "", "ratio", "limit", "CPU in µs"),
+        *("level", "HPL in cm", "VPL", "misleading", "", "vertical", "", "exceeded", "", "unwarned"),
+        *("ratio", "limit", "CPU in µs"),
     )
     cells = [_cells(row) for row in rows]
     for column, head in enumerate(heads):
@@ -108,6 +127,7 @@ def _table(study: "Study", plan: "Plan", rows: "Sequence[Row]") -> "Table":
 
 
 def _cells(row: "Row") -> tuple[str, ...]:
+    in_a_room = row.study == "room"  # whose table has columns enough without what its limits say nothing of
     return (
         row.case,
         _number(row.rmse_m, 100.0, row.rmse_error_m),
@@ -115,26 +135,36 @@ def _cells(row: "Row") -> tuple[str, ...]:
         _number(row.max_m, 100.0),
         _number(row.said_m, 100.0),
         _number(row.nees),
-        "" if row.nees_interval is None else "{:.2f}–{:.2f}".format(*row.nees_interval),
+        "" if row.nees_interval is None or in_a_room else "{:.2f}–{:.2f}".format(*row.nees_interval),
         "" if row.risk is not None else _percent(row.available),
         _number(row.bound_m, 100.0),
-        "" if row.risk is None else _percent(row.available),
+        _percent(row.level if row.risk is None else row.available),
         _number(row.hpl_m, 100.0, digits=1),
         _number(row.vpl_m, 100.0, digits=1),
         _number(row.hmi, 1e4),
         _interval(row.hmi_interval),
         _number(row.hmi_vertical, 1e4),
         _interval(row.hmi_vertical_interval),
+        _rare(row.exceeded),
+        "" if row.exceeded_interval is None else "–".join(map(_rare, row.exceeded_interval)),
+        _rare(row.exceeded_unwarned),
         _number(row.ratio, 1.0, row.ratio_error, 3),
         _limit(row),
-        _number(row.cpu_us_per_message, digits=0),
+        "" if in_a_room else _number(row.cpu_us_per_message, digits=0),
     )
 
 
 def _limit(row: "Row") -> str:
-    """The largest ratio that is accepted, or else the risk of levels, and whether it was held."""
+    """Which limits were missed; or the largest ratio that is accepted, else the risk of levels, and whether it held."""
+    if row.limits:
+        return "missed: " + ", ".join(map(_FIGURES.__getitem__, row.missed)) if row.missed else "held"
     limit = row.risk if row.limit is None else row.limit
     return "" if limit is None else f"{limit:g} {'held' if row.passed else 'missed'}"
+
+
+def _rare(share: float | None) -> str:
+    """In 10⁻⁴."""
+    return "" if share is None else f"{1e4 * share:.{0 if share >= 1e-2 else 2}f}"
 
 
 def _percent(share: float | None) -> str:

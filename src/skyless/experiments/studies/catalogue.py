@@ -6,7 +6,17 @@ from typing import Any, Final
 
 from msgspec.structs import replace
 
-from skyless.experiments.studies import efficiency_rows, integrity, integrity_picture, loss, motion, nlos, scale, sync
+from skyless.experiments.studies import (
+    efficiency_rows,
+    integrity,
+    integrity_picture,
+    loss,
+    motion,
+    nlos,
+    room,
+    scale,
+    sync,
+)
 from skyless.experiments.studies.picture import Look, draw
 from skyless.experiments.studies.plan import Cell, Plan, Row, Study
 from skyless.experiments.studies.summary import Case, world_cells, world_rows
@@ -50,6 +60,10 @@ STUDIES: Final = {
             integrity.cells,
             integrity.rows,
             integrity_picture.draw,
+        ),
+        replace(
+            _of_worlds("room", "the room", room.cases, Look("The room", ("rmse", "nees", "level", "exceeded"))),
+            rows=room.rows,
         ),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
     )

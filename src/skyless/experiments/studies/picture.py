@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from msgspec import Struct
 from numpy.typing import NDArray
 
@@ -41,16 +42,46 @@ class _Panel(Struct, frozen=True):
     target: float | None = None
     """What a good receiver has; the values are then points about it, not lengths."""
     limits: bool = False
+    """Whether limits on the ratio are drawn as limits on the RMSE."""
+    figure: str = ""
+    """Field of a row whose own limits are drawn, ``scale`` times as large."""
+    scale: float = 1.0
+    log: bool | None = None
+    """Whether the axis of bars is logarithmic; None for where values lie far apart."""
 
 
 def _cm(value_m: float | None) -> float | None:
     return None if value_m is None else 100.0 * value_m
 
 
+LEAST: Final = 1e-6
+"""Smaller shares of exceeded levels are drawn here, none as well."""
+
+
+def _exceeded(row: Row) -> float | None:
+    return None if row.exceeded is None else 1e4 * max(row.exceeded, LEAST)
+
+
 _PANELS: Final = {
-    "rmse": _Panel("RMSE in cm", lambda row: _cm(row.rmse_m), lambda row: _cm(row.rmse_error_m), limits=True),
+    "rmse": _Panel(
+        "RMSE in cm",
+        lambda row: _cm(row.rmse_m),
+        lambda row: _cm(row.rmse_error_m),
+        limits=True,
+        figure="rmse_m",
+        scale=100.0,
+    ),
     "ratio": _Panel("RMSE over bound", lambda row: row.ratio, lambda row: row.ratio_error, 1.0),
-    "nees": _Panel("NEES per dimension", lambda row: row.nees, lambda _: None, 1.0),
+    "nees": _Panel("NEES per dimension", lambda row: row.nees, lambda _: None, 1.0, figure="nees"),
+    "level": _Panel(
+        "fixes with a level in %",
+        lambda row: None if row.level is None else 100.0 * row.level,
+        lambda _: None,
+        figure="level",
+        scale=100.0,
+        log=False,
+    ),
+    "exceeded": _Panel("levels exceeded in 10⁻⁴", _exceeded, lambda _: None, figure="exceeded", scale=1e4, log=True),
     "cpu": _Panel("CPU in µs a message", lambda row: row.cpu_us_per_message, lambda _: None),
 }
 
@@ -89,7 +120,7 @@ def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
             axes.set_ylim(top=max(axes.get_ylim()[1], 1.3 * panel.target))
         axes.set(ylabel=panel.label)
     else:
-        _named(axes, rows, values, errors, points=panel.target is not None)
+        _named(axes, panel, rows, values, errors)
         axes.set(xlabel=panel.label)
     if panel.target is not None:
         (axes.axhline if curve else axes.axvline)(panel.target, color=MUTED, linewidth=1.0, linestyle="--", zorder=1.5)
@@ -97,6 +128,8 @@ def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
         _intervals(axes, rows, curve=curve)
     if panel.limits:
         _limits(axes, rows)
+    if panel.figure and not curve:
+        _own_limits(axes, panel, rows)
 
 
 def _or_nan(value: float | None) -> float:
@@ -118,24 +151,26 @@ def _curve(axes: Axes, x: Array, values: Array, errors: Array, look: Look, serie
         axes.set_ylim(0.0, 1.15 * max(highest, 1e-9))
 
 
-def _plain_numbers(axis: Axis) -> None:
+def _plain_numbers(axis: Axis, *, between: bool = True) -> None:
+    """Numbers at the powers of ten, and ``between`` them."""
     axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter("{x:g}")
+    axis.set_minor_formatter("{x:g}" if between else NullFormatter())
     axis.set_tick_params(which="minor", labelsize=6.0)
 
 
-def _named(axes: Axes, rows: list[Row], values: Array, errors: Array, *, points: bool) -> None:
+def _named(axes: Axes, panel: _Panel, rows: list[Row], values: Array, errors: Array) -> None:
     places = np.arange(len(rows))
     colours = [ORANGE if row.passed is False else BLUE for row in rows]
     for place, value, error, colour in zip(places, values, errors, colours, strict=True):
-        if points:
+        if panel.target is not None:
             axes.errorbar(value, place, xerr=error, fmt="o", color=colour, markersize=5, capsize=2, zorder=3)
         else:
             axes.barh(place, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
-    if np.nanmax(values, initial=0.0) > WIDE * np.nanmin(values, initial=np.inf):
+    wide = np.nanmax(values, initial=0.0) > WIDE * np.nanmin(values, initial=np.inf)
+    if (wide if panel.log is None else panel.log) and np.isfinite(values).any():
         axes.set_xscale("log")
         axes.set_xlim(left=0.6 * float(np.nanmin(values)))
-        _plain_numbers(axes.xaxis)
+        _plain_numbers(axes.xaxis, between=panel.log is None)
     axes.set_yticks(places, [row.case for row in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
@@ -160,3 +195,14 @@ def _limits(axes: Axes, rows: list[Row]) -> None:
         x, y, mark = (limit_cm, place, "|") if row.x is None else (row.x, limit_cm, "_")
         (line,) = axes.plot(x, y, mark, color=RED, markersize=14, markeredgewidth=1.6, linestyle="none", label="limit")
         axes.legend(handles=[line])
+
+
+def _own_limits(axes: Axes, panel: _Panel, rows: list[Row]) -> None:
+    """Mark what a figure should be at least or at most."""
+    for place, row in enumerate(rows):
+        ends = [end for one in row.limits if one.figure == panel.figure for end in (one.least, one.most)]
+        values = [panel.scale * end for end in ends if end is not None]
+        if values:
+            places = [float(place)] * len(values)
+            (line,) = axes.plot(values, places, "|", color=RED, markersize=14, markeredgewidth=1.6, label="limit")
+            axes.legend(handles=[line])

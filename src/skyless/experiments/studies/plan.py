@@ -36,10 +36,17 @@ class Plan(Struct, frozen=True):
     """Fixes with a higher level count as not available (``integrity``)."""
 
 
+QUICK: Final = Plan(worlds=6, seconds=10.0, tags=2, episodes=200)
+
+USUAL: Final = {"room": Plan(worlds=20, seconds=15.0, tags=5)}
+"""Of studies that do not take the usual amounts; those of ``room`` are the room's own, its other cases have fewer."""
+
+
 def plan_of(
     method: str,
     seed: int,
     *,
+    study: str | None = None,
     quick: bool = False,
     noise_ps: float = 100.0,
     qa: float = 0.3,
@@ -51,9 +58,7 @@ def plan_of(
     alert_limit_m: float | None = None,
 ) -> Plan:
     """The usual amounts, or with ``quick`` few, where none are given."""
-    usual = Plan()
-    if quick:
-        usual = Plan(worlds=6, seconds=10.0, tags=2, episodes=200)
+    usual = QUICK if quick else USUAL.get(study or "", Plan())
     return Plan(
         method=method,
         seed=seed,
@@ -80,6 +85,19 @@ class Cell(Struct, frozen=True):
     argument: Any
     weight_s: float
     """About how long it takes: the longest are begun first."""
+
+
+class Limit(Struct, frozen=True):
+    """What a figure of a row should be at least, at most, or both."""
+
+    figure: str
+    """Name of the row's field."""
+    least: float | None = None
+    most: float | None = None
+
+    def __str__(self) -> str:
+        low, high = ("" if one is None else f"{one:g}" for one in (self.least, self.most))
+        return f"{self.figure}:{low}..{high}"
 
 
 class Row(Struct, frozen=True):
@@ -125,6 +143,10 @@ class Row(Struct, frozen=True):
     of: str | None = None
     limit: float | None = None
     """Largest ``ratio`` that is accepted."""
+    limits: tuple[Limit, ...] = ()
+    """All that are accepted, of rows with more than one."""
+    missed: tuple[str, ...] = ()
+    """Figures outside of them."""
     passed: bool | None = None
     cpu_us_per_message: float | None = None
     cpu_ms_per_tag_s: float | None = None
@@ -138,8 +160,16 @@ class Row(Struct, frozen=True):
     hmi_vertical: float | None = None
     hmi_vertical_interval: tuple[float, float] | None = None
     hpl_m: float | None = None
-    """Median horizontal level of the fixes that promise one; mean of the chunks' medians."""
+    """Median horizontal level of the fixes that promise one (``integrity``: mean of the chunks' medians)."""
     vpl_m: float | None = None
+    level: float | None = None
+    """Share of the judged fixes that give a horizontal protection level (``room``)."""
+    exceeded: float | None = None
+    """Share of those whose horizontal error is larger than it."""
+    exceeded_interval: tuple[float, float] | None = None
+    """Where that share truly lies, with 99 %, with tags as independent units."""
+    exceeded_unwarned: float | None = None
+    """Share of the fixes with a level whose error is larger, and which carry no alert."""
     smallest_m: float | None = None
     """Horizontal error that the share ``risk`` of fixes exceeds, with or without a level."""
 

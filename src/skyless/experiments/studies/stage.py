@@ -63,7 +63,7 @@ def worlds(
     for number in range(count or plan.worlds):
         seed = seed_of(plan.seed, number)
         own = {name: fault(number) if callable(fault) else fault for name, fault in faults.items()}
-        impairments = impairments_of(Request(site, **own), site)
+        impairments = impairments_of(Request(site, seed=seed, **own), site)
         runs.append(
             Run(
                 site=assumed or site,

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from skyless.experiments.studies.plan import Cell, Plan, Row
+from skyless.experiments.studies.plan import Cell, Limit, Plan, Row
 from skyless.experiments.studies.worlds import Run, RunResult, run_world
 
 Array = NDArray[np.float64]
@@ -29,8 +29,10 @@ class Case(Struct, frozen=True):
     x: float | None
     runs: tuple[Run, ...]
     of: str | None = None
-    """Case over whose RMSE this one's is the ratio, in worlds of the same seeds."""
+    """Case over whose RMSE this one's is the ratio, in worlds of the same seeds; it may have more of them."""
     limit: float | None = None
+    limits: tuple[Limit, ...] = ()
+    """On other figures than the ratio."""
 
 
 def world_cells(cases: Sequence[Case]) -> list[Cell]:
@@ -47,7 +49,10 @@ def world_rows(study: str, plan: Plan, cases: Sequence[Case], results: Sequence[
     """A row for each case; the results stand in the order of ``world_cells``."""
     rest = iter(results)
     worlds = {case.name: [next(rest) for _ in case.runs] for case in cases}
-    return [_row(study, plan, case, worlds[case.name], worlds[case.of] if case.of else None) for case in cases]
+    return [
+        _row(study, plan, case, worlds[case.name], worlds[case.of][: len(case.runs)] if case.of else None)
+        for case in cases
+    ]
 
 
 def _row(study: str, plan: Plan, case: Case, worlds: list[RunResult], clean: list[RunResult] | None) -> Row:

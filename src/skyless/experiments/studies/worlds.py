@@ -17,6 +17,7 @@ from skyless.air.malformed import Malformed
 from skyless.air.schedule import schedule_of
 from skyless.anchor import Anchor
 from skyless.experiments.statistics import EvenSample
+from skyless.experiments.studies.level_counts import LevelCounter, LevelCounts
 from skyless.positioning.fix import Fix
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import Impairments
@@ -74,6 +75,8 @@ class RunResult(Struct, frozen=True):
     """Seconds of all tags together."""
     cpu_s: float
     """That the tags took, measured."""
+    levels: LevelCounts | None = None
+    """None for methods that give no protection levels."""
 
 
 class _Judge:
@@ -88,6 +91,7 @@ class _Judge:
         self._sums = np.zeros(4)
         self._max_m = 0.0
         self._sample = EvenSample(1, SAMPLE_ROWS)
+        self._levels = LevelCounter(len(run.trajectories))
         first, end = int(run.warmup_s / self._superframe_s), math.ceil(run.until_s / self._superframe_s - 1e-3)
         self._superframes = (end - first) * len(run.trajectories)
 
@@ -96,7 +100,9 @@ class _Judge:
         if time_s < self._from_s or superframe == self._last[tag]:
             return
         self._last[tag] = superframe
-        error = (fix.position_m - truth_m)[: self._dim]
+        off_m = fix.position_m - truth_m
+        self._levels.add(tag, fix, math.hypot(off_m[0], off_m[1]))
+        error = off_m[: self._dim]
         covariance = fix.covariance_m2[: self._dim, : self._dim]
         squared = float(error @ error)
         nees = float(error @ np.linalg.solve(covariance, error))
@@ -118,6 +124,7 @@ class _Judge:
             messages=messages,
             tag_s=tag_s,
             cpu_s=cpu_s,
+            levels=self._levels.counts(),
         )
 
 
