@@ -9,6 +9,7 @@ from skyless.constants import TICK_S
 from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Start
 from skyless.positioning.estimator.estimator import (
     NO_REPORT,
+    OPEN_RANGE_STD_M,
     REJECTED,
     STALE,
     UNCOVERED_CHI2,
@@ -51,11 +52,14 @@ SPEED_STD_GROWTH: Final = 4.0
 MAX_SPEED_STD_MPS: Final = 32.0
 """... the next start assumes a speed higher by this factor, up to this."""
 
-OPEN_RANGE_STD_M: Final = 1.0
-"""Constant errors of ranges that a start has to expect whose faults contradicted the one before."""
+DOUBT_S: Final = 6.0
+"""Faults that show so soon after a start, and of whose anchors nothing can be said, have led to a wrong place."""
+
+CALM: Final = 0.1
+"""Range errors that have jumped more lately make faults of their own; a new start would not help."""
 
 CAUTION_S: Final = 5.0
-"""A start that expects them is not repeated for so long."""
+"""A start with open range errors is not repeated for so long."""
 
 REORDERED_S: Final = 0.1
 """Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
@@ -86,7 +90,7 @@ class Estimation:
         self._index_of: dict[int, int] = {}
         self._known_m: dict[int, NDArray[np.float64]] = {}
         self._start: JointStart | None = self._new_start()
-        self._range_std_m: float | None = None
+        self._open_range_errors = False
         self._time = fix_time or FixTime()
         self._in_use = AnchorsInUse(superframe_s)
         self._master_less_tag_ticks = 0
@@ -154,10 +158,11 @@ class Estimation:
         """Whether a new start is needed, as relays or faults contradict this one; says what that has to expect."""
         if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
             age_s = (rx_ticks - self._started_ticks) * TICK_S
-            cautious = self._range_std_m is not None
-            limit = 2.0 * SURE_CHI2 if age_s < EARLY_S and not cautious else UNCOVERED_CHI2
-            if self._estimator.fault_test > limit and (not cautious or age_s > CAUTION_S):
-                self._range_std_m = OPEN_RANGE_STD_M
+            cautious = self._open_range_errors
+            limit = SURE_CHI2 if age_s < DOUBT_S and not cautious else UNCOVERED_CHI2
+            calm = self._estimator.obstruction < CALM
+            if calm and self._estimator.fault_test > limit and (not cautious or age_s > CAUTION_S):
+                self._open_range_errors = True
                 return True
         if not self._relays_may_contradict:
             self._relays_may_contradict = self._estimator.relays_fit
@@ -190,12 +195,14 @@ class Estimation:
         self._in_use.begin(start.used)
         dim, begin_ticks = self._estimator.dim, packets[0].rx_ticks_tag
         age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
-        error = self._settings.range_std_m if self._range_std_m is None else self._range_std_m
+        error = OPEN_RANGE_STD_M if self._open_range_errors else self._settings.range_std_m
         inflation = COVARIANCE_MARGIN * (
             1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
         )
         covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * start.speed_variance * np.eye(dim)
-        self._estimator.start(begin_ticks, start.solution[:dim], covariance, start.speed_variance, self._range_std_m)
+        self._estimator.start(
+            begin_ticks, start.solution[:dim], covariance, start.speed_variance, self._open_range_errors
+        )
         for packet in packets:
             self._process(packet)
 

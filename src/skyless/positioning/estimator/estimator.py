@@ -63,6 +63,10 @@ LOST_SHARE: Final = 0.5
 MOST_REFUSED: Final = 4.0
 """Relays beyond the gate lately; fewer may be late ones."""
 
+OPEN_RANGE_STD_M: Final = 1.0
+OPEN_SURVEY_STD_M: Final = 0.15
+"""What a start expects that follows one which was contradicted."""
+
 FADING: Final = 0.95
 """What a packet leaves of the counts of relays lately."""
 
@@ -382,16 +386,17 @@ class Estimator:
         position_m: Vector,
         covariance_m2: Matrix,
         speed_variance: float,
-        range_std_m: float | None = None,
+        open_range_errors: bool = False,
     ) -> None:
         """Begin at a position, shapes (dim,) and (dim, dim), without any anchor.
 
-        ``range_std_m``: of the constant errors of ranges, where the settings' are contradicted.
+        ``open_range_errors``: expect ranges to be wrong by metres and anchors to stand elsewhere than told, since what
+        the settings say of them has been contradicted.
         """
         settings, dim = self.settings, self.dim
         state = new_state(settings, len(self._table_m))
-        if range_std_m is not None:
-            state.settings["range_std_m"] = range_std_m
+        if open_range_errors:
+            state.settings["range_std_m"], state.settings["survey_std_m"] = OPEN_RANGE_STD_M, OPEN_SURVEY_STD_M
         state.x[:dim] = position_m
         state.P[:dim, :dim] = covariance_m2
         state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
@@ -476,6 +481,11 @@ class Estimator:
     def fault_test(self) -> float:
         """The larger test of faults, χ² with as many degrees of freedom as there are anchors if there are none."""
         return float(max(self._levels[LASTING_CHI2], self._levels[RECENT_CHI2]))
+
+    @property
+    def obstruction(self) -> float:
+        """1 where range errors have jumped lately, 0 where they do not."""
+        return float(self._state.status[0]["obstruction"])
 
     @property
     def is_lost(self) -> bool:

@@ -26,9 +26,12 @@ from skyless.positioning.estimator.kalman import (
     update,
 )
 from skyless.positioning.estimator.monitor import (
+    COMMON,
+    MAX_WALK_SCALE,
     adapt_clock_noise,
     adapt_process_noise,
     has_jumped,
+    is_common,
     is_warm,
     open_range_error,
     variance_scale,
@@ -58,6 +61,9 @@ REPORT_GAIN: Final = 1.25
 
 LEAST_REPORT_VARIANCE: Final = 0.1
 """Of that of a pair of stamps: no anchor knows its clock better, whatever it says."""
+
+STEADY_WALK_SCALE: Final = 4.0
+"""Reports of clocks whose random walk counts more than this are not used."""
 
 CLOCK_JUMPED: Final = 2
 
@@ -162,7 +168,11 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     innovation = (rx_ticks - tx_ticks - a["offset_ticks"]) * TICK_M - range_m - bend_m - _along(s, 2 * dim, terms)
     innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
     a["range_m"] = range_m
-    if is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
+    a["innovation"] = innovation / np.sqrt(innovation_variance)
+    if is_warm(s) and abs(a["innovation"]) > COMMON and is_common(s, a["innovation"]):
+        status["walk_scale"] = MAX_WALK_SCALE
+        a["outliers_in_row"] = 0
+    elif is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
         if a["relay_outliers_in_row"] >= CLOCK_JUMP_RELAYS:
             return CLOCK_JUMPED
         innovation = _jump(s, anchor, innovation, terms, rx_variance)
@@ -312,6 +322,8 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
     if master < 0 or master == anchor:
         return
+    if max(a["walk_scale"], s.anchors[master]["walk_scale"]) > STEADY_WALK_SCALE:
+        return  # the anchor's filter, which assumes what the almanac says, lags behind such a clock as well
     dim, n = settings["dim"], dynamic_states(s)
     variance = max(variance_m2, LEAST_REPORT_VARIANCE * (settings["tx_variance_m2"] + settings["rx_variance_m2"]))
     back_s = a["range_m"] / SPEED_OF_LIGHT_MPS

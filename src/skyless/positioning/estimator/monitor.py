@@ -31,7 +31,7 @@ OFTEN_LATE: Final = 0.02
 AGREEMENT: Final = 3.0
 """... if they agree within so many standard deviations of two receptions."""
 
-JUMP_STD_M: Final = 0.3
+JUMP_STD_M: Final = 0.2
 """Of a range error that has jumped, beyond what it was, unless it has jumped by more."""
 
 JUMP_RISE: Final = 0.5
@@ -57,12 +57,16 @@ COMMON_GAIN: Final = 0.05
 COMMON_LIMIT: Final = 6.25
 """Of the square of the running mean of all innovations, 1 where the filter is right; those of the tag's clock."""
 
+COMMON: Final = 1.5
+"""Where the newest innovations of all anchors lie beyond so many standard deviations on one side, the tag's
+clock has left its rate: nothing else makes all of them late, or early, at once."""
+
 WALK_GAIN: Final = 1.1
 WALK_LOSS: Final = 0.99
-RELAY_GAIN: Final = 0.02
+RELAY_GAIN: Final = 0.05
 RELAY_LIMIT: Final = 9.0
-RELAY_WALK_GAIN: Final = 1.05
-RELAY_WALK_LOSS: Final = 0.995
+RELAY_WALK_GAIN: Final = 1.2
+RELAY_WALK_LOSS: Final = 0.99
 MAX_WALK_SCALE: Final = 1e4
 
 
@@ -96,6 +100,16 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
     a["outlier_m"] = innovation
     needed = IN_ROW_WHERE_LATE if status["late_share"] > OFTEN_LATE else IN_ROW
     return bool(a["outliers_in_row"] >= needed)
+
+
+@kernel
+def is_common(s: EstimatorState, normalised: float) -> bool:
+    """Whether the newest innovations of all anchors lie on the side of this one; the tag's clock it is then."""
+    for anchor in range(len(s.anchors)):
+        newest = s.anchors[anchor]["innovation"]
+        if newest * normalised <= 0.0 or abs(newest) <= COMMON:
+            return False
+    return len(s.anchors) > s.settings[0]["dim"]
 
 
 @kernel

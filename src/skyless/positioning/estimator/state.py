@@ -47,6 +47,7 @@ ANCHOR: Final = np.dtype(
         ("is_relayed", np.int64),  # whether others relay its packets
         ("has_tx_noise", np.int64),  # whether its newest packet's TX noise is a state
         ("packets", np.int64),
+        ("innovation", np.float64),  # its newest one, normalised
         ("outliers_in_row", np.int64),
         ("outlier_m", np.float64),  # the newest of them
         ("is_obstructed", np.int64),  # whether its range error has jumped and not come back
