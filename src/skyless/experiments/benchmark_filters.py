@@ -220,4 +220,4 @@ class PlainJoint:
         self.x = self.x + gain * innovation
         keep = np.eye(len(self.x)) - np.outer(gain, h)
         self.P = keep @ self.P @ keep.T + variance * np.outer(gain, gain)
-        return innovation / spread**0.5
+        return innovation / float(np.sqrt(spread))
