@@ -9,7 +9,7 @@ from skyless.errors import SkylessError
 from skyless.experiments.figures import picture
 from skyless.experiments.studies.catalogue import STUDIES
 from skyless.experiments.studies.episodes import Case, draw_episode
-from skyless.experiments.studies.integrity import ALL, MOST_RATIO, Chunk, anchors_of, cells, rows
+from skyless.experiments.studies.integrity import ALL, MOST_RATIO, Chunk, anchors_of, cells, rows, run_chunk
 from skyless.experiments.studies.integrity_faults import BURST_S, FAULTS, Fault, faulty
 from skyless.experiments.studies.plan import plan_of
 from skyless.experiments.studies.rare import CLUSTER, rare_interval
@@ -122,6 +122,18 @@ def test_cells_carry_what_is_asked():
     assert len(found) == 2 * len(FAULTS)
     assert {(cell.argument[0].risk, cell.argument[0].alert_limit_m) for cell in found} == {(1e-3, 0.5)}
     assert [len(cell.argument[1]) for cell in found[:2]] == [50, 10]
+
+
+@pytest.mark.parametrize("place", ["lab", "room"])
+def test_levels_hold_in_clean_episodes(place):
+    cell = next(cell for cell in cells(plan_of("joint", 1, episodes=3)) if cell.name == f"{place}, clean")
+    told = run_chunk(cell.argument)
+    fixes, promised, across, above = told.counts.T
+    assert (fixes > 350).all()
+    assert (promised == fixes).all()
+    assert not across.any()
+    assert not above.any()
+    assert 0.0 < told.top.max() < 1.0
 
 
 def test_other_methods_have_no_levels():
