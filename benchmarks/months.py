@@ -12,18 +12,17 @@ import time
 import numpy as np
 
 from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.positioning.joint import JointFilter
-from skyless.positioning.joint_messages import Messages
-from skyless.positioning.joint_report import covariance_of
-from skyless.positioning.joint_settings import JointSettings
-from skyless.positioning.joint_state import REJECTED
-from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings, track
+from skyless.positioning.estimator.estimator import Estimator, Packets
+from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import layout
+from skyless.positioning.tracker import REJECTED, PseudorangeTracker, TrackerSettings, track
 
 NODES, SUPERFRAMES, SLOT_TICKS = 7, 2048, round(5e-3 * TICK_RATE_HZ)
 TAG_M = np.array([3.0, 4.0, 0.0])
 ANGLES = 2.0 * np.pi * np.arange(NODES) / NODES
 ANCHORS_M = np.column_stack([3.0 + 4.0 * np.cos(ANGLES), 4.0 + 5.0 * np.sin(ANGLES), np.zeros(NODES)])
 NOISE_M = 0.03
+EXACT = EstimatorSettings(qa=0.3, height_m=0.0, survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0)
 CHECKS = 100
 
 
@@ -66,20 +65,20 @@ class Joint:
         relays, ends = minute.relays(mesh)
         sequences = np.arange(minute.count) // NODES % 256
         self.minute, self.count = minute, minute.count
-        self.messages = Messages(minute.senders, sequences, minute.rx_ticks, minute.tx_ticks, relays, ends)
-        self.filter = JointFilter(JointSettings(qa=0.3, height_m=0.0), ANCHORS_M)
+        self.packets = Packets(minute.senders, sequences, minute.rx_ticks, minute.tx_ticks, relays, ends)
+        self.filter = Estimator(EXACT, ANCHORS_M)
         self.filter.start(0, TAG_M[:2], 1e-2 * np.eye(2), 0.01)
 
     def once(self):
-        m = self.messages
-        self.filter.track(m)
-        m.rx_ticks[:] += self.minute.tag_step
-        m.tx_ticks[:] += self.minute.steps[m.sites]
-        m.relays[:, 3] += self.minute.steps[m.relays[:, 0]]
+        p = self.packets
+        self.filter.track(p)
+        p.rx_ticks[:] += self.minute.tag_step
+        p.tx_ticks[:] += self.minute.steps[p.anchors]
+        p.relays[:, 3] += self.minute.steps[p.relays[:, 0]]
 
     def state(self):
-        P = covariance_of(self.filter.arrays)
-        return self.filter.arrays.x[: len(P)], P, int(self.filter.arrays.counts[REJECTED])
+        s, clocked = self.filter.state, layout(2, NODES).tx_noise
+        return s.x[:clocked], s.P[:clocked, :clocked], int(s.status[0]["rejected"])
 
     def position(self):
         return self.filter.motion()[0][:2]

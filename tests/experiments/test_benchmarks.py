@@ -43,15 +43,15 @@ def test_filterpy_says_the_same():
 
 
 @pytest.mark.parametrize("mesh", [False, True])
-def test_plain_numpy_is_the_joint_filter_but_for_its_first_packets(mesh):
+def test_plain_numpy_is_the_estimator_but_for_its_first_packets(mesh):
     """It begins with wide priors where the kernel begins with an anchor's first packet."""
     runs = JointRuns(60, mesh=mesh)
-    m, joint = runs.messages, runs.begun()
-    plain = PlainJoint(runs.settings, ANCHORS_M, int(m.rx_ticks[0]), runs.tag_m[:2], START_VARIANCES)
-    for packet in packets_of(m, runs.count):
+    p, estimator = runs.packets, runs.begun()
+    plain = PlainJoint(runs.settings, ANCHORS_M, int(p.rx_ticks[0]), runs.tag_m[:2], START_VARIANCES)
+    for packet in packets_of(p, runs.count):
         plain.hear(*packet)
-    joint.track(m)
-    motion, covariance = joint.motion()
+    estimator.track(p)
+    motion, covariance = estimator.motion()
     np.testing.assert_allclose(plain.x[:2], motion[:2], atol=1e-4)
     np.testing.assert_allclose(plain.x[2:4], motion[2:], atol=1e-3)
     np.testing.assert_allclose(plain.P[:2, :2], covariance[:2, :2], rtol=2e-3, atol=1e-8)

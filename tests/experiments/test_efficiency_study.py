@@ -6,23 +6,23 @@ import pytest
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.experiments.studies.efficiency import CASES, efficiency, run_chunk
 from skyless.experiments.studies.episodes import Case, draw_episode
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
-LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors])
-SLOT_S = lab_site().schedule.slot_s
+LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in ideal_lab_site().anchors])
+SLOT_S = ideal_lab_site().schedule.slot_s
 
 
 def test_stamps_have_the_noise_they_are_said_to_have():
     """A tag's and an anchor's stamps of one frame differ by two RX noises, and by TX noise not at all; clocks apart."""
     case = Case(mesh=True, at_once=True, noise_ps=200.0, random_walk_fm=0.0)
     episode = draw_episode(np.random.default_rng(1), LAB_M, SLOT_S, case, 400)
-    m = episode.messages
+    p = episode.packets
     residuals = []
-    for site in range(6):
-        frames = np.flatnonzero(m.sites == site)
-        time_s = (m.rx_ticks[frames] - m.rx_ticks[0]) * TICK_S
-        flight_m = np.linalg.norm(episode.path_m[frames] - LAB_M[site], axis=1)
-        one_way = (m.rx_ticks[frames] - m.tx_ticks[frames]) * TICK_M - flight_m
+    for anchor in range(6):
+        frames = np.flatnonzero(p.anchors == anchor)
+        time_s = (p.rx_ticks[frames] - p.rx_ticks[0]) * TICK_S
+        flight_m = np.linalg.norm(episode.path_m[frames] - LAB_M[anchor], axis=1)
+        one_way = (p.rx_ticks[frames] - p.tx_ticks[frames]) * TICK_M - flight_m
         residuals.append(one_way - np.polyval(np.polyfit(time_s, one_way, 3), time_s))
     expected_m = np.sqrt(2.0) * 200e-12 * SPEED_OF_LIGHT_MPS
     assert np.std(residuals) == pytest.approx(expected_m, rel=0.05)
@@ -30,18 +30,18 @@ def test_stamps_have_the_noise_they_are_said_to_have():
 
 def test_relays_name_receptions_that_the_tag_can_place():
     for at_once in (False, True):
-        m = draw_episode(np.random.default_rng(2), LAB_M, SLOT_S, Case(mesh=True, at_once=at_once), 20).messages
-        sent = {(site, sequence): tx for site, sequence, tx in zip(m.sites, m.sequences, m.tx_ticks, strict=True)}
-        assert len({tuple(row) for row in m.relays[:, :3].tolist()}) == len(m.relays)
+        p = draw_episode(np.random.default_rng(2), LAB_M, SLOT_S, Case(mesh=True, at_once=at_once), 20).packets
+        sent = set(zip(p.anchors.tolist(), p.sequences.tolist(), strict=True))
+        assert len({tuple(row) for row in p.relays[:, :3].tolist()}) == len(p.relays)
         begin = 0
-        for k, end in enumerate(m.ends.tolist()):
-            for listener, site, sequence, _ in m.relays[begin:end].tolist():
-                assert listener != site
-                assert (site, sequence) in sent
-                assert (site if at_once else listener) == m.sites[k]
+        for k, end in enumerate(p.ends.tolist()):
+            for listener, sender, sequence, _ in p.relays[begin:end].tolist():
+                assert listener != sender
+                assert (sender, sequence) in sent
+                assert (sender if at_once else listener) == p.anchors[k]
             begin = end
-        assert begin == len(m.relays)
-        assert len(m.relays) == 120 * 5 - (0 if at_once else 15)
+        assert begin == len(p.relays)
+        assert len(p.relays) == 120 * 5 - (0 if at_once else 15)
 
 
 def test_episodes_do_not_depend_on_how_they_are_shared_out():

@@ -9,9 +9,9 @@ from msgspec.structs import asdict, replace
 from skyless.experiments.fleet import report
 from skyless.experiments.scenarios import Request, fleet_of, trajectories_of
 from skyless.simulation.impairments import AnchorOutage, Outage
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
-LAB = lab_site()
+LAB = ideal_lab_site()
 P1 = (3.0, 4.0)
 SEEDS = (1, 2, 3)
 C = 299_792_458.0

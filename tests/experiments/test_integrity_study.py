@@ -9,13 +9,13 @@ from skyless.errors import SkylessError
 from skyless.experiments.figures import picture
 from skyless.experiments.studies.catalogue import STUDIES
 from skyless.experiments.studies.episodes import Case, draw_episode
-from skyless.experiments.studies.integrity import ALL, MOST_RATIO, Chunk, anchors_of, cells, rows
+from skyless.experiments.studies.integrity import ALL, MOST_RATIO, Chunk, anchors_of, cells, rows, run_chunk
 from skyless.experiments.studies.integrity_faults import BURST_S, FAULTS, Fault, faulty
 from skyless.experiments.studies.plan import plan_of
 from skyless.experiments.studies.rare import CLUSTER, rare_interval
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
-SLOT_S = lab_site().schedule.slot_s
+SLOT_S = ideal_lab_site().schedule.slot_s
 PLAN = plan_of("joint", 1, episodes=100)
 
 
@@ -26,25 +26,25 @@ def episode_of(superframes=120):
 @pytest.mark.parametrize(("kind", "sign"), [("step", 1.0), ("early", -1.0), ("delay", 1.0)])
 def test_a_fault_changes_what_is_heard_of_its_anchor_from_the_onset_on(kind, sign):
     episode, anchor, onset = episode_of(), 3, 240
-    messages = faulty(episode, Fault("lab", 1.0, kind), anchor, onset, SLOT_S)
-    late_m = (messages.rx_ticks - episode.messages.rx_ticks) * TICK_M
-    touched = (messages.sites == anchor) & (np.arange(len(late_m)) >= onset)
+    packets = faulty(episode, Fault("lab", 1.0, kind), anchor, onset, SLOT_S)
+    late_m = (packets.rx_ticks - episode.packets.rx_ticks) * TICK_M
+    touched = (packets.anchors == anchor) & (np.arange(len(late_m)) >= onset)
     assert late_m[touched] == pytest.approx(sign, abs=TICK_M)
     assert not late_m[~touched].any()
-    relayed_m = (messages.relays[:, 3] - episode.messages.relays[:, 3]) * TICK_M
-    of_anchor = (messages.relays[:, 1] == anchor) & (messages.relays[:, 2] >= onset // 6)
+    relayed_m = (packets.relays[:, 3] - episode.packets.relays[:, 3]) * TICK_M
+    of_anchor = (packets.relays[:, 1] == anchor) & (packets.relays[:, 2] >= onset // 6)
     assert not relayed_m[~of_anchor].any()
     assert relayed_m[of_anchor] == pytest.approx(1.0 if kind == "delay" else 0.0, abs=TICK_M)
 
 
 def test_ramps_grow_for_a_second_and_bursts_come_and_go():
     episode, anchor, onset = episode_of(), 0, 60
-    own = episode.messages.sites == anchor
+    own = episode.packets.anchors == anchor
     since_s = (np.arange(len(own)) - onset)[own] * SLOT_S
 
     def late_m(kind):
         return (
-            (faulty(episode, Fault("lab", 2.0, kind), anchor, onset, SLOT_S).rx_ticks - episode.messages.rx_ticks)
+            (faulty(episode, Fault("lab", 2.0, kind), anchor, onset, SLOT_S).rx_ticks - episode.packets.rx_ticks)
             * TICK_M
         )[own]
 
@@ -122,6 +122,18 @@ def test_cells_carry_what_is_asked():
     assert len(found) == 2 * len(FAULTS)
     assert {(cell.argument[0].risk, cell.argument[0].alert_limit_m) for cell in found} == {(1e-3, 0.5)}
     assert [len(cell.argument[1]) for cell in found[:2]] == [50, 10]
+
+
+@pytest.mark.parametrize("place", ["lab", "room"])
+def test_levels_hold_in_clean_episodes(place):
+    cell = next(cell for cell in cells(plan_of("joint", 1, episodes=3)) if cell.name == f"{place}, clean")
+    told = run_chunk(cell.argument)
+    fixes, promised, across, above = told.counts.T
+    assert (fixes > 350).all()
+    assert (promised == fixes).all()
+    assert not across.any()
+    assert not above.any()
+    assert 0.0 < told.top.max() < 1.0
 
 
 def test_other_methods_have_no_levels():

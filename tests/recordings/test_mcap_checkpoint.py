@@ -14,7 +14,6 @@ from machines.bench import LAB, PAIRS, ROOM, tape
 from skyless.air.codec import decode, encode
 from skyless.air.reception import Reception
 from skyless.methods import METHODS
-from skyless.positioning.joint_state import DIM, NOISE, NOISES, SITE, SLOTS, TERMS
 from skyless.receiver import Receiver
 from skyless.recordings.checkpoint import FORMAT, RefusedError, load, save
 from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
@@ -177,41 +176,92 @@ def test_damaged_bytes_are_refused_or_harmless(data):
             assert error.reason.startswith("checkpoint-")
 
 
+def fill(array, place, value):
+    array[place] = value
+
+
 @pytest.mark.parametrize(
     "change",
     [
-        lambda s: s.counts.__setitem__(SLOTS, 9),
-        lambda s: s.counts.__setitem__(SLOTS, -1),
-        lambda s: s.counts.__setitem__(NOISES, 7),
-        lambda s: s.counts.__setitem__(TERMS, 3),
-        lambda s: s.slot_of.__setitem__(0, 5),
-        lambda s: s.slot_of.__setitem__(7, 1 << 40),
-        lambda s: s.slots.__setitem__((2, NOISE), 99),
-        lambda s: s.slots.__setitem__((2, NOISE), -2),
-        lambda s: s.slots.__setitem__((2, SITE), -5),
-        lambda s: s.settings.__setitem__(DIM, 3.0),
+        lambda s: fill(s.index_of, 0, 5),
+        lambda s: fill(s.index_of, 5, 1 << 40),
+        lambda s: fill(s.index_of, 3, -1),
+        lambda s: fill(s.anchors["table_index"], 2, -5),
+        lambda s: fill(s.anchors["table_index"], 2, 6),
+        lambda s: fill(s.anchors["table_index"], 2, s.anchors["table_index"][1]),
+        lambda s: fill(s.settings["dim"], 0, 3),
+        lambda s: fill(s.settings["dim"], 0, -1),
+        lambda s: s._replace(index_of=s.index_of[:5].copy()),
+        lambda s: s._replace(index_of=s.index_of.astype(np.int32)),
         lambda s: s._replace(P=s.P[:8, :8].copy()),
         lambda s: s._replace(P=s.P.astype(np.float32)),
-        lambda s: s._replace(relayed=s.relayed[:1].copy()),
-        lambda s: s._replace(x=np.asfortranarray(s.P)),
+        lambda s: s._replace(P=np.asfortranarray(s.P)),
+        lambda s: s._replace(V=s.V[:-1].copy()),
+        lambda s: s._replace(x=s.P),
+        lambda s: s._replace(information=s.information[:1].copy()),
+        lambda s: s._replace(evidence=s.evidence[:, 1:].copy()),
+        lambda s: s._replace(anchors=s.anchors[:-1].copy()),
+        lambda s: s._replace(packets=s.packets[:, :-1].copy()),
+        lambda s: s._replace(links=s.links[:1].copy()),
+        lambda s: s._replace(links=np.zeros(s.links.shape, s.packets.dtype)),
+        lambda s: s._replace(status=s.status[:0].copy()),
+        lambda s: s._replace(settings=s.settings[:0].copy()),
+        lambda s: s._replace(h=s.h[:-1].copy()),
+        lambda s: s._replace(h_index=s.h_index[:-1].copy()),
+        lambda s: s._replace(ph=s.ph[:-1].copy()),
+        lambda s: s._replace(fault_input=s.fault_input[:-1].copy()),
+        lambda s: s._replace(x=None),
         tuple,
     ],
 )
-def test_joint_filters_that_would_lead_their_kernels_astray_are_refused(change):
-    receiver = Receiver("joint")
-    for one in tape(LAB, 1.0):
-        receiver.hear(one.reception)
+def test_states_that_would_lead_their_kernels_astray_are_refused(change):
+    receiver = joint_receiver()
     assert save(load(save(receiver))) == save(receiver)
-    joint = receiver.method.filter
-    changed = change(joint.arrays)
+    estimator = receiver.method.estimator
+    changed = change(estimator.state)
     if changed is not None:
-        vars(joint)["_arrays"] = changed
+        vars(estimator)["_state"] = changed
     assert refusal(save(receiver)) == "checkpoint-damaged"
 
 
-def test_addresses_in_a_checkpoint_are_refused():
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("dim", lambda _: 3),
+        ("settings", lambda settings: replace(settings, height_m=None)),
+        ("settings", lambda _: None),
+        ("_table_m", lambda table_m: table_m[:-1]),
+        ("_table_m", tuple),
+        ("_table_m", lambda table_m: [*table_m[:-1], np.zeros(2)]),
+        ("_identifiers", lambda identifiers: identifiers[:-1].copy()),
+        ("_k", lambda k: k[:1].copy()),
+        ("_levels", lambda levels: levels[:-1].copy()),
+        ("_rows", lambda rows: rows[:-1].copy()),
+        ("_packed", lambda packed: packed[:-1].copy()),
+        ("_packed", lambda packed: packed.astype(np.int64)),
+        ("_listed", lambda listed: listed[:-1].copy()),
+        ("_listed", lambda listed: listed[:, :3].copy()),
+        ("_work", lambda work: work[:-1].copy()),
+        ("_work", lambda work: work[:, :-1].copy()),
+    ],
+)
+def test_estimators_that_would_lead_their_kernels_astray_are_refused(name, change):
+    receiver = joint_receiver()
+    own = vars(receiver.method.estimator)
+    own[name] = change(own[name])
+    assert refusal(save(receiver)) == "checkpoint-damaged"
+
+
+@pytest.mark.parametrize("index", [-1, 6, 0.0, None])
+def test_anchors_that_are_not_in_the_table_are_refused(index):
+    receiver = joint_receiver()
+    anchors = vars(receiver.method)["_index_of"]
+    anchors[next(iter(anchors))] = index
+    assert refusal(save(receiver)) == "checkpoint-damaged"
+
+
+def joint_receiver():
     receiver = Receiver("joint")
     for one in tape(LAB, 1.0):
         receiver.hear(one.reception)
-    vars(receiver.method.filter)["_addresses"] = (1, 2)
-    assert refusal(save(receiver)) == "checkpoint-damaged"
+    return receiver

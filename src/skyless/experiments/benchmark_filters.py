@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.positioning.joint_hearing import RELAY_AGE_S
-from skyless.positioning.joint_settings import JointSettings
+from skyless.positioning.estimator.estimator import RELAY_AGE_S
+from skyless.positioning.estimator.monitor import COMMON_GAIN, COMMON_LIMIT, WALK_GAIN, WALK_LOSS
+from skyless.positioning.estimator.settings import MAX_CLOCK_RATE, EstimatorSettings
+from skyless.positioning.estimator.state import START_WALK_SCALE
 from skyless.positioning.tracker import (
     AGILITY_GAIN,
     AGILITY_LOSS,
@@ -121,40 +123,51 @@ class PlainJoint:
     """``joint`` as one would write it first: all anchors from the start, a wide prior, nothing exploited.
 
     The states are position and velocity (the height is given), then of every anchor the offset of its clock, then the
-    rates, then the noise of each last TX stamp.
+    rates, then the noise of each last TX stamp. Survey and ranges are taken for exact, no packet for late, and of the
+    process noise only that of the tag's clock adapts.
     """
 
     def __init__(
-        self, settings: JointSettings, anchors_m: Matrix, rx_ticks: int, start_m: Vector, variances: tuple[float, float]
+        self,
+        settings: EstimatorSettings,
+        anchors_m: Matrix,
+        rx_ticks: int,
+        start_m: Vector,
+        variances: tuple[float, float],
     ) -> None:
         """``start_m``: (2,); ``variances``: of position and speed."""
         n = len(anchors_m)
         self._s, self._anchors_m, self._n, self._epoch = settings, anchors_m, n, rx_ticks
         self.x = np.concatenate([start_m, np.zeros(2 + 3 * n)])
-        rate = settings.array()[8]
+        rate = (MAX_CLOCK_RATE * SPEED_OF_LIGHT_MPS) ** 2
         self.P = np.diag([variances[0]] * 2 + [variances[1]] * 2 + [1e8] * n + [rate] * n + [0.0] * n)
         self._whole: dict[int, int] = {}
         self._packets: dict[tuple[int, int], tuple[int, int]] = {}
         self._relayed: dict[tuple[int, int], int] = {}
         self._newest: dict[int, int] = {}
         self._range_m: dict[int, float] = {}
+        self._walk_scale, self._common_mean, self._count = START_WALK_SCALE, 0.0, 0
 
-    def hear(self, site: int, sequence: int, rx: int, tx: int, relays: NDArray[np.int64]) -> None:
-        """Take one packet, as ``JointFilter.hear`` does."""
+    def hear(self, anchor: int, sequence: int, rx: int, tx: int, relays: NDArray[np.int64]) -> None:
+        """Take one packet, as ``Estimator.process`` does."""
         self._elapse(rx)
         n, s = self._n, self._s
-        noise = 4 + 2 * n + site
+        noise = 4 + 2 * n + anchor
         self.P[noise, :] = self.P[:, noise] = 0.0
         self.P[noise, noise], self.x[noise] = s.tx_variance_m2, 0.0
-        away = np.append(self.x[:2], s.height_m or 0.0) - self._anchors_m[site]
+        away = np.append(self.x[:2], s.height_m or 0.0) - self._anchors_m[anchor]
         range_m = float(np.linalg.norm(away))
         h = np.zeros(len(self.x))
         h[:2] = away[:2] / range_m
-        h[4 + site] = h[noise] = 1.0
-        whole = self._whole.setdefault(site, rx - tx)
-        self._update(h, (rx - tx - whole) * TICK_M - range_m - self.x[4 + site], s.rx_variance_m2)
-        self._newest[site], self._range_m[site] = tx, range_m
-        self._packets[site, sequence] = (tx, rx)
+        h[4 + anchor] = h[noise] = 1.0
+        whole = self._whole.setdefault(anchor, rx - tx)
+        innovation = (rx - tx - whole) * TICK_M - range_m - self.x[4 + anchor]
+        normalised = self._update(h, innovation, s.rx_variance_m2)
+        if self._count > 2 * n:
+            self._adapt(normalised)
+        self._count += 1
+        self._newest[anchor], self._range_m[anchor] = tx, range_m
+        self._packets[anchor, sequence] = (tx, rx)
         for listener, of, number, heard in relays.tolist():
             self._hear_relay(listener, of, number, heard)
 
@@ -168,12 +181,18 @@ class PlainJoint:
         F[b, f] = dt * np.eye(n)
         Q[:2, :2], Q[2:4, 2:4] = np.eye(2) * s.qa * dt**3 / 3, np.eye(2) * s.qa * dt
         Q[:2, 2:4] = Q[2:4, :2] = np.eye(2) * s.qa * dt**2 / 2
-        both = np.eye(n) + np.ones((n, n))
-        Q[b, b] = both * (s.white * dt + s.walk * dt**3 / 3)
-        Q[b, f] = Q[f, b] = both * s.walk * dt**2 / 2
-        Q[f, f] = both * s.walk * dt
+        white, walk = np.eye(n) + np.ones((n, n)), s.walk * (np.eye(n) + self._walk_scale * np.ones((n, n)))
+        Q[b, b] = white * s.white * dt + walk * dt**3 / 3
+        Q[b, f] = Q[f, b] = walk * dt**2 / 2
+        Q[f, f] = walk * dt
         self.x = F @ self.x
         self.P = F @ self.P @ F.T + Q
+
+    def _adapt(self, normalised: float) -> None:
+        """The process noise of the tag's clock, from an innovation over its standard deviation."""
+        self._common_mean += COMMON_GAIN * (normalised - self._common_mean)
+        square = self._common_mean**2 * (2.0 - COMMON_GAIN) / COMMON_GAIN
+        self._walk_scale = max(self._walk_scale * (WALK_GAIN if square > COMMON_LIMIT else WALK_LOSS), 1.0)
 
     def _hear_relay(self, listener: int, of: int, sequence: int, heard: int) -> None:
         n, s = self._n, self._s
@@ -195,8 +214,10 @@ class PlainJoint:
         measured = (heard - tx - self._whole[of] + self._whole[listener]) * TICK_M - way_m
         self._update(h, measured - h @ self.x, variance)
 
-    def _update(self, h: Vector, innovation: float, variance: float) -> None:
-        gain = self.P @ h / (h @ self.P @ h + variance)
+    def _update(self, h: Vector, innovation: float, variance: float) -> float:
+        spread = float(h @ self.P @ h) + variance
+        gain = self.P @ h / spread
         self.x = self.x + gain * innovation
         keep = np.eye(len(self.x)) - np.outer(gain, h)
         self.P = keep @ self.P @ keep.T + variance * np.outer(gain, gain)
+        return innovation / float(np.sqrt(spread))

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.experiments.benchmark_filters import FilterpyTracker, PlainJoint, PlainTracker
 from skyless.experiments.benchmark_loops import joint_filter, scalar_filter
-from skyless.experiments.studies.episodes import Case, draw_episode
-from skyless.positioning.joint import JointFilter
-from skyless.positioning.joint_messages import Messages
-from skyless.positioning.joint_settings import JointSettings
+from skyless.experiments.studies.episodes import Case, draw_episode, settings_of
+from skyless.positioning.estimator.estimator import Estimator, Packets
 from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings, track
 
 Array = NDArray[np.float64]
@@ -34,14 +32,14 @@ class TrackerRuns:
 
     def __init__(self, superframes: int) -> None:
         episode = draw_episode(np.random.default_rng(1), ANCHORS_M, SLOT_S, Case(qa=0.0), superframes)
-        sites, draw = episode.messages.sites, np.random.default_rng(2)
-        self.count = len(sites)
+        senders, draw = episode.packets.anchors, np.random.default_rng(2)
+        self.count = len(senders)
         self.settings = TrackerSettings(height_m=0.0)
         self.tag_m = episode.path_m[0]
-        self.anchors_m = ANCHORS_M[sites]
+        self.anchors_m = ANCHORS_M[senders]
         self.pseudoranges_m = np.linalg.norm(self.anchors_m - self.tag_m, axis=1)
         self.pseudoranges_m += draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
-        self.rx_ticks = episode.messages.rx_ticks
+        self.rx_ticks = episode.packets.rx_ticks
         self.tx_ticks: Ticks = self.rx_ticks - np.rint(self.pseudoranges_m / TICK_M).astype(np.int64)
         self.variances = np.full(self.count, 1e-4)
 
@@ -87,40 +85,40 @@ class JointRuns:
     def __init__(self, superframes: int, *, mesh: bool) -> None:
         case = Case(mesh=mesh, qa=0.0)
         episode = draw_episode(np.random.default_rng(1), ANCHORS_M, SLOT_S, case, superframes)
-        self.messages, self.tag_m = episode.messages, episode.path_m[0]
-        self.count = len(self.messages.sites)
-        self.settings = JointSettings(height_m=0.0)
+        self.packets, self.tag_m = episode.packets, episode.path_m[0]
+        self.count = len(self.packets.anchors)
+        self.settings = settings_of(Case(mesh=mesh), height_m=0.0)
 
-    def begun(self) -> JointFilter:
+    def begun(self) -> Estimator:
         """A filter that begins where the tag stands, without any anchor in view."""
-        joint = JointFilter(self.settings, ANCHORS_M)
+        estimator = Estimator(self.settings, ANCHORS_M)
         position, speed = START_VARIANCES
-        joint.start(int(self.messages.rx_ticks[0]), self.tag_m[:2], position * np.eye(2), speed)
-        return joint
+        estimator.start(int(self.packets.rx_ticks[0]), self.tag_m[:2], position * np.eye(2), speed)
+        return estimator
 
-    def part(self, begin: int, end: int) -> Messages:
-        """Some of the messages, with what they relay."""
-        m = self.messages
-        first = int(m.ends[begin - 1]) if begin else 0
-        columns = (m.sites[begin:end], m.sequences[begin:end], m.rx_ticks[begin:end], m.tx_ticks[begin:end])
-        return Messages(*columns, m.relays[first : int(m.ends[end - 1])], m.ends[begin:end] - first)
+    def part(self, begin: int, end: int) -> Packets:
+        """Some of the packets, with what they relay."""
+        p = self.packets
+        first = int(p.ends[begin - 1]) if begin else 0
+        columns = (p.anchors[begin:end], p.sequences[begin:end], p.rx_ticks[begin:end], p.tx_ticks[begin:end])
+        return Packets(*columns, p.relays[first : int(p.ends[end - 1])], p.ends[begin:end] - first)
 
     def kernel(self) -> Run:
         """All messages through the kernel."""
-        joint = self.begun()
-        return lambda: joint.track(self.messages)
+        estimator = self.begun()
+        return lambda: estimator.track(self.packets)
 
     def plain(self, count: int) -> Run:
         """The first messages through plain NumPy."""
-        m = self.messages
-        joint = PlainJoint(self.settings, ANCHORS_M, int(m.rx_ticks[0]), self.tag_m[:2], START_VARIANCES)
-        rows = list(packets_of(m, count))
+        p = self.packets
+        joint = PlainJoint(self.settings, ANCHORS_M, int(p.rx_ticks[0]), self.tag_m[:2], START_VARIANCES)
+        rows = list(packets_of(p, count))
         return lambda: _each(lambda row: joint.hear(*row), rows)
 
     def loop(self) -> Run:
         """As many messages through a plain loop of 18 states; all clocks run alike."""
         draw = np.random.default_rng(2)
-        senders = self.messages.sites
+        senders = self.packets.anchors
         ranges_m = np.linalg.norm(ANCHORS_M[senders] - self.tag_m, axis=1)
         pseudoranges_m = ranges_m + draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
         sync_m = draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
@@ -130,16 +128,16 @@ class JointRuns:
         return lambda: joint_filter(x, P, ANCHORS_M, senders, steps, pseudoranges_m, sync_m, 2e-3, noise)
 
 
-def packets_of(messages: Messages, count: int) -> Iterable[tuple[int, int, int, int, Ticks]]:
-    """The first packets as ``JointFilter.hear`` takes them."""
+def packets_of(packets: Packets, count: int) -> Iterable[tuple[int, int, int, int, Ticks]]:
+    """The first packets as ``Estimator.process`` takes them."""
     begin = 0
-    for k, end in enumerate(messages.ends[:count].tolist()):
+    for k, end in enumerate(packets.ends[:count].tolist()):
         yield (
-            int(messages.sites[k]),
-            int(messages.sequences[k]),
-            int(messages.rx_ticks[k]),
-            int(messages.tx_ticks[k]),
-            messages.relays[begin:end],
+            int(packets.anchors[k]),
+            int(packets.sequences[k]),
+            int(packets.rx_ticks[k]),
+            int(packets.tx_ticks[k]),
+            packets.relays[begin:end],
         )
         begin = end
 

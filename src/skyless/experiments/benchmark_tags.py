@@ -64,8 +64,8 @@ def many_joints() -> TagsSpeed:
     parts = [runs.part(k * CHUNK * NODES, (k + 1) * CHUNK * NODES) for k in range(CHUNKS)]
 
     def tag() -> Tag:
-        joint = runs.begun()
-        return lambda chunk: joint.track(parts[chunk])
+        estimator = runs.begun()
+        return lambda chunk: estimator.track(parts[chunk])
 
     return _many(tag)
 

@@ -13,10 +13,10 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.positioning.acquisition import Start
+from skyless.positioning.estimation import Estimation
+from skyless.positioning.estimator.estimator import Estimator
+from skyless.positioning.estimator.soundness import is_sound
 from skyless.positioning.in_use import AnchorsInUse
-from skyless.positioning.joint import JointFilter
-from skyless.positioning.joint_soundness import is_sound
-from skyless.positioning.joint_tracking import JointTracking
 from skyless.positioning.observation import Observation
 from skyless.positioning.tracker import PseudorangeTracker
 from skyless.receiver import Receiver
@@ -24,8 +24,9 @@ from skyless.recordings.checkpoint_graph import Arrays
 from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
 from skyless.recordings.checkpoint_writer import write_graph
 
-FORMAT: Final = 11
-MAX_BYTES: Final = 1 << 20
+FORMAT: Final = 12
+MAX_BYTES: Final = 1 << 23
+"""Enough for an estimator of a hundred anchors."""
 
 
 class _Envelope(Struct, frozen=True):
@@ -102,10 +103,12 @@ def _in_use(value: AnchorsInUse) -> bool:
     return _floats(value.anchors_m, len(value.anchors), 3)
 
 
-def _joint_tracking(value: JointTracking) -> bool:
-    places = vars(value)["_place_of"].values()
-    known = vars(value)["_known_m"].values()
-    return value.filter.has_anchors(places) and all(_floats(place, 3) for place in known)
+def _estimation(value: Estimation) -> bool:
+    estimator, known_m = value.estimator, vars(value)["_known_m"]
+    if type(estimator) is not Estimator or not all(_floats(position_m, 3) for position_m in known_m.values()):
+        return False
+    count = len(estimator.state.index_of)
+    return all(type(index) is int and 0 <= index < count for index in vars(value)["_index_of"].values())
 
 
 def _receiver(value: Receiver) -> bool:
@@ -117,8 +120,8 @@ _SOUND: Final[Arrays] = {
     Start: _start,
     PseudorangeTracker: _tracker,
     AnchorsInUse: _in_use,
-    JointFilter: is_sound,
-    JointTracking: _joint_tracking,
+    Estimator: is_sound,
+    Estimation: _estimation,
     Receiver: _receiver,
 }
 """The classes that hold arrays, and whether one's arrays have the shapes that its kernels count on."""

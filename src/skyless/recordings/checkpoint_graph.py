@@ -11,6 +11,9 @@ from typing import Any, Final
 import numpy as np
 from msgspec import Struct
 
+from skyless.positioning.estimator.settings import SETTINGS
+from skyless.positioning.estimator.state import ANCHOR, LINK, PACKET, STATUS
+
 PACKAGES: Final = (
     "skyless.air",
     "skyless.clocks",
@@ -22,6 +25,9 @@ PACKAGES: Final = (
 """Where the classes of a protocol machine live."""
 
 PLAIN: Final[tuple[type, ...]] = (type(None), bool, float, str, bytes)
+
+RECORDS: Final = {"anchor": ANCHOR, "packet": PACKET, "link": LINK, "status": STATUS, "settings": SETTINGS}
+"""Types of the records that arrays may consist of."""
 
 Node = list[Any]
 Arrays = Mapping[type, Callable[[Any], bool]]

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import astuple
 
-from skyless.recordings.checkpoint_graph import PLAIN, Arrays, Node, holds_arrays, is_ours
+from skyless.recordings.checkpoint_graph import PLAIN, RECORDS, Arrays, Node, holds_arrays, is_ours
 
 MOST_NODES: Final = 200_000
 
@@ -194,6 +194,8 @@ def _find(module: str, name: str) -> type:
 
 
 def _dtype(name: str) -> np.dtype[Any]:
+    if name in RECORDS:
+        return RECORDS[name]
     found = np.dtype(name)
     if found.kind not in "biuf":
         raise DamagedGraphError("no numbers")

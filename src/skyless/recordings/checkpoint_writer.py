@@ -8,8 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from skyless.addresses import Addresses
-from skyless.recordings.checkpoint_graph import PLAIN, Arrays, Node, fields_of, holds_arrays, is_ours
+from skyless.recordings.checkpoint_graph import PLAIN, RECORDS, Arrays, Node, fields_of, holds_arrays, is_ours
 
 _INT64: Final = 1 << 63
 
@@ -36,9 +35,7 @@ class _Writer:
         return self._nodes
 
     def _of(self, value: object) -> int:
-        """Number of the value's node; addresses are nothing to others."""
-        if type(value) is Addresses:
-            value = None
+        """Number of the value's node."""
         number = self._number.get(id(value))
         if number is None:
             number = self._number[id(value)] = len(self._nodes)
@@ -98,7 +95,8 @@ class _Writer:
         return ["counter", self._all(value), self._all(value.values())]
 
     def _array(self, value: np.ndarray[Any, Any]) -> Node:
-        if value.dtype.kind not in "biuf":
+        kind = next((name for name, record in RECORDS.items() if value.dtype == record), value.dtype.str)
+        if value.dtype.kind not in "biuf" and kind not in RECORDS:
             raise TypeError(f"an array of {value.dtype} has no form here")
         if value.base is not None and any(
             other is not value and isinstance(other, np.ndarray) and np.may_share_memory(other, value)
@@ -107,7 +105,7 @@ class _Writer:
             raise TypeError("arrays that share their memory have no form here")
         fortran = value.flags.f_contiguous and not value.flags.c_contiguous
         data = value.tobytes("F" if fortran else "C")
-        return ["array", value.dtype.str, list(value.shape), fortran, value.flags.writeable, data]
+        return ["array", kind, list(value.shape), fortran, value.flags.writeable, data]
 
 
 _WRITERS: Final[dict[type, Callable[[_Writer, Any], Node]]] = {

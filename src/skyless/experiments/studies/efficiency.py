@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from skyless.experiments.lab_bound import LAST, SPEED_STD_MPS, WHITE_FM
 from skyless.experiments.monte_carlo import cores
 from skyless.experiments.studies.episodes import Case, Episode, draw_episode, settings_of
-from skyless.positioning.joint import JointFilter
+from skyless.positioning.estimator.estimator import Estimator
 from skyless.site.lab import ideal_lab_site
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
@@ -117,12 +117,12 @@ def _run(case: Case, draw: np.random.Generator) -> list[float]:
 
 
 def _filtered(case: Case, anchors: Array, episode: Episode, draw: np.random.Generator) -> tuple[Array, Array]:
-    joint = JointFilter(settings_of(case, height_m=0.0), anchors)
+    estimator = Estimator(settings_of(case, height_m=0.0), anchors)
     start = episode.path_m[0, :2] + draw.normal(0.0, START_STD_M, 2)
-    joint.start(int(episode.messages.rx_ticks[0]), start, START_STD_M**2 * np.eye(2), SPEED_STD_MPS**2)
+    estimator.start(int(episode.packets.rx_ticks[0]), start, START_STD_M**2 * np.eye(2), SPEED_STD_MPS**2)
     frames = len(episode.path_m)
     motions, variances = np.empty((frames, 4)), np.empty((frames, 4))
-    joint.track(episode.messages, motions, variances)
+    estimator.track(episode.packets, motions, variances)
     return motions, variances
 
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.experiments.lab_bound import SUPERFRAMES, WHITE_FM, random_path
-from skyless.positioning.joint_messages import Messages
-from skyless.positioning.joint_settings import JointSettings
+from skyless.positioning.estimator.estimator import Packets
+from skyless.positioning.estimator.settings import EstimatorSettings
 
 Array = NDArray[np.float64]
 Ticks = NDArray[np.int64]
@@ -40,7 +40,7 @@ class Case(Struct, frozen=True):
 class Episode(Struct, frozen=True):
     """What one tag heard, and where it was."""
 
-    messages: Messages
+    packets: Packets
     path_m: Array
     """Place at each frame, shape (frames, 3)."""
 
@@ -65,21 +65,25 @@ def draw_episode(
     arrived = (left[:, None] + way) * (1.0 + rates / SPEED_OF_LIGHT_MPS)
     rx_ticks = _ticks(time_m[:, None] + offsets + arrived + noise_m * draw.normal(size=(frames, n + 1)))
     relays, ends = _relays(rx_ticks, senders, n, case)
-    messages = Messages(senders, np.arange(frames) // n % 256, rx_ticks[:, n].copy(), tx_ticks, relays, ends)
-    return Episode(messages, path_m)
+    packets = Packets(senders, np.arange(frames) // n % 256, rx_ticks[:, n].copy(), tx_ticks, relays, ends)
+    return Episode(packets, path_m)
 
 
-def settings_of(case: Case, height_m: float | None) -> JointSettings:
+def settings_of(case: Case, height_m: float | None) -> EstimatorSettings:
     """What a filter has to assume for an episode to be just what it assumes."""
     light2 = SPEED_OF_LIGHT_MPS**2
     stamp = light2 * (case.noise_ps * 1e-12) ** 2
-    return JointSettings(
+    return EstimatorSettings(
         qa=case.qa,
         white=light2 * WHITE_FM**2,
         walk=light2 * case.random_walk_fm**2,
         tx_variance_m2=stamp,
         rx_variance_m2=stamp + TICK_M**2 / 12.0,
         height_m=height_m,
+        survey_std_m=0.0,
+        range_std_m=0.0,
+        slope_std_m=0.0,
+        place_std_m=0.0,
     )
 
 

@@ -1,4 +1,4 @@
-"""The study ``integrity``: whether ``joint``'s protection levels hold while one anchor's messages are late.
+"""The study ``integrity``: whether ``joint``'s protection levels hold while one anchor's packets are late.
 
 Matched episodes of the filter itself, as in ``efficiency``. In the middle of each, the tag's receptions of one anchor
 drawn by chance become late, at once or more and more, or go wrong in other ways (``integrity_faults``). Every fix from
@@ -21,11 +21,9 @@ from skyless.experiments.studies.episodes import Case, draw_episode, settings_of
 from skyless.experiments.studies.integrity_faults import FAULTS, Fault, faulty
 from skyless.experiments.studies.plan import Cell, Plan, Row
 from skyless.experiments.studies.rare import rare_interval
-from skyless.positioning.joint import JointFilter
-from skyless.positioning.joint_hearing import REJECTED
-from skyless.positioning.joint_messages import Messages
-from skyless.positioning.protection import limits_of, protected_track
-from skyless.positioning.protection_levels import DETECTED, HPL, LEVELS, STATE, VPL
+from skyless.positioning.estimator.estimator import ACCEPTED, JOINED, Estimator, Packets
+from skyless.positioning.estimator.levels import HPL, LEVELS, VPL
+from skyless.positioning.protection import CONTRADICTED
 from skyless.site.lab import ideal_lab_site
 
 Array = NDArray[np.float64]
@@ -41,6 +39,9 @@ EPISODE_S: Final = 0.008
 
 TOP: Final = 100
 """So many of the largest errors a chunk tells at least, and ten times the share of its epochs that the risk is."""
+
+OUTCOME, SOUNDNESS = LEVELS, LEVELS + 1
+"""What became of a packet and what can be said of the position, behind its levels."""
 
 MOST_RATIO: Final = 1.5
 ALL: Final = "all faults"
@@ -123,40 +124,28 @@ def _run(setting: Setting, draw: Generator) -> tuple[NDArray[Any], ...]:
     anchors_m, slot_s = anchors_of(setting.fault.place), ideal_lab_site().schedule.slot_s
     episode = draw_episode(draw, anchors_m, slot_s, setting.case, SUPERFRAMES)
     onset = int(draw.integers(*ONSETS)) * len(anchors_m)
-    messages = faulty(episode, setting.fault, int(draw.integers(len(anchors_m))), onset, slot_s)
-    motions, levels = _filtered(setting, anchors_m, messages, episode.path_m[0] + draw.normal(0.0, START_STD_M, 3))
-    fixes = np.flatnonzero(levels[onset:, LEVELS] != REJECTED) + onset
+    packets = faulty(episode, setting.fault, int(draw.integers(len(anchors_m))), onset, slot_s)
+    motions, levels = _filtered(setting, anchors_m, packets, episode.path_m[0] + draw.normal(0.0, START_STD_M, 3))
+    fixes = np.flatnonzero(np.isin(levels[onset:, OUTCOME], (ACCEPTED, JOINED))) + onset
     errors, told = np.zeros((len(fixes), 3)), levels[fixes]
     dim = motions.shape[1] // 2
     errors[:, :dim] = motions[fixes, :dim] - episode.path_m[fixes, :dim]
     vpl = told[:, VPL] if dim == 3 else np.full(len(fixes), np.inf)
-    promised = told[:, STATE] < DETECTED
+    promised = told[:, SOUNDNESS] < CONTRADICTED
     if setting.alert_limit_m is not None:
         promised &= told[:, HPL] <= setting.alert_limit_m
     return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2]), told[:, HPL], vpl, promised
 
 
-def _filtered(setting: Setting, anchors_m: Array, messages: Messages, start_m: Array) -> tuple[Array, Array]:
+def _filtered(setting: Setting, anchors_m: Array, packets: Packets, start_m: Array) -> tuple[Array, Array]:
     """Motions and levels after every packet."""
     height_m = 0.0 if setting.fault.place == "lab" else None
-    joint = JointFilter(settings_of(setting.case, height_m), anchors_m)
-    dim, n = joint.dim, len(messages.sites)
-    joint.start(int(messages.rx_ticks[0]), start_m[:dim], START_STD_M**2 * np.eye(dim), SPEED_STD_MPS**2)
-    motions, levels = np.empty((n, 2 * dim)), np.empty((n, LEVELS + 1))
-    protected_track(
-        joint.arrays,
-        messages.sites,
-        messages.sequences,
-        messages.rx_ticks,
-        messages.tx_ticks,
-        messages.relays,
-        messages.ends,
-        limits_of(setting.risk),
-        np.empty(2 * dim),
-        np.empty((2 * dim, 2 * dim)),
-        motions,
-        levels,
-    )
+    settings = replace(settings_of(setting.case, height_m), integrity_risk=setting.risk)
+    estimator = Estimator(settings, anchors_m)
+    dim, n = estimator.dim, len(packets.anchors)
+    estimator.start(int(packets.rx_ticks[0]), start_m[:dim], START_STD_M**2 * np.eye(dim), SPEED_STD_MPS**2)
+    motions, levels = np.empty((n, 2 * dim)), np.zeros((n, LEVELS + 2))
+    estimator.track(packets, motions, levels=levels)
     return motions, levels
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skyless.constants import TICK_M
 from skyless.experiments.studies.episodes import Episode
-from skyless.positioning.joint_messages import Messages
+from skyless.positioning.estimator.estimator import Packets
 
 Kind = Literal["step", "ramp", "early", "bursts", "delay"]
 
@@ -60,19 +60,19 @@ FAULTS: Final = tuple(
 )
 
 
-def faulty(episode: Episode, fault: Fault, anchor: int, onset: int, slot_s: float) -> Messages:
-    """The episode's messages with the anchor's fault, from the packet ``onset`` on."""
-    messages = episode.messages
+def faulty(episode: Episode, fault: Fault, anchor: int, onset: int, slot_s: float) -> Packets:
+    """The episode's packets with the anchor's fault, from the packet ``onset`` on."""
+    packets = episode.packets
     size = fault.size_m / TICK_M
-    share = _share((np.arange(len(messages.sites)) - onset) * slot_s, fault.kind)
-    late = np.where(messages.sites == anchor, np.rint(size * share), 0.0).astype(np.int64)
-    relays = messages.relays
+    share = _share((np.arange(len(packets.anchors)) - onset) * slot_s, fault.kind)
+    late = np.where(packets.anchors == anchor, np.rint(size * share), 0.0).astype(np.int64)
+    relays = packets.relays
     if fault.kind == "delay":
-        begun = messages.sequences[onset]  # an episode is shorter than sequence numbers take to come around
+        begun = packets.sequences[onset]  # an episode is shorter than sequence numbers take to come around
         heard_late = (relays[:, 1] == anchor) & (relays[:, 2] >= begun)
         relays = relays.copy()
         relays[heard_late, 3] += round(size)
-    return replace(messages, rx_ticks=messages.rx_ticks + late, relays=relays)
+    return replace(packets, rx_ticks=packets.rx_ticks + late, relays=relays)
 
 
 def _share(since_s: NDArray[np.floating[Any]], kind: Kind) -> NDArray[np.float64]:

@@ -233,6 +233,7 @@ def _track(
         if len(motions) > 0:
             for one in range(dim):
                 motions[n, one], motions[n, dim + one] = s.x[one], s.x[dim + len(s.anchors) + one]
+        if len(covariances) > 0:
             for one in range(dim):
                 for other in range(dim):
                     covariances[n, dim * one + other] = s.P[one, other]
