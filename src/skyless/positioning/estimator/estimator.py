@@ -11,7 +11,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.air.beacon import HEARD
-from skyless.compiled import kernel
+from skyless.compiled import kernel, threaded_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.estimator.faults import fade_recent_faults, open_lasting_faults
 from skyless.positioning.estimator.kalman import predict
@@ -202,7 +202,7 @@ def _relayed(s: EstimatorState, listener: int, sender: int, sequence: int, rx_ti
         s.anchors[sender]["is_relayed"] = 1
 
 
-@kernel
+@threaded_kernel
 def _track(
     s: EstimatorState,
     begin: int,
