@@ -2,9 +2,9 @@
 
 The filter's P, with constant errors of ranges and survey as the site tells them, is run through superframes until it
 repeats. It holds what the filter allows for accelerations, which a tag at rest does not have. That part follows from
-the estimator's sensitivities V: rows of V begin as a velocity that the filter does not know of, and the squares of what
-they do to the position, summed over the time after that, are what accelerations add to P. Another row holds the
-walls' delays.
+the estimator's sensitivities V: rows of V begin, at moments of a superframe, as a velocity that the filter does not
+know of, and the squares of what they do to the position, integrated over the time after that, are what accelerations
+add to P. Another row holds the walls' delays.
 
 Where only a share of an anchor's packets arrives, the stamps of all count for as much less: their variances are divided
 by the share, and those of relayed receptions by the share of all three that they take.
@@ -54,8 +54,11 @@ LONGEST_S: Final = 4.0
 LONGEST: Final = 20
 """... so many superframes."""
 
-PHASES: Final = 4
-"""Packets of a superframe before which an acceleration begins."""
+KICKS: Final = 4
+"""Moments of a superframe at which an acceleration is tried."""
+
+NEVER: Final = 1 << 62
+"""After all others."""
 
 START_VARIANCE: Final = 1.0
 """Of each component of position and velocity, m² and m²/s²; the steady state does not depend on it."""
@@ -69,7 +72,7 @@ def site_state(settings: EstimatorSettings, anchors_m: Matrix, in_view: Integers
         s.P[axis, axis] = START_VARIANCE
     for row in in_view.tolist():
         s = with_anchor(s, row, anchors_m[row])
-    rows = len(s.V) + 1 + PHASES * settings.dim
+    rows = len(s.V) + 1 + KICKS * settings.dim
     return s._replace(V=np.zeros((rows, len(s.x))), fault_input=np.zeros(rows))
 
 
@@ -81,32 +84,25 @@ def _superframe(
     share: Vector,
     sight: Matrix,
     begin_ticks: int,
-    phases: int,
+    kicks_ticks: int,
     motion: Vector,
     row: Vector,
 ) -> int:
     """Process a superframe's packets; when it ends.
 
     Leaves sums over packets, each by how often it arrives, of the position's variances and squared mean error in
-    ``row``. In ``phases`` of the packets an acceleration begins; what these add to the variances goes into ``motion``.
+    ``row``. The tag is kicked at moments of the superframe that begins at ``kicks_ticks``; the squares of what that
+    does to the position are added to ``motion``.
     """
-    settings, status = s.settings[0], s.status[0]
-    dim, count, now = settings["dim"], len(s.anchors), begin_ticks
-    where = layout(dim, count)
-    walls, packets, begun = 2 * count + dim, 0, 0
+    dim, count, now = s.settings[0]["dim"], len(s.anchors), begin_ticks
+    walls = 2 * count + dim
     row[SIGMA_X : SIGMA_Z + 1], row[FIX_SHARE], row[BIAS] = 0.0, 0.0, 0.0
     for k in range(len(clocks.sender)):
         now += round(clocks.gap_s[k] / TICK_S)
         own = s.index_of[clocks.sender[k]]
         if own < 0:
             continue
-        if begun < phases and begun * count <= packets * phases:
-            for axis in range(dim):
-                s.V[walls + 1 + begun * dim + axis, where.velocity + axis] = 1.0
-            begun += 1
-        packets += 1
-        dt_s = (now - status["epoch_ticks"]) * TICK_S
-        predict(s, now)
+        _let_time_pass(s, now, kicks_ticks, clocks.gap_s.sum())
         arrives = share[clocks.sender[k]]
         _own_reception(s, own, now, arrives, sight[clocks.sender[k], 3])
         for r in range(relays.ends[k - 1] if k > 0 else 0, relays.ends[k]):
@@ -119,8 +115,22 @@ def _superframe(
             row[SIGMA_X + axis] += arrives * s.P[axis, axis]
             row[BIAS] += arrives * s.V[walls, axis] ** 2
             for fault in range(walls + 1, s.V.shape[0]):
-                motion[axis] += settings["qa"] * dt_s * s.V[fault, axis] ** 2
+                motion[axis] += arrives * s.V[fault, axis] ** 2
     return now
+
+
+@kernel
+def _let_time_pass(s: EstimatorState, now: int, kicks_ticks: int, superframe_s: float) -> None:
+    """Time update, with a velocity of 1 m/s that the filter does not know of from each moment of a kick on."""
+    dim, count, before = s.settings[0]["dim"], len(s.anchors), s.status[0]["epoch_ticks"]
+    velocity = layout(dim, count).velocity
+    predict(s, now)
+    for kick in range(KICKS):
+        moment = kicks_ticks + round((kick + 0.5) / KICKS * superframe_s / TICK_S)
+        if before < moment <= now:
+            for axis in range(dim):
+                row = 2 * count + dim + 1 + dim * kick + axis
+                s.V[row, axis], s.V[row, velocity + axis] = (now - moment) * TICK_S, 1.0
 
 
 @kernel
@@ -159,26 +169,26 @@ def _relay(s: EstimatorState, listener: int, sender: int, age_s: float, share: f
 @threaded_kernel
 def settle(s: EstimatorState, clocks: AnchorClocks, relays: Relays, share: Vector, sight: Matrix, row: Vector) -> None:
     """Predict for a tag at the state's position; ``FIX_SHARE`` becomes the number of fixes in a superframe."""
-    dim, count = s.settings[0]["dim"], len(s.anchors)
-    superframe_s = clocks.gap_s.sum()
+    dim, superframe_s = s.settings[0]["dim"], clocks.gap_s.sum()
     most = max(LONGEST, math.ceil(LONGEST_S / superframe_s))
     step = max(1, math.ceil(SETTLING_S / superframe_s))
     now, motion, before = 0, np.zeros(dim), 0.0
     for superframe in range(most):
-        now = _superframe(s, clocks, relays, share, sight, now, 0, motion, row)
+        now = _superframe(s, clocks, relays, share, sight, now, NEVER, motion, row)
         if superframe % step == step - 1:
             variance = row[SIGMA_X : SIGMA_X + dim].sum()
             if abs(variance - before) <= SETTLED * variance:
                 break
             before = variance
-    phases, before = min(PHASES, count), 0.0
+    kicks_ticks, before = now, 0.0
     for superframe in range(most):
-        now = _superframe(s, clocks, relays, share, sight, now, phases if superframe == 0 else 0, motion, row)
+        now = _superframe(s, clocks, relays, share, sight, now, kicks_ticks, motion, row)
         if superframe % step == step - 1:
-            if motion.sum() - before <= SETTLED * motion.sum():
+            if superframe >= 1 and motion.sum() - before <= SETTLED * motion.sum():
                 break
             before = motion.sum()
-    _finish(row, dim, motion / phases)
+    motion *= s.settings[0]["qa"] * superframe_s / (KICKS * row[FIX_SHARE])
+    _finish(row, dim, motion)
 
 
 @kernel
