@@ -13,13 +13,13 @@ from skyless.planning.links import anchor_links, anchor_positions, link_budget
 from skyless.planning.predict import PlanSettings, Predictor
 from skyless.planning.relays import AGE_S, LATE_M, TOLD, relays_of
 from skyless.simulation.channel import ChannelModel, pack_walls
-from skyless.site.lab import lab_site
-from skyless.site.model import AnchorSite, Site, TagsSite, WallSite
+from skyless.site.lab import ideal_lab_site, lab_site
+from skyless.site.model import EXACT, AnchorSite, Site, TagsSite, WallSite
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
-LAB = lab_site(100.0)
+LAB = ideal_lab_site(100.0)
 PLACES = ((0, 0, 0.2), (4, 0, 2.9), (8, 0, 0.4), (8, 5, 2.7), (8, 10, 0.2), (4, 10, 2.9), (0, 10, 0.5), (0, 5, 2.6))
-ROOM = Site("room", 2, 1, tuple(AnchorSite(k + 1, *place) for k, place in enumerate(PLACES)))
+ROOM = Site("room", 2, 1, tuple(AnchorSite(k + 1, *place) for k, place in enumerate(PLACES)), accuracy=EXACT)
 QA = 0.3
 
 
@@ -66,46 +66,54 @@ def dense(site, point, superframes, shift_m=0.0):
     """Means over the last superframe: what the filter says, the true mean square of a tag at rest, its mean error.
 
     Matrices as in a textbook, Joseph's form for the true error; all anchors in view. ``shift_m``: by how much the
-    tag's receptions of anchor 3 are late.
+    tag's receptions of anchor 3 are late. Errors of ranges and survey are states that relays leave as they are.
     """
-    anchors = anchor_positions(site)
+    anchors, accuracy = anchor_positions(site), site.accuracy
     n, dim = len(anchors), 2 if site.tags.height_m is not None else 3
     clocks, told = relays(site)
     tx_var, rx_var = stamp_variances(site)
     white, walk = (SPEED_OF_LIGHT_MPS * site.noise.white_fm) ** 2, (SPEED_OF_LIGHT_MPS * site.noise.random_walk_fm) ** 2
     half = dim + n
-    P = np.diag([0.1] * half + [0.1] * half + [tx_var] * n)
+    errors = 2 * half + n
+    constant, change, slope, survey = errors, errors + n, errors + 2 * n, errors + 2 * n + 1
+    stds = [accuracy.range_std_m] * n + [accuracy.place_std_m] * n + [accuracy.slope_std_m]
+    stds += [accuracy.survey_std_m] * n * dim
+    P = np.diag(np.r_[[1.0] * dim, [100.0] * n, [1.0] * dim, [100.0] * n, [tx_var] * n, np.square(stds)])
     S, mean = P.copy(), np.zeros(len(P))
     said = true = shifts = 0.0
+    kept = np.exp(-clocks.gap_s.sum() / accuracy.place_time_s)
     for superframe in range(superframes):
         for k, i in enumerate(clocks.sender):
             dt, F, Q = clocks.gap_s[k], np.eye(len(P)), np.zeros((len(P), len(P)))
             F[range(half), range(half, 2 * half)] = dt
+            F[2 * half + i, 2 * half + i] = 0.0
+            F[change + i, change + i] = kept
             shape = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
             common = np.eye(n) + 1.0
             rows = np.r_[dim:half, half + dim : 2 * half]
             Q[np.ix_(rows, rows)] = np.kron(walk * shape + np.diag([white * dt, 0.0]), common)
+            Q[2 * half + i, 2 * half + i] = tx_var
+            Q[change + i, change + i] = (1.0 - kept**2) * accuracy.place_std_m**2
             motion = np.zeros_like(Q)
             rows = np.r_[0:dim, half : half + dim]
             motion[np.ix_(rows, rows)] = np.kron(QA * shape, np.eye(dim))
-            keep = np.ones(len(P))
-            keep[2 * half + i] = 0.0
-            fresh = np.diag(tx_var * (1.0 - keep))
-            P = np.outer(keep, keep) * (F @ P @ F.T + Q + motion) + fresh
-            S = np.outer(keep, keep) * (F @ S @ F.T + Q) + fresh
-            mean = keep * (F @ mean)
-            towards = (point - anchors[i]) / np.linalg.norm(point - anchors[i])
+            P, S, mean = F @ P @ F.T + Q + motion, F @ S @ F.T + Q, F @ mean
+            range_m = np.linalg.norm(point - anchors[i])
+            towards = ((point - anchors[i]) / range_m)[:dim]
             h = np.zeros(len(P))
-            h[:dim], h[dim + i], h[2 * half + i] = towards[:dim], 1.0, 1.0
-            measured = [(h, rx_var, shift_m * (site.anchors[i].id == 3))]
+            h[:dim], h[dim + i], h[2 * half + i] = towards, 1.0, 1.0
+            h[constant + i], h[change + i], h[slope] = 1.0, 1.0, np.clip((range_m - 4.0) / 4.0, -1.0, 1.0)
+            h[survey + dim * i : survey + dim * (i + 1)] = -towards
+            measured = [(h, rx_var, len(P), shift_m * (site.anchors[i].id == 3))]
             for r in range(told.ends[k - 1] if k else 0, told.ends[k]):
                 j, age = told.heard[r], told.values[r, AGE_S]
                 h = np.zeros(len(P))
                 h[dim + j], h[dim + i], h[2 * half + j] = 1.0, -1.0, 1.0
                 h[half + dim + j], h[half + dim + i] = -age, age
-                measured.append((h, rx_var + 2.0 * age * (white + walk * age**2 / 3.0), 0.0))
-            for h, variance, late in measured:
+                measured.append((h, rx_var + 2.0 * age * (white + walk * age**2 / 3.0), slope, 0.0))
+            for h, variance, updated, late in measured:
                 gain = P @ h / (h @ P @ h + variance)
+                gain[updated:] = 0.0
                 A = np.eye(len(P)) - np.outer(gain, h)
                 P, S = (A @ X @ A.T + variance * np.outer(gain, gain) for X in (P, S))
                 mean = mean + gain * (late - h @ mean)
@@ -116,14 +124,32 @@ def dense(site, point, superframes, shift_m=0.0):
     return np.sqrt([said, true, shifts])
 
 
-@pytest.mark.parametrize(("site", "point"), [(LAB, (2.0, 5.5, 0.0)), (ROOM, (6.0, 3.0, 1.0))])
-def test_the_true_error_is_that_of_a_dense_recursion(site, point):
+@pytest.mark.parametrize(
+    ("site", "point", "motion"),
+    [(LAB, (2.0, 5.5, 0.0), 0.93), (ROOM, (6.0, 3.0, 1.0), 0.93), (lab_site(), (1.2, 1.6, 0.0), 0.99)],
+    ids=("lab", "3-D", "range errors"),
+)
+def test_the_true_error_is_that_of_a_dense_recursion(site, point, motion):
     row = Predictor(site, PlanSettings("joint", qa=QA)).at(np.array([point]))[0]
-    said, true, _ = dense(site, np.array(point), 150)
-    assert row[CLAIMED] == pytest.approx(said, rel=2e-3)
-    assert row[SIGMA] == pytest.approx(true, rel=4e-3)  # the motion's part is taken at four packets of six or eight
-    assert row[SIGMA] < 0.93 * row[CLAIMED]
+    said, true, _ = dense(site, np.array(point), 100)
+    assert row[CLAIMED] == pytest.approx(said, rel=4e-3)
+    assert row[SIGMA] == pytest.approx(true, rel=4e-3)
+    assert row[SIGMA] < motion * row[CLAIMED]
     assert (row[SIGMA_X : SIGMA_Z + 1] ** 2).sum() == pytest.approx(row[SIGMA] ** 2)
+
+
+def test_range_errors_add_to_the_noise():
+    """Twice the errors of survey and ranges add four times as much to the square of the position's."""
+    base = replace(lab_site().accuracy, place_std_m=0.0)
+    twice = replace(
+        base, **{name: 2.0 * getattr(base, name) for name in ("survey_std_m", "range_std_m", "slope_std_m")}
+    )
+    point = np.array([[1.2, 1.6, 0.0]])
+    exact, one, two = (
+        Predictor(lab_site(accuracy=accuracy), PlanSettings("joint")).at(point)[0, SIGMA] ** 2
+        for accuracy in (EXACT, base, twice)
+    )
+    assert (two - exact) / (one - exact) == pytest.approx(4.0, rel=0.1)
 
 
 def test_a_late_anchor_shifts_positions_as_in_a_dense_recursion():

@@ -19,11 +19,11 @@ from skyless.planning.floor import along, area, distance_outside, floor_of, insi
 from skyless.planning.maps import grid_of, plan_map, summary_of
 from skyless.planning.predict import PlanSettings, Predictor
 from skyless.planning.tables import csv_lines, geojson_lines, to_wgs84
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, GeoreferenceSite, WallSite
 
 L_SHAPE = np.array([(0, 0), (12, 0), (12, 4), (5, 4), (5, 9), (0, 9)], dtype=float)
-LAB = lab_site()
+LAB = ideal_lab_site()
 
 
 def lab_map(step=0.5, method="bracketed", site=LAB):

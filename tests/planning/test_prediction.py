@@ -15,13 +15,13 @@ from skyless.planning.rounds import delays, phase_covariance
 from skyless.planning.tracker_steps import gated
 from skyless.positioning.snapshots import SnapshotMethod
 from skyless.simulation.channel import ChannelModel, pack_walls
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, NoiseSite, Site, TagsSite, WallSite
 from skyless.uncertainty.dop import dops_at
 from skyless.uncertainty.position import position_covariance
 from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance, literal_delayed_covariance
 
-LAB = lab_site(100.0)
+LAB = ideal_lab_site(100.0)
 QUIET = replace(LAB, noise=NoiseSite(100.0, 100.0, 1e-15, 1e-15))
 """The lab with crystals so good that only stamps count."""
 

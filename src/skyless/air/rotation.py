@@ -17,7 +17,7 @@ def pages_of(site: Site) -> tuple[Page, ...]:
     Raises:
         ValueError: two anchors would share a slot (see ``first_slots``).
     """
-    schedule, noise, slots, earth = schedule_of(site), site.noise, first_slots(site), site.georeference
+    schedule, slots, earth = schedule_of(site), first_slots(site), site.georeference
     pages: list[Page] = [
         SchedulePage(
             schedule.slot_ticks,
@@ -27,14 +27,22 @@ def pages_of(site: Site) -> tuple[Page, ...]:
             len(site.anchors),
             site.tags.height_m,
         ),
-        NoisePage(noise.tx_stamp_ps * 1e-12, noise.rx_stamp_ps * 1e-12, noise.white_fm, noise.random_walk_fm),
-        AccuracyPage(**asdict(site.accuracy)),
+        *filter_pages_of(site),
     ]
     pages += [AnchorPage(node.id, node.x_m, node.y_m, node.z_m, slots[node.id]) for node in site.anchors]
     if earth is not None:
         heading_deg = earth.heading_deg % 360.0
         pages.append(GeoreferencePage(earth.latitude_deg, earth.longitude_deg, earth.height_m, heading_deg))
     return tuple(pages)
+
+
+def filter_pages_of(site: Site) -> tuple[NoisePage, AccuracyPage]:
+    """What the site tells the filters of its tags."""
+    noise = site.noise
+    return (
+        NoisePage(noise.tx_stamp_ps * 1e-12, noise.rx_stamp_ps * 1e-12, noise.white_fm, noise.random_walk_fm),
+        AccuracyPage(**asdict(site.accuracy)),
+    )
 
 
 def page_for(pages: tuple[Page, ...], superframe: int, slot: int) -> Page:

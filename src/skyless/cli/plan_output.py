@@ -25,7 +25,8 @@ NOTES: Final = (
     "Links are free space on channel 5 with the walls' losses of the site file; people, furniture, reflections and "
     "antennas' patterns are not known to the plan.",
     "Walls delay what crosses them as the site file says; nothing else comes late.",
-    "Positions of the anchors, antenna delays and power-dependent range biases are taken to be right.",
+    "joint's figures hold the errors of survey and ranges that the site file states (accuracy); for the other methods "
+    "positions of the anchors, antenna delays and ranges are taken to be right.",
 )
 
 

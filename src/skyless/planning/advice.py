@@ -150,7 +150,7 @@ def _walls(predictor: Predictor, plan: PlanMap) -> list[str]:
         return []
     largest = float(bias[known].max())
     # its monitors are not in the prediction (docs/planning.md)
-    monitors = "; joint leaves anchors out there at times, and positions scatter more than predicted"
+    monitors = "; joint may take delays for faults of anchors there, and err more than predicted"
     return [
         f"walls' delays shift positions by more than their standard deviation in {worse.sum() / known.sum():.0%} of "
         f"the region, by {100 * largest:.0f} cm at most{monitors if predictor.settings.method == 'joint' else ''}"

@@ -1,9 +1,10 @@
-"""Predicted errors of ``joint`` for a tag at rest: the filter's covariance, less what it allows for motion.
+"""Predicted errors of ``joint`` for a tag at rest: the estimator's own kernels on a superframe, covariance only.
 
-P is the filter's own covariance, run through superframes until it is periodic. Its noises are as it assumes, so that
-the true error has the same covariance but for the accelerations that it allows for and a tag at rest does not have.
-What these add to P follows from the gains: what errors will do to the position is carried back through the superframes
-before. The walls' delays are carried forward through the same gains.
+The filter's P, with constant errors of ranges and survey as the site tells them, is run through superframes until it
+repeats. It holds what the filter allows for accelerations, which a tag at rest does not have. That part follows from
+the estimator's sensitivities V: rows of V begin, at moments of a superframe, as a velocity that the filter does not
+know of, and the squares of what they do to the position, integrated over the time after that, are what accelerations
+add to P. Another row holds the walls' delays.
 
 Where only a share of an anchor's packets arrives, the stamps of all count for as much less: their variances are divided
 by the share, and those of relayed receptions by the share of all three that they take.
@@ -16,160 +17,178 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.compiled import kernel, threaded_kernel
+from skyless.constants import TICK_S
 from skyless.planning.anchor_clocks import AnchorClocks
 from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
 from skyless.planning.geometry import Scene, fill_dops, observe
-from skyless.planning.joint_script import Script, new_script, write_script
-from skyless.planning.joint_steps import (
-    MOST_PLACES,
-    RX_VAR,
-    TX_VAR,
-    Work,
-    advance,
-    back_in_time,
-    back_through,
-    by_anchor,
-    by_tag,
-    correct,
-    new_packet,
-    relay_variance,
-    shift_by,
+from skyless.planning.relays import AGE_S, LATE_M, TOLD, Relays
+from skyless.positioning.estimator.faults import compute_fault_input
+from skyless.positioning.estimator.kalman import (
+    compute_ph,
+    dynamic_states,
+    predict,
+    relax_range_error,
+    reset_state,
+    update,
 )
-from skyless.planning.relays import Relays
+from skyless.positioning.estimator.kinds import first_reception, reception_terms, relay_terms, relay_variance
+from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorState, layout, new_state, with_anchor
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-SETTLED: Final = 1e-4
-"""Relative change of the position's variance, or of a sum, over a superframe below which it counts as complete, ..."""
+RARELY: Final = 0.1
+"""An anchor of whose frames fewer arrive does not help the tag."""
 
-SETTLED_IN_A_ROW: Final = 4
-"""... for so many superframes: one alone may be the turning point of an overshoot."""
+SETTLED: Final = 1e-3
+"""Relative change of the position's variance, or of a sum, in a tenth of a second or in a superframe, if that is
+longer, below which it counts as complete, ..."""
+
+SETTLING_S: Final = 0.1
 
 LONGEST_S: Final = 4.0
-"""Filter time after which it counts so in any case, and ..."""
+"""... or after so long, and ..."""
 
 LONGEST: Final = 20
-"""... superframes."""
+"""... so many superframes."""
 
-AS_LONG: Final = 4
-"""Sums over the past go back at most so many times as far as the covariance took to settle."""
+KICKS: Final = 4
+"""Moments of a superframe at which an acceleration is tried."""
 
-PHASES: Final = 4
-"""Packets of a superframe at which the motion's part is computed."""
+NEVER: Final = 1 << 62
+"""After all others."""
 
-
-@kernel
-def begin(P: Matrix, half: int, tx_var: float) -> None:
-    """Start somewhere sensible; the steady state does not depend on it."""
-    P[:] = 0.0
-    for value in range(half):
-        P[value, value] = 0.01
-        P[half + value, half + value] = 0.05
-    for noise in range(2 * half, len(P)):
-        P[noise, noise] = tx_var
+START_VARIANCE: Final = 1.0
+"""Of each component of position and velocity, m² and m²/s²; the steady state does not depend on it."""
 
 
-@kernel
-def _superframe(work: Work, dim: int, script: Script, settings: Vector, qa: float, row: Vector) -> None:
-    """Take the packets of one superframe; leaves every gain, and sums of the position's variances in ``row``."""
-    P, gains, places, h, ph = work
-    half, update, relay = dim + script.counts[0], 0, 0
-    row[SIGMA_X : SIGMA_Z + 1], row[FIX_SHARE] = 0.0, 0.0
-    for k in range(script.counts[1]):
-        own, share = script.sender[k], script.share[k]
-        advance(P, dim, half, script.since_s[k], qa, settings)
-        new_packet(P, 2 * half + own, settings[TX_VAR] / share)
-        count = by_tag(script.sight[own], dim, half, own, places, h)
-        correct(P, places, h, count, settings[RX_VAR] / share, ph, gains[update])
-        update += 1
-        for r in range(relay, script.end[k]):
-            count = by_anchor(dim, half, own, script.heard[r], script.age_s[r], places, h)
-            variance = relay_variance(script.age_s[r], settings) / script.part[r]
-            correct(P, places, h, count, variance, ph, gains[update])
-            update += 1
-        relay = script.end[k]
-        for axis in range(dim):
-            row[SIGMA_X + axis] += share * P[axis, axis]
-        row[FIX_SHARE] += share
+def site_state(settings: EstimatorSettings, anchors_m: Matrix, in_view: Integers) -> EstimatorState:
+    """The estimator's state with the anchors in these rows of the site; V has rows for walls and accelerations."""
+    s = new_state(settings, len(anchors_m))
+    s.status["walk_scale"] = 1.0
+    for axis in range(2 * settings.dim):
+        s.P[axis, axis] = START_VARIANCE
+    for row in in_view.tolist():
+        s = with_anchor(s, row, anchors_m[row])
+    rows = len(s.V) + 1 + KICKS * settings.dim
+    return s._replace(V=np.zeros((rows, len(s.x))), fault_input=np.zeros(rows))
 
 
 @kernel
-def settle_joint(
-    work: Work, dim: int, script: Script, settings: Vector, qa: float, superframe_s: float, row: Vector
+def _superframe(
+    s: EstimatorState,
+    clocks: AnchorClocks,
+    relays: Relays,
+    share: Vector,
+    sight: Matrix,
+    begin_ticks: int,
+    kicks_ticks: int,
+    motion: Vector,
+    row: Vector,
 ) -> int:
-    """Run superframes until they repeat; returns how many."""
-    before, settled, count = 0.0, 0, 0
-    while settled < SETTLED_IN_A_ROW and (count * superframe_s < LONGEST_S or count < LONGEST):
-        _superframe(work, dim, script, settings, qa, row)
-        now = row[SIGMA_X : SIGMA_X + dim].sum()
-        settled = settled + 1 if abs(now - before) <= SETTLED * now else 0
-        before = now
-        count += 1
-    return count
+    """Process a superframe's packets; when it ends.
+
+    Leaves sums over packets, each by how often it arrives, of the position's variances and squared mean error in
+    ``row``. The tag is kicked at moments of the superframe that begins at ``kicks_ticks``; the squares of what that
+    does to the position are added to ``motion``.
+    """
+    dim, count, now = s.settings[0]["dim"], len(s.anchors), begin_ticks
+    walls = 2 * count + dim
+    row[SIGMA_X : SIGMA_Z + 1], row[FIX_SHARE], row[BIAS] = 0.0, 0.0, 0.0
+    for k in range(len(clocks.sender)):
+        now += round(clocks.gap_s[k] / TICK_S)
+        own = s.index_of[clocks.sender[k]]
+        if own < 0:
+            continue
+        _let_time_pass(s, now, kicks_ticks, clocks.gap_s.sum())
+        arrives = share[clocks.sender[k]]
+        _own_reception(s, own, now, arrives, sight[clocks.sender[k], 3])
+        for r in range(relays.ends[k - 1] if k > 0 else 0, relays.ends[k]):
+            sender = s.index_of[relays.heard[r]]
+            if sender >= 0 and s.anchors[sender]["packets"] > 0:
+                told = arrives * share[relays.heard[r]] * relays.values[r, TOLD]
+                _relay(s, own, sender, relays.values[r, AGE_S], told, relays.values[r, LATE_M])
+        row[FIX_SHARE] += arrives
+        for axis in range(dim):
+            row[SIGMA_X + axis] += arrives * s.P[axis, axis]
+            row[BIAS] += arrives * s.V[walls, axis] ** 2
+            for fault in range(walls + 1, s.V.shape[0]):
+                motion[axis] += arrives * s.V[fault, axis] ** 2
+    return now
 
 
 @kernel
-def _by_motion(
-    work: Work, adjoint: Matrix, phase: int, dim: int, script: Script, qa: float, most: int, caused: Vector
-) -> None:
-    """Fill ``caused`` with the variances, after packet ``phase``, that the filter's accelerations have."""
-    half, packets, relays = dim + script.counts[0], script.counts[1], script.counts[2]
-    _, gains, places, h, _ = work
-    adjoint[:], caused[:], before = 0.0, 0.0, 0.0
-    for axis in range(dim):
-        adjoint[axis, axis] = 1.0
-    for superframe in range(most):
-        update = packets + relays
-        for k in range(packets - 1, -1, -1):
-            first = script.end[k - 1] if k > 0 else 0
-            if superframe == 0 and k > phase:
-                update -= script.end[k] - first + 1
-                continue
-            own = script.sender[k]
-            for r in range(script.end[k] - 1, first - 1, -1):
-                update -= 1
-                count = by_anchor(dim, half, own, script.heard[r], script.age_s[r], places, h)
-                back_through(adjoint, places, h, count, gains[update])
-            update -= 1
-            count = by_tag(script.sight[own], dim, half, own, places, h)
-            back_through(adjoint, places, h, count, gains[update])
-            adjoint[:, 2 * half + own] = 0.0
-            back_in_time(adjoint, dim, half, script.since_s[k], qa, caused)
-        now = caused.sum()
-        if now - before <= SETTLED * now:
-            break
-        before = now
-
-
-@kernel
-def _by_walls(work: Work, dim: int, script: Script, most: int, row: Vector) -> None:
-    """Carry the mean error that delays make through the superframes; leaves the sum of its squares in ``row``."""
-    half, before = dim + script.counts[0], 0.0
-    _, gains, places, h, shift = work
-    shift[:] = 0.0
-    for _ in range(most):
-        update, relay = 0, 0
-        row[BIAS] = 0.0
-        for k in range(script.counts[1]):
-            own = script.sender[k]
-            for value in range(half):
-                shift[value] += script.since_s[k] * shift[half + value]
-            shift[2 * half + own] = 0.0
-            count = by_tag(script.sight[own], dim, half, own, places, h)
-            shift_by(shift, places, h, count, script.sight[own, 3], gains[update])
-            update += 1
-            for r in range(relay, script.end[k]):
-                count = by_anchor(dim, half, own, script.heard[r], script.age_s[r], places, h)
-                shift_by(shift, places, h, count, script.late_m[r], gains[update])
-                update += 1
-            relay = script.end[k]
+def _let_time_pass(s: EstimatorState, now: int, kicks_ticks: int, superframe_s: float) -> None:
+    """Time update, with a velocity of 1 m/s that the filter does not know of from each moment of a kick on."""
+    dim, count, before = s.settings[0]["dim"], len(s.anchors), s.status[0]["epoch_ticks"]
+    velocity = layout(dim, count).velocity
+    predict(s, now)
+    for kick in range(KICKS):
+        moment = kicks_ticks + round((kick + 0.5) / KICKS * superframe_s / TICK_S)
+        if before < moment <= now:
             for axis in range(dim):
-                row[BIAS] += script.share[k] * shift[axis] * shift[axis]
-        if abs(row[BIAS] - before) <= SETTLED * row[BIAS]:
-            break
-        before = row[BIAS]
+                row = 2 * count + dim + 1 + dim * kick + axis
+                s.V[row, axis], s.V[row, velocity + axis] = (now - moment) * TICK_S, 1.0
+
+
+@kernel
+def _own_reception(s: EstimatorState, anchor: int, rx_ticks: int, share: float, late_m: float) -> None:
+    """The tag's reception of an anchor, of which so large a share arrives, so late."""
+    settings, a, n = s.settings[0], s.anchors[anchor], len(s.x)
+    where = layout(settings["dim"], len(s.anchors))
+    walls = 2 * len(s.anchors) + settings["dim"]
+    if a["packets"] == 0:
+        first_reception(s, anchor, rx_ticks, rx_ticks)
+        s.V[walls, where.offset + anchor] += late_m
+    else:
+        relax_range_error(s, anchor, (rx_ticks - a["rx_ticks"]) * TICK_S, 0.0)
+        reset_state(s, where.tx_noise + anchor, settings["tx_variance_m2"] / share)
+        terms, _ = reception_terms(s, anchor, 1)
+        variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + settings["rx_variance_m2"] / share
+        compute_fault_input(s, terms, anchor)
+        s.fault_input[walls] += late_m
+        update(s, 0.0, variance, 1.0, n)
+    a["rx_ticks"] = rx_ticks
+    a["packets"] += 1
+
+
+@kernel
+def _relay(s: EstimatorState, listener: int, sender: int, age_s: float, share: float, late_m: float) -> None:
+    """A relayed reception, of which the tag can use so large a share, so late."""
+    terms = relay_terms(s, listener, sender, age_s, True)
+    variance = relay_variance(s, listener, sender, age_s) / share
+    variance += compute_ph(s.P, s.h, s.h_index, terms, s.ph)
+    compute_fault_input(s, terms, -1)
+    if s.links[listener, sender]["variance_m2"] == 0.0:  # else the pair's constant takes the delay
+        s.fault_input[2 * len(s.anchors) + s.settings[0]["dim"]] += late_m
+    update(s, 0.0, variance, 1.0, dynamic_states(s))
+
+
+@threaded_kernel
+def settle(s: EstimatorState, clocks: AnchorClocks, relays: Relays, share: Vector, sight: Matrix, row: Vector) -> None:
+    """Predict for a tag at the state's position; ``FIX_SHARE`` becomes the number of fixes in a superframe."""
+    dim, superframe_s = s.settings[0]["dim"], clocks.gap_s.sum()
+    most = max(LONGEST, math.ceil(LONGEST_S / superframe_s))
+    step = max(1, math.ceil(SETTLING_S / superframe_s))
+    now, motion, before = 0, np.zeros(dim), 0.0
+    for superframe in range(most):
+        now = _superframe(s, clocks, relays, share, sight, now, NEVER, motion, row)
+        if superframe % step == step - 1:
+            variance = row[SIGMA_X : SIGMA_X + dim].sum()
+            if abs(variance - before) <= SETTLED * variance:
+                break
+            before = variance
+    kicks_ticks, before = now, 0.0
+    for superframe in range(most):
+        now = _superframe(s, clocks, relays, share, sight, now, kicks_ticks, motion, row)
+        if superframe % step == step - 1:
+            if superframe >= 1 and motion.sum() - before <= SETTLED * motion.sum():
+                break
+            before = motion.sum()
+    motion *= s.settings[0]["qa"] * superframe_s / (KICKS * row[FIX_SHARE])
+    _finish(row, dim, motion)
 
 
 @kernel
@@ -188,56 +207,39 @@ def _finish(row: Vector, dim: int, motion: Vector) -> None:
 
 
 @kernel
-def _fill_point(dim: int, script: Script, settings: Vector, qa: float, superframe_s: float, row: Vector) -> None:
-    """Predict for one point; ``FIX_SHARE`` becomes the number of fixes in a superframe."""
-    half, packets = dim + script.counts[0], script.counts[1]
-    states = half + half + script.counts[0]
-    work = Work(
-        P=np.zeros((states, states)),
-        gains=np.zeros((packets + script.counts[2], states)),
-        places=np.zeros(MOST_PLACES, np.int64),
-        h=np.zeros(MOST_PLACES),
-        vector=np.zeros(states),
-    )
-    adjoint, motion, caused = np.zeros((dim, states)), np.zeros(dim), np.zeros(dim)
-    begin(work.P, half, settings[TX_VAR])
-    most = AS_LONG * settle_joint(work, dim, script, settings, qa, superframe_s, row)
-    phases = min(PHASES, packets)
-    for phase in range(phases):
-        last = (phase + 1) * packets // phases - 1
-        _by_motion(work, adjoint, last, dim, script, qa, most, caused)
-        motion += caused / phases
-    _by_walls(work, dim, script, most, row)
-    _finish(row, dim, motion)
+def _observe(scene: Scene, point: Vector, dim: int, share: Vector, sight: Matrix, row: Vector) -> None:
+    """What a point has in view, and its DOPs."""
+    n = len(scene.anchors)
+    observe(scene, point, share, sight)
+    fill_dops(scene.anchors, share, point, dim, np.zeros((n, 3)), np.zeros((4, 4)), np.zeros((4, 4)), row)
 
 
-@threaded_kernel
 def fill_joint_sigma(
     points: Matrix,
-    dim: int,
+    settings: EstimatorSettings,
     scene: Scene,
     clocks: AnchorClocks,
     relays: Relays,
-    qa: float,
-    settings: Vector,
     farthest: float,
     table: Matrix,
 ) -> None:
     """Fill ``table`` (points, columns) for the points, shape (m, 3)."""
-    n, superframe_s = len(scene.anchors), clocks.gap_s.sum()
-    share, sight = np.zeros(n), np.zeros((n, 4))
-    seen, normal, inverse = np.zeros((n, 3)), np.zeros((4, 4)), np.zeros((4, 4))
-    script = new_script(n, len(clocks.sender), len(relays.heard))
-    for m in range(len(points)):
-        row = table[m]
-        observe(scene, points[m], share, sight)
-        fill_dops(scene.anchors, share, points[m], dim, seen, normal, inverse, row)
-        write_script(script, share, sight, clocks, relays)
-        row[SIGMA:] = math.inf
-        row[FIX_SHARE] = 0.0
-        if script.counts[0] > dim:
-            _fill_point(dim, script, settings, qa, superframe_s, row)
-            row[FIX_SHARE] /= len(clocks.sender)
-            if not row[SIGMA] < farthest:
-                row[SIGMA:] = math.inf
-                row[FIX_SHARE] = 0.0
+    n, dim = len(scene.anchors), settings.dim
+    share, sight, seen = np.zeros(n), np.zeros((n, 4)), np.zeros(0, np.int64)
+    fresh = site_state(settings, scene.anchors, seen)
+    for point, row in zip(points, table, strict=True):
+        _observe(scene, point, dim, share, sight, row)
+        row[SIGMA:], row[FIX_SHARE] = math.inf, 0.0
+        in_view = np.flatnonzero(share >= RARELY)
+        if len(in_view) <= dim:
+            continue
+        if not np.array_equal(in_view, seen):
+            seen, fresh = in_view, site_state(settings, scene.anchors, in_view)
+        s = EstimatorState._make(part.copy() for part in fresh)
+        s.x[:dim] = point[:dim]
+        if dim == 2:
+            s.settings["height_m"] = point[2]
+        settle(s, clocks, relays, share, sight, row)
+        row[FIX_SHARE] /= len(clocks.sender)
+        if not row[SIGMA] < farthest:
+            row[SIGMA:], row[FIX_SHARE] = math.inf, 0.0

@@ -38,7 +38,7 @@ STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 10
 TRACKER_BUDGET: Final = 150_000
 """Points of the tracker times what one costs, anchors and a constant."""
 
-JOINT_BUDGET: Final = 1e6
+JOINT_BUDGET: Final = 2.5e5
 """Points of the joint filter times what one costs, the square of the anchors in view and a constant."""
 
 MOST_ASKED: Final = 500

@@ -11,6 +11,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from skyless.air.rotation import filter_pages_of
+from skyless.air.schedule import schedule_of
 from skyless.clocks.filter import clock_noise
 from skyless.compiled import threaded_kernel
 from skyless.methods import DEFAULT_METHOD, FILTERS
@@ -23,6 +25,7 @@ from skyless.planning.relays import relays_of
 from skyless.planning.rounds import rounds_of
 from skyless.planning.snapshot_sigma import fill_snapshot_sigma
 from skyless.planning.tracker_sigma import fill_tracker_sigma
+from skyless.positioning.new_method import estimator_settings
 from skyless.positioning.snapshots import SnapshotMethod
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.model import Site
@@ -94,14 +97,10 @@ class Predictor:
             table,
         )
 
-    def _noises(self) -> Vector:
-        """Of one oscillator, white and random walk, and of a TX and an RX stamp: for the filters' predictions."""
+    def _tracker(self) -> Fill:
         noise = self.site.noise
         one = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
-        return np.array([one.white, one.walk, *stamp_variances(self.site)])
-
-    def _tracker(self) -> Fill:
-        settings = self._noises()
+        settings = np.array([one.white, one.walk, *stamp_variances(self.site)])
         return lambda points, table: fill_tracker_sigma(
             points,
             self.dim,
@@ -116,16 +115,17 @@ class Predictor:
         )
 
     def _joint(self) -> Fill:
-        settings = self._noises()
+        superframe_s = 1.0 / schedule_of(self.site).superframe_rate_hz
+        settings = estimator_settings(
+            self.settings.qa, self.site.tags.height_m, *filter_pages_of(self.site), superframe_s
+        )
         relays = relays_of(self.anchors_m, self.master, self.clocks, self.budget, self.walls)
         return lambda points, table: fill_joint_sigma(
             points,
-            self.dim,
+            settings,
             self._scene,
             self.clocks,
             relays,
-            self.settings.qa,
-            settings,
             self.farthest_m,
             table,
         )

@@ -1,5 +1,10 @@
-"""Predictions against the simulated world: tags at rest at given points, each one's errors beside its prediction."""
+"""Predictions against the simulated world: tags at rest at given points, each one's errors beside its prediction.
 
+Where the method is ``joint`` and the site's survey and ranges have errors, there are many worlds, each with errors
+drawn anew, and what is compared is the RMSE over all of them.
+"""
+
+import math
 from collections.abc import Callable
 from typing import Final
 
@@ -10,18 +15,24 @@ from numpy.typing import NDArray
 
 from skyless.air.schedule import schedule_of
 from skyless.experiments.fleet import Fleet, FleetSettings
+from skyless.experiments.room import Room
 from skyless.experiments.scenarios import Request, impairments_of
 from skyless.methods import FILTERS
 from skyless.planning.columns import CLAIMED, FIX_SHARE, RMSE, SIGMA
 from skyless.planning.maps import PlanMap
 from skyless.planning.predict import Predictor
+from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Static
+from skyless.site.model import AccuracySite
 
 Matrix = NDArray[np.float64]
 
 WARM_UP_S: Final = 3.0
 BATCH_ROUNDS: Final = 60
 """Superframes that make a batch: longer than the filters remember, so that batches are independent."""
+
+WORLDS: Final = 20
+"""In which survey and ranges have errors drawn anew."""
 
 
 class PointCheck(Struct, frozen=True):
@@ -31,7 +42,7 @@ class PointCheck(Struct, frozen=True):
     predicted_sigma_m: float | None
     simulated_sigma_m: float | None
     ratio: float | None
-    """Simulated over predicted standard deviation."""
+    """Simulated over predicted standard deviation; over RMSE where survey and ranges have errors."""
     ratio_error: float | None
     """Standard error of the ratio, from the scatter of the batches."""
     predicted_rmse_m: float | None
@@ -59,12 +70,11 @@ class Verification(Struct, frozen=True):
 class _Batches:
     """Sums of one tag's errors, batch by batch."""
 
-    def __init__(self, batch_s: float) -> None:
-        self._batch_s = batch_s
+    def __init__(self) -> None:
         self._sums: dict[int, Matrix] = {}
 
-    def add(self, time_s: float, error_m: Matrix) -> None:
-        sums = self._sums.setdefault(int(time_s / self._batch_s), np.zeros(5))
+    def add(self, batch: int, error_m: Matrix) -> None:
+        sums = self._sums.setdefault(batch, np.zeros(5))
         sums[0] += 1.0
         sums[1:4] += error_m
         sums[4] += error_m @ error_m
@@ -73,16 +83,18 @@ class _Batches:
     def fixes(self) -> int:
         return int(sum(sums[0] for sums in self._sums.values()))
 
-    def statistics(self) -> tuple[float, float, float]:
-        """Standard deviation about the mean, root mean square, and the relative standard error of the former."""
+    def statistics(self, *, about_mean: bool) -> tuple[float, float, float]:
+        """Standard deviation, root mean square, and the relative standard error of the former or of the latter."""
         rows = np.array(list(self._sums.values()))
         total = rows.sum(axis=0)
         mean = total[1:4] / total[0]
-        variance = total[4] / total[0] - mean @ mean
-        spread = rows[:, 4] - 2.0 * rows[:, 1:4] @ mean + rows[:, 0] * (mean @ mean) - rows[:, 0] * variance
-        count = len(rows)
-        error = np.sqrt((spread @ spread) * count / max(count - 1, 1)) / (total[0] * variance)
-        return float(np.sqrt(variance)), float(np.sqrt(total[4] / total[0])), float(error / 2.0)
+        variance, mean_square = total[4] / total[0] - mean @ mean, total[4] / total[0]
+        spread = rows[:, 4] - rows[:, 0] * mean_square
+        if about_mean:
+            spread += 2.0 * (rows[:, 0] * (mean @ mean) - rows[:, 1:4] @ mean)
+        count, judged = len(rows), variance if about_mean else mean_square
+        error = np.sqrt((spread @ spread) * count / max(count - 1, 1)) / (total[0] * judged)
+        return float(np.sqrt(variance)), float(np.sqrt(mean_square)), float(error / 2.0)
 
 
 def random_points(plan: PlanMap, count: int, seed: int) -> Matrix:
@@ -107,46 +119,66 @@ def verify(
     """Let a tag rest at each point, shape (m, 3), for so many superframes, and compare."""
     site, settings = predictor.site, predictor.settings
     superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
-    impairments = replace(impairments_of(Request(site=site), site), channel=settings.channel)
+    worlds = 1 if settings.method != "joint" or site.accuracy.is_exact else WORLDS
+    rounds = max(rounds // worlds, 1)
     still = [Static(*point) for point in points_m.tolist()]
     warm_up_s = max(WARM_UP_S, 60.0 * superframe_s)
-    fleet = Fleet(site, still, impairments, seed, FleetSettings(settings.method, settings.qa, warm_up_s))
-    batches = [_Batches(BATCH_ROUNDS * superframe_s) for _ in still]
-    end_s, now_s = warm_up_s + rounds * superframe_s, 0.0
-    while now_s < end_s:
-        now_s = min(now_s + 0.25, end_s)
-        for judged in fleet.run(now_s):
-            if judged.time_s >= warm_up_s:
-                batches[judged.tag].add(judged.time_s, judged.error_m)
-        if progress is not None:
-            progress(now_s / end_s)
-    per_round = len(predictor.clocks.sender) if settings.method in FILTERS else 1
-    rows = predictor.at(points_m)
+    batches = [_Batches() for _ in still]
+    end_s = warm_up_s + rounds * superframe_s
+    for world in range(worlds):
+        room = None if worlds == 1 else _room(site.accuracy, world)
+        request = Request(site=site, seed=seed + world, room=room)
+        impairments = replace(impairments_of(request, site), channel=settings.channel)
+        fleet = Fleet(site, still, impairments, request.seed, FleetSettings(settings.method, settings.qa, warm_up_s))
+        now_s = 0.0
+        while now_s < end_s:
+            now_s = min(now_s + 0.25, end_s)
+            for judged in fleet.run(now_s):
+                if judged.time_s >= warm_up_s:
+                    batch = int(judged.time_s / (BATCH_ROUNDS * superframe_s)) if worlds == 1 else world
+                    batches[judged.tag].add(batch, judged.error_m)
+            if progress is not None:
+                progress((world + now_s / end_s) / worlds)
+    per_round = len(predictor.clocks.sender) if settings.method in FILTERS else _frames(predictor)
+    possible, rows = worlds * rounds * per_round, predictor.at(points_m)
     checks = [
-        _check(point, row, batch, rounds * per_round * _frames(predictor))
+        _check(point, row, batch, possible, has_range_errors=worlds > 1)
         for point, row, batch in zip(points_m, rows, batches, strict=True)
     ]
-    return _summary(settings.method, seed, end_s, checks)
+    return _summary(settings.method, seed, worlds * end_s, checks)
+
+
+def _room(accuracy: AccuracySite, world: int) -> Room:
+    """Errors with the site's standard deviations; the slope, one for all, has them with both signs in turn."""
+    ranges = RangeErrorModel(
+        constant_m=math.sqrt(3.0) * accuracy.range_std_m,
+        slope_m=accuracy.slope_std_m * (-1.0) ** world,
+        changing_m=accuracy.place_std_m,
+        correlation_s=accuracy.place_time_s,
+    )
+    return Room(axis_std_m=accuracy.survey_std_m, ranges=ranges)
 
 
 def _frames(predictor: Predictor) -> int:
     """Snapshot methods give a fix in every round, of which a superframe has one for each frame of a node."""
-    return 1 if predictor.settings.method in FILTERS else predictor.site.schedule.frames_per_node
+    return predictor.site.schedule.frames_per_node
 
 
-def _check(point: Matrix, row: Matrix, batch: _Batches, possible: int) -> PointCheck:
+def _check(point: Matrix, row: Matrix, batch: _Batches, possible: int, *, has_range_errors: bool) -> PointCheck:
     predicted = bool(np.isfinite(row[SIGMA]))
-    std_m = rmse_m = error = None
+    std_m = rmse_m = ratio = ratio_error = None
     if batch.fixes > 1:
-        std_m, rmse_m, error = batch.statistics()
-    both = predicted and std_m is not None
+        std_m, rmse_m, error = batch.statistics(about_mean=not has_range_errors)
+        if predicted:
+            ratio = rmse_m / float(row[RMSE]) if has_range_errors else std_m / float(row[SIGMA])
+            ratio_error = error * ratio
     x, y, z = point.tolist()
     return PointCheck(
         position_m=(x, y, z),
         predicted_sigma_m=float(row[SIGMA]) if predicted else None,
         simulated_sigma_m=std_m,
-        ratio=std_m / float(row[SIGMA]) if both and std_m is not None else None,
-        ratio_error=error * (std_m or 0.0) / float(row[SIGMA]) if both and error is not None else None,
+        ratio=ratio,
+        ratio_error=ratio_error,
         predicted_rmse_m=float(row[RMSE]) if predicted else None,
         simulated_rmse_m=rmse_m,
         predicted_claim_m=float(row[CLAIMED]) if predicted else None,

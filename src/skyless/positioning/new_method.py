@@ -3,6 +3,7 @@
 from typing import Final
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.air.almanac import AccuracyPage, NoisePage, SchedulePage
 from skyless.clocks.filter import clock_noise
@@ -49,7 +50,12 @@ def new_method(
         )
         return Snapshots(SnapshotMethod(wanted.method), settings, time)
     if wanted.method == "joint":
-        assumed = _estimator_settings(wanted, schedule, noise, accuracy, superframe_s)
+        assumed = replace(
+            estimator_settings(wanted.qa, schedule.tag_height_m, noise, accuracy, superframe_s),
+            max_acceleration_mps2=wanted.max_acceleration_mps2,
+            integrity_risk=wanted.integrity.risk,
+            alert_limit_m=wanted.integrity.alert_limit_m,
+        )
         return Estimation(assumed, wanted.z_bounds_m, time, superframe_s)
     return Tracking(_tracker_settings(wanted, schedule, noise), wanted.z_bounds_m, time, superframe_s)
 
@@ -59,18 +65,19 @@ def _stamp_variances(noise: NoisePage) -> tuple[float, float]:
     return stamp_variance_m2(noise.tx_stamp_s, rounded=False), stamp_variance_m2(noise.rx_stamp_s, rounded=True)
 
 
-def _estimator_settings(
-    wanted: Wanted, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage, superframe_s: float
+def estimator_settings(
+    qa: float, height_m: float | None, noise: NoisePage, accuracy: AccuracyPage, superframe_s: float
 ) -> EstimatorSettings:
+    """What the estimator assumes at a site with this noise and accuracy; of its integrity and the tag the defaults."""
     tx_variance, rx_variance = _stamp_variances(noise)
     own = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
     return EstimatorSettings(
-        qa=wanted.qa,
+        qa=qa,
         white=own.white,
         walk=own.walk,
         tx_variance_m2=tx_variance,
         rx_variance_m2=rx_variance,
-        height_m=schedule.tag_height_m,
+        height_m=height_m,
         drop_s=max(DROP_S, 4.0 * superframe_s),
         survey_std_m=accuracy.survey_std_m,
         range_std_m=accuracy.range_std_m,
@@ -78,9 +85,6 @@ def _estimator_settings(
         place_std_m=accuracy.place_std_m,
         place_distance_m=accuracy.place_distance_m,
         place_time_s=accuracy.place_time_s,
-        max_acceleration_mps2=wanted.max_acceleration_mps2,
-        integrity_risk=wanted.integrity.risk,
-        alert_limit_m=wanted.integrity.alert_limit_m,
     )
 
 

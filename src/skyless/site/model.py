@@ -59,6 +59,11 @@ class AccuracySite(Struct, frozen=True, forbid_unknown_fields=True):
     place_time_s: float = 100.0
     """Time over which that part changes while the tag is at rest."""
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether survey and ranges are taken for exact."""
+        return self.survey_std_m == self.range_std_m == self.slope_std_m == self.place_std_m == 0.0
+
 
 EXACT: Final = AccuracySite(survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0)
 """Survey and ranges without error, as in simulated ideal air."""

@@ -141,6 +141,18 @@ def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
 
 
 @kernel
+def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[int, float]:
+    """Put the tag's reception of an anchor into ``h``; its terms, and the distance."""
+    dim = s.settings[0]["dim"]
+    where = layout(dim, len(s.anchors))
+    range_m = _add_direction(s, 0, anchor, 1.0)
+    term = _set_term(s, 2 * dim, where.offset + anchor, 1.0)
+    if has_tx_noise:
+        term = _set_term(s, term, where.tx_noise + anchor, 1.0)
+    return _range_error_terms(s, term, anchor, range_m, 1.0), range_m
+
+
+@kernel
 def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, variance_factor: float) -> int:
     """Process the tag's reception of an anchor's packet: 1 if it was used, 0 if not, ``CLOCK_JUMPED`` to join anew.
 
@@ -153,16 +165,13 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     offset = where.offset + anchor
     elapsed_s = (rx_ticks - a["rx_ticks"]) * TICK_S
     relax_range_error(s, anchor, elapsed_s, status["walked_m"] - a["walked_m"])
-    range_m = _add_direction(s, 0, anchor, 1.0)
-    term = _set_term(s, 2 * dim, offset, 1.0)
     rx_variance = settings["rx_variance_m2"]
     a["has_tx_noise"] = a["is_relayed"]
     if a["is_relayed"]:
         reset_state(s, where.tx_noise + anchor, settings["tx_variance_m2"])
-        term = _set_term(s, term, where.tx_noise + anchor, 1.0)
     else:
         rx_variance += settings["tx_variance_m2"]
-    terms = _range_error_terms(s, term, anchor, range_m, 1.0)
+    terms, range_m = reception_terms(s, anchor, a["is_relayed"])
     bend_m = _bend_m(s, range_m, rx_variance)
     rx_variance += 2.0 * bend_m * bend_m
     innovation = (rx_ticks - tx_ticks - a["offset_ticks"]) * TICK_M - range_m - bend_m - _along(s, 2 * dim, terms)
@@ -249,6 +258,25 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
 
 
 @kernel
+def relay_terms(s: EstimatorState, listener: int, sender: int, age_s: float, has_tx_noise: bool) -> int:
+    """Put an anchor's reception of another, so long ago, into ``h``; its terms."""
+    where = layout(s.settings[0]["dim"], len(s.anchors))
+    term = _set_term(s, 0, where.offset + sender, 1.0)
+    term = _set_term(s, term, where.offset + listener, -1.0)
+    term = _set_term(s, term, where.rate + sender, -age_s)
+    term = _set_term(s, term, where.rate + listener, age_s)
+    return int(_set_term(s, term, where.tx_noise + sender, 1.0)) if has_tx_noise else int(term)
+
+
+@kernel
+def relay_variance(s: EstimatorState, listener: int, sender: int, age_s: float) -> float:
+    """Of such a reception: its RX stamp's, and what two oscillators have done since."""
+    settings, i, j = s.settings[0], s.anchors[listener], s.anchors[sender]
+    walk = settings["walk"] * max(i["walk_scale"], j["walk_scale"])
+    return float(settings["rx_variance_m2"] + 2.0 * age_s * (settings["white"] + walk * age_s * age_s / 3.0))
+
+
+@kernel
 def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_rx_ticks: int, rx_ticks: int) -> None:
     """Process the reception, by the anchor ``listener``, of a packet of ``sender`` that the tag has received as well.
 
@@ -259,22 +287,15 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
     """
     settings, status = s.settings[0], s.status[0]
     i, j = s.anchors[listener], s.anchors[sender]
-    dim = settings["dim"]
     squared = 0.0
     for axis in range(3):
         squared += (i["position_m"][axis] - j["position_m"][axis]) ** 2
     distance_m = np.sqrt(squared)
     age_s = (status["epoch_ticks"] - packet_rx_ticks) * TICK_S + (j["range_m"] - distance_m) / SPEED_OF_LIGHT_MPS
-    where = layout(dim, len(s.anchors))
-    term = _set_term(s, 0, where.offset + sender, 1.0)
-    term = _set_term(s, term, where.offset + listener, -1.0)
-    term = _set_term(s, term, where.rate + sender, -age_s)
-    term = _set_term(s, term, where.rate + listener, age_s)
-    walk = settings["walk"] * max(i["walk_scale"], j["walk_scale"])
-    variance = settings["rx_variance_m2"] + 2.0 * age_s * (settings["white"] + walk * age_s * age_s / 3.0)
-    if j["tx_ticks"] == tx_ticks and j["has_tx_noise"]:
-        term = _set_term(s, term, where.tx_noise + sender, 1.0)
-    else:
+    has_tx_noise = j["tx_ticks"] == tx_ticks and j["has_tx_noise"] != 0
+    term = relay_terms(s, listener, sender, age_s, has_tx_noise)
+    variance = relay_variance(s, listener, sender, age_s)
+    if not has_tx_noise:
         variance += settings["tx_variance_m2"]
     link = s.links[min(listener, sender), max(listener, sender)]
     whole = j["offset_ticks"] - i["offset_ticks"]

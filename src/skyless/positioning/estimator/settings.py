@@ -56,11 +56,6 @@ class EstimatorSettings(Struct, frozen=True):
         """Dimensions of the position that are estimated."""
         return 3 if self.height_m is None else 2
 
-    @property
-    def is_exact(self) -> bool:
-        """Whether survey and ranges are taken for exact."""
-        return self.survey_std_m == self.range_std_m == self.slope_std_m == self.place_std_m == 0.0
-
     def record(self) -> NDArray[np.void]:
         """The settings as the kernels take them, shape (1,)."""
         record = np.zeros(1, SETTINGS)
