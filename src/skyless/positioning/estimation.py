@@ -9,7 +9,6 @@ from skyless.constants import TICK_S
 from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Start
 from skyless.positioning.estimator.estimator import (
     NO_REPORT,
-    OPEN_RANGE_STD_M,
     REJECTED,
     STALE,
     UNCOVERED_CHI2,
@@ -18,6 +17,7 @@ from skyless.positioning.estimator.estimator import (
 )
 from skyless.positioning.estimator.faults import SURE_CHI2
 from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import OPEN_RANGE_STD_M
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_rows import QUALITY
 from skyless.positioning.fix_time import FixTime
@@ -52,7 +52,7 @@ SPEED_STD_GROWTH: Final = 4.0
 MAX_SPEED_STD_MPS: Final = 32.0
 """... the next start assumes a speed higher by this factor, up to this."""
 
-DOUBT_S: Final = 6.0
+DOUBT_S: Final = 2.0
 """Faults that show so soon after a start, and of whose anchors nothing can be said, have led to a wrong place."""
 
 CALM: Final = 0.1

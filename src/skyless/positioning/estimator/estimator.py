@@ -63,10 +63,6 @@ LOST_SHARE: Final = 0.5
 MOST_REFUSED: Final = 4.0
 """Relays beyond the gate lately; fewer may be late ones."""
 
-OPEN_RANGE_STD_M: Final = 1.0
-OPEN_SURVEY_STD_M: Final = 0.15
-"""What a start expects that follows one which was contradicted."""
-
 FADING: Final = 0.95
 """What a packet leaves of the counts of relays lately."""
 
@@ -397,7 +393,7 @@ class Estimator:
         settings, dim = self.settings, self.dim
         state = new_state(settings, len(self._table_m))
         if open_range_errors:
-            state.settings["range_std_m"], state.settings["survey_std_m"] = OPEN_RANGE_STD_M, OPEN_SURVEY_STD_M
+            state.status["open_range_errors"] = 1
         state.x[:dim] = position_m
         state.P[:dim, :dim] = covariance_m2
         state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance

@@ -104,12 +104,18 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
 
 @kernel
 def is_common(s: EstimatorState, normalised: float) -> bool:
-    """Whether the newest innovations of all anchors lie on the side of this one; the tag's clock it is then."""
+    """Whether the newest innovations of all anchors but one, which may say nothing, lie on the side of this one.
+
+    The tag's clock it is then. A faulty anchor draws the others to the opposite side of its own.
+    """
+    silent = 0
     for anchor in range(len(s.anchors)):
         newest = s.anchors[anchor]["innovation"]
-        if newest * normalised <= 0.0 or abs(newest) <= COMMON:
+        if abs(newest) <= COMMON:
+            silent += 1
+        elif newest * normalised <= 0.0:
             return False
-    return len(s.anchors) > s.settings[0]["dim"]
+    return bool(silent <= 1 and len(s.anchors) > s.settings[0]["dim"])
 
 
 @kernel

@@ -104,6 +104,7 @@ STATUS: Final = np.dtype(
         ("walk_scale", np.float64),  # factor on its random walk
         ("obstruction", np.float64),  # 1 where range errors have jumped lately, 0 where they do not
         ("walked_m", np.float64),
+        ("open_range_errors", np.int64),  # whether anchors join with range errors beyond what the settings say
     ],
     align=True,
 )
@@ -207,6 +208,10 @@ def new_state(settings: EstimatorSettings, table_size: int) -> EstimatorState:
 START_WALK_SCALE: Final = 100.0
 """Of the tag's oscillator, which warms up after it was switched on."""
 
+OPEN_RANGE_STD_M: Final = 0.5
+OPEN_SURVEY_STD_M: Final = 0.15
+"""What a start expects of ranges and survey that follows one which was contradicted."""
+
 PAIR_STD_M: Final = 0.05
 """Of the constant of a pair of anchors beside what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
 
@@ -227,10 +232,13 @@ def with_anchor(s: EstimatorState, table_index: int, position_m: Vector) -> Esti
         link["tx_ticks"], link["variance_m2"] = NEVER, pair_variance
     where = layout(dim, count + 1)
     grown.P[where.change + count, where.change + count] = settings["place_std_m"] ** 2
-    grown.P[where.constant + count, where.constant + count] = settings["range_std_m"] ** 2
+    range_std_m, survey_std_m = settings["range_std_m"], settings["survey_std_m"]
+    if s.status[0]["open_range_errors"]:
+        range_std_m, survey_std_m = OPEN_RANGE_STD_M, OPEN_SURVEY_STD_M
+    grown.P[where.constant + count, where.constant + count] = range_std_m**2
     survey = where.survey + dim * count
     for axis in range(dim):
-        grown.P[survey + axis, survey + axis] = settings["survey_std_m"] ** 2
+        grown.P[survey + axis, survey + axis] = survey_std_m**2
     grown.index_of[table_index] = count
     return grown
 
