@@ -68,6 +68,9 @@ def _advance(x: Vector, P: Matrix, V: Matrix, values: int, dt: float) -> None:
     for row in range(n):
         for value in range(values):
             P[row, value] += dt * P[row, values + value]
+    for value in range(values):  # of two orders of the same sum
+        for other in range(value):
+            P[value, other] = P[other, value]
     for fault in range(V.shape[0]):
         for value in range(values):
             V[fault, value] += dt * V[fault, values + value]
