@@ -51,7 +51,7 @@ def test_pages_of_a_site():
     assert pages == (
         SchedulePage(2**27, 5, 1, 1, 2, 1.2),
         NoisePage(pytest.approx(100e-12), pytest.approx(100e-12), 2e-11, 1e-9),
-        AccuracyPage(0.02, 0.03, 0.05, 0.03, 1.0, 100.0),
+        AccuracyPage(0.02, 0.03, 0.05, 0.005, 1.0, 100.0),
         AnchorPage(1, 0.1, 1.0, 2.5, 0),
         AnchorPage(2, 0.2, 1.0, 2.5, 1),
         GeoreferencePage(52.0, 4.0, 3.0, 270.0),

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from skyless.experiments.fleet import Fleet, FleetSettings
 from skyless.experiments.scenarios import Request, impairments_of
@@ -11,7 +12,8 @@ from skyless.methods import FILTERS
 from skyless.positioning.fix import motion_fix
 from skyless.positioning.tracker import RESTLESS_CHI2
 from skyless.simulation.trajectory import Waypoints
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
+from skyless.site.model import EXACT
 from skyless.site.room import room_site
 
 
@@ -19,7 +21,7 @@ from skyless.site.room import room_site
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_vehicle_at_20_metres_a_second(tag_height_m, seed):
     """It crosses the hall in 1.4 s; half a second after the site's power-on it must be followed, and rightly."""
-    site = room_site(30.0, 20.0, 8, 4.0, tag_height_m)
+    site = replace(room_site(30.0, 20.0, 8, 4.0, tag_height_m), accuracy=EXACT)
     path = Waypoints([(1.0, 10.0, 1.2), (29.0, 10.0, 1.2)], 20.0)
     fleet = Fleet(site, [path], impairments_of(Request(site), site), seed, FleetSettings())
     judged = [one for one in fleet.run(1.35) if one.time_s > 0.5]
@@ -34,7 +36,7 @@ def test_fixes_know_what_hard_turns_cost_them(method):
 
     The NEES of the tracker's fixes made while innovations are too large is 15 with its own covariance.
     """
-    site, normalised = lab_site(), []
+    site, normalised = ideal_lab_site(), []
     path = Waypoints([(1.5, 2.0), (4.5, 2.0), (4.5, 6.0), (1.5, 6.0)], 3.0, loop=True, corner_s=0.2)
     for seed in (1, 2):
         fleet = Fleet(site, [path], impairments_of(Request(site), site), seed, FleetSettings(method))

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from skyless.experiments.scenarios import Request, fleet_of
 from skyless.methods import FILTERS
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 SIDES = 5.0
 
@@ -19,7 +19,7 @@ def test_a_start_is_not_sure_of_a_wrong_place(seed, method):
     Radial errors over their standard deviation are below 6 but for 2·10⁻⁸ of Gaussian ones; the first fixes of a tag
     that walks are less than Gaussian, so 10 is what nothing may exceed.
     """
-    lab = lab_site()
+    lab = ideal_lab_site()
     site = replace(lab, anchors=tuple(replace(a, x_m=SIDES * a.x_m, y_m=SIDES * a.y_m) for a in lab.anchors))
     fleet = fleet_of(Request(site, method=method, seed=seed, tags=8, warmup_s=0.0))
     normalised, firsts = [], set()

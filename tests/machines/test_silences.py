@@ -8,13 +8,17 @@ from msgspec.structs import replace
 
 from skyless.experiments.scenarios import Request, fleet_of
 from skyless.positioning.kalman import horizontal_variance, predict_motion
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
+from skyless.site.model import EXACT
 from skyless.site.room import room_site
 
 LISTENING_S = 3.0
 
 
-@pytest.mark.parametrize("site", [lab_site(), room_site(30.0, 20.0, 8, 4.0, None)], ids=lambda site: site.name)
+HALL = replace(room_site(30.0, 20.0, 8, 4.0, None), accuracy=EXACT)
+
+
+@pytest.mark.parametrize("site", [ideal_lab_site(), HALL], ids=lambda site: site.name)
 @pytest.mark.parametrize("silence_s", [2.0, 3.0, 4.5])
 def test_fixes_after_a_silence_know_their_error(site, silence_s):
     """Errors of a normal variable in 2 or 3 axes exceed five of its radial sigmas once in 10⁶ and more."""
@@ -46,7 +50,7 @@ def test_the_spread_ahead_is_that_of_the_prediction():
 
 def test_superframes_of_seconds_are_silences():
     """255 slots of 15.7 ms, of which six are used: 94 ms of beacons every 4 s."""
-    lab = lab_site()
+    lab = ideal_lab_site()
     slow = replace(lab, schedule=replace(lab.schedule, slot_s=15.7e-3, slots=255))
     fleet = fleet_of(Request(slow, tags=4))
     judged = list(fleet.run(60.0))

@@ -14,10 +14,10 @@ from skyless.radios.radio import Sent
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.ticks import difference, wrap
 
-LAB = lab_site()
+LAB = ideal_lab_site()
 PLACE_M = (2.0, 3.0, 0.0)
 
 

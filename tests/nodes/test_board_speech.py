@@ -20,7 +20,7 @@ from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 DELAY = 16_450
 
@@ -155,7 +155,7 @@ def test_garbage_from_the_host_is_counted_and_hurts_nothing():
     assert host.radio.transmissions == []
 
 
-LAB = lab_site()
+LAB = ideal_lab_site()
 
 
 def frames():

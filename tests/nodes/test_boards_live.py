@@ -4,7 +4,7 @@ import asyncio
 import time
 
 import pytest
-from live_site import PLACES, LiveSite, are_right
+from live_nodes import PLACES, LiveSite, are_right
 
 from skyless.experiments.warm import compile_kernels, compile_packet_kernels
 

@@ -5,7 +5,7 @@ import random
 
 import pytest
 from firmware_board import FirmwareBoard
-from live_site import LiveSite, are_right
+from live_nodes import LiveSite, are_right
 
 from skyless.experiments.warm import compile_kernels
 from skyless.firmware.board import NONE

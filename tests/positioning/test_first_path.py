@@ -17,7 +17,7 @@ from skyless.simulation.impairments import AnchorBias, Impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
 POWERS = st.floats(-150.0, 0.0)
 
@@ -55,7 +55,7 @@ def test_emulated_paths_show_what_real_ones_do(extra_m, least_db, most_db):
 
 def _squared(method, diagnostics, told, *, bias_m=0.0, nlos=0.0):
     """Squared and normalised errors of a tag that lies still, shape (fixes,), and all fixes as bytes."""
-    site = lab_site(100.0)
+    site = ideal_lab_site(100.0)
     biases = (AnchorBias(2, bias_m),) if bias_m else ()
     channel = ChannelModel(nlos_probability=nlos)
     faults = Impairments(anchor_biases=biases, channel=channel, diagnostics=diagnostics)
@@ -92,7 +92,7 @@ def test_blocked_paths_that_show_cost_less(fault, least_gain):
 
 
 def test_radios_that_tell_nonsense_are_believed_as_those_that_tell_nothing():
-    site = lab_site(100.0)
+    site = ideal_lab_site(100.0)
     world = World(site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(2.0, 3.0))], Impairments(), 5)
     plain, odd = Receiver("joint"), Receiver("joint")
     told = [

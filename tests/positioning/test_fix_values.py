@@ -11,8 +11,7 @@ import pytest
 from skyless.positioning.alert import Alert
 from skyless.positioning.fix import Fix
 from skyless.positioning.fix_rows import MOTION_ROWS, PROTECTED_ROWS, QUALITY
-from skyless.positioning.protection import IntegrityRequirement
-from skyless.positioning.protection_levels import DETECTED
+from skyless.positioning.protection import CONTRADICTED, IntegrityRequirement
 
 ANCHORS_M = np.eye(4, 3)
 
@@ -45,7 +44,7 @@ def test_methods_without_velocity_have_none():
         (False, None, 0.0, (0.4, 0.9, Alert.NONE)),
         (True, None, 0.0, (0.4, None, Alert.NONE)),
         (True, 0.3, 0.0, (0.4, None, Alert.LIMIT)),
-        (True, 0.3, float(DETECTED), (None, None, Alert.NOT_EXCLUDED)),
+        (True, 0.3, float(CONTRADICTED), (None, None, Alert.NOT_EXCLUDED)),
     ],
 )
 def test_levels_answer_what_was_asked(known, limit_m, state, expected):

@@ -12,6 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from skyless.positioning.fix import NoFixReason
+from skyless.positioning.least_squares import GAIN_TOLERANCE
 from skyless.positioning.minima import mean_if_positive
 from skyless.positioning.solver import NoSolution, PseudorangeSolution, Solution, locate, locate_pseudoranges
 from skyless.uncertainty.dop import dilution_of_precision
@@ -182,16 +183,27 @@ def in_two_orders(seed, n, height_known):
 
 @settings(max_examples=200)
 @given(seed=SEEDS, n=st.integers(6, 9), height_known=st.booleans())
+@example(seed=2826940130, n=7, height_known=True)
+@example(seed=2697390792, n=8, height_known=False)
 def test_the_order_of_the_anchors_does_not_move_the_position(seed, n, height_known):
+    """To what the iterations leave over.
+
+    The last of k steps promises to gain less than the part t of the cost, so it is below √(t·χ²) standard deviations.
+    Where residuals are curved, steps shrink by a factor ρ only, and ρ/(1 − ρ) times the last is still missing. From a
+    first one of a standard deviation or more, k steps at ρ came down by 10⁶ at least, so 1/(1 − ρ) is below k/14.
+    """
     both = in_two_orders(seed, n, height_known)
     if both is None or any(isinstance(s, NoSolution) for s in both):
         return
     straight, shuffled = both
     if np.abs(shuffled.position_m - straight.position_m).max() > 0.1:
         return  # two minima within one error ellipse: either is right
-    np.testing.assert_allclose(shuffled.position_m, straight.position_m, atol=1e-6)
+    std_m = np.linalg.eigvalsh(straight.covariance_joint_m2)[-1] ** 0.5
+    last_m = std_m * (GAIN_TOLERANCE * max(straight.chi2, shuffled.chi2)) ** 0.5
+    left_m = 1e-6 + last_m * (straight.iterations + shuffled.iterations) / 14.0
+    np.testing.assert_allclose(shuffled.position_m, straight.position_m, rtol=0.0, atol=left_m)
     np.testing.assert_allclose(shuffled.covariance_joint_m2, straight.covariance_joint_m2, rtol=1e-4, atol=1e-9)
-    assert shuffled.bias_m == pytest.approx(straight.bias_m, abs=1e-6)
+    assert shuffled.bias_m == pytest.approx(straight.bias_m, abs=left_m, rel=0.0)
     assert shuffled.chi2 == pytest.approx(straight.chi2, rel=1e-4, abs=1e-6)
 
 

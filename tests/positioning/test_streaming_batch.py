@@ -13,7 +13,7 @@ from skyless.experiments.scenarios import Request, fleet_of
 from skyless.positioning.pair_state import PairSettings
 from skyless.positioning.pair_tracker import PairTracker, track_pairs
 from skyless.positioning.tracker import PseudorangeTracker, track
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 from skyless.site.room import room_site
 
 ROOM = room_site(8.0, 6.0, 8, 3.0, None)
@@ -48,8 +48,8 @@ def streamed(site, until_s, **request):
 @pytest.mark.parametrize(
     ("site", "request_"),
     [
-        (lab_site(), {"positions_m": ((3.0, 4.0),)}),
-        (lab_site(), {"seed": 3, "speed_mps": 1.5, "loss": 0.3, "nlos": 0.05}),
+        (ideal_lab_site(), {"positions_m": ((3.0, 4.0),)}),
+        (ideal_lab_site(), {"seed": 3, "speed_mps": 1.5, "loss": 0.3, "nlos": 0.05}),
         (ROOM, {"positions_m": ((3.0, 4.0, 1.2),)}),
     ],
     ids=["static", "walking with obstacles", "3-D"],
@@ -109,7 +109,7 @@ def positions(until_s=0.25):
     """All positions of a tag by three methods, through anchors, ether and receiver."""
     found = {}
     for method in ("literal", "bracketed", "tracker"):
-        fleet = fleet_of(Request(lab_site(), method=method, positions_m=((3.0, 4.0),)))
+        fleet = fleet_of(Request(ideal_lab_site(), method=method, positions_m=((3.0, 4.0),)))
         found[method] = [judged.fix.position_m.tolist() for judged in fleet.run(until_s)]
     return found
 

@@ -45,6 +45,10 @@ SUBTICKS: Final = 256
 SLOPE_FROM_M: Final = 4.0
 """Where the errors that grow with distance pass through zero, and by which range they change once (APS011)."""
 
+SLOPE_STEP_M: Final = 0.25
+"""The slope counts at a range that follows in such steps: where it followed the estimate's noise, which is in the
+innovation as well, a tag at rest would learn the slope from nothing else (Huang and Roumeliotis 2008)."""
+
 BEND_SHARE: Final = 0.01
 """Where ranges are so curved that it counts for more than this part of the stamps' variance, it is counted."""
 
@@ -104,7 +108,10 @@ def _range_error_terms(s: EstimatorState, term: int, anchor: int, range_m: float
     where = layout(s.settings[0]["dim"], len(s.anchors))
     term = _set_term(s, term, where.change + anchor, sign)
     term = _set_term(s, term, where.constant + anchor, sign)
-    far = min(max((range_m - SLOPE_FROM_M) / SLOPE_FROM_M, -1.0), 1.0)
+    a = s.anchors[anchor]
+    if abs(range_m - a["slope_range_m"]) > SLOPE_STEP_M:
+        a["slope_range_m"] = range_m
+    far = min(max((a["slope_range_m"] - SLOPE_FROM_M) / SLOPE_FROM_M, -1.0), 1.0)
     return int(_set_term(s, term, where.slope, sign * far))
 
 

@@ -43,6 +43,7 @@ ANCHOR: Final = np.dtype(
         ("rx_ticks", np.int64),  # ... and the tag's
         ("offset_ticks", np.int64),  # whole ticks of the offset
         ("range_m", np.float64),  # at its newest packet
+        ("slope_range_m", np.float64),  # at which its range errors' slope counts
         ("walked_m", np.float64),  # the tag's way at its newest packet
         ("is_relayed", np.int64),  # whether others relay its packets
         ("has_tx_noise", np.int64),  # whether its newest packet's TX noise is a state

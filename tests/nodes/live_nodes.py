@@ -14,9 +14,9 @@ from skyless.nodes.tag import TagNode, TagSettings
 from skyless.radios.open import open_radios, open_sniffers
 from skyless.radios.radio import AntennaDelays
 from skyless.simulation.trajectory import Static
-from skyless.site.lab import lab_site
+from skyless.site.lab import ideal_lab_site
 
-LAB = lab_site()
+LAB = ideal_lab_site()
 PLACE_M = (2.0, 3.0, LAB.tags.height_m)
 PLACES = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in LAB.anchors}
 TAGS = ("tag1", "tag2", "tag3", "tag4")

@@ -1,0 +1,360 @@
+"""What late receptions do to the estimate: sensitivities, evidence, taking faults into the state, protection levels."""
+
+import numpy as np
+import pytest
+from estimator_builders import (
+    LAB_M,
+    MESH,
+    PLAIN,
+    ROOM_M,
+    SLOT_S,
+    Case,
+    begun,
+    episode_of,
+    kept,
+    late,
+    late_from,
+    one_by_one,
+    same,
+    settings_of,
+    tracked,
+    where,
+)
+from msgspec.structs import replace
+from scipy.stats import binom, chi2
+
+from skyless.constants import TICK_M
+from skyless.positioning.alert import Alert
+from skyless.positioning.estimator import faults
+from skyless.positioning.estimator.faults import OPENED_STD_M, explained_chi2, open_lasting_faults, solve
+from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LASTING_STD_M, LEVELS, RECENT_STD_M, protect
+from skyless.positioning.estimator.state import with_anchor
+from skyless.positioning.protection import CONTRADICTED, SOUND, IntegrityRequirement, integrity_of, limits_of
+
+RISK = 1e-4
+LATE_M = 4 * TICK_M
+"""Whole ticks, as stamps are."""
+
+ROOM_ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
+OPEN = {"gate": 1e6}
+
+
+def follow(one, packets, other, other_packets, before=None):
+    """Process both, the other one with the process noise of the first: what faults do is linear apart from that."""
+    for ours, theirs in zip(one_by_one(packets), one_by_one(other_packets), strict=True):
+        if before is not None:
+            before(other, theirs)
+        if len(one.state.anchors) == len(other.state.anchors):
+            for name in ("q_scale", "walk_scale", "common_mean", "lag", "lag_square"):
+                other.state.status[name] = one.state.status[name]
+            other.state.anchors["walk_scale"] = one.state.anchors["walk_scale"]
+        assert one.process(*ours) == other.process(*theirs)
+        for estimator in (one, other):  # constants of pairs are beside the filter, and in no sensitivity
+            estimator.state.links["variance_m2"] = 0.0
+    for estimator in (one, other):
+        status = estimator.state.status
+        assert status["obstructions"] == status["faults_opened"] == status["rejected"] == 0
+
+
+def apart_from_offsets(estimator):
+    """States other than offsets, whose whole ticks stand elsewhere."""
+    place = where(estimator)
+    return np.setdiff1d(np.arange(place.end), np.arange(place.offset, place.velocity))
+
+
+@pytest.mark.parametrize("errors", [{}, ROOM_ERRORS], ids=["exact", "range errors"])
+@pytest.mark.parametrize(
+    ("case", "anchors_m", "height_m"), [(PLAIN, LAB_M, 0.0), (MESH, LAB_M, 0.0), (MESH, ROOM_M, None)]
+)
+def test_sensitivities_are_what_a_fault_does_to_the_state(case, anchors_m, height_m, errors):
+    """One anchor late by 2 cm since it joined, against the same without.
+
+    Stamps have no noise but their ticks: the gain's change with the place, times innovations, is in no sensitivity.
+    """
+    episode, anchor = episode_of(replace(case, noise_ps=0.0, qa=1e-6, random_walk_fm=1e-12), 40, 1, anchors_m), 2
+    assumed = settings_of(case, height_m, **OPEN, **errors)
+    clean, faulty = (begun(episode, assumed, anchors_m, 0.1, off=0.0) for _ in range(2))
+    follow(clean, episode.packets, faulty, late_from(episode.packets, anchor, LATE_M))
+    # range errors: the range at which their slope counts goes in steps, a little earlier or later in either
+    apart, s = np.arange(clean.dim) if errors else apart_from_offsets(clean), clean.state
+    moved, expected = ((faulty.state.x - s.x) / LATE_M)[apart], s.V[anchor][apart]
+    assert np.linalg.norm(expected[: clean.dim]) > 0.02
+    np.testing.assert_allclose(moved, expected, rtol=0.03, atol=0.01 * np.abs(expected).max())
+
+
+def test_sensitivities_to_acceleration_are_what_it_does():
+    """The tag accelerates by 2 m/s² along one axis: the position falls behind by V times that."""
+    episode, acceleration = episode_of(Case(noise_ps=0.0, qa=1e-6, random_walk_fm=1e-12), 40), 2.0
+    time_s = np.arange(len(episode.path_m)) * SLOT_S
+    step_m = np.outer(0.5 * acceleration * time_s**2, [1.0, 0.0, 0.0])
+    flights_m = [
+        np.linalg.norm(episode.path_m + share * step_m - LAB_M[episode.packets.anchors], axis=1) for share in (0, 1)
+    ]
+    one, other = (begun(episode, settings_of(MESH, **OPEN), off=0.0) for _ in range(2))
+    follow(one, episode.packets, other, late(episode.packets, flights_m[1] - flights_m[0]))
+    behind_m = other.state.x[:2] - step_m[-1, :2] - one.state.x[:2]
+    expected = one.state.V[2 * len(LAB_M), :2]
+    assert np.linalg.norm(expected) > 0.002
+    np.testing.assert_allclose(behind_m / acceleration, expected, atol=0.2 * np.linalg.norm(expected))
+
+
+def test_evidence_finds_the_size_of_a_fault():
+    episode, sizes = episode_of(MESH), []
+    for late_m in (0.0, LATE_M):
+        run = tracked(begun(episode, settings_of(MESH, **OPEN)), late_from(episode.packets, 3, late_m))
+        s = run.estimator.state
+        sizes.append(np.linalg.solve(s.information[0] + 1e-3 * np.eye(6), s.evidence[0]))
+    np.testing.assert_allclose((sizes[1] - sizes[0])[3] - np.delete(sizes[1] - sizes[0], 3).mean(), LATE_M, rtol=0.1)
+
+
+def test_without_faults_their_test_is_chi_squared():
+    """yᵀ·M⁺·y over the directions that are seen, in 200 episodes; ranges of a tag that moves see five of six."""
+    total, freedom = 0.0, 0
+    for seed in range(200):
+        episode = episode_of(MESH, 60, seed)
+        s = tracked(begun(episode, settings_of(MESH, gate=6.0), seed=seed + 1000), episode.packets).estimator.state
+        if s.status["obstructions"] or s.status["faults_opened"]:
+            continue
+        values, vectors = np.linalg.eigh(s.information[0])
+        seen = values > 1e-3 * values[-1]
+        total += np.sum((vectors.T @ s.evidence[0])[seen] ** 2 / values[seen])
+        freedom += np.count_nonzero(seen)
+    low, high = chi2.ppf([0.0005, 0.9995], freedom)
+    assert low < total < high
+
+
+def test_equations_are_solved():
+    draw = np.random.default_rng(1)
+    root, right = draw.normal(size=(5, 7)), draw.normal(size=(3, 5))
+    M = root @ root.T
+    work = np.vstack([M, right])
+    solve(work, 5, 3)
+    np.testing.assert_allclose(work[5:], np.linalg.solve(M, right.T).T, rtol=1e-9)
+
+
+def test_how_much_one_or_two_faults_explain():
+    s = tracked(begun(episode := episode_of(MESH, 20), settings_of(MESH)), episode.packets).estimator.state
+    draw = np.random.default_rng(2)
+    root = draw.normal(size=(6, 9))
+    s.information[0], s.evidence[0] = root @ root.T, draw.normal(size=6)
+    M = s.information[0] + np.eye(6) / OPENED_STD_M**2
+    for one in range(6):
+        for other in range(one + 1):
+            both = sorted({one, other})
+            y = s.evidence[0][both]
+            assert explained_chi2(s, one, other) == pytest.approx(y @ np.linalg.solve(M[np.ix_(both, both)], y))
+
+
+# Opening
+
+
+@pytest.mark.parametrize("errors", [{}, {"range_std_m": 0.03, "place_std_m": 0.005}], ids=["exact", "range errors"])
+@pytest.mark.parametrize("late_m", [0.0, LATE_M])
+def test_opening_a_fault_is_a_filter_that_had_it_open_from_the_beginning(late_m, errors):
+    """The other filter's constant of that anchor has the fault's variance besides, when it joins.
+
+    So it is but for what relays only consider: that follows the fault as well.
+    """
+    anchor, case = 2, MESH
+    episode = episode_of(Case(noise_ps=0.0, qa=1e-6, random_walk_fm=1e-12), 40)
+    packets = late_from(episode.packets, anchor, late_m)
+    assumed = settings_of(case, **OPEN, **errors)
+    opened, wide = (begun(episode, assumed, std_m=0.1, off=0.0) for _ in range(2))
+
+    def widen(estimator, packet):
+        if packet[0] == anchor and estimator.state.index_of[anchor] < 0:
+            estimator._use(with_anchor(estimator.state, anchor, LAB_M[anchor]))
+            constant = where(estimator).constant + int(estimator.state.index_of[anchor])
+            estimator.state.P[constant, constant] += OPENED_STD_M**2
+
+    follow(opened, packets, wide, packets, widen)
+    faults._open_lasting_fault(opened.state, anchor)
+    ours, theirs, apart = opened.state, wide.state, apart_from_offsets(wide)
+    scale = np.sqrt(np.diag(theirs.P))
+    used = scale > 1e-9
+    apart = np.intersect1d(apart, np.flatnonzero(used))
+    np.testing.assert_allclose((ours.x - theirs.x)[apart] / scale[apart], 0.0, atol=0.05)
+    off = (ours.P - theirs.P)[np.ix_(used, used)] / np.outer(scale[used], scale[used])
+    np.testing.assert_allclose(off, 0.0, atol=0.02)
+    np.testing.assert_allclose(ours.V[:6], theirs.V[:6] * (np.arange(6) != anchor)[:, None], atol=0.05)
+    assert not ours.V[anchor].any()
+    assert not ours.information[0][anchor].any()
+    assert np.array_equal(ours.P, ours.P.T)
+
+
+AGILE = Case(qa=0.3)
+
+
+@pytest.mark.parametrize("liars", [(2,), (1, 4)])
+@pytest.mark.parametrize("late_m", [0.3, -0.3, 1.5])
+@pytest.mark.parametrize("errors", [{}, ROOM_ERRORS], ids=["exact", "range errors"])
+def test_anchors_that_are_off_from_the_start_on_deceive_nobody(liars, late_m, errors):
+    """One is found within 3 s, and no other blamed; with two the level covers the error, or there is none."""
+    for seed in range(2):
+        episode = episode_of(AGILE, 300, seed)
+        wrong = np.where(np.isin(episode.packets.anchors, liars), late_m, 0.0)
+        run = tracked(begun(episode, settings_of(AGILE, **errors)), late(episode.packets, wrong))
+        off_m = np.linalg.norm(run.errors(episode), axis=1)[60:]
+        assert np.all((off_m < run.levels[60:, HPL]) | (run.levels[60:, -1] >= CONTRADICTED))
+        if len(liars) == 1:
+            assert off_m[1140:].max() < 0.1
+            assert not set(run.estimator.obstructed) - set(liars)
+
+
+@pytest.mark.parametrize("errors", [{}, ROOM_ERRORS], ids=["exact", "range errors"])
+def test_clean_packets_are_believed(errors):
+    for seed in range(6):
+        episode = episode_of(AGILE, 400, seed)
+        run = tracked(begun(episode, settings_of(AGILE, **errors)), episode.packets)
+        status = run.estimator.state.status[0]
+        assert status["faults_opened"] == status["obstructions"] == status["impossible"] == 0
+        assert (run.levels[100:, -1] == SOUND).all()
+
+
+def test_too_few_anchors_single_nobody_out():
+    episode = episode_of(MESH, 60)
+    packets = kept(episode.packets, episode.packets.anchors < 4)
+    estimator = begun(episode, settings_of(MESH))
+    estimator.track(packets)
+    estimator.state.evidence[0] = [100.0, 0.0, 0.0, 0.0]
+    assert open_lasting_faults(estimator.state, 1e4) == 0
+
+
+# Protection levels
+
+
+def biased(rng, packets, lasting_std_m, anchors):
+    return late(packets, rng.normal(0.0, lasting_std_m, anchors)[packets.anchors])
+
+
+def test_levels_are_the_ellipse_and_the_shift_of_all_faults():
+    """Against matrices, with evidence that is drawn."""
+    episode = episode_of(MESH, 40, 1, ROOM_M)
+    estimator = begun(episode, settings_of(MESH, None, **ROOM_ERRORS), ROOM_M)
+    estimator.track(episode.packets)
+    s, n, k = estimator.state, len(ROOM_M), limits_of(RISK)
+    s.evidence[:] = np.random.default_rng(3).normal(0.0, 10.0, s.evidence.shape)
+    levels, work = np.zeros(LEVELS), np.zeros((n + 4, n))
+    protect(s, k[0], k[1], work, levels)
+    hpl, vpl = [], []
+    for bank, std_m in enumerate((LASTING_STD_M, RECENT_STD_M)):
+        information = s.information[bank] + np.eye(n) / std_m**2
+        V = s.V[bank * n : (bank + 1) * n, :3]
+        shift = V.T @ np.linalg.solve(information, s.evidence[bank])
+        spread = s.P[:3, :3] + V.T @ np.linalg.solve(information, V)
+        hpl.append(np.linalg.norm(shift[:2]) + k[0] * np.linalg.eigvalsh(spread[:2, :2])[-1] ** 0.5)
+        vpl.append(abs(shift[2]) + k[1] * spread[2, 2] ** 0.5)
+        chi = s.evidence[bank] @ np.linalg.solve(information, s.evidence[bank])
+        assert levels[LASTING_CHI2 + bank] == pytest.approx(chi)
+    assert levels[:2] == pytest.approx([max(hpl), max(vpl)])
+
+
+def exceeded(case, assumed, worlds, draw_packets, risk):
+    """Epochs with a level, a second apart and so nearly independent, and those with an error above."""
+    promised = above = 0
+    for seed in range(worlds):
+        episode = episode_of(case, 270, seed)
+        estimator = begun(episode, replace(assumed, integrity_risk=risk), seed=seed + 500)
+        run = tracked(estimator, draw_packets(np.random.default_rng(seed + 900), episode.packets))
+        errors = np.linalg.norm(run.errors(episode), axis=1)
+        for k in range(399, len(errors), 400):
+            if integrity_of([*run.levels[k, :2], run.levels[k, -1]], risk, True, None).hpl_m is not None:
+                promised += 1
+                above += bool(errors[k] > run.levels[k, HPL])
+    return promised, above
+
+
+WORLDS = {
+    "clean": lambda rng, p: p,
+    "all anchors late": lambda rng, p: biased(rng, p, 0.03, 6),
+    "one late by 0.1 m": lambda rng, p: late_from(p, int(rng.integers(6)), 0.1),
+    "one late by 0.3 m": lambda rng, p: late_from(p, int(rng.integers(6)), 0.3),
+    "0.1 m from the middle on": lambda rng, p: late_from(p, int(rng.integers(6)), 0.1, 800),
+    "2 m from the middle on": lambda rng, p: late_from(p, int(rng.integers(6)), 2.0, 800),
+    "two late by 0.1 m": lambda rng, p: late_from(late_from(p, 1, 0.1), 4, 0.1),
+}
+
+
+@pytest.mark.parametrize("errors", [{}, ROOM_ERRORS], ids=["exact", "range errors"])
+@pytest.mark.parametrize("name", WORLDS)
+def test_errors_exceed_levels_as_seldom_as_stated(name, errors):
+    """At a risk of 2 % a fault that is not covered shows in 160 epochs; more than 9 above come once in 400 times."""
+    case, risk = Case(qa=0.3), 0.02
+    promised, above = exceeded(case, settings_of(case, **errors), 40, WORLDS[name], risk)
+    assert promised > 80
+    assert above <= binom.ppf(0.9975, promised, risk)
+
+
+def test_strict_levels_hold_and_are_not_much_larger_than_need_be():
+    promised, above = exceeded(MESH, settings_of(MESH), 40, WORLDS["clean"], RISK)
+    assert (promised, above) == (160, 0)
+    run = tracked(begun(episode := episode_of(MESH, 200), settings_of(MESH)), episode.packets)
+    assert 0.03 < run.levels[-1, HPL] < 0.3
+
+
+def integrity(run, k=-1):
+    return integrity_of([*run.levels[k, :2], run.levels[k, -1]], RISK, True, None)
+
+
+def test_a_coarse_fault_is_told_covered_and_forgotten_when_it_is_over():
+    case = Case(qa=0.3)
+    episode = episode_of(case, 200)
+    run = tracked(begun(episode, settings_of(case)), late_from(episode.packets, 1, 2.0, 300, 800))
+    assert integrity(run, 290).alert is Alert.NONE
+    told = integrity(run, 700)
+    assert told.alert is Alert.EXCLUDED
+    assert np.linalg.norm(run.errors(episode)[700]) < told.hpl_m < 1.0
+    assert integrity(run).alert is Alert.NONE
+
+
+def test_too_few_anchors_for_a_position_leave_nothing_to_promise():
+    episode = episode_of(MESH, 134)
+    for left, sound in ((3, True), (2, False)):
+        p = episode.packets
+        packets = kept(p, (np.arange(len(p.anchors)) < 300) | (p.anchors < left))
+        run = tracked(begun(episode, settings_of(MESH, drop_s=0.1)), packets)
+        assert len(run.estimator.state.anchors) == left
+        assert (integrity(run).hpl_m is not None) == sound
+        assert (integrity(run).alert is Alert.UNAVAILABLE) != sound
+
+
+def test_an_estimator_that_has_just_begun_promises_nothing():
+    episode = episode_of(MESH, 2)
+    told = integrity(tracked(begun(episode, settings_of(MESH)), episode.packets))
+    assert (told.alert, told.hpl_m) == (Alert.UNAVAILABLE, None)
+
+
+def test_a_tag_that_may_accelerate_has_larger_levels():
+    episode, found = episode_of(MESH, 60), []
+    for acceleration in (0.0, 1.0, 2.0):
+        assumed = settings_of(MESH, max_acceleration_mps2=acceleration)
+        found.append(tracked(begun(episode, assumed), episode.packets).levels[-1, HPL])
+    assert found[1] > found[0]
+    assert found[2] - found[1] == pytest.approx(found[1] - found[0])
+
+
+def test_following_faults_changes_no_state():
+    """Until one is opened, levels are beside the filter."""
+    episode = episode_of(MESH, 60)
+    one, two = (begun(episode, settings_of(MESH, **ROOM_ERRORS)) for _ in range(2))
+    one.track(episode.packets)
+    tracked(two, episode.packets)
+    assert same(one.state, two.state)
+
+
+def test_a_smaller_risk_gives_larger_levels():
+    strict, lax = limits_of(1e-7), limits_of(1e-3)
+    assert np.all(strict[:2] > lax[:2])
+
+
+@pytest.mark.parametrize("limit_m", [0.0, -1.0, float("inf"), float("nan")])
+def test_impossible_alert_limits_are_refused(limit_m):
+    with pytest.raises(ValueError, match="alert_limit_m is"):
+        IntegrityRequirement(alert_limit_m=limit_m)
+
+
+@pytest.mark.parametrize("risk", [0.0, -1e-4, 0.5, float("nan")])
+def test_impossible_risks_are_refused(risk):
+    for refuse in (limits_of, IntegrityRequirement):
+        with pytest.raises(ValueError, match="risk is"):
+            refuse(risk)
