@@ -58,18 +58,19 @@ def test_a_run_tells_what_was_asked_of_it(run):
 
 def test_protection_levels_are_told_and_hold_with_a_late_anchor(run, tmp_path):
     asked = ["--method", "joint", "--duration", "6", "--bias", "2:0.5", "--integrity-risk", "1e-3", "--json"]
-    told = report(run(*asked, "--alert-limit-m", "0.07", "--fixes-csv", "fixes.csv"))
+    told = report(run(*asked, "--alert-limit-m", "0.2", "--fixes-csv", "fixes.csv"))
     levels = told["levels"]
     assert (levels["integrity_risk"], levels["misleading"]) == (1e-3, 0)
     assert levels["available"] > 0.95
     assert sum(levels["alerts"].values()) == told["fixes"]
-    assert set(levels["alerts"]) <= {"detected-excluded", "alert-limit-exceeded", "detected-not-excluded"}
-    assert min(levels["alerts"].get(alert, 0) for alert in ("detected-excluded", "alert-limit-exceeded")) > 0
+    assert set(levels["alerts"]) <= {"none", "detected-excluded", "alert-limit-exceeded", "detected-not-excluded"}
+    assert levels["alerts"].get("alert-limit-exceeded", 0) > 0
     with (tmp_path / "fixes.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     assert {row["integrity_risk"] for row in table} == {"0.001"}
-    exceeded = [float(row["hpl_m"]) > 0.07 for row in table if row["hpl_m"]]
-    assert exceeded == [row["alert"] == "alert-limit-exceeded" for row in table if row["hpl_m"]]
+    given = [row for row in table if row["hpl_m"] and abs(float(row["hpl_m"]) - 0.2) > 1e-3]  # the table is rounded
+    assert len(given) > 500
+    assert all((float(row["hpl_m"]) > 0.2) == (row["alert"] == "alert-limit-exceeded") for row in given)
     assert table[0]["alert"] == "unavailable"
     assert report(run("--method", "weighted", "--duration", "3", "--json"))["levels"] is None
     code, out, _ = run("--method", "joint", "--duration", "3")

@@ -29,7 +29,7 @@ from skyless.positioning.estimator import faults
 from skyless.positioning.estimator.faults import OPENED_STD_M, explained_chi2, open_lasting_faults, solve
 from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LASTING_STD_M, LEVELS, RECENT_STD_M, protect
 from skyless.positioning.estimator.state import with_anchor
-from skyless.positioning.protection import CONTRADICTED, SOUND, IntegrityRequirement, integrity_of, limits_of
+from skyless.positioning.protection import CONTRADICTED, IntegrityRequirement, integrity_of, limits_of
 
 RISK = 1e-4
 LATE_M = 4 * TICK_M
@@ -203,12 +203,16 @@ def test_anchors_that_are_off_from_the_start_on_deceive_nobody(liars, late_m, er
 
 @pytest.mark.parametrize("errors", [{}, ROOM_ERRORS], ids=["exact", "range errors"])
 def test_clean_packets_are_believed(errors):
+    jumps = 0
     for seed in range(6):
         episode = episode_of(AGILE, 400, seed)
         run = tracked(begun(episode, settings_of(AGILE, **errors)), episode.packets)
         status = run.estimator.state.status[0]
-        assert status["faults_opened"] == status["obstructions"] == status["impossible"] == 0
-        assert (run.levels[100:, -1] == SOUND).all()
+        assert status["faults_opened"] == status["impossible"] == 0
+        jumps += status["obstructions"]
+    # two innovations in a row beyond three standard deviations that agree: 3.6e-6 a packet, 14400 packets, so that
+    # more than two have a probability of 2e-5
+    assert jumps <= 2
 
 
 def test_too_few_anchors_single_nobody_out():

@@ -36,7 +36,7 @@ class TextbookFilter:
         self.x[self.p], self.P[: self.dim, : self.dim] = position_m, covariance_m2
         self.slope_range_m = {}
         self.whole, self.newest, self.packets, self.relayed, self.walked_m = {}, {}, {}, set(), 0.0
-        pair_variance = 0.0 if settings.is_exact else PAIR_STD_M**2
+        pair_variance = PAIR_STD_M**2 if settings.range_std_m or settings.survey_std_m else 0.0
         self.pairs = {frozenset((i, j)): [0.0, pair_variance] for i in range(n) for j in range(i)}
 
     def hear(self, packet, q_scale, own_walk_scale, walk_scales):

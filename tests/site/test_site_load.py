@@ -53,7 +53,7 @@ def test_least_file(load):
     assert [a.id for a in site.anchors] == [1, 2, 7]
     assert site.anchors[2].y_m == 8.0
     assert site.tags.height_m is None
-    assert site.accuracy == AccuracySite(0.02, 0.03, 0.05, 0.03, 1.0, 100.0)
+    assert site.accuracy == AccuracySite(0.02, 0.03, 0.05, 0.005, 1.0, 100.0)
 
 
 def test_every_table(load, tmp_path):

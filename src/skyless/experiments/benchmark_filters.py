@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.positioning.estimator.estimator import RELAY_AGE_S
 from skyless.positioning.estimator.monitor import COMMON_GAIN, COMMON_LIMIT, WALK_GAIN, WALK_LOSS
 from skyless.positioning.estimator.settings import MAX_CLOCK_RATE, EstimatorSettings
 from skyless.positioning.estimator.state import START_WALK_SCALE
+from skyless.positioning.new_method import RELAY_AGE_S
 from skyless.positioning.tracker import (
     AGILITY_GAIN,
     AGILITY_LOSS,

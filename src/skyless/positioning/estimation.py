@@ -55,8 +55,17 @@ MAX_SPEED_STD_MPS: Final = 32.0
 DOUBT_S: Final = 2.0
 """Faults that show so soon after a start, and of whose anchors nothing can be said, have led to a wrong place."""
 
+UNEXPLAINED_CHI2: Final = 30.0
+"""What faults of two anchors leave of the test where there are more."""
+
+MANY_JUMPS: Final = 3
+"""So many range errors that jump early are a tag that is faster than assumed."""
+
 CALM: Final = 0.1
 """Range errors that have jumped more lately make faults of their own; a new start would not help."""
+
+LATE_S: Final = 0.5
+"""By then it is known how often packets are late; a start that was wrong for that reason is repeated."""
 
 CAUTION_S: Final = 5.0
 """A start with open range errors is not repeated for so long."""
@@ -139,11 +148,11 @@ class Estimation:
         self._newest_ticks = max(self._newest_ticks, rx_ticks)
         if outcome in {REJECTED, STALE}:
             if self._estimator.is_lost:
-                early = (rx_ticks - self._started_ticks) * TICK_S < EARLY_S
-                faster = min(SPEED_STD_GROWTH * self._speed_std_mps, MAX_SPEED_STD_MPS)
-                self._speed_std_mps = faster if early else SPEED_STD_MPS
-                self._start = self._new_start()
+                self._start_anew(rx_ticks)
             return NoFixReason.RESIDUALS
+        if self._is_too_fast(rx_ticks):
+            self._start_anew(rx_ticks)
+            return NoFixReason.ACQUIRING
         if self._is_contradicted(rx_ticks):
             self._start = self._new_start()
             return NoFixReason.ACQUIRING
@@ -154,6 +163,19 @@ class Estimation:
         """A fix when a packet came that was not used itself: by all others, and by what was relayed with it."""
         return NoFixReason.RESIDUALS if self._start is not None else self._fix(observation)
 
+    def _start_anew(self, rx_ticks: int) -> None:
+        """Look for a new start; a filter that is lost early has a tag that is faster than assumed."""
+        early = (rx_ticks - self._started_ticks) * TICK_S < EARLY_S
+        faster = min(SPEED_STD_GROWTH * self._speed_std_mps, MAX_SPEED_STD_MPS)
+        self._speed_std_mps = faster if early else SPEED_STD_MPS
+        self._start = self._new_start()
+
+    def _is_too_fast(self, rx_ticks: int) -> bool:
+        """Whether the range errors of several anchors have jumped early: it is the tag that has moved."""
+        early = (rx_ticks - self._started_ticks) * TICK_S < EARLY_S
+        several = self._estimator.jumps >= MANY_JUMPS
+        return early and several and self._speed_std_mps < MAX_SPEED_STD_MPS
+
     def _is_contradicted(self, rx_ticks: int) -> bool:
         """Whether a new start is needed, as relays or faults contradict this one; says what that has to expect."""
         if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
@@ -161,9 +183,11 @@ class Estimation:
             cautious = self._open_range_errors
             limit = SURE_CHI2 if age_s < DOUBT_S and not cautious else UNCOVERED_CHI2
             calm = self._estimator.obstruction < CALM
+            if age_s < DOUBT_S and self._estimator.unexplained_test < UNEXPLAINED_CHI2:
+                limit = UNCOVERED_CHI2  # one or two anchors, which the estimator will find
             if calm and self._estimator.fault_test > limit and (not cautious or age_s > CAUTION_S):
-                self._open_range_errors = True
-                return True
+                self._open_range_errors = not self._estimator.is_late_often
+                return age_s > LATE_S or self._open_range_errors
         if not self._relays_may_contradict:
             self._relays_may_contradict = self._estimator.relays_fit
         elif self._estimator.is_contradicted:

@@ -73,7 +73,9 @@ class JointStart(Acquisition):
             return with_master
         now = pairs[-1][-1].rx_ticks_tag
         self._links = {
-            ends: link for ends, link in self._links.items() if (now - link.rx_ticks_tag) * TICK_S < MAX_LINK_AGE_S
+            ends: link
+            for ends, link in self._links.items()
+            if (now - link.rx_ticks_tag) * TICK_S < max(MAX_LINK_AGE_S, self._max_age_s)
         }
         by_anchor = {pair[0].anchor: pair for pair in pairs}
         rates = {anchor: _rate(*pair) for anchor, pair in by_anchor.items()}

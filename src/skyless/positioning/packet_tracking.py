@@ -29,7 +29,7 @@ from skyless.ticks import LAST_TICKS, Unwrapper, nearest
 RANDOM_WALK_FM: Final = 5e-9
 """Of the oscillators, 1/√s. Between 1e-9 and 7e-9 on the captures of TDoA3 anchors; too much of it costs little."""
 
-MASTERLESS: Final = EstimatorSettings(walk=(RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2)
+MASTERLESS: Final = EstimatorSettings(walk=(RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2, max_walk_scale=1.0)
 """The stamps of those captures are no noisier than others, 85 ps each where nothing is in the way."""
 
 PERIOD_S: Final = 0.15

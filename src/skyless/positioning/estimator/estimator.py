@@ -13,10 +13,16 @@ from numpy.typing import NDArray
 from skyless.air.beacon import HEARD
 from skyless.compiled import kernel, threaded_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.positioning.estimator.faults import fade_recent_faults, open_lasting_faults
+from skyless.positioning.estimator.faults import (
+    explained_chi2,
+    fade_recent_faults,
+    lasting_chi2,
+    open_lasting_faults,
+)
 from skyless.positioning.estimator.kalman import predict
 from skyless.positioning.estimator.kinds import CLOCK_JUMPED, first_reception, own_reception, relay, report
-from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LEVELS, RECENT_CHI2, VPL, protect
+from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LASTING_STD_M, LEVELS, RECENT_CHI2, VPL, protect
+from skyless.positioning.estimator.monitor import OFTEN_LATE, covariance_scale
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.estimator.state import (
     NEVER,
@@ -38,9 +44,6 @@ from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
 REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = range(7)
 """What became of a packet; the last three ask for an anchor to join or leave, and for the packet again."""
-
-RELAY_AGE_S: Final = 1.0
-"""Older packets are not relayed, as sequence numbers come around."""
 
 RESTART_M: Final = 300.0
 """No path is longer than expected by so much: the anchor's counter has jumped, ..."""
@@ -136,6 +139,7 @@ def _process(  # noqa: PLR0911 - each outcome where it is known
     subticks: int,
     report_variance_m2: float,
     variance_factor: float,
+    work: Matrix,
 ) -> int:
     """Process one packet and what it relays, rows ``first`` to ``last``; what became of it."""
     status = s.status[0]
@@ -181,7 +185,15 @@ def _process(  # noqa: PLR0911 - each outcome where it is known
             _relayed(s, s.index_of[relays[row, 0]], s.index_of[relays[row, 1]], relays[row, 2], relays[row, 3])
         if report_variance_m2 > 0.0 and master >= 0:
             report(s, anchor, s.index_of[master], subticks, report_variance_m2)
+    _open_faults(s, work)
     return outcome
+
+
+@kernel
+def _open_faults(s: EstimatorState, work: Matrix) -> None:
+    """Look for lasting faults once in a round of packets."""
+    if s.status[0]["packets"] % len(s.anchors) == 0:
+        open_lasting_faults(s, lasting_chi2(s, LASTING_STD_M, work))
 
 
 @kernel
@@ -191,7 +203,7 @@ def _relayed(s: EstimatorState, listener: int, sender: int, sequence: int, rx_ti
         return
     packet = s.packets[sender, sequence % REMEMBERED]
     link = s.links[listener, sender]
-    young = (s.status[0]["epoch_ticks"] - packet["rx_ticks"]) * TICK_S < RELAY_AGE_S
+    young = (s.status[0]["epoch_ticks"] - packet["rx_ticks"]) * TICK_S < s.settings[0]["relay_age_s"]
     if packet["sequence"] == sequence and packet["tx_ticks"] > link["tx_ticks"] and young:
         link["tx_ticks"] = packet["tx_ticks"]
         relay(s, listener, sender, packet["tx_ticks"], packet["rx_ticks"], rx_ticks)
@@ -222,7 +234,7 @@ def _track(
     for n in range(begin, len(anchors)):
         first = ends[n - 1] if n > 0 else 0
         outcome = _process(
-            s, anchors[n], sequences[n], rx_ticks[n], tx_ticks[n], relays, first, ends[n], -1, 0, 0.0, 1.0
+            s, anchors[n], sequences[n], rx_ticks[n], tx_ticks[n], relays, first, ends[n], -1, 0, 0.0, 1.0, work
         )
         if outcome >= NEW_ANCHOR:
             return n
@@ -235,8 +247,6 @@ def _track(
                     covariances[n, dim * one + other] = s.P[one, other]
         if len(levels) > 0:
             protect(s, k[0], k[1], work, levels[n])
-            if open_lasting_faults(s, levels[n, LASTING_CHI2]) > 0:
-                protect(s, k[0], k[1], work, levels[n])
             levels[n, LEVELS] = outcome
             levels[n, LEVELS + 1] = _soundness(s, levels[n])
     return len(anchors)
@@ -251,7 +261,7 @@ def _soundness(s: EstimatorState, levels: Vector) -> int:
     if max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > UNCOVERED_CHI2:
         return CONTRADICTED
     for anchor in range(count):
-        if s.anchors[anchor]["is_obstructed"]:
+        if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
             return OBSTRUCTED
     return SOUND
 
@@ -305,15 +315,13 @@ def _process_frame(
         subticks,
         report_variance_m2,
         variance_factor,
+        work,
     )
     if outcome >= NEW_ANCHOR:
         return outcome
     fill_motion(s, rows)
     rows[QUALITY, 0], rows[QUALITY, 1] = s.status[0]["mean_nis"], s.status[0]["mean_square_m2"]
     protect(s, k[0], k[1], work, levels)
-    if open_lasting_faults(s, levels[LASTING_CHI2]) > 0:
-        protect(s, k[0], k[1], work, levels)
-        fill_motion(s, rows)
     rows[QUALITY, 2] = max(levels[LASTING_CHI2], levels[RECENT_CHI2])
     rows[PROTECTION, 0], rows[PROTECTION, 1], rows[PROTECTION, 2] = levels[HPL], levels[VPL], _soundness(s, levels)
     return outcome
@@ -323,11 +331,12 @@ def _process_frame(
 def fill_motion(s: EstimatorState, rows: Matrix) -> None:
     """Write position, velocity and their covariances as a fix carries them."""
     dim, velocity = s.settings[0]["dim"], layout(s.settings[0]["dim"], len(s.anchors)).velocity
+    scale = covariance_scale(s)
     for one in range(dim):
         rows[POSITION, one], rows[VELOCITY, one] = s.x[one], s.x[velocity + one]
         for other in range(dim):
-            rows[POSITION + 1 + one, other] = s.P[one, other]
-            rows[VELOCITY + 1 + one, other] = s.P[velocity + one, velocity + other]
+            rows[POSITION + 1 + one, other] = scale * s.P[one, other]
+            rows[VELOCITY + 1 + one, other] = scale * s.P[velocity + one, velocity + other]
     if dim == 2:
         rows[POSITION, 2] = s.settings[0]["height_m"]
 
@@ -385,13 +394,14 @@ class Estimator:
         speed_variance: float,
         open_range_errors: bool = False,
     ) -> None:
-        """Begin at a position, shapes (dim,) and (dim, dim), without any anchor.
+        """Begin at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept.
 
         ``open_range_errors``: expect ranges to be wrong by metres and anchors to stand elsewhere than told, since what
         the settings say of them has been contradicted.
         """
         settings, dim = self.settings, self.dim
         state = new_state(settings, len(self._table_m))
+        state.status["late_share"] = self._state.status["late_share"]
         if open_range_errors:
             state.status["open_range_errors"] = 1
         state.x[:dim] = position_m
@@ -480,6 +490,23 @@ class Estimator:
         return float(max(self._levels[LASTING_CHI2], self._levels[RECENT_CHI2]))
 
     @property
+    def unexplained_test(self) -> float:
+        """What the faults of any two anchors leave of the test of lasting ones."""
+        s = self._state
+        pairs = ((one, other) for one in range(len(s.anchors)) for other in range(one + 1))
+        return float(self._levels[LASTING_CHI2]) - max(explained_chi2(s, one, other) for one, other in pairs)
+
+    @property
+    def is_late_often(self) -> bool:
+        """Whether single packets are late often."""
+        return bool(self._state.status[0]["late_share"] > OFTEN_LATE)
+
+    @property
+    def jumps(self) -> int:
+        """How many range errors have jumped since the start."""
+        return int(self._state.status[0]["obstructions"])
+
+    @property
     def obstruction(self) -> float:
         """1 where range errors have jumped lately, 0 where they do not."""
         return float(self._state.status[0]["obstruction"])
@@ -506,9 +533,10 @@ class Estimator:
 
     @property
     def obstructed(self) -> tuple[int, ...]:
-        """Indices in the table of the anchors whose range error has jumped and not come back."""
+        """Indices in the table of the anchors whose range error has jumped and stayed, or has a lasting fault."""
         anchors = self._state.anchors
-        return tuple(anchors["table_index"][anchors["is_obstructed"] != 0].tolist())
+        faulty = (anchors["is_obstructed"] != 0) | (anchors["has_fault"] != 0)
+        return tuple(anchors["table_index"][faulty].tolist())
 
     def horizontal_variance_m2(self, ahead_s: float) -> float:
         """Sum of the variances of x and y so much later, if nothing is received until then."""

@@ -103,6 +103,22 @@ def solve(work: Matrix, count: int, columns: int) -> None:
 
 
 @kernel
+def lasting_chi2(s: EstimatorState, std_m: float, work: Matrix) -> float:
+    """The test of all lasting faults, of that standard deviation beforehand; ``work`` as for ``levels.protect``."""
+    count, y, M = len(s.anchors), s.evidence[0], s.information[0]
+    for one in range(count):
+        for other in range(count):
+            work[one, other] = M[one, other]
+        work[one, one] += 1.0 / (std_m * std_m)
+        work[count, one] = y[one]
+    solve(work, count, 1)
+    total = 0.0
+    for one in range(count):
+        total += y[one] * work[count, one]
+    return total
+
+
+@kernel
 def explained_chi2(s: EstimatorState, one: int, other: int) -> float:
     """How much of the test of all lasting faults those of two anchors explain, or of one where both are the same."""
     y, M, weight = s.evidence[0], s.information[0], 1.0 / OPENED_STD_M**2
@@ -181,4 +197,5 @@ def _open_lasting_fault(s: EstimatorState, anchor: int) -> None:
         M[anchor, other] = M[other, anchor] = 0.0
     for state in range(n):
         opened[state] = 0.0
+    s.anchors[anchor]["has_fault"] = 1
     s.status[0]["faults_opened"] += 1

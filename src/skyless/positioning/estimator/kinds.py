@@ -27,9 +27,10 @@ from skyless.positioning.estimator.kalman import (
 )
 from skyless.positioning.estimator.monitor import (
     COMMON,
-    MAX_WALK_SCALE,
+    OFTEN_LATE,
     adapt_clock_noise,
     adapt_process_noise,
+    end_small_obstruction,
     has_jumped,
     is_common,
     is_warm,
@@ -58,6 +59,9 @@ CLOCK_JUMP_RELAYS: Final = 4
 PAIR_OUTLIERS: Final = 4
 """Relays of a pair in a row beyond the gate are another path between the two."""
 
+JOIN_VARIANCE_M2: Final = 1.0
+"""Where packets are late often an anchor's first one may be so too."""
+
 PAIR_JUMP_M2: Final = 0.25
 
 REPORT_GAIN: Final = 1.25
@@ -65,6 +69,9 @@ REPORT_GAIN: Final = 1.25
 
 LEAST_REPORT_VARIANCE: Final = 0.1
 """Of that of a pair of stamps: no anchor knows its clock better, whatever it says."""
+
+REJOIN_AFTER: Final = 20
+"""An anchor whose packets are rejected so often in a row joins anew: its first was late, and its rate is wrong."""
 
 STEADY_WALK_SCALE: Final = 4.0
 """Reports of clocks whose random walk counts more than this are not used."""
@@ -186,7 +193,7 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     a["range_m"] = range_m
     a["innovation"] = innovation / np.sqrt(innovation_variance)
     if is_warm(s) and abs(a["innovation"]) > COMMON and is_common(s, a["innovation"]):
-        status["walk_scale"] = MAX_WALK_SCALE
+        status["walk_scale"] = settings["max_walk_scale"]
         a["outliers_in_row"] = 0
     elif is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
         if a["relay_outliers_in_row"] >= CLOCK_JUMP_RELAYS:
@@ -195,7 +202,10 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
         innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
     scale = variance_scale(s, innovation, innovation_variance)
     if scale == 0.0:
-        return 0
+        a["rejected_in_row"] += 1
+        return CLOCK_JUMPED if a["rejected_in_row"] >= REJOIN_AFTER else 0
+    a["rejected_in_row"] = 0
+    end_small_obstruction(s, anchor)
     normalised = innovation / np.sqrt(innovation_variance)
     if is_warm(s):
         adapt_process_noise(s, normalised / scale)
@@ -249,6 +259,8 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     bend_m = _bend_m(s, range_m, variance)
     variance += 2.0 * bend_m * bend_m + compute_ph(P, s.h, s.h_index, terms, s.ph)
     compute_fault_input(s, terms, anchor)
+    if s.status[0]["late_share"] > OFTEN_LATE:
+        variance += JOIN_VARIANCE_M2
     for state in range(n):
         P[state, offset] = -s.ph[state]
         P[offset, state] = -s.ph[state]

@@ -16,6 +16,7 @@ import numpy as np
 
 from skyless.compiled import kernel
 from skyless.positioning.estimator.faults import solve
+from skyless.positioning.estimator.monitor import covariance_scale
 from skyless.positioning.estimator.state import EstimatorState, Matrix, Vector
 
 LASTING_STD_M: Final = 0.3
@@ -37,6 +38,7 @@ def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, work: Mat
     ``horizontal_k`` and ``vertical_k`` are how many standard deviations the risk allows.
     """
     dim, count, P, V = s.settings[0]["dim"], len(s.anchors), s.P, s.V
+    scale = covariance_scale(s)
     levels[HPL] = levels[VPL] = 0.0
     for bank in range(2):
         std_m = LASTING_STD_M if bank == 0 else RECENT_STD_M
@@ -50,7 +52,7 @@ def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, work: Mat
                 work[count + 1 + axis, one] = V[begin + one, axis]
         solve(work, count, 1 + dim)
         chi2, shift_x, shift_y, shift_z = 0.0, 0.0, 0.0, 0.0
-        xx, xy, yy, zz = P[0, 0], P[0, 1], P[1, 1], 0.0
+        xx, xy, yy, zz = scale * P[0, 0], scale * P[0, 1], scale * P[1, 1], 0.0
         for one in range(count):
             fault_m = work[count, one]
             chi2 += s.evidence[bank, one] * fault_m
@@ -66,7 +68,7 @@ def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, work: Mat
         largest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
         levels[HPL] = max(levels[HPL], np.hypot(shift_x, shift_y) + horizontal_k * np.sqrt(largest))
         if dim == 3:
-            levels[VPL] = max(levels[VPL], abs(shift_z) + vertical_k * np.sqrt(P[2, 2] + zz))
+            levels[VPL] = max(levels[VPL], abs(shift_z) + vertical_k * np.sqrt(scale * P[2, 2] + zz))
         levels[LASTING_CHI2 + bank] = chi2
     acceleration = s.settings[0]["max_acceleration_mps2"]
     if acceleration > 0.0:

@@ -16,6 +16,9 @@ from skyless.positioning.estimator.state import EstimatorState, layout
 FORGETTING: Final = 0.02
 """Weight of the newest innovation in the running means, about the last 50."""
 
+INCONSISTENT_NIS: Final = 1.6
+"""Mean of the normalised innovations squared beyond which the tag moves more than assumed (noise alone: 1)."""
+
 SUSPECT: Final = 3.0
 """Innovations beyond so many standard deviations, ..."""
 
@@ -37,6 +40,10 @@ JUMP_STD_M: Final = 0.2
 JUMP_RISE: Final = 0.5
 """By so much of its full size a jump raises the process noise of all range errors."""
 
+ENDED_STD_M: Final = 0.05
+ENDED: Final = 2.0
+"""An obstruction has ended where its error is known to this, and less than so many standard deviations from none."""
+
 LATE_FORGETTING: Final = 0.005
 LATE_DENSITY: Final = 0.05
 """Probability density of a late reception's normalised innovation: a standard deviation of 5 cm, a metre late."""
@@ -46,15 +53,15 @@ HUBER: Final = 1.5
 
 LAG_GAIN: Final = 0.05
 LAG_FORGETTING: Final = 0.01
-LAG_LIMIT: Final = 2.3
+LAG_LIMIT: Final = 2.6
 """Of the mean square of the innovations' running means along the axes, 1 where the filter is right."""
 
-Q_SCALE_GAIN: Final = 1.03
+Q_SCALE_GAIN: Final = 1.05
 Q_SCALE_LOSS: Final = 0.99
-MAX_Q_SCALE: Final = 300.0
+MAX_Q_SCALE: Final = 100.0
 
 COMMON_GAIN: Final = 0.05
-COMMON_LIMIT: Final = 6.25
+COMMON_LIMIT: Final = 9.0
 """Of the square of the running mean of all innovations, 1 where the filter is right; those of the tag's clock."""
 
 COMMON: Final = 1.5
@@ -64,10 +71,9 @@ clock has left its rate: nothing else makes all of them late, or early, at once.
 WALK_GAIN: Final = 1.1
 WALK_LOSS: Final = 0.99
 RELAY_GAIN: Final = 0.05
-RELAY_LIMIT: Final = 9.0
+RELAY_LIMIT: Final = 16.0
 RELAY_WALK_GAIN: Final = 1.2
 RELAY_WALK_LOSS: Final = 0.99
-MAX_WALK_SCALE: Final = 1e4
 
 
 @kernel
@@ -131,6 +137,16 @@ def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
 
 
 @kernel
+def end_small_obstruction(s: EstimatorState, anchor: int) -> None:
+    """End an obstruction that has gone without a jump back: the range error is known, and is hardly there."""
+    a, change = s.anchors[anchor], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
+    error_m, variance = s.x[change], s.P[change, change]
+    if a["is_obstructed"] and variance < ENDED_STD_M**2 and error_m * error_m < ENDED * ENDED * variance:
+        a["is_obstructed"] = 0
+        s.status[0]["ends_of_obstructions"] += 1
+
+
+@kernel
 def variance_scale(s: EstimatorState, innovation: float, innovation_variance: float) -> float:
     """Factor on the innovation's variance of a reception of the tag; 0 if it is not to be used. Counts it."""
     status, settings = s.status[0], s.settings[0]
@@ -172,9 +188,19 @@ def adapt_process_noise(s: EstimatorState, normalised: float) -> None:
         status["q_scale"] = max(status["q_scale"] * Q_SCALE_LOSS, 1.0)
     status["common_mean"] += COMMON_GAIN * (normalised - status["common_mean"])
     if status["common_mean"] ** 2 * (2.0 - COMMON_GAIN) / COMMON_GAIN > COMMON_LIMIT:
-        status["walk_scale"] = min(status["walk_scale"] * WALK_GAIN, MAX_WALK_SCALE)
+        status["walk_scale"] = min(status["walk_scale"] * WALK_GAIN, s.settings[0]["max_walk_scale"])
     else:
         status["walk_scale"] = max(status["walk_scale"] * WALK_LOSS, 1.0)
+
+
+@kernel
+def covariance_scale(s: EstimatorState) -> float:
+    """Factor on the position's covariance while innovations are larger than the filter expects.
+
+    Most of an innovation is the stamps' noise, so the state errs by more than the innovations tell.
+    """
+    nis = s.status[0]["mean_nis"]
+    return float(nis * nis) if nis > INCONSISTENT_NIS else 1.0
 
 
 @kernel
@@ -183,6 +209,6 @@ def adapt_clock_noise(s: EstimatorState, anchor: int, normalised: float) -> None
     a = s.anchors[anchor]
     a["relay_mean"] += RELAY_GAIN * (normalised - a["relay_mean"])
     if a["relay_mean"] ** 2 * (2.0 - RELAY_GAIN) / RELAY_GAIN > RELAY_LIMIT:
-        a["walk_scale"] = min(a["walk_scale"] * RELAY_WALK_GAIN, MAX_WALK_SCALE)
+        a["walk_scale"] = min(a["walk_scale"] * RELAY_WALK_GAIN, s.settings[0]["max_walk_scale"])
     else:
         a["walk_scale"] = max(a["walk_scale"] * RELAY_WALK_LOSS, 1.0)

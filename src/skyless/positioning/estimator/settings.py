@@ -33,6 +33,8 @@ class EstimatorSettings(Struct, frozen=True):
     """Height of the tag where it is given; None to estimate it."""
     drop_s: float = 2.0
     """Anchors that are silent for longer leave the state."""
+    relay_age_s: float = 1.0
+    """Older packets are not relayed, as sequence numbers come around."""
     survey_std_m: float = 0.02
     """Of each coordinate of an anchor."""
     range_std_m: float = 0.03
@@ -47,6 +49,8 @@ class EstimatorSettings(Struct, frozen=True):
     """... and time over which it changes at rest."""
     max_acceleration_mps2: float = 0.0
     """The tag's largest acceleration, as far as levels are to cover it beyond ``qa``."""
+    max_walk_scale: float = 1e4
+    """At most so many times ``walk`` counts where innovations show that oscillators wander more."""
     integrity_risk: float = RISK
     alert_limit_m: float | None = None
     """Fixes with a higher horizontal protection level say so."""
@@ -76,6 +80,7 @@ _NAMES: Final = (
     "gate",
     "height_m",
     "drop_s",
+    "relay_age_s",
     "survey_std_m",
     "range_std_m",
     "slope_std_m",
@@ -83,6 +88,7 @@ _NAMES: Final = (
     "place_distance_m",
     "place_time_s",
     "max_acceleration_mps2",
+    "max_walk_scale",
     "integrity_risk",
 )
 

@@ -49,9 +49,11 @@ ANCHOR: Final = np.dtype(
         ("has_tx_noise", np.int64),  # whether its newest packet's TX noise is a state
         ("packets", np.int64),
         ("innovation", np.float64),  # its newest one, normalised
+        ("rejected_in_row", np.int64),
         ("outliers_in_row", np.int64),
         ("outlier_m", np.float64),  # the newest of them
         ("is_obstructed", np.int64),  # whether its range error has jumped and not come back
+        ("has_fault", np.int64),  # whether a lasting fault of it was taken into the state
         ("relay_outliers_in_row", np.int64),
         ("relay_mean", np.float64),  # running mean of what relays say of its clock, normalised
         ("walk_scale", np.float64),  # factor on its oscillator's random walk
@@ -183,7 +185,7 @@ def new_state(settings: EstimatorSettings, table_size: int) -> EstimatorState:
     n = where.end
     status = np.zeros(1, STATUS)
     status["q_scale"] = status["mean_nis"] = 1.0
-    status["walk_scale"] = START_WALK_SCALE
+    status["walk_scale"] = min(START_WALK_SCALE, settings.max_walk_scale)
     status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
     P = np.zeros((n, n))
     P[where.slope, where.slope] = settings.slope_std_m**2
