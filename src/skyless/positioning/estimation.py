@@ -59,7 +59,8 @@ UNEXPLAINED_CHI2: Final = 30.0
 """What faults of two anchors leave of the test where there are more."""
 
 MANY_JUMPS: Final = 3
-"""So many range errors that jump early are a tag that is faster than assumed."""
+EARLY_NIS: Final = 3.0
+"""So many range errors that jump early, or so large innovations on average, are a tag that is faster than assumed."""
 
 CALM: Final = 0.1
 """Range errors that have jumped more lately make faults of their own; a new start would not help."""
@@ -171,9 +172,9 @@ class Estimation:
         self._start = self._new_start()
 
     def _is_too_fast(self, rx_ticks: int) -> bool:
-        """Whether the range errors of several anchors have jumped early: it is the tag that has moved."""
+        """Whether the range errors of several anchors jump early, or nothing fits: it is the tag that has moved."""
         early = (rx_ticks - self._started_ticks) * TICK_S < EARLY_S
-        several = self._estimator.jumps >= MANY_JUMPS
+        several = self._estimator.jumps >= MANY_JUMPS or self._estimator.rows.item(QUALITY, 0) > EARLY_NIS
         return early and several and self._speed_std_mps < MAX_SPEED_STD_MPS
 
     def _is_contradicted(self, rx_ticks: int) -> bool:

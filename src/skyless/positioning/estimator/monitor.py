@@ -31,6 +31,9 @@ IN_ROW_WHERE_LATE: Final = 5
 OFTEN_LATE: Final = 0.02
 """... which is a larger share of them than this, ..."""
 
+TOGETHER: Final = 7.0
+"""... together beyond so many (by chance once in some million packets), ..."""
+
 AGREEMENT: Final = 3.0
 """... if they agree within so many standard deviations of two receptions."""
 
@@ -101,7 +104,9 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
     settings = s.settings[0]
     stamps = 2.0 * (settings["tx_variance_m2"] + settings["rx_variance_m2"])
     apart = innovation - a["outlier_m"]
+    both = innovation + a["outlier_m"]
     agrees = a["outliers_in_row"] > 0 and apart * apart <= AGREEMENT * AGREEMENT * stamps
+    agrees = agrees and both * both > TOGETHER * TOGETHER * innovation_variance
     a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
     a["outlier_m"] = innovation
     needed = IN_ROW_WHERE_LATE if status["late_share"] > OFTEN_LATE else IN_ROW
