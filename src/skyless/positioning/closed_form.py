@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import kernel, part
 from skyless.uncertainty.cholesky import factorise, solve
 
 FREE: Final = 0
@@ -37,8 +37,9 @@ def spread(points: NDArray[np.float64], axes: NDArray[np.float64]) -> tuple[floa
     point farthest from that line, and across both. Where the points are in one line, only the first row is
     set and width is 0.
     """
-    extent = _farthest(points, axes, 0)
-    width = _farthest(points, axes, 1) if extent > 0.0 else 0.0
+    extent, width = 0.0, 0.0
+    for row in range(2):
+        extent, width = width, _farthest(points, axes, row)
     if not width > 1e-9 * extent:
         return extent, 0.0, 0.0
     for i in range(3):
@@ -87,13 +88,14 @@ def starting_points(
     if kind != PLANE:
         count = _intersections(anchors, tdoa, dims, height, normal, solution, starts)
     if len(tdoa) > dims and _interpolation(anchors, tdoa, dims, height, normal, solution[0]):
-        starts[count] = solution[0, :3]
+        for axis in range(3):
+            starts[count, axis] = solution[0, axis]
         if kind == HEIGHT:
             starts[count, 2] = height
         elif kind == PLANE:
             starts[count, 2] = _square_across(solution[0])
         count += 1
-    if kind == FREE and _interpolation(anchors, tdoa, 2, 0.0, normal, solution[0]):
+    if kind == FREE and _interpolation(anchors, tdoa, dims - 1, 0.0, normal, solution[0]):
         across = math.sqrt(max(_square_across(solution[0]), 0.0))
         for sign in (1.0, -1.0):
             starts[count, 0], starts[count, 1] = solution[0, 0], solution[0, 1]
@@ -102,13 +104,13 @@ def starting_points(
     return count
 
 
-@kernel
+@part
 def _square_across(solution: NDArray[np.float64]) -> float:
     """The square of the coordinate across the plane, from (x, y, ρ)."""
     return float(solution[2] * solution[2] - solution[0] * solution[0] - solution[1] * solution[1])
 
 
-@kernel
+@part
 def _right_hand_side(anchor: NDArray[np.float64], tdoa: float, dims: int, height: float) -> float:
     square = anchor[0] * anchor[0] + anchor[1] * anchor[1] + anchor[2] * anchor[2]
     known = anchor[2] * height if dims == 2 else 0.0
@@ -185,7 +187,7 @@ def _intersections(
     return count
 
 
-@kernel
+@part
 def _root(a: float, half_b: float, c: float, first: bool) -> float:
     """One of the roots of a·ρ² + 2·half_b·ρ + c, in the form that does not cancel; −1 where there is none."""
     discriminant = half_b * half_b - a * c

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import kernel, part
 from skyless.positioning.closed_form import HEIGHT, PLANE
 from skyless.uncertainty.cholesky import factorise, invert, solve, whiten
 
@@ -114,7 +114,7 @@ def damped_step(
     return True
 
 
-@kernel
+@part
 def _eased(damping: float, ratio: float) -> float:
     """Next damping after a success, by the ratio of what it gained to what was promised (H. B. Nielsen 1999)."""
     if ratio < 0.5:
@@ -164,8 +164,11 @@ def minimise(
         if next_cost < cost:
             damping, growth = _eased(damping, (cost - next_cost) / max(promised, 1e-300)), 2.0
             cost = next_cost
-            state[:3] = trial[:3]
-            normal[:] = next_normal
+            for row in range(4):
+                for column in range(4):
+                    normal[row, column] = next_normal[row, column]
+            for axis in range(3):
+                state[axis] = trial[axis]
         else:
             damping, growth = max(growth * damping, FIRST_DAMPING), 2.0 * growth
         if small:
@@ -197,7 +200,8 @@ def assess(
     dims = 2 if kind == HEIGHT else 3
     normal, spread_normal, inverse = work[0], work[1], work[2]
     linearise(anchors, tdoa, state, kind, system)
-    residuals[:] = system[:, dims]
+    for i in range(len(system)):
+        residuals[i] = system[i, dims]
     if not weighted:
         square(system, dims, normal)
         sandwich(system, dims, covariance, spread_normal)
