@@ -3,6 +3,7 @@
 It needs nothing but beacons: anchors, schedule and noise figures come from the almanac on the air.
 """
 
+import math
 from collections import Counter
 from typing import Final
 
@@ -56,10 +57,14 @@ class Receiver:
         is asked of the protection levels (``joint``), which cover accelerations up to ``max_acceleration_mps2``.
 
         Raises:
-            ValueError: there is no such method.
+            ValueError: there is no such method, or the acceleration is negative or not finite.
         """
         if method not in METHODS:
             raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")
+        if not 0.0 <= max_acceleration_mps2 < math.inf:
+            raise ValueError(
+                f"max_acceleration_mps2 is {max_acceleration_mps2!r}; it should be a finite number from 0 on"
+            )
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self.almanac = AlmanacBook()

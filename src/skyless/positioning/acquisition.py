@@ -32,6 +32,27 @@ CONTRADICTIONS: Final = frozenset({NoFixReason.RESIDUALS, NoFixReason.BAD_GEOMET
 SPEED_STD_MPS: Final = 1.0
 """Typical speed of a tag; it smears pseudoranges taken at different times and starts the velocity."""
 
+MAX_GAP_S: Final = 5.0
+"""After a longer silence the state says less than a new start would."""
+
+MAX_SPREAD: Final = 0.05
+"""With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
+state: updates would make it confident of a wrong place, so a new start is better."""
+
+SLOW_S: Final = 0.2
+SLOW_SPREAD: Final = 0.2
+"""Borne in longer superframes, where a new start takes seconds."""
+
+SHORT_SILENCE_S: Final = 0.1
+"""Over shorter silences no state grows much wider."""
+
+EARLY_S: Final = 1.0
+"""A filter that is lost so soon after its start may have a tag that is faster than assumed; ..."""
+
+SPEED_STD_GROWTH: Final = 4.0
+MAX_SPEED_STD_MPS: Final = 32.0
+"""... the next start assumes a speed higher by this factor, up to this."""
+
 
 class Start(Struct, frozen=True):
     """A first state: everything ``PseudorangeTracker.start`` wants."""

@@ -6,7 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
-from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Start
+from skyless.positioning.acquisition import (
+    EARLY_S,
+    MAX_AGE_S,
+    MAX_GAP_S,
+    MAX_SPEED_STD_MPS,
+    MAX_SPREAD,
+    SHORT_SILENCE_S,
+    SLOW_S,
+    SLOW_SPREAD,
+    SPEED_STD_GROWTH,
+    SPEED_STD_MPS,
+    Start,
+)
 from skyless.positioning.estimator.estimator import (
     NO_REPORT,
     REJECTED,
@@ -29,28 +41,7 @@ from skyless.positioning.protection import IntegrityRequirement
 from skyless.ticks import from_seconds
 
 COVARIANCE_MARGIN: Final = 4.0
-"""The start's covariance is taken so many times larger, as the filter is then given the packets that it rests on."""
-
-MAX_GAP_S: Final = 5.0
-"""After a longer silence the state says less than a new start would."""
-
-MAX_SPREAD: Final = 0.05
-"""With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
-state: updates would make it confident of a wrong place, so a new start is better."""
-
-SLOW_S: Final = 0.2
-SLOW_SPREAD: Final = 0.2
-"""Borne in longer superframes, where a new start takes seconds."""
-
-SHORT_SILENCE_S: Final = 0.1
-"""Over shorter silences no state grows much wider."""
-
-EARLY_S: Final = 1.0
-"""A filter that is lost so soon after its start may have a tag that is faster than assumed; ..."""
-
-SPEED_STD_GROWTH: Final = 4.0
-MAX_SPEED_STD_MPS: Final = 32.0
-"""... the next start assumes a speed higher by this factor, up to this."""
+"""Factor on the start's covariance, as the filter is then given the packets that it rests on."""
 
 DOUBT_S: Final = 2.0
 """Faults that show so soon after a start, and of whose anchors nothing can be said, have led to a wrong place."""
@@ -60,7 +51,7 @@ UNEXPLAINED_CHI2: Final = 30.0
 
 MANY_JUMPS: Final = 3
 EARLY_NIS: Final = 3.0
-"""So many range errors that jump early, or so large innovations on average, are a tag that is faster than assumed."""
+"""Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed."""
 
 CALM: Final = 0.1
 """Range errors that have jumped more lately make faults of their own; a new start would not help."""

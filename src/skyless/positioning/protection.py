@@ -21,11 +21,11 @@ MARGIN: Final = 1.05
 HPL, VPL, STATE = range(3)
 """What a fix carries of its levels; the state is one of ..."""
 
-SOUND, OBSTRUCTED, UNUSED, CONTRADICTED, UNAVAILABLE = range(5)
-"""... a position without known faults, with anchors whose range error has jumped, (no longer used), with a fault that
-the levels may not cover, and one of which nothing can be promised."""
+SOUND, OBSTRUCTED, CONTRADICTED, UNAVAILABLE = range(4)
+"""... a position without known faults, with anchors whose range error has jumped or was wrong from the start, with a
+fault that the levels may not cover, and one of which nothing can be promised."""
 
-_ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
+_ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
 
 
 class Integrity(Struct, frozen=True, gc=False):

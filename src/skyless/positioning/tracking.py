@@ -1,38 +1,28 @@
 """``tracker`` as a positioning method: cold start, message by message updates, and starting again when lost."""
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
-from skyless.positioning.acquisition import MAX_AGE_S, SPEED_STD_MPS, Acquisition, Start
+from skyless.positioning.acquisition import (
+    EARLY_S,
+    MAX_AGE_S,
+    MAX_GAP_S,
+    MAX_SPEED_STD_MPS,
+    MAX_SPREAD,
+    SHORT_SILENCE_S,
+    SLOW_S,
+    SLOW_SPREAD,
+    SPEED_STD_GROWTH,
+    SPEED_STD_MPS,
+    Acquisition,
+    Start,
+)
 from skyless.positioning.fix import Fix, NoFixReason, motion_fix
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.in_use import AnchorsInUse
 from skyless.positioning.observation import Observation
 from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings
-
-MAX_GAP_S: Final = 5.0
-"""After a longer silence the state says less than a new start would."""
-
-MAX_SPREAD: Final = 0.05
-"""With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
-state: updates would make it confident of a wrong place, so a new start is better."""
-
-SLOW_S: Final = 0.2
-SLOW_SPREAD: Final = 0.2
-"""Borne in longer superframes, where a new start takes seconds."""
-
-SHORT_SILENCE_S: Final = 0.1
-"""Over shorter silences no state grows much wider."""
-
-SOON_S: Final = 1.0
-"""A filter that is lost so soon after its start may have a tag that is faster than assumed; ..."""
-
-HASTE: Final = 4.0
-MAX_SPEED_STD_MPS: Final = 32.0
-"""... the next start assumes a speed higher by this factor, up to this."""
 
 
 class Tracking:
@@ -91,8 +81,10 @@ class Tracking:
         self._heard_ticks = observation.rx_ticks_tag
         if not accepted:
             if self._tracker.lost:
-                soon = (observation.rx_ticks_tag - self._started_ticks) * TICK_S < SOON_S
-                self._speed_std_mps = min(HASTE * self._speed_std_mps, MAX_SPEED_STD_MPS) if soon else SPEED_STD_MPS
+                soon = (observation.rx_ticks_tag - self._started_ticks) * TICK_S < EARLY_S
+                self._speed_std_mps = (
+                    min(SPEED_STD_GROWTH * self._speed_std_mps, MAX_SPEED_STD_MPS) if soon else SPEED_STD_MPS
+                )
                 self._acquisition = self._new_acquisition()
             return NoFixReason.RESIDUALS
         self._in_use.use(observation)

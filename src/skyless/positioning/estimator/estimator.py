@@ -46,10 +46,10 @@ REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = 
 """What became of a packet; the last three ask for an anchor to join or leave, and for the packet again."""
 
 RESTART_M: Final = 300.0
-"""No path is longer than expected by so much: the anchor's counter has jumped, ..."""
+"""A path that seems longer than expected by more than this is a counter that has jumped, ..."""
 
 RESTART_IN_ROW: Final = 3
-"""... if so many packets in a row say so."""
+"""... if this number of packets in a row say so."""
 
 MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS
 """Between two clocks that are still crystals."""
@@ -58,7 +58,7 @@ UNCOVERED_CHI2: Final = 240.0
 """A test of faults beyond this shows one that the levels may not cover."""
 
 LOST_IN_ROW: Final = 8
-"""So many packets beyond the gate in a row, of more anchors than can all be blocked, mean a wrong state, ..."""
+"""This number of packets beyond the gate in a row, of more anchors than can all be blocked, is a wrong state, ..."""
 
 LOST_SHARE: Final = 0.5
 """... as does a larger share of them."""
@@ -396,7 +396,7 @@ class Estimator:
     ) -> None:
         """Begin at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept.
 
-        ``open_range_errors``: expect ranges to be wrong by metres and anchors to stand elsewhere than told, since what
+        ``open_range_errors``: expect ranges to be wrong by half a metre and anchors to be misplaced, since what
         the settings say of them has been contradicted.
         """
         settings, dim = self.settings, self.dim
@@ -513,7 +513,7 @@ class Estimator:
 
     @property
     def is_lost(self) -> bool:
-        """Whether so many packets do not fit that the state must be wrong."""
+        """Whether more packets are rejected than a right state would reject."""
         status = self._state.status[0]
         in_row = int(status["rejected_in_row"]) + int(status["stale_in_row"])
         late = min(float(status["late_share"]), 0.45)

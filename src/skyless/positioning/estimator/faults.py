@@ -17,27 +17,27 @@ from skyless.compiled import kernel
 from skyless.positioning.estimator.state import EstimatorState, Matrix, layout
 
 RECENT_PACKETS: Final = 24.0
-"""Faults of so many packets of each anchor are recent."""
+"""Number of packets of each anchor over which a fault counts as recent."""
 
 OPENED_STD_M: Final = 1.0
-"""Of a fault that is taken into the state, beforehand."""
+"""Standard deviation of a fault that is taken into the state, before anything is known of it."""
 
 SURE_CHI2: Final = 50.0
 """A test beyond this shows a lasting fault: χ² of eight degrees of freedom is larger with a probability of 4·10⁻⁸."""
 
 EXPLAINED_CHI2: Final = 20.0
-"""What is left of it where the anchors with faults are known."""
+"""Largest part of the test that the faults of the right anchors may leave unexplained."""
 
 RIVAL_CHI2: Final = 20.0
-"""So much less any other anchors have to explain."""
+"""Least difference to what the faults of any other anchors explain."""
 
 MOST_FAULTS: Final = 2
-"""At most so many anchors are singled out."""
+"""Largest number of anchors that are singled out."""
 
 
 @kernel
 def compute_fault_input(s: EstimatorState, terms: int, own: int) -> None:
-    """S = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1."""
+    """Compute s = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1."""
     V, fault_input, h, h_index = s.V, s.fault_input, s.h, s.h_index
     count = len(s.anchors)
     for fault in range(V.shape[0]):

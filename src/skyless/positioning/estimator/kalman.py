@@ -137,7 +137,7 @@ def reset_state(s: EstimatorState, state: int, variance: float) -> None:
 
 @kernel
 def compute_ph(P: Matrix, h: Vector, h_index: Integers, terms: int, ph: Vector) -> float:
-    """P·h of a measurement with so many terms; returns hᵀ·P·h."""
+    """Compute P·h of a measurement with ``terms`` terms; returns hᵀ·P·h."""
     n = P.shape[1]
     for column in range(n):
         ph[column] = 0.0

@@ -65,13 +65,13 @@ JOIN_VARIANCE_M2: Final = 1.0
 PAIR_JUMP_M2: Final = 0.25
 
 REPORT_GAIN: Final = 1.25
-"""A report is used where the filter's own variance is so many times larger."""
+"""A report is used where the filter's own variance is larger by this factor."""
 
 LEAST_REPORT_VARIANCE: Final = 0.1
 """Of that of a pair of stamps: no anchor knows its clock better, whatever it says."""
 
 REJOIN_AFTER: Final = 20
-"""An anchor whose packets are rejected so often in a row joins anew: its first was late, and its rate is wrong."""
+"""An anchor with this number of rejected packets in a row joins again: its first was late, so its rate is wrong."""
 
 STEADY_WALK_SCALE: Final = 4.0
 """Reports of clocks whose random walk counts more than this are not used."""

@@ -1,7 +1,7 @@
 """Which measurements are used, and how process noise follows what innovations show.
 
 Late receptions are the rule where paths are blocked, early ones are not. A single late one is left out; where those
-that follow agree with it, the range error has jumped, and is estimated anew from there. What is systematic in the
+that follow agree with it, the range error has jumped, and is estimated again from there. What is systematic in the
 innovations along an axis is motion, what all anchors have in common is the tag's clock, and what relays say of one
 anchor's clock is that clock.
 """
@@ -131,7 +131,7 @@ def is_common(s: EstimatorState, normalised: float) -> bool:
 
 @kernel
 def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
-    """Let an anchor's range error be estimated anew from a jump on."""
+    """Let an anchor's range error be estimated again from a jump on."""
     status, change = s.status[0], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
     a = s.anchors[anchor]
     a["outliers_in_row"] = 0

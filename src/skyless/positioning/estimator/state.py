@@ -9,7 +9,7 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
     changes     for each anchor the part of the tag's range error to it that changes along the way
     constants   the part that stays
     slope       how ranges lengthen with distance
-    surveys     for each anchor (dim) its true position − its told position
+    surveys     for each anchor (dim) its true position − its position in the almanac
 
 Everything before ``slope`` is updated by all measurements; what follows is updated by the tag's own receptions only
 and is a consider parameter (Schmidt 1966) of the others, which say next to nothing of it.
