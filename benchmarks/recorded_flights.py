@@ -313,18 +313,23 @@ def placed(distances_m):
     return {name: tuple(place) for name, place in zip(names, places_m.tolist(), strict=True)}
 
 
-def packets_judged(one, method):
+def packets_judged(one, measurements):
     """Score of a recording of packets, the report, and the mean error."""
     height_m, _ = height_to_hold(one.height, one.anchors_m, None, None, format_of(one.path).name)
     judge = Keeper(None, planar=height_m is not None, settle_s=SETTLE_REST_S)
-    options = {} if method is None else {"method": method}
+    options = {} if measurements is None else {"measurements": measurements}
     report, (position_m, covariance_m2, levels_m, alerted) = replayed(
         one.path, one.anchors_m, judge, height_m, listener=one.listener, **options
     )
     here = np.array(judge.since_s) >= SETTLE_REST_S
     error_m = position_m[here, :2] - one.true_m
     scored = score(np.array(judge.times_s)[here], error_m, covariance_m2[here], levels_m[here], alerted[here])
-    told = {"name": one.name, "method": report.method, "reason": report.reason, **msgspec.to_builtins(scored)}
+    told = {
+        "name": one.name,
+        "measurements": report.measurements,
+        "reason": report.reason,
+        **msgspec.to_builtins(scored),
+    }
     std_m = np.sqrt(np.trace(covariance_m2[here][:, :2, :2], axis1=1, axis2=2)) if len(error_m) else np.array([])
     return told | {
         "median_m": np.median(position_m[here, :2], axis=0).tolist() if len(error_m) else None,
@@ -421,19 +426,19 @@ def as_told(row):
     return {**msgspec.to_builtins(row), "ratio_2d": row.ratio_2d, "ratio_3d": row.ratio_3d}
 
 
-def packet_table(packets, method):
+def packet_table(packets, measurements):
     """Show recordings of packets; all of it as a list."""
     print()
-    heading("packets", "method", "fixes", "median m", "RMSE 2-D m", "claimed σ m", "HPL m", *HONESTY)
+    heading("packets", "measurements", "fixes", "median m", "RMSE 2-D m", "claimed σ m", "HPL m", *HONESTY)
     told = []
     for one in packets:
-        row = packets_judged(one, method)
+        row = packets_judged(one, measurements)
         told.append(row)
         median_m = "–" if row["median_m"] is None else "{:.2f}, {:.2f}".format(*row["median_m"])
         fixes = str(row["fixes"]) if row["reason"] is None else f"none: {row['reason']}"
         metres = (number(row[name], ".3f") for name in ("rmse_2d_m", "claimed_m", "hpl_m"))
         scored = msgspec.convert({name: row[name] for name in Score.__struct_fields__}, Score)
-        line(row["name"], str(row["method"]), fixes, median_m, *metres, *honesty(scored))
+        line(row["name"], str(row["measurements"]), fixes, median_m, *metres, *honesty(scored))
     return told
 
 
@@ -443,7 +448,7 @@ def main(arguments=None):
     parser.add_argument("folder", type=Path, nargs="?", default=default)
     parser.add_argument("--calibrated", action="store_true", help="also calibrate on trial 1 and replay the others")
     parser.add_argument("--only", default="", help="recordings whose name holds this text")
-    parser.add_argument("--method", help="of recordings of packets, instead of what suits each")
+    parser.add_argument("--measurements", help="of recordings of packets, instead of what suits each")
     parser.add_argument("--json", action="store_true", help="end with all of it as one line")
     asked = parser.parse_args(arguments)
     recordings = [one for one in recordings_in(asked.folder) if asked.only in one.name]
@@ -452,7 +457,7 @@ def main(arguments=None):
         parser.error(f"no recordings in {asked.folder}: give their folder, or set SKYLESS_DATA to it")
     told = tables(recordings, asked.calibrated) if recordings else {}
     if packets:
-        told["packets"] = packet_table(packets, asked.method)
+        told["packets"] = packet_table(packets, asked.measurements)
     if asked.json:
         print(json.dumps(told))
 

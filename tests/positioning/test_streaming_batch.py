@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from skyless.experiments.scenarios import Request, fleet_of
-from skyless.positioning.pair_state import PairSettings
-from skyless.positioning.pair_tracker import PairTracker, track_pairs
 from skyless.positioning.tracker import PseudorangeTracker, track
 from skyless.site.lab import ideal_lab_site
 from skyless.site.room import room_site
@@ -71,38 +69,6 @@ def test_a_simulated_stream_in_one_loop(site, request_):
     assert np.array_equal(P, tracker.P)
     assert np.array_equal(whole, tracker.whole)
     assert np.array_equal(statistics, tracker.statistics)
-
-
-@pytest.mark.parametrize("height_m", [None, 1.0])
-def test_pair_differences_in_one_loop(height_m):
-    generator = np.random.default_rng(2)
-    corners = np.array([(x, y, z) for x in (0.0, 5.0) for y in (0.0, 4.0) for z in (0.2, 2.8)])
-    count, tag = 3000, np.array([2.0, 1.5, 1.0])
-    pairs = np.array([generator.permutation(8)[:2] for _ in range(count)])
-    a_m, b_m = corners[pairs[:, 0]], corners[pairs[:, 1]]
-    tdoa_m = np.linalg.norm(tag - b_m, axis=1) - np.linalg.norm(tag - a_m, axis=1) + generator.normal(0, 0.2, count)
-    tdoa_m[::50] += 5.0  # beyond the gate
-    tdoa_m[(pairs[:, 1] == 3) & (np.arange(count) > 2000)] += 1.0  # an anchor is left out
-    dt_s = generator.uniform(0.0, 0.02, count)
-    one, two = (PairTracker(PairSettings(height_m=height_m)) for _ in range(2))
-    for tracker in (one, two):
-        tracker.start(np.array([2.5, 2.0, 1.5])[: tracker.dim], np.eye(tracker.dim), 1.0)
-        for anchor in range(8):
-            assert tracker.slot(anchor) == anchor
-    states = np.empty((count, len(one.x)))
-    results = []
-    streaming = np.empty_like(states)
-    for k in range(count):
-        results.append(one.hear(*pairs[k].tolist(), a_m[k], b_m[k], float(dt_s[k]), float(tdoa_m[k])))
-        streaming[k] = one.x
-    accepted = track_pairs(two.arrays, pairs[:, 0], pairs[:, 1], a_m, b_m, dt_s, tdoa_m, states)
-    assert accepted == sum(results)
-    assert count - accepted >= count // 50
-    assert np.array_equal(states, streaming)
-    for streamed_array, batch_array in zip(one.arrays, two.arrays, strict=True):
-        assert np.array_equal(streamed_array, batch_array)
-    assert one.excluded == two.excluded == (3,)
-    assert np.linalg.norm(two.x[: two.dim] - tag[: two.dim]) < 0.3
 
 
 def positions(until_s=0.25):

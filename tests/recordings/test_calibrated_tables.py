@@ -3,10 +3,10 @@
 import pytest
 
 from skyless.errors import ConfigurationError
-from skyless.positioning.pair_calibration import AnchorCalibration, PairCalibration
+from skyless.positioning.difference_calibration import AnchorCalibration, DifferenceCalibration
 from skyless.recordings.anchors import calibrated_table, new_table, read_anchors, read_calibration
 
-KNOWN = PairCalibration({1: AnchorCalibration(0.1234, 0.08, 0.061), 16: AnchorCalibration(-0.1)})
+KNOWN = DifferenceCalibration({1: AnchorCalibration(0.1234, 0.08, 0.061), 16: AnchorCalibration(-0.1)})
 TABLE = 'name,id,x_m,y_m,z_m\n"door, left",1,0.10,0,2.5000\n\nwindow,0x10,6,0,2\nfar,3,6,8,2\n'
 
 

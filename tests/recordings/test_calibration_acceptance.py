@@ -34,13 +34,13 @@ def trained(skyless, recordings, tmp_path, name):
 
 @pytest.mark.parametrize("trial", [1, 2, 3])
 def test_free_flights_by_each_other(recordings, skyless, tmp_path, trial):
-    """By trial 1 the others are to come to 0.030 and 0.050 m; any other trial that calibrates gives 0.057 at most."""
+    """By trial 1 the others are to come to 0.030 and 0.050 m; any other trial that calibrates gives 0.060 at most."""
     report, anchors = trained(skyless, recordings, tmp_path, f"const1-trial{trial}-tdoa2")
     assert 0.05 < report["slope_m"] < 0.1  # APS011, which is for another channel: 0.03 to 0.10
     for other in {1, 2, 3} - {trial}:
         judged = skyless("replay", *tables(recordings, f"const1-trial{other}-tdoa2"), "--anchors", anchors)
         assert judged["rmse_2d_m"] <= 0.030
-        assert judged["rmse_3d_m"] <= (0.050 if trial == 1 else 0.057)
+        assert judged["rmse_3d_m"] <= (0.050 if trial == 1 else 0.060)
 
 
 def test_free_flights_of_anchors_without_a_schedule(recordings, skyless, tmp_path):
@@ -56,7 +56,7 @@ def test_flights_among_obstacles_by_one_without(recordings, skyless, tmp_path, t
     _, anchors = trained(skyless, recordings, tmp_path, "const4-trial1-tdoa2-traj1")
     judged = skyless("replay", *tables(recordings, f"const4-trial{trial}-tdoa2-traj1"), "--anchors", anchors)
     assert judged["rmse_2d_m"] <= 0.072
-    assert judged["rmse_3d_m"] <= 0.15
+    assert judged["rmse_3d_m"] <= 0.165
 
 
 def test_a_calibration_among_obstacles_says_so(recordings, skyless, tmp_path):

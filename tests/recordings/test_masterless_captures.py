@@ -38,14 +38,14 @@ def replay(folder, capsys, monkeypatch):
 
 @pytest.mark.parametrize("system", hall.CAPTURES)
 @pytest.mark.parametrize("speed_mps", [0.0, 1.0])
-def test_joint_takes_the_packets_and_is_better_than_their_differences(replay, system, speed_mps):
+def test_packets_are_better_than_their_differences(replay, system, speed_mps):
     packets = replay(f"{system}-{speed_mps}")
-    assert (packets["format"], packets["method"]) == ("bitcraze-binary", "joint")
+    assert (packets["format"], packets["measurements"]) == ("bitcraze-binary", "packets")
     assert packets["fixes"] > 0.98 * packets["receptions"]
     assert packets["rmse_2d_m"] < 0.03
     assert packets["rmse_3d_m"] < 0.06
     assert packets["first_fix_s"] < 0.15  # two packets of each anchor, three frames at most
-    pairs = replay(f"{system}-{speed_mps}", "--method", "tracker")
+    pairs = replay(f"{system}-{speed_mps}", "--measurements", "differences")
     assert packets["rmse_3d_m"] < pairs["rmse_3d_m"]
 
 
@@ -63,22 +63,23 @@ def test_the_captures_are_of_the_systems(folder, system):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--method", "bracketed"], ["bracketed", "tracker, joint"]),
-        (["--method", "joint", "--tdoa-std", "0.1"], ["--tdoa-std", "joint"]),
+        (["--measurements", "ranges"], ["ranges", "packets, differences"]),
+        (["--measurements", "packets", "--tdoa-std", "0.1"], ["--tdoa-std", "packets"]),
+        (["--method", "joint"], ["--method", "skyless record"]),
     ],
 )
-def test_methods_that_cannot_be(folder, capsys, options, words):
+def test_measurements_that_cannot_be(folder, capsys, options, words):
     assert main(["replay", str(folder / "tdoa2-0.0"), "--anchors", str(folder / "anchors.csv"), *options]) == 2
     err = capsys.readouterr().err
     assert all(word in err for word in words)
 
 
-def test_joint_needs_packets(tmp_path, capsys):
+def test_packets_are_wanted_of_a_table(tmp_path, capsys):
     table = tmp_path / "table.csv"
     table.write_text("t_s,idA,idB,tdoa_m\n1,2,3,4\n")
-    assert main(["replay", str(table), "--method", "joint"]) == 2
+    assert main(["replay", str(table), "--measurements", "packets"]) == 2
     assert "tdoa-table holds no anchors' packets" in capsys.readouterr().err
 
 
-def test_the_noise_that_is_wished_for_is_the_trackers(replay):
-    assert replay("tdoa3-0.0", "--tdoa-std", "0.2")["method"] == "tracker"
+def test_a_noise_of_differences_asks_for_differences(replay):
+    assert replay("tdoa3-0.0", "--tdoa-std", "0.2")["measurements"] == "differences"

@@ -12,7 +12,6 @@ from skyless.cli.options import (
     NotNegative,
     Positive,
     integrity_of,
-    known_method,
     spare_inputs,
 )
 from skyless.cli.output import print_json
@@ -20,8 +19,7 @@ from skyless.cli.progress import progress_bar, status
 from skyless.cli.replay_input import flight_height, height_to_hold, known_anchors, known_truth
 from skyless.cli.replay_output import draw_track, fix_writer, see_that_it_can_be_drawn, show
 from skyless.cli.replay_site import Options, is_mcap, replay_site, see_that_they_are_left_out
-from skyless.errors import ConfigurationError
-from skyless.methods import FILTERS
+from skyless.errors import ConfigurationError, SkylessError
 
 if TYPE_CHECKING:
     from skyless.experiments.judge import Judge
@@ -53,6 +51,7 @@ def replay(
     uncalibrated: bool = False,
     tag: str | None = None,
     method: str | None = None,
+    measurements: str | None = None,
     integrity_risk: IntegrityRisk | None = None,
     alert_limit_m: Positive | None = None,
     fixes: Path | None = None,
@@ -95,14 +94,16 @@ def replay(
     qa
         Agility that the filter assumes, m²/s³.
     tdoa_std
-        Noise of a time difference that the tracker assumes, metres.
+        Noise of what is new in a time difference, metres.
     uncalibrated
         Leave out the calibration that the table of anchors holds.
     tag
         Name of the tag, in recordings of skyless record; by default all.
     method
-        In recordings of skyless record, another method than the tag's own; else joint, which takes the anchors' packets
-        as they are and is the default for Bitcraze's, or tracker, which takes time differences.
+        Another method than the tag's own, in recordings of skyless record.
+    measurements
+        What the filter is given of other recordings: packets, as anchors sent them, which is the default for
+        Bitcraze's; or differences, which are made of them.
     integrity_risk
         Another probability than the tag's own that an error exceeds its protection level, in recordings of skyless
         record (joint).
@@ -116,7 +117,7 @@ def replay(
         Write one JSON object instead of the table.
     """
     from skyless.experiments.judge import Judge
-    from skyless.experiments.replay import Replay, ReplayRequest
+    from skyless.experiments.replay import MEASUREMENTS, Replay, ReplayRequest
     from skyless.recordings.anchors import read_calibration
     from skyless.recordings.formats import format_of
 
@@ -127,6 +128,7 @@ def replay(
         useless = {
             "--anchors": anchors, "--truth": truth, "--lever-arm": lever_arm, "--format": format,
             "--listener": listener, "--qa": qa, "--tdoa-std": tdoa_std,
+            "--measurements": measurements,
             "--height": None if height == "auto" else height, "--uncalibrated": uncalibrated or None,
         }  # fmt: skip
         see_that_they_are_left_out(useless, "a recording of skyless record brings its own")
@@ -135,10 +137,10 @@ def replay(
             asked = integrity_of(integrity_risk, alert_limit_m, method)
         replay_site(file, Options(tag, method, asked, settle, above, site, fixes, plot, json))
         return
-    of_sites = {"--tag": tag, "--integrity-risk": integrity_risk, "--alert-limit-m": alert_limit_m}
+    of_sites = {"--tag": tag, "--method": method, "--integrity-risk": integrity_risk, "--alert-limit-m": alert_limit_m}
     see_that_they_are_left_out(of_sites, "it is for recordings of skyless record")
-    if method is not None:
-        known_method(method, FILTERS)
+    if measurements not in {None, *MEASUREMENTS}:
+        raise SkylessError(f"--measurements is {measurements!r}; it should be one of {', '.join(MEASUREMENTS)}")
     places, site_height_m = known_anchors(anchors, site)
     known = known_truth(file, truth, lever_arm, format, listener)
     height_m, note = height_to_hold(height, places, site_height_m, known, format_of(file, format).name)
@@ -153,7 +155,7 @@ def replay(
         qa=qa,
         tdoa_std_m=tdoa_std,
         calibration=None if anchors is None or uncalibrated else read_calibration(anchors),
-        method=method,
+        measurements=measurements,
     )
     report = _run(Replay(request, judge), file, fixes)
     _see_that_it_was_heard(file, listener, report)
@@ -190,7 +192,7 @@ def _run(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
     from skyless.experiments.warm import compile_packet_kernels, compile_pair_kernels
 
     with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
-        if run.method == "joint":
+        if run.measurements == "packets":
             compile_packet_kernels()
         else:
             compile_pair_kernels()

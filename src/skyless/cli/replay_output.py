@@ -80,6 +80,9 @@ def show(report: "ReplayReport", note: str, distances: dict[str, float], more: S
         table.add_row(name, value)
     for reason, count in report.drops.items():
         table.add_row(f"dropped: {reason}", str(count))
+    for pair, by_m in report.contradictions_m.items():
+        nearer = "nearer" if by_m < 0.0 else "farther"
+        table.add_row(f"anchors {pair}", f"range each other {abs(by_m):.2f} m {nearer} than the table has them")
     for pair, metres in distances.items():
         table.add_row(f"distance {pair}", f"{metres:.3f} m")
     console().print(table)
@@ -93,7 +96,7 @@ def _lines(report: "ReplayReport", note: str) -> list[tuple[str, str]]:
     truth_known = any(pair.against_truth for pair in report.pairs)
     return [
         ("fixes", fixes),
-        ("method", str(report.method)),
+        ("method", _method(report)),
         ("rate", "–" if report.rate_hz is None else f"{report.rate_hz:.1f} Hz"),
         ("height", height),
         ("median position", _triple(report.median_m)),
@@ -106,6 +109,10 @@ def _lines(report: "ReplayReport", note: str) -> list[tuple[str, str]]:
         ("largest error", _metres(report.max_m)),
         ("speed", f"{report.receptions_per_s:,.0f} receptions/s"),
     ]
+
+
+def _method(report: "ReplayReport") -> str:
+    return f"{report.method}" if report.measurements is None else f"{report.method}, given {report.measurements}"
 
 
 def _metres(value: float | None) -> str:

@@ -13,7 +13,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.experiments.calibration_fit import Differences, Fit, Vector, fit, moves
-from skyless.positioning.pair_calibration import AnchorCalibration, PairCalibration
+from skyless.positioning.difference_calibration import AnchorCalibration, DifferenceCalibration
 
 FEWEST: Final = 3
 """Accepted differences below which nothing is said of an anchor."""
@@ -67,10 +67,10 @@ class CalibrationEstimate(Struct, frozen=True):
     used: int
     rejected: int
 
-    def calibration(self) -> PairCalibration:
+    def calibration(self) -> DifferenceCalibration:
         """As a receiver applies it."""
         slope_m = self.slope_m or 0.0
-        return PairCalibration(
+        return DifferenceCalibration(
             {
                 anchor.anchor: AnchorCalibration(anchor.bias_m, slope_m, _at_most(anchor))
                 for anchor in self.anchors

@@ -15,24 +15,28 @@ from skyless.errors import SkylessError
 from skyless.experiments.judge import Judge, Judgement
 from skyless.experiments.noise import NoiseBook, PairNoise
 from skyless.experiments.replay_ways import ByPackets, ByPairs, Way
+from skyless.positioning.difference_calibration import DifferenceCalibration
+from skyless.positioning.difference_tracking import DIFFERENCES, DifferenceTracking
+from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.masterless import PairEngine
 from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
-from skyless.positioning.pair_calibration import PairCalibration
-from skyless.positioning.pair_state import PairSettings
-from skyless.positioning.pair_tracking import PairTracking
 from skyless.recordings.formats import Recording, format_of, open_recording
 
-PROFILES: Final[Mapping[str, PairSettings]] = {
-    "miluv": PairSettings(qa=0.1, tdoa_std_m=0.5, constant_std_m=0.15, place_std_m=0.15),
+PROFILES: Final[Mapping[str, EstimatorSettings]] = {
+    "miluv": structs.replace(DIFFERENCES, qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),
 }
 """Settings for formats whose nature asks for others: MILUV's exchanges come once or twice a second, among obstacles."""
 
 BATCH: Final = 512
 """Records that are read at a time: reading and filtering by turns take each other's place in the processor's caches."""
 
-PACKETS_TO_JOINT: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
-"""Formats whose packets ``joint`` takes by default; it was better on real captures. Of Avalue's it was not."""
+PACKETS, DIFFERENCES_MADE = "packets", "differences"
+MEASUREMENTS: Final = (PACKETS, DIFFERENCES_MADE)
+"""What the filter is given: anchors' packets as they are, or time differences made of them."""
+
+FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
+"""Formats of which packets are taken by default, which real captures showed to be better. Of Avalue's they were not."""
 
 
 class ReplayRequest(Struct, frozen=True):
@@ -47,9 +51,9 @@ class ReplayRequest(Struct, frozen=True):
     qa: float | None = None
     tdoa_std_m: float | None = None
     z_bounds_m: tuple[float, float] | None = None
-    calibration: PairCalibration | None = None
-    method: str | None = None
-    """One of ``FILTERS``; None: what suits the format."""
+    calibration: DifferenceCalibration | None = None
+    measurements: str | None = None
+    """One of ``MEASUREMENTS``; None: what suits the format."""
 
 
 class ReplayReport(Struct, frozen=True):
@@ -82,6 +86,11 @@ class ReplayReport(Struct, frozen=True):
     wall_s: float
     receptions_per_s: float
     method: str | None
+    measurements: str | None
+    """What the filter was given, one of ``MEASUREMENTS``; None for the receptions of a site."""
+    contradictions_m: dict[str, float]
+    """Pairs of anchors whose own ranging contradicts the table: by how much they are farther (if negative, nearer)
+    than it says."""
 
 
 class Replay:
@@ -90,27 +99,28 @@ class Replay:
     def __init__(self, request: ReplayRequest, judge: Judge) -> None:
         self._request = request
         self._judge = judge
-        self.method = self._method()
+        self.measurements = self._measurements()
         self.recording: Recording = open_recording(request.path, request.format, request.listener)
         self._noise = NoiseBook(judge, request.anchors_m)
-        self._way: Way = self._by_packets() if self.method == "joint" else self._by_pairs()
+        self._way: Way = self._by_packets() if self.measurements == PACKETS else self._by_pairs()
         self.receptions = 0
         self.fixes = 0
         self._first_s: float | None = None
         self._last_s = 0.0
         self._first_fix_s: float | None = None
 
-    def _method(self) -> str:
-        """The method that was asked for, or that suits the recording."""
+    def _measurements(self) -> str:
+        """The measurements that were asked for, or that suit the recording."""
         request, kind = self._request, format_of(self._request.path, self._request.format)
-        if request.method is None:
-            suits = kind.name in PACKETS_TO_JOINT and request.anchors_m and request.tdoa_std_m is None
-            return "joint" if suits else "tracker"
-        if request.method == "joint" and kind.tx_bits is None:
-            raise SkylessError(f"--method is 'joint'; it should be 'tracker': {kind.name} holds no anchors' packets")
-        if request.method == "joint" and request.tdoa_std_m is not None:
-            raise SkylessError("--tdoa-std is the noise of the differences of --method tracker; joint makes none")
-        return request.method
+        if request.measurements is None:
+            suits = kind.name in FORMATS_BY_PACKETS and request.anchors_m and request.tdoa_std_m is None
+            return PACKETS if suits else DIFFERENCES_MADE
+        if request.measurements == PACKETS and kind.tx_bits is None:
+            wanted = f"it should be 'differences': {kind.name} holds no anchors' packets"
+            raise SkylessError(f"--measurements is 'packets'; {wanted}")
+        if request.measurements == PACKETS and request.tdoa_std_m is not None:
+            raise SkylessError("--tdoa-std is the noise of differences; --measurements packets makes none")
+        return request.measurements
 
     def _engine(self) -> PairEngine | None:
         bits = self.recording.format.tx_bits
@@ -118,10 +128,10 @@ class Replay:
 
     def _by_pairs(self) -> ByPairs:
         request = self._request
-        asked = {"qa": request.qa, "tdoa_std_m": request.tdoa_std_m, "height_m": request.height_m}
+        asked = {"qa": request.qa, "difference_std_m": request.tdoa_std_m, "height_m": request.height_m}
         known = {key: value for key, value in asked.items() if value is not None}
-        settings = structs.replace(PROFILES.get(self.recording.format.name, PairSettings()), **known)
-        tracking = PairTracking(settings, request.anchors_m, request.z_bounds_m, request.calibration)
+        settings = structs.replace(PROFILES.get(self.recording.format.name, DIFFERENCES), **known)
+        tracking = DifferenceTracking(settings, request.anchors_m, request.z_bounds_m, request.calibration)
         return ByPairs(tracking, self._engine(), self._noise)
 
     def _by_packets(self) -> ByPackets:
@@ -193,5 +203,7 @@ class Replay:
             pairs=pairs,
             wall_s=wall_s,
             receptions_per_s=self.receptions / wall_s if wall_s > 0.0 else 0.0,
-            method=self.method,
+            method="joint",
+            measurements=self.measurements,
+            contradictions_m={f"{a}-{b}": by_m for (a, b), by_m in sorted(self._way.contradictions_m.items())},
         )

@@ -132,6 +132,8 @@ class SiteReplay:
             receptions_per_s=replay.receptions / wall_s if wall_s > 0.0 else 0.0,
             tag=tag,
             method=replay.method,
+            measurements=None,
+            contradictions_m={},
             identical=replay.identical,
             segments=replay.segments,
             cold_starts=replay.cold_starts,

@@ -1,22 +1,22 @@
-"""The two ways from records to fixes: time differences of pairs, or ``joint`` on the packets themselves."""
+"""The two ways from records to fixes: time differences of pairs, or the packets themselves."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, Protocol
 
 from skyless.air.packet import Packet, PairTdoa
 from skyless.experiments.noise import NoiseBook
+from skyless.positioning.difference_tracking import DifferenceTracking
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.masterless import PairEngine
 from skyless.positioning.packet_tracking import PacketTracking
-from skyless.positioning.pair_tracking import PairTracking
 
 Record = Packet | PairTdoa
 Triple = tuple[float, float, float]
 
 SAMPLED: Final = 128
 SAMPLED_OF: Final = 1024
-"""Of so many packets so many show the noise of time differences, which ``joint`` has no use for."""
+"""Of so many packets so many show the noise of time differences, for which packets have no use."""
 
 
 class Way(Protocol):
@@ -45,11 +45,16 @@ class Way(Protocol):
         """What could not be used, by reason."""
         ...
 
+    @property
+    def contradictions_m(self) -> Mapping[tuple[int, int], float]:
+        """Pairs of anchors whose own ranging contradicts the table."""
+        ...
+
 
 class ByPairs:
     """Time differences of pairs, ready or made of packets, and the filter of pairs."""
 
-    def __init__(self, tracking: PairTracking, engine: PairEngine | None, noise: NoiseBook) -> None:
+    def __init__(self, tracking: DifferenceTracking, engine: PairEngine | None, noise: NoiseBook) -> None:
         self._tracking = tracking
         self._engine = engine
         self._noise = noise
@@ -93,9 +98,14 @@ class ByPairs:
             total.update(self._engine.drops)
         return total
 
+    @property
+    def contradictions_m(self) -> Mapping[tuple[int, int], float]:
+        """Pairs of anchors whose own ranging contradicts the table: differences do not tell."""
+        return {}
+
 
 class ByPackets:
-    """``joint`` on the packets; of a part of them differences as well, for the recording's noise to be told."""
+    """Packets as they are; of a part of them differences as well, for the recording's noise to be told."""
 
     def __init__(self, tracking: PacketTracking, engine: PairEngine, noise: NoiseBook) -> None:
         self._tracking = tracking
@@ -133,3 +143,8 @@ class ByPackets:
     def drops(self) -> Counter[str]:
         """What could not be used, by reason."""
         return self._tracking.drops
+
+    @property
+    def contradictions_m(self) -> Mapping[tuple[int, int], float]:
+        """Pairs of anchors whose own ranging contradicts the table."""
+        return self._tracking.contradictions_m

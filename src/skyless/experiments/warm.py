@@ -8,9 +8,8 @@ from skyless.air.packet import Packet, PairTdoa, Relay
 from skyless.constants import TICK_M
 from skyless.experiments.fleet import Fleet, FleetSettings
 from skyless.methods import DEFAULT_METHOD
+from skyless.positioning.difference_tracking import DIFFERENCES, DifferenceTracking
 from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
-from skyless.positioning.pair_state import PairSettings
-from skyless.positioning.pair_tracking import PairTracking
 from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import lab_site
@@ -27,7 +26,7 @@ def compile_kernels(method: str = DEFAULT_METHOD) -> None:
 def compile_pair_kernels() -> None:
     """Start a filter of pair differences and feed it a little."""
     places = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors}
-    tracking = PairTracking(PairSettings(height_m=0.0), places)
+    tracking = DifferenceTracking(structs.replace(DIFFERENCES, height_m=0.0), places)
     tag_m = (2.0, 3.0, 0.0)
     for k in range(24):
         a, b = 1 + k % 6, 1 + (k + 1) % 6

@@ -17,8 +17,8 @@ from skyless.outputs.address import MqttAddress
 from skyless.outputs.link import Link
 from skyless.outputs.messages import Counters, FixMessage, SiteMessage
 from skyless.outputs.topics import fix_topic, health_topic, site_topic
+from skyless.positioning.difference_calibration import DifferenceCalibration
 from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
-from skyless.positioning.pair_calibration import PairCalibration
 from skyless.radios.radio import Gone, Restarted
 from skyless.radios.sniffer_radio import SnifferRadio
 from skyless.site.check import check_site
@@ -37,7 +37,7 @@ class PacketTagSettings(Struct, frozen=True):
     qa: float = MASTERLESS.qa
     height_m: float | None = None
     """Height of the tags where it is known; None to estimate it."""
-    calibration: PairCalibration | None = None
+    calibration: DifferenceCalibration | None = None
     publish_hz: float = 50.0
 
 

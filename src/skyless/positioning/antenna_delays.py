@@ -38,6 +38,21 @@ def antenna_delays_m(excess_m: Mapping[Pair, float]) -> dict[int, float]:
     return dict(zip(anchors, delays[:-1].tolist(), strict=True))
 
 
+def contradictions_m(excess_m: Mapping[Pair, float], delays_m: Mapping[int, float]) -> dict[Pair, float]:
+    """Pairs whose flights cannot be had by their positions, by how much they are too long; empty where all can.
+
+    Obstacles make flights longer, and only that; where one is too short, positions are wrong.
+    """
+    if not excess_m:
+        return {}
+    middle = float(np.median(list(excess_m.values())))
+    off_m = {
+        (a, b): excess - middle - delays_m.get(a, 0.0) - delays_m.get(b, 0.0) for (a, b), excess in excess_m.items()
+    }
+    wrong = {pair: round(off, 3) for pair, off in off_m.items() if abs(off) > BLOCKED_M}
+    return wrong if min(wrong.values(), default=0.0) < 0.0 else {}
+
+
 def _design(pairs: Mapping[Pair, float], anchors: list[int]) -> NDArray[np.float64]:
     """A row for each pair: its two anchors, and what all have in common in the last column."""
     place = {anchor: k for k, anchor in enumerate(anchors)}

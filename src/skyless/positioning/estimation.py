@@ -3,6 +3,7 @@
 from typing import Final
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
@@ -80,6 +81,8 @@ class Estimation:
         superframe_s: float = 0.0,
     ) -> None:
         """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites."""
+        if z_bounds_m is not None:
+            settings = replace(settings, lowest_m=z_bounds_m[0], highest_m=z_bounds_m[1])
         self._settings = settings
         self._height_known = settings.height_m is not None
         self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit_m)

@@ -10,27 +10,37 @@ from math import dist, log
 from typing import Final
 
 import numpy as np
+from msgspec.structs import replace
 
 from skyless.air.packet import Packet, Point, Relay
 from skyless.clocks.stamps import NOISE_TICKS
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
+from skyless.positioning.difference_calibration import NEAREST_M, NOTHING, DifferenceCalibration
+from skyless.positioning.difference_start import NEIGHBOURHOOD
+from skyless.positioning.difference_tracking import DIFFERENCES, MAX_STD_M
 from skyless.positioning.estimation import Estimation
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.masterless import MOST_ANCHORS, remember
 from skyless.positioning.observation import Observation
-from skyless.positioning.pair_calibration import NEAREST_M, NOTHING, PairCalibration
-from skyless.positioning.pair_start import NEIGHBOURHOOD
-from skyless.positioning.pair_tracking import MAX_STD_M
 from skyless.positioning.relay_delays import RelayDelays
 from skyless.ticks import LAST_TICKS, Unwrapper, nearest
 
 RANDOM_WALK_FM: Final = 5e-9
 """Of the oscillators, 1/√s. Between 1e-9 and 7e-9 on the captures of TDoA3 anchors; too much of it costs little."""
 
-MASTERLESS: Final = EstimatorSettings(walk=(RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2, max_walk_scale=1.0)
-"""The stamps of those captures are no noisier than others, 85 ps each where nothing is in the way."""
+MASTERLESS: Final = replace(
+    DIFFERENCES,
+    gate=4.0,
+    white=EstimatorSettings().white,
+    walk=(RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2,
+    max_walk_scale=1.0,
+    drop_s=EstimatorSettings().drop_s,
+    rx_variance_m2=2e-3,
+    slope_std_m=0.05,
+)
+"""Ranges err as those of differences do, and in those captures a reception is 4 cm off by itself."""
 
 PERIOD_S: Final = 0.15
 """Anchors send 6 to 60 times a second; the filter is told the slowest."""
@@ -78,7 +88,7 @@ class PacketTracking:
         anchors_m: Mapping[int, Point],
         tx_bits: int = 32,
         z_bounds_m: tuple[float, float] | None = None,
-        calibration: PairCalibration | None = None,
+        calibration: DifferenceCalibration | None = None,
     ) -> None:
         """``anchors_m`` places the anchors; positions that packets carry serve where it has none.
 
@@ -118,6 +128,11 @@ class PacketTracking:
         self._count_relays()
         return self._drops + Counter({"relay-outlier": self._refused_before + self._refused_now})
 
+    @property
+    def contradictions_m(self) -> Mapping[tuple[int, int], float]:
+        """Pairs of anchors whose own ranging contradicts the positions; fixes then have no protection level."""
+        return self._delays.contradictions_m
+
     def hear(self, packet: Packet) -> Fix | None:
         """Take one packet; a fix, or None, and ``reason`` says why.
 
@@ -148,6 +163,8 @@ class PacketTracking:
             0.0,
             tuple(relays),
         )
+        if self._delays.contradictions_m:
+            self._tracking.estimator.withhold_levels()
         fix = self._tracking.hear(observation)
         if not isinstance(fix, Fix):
             self._count_relays()

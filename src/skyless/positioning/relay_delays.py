@@ -13,7 +13,7 @@ from skyless.air.packet import Point
 from skyless.clocks.running_median import RunningMedian
 from skyless.constants import TICK_M
 from skyless.positioning.anchor_flights import AnchorFlights, distance_ticks
-from skyless.positioning.antenna_delays import antenna_delays_m
+from skyless.positioning.antenna_delays import antenna_delays_m, contradictions_m
 
 SETTLED: Final = 32
 REFRESH: Final = 8
@@ -52,7 +52,10 @@ class RelayDelays:
         self._excess_m: dict[Pair, RunningMedian] = {}
         self.own_m: dict[int, float] = {}
         """The anchors' own delays, each half of TX and RX together, less what all have in common."""
-        self._until_estimate = self._wait = FIRST_ESTIMATE if estimate else 0
+        self.contradictions_m: dict[Pair, float] = {}
+        """Pairs that range each other nearer, or farther, than the positions say while others seem nearer."""
+        self._estimates_own = estimate
+        self._until_estimate = self._wait = FIRST_ESTIMATE
 
     def ticks(self, listener: int, sender: int, tx_ticks: int, rx_ticks: int, told_ticks: float | None) -> int | None:
         """What to take off this reception, whole ticks; None while the pair's flight is unknown.
@@ -67,10 +70,9 @@ class RelayDelays:
             return way.delay_ticks
         flight = self._flights.hear(sender, listener, tx_ticks, rx_ticks, told_ticks)
         self._refresh(way, listener, sender, flight)
-        if self._wait:
-            self._until_estimate -= 1
-            if self._until_estimate == 0:
-                self._estimate()
+        self._until_estimate -= 1
+        if self._until_estimate == 0:
+            self._estimate()
         return way.delay_ticks
 
     def forget(self, anchor: int) -> None:
@@ -104,4 +106,7 @@ class RelayDelays:
         self._wait = min(2 * self._wait, LONGEST_WAIT)
         self._until_estimate = self._wait
         known = {pair: value for pair, median in self._excess_m.items() if (value := median.value) is not None}
-        self.own_m = antenna_delays_m(known)
+        own_m = antenna_delays_m(known)
+        self.contradictions_m = contradictions_m(known, own_m)
+        if self._estimates_own:
+            self.own_m = own_m

@@ -8,7 +8,7 @@ from typing import Final
 
 from skyless.air.packet import Point
 from skyless.errors import ConfigurationError
-from skyless.positioning.pair_calibration import AnchorCalibration, PairCalibration
+from skyless.positioning.difference_calibration import AnchorCalibration, DifferenceCalibration
 from skyless.recordings.source import read_lines
 from skyless.recordings.table import finite
 
@@ -34,7 +34,7 @@ def read_anchors(path: str | PathLike[str]) -> dict[int, Point]:
     return anchors
 
 
-def read_calibration(path: str | PathLike[str]) -> PairCalibration | None:
+def read_calibration(path: str | PathLike[str]) -> DifferenceCalibration | None:
     """Calibration that a table of anchors holds; None for a table without ``bias_m``.
 
     Raises:
@@ -48,10 +48,10 @@ def read_calibration(path: str | PathLike[str]) -> PairCalibration | None:
             raise ConfigurationError(path, place, known[NOISE], "a number that is not negative")
         if BIAS in known:
             anchors[identifier] = AnchorCalibration(known[BIAS], known.get(SLOPE, 0.0), known.get(NOISE))
-    return PairCalibration(anchors) if anchors else None
+    return DifferenceCalibration(anchors) if anchors else None
 
 
-def calibrated_table(path: str | PathLike[str], calibration: PairCalibration) -> str:
+def calibrated_table(path: str | PathLike[str], calibration: DifferenceCalibration) -> str:
     """The table with another calibration; everything else stays as it is.
 
     Raises:
@@ -73,7 +73,7 @@ def calibrated_table(path: str | PathLike[str], calibration: PairCalibration) ->
     return out.getvalue()
 
 
-def new_table(anchors_m: Mapping[int, Point], calibration: PairCalibration) -> str:
+def new_table(anchors_m: Mapping[int, Point], calibration: DifferenceCalibration) -> str:
     """A table of anchors that stood in none."""
     rows = [",".join((*COLUMNS, *CALIBRATION_COLUMNS))]
     for anchor, place_m in sorted(anchors_m.items()):

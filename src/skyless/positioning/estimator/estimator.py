@@ -19,10 +19,19 @@ from skyless.positioning.estimator.faults import (
     lasting_chi2,
     open_lasting_faults,
 )
-from skyless.positioning.estimator.kalman import predict
-from skyless.positioning.estimator.kinds import CLOCK_JUMPED, first_reception, own_reception, relay, report
+from skyless.positioning.estimator.flatness import fit_plane, is_height_open
+from skyless.positioning.estimator.kalman import is_at_rest, predict
+from skyless.positioning.estimator.kinds import (
+    CLOCK_JUMPED,
+    difference,
+    first_reception,
+    own_reception,
+    relay,
+    report,
+    zero_velocity,
+)
 from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LASTING_STD_M, LEVELS, RECENT_CHI2, VPL, protect
-from skyless.positioning.estimator.monitor import OFTEN_LATE, covariance_scale
+from skyless.positioning.estimator.monitor import OFTEN_LATE, covariance_scale, follow_rest
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.estimator.state import (
     NEVER,
@@ -62,6 +71,9 @@ LOST_IN_ROW: Final = 8
 
 LOST_SHARE: Final = 0.5
 """... as does a larger share of them."""
+
+DOUBTED_STD_M: Final = 0.3
+"""Of the range error of an anchor that did not fit at the start."""
 
 MOST_REFUSED: Final = 4.0
 """Relays beyond the gate lately; fewer may be late ones."""
@@ -163,6 +175,7 @@ def _process(  # noqa: PLR0911 - each outcome where it is known
         status["impossible"] += 1
         return REJECTED
     status["stale_in_row"] = 0
+    elapsed_s = (rx_ticks - status["epoch_ticks"]) * TICK_S
     predict(s, rx_ticks)
     fade_recent_faults(s)
     outcome = JOINED
@@ -185,8 +198,18 @@ def _process(  # noqa: PLR0911 - each outcome where it is known
             _relayed(s, s.index_of[relays[row, 0]], s.index_of[relays[row, 1]], relays[row, 2], relays[row, 3])
         if report_variance_m2 > 0.0 and master >= 0:
             report(s, anchor, s.index_of[master], subticks, report_variance_m2)
+    _rest(s, elapsed_s)
     _open_faults(s, work)
     return outcome
+
+
+@kernel
+def _rest(s: EstimatorState, elapsed_s: float) -> None:
+    """Look whether the tag stands still, and use it."""
+    if s.settings[0]["rest_s"] > 0.0:
+        follow_rest(s, elapsed_s)
+        if is_at_rest(s):
+            zero_velocity(s)
 
 
 @kernel
@@ -256,9 +279,9 @@ def _track(
 def _soundness(s: EstimatorState, levels: Vector) -> int:
     """What can be said of a position with these levels."""
     count, status = len(s.anchors), s.status[0]
-    if count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count:
+    if count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count or is_height_open(s):
         return UNAVAILABLE
-    if max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > UNCOVERED_CHI2:
+    if status["withholds_levels"] or max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > UNCOVERED_CHI2:
         return CONTRADICTED
     for anchor in range(count):
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
@@ -319,11 +342,54 @@ def _process_frame(
     )
     if outcome >= NEW_ANCHOR:
         return outcome
+    _fill_rows(s, k, work, levels, rows)
+    return outcome
+
+
+@kernel
+def _fill_rows(s: EstimatorState, k: Vector, work: Matrix, levels: Vector, rows: Matrix) -> None:
+    """Write all that a fix carries."""
     fill_motion(s, rows)
     rows[QUALITY, 0], rows[QUALITY, 1] = s.status[0]["mean_nis"], s.status[0]["mean_square_m2"]
     protect(s, k[0], k[1], work, levels)
     rows[QUALITY, 2] = max(levels[LASTING_CHI2], levels[RECENT_CHI2])
     rows[PROTECTION, 0], rows[PROTECTION, 1], rows[PROTECTION, 2] = levels[HPL], levels[VPL], _soundness(s, levels)
+
+
+@kernel
+def _process_difference(
+    s: EstimatorState,
+    table_a: int,
+    table_b: int,
+    rx_ticks: int,
+    difference_m: float,
+    k: Vector,
+    work: Matrix,
+    levels: Vector,
+    rows: Matrix,
+) -> int:
+    """Process one ready-made difference of ranges, to b less to a, and all that a fix carries."""
+    status = s.status[0]
+    if rx_ticks < status["epoch_ticks"]:
+        status["stale"] += 1
+        status["stale_in_row"] += 1
+        return STALE
+    a, b = s.index_of[table_a], s.index_of[table_b]
+    if _silent_anchor(s, rx_ticks) >= 0:
+        return SILENT_ANCHOR
+    status["stale_in_row"] = 0
+    elapsed_s = (rx_ticks - status["epoch_ticks"]) * TICK_S
+    predict(s, rx_ticks)
+    fade_recent_faults(s)
+    outcome = ACCEPTED if difference(s, a, b, rx_ticks, difference_m) == 1 else REJECTED
+    status["packets"] += 1
+    for anchor in (a, b):
+        used = s.anchors[anchor]
+        used["packets"] += 1
+        used["rx_ticks"], used["walked_m"] = rx_ticks, status["walked_m"]
+    _rest(s, elapsed_s)
+    _open_faults(s, work)
+    _fill_rows(s, k, work, levels, rows)
     return outcome
 
 
@@ -360,6 +426,7 @@ class Estimator:
     def _use(self, state: EstimatorState) -> None:
         self._state = state
         count = len(state.anchors)
+        fit_plane(state)
         self._work = np.zeros((count + 1 + self.dim, max(count, 1)))
 
     @property
@@ -385,6 +452,20 @@ class Estimator:
         anchor = self._state.index_of[table_index]
         if anchor >= 0:
             self._state.anchors[anchor]["position_m"] = position_m
+            fit_plane(self._state)
+
+    def doubt_anchor(self, table_index: int) -> None:
+        """Expect that the ranges to an anchor are wrong by metres."""
+        if self._state.index_of[table_index] < 0:
+            self._resize(NEW_ANCHOR, table_index, 0)
+        state = self._state
+        anchor = int(state.index_of[table_index])
+        constant = layout(self.dim, len(state.anchors)).constant + anchor
+        state.P[constant, constant] = DOUBTED_STD_M**2
+
+    def withhold_levels(self) -> None:
+        """Promise nothing until a new start: the anchors do not stand where the table says."""
+        self._state.status["withholds_levels"] = 1
 
     def start(
         self,
@@ -443,6 +524,21 @@ class Estimator:
             if outcome < NEW_ANCHOR:
                 return outcome
             self._resize(outcome, table_index, rx_ticks)
+
+    def process_difference(self, table_a: int, table_b: int, rx_ticks: int, difference_m: float) -> int:
+        """Process a ready-made difference of ranges, to anchor b less to anchor a; as ``process``."""
+        if not np.isfinite(difference_m):
+            return REJECTED
+        while True:
+            for index in (table_a, table_b):
+                if self._state.index_of[index] < 0:
+                    self._resize(NEW_ANCHOR, index, rx_ticks)
+            outcome = _process_difference(
+                self._state, table_a, table_b, rx_ticks, difference_m, self._k, self._work, self._levels, self._rows
+            )
+            if outcome < NEW_ANCHOR:
+                return outcome
+            self._resize(outcome, table_a, rx_ticks)
 
     def track(
         self,
@@ -518,6 +614,11 @@ class Estimator:
         in_row = int(status["rejected_in_row"]) + int(status["stale_in_row"])
         late = min(float(status["late_share"]), 0.45)
         return bool(status["rejected_share"] > LOST_SHARE or in_row * (1.0 - 2.0 * late) >= LOST_IN_ROW)
+
+    @property
+    def refuses_most(self) -> bool:
+        """Whether most measurements lie beyond the gate."""
+        return bool(self._state.status[0]["rejected_share"] > LOST_SHARE)
 
     @property
     def is_contradicted(self) -> bool:

@@ -51,6 +51,13 @@ def compute_fault_input(s: EstimatorState, terms: int, own: int) -> None:
 
 
 @kernel
+def subtract_fault_input(s: EstimatorState, anchor: int) -> None:
+    """Of an anchor with whose reception a difference begins: its faults count with the opposite sign."""
+    s.fault_input[anchor] -= 1.0
+    s.fault_input[len(s.anchors) + anchor] -= 1.0
+
+
+@kernel
 def gather_evidence(s: EstimatorState, innovation: float, innovation_variance: float) -> None:
     """What an innovation says of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S."""
     evidence, information, fault_input, count = s.evidence, s.information, s.fault_input, len(s.anchors)

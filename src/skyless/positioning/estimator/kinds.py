@@ -16,7 +16,7 @@ import numpy as np
 
 from skyless.compiled import kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.positioning.estimator.faults import compute_fault_input, gather_evidence
+from skyless.positioning.estimator.faults import compute_fault_input, gather_evidence, subtract_fault_input
 from skyless.positioning.estimator.kalman import (
     OBSTRUCTED_STD_M,
     compute_ph,
@@ -29,7 +29,9 @@ from skyless.positioning.estimator.monitor import (
     COMMON,
     OFTEN_LATE,
     adapt_clock_noise,
+    adapt_place_noise,
     adapt_process_noise,
+    difference_scale,
     end_small_obstruction,
     has_jumped,
     is_common,
@@ -77,6 +79,9 @@ STEADY_WALK_SCALE: Final = 4.0
 """Reports of clocks whose random walk counts more than this are not used."""
 
 CLOCK_JUMPED: Final = 2
+
+REST_STD_MPS: Final = 0.01
+"""Of the velocity of a tag that stands still, each time a measurement is processed."""
 
 
 @kernel
@@ -213,6 +218,7 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     compute_fault_input(s, terms, anchor)
     gather_evidence(s, innovation, used_variance)
     update(s, innovation, used_variance, 1.0, len(s.x))
+    adapt_place_noise(s, anchor, elapsed_s)
     steps = int(np.floor(s.x[offset] / TICK_M))
     a["offset_ticks"] += steps
     s.x[offset] -= steps * TICK_M
@@ -230,7 +236,7 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
     if a["is_obstructed"] and innovation < 0.0:
         innovation += s.x[change]
         share = min(status["obstruction"], 1.0)
-        reset_state(s, change, settings["place_std_m"] ** 2 + share * OBSTRUCTED_STD_M**2)
+        reset_state(s, change, a["place_variance_m2"] + share * OBSTRUCTED_STD_M**2)
         a["is_obstructed"] = a["outliers_in_row"] = 0
         status["ends_of_obstructions"] += 1
         left = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
@@ -393,3 +399,67 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     # K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q)
     whole_s = own_variance * own_variance / (own_variance - variance)
     update(s, innovation, whole_s, whole_s / own_variance, n)
+
+
+# A ready-made time difference
+
+
+@kernel
+def difference_terms(s: EstimatorState, a: int, b: int) -> tuple[int, float]:
+    """Put a difference of ranges, to anchor b less to anchor a, into ``h``; its terms, and the difference.
+
+    Its gradient stands in the first terms, as the other kinds' directions do.
+    """
+    dim = s.settings[0]["dim"]
+    far_m = _add_direction(s, 0, b, 1.0)
+    near_m = _add_direction(s, 2 * dim, a, -1.0)
+    for axis in range(dim):
+        s.h[axis] += s.h[2 * dim + axis]
+        s.h[2 * dim + axis] = 0.0
+    term = _range_error_terms(s, 4 * dim, b, far_m, 1.0)
+    return _range_error_terms(s, term, a, near_m, -1.0), far_m - near_m
+
+
+@kernel
+def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: float) -> int:
+    """Process a ready-made difference of ranges, to anchor b less to anchor a: 1 if it was used, 0 if not.
+
+    d = |p − b| − |p − a| + range errors of b − those of a + noise. Nothing is learnt of clocks, which whoever made
+    the difference has taken out of it.
+    """
+    settings, status = s.settings[0], s.status[0]
+    dim, walked_m = settings["dim"], status["walked_m"]
+    a_elapsed_s = (rx_ticks - s.anchors[a]["rx_ticks"]) * TICK_S if s.anchors[a]["packets"] > 0 else 0.0
+    b_elapsed_s = (rx_ticks - s.anchors[b]["rx_ticks"]) * TICK_S if s.anchors[b]["packets"] > 0 else 0.0
+    relax_range_error(s, a, a_elapsed_s, walked_m - s.anchors[a]["walked_m"])
+    relax_range_error(s, b, b_elapsed_s, walked_m - s.anchors[b]["walked_m"])
+    terms, expected_m = difference_terms(s, a, b)
+    innovation = difference_m - expected_m - _along(s, 4 * dim, terms)
+    innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + settings["difference_std_m"] ** 2
+    scale = difference_scale(s, innovation, innovation_variance)
+    if scale > 0.0:
+        if is_warm(s):
+            adapt_process_noise(s, innovation / np.sqrt(innovation_variance) / scale)
+        compute_fault_input(s, terms, b)
+        subtract_fault_input(s, a)
+        gather_evidence(s, innovation, innovation_variance * scale)
+        update(s, innovation, innovation_variance * scale, 1.0, len(s.x))
+        adapt_place_noise(s, a, a_elapsed_s)
+        adapt_place_noise(s, b, b_elapsed_s)
+    return int(scale > 0.0)
+
+
+# The tag stands still
+
+
+@kernel
+def zero_velocity(s: EstimatorState) -> None:
+    """Process the knowledge that a tag at rest has no velocity, one axis after the other."""
+    dim = s.settings[0]["dim"]
+    velocity = layout(dim, len(s.anchors)).velocity
+    for axis in range(dim):
+        term = _set_term(s, 0, velocity + axis, 1.0)
+        variance = compute_ph(s.P, s.h, s.h_index, term, s.ph) + REST_STD_MPS**2
+        innovation = -s.x[velocity + axis]
+        compute_fault_input(s, term, -1)
+        update(s, innovation, variance, 1.0, len(s.x))

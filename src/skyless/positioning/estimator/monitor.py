@@ -54,6 +54,15 @@ LATE_DENSITY: Final = 0.05
 HUBER: Final = 1.5
 """Where receptions are late often, innovations beyond so many standard deviations weigh less."""
 
+DIFFERENCE_HUBER: Final = 1.0
+"""Ready-made differences with innovations beyond so many standard deviations weigh less."""
+
+MOST_PLACE_STD_M: Final = 0.5
+"""Of what range errors change along the way; larger ones are jumps."""
+
+MOVED: Final = 1.0
+"""Mean square of what a tag is away from where it was, over the variances, beyond which it is taken to move."""
+
 LAG_GAIN: Final = 0.05
 LAG_FORGETTING: Final = 0.01
 LAG_LIMIT: Final = 2.6
@@ -172,6 +181,55 @@ def variance_scale(s: EstimatorState, innovation: float, innovation_variance: fl
     if status["late_share"] > OFTEN_LATE and abs(normalised) > HUBER:
         return float(abs(normalised) / HUBER)
     return 1.0
+
+
+@kernel
+def difference_scale(s: EstimatorState, innovation: float, innovation_variance: float) -> float:
+    """Factor on the innovation's variance of a time difference; 0 if it is not to be used. Counts it.
+
+    Either of its anchors may be late, so large ones weigh less on both sides.
+    """
+    status, normalised = s.status[0], abs(innovation) / np.sqrt(innovation_variance)
+    status["rejected_share"] *= 1.0 - FORGETTING
+    if not normalised <= s.settings[0]["gate"]:
+        status["rejected"] += 1
+        status["rejected_in_row"] += 1
+        status["rejected_share"] += FORGETTING
+        return 0.0
+    status["accepted"] += 1
+    status["rejected_in_row"] = 0
+    status["mean_nis"] += FORGETTING * (normalised * normalised - status["mean_nis"])
+    status["mean_square_m2"] += FORGETTING * (innovation * innovation - status["mean_square_m2"])
+    return float(max(1.0, normalised / DIFFERENCE_HUBER))
+
+
+@kernel
+def adapt_place_noise(s: EstimatorState, anchor: int, elapsed_s: float) -> None:
+    """Let the variance of an anchor's changing range error follow its estimate: the mean of its square.
+
+    The maximisation step of expectation maximisation (Shumway and Stoffer 1982) with a memory that fades.
+    """
+    settings, a = s.settings[0], s.anchors[anchor]
+    memory_s = settings["place_memory_s"]
+    if memory_s > 0.0:
+        change = layout(settings["dim"], len(s.anchors)).change + anchor
+        square = s.x[change] ** 2 + s.P[change, change]
+        variance = a["place_variance_m2"] + min(elapsed_s / memory_s, 0.5) * (square - a["place_variance_m2"])
+        a["place_variance_m2"] = min(max(variance, settings["least_place_std_m"] ** 2), MOST_PLACE_STD_M**2)
+
+
+@kernel
+def follow_rest(s: EstimatorState, dt: float) -> None:
+    """Count for how long the tag has shown no motion: neither its position, nor innovations that stay on one side."""
+    status, dim = s.status[0], s.settings[0]["dim"]
+    square = 0.0
+    for axis in range(dim):
+        square += (s.x[axis] - status["rest_m"][axis]) ** 2 / s.P[axis, axis]
+    status["rest_s"] += dt
+    if square > MOVED * dim or status["lag_square"] > LAG_LIMIT or status["rejected_in_row"] > 1:
+        status["rest_s"] = 0.0
+        for axis in range(dim):
+            status["rest_m"][axis] = s.x[axis]
 
 
 @kernel

@@ -31,6 +31,9 @@ class EstimatorSettings(Struct, frozen=True):
     """Innovations beyond so many standard deviations are not used."""
     height_m: float | None = None
     """Height of the tag where it is given; None to estimate it."""
+    lowest_m: float = -np.inf
+    highest_m: float = np.inf
+    """Between which the tag's height is known to be."""
     drop_s: float = 2.0
     """Anchors that are silent for longer leave the state."""
     relay_age_s: float = 1.0
@@ -47,6 +50,14 @@ class EstimatorSettings(Struct, frozen=True):
     """Distance over which that part changes, ..."""
     place_time_s: float = 100.0
     """... and time over which it changes at rest."""
+    place_memory_s: float = 0.0
+    """Time within which the size of each anchor's changing part is estimated again; 0 where it is ``place_std_m``."""
+    least_place_std_m: float = 0.05
+    """No changing part is estimated to be smaller."""
+    difference_std_m: float = 0.12
+    """Of what is new in each ready-made time difference."""
+    rest_s: float = 0.0
+    """A tag that has not shown any motion for so long is taken to stand still; 0: never."""
     max_acceleration_mps2: float = 0.0
     """The tag's largest acceleration, as far as levels are to cover it beyond ``qa``."""
     max_walk_scale: float = 1e4
@@ -79,6 +90,8 @@ _NAMES: Final = (
     "rx_variance_m2",
     "gate",
     "height_m",
+    "lowest_m",
+    "highest_m",
     "drop_s",
     "relay_age_s",
     "survey_std_m",
@@ -88,6 +101,10 @@ _NAMES: Final = (
     "place_distance_m",
     "place_time_s",
     "max_acceleration_mps2",
+    "place_memory_s",
+    "least_place_std_m",
+    "difference_std_m",
+    "rest_s",
     "max_walk_scale",
     "integrity_risk",
 )

@@ -48,7 +48,7 @@ def is_sound(estimator: Estimator) -> bool:
 
 def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[Wanted]:
     count = len(s.anchors)
-    n, faults, terms = layout(dim, count).end, 2 * count + dim, 3 * dim + 8
+    n, faults, terms = layout(dim, count).end, 2 * count + dim, 4 * dim + 8
     yield s.x, (n,), np.float64
     yield s.P, (n, n), np.float64
     yield s.V, (faults, n), np.float64

@@ -57,6 +57,7 @@ ANCHOR: Final = np.dtype(
         ("relay_outliers_in_row", np.int64),
         ("relay_mean", np.float64),  # running mean of what relays say of its clock, normalised
         ("walk_scale", np.float64),  # factor on its oscillator's random walk
+        ("place_variance_m2", np.float64),  # of the part of its range error that changes along the way
     ],
     align=True,
 )
@@ -107,6 +108,11 @@ STATUS: Final = np.dtype(
         ("walk_scale", np.float64),  # factor on its random walk
         ("obstruction", np.float64),  # 1 where range errors have jumped lately, 0 where they do not
         ("walked_m", np.float64),
+        ("rest_s", np.float64),  # since the tag last showed motion ...
+        ("rest_m", np.float64, (3,)),  # ... and where it was then
+        ("withholds_levels", np.int64),  # whether the anchors' positions are known to be wrong
+        ("plane_m", np.float64, (3,)),  # a point of the plane that lies closest to the anchors, ...
+        ("plane_normal", np.float64, (3,)),  # ... and its normal
         ("open_range_errors", np.int64),  # whether anchors join with range errors beyond what the settings say
     ],
     align=True,
@@ -201,8 +207,8 @@ def new_state(settings: EstimatorSettings, table_size: int) -> EstimatorState:
         status=status,
         settings=settings.record(),
         index_of=np.full(table_size, -1, np.int64),
-        h=np.zeros(3 * dim + 8),
-        h_index=np.zeros(3 * dim + 8, np.int64),
+        h=np.zeros(4 * dim + 8),
+        h_index=np.zeros(4 * dim + 8, np.int64),
         ph=np.zeros(n),
         fault_input=np.zeros(dim),
     )
@@ -227,6 +233,7 @@ def with_anchor(s: EstimatorState, table_index: int, position_m: Vector) -> Esti
     last["table_index"], last["position_m"] = table_index, position_m
     last["tx_ticks"] = last["rx_ticks"] = NEVER
     last["walk_scale"] = 1.0
+    last["place_variance_m2"] = settings["place_std_m"] ** 2
     grown.packets[count] = (NEVER, NEVER, NEVER)
     pair_variance = 0.0
     if settings["range_std_m"] > 0.0 or settings["survey_std_m"] > 0.0:
@@ -234,7 +241,7 @@ def with_anchor(s: EstimatorState, table_index: int, position_m: Vector) -> Esti
     for link in (grown.links[count], grown.links[:, count]):
         link["tx_ticks"], link["variance_m2"] = NEVER, pair_variance
     where = layout(dim, count + 1)
-    grown.P[where.change + count, where.change + count] = settings["place_std_m"] ** 2
+    grown.P[where.change + count, where.change + count] = last["place_variance_m2"]
     range_std_m, survey_std_m = settings["range_std_m"], settings["survey_std_m"]
     if s.status[0]["open_range_errors"]:
         range_std_m, survey_std_m = OPEN_RANGE_STD_M, OPEN_SURVEY_STD_M

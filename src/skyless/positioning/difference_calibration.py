@@ -10,6 +10,7 @@ the slope from the receiver: a DW1000 stamps strong signals early (Decawave APS0
 their zero is arbitrary.
 """
 
+from math import log
 from typing import Final
 
 import numpy as np
@@ -29,8 +30,9 @@ SHARED: Final = 1.5
 TYPICAL_SLOPE_M: Final = 0.05
 """Of a DW1000 that nobody has calibrated: APS011 says 0.03 to 0.10 m, flights that told it 0.03 to 0.08 m."""
 
-KNOWN_STD_M: Final = 0.03
-"""Of a constant that was calibrated: between recordings of the same anchors it differs by so much."""
+KNOWN_STD_M: Final = 0.02
+"""Of a constant that was calibrated, beside what the survey is off: between recordings of the same anchors it differs
+by 3 cm in all."""
 
 
 class AnchorCalibration(Struct, frozen=True):
@@ -47,7 +49,7 @@ NOTHING: Final = AnchorCalibration(0.0)
 UNKNOWN: Final = AnchorCalibration(0.0, TYPICAL_SLOPE_M)
 
 
-class PairCalibration(Struct, frozen=True):
+class DifferenceCalibration(Struct, frozen=True):
     """What is known of the anchors; those that are not in it are taken as they are."""
 
     anchors: dict[int, AnchorCalibration]
@@ -56,11 +58,16 @@ class PairCalibration(Struct, frozen=True):
         """What is known of an anchor, or of any."""
         return self.anchors.get(anchor, UNKNOWN)
 
+    def error_m(self, anchor: int, range_m: float) -> float:
+        """By how much an anchor seems too far away."""
+        known = self.of(anchor)
+        return known.bias_m + known.slope_m * log(max(range_m, NEAREST_M))
+
     def constant_m(self, pair: PairTdoa) -> float:
         """By how much a difference is too large for its anchors' constants."""
         return self.of(pair.anchor_b).bias_m - self.of(pair.anchor_a).bias_m
 
-    def tdoa_std_m(self, otherwise_m: float) -> float:
+    def difference_std_m(self, otherwise_m: float) -> float:
         """Of a difference, by the median of what was measured at the anchors, where that is less than otherwise."""
         known = [anchor.noise_m for anchor in self.anchors.values() if anchor.noise_m is not None]
         return min(SHARED * max(float(np.median(known)), LEAST_NOISE_M), otherwise_m) if known else otherwise_m

@@ -3,8 +3,7 @@
 import numpy as np
 
 from skyless.air.packet import PairTdoa
-from skyless.positioning.pair_state import PairSettings
-from skyless.positioning.pair_tracking import PairTracking
+from skyless.positioning.difference_tracking import DIFFERENCES, DifferenceTracking
 
 ANCHORS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * (n >> 2)) for n in range(8)}
 STD_M = 0.1
@@ -13,7 +12,7 @@ STD_M = 0.1
 def test_a_tag_that_moved_on_in_silence_is_found_again():
     """Round and round at 1 m/s, heard for 3 s and then not for 8 s; the noise is half of what the filter assumes."""
     generator = np.random.default_rng(4)
-    tracking = PairTracking(PairSettings(), ANCHORS_M)
+    tracking = DifferenceTracking(DIFFERENCES, ANCHORS_M)
     errors_m, sigmas_m = [], []
     for k in range(60_000):
         time_s = k / 400.0

@@ -8,9 +8,8 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.air.packet import PairTdoa
+from skyless.positioning.difference_calibration import DifferenceCalibration
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.pair_calibration import PairCalibration
-from skyless.positioning.pair_state import START_STD_M
 from skyless.positioning.pairs import against_reference
 from skyless.positioning.solver import NoSolution, Solution, locate
 
@@ -21,6 +20,9 @@ STOREYS: Final = 0.5
 """... and so is one farther above or below than this part."""
 
 LEAST_DIAGONAL_M: Final = 5.0
+
+START_STD_M: Final = 0.22
+"""Of a difference with all that is wrong with it, where nothing has been learnt yet."""
 
 MISFIT: Final = 4.0
 """A start with so much larger residuals than expected, chi² per degree of freedom, is tried without each anchor."""
@@ -50,7 +52,7 @@ class Start(Struct, frozen=True):
 def find_start(
     window: Sequence[PairTdoa],
     places_m: Mapping[int, NDArray[np.float64]],
-    calibration: PairCalibration,
+    calibration: DifferenceCalibration,
     height_m: float | None,
     z_bounds_m: tuple[float, float] | None,
 ) -> Start | NoSolution:
