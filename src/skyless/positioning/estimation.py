@@ -82,7 +82,9 @@ class Estimation:
         """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites."""
         self._settings = settings
         self._height_known = settings.height_m is not None
-        self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit_m)
+        self._asked = IntegrityRequirement(
+            settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2
+        )
         self._superframe_s = superframe_s
         self._max_spread = MAX_SPREAD if superframe_s < SLOW_S else SLOW_SPREAD
         self._z_bounds_m = z_bounds_m

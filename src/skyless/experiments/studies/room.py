@@ -22,6 +22,7 @@ from skyless.experiments.studies.room_bound import biases_of, bound_cells, with_
 from skyless.experiments.studies.stage import anchor_of, box, worlds
 from skyless.experiments.studies.summary import Case, world_cells, world_rows
 from skyless.experiments.studies.worlds import RunResult
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.simulation.impairments import AnchorBias, Body, WarmUp
 from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Trajectory, Waypoints
@@ -61,6 +62,8 @@ CRYSTALS: Final = ((1.0, 20.0), (-1.0, 20.0), (2.0, 20.0), (-2.0, 20.0), (5.0, 6
 
 TURNS_MPS2: Final = (3.0, 6.0, 10.0, 30.0)
 TURNING_MPS: Final = 3.0
+STATED_MPS2: Final = 10.0
+"""Turns that are also driven with the tag's largest acceleration stated."""
 
 _LATE_KEY: Final = 23
 _PATH_KEY: Final = 29
@@ -191,16 +194,14 @@ def _crystals(plan: Plan) -> list[Case]:
 
 
 def _turns(plan: Plan) -> list[Case]:
-    return [
-        _case(
-            plan,
-            f"turns of {turn:g} m/s² at {TURNING_MPS:g} m/s",
-            "turns",
-            *((_exceeded(1e-3),) if turn == 10.0 else ()),
-            paths=partial(turning, plan, turn),
-        )
-        for turn in TURNS_MPS2
-    ]
+    """Of tags that nobody has told of it, and of some that know how hard they turn."""
+    found = []
+    for turn, stated in (*((turn, False) for turn in TURNS_MPS2), (STATED_MPS2, True)):
+        name = f"turns of {turn:g} m/s² at {TURNING_MPS:g} m/s" + (", stated" if stated else "")
+        limits = (_exceeded(1e-3),) if turn == STATED_MPS2 else ()
+        asked = IntegrityRequirement(max_acceleration_mps2=turn if stated else 0.0)
+        found.append(_case(plan, name, "turns", *limits, paths=partial(turning, plan, turn), integrity=asked))
+    return found
 
 
 def turning(plan: Plan, acceleration_mps2: float, seed: int) -> Sequence[Trajectory]:
