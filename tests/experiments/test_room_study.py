@@ -14,7 +14,7 @@ from skyless.experiments.studies.level_counts import LevelCounter, LevelCounts
 from skyless.experiments.studies.limits import judged
 from skyless.experiments.studies.plan import Limit, Row, plan_of
 from skyless.experiments.studies.rare import rare_interval
-from skyless.experiments.studies.room_bound import biases_of, bound_cells, bound_variance_m2
+from skyless.experiments.studies.room_bound import biases_of, bound_cells
 from skyless.experiments.studies.stage import box
 from skyless.experiments.studies.worlds import RunResult, run_world
 from skyless.positioning.alert import Alert
@@ -264,13 +264,12 @@ def test_the_bound_is_of_what_the_worlds_draw():
 
 def test_the_bound_of_the_room():
     """What ``docs/maths.md`` says of it, from the first six of the hundred tags."""
-    plan = plan_of("joint", 11, study="room", worlds=2)
-    plan = replace(plan, tags=3)
-    bounds_m = {
-        case.name: math.sqrt(np.mean([bound_variance_m2(cell.argument) for cell in bound_cells([case])]))
-        for case in room.cases(plan)[:2]
-    }
-    assert bounds_m == {"the room": pytest.approx(0.0240, rel=0.03), "unbiased air": pytest.approx(0.0156, rel=0.02)}
+    plan = replace(plan_of("joint", 11, study="room", worlds=2), tags=3)
+    base, air = room.cases(plan)[:2]
+    pairs = replace(base, biases=replace(base.biases, pair_std_m=0.05))
+    for case, bound_m in ((base, 0.0240), (air, 0.0156), (pairs, 0.0253)):
+        variances_m2 = [cell.function(cell.argument) for cell in bound_cells([case])]
+        assert math.sqrt(np.mean(variances_m2)) == pytest.approx(bound_m, rel=0.02)
 
 
 def test_tags_that_know_how_hard_they_turn_turn_as_those_that_do_not():
