@@ -3,7 +3,6 @@
 It needs nothing but beacons: anchors, schedule and noise figures come from the almanac on the air.
 """
 
-import math
 from collections import Counter
 from typing import Final
 
@@ -48,27 +47,22 @@ class Receiver:
         qa: float = 0.3,
         z_bounds_m: tuple[float, float] | None = None,
         integrity: IntegrityRequirement | None = None,
-        max_acceleration_mps2: float = 0.0,
     ) -> None:
         """Make a tag that knows nothing yet.
 
         ``method`` is one of ``METHODS``; ``site`` the only site to listen to, by default the first that is heard;
         ``qa`` the tag's agility in m²/s³ (filters); ``z_bounds_m`` decides between mirror solutions; ``integrity``
-        is asked of the protection levels (``joint``), which cover accelerations up to ``max_acceleration_mps2``.
+        is asked of the protection levels (``joint``).
 
         Raises:
-            ValueError: there is no such method, or the acceleration is negative or not finite.
+            ValueError: there is no such method.
         """
         if method not in METHODS:
             raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")
-        if not 0.0 <= max_acceleration_mps2 < math.inf:
-            raise ValueError(
-                f"max_acceleration_mps2 is {max_acceleration_mps2!r}; it should be a finite number from 0 on"
-            )
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self.almanac = AlmanacBook()
-        self._wanted = Wanted(method, qa, z_bounds_m, integrity or IntegrityRequirement(), max_acceleration_mps2)
+        self._wanted = Wanted(method, qa, z_bounds_m, integrity or IntegrityRequirement())
         self._site = site
         self._may_change_site = site is None
         self._site_heard_ticks = 0

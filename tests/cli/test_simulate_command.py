@@ -199,6 +199,8 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--integrity-risk", "0"], ["--integrity-risk"]),
         (["--integrity-risk", "1"], ["--integrity-risk"]),
         (["--alert-limit-m", "0"], ["--alert-limit-m"]),
+        (["--max-acceleration", "nan"], ["--max-acceleration"]),
+        (["--max-acceleration", "10", "--method", "literal"], ["--max-acceleration", "10", "literal"]),
         (["--alert-limit-m", "0.1", "--method", "tracker"], ["--alert-limit-m", "0.1", "tracker"]),
         (["--position", "1,2", "--tags", "5"], ["--position", "--tags", "either"]),
         (["--position", "1,2", "--speed", "2"], ["--position", "--speed", "either"]),

@@ -14,12 +14,14 @@ from skyless.experiments.studies.level_counts import LevelCounter, LevelCounts
 from skyless.experiments.studies.limits import judged
 from skyless.experiments.studies.plan import Limit, Row, plan_of
 from skyless.experiments.studies.rare import rare_interval
+from skyless.experiments.studies.room_bound import biases_of, bound_cells
 from skyless.experiments.studies.stage import box
 from skyless.experiments.studies.worlds import RunResult, run_world
 from skyless.positioning.alert import Alert
 from skyless.simulation.channel import cross_walls, pack_walls
 from skyless.simulation.impairments import Body
 from skyless.site.lab import lab_site
+from skyless.uncertainty.biased_bound import Biases
 
 PLAN = plan_of("tracker", 1, study="room")
 CASES = {case.name: case for case in room.cases(PLAN)}
@@ -141,10 +143,12 @@ def test_the_limits_are_those_of_the_acceptance():
         "past a wall": {"rmse_m:..0.08", "nees:..3", "exceeded:..0.001"},
         "a body": {"rmse_m:..0.12", "nees:..4", "exceeded:..0.001"},
         "turns of 10 m/s² at 3 m/s": {"exceeded:..0.001"},
+        "turns of 10 m/s² at 3 m/s, stated": {"exceeded:..0.001"},
         **{name: {"exceeded:..0.001"} for name in late},
         **{name: {"exceeded:..0.0003"} for name in off},
     }
-    ratios = {name: (case.of, case.limit) for name, case in CASES.items() if case.limit is not None}
+    assert (CASES[room.BASE].of, CASES[room.BASE].limit) == (None, 1.15)
+    ratios = {name: (case.of, case.limit) for name, case in CASES.items() if case.of is not None}
     assert set(ratios.values()) == {("the room", 1.3)}
     assert len(ratios) == 6
 
@@ -190,7 +194,8 @@ def test_levels_are_counted_for_each_tag():
 
 def _results(plan, levels):
     one = RunResult(9, 9, 0.01, 0.01, 9.0, 0, 0.1, np.full(9, 0.03), 9, 1.0, 1e-3, levels)
-    return [one] * len(STUDIES["room"].cells(plan))
+    each = room.cases(plan)
+    return [one] * sum(len(case.runs) for case in each) + [0.02**2] * len(bound_cells(each))
 
 
 def test_rows_have_shares_of_the_fixes_with_a_level_and_intervals_over_tags():
@@ -203,7 +208,12 @@ def test_rows_have_shares_of_the_fixes_with_a_level_and_intervals_over_tags():
     assert row.exceeded_interval == (rare_interval(np.array([3.0, 0.0, 3.0, 0.0]), 12.0)[0], 1.0)
     assert row.exceeded_unwarned == pytest.approx(2.0 / 12.0)
     assert row.hpl_m == pytest.approx(0.25)
-    assert row.missed == ("rmse_m", "level", "exceeded")
+    assert (row.bound_m, row.ratio) == (pytest.approx(0.02), pytest.approx(5.0 / 3.0))
+    assert row.missed == ("rmse_m", "level", "exceeded", "ratio")
+    assert {row.case for row in rows if row.bound_m is not None} == {
+        *("the room", "unbiased air", "hall, 8 anchors", "3-D room, 8 anchors", "constants change in 10 s"),
+        *("constants change within 1 m", "constants within 10 cm", "each axis N(5 cm)"),
+    }
     none = LevelCounts(*map(np.array, ([4.0, 5.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0])), hpl_m=np.empty(0))
     row = room.rows(plan, _results(plan, none))[0]
     assert (row.level, row.exceeded, row.hpl_m) == (0.0, None, None)
@@ -218,13 +228,57 @@ def test_the_table_and_the_picture_show_levels_and_what_is_missed(capsys):
     for words in (
         "past a wall",
         "3 of 6 late, 0.5–2 m, 6 s",
-        "missed: RMSE, level, exceeded",
+        "missed: RMSE, level, exceeded, ratio",
         "held",
         "66.7 %",
         "5000",
     ):
         assert words in out
     assert picture(STUDIES["room"].draw(rows), "png", 40.0).startswith(b"\x89PNG")
+
+
+def test_the_bound_is_of_what_the_worlds_draw():
+    found = {name: case.biases for name, case in CASES.items() if case.biases is not None}
+    usual = found[room.BASE]
+    assert (usual.survey_std_m, usual.constant_std_m, usual.slope_std_m) == (
+        0.02,
+        pytest.approx(0.0289, rel=1e-2),
+        0.05,
+    )
+    assert (usual.changing_std_m, usual.pair_std_m) == (0.0, 0.0)
+    assert found["unbiased air"] == Biases()
+    assert (found["each axis N(5 cm)"].survey_std_m, found["constants within 10 cm"].constant_std_m) == (
+        0.05,
+        pytest.approx(0.0577, rel=1e-2),
+    )
+    slow, near = found["constants change in 10 s"], found["constants change within 1 m"]
+    assert (slow.constant_std_m, slow.changing_std_m, slow.correlation_s, slow.correlation_m) == (
+        0,
+        0.029,
+        10,
+        math.inf,
+    )
+    assert (near.correlation_s, near.correlation_m) == (math.inf, 1.0)
+    assert biases_of(None) == Biases()
+
+
+def test_the_bound_of_the_room():
+    """What ``docs/maths.md`` says of it, from the first six of the hundred tags."""
+    plan = replace(plan_of("joint", 11, study="room", worlds=2), tags=3)
+    base, air = room.cases(plan)[:2]
+    pairs = replace(base, biases=replace(base.biases, pair_std_m=0.05))
+    for case, bound_m in ((base, 0.0240), (air, 0.0156), (pairs, 0.0253)):
+        variances_m2 = [cell.function(cell.argument) for cell in bound_cells([case])]
+        assert math.sqrt(np.mean(variances_m2)) == pytest.approx(bound_m, rel=0.02)
+
+
+def test_tags_that_know_how_hard_they_turn_turn_as_those_that_do_not():
+    stated, other = CASES["turns of 10 m/s² at 3 m/s, stated"].runs, CASES["turns of 10 m/s² at 3 m/s"].runs
+    assert {run.integrity.max_acceleration_mps2 for run in stated} == {10.0}
+    assert {run.integrity.max_acceleration_mps2 for case in CASES.values() for run in case.runs} == {0.0, 10.0}
+    for a, b in zip(stated, other, strict=True):
+        assert (a.seed, a.impairments) == (b.seed, b.impairments)
+        assert [p.position(5.0).tolist() for p in a.trajectories] == [p.position(5.0).tolist() for p in b.trajectories]
 
 
 def test_one_world_of_the_room_judges_levels_beside_errors():

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import cycle
 from xml.etree import ElementTree
 
 import numpy as np
@@ -69,11 +70,12 @@ def test_the_study_of_the_room_tells_levels_and_what_is_missed(run, tmp_path):
     code, out, err = run("room", *small, "--json", "--out", "folder")
     assert (code, err, out.count("\n")) == (0, "", 1)
     rows = json.loads(out)["rows"]
-    assert len(rows) == 37
+    assert len(rows) == 38
     first = rows[0]
     assert (first["case"], first["method"], first["runs"]) == ("the room", "joint", 2)
-    assert {limit["figure"] for limit in first["limits"]} == {"rmse_m", "nees", "level", "exceeded", "hpl_m"}
+    assert {limit["figure"] for limit in first["limits"]} == {"rmse_m", "nees", "level", "exceeded", "hpl_m", "ratio"}
     assert first["passed"] == (not first["missed"])
+    assert 0.024 < first["bound_m"] < 0.035
     for row in rows:
         assert 0.0 <= row["level"] <= 1.0
         assert (row["exceeded"] is None) == (row["level"] == 0.0)
@@ -90,15 +92,16 @@ def test_every_study_can_be_drawn(name, tmp_path):
     from skyless.experiments.figures import picture
     from skyless.experiments.studies.catalogue import STUDIES
     from skyless.experiments.studies.plan import plan_of
-    from skyless.experiments.studies.worlds import RunResult
+    from skyless.experiments.studies.worlds import RunResult, run_world
 
     plan = plan_of("tracker", 1, quick=True, worlds=2)
     study = STUDIES[name]
     some = RunResult(9, 9, 0.01, 0.01, 9.0, 0, 0.1, np.full(9, 0.03), 9, 1.0, 1e-3)
     none = RunResult(0, 9, 0.0, 0.0, 0.0, 0, 0.0, np.empty(0), 9, 1.0, 1e-3)
     for results in ([some], [none], [some, none]):
-        count = len(study.cells(plan))
-        rows = study.rows(plan, (results * count)[:count])
+        cells = study.cells(plan)
+        worlds = cycle(results)
+        rows = study.rows(plan, [next(worlds) if cell.function is run_world else 0.02**2 for cell in cells])
         assert picture(study.draw(rows), "png", 50.0).startswith(b"\x89PNG")
 
 

@@ -355,6 +355,12 @@ def test_impossible_alert_limits_are_refused(limit_m):
         IntegrityRequirement(alert_limit_m=limit_m)
 
 
+@pytest.mark.parametrize("acceleration", [-1.0, float("inf"), float("nan")])
+def test_impossible_accelerations_are_refused(acceleration):
+    with pytest.raises(ValueError, match=r"max_acceleration_mps2 is .* it should be a finite number from 0 on"):
+        IntegrityRequirement(max_acceleration_mps2=acceleration)
+
+
 @pytest.mark.parametrize("risk", [0.0, -1e-4, 0.5, float("nan")])
 def test_impossible_risks_are_refused(risk):
     for refuse in (limits_of, IntegrityRequirement):

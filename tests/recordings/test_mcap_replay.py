@@ -54,7 +54,7 @@ def test_replay_gives_the_live_fixes_bit_by_bit(tmp_path, method, join_s):
 @pytest.mark.parametrize("join_s", [0.0, 1.0], ids=["from its start", "from its middle"])
 @pytest.mark.parametrize("with_state", [True, False])
 def test_what_was_asked_of_levels_is_replayed(tmp_path, join_s, with_state):
-    path, asked = tmp_path / "live.mcap", IntegrityRequirement(1e-6, 0.02)
+    path, asked = tmp_path / "live.mcap", IntegrityRequirement(1e-6, 0.02, 10.0)
     said = messages(2.0, ("a",), "joint", join_s, integrity=asked)
     if not with_state:
         said = changed(said, lambda _, m: [m if m.start is None else replace(m, start=replace(m.start, state=None))])
@@ -86,10 +86,19 @@ def test_levels_of_another_risk_are_larger_and_no_longer_compared(tmp_path):
     assert last[1].hpl_m > 1.15 * last[0].hpl_m
 
 
-@pytest.mark.parametrize(("risk", "limit_m"), [(0.0, None), ("high", None), (1e-4, -1.0), (1e-4, "far")])
-def test_levels_that_nobody_can_ask_for_are_counted(tmp_path, risk, limit_m):
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"integrity_risk": 0.0},
+        {"integrity_risk": "high"},
+        {"alert_limit_m": -1.0},
+        {"alert_limit_m": "far"},
+        {"max_acceleration_mps2": -1.0},
+        {"max_acceleration_mps2": "fast"},
+    ],
+)
+def test_levels_that_nobody_can_ask_for_are_counted(tmp_path, forged):
     path = tmp_path / "forged.mcap"
-    forged = {"integrity_risk": risk, "alert_limit_m": limit_m}
 
     def forge(_, m):
         if m.start is None:
@@ -255,6 +264,7 @@ def test_mistakes_are_told_in_one_line(tmp_path, capsys):
         ([str(path), "--truth", str(bare)], "left out"),
         ([str(path), "--integrity-risk", "2"], "--integrity-risk"),
         ([str(path), "--alert-limit-m", "0"], "--alert-limit-m"),
+        ([str(path), "--max-acceleration", "-1"], "--max-acceleration"),
         ([str(bare)], "raw receptions is missing"),
     ):
         assert main(["replay", *arguments]) == 2

@@ -11,7 +11,7 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.nodes import MqttCa, broker, say, site_named
-from skyless.cli.options import IntegrityRisk, Picoseconds, Positive, integrity_of, known_method
+from skyless.cli.options import IntegrityRisk, NotNegative, Picoseconds, Positive, integrity_of, known_method
 from skyless.cli.output import console, print_json
 from skyless.cli.progress import status
 from skyless.errors import SkylessError
@@ -42,6 +42,7 @@ def demo(
     method: str = DEFAULT_METHOD,
     integrity_risk: IntegrityRisk | None = None,
     alert_limit_m: Positive | None = None,
+    max_acceleration: NotNegative | None = None,
     apart: bool = False,
     mqtt: Annotated[str | None, Parameter(env_var="SKYLESS_MQTT")] = None,
     mqtt_ca: MqttCa = None,
@@ -73,6 +74,8 @@ def demo(
         Probability, for each fix, that the error exceeds its protection level (joint); 1e-4 by default.
     alert_limit_m
         Fixes with a higher protection level than so many metres carry an alert (joint).
+    max_acceleration
+        The largest acceleration of the tags in m/s², for protection levels that cover their hardest turns (joint).
     apart
         Run every anchor and every tag as a process of its own, to kill and to freeze.
     mqtt
@@ -105,7 +108,7 @@ def demo(
         noise_ps=noise_ps,
         seed=seed,
         method=method,
-        integrity=integrity_of(integrity_risk, alert_limit_m, method),
+        integrity=integrity_of(integrity_risk, alert_limit_m, max_acceleration, method),
         broker=None if mqtt is None else broker(mqtt, mqtt_ca),
         record=_recording(record, folder),
         record_limit_mb=1000.0,

@@ -25,8 +25,10 @@ IntegrityRisk = Annotated[float, Parameter(validator=Number(gt=0, lte=0.1))]
 """Probability, for each fix, that an error exceeds its protection level; 10⁻⁴ where none is given."""
 
 
-def integrity_of(risk: float | None, alert_limit_m: float | None, method: str | None = None) -> "IntegrityRequirement":
-    """What --integrity-risk and --alert-limit-m ask of protection levels.
+def integrity_of(
+    risk: float | None, alert_limit_m: float | None, max_acceleration_mps2: float | None, method: str | None = None
+) -> "IntegrityRequirement":
+    """What --integrity-risk, --alert-limit-m and --max-acceleration ask of protection levels.
 
     Raises:
         SkylessError: the method gives none, so that a limit would be watched by nobody.
@@ -34,13 +36,14 @@ def integrity_of(risk: float | None, alert_limit_m: float | None, method: str | 
     from skyless.positioning.protection import RISK, IntegrityRequirement
 
     if method in METHODS and method != PROTECTED:
-        for option, value in (("integrity-risk", risk), ("alert-limit-m", alert_limit_m)):
+        asked = {"integrity-risk": risk, "alert-limit-m": alert_limit_m, "max-acceleration": max_acceleration_mps2}
+        for option, value in asked.items():
             if value is not None:
                 raise SkylessError(
                     f"--{option} is {value:g}; it should be left out: {method} gives no protection levels"
                 )
 
-    return IntegrityRequirement(RISK if risk is None else risk, alert_limit_m)
+    return IntegrityRequirement(RISK if risk is None else risk, alert_limit_m, max_acceleration_mps2 or 0.0)
 
 
 def known_method(method: str, names: Sequence[str] = METHODS) -> None:

@@ -54,6 +54,7 @@ def replay(
     measurements: str | None = None,
     integrity_risk: IntegrityRisk | None = None,
     alert_limit_m: Positive | None = None,
+    max_acceleration: NotNegative | None = None,
     fixes: Path | None = None,
     plot: Path | None = None,
     json: bool = False,
@@ -64,8 +65,8 @@ def replay(
     of time differences, MILUV passive ticks and Avalue receptions; the format is recognised by the content.
 
     A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
-    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --settle, --above, --fixes, --plot and
-    --json.
+    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --settle, --above,
+    --fixes, --plot and --json.
 
     Parameters
     ----------
@@ -108,7 +109,10 @@ def replay(
         Another probability than the tag's own that an error exceeds its protection level, in recordings of skyless
         record (joint).
     alert_limit_m
-        Another alert limit than the tag's own, in metres; both begin anew, as another method does.
+        Another alert limit than the tag's own, in metres.
+    max_acceleration
+        Another largest acceleration than the tag's own, in m/s². With any of these three tags begin anew, as with
+        another method, and those that are not given are as of a tag of which nothing was asked.
     fixes
         Write every fix into this table.
     plot
@@ -133,11 +137,14 @@ def replay(
         }  # fmt: skip
         see_that_they_are_left_out(useless, "a recording of skyless record brings its own")
         asked = None
-        if integrity_risk is not None or alert_limit_m is not None:
-            asked = integrity_of(integrity_risk, alert_limit_m, method)
+        if not (integrity_risk is None and alert_limit_m is None and max_acceleration is None):
+            asked = integrity_of(integrity_risk, alert_limit_m, max_acceleration, method)
         replay_site(file, Options(tag, method, asked, settle, above, site, fixes, plot, json))
         return
-    of_sites = {"--tag": tag, "--method": method, "--integrity-risk": integrity_risk, "--alert-limit-m": alert_limit_m}
+    of_sites = {
+        "--tag": tag, "--method": method, "--integrity-risk": integrity_risk, "--alert-limit-m": alert_limit_m,
+        "--max-acceleration": max_acceleration,
+    }  # fmt: skip
     see_that_they_are_left_out(of_sites, "it is for recordings of skyless record")
     if measurements not in {None, *MEASUREMENTS}:
         raise SkylessError(f"--measurements is {measurements!r}; it should be one of {', '.join(MEASUREMENTS)}")

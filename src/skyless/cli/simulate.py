@@ -59,6 +59,7 @@ def simulate(
     qa: Positive = 0.3,
     integrity_risk: IntegrityRisk | None = None,
     alert_limit_m: Positive | None = None,
+    max_acceleration: NotNegative | None = None,
     noise_ps: Picoseconds | None = None,
     fixes: Annotated[int, Parameter(validator=Number(gte=1))] | None = None,
     duration: Positive | None = None,
@@ -104,6 +105,8 @@ def simulate(
         Probability, for each fix, that the error exceeds its protection level (joint); 1e-4 by default.
     alert_limit_m
         Fixes with a higher protection level than so many metres carry an alert (joint).
+    max_acceleration
+        The largest acceleration of the tags in m/s², for protection levels that cover their hardest turns (joint).
     noise_ps
         Noise of every TX and RX stamp in picoseconds, known to the filters; by default the site's own figures.
     fixes
@@ -160,7 +163,7 @@ def simulate(
         tags=1 if tags is None else tags,
         speed_mps=1.0 if speed is None else speed,
         qa=qa,
-        integrity=integrity_of(integrity_risk, alert_limit_m, method),
+        integrity=integrity_of(integrity_risk, alert_limit_m, max_acceleration, method),
         warmup_s=warmup,
         most_fixes=fixes,
         loss=loss,

@@ -93,7 +93,7 @@ def study(
     from skyless.experiments.studies.catalogue import STUDIES
     from skyless.experiments.studies.plan import plan_of
 
-    asked = integrity_of(integrity_risk, alert_limit_m)
+    asked = integrity_of(integrity_risk, alert_limit_m, None)
     if name != "integrity" and (integrity_risk is not None or alert_limit_m is not None):
         raise SkylessError("--integrity-risk and --alert-limit-m are for the study integrity")
     _see_that_it_applies(name, episodes, {"worlds": worlds, "seconds": seconds, "noise-ps": noise_ps, "qa": qa})

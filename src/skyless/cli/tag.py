@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, broker, say
-from skyless.cli.options import IntegrityRisk, Positive, finite_numbers, integrity_of, known_method
+from skyless.cli.options import IntegrityRisk, NotNegative, Positive, finite_numbers, integrity_of, known_method
 from skyless.errors import SkylessError
 from skyless.methods import DEFAULT_METHOD
 from skyless.radios.open import DEFAULT_RADIO, is_simulated, is_sniffer, open_radios, open_sniffers
@@ -32,6 +32,7 @@ def tag(
     qa: Positive = 0.3,
     integrity_risk: IntegrityRisk | None = None,
     alert_limit_m: Positive | None = None,
+    max_acceleration: NotNegative | None = None,
     publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0,
     site_id: Annotated[int | None, Parameter(validator=Number(gte=0, lt=0xFFFE))] = None,
     anchors: Path | None = None,
@@ -61,6 +62,8 @@ def tag(
         Probability, for each fix, that the error exceeds its protection level (joint); 1e-4 by default.
     alert_limit_m
         Fixes with a higher protection level than so many metres carry an alert (joint).
+    max_acceleration
+        The largest acceleration of the tags in m/s², for protection levels that cover their hardest turns (joint).
     publish_hz
         Fixes a second and tag on MQTT at most.
     site_id
@@ -87,13 +90,13 @@ def tag(
         )
     known_method(method)
     if is_sniffer(radio):
-        if integrity_risk is not None or alert_limit_m is not None:
-            raise SkylessError("--integrity-risk and --alert-limit-m are not for sniffers")
+        if not (integrity_risk is None and alert_limit_m is None and max_acceleration is None):
+            raise SkylessError("--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers")
         serve = _on_sniffers(radio, names, _system(anchors, height, site_id, qa, publish_hz), address)
     elif anchors is not None or height is not None:
         raise SkylessError("--anchors and --height are for sniffers; other tags hear from the air where anchors stand")
     else:
-        asked = integrity_of(integrity_risk, alert_limit_m, method)
+        asked = integrity_of(integrity_risk, alert_limit_m, max_acceleration, method)
         settings = TagSettings(method, qa, site_id, integrity=asked, publish_hz=publish_hz)
         serve = _on_radios(radio, names, settings, address)
     with contextlib.suppress(KeyboardInterrupt):

@@ -122,6 +122,8 @@ class WholeSite:
             computing += ["--integrity-risk", str(asked.integrity.risk)]
         if asked.integrity.alert_limit_m is not None:
             computing += ["--alert-limit-m", str(asked.integrity.alert_limit_m)]
+        if asked.integrity.max_acceleration_mps2 > 0.0:
+            computing += ["--max-acceleration", str(asked.integrity.max_acceleration_mps2)]
         tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
         programs += [
             Program(_named("tag", some), ("tag", *some, *radio, *mqtt, *computing))

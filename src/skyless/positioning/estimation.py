@@ -85,7 +85,9 @@ class Estimation:
             settings = replace(settings, lowest_m=z_bounds_m[0], highest_m=z_bounds_m[1])
         self._settings = settings
         self._height_known = settings.height_m is not None
-        self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit_m)
+        self._asked = IntegrityRequirement(
+            settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2
+        )
         self._superframe_s = superframe_s
         self._max_spread = MAX_SPREAD if superframe_s < SLOW_S else SLOW_SPREAD
         self._z_bounds_m = z_bounds_m

@@ -43,8 +43,6 @@ class Wanted(Struct, frozen=True):
     """Decides between mirror solutions."""
     integrity: IntegrityRequirement
     """What is asked of the protection levels (``joint``)."""
-    max_acceleration_mps2: float = 0.0
-    """The tag's largest acceleration, which the levels cover."""
 
 
 def new_method(
@@ -61,7 +59,7 @@ def new_method(
     if wanted.method == "joint" and superframe_s <= LONGEST_FOR_JOINT_S:
         assumed = replace(
             estimator_settings(wanted.qa, schedule.tag_height_m, noise, accuracy, superframe_s),
-            max_acceleration_mps2=wanted.max_acceleration_mps2,
+            max_acceleration_mps2=wanted.integrity.max_acceleration_mps2,
             integrity_risk=wanted.integrity.risk,
             alert_limit_m=wanted.integrity.alert_limit_m,
         )

@@ -44,18 +44,23 @@ class IntegrityRequirement(Struct, frozen=True):
     """What an application asks of the levels.
 
     Raises:
-        ValueError: the risk is not between 0 and 0.1, or the limit is not a length.
+        ValueError: the risk is not between 0 and 0.1, the limit is not a length, or the acceleration none.
     """
 
     risk: float = RISK
     """Probability, for each fix, that an error exceeds its protection level."""
     alert_limit_m: float | None = None
     """Fixes with a higher horizontal protection level say so."""
+    max_acceleration_mps2: float = 0.0
+    """The tag's largest acceleration, which the levels then cover whatever its agility; 0 where it is not known."""
 
     def __post_init__(self) -> None:
         limits_of(self.risk)
         if self.alert_limit_m is not None and not 0.0 < self.alert_limit_m < np.inf:
             raise ValueError(f"alert_limit_m is {self.alert_limit_m!r}; it should be more than 0 m")
+        if not 0.0 <= self.max_acceleration_mps2 < np.inf:
+            told = repr(self.max_acceleration_mps2)
+            raise ValueError(f"max_acceleration_mps2 is {told}; it should be a finite number from 0 on")
 
 
 def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert_limit_m: float | None) -> Integrity:

@@ -141,7 +141,11 @@ def receiver_settings(
 ) -> Settings:
     """How a receiver is made, as a segment tells it."""
     low_m, high_m = (None, None) if z_bounds_m is None else z_bounds_m
-    asked = {"integrity_risk": integrity.risk, "alert_limit_m": integrity.alert_limit_m}
+    asked = {
+        "integrity_risk": integrity.risk,
+        "alert_limit_m": integrity.alert_limit_m,
+        "max_acceleration_mps2": integrity.max_acceleration_mps2,
+    }
     return {"method": method, "site": site, "qa": qa, "z_low_m": low_m, "z_high_m": high_m, **asked}
 
 

@@ -189,7 +189,7 @@ def _superframe(
     for sender in range(n):
         frame = superframe * n + sender
         if frame > 0:
-            predict(P, dims, slot_s, settings)
+            predict(P, dims, n, slot_s, settings)
         new_packet(P, settings[TX])
         hear_by_tag(P, h, ph, anchors, sender, path[frame], dims, settings[RX])
         for listener in range(n):
@@ -198,15 +198,19 @@ def _superframe(
 
 
 @kernel
-def predict(P: Array, dims: int, dt_s: float, settings: Array) -> None:
-    """Advance by ``dt_s``: constant velocity, and clocks whose differences all hold the first anchor's oscillator."""
+def predict(P: Array, dims: int, clocks: int, dt_s: float, settings: Array) -> None:
+    """Advance by ``dt_s``: constant velocity, and clocks whose differences all hold the first anchor's oscillator.
+
+    ``clocks``: how many clocks are states. What stands behind them stays as it is.
+    """
+    behind = 2 * (dims + clocks)
     for axis in range(dims):
         _advance(P, axis, dims + axis, dt_s)
         _add_noise(P, axis, dims + axis, axis, dims + axis, dt_s, 0.0, settings[QA])
-    for i in range(2 * dims, len(P) - 1, 2):
+    for i in range(2 * dims, behind, 2):
         _advance(P, i, i + 1, dt_s)
-    for i in range(2 * dims, len(P) - 1, 2):
-        for j in range(2 * dims, len(P) - 1, 2):
+    for i in range(2 * dims, behind, 2):
+        for j in range(2 * dims, behind, 2):
             share = 2.0 if i == j else 1.0
             _add_noise(P, i, i + 1, j, j + 1, dt_s, share * settings[WHITE], share * settings[WALK])
 
@@ -243,23 +247,35 @@ def hear_by_tag(
     P: Array, h: Array, ph: Array, anchors: Array, sender: int, place: Array, dims: int, variance: float
 ) -> None:
     """The tag's stamp less the frame's: range, its clock, less the sender's clock, less the TX noise."""
+    tag_terms(h, anchors, sender, place, dims)
+    update(P, h, ph, variance)
+
+
+@kernel
+def tag_terms(h: Array, anchors: Array, sender: int, place: Array, dims: int) -> None:
+    """Put that measurement into ``h``."""
     h[:] = 0.0
     towards = direction(anchors, sender, place)
     for axis in range(dims):
         h[axis] = towards[axis]
     h[2 * dims] = 1.0
     _subtract_sender(h, sender, dims)
-    _update(P, h, ph, variance)
 
 
 @kernel
 def hear_by_anchor(P: Array, h: Array, ph: Array, sender: int, listener: int, dims: int, variance: float) -> None:
     """An anchor's stamp less the frame's; the distance is known."""
+    anchor_terms(h, sender, listener, dims)
+    update(P, h, ph, variance)
+
+
+@kernel
+def anchor_terms(h: Array, sender: int, listener: int, dims: int) -> None:
+    """Put that measurement into ``h``."""
     h[:] = 0.0
     if listener > 0:
         h[2 * dims + 2 * listener] = 1.0
     _subtract_sender(h, sender, dims)
-    _update(P, h, ph, variance)
 
 
 @kernel
@@ -270,7 +286,7 @@ def _subtract_sender(h: Array, sender: int, dims: int) -> None:
 
 
 @kernel
-def _update(P: Array, h: Array, ph: Array, variance: float) -> None:
+def update(P: Array, h: Array, ph: Array, variance: float) -> None:
     """What a scalar measurement h with this variance leaves of the covariance."""
     n = len(P)
     ph[:] = 0.0

@@ -86,7 +86,7 @@ def _run_received(
     for frame in range(len(path)):
         sender = frame % n
         if frame > 0:
-            predict(P, dims, slot_s, settings)
+            predict(P, dims, n, slot_s, settings)
         new_packet(P, settings[TX])
         if known[frame, n]:
             hear_by_tag(P, h, ph, anchors, sender, path[frame], dims, settings[RX])

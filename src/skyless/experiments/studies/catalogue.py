@@ -63,6 +63,7 @@ STUDIES: Final = {
         ),
         replace(
             _of_worlds("room", "the room", room.cases, Look("The room", ("rmse", "nees", "level", "exceeded"))),
+            cells=room.cells,
             rows=room.rows,
         ),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),

@@ -16,11 +16,13 @@ from skyless.experiments.scenarios import wanderers
 from skyless.experiments.studies.level_counts import LevelCounts
 from skyless.experiments.studies.limits import judged
 from skyless.experiments.studies.motions import laps
-from skyless.experiments.studies.plan import Limit, Plan, Row, seed_of
+from skyless.experiments.studies.plan import Cell, Limit, Plan, Row, seed_of
 from skyless.experiments.studies.rare import rare_interval
+from skyless.experiments.studies.room_bound import biases_of, bound_cells, with_bound
 from skyless.experiments.studies.stage import anchor_of, box, worlds
-from skyless.experiments.studies.summary import Case, world_rows
+from skyless.experiments.studies.summary import Case, world_cells, world_rows
 from skyless.experiments.studies.worlds import RunResult
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.simulation.impairments import AnchorBias, Body, WarmUp
 from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Trajectory, Waypoints
@@ -30,6 +32,9 @@ from skyless.site.model import AnchorSite, Site, TagsSite, WallSite
 BASE: Final = "the room"
 AIR: Final = "unbiased air"
 WARMUP_S: Final = 1.5
+
+BOUND_RATIO: Final = 1.15
+"""Over the Cramér–Rao bound, at most, in the room itself."""
 
 SHARE: Final = 0.25
 """Worlds of each case but the room itself, of those that the room has."""
@@ -57,6 +62,8 @@ CRYSTALS: Final = ((1.0, 20.0), (-1.0, 20.0), (2.0, 20.0), (-2.0, 20.0), (5.0, 6
 
 TURNS_MPS2: Final = (3.0, 6.0, 10.0, 30.0)
 TURNING_MPS: Final = 3.0
+STATED_MPS2: Final = 10.0
+"""Turns that are also driven with the tag's largest acceleration stated."""
 
 _LATE_KEY: Final = 23
 _PATH_KEY: Final = 29
@@ -77,13 +84,16 @@ def _case(
     *limits: Limit,
     site: Site | None = None,
     paths: Paths | None = None,
+    bounded: bool = False,
     **faults: Any,  # noqa: ANN401 - of ``worlds``
 ) -> Case:
+    """``bounded``: nothing is wrong but what the room's errors of survey and ranges are, so that there is a bound."""
     place = site or lab_site(plan.noise_ps)
     count = plan.worlds if name == BASE else max(2, round(SHARE * plan.worlds))
     ways = paths or partial(wanderers, place, plan.tags)
     faults = {"room": Room(), **faults}
-    return Case(name, series, None, worlds(plan, place, ways, warmup_s=WARMUP_S, count=count, **faults), limits=limits)
+    runs = worlds(plan, place, ways, warmup_s=WARMUP_S, count=count, **faults)
+    return Case(name, series, None, runs, limits=limits, biases=biases_of(faults["room"]) if bounded else None)
 
 
 def _exceeded(most: float) -> Limit:
@@ -99,10 +109,10 @@ def _places(plan: Plan) -> list[Case]:
         Limit("hpl_m", most=0.30),
     )
     return [
-        _case(plan, BASE, "rooms", *usual),
-        _case(plan, AIR, "rooms", Limit("rmse_m", most=0.019), room=None),
-        _case(plan, "hall, 8 anchors", "rooms", Limit("level", 0.97), site=hall_site(plan.noise_ps)),
-        _case(plan, "3-D room, 8 anchors", "rooms", site=room_3d_site(plan.noise_ps)),
+        replace(_case(plan, BASE, "rooms", *usual, bounded=True), limit=BOUND_RATIO),
+        _case(plan, AIR, "rooms", Limit("rmse_m", most=0.019), room=None, bounded=True),
+        _case(plan, "hall, 8 anchors", "rooms", Limit("level", 0.97), site=hall_site(plan.noise_ps), bounded=True),
+        _case(plan, "3-D room, 8 anchors", "rooms", site=room_3d_site(plan.noise_ps), bounded=True),
     ]
 
 
@@ -116,7 +126,7 @@ def _errors(plan: Plan) -> list[Case]:
     off = [(1, 0.10), (1, 0.15), (1, 0.20), (1, 0.30), (2, 0.20)]
     return [
         *(
-            _case(plan, name, "ranges", room=Room(ranges=RangeErrorModel(slope_m=0.05, **changes)))
+            _case(plan, name, "ranges", room=Room(ranges=RangeErrorModel(slope_m=0.05, **changes)), bounded=True)
             for name, changes in ranges.items()
         ),
         *(
@@ -129,7 +139,7 @@ def _errors(plan: Plan) -> list[Case]:
             )
             for count, off_m in off
         ),
-        _case(plan, "each axis N(5 cm)", "places of anchors", room=Room(axis_std_m=0.05)),
+        _case(plan, "each axis N(5 cm)", "places of anchors", room=Room(axis_std_m=0.05), bounded=True),
     ]
 
 
@@ -184,16 +194,14 @@ def _crystals(plan: Plan) -> list[Case]:
 
 
 def _turns(plan: Plan) -> list[Case]:
-    return [
-        _case(
-            plan,
-            f"turns of {turn:g} m/s² at {TURNING_MPS:g} m/s",
-            "turns",
-            *((_exceeded(1e-3),) if turn == 10.0 else ()),
-            paths=partial(turning, plan, turn),
-        )
-        for turn in TURNS_MPS2
-    ]
+    """Of tags that nobody has told of it, and of some that know how hard they turn."""
+    found = []
+    for turn, stated in (*((turn, False) for turn in TURNS_MPS2), (STATED_MPS2, True)):
+        name = f"turns of {turn:g} m/s² at {TURNING_MPS:g} m/s" + (", stated" if stated else "")
+        limits = (_exceeded(1e-3),) if turn == STATED_MPS2 else ()
+        asked = IntegrityRequirement(max_acceleration_mps2=turn if stated else 0.0)
+        found.append(_case(plan, name, "turns", *limits, paths=partial(turning, plan, turn), integrity=asked))
+    return found
 
 
 def turning(plan: Plan, acceleration_mps2: float, seed: int) -> Sequence[Trajectory]:
@@ -227,13 +235,22 @@ def _around(x_m: float, y_m: float) -> list[tuple[float, float]]:
     return [(x_m * a, y_m * b) for a, b in zip(along_x, along_y, strict=True)]
 
 
+def cells(plan: Plan) -> list[Cell]:
+    """The worlds of all cases, then their bounds where there are some."""
+    each = cases(plan)
+    return [*world_cells(each), *bound_cells(each)]
+
+
 def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
-    """A row for each case; the results stand in the order of ``world_cells``."""
-    each, rest = cases(plan), iter(results)
+    """A row for each case; the results stand in the order of ``cells``."""
+    each = cases(plan)
+    count = sum(len(case.runs) for case in each)
+    ran, bounds = iter(results[:count]), iter(results[count:])
     found = []
-    for case, row in zip(each, world_rows("room", plan, each, results), strict=True):
-        own: list[RunResult] = [next(rest) for _ in case.runs]
-        found.append(judged(_with_levels(row, own), case.limits))
+    for case, row in zip(each, world_rows("room", plan, each, results[:count]), strict=True):
+        own: list[RunResult] = [next(ran) for _ in case.runs]
+        bounded = row if case.biases is None else with_bound(row, own, [next(bounds) for _ in case.runs])
+        found.append(judged(_with_levels(bounded, own), case.limits))
     return found
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from skyless.experiments.scenarios import WALL_MARGIN_M, Request, impairments_of, trajectories_of
 from skyless.experiments.studies.plan import Plan, seed_of
 from skyless.experiments.studies.worlds import Run
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.trajectory import Trajectory
 from skyless.site.lab import ideal_lab_site
@@ -51,6 +52,7 @@ def worlds(
     seconds: float | None = None,
     count: int | None = None,
     lost_at_tags: float = 0.0,
+    integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
     **faults: Any,  # noqa: ANN401 - of a Request
 ) -> tuple[Run, ...]:
     """Worlds of a case; those of the same number have the same seed in all cases of a study.
@@ -76,6 +78,7 @@ def worlds(
                 warmup_s=warmup_s,
                 until_s=warmup_s + (seconds or plan.seconds),
                 lost_at_tags=lost_at_tags,
+                integrity=integrity,
             )
         )
     return tuple(runs)

@@ -11,6 +11,7 @@ from scipy.stats import t as student
 
 from skyless.experiments.studies.plan import Cell, Limit, Plan, Row
 from skyless.experiments.studies.worlds import Run, RunResult, run_world
+from skyless.uncertainty.biased_bound import Biases
 
 Array = NDArray[np.float64]
 
@@ -33,6 +34,9 @@ class Case(Struct, frozen=True):
     limit: float | None = None
     limits: tuple[Limit, ...] = ()
     """On other figures than the ratio."""
+    biases: Biases | None = None
+    """What the worlds' ranges and anchors are off by, for the Cramér–Rao bound over which the ratio is then; None for
+    cases without a bound."""
 
 
 def world_cells(cases: Sequence[Case]) -> list[Cell]:

@@ -19,6 +19,7 @@ from skyless.anchor import Anchor
 from skyless.experiments.statistics import EvenSample
 from skyless.experiments.studies.level_counts import LevelCounter, LevelCounts
 from skyless.positioning.fix import Fix
+from skyless.positioning.protection import IntegrityRequirement
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.stations import TagSpec
@@ -51,6 +52,7 @@ class Run(Struct, frozen=True):
     until_s: float
     lost_at_tags: float = 0.0
     """Probability that a tag does not hear a message which anchors may well hear."""
+    integrity: IntegrityRequirement = IntegrityRequirement()
 
 
 class RunResult(Struct, frozen=True):
@@ -132,7 +134,7 @@ def run_world(run: Run) -> RunResult:
     """Let a world run and judge its tags."""
     tags = [TagSpec(trajectory) for trajectory in run.trajectories]
     world = World(run.site, lambda anchor: Anchor(run.site, anchor), tags, run.impairments, run.seed)
-    receivers = [Receiver(run.method, qa=run.qa) for _ in tags]
+    receivers = [Receiver(run.method, qa=run.qa, integrity=run.integrity) for _ in tags]
     judge, messages, cpu_s = _Judge(run), 0, 0.0
     draw = stream(run.seed, _LOSS_KEY, 0)
     for broadcast in world.run(run.until_s):
