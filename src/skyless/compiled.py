@@ -79,6 +79,16 @@ def jitted(function: Function) -> Function:
     return register_jitable(function)
 
 
+def step(function: Function) -> Function:
+    """Compile a step of a kernel, which becomes part of its callers.
+
+    A step that takes arrays returns at its end only. Then the compiler sees that all references to arrays that it
+    counts up it counts down again, and leaves both out; with a dozen arrays they take as long as the arithmetic. A
+    kernel is rid of them where all that it calls are steps.
+    """
+    return _compile(function, {"forceinline": True})
+
+
 def borrowing_kernel(function: Function) -> Function:
     """Compile a step that only borrows its arrays, makes none nor parts of one, and becomes part of its caller.
 

@@ -163,7 +163,7 @@ def test_opening_a_fault_is_a_filter_that_had_it_open_from_the_beginning(late_m,
 
     def widen(estimator, packet):
         if packet[0] == anchor and estimator.state.index_of[anchor] < 0:
-            estimator._use(with_anchor(estimator.state, anchor, LAB_M[anchor]))
+            estimator._state = with_anchor(estimator.state, anchor, LAB_M[anchor])
             constant = where(estimator).constant + int(estimator.state.index_of[anchor])
             estimator.state.P[constant, constant] += OPENED_STD_M**2
 

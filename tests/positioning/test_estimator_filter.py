@@ -367,7 +367,7 @@ def test_an_anchor_that_leaves_takes_nothing_with_it():
     estimator.track(episode.packets)
     size, others = where(estimator).end, [0, 1, 3, 4, 5]
     before, clocks = estimator.motion(), [estimator.clock(k) for k in others]
-    estimator._use(without_anchor(estimator.state, 2))
+    estimator._state = without_anchor(estimator.state, 2)
     assert size - where(estimator).end == 2 + 3 + 2
     for ours, theirs in zip(estimator.motion(), before, strict=True):
         np.testing.assert_array_equal(ours, theirs)

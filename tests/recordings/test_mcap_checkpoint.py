@@ -241,8 +241,6 @@ def test_states_that_would_lead_their_kernels_astray_are_refused(change):
         ("_packed", lambda packed: packed.astype(np.int64)),
         ("_listed", lambda listed: listed[:-1].copy()),
         ("_listed", lambda listed: listed[:, :3].copy()),
-        ("_work", lambda work: work[:-1].copy()),
-        ("_work", lambda work: work[:, :-1].copy()),
     ],
 )
 def test_estimators_that_would_lead_their_kernels_astray_are_refused(name, change):

@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import kernel
+from skyless.compiled import step
 from skyless.constants import TICK_S
 from skyless.positioning.estimator.state import EstimatorState, Integers, Matrix, Vector, layout
 
@@ -20,63 +20,62 @@ OBSTRUCTED_WALK: Final = 0.004
 OBSTRUCTION_MEMORY_S: Final = 10.0
 
 
-@kernel
+@step
 def predict(s: EstimatorState, rx_ticks: int) -> None:
     """Time update to a reading of the tag: F·P·Fᵀ + Q for constant velocity and constant clock rates.
 
     The tag's oscillator is in all offsets, so its noise is common to them.
     """
     status, settings = s.status[0], s.settings[0]
-    x, P, V = s.x, s.P, s.V
     dim, count = settings["dim"], len(s.anchors)
     where = layout(dim, count)
     dt = (rx_ticks - status["epoch_ticks"]) * TICK_S
-    status["epoch_ticks"] = rx_ticks
     speed_squared = 0.0
     for axis in range(dim):
-        speed_squared += x[where.velocity + axis] ** 2
+        speed_squared += s.x[where.velocity + axis] ** 2
     status["walked_m"] += np.sqrt(speed_squared) * dt
     status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
-    _advance(x, P, V, where.velocity, dt)
+    _advance(s, where.velocity, dt)
     motion = settings["qa"] * status["q_scale"]
     for axis in range(dim):
-        _add_noise(P, axis, where.velocity + axis, dt, 0.0, motion)
-        V[2 * count + axis, axis] -= 0.5 * dt * dt  # an acceleration that the filter does not know of
-        V[2 * count + axis, where.velocity + axis] -= dt
+        _add_noise(s.P, axis, where.velocity + axis, dt, 0.0, motion)
+        s.V[2 * count + axis, axis] -= 0.5 * dt * dt  # an acceleration that the filter does not know of
+        s.V[2 * count + axis, where.velocity + axis] -= dt
     walk = settings["walk"]
     for anchor in range(count):
         scale = s.anchors[anchor]["walk_scale"]
-        _add_noise(P, where.offset + anchor, where.rate + anchor, dt, settings["white"], walk * scale)
+        _add_noise(s.P, where.offset + anchor, where.rate + anchor, dt, settings["white"], walk * scale)
     common = walk * status["walk_scale"]
     value, cross, rate = settings["white"] * dt + common * dt**3 / 3.0, common * dt**2 / 2.0, common * dt
     for i in range(where.offset, where.offset + count):
         for j in range(where.offset, where.offset + count):
-            P[i, j] += value
-            P[i, where.velocity + j] += cross
-            P[where.velocity + i, j] += cross
-            P[where.velocity + i, where.velocity + j] += rate
+            s.P[i, j] += value
+            s.P[i, where.velocity + j] += cross
+            s.P[where.velocity + i, j] += cross
+            s.P[where.velocity + i, where.velocity + j] += rate
+    s.status[0]["epoch_ticks"] = rx_ticks
 
 
-@kernel
-def _advance(x: Vector, P: Matrix, V: Matrix, values: int, dt: float) -> None:
+@step
+def _advance(s: EstimatorState, values: int, dt: float) -> None:
     """The first states gain dt·(their rates), which follow them."""
-    n = P.shape[0]
+    n = len(s.x)
     for value in range(values):
-        x[value] += dt * x[values + value]
+        s.x[value] += dt * s.x[values + value]
         for column in range(n):
-            P[value, column] += dt * P[values + value, column]
+            s.P[value, column] += dt * s.P[values + value, column]
     for row in range(n):
         for value in range(values):
-            P[row, value] += dt * P[row, values + value]
+            s.P[row, value] += dt * s.P[row, values + value]
     for value in range(values):
         for other in range(value):
-            P[value, other] = P[other, value]
-    for fault in range(V.shape[0]):
+            s.P[value, other] = s.P[other, value]
+    for fault in range(len(s.fault_input)):
         for value in range(values):
-            V[fault, value] += dt * V[fault, values + value]
+            s.V[fault, value] += dt * s.V[fault, values + value]
 
 
-@kernel
+@step
 def _add_noise(P: Matrix, value: int, rate: int, dt: float, white: float, walk: float) -> None:
     """Process noise of a value and its rate."""
     P[value, value] += white * dt + walk * dt**3 / 3.0
@@ -85,7 +84,7 @@ def _add_noise(P: Matrix, value: int, rate: int, dt: float, white: float, walk: 
     P[rate, rate] += walk * dt
 
 
-@kernel
+@step
 def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float) -> None:
     """Time update of an anchor's range errors over what has passed and was walked since its newest packet.
 
@@ -107,7 +106,7 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
         _decay(s, constant, np.exp(-obstructed), settings["range_std_m"] ** 2)
 
 
-@kernel
+@step
 def _decay(s: EstimatorState, state: int, kept: float, variance: float) -> None:
     """A state decays towards zero and keeps, in the long run, that variance."""
     x, P, V = s.x, s.P, s.V
@@ -121,7 +120,7 @@ def _decay(s: EstimatorState, state: int, kept: float, variance: float) -> None:
         V[fault, state] *= kept
 
 
-@kernel
+@step
 def reset_state(s: EstimatorState, state: int, variance: float) -> None:
     """Forget a state: zero, uncorrelated, with that variance."""
     x, P, V = s.x, s.P, s.V
@@ -135,7 +134,7 @@ def reset_state(s: EstimatorState, state: int, variance: float) -> None:
         V[fault, state] = 0.0
 
 
-@kernel
+@step
 def compute_ph(P: Matrix, h: Vector, h_index: Integers, terms: int, ph: Vector) -> float:
     """Compute P·h of a measurement with ``terms`` terms; returns hᵀ·P·h."""
     n = P.shape[1]
@@ -151,7 +150,7 @@ def compute_ph(P: Matrix, h: Vector, h_index: Integers, terms: int, ph: Vector) 
     return total
 
 
-@kernel
+@step
 def update(s: EstimatorState, innovation: float, innovation_variance: float, gain_scale: float, updated: int) -> None:
     """Scalar update of the first ``updated`` states by the measurement in ``h`` with P·h in ``ph``.
 
@@ -179,7 +178,7 @@ def update(s: EstimatorState, innovation: float, innovation_variance: float, gai
             V[fault, state] += gain * u[state]
 
 
-@kernel
+@step
 def dynamic_states(s: EstimatorState) -> int:
     """How many states all measurements update; those that follow only the tag's own receptions do."""
     return layout(s.settings[0]["dim"], len(s.anchors)).slope

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import kernel
+from skyless.compiled import step
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.estimator.faults import compute_fault_input, gather_evidence
 from skyless.positioning.estimator.kalman import (
@@ -79,7 +79,7 @@ STEADY_WALK_SCALE: Final = 4.0
 CLOCK_JUMPED: Final = 2
 
 
-@kernel
+@step
 def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> float:
     """Put the unit vector from an anchor to the tag into the measurement; returns their distance.
 
@@ -103,13 +103,13 @@ def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> fl
     return float(range_m)
 
 
-@kernel
+@step
 def _set_term(s: EstimatorState, term: int, state: int, weight: float) -> int:
     s.h[term], s.h_index[term] = weight, state
     return term + 1
 
 
-@kernel
+@step
 def _range_error_terms(s: EstimatorState, term: int, anchor: int, range_m: float, sign: float) -> int:
     """Range errors of an anchor: the part that changes, the part that stays, and the slope."""
     where = layout(s.settings[0]["dim"], len(s.anchors))
@@ -122,7 +122,7 @@ def _range_error_terms(s: EstimatorState, term: int, anchor: int, range_m: float
     return int(_set_term(s, term, where.slope, sign * far))
 
 
-@kernel
+@step
 def _along(s: EstimatorState, begin: int, end: int) -> float:
     """h·x of terms from ``begin`` to ``end``."""
     total = 0.0
@@ -131,7 +131,7 @@ def _along(s: EstimatorState, begin: int, end: int) -> float:
     return total
 
 
-@kernel
+@step
 def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
     """Half the position's variance across the direction, over the range: what the range is longer by on average.
 
@@ -143,18 +143,17 @@ def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
     for axis in range(dim):
         across += P[axis, axis]
     least = BEND_SHARE * variance * range_m * range_m
-    if 0.5 * across * across < least:
-        return 0.0
-    for one in range(dim):
-        for other in range(dim):
-            across -= h[one] * P[one, other] * h[other]
+    if 0.5 * across * across >= least:
+        for one in range(dim):
+            for other in range(dim):
+                across -= h[one] * P[one, other] * h[other]
     return float(0.5 * across / range_m) if 0.5 * across * across >= least else 0.0
 
 
 # The tag receives an anchor
 
 
-@kernel
+@step
 def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[int, float]:
     """Put the tag's reception of an anchor into ``h``; its terms, and the distance."""
     dim = s.settings[0]["dim"]
@@ -166,7 +165,7 @@ def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[
     return _range_error_terms(s, term, anchor, range_m, 1.0), range_m
 
 
-@kernel
+@step
 def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, variance_factor: float) -> int:
     """Process the tag's reception of an anchor's packet: 1 if it was used, 0 if not, ``CLOCK_JUMPED`` to join anew.
 
@@ -192,41 +191,41 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
     a["range_m"] = range_m
     a["innovation"] = innovation / np.sqrt(innovation_variance)
+    clock_jumped = False
     if is_warm(s) and abs(a["innovation"]) > COMMON and is_common(s, a["innovation"]):
         status["walk_scale"] = settings["max_walk_scale"]
         a["outliers_in_row"] = 0
     elif is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
-        if a["relay_outliers_in_row"] >= CLOCK_JUMP_RELAYS:
-            return CLOCK_JUMPED
-        innovation = _jump(s, anchor, innovation, terms, rx_variance)
-        innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
-    scale = variance_scale(s, innovation, innovation_variance)
-    if scale == 0.0:
-        a["rejected_in_row"] += 1
-        return CLOCK_JUMPED if a["rejected_in_row"] >= REJOIN_AFTER else 0
-    a["rejected_in_row"] = 0
-    end_small_obstruction(s, anchor)
-    normalised = innovation / np.sqrt(innovation_variance)
-    if is_warm(s):
-        adapt_process_noise(s, normalised / scale)
-    used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]
-    compute_fault_input(s, terms, anchor)
-    gather_evidence(s, innovation, used_variance)
-    update(s, innovation, used_variance, 1.0, len(s.x))
-    steps = int(np.floor(s.x[offset] / TICK_M))
-    a["offset_ticks"] += steps
-    s.x[offset] -= steps * TICK_M
-    return 1
+        clock_jumped = a["relay_outliers_in_row"] >= CLOCK_JUMP_RELAYS
+        if not clock_jumped:
+            innovation, innovation_variance = _jump(s, anchor, innovation, terms, rx_variance)
+    scale = 0.0 if clock_jumped else variance_scale(s, innovation, innovation_variance)
+    used = scale > 0.0
+    if used:
+        end_small_obstruction(s, anchor)
+        normalised = innovation / np.sqrt(innovation_variance)
+        if is_warm(s):
+            adapt_process_noise(s, normalised / scale)
+        used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]
+        compute_fault_input(s, terms, anchor)
+        gather_evidence(s, innovation, used_variance)
+        update(s, innovation, used_variance, 1.0, len(s.x))
+        steps = int(np.floor(s.x[offset] / TICK_M))
+        a["offset_ticks"] += steps
+        s.x[offset] -= steps * TICK_M
+    s.anchors[anchor]["rejected_in_row"] = 0 if used else a["rejected_in_row"] + 1
+    return CLOCK_JUMPED if clock_jumped or a["rejected_in_row"] >= REJOIN_AFTER else int(used)
 
 
-@kernel
-def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_variance: float) -> float:
+@step
+def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_variance: float) -> tuple[float, float]:
     """An anchor's range error has jumped: back to what it was before it was obstructed, or to something new.
 
-    Returns the innovation that is left.
+    Returns the innovation that is left, and its variance.
     """
     a, status, settings = s.anchors[anchor], s.status[0], s.settings[0]
     change = layout(settings["dim"], len(s.anchors)).change + anchor
+    has_ended = False
     if a["is_obstructed"] and innovation < 0.0:
         innovation += s.x[change]
         share = min(status["obstruction"], 1.0)
@@ -234,13 +233,13 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
         a["is_obstructed"] = a["outliers_in_row"] = 0
         status["ends_of_obstructions"] += 1
         left = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
-        if innovation * innovation <= settings["gate"] ** 2 * left:
-            return innovation
-    open_range_error(s, anchor, innovation)
-    return innovation
+        has_ended = innovation * innovation <= settings["gate"] ** 2 * left
+    if not has_ended:
+        open_range_error(s, anchor, innovation)
+    return innovation, compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
 
 
-@kernel
+@step
 def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> None:
     """Begin with an anchor's clock: the limit of an update of an offset of which nothing was known.
 
@@ -276,7 +275,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
 # An anchor received another
 
 
-@kernel
+@step
 def relay_terms(s: EstimatorState, listener: int, sender: int, age_s: float, has_tx_noise: bool) -> int:
     """Put an anchor's reception of another, so long ago, into ``h``; its terms."""
     where = layout(s.settings[0]["dim"], len(s.anchors))
@@ -287,7 +286,7 @@ def relay_terms(s: EstimatorState, listener: int, sender: int, age_s: float, has
     return int(_set_term(s, term, where.tx_noise + sender, 1.0)) if has_tx_noise else int(term)
 
 
-@kernel
+@step
 def relay_variance(s: EstimatorState, listener: int, sender: int, age_s: float) -> float:
     """Of such a reception: its RX stamp's, and what two oscillators have done since."""
     settings, i, j = s.settings[0], s.anchors[listener], s.anchors[sender]
@@ -295,7 +294,7 @@ def relay_variance(s: EstimatorState, listener: int, sender: int, age_s: float) 
     return float(settings["rx_variance_m2"] + 2.0 * age_s * (settings["white"] + walk * age_s * age_s / 3.0))
 
 
-@kernel
+@step
 def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_rx_ticks: int, rx_ticks: int) -> None:
     """Process the reception, by the anchor ``listener``, of a packet of ``sender`` that the tag has received as well.
 
@@ -335,22 +334,23 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         if link["outliers_in_row"] >= PAIR_OUTLIERS:
             link["outliers_in_row"] = 0
             link["variance_m2"] += PAIR_JUMP_M2
-        return
-    status["relays_used"] += 1
-    status["relays_taken"] += 1.0
-    i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = link["outliers_in_row"] = 0
-    share = pair_variance / innovation_variance
-    link["constant_m"] += share * innovation
-    link["variance_m2"] -= share * pair_variance
-    compute_fault_input(s, term, -1)
-    gather_evidence(s, innovation, innovation_variance)
-    update(s, innovation, innovation_variance, 1.0, dynamic_states(s))
+    else:
+        status["relays_used"] += 1
+        status["relays_taken"] += 1.0
+        i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = link["outliers_in_row"] = 0
+        share = pair_variance / innovation_variance
+        link["constant_m"] += share * innovation
+        link["variance_m2"] -= share * pair_variance
+        compute_fault_input(s, term, -1)
+        gather_evidence(s, innovation, innovation_variance)
+        update(s, innovation, innovation_variance, 1.0, dynamic_states(s))
+    s.anchors[sender]["is_relayed"] = 1
 
 
 # An anchor tells what its clock reads against the master's
 
 
-@kernel
+@step
 def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_m2: float) -> None:
     """Let what an anchor knows of its clock against the master's replace what the filter knows, where that is worse.
 
@@ -359,11 +359,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     other states follow by P_xd/P times that difference. ``subticks``: the anchor's reading less the master's at the
     packet's TX stamp, modulo 2⁴⁸.
     """
-    settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
-    if master < 0 or master == anchor:
-        return
-    if max(a["walk_scale"], s.anchors[master]["walk_scale"]) > STEADY_WALK_SCALE:
-        return  # the anchor's filter, which assumes what the almanac says, lags behind such a clock as well
+    settings, a = s.settings[0], s.anchors[anchor]
     dim, n = settings["dim"], dynamic_states(s)
     variance = max(variance_m2, LEAST_REPORT_VARIANCE * (settings["tx_variance_m2"] + settings["rx_variance_m2"]))
     back_s = a["range_m"] / SPEED_OF_LIGHT_MPS
@@ -376,20 +372,21 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     for one in range(term):
         for other in range(term):
             own_variance += s.h[one] * s.h[other] * s.P[s.h_index[one], s.h_index[other]]
-    if own_variance <= REPORT_GAIN * variance:
-        return
     whole = (s.anchors[master]["offset_ticks"] - a["offset_ticks"]) & TICK_MASK
     wrap = SUBTICKS * (TICK_MASK + 1)
     off = (subticks - SUBTICKS * whole) & (wrap - 1)
     if off >= wrap // 2:
         off -= wrap
     innovation = off * (TICK_M / SUBTICKS) - _along(s, 0, term)
-    if innovation * innovation > settings["gate"] ** 2 * (own_variance + variance):
-        status["reports_rejected"] += 1
-        return
-    status["reports_used"] += 1
-    compute_ph(s.P, s.h, s.h_index, term, s.ph)
-    compute_fault_input(s, term, -1)
-    # K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q)
-    whole_s = own_variance * own_variance / (own_variance - variance)
-    update(s, innovation, whole_s, whole_s / own_variance, n)
+    # the filter of an anchor assumes what the almanac says of clocks; behind one that wanders more it lags as well
+    steady = max(a["walk_scale"], s.anchors[master]["walk_scale"]) <= STEADY_WALK_SCALE
+    is_news = steady and own_variance > REPORT_GAIN * variance
+    fits = innovation * innovation <= settings["gate"] ** 2 * (own_variance + variance)
+    if is_news and fits:
+        compute_ph(s.P, s.h, s.h_index, term, s.ph)
+        compute_fault_input(s, term, -1)
+        # K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q)
+        whole_s = own_variance * own_variance / (own_variance - variance)
+        update(s, innovation, whole_s, whole_s / own_variance, n)
+    s.status[0]["reports_used"] += int(is_news and fits)
+    s.status[0]["reports_rejected"] += int(is_news and not fits)

@@ -40,7 +40,7 @@ def is_sound(estimator: Estimator) -> bool:
         return False
     if own["dim"] != settings.dim or not isinstance(own["_table_m"], list) or len(own["_table_m"]) > MOST:
         return False
-    arrays = [*_of_state(state, settings.dim, len(own["_table_m"])), *_of_estimator(own, len(state.anchors))]
+    arrays = [*_of_state(state, settings.dim, len(own["_table_m"])), *_of_estimator(own)]
     if not all(_is_array(*wanted) for wanted in arrays):
         return False
     return bool(state.settings["dim"][0] == settings.dim) and _is_inverse(state.index_of, state.anchors["table_index"])
@@ -64,10 +64,11 @@ def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[Wanted]:
     yield s.h_index, (terms,), np.int64
     yield s.ph, (n,), np.float64
     yield s.fault_input, (faults,), np.float64
+    yield s.work, (count + 1 + dim, count), np.float64
 
 
-def _of_estimator(own: dict[str, Any], count: int) -> Iterator[Wanted]:
-    table_m, listed, dim = own["_table_m"], own["_listed"], own["dim"]
+def _of_estimator(own: dict[str, Any]) -> Iterator[Wanted]:
+    table_m, listed = own["_table_m"], own["_listed"]
     for position_m in table_m:
         yield position_m, (3,), np.float64
     yield own["_identifiers"], (len(table_m),), np.int64
@@ -76,7 +77,6 @@ def _of_estimator(own: dict[str, Any], count: int) -> Iterator[Wanted]:
     yield own["_rows"], (PROTECTED_ROWS, 3), np.float64
     yield own["_packed"], (MOST_PACKED * HEARD.size,), np.uint8
     yield listed, (max(len(listed), MOST_PACKED), 4), np.int64
-    yield own["_work"], (count + 1 + dim, max(count, 1)), np.float64
 
 
 def _is_array(value: object, shape: tuple[int, ...], kind: DTypeLike) -> bool:

@@ -79,6 +79,7 @@ LINK: Final = np.dtype(
 STATUS: Final = np.dtype(
     [
         ("epoch_ticks", np.int64),  # the tag's reading at the newest packet
+        ("outcome", np.int64),  # what became of it
         ("packets", np.int64),
         ("accepted", np.int64),
         ("rejected", np.int64),
@@ -147,6 +148,8 @@ class EstimatorState(NamedTuple):
     """P·h of the measurement at hand, shape (n,)."""
     fault_input: Vector
     """By how much each fault is in the innovation at hand, shape (2·anchors + dim,)."""
+    work: Matrix
+    """Room for systems of equations of all faults of one kind, shape (anchors + 1 + dim, anchors)."""
 
 
 class Layout(NamedTuple):
@@ -205,6 +208,7 @@ def new_state(settings: EstimatorSettings, table_size: int) -> EstimatorState:
         h_index=np.zeros(3 * dim + 8, np.int64),
         ph=np.zeros(n),
         fault_input=np.zeros(dim),
+        work=np.zeros((1 + dim, 0)),
     )
 
 
@@ -286,6 +290,7 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
         index_of=index_of,
         ph=np.zeros(n),
         fault_input=np.zeros(2 * new + dim),
+        work=np.zeros((new + 1 + dim, new)),
     )
     for index, anchor in enumerate(result.anchors):
         if kept[index] >= 0:
