@@ -400,10 +400,8 @@ class Estimator:
         the settings say of them has been contradicted.
         """
         settings, dim = self.settings, self.dim
-        state = new_state(settings, len(self._table_m))
+        state = new_state(settings, len(self._table_m), open_range_errors=open_range_errors)
         state.status["late_share"] = self._state.status["late_share"]
-        if open_range_errors:
-            state.status["open_range_errors"] = 1
         state.x[:dim] = position_m
         state.P[:dim, :dim] = covariance_m2
         state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance

@@ -14,7 +14,7 @@ would have, had that error been open from the beginning.
 from typing import Final
 
 from skyless.compiled import step
-from skyless.positioning.estimator.state import EstimatorState, Matrix, layout
+from skyless.positioning.estimator.state import LASTING, EstimatorState, Matrix, layout, uncertain_states
 
 RECENT_PACKETS: Final = 24.0
 """Number of packets of each anchor over which a fault counts as recent."""
@@ -66,11 +66,11 @@ def gather_evidence(s: EstimatorState, innovation: float, innovation_variance: f
 @step
 def fade_recent_faults(s: EstimatorState) -> None:
     """Forget a share of what recent faults have done, and of the evidence for them, once in a round of packets."""
-    count = len(s.anchors)
+    count, n = len(s.anchors), uncertain_states(s)
     if s.status[0]["packets"] % count == 0:
         kept = 1.0 - 1.0 / RECENT_PACKETS
         for fault in range(count, 2 * count):
-            for state in range(len(s.x)):
+            for state in range(n):
                 s.V[fault, state] *= kept
         for one in range(count):
             s.evidence[1, one] *= kept
@@ -198,4 +198,5 @@ def _open_lasting_fault(s: EstimatorState, anchor: int) -> None:
     for state in range(n):
         opened[state] = 0.0
     s.anchors[anchor]["has_fault"] = 1
+    s.status[0]["range_errors"] = LASTING
     s.status[0]["faults_opened"] += 1

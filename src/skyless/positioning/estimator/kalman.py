@@ -6,7 +6,7 @@ import numpy as np
 
 from skyless.compiled import step
 from skyless.constants import TICK_S
-from skyless.positioning.estimator.state import EstimatorState, Integers, Matrix, Vector, layout
+from skyless.positioning.estimator.state import EstimatorState, Matrix, layout, uncertain_states
 
 OBSTRUCTED_STD_M: Final = 0.08
 """Where range errors jump, those of all anchors change with this standard deviation, ..."""
@@ -59,7 +59,7 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
 @step
 def _advance(s: EstimatorState, values: int, dt: float) -> None:
     """The first states gain dt·(their rates), which follow them."""
-    n = len(s.x)
+    n = uncertain_states(s)
     for value in range(values):
         s.x[value] += dt * s.x[values + value]
         for column in range(n):
@@ -109,11 +109,11 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
 @step
 def _decay(s: EstimatorState, state: int, kept: float, variance: float) -> None:
     """A state decays towards zero and keeps, in the long run, that variance."""
-    x, P, V = s.x, s.P, s.V
+    x, P, V, n = s.x, s.P, s.V, uncertain_states(s)
     x[state] *= kept
-    for column in range(P.shape[1]):
+    for column in range(n):
         P[state, column] *= kept
-    for row in range(P.shape[0]):
+    for row in range(n):
         P[row, state] = P[state, row]
     P[state, state] = kept * P[state, state] + (1.0 - kept * kept) * variance
     for fault in range(V.shape[0]):
@@ -123,11 +123,11 @@ def _decay(s: EstimatorState, state: int, kept: float, variance: float) -> None:
 @step
 def reset_state(s: EstimatorState, state: int, variance: float) -> None:
     """Forget a state: zero, uncorrelated, with that variance."""
-    x, P, V = s.x, s.P, s.V
+    x, P, V, n = s.x, s.P, s.V, uncertain_states(s)
     x[state] = 0.0
-    for column in range(P.shape[1]):
+    for column in range(n):
         P[state, column] = 0.0
-    for row in range(P.shape[0]):
+    for row in range(n):
         P[row, state] = 0.0
     P[state, state] = variance
     for fault in range(V.shape[0]):
@@ -135,18 +135,20 @@ def reset_state(s: EstimatorState, state: int, variance: float) -> None:
 
 
 @step
-def compute_ph(P: Matrix, h: Vector, h_index: Integers, terms: int, ph: Vector) -> float:
+def compute_ph(s: EstimatorState, terms: int) -> float:
     """Compute P·h of a measurement with ``terms`` terms; returns hᵀ·P·h."""
-    n = P.shape[1]
+    P, h, h_index, ph, n = s.P, s.h, s.h_index, s.ph, uncertain_states(s)
     for column in range(n):
         ph[column] = 0.0
-    for term in range(terms):
-        row, weight = h_index[term], h[term]
-        for column in range(n):
-            ph[column] += weight * P[row, column]
     total = 0.0
     for term in range(terms):
-        total += h[term] * ph[h_index[term]]
+        row, weight = h_index[term], h[term]
+        if row < n:
+            for column in range(n):
+                ph[column] += weight * P[row, column]
+    for term in range(terms):
+        if h_index[term] < n:
+            total += h[term] * ph[h_index[term]]
     return total
 
 
@@ -157,13 +159,12 @@ def update(s: EstimatorState, innovation: float, innovation_variance: float, gai
     K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
     follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit.
     """
-    x, P, V, u, fault_input = s.x, s.P, s.V, s.ph, s.fault_input
-    n = P.shape[0]
+    x, P, V, u, fault_input, n = s.x, s.P, s.V, s.ph, s.fault_input, uncertain_states(s)
     root = np.sqrt(innovation_variance)
     step = gain_scale * innovation / root
     for state in range(n):
         u[state] /= root
-    for state in range(updated):
+    for state in range(min(updated, n)):
         factor = u[state]
         x[state] += factor * step
         for column in range(n):
@@ -174,7 +175,7 @@ def update(s: EstimatorState, innovation: float, innovation_variance: float, gai
             P[state, column] -= factor * u[column]
     for fault in range(V.shape[0]):
         gain = gain_scale * fault_input[fault] / root
-        for state in range(updated):
+        for state in range(min(updated, n)):
             V[fault, state] += gain * u[state]
 
 

@@ -37,7 +37,7 @@ from skyless.positioning.estimator.monitor import (
     open_range_error,
     variance_scale,
 )
-from skyless.positioning.estimator.state import EstimatorState, layout
+from skyless.positioning.estimator.state import EstimatorState, layout, uncertain_states
 from skyless.ticks import TICK_MASK
 
 SUBTICKS: Final = 256
@@ -188,7 +188,7 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     bend_m = _bend_m(s, range_m, rx_variance)
     rx_variance += 2.0 * bend_m * bend_m
     innovation = (rx_ticks - tx_ticks - a["offset_ticks"]) * TICK_M - range_m - bend_m - _along(s, 2 * dim, terms)
-    innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
+    innovation_variance = compute_ph(s, terms) + rx_variance
     a["range_m"] = range_m
     a["innovation"] = innovation / np.sqrt(innovation_variance)
     clock_jumped = False
@@ -232,11 +232,11 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
         reset_state(s, change, settings["place_std_m"] ** 2 + share * OBSTRUCTED_STD_M**2)
         a["is_obstructed"] = a["outliers_in_row"] = 0
         status["ends_of_obstructions"] += 1
-        left = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
+        left = compute_ph(s, terms) + rx_variance
         has_ended = innovation * innovation <= settings["gate"] ** 2 * left
     if not has_ended:
         open_range_error(s, anchor, innovation)
-    return innovation, compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
+    return innovation, compute_ph(s, terms) + rx_variance
 
 
 @step
@@ -246,7 +246,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     Whatever is wrong with the position and with the range is then in the offset.
     """
     settings, a, P = s.settings[0], s.anchors[anchor], s.P
-    dim, n = settings["dim"], len(s.x)
+    dim, n = settings["dim"], uncertain_states(s)
     where = layout(dim, len(s.anchors))
     offset, noise, rate = where.offset + anchor, where.tx_noise + anchor, where.rate + anchor
     reset_state(s, noise, settings["tx_variance_m2"])
@@ -256,7 +256,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     terms = _range_error_terms(s, _set_term(s, 2 * dim, noise, 1.0), anchor, range_m, 1.0)
     variance = settings["rx_variance_m2"]
     bend_m = _bend_m(s, range_m, variance)
-    variance += 2.0 * bend_m * bend_m + compute_ph(P, s.h, s.h_index, terms, s.ph)
+    variance += 2.0 * bend_m * bend_m + compute_ph(s, terms)
     compute_fault_input(s, terms, anchor)
     if s.status[0]["late_share"] > OFTEN_LATE:
         variance += JOIN_VARIANCE_M2
@@ -319,7 +319,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
     whole = j["offset_ticks"] - i["offset_ticks"]
     innovation = (rx_ticks - tx_ticks - whole) * TICK_M - distance_m - link["constant_m"] - _along(s, 0, term)
     pair_variance = link["variance_m2"]
-    innovation_variance = compute_ph(s.P, s.h, s.h_index, term, s.ph) + variance + pair_variance
+    innovation_variance = compute_ph(s, term) + variance + pair_variance
     normalised = innovation / np.sqrt(innovation_variance)
     if is_warm(s):
         clipped = min(max(normalised, -settings["gate"]), settings["gate"])
@@ -383,7 +383,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     is_news = steady and own_variance > REPORT_GAIN * variance
     fits = innovation * innovation <= settings["gate"] ** 2 * (own_variance + variance)
     if is_news and fits:
-        compute_ph(s.P, s.h, s.h_index, term, s.ph)
+        compute_ph(s, term)
         compute_fault_input(s, term, -1)
         # K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q)
         whole_s = own_variance * own_variance / (own_variance - variance)

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import step
-from skyless.positioning.estimator.state import EstimatorState, layout
+from skyless.positioning.estimator.state import PASSING, EstimatorState, layout
 
 FORGETTING: Final = 0.02
 """Weight of the newest innovation in the running means, about the last 50."""
@@ -139,6 +139,7 @@ def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
     status["obstructions"] += 1
     status["obstruction"] = min(status["obstruction"] + JUMP_RISE, 2.0)
     s.P[change, change] += max(JUMP_STD_M**2, innovation * innovation)
+    status["range_errors"] = max(status["range_errors"], PASSING)
 
 
 @step

@@ -12,7 +12,9 @@ from skyless.positioning.estimator.levels import LEVELS
 from skyless.positioning.estimator.settings import SETTINGS, EstimatorSettings
 from skyless.positioning.estimator.state import (
     ANCHOR,
+    LASTING,
     LINK,
+    NONE,
     PACKET,
     REMEMBERED,
     STATUS,
@@ -43,12 +45,14 @@ def is_sound(estimator: Estimator) -> bool:
     arrays = [*_of_state(state, settings.dim, len(own["_table_m"])), *_of_estimator(own)]
     if not all(_is_array(*wanted) for wanted in arrays):
         return False
-    return bool(state.settings["dim"][0] == settings.dim) and _is_inverse(state.index_of, state.anchors["table_index"])
+    if state.settings["dim"][0] != settings.dim or not NONE <= state.status["range_errors"][0] <= LASTING:
+        return False
+    return _is_inverse(state.index_of, state.anchors["table_index"])
 
 
 def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[Wanted]:
     count = len(s.anchors)
-    n, faults, terms = layout(dim, count).end, 2 * count + dim, 3 * dim + 8
+    n, faults, terms = layout(dim, count).room, 2 * count + dim, 3 * dim + 8
     yield s.x, (n,), np.float64
     yield s.P, (n, n), np.float64
     yield s.V, (faults, n), np.float64

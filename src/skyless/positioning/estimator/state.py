@@ -13,6 +13,9 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
 
 Everything before ``slope`` is updated by all measurements; what follows is updated by the tag's own receptions only
 and is a consider parameter (Schmidt 1966) of the others, which say next to nothing of it.
+
+Range errors and surveys stand last because many a site calls them exact. What is exact has no variance and no
+covariance, so ``uncertain_states`` leaves it out of all arithmetic, until a jump or a fault shows otherwise.
 """
 
 from typing import Final, NamedTuple, TypeVar
@@ -20,7 +23,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import jitted
+from skyless.compiled import jitted, step
 from skyless.positioning.estimator.settings import EstimatorSettings
 
 Vector = NDArray[np.float64]
@@ -31,6 +34,12 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 REMEMBERED: Final = 16
 """Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
+
+LANES: Final = 8
+"""Numbers in the longest vectors of processors."""
+
+NONE, PASSING, LASTING = range(3)
+"""Which range errors are not known to be zero: none, those that change, or all of them, and surveys."""
 
 NEVER: Final = -(1 << 62)
 """A time before all others."""
@@ -109,6 +118,7 @@ STATUS: Final = np.dtype(
         ("obstruction", np.float64),  # 1 where range errors have jumped lately, 0 where they do not
         ("walked_m", np.float64),
         ("open_range_errors", np.int64),  # whether anchors join with range errors beyond what the settings say
+        ("range_errors", np.int64),  # which of them there are: NONE, PASSING or LASTING
     ],
     align=True,
 )
@@ -116,7 +126,7 @@ STATUS: Final = np.dtype(
 
 
 class EstimatorState(NamedTuple):
-    """Everything that the kernels work on, for one tag with n states and so many anchors."""
+    """Everything that the kernels work on, for one tag with so many anchors and n states (``Layout.room``)."""
 
     x: Vector
     """Shape (n,)."""
@@ -167,6 +177,8 @@ class Layout(NamedTuple):
     survey: int
     """``dim`` states for each anchor."""
     end: int
+    room: int
+    """Length of arrays of states: ``end`` up to a multiple of ``LANES``, so that rows fill whole vectors."""
 
 
 @jitted
@@ -175,18 +187,40 @@ def layout(dim: int, anchors: int) -> Layout:
     values = dim + anchors
     behind = 2 * values
     slope = behind + 3 * anchors
+    end = slope + 1 + dim * anchors
     return Layout(
-        dim, values, values + dim, behind, behind + anchors, behind + 2 * anchors, slope, slope + 1,
-        slope + 1 + dim * anchors,
+        dim, values, values + dim, behind, behind + anchors, behind + 2 * anchors, slope, slope + 1, end,
+        -(-end // LANES) * LANES,
     )  # fmt: skip
 
 
-def new_state(settings: EstimatorSettings, table_size: int) -> EstimatorState:
-    """A state without anchors at the origin, for a table of so many."""
+@step
+def uncertain_states(s: EstimatorState) -> int:
+    """How many states count: all that follow are exact, and all that they have to do with others is zero.
+
+    A multiple of ``LANES``.
+    """
+    where, range_errors = layout(s.settings[0]["dim"], len(s.anchors)), s.status[0]["range_errors"]
+    end = where.end if range_errors == LASTING else where.constant if range_errors == PASSING else where.change
+    return int(-(-end // LANES) * LANES)
+
+
+def _expected_range_errors(settings: Records, status: Records) -> int:
+    """Which of them there are from the beginning."""
+    names = ("survey_std_m", "range_std_m", "slope_std_m")
+    if status["open_range_errors"] or any(settings[name] > 0.0 for name in names):
+        return LASTING
+    return PASSING if settings["place_std_m"] > 0.0 else NONE
+
+
+def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors: bool = False) -> EstimatorState:
+    """A state without anchors at the origin, for a table of so many; see ``Estimator.start``."""
     dim = settings.dim
     where = layout(dim, 0)
-    n = where.end
+    n = where.room
     status = np.zeros(1, STATUS)
+    status["open_range_errors"] = open_range_errors
+    status["range_errors"] = _expected_range_errors(settings.record()[0], status[0])
     status["q_scale"] = status["mean_nis"] = 1.0
     status["walk_scale"] = min(START_WALK_SCALE, settings.max_walk_scale)
     status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
@@ -275,6 +309,7 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
     for anchor in kept:
         first = was.survey + dim * anchor
         states += [-1] * dim if anchor < 0 else range(first, first + dim)
+    states += [-1] * (layout(dim, new).room - len(states))
     faults = [*kept, *(old + anchor if anchor >= 0 else -1 for anchor in kept), *range(2 * old, 2 * old + dim)]
     n = len(states)
     index_of = np.full_like(s.index_of, -1)
