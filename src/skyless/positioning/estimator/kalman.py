@@ -62,11 +62,12 @@ def _advance(s: EstimatorState, values: int, dt: float) -> None:
     n = uncertain_states(s)
     for value in range(values):
         s.x[value] += dt * s.x[values + value]
-        for column in range(n):
-            s.P[value, column] += dt * s.P[values + value, column]
     for row in range(n):
         for value in range(values):
             s.P[row, value] += dt * s.P[row, values + value]
+    for value in range(values):
+        for column in range(n):
+            s.P[value, column] += dt * s.P[values + value, column]
     for value in range(values):
         for other in range(value):
             s.P[value, other] = s.P[other, value]
@@ -164,15 +165,12 @@ def update(s: EstimatorState, innovation: float, innovation_variance: float, gai
     step = gain_scale * innovation / root
     for state in range(n):
         u[state] /= root
+    for state in range(n):
+        factor = u[state]
+        for column in range(n if state < updated else updated):
+            P[state, column] -= factor * u[column]
     for state in range(min(updated, n)):
-        factor = u[state]
-        x[state] += factor * step
-        for column in range(n):
-            P[state, column] -= factor * u[column]
-    for state in range(updated, n):
-        factor = u[state]
-        for column in range(updated):
-            P[state, column] -= factor * u[column]
+        x[state] += u[state] * step
     for fault in range(V.shape[0]):
         gain = gain_scale * fault_input[fault] / root
         for state in range(min(updated, n)):

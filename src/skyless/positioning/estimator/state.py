@@ -311,32 +311,31 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
         states += [-1] * dim if anchor < 0 else range(first, first + dim)
     states += [-1] * (layout(dim, new).room - len(states))
     faults = [*kept, *(old + anchor if anchor >= 0 else -1 for anchor in kept), *range(2 * old, 2 * old + dim)]
-    n = len(states)
+    n, of_states, of_anchors = len(states), np.array(states), np.array(kept, np.int64)
     index_of = np.full_like(s.index_of, -1)
     result = s._replace(
-        x=_take(s.x, states),
-        P=_take(s.P, states, states),
-        V=_take(s.V, faults, states),
-        information=np.stack([_take(part, kept, kept) for part in s.information]),
-        evidence=np.stack([_take(part, kept) for part in s.evidence]),
-        anchors=_take(s.anchors, kept),
-        packets=_take(s.packets, kept),
-        links=_take(s.links, kept, kept),
+        x=_take(s.x, of_states),
+        P=_take(s.P, of_states, of_states),
+        V=_take(s.V, np.array(faults), of_states),
+        information=_take(s.information, np.arange(2), of_anchors, of_anchors),
+        evidence=_take(s.evidence, np.arange(2), of_anchors),
+        anchors=_take(s.anchors, of_anchors),
+        packets=_take(s.packets, of_anchors),
+        links=_take(s.links, of_anchors, of_anchors),
         index_of=index_of,
         ph=np.zeros(n),
         fault_input=np.zeros(2 * new + dim),
         work=np.zeros((new + 1 + dim, new)),
     )
-    for index, anchor in enumerate(result.anchors):
-        if kept[index] >= 0:
-            index_of[anchor["table_index"]] = index
+    there = of_anchors >= 0
+    index_of[result.anchors["table_index"][there]] = np.flatnonzero(there)
     return result
 
 
-def _take(source: NDArray[Scalar], *indices: list[int]) -> NDArray[Scalar]:
+def _take(source: NDArray[Scalar], *indices: Integers) -> NDArray[Scalar]:
     """Rows (and columns) of an array; zeros for an index of −1."""
-    wanted = [np.array(index, np.int64) for index in indices]
-    result = np.zeros([len(index) for index in indices] + list(source.shape[len(indices) :]), source.dtype)
-    there = np.ix_(*(np.flatnonzero(index >= 0) for index in wanted))
-    result[there] = source[np.ix_(*(index[index >= 0] for index in wanted))]
-    return result
+    shape, axes = source.shape, len(indices)
+    with_zeros = np.zeros([length + 1 for length in shape[:axes]] + list(shape[axes:]), source.dtype)
+    with_zeros[tuple(slice(-1) for _ in indices)] = source  # the last ones, of index −1, are left
+    places = [index.reshape([-1] + [1] * (axes - 1 - axis)) for axis, index in enumerate(indices)]
+    return with_zeros[tuple(places)]
