@@ -13,6 +13,8 @@ would have, had that error been open from the beginning.
 
 from typing import Final
 
+import numpy as np
+
 from skyless.compiled import step
 from skyless.positioning.estimator.state import LASTING, EstimatorState, Matrix, layout, uncertain_states
 
@@ -79,25 +81,21 @@ def fade_recent_faults(s: EstimatorState) -> None:
 
 
 @step
-def solve(work: Matrix, count: int, columns: int) -> None:
-    """Solve for the right-hand sides in the rows behind a symmetric matrix, in place, by Cholesky factors."""
+def whiten(work: Matrix, count: int, vectors: int) -> None:
+    """Make L⁻¹·r of the vectors r in the rows behind a symmetric matrix M = L·Lᵀ, in place, by Cholesky's method.
+
+    So r·M⁻¹·q is the product of what becomes of r and of q. Rows of vectors go the way of rows of the matrix.
+    """
     for column in range(count):
-        for row in range(column, count):
+        total = work[column, column]
+        for k in range(column):
+            total -= work[column, k] * work[column, k]
+        inverse = 1.0 / np.sqrt(max(total, 1e-30))
+        for row in range(column + 1, count + vectors):
             total = work[row, column]
             for k in range(column):
                 total -= work[row, k] * work[column, k]
-            work[row, column] = max(total, 1e-30) ** 0.5 if row == column else total / work[column, column]
-    for right in range(count, count + columns):
-        for row in range(count):
-            total = work[right, row]
-            for k in range(row):
-                total -= work[row, k] * work[right, k]
-            work[right, row] = total / work[row, row]
-        for row in range(count - 1, -1, -1):
-            total = work[right, row]
-            for k in range(row + 1, count):
-                total -= work[k, row] * work[right, k]
-            work[right, row] = total / work[row, row]
+            work[row, column] = total * inverse
 
 
 @step
@@ -109,10 +107,10 @@ def lasting_chi2(s: EstimatorState, std_m: float) -> float:
             s.work[one, other] = M[one, other]
         s.work[one, one] += 1.0 / (std_m * std_m)
         s.work[count, one] = y[one]
-    solve(s.work, count, 1)
+    whiten(s.work, count, 1)
     total = 0.0
     for one in range(count):
-        total += y[one] * s.work[count, one]
+        total += s.work[count, one] ** 2
     return total
 
 

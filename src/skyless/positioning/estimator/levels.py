@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import step
-from skyless.positioning.estimator.faults import solve
+from skyless.positioning.estimator.faults import whiten
 from skyless.positioning.estimator.monitor import covariance_scale
 from skyless.positioning.estimator.state import EstimatorState, Vector
 
@@ -32,12 +32,10 @@ LEVELS: Final = 4
 
 
 @step
-def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, levels: Vector) -> None:
-    """Write the levels in metres and the tests of faults.
-
-    ``horizontal_k`` and ``vertical_k`` are how many standard deviations the risk allows.
-    """
-    dim, count = s.settings[0]["dim"], len(s.anchors)
+def protect(s: EstimatorState, levels: Vector) -> None:
+    """Write the levels in metres and the tests of faults."""
+    settings = s.settings[0]
+    dim, count = settings["dim"], len(s.anchors)
     scale = covariance_scale(s)
     levels[HPL] = levels[VPL] = 0.0
     for bank in range(2):
@@ -50,25 +48,25 @@ def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, levels: V
             s.work[count, one] = s.evidence[bank, one]
             for axis in range(dim):
                 s.work[count + 1 + axis, one] = s.V[begin + one, axis]
-        solve(s.work, count, 1 + dim)
+        whiten(s.work, count, 1 + dim)
         chi2, shift_x, shift_y, shift_z = 0.0, 0.0, 0.0, 0.0
         xx, xy, yy, zz = scale * s.P[0, 0], scale * s.P[0, 1], scale * s.P[1, 1], 0.0
         for one in range(count):
-            fault_m = s.work[count, one]
-            chi2 += s.evidence[bank, one] * fault_m
-            vx, vy = s.V[begin + one, 0], s.V[begin + one, 1]
-            shift_x += vx * fault_m
-            shift_y += vy * fault_m
-            xx += vx * s.work[count + 1, one]
-            xy += vx * s.work[count + 2, one]
-            yy += vy * s.work[count + 2, one]
+            fault, vx, vy = s.work[count, one], s.work[count + 1, one], s.work[count + 2, one]
+            chi2 += fault * fault
+            shift_x += vx * fault
+            shift_y += vy * fault
+            xx += vx * vx
+            xy += vx * vy
+            yy += vy * vy
             if dim == 3:
-                shift_z += s.V[begin + one, 2] * fault_m
-                zz += s.V[begin + one, 2] * s.work[count + 3, one]
+                vz = s.work[count + 3, one]
+                shift_z += vz * fault
+                zz += vz * vz
         largest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-        levels[HPL] = max(levels[HPL], np.hypot(shift_x, shift_y) + horizontal_k * np.sqrt(largest))
+        levels[HPL] = max(levels[HPL], np.hypot(shift_x, shift_y) + settings["horizontal_k"] * np.sqrt(largest))
         if dim == 3:
-            levels[VPL] = max(levels[VPL], abs(shift_z) + vertical_k * np.sqrt(scale * s.P[2, 2] + zz))
+            levels[VPL] = max(levels[VPL], abs(shift_z) + settings["vertical_k"] * np.sqrt(scale * s.P[2, 2] + zz))
         levels[LASTING_CHI2 + bank] = chi2
     squared, up = 0.0, 0.0
     for column in range(2 * count, 2 * count + dim):

@@ -76,7 +76,6 @@ def _of_estimator(own: dict[str, Any]) -> Iterator[Wanted]:
     for position_m in table_m:
         yield position_m, (3,), np.float64
     yield own["_identifiers"], (len(table_m),), np.int64
-    yield own["_k"], (2,), np.float64
     yield own["_levels"], (LEVELS,), np.float64
     yield own["_rows"], (PROTECTED_ROWS, 3), np.float64
     yield own["_packed"], (MOST_PACKED * HEARD.size,), np.uint8

@@ -28,6 +28,7 @@ from skyless.positioning.estimator.settings import EstimatorSettings
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+Cube = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Records = NDArray[np.void]
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -135,7 +136,7 @@ class EstimatorState(NamedTuple):
     V: Matrix
     """What faults do to x, shape (2·anchors + dim, n): for each metre by which the tag's receptions of an anchor have
     been late since it joined, the same lately, and for each m/s² of acceleration along an axis."""
-    information: Matrix
+    information: Cube
     """Of both kinds of faults of all anchors in the innovations, shape (2, anchors, anchors)."""
     evidence: Matrix
     """What innovations say of them, shape (2, anchors)."""
