@@ -4,7 +4,7 @@ Anchors join and leave between packets, in NumPy; everything else is one kernel 
 """
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from msgspec import Struct
@@ -31,6 +31,7 @@ from skyless.positioning.estimator.state import (
     EstimatorState,
     Integers,
     Matrix,
+    Places,
     Records,
     Vector,
     layout,
@@ -78,7 +79,7 @@ FIRST_PACKETS: Final = 3
 """Of each anchor, before which nothing is promised."""
 
 
-class Report(NamedTuple):
+class Report(Struct, frozen=True, gc=False):
     """What an anchor says of its clock."""
 
     master: int
@@ -288,7 +289,7 @@ def _process_frame(
     settings: Records,
     index_of: Integers,
     h: Vector,
-    h_index: Integers,
+    h_index: Places,
     ph: Vector,
     fault_input: Vector,
     work: Matrix,
@@ -452,11 +453,12 @@ class Estimator:
                 self._listed = np.zeros((listed + MOST_PACKED, 4), np.int64)
             self._listed[:listed] = relays
         if packed:
-            self._packed[: len(packed)] = np.frombuffer(packed, np.uint8)
+            self._packed.data[: len(packed)] = packed
         while True:
             outcome = _process_frame(
                 *self._state, self._identifiers, self._packed, len(packed), self._listed, listed,
-                table_index, sequence, rx_ticks, tx_ticks, report[0], report[1], report[2], variance_factor,
+                table_index, sequence, rx_ticks, tx_ticks, report.master, report.subticks,
+                report.variance_m2, variance_factor,
                 self._levels, self._rows,
             )  # fmt: skip
             if outcome < NEW_ANCHOR:
@@ -541,8 +543,8 @@ class Estimator:
     @property
     def is_contradicted(self) -> bool:
         """Whether most of what anchors received of each other does not fit: a wrong place draws all clocks with it."""
-        status = self._state.status[0]
-        return bool(status["relays_refused"] > max(MOST_REFUSED, float(status["relays_taken"])))
+        refused = self._state.status["relays_refused"].item()
+        return refused > MOST_REFUSED and bool(refused > self._state.status["relays_taken"].item())
 
     @property
     def relays_fit(self) -> bool:

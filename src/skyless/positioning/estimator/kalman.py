@@ -34,7 +34,8 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
     for axis in range(dim):
         speed_squared += s.x[where.velocity + axis] ** 2
     status["walked_m"] += np.sqrt(speed_squared) * dt
-    status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
+    if status["obstruction"] > 0.0:
+        status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
     _advance(s, where.velocity, dt)
     motion = settings["qa"] * status["q_scale"]
     for axis in range(dim):

@@ -65,7 +65,7 @@ def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[Wanted]:
     yield s.settings, (1,), SETTINGS
     yield s.index_of, (table_size,), np.int64
     yield s.h, (terms,), np.float64
-    yield s.h_index, (terms,), np.int64
+    yield s.h_index, (terms,), np.uint32
     yield s.ph, (n,), np.float64
     yield s.fault_input, (faults,), np.float64
     yield s.work, (count + 1 + dim, count), np.float64

@@ -29,6 +29,8 @@ from skyless.positioning.estimator.settings import EstimatorSettings
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Cube = NDArray[np.float64]
+Places = NDArray[np.uint32]
+"""Indices that cannot count from an array's end, for which kernels would have to look at each."""
 Integers = NDArray[np.int64]
 Records = NDArray[np.void]
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -154,7 +156,7 @@ class EstimatorState(NamedTuple):
     """Index among ``anchors`` of each anchor of the site's table, −1 for those that are not in the state."""
     h: Vector
     """The measurement at hand where it is not zero, at the places in ``h_index``."""
-    h_index: Integers
+    h_index: Places
     ph: Vector
     """P·h of the measurement at hand, shape (n,)."""
     fault_input: Vector
@@ -240,7 +242,7 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
         settings=settings.record(),
         index_of=np.full(table_size, -1, np.int64),
         h=np.zeros(3 * dim + 8),
-        h_index=np.zeros(3 * dim + 8, np.int64),
+        h_index=np.zeros(3 * dim + 8, np.uint32),
         ph=np.zeros(n),
         fault_input=np.zeros(dim),
         work=np.zeros((1 + dim, 0)),
