@@ -79,6 +79,16 @@ def jitted(function: Function) -> Function:
     return register_jitable(function)
 
 
+def step(function: Function) -> Function:
+    """A step of kernels: compiled as part of each that calls it, and plain Python where Python calls it.
+
+    A step that takes arrays returns at its end only. Then the compiler sees that all references to arrays that it
+    counts up it counts down again, and leaves both out; with a dozen arrays they take as long as the arithmetic. A
+    kernel is rid of them where all that it calls are steps.
+    """
+    return register_jitable(forceinline=True, error_model="numpy")(function)
+
+
 def borrowing_kernel(function: Function) -> Function:
     """Compile a step that only borrows its arrays, makes none nor parts of one, and becomes part of its caller.
 

@@ -197,8 +197,9 @@ def observations_of(packets, anchors_m=LAB_M):
 
 
 def same(one, other):
-    """Whether two states are the same to the bit."""
-    return all(ours.tobytes() == theirs.tobytes() for ours, theirs in zip(one, other, strict=True))
+    """Whether two states are the same to the bit, but for the room for calculations."""
+    pairs = zip(one._replace(work=one.x), other._replace(work=other.x), strict=True)
+    return all(ours.tobytes() == theirs.tobytes() for ours, theirs in pairs)
 
 
 def where(estimator):

@@ -26,9 +26,9 @@ from scipy.stats import binom, chi2
 from skyless.constants import TICK_M
 from skyless.positioning.alert import Alert
 from skyless.positioning.estimator import faults
-from skyless.positioning.estimator.faults import OPENED_STD_M, explained_chi2, open_lasting_faults, solve
+from skyless.positioning.estimator.faults import OPENED_STD_M, explained_chi2, open_lasting_faults, whiten
 from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LASTING_STD_M, LEVELS, RECENT_STD_M, protect
-from skyless.positioning.estimator.state import with_anchor
+from skyless.positioning.estimator.state import LASTING, with_anchor
 from skyless.positioning.protection import CONTRADICTED, IntegrityRequirement, integrity_of, limits_of
 
 RISK = 1e-4
@@ -123,13 +123,13 @@ def test_without_faults_their_test_is_chi_squared():
     assert low < total < high
 
 
-def test_equations_are_solved():
+def test_products_of_whitened_vectors_are_solutions():
     draw = np.random.default_rng(1)
     root, right = draw.normal(size=(5, 7)), draw.normal(size=(3, 5))
     M = root @ root.T
     work = np.vstack([M, right])
-    solve(work, 5, 3)
-    np.testing.assert_allclose(work[5:], np.linalg.solve(M, right.T).T, rtol=1e-9)
+    whiten(work, 5, 3)
+    np.testing.assert_allclose(work[5:] @ work[5:].T, right @ np.linalg.solve(M, right.T), rtol=1e-9)
 
 
 def test_how_much_one_or_two_faults_explain():
@@ -163,9 +163,10 @@ def test_opening_a_fault_is_a_filter_that_had_it_open_from_the_beginning(late_m,
 
     def widen(estimator, packet):
         if packet[0] == anchor and estimator.state.index_of[anchor] < 0:
-            estimator._use(with_anchor(estimator.state, anchor, LAB_M[anchor]))
+            estimator._state = with_anchor(estimator.state, anchor, LAB_M[anchor])
             constant = where(estimator).constant + int(estimator.state.index_of[anchor])
             estimator.state.P[constant, constant] += OPENED_STD_M**2
+            estimator.state.status["range_errors"] = LASTING
 
     follow(opened, packets, wide, packets, widen)
     faults._open_lasting_fault(opened.state, anchor)
@@ -236,8 +237,8 @@ def test_levels_are_the_ellipse_and_the_shift_of_all_faults():
     estimator.track(episode.packets)
     s, n, k = estimator.state, len(ROOM_M), limits_of(RISK)
     s.evidence[:] = np.random.default_rng(3).normal(0.0, 10.0, s.evidence.shape)
-    levels, work = np.zeros(LEVELS), np.zeros((n + 4, n))
-    protect(s, k[0], k[1], work, levels)
+    levels = np.zeros(LEVELS)
+    protect(s, levels)
     hpl, vpl = [], []
     for bank, std_m in enumerate((LASTING_STD_M, RECENT_STD_M)):
         information = s.information[bank] + np.eye(n) / std_m**2

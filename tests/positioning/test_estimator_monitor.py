@@ -269,7 +269,7 @@ def test_a_report_replaces_what_is_known_worse():
     within.process(*arriving[k], report=Report(0, reports[k].subticks, q))
     s, t, place = without.state, within.state, where(without)
     assert t.status["reports_used"] == s.status["reports_used"] + 1
-    h, (m, i) = np.zeros(place.end), s.index_of[[0, 4]]
+    h, (m, i) = np.zeros(len(s.x)), s.index_of[[0, 4]]
     back_s = s.anchors["range_m"][i] / SPEED_OF_LIGHT_MPS
     h[[place.offset + m, place.offset + i]] = 1.0, -1.0
     h[[place.rate + m, place.rate + i]] = -back_s, back_s
@@ -289,7 +289,7 @@ def test_a_report_replaces_what_is_known_worse():
 
 def test_wrong_reports_are_counted_and_do_nothing():
     episode, packets, reports, _ = with_losses(MESH, 0.9, 7)
-    wrong = [said._replace(subticks=(said.subticks + 10_000 * SUBTICKS) % MODULO) for said in reports]
+    wrong = [replace(said, subticks=(said.subticks + 10_000 * SUBTICKS) % MODULO) for said in reports]
     bare, told = (begun(episode, settings_of(MESH)) for _ in range(2))
     processed(bare, packets, [NOTHING] * len(reports))
     processed(told, packets, wrong)

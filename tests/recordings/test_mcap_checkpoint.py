@@ -234,15 +234,12 @@ def test_states_that_would_lead_their_kernels_astray_are_refused(change):
         ("_table_m", tuple),
         ("_table_m", lambda table_m: [*table_m[:-1], np.zeros(2)]),
         ("_identifiers", lambda identifiers: identifiers[:-1].copy()),
-        ("_k", lambda k: k[:1].copy()),
         ("_levels", lambda levels: levels[:-1].copy()),
         ("_rows", lambda rows: rows[:-1].copy()),
         ("_packed", lambda packed: packed[:-1].copy()),
         ("_packed", lambda packed: packed.astype(np.int64)),
         ("_listed", lambda listed: listed[:-1].copy()),
         ("_listed", lambda listed: listed[:, :3].copy()),
-        ("_work", lambda work: work[:-1].copy()),
-        ("_work", lambda work: work[:, :-1].copy()),
     ],
 )
 def test_estimators_that_would_lead_their_kernels_astray_are_refused(name, change):

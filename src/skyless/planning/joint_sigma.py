@@ -146,7 +146,7 @@ def _own_reception(s: EstimatorState, anchor: int, rx_ticks: int, share: float, 
         relax_range_error(s, anchor, (rx_ticks - a["rx_ticks"]) * TICK_S, 0.0)
         reset_state(s, where.tx_noise + anchor, settings["tx_variance_m2"] / share)
         terms, _ = reception_terms(s, anchor, 1)
-        variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + settings["rx_variance_m2"] / share
+        variance = compute_ph(s, terms) + settings["rx_variance_m2"] / share
         compute_fault_input(s, terms, anchor)
         s.fault_input[walls] += late_m
         update(s, 0.0, variance, 1.0, n)
@@ -159,7 +159,7 @@ def _relay(s: EstimatorState, listener: int, sender: int, age_s: float, share: f
     """A relayed reception, of which the tag can use so large a share, so late."""
     terms = relay_terms(s, listener, sender, age_s, True)
     variance = relay_variance(s, listener, sender, age_s) / share
-    variance += compute_ph(s.P, s.h, s.h_index, terms, s.ph)
+    variance += compute_ph(s, terms)
     compute_fault_input(s, terms, -1)
     if s.links[listener, sender]["variance_m2"] == 0.0:  # else the pair's constant takes the delay
         s.fault_input[2 * len(s.anchors) + s.settings[0]["dim"]] += late_m

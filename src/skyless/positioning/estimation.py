@@ -169,9 +169,10 @@ class Estimation:
 
     def _is_too_fast(self, rx_ticks: int) -> bool:
         """Whether the range errors of several anchors jump early, or nothing fits: it is the tag that has moved."""
-        early = (rx_ticks - self._started_ticks) * TICK_S < EARLY_S
+        if (rx_ticks - self._started_ticks) * TICK_S >= EARLY_S:
+            return False
         several = self._estimator.jumps >= MANY_JUMPS or self._estimator.rows.item(QUALITY, 0) > EARLY_NIS
-        return early and several and self._speed_std_mps < MAX_SPEED_STD_MPS
+        return several and self._speed_std_mps < MAX_SPEED_STD_MPS
 
     def _is_contradicted(self, rx_ticks: int) -> bool:
         """Whether a new start is needed, as relays or faults contradict this one; says what that has to expect."""

@@ -4,14 +4,14 @@ Anchors join and leave between packets, in NumPy; everything else is one kernel 
 """
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.air.beacon import HEARD
-from skyless.compiled import kernel, threaded_kernel
+from skyless.compiled import kernel, step, threaded_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.estimator.faults import (
     explained_chi2,
@@ -36,9 +36,12 @@ from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.estimator.state import (
     NEVER,
     REMEMBERED,
+    Cube,
     EstimatorState,
     Integers,
     Matrix,
+    Places,
+    Records,
     Vector,
     layout,
     new_state,
@@ -48,7 +51,7 @@ from skyless.positioning.estimator.state import (
 )
 from skyless.positioning.fix_rows import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
 from skyless.positioning.kalman import horizontal_variance
-from skyless.positioning.protection import CONTRADICTED, OBSTRUCTED, SOUND, UNAVAILABLE, limits_of
+from skyless.positioning.protection import CONTRADICTED, OBSTRUCTED, SOUND, UNAVAILABLE
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
 REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = range(7)
@@ -88,7 +91,7 @@ FIRST_PACKETS: Final = 3
 """Of each anchor, before which nothing is promised."""
 
 
-class Report(NamedTuple):
+class Report(Struct, frozen=True, gc=False):
     """What an anchor says of its clock."""
 
     master: int
@@ -117,18 +120,18 @@ class Packets(Struct, frozen=True):
     """Where the relays of each packet end."""
 
 
-@kernel
+@step
 def _silent_anchor(s: EstimatorState, rx_ticks: int) -> int:
     """An anchor that has been silent for too long, or −1."""
-    longest = s.settings[0]["drop_s"]
+    longest, silent = s.settings[0]["drop_s"], -1
     for anchor in range(len(s.anchors)):
         a = s.anchors[anchor]
-        if a["packets"] > 0 and (rx_ticks - a["rx_ticks"]) * TICK_S > longest:
-            return anchor
-    return -1
+        if silent < 0 and a["packets"] > 0 and (rx_ticks - a["rx_ticks"]) * TICK_S > longest:
+            silent = anchor
+    return silent
 
 
-@kernel
+@step
 def _is_impossible(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> bool:
     """Whether no clock can have gone from an anchor's newest packet to this one."""
     a = s.anchors[anchor]
@@ -138,7 +141,7 @@ def _is_impossible(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int)
 
 
 @kernel
-def _process(  # noqa: PLR0911 - each outcome where it is known
+def _process(
     s: EstimatorState,
     table_index: int,
     sequence: int,
@@ -151,86 +154,94 @@ def _process(  # noqa: PLR0911 - each outcome where it is known
     subticks: int,
     report_variance_m2: float,
     variance_factor: float,
-    work: Matrix,
 ) -> int:
     """Process one packet and what it relays, rows ``first`` to ``last``; what became of it."""
-    status = s.status[0]
-    if status["packets"] > 0 and rx_ticks < status["epoch_ticks"]:
-        status["stale"] += 1
-        status["stale_in_row"] += 1
-        return STALE
-    anchor = s.index_of[table_index]
-    if anchor < 0:
-        return NEW_ANCHOR
-    if _silent_anchor(s, rx_ticks) >= 0:
-        return SILENT_ANCHOR
-    a = s.anchors[anchor]
-    joins = a["packets"] == 0
-    if not joins and (tx_ticks == a["tx_ticks"] or _is_impossible(s, anchor, rx_ticks, tx_ticks)):
-        if tx_ticks != a["tx_ticks"]:
-            a["outliers_in_row"] += 1
-            status["rejected_in_row"] += 1
-            if a["outliers_in_row"] >= RESTART_IN_ROW:
-                return RESTARTED_CLOCK
-        status["impossible"] += 1
-        return REJECTED
-    status["stale_in_row"] = 0
+    status, anchor = s.status[0], s.index_of[table_index]
+    outcome = _admit(s, anchor, rx_ticks, tx_ticks)
+    joins, was_known = outcome == JOINED, outcome == ACCEPTED
     elapsed_s = (rx_ticks - status["epoch_ticks"]) * TICK_S
-    predict(s, rx_ticks)
-    fade_recent_faults(s)
-    outcome = JOINED
-    if joins:
-        first_reception(s, anchor, rx_ticks, tx_ticks)
-    else:
-        result = own_reception(s, anchor, rx_ticks, tx_ticks, variance_factor)
-        if result == CLOCK_JUMPED:
-            return RESTARTED_CLOCK
-        outcome = ACCEPTED if result == 1 else REJECTED
-    status["packets"] += 1
-    a["packets"] += 1
-    a["tx_ticks"], a["rx_ticks"], a["walked_m"] = tx_ticks, rx_ticks, status["walked_m"]
-    packet = s.packets[anchor, sequence % REMEMBERED]
-    packet["sequence"], packet["tx_ticks"], packet["rx_ticks"] = sequence, tx_ticks, rx_ticks
-    if not joins:
+    if joins or was_known:
+        status["stale_in_row"] = 0
+        predict(s, rx_ticks)
+        fade_recent_faults(s)
+        if joins:
+            first_reception(s, anchor, rx_ticks, tx_ticks)
+        else:
+            result = own_reception(s, anchor, rx_ticks, tx_ticks, variance_factor)
+            outcome = RESTARTED_CLOCK if result == CLOCK_JUMPED else ACCEPTED if result == 1 else REJECTED
+            was_known = result != CLOCK_JUMPED
+    if joins or was_known:
+        status["packets"] += 1
+        _remember(s, anchor, sequence, rx_ticks, tx_ticks)
+    if was_known:
         status["relays_taken"] *= FADING
         status["relays_refused"] *= FADING
-        for row in range(first, last):
-            _relayed(s, s.index_of[relays[row, 0]], s.index_of[relays[row, 1]], relays[row, 2], relays[row, 3])
-        if report_variance_m2 > 0.0 and master >= 0:
-            report(s, anchor, s.index_of[master], subticks, report_variance_m2)
-    _rest(s, elapsed_s)
-    _open_faults(s, work)
+    _process_relays(s, relays, first, last if was_known else first)
+    if was_known and report_variance_m2 > 0.0 and master >= 0 and s.index_of[master] not in (-1, anchor):
+        report(s, anchor, s.index_of[master], subticks, report_variance_m2)
+    if joins or was_known:
+        _look_around(s, elapsed_s)
+    s.status[0]["outcome"] = outcome
     return outcome
 
 
-@kernel
-def _rest(s: EstimatorState, elapsed_s: float) -> None:
-    """Look whether the tag stands still, and use it."""
+@step
+def _look_around(s: EstimatorState, elapsed_s: float) -> None:
+    """Look whether the tag stands still, and once in a round of packets for lasting faults."""
     if s.settings[0]["rest_s"] > 0.0:
         follow_rest(s, elapsed_s)
         if is_at_rest(s):
             zero_velocity(s)
-
-
-@kernel
-def _open_faults(s: EstimatorState, work: Matrix) -> None:
-    """Look for lasting faults once in a round of packets."""
     if s.status[0]["packets"] % len(s.anchors) == 0:
-        open_lasting_faults(s, lasting_chi2(s, LASTING_STD_M, work))
+        open_lasting_faults(s, lasting_chi2(s, LASTING_STD_M))
 
 
-@kernel
-def _relayed(s: EstimatorState, listener: int, sender: int, sequence: int, rx_ticks: int) -> None:
-    """Process a relayed reception once, if the tag has received that very packet."""
-    if listener < 0 or sender < 0 or listener == sender:
-        return
-    packet = s.packets[sender, sequence % REMEMBERED]
-    link = s.links[listener, sender]
-    young = (s.status[0]["epoch_ticks"] - packet["rx_ticks"]) * TICK_S < s.settings[0]["relay_age_s"]
-    if packet["sequence"] == sequence and packet["tx_ticks"] > link["tx_ticks"] and young:
-        link["tx_ticks"] = packet["tx_ticks"]
-        relay(s, listener, sender, packet["tx_ticks"], packet["rx_ticks"], rx_ticks)
-        s.anchors[sender]["is_relayed"] = 1
+@step
+def _admit(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> int:
+    """``JOINED`` or ``ACCEPTED`` for a packet that can be processed; for others what becomes of them, counted."""
+    status = s.status[0]
+    outcome = ACCEPTED
+    if status["packets"] > 0 and rx_ticks < status["epoch_ticks"]:
+        status["stale"] += 1
+        status["stale_in_row"] += 1
+        outcome = STALE
+    elif anchor < 0:
+        outcome = NEW_ANCHOR
+    elif _silent_anchor(s, rx_ticks) >= 0:
+        outcome = SILENT_ANCHOR
+    elif s.anchors[anchor]["packets"] == 0:
+        outcome = JOINED
+    elif tx_ticks == s.anchors[anchor]["tx_ticks"]:
+        outcome = REJECTED
+    elif _is_impossible(s, anchor, rx_ticks, tx_ticks):
+        s.anchors[anchor]["outliers_in_row"] += 1
+        status["rejected_in_row"] += 1
+        outcome = REJECTED if s.anchors[anchor]["outliers_in_row"] < RESTART_IN_ROW else RESTARTED_CLOCK
+    s.status[0]["impossible"] += int(outcome == REJECTED)
+    return outcome
+
+
+@step
+def _remember(s: EstimatorState, anchor: int, sequence: int, rx_ticks: int, tx_ticks: int) -> None:
+    """Keep what later packets and relays of this one need."""
+    a, packet = s.anchors[anchor], s.packets[anchor, sequence % REMEMBERED]
+    a["packets"] += 1
+    a["tx_ticks"], a["rx_ticks"], a["walked_m"] = tx_ticks, rx_ticks, s.status[0]["walked_m"]
+    packet["sequence"], packet["tx_ticks"], packet["rx_ticks"] = sequence, tx_ticks, rx_ticks
+
+
+@step
+def _process_relays(s: EstimatorState, relays: Integers, first: int, last: int) -> None:
+    """Process relayed receptions once each, if the tag has received those very packets."""
+    for row in range(first, last):
+        listener, sender = s.index_of[relays[row, 0]], s.index_of[relays[row, 1]]
+        sequence, rx_ticks = relays[row, 2], relays[row, 3]
+        if listener >= 0 and sender >= 0 and listener != sender:
+            packet, link = s.packets[sender, sequence % REMEMBERED], s.links[listener, sender]
+            young = (s.status[0]["epoch_ticks"] - packet["rx_ticks"]) * TICK_S < s.settings[0]["relay_age_s"]
+            if packet["sequence"] == sequence and packet["tx_ticks"] > link["tx_ticks"] and young:
+                link["tx_ticks"] = packet["tx_ticks"]
+                relay(s, listener, sender, packet["tx_ticks"], packet["rx_ticks"], rx_ticks)
 
 
 @threaded_kernel
@@ -243,8 +254,6 @@ def _track(
     tx_ticks: Integers,
     relays: Integers,
     ends: Integers,
-    k: Vector,
-    work: Matrix,
     motions: Matrix,
     covariances: Matrix,
     levels: Matrix,
@@ -257,7 +266,7 @@ def _track(
     for n in range(begin, len(anchors)):
         first = ends[n - 1] if n > 0 else 0
         outcome = _process(
-            s, anchors[n], sequences[n], rx_ticks[n], tx_ticks[n], relays, first, ends[n], -1, 0, 0.0, 1.0, work
+            s, anchors[n], sequences[n], rx_ticks[n], tx_ticks[n], relays, first, ends[n], -1, 0, 0.0, 1.0
         )
         if outcome >= NEW_ANCHOR:
             return n
@@ -269,29 +278,45 @@ def _track(
                 for other in range(dim):
                     covariances[n, dim * one + other] = s.P[one, other]
         if len(levels) > 0:
-            protect(s, k[0], k[1], work, levels[n])
+            protect(s, levels[n])
             levels[n, LEVELS] = outcome
             levels[n, LEVELS + 1] = _soundness(s, levels[n])
     return len(anchors)
 
 
-@kernel
+@step
 def _soundness(s: EstimatorState, levels: Vector) -> int:
     """What can be said of a position with these levels."""
     count, status = len(s.anchors), s.status[0]
-    if count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count or is_height_open(s):
-        return UNAVAILABLE
-    if status["withholds_levels"] or max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > UNCOVERED_CHI2:
-        return CONTRADICTED
+    soundness = SOUND
     for anchor in range(count):
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
-            return OBSTRUCTED
-    return SOUND
+            soundness = OBSTRUCTED
+    if status["withholds_levels"] or max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > UNCOVERED_CHI2:
+        soundness = CONTRADICTED
+    if count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count or is_height_open(s):
+        soundness = UNAVAILABLE
+    return soundness
 
 
 @kernel
 def _process_frame(
-    s: EstimatorState,
+    x: Vector,
+    P: Matrix,
+    V: Matrix,
+    information: Cube,
+    evidence: Matrix,
+    anchors: Records,
+    packets: Records,
+    links: Records,
+    status: Records,
+    settings: Records,
+    index_of: Integers,
+    h: Vector,
+    h_index: Places,
+    ph: Vector,
+    fault_input: Vector,
+    work: Matrix,
     identifiers: Integers,
     packed: NDArray[np.uint8],
     packed_bytes: int,
@@ -305,12 +330,17 @@ def _process_frame(
     subticks: int,
     report_variance_m2: float,
     variance_factor: float,
-    k: Vector,
-    work: Matrix,
     levels: Vector,
     rows: Matrix,
 ) -> int:
-    """``_process`` for a packet whose relays are bytes of its frame, and all that a fix carries (``fix_rows``)."""
+    """``_process`` for a packet whose relays are bytes of its frame, and all that a fix carries (``fix_rows``).
+
+    The state comes in pieces, as the compiler takes arrays from Python in half the time that a tuple of them takes.
+    """
+    s = EstimatorState(
+        x, P, V, information, evidence, anchors, packets, links, status, settings, index_of, h, h_index, ph,
+        fault_input, work,
+    )  # fmt: skip
     count = listed_rows
     for begin in range(0, packed_bytes, 8):
         identifier = np.int64(packed[begin]) | np.int64(packed[begin + 1]) << 8
@@ -338,20 +368,19 @@ def _process_frame(
         subticks,
         report_variance_m2,
         variance_factor,
-        work,
     )
     if outcome >= NEW_ANCHOR:
         return outcome
-    _fill_rows(s, k, work, levels, rows)
+    _fill_rows(s, levels, rows)
     return outcome
 
 
-@kernel
-def _fill_rows(s: EstimatorState, k: Vector, work: Matrix, levels: Vector, rows: Matrix) -> None:
+@step
+def _fill_rows(s: EstimatorState, levels: Vector, rows: Matrix) -> None:
     """Write all that a fix carries."""
     fill_motion(s, rows)
     rows[QUALITY, 0], rows[QUALITY, 1] = s.status[0]["mean_nis"], s.status[0]["mean_square_m2"]
-    protect(s, k[0], k[1], work, levels)
+    protect(s, levels)
     rows[QUALITY, 2] = max(levels[LASTING_CHI2], levels[RECENT_CHI2])
     rows[PROTECTION, 0], rows[PROTECTION, 1], rows[PROTECTION, 2] = levels[HPL], levels[VPL], _soundness(s, levels)
 
@@ -363,18 +392,15 @@ def _process_difference(
     table_b: int,
     rx_ticks: int,
     difference_m: float,
-    k: Vector,
-    work: Matrix,
     levels: Vector,
     rows: Matrix,
 ) -> int:
     """Process one ready-made difference of ranges, to b less to a, and all that a fix carries."""
-    status = s.status[0]
+    status, a, b = s.status[0], s.index_of[table_a], s.index_of[table_b]
     if rx_ticks < status["epoch_ticks"]:
         status["stale"] += 1
         status["stale_in_row"] += 1
         return STALE
-    a, b = s.index_of[table_a], s.index_of[table_b]
     if _silent_anchor(s, rx_ticks) >= 0:
         return SILENT_ANCHOR
     status["stale_in_row"] = 0
@@ -387,13 +413,12 @@ def _process_difference(
         used = s.anchors[anchor]
         used["packets"] += 1
         used["rx_ticks"], used["walked_m"] = rx_ticks, status["walked_m"]
-    _rest(s, elapsed_s)
-    _open_faults(s, work)
-    _fill_rows(s, k, work, levels, rows)
+    _look_around(s, elapsed_s)
+    _fill_rows(s, levels, rows)
     return outcome
 
 
-@kernel
+@step
 def fill_motion(s: EstimatorState, rows: Matrix) -> None:
     """Write position, velocity and their covariances as a fix carries them."""
     dim, velocity = s.settings[0]["dim"], layout(s.settings[0]["dim"], len(s.anchors)).velocity
@@ -416,18 +441,11 @@ class Estimator:
         self.dim = settings.dim
         self._table_m: list[Vector] = [] if table_m is None else [np.array(row, np.float64) for row in table_m]
         self._identifiers = np.full(len(self._table_m), -1)
-        self._k = limits_of(settings.integrity_risk)[:2]
         self._levels = np.zeros(LEVELS)
         self._rows = np.zeros((PROTECTED_ROWS, 3))
         self._packed = np.zeros(MOST_PACKED * HEARD.size, np.uint8)
         self._listed = np.zeros((MOST_PACKED, 4), np.int64)
-        self._use(new_state(settings, len(self._table_m)))
-
-    def _use(self, state: EstimatorState) -> None:
-        self._state = state
-        count = len(state.anchors)
-        fit_plane(state)
-        self._work = np.zeros((count + 1 + self.dim, max(count, 1)))
+        self._state = new_state(settings, len(self._table_m))
 
     @property
     def state(self) -> EstimatorState:
@@ -443,7 +461,7 @@ class Estimator:
         """Add an anchor to the table; returns its index. ``identifier``: by which relays in frames call it."""
         self._table_m.append(np.array(position_m, np.float64))
         self._identifiers = np.append(self._identifiers, identifier)
-        self._use(with_table(self._state, len(self._table_m)))
+        self._state = with_table(self._state, len(self._table_m))
         return len(self._table_m) - 1
 
     def move_anchor(self, table_index: int, position_m: Vector) -> None:
@@ -481,15 +499,13 @@ class Estimator:
         the settings say of them has been contradicted.
         """
         settings, dim = self.settings, self.dim
-        state = new_state(settings, len(self._table_m))
+        state = new_state(settings, len(self._table_m), open_range_errors=open_range_errors)
         state.status["late_share"] = self._state.status["late_share"]
-        if open_range_errors:
-            state.status["open_range_errors"] = 1
         state.x[:dim] = position_m
         state.P[:dim, :dim] = covariance_m2
         state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
         state.status["epoch_ticks"] = rx_ticks
-        self._use(state)
+        self._state = state
 
     def process(
         self,
@@ -514,12 +530,13 @@ class Estimator:
                 self._listed = np.zeros((listed + MOST_PACKED, 4), np.int64)
             self._listed[:listed] = relays
         if packed:
-            self._packed[: len(packed)] = np.frombuffer(packed, np.uint8)
+            self._packed.data[: len(packed)] = packed
         while True:
             outcome = _process_frame(
-                self._state, self._identifiers, self._packed, len(packed), self._listed, listed,
-                table_index, sequence, rx_ticks, tx_ticks, report[0], report[1], report[2], variance_factor,
-                self._k, self._work, self._levels, self._rows,
+                *self._state, self._identifiers, self._packed, len(packed), self._listed, listed,
+                table_index, sequence, rx_ticks, tx_ticks, report.master, report.subticks,
+                report.variance_m2, variance_factor,
+                self._levels, self._rows,
             )  # fmt: skip
             if outcome < NEW_ANCHOR:
                 return outcome
@@ -534,7 +551,7 @@ class Estimator:
                 if self._state.index_of[index] < 0:
                     self._resize(NEW_ANCHOR, index, rx_ticks)
             outcome = _process_difference(
-                self._state, table_a, table_b, rx_ticks, difference_m, self._k, self._work, self._levels, self._rows
+                self._state, table_a, table_b, rx_ticks, difference_m, self._levels, self._rows
             )
             if outcome < NEW_ANCHOR:
                 return outcome
@@ -559,7 +576,7 @@ class Estimator:
         levels = nothing if levels is None else levels
         columns = (packets.anchors, packets.sequences, packets.rx_ticks, packets.tx_ticks, packets.relays, packets.ends)
         while True:
-            done = _track(self._state, done, *columns, self._k, self._work, motions, covariances, levels)
+            done = _track(self._state, done, *columns, motions, covariances, levels)
             if done == len(packets.anchors):
                 return
             index, rx_ticks = int(packets.anchors[done]), int(packets.rx_ticks[done])
@@ -571,14 +588,13 @@ class Estimator:
         """Let an anchor join or leave, as a packet asks for."""
         state = self._state
         if outcome == NEW_ANCHOR:
-            self._use(with_anchor(state, table_index, self._table_m[table_index]))
-            return
-        if outcome == RESTARTED_CLOCK:
+            self._state = with_anchor(state, table_index, self._table_m[table_index])
+        elif outcome == RESTARTED_CLOCK:
             state.status["clock_restarts"] += 1
-            leaving = int(state.index_of[table_index])
+            self._state = without_anchor(state, int(state.index_of[table_index]))
         else:
-            leaving = _silent_anchor(state, rx_ticks)
-        self._use(without_anchor(state, leaving))
+            self._state = without_anchor(state, _silent_anchor(state, rx_ticks))
+        fit_plane(self._state)
 
     @property
     def fault_test(self) -> float:
@@ -623,8 +639,8 @@ class Estimator:
     @property
     def is_contradicted(self) -> bool:
         """Whether most of what anchors received of each other does not fit: a wrong place draws all clocks with it."""
-        status = self._state.status[0]
-        return bool(status["relays_refused"] > max(MOST_REFUSED, float(status["relays_taken"])))
+        refused = self._state.status["relays_refused"].item()
+        return refused > MOST_REFUSED and bool(refused > self._state.status["relays_taken"].item())
 
     @property
     def relays_fit(self) -> bool:

@@ -13,8 +13,10 @@ would have, had that error been open from the beginning.
 
 from typing import Final
 
-from skyless.compiled import kernel
-from skyless.positioning.estimator.state import EstimatorState, Matrix, layout
+import numpy as np
+
+from skyless.compiled import step
+from skyless.positioning.estimator.state import LASTING, EstimatorState, Matrix, layout, uncertain_states
 
 RECENT_PACKETS: Final = 24.0
 """Number of packets of each anchor over which a fault counts as recent."""
@@ -35,7 +37,7 @@ MOST_FAULTS: Final = 2
 """Largest number of anchors that are singled out."""
 
 
-@kernel
+@step
 def compute_fault_input(s: EstimatorState, terms: int, own: int) -> None:
     """Compute s = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1."""
     V, fault_input, h, h_index = s.V, s.fault_input, s.h, s.h_index
@@ -50,14 +52,14 @@ def compute_fault_input(s: EstimatorState, terms: int, own: int) -> None:
         fault_input[count + own] += 1.0
 
 
-@kernel
+@step
 def subtract_fault_input(s: EstimatorState, anchor: int) -> None:
     """Of an anchor with whose reception a difference begins: its faults count with the opposite sign."""
     s.fault_input[anchor] -= 1.0
     s.fault_input[len(s.anchors) + anchor] -= 1.0
 
 
-@kernel
+@step
 def gather_evidence(s: EstimatorState, innovation: float, innovation_variance: float) -> None:
     """What an innovation says of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S."""
     evidence, information, fault_input, count = s.evidence, s.information, s.fault_input, len(s.anchors)
@@ -70,81 +72,77 @@ def gather_evidence(s: EstimatorState, innovation: float, innovation_variance: f
                 information[bank, one, other] += weight * fault_input[begin + other]
 
 
-@kernel
+@step
 def fade_recent_faults(s: EstimatorState) -> None:
     """Forget a share of what recent faults have done, and of the evidence for them, once in a round of packets."""
-    count = len(s.anchors)
-    if s.status[0]["packets"] % count != 0:
-        return
-    kept = 1.0 - 1.0 / RECENT_PACKETS
-    V, evidence, information = s.V, s.evidence, s.information
-    for fault in range(count, 2 * count):
-        for state in range(V.shape[1]):
-            V[fault, state] *= kept
-    for one in range(count):
-        evidence[1, one] *= kept
-        for other in range(count):
-            information[1, one, other] *= kept
+    count, n = len(s.anchors), uncertain_states(s)
+    if s.status[0]["packets"] % count == 0:
+        kept = 1.0 - 1.0 / RECENT_PACKETS
+        for fault in range(count, 2 * count):
+            for state in range(n):
+                s.V[fault, state] *= kept
+        for one in range(count):
+            s.evidence[1, one] *= kept
+            for other in range(count):
+                s.information[1, one, other] *= kept
 
 
-@kernel
-def solve(work: Matrix, count: int, columns: int) -> None:
-    """Solve for the right-hand sides in the rows behind a symmetric matrix, in place, by Cholesky factors."""
+@step
+def whiten(work: Matrix, count: int, vectors: int) -> None:
+    """Make L⁻¹·r of the vectors r in the rows behind a symmetric matrix M = L·Lᵀ, in place, by Cholesky's method.
+
+    So r·M⁻¹·q is the product of what becomes of r and of q. Rows of vectors go the way of rows of the matrix.
+    """
     for column in range(count):
-        for row in range(column, count):
+        total = work[column, column]
+        for k in range(column):
+            total -= work[column, k] * work[column, k]
+        inverse = 1.0 / np.sqrt(max(total, 1e-30))
+        for row in range(column + 1, count + vectors):
             total = work[row, column]
             for k in range(column):
                 total -= work[row, k] * work[column, k]
-            work[row, column] = max(total, 1e-30) ** 0.5 if row == column else total / work[column, column]
-    for right in range(count, count + columns):
-        for row in range(count):
-            total = work[right, row]
-            for k in range(row):
-                total -= work[row, k] * work[right, k]
-            work[right, row] = total / work[row, row]
-        for row in range(count - 1, -1, -1):
-            total = work[right, row]
-            for k in range(row + 1, count):
-                total -= work[k, row] * work[right, k]
-            work[right, row] = total / work[row, row]
+            work[row, column] = total * inverse
 
 
-@kernel
-def lasting_chi2(s: EstimatorState, std_m: float, work: Matrix) -> float:
-    """The test of all lasting faults, of that standard deviation beforehand; ``work`` as for ``levels.protect``."""
+@step
+def lasting_chi2(s: EstimatorState, std_m: float) -> float:
+    """The test of all lasting faults, of that standard deviation beforehand."""
     count, y, M = len(s.anchors), s.evidence[0], s.information[0]
     for one in range(count):
         for other in range(count):
-            work[one, other] = M[one, other]
-        work[one, one] += 1.0 / (std_m * std_m)
-        work[count, one] = y[one]
-    solve(work, count, 1)
+            s.work[one, other] = M[one, other]
+        s.work[one, one] += 1.0 / (std_m * std_m)
+        s.work[count, one] = y[one]
+    whiten(s.work, count, 1)
     total = 0.0
     for one in range(count):
-        total += y[one] * work[count, one]
+        total += s.work[count, one] ** 2
     return total
 
 
-@kernel
+@step
 def explained_chi2(s: EstimatorState, one: int, other: int) -> float:
     """How much of the test of all lasting faults those of two anchors explain, or of one where both are the same."""
     y, M, weight = s.evidence[0], s.information[0], 1.0 / OPENED_STD_M**2
     a, b, both = M[one, one] + weight, M[other, other] + weight, M[one, other]
     if one == other:
-        return float(y[one] * y[one] / a)
-    return float((b * y[one] ** 2 - 2.0 * both * y[one] * y[other] + a * y[other] ** 2) / (a * b - both * both))
+        explained = y[one] * y[one] / a
+    else:
+        explained = (b * y[one] ** 2 - 2.0 * both * y[one] * y[other] + a * y[other] ** 2) / (a * b - both * both)
+    return float(explained)
 
 
-@kernel
+@step
 def open_lasting_faults(s: EstimatorState, chi2: float) -> int:
     """Take lasting faults into the state where the test ``chi2`` of all of them is sure; how many anchors have one.
 
     They are the one or two anchors whose faults explain the test while no others do as well, or none.
     """
     count, dim = len(s.anchors), s.settings[0]["dim"]
-    if chi2 <= SURE_CHI2:
-        return 0
-    for faults in range(1, min(MOST_FAULTS, count - dim - 2) + 1):
+    most_faults = min(MOST_FAULTS, count - dim - 2) if chi2 > SURE_CHI2 else 0
+    opened = 0
+    for faults in range(1, most_faults + 1):
         first, second, most, rival = -1, -1, 0.0, 0.0
         for one in range(count):
             for other in range(one + 1):
@@ -154,16 +152,16 @@ def open_lasting_faults(s: EstimatorState, chi2: float) -> int:
                         first, second, most, rival = one, other, explained, most
                     elif explained > rival:
                         rival = explained
-        if chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_CHI2:
+        if opened == 0 and chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_CHI2:
             _open_lasting_fault(s, first)
             if second != first:
                 _open_lasting_fault(s, second)
             forget_recent_faults(s)
-            return faults
-    return 0
+            opened = faults
+    return opened
 
 
-@kernel
+@step
 def forget_recent_faults(s: EstimatorState) -> None:
     """Judge recent faults from here on."""
     V, evidence, information, count = s.V, s.evidence, s.information, len(s.anchors)
@@ -175,7 +173,7 @@ def forget_recent_faults(s: EstimatorState) -> None:
             V[count + fault, state] = 0.0
 
 
-@kernel
+@step
 def _open_lasting_fault(s: EstimatorState, anchor: int) -> None:
     """Take one anchor's fault into its constant range error; the other hypotheses are conditioned on it."""
     x, P, V, y, M = s.x, s.P, s.V, s.evidence[0], s.information[0]
@@ -205,4 +203,5 @@ def _open_lasting_fault(s: EstimatorState, anchor: int) -> None:
     for state in range(n):
         opened[state] = 0.0
     s.anchors[anchor]["has_fault"] = 1
+    s.status[0]["range_errors"] = LASTING
     s.status[0]["faults_opened"] += 1

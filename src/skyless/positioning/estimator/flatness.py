@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import kernel
+from skyless.compiled import step
 from skyless.positioning.estimator.state import EstimatorState
 
 PROBE_M: Final = 1.0
@@ -25,35 +25,37 @@ def fit_plane(s: EstimatorState) -> None:
         status["plane_normal"] = np.linalg.svd(anchors_m - status["plane_m"], full_matrices=False)[2][2]
 
 
-@kernel
+@step
+def _apart_m(s: EstimatorState, anchor: int, off_m: float, probe_m: float) -> float:
+    """By how much an anchor is farther from a place above the tag's foot in the plane than from one below."""
+    normal, a_m = s.status[0]["plane_normal"], s.anchors[anchor]["position_m"]
+    above, below = 0.0, 0.0
+    for axis in range(3):
+        foot_m = s.x[axis] - off_m * normal[axis] - a_m[axis]
+        above += (foot_m + probe_m * normal[axis]) ** 2
+        below += (foot_m - probe_m * normal[axis]) ** 2
+    return float(np.sqrt(above) - np.sqrt(below))
+
+
+@step
 def is_height_open(s: EstimatorState) -> bool:
     """Whether the tag and its mirror image behind the anchors' plane explain the ranges alike.
 
     Range errors make up for what is left of the difference, and what all ranges have in common is the tag's clock.
     Not where the image lies where the tag cannot be.
     """
-    x, status, settings = s.x, s.status[0], s.settings[0]
-    normal, count = status["plane_normal"], len(s.anchors)
-    if settings["dim"] == 2 or (normal[0] == 0.0 and normal[1] == 0.0 and normal[2] == 0.0):
-        return False
-    off_m = 0.0
-    for axis in range(3):
-        off_m += normal[axis] * (x[axis] - status["plane_m"][axis])
-    image_z_m = x[2] - 2.0 * off_m * normal[2]
-    is_image_possible = settings["lowest_m"] <= image_z_m <= settings["highest_m"]
-    if not is_image_possible and off_m * off_m * normal[2] ** 2 > s.P[2, 2]:
-        return False
-    probe_m = max(abs(off_m), PROBE_M)
-    total, square = 0.0, 0.0
+    status, settings = s.status[0], s.settings[0]
+    normal, count, off_m, square, total = status["plane_normal"], len(s.anchors), 0.0, 0.0, 0.0
     variance = settings["range_std_m"] ** 2 + settings["survey_std_m"] ** 2 + settings["rx_variance_m2"]
-    for anchor in range(count):
-        a = s.anchors[anchor]["position_m"]
-        above, below = 0.0, 0.0
+    if settings["dim"] == 3:
         for axis in range(3):
-            foot_m = x[axis] - off_m * normal[axis] - a[axis]
-            above += (foot_m + probe_m * normal[axis]) ** 2
-            below += (foot_m - probe_m * normal[axis]) ** 2
-        apart_m = np.sqrt(above) - np.sqrt(below)
-        total += apart_m
-        square += apart_m * apart_m
-    return bool(square - total * total / count < TOLD_CHI2 * variance)
+            off_m += normal[axis] * (s.x[axis] - status["plane_m"][axis])
+        for anchor in range(count):
+            apart_m = _apart_m(s, anchor, off_m, max(abs(off_m), PROBE_M))
+            total += apart_m
+            square += apart_m * apart_m
+    is_flat = square - total * total / count < TOLD_CHI2 * variance
+    image_z_m = s.x[2] - 2.0 * off_m * normal[2]
+    is_image_possible = settings["lowest_m"] <= image_z_m <= settings["highest_m"]
+    is_near = off_m * off_m * normal[2] ** 2 <= s.P[2, 2]
+    return bool(settings["dim"] == 3 and is_flat and (is_image_possible or is_near))

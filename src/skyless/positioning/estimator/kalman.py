@@ -4,9 +4,9 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import kernel
+from skyless.compiled import step
 from skyless.constants import TICK_S
-from skyless.positioning.estimator.state import EstimatorState, Integers, Matrix, Vector, layout
+from skyless.positioning.estimator.state import EstimatorState, Matrix, layout, uncertain_states
 
 OBSTRUCTED_STD_M: Final = 0.08
 """Where range errors jump, those of all anchors change with this standard deviation, ..."""
@@ -23,72 +23,73 @@ REST_SHARE: Final = 2e-7
 """Part of the process noise of motion that is left at rest: 5 cm within half a minute."""
 
 
-@kernel
+@step
 def predict(s: EstimatorState, rx_ticks: int) -> None:
     """Time update to a reading of the tag: F·P·Fᵀ + Q for constant velocity and constant clock rates.
 
     The tag's oscillator is in all offsets, so its noise is common to them.
     """
     status, settings = s.status[0], s.settings[0]
-    x, P, V = s.x, s.P, s.V
     dim, count = settings["dim"], len(s.anchors)
     where = layout(dim, count)
     dt = (rx_ticks - status["epoch_ticks"]) * TICK_S
-    status["epoch_ticks"] = rx_ticks
     speed_squared = 0.0
     for axis in range(dim):
-        speed_squared += x[where.velocity + axis] ** 2
+        speed_squared += s.x[where.velocity + axis] ** 2
     status["walked_m"] += np.sqrt(speed_squared) * dt
-    status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
-    _advance(x, P, V, where.velocity, dt)
+    if status["obstruction"] > 0.0:
+        status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
+    _advance(s, where.velocity, dt)
     motion = settings["qa"] * status["q_scale"]
     if is_at_rest(s):
         motion *= REST_SHARE
     for axis in range(dim):
-        _add_noise(P, axis, where.velocity + axis, dt, 0.0, motion)
-        V[2 * count + axis, axis] -= 0.5 * dt * dt  # an acceleration that the filter does not know of
-        V[2 * count + axis, where.velocity + axis] -= dt
+        _add_noise(s.P, axis, where.velocity + axis, dt, 0.0, motion)
+        s.V[2 * count + axis, axis] -= 0.5 * dt * dt  # an acceleration that the filter does not know of
+        s.V[2 * count + axis, where.velocity + axis] -= dt
     walk = settings["walk"]
     for anchor in range(count):
         scale = s.anchors[anchor]["walk_scale"]
-        _add_noise(P, where.offset + anchor, where.rate + anchor, dt, settings["white"], walk * scale)
+        _add_noise(s.P, where.offset + anchor, where.rate + anchor, dt, settings["white"], walk * scale)
     common = walk * status["walk_scale"]
     value, cross, rate = settings["white"] * dt + common * dt**3 / 3.0, common * dt**2 / 2.0, common * dt
     for i in range(where.offset, where.offset + count):
         for j in range(where.offset, where.offset + count):
-            P[i, j] += value
-            P[i, where.velocity + j] += cross
-            P[where.velocity + i, j] += cross
-            P[where.velocity + i, where.velocity + j] += rate
+            s.P[i, j] += value
+            s.P[i, where.velocity + j] += cross
+            s.P[where.velocity + i, j] += cross
+            s.P[where.velocity + i, where.velocity + j] += rate
+    s.status[0]["epoch_ticks"] = rx_ticks
 
 
-@kernel
+@step
 def is_at_rest(s: EstimatorState) -> bool:
     """Whether the tag has shown no motion for so long that it is taken to stand still."""
     rest_s = s.settings[0]["rest_s"]
     return bool(0.0 < rest_s < s.status[0]["rest_s"])
 
 
-@kernel
-def _advance(x: Vector, P: Matrix, V: Matrix, values: int, dt: float) -> None:
+@step
+def _advance(s: EstimatorState, values: int, dt: float) -> None:
     """The first states gain dt·(their rates), which follow them."""
-    n = P.shape[0]
+    n = uncertain_states(s)
     for value in range(values):
-        x[value] += dt * x[values + value]
-        for column in range(n):
-            P[value, column] += dt * P[values + value, column]
+        s.x[value] += dt * s.x[values + value]
     for row in range(n):
         for value in range(values):
-            P[row, value] += dt * P[row, values + value]
+            s.P[row, value] += dt * s.P[row, values + value]
+    for value in range(values):
+        for column in range(n):
+            s.P[value, column] += dt * s.P[values + value, column]
     for value in range(values):
         for other in range(value):
-            P[value, other] = P[other, value]
-    for fault in range(V.shape[0]):
+            s.P[value, other] = s.P[other, value]
+    for fault in range(len(s.fault_input)):
         for value in range(values):
-            V[fault, value] += dt * V[fault, values + value]
+            s.V[fault, value] += dt * s.V[fault, values + value]
 
 
-@kernel
+@step
 def _add_noise(P: Matrix, value: int, rate: int, dt: float, white: float, walk: float) -> None:
     """Process noise of a value and its rate."""
     P[value, value] += white * dt + walk * dt**3 / 3.0
@@ -97,7 +98,7 @@ def _add_noise(P: Matrix, value: int, rate: int, dt: float, white: float, walk: 
     P[rate, rate] += walk * dt
 
 
-@kernel
+@step
 def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float) -> None:
     """Time update of an anchor's range errors over what has passed and was walked since its newest packet.
 
@@ -119,79 +120,77 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
         _decay(s, constant, np.exp(-obstructed), settings["range_std_m"] ** 2)
 
 
-@kernel
+@step
 def _decay(s: EstimatorState, state: int, kept: float, variance: float) -> None:
     """A state decays towards zero and keeps, in the long run, that variance."""
-    x, P, V = s.x, s.P, s.V
+    x, P, V, n = s.x, s.P, s.V, uncertain_states(s)
     x[state] *= kept
-    for column in range(P.shape[1]):
+    for column in range(n):
         P[state, column] *= kept
-    for row in range(P.shape[0]):
+    for row in range(n):
         P[row, state] = P[state, row]
     P[state, state] = kept * P[state, state] + (1.0 - kept * kept) * variance
     for fault in range(V.shape[0]):
         V[fault, state] *= kept
 
 
-@kernel
+@step
 def reset_state(s: EstimatorState, state: int, variance: float) -> None:
     """Forget a state: zero, uncorrelated, with that variance."""
-    x, P, V = s.x, s.P, s.V
+    x, P, V, n = s.x, s.P, s.V, uncertain_states(s)
     x[state] = 0.0
-    for column in range(P.shape[1]):
+    for column in range(n):
         P[state, column] = 0.0
-    for row in range(P.shape[0]):
+    for row in range(n):
         P[row, state] = 0.0
     P[state, state] = variance
     for fault in range(V.shape[0]):
         V[fault, state] = 0.0
 
 
-@kernel
-def compute_ph(P: Matrix, h: Vector, h_index: Integers, terms: int, ph: Vector) -> float:
+@step
+def compute_ph(s: EstimatorState, terms: int) -> float:
     """Compute P·h of a measurement with ``terms`` terms; returns hᵀ·P·h."""
-    n = P.shape[1]
+    P, h, h_index, ph, n = s.P, s.h, s.h_index, s.ph, uncertain_states(s)
     for column in range(n):
         ph[column] = 0.0
-    for term in range(terms):
-        row, weight = h_index[term], h[term]
-        for column in range(n):
-            ph[column] += weight * P[row, column]
     total = 0.0
     for term in range(terms):
-        total += h[term] * ph[h_index[term]]
+        row, weight = h_index[term], h[term]
+        if row < n:
+            for column in range(n):
+                ph[column] += weight * P[row, column]
+    for term in range(terms):
+        if h_index[term] < n:
+            total += h[term] * ph[h_index[term]]
     return total
 
 
-@kernel
+@step
 def update(s: EstimatorState, innovation: float, innovation_variance: float, gain_scale: float, updated: int) -> None:
     """Scalar update of the first ``updated`` states by the measurement in ``h`` with P·h in ``ph``.
 
     K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
     follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit.
     """
-    x, P, V, u, fault_input = s.x, s.P, s.V, s.ph, s.fault_input
-    n = P.shape[0]
+    x, P, V, u, fault_input, n = s.x, s.P, s.V, s.ph, s.fault_input, uncertain_states(s)
     root = np.sqrt(innovation_variance)
     step = gain_scale * innovation / root
     for state in range(n):
         u[state] /= root
-    for state in range(updated):
+    for state in range(n):
         factor = u[state]
-        x[state] += factor * step
-        for column in range(n):
+        for column in range(n if state < updated else updated):
             P[state, column] -= factor * u[column]
-    for state in range(updated, n):
-        factor = u[state]
-        for column in range(updated):
-            P[state, column] -= factor * u[column]
+    for state in range(min(updated, n)):
+        x[state] += u[state] * step
     for fault in range(V.shape[0]):
         gain = gain_scale * fault_input[fault] / root
-        for state in range(updated):
+        for state in range(min(updated, n)):
             V[fault, state] += gain * u[state]
 
 
-@kernel
+@step
 def dynamic_states(s: EstimatorState) -> int:
     """How many states all measurements update; those that follow only the tag's own receptions do."""
     return layout(s.settings[0]["dim"], len(s.anchors)).slope

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import kernel
+from skyless.compiled import step
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.estimator.faults import compute_fault_input, gather_evidence, subtract_fault_input
 from skyless.positioning.estimator.kalman import (
@@ -39,7 +39,7 @@ from skyless.positioning.estimator.monitor import (
     open_range_error,
     variance_scale,
 )
-from skyless.positioning.estimator.state import EstimatorState, layout
+from skyless.positioning.estimator.state import EstimatorState, layout, uncertain_states
 from skyless.ticks import TICK_MASK
 
 SUBTICKS: Final = 256
@@ -84,7 +84,7 @@ REST_STD_MPS: Final = 0.01
 """Of the velocity of a tag that stands still, each time a measurement is processed."""
 
 
-@kernel
+@step
 def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> float:
     """Put the unit vector from an anchor to the tag into the measurement; returns their distance.
 
@@ -108,13 +108,13 @@ def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> fl
     return float(range_m)
 
 
-@kernel
+@step
 def _set_term(s: EstimatorState, term: int, state: int, weight: float) -> int:
     s.h[term], s.h_index[term] = weight, state
     return term + 1
 
 
-@kernel
+@step
 def _range_error_terms(s: EstimatorState, term: int, anchor: int, range_m: float, sign: float) -> int:
     """Range errors of an anchor: the part that changes, the part that stays, and the slope."""
     where = layout(s.settings[0]["dim"], len(s.anchors))
@@ -127,7 +127,7 @@ def _range_error_terms(s: EstimatorState, term: int, anchor: int, range_m: float
     return int(_set_term(s, term, where.slope, sign * far))
 
 
-@kernel
+@step
 def _along(s: EstimatorState, begin: int, end: int) -> float:
     """h·x of terms from ``begin`` to ``end``."""
     total = 0.0
@@ -136,7 +136,7 @@ def _along(s: EstimatorState, begin: int, end: int) -> float:
     return total
 
 
-@kernel
+@step
 def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
     """Half the position's variance across the direction, over the range: what the range is longer by on average.
 
@@ -148,18 +148,17 @@ def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
     for axis in range(dim):
         across += P[axis, axis]
     least = BEND_SHARE * variance * range_m * range_m
-    if 0.5 * across * across < least:
-        return 0.0
-    for one in range(dim):
-        for other in range(dim):
-            across -= h[one] * P[one, other] * h[other]
+    if 0.5 * across * across >= least:
+        for one in range(dim):
+            for other in range(dim):
+                across -= h[one] * P[one, other] * h[other]
     return float(0.5 * across / range_m) if 0.5 * across * across >= least else 0.0
 
 
 # The tag receives an anchor
 
 
-@kernel
+@step
 def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[int, float]:
     """Put the tag's reception of an anchor into ``h``; its terms, and the distance."""
     dim = s.settings[0]["dim"]
@@ -171,7 +170,7 @@ def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[
     return _range_error_terms(s, term, anchor, range_m, 1.0), range_m
 
 
-@kernel
+@step
 def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, variance_factor: float) -> int:
     """Process the tag's reception of an anchor's packet: 1 if it was used, 0 if not, ``CLOCK_JUMPED`` to join anew.
 
@@ -194,66 +193,66 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     bend_m = _bend_m(s, range_m, rx_variance)
     rx_variance += 2.0 * bend_m * bend_m
     innovation = (rx_ticks - tx_ticks - a["offset_ticks"]) * TICK_M - range_m - bend_m - _along(s, 2 * dim, terms)
-    innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
+    innovation_variance = compute_ph(s, terms) + rx_variance
     a["range_m"] = range_m
     a["innovation"] = innovation / np.sqrt(innovation_variance)
+    clock_jumped = False
     if is_warm(s) and abs(a["innovation"]) > COMMON and is_common(s, a["innovation"]):
         status["walk_scale"] = settings["max_walk_scale"]
         a["outliers_in_row"] = 0
     elif is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
-        if a["relay_outliers_in_row"] >= CLOCK_JUMP_RELAYS:
-            return CLOCK_JUMPED
-        innovation = _jump(s, anchor, innovation, terms, rx_variance)
-        innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
-    scale = variance_scale(s, innovation, innovation_variance)
-    if scale == 0.0:
-        a["rejected_in_row"] += 1
-        return CLOCK_JUMPED if a["rejected_in_row"] >= REJOIN_AFTER else 0
-    a["rejected_in_row"] = 0
-    end_small_obstruction(s, anchor)
-    normalised = innovation / np.sqrt(innovation_variance)
-    if is_warm(s):
-        adapt_process_noise(s, normalised / scale)
-    used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]
-    compute_fault_input(s, terms, anchor)
-    gather_evidence(s, innovation, used_variance)
-    update(s, innovation, used_variance, 1.0, len(s.x))
-    adapt_place_noise(s, anchor, elapsed_s)
-    steps = int(np.floor(s.x[offset] / TICK_M))
-    a["offset_ticks"] += steps
-    s.x[offset] -= steps * TICK_M
-    return 1
+        clock_jumped = a["relay_outliers_in_row"] >= CLOCK_JUMP_RELAYS
+        if not clock_jumped:
+            innovation, innovation_variance = _jump(s, anchor, innovation, terms, rx_variance)
+    scale = 0.0 if clock_jumped else variance_scale(s, innovation, innovation_variance)
+    used = scale > 0.0
+    if used:
+        end_small_obstruction(s, anchor)
+        normalised = innovation / np.sqrt(innovation_variance)
+        if is_warm(s):
+            adapt_process_noise(s, normalised / scale)
+        used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]
+        compute_fault_input(s, terms, anchor)
+        gather_evidence(s, innovation, used_variance)
+        update(s, innovation, used_variance, 1.0, len(s.x))
+        adapt_place_noise(s, anchor, elapsed_s)
+        steps = int(np.floor(s.x[offset] / TICK_M))
+        a["offset_ticks"] += steps
+        s.x[offset] -= steps * TICK_M
+    s.anchors[anchor]["rejected_in_row"] = 0 if used else a["rejected_in_row"] + 1
+    return CLOCK_JUMPED if clock_jumped or a["rejected_in_row"] >= REJOIN_AFTER else int(used)
 
 
-@kernel
-def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_variance: float) -> float:
+@step
+def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_variance: float) -> tuple[float, float]:
     """An anchor's range error has jumped: back to what it was before it was obstructed, or to something new.
 
-    Returns the innovation that is left.
+    Returns the innovation that is left, and its variance.
     """
     a, status, settings = s.anchors[anchor], s.status[0], s.settings[0]
     change = layout(settings["dim"], len(s.anchors)).change + anchor
+    has_ended = False
     if a["is_obstructed"] and innovation < 0.0:
         innovation += s.x[change]
         share = min(status["obstruction"], 1.0)
         reset_state(s, change, a["place_variance_m2"] + share * OBSTRUCTED_STD_M**2)
         a["is_obstructed"] = a["outliers_in_row"] = 0
         status["ends_of_obstructions"] += 1
-        left = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + rx_variance
-        if innovation * innovation <= settings["gate"] ** 2 * left:
-            return innovation
-    open_range_error(s, anchor, innovation)
-    return innovation
+        left = compute_ph(s, terms) + rx_variance
+        has_ended = innovation * innovation <= settings["gate"] ** 2 * left
+    if not has_ended:
+        open_range_error(s, anchor, innovation)
+    return innovation, compute_ph(s, terms) + rx_variance
 
 
-@kernel
+@step
 def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> None:
     """Begin with an anchor's clock: the limit of an update of an offset of which nothing was known.
 
     Whatever is wrong with the position and with the range is then in the offset.
     """
     settings, a, P = s.settings[0], s.anchors[anchor], s.P
-    dim, n = settings["dim"], len(s.x)
+    dim, n = settings["dim"], uncertain_states(s)
     where = layout(dim, len(s.anchors))
     offset, noise, rate = where.offset + anchor, where.tx_noise + anchor, where.rate + anchor
     reset_state(s, noise, settings["tx_variance_m2"])
@@ -263,7 +262,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     terms = _range_error_terms(s, _set_term(s, 2 * dim, noise, 1.0), anchor, range_m, 1.0)
     variance = settings["rx_variance_m2"]
     bend_m = _bend_m(s, range_m, variance)
-    variance += 2.0 * bend_m * bend_m + compute_ph(P, s.h, s.h_index, terms, s.ph)
+    variance += 2.0 * bend_m * bend_m + compute_ph(s, terms)
     compute_fault_input(s, terms, anchor)
     if s.status[0]["late_share"] > OFTEN_LATE:
         variance += JOIN_VARIANCE_M2
@@ -282,7 +281,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
 # An anchor received another
 
 
-@kernel
+@step
 def relay_terms(s: EstimatorState, listener: int, sender: int, age_s: float, has_tx_noise: bool) -> int:
     """Put an anchor's reception of another, so long ago, into ``h``; its terms."""
     where = layout(s.settings[0]["dim"], len(s.anchors))
@@ -293,7 +292,7 @@ def relay_terms(s: EstimatorState, listener: int, sender: int, age_s: float, has
     return int(_set_term(s, term, where.tx_noise + sender, 1.0)) if has_tx_noise else int(term)
 
 
-@kernel
+@step
 def relay_variance(s: EstimatorState, listener: int, sender: int, age_s: float) -> float:
     """Of such a reception: its RX stamp's, and what two oscillators have done since."""
     settings, i, j = s.settings[0], s.anchors[listener], s.anchors[sender]
@@ -301,7 +300,7 @@ def relay_variance(s: EstimatorState, listener: int, sender: int, age_s: float) 
     return float(settings["rx_variance_m2"] + 2.0 * age_s * (settings["white"] + walk * age_s * age_s / 3.0))
 
 
-@kernel
+@step
 def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_rx_ticks: int, rx_ticks: int) -> None:
     """Process the reception, by the anchor ``listener``, of a packet of ``sender`` that the tag has received as well.
 
@@ -326,7 +325,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
     whole = j["offset_ticks"] - i["offset_ticks"]
     innovation = (rx_ticks - tx_ticks - whole) * TICK_M - distance_m - link["constant_m"] - _along(s, 0, term)
     pair_variance = link["variance_m2"]
-    innovation_variance = compute_ph(s.P, s.h, s.h_index, term, s.ph) + variance + pair_variance
+    innovation_variance = compute_ph(s, term) + variance + pair_variance
     normalised = innovation / np.sqrt(innovation_variance)
     if is_warm(s):
         clipped = min(max(normalised, -settings["gate"]), settings["gate"])
@@ -341,22 +340,23 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         if link["outliers_in_row"] >= PAIR_OUTLIERS:
             link["outliers_in_row"] = 0
             link["variance_m2"] += PAIR_JUMP_M2
-        return
-    status["relays_used"] += 1
-    status["relays_taken"] += 1.0
-    i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = link["outliers_in_row"] = 0
-    share = pair_variance / innovation_variance
-    link["constant_m"] += share * innovation
-    link["variance_m2"] -= share * pair_variance
-    compute_fault_input(s, term, -1)
-    gather_evidence(s, innovation, innovation_variance)
-    update(s, innovation, innovation_variance, 1.0, dynamic_states(s))
+    else:
+        status["relays_used"] += 1
+        status["relays_taken"] += 1.0
+        i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = link["outliers_in_row"] = 0
+        share = pair_variance / innovation_variance
+        link["constant_m"] += share * innovation
+        link["variance_m2"] -= share * pair_variance
+        compute_fault_input(s, term, -1)
+        gather_evidence(s, innovation, innovation_variance)
+        update(s, innovation, innovation_variance, 1.0, dynamic_states(s))
+    s.anchors[sender]["is_relayed"] = 1
 
 
 # An anchor tells what its clock reads against the master's
 
 
-@kernel
+@step
 def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_m2: float) -> None:
     """Let what an anchor knows of its clock against the master's replace what the filter knows, where that is worse.
 
@@ -365,11 +365,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     other states follow by P_xd/P times that difference. ``subticks``: the anchor's reading less the master's at the
     packet's TX stamp, modulo 2⁴⁸.
     """
-    settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
-    if master < 0 or master == anchor:
-        return
-    if max(a["walk_scale"], s.anchors[master]["walk_scale"]) > STEADY_WALK_SCALE:
-        return  # the anchor's filter, which assumes what the almanac says, lags behind such a clock as well
+    settings, a = s.settings[0], s.anchors[anchor]
     dim, n = settings["dim"], dynamic_states(s)
     variance = max(variance_m2, LEAST_REPORT_VARIANCE * (settings["tx_variance_m2"] + settings["rx_variance_m2"]))
     back_s = a["range_m"] / SPEED_OF_LIGHT_MPS
@@ -382,29 +378,30 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     for one in range(term):
         for other in range(term):
             own_variance += s.h[one] * s.h[other] * s.P[s.h_index[one], s.h_index[other]]
-    if own_variance <= REPORT_GAIN * variance:
-        return
     whole = (s.anchors[master]["offset_ticks"] - a["offset_ticks"]) & TICK_MASK
     wrap = SUBTICKS * (TICK_MASK + 1)
     off = (subticks - SUBTICKS * whole) & (wrap - 1)
     if off >= wrap // 2:
         off -= wrap
     innovation = off * (TICK_M / SUBTICKS) - _along(s, 0, term)
-    if innovation * innovation > settings["gate"] ** 2 * (own_variance + variance):
-        status["reports_rejected"] += 1
-        return
-    status["reports_used"] += 1
-    compute_ph(s.P, s.h, s.h_index, term, s.ph)
-    compute_fault_input(s, term, -1)
-    # K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q)
-    whole_s = own_variance * own_variance / (own_variance - variance)
-    update(s, innovation, whole_s, whole_s / own_variance, n)
+    # the filter of an anchor assumes what the almanac says of clocks; behind one that wanders more it lags as well
+    steady = max(a["walk_scale"], s.anchors[master]["walk_scale"]) <= STEADY_WALK_SCALE
+    is_news = steady and own_variance > REPORT_GAIN * variance
+    fits = innovation * innovation <= settings["gate"] ** 2 * (own_variance + variance)
+    if is_news and fits:
+        compute_ph(s, term)
+        compute_fault_input(s, term, -1)
+        # K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q)
+        whole_s = own_variance * own_variance / (own_variance - variance)
+        update(s, innovation, whole_s, whole_s / own_variance, n)
+    s.status[0]["reports_used"] += int(is_news and fits)
+    s.status[0]["reports_rejected"] += int(is_news and not fits)
 
 
 # A ready-made time difference
 
 
-@kernel
+@step
 def difference_terms(s: EstimatorState, a: int, b: int) -> tuple[int, float]:
     """Put a difference of ranges, to anchor b less to anchor a, into ``h``; its terms, and the difference.
 
@@ -420,7 +417,7 @@ def difference_terms(s: EstimatorState, a: int, b: int) -> tuple[int, float]:
     return _range_error_terms(s, term, a, near_m, -1.0), far_m - near_m
 
 
-@kernel
+@step
 def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: float) -> int:
     """Process a ready-made difference of ranges, to anchor b less to anchor a: 1 if it was used, 0 if not.
 
@@ -435,7 +432,7 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
     relax_range_error(s, b, b_elapsed_s, walked_m - s.anchors[b]["walked_m"])
     terms, expected_m = difference_terms(s, a, b)
     innovation = difference_m - expected_m - _along(s, 4 * dim, terms)
-    innovation_variance = compute_ph(s.P, s.h, s.h_index, terms, s.ph) + settings["difference_std_m"] ** 2
+    innovation_variance = compute_ph(s, terms) + settings["difference_std_m"] ** 2
     scale = difference_scale(s, innovation, innovation_variance)
     if scale > 0.0:
         if is_warm(s):
@@ -452,14 +449,14 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
 # The tag stands still
 
 
-@kernel
+@step
 def zero_velocity(s: EstimatorState) -> None:
     """Process the knowledge that a tag at rest has no velocity, one axis after the other."""
     dim = s.settings[0]["dim"]
     velocity = layout(dim, len(s.anchors)).velocity
     for axis in range(dim):
         term = _set_term(s, 0, velocity + axis, 1.0)
-        variance = compute_ph(s.P, s.h, s.h_index, term, s.ph) + REST_STD_MPS**2
+        variance = compute_ph(s, term) + REST_STD_MPS**2
         innovation = -s.x[velocity + axis]
         compute_fault_input(s, term, -1)
         update(s, innovation, variance, 1.0, len(s.x))

@@ -14,10 +14,10 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import kernel
-from skyless.positioning.estimator.faults import solve
+from skyless.compiled import step
+from skyless.positioning.estimator.faults import whiten
 from skyless.positioning.estimator.monitor import covariance_scale
-from skyless.positioning.estimator.state import EstimatorState, Matrix, Vector
+from skyless.positioning.estimator.state import EstimatorState, Vector
 
 LASTING_STD_M: Final = 0.3
 """Of a fault that has been there since the anchor joined, ..."""
@@ -31,13 +31,11 @@ HPL, VPL, LASTING_CHI2, RECENT_CHI2 = range(4)
 LEVELS: Final = 4
 
 
-@kernel
-def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, work: Matrix, levels: Vector) -> None:
-    """Write the levels in metres and the tests of faults; ``work`` has shape (2·anchors + 8, anchors).
-
-    ``horizontal_k`` and ``vertical_k`` are how many standard deviations the risk allows.
-    """
-    dim, count, P, V = s.settings[0]["dim"], len(s.anchors), s.P, s.V
+@step
+def protect(s: EstimatorState, levels: Vector) -> None:
+    """Write the levels in metres and the tests of faults."""
+    settings = s.settings[0]
+    dim, count = settings["dim"], len(s.anchors)
     scale = covariance_scale(s)
     levels[HPL] = levels[VPL] = 0.0
     for bank in range(2):
@@ -45,37 +43,35 @@ def protect(s: EstimatorState, horizontal_k: float, vertical_k: float, work: Mat
         begin = bank * count
         for one in range(count):
             for other in range(count):
-                work[one, other] = s.information[bank, one, other]
-            work[one, one] += 1.0 / (std_m * std_m)
-            work[count, one] = s.evidence[bank, one]
+                s.work[one, other] = s.information[bank, one, other]
+            s.work[one, one] += 1.0 / (std_m * std_m)
+            s.work[count, one] = s.evidence[bank, one]
             for axis in range(dim):
-                work[count + 1 + axis, one] = V[begin + one, axis]
-        solve(work, count, 1 + dim)
+                s.work[count + 1 + axis, one] = s.V[begin + one, axis]
+        whiten(s.work, count, 1 + dim)
         chi2, shift_x, shift_y, shift_z = 0.0, 0.0, 0.0, 0.0
-        xx, xy, yy, zz = scale * P[0, 0], scale * P[0, 1], scale * P[1, 1], 0.0
+        xx, xy, yy, zz = scale * s.P[0, 0], scale * s.P[0, 1], scale * s.P[1, 1], 0.0
         for one in range(count):
-            fault_m = work[count, one]
-            chi2 += s.evidence[bank, one] * fault_m
-            vx, vy = V[begin + one, 0], V[begin + one, 1]
-            shift_x += vx * fault_m
-            shift_y += vy * fault_m
-            xx += vx * work[count + 1, one]
-            xy += vx * work[count + 2, one]
-            yy += vy * work[count + 2, one]
+            fault, vx, vy = s.work[count, one], s.work[count + 1, one], s.work[count + 2, one]
+            chi2 += fault * fault
+            shift_x += vx * fault
+            shift_y += vy * fault
+            xx += vx * vx
+            xy += vx * vy
+            yy += vy * vy
             if dim == 3:
-                shift_z += V[begin + one, 2] * fault_m
-                zz += V[begin + one, 2] * work[count + 3, one]
+                vz = s.work[count + 3, one]
+                shift_z += vz * fault
+                zz += vz * vz
         largest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-        levels[HPL] = max(levels[HPL], np.hypot(shift_x, shift_y) + horizontal_k * np.sqrt(largest))
+        levels[HPL] = max(levels[HPL], np.hypot(shift_x, shift_y) + settings["horizontal_k"] * np.sqrt(largest))
         if dim == 3:
-            levels[VPL] = max(levels[VPL], abs(shift_z) + vertical_k * np.sqrt(scale * P[2, 2] + zz))
+            levels[VPL] = max(levels[VPL], abs(shift_z) + settings["vertical_k"] * np.sqrt(scale * s.P[2, 2] + zz))
         levels[LASTING_CHI2 + bank] = chi2
-    acceleration = s.settings[0]["max_acceleration_mps2"]
-    if acceleration > 0.0:
-        squared, up = 0.0, 0.0
-        for column in range(2 * count, 2 * count + dim):
-            squared += V[column, 0] ** 2 + V[column, 1] ** 2
-            if dim == 3:
-                up += V[column, 2] ** 2
-        levels[HPL] += acceleration * np.sqrt(squared)
-        levels[VPL] += acceleration * np.sqrt(up)
+    squared, up = 0.0, 0.0
+    for column in range(2 * count, 2 * count + dim):
+        squared += s.V[column, 0] ** 2 + s.V[column, 1] ** 2
+        if dim == 3:
+            up += s.V[column, 2] ** 2
+    levels[HPL] += s.settings[0]["max_acceleration_mps2"] * np.sqrt(squared)
+    levels[VPL] += s.settings[0]["max_acceleration_mps2"] * np.sqrt(up)

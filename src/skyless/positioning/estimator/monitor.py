@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import kernel
-from skyless.positioning.estimator.state import EstimatorState, layout
+from skyless.compiled import step
+from skyless.positioning.estimator.state import PASSING, EstimatorState, layout
 
 FORGETTING: Final = 0.02
 """Weight of the newest innovation in the running means, about the last 50."""
@@ -88,7 +88,7 @@ RELAY_WALK_GAIN: Final = 1.2
 RELAY_WALK_LOSS: Final = 0.99
 
 
-@kernel
+@step
 def gate_of(s: EstimatorState) -> float:
     """Beyond how many standard deviations a reception is more likely late than not."""
     late = min(s.status[0]["late_share"], 0.9)
@@ -97,48 +97,48 @@ def gate_of(s: EstimatorState) -> float:
     return float(min(gate, np.sqrt(-2.0 * np.log(odds)))) if odds > 1e-6 else float(gate)
 
 
-@kernel
+@step
 def is_warm(s: EstimatorState) -> bool:
     """Whether two packets of each anchor have been processed since the start."""
     return bool(s.status[0]["packets"] > 2 * len(s.anchors))
 
 
-@kernel
+@step
 def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_variance: float) -> bool:
     """Whether this reception and those before it show that an anchor's range error has jumped."""
     a, status = s.anchors[anchor], s.status[0]
     if innovation * innovation <= SUSPECT * SUSPECT * innovation_variance:
         a["outliers_in_row"] = 0
-        return False
-    settings = s.settings[0]
-    stamps = 2.0 * (settings["tx_variance_m2"] + settings["rx_variance_m2"])
-    apart = innovation - a["outlier_m"]
-    both = innovation + a["outlier_m"]
-    agrees = a["outliers_in_row"] > 0 and apart * apart <= AGREEMENT * AGREEMENT * stamps
-    agrees = agrees and both * both > TOGETHER * TOGETHER * innovation_variance
-    a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
-    a["outlier_m"] = innovation
+    else:
+        settings = s.settings[0]
+        stamps = 2.0 * (settings["tx_variance_m2"] + settings["rx_variance_m2"])
+        apart = innovation - a["outlier_m"]
+        both = innovation + a["outlier_m"]
+        agrees = a["outliers_in_row"] > 0 and apart * apart <= AGREEMENT * AGREEMENT * stamps
+        agrees = agrees and both * both > TOGETHER * TOGETHER * innovation_variance
+        a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
+        a["outlier_m"] = innovation
     needed = IN_ROW_WHERE_LATE if status["late_share"] > OFTEN_LATE else IN_ROW
     return bool(a["outliers_in_row"] >= needed)
 
 
-@kernel
+@step
 def is_common(s: EstimatorState, normalised: float) -> bool:
     """Whether the newest innovations of all anchors but one, which may say nothing, lie on the side of this one.
 
     The tag's clock it is then. A faulty anchor draws the others to the opposite side of its own.
     """
-    silent = 0
+    others = 0
     for anchor in range(len(s.anchors)):
         newest = s.anchors[anchor]["innovation"]
         if abs(newest) <= COMMON:
-            silent += 1
+            others += 1
         elif newest * normalised <= 0.0:
-            return False
-    return bool(silent <= 1 and len(s.anchors) > s.settings[0]["dim"])
+            others += 2
+    return bool(len(s.anchors) > s.settings[0]["dim"] and others <= 1)
 
 
-@kernel
+@step
 def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
     """Let an anchor's range error be estimated again from a jump on."""
     status, change = s.status[0], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
@@ -148,9 +148,10 @@ def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
     status["obstructions"] += 1
     status["obstruction"] = min(status["obstruction"] + JUMP_RISE, 2.0)
     s.P[change, change] += max(JUMP_STD_M**2, innovation * innovation)
+    status["range_errors"] = max(status["range_errors"], PASSING)
 
 
-@kernel
+@step
 def end_small_obstruction(s: EstimatorState, anchor: int) -> None:
     """End an obstruction that has gone without a jump back: the range error is known, and is hardly there."""
     a, change = s.anchors[anchor], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
@@ -160,7 +161,7 @@ def end_small_obstruction(s: EstimatorState, anchor: int) -> None:
         s.status[0]["ends_of_obstructions"] += 1
 
 
-@kernel
+@step
 def variance_scale(s: EstimatorState, innovation: float, innovation_variance: float) -> float:
     """Factor on the innovation's variance of a reception of the tag; 0 if it is not to be used. Counts it."""
     status, settings = s.status[0], s.settings[0]
@@ -168,42 +169,45 @@ def variance_scale(s: EstimatorState, innovation: float, innovation_variance: fl
     within = -settings["gate"] <= normalised <= settings["gate"]
     status["late_share"] += LATE_FORGETTING * ((0.0 if within else 1.0) - status["late_share"])
     status["rejected_share"] *= 1.0 - FORGETTING
-    if not within or normalised > gate_of(s):
+    scale, gate = 1.0, gate_of(s)
+    if not within or normalised > gate:
+        scale = 0.0
         status["rejected"] += 1
         if not within:
             status["rejected_in_row"] += 1
             status["rejected_share"] += FORGETTING
-        return 0.0
-    status["accepted"] += 1
-    status["rejected_in_row"] = 0
-    status["mean_nis"] += FORGETTING * (normalised * normalised - status["mean_nis"])
-    status["mean_square_m2"] += FORGETTING * (innovation * innovation - status["mean_square_m2"])
-    if status["late_share"] > OFTEN_LATE and abs(normalised) > HUBER:
-        return float(abs(normalised) / HUBER)
-    return 1.0
+    else:
+        status["accepted"] += 1
+        status["rejected_in_row"] = 0
+        status["mean_nis"] += FORGETTING * (normalised * normalised - status["mean_nis"])
+        status["mean_square_m2"] += FORGETTING * (innovation * innovation - status["mean_square_m2"])
+        if status["late_share"] > OFTEN_LATE and abs(normalised) > HUBER:
+            scale = abs(normalised) / HUBER
+    return float(scale)
 
 
-@kernel
+@step
 def difference_scale(s: EstimatorState, innovation: float, innovation_variance: float) -> float:
     """Factor on the innovation's variance of a time difference; 0 if it is not to be used. Counts it.
 
     Either of its anchors may be late, so large ones weigh less on both sides.
     """
     status, normalised = s.status[0], abs(innovation) / np.sqrt(innovation_variance)
+    used = normalised <= s.settings[0]["gate"]
     status["rejected_share"] *= 1.0 - FORGETTING
-    if not normalised <= s.settings[0]["gate"]:
+    if used:
+        status["accepted"] += 1
+        status["rejected_in_row"] = 0
+        status["mean_nis"] += FORGETTING * (normalised * normalised - status["mean_nis"])
+        status["mean_square_m2"] += FORGETTING * (innovation * innovation - status["mean_square_m2"])
+    else:
         status["rejected"] += 1
         status["rejected_in_row"] += 1
         status["rejected_share"] += FORGETTING
-        return 0.0
-    status["accepted"] += 1
-    status["rejected_in_row"] = 0
-    status["mean_nis"] += FORGETTING * (normalised * normalised - status["mean_nis"])
-    status["mean_square_m2"] += FORGETTING * (innovation * innovation - status["mean_square_m2"])
-    return float(max(1.0, normalised / DIFFERENCE_HUBER))
+    return float(max(1.0, normalised / DIFFERENCE_HUBER)) if used else 0.0
 
 
-@kernel
+@step
 def adapt_place_noise(s: EstimatorState, anchor: int, elapsed_s: float) -> None:
     """Let the variance of an anchor's changing range error follow its estimate: the mean of its square.
 
@@ -218,7 +222,7 @@ def adapt_place_noise(s: EstimatorState, anchor: int, elapsed_s: float) -> None:
         a["place_variance_m2"] = min(max(variance, settings["least_place_std_m"] ** 2), MOST_PLACE_STD_M**2)
 
 
-@kernel
+@step
 def follow_rest(s: EstimatorState, dt: float) -> None:
     """Count for how long the tag has shown no motion: neither its position, nor innovations that stay on one side."""
     status, dim = s.status[0], s.settings[0]["dim"]
@@ -232,7 +236,7 @@ def follow_rest(s: EstimatorState, dt: float) -> None:
             status["rest_m"][axis] = s.x[axis]
 
 
-@kernel
+@step
 def adapt_process_noise(s: EstimatorState, normalised: float) -> None:
     """Raise the motion's and the tag clock's process noise where innovations stay on one side, else lower it.
 
@@ -256,7 +260,7 @@ def adapt_process_noise(s: EstimatorState, normalised: float) -> None:
         status["walk_scale"] = max(status["walk_scale"] * WALK_LOSS, 1.0)
 
 
-@kernel
+@step
 def covariance_scale(s: EstimatorState) -> float:
     """Factor on the position's covariance while innovations are larger than the filter expects.
 
@@ -266,7 +270,7 @@ def covariance_scale(s: EstimatorState) -> float:
     return float(nis * nis) if nis > INCONSISTENT_NIS else 1.0
 
 
-@kernel
+@step
 def adapt_clock_noise(s: EstimatorState, anchor: int, normalised: float) -> None:
     """Raise the process noise of an anchor's clock where what relays say of it stays on one side, else lower it."""
     a = s.anchors[anchor]

@@ -7,6 +7,7 @@ from msgspec import Struct, structs
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
+from skyless.positioning.protection import limits_of
 
 MAX_CLOCK_RATE: Final = 50e-6
 """Two crystals of ±20 ppm, and margin."""
@@ -79,6 +80,7 @@ class EstimatorSettings(Struct, frozen=True):
                 record[name] = 0.0 if value is None else value
         record["dim"] = self.dim
         record["clock_rate_variance"] = (MAX_CLOCK_RATE * SPEED_OF_LIGHT_MPS) ** 2
+        record["horizontal_k"], record["vertical_k"] = limits_of(self.integrity_risk)[:2]
         return record
 
 
@@ -106,10 +108,16 @@ _NAMES: Final = (
     "difference_std_m",
     "rest_s",
     "max_walk_scale",
-    "integrity_risk",
 )
 
 SETTINGS: Final = np.dtype(
-    [("dim", np.int64), *((name, np.float64) for name in _NAMES), ("clock_rate_variance", np.float64)], align=True
+    [
+        ("dim", np.int64),
+        *((name, np.float64) for name in _NAMES),
+        ("clock_rate_variance", np.float64),
+        ("horizontal_k", np.float64),  # how many standard deviations the risk of levels allows
+        ("vertical_k", np.float64),
+    ],
+    align=True,
 )
 """``EstimatorSettings`` for the kernels."""

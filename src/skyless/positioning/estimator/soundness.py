@@ -12,7 +12,9 @@ from skyless.positioning.estimator.levels import LEVELS
 from skyless.positioning.estimator.settings import SETTINGS, EstimatorSettings
 from skyless.positioning.estimator.state import (
     ANCHOR,
+    LASTING,
     LINK,
+    NONE,
     PACKET,
     REMEMBERED,
     STATUS,
@@ -40,15 +42,17 @@ def is_sound(estimator: Estimator) -> bool:
         return False
     if own["dim"] != settings.dim or not isinstance(own["_table_m"], list) or len(own["_table_m"]) > MOST:
         return False
-    arrays = [*_of_state(state, settings.dim, len(own["_table_m"])), *_of_estimator(own, len(state.anchors))]
+    arrays = [*_of_state(state, settings.dim, len(own["_table_m"])), *_of_estimator(own)]
     if not all(_is_array(*wanted) for wanted in arrays):
         return False
-    return bool(state.settings["dim"][0] == settings.dim) and _is_inverse(state.index_of, state.anchors["table_index"])
+    if state.settings["dim"][0] != settings.dim or not NONE <= state.status["range_errors"][0] <= LASTING:
+        return False
+    return _is_inverse(state.index_of, state.anchors["table_index"])
 
 
 def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[Wanted]:
     count = len(s.anchors)
-    n, faults, terms = layout(dim, count).end, 2 * count + dim, 4 * dim + 8
+    n, faults, terms = layout(dim, count).room, 2 * count + dim, 4 * dim + 8
     yield s.x, (n,), np.float64
     yield s.P, (n, n), np.float64
     yield s.V, (faults, n), np.float64
@@ -61,22 +65,21 @@ def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[Wanted]:
     yield s.settings, (1,), SETTINGS
     yield s.index_of, (table_size,), np.int64
     yield s.h, (terms,), np.float64
-    yield s.h_index, (terms,), np.int64
+    yield s.h_index, (terms,), np.uint32
     yield s.ph, (n,), np.float64
     yield s.fault_input, (faults,), np.float64
+    yield s.work, (count + 1 + dim, count), np.float64
 
 
-def _of_estimator(own: dict[str, Any], count: int) -> Iterator[Wanted]:
-    table_m, listed, dim = own["_table_m"], own["_listed"], own["dim"]
+def _of_estimator(own: dict[str, Any]) -> Iterator[Wanted]:
+    table_m, listed = own["_table_m"], own["_listed"]
     for position_m in table_m:
         yield position_m, (3,), np.float64
     yield own["_identifiers"], (len(table_m),), np.int64
-    yield own["_k"], (2,), np.float64
     yield own["_levels"], (LEVELS,), np.float64
     yield own["_rows"], (PROTECTED_ROWS, 3), np.float64
     yield own["_packed"], (MOST_PACKED * HEARD.size,), np.uint8
     yield listed, (max(len(listed), MOST_PACKED), 4), np.int64
-    yield own["_work"], (count + 1 + dim, max(count, 1)), np.float64
 
 
 def _is_array(value: object, shape: tuple[int, ...], kind: DTypeLike) -> bool:

@@ -13,6 +13,9 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
 
 Everything before ``slope`` is updated by all measurements; what follows is updated by the tag's own receptions only
 and is a consider parameter (Schmidt 1966) of the others, which say next to nothing of it.
+
+Range errors and surveys stand last because many a site calls them exact. What is exact has no variance and no
+covariance, so ``uncertain_states`` leaves it out of all arithmetic, until a jump or a fault shows otherwise.
 """
 
 from typing import Final, NamedTuple, TypeVar
@@ -20,17 +23,26 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import jitted
+from skyless.compiled import jitted, step
 from skyless.positioning.estimator.settings import EstimatorSettings
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+Cube = NDArray[np.float64]
+Places = NDArray[np.uint32]
+"""Indices that cannot count from an array's end, for which kernels would have to look at each."""
 Integers = NDArray[np.int64]
 Records = NDArray[np.void]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 REMEMBERED: Final = 16
 """Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
+
+LANES: Final = 8
+"""Numbers in the longest vectors of processors."""
+
+NONE, PASSING, LASTING = range(3)
+"""Which range errors are not known to be zero: none, those that change, or all of them, and surveys."""
 
 NEVER: Final = -(1 << 62)
 """A time before all others."""
@@ -80,6 +92,7 @@ LINK: Final = np.dtype(
 STATUS: Final = np.dtype(
     [
         ("epoch_ticks", np.int64),  # the tag's reading at the newest packet
+        ("outcome", np.int64),  # what became of it
         ("packets", np.int64),
         ("accepted", np.int64),
         ("rejected", np.int64),
@@ -114,6 +127,7 @@ STATUS: Final = np.dtype(
         ("plane_m", np.float64, (3,)),  # a point of the plane that lies closest to the anchors, ...
         ("plane_normal", np.float64, (3,)),  # ... and its normal
         ("open_range_errors", np.int64),  # whether anchors join with range errors beyond what the settings say
+        ("range_errors", np.int64),  # which of them there are: NONE, PASSING or LASTING
     ],
     align=True,
 )
@@ -121,7 +135,7 @@ STATUS: Final = np.dtype(
 
 
 class EstimatorState(NamedTuple):
-    """Everything that the kernels work on, for one tag with n states and so many anchors."""
+    """Everything that the kernels work on, for one tag with so many anchors and n states (``Layout.room``)."""
 
     x: Vector
     """Shape (n,)."""
@@ -130,7 +144,7 @@ class EstimatorState(NamedTuple):
     V: Matrix
     """What faults do to x, shape (2·anchors + dim, n): for each metre by which the tag's receptions of an anchor have
     been late since it joined, the same lately, and for each m/s² of acceleration along an axis."""
-    information: Matrix
+    information: Cube
     """Of both kinds of faults of all anchors in the innovations, shape (2, anchors, anchors)."""
     evidence: Matrix
     """What innovations say of them, shape (2, anchors)."""
@@ -148,11 +162,13 @@ class EstimatorState(NamedTuple):
     """Index among ``anchors`` of each anchor of the site's table, −1 for those that are not in the state."""
     h: Vector
     """The measurement at hand where it is not zero, at the places in ``h_index``."""
-    h_index: Integers
+    h_index: Places
     ph: Vector
     """P·h of the measurement at hand, shape (n,)."""
     fault_input: Vector
     """By how much each fault is in the innovation at hand, shape (2·anchors + dim,)."""
+    work: Matrix
+    """Room for systems of equations of all faults of one kind, shape (anchors + 1 + dim, anchors)."""
 
 
 class Layout(NamedTuple):
@@ -170,6 +186,8 @@ class Layout(NamedTuple):
     survey: int
     """``dim`` states for each anchor."""
     end: int
+    room: int
+    """Length of arrays of states: ``end`` up to a multiple of ``LANES``, so that rows fill whole vectors."""
 
 
 @jitted
@@ -178,18 +196,40 @@ def layout(dim: int, anchors: int) -> Layout:
     values = dim + anchors
     behind = 2 * values
     slope = behind + 3 * anchors
+    end = slope + 1 + dim * anchors
     return Layout(
-        dim, values, values + dim, behind, behind + anchors, behind + 2 * anchors, slope, slope + 1,
-        slope + 1 + dim * anchors,
+        dim, values, values + dim, behind, behind + anchors, behind + 2 * anchors, slope, slope + 1, end,
+        -(-end // LANES) * LANES,
     )  # fmt: skip
 
 
-def new_state(settings: EstimatorSettings, table_size: int) -> EstimatorState:
-    """A state without anchors at the origin, for a table of so many."""
+@step
+def uncertain_states(s: EstimatorState) -> int:
+    """How many states count: all that follow are exact, and all that they have to do with others is zero.
+
+    A multiple of ``LANES``.
+    """
+    where, range_errors = layout(s.settings[0]["dim"], len(s.anchors)), s.status[0]["range_errors"]
+    end = where.end if range_errors == LASTING else where.constant if range_errors == PASSING else where.change
+    return int(-(-end // LANES) * LANES)
+
+
+def _expected_range_errors(settings: Records, status: Records) -> int:
+    """Which of them there are from the beginning."""
+    names = ("survey_std_m", "range_std_m", "slope_std_m")
+    if status["open_range_errors"] or any(settings[name] > 0.0 for name in names):
+        return LASTING
+    return PASSING if settings["place_std_m"] > 0.0 else NONE
+
+
+def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors: bool = False) -> EstimatorState:
+    """A state without anchors at the origin, for a table of so many; see ``Estimator.start``."""
     dim = settings.dim
     where = layout(dim, 0)
-    n = where.end
+    n = where.room
     status = np.zeros(1, STATUS)
+    status["open_range_errors"] = open_range_errors
+    status["range_errors"] = _expected_range_errors(settings.record()[0], status[0])
     status["q_scale"] = status["mean_nis"] = 1.0
     status["walk_scale"] = min(START_WALK_SCALE, settings.max_walk_scale)
     status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
@@ -208,9 +248,10 @@ def new_state(settings: EstimatorSettings, table_size: int) -> EstimatorState:
         settings=settings.record(),
         index_of=np.full(table_size, -1, np.int64),
         h=np.zeros(4 * dim + 8),
-        h_index=np.zeros(4 * dim + 8, np.int64),
+        h_index=np.zeros(4 * dim + 8, np.uint32),
         ph=np.zeros(n),
         fault_input=np.zeros(dim),
+        work=np.zeros((1 + dim, 0)),
     )
 
 
@@ -278,32 +319,33 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
     for anchor in kept:
         first = was.survey + dim * anchor
         states += [-1] * dim if anchor < 0 else range(first, first + dim)
+    states += [-1] * (layout(dim, new).room - len(states))
     faults = [*kept, *(old + anchor if anchor >= 0 else -1 for anchor in kept), *range(2 * old, 2 * old + dim)]
-    n = len(states)
+    n, of_states, of_anchors = len(states), np.array(states), np.array(kept, np.int64)
     index_of = np.full_like(s.index_of, -1)
     result = s._replace(
-        x=_take(s.x, states),
-        P=_take(s.P, states, states),
-        V=_take(s.V, faults, states),
-        information=np.stack([_take(part, kept, kept) for part in s.information]),
-        evidence=np.stack([_take(part, kept) for part in s.evidence]),
-        anchors=_take(s.anchors, kept),
-        packets=_take(s.packets, kept),
-        links=_take(s.links, kept, kept),
+        x=_take(s.x, of_states),
+        P=_take(s.P, of_states, of_states),
+        V=_take(s.V, np.array(faults), of_states),
+        information=_take(s.information, np.arange(2), of_anchors, of_anchors),
+        evidence=_take(s.evidence, np.arange(2), of_anchors),
+        anchors=_take(s.anchors, of_anchors),
+        packets=_take(s.packets, of_anchors),
+        links=_take(s.links, of_anchors, of_anchors),
         index_of=index_of,
         ph=np.zeros(n),
         fault_input=np.zeros(2 * new + dim),
+        work=np.zeros((new + 1 + dim, new)),
     )
-    for index, anchor in enumerate(result.anchors):
-        if kept[index] >= 0:
-            index_of[anchor["table_index"]] = index
+    there = of_anchors >= 0
+    index_of[result.anchors["table_index"][there]] = np.flatnonzero(there)
     return result
 
 
-def _take(source: NDArray[Scalar], *indices: list[int]) -> NDArray[Scalar]:
+def _take(source: NDArray[Scalar], *indices: Integers) -> NDArray[Scalar]:
     """Rows (and columns) of an array; zeros for an index of −1."""
-    wanted = [np.array(index, np.int64) for index in indices]
-    result = np.zeros([len(index) for index in indices] + list(source.shape[len(indices) :]), source.dtype)
-    there = np.ix_(*(np.flatnonzero(index >= 0) for index in wanted))
-    result[there] = source[np.ix_(*(index[index >= 0] for index in wanted))]
-    return result
+    shape, axes = source.shape, len(indices)
+    with_zeros = np.zeros([length + 1 for length in shape[:axes]] + list(shape[axes:]), source.dtype)
+    with_zeros[tuple(slice(-1) for _ in indices)] = source  # the last ones, of index −1, are left
+    places = [index.reshape([-1] + [1] * (axes - 1 - axis)) for axis, index in enumerate(indices)]
+    return with_zeros[tuple(places)]
