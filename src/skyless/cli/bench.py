@@ -62,7 +62,13 @@ def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
     load = "" if speed.load is None else f", load {speed.load:.1f}"
     out.print(f"{speed.cores} cores{load}; filters on one core, medians")
     kernels = speed.kernels
-    for name, kernel in (("tracker", kernels.tracker), ("joint", kernels.joint), ("joint, mesh", kernels.joint_mesh)):
+    for name, kernel in (
+        ("tracker", kernels.tracker),
+        ("joint", kernels.joint),
+        ("joint, mesh", kernels.joint_mesh),
+        ("joint, room", kernels.joint_room),
+        ("joint, room, mesh", kernels.joint_room_mesh),
+    ):
         ratios = f"{kernel.ratio:.0f} × NumPy, {kernel.loop_ratio:.2f} × a plain compiled loop"
         if kernel.filterpy_ratio is not None:
             ratios += f", {kernel.filterpy_ratio:.0f} × filterpy"

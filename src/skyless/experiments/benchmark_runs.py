@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
@@ -11,6 +12,7 @@ from skyless.experiments.benchmark_filters import FilterpyTracker, PlainJoint, P
 from skyless.experiments.benchmark_loops import joint_filter, scalar_filter
 from skyless.experiments.studies.episodes import Case, draw_episode, settings_of
 from skyless.positioning.estimator.estimator import Estimator, Packets
+from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings, track
 
 Array = NDArray[np.float64]
@@ -23,6 +25,7 @@ SLOT_S: Final = 2.1e-3
 NOISE_M: Final = 100e-12 * SPEED_OF_LIGHT_MPS
 _ANGLES: Final = 2.0 * np.pi * np.arange(NODES) / NODES
 ANCHORS_M: Final = np.column_stack([3.0 + 4.0 * np.cos(_ANGLES), 4.0 + 5.0 * np.sin(_ANGLES), np.zeros(NODES)])
+RANGE_ERRORS: Final = ("survey_std_m", "range_std_m", "slope_std_m", "place_std_m")
 START_VARIANCES: Final = (0.09, 0.16)
 """Of a position and of a speed."""
 
@@ -82,12 +85,16 @@ class TrackerRuns:
 class JointRuns:
     """The same messages for ``joint`` and for plain NumPy; a loop of 18 states beside them."""
 
-    def __init__(self, superframes: int, *, mesh: bool) -> None:
+    def __init__(self, superframes: int, *, mesh: bool, exact: bool = True) -> None:
+        """``exact``: whether the filter takes survey and ranges for exact, else it estimates their errors as well."""
         case = Case(mesh=mesh, qa=0.0)
         episode = draw_episode(np.random.default_rng(1), ANCHORS_M, SLOT_S, case, superframes)
         self.packets, self.tag_m = episode.packets, episode.path_m[0]
         self.count = len(self.packets.anchors)
         self.settings = settings_of(Case(mesh=mesh), height_m=0.0)
+        if not exact:
+            usual = EstimatorSettings()
+            self.settings = replace(self.settings, **{name: getattr(usual, name) for name in RANGE_ERRORS})
 
     def begun(self) -> Estimator:
         """A filter that begins where the tag stands, without any anchor in view."""

@@ -71,7 +71,11 @@ class Kernels(Struct, frozen=True):
 
     tracker: KernelSpeed
     joint: KernelSpeed
+    """As ``joint_mesh`` at a site that calls survey and ranges exact, as plain NumPy and the loop take them for; ..."""
     joint_mesh: KernelSpeed
+    joint_room: KernelSpeed
+    """... this and the next estimate their errors as well: 54 states."""
+    joint_room_mesh: KernelSpeed
     streaming: StreamingSpeed
 
 
@@ -101,7 +105,14 @@ def measure_all(effort: Effort = FULL) -> Speed:
     """Measure everything: medians of several short runs, by the time of a thread that stays on one core."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     with one_core():
-        kernels = Kernels(_tracker(effort), _joint(effort, mesh=False), _joint(effort, mesh=True), _streaming(effort))
+        kernels = Kernels(
+            _tracker(effort),
+            _joint(effort, mesh=False),
+            _joint(effort, mesh=True),
+            _joint(effort, mesh=False, exact=False),
+            _joint(effort, mesh=True, exact=False),
+            _streaming(effort),
+        )
         snapshots = _snapshots(effort)
     tags = {"tracker": many_trackers(), "joint": many_joints()}
     return Speed(kernels, snapshots, tags, load, cores(), None if find_spec("filterpy") else NO_FILTERPY)
@@ -133,8 +144,8 @@ def _tracker(effort: Effort) -> KernelSpeed:
     return _speed(runs, effort, (lambda: runs.filterpy(effort.plain_messages)) if find_spec("filterpy") else None)
 
 
-def _joint(effort: Effort, *, mesh: bool) -> KernelSpeed:
-    return _speed(JointRuns(effort.superframes, mesh=mesh), effort, None)
+def _joint(effort: Effort, *, mesh: bool, exact: bool = True) -> KernelSpeed:
+    return _speed(JointRuns(effort.superframes, mesh=mesh, exact=exact), effort, None)
 
 
 def _streaming(effort: Effort) -> StreamingSpeed:
