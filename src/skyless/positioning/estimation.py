@@ -32,13 +32,13 @@ from skyless.positioning.estimator.faults import SURE_CHI2
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.estimator.state import OPEN_RANGE_STD_M
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.fix_rows import QUALITY
+from skyless.positioning.fix_rows import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.in_use import AnchorsInUse
 from skyless.positioning.joint_start import JointStart
 from skyless.positioning.master_scale import MasterScale
 from skyless.positioning.observation import Observation
-from skyless.positioning.protection import IntegrityRequirement
+from skyless.positioning.protection import UNAVAILABLE, IntegrityRequirement
 from skyless.ticks import from_seconds
 
 COVARIANCE_MARGIN: Final = 4.0
@@ -56,6 +56,10 @@ EARLY_NIS: Final = 3.0
 
 CALM: Final = 0.1
 """Range errors that have jumped more lately make faults of their own; a new start would not help."""
+
+LONGEST_SUPERFRAME_S: Final = 2.0
+"""In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted so far, and each round
+of packets is a start of its own."""
 
 LATE_S: Final = 0.5
 """By then it is known how often packets are late; a start that was wrong for that reason is repeated."""
@@ -139,6 +143,8 @@ class Estimation:
             start = self._start.hear(observation)
             if isinstance(start, NoFixReason):
                 return start
+            if self._superframe_s > LONGEST_SUPERFRAME_S:
+                return self._fix_of(start, observation)
             self._begin(start, self._start.packets())
             return self._fix(observation)
         outcome = self._process(observation)
@@ -197,6 +203,8 @@ class Estimation:
         settings = self._settings
         max_age_s = max(MAX_AGE_S, 2.5 * self._superframe_s)
         variance = settings.tx_variance_m2 + settings.rx_variance_m2
+        if self._superframe_s > LONGEST_SUPERFRAME_S:
+            variance += settings.range_std_m**2 + settings.survey_std_m**2
         return JointStart(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps)
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
@@ -268,6 +276,22 @@ class Estimation:
                 self._estimator.move_anchor(index, anchor_m)
             self._known_m[anchor] = anchor_m
         return self._index_of[anchor]
+
+    def _fix_of(self, start: Start, observation: Observation) -> Fix:
+        """What a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""
+        dim, rows = self._estimator.dim, np.zeros((PROTECTED_ROWS, 3))
+        rows[POSITION, :dim] = start.solution[:dim]
+        if self._settings.height_m is not None:
+            rows[POSITION, 2] = self._settings.height_m
+        rows[POSITION + 1 : POSITION + 1 + dim, :dim] = start.covariance[:dim, :dim]
+        rows[VELOCITY + 1 : VELOCITY + 1 + dim, :dim] = start.speed_variance * np.eye(dim)
+        rows[PROTECTION, 2] = UNAVAILABLE
+        self._in_use.begin(start.used)
+        rx_ticks, in_use = observation.rx_ticks_tag, self._in_use
+        time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
+        return Fix(
+            time_s, rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", self._height_known, 1, self._asked
+        )
 
     def _fix(self, observation: Observation) -> Fix | NoFixReason:
         in_use, estimator, known = self._in_use, self._estimator, self._height_known

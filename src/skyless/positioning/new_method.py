@@ -23,10 +23,6 @@ DROP_S: Final = 2.0
 """An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""
 
 
-LONGEST_FOR_JOINT_S: Final = 2.0
-"""In longer superframes a tag may be metres away when it hears an anchor again, and a round of packets is not enough
-to draw a position together that is so wide: the tracker serves instead."""
-
 RELAY_AGE_S: Final = 1.0
 RELAY_SUPERFRAMES: Final = 2.5
 """Relays of packets that are older than the one, or than so many superframes, are not used."""
@@ -56,7 +52,7 @@ def new_method(
             master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, wanted.z_bounds_m
         )
         return Snapshots(SnapshotMethod(wanted.method), settings, time)
-    if wanted.method == "joint" and superframe_s <= LONGEST_FOR_JOINT_S:
+    if wanted.method == "joint":
         assumed = replace(
             estimator_settings(wanted.qa, schedule.tag_height_m, noise, accuracy, superframe_s),
             max_acceleration_mps2=wanted.integrity.max_acceleration_mps2,
