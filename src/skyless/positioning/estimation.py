@@ -141,12 +141,7 @@ class Estimation:
         if self._start is not None:
             self._start.learn(observation)
             start = self._start.hear(observation)
-            if isinstance(start, NoFixReason):
-                return start
-            if self._superframe_s > LONGEST_SUPERFRAME_S:
-                return self._fix_of(start, observation)
-            self._begin(start, self._start.packets())
-            return self._fix(observation)
+            return start if isinstance(start, NoFixReason) else self._first_fix(start, observation)
         outcome = self._process(observation)
         self._newest_ticks = max(self._newest_ticks, rx_ticks)
         if outcome in {REJECTED, STALE}:
@@ -276,6 +271,14 @@ class Estimation:
                 self._estimator.move_anchor(index, anchor_m)
             self._known_m[anchor] = anchor_m
         return self._index_of[anchor]
+
+    def _first_fix(self, start: Start, observation: Observation) -> Fix | NoFixReason:
+        """Begin where a start is, if the filter can predict from there to the next packets at all."""
+        if self._superframe_s > LONGEST_SUPERFRAME_S:
+            return self._fix_of(start, observation)
+        assert self._start is not None
+        self._begin(start, self._start.packets())
+        return self._fix(observation)
 
     def _fix_of(self, start: Start, observation: Observation) -> Fix:
         """What a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""
