@@ -26,9 +26,9 @@ from scipy.stats import binom, chi2
 from skyless.constants import TICK_M
 from skyless.positioning.alert import Alert
 from skyless.positioning.estimator import faults
-from skyless.positioning.estimator.faults import OPENED_STD_M, explained_chi2, open_lasting_faults, solve
-from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LASTING_STD_M, LEVELS, RECENT_STD_M, protect
-from skyless.positioning.estimator.state import with_anchor
+from skyless.positioning.estimator.faults import OPENED_STD_M, explained_chi2, open_faults, solve
+from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LEVELS, RECENT_STD_M, protect
+from skyless.positioning.estimator.state import LASTING_STD_M, with_anchor
 from skyless.positioning.protection import CONTRADICTED, IntegrityRequirement, integrity_of, limits_of
 
 RISK = 1e-4
@@ -168,7 +168,7 @@ def test_opening_a_fault_is_a_filter_that_had_it_open_from_the_beginning(late_m,
             estimator.state.P[constant, constant] += OPENED_STD_M**2
 
     follow(opened, packets, wide, packets, widen)
-    faults._open_lasting_fault(opened.state, anchor)
+    faults._open_fault(opened.state, 0, anchor)
     ours, theirs, apart = opened.state, wide.state, apart_from_offsets(wide)
     scale = np.sqrt(np.diag(theirs.P))
     used = scale > 1e-9
@@ -219,7 +219,8 @@ def test_too_few_anchors_single_nobody_out():
     estimator = begun(episode, settings_of(MESH))
     estimator.track(packets)
     estimator.state.evidence[0] = [100.0, 0.0, 0.0, 0.0]
-    assert open_lasting_faults(estimator.state, 1e4) == 0
+    open_faults(estimator.state, 1e4, 0.0)
+    assert estimator.state.status["faults_opened"] == 0
 
 
 # Protection levels

@@ -3,7 +3,7 @@
 Anchors join and leave between packets, in NumPy; everything else is one kernel a packet.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,17 +14,27 @@ from skyless.air.beacon import HEARD
 from skyless.compiled import kernel, threaded_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.estimator.faults import (
+    SURE_CHI2,
     explained_chi2,
     fade_recent_faults,
-    lasting_chi2,
-    open_lasting_faults,
+    fault_chi2,
+    open_faults,
 )
 from skyless.positioning.estimator.kalman import predict
 from skyless.positioning.estimator.kinds import CLOCK_JUMPED, first_reception, own_reception, relay, report
-from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LASTING_STD_M, LEVELS, RECENT_CHI2, VPL, protect
+from skyless.positioning.estimator.levels import (
+    HPL,
+    LASTING_CHI2,
+    LEVELS,
+    RECENT_CHI2,
+    RECENT_STD_M,
+    VPL,
+    protect,
+)
 from skyless.positioning.estimator.monitor import OFTEN_LATE, covariance_scale
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.estimator.state import (
+    LASTING_STD_M,
     NEVER,
     REMEMBERED,
     EstimatorState,
@@ -74,6 +84,10 @@ MOST_PACKED: Final = 16
 
 FIRST_PACKETS: Final = 3
 """Of each anchor, before which nothing is promised."""
+
+
+WIDE: Final = 0.05
+"""Part of the mean range; positions with a larger standard deviation have no level."""
 
 
 class Report(NamedTuple):
@@ -191,9 +205,9 @@ def _process(  # noqa: PLR0911 - each outcome where it is known
 
 @kernel
 def _open_faults(s: EstimatorState, work: Matrix) -> None:
-    """Look for lasting faults once in a round of packets."""
+    """Look for faults once in a round of packets."""
     if s.status[0]["packets"] % len(s.anchors) == 0:
-        open_lasting_faults(s, lasting_chi2(s, LASTING_STD_M, work))
+        open_faults(s, fault_chi2(s, 0, s.status[0]["fault_std_m"], work), fault_chi2(s, 1, RECENT_STD_M, work))
 
 
 @kernel
@@ -258,12 +272,24 @@ def _soundness(s: EstimatorState, levels: Vector) -> int:
     count, status = len(s.anchors), s.status[0]
     if count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count:
         return UNAVAILABLE
-    if max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > UNCOVERED_CHI2:
+    is_doubted = status["fault_std_m"] > LASTING_STD_M  # faults are not singled out then
+    if max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > (SURE_CHI2 if is_doubted else UNCOVERED_CHI2):
         return CONTRADICTED
+    if _is_wide(s):
+        return UNAVAILABLE
     for anchor in range(count):
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
             return OBSTRUCTED
     return SOUND
+
+
+@kernel
+def _is_wide(s: EstimatorState) -> bool:
+    """Whether the position is so uncertain that ranges are curved within it; levels are of first order."""
+    count, range_m = len(s.anchors), 0.0
+    for anchor in range(count):
+        range_m += s.anchors[anchor]["range_m"] / count
+    return bool(s.P[0, 0] + s.P[1, 1] > (WIDE * range_m) ** 2)
 
 
 @kernel
@@ -350,6 +376,7 @@ class Estimator:
         self.dim = settings.dim
         self._table_m: list[Vector] = [] if table_m is None else [np.array(row, np.float64) for row in table_m]
         self._identifiers = np.full(len(self._table_m), -1)
+        self._left_out: frozenset[int] = frozenset()
         self._k = limits_of(settings.integrity_risk)[:2]
         self._levels = np.zeros(LEVELS)
         self._rows = np.zeros((PROTECTED_ROWS, 3))
@@ -393,17 +420,22 @@ class Estimator:
         covariance_m2: Matrix,
         speed_variance: float,
         open_range_errors: bool = False,
+        fault_std_m: float = LASTING_STD_M,
+        left_out: Iterable[int] = (),
     ) -> None:
         """Begin at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept.
 
         ``open_range_errors``: expect ranges to be wrong by half a metre and anchors to be misplaced, since what
-        the settings say of them has been contradicted.
+        the settings say of them has been contradicted. ``left_out``: do so of these anchors of the table alone.
+        ``fault_std_m``: of range errors of all anchors that the levels are to cover.
         """
         settings, dim = self.settings, self.dim
         state = new_state(settings, len(self._table_m))
         state.status["late_share"] = self._state.status["late_share"]
         if open_range_errors:
             state.status["open_range_errors"] = 1
+        state.status["fault_std_m"] = fault_std_m
+        self._left_out = frozenset(left_out)
         state.x[:dim] = position_m
         state.P[:dim, :dim] = covariance_m2
         state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
@@ -475,7 +507,8 @@ class Estimator:
         """Let an anchor join or leave, as a packet asks for."""
         state = self._state
         if outcome == NEW_ANCHOR:
-            self._use(with_anchor(state, table_index, self._table_m[table_index]))
+            is_open = table_index in self._left_out
+            self._use(with_anchor(state, table_index, self._table_m[table_index], is_open))
             return
         if outcome == RESTARTED_CLOCK:
             state.status["clock_restarts"] += 1

@@ -31,6 +31,7 @@ from skyless.positioning.estimator.monitor import (
     adapt_clock_noise,
     adapt_process_noise,
     end_small_obstruction,
+    follow_change,
     has_jumped,
     is_common,
     is_warm,
@@ -207,6 +208,8 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     a["rejected_in_row"] = 0
     end_small_obstruction(s, anchor)
     normalised = innovation / np.sqrt(innovation_variance)
+    if a["is_obstructed"]:
+        follow_change(s, anchor, normalised)
     if is_warm(s):
         adapt_process_noise(s, normalised / scale)
     used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]

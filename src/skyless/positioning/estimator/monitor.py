@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import kernel
+from skyless.positioning.estimator.faults import begin_obstruction
 from skyless.positioning.estimator.state import EstimatorState, layout
 
 FORGETTING: Final = 0.02
@@ -40,12 +41,21 @@ AGREEMENT: Final = 3.0
 JUMP_STD_M: Final = 0.2
 """Of a range error that has jumped, beyond what it was, unless it has jumped by more."""
 
-JUMP_RISE: Final = 0.5
-"""By so much of its full size a jump raises the process noise of all range errors."""
+CHANGE_GAIN: Final = 0.1
+CHANGE_LIMIT: Final = 4.0
+"""Of the square of the running mean of an obstructed anchor's innovations, 1 where its error wanders as expected."""
+
+CHANGE_GROWTH: Final = 1.2
+CHANGE_LOSS: Final = 0.97
+MOST_CHANGE_SCALE: Final = 250.0
+"""A range error that has jumped then changes by 1 m in a second at most."""
 
 ENDED_STD_M: Final = 0.05
 ENDED: Final = 2.0
 """An obstruction has ended where its error is known to this, and less than so many standard deviations from none."""
+
+SETTLED: Final = 2.0
+"""A range error whose process noise is raised by less does not change any more."""
 
 LATE_FORGETTING: Final = 0.005
 LATE_DENSITY: Final = 0.05
@@ -132,13 +142,21 @@ def is_common(s: EstimatorState, normalised: float) -> bool:
 @kernel
 def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
     """Let an anchor's range error be estimated again from a jump on."""
-    status, change = s.status[0], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
-    a = s.anchors[anchor]
-    a["outliers_in_row"] = 0
-    a["is_obstructed"] = 1
-    status["obstructions"] += 1
-    status["obstruction"] = min(status["obstruction"] + JUMP_RISE, 2.0)
+    change = layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
+    s.status[0]["obstructions"] += 1
+    begin_obstruction(s, anchor)
     s.P[change, change] += max(JUMP_STD_M**2, innovation * innovation)
+
+
+@kernel
+def follow_change(s: EstimatorState, anchor: int, normalised: float) -> None:
+    """Raise the process noise of an obstructed anchor's range error where its innovations stay on one side."""
+    a = s.anchors[anchor]
+    a["change_mean"] += CHANGE_GAIN * (normalised - a["change_mean"])
+    if a["change_mean"] ** 2 * (2.0 - CHANGE_GAIN) / CHANGE_GAIN > CHANGE_LIMIT:
+        a["change_scale"] = min(a["change_scale"] * CHANGE_GROWTH, MOST_CHANGE_SCALE)
+    else:
+        a["change_scale"] = max(a["change_scale"] * CHANGE_LOSS, 1.0)
 
 
 @kernel
@@ -146,7 +164,8 @@ def end_small_obstruction(s: EstimatorState, anchor: int) -> None:
     """End an obstruction that has gone without a jump back: the range error is known, and is hardly there."""
     a, change = s.anchors[anchor], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
     error_m, variance = s.x[change], s.P[change, change]
-    if a["is_obstructed"] and variance < ENDED_STD_M**2 and error_m * error_m < ENDED * ENDED * variance:
+    settled = a["is_obstructed"] and a["change_scale"] < SETTLED and variance < ENDED_STD_M**2
+    if settled and error_m * error_m < ENDED * ENDED * variance:
         a["is_obstructed"] = 0
         s.status[0]["ends_of_obstructions"] += 1
 
