@@ -35,6 +35,11 @@ OFTEN_LATE: Final = 0.02
 TOGETHER: Final = 7.0
 """... together beyond so many (by chance once in some million packets), ..."""
 
+OBSTRUCTED_SUSPECT: Final = 1.8
+OBSTRUCTED_TOGETHER: Final = 4.2
+"""The same where range errors have jumped lately: more are to be expected there, so less evidence is enough (by chance
+once in some hundred packets; a person in the way: 11 instead of 15 cm)."""
+
 AGREEMENT: Final = 3.0
 """... if they agree within so many standard deviations of two receptions."""
 
@@ -108,7 +113,10 @@ def is_warm(s: EstimatorState) -> bool:
 def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_variance: float) -> bool:
     """Whether this reception and those before it show that an anchor's range error has jumped."""
     a, status = s.anchors[anchor], s.status[0]
-    if innovation * innovation <= SUSPECT * SUSPECT * innovation_variance:
+    share = min(status["obstruction"], 1.0)
+    suspect = SUSPECT + share * (OBSTRUCTED_SUSPECT - SUSPECT)
+    together = TOGETHER + share * (OBSTRUCTED_TOGETHER - TOGETHER)
+    if innovation * innovation <= suspect * suspect * innovation_variance:
         a["outliers_in_row"] = 0
         return False
     settings = s.settings[0]
@@ -116,7 +124,7 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
     apart = innovation - a["outlier_m"]
     both = innovation + a["outlier_m"]
     agrees = a["outliers_in_row"] > 0 and apart * apart <= AGREEMENT * AGREEMENT * stamps
-    agrees = agrees and both * both > TOGETHER * TOGETHER * innovation_variance
+    agrees = agrees and both * both > together * together * innovation_variance
     a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
     a["outlier_m"] = innovation
     needed = IN_ROW_WHERE_LATE if status["late_share"] > OFTEN_LATE else IN_ROW
