@@ -87,7 +87,11 @@ FIRST_PACKETS: Final = 3
 
 
 WIDE: Final = 0.05
-"""Part of the mean range; positions with a larger standard deviation have no level."""
+"""Part of the mean range; ranges are curved within positions of a larger standard deviation, which have no level."""
+
+OPEN_WIDE: Final = 0.02
+"""The same where all range errors are open: then only the tag's way tells its position, by directions that change, and
+a filter that is linearised at a wrong place learns too much from them (errors of 5 standard deviations)."""
 
 
 class Report(NamedTuple):
@@ -275,7 +279,9 @@ def _soundness(s: EstimatorState, levels: Vector) -> int:
     is_doubted = status["fault_std_m"] > LASTING_STD_M  # faults are not singled out then
     if max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > (SURE_CHI2 if is_doubted else UNCOVERED_CHI2):
         return CONTRADICTED
-    if _is_wide(s):
+    if status["open_range_errors"] and _is_wider(s, OPEN_WIDE):
+        return CONTRADICTED
+    if _is_wider(s, WIDE):
         return UNAVAILABLE
     for anchor in range(count):
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
@@ -284,12 +290,12 @@ def _soundness(s: EstimatorState, levels: Vector) -> int:
 
 
 @kernel
-def _is_wide(s: EstimatorState) -> bool:
-    """Whether the position is so uncertain that ranges are curved within it; levels are of first order."""
+def _is_wider(s: EstimatorState, share: float) -> bool:
+    """Whether the position's standard deviation is a larger share of the mean range; levels are of first order."""
     count, range_m = len(s.anchors), 0.0
     for anchor in range(count):
         range_m += s.anchors[anchor]["range_m"] / count
-    return bool(s.P[0, 0] + s.P[1, 1] > (WIDE * range_m) ** 2)
+    return bool(s.P[0, 0] + s.P[1, 1] > (share * range_m) ** 2)
 
 
 @kernel

@@ -35,10 +35,11 @@ OFTEN_LATE: Final = 0.02
 TOGETHER: Final = 7.0
 """... together beyond so many (by chance once in some million packets), ..."""
 
-OBSTRUCTED_SUSPECT: Final = 1.8
-OBSTRUCTED_TOGETHER: Final = 4.2
+OBSTRUCTED_SUSPECT: Final = 2.2
+OBSTRUCTED_TOGETHER: Final = 5.0
 """The same where range errors have jumped lately: more are to be expected there, so less evidence is enough (by chance
-once in some hundred packets; a person in the way: 11 instead of 15 cm)."""
+once in some thousand packets), while enough other anchors are not obstructed:
+else what all of them share, as the tag's clock, would open one after another."""
 
 AGREEMENT: Final = 3.0
 """... if they agree within so many standard deviations of two receptions."""
@@ -113,7 +114,10 @@ def is_warm(s: EstimatorState) -> bool:
 def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_variance: float) -> bool:
     """Whether this reception and those before it show that an anchor's range error has jumped."""
     a, status = s.anchors[anchor], s.status[0]
-    share = min(status["obstruction"], 1.0)
+    free = 0
+    for other in range(len(s.anchors)):
+        free += 0 if s.anchors[other]["is_obstructed"] else 1
+    share = min(status["obstruction"], 1.0) if free > s.settings[0]["dim"] + 1 else 0.0
     suspect = SUSPECT + share * (OBSTRUCTED_SUSPECT - SUSPECT)
     together = TOGETHER + share * (OBSTRUCTED_TOGETHER - TOGETHER)
     if innovation * innovation <= suspect * suspect * innovation_variance:
