@@ -21,9 +21,12 @@ def test_what_all_have_in_common_is_nobodys(delays_m, common_m):
     assert sum(ours.values()) == pytest.approx(0.0, abs=1e-9)
 
 
-@given(delays, st.integers(0, 99))
+@given(st.lists(st.floats(-0.05, 0.05), min_size=2, max_size=9), st.integers(0, 99))
 def test_it_is_the_conditional_mean_of_a_gaussian(delays_m, seed):
-    """The same by covariances instead of information, with a common part of which nothing was known."""
+    """The same by covariances instead of information, with a common part of which nothing was known.
+
+    Delays and noise are too small for any pair to pass for blocked.
+    """
     told = excesses(delays_m)
     noise = np.random.default_rng(seed).normal(0.0, 0.03, len(told))
     told = {pair: value + error for (pair, value), error in zip(told.items(), noise, strict=True)}

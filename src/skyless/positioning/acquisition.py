@@ -6,6 +6,7 @@ same anchor tell the drift; then all anchors' newest pseudoranges are carried to
 
 from typing import Final
 
+import msgspec
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.fix import NoFixReason
 from skyless.positioning.observation import Observation
-from skyless.positioning.solver import NoSolution, locate_pseudoranges
+from skyless.positioning.solver import RESIDUAL_TAIL, NoSolution, locate_pseudoranges
 
 MAX_AGE_S: Final = 0.5
 """Older messages no longer serve the start, unless superframes are so long; and then only for the rate of the clock, as
@@ -67,6 +68,10 @@ class Start(Struct, frozen=True):
     clock_rate_mps: float
     clock_rate_variance: float
     speed_variance: float
+    is_contradicted: bool = False
+    """Whether the messages of all anchors contradict each other, ..."""
+    left_out: tuple[int, ...] = ()
+    """... but not without these, which are not in ``used``."""
 
 
 class Acquisition:
@@ -133,10 +138,16 @@ class Acquisition:
     def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
         """Where one anchor alone contradicts all others, do without it; they must still be able to contradict."""
         results = [self._solve(pairs[:k] + pairs[k + 1 :], now) for k in range(len(pairs))]
-        starts = [result for result in results if isinstance(result, Start)]
+        starts = [
+            msgspec.structs.replace(result, is_contradicted=True, left_out=(pairs[k][0].anchor,))
+            for k, result in enumerate(results)
+            if isinstance(result, Start)
+        ]
         return starts[0] if len(starts) == 1 else NoFixReason.RESIDUALS
 
-    def _solve(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
+    def _solve(
+        self, pairs: list[list[Observation]], now: int, residual_tail: float = RESIDUAL_TAIL
+    ) -> Start | NoFixReason:
         base = _offset_ticks(pairs[0][-1])[0]
         rates = np.array([_clock_rate(first, second) for first, second in pairs])
         intervals = np.array([(second.rx_ticks_tag - first.rx_ticks_tag) * TICK_S for first, second in pairs])
@@ -153,6 +164,7 @@ class Acquisition:
             variances,
             height_m=self._height_m,
             z_bounds_m=self._z_bounds_m,
+            residual_tail=residual_tail,
         )
         if isinstance(result, NoSolution):
             return result.reason

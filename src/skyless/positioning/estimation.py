@@ -30,7 +30,7 @@ from skyless.positioning.estimator.estimator import (
 )
 from skyless.positioning.estimator.faults import SURE_CHI2
 from skyless.positioning.estimator.settings import EstimatorSettings
-from skyless.positioning.estimator.state import OPEN_RANGE_STD_M
+from skyless.positioning.estimator.state import CONTRADICTED_STD_M, LASTING_STD_M, OPEN_RANGE_STD_M
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_rows import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
 from skyless.positioning.fix_time import FixTime
@@ -64,7 +64,7 @@ of packets is a start of its own."""
 LATE_S: Final = 0.5
 """By then it is known how often packets are late; a start that was wrong for that reason is repeated."""
 
-CAUTION_S: Final = 5.0
+CAUTION_S: Final = 1.0
 """A start with open range errors is not repeated for so long."""
 
 REORDERED_S: Final = 0.1
@@ -101,6 +101,7 @@ class Estimation:
         self._known_m: dict[int, NDArray[np.float64]] = {}
         self._start: JointStart | None = self._new_start()
         self._open_range_errors = False
+        self._is_open = self._is_doubted = False
         self._time = fix_time or FixTime()
         self._in_use = AnchorsInUse(superframe_s)
         self._master_less_tag_ticks = 0
@@ -179,12 +180,11 @@ class Estimation:
         """Whether a new start is needed, as relays or faults contradict this one; says what that has to expect."""
         if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
             age_s = (rx_ticks - self._started_ticks) * TICK_S
-            cautious = self._open_range_errors
-            limit = SURE_CHI2 if age_s < DOUBT_S and not cautious else UNCOVERED_CHI2
+            limit = SURE_CHI2 if age_s < DOUBT_S or self._is_doubted else UNCOVERED_CHI2
             calm = self._estimator.obstruction < CALM
-            if age_s < DOUBT_S and self._estimator.unexplained_test < UNEXPLAINED_CHI2:
+            if not self._is_doubted and age_s < DOUBT_S and self._estimator.unexplained_test < UNEXPLAINED_CHI2:
                 limit = UNCOVERED_CHI2  # one or two anchors, which the estimator will find
-            if calm and self._estimator.fault_test > limit and (not cautious or age_s > CAUTION_S):
+            if calm and self._estimator.fault_test > limit and (not self._is_open or age_s > CAUTION_S):
                 self._open_range_errors = not self._estimator.is_late_often
                 return age_s > LATE_S or self._open_range_errors
         if not self._relays_may_contradict:
@@ -220,13 +220,21 @@ class Estimation:
         self._in_use.begin(start.used)
         dim, begin_ticks = self._estimator.dim, packets[0].rx_ticks_tag
         age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
-        error = OPEN_RANGE_STD_M if self._open_range_errors else self._settings.range_std_m
-        inflation = COVARIANCE_MARGIN * (
-            1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
-        )
+        self._is_open = self._open_range_errors or (start.is_contradicted and not start.left_out)
+        self._is_doubted = self._is_open or start.is_contradicted
+        error = OPEN_RANGE_STD_M if self._is_doubted else self._settings.range_std_m
+        inflation = 1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
+        if not self._is_doubted:
+            inflation *= COVARIANCE_MARGIN
         covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * start.speed_variance * np.eye(dim)
         self._estimator.start(
-            begin_ticks, start.solution[:dim], covariance, start.speed_variance, self._open_range_errors
+            begin_ticks,
+            start.solution[:dim],
+            covariance,
+            start.speed_variance,
+            self._is_open,
+            CONTRADICTED_STD_M if self._is_doubted else LASTING_STD_M,
+            [self._index(packet) for packet in packets if packet.anchor in start.left_out],
         )
         for packet in packets:
             self._process(packet)

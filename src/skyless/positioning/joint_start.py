@@ -13,7 +13,8 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.constants import TICK_M, TICK_S
-from skyless.positioning.acquisition import Acquisition
+from skyless.positioning.acquisition import PATIENCE_S, Acquisition, Start
+from skyless.positioning.fix import NoFixReason
 from skyless.positioning.observation import Observation
 
 MAX_LINK_AGE_S: Final = 1.0
@@ -51,11 +52,23 @@ class JointStart(Acquisition):
     ) -> None:
         super().__init__(height_m, stamp_variance_m2, z_bounds_m, max_age_s, speed_std_mps)
         self._links: dict[tuple[int, int], _Link] = {}
+        self._contradicted_ticks: int | None = None
+        """When packets first contradicted each other."""
 
     def packets(self) -> list[Observation]:
         """The last two packets of each anchor, in the order of their receptions."""
         kept = [observation for pair in self._heard.values() for observation in pair]
         return sorted(kept, key=lambda observation: observation.rx_ticks_tag)
+
+    def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
+        """Where no single anchor contradicts all others, for half a second, start from all of them as they are."""
+        result = super()._solve_without_one(pairs, now)
+        if self._contradicted_ticks is None:
+            self._contradicted_ticks = now
+        if isinstance(result, Start) or (now - self._contradicted_ticks) * TICK_S < PATIENCE_S:
+            return result
+        result = self._solve(pairs, now, residual_tail=0.0)
+        return msgspec.structs.replace(result, is_contradicted=True) if isinstance(result, Start) else result
 
     def learn(self, observation: Observation) -> None:
         """Keep what an anchor relays; to be called before ``hear``."""

@@ -3,7 +3,7 @@
 Anchors join and leave between packets, in NumPy; everything else is one kernel a packet.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -14,10 +14,11 @@ from skyless.air.beacon import HEARD
 from skyless.compiled import kernel, step, threaded_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.positioning.estimator.faults import (
+    SURE_CHI2,
     explained_chi2,
     fade_recent_faults,
-    lasting_chi2,
-    open_lasting_faults,
+    fault_chi2,
+    open_faults,
 )
 from skyless.positioning.estimator.flatness import fit_plane, is_height_open
 from skyless.positioning.estimator.kalman import is_at_rest, predict
@@ -30,10 +31,19 @@ from skyless.positioning.estimator.kinds import (
     report,
     zero_velocity,
 )
-from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LASTING_STD_M, LEVELS, RECENT_CHI2, VPL, protect
+from skyless.positioning.estimator.levels import (
+    HPL,
+    LASTING_CHI2,
+    LEVELS,
+    RECENT_CHI2,
+    RECENT_STD_M,
+    VPL,
+    protect,
+)
 from skyless.positioning.estimator.monitor import OFTEN_LATE, covariance_scale, follow_rest
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.estimator.state import (
+    LASTING_STD_M,
     NEVER,
     REMEMBERED,
     Cube,
@@ -89,6 +99,14 @@ MOST_PACKED: Final = 16
 
 FIRST_PACKETS: Final = 3
 """Of each anchor, before which nothing is promised."""
+
+
+WIDE: Final = 0.05
+"""Part of the mean range; ranges are curved within positions of a larger standard deviation, which have no level."""
+
+OPEN_WIDE: Final = 0.02
+"""The same where all range errors are open: then only the tag's way tells its position, by directions that change, and
+a filter that is linearised at a wrong place learns too much from them (errors of 5 standard deviations)."""
 
 
 class Report(Struct, frozen=True, gc=False):
@@ -187,13 +205,13 @@ def _process(
 
 @step
 def _look_around(s: EstimatorState, elapsed_s: float) -> None:
-    """Look whether the tag stands still, and once in a round of packets for lasting faults."""
+    """Look whether the tag stands still, and once in a round of packets for faults."""
     if s.settings[0]["rest_s"] > 0.0:
         follow_rest(s, elapsed_s)
         if is_at_rest(s):
             zero_velocity(s)
     if s.status[0]["packets"] % len(s.anchors) == 0:
-        open_lasting_faults(s, lasting_chi2(s, LASTING_STD_M))
+        open_faults(s, fault_chi2(s, 0, s.status[0]["fault_std_m"]), fault_chi2(s, 1, RECENT_STD_M))
 
 
 @step
@@ -285,6 +303,15 @@ def _track(
 
 
 @step
+def _spread(s: EstimatorState) -> float:
+    """The position's horizontal standard deviation as a part of the mean range; levels are of first order in it."""
+    range_m = 0.0
+    for anchor in range(len(s.anchors)):
+        range_m += s.anchors[anchor]["range_m"] / len(s.anchors)
+    return float(np.sqrt(s.P[0, 0] + s.P[1, 1]) / max(range_m, 1e-6))
+
+
+@step
 def _soundness(s: EstimatorState, levels: Vector) -> int:
     """What can be said of a position with these levels."""
     count, status = len(s.anchors), s.status[0]
@@ -292,9 +319,14 @@ def _soundness(s: EstimatorState, levels: Vector) -> int:
     for anchor in range(count):
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
             soundness = OBSTRUCTED
-    if status["withholds_levels"] or max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > UNCOVERED_CHI2:
+    limit = SURE_CHI2 if status["fault_std_m"] > LASTING_STD_M else UNCOVERED_CHI2  # doubted: none are singled out
+    share = _spread(s)
+    if status["withholds_levels"] or max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > limit:
         soundness = CONTRADICTED
-    if count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count or is_height_open(s):
+    if status["open_range_errors"] and share > OPEN_WIDE:
+        soundness = CONTRADICTED
+    is_new = count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count
+    if is_new or share > WIDE or is_height_open(s):
         soundness = UNAVAILABLE
     return soundness
 
@@ -441,6 +473,7 @@ class Estimator:
         self.dim = settings.dim
         self._table_m: list[Vector] = [] if table_m is None else [np.array(row, np.float64) for row in table_m]
         self._identifiers = np.full(len(self._table_m), -1)
+        self._left_out: frozenset[int] = frozenset()
         self._levels = np.zeros(LEVELS)
         self._rows = np.zeros((PROTECTED_ROWS, 3))
         self._packed = np.zeros(MOST_PACKED * HEARD.size, np.uint8)
@@ -492,15 +525,20 @@ class Estimator:
         covariance_m2: Matrix,
         speed_variance: float,
         open_range_errors: bool = False,
+        fault_std_m: float = LASTING_STD_M,
+        left_out: Iterable[int] = (),
     ) -> None:
         """Begin at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept.
 
         ``open_range_errors``: expect ranges to be wrong by half a metre and anchors to be misplaced, since what
-        the settings say of them has been contradicted.
+        the settings say of them has been contradicted. ``left_out``: do so of these anchors of the table alone.
+        ``fault_std_m``: of range errors of all anchors that the levels are to cover.
         """
         settings, dim = self.settings, self.dim
         state = new_state(settings, len(self._table_m), open_range_errors=open_range_errors)
         state.status["late_share"] = self._state.status["late_share"]
+        state.status["fault_std_m"] = fault_std_m
+        self._left_out = frozenset(left_out)
         state.x[:dim] = position_m
         state.P[:dim, :dim] = covariance_m2
         state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
@@ -588,7 +626,8 @@ class Estimator:
         """Let an anchor join or leave, as a packet asks for."""
         state = self._state
         if outcome == NEW_ANCHOR:
-            self._state = with_anchor(state, table_index, self._table_m[table_index])
+            is_open = table_index in self._left_out
+            self._state = with_anchor(state, table_index, self._table_m[table_index], is_open)
         elif outcome == RESTARTED_CLOCK:
             state.status["clock_restarts"] += 1
             self._state = without_anchor(state, int(state.index_of[table_index]))

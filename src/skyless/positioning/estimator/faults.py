@@ -16,9 +16,17 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import step
-from skyless.positioning.estimator.state import LASTING, EstimatorState, Matrix, layout, uncertain_states
+from skyless.positioning.estimator.state import (
+    LASTING,
+    LASTING_STD_M,
+    PASSING,
+    EstimatorState,
+    Matrix,
+    layout,
+    uncertain_states,
+)
 
-RECENT_PACKETS: Final = 24.0
+RECENT_PACKETS: Final = 16.0
 """Number of packets of each anchor over which a fault counts as recent."""
 
 OPENED_STD_M: Final = 1.0
@@ -35,6 +43,15 @@ RIVAL_CHI2: Final = 20.0
 
 MOST_FAULTS: Final = 2
 """Largest number of anchors that are singled out."""
+
+EARLY_WEIGHT: Final = 0.8
+"""Obstacles make packets late, not early; a fault that is early has to explain more by this."""
+
+JUMP_RISE: Final = 0.5
+"""By so much of its full size a jump raises the process noise of all range errors."""
+
+FIRST_CHANGE_SCALE: Final = 25.0
+"""Factor on the process noise of a range error that has just jumped: it may still be changing."""
 
 
 @step
@@ -70,6 +87,8 @@ def gather_evidence(s: EstimatorState, innovation: float, innovation_variance: f
             evidence[bank, one] += weight * innovation
             for other in range(count):
                 information[bank, one, other] += weight * fault_input[begin + other]
+                if bank == 0:
+                    information[2, one, other] += weight * fault_input[count + other]
 
 
 @step
@@ -85,6 +104,7 @@ def fade_recent_faults(s: EstimatorState) -> None:
             s.evidence[1, one] *= kept
             for other in range(count):
                 s.information[1, one, other] *= kept
+                s.information[2, one, other] *= kept
 
 
 @step
@@ -106,9 +126,9 @@ def whiten(work: Matrix, count: int, vectors: int) -> None:
 
 
 @step
-def lasting_chi2(s: EstimatorState, std_m: float) -> float:
-    """The test of all lasting faults, of that standard deviation beforehand."""
-    count, y, M = len(s.anchors), s.evidence[0], s.information[0]
+def fault_chi2(s: EstimatorState, bank: int, std_m: float) -> float:
+    """The test of all faults of a kind, of that standard deviation beforehand."""
+    count, y, M = len(s.anchors), s.evidence[bank], s.information[bank]
     for one in range(count):
         for other in range(count):
             s.work[one, other] = M[one, other]
@@ -134,14 +154,75 @@ def explained_chi2(s: EstimatorState, one: int, other: int) -> float:
 
 
 @step
-def open_lasting_faults(s: EstimatorState, chi2: float) -> int:
-    """Take lasting faults into the state where the test ``chi2`` of all of them is sure; how many anchors have one.
+def open_faults(s: EstimatorState, lasting_chi2: float, recent_chi2: float) -> None:
+    """Take faults into the state where a test of all of a kind is sure.
 
-    They are the one or two anchors whose faults explain the test while no others do as well, or none.
+    After a start that was contradicted, none are singled out: any number of anchors may be late then, and those that
+    explain the test are now and then the wrong ones.
     """
+    singles_out = s.status[0]["fault_std_m"] <= LASTING_STD_M
+    if singles_out and recent_chi2 > SURE_CHI2 and _largest(s, 1) >= _largest(s, 0):
+        _open_recent_faults(s)
+    elif singles_out and lasting_chi2 > SURE_CHI2:
+        _open_lasting_faults(s, lasting_chi2)
+
+
+@step
+def _largest(s: EstimatorState, bank: int) -> float:
+    """How much the fault of a single anchor explains at most."""
+    most = 0.0
+    for anchor in range(len(s.anchors)):
+        most = max(most, _explained_alone(s, bank, anchor))
+    return most
+
+
+@step
+def _explained_alone(s: EstimatorState, bank: int, anchor: int) -> float:
+    """How much the fault of an anchor explains; that it is early is less likely, and counts less."""
+    y, M = s.evidence[bank, anchor], s.information[bank, anchor, anchor]
+    return float((1.0 if y > 0.0 else EARLY_WEIGHT) * y * y / (M + 1.0 / OPENED_STD_M**2))
+
+
+@step
+def _open_recent_faults(s: EstimatorState) -> None:
+    """Open the range errors of the anchors whose recent faults explain the innovations about as well as any other's.
+
+    A single one opens by itself; where it cannot be told which of several it is, the position rests on none of them,
+    as long as enough anchors are left.
+    """
+    count, spare = len(s.anchors), len(s.anchors) - s.settings[0]["dim"] - 1
+    for anchor in range(count):
+        spare -= 1 if s.anchors[anchor]["is_obstructed"] else 0
+        s.ph[anchor] = _explained_alone(s, 1, anchor)
+    limit = _largest(s, 1) - RIVAL_CHI2
+    first = 0
+    while spare > 0 and first >= 0:
+        first = -1
+        for anchor in range(count):
+            if s.ph[anchor] > limit and (first < 0 or s.ph[anchor] > s.ph[first]):
+                first = anchor
+        if first >= 0:
+            s.ph[first] = 0.0
+            spare -= 1
+            _open_fault(s, 1, first)
+            begin_obstruction(s, first)
+
+
+@step
+def begin_obstruction(s: EstimatorState, anchor: int) -> None:
+    """Note that an anchor's range error has jumped; it may still be changing."""
+    a, status = s.anchors[anchor], s.status[0]
+    a["outliers_in_row"] = 0
+    a["is_obstructed"] = 1
+    a["change_mean"], a["change_scale"] = 0.0, FIRST_CHANGE_SCALE
+    status["obstruction"] = min(status["obstruction"] + JUMP_RISE, 2.0)
+
+
+@step
+def _open_lasting_faults(s: EstimatorState, chi2: float) -> None:
+    """Take the lasting faults of one or two anchors into the state, where no others explain the test as well."""
     count, dim = len(s.anchors), s.settings[0]["dim"]
-    most_faults = min(MOST_FAULTS, count - dim - 2) if chi2 > SURE_CHI2 else 0
-    opened = 0
+    most_faults, opened = min(MOST_FAULTS, count - dim - 2), False
     for faults in range(1, most_faults + 1):
         first, second, most, rival = -1, -1, 0.0, 0.0
         for one in range(count):
@@ -152,56 +233,55 @@ def open_lasting_faults(s: EstimatorState, chi2: float) -> int:
                         first, second, most, rival = one, other, explained, most
                     elif explained > rival:
                         rival = explained
-        if opened == 0 and chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_CHI2:
-            _open_lasting_fault(s, first)
+        if not opened and chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_CHI2:
+            opened = True
+            _open_fault(s, 0, first)
+            s.anchors[first]["has_fault"] = 1
             if second != first:
-                _open_lasting_fault(s, second)
-            forget_recent_faults(s)
-            opened = faults
-    return opened
+                _open_fault(s, 0, second)
+                s.anchors[second]["has_fault"] = 1
 
 
 @step
-def forget_recent_faults(s: EstimatorState) -> None:
-    """Judge recent faults from here on."""
-    V, evidence, information, count = s.V, s.evidence, s.information, len(s.anchors)
-    for fault in range(count):
-        evidence[1, fault] = 0.0
-        for other in range(count):
-            information[1, fault, other] = 0.0
-        for state in range(V.shape[1]):
-            V[count + fault, state] = 0.0
-
-
-@step
-def _open_lasting_fault(s: EstimatorState, anchor: int) -> None:
-    """Take one anchor's fault into its constant range error; the other hypotheses are conditioned on it."""
-    x, P, V, y, M = s.x, s.P, s.V, s.evidence[0], s.information[0]
-    count, n = len(s.anchors), len(x)
-    gain = 1.0 / (M[anchor, anchor] + 1.0 / OPENED_STD_M**2)
-    fault_m = gain * y[anchor]
-    opened = V[anchor]  # what it adds to each state: 1 − V for the range error, −V for all others
+def _open_fault(s: EstimatorState, bank: int, anchor: int) -> None:
+    """Take a fault into its anchor's range error; all other hypotheses are conditioned on it (Schur's complement)."""
+    status = s.status[0]
+    status["range_errors"] = max(status["range_errors"], LASTING if bank == 0 else PASSING)
+    x, P, V, evidence, information, column = s.x, s.P, s.V, s.evidence, s.information, s.fault_input
+    count, n = len(s.anchors), uncertain_states(s)
+    where, chosen = layout(s.settings[0]["dim"], count), bank * count + anchor
+    gain = 1.0 / (information[bank, anchor, anchor] + 1.0 / OPENED_STD_M**2)
+    fault_m = gain * evidence[bank, anchor]
+    variance = gain if bank == 0 else gain + fault_m * fault_m
+    opened = V[chosen]  # what it adds to each state: 1 − V for the range error, −V for all others
     for state in range(n):
         opened[state] = -opened[state]
-    opened[layout(s.settings[0]["dim"], count).constant + anchor] += 1.0
+    opened[(where.constant if bank == 0 else where.change) + anchor] += 1.0
     for row in range(n):
         x[row] += opened[row] * fault_m
-        for column in range(n):
-            P[row, column] += opened[row] * opened[column] * gain
+        for other in range(n):
+            P[row, other] += opened[row] * opened[other] * variance
     for other in range(count):
-        if other != anchor:
-            share = M[other, anchor] * gain
-            y[other] -= share * y[anchor]
-            for third in range(count):
-                if third != anchor:
-                    M[other, third] -= share * M[third, anchor]
-            for state in range(n):
-                V[other, state] += share * opened[state]
-    y[anchor] = 0.0
+        lasting, recent = (anchor, other) if bank == 0 else (other, anchor)
+        column[bank * count + other] = information[bank, other, anchor]
+        column[count - bank * count + other] = information[2, lasting, recent]
+    column[chosen] = 0.0
+    for one in range(2 * count):
+        if one == chosen:
+            continue
+        share = gain * column[one]
+        kind = one // count
+        evidence[kind, one - kind * count] -= share * evidence[bank, anchor]
+        for other in range(count):
+            information[kind, one - kind * count, other] -= share * column[kind * count + other]
+            if kind == 0:
+                information[2, one, other] -= share * column[count + other]
+        for state in range(n):
+            V[one, state] += share * opened[state]
+    evidence[bank, anchor] = 0.0
     for other in range(count):
-        M[anchor, other] = M[other, anchor] = 0.0
+        lasting, recent = (anchor, other) if bank == 0 else (other, anchor)
+        information[bank, anchor, other] = information[bank, other, anchor] = information[2, lasting, recent] = 0.0
     for state in range(n):
         opened[state] = 0.0
-    s.anchors[anchor]["has_fault"] = 1
-    s.status[0]["range_errors"] = LASTING
     s.status[0]["faults_opened"] += 1

@@ -110,7 +110,7 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
     change, constant = where.change + anchor, where.constant + anchor
     obstructed = share * dt / OBSTRUCTED_S
     if s.anchors[anchor]["is_obstructed"]:
-        s.P[change, change] += OBSTRUCTED_WALK * dt
+        s.P[change, change] += OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"] * dt
     else:
         variance = s.anchors[anchor]["place_variance_m2"] + share * OBSTRUCTED_STD_M**2
         usual = dt / settings["place_time_s"] + walked_m / settings["place_distance_m"]

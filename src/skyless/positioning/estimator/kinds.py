@@ -33,6 +33,7 @@ from skyless.positioning.estimator.monitor import (
     adapt_process_noise,
     difference_scale,
     end_small_obstruction,
+    follow_change,
     has_jumped,
     is_common,
     is_warm,
@@ -209,6 +210,8 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     if used:
         end_small_obstruction(s, anchor)
         normalised = innovation / np.sqrt(innovation_variance)
+        if a["is_obstructed"]:
+            follow_change(s, anchor, normalised)
         if is_warm(s):
             adapt_process_noise(s, normalised / scale)
         used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]
@@ -410,6 +413,7 @@ def difference_terms(s: EstimatorState, a: int, b: int) -> tuple[int, float]:
     dim = s.settings[0]["dim"]
     far_m = _add_direction(s, 0, b, 1.0)
     near_m = _add_direction(s, 2 * dim, a, -1.0)
+    s.anchors[b]["range_m"], s.anchors[a]["range_m"] = far_m, near_m
     for axis in range(dim):
         s.h[axis] += s.h[2 * dim + axis]
         s.h[2 * dim + axis] = 0.0
@@ -441,6 +445,8 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
         subtract_fault_input(s, a)
         gather_evidence(s, innovation, innovation_variance * scale)
         update(s, innovation, innovation_variance * scale, 1.0, len(s.x))
+        end_small_obstruction(s, a)
+        end_small_obstruction(s, b)
         adapt_place_noise(s, a, a_elapsed_s)
         adapt_place_noise(s, b, b_elapsed_s)
     return int(scale > 0.0)

@@ -19,11 +19,8 @@ from skyless.positioning.estimator.faults import whiten
 from skyless.positioning.estimator.monitor import covariance_scale
 from skyless.positioning.estimator.state import EstimatorState, Vector
 
-LASTING_STD_M: Final = 0.3
-"""Of a fault that has been there since the anchor joined, ..."""
-
 RECENT_STD_M: Final = 0.08
-"""... and of one that has begun lately without a jump that shows."""
+"""Of a fault that has begun lately without a jump that shows."""
 
 HPL, VPL, LASTING_CHI2, RECENT_CHI2 = range(4)
 """What ``protect`` writes."""
@@ -39,7 +36,7 @@ def protect(s: EstimatorState, levels: Vector) -> None:
     scale = covariance_scale(s)
     levels[HPL] = levels[VPL] = 0.0
     for bank in range(2):
-        std_m = LASTING_STD_M if bank == 0 else RECENT_STD_M
+        std_m = s.status[0]["fault_std_m"] if bank == 0 else RECENT_STD_M
         begin = bank * count
         for one in range(count):
             for other in range(count):

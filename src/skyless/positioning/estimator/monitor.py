@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import step
+from skyless.positioning.estimator.faults import begin_obstruction
 from skyless.positioning.estimator.state import PASSING, EstimatorState, layout
 
 FORGETTING: Final = 0.02
@@ -34,18 +35,33 @@ OFTEN_LATE: Final = 0.02
 TOGETHER: Final = 7.0
 """... together beyond so many (by chance once in some million packets), ..."""
 
+OBSTRUCTED_SUSPECT: Final = 2.2
+OBSTRUCTED_TOGETHER: Final = 5.0
+"""The same where range errors have jumped lately: more are to be expected there, so less evidence is enough (by chance
+once in some thousand packets), while enough other anchors are not obstructed:
+else what all of them share, as the tag's clock, would open one after another."""
+
 AGREEMENT: Final = 3.0
 """... if they agree within so many standard deviations of two receptions."""
 
 JUMP_STD_M: Final = 0.2
 """Of a range error that has jumped, beyond what it was, unless it has jumped by more."""
 
-JUMP_RISE: Final = 0.5
-"""By so much of its full size a jump raises the process noise of all range errors."""
+CHANGE_GAIN: Final = 0.1
+CHANGE_LIMIT: Final = 4.0
+"""Of the square of the running mean of an obstructed anchor's innovations, 1 where its error wanders as expected."""
+
+CHANGE_GROWTH: Final = 1.2
+CHANGE_LOSS: Final = 0.97
+MOST_CHANGE_SCALE: Final = 250.0
+"""A range error that has jumped then changes by 1 m in a second at most."""
 
 ENDED_STD_M: Final = 0.05
 ENDED: Final = 2.0
 """An obstruction has ended where its error is known to this, and less than so many standard deviations from none."""
+
+SETTLED: Final = 2.0
+"""A range error whose process noise is raised by less does not change any more."""
 
 LATE_FORGETTING: Final = 0.005
 LATE_DENSITY: Final = 0.05
@@ -107,7 +123,13 @@ def is_warm(s: EstimatorState) -> bool:
 def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_variance: float) -> bool:
     """Whether this reception and those before it show that an anchor's range error has jumped."""
     a, status = s.anchors[anchor], s.status[0]
-    if innovation * innovation <= SUSPECT * SUSPECT * innovation_variance:
+    free = 0
+    for other in range(len(s.anchors)):
+        free += 0 if s.anchors[other]["is_obstructed"] else 1
+    share = min(status["obstruction"], 1.0) if free > s.settings[0]["dim"] + 1 else 0.0
+    suspect = SUSPECT + share * (OBSTRUCTED_SUSPECT - SUSPECT)
+    together = TOGETHER + share * (OBSTRUCTED_TOGETHER - TOGETHER)
+    if innovation * innovation <= suspect * suspect * innovation_variance:
         a["outliers_in_row"] = 0
     else:
         settings = s.settings[0]
@@ -115,7 +137,7 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
         apart = innovation - a["outlier_m"]
         both = innovation + a["outlier_m"]
         agrees = a["outliers_in_row"] > 0 and apart * apart <= AGREEMENT * AGREEMENT * stamps
-        agrees = agrees and both * both > TOGETHER * TOGETHER * innovation_variance
+        agrees = agrees and both * both > together * together * innovation_variance
         a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
         a["outlier_m"] = innovation
     needed = IN_ROW_WHERE_LATE if status["late_share"] > OFTEN_LATE else IN_ROW
@@ -141,14 +163,22 @@ def is_common(s: EstimatorState, normalised: float) -> bool:
 @step
 def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
     """Let an anchor's range error be estimated again from a jump on."""
-    status, change = s.status[0], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
-    a = s.anchors[anchor]
-    a["outliers_in_row"] = 0
-    a["is_obstructed"] = 1
-    status["obstructions"] += 1
-    status["obstruction"] = min(status["obstruction"] + JUMP_RISE, 2.0)
+    change = layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
+    s.status[0]["obstructions"] += 1
+    begin_obstruction(s, anchor)
     s.P[change, change] += max(JUMP_STD_M**2, innovation * innovation)
-    status["range_errors"] = max(status["range_errors"], PASSING)
+    s.status[0]["range_errors"] = max(s.status[0]["range_errors"], PASSING)
+
+
+@step
+def follow_change(s: EstimatorState, anchor: int, normalised: float) -> None:
+    """Raise the process noise of an obstructed anchor's range error where its innovations stay on one side."""
+    a = s.anchors[anchor]
+    a["change_mean"] += CHANGE_GAIN * (normalised - a["change_mean"])
+    if a["change_mean"] ** 2 * (2.0 - CHANGE_GAIN) / CHANGE_GAIN > CHANGE_LIMIT:
+        a["change_scale"] = min(a["change_scale"] * CHANGE_GROWTH, MOST_CHANGE_SCALE)
+    else:
+        a["change_scale"] = max(a["change_scale"] * CHANGE_LOSS, 1.0)
 
 
 @step
@@ -156,7 +186,8 @@ def end_small_obstruction(s: EstimatorState, anchor: int) -> None:
     """End an obstruction that has gone without a jump back: the range error is known, and is hardly there."""
     a, change = s.anchors[anchor], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
     error_m, variance = s.x[change], s.P[change, change]
-    if a["is_obstructed"] and variance < ENDED_STD_M**2 and error_m * error_m < ENDED * ENDED * variance:
+    settled = a["is_obstructed"] and a["change_scale"] < SETTLED and variance < ENDED_STD_M**2
+    if settled and error_m * error_m < ENDED * ENDED * variance:
         a["is_obstructed"] = 0
         s.status[0]["ends_of_obstructions"] += 1
 

@@ -40,6 +40,8 @@ def is_sound(estimator: Estimator) -> bool:
     settings, state = own["settings"], own["_state"]
     if not isinstance(settings, EstimatorSettings) or not isinstance(state, EstimatorState):
         return False
+    if not isinstance(own["_left_out"], frozenset):
+        return False
     if own["dim"] != settings.dim or not isinstance(own["_table_m"], list) or len(own["_table_m"]) > MOST:
         return False
     arrays = [*_of_state(state, settings.dim, len(own["_table_m"])), *_of_estimator(own)]
@@ -56,7 +58,7 @@ def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[Wanted]:
     yield s.x, (n,), np.float64
     yield s.P, (n, n), np.float64
     yield s.V, (faults, n), np.float64
-    yield s.information, (2, count, count), np.float64
+    yield s.information, (3, count, count), np.float64
     yield s.evidence, (2, count), np.float64
     yield s.anchors, (count,), ANCHOR
     yield s.packets, (count, REMEMBERED), PACKET

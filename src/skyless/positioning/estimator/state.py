@@ -65,6 +65,8 @@ ANCHOR: Final = np.dtype(
         ("outliers_in_row", np.int64),
         ("outlier_m", np.float64),  # the newest of them
         ("is_obstructed", np.int64),  # whether its range error has jumped and not come back
+        ("change_mean", np.float64),  # running mean of its innovations since then, normalised
+        ("change_scale", np.float64),  # factor on the process noise of a range error that has jumped
         ("has_fault", np.int64),  # whether a lasting fault of it was taken into the state
         ("relay_outliers_in_row", np.int64),
         ("relay_mean", np.float64),  # running mean of what relays say of its clock, normalised
@@ -128,6 +130,7 @@ STATUS: Final = np.dtype(
         ("plane_normal", np.float64, (3,)),  # ... and its normal
         ("open_range_errors", np.int64),  # whether anchors join with range errors beyond what the settings say
         ("range_errors", np.int64),  # which of them there are: NONE, PASSING or LASTING
+        ("fault_std_m", np.float64),  # of lasting faults, beforehand
     ],
     align=True,
 )
@@ -145,7 +148,8 @@ class EstimatorState(NamedTuple):
     """What faults do to x, shape (2·anchors + dim, n): for each metre by which the tag's receptions of an anchor have
     been late since it joined, the same lately, and for each m/s² of acceleration along an axis."""
     information: Cube
-    """Of both kinds of faults of all anchors in the innovations, shape (2, anchors, anchors)."""
+    """Of both kinds of faults of all anchors in the innovations, and of lasting (row) with recent ones (column), shape
+    (3, anchors, anchors)."""
     evidence: Matrix
     """What innovations say of them, shape (2, anchors)."""
     anchors: Records
@@ -232,6 +236,7 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
     status["range_errors"] = _expected_range_errors(settings.record()[0], status[0])
     status["q_scale"] = status["mean_nis"] = 1.0
     status["walk_scale"] = min(START_WALK_SCALE, settings.max_walk_scale)
+    status["fault_std_m"] = LASTING_STD_M
     status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
     P = np.zeros((n, n))
     P[where.slope, where.slope] = settings.slope_std_m**2
@@ -239,7 +244,7 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
         x=np.zeros(n),
         P=P,
         V=np.zeros((dim, n)),
-        information=np.zeros((2, 0, 0)),
+        information=np.zeros((3, 0, 0)),
         evidence=np.zeros((2, 0)),
         anchors=np.zeros(0, ANCHOR),
         packets=np.zeros((0, REMEMBERED), PACKET),
@@ -258,7 +263,13 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
 START_WALK_SCALE: Final = 100.0
 """Of the tag's oscillator, which warms up after it was switched on."""
 
-OPEN_RANGE_STD_M: Final = 0.5
+LASTING_STD_M: Final = 0.3
+"""Of a fault that has been there since the anchor joined, ..."""
+
+CONTRADICTED_STD_M: Final = 1.0
+"""... and where the packets that led to the start contradict each other, so that some are late by more."""
+
+OPEN_RANGE_STD_M: Final = 1.0
 OPEN_SURVEY_STD_M: Final = 0.15
 """What a start expects of ranges and survey that follows one which was contradicted."""
 
@@ -266,8 +277,8 @@ PAIR_STD_M: Final = 0.05
 """Of the constant of a pair of anchors beside what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
 
 
-def with_anchor(s: EstimatorState, table_index: int, position_m: Vector) -> EstimatorState:
-    """The state with one more anchor, nothing known of its clock."""
+def with_anchor(s: EstimatorState, table_index: int, position_m: Vector, is_open: bool = False) -> EstimatorState:
+    """The state with one more anchor, nothing known of its clock; if it is open, next to nothing of its range error."""
     settings, count = s.settings[0], len(s.anchors)
     grown = _selected(s, [*range(count), -1])
     dim, last = int(settings["dim"]), grown.anchors[count]
@@ -284,7 +295,8 @@ def with_anchor(s: EstimatorState, table_index: int, position_m: Vector) -> Esti
     where = layout(dim, count + 1)
     grown.P[where.change + count, where.change + count] = last["place_variance_m2"]
     range_std_m, survey_std_m = settings["range_std_m"], settings["survey_std_m"]
-    if s.status[0]["open_range_errors"]:
+    if is_open or s.status[0]["open_range_errors"]:
+        s.status[0]["range_errors"] = LASTING
         range_std_m, survey_std_m = OPEN_RANGE_STD_M, OPEN_SURVEY_STD_M
     grown.P[where.constant + count, where.constant + count] = range_std_m**2
     survey = where.survey + dim * count
@@ -327,7 +339,7 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
         x=_take(s.x, of_states),
         P=_take(s.P, of_states, of_states),
         V=_take(s.V, np.array(faults), of_states),
-        information=_take(s.information, np.arange(2), of_anchors, of_anchors),
+        information=_take(s.information, np.arange(3), of_anchors, of_anchors),
         evidence=_take(s.evidence, np.arange(2), of_anchors),
         anchors=_take(s.anchors, of_anchors),
         packets=_take(s.packets, of_anchors),
