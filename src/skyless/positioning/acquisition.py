@@ -1,4 +1,4 @@
-"""The tracker's cold start: position and clock from beacons alone, without a guess.
+"""A cold start: position and clock from beacons alone, without a guess.
 
 The tag's clock runs up to 20 ppm off, so pseudoranges of one superframe drift by tens of metres. Two messages of the
 same anchor tell the drift; then all anchors' newest pseudoranges are carried to one time and solved in closed form.
@@ -55,17 +55,14 @@ MAX_SPEED_STD_MPS: Final = 32.0
 
 
 class Start(Struct, frozen=True):
-    """A first state: everything ``PseudorangeTracker.start`` wants."""
+    """A first position, and the speed that is assumed of the tag."""
 
     used: tuple[Observation, ...]
     """The messages that it rests on, one of each anchor."""
     rx_ticks_tag: int
-    whole_offset_ticks: int
     solution: NDArray[np.float64]
     """[position (dim), clock offset], metres."""
     covariance: NDArray[np.float64]
-    clock_rate_mps: float
-    clock_rate_variance: float
     speed_variance: float
 
 
@@ -161,11 +158,8 @@ class Acquisition:
         return Start(
             tuple(newest),
             now,
-            base,
             solution,
             result.covariance_joint_m2,
-            rate,
-            rate_variance,
             self._speed_variance,
         )
 

@@ -139,14 +139,7 @@ class Estimation:
         ):
             self._start = self._new_start()
         if self._start is not None:
-            self._start.learn(observation)
-            start = self._start.hear(observation)
-            if isinstance(start, NoFixReason):
-                return start
-            if self._superframe_s > LONGEST_SUPERFRAME_S:
-                return self._fix_of(start, observation)
-            self._begin(start, self._start.packets())
-            return self._fix(observation)
+            return self._look_for_start(self._start, observation)
         outcome = self._process(observation)
         self._newest_ticks = max(self._newest_ticks, rx_ticks)
         if outcome in {REJECTED, STALE}:
@@ -160,6 +153,16 @@ class Estimation:
             self._start = self._new_start()
             return NoFixReason.ACQUIRING
         self._in_use.use(observation)
+        return self._fix(observation)
+
+    def _look_for_start(self, starting: JointStart, observation: Observation) -> Fix | NoFixReason:
+        starting.learn(observation)
+        start = starting.hear(observation)
+        if isinstance(start, NoFixReason):
+            return start
+        if self._superframe_s > LONGEST_SUPERFRAME_S:
+            return self._fix_of(start, observation)
+        self._begin(start, starting.packets())
         return self._fix(observation)
 
     def coast(self, observation: Observation) -> Fix | NoFixReason:

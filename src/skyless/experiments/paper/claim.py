@@ -14,7 +14,7 @@ from skyless.simulation.scenario import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 
-METHODS: Final = ("literal", "weighted", "bracketed", "tracker")
+METHODS: Final = ("literal", "weighted", "bracketed", "joint")
 CLAIM_FIXES: Final = 30_000
 """As many as the paper made at each position."""
 
@@ -129,8 +129,8 @@ def trend_of(rows: list[Worst]) -> Trend:
 
 def judge(crossings_ps: dict[str, float]) -> tuple[Verdict, str]:
     """Whether ``literal`` keeps below the limit at the noise of the paper and at that of its radio."""
-    literal, tracker = crossings_ps["literal"], crossings_ps["tracker"]
-    limits = f"literal up to {literal:.0f} ps, tracker up to {tracker:.0f} ps"
+    literal, joint = crossings_ps["literal"], crossings_ps["joint"]
+    limits = f"literal up to {literal:.0f} ps, joint up to {joint:.0f} ps"
     if literal > DW1000_PS[1]:
         return Verdict.HOLDS, f"Even stamps as noisy as a DW1000's keep below 20 cm ({limits})."
     if literal > PAPER_PS:
