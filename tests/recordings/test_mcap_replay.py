@@ -173,7 +173,7 @@ def with_node(start, change):
 
 
 def break_attributes(node):
-    """Every method's and tracker's attribute is a text: sound as data, nonsense as a receiver."""
+    """Every attribute of the receiver is a text: sound as data, nonsense as a receiver."""
     if node[0] == "object" and node[2] == "Receiver":
         node[4] = [node[4][0]] * len(node[4])
 

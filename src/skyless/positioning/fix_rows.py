@@ -14,6 +14,4 @@ VELOCITY: Final = 5
 PROTECTION: Final = 9
 """The first three of the levels (``protect``), for methods that know some."""
 
-MOTION_ROWS: Final = 9
-
 PROTECTED_ROWS: Final = 10
