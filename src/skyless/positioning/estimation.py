@@ -262,7 +262,7 @@ class Estimation:
 
     def _report(self, observation: Observation) -> Report:
         """What the anchor says of its clock against the master's."""
-        claim, variance_m2 = observation.claim, observation.sync_variance_m2
+        claim, variance_m2 = observation.claim, observation.tx_variance_m2
         if claim is None or variance_m2 <= 0.0:
             return NO_REPORT
         master, subticks = self._index_of.get(claim.master), self._master_scale.difference(observation)
