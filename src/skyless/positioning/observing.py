@@ -51,10 +51,11 @@ class Observer:
         """One observation of a beacon in a frame; ``claim``, the one that is followed, is mostly the beacon's too."""
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
         if not self._for_joint:
-            heard = _stamp_of(beacon.master_heard if beacon.master == self._master else None, tx_ticks)
+            heard = beacon.master_heard if beacon.master == self._master else None
+            master_sequence, master_rx_ticks = _stamp_of(heard, tx_ticks)
             return Observation(
-                beacon.anchor, anchor_m, self._round(beacon), beacon.sequence, rx_ticks, tx_ticks, *heard,
-                ticks_master, fraction, variance_m2, (), None, rx_variance_factor,
+                beacon.anchor, anchor_m, self._round(beacon), beacon.sequence, rx_ticks, tx_ticks, master_sequence,
+                master_rx_ticks, ticks_master, fraction, variance_m2, (), None, rx_variance_factor,
             )  # fmt: skip
         if ticks_master is None:
             claim = None
