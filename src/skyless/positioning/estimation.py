@@ -18,6 +18,7 @@ from skyless.positioning.acquisition import (
     SLOW_SPREAD,
     SPEED_STD_GROWTH,
     SPEED_STD_MPS,
+    Acquisition,
     Start,
 )
 from skyless.positioning.estimator.estimator import (
@@ -35,7 +36,6 @@ from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_rows import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.in_use import AnchorsInUse
-from skyless.positioning.joint_start import JointStart
 from skyless.positioning.master_scale import MasterScale
 from skyless.positioning.observation import Observation
 from skyless.positioning.protection import UNAVAILABLE, IntegrityRequirement
@@ -99,7 +99,7 @@ class Estimation:
         self._estimator = Estimator(settings)
         self._index_of: dict[int, int] = {}
         self._known_m: dict[int, NDArray[np.float64]] = {}
-        self._start: JointStart | None = self._new_start()
+        self._start: Acquisition | None = self._new_start()
         self._open_range_errors = False
         self._time = fix_time or FixTime()
         self._in_use = AnchorsInUse(superframe_s)
@@ -155,7 +155,7 @@ class Estimation:
         self._in_use.use(observation)
         return self._fix(observation)
 
-    def _look_for_start(self, starting: JointStart, observation: Observation) -> Fix | NoFixReason:
+    def _look_for_start(self, starting: Acquisition, observation: Observation) -> Fix | NoFixReason:
         starting.learn(observation)
         start = starting.hear(observation)
         if isinstance(start, NoFixReason):
@@ -202,13 +202,13 @@ class Estimation:
             return True
         return False
 
-    def _new_start(self) -> JointStart:
+    def _new_start(self) -> Acquisition:
         settings = self._settings
         max_age_s = max(MAX_AGE_S, 2.5 * self._superframe_s)
         variance = settings.tx_variance_m2 + settings.rx_variance_m2
         if self._superframe_s > LONGEST_SUPERFRAME_S:
             variance += settings.range_std_m**2 + settings.survey_std_m**2
-        return JointStart(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps)
+        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps)
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
