@@ -22,6 +22,8 @@ FIT_FROM_PS: Final = 50.0
 """Below, rounding to ticks and the crystals' own noise flatten the curve."""
 
 
+CARRIED_ON: Final = " Where the limit is reached by {}, beyond {:g} ps, the power law is carried on."
+
 SCALED: Final = (
     " The largest of {} errors is carried on to {} as Gaussian errors grow; the table has what was simulated."
 )
@@ -157,6 +159,8 @@ def section(plan: Plan, results: Results) -> Section:
             (f"{noise_ps:g}", str(cells[0].seed), *(f"{100 * c.max_m:.1f} ({100 * c.rmse_m:.2f})" for c in cells))
         )
     table.append(("reaches 20 cm at", "", *(_range(crossings[method]) for method in METHODS)))
+    beyond = [method for method in METHODS if crossings[method][1] > max(plan.noises_ps)]
+    carried_on = CARRIED_ON.format(" and ".join(beyond), max(plan.noises_ps)) if beyond else ""
     scaled = "" if plan.fixes == CLAIM_FIXES else SCALED.format(grouped(plan.fixes), grouped(CLAIM_FIXES))
     return Section(
         key="largest-error",
@@ -167,7 +171,7 @@ def section(plan: Plan, results: Results) -> Section:
             f"{grouped(plan.fixes)} fixes at P1 for each of {len(plan.noises_ps)} stamp noises, each in a world of its "
             "own; four methods on the same receptions. A largest error scatters from run to run, so a power law is "
             f"fitted from {FIT_FROM_PS:g} ps on; the bands hold 90 % of the largest of so many independent Gaussian "
-            f"errors. No obstacles and no biased stamps.{scaled}"
+            f"errors. No obstacles and no biased stamps.{carried_on}{scaled}"
         ),
         verdict=verdict,
         reason=reason,
