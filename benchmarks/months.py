@@ -1,4 +1,4 @@
-"""Months of messages through a filter: ``python benchmarks/months.py tracker|joint|joint_mesh [MESSAGES]``.
+"""Months of messages through a filter: ``python benchmarks/months.py joint|joint_mesh [MESSAGES]``.
 
 A minute of a tag that stands still, seven nodes, crystals of up to 20 ppm, is drawn once and heard again and again on
 counters that go on. A hundred times on the way the covariance must be symmetric to the bit, positive and as large as
@@ -15,7 +15,6 @@ from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.positioning.estimator.estimator import Estimator, Packets
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.estimator.state import layout
-from skyless.positioning.tracker import REJECTED, PseudorangeTracker, TrackerSettings, track
 
 NODES, SUPERFRAMES, SLOT_TICKS = 7, 2048, round(5e-3 * TICK_RATE_HZ)
 TAG_M = np.array([3.0, 4.0, 0.0])
@@ -84,30 +83,6 @@ class Joint:
         return self.filter.motion()[0][:2]
 
 
-class Tracker:
-    def __init__(self):
-        minute = Minute()
-        self.minute, self.count = minute, minute.count
-        self.tx = np.array([minute.reading(k, 0) for k in range(self.count)])
-        self.filter = PseudorangeTracker(TrackerSettings(qa=0.3, height_m=0.0))
-        rate = (1.0 - minute.steps[0] / minute.tag_step) * 299_792_458.0
-        self.filter.start(0, 0, np.array([*TAG_M[:2], 0.0]), 0.01 * np.eye(3), rate, 1.0, 0.01)
-        self.rest = (np.zeros(self.count), np.full(self.count, 1e-4), np.empty((self.count, 6)))
-
-    def once(self):
-        t = self.filter
-        arrays = (t.x, t.P, t.whole, t.statistics, t.settings, t.h, t.ph)
-        track(*arrays, ANCHORS_M[self.minute.senders], self.minute.rx_ticks, self.tx, *self.rest)
-        self.minute.rx_ticks += self.minute.tag_step
-        self.tx += self.minute.steps[0]
-
-    def state(self):
-        return self.filter.x, self.filter.P, int(self.filter.whole[REJECTED])
-
-    def position(self):
-        return self.filter.x[:2]
-
-
 def check(run, early):
     """The smallest eigenvalue of the correlations, the largest change of a variance, the error; raises if unsound."""
     x, P, _ = run.state()
@@ -127,7 +102,7 @@ def check(run, early):
 def main():
     kind = sys.argv[1]
     wanted = int(float(sys.argv[2])) if len(sys.argv) > 2 else 10**9
-    run = Tracker() if kind == "tracker" else Joint(kind == "joint_mesh")
+    run = Joint(kind == "joint_mesh")
     rounds = -(-wanted // run.count)
     every = max(1, rounds // CHECKS)
     started_s, early, found = time.perf_counter(), None, []

@@ -89,15 +89,6 @@ def step(function: Function) -> Function:
     return register_jitable(forceinline=True, error_model="numpy")(function)
 
 
-def borrowing_kernel(function: Function) -> Function:
-    """Compile a step that only borrows its arrays, makes none nor parts of one, and becomes part of its caller.
-
-    References to arrays are not counted, nor their headers copied from call to call. With a dozen arrays both would
-    take several times as long as the arithmetic.
-    """
-    return _compile(function, {"nogil": True, "_nrt": False, "forceinline": True})
-
-
 def threaded_kernel(function: Function) -> Function:
     """Compile a long loop that runs without the interpreter's lock, so that threads run it side by side."""
     return _compile(function, {"nogil": True})

@@ -3,7 +3,7 @@
 from typing import Final
 
 SNAPSHOTS: Final = ("literal", "literal-delayed", "weighted", "bracketed")
-FILTERS: Final = ("tracker", "joint")
+FILTERS: Final = ("joint",)
 METHODS: Final = (*SNAPSHOTS, *FILTERS)
 
 DEFAULT_METHOD: Final = "joint"

@@ -15,7 +15,7 @@ def test_it_measures_everything_beside_its_yardsticks(capsys):
     assert told["ratio"] == rates[1] / rates[0]
     kernels = everything["kernels"]
     assert kernels["streaming"]["seconds_per_message"] > 0.0
-    for name in ("tracker", "joint", "joint_mesh", "joint_room", "joint_room_mesh"):
+    for name in ("joint", "joint_mesh", "joint_room", "joint_room_mesh"):
         kernel = kernels[name]
         assert kernel["ratio"] == kernel["messages_per_s"] / kernel["numpy_messages_per_s"] > 1.0
         assert kernel["loop_ratio"] == kernel["messages_per_s"] / kernel["loop_messages_per_s"] > 0.0

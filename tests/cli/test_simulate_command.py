@@ -88,7 +88,7 @@ def test_the_same_seed_gives_the_same_run(run):
     assert first["rmse_m"] != other["rmse_m"]
 
 
-@pytest.mark.parametrize("method", ["literal", "literal-delayed", "weighted", "bracketed", "tracker"])
+@pytest.mark.parametrize("method", ["literal", "literal-delayed", "weighted", "bracketed", "joint"])
 def test_it_stops_at_the_wanted_number_of_fixes(run, method):
     told = report(run("--method", method, "--position", "3,4", "--fixes", "40", "--warmup", "1", "--json"))
     assert told["method"] == method
@@ -132,7 +132,7 @@ def test_faults_show_in_the_figures(run):
 
 def test_the_room_is_the_lab_with_the_errors_of_rooms(run):
     """The same seed again gives the same room; paths may be given there, with their speed."""
-    base = ["--method", "tracker", "--tags", "3", "--duration", "5", "--json"]
+    base = ["--method", "joint", "--tags", "3", "--duration", "5", "--json"]
     lab, room, again = (report(run("--scenario", name, *base)) for name in ("lab", "room", "room"))
     assert (lab["site"], room["site"], room["tags"]) == ("lab", "room", 3)
     assert room["rmse_m"] == again["rmse_m"] > 1.5 * lab["rmse_m"]
@@ -140,7 +140,7 @@ def test_the_room_is_the_lab_with_the_errors_of_rooms(run):
     assert report(run("--scenario", "room", *walk))["tags"] == 1
 
 
-@pytest.mark.parametrize("method", ["weighted", "tracker"])
+@pytest.mark.parametrize("method", ["weighted", "joint"])
 def test_deaf_tags_make_no_fix_and_find_themselves_again(run, tmp_path, method):
     base = ["--method", method, "--duration", "8", "--fixes-csv", "fixes.csv", "--json"]
     told = report(run(*base, "--deaf", "3:4.5", "--deaf", "5:5.5"))
@@ -201,7 +201,7 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--alert-limit-m", "0"], ["--alert-limit-m"]),
         (["--max-acceleration", "nan"], ["--max-acceleration"]),
         (["--max-acceleration", "10", "--method", "literal"], ["--max-acceleration", "10", "literal"]),
-        (["--alert-limit-m", "0.1", "--method", "tracker"], ["--alert-limit-m", "0.1", "tracker"]),
+        (["--alert-limit-m", "0.1", "--method", "weighted"], ["--alert-limit-m", "0.1", "weighted"]),
         (["--position", "1,2", "--tags", "5"], ["--position", "--tags", "either"]),
         (["--position", "1,2", "--speed", "2"], ["--position", "--speed", "either"]),
         (["--waypoints", "1,1;5,1", "--tags", "2"], ["--waypoints", "--tags", "either"]),
@@ -212,7 +212,8 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--waypoints", "1,1;5,1;5,1"], ["--waypoints", "1,1;5,1;5,1", "0.01 m or more"]),
         (["--site", "missing.toml"], ["missing.toml", "readable site file"]),
         (["--site", "."], ["readable site file"]),
-        (["--method", "magic"], ["method", "magic", "tracker", "literal"]),
+        (["--method", "magic"], ["method", "magic", "joint", "literal"]),
+        (["--method", "tracker"], ["method", "tracker", "joint", "literal"]),
         (["--position", "3"], ["--position", "'3'", "2 or 3"]),
         (["--position", "north"], ["--position", "north", "2 or 3"]),
         (["--position", "nan,1"], ["--position", "nan,1"]),

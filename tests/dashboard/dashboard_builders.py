@@ -33,7 +33,7 @@ def fix(
         "chi2": 2.5,
         "dof": 3,
         "residual_rms_m": 0.01,
-        "method": "tracker",
+        "method": "joint",
         "height_known": True,
         "latency_s": 0.001,
     }

@@ -73,7 +73,7 @@ def phases(number, superframe):
 
 def tag_health(name, number, time_s, unix_s, reason=None):
     return {
-        "tag": name, "unix_s": unix_s, "uptime_s": time_s, "method": "tracker", "receptions": int(476 * time_s),
+        "tag": name, "unix_s": unix_s, "uptime_s": time_s, "method": "joint", "receptions": int(476 * time_s),
         "fixes": int(470 * time_s), "updates_per_s": 470 + 5 * math.sin(time_s + number), "reason": reason,
         "first_fix_s": 0.31, "latency_p50_s": 0.00042, "latency_p99_s": 0.0013 + 0.0002 * math.sin(time_s),
         "counters": {"late": 3, "foreign": 0}, "mqtt": mqtt(), "cpu": 0.021, "memory_bytes": 143_000_000,
@@ -114,5 +114,5 @@ def overlay(kind, step_m):
     return {
         "kind": kind, "unit": "m" if kind == "sigma" else "1", "x_m": [0, (columns - 1) * step_m],
         "y_m": [0, (rows - 1) * step_m], "step_m": step_m, "columns": columns, "rows": rows, "values": values,
-        "method": "tracker", "levels": {"good": scale, "bad": 2.6 * scale},
+        "method": "joint", "levels": {"good": scale, "bad": 2.6 * scale},
     }  # fmt: skip

@@ -19,21 +19,21 @@ PNG_2_BY_1 = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\x0dIHDR" + (200).to_bytes(4, "big")
 
 
 def test_the_grid_covers_all_anchors_in_cells_of_the_step():
-    task = overlay_task(LAB, None, "tracker", 0.25)
+    task = overlay_task(LAB, None, "joint", 0.25)
     assert (task.columns, task.rows, task.step_m) == (24, 32, 0.25)
     assert task.box_m == (0.0, 0.0, 6.0, 8.0)
-    assert overlay_task(LAB, None, "tracker", 0.35).columns == 18  # the last cell sticks out
+    assert overlay_task(LAB, None, "joint", 0.35).columns == 18  # the last cell sticks out
 
 
 def test_the_grid_covers_the_floor_plan_too():
     site = replace(LAB, floor_plan=FloorPlanSite("plan.png", 20.0, -5.0, -1.0))
-    assert overlay_task(site, PNG_2_BY_1, "tracker", 0.5).box_m == (-5.0, -1.0, 15.0, 9.0)
-    assert overlay_task(site, None, "tracker", 0.5).box_m == (0.0, 0.0, 6.0, 8.0)
+    assert overlay_task(site, PNG_2_BY_1, "joint", 0.5).box_m == (-5.0, -1.0, 15.0, 9.0)
+    assert overlay_task(site, None, "joint", 0.5).box_m == (0.0, 0.0, 6.0, 8.0)
 
 
 def test_a_large_hall_gets_a_coarser_grid_and_every_grid_is_bounded():
     anchors = tuple(replace(anchor, x_m=anchor.x_m * 100.0, y_m=anchor.y_m * 100.0) for anchor in LAB.anchors)
-    task = overlay_task(replace(LAB, anchors=anchors), None, "tracker", 0.25)
+    task = overlay_task(replace(LAB, anchors=anchors), None, "joint", 0.25)
     assert task.columns * task.rows <= MOST_CELLS
     assert task.step_m == 5.0
 

@@ -137,5 +137,5 @@ def test_levels_hold_in_clean_episodes(place):
 
 
 def test_other_methods_have_no_levels():
-    with pytest.raises(SkylessError, match="--method is 'tracker'"):
-        cells(plan_of("tracker", 1))
+    with pytest.raises(SkylessError, match="--method is 'literal'"):
+        cells(plan_of("literal", 1))

@@ -120,9 +120,9 @@ def test_updates_come_at_the_rates_of_the_schedule(made):
     rates = {(count["site"][:3], count["method"]): count["updates"] for count in section["numbers"]["counts"]}
     for key, per_s in {
         ("six", "literal"): 1 / 15e-3,
-        ("six", "tracker"): 400.0,
+        ("six", "joint"): 400.0,
         ("sev", "literal"): 1 / 14.7033e-3,
-        ("sev", "tracker"): 476.07,
+        ("sev", "joint"): 476.07,
     }.items():
         assert abs(rates[key] - per_s * TINY.rate_s) <= 1.0, key
 

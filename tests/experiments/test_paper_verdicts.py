@@ -89,7 +89,7 @@ def test_other_verdicts_follow_their_numbers():
     assert [dop_map.judge(c, a)[0] for c, a in ((0.95, 0.02), (0.95, 0.3), (-0.2, 0.3))] == [HOLDS, CORRECTED, FAILS]
     assert [timeline.judge(3, 3, f, 100)[0] for f in (100, 90)] == [HOLDS, FAILS]
     assert [rate.judge(hz, 400.0)[0] for hz in (66.7, 60.0)] == [HOLDS, FAILS]
-    limits = [claim.judge({"literal": ps, "tracker": 2 * ps})[0] for ps in (160.0, 101.0, 12.0)]
+    limits = [claim.judge({"literal": ps, "joint": 2 * ps})[0] for ps in (160.0, 101.0, 12.0)]
     assert limits == [HOLDS, CORRECTED, FAILS]
     alone = {"sent": 400, "senders": 6, "heard_by_tags": 400}
     assert scenario.judge(alone, {**alone, "heard_by_tags": 800}, 2)[0] is HOLDS

@@ -66,9 +66,9 @@ def test_tags_of_a_room_roam_in_the_box_unless_told_where_to_be():
 
 
 def test_the_room_costs_accuracy_and_is_the_same_for_every_method():
-    """``tracker`` has about 5 cm where it has 2 in clean air."""
+    """``joint`` has about 5 cm where it has 2 in clean air."""
     told = []
-    for room, method in ((None, "tracker"), (Room(), "tracker"), (Room(), "literal")):
+    for room, method in ((None, "joint"), (Room(), "joint"), (Room(), "literal")):
         asked = Request(LAB, method, seed=2, tags=4, room=room, warmup_s=1.5)
         fleet = fleet_of(asked)
         truths = {(one.tag, one.time_s): one.truth_m.tolist() for one in fleet.run(6.0)}

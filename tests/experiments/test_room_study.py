@@ -23,7 +23,7 @@ from skyless.simulation.impairments import Body
 from skyless.site.lab import lab_site
 from skyless.uncertainty.biased_bound import Biases
 
-PLAN = plan_of("tracker", 1, study="room")
+PLAN = plan_of("joint", 1, study="room")
 CASES = {case.name: case for case in room.cases(PLAN)}
 EMPTY = Row("room", "joint", "a", "s", None, True, 100.0, 2, 10, 0.03)
 
@@ -34,7 +34,7 @@ def test_the_room_has_a_hundred_tags_in_twenty_draws_and_the_rest_a_quarter():
     assert set(sizes.values()) == {(5, 5)}
     run = CASES[room.BASE].runs[0]
     assert (run.warmup_s, run.until_s, run.qa) == (1.5, 16.5, 0.3)
-    few = room.cases(plan_of("tracker", 1, study="room", quick=True))
+    few = room.cases(plan_of("joint", 1, study="room", quick=True))
     assert {(len(case.runs), len(case.runs[0].trajectories)) for case in few} == {(6, 2), (2, 2)}
 
 
@@ -288,4 +288,4 @@ def test_one_world_of_the_room_judges_levels_beside_errors():
     assert (result.levels.exceeded <= result.levels.levels).all()
     assert (result.levels.levels <= result.levels.fixes).all()
     assert len(result.levels.hpl_m) == result.levels.levels.sum()
-    assert run_world(room.cases(replace(plan, method="tracker"))[0].runs[0]).levels is None
+    assert run_world(room.cases(replace(plan, method="literal"))[0].runs[0]).levels is None

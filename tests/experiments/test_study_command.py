@@ -16,7 +16,7 @@ import pytest
 from skyless.cli.main import main
 
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "study"]
-SMALL = ["--method", "tracker", "--quick", "--worlds", "2", "--seconds", "1", "--processes", "1"]
+SMALL = ["--method", "joint", "--quick", "--worlds", "2", "--seconds", "1", "--processes", "1"]
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def test_a_study_tells_its_rows_and_writes_its_files(run, tmp_path):
     code, out, err = run("loss", *SMALL, "--json", "--out", "deep/folder", "--plot", "loss.svg")
     assert (code, err, out.count("\n")) == (0, "", 1)
     told = json.loads(out)
-    assert (told["study"], told["method"], told["seed"], told["simulated"]) == ("loss", "tracker", 1, True)
+    assert (told["study"], told["method"], told["seed"], told["simulated"]) == ("loss", "joint", 1, True)
     keys = {"method", "mesh", "noise_ps", "case", "rmse_m", "bound_m", "ratio", "limit", "passed", "nees"}
     assert all(row.keys() >= keys for row in told["rows"])
     half = next(row for row in told["rows"] if row["case"] == "50 % lost at tags")
@@ -94,7 +94,7 @@ def test_every_study_can_be_drawn(name, tmp_path):
     from skyless.experiments.studies.plan import plan_of
     from skyless.experiments.studies.worlds import RunResult, run_world
 
-    plan = plan_of("tracker", 1, quick=True, worlds=2)
+    plan = plan_of("joint", 1, quick=True, worlds=2)
     study = STUDIES[name]
     some = RunResult(9, 9, 0.01, 0.01, 9.0, 0, 0.1, np.full(9, 0.03), 9, 1.0, 1e-3)
     none = RunResult(0, 9, 0.0, 0.0, 0.0, 0, 0.0, np.empty(0), 9, 1.0, 1e-3)
@@ -114,12 +114,12 @@ def test_every_study_can_be_drawn(name, tmp_path):
         (["room", "--integrity-risk", "1e-3"], "are for the study integrity"),
         (["room", "--method", "guess"], "it should be one of literal"),
         (["efficiency", "--seconds", "5"], "--seconds is not for the study efficiency"),
-        (["efficiency", "--method", "tracker"], "--method is 'tracker'"),
+        (["efficiency", "--method", "literal"], "--method is 'literal'"),
         (["loss", "--integrity-risk", "1e-3"], "are for the study integrity"),
         (["loss", "--alert-limit-m", "1"], "are for the study integrity"),
         (["integrity", "--integrity-risk", "0"], "--integrity-risk"),
         (["integrity", "--alert-limit-m", "nan"], "--alert-limit-m"),
-        (["integrity", "--method", "tracker"], "protection levels are given by joint"),
+        (["integrity", "--method", "literal"], "protection levels are given by joint"),
         (["loss", "--method", "guess"], "it should be one of literal"),
         (["loss", "--worlds", "1"], "--worlds"),
         (["loss", "--seconds", "nan"], "--seconds"),
@@ -139,7 +139,7 @@ def test_wrong_input_is_one_line(run, arguments, said):
 def test_an_interrupt_leaves_no_file_and_no_traceback(tmp_path):
     """As a terminal sends it: to the whole group, workers among them, at the start and in the middle."""
     for patience_s in (2.0, 12.0):
-        command = [*COMMAND, "loss", "--method", "tracker", "--out", str(tmp_path / "out")]
+        command = [*COMMAND, "loss", "--method", "joint", "--out", str(tmp_path / "out")]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
         time.sleep(patience_s)
         os.killpg(process.pid, signal.SIGINT)

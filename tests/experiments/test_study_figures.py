@@ -17,7 +17,7 @@ from skyless.simulation.world import World
 from skyless.site.check import check_site
 from skyless.site.lab import lab_site
 
-SMALL = Plan(method="tracker", worlds=2, seconds=1.0, tags=1)
+SMALL = Plan(method="joint", worlds=2, seconds=1.0, tags=1)
 RANDOM = np.random.default_rng(5)
 
 
@@ -90,16 +90,16 @@ def test_the_interval_is_students():
     assert interval(None, 1) is None
 
 
-def test_the_tracker_in_the_lab_is_found_honest_and_as_good_as_it_is():
-    """1.9 to 2.0 cm at 100 ps (``docs/maths.md`` section 5); walking costs nothing at 1 m/s."""
-    plan = Plan(method="tracker", worlds=6, seconds=4.0, tags=2)
+def test_joint_in_the_lab_is_found_honest_and_as_good_as_it_is():
+    """1.4 cm at 100 ps (``docs/studies.md``), walking at 1 m/s; it allows for turns that are few, so NEES is 0.8."""
+    plan = Plan(method="joint", worlds=6, seconds=4.0, tags=2)
     case = Case("clean", "s", None, walking(plan), "clean", 1.3)
     (row,) = world_rows("study", plan, [case], [run_world(run) for run in case.runs])
-    assert row.rmse_m == pytest.approx(0.020, rel=0.1)
+    assert row.rmse_m == pytest.approx(0.0143, rel=0.1)
     assert 0.0 < row.rmse_error_m < 0.1 * row.rmse_m
-    assert row.nees_interval[0] < row.nees < row.nees_interval[1]
+    assert 0.7 < row.nees < row.nees_interval[1]
     assert row.available == pytest.approx(1.0, abs=0.003)
-    assert (row.ratio, row.passed, row.mesh) == (1.0, True, None)
+    assert (row.ratio, row.passed, row.mesh) == (1.0, True, True)
     assert row.fixes == pytest.approx(6 * 2 * 4.0 / 0.015, rel=0.01)
     assert 0.0 < row.cpu_us_per_message < 10_000.0
 
@@ -137,12 +137,12 @@ def test_worlds_of_one_number_are_the_same_in_all_cases():
 @pytest.mark.parametrize("quick", [False, True])
 @pytest.mark.parametrize("module", [loss, nlos, motion, sync, room, scale])
 def test_cases_can_be_told_apart_and_compared(module, quick):
-    plan = plan_of("tracker", 1, quick=quick, worlds=2)
+    plan = plan_of("joint", 1, quick=quick, worlds=2)
     cases = module.cases(plan)
     names = [case.name for case in cases]
     assert len(set(names)) == len(names)
     assert all(case.of is None or case.of in names for case in cases)
-    assert all(case.of is not None for case in cases if case.limit is not None)
+    assert all(case.of is not None or case.biases is not None for case in cases if case.limit is not None)
     assert len(world_cells(cases)) == sum(len(case.runs) for case in cases)
     for case in cases:
         check_site(case.runs[0].site, None)
@@ -150,7 +150,7 @@ def test_cases_can_be_told_apart_and_compared(module, quick):
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_the_limits_that_were_asked_for_are_there(quick):
-    plan = plan_of("tracker", 1, quick=quick, worlds=2)
+    plan = plan_of("joint", 1, quick=quick, worlds=2)
     limits = {case.name: case.limit for case in (*loss.cases(plan), *nlos.cases(plan)) if case.limit}
     for kind in (loss.AT_TAGS, loss.EVERYWHERE):
         assert (limits.pop(f"50 % {kind}"), limits.pop(f"90 % {kind}")) == (1.3, 2.5)

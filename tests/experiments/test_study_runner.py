@@ -16,7 +16,7 @@ from skyless.experiments.studies.plan import MEASURED, Cell, Plan
 from skyless.experiments.studies.runner import run_cells, run_cells_on_dask
 from skyless.experiments.studies.summary import world_cells, world_rows
 
-PLAN = Plan(method="tracker", seed=3, quick=True, worlds=2, seconds=1.0, tags=1)
+PLAN = Plan(method="joint", seed=3, quick=True, worlds=2, seconds=1.0, tags=1)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_the_same_rows_from_one_process_from_two_and_from_a_cluster(cluster):
 
 
 def test_another_seed_gives_other_rows():
-    work = [world_cells(loss.cases(Plan(method="tracker", seed=seed, worlds=2, seconds=1.0)))[0] for seed in (3, 4)]
+    work = [world_cells(loss.cases(Plan(method="joint", seed=seed, worlds=2, seconds=1.0)))[0] for seed in (3, 4)]
     first, second = (cell.function(cell.argument) for cell in work)
     assert first.squared_m2 != second.squared_m2
 

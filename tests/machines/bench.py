@@ -26,7 +26,7 @@ LOFT = replace(ROOM, anchors=tuple(replace(anchor, z_m=5.0) for anchor in ROOM.a
 PAIRS = replace(LAB, schedule=replace(LAB.schedule, frames_per_node=2))
 """The paper's pair in every superframe."""
 SNAPSHOTS = ("literal", "literal-delayed", "weighted", "bracketed")
-EVERY_METHOD = (*SNAPSHOTS, "tracker", "joint")
+EVERY_METHOD = (*SNAPSHOTS, "joint")
 
 
 class Stage:

@@ -122,7 +122,7 @@ def test_an_anchor_on_a_hostile_channel():
     assert anchor.synchronisation.beacons > 50
 
 
-@pytest.mark.parametrize("method", ["weighted", "tracker"])
+@pytest.mark.parametrize("method", ["weighted", "joint"])
 def test_a_radio_that_stamps_nonsense(method):
     """Any stamps and host times for any frames; sane again, the tag has fixes within a second."""
     heard, generator = tape(), np.random.default_rng(4)

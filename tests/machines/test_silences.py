@@ -7,10 +7,13 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.experiments.scenarios import Request, fleet_of
-from skyless.positioning.kalman import horizontal_variance, predict_motion
+from skyless.positioning.estimator.estimator import Estimator
+from skyless.positioning.estimator.kalman import predict
+from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import EXACT
 from skyless.site.room import room_site
+from skyless.ticks import from_seconds
 
 LISTENING_S = 3.0
 
@@ -42,10 +45,12 @@ def test_the_spread_ahead_is_that_of_the_prediction():
     generator = np.random.default_rng(1)
     for dim in (2, 3):
         root = generator.normal(size=(2 * dim, 2 * dim))
-        P, x = root @ root.T, np.zeros(2 * dim)
-        told = horizontal_variance(P, dim, 1.7, 0.4)
-        predict_motion(x, P, dim, 1.7, 0.4)
-        assert told == pytest.approx(P[0, 0] + P[1, 1], rel=1e-12)
+        estimator = Estimator(EstimatorSettings(qa=0.4, height_m=0.0 if dim == 2 else None))
+        P = estimator.state.P
+        P[: 2 * dim, : 2 * dim] = root @ root.T
+        told, epoch = estimator.horizontal_variance_m2(1.7), int(estimator.state.status[0]["epoch_ticks"])
+        predict(estimator.state, epoch + from_seconds(1.7))
+        assert told == pytest.approx(P[0, 0] + P[1, 1], rel=1e-9)
 
 
 def test_superframes_of_seconds_are_silences():

@@ -52,7 +52,7 @@ def walled(rule):
 class Story:
     """What happened on the air: every beacon with its true time, and every fix beside the truth."""
 
-    def __init__(self, stage, until_s, tags=(), method="tracker"):
+    def __init__(self, stage, until_s, tags=(), method="joint"):
         self.stage, self.until_s = stage, until_s
         self.receivers = [Receiver(method) for _ in tags]
         self.beacons, self.fixes = [], [[] for _ in tags]

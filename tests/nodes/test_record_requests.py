@@ -12,7 +12,7 @@ from skyless.outputs.topics import receptions_topic, status_topic
 from skyless.recordings.mcap_file import McapFile
 
 ONE = RawReception(b"frame", 5, 1.0)
-START = SegmentStart(0, {"method": "tracker"}, None)
+START = SegmentStart(0, {"method": "joint"}, None)
 
 
 @pytest.fixture

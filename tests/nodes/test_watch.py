@@ -29,7 +29,7 @@ class FakeLink:
 def fix(tag="t1", serial=1, unix_s=NOW_S, position_m=(1.0, 2.0, 0.0), std_m=0.1, height_known=True, latency_s=1e-3):
     return FixMessage(
         tag, serial, unix_s, 0.0, position_m, UNIT, None, None, std_m, None, None, None, None, (1, 2), 0.0, 2, 0.0,
-        "tracker", height_known, latency_s,
+        "joint", height_known, latency_s,
     )  # fmt: skip
 
 
@@ -39,7 +39,7 @@ def truth(unix_s, position_m, velocity_mps=(0.0, 0.0, 0.0), tag="t1"):
 
 def health(unix_s, fixes, tag="t1"):
     return TagHealth(
-        tag, unix_s, 1.0, "tracker", fixes, fixes, 0.0, None, 0.1, None, None, {}, Counters(0, 0, 0), 0.1, 1, ()
+        tag, unix_s, 1.0, "joint", fixes, fixes, 0.0, None, 0.1, None, None, {}, Counters(0, 0, 0), 0.1, 1, ()
     )
 
 

@@ -82,15 +82,12 @@ def test_a_summary_is_that_of_the_table():
     assert sigma[0][k] == sigma.max()
 
 
-@pytest.mark.parametrize(
-    ("method", "budget"), [("tracker", ("TRACKER_BUDGET", 1500.0)), ("joint", ("JOINT_BUDGET", 1.4e4))]
-)
-def test_interpolation_of_filters_is_close_and_keeps_walls_sharp(monkeypatch, method, budget):
+def test_interpolation_of_the_filter_is_close_and_keeps_walls_sharp(monkeypatch):
     """A wall that hides two anchors altogether: what was computed in full every 0.2 m against every 0.8 m."""
     site = replace(LAB, walls=(WallSite(2.0, 3.0, 4.0, 3.0, loss_db=60.0, delay_m=0.0),))
-    full = lab_map(0.2, method, site)
-    monkeypatch.setattr(maps, *budget)
-    rough = lab_map(0.2, method, site)
+    full = lab_map(0.2, "joint", site)
+    monkeypatch.setattr(maps, "JOINT_BUDGET", 1.4e4)
+    rough = lab_map(0.2, "joint", site)
     assert full.computed_every_m == 0.2
     assert rough.computed_every_m == pytest.approx(0.8)
     assert (rough.column(ANCHORS) == full.column(ANCHORS)).all()

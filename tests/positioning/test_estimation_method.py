@@ -379,7 +379,6 @@ def with_site_time(packets, claim):
             tx_fraction_ticks=float(fraction),
             tx_variance_m2=variance,
             claim=claim,
-            sync_variance_m2=variance,
         )
 
 
@@ -390,7 +389,7 @@ def test_reports_help_where_most_packets_are_lost():
         keep = np.random.default_rng(seed + 50).random(len(episode.path_m)) >= 0.85
         keep[:30] = True
         told = list(with_site_time(episode.packets, Claim(1, 0)))
-        silent = [replace(o, claim=None, sync_variance_m2=0.0, tx_ticks_master=None) for o in told]
+        silent = [replace(o, claim=None, tx_variance_m2=0.0, tx_ticks_master=None) for o in told]
         for k, observations in enumerate((silent, told)):
             method = Estimation(settings_of(replace(PLAIN, qa=0.3)))
             for n, observation in enumerate(observations):

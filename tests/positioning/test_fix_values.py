@@ -10,7 +10,7 @@ import pytest
 
 from skyless.positioning.alert import Alert
 from skyless.positioning.fix import Fix
-from skyless.positioning.fix_rows import MOTION_ROWS, PROTECTED_ROWS, QUALITY
+from skyless.positioning.fix_rows import PROTECTED_ROWS, PROTECTION, QUALITY
 from skyless.positioning.protection import CONTRADICTED, IntegrityRequirement
 
 ANCHORS_M = np.eye(4, 3)
@@ -22,7 +22,7 @@ def fix_of(rows: int, *, known=False, asked=None, state=0.0) -> Fix:
 
 
 def test_rows_are_position_covariance_quality_velocity_and_its_covariance():
-    fix = fix_of(MOTION_ROWS)
+    fix = fix_of(PROTECTION)
     assert fix.position_m.tolist() == [1, 2, 3]
     assert fix.covariance_m2.tolist() == [[4, 5, 6], [7, 8, 9], [10, 11, 12]]
     assert (fix.chi2, fix.residual_rms_m, fix.dof) == (13.0, math.sqrt(14.0), 2)

@@ -64,7 +64,7 @@ def test_anchors_collect_garbage_in_their_own_slots_and_the_tag_where_there_is_s
     assert all(1 <= machine.node.line.collections <= 3 for machine in machines.values())
 
 
-@pytest.mark.parametrize("method", ["tracker", "joint"])
+@pytest.mark.parametrize("method", ["joint"])
 def test_the_fixes_are_those_of_the_emulated_radio(ways, method):
     """Measured powers and offsets are rounded by chip and line, so the emulated radio is given those."""
     emulated, heard, _, _ = ways

@@ -85,7 +85,7 @@ def listener_pair():
     return board, ListenerRadio(board.pty.place, 115_200, "tag1")
 
 
-@pytest.mark.parametrize("method", ["tracker", "joint", "bracketed"])
+@pytest.mark.parametrize("method", ["joint", "bracketed"])
 @pytest.mark.parametrize("pair", [link_pair, listener_pair])
 def test_fixes_over_a_serial_port_are_those_of_the_radio_itself_bit_for_bit(pair, method):
     arrived, counters = asyncio.run(over_the_line(HEARD, pair))

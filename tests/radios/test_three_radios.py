@@ -114,7 +114,7 @@ def test_what_the_chip_measures_is_what_the_air_tells_but_for_rounding(ways):
         assert other.diagnostics.carrier_offset_ppm == pytest.approx(one.diagnostics.carrier_offset_ppm, abs=0.0011)
 
 
-@pytest.mark.parametrize("method", ["tracker", "joint", "bracketed"])
+@pytest.mark.parametrize("method", ["joint", "bracketed"])
 def test_three_radios_give_the_same_fixes_bit_for_bit(ways, method):
     _, rounded, serial, chip, _, _ = ways
     here = fixes_of(rounded, method)

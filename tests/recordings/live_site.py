@@ -20,7 +20,7 @@ USUAL = IntegrityRequirement()
 PLACES = {"a": (3.0, 4.0, 0.0), "b": (2.0, 2.0, 0.0), "c": (5.0, 3.0, 0.0)}
 
 
-def messages(seconds=2.0, tags=("a",), method="tracker", join_s=0.5, publish_every=1, integrity=USUAL):
+def messages(seconds=2.0, tags=("a",), method="joint", join_s=0.5, publish_every=1, integrity=USUAL):
     """(unix_s, topic, payload) of a site; somebody asks for receptions from ``join_s`` on."""
     said = [(UNIX_S, topics.site_topic(SITE.id), SiteMessage(SITE, True, UNIX_S))]
     for tag in tags:

@@ -10,7 +10,7 @@ from skyless.receiver import Receiver
 from skyless.recordings.checkpoint import load
 from skyless.recordings.reception_log import MOST_PENDING, ReceptionLog, raw, receiver_settings
 
-SETTINGS = receiver_settings("tracker")
+SETTINGS = receiver_settings("joint")
 HEARD = [one.reception for one in tape(LAB, 2.0)]
 
 

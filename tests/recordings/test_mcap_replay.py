@@ -173,7 +173,7 @@ def with_node(start, change):
 
 
 def break_attributes(node):
-    """Every method's and tracker's attribute is a text: sound as data, nonsense as a receiver."""
+    """Every attribute of the receiver is a text: sound as data, nonsense as a receiver."""
     if node[0] == "object" and node[2] == "Receiver":
         node[4] = [node[4][0]] * len(node[4])
 
@@ -187,12 +187,13 @@ def break_attributes(node):
         (lambda start: with_node(start, break_attributes), "checkpoint-damaged"),
         (lambda start: replace(start, state=None), "no-checkpoint"),
         (lambda start: replace(start, state=b"", settings={"method": "rm -rf"}), "impossible-settings"),
+        (lambda start: replace(start, state=b"", settings={"method": "tracker"}), "impossible-settings"),
         (
             lambda start: replace(start, state=b"", settings={"method": 3.5, "qa": -1, "site": "x"}),
             "checkpoint-damaged",
         ),
     ],
-    ids=["garbage", "cut", "version", "nonsense", "none", "method", "settings"],
+    ids=["garbage", "cut", "version", "nonsense", "none", "method", "a method of version 0.1", "settings"],
 )
 def test_a_bad_checkpoint_is_counted_and_the_replay_begins_cold(tmp_path, change, reason):
     report = forged(tmp_path / "forged.mcap", change)

@@ -99,7 +99,7 @@ def test_flights_in_free_space(recordings, replay, trial, system, limit_2d_m, li
 @pytest.mark.parametrize(
     ("trial", "limit_2d_m", "limit_3d_m"),
     # a filter with a gate alone: 0.06 / 0.21, 0.11 / 0.34 and 0.13 / 0.37
-    [(1, 0.05, 0.13), (3, 0.08, 0.24), (5, 0.08, 0.21)],
+    [(1, 0.05, 0.13), (3, 0.08, 0.18), (5, 0.08, 0.21)],
 )
 def test_flights_among_obstacles(recordings, replay, trial, limit_2d_m, limit_3d_m):
     name = f"util_flights/const4/const4-trial{trial}-tdoa2-traj1"

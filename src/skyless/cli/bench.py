@@ -63,7 +63,6 @@ def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
     out.print(f"{speed.cores} cores{load}; filters on one core, medians")
     kernels = speed.kernels
     for name, kernel in (
-        ("tracker", kernels.tracker),
         ("joint", kernels.joint),
         ("joint, mesh", kernels.joint_mesh),
         ("joint, room", kernels.joint_room),
@@ -73,9 +72,7 @@ def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
         if kernel.filterpy_ratio is not None:
             ratios += f", {kernel.filterpy_ratio:.0f} × filterpy"
         out.print(f"{name:<24}{kernel.messages_per_s:>14,.0f} messages/s  {ratios}")
-    streaming = kernels.streaming
-    for name, value in (("joint", streaming.seconds_per_message), ("tracker", streaming.tracker_seconds_per_message)):
-        out.print(f"{'Receiver, ' + name:<24}{1e6 * value:>14.1f} µs a message")
+    out.print(f"{'Receiver, joint':<24}{1e6 * kernels.streaming.seconds_per_message:>14.1f} µs a message")
     snapshots = speed.snapshots
     out.print(
         f"{'snapshots':<24}{snapshots.fixes_per_s:>14,.0f} fixes/s  {snapshots.ratio:.1f} × scipy's least_squares"

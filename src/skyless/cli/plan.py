@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _Count = Annotated[int, Parameter(validator=Number(gte=1, lte=200))]
 
-app = App(name="plan", help_epilogue="Example: skyless plan hall.toml --method tracker --plot hall.png --target 5")
+app = App(name="plan", help_epilogue="Example: skyless plan hall.toml --method joint --plot hall.png --target 5")
 
 
 @app.default
@@ -74,11 +74,11 @@ def plan(
     file
         The site file.
     method
-        literal, literal-delayed, weighted, bracketed, tracker or joint.
+        literal, literal-delayed, weighted, bracketed or joint.
     noise_ps
         Noise of every TX and RX stamp in picoseconds; by default the site's own figures.
     qa
-        Agility that tracker and joint assume, m²/s³.
+        Agility that joint assumes, m²/s³.
     range_m
         How far a frame carries in the open, metres: half arrive there; by default what the link budget gives (31 m).
     step

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from skyless.planning.verify import Verification
 
 NOTES: Final = (
-    "Tags are at rest. A moving tag's filter (tracker, joint) is less exact; the paper's methods hardly notice motion "
+    "Tags are at rest. A moving tag's filter (joint) is less exact; the paper's methods hardly notice motion "
     "up to 1 m/s.",
     "Stamps' noise and crystals are those of the site file, and the filters know them.",
     "Links are free space on channel 5 with the walls' losses of the site file; people, furniture, reflections and "
@@ -112,7 +112,7 @@ def described(result: dict[str, Any]) -> str:
     """Method, noise and schedule in one line."""
     tx_ps, rx_ps = result["tx_stamp_ps"], result["rx_stamp_ps"]
     noise = f"{tx_ps:g} ps" if tx_ps == rx_ps else f"{tx_ps:g} ps (TX) and {rx_ps:g} ps (RX)"
-    agility = f" with qa {result['qa']:g} m²/s³" if result["method"] in {"tracker", "joint"} else ""
+    agility = f" with qa {result['qa']:g} m²/s³" if result["method"] == "joint" else ""
     return (
         f"predicted for {result['method']}{agility}, stamps of {noise}, "
         f"superframes of {1e3 * result['superframe_s']:.1f} ms, tags at rest"

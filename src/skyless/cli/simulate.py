@@ -41,7 +41,7 @@ _PATIENCE_S: Final = 60.0
 app = App(
     name="simulate",
     help_epilogue=(
-        "Example: skyless simulate --scenario lab --method tracker --noise-ps 100 --position 3,4 --fixes 3000 --seed 7"
+        "Example: skyless simulate --scenario lab --method joint --noise-ps 100 --position 3,4 --fixes 3000 --seed 7"
     ),
 )
 
@@ -89,8 +89,8 @@ def simulate(
     site
         A site file instead of a named one.
     method
-        literal, literal-delayed, weighted, bracketed, tracker or joint.
-        Fixes of all but the tracker hold at the master's message that they refer to, but are judged when made.
+        literal, literal-delayed, weighted, bracketed or joint.
+        Fixes of all but joint hold at the master's message that they refer to, but are judged when made.
     position
         Where a tag lies still, x,y or x,y,z in metres; may be given several times.
     waypoints
@@ -100,7 +100,7 @@ def simulate(
     speed
         How fast tags walk, in m/s; 1 by default. In the room only for --waypoints.
     qa
-        Agility that the tracker assumes, m²/s³.
+        Agility that joint assumes, m²/s³.
     integrity_risk
         Probability, for each fix, that the error exceeds its protection level (joint); 1e-4 by default.
     alert_limit_m

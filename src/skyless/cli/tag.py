@@ -57,7 +57,7 @@ def tag(
     method
         How positions are computed (sniffers: always joint).
     qa
-        Agility of the tags in m²/s³ (tracker).
+        Agility of the tags in m²/s³ (joint).
     integrity_risk
         Probability, for each fix, that the error exceeds its protection level (joint); 1e-4 by default.
     alert_limit_m

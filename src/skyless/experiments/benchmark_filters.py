@@ -1,4 +1,4 @@
-"""The yardsticks of ``skyless bench``: ``tracker`` and ``joint`` in plain NumPy, matrix by matrix, and filterpy's EKF.
+"""The yardsticks of ``skyless bench``: ``joint`` in plain NumPy, matrix by matrix, and by filterpy's EKF.
 
 They take the same measurements as the kernels and come to the same states (``tests/experiments/test_benchmarks.py``).
 """
@@ -14,109 +14,9 @@ from skyless.positioning.estimator.monitor import COMMON_GAIN, COMMON_LIMIT, WAL
 from skyless.positioning.estimator.settings import MAX_CLOCK_RATE, EstimatorSettings
 from skyless.positioning.estimator.state import START_WALK_SCALE
 from skyless.positioning.new_method import RELAY_AGE_S
-from skyless.positioning.tracker import (
-    AGILITY_GAIN,
-    AGILITY_LOSS,
-    FORGETTING,
-    MAX_AGILITY,
-    RESTLESS_CHI2,
-    PseudorangeTracker,
-    TrackerSettings,
-)
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
-
-
-def transition(dim: int, dt_s: float, qa: float, white: float, walk: float) -> tuple[Matrix, Matrix]:
-    """F and Q of [position (dim), velocity (dim), clock offset, rate]."""
-    n = 2 * dim + 2
-    F, Q = np.eye(n), np.zeros((n, n))
-    F[:dim, dim:-2] = dt_s * np.eye(dim)
-    F[-2, -1] = dt_s
-    Q[:dim, :dim] = np.eye(dim) * qa * dt_s**3 / 3
-    Q[:dim, dim:-2] = Q[dim:-2, :dim] = np.eye(dim) * qa * dt_s**2 / 2
-    Q[dim:-2, dim:-2] = np.eye(dim) * qa * dt_s
-    Q[-2:, -2:] = [
-        [white * dt_s + walk * dt_s**3 / 3, walk * dt_s**2 / 2],
-        [walk * dt_s**2 / 2, walk * dt_s],
-    ]
-    return F, Q
-
-
-class PlainTracker:
-    """``tracker`` as one would write it first, beginning where a real one stands; the height is given."""
-
-    def __init__(self, settings: TrackerSettings, begun: PseudorangeTracker) -> None:
-        self._s = settings
-        self._height_m = settings.height_m or 0.0
-        self.x, self.P = begun.x.copy(), begun.P.copy()
-        self._epoch, self._whole = (int(value) for value in begun.whole[:2])
-        self._chi2, self._agility = 1.0, 1.0
-
-    def elapse(self, rx_ticks: int) -> tuple[Matrix, Matrix]:
-        """F and Q up to a reading of the tag."""
-        dt_s = (rx_ticks - self._epoch) * TICK_S / (1.0 + self.x[-1] / SPEED_OF_LIGHT_MPS)
-        self._epoch = rx_ticks
-        return transition(2, dt_s, self._s.qa * self._agility, self._s.white, self._s.walk)
-
-    def expected(self, x: Vector, anchor_m: Vector) -> tuple[float, Vector]:
-        """The pseudorange that a state expects, in metres, and its gradient."""
-        away = np.append(x[:2], self._height_m) - anchor_m
-        range_m = float(np.linalg.norm(away))
-        return range_m + x[-2], np.array([away[0] / range_m, away[1] / range_m, 0.0, 0.0, 1.0, 0.0])
-
-    def measured(self, rx_ticks: int, tx_ticks: int) -> float:
-        """The pseudorange in metres, less whole ticks."""
-        return (rx_ticks - tx_ticks - self._whole) * TICK_M
-
-    def hear(self, anchor_m: Vector, rx_ticks: int, tx_ticks: int, tx_variance_m2: float) -> bool:
-        """Take one beacon; False beyond the gate."""
-        F, Q = self.elapse(rx_ticks)
-        self.x = F @ self.x
-        self.P = F @ self.P @ F.T + Q
-        expected_m, h = self.expected(self.x, anchor_m)
-        innovation = self.measured(rx_ticks, tx_ticks) - expected_m
-        spread = float(h @ self.P @ h) + self._s.stamp_variance_m2 + tx_variance_m2
-        normalised = innovation**2 / spread
-        if normalised > self._s.gate**2:
-            return False
-        gain = self.P @ h / spread
-        self.x = self.x + gain * innovation
-        self.P = self.P - np.outer(gain, self.P @ h)
-        self._chi2 += FORGETTING * (normalised - self._chi2)
-        restless = self._chi2 > RESTLESS_CHI2
-        self._agility = (
-            min(self._agility * AGILITY_GAIN, MAX_AGILITY) if restless else max(self._agility * AGILITY_LOSS, 1.0)
-        )
-        return True
-
-
-class FilterpyTracker(PlainTracker):
-    """The same measurements through filterpy's extended Kalman filter, which has no gate and no agility.
-
-    Raises:
-        ImportError: filterpy is not installed.
-    """
-
-    def __init__(self, settings: TrackerSettings, begun: PseudorangeTracker) -> None:
-        super().__init__(settings, begun)
-        self.filter: Any = import_module("filterpy.kalman").ExtendedKalmanFilter(dim_x=6, dim_z=1)
-        self.filter.x, self.filter.P = self.x.reshape(6, 1), self.P
-
-    def hear(self, anchor_m: Vector, rx_ticks: int, tx_ticks: int, tx_variance_m2: float) -> bool:
-        """Take one beacon."""
-        ekf = self.filter
-        ekf.F, ekf.Q = self.elapse(rx_ticks)
-        ekf.predict()
-        ekf.R[0, 0] = self._s.stamp_variance_m2 + tx_variance_m2
-        ekf.update(
-            np.array([[self.measured(rx_ticks, tx_ticks)]]),
-            lambda x: self.expected(x[:, 0], anchor_m)[1].reshape(1, 6),
-            lambda x: np.array([[self.expected(x[:, 0], anchor_m)[0]]]),
-        )
-        self.x, self.P = ekf.x[:, 0], ekf.P
-        return True
 
 
 class PlainJoint:
@@ -185,6 +85,9 @@ class PlainJoint:
         Q[b, b] = white * s.white * dt + walk * dt**3 / 3
         Q[b, f] = Q[f, b] = walk * dt**2 / 2
         Q[f, f] = walk * dt
+        self._predict(F, Q)
+
+    def _predict(self, F: Matrix, Q: Matrix) -> None:
         self.x = F @ self.x
         self.P = F @ self.P @ F.T + Q
 
@@ -221,3 +124,36 @@ class PlainJoint:
         keep = np.eye(len(self.x)) - np.outer(gain, h)
         self.P = keep @ self.P @ keep.T + variance * np.outer(gain, gain)
         return innovation / float(np.sqrt(spread))
+
+
+class FilterpyJoint(PlainJoint):
+    """The same through filterpy's extended Kalman filter.
+
+    Raises:
+        ImportError: filterpy is not installed.
+    """
+
+    def __init__(
+        self,
+        settings: EstimatorSettings,
+        anchors_m: Matrix,
+        rx_ticks: int,
+        start_m: Vector,
+        variances: tuple[float, float],
+    ) -> None:
+        super().__init__(settings, anchors_m, rx_ticks, start_m, variances)
+        self.filter: Any = import_module("filterpy.kalman").ExtendedKalmanFilter(dim_x=len(self.x), dim_z=1)
+
+    def _predict(self, F: Matrix, Q: Matrix) -> None:
+        ekf = self.filter
+        ekf.x, ekf.P, ekf.F, ekf.Q = self.x.reshape(-1, 1), self.P, F, Q
+        ekf.predict()
+        self.x, self.P = ekf.x[:, 0], ekf.P
+
+    def _update(self, h: Vector, innovation: float, variance: float) -> float:
+        ekf = self.filter
+        ekf.x, ekf.P = self.x.reshape(-1, 1), self.P
+        ekf.R[0, 0] = variance
+        ekf.update(np.array([[innovation]]), lambda _: h.reshape(1, -1), lambda _: np.zeros((1, 1)))
+        self.x, self.P = ekf.x[:, 0], ekf.P
+        return innovation / float(np.sqrt(ekf.S[0, 0]))

@@ -14,30 +14,6 @@ Integers = NDArray[np.int64]
 
 
 @threaded_kernel
-def scalar_filter(
-    x: Vector, P: Matrix, anchors_m: Matrix, dt_s: Vector, pseudoranges_m: Vector, variance: float, noise: Vector
-) -> float:
-    """Eight states, [position, velocity, clock, rate], one pseudorange after the other; returns the last x.
-
-    ``noise`` holds the agility and the clock's white and random-walk figures. ``x`` is (8,), ``P`` (8, 8).
-    """
-    n = 8
-    h, ph = np.zeros(n), np.zeros(n)
-    for k in range(len(dt_s)):
-        _elapse(x, P, 3, 1, dt_s[k], noise)
-        squared = 0.0
-        for axis in range(3):
-            h[axis] = x[axis] - anchors_m[k, axis]
-            squared += h[axis] * h[axis]
-        range_m = np.sqrt(squared)
-        for axis in range(3):
-            h[axis] /= range_m
-        h[6] = 1.0
-        _update(x, P, h, ph, pseudoranges_m[k] - range_m - x[6], variance)
-    return float(x[0])
-
-
-@threaded_kernel
 def joint_filter(
     x: Vector,
     P: Matrix,

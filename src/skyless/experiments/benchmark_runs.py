@@ -7,13 +7,12 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.experiments.benchmark_filters import FilterpyTracker, PlainJoint, PlainTracker
-from skyless.experiments.benchmark_loops import joint_filter, scalar_filter
+from skyless.constants import SPEED_OF_LIGHT_MPS
+from skyless.experiments.benchmark_filters import FilterpyJoint, PlainJoint
+from skyless.experiments.benchmark_loops import joint_filter
 from skyless.experiments.studies.episodes import Case, draw_episode, settings_of
 from skyless.positioning.estimator.estimator import Estimator, Packets
 from skyless.positioning.estimator.settings import EstimatorSettings
-from skyless.positioning.tracker import PseudorangeTracker, TrackerSettings, track
 
 Array = NDArray[np.float64]
 Ticks = NDArray[np.int64]
@@ -30,60 +29,8 @@ START_VARIANCES: Final = (0.09, 0.16)
 """Of a position and of a speed."""
 
 
-class TrackerRuns:
-    """The same measurements for ``tracker``, for plain NumPy, filterpy, and a loop of eight states."""
-
-    def __init__(self, superframes: int) -> None:
-        episode = draw_episode(np.random.default_rng(1), ANCHORS_M, SLOT_S, Case(qa=0.0), superframes)
-        senders, draw = episode.packets.anchors, np.random.default_rng(2)
-        self.count = len(senders)
-        self.settings = TrackerSettings(height_m=0.0)
-        self.tag_m = episode.path_m[0]
-        self.anchors_m = ANCHORS_M[senders]
-        self.pseudoranges_m = np.linalg.norm(self.anchors_m - self.tag_m, axis=1)
-        self.pseudoranges_m += draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
-        self.rx_ticks = episode.packets.rx_ticks
-        self.tx_ticks: Ticks = self.rx_ticks - np.rint(self.pseudoranges_m / TICK_M).astype(np.int64)
-        self.variances = np.full(self.count, 1e-4)
-
-    def begun(self) -> PseudorangeTracker:
-        """A tracker that begins where the tag stands."""
-        tracker = PseudorangeTracker(self.settings)
-        start = np.array([*self.tag_m[:2], 0.0])
-        tracker.start(int(self.rx_ticks[0]), 0, start, 0.01 * np.eye(3), 0.0, 1.0, 1.0)
-        return tracker
-
-    def batch(self, t: PseudorangeTracker, part: slice, states: Array) -> None:
-        """Give a tracker some of the messages in one call; rows of ``states`` are filled in."""
-        arrays = (t.x, t.P, t.whole, t.statistics, t.settings, t.h, t.ph)
-        columns = (self.anchors_m[part], self.rx_ticks[part], self.tx_ticks[part])
-        track(*arrays, *columns, np.zeros(len(columns[0])), self.variances[part], states)
-
-    def kernel(self) -> Run:
-        """All messages through the kernel."""
-        tracker, states = self.begun(), np.empty((self.count, 6))
-        return lambda: self.batch(tracker, slice(None), states)
-
-    def plain(self, count: int, kind: type[PlainTracker] = PlainTracker) -> Run:
-        """The first messages through plain NumPy or filterpy."""
-        tracker = kind(self.settings, self.begun())
-        rows = list(zip(self.anchors_m[:count], self.rx_ticks[:count].tolist(), self.tx_ticks.tolist(), strict=False))
-        return lambda: _each(lambda row: tracker.hear(row[0], row[1], row[2], 1e-4), rows)
-
-    def filterpy(self, count: int) -> Run:
-        """The first messages through filterpy."""
-        return self.plain(count, FilterpyTracker)
-
-    def loop(self) -> Run:
-        """All messages through a plain loop of eight states."""
-        x, P = np.zeros(8), np.eye(8)
-        x[:2] = self.tag_m[:2]
-        steps, noise = np.full(self.count, SLOT_S), np.array([self.settings.qa, 7.2e-5, 0.18])
-        return lambda: scalar_filter(x, P, self.anchors_m, steps, self.pseudoranges_m, 2e-3, noise)
-
-
 class JointRuns:
-    """The same messages for ``joint`` and for plain NumPy; a loop of 18 states beside them."""
+    """The same messages for ``joint``, plain NumPy and filterpy; a loop of 18 states beside them."""
 
     def __init__(self, superframes: int, *, mesh: bool, exact: bool = True) -> None:
         """``exact``: whether the filter takes survey and ranges for exact, else it estimates their errors as well."""
@@ -91,6 +38,10 @@ class JointRuns:
         episode = draw_episode(np.random.default_rng(1), ANCHORS_M, SLOT_S, case, superframes)
         self.packets, self.tag_m = episode.packets, episode.path_m[0]
         self.count = len(self.packets.anchors)
+        ranges_m, draw = np.linalg.norm(ANCHORS_M[self.packets.anchors] - self.tag_m, axis=1), np.random.default_rng(2)
+        self.pseudoranges_m: Array = ranges_m + draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
+        """What a tag with a perfect clock would measure."""
+        self._sync_m = draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
         self.settings = settings_of(Case(mesh=mesh), height_m=0.0)
         if not exact:
             usual = EstimatorSettings()
@@ -115,24 +66,24 @@ class JointRuns:
         estimator = self.begun()
         return lambda: estimator.track(self.packets)
 
-    def plain(self, count: int) -> Run:
-        """The first messages through plain NumPy."""
+    def plain(self, count: int, kind: type[PlainJoint] = PlainJoint) -> Run:
+        """The first messages through plain NumPy or filterpy."""
         p = self.packets
-        joint = PlainJoint(self.settings, ANCHORS_M, int(p.rx_ticks[0]), self.tag_m[:2], START_VARIANCES)
+        joint = kind(self.settings, ANCHORS_M, int(p.rx_ticks[0]), self.tag_m[:2], START_VARIANCES)
         rows = list(packets_of(p, count))
         return lambda: _each(lambda row: joint.hear(*row), rows)
 
+    def filterpy(self, count: int) -> Run:
+        """The first messages through filterpy."""
+        return self.plain(count, FilterpyJoint)
+
     def loop(self) -> Run:
         """As many messages through a plain loop of 18 states; all clocks run alike."""
-        draw = np.random.default_rng(2)
-        senders = self.packets.anchors
-        ranges_m = np.linalg.norm(ANCHORS_M[senders] - self.tag_m, axis=1)
-        pseudoranges_m = ranges_m + draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
-        sync_m = draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
+        measured = (self.pseudoranges_m, self._sync_m)
         x, P = np.zeros(18), np.eye(18)
         x[:2] = self.tag_m[:2]
         steps, noise = np.full(self.count, SLOT_S), np.array([self.settings.qa, 3.6e-5, 0.09])
-        return lambda: joint_filter(x, P, ANCHORS_M, senders, steps, pseudoranges_m, sync_m, 2e-3, noise)
+        return lambda: joint_filter(x, P, ANCHORS_M, self.packets.anchors, steps, *measured, 2e-3, noise)
 
 
 def packets_of(packets: Packets, count: int) -> Iterable[tuple[int, int, int, int, Ticks]]:

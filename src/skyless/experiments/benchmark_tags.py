@@ -8,10 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Final
 
-import numpy as np
 from msgspec import Struct
 
-from skyless.experiments.benchmark_runs import NODES, JointRuns, TrackerRuns
+from skyless.experiments.benchmark_runs import NODES, JointRuns
 from skyless.experiments.monte_carlo import cores
 
 TAGS: Final = (1, 100, 10_000)
@@ -44,18 +43,6 @@ def one_core() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, before)
-
-
-def many_trackers() -> TagsSpeed:
-    """Measure ``tracker``."""
-    runs = TrackerRuns(CHUNK * CHUNKS)
-    size = CHUNK * NODES
-
-    def tag() -> Tag:
-        tracker, states = runs.begun(), np.empty((size, 6))
-        return lambda chunk: runs.batch(tracker, slice(chunk * size, (chunk + 1) * size), states)
-
-    return _many(tag)
 
 
 def many_joints() -> TagsSpeed:

@@ -15,8 +15,8 @@ from scipy.optimize import least_squares
 from skyless.air.codec import decode_cached
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
-from skyless.experiments.benchmark_runs import ANCHORS_M, NODES, Array, JointRuns, Run, TrackerRuns
-from skyless.experiments.benchmark_tags import TagsSpeed, many_joints, many_trackers, one_core
+from skyless.experiments.benchmark_runs import ANCHORS_M, NODES, Array, JointRuns, Run
+from skyless.experiments.benchmark_tags import TagsSpeed, many_joints, one_core
 from skyless.experiments.monte_carlo import cores
 from skyless.positioning.solver import PseudorangeSolution, locate_pseudoranges
 from skyless.receiver import Receiver
@@ -52,9 +52,10 @@ class KernelSpeed(Struct, frozen=True):
     """To plain NumPy."""
     numpy_messages_per_s: float
     loop_messages_per_s: float
-    """Of a plain Numba loop: 8 states beside ``tracker``, 18 with a sync update beside ``joint``."""
+    """Of a plain Numba loop of 18 states with a sync update."""
     loop_ratio: float
     filterpy_messages_per_s: float | None = None
+    """Measured for ``joint`` only."""
     filterpy_ratio: float | None = None
 
 
@@ -62,14 +63,11 @@ class StreamingSpeed(Struct, frozen=True):
     """Seconds of a core per beacon, from bytes to fix: ``Receiver.hear``, every frame for the first time."""
 
     seconds_per_message: float
-    """With ``joint``."""
-    tracker_seconds_per_message: float
 
 
 class Kernels(Struct, frozen=True):
     """The filters."""
 
-    tracker: KernelSpeed
     joint: KernelSpeed
     """As ``joint_mesh`` at a site that calls survey and ranges exact, as plain NumPy and the loop take them for; ..."""
     joint_mesh: KernelSpeed
@@ -106,15 +104,14 @@ def measure_all(effort: Effort = FULL) -> Speed:
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     with one_core():
         kernels = Kernels(
-            _tracker(effort),
-            _joint(effort, mesh=False),
+            _joint(effort, mesh=False, filterpy=find_spec("filterpy") is not None),
             _joint(effort, mesh=True),
             _joint(effort, mesh=False, exact=False),
             _joint(effort, mesh=True, exact=False),
             _streaming(effort),
         )
         snapshots = _snapshots(effort)
-    tags = {"tracker": many_trackers(), "joint": many_joints()}
+    tags = {"joint": many_joints()}
     return Speed(kernels, snapshots, tags, load, cores(), None if find_spec("filterpy") else NO_FILTERPY)
 
 
@@ -130,22 +127,13 @@ def seconds(prepare: Callable[[], Run], runs: int) -> float:
     return statistics.median(times)
 
 
-def _speed(runs: TrackerRuns | JointRuns, effort: Effort, filterpy: Callable[[], Run] | None) -> KernelSpeed:
-    few = effort.plain_messages
+def _joint(effort: Effort, *, mesh: bool, exact: bool = True, filterpy: bool = False) -> KernelSpeed:
+    runs, few = JointRuns(effort.superframes, mesh=mesh, exact=exact), effort.plain_messages
     own = runs.count / seconds(runs.kernel, effort.runs)
     loop = runs.count / seconds(runs.loop, effort.runs)
     plain = few / seconds(lambda: runs.plain(few), 3)
-    other = few / seconds(filterpy, 3) if filterpy else None
+    other = few / seconds(lambda: runs.filterpy(few), 3) if filterpy else None
     return KernelSpeed(own, own / plain, plain, loop, own / loop, other, own / other if other else None)
-
-
-def _tracker(effort: Effort) -> KernelSpeed:
-    runs = TrackerRuns(effort.superframes)
-    return _speed(runs, effort, (lambda: runs.filterpy(effort.plain_messages)) if find_spec("filterpy") else None)
-
-
-def _joint(effort: Effort, *, mesh: bool, exact: bool = True) -> KernelSpeed:
-    return _speed(JointRuns(effort.superframes, mesh=mesh, exact=exact), effort, None)
 
 
 def _streaming(effort: Effort) -> StreamingSpeed:
@@ -153,15 +141,11 @@ def _streaming(effort: Effort) -> StreamingSpeed:
     world = World(site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(3.0, 4.0))], lab_impairments(100.0), 1)
     heard = [reception for sent in world.run(WARM_S + effort.streaming_s) for _, reception, _ in sent.receptions()]
     warm = round(len(heard) * WARM_S / (WARM_S + effort.streaming_s))
-    joint, tracker = (
-        seconds(partial(_hearing, method, heard, warm), max(3, effort.runs // 2)) / (len(heard) - warm)
-        for method in ("joint", "tracker")
-    )
-    return StreamingSpeed(joint, tracker)
+    return StreamingSpeed(seconds(partial(_hearing, heard, warm), max(3, effort.runs // 2)) / (len(heard) - warm))
 
 
-def _hearing(method: str, heard: list[Reception], warm: int) -> Run:
-    receiver = Receiver(method)
+def _hearing(heard: list[Reception], warm: int) -> Run:
+    receiver = Receiver()
     for reception in heard[:warm]:
         receiver.hear(reception)
     decode_cached.cache_clear()
@@ -175,7 +159,7 @@ def _hearing(method: str, heard: list[Reception], warm: int) -> Run:
 
 
 def _snapshots(effort: Effort) -> SnapshotSpeed:
-    runs = TrackerRuns(effort.plain_messages // NODES + 1)
+    runs = JointRuns(effort.plain_messages // NODES + 1, mesh=False)
     rows = runs.pseudoranges_m[: effort.plain_messages // NODES * NODES].reshape(-1, NODES)
     variances, middle = np.full(NODES, 2e-3), np.array([*ANCHORS_M[:, :2].mean(axis=0), 0.0])
 

@@ -1,6 +1,6 @@
 """Maps: predictions over a grid of the floor, one slice for each height.
 
-The filters' points are dear. On large grids they are computed on a coarser one (on the largest the other methods,
+The filter's points are dear. On large grids they are computed on a coarser one (on the largest the other methods,
 too), and their ratio to the PDOP of anchors weighted by their share of frames, which is smooth, is interpolated; that
 PDOP is computed at every point, so that edges behind walls stay sharp.
 """
@@ -35,9 +35,6 @@ Array = NDArray[np.float64]
 MOST_POINTS: Final = 5_000_000
 NICE_POINTS: Final = 12_000
 STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-TRACKER_BUDGET: Final = 150_000
-"""Points of the tracker times what one costs, anchors and a constant."""
-
 JOINT_BUDGET: Final = 2.5e5
 """Points of the joint filter times what one costs, the square of the anchors in view and a constant."""
 
@@ -45,7 +42,7 @@ MOST_ASKED: Final = 500
 """Points that are asked for their anchors in view."""
 
 SNAPSHOT_BUDGET: Final = 20_000_000
-"""The tracker's for the snapshot methods, which only the largest grids exceed."""
+"""Points of a snapshot method times what one costs, anchors and a constant; only the largest grids exceed it."""
 
 
 class Grid(Struct, frozen=True):
@@ -190,8 +187,7 @@ def _stride(predictor: Predictor, grid: Grid, points: Matrix) -> int:
         some = points[:: math.ceil(len(points) / MOST_ASKED)]
         most = JOINT_BUDGET / float(((predictor.geometry_at(some)[:, ANCHORS] + 8.0) ** 2).mean())
     else:
-        budget = TRACKER_BUDGET if predictor.settings.method == "tracker" else SNAPSHOT_BUDGET
-        most = budget / (len(predictor.anchors_m) + 14.0)
+        most = SNAPSHOT_BUDGET / (len(predictor.anchors_m) + 14.0)
     return max(1, math.ceil(math.sqrt(grid.points / most)))
 
 

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from skyless.air.rotation import filter_pages_of
 from skyless.air.schedule import schedule_of
-from skyless.clocks.filter import clock_noise
 from skyless.compiled import threaded_kernel
 from skyless.methods import DEFAULT_METHOD, FILTERS
-from skyless.planning.anchor_clocks import anchor_clocks, stamp_variances
+from skyless.planning.anchor_clocks import anchor_clocks
 from skyless.planning.columns import COLUMNS, SIGMA
 from skyless.planning.geometry import Scene, fill_dops, observe, weighted_pdop
 from skyless.planning.joint_sigma import fill_joint_sigma
@@ -24,7 +23,6 @@ from skyless.planning.links import AnchorLinks, anchor_links, anchor_positions, 
 from skyless.planning.relays import relays_of
 from skyless.planning.rounds import rounds_of
 from skyless.planning.snapshot_sigma import fill_snapshot_sigma
-from skyless.planning.tracker_sigma import fill_tracker_sigma
 from skyless.positioning.new_method import estimator_settings
 from skyless.positioning.snapshots import SnapshotMethod
 from skyless.simulation.channel import ChannelModel, pack_walls
@@ -37,8 +35,8 @@ Fill = Callable[[Matrix, Matrix], None]
 CHUNK: Final = 2000
 """Points that a thread takes at once; ..."""
 
-FILTERS_CHUNK: Final = 100
-"""... fewer for the filters, whose points are dear."""
+FILTER_CHUNK: Final = 100
+"""... fewer for the filter, whose points are dear."""
 
 
 class PlanSettings(Struct, frozen=True):
@@ -48,7 +46,7 @@ class PlanSettings(Struct, frozen=True):
     noise_ps: float | None = None
     """Noise of every TX and RX stamp; None for the site's own figures."""
     qa: float = 0.3
-    """Agility that the filters assume, m²/s³."""
+    """Agility that the filter assumes, m²/s³."""
     channel: ChannelModel = ChannelModel()
 
 
@@ -67,8 +65,8 @@ class Predictor:
         self._scene = Scene(self.anchors_m, self.clocks.speaks, self.budget, self.walls)
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
         if settings.method in FILTERS:
-            self._fill = self._tracker() if settings.method == "tracker" else self._joint()
-            self._chunk = FILTERS_CHUNK
+            self._fill = self._joint()
+            self._chunk = FILTER_CHUNK
         else:
             self._fill = self._snapshots(SnapshotMethod(settings.method))
             self._chunk = CHUNK
@@ -93,23 +91,6 @@ class Predictor:
             np.full((n, 1), rounds.assumed_common**0.5),
             rounds.true_own,
             rounds.common,
-            self.farthest_m,
-            table,
-        )
-
-    def _tracker(self) -> Fill:
-        noise = self.site.noise
-        one = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
-        settings = np.array([one.white, one.walk, *stamp_variances(self.site)])
-        return lambda points, table: fill_tracker_sigma(
-            points,
-            self.dim,
-            self._scene,
-            self.master,
-            self.links.delay_m,
-            self.clocks,
-            self.settings.qa,
-            settings,
             self.farthest_m,
             table,
         )

@@ -1,1 +1,1 @@
-"""From pseudoranges and time differences to positions: solver, the paper's methods, the tracker."""
+"""From pseudoranges and time differences to positions: solver, the paper's methods, the estimator."""

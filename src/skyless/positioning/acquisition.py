@@ -1,9 +1,13 @@
-"""The tracker's cold start: position and clock from beacons alone, without a guess.
+"""The cold start: where the tag is, from packets alone and without a guess.
 
-The tag's clock runs up to 20 ppm off, so pseudoranges of one superframe drift by tens of metres. Two messages of the
-same anchor tell the drift; then all anchors' newest pseudoranges are carried to one time and solved in closed form.
+Wherever anchor i tells when it heard a packet of anchor j that the tag heard as well, the difference of their clocks
+at that moment is known but for noise. Along such links all TX times are carried to the clock of one anchor, unless more
+anchors tell theirs on the master's. The tag's clock runs up to 20 ppm off, so pseudoranges of one superframe drift by
+tens of metres. Two messages of the same anchor tell the drift; then all anchors' newest pseudoranges are carried to one
+time and solved in closed form.
 """
 
+from collections import deque
 from typing import Final
 
 import msgspec
@@ -55,18 +59,37 @@ MAX_SPEED_STD_MPS: Final = 32.0
 """... the next start assumes a speed higher by this factor, up to this."""
 
 
+MAX_LINK_AGE_S: Final = 1.0
+"""Older links are forgotten."""
+
+
+class _Link(Struct, frozen=True):
+    """Reading of one anchor's clock less that of another's, when the tag's read ``rx_ticks_tag``."""
+
+    rx_ticks_tag: int
+    ticks: int
+    fraction_ticks: float
+
+
+class _Scale(Struct, frozen=True):
+    """How an anchor's TX times become those of the reference: the sum of links on the way to it."""
+
+    ticks: int
+    fraction_ticks: float
+    rates_at: tuple[tuple[float, int], ...]
+    """What each link lacks: a rate, and since which reading of the tag."""
+    links: int
+
+
 class Start(Struct, frozen=True):
-    """A first state: everything ``PseudorangeTracker.start`` wants."""
+    """A first position, and the speed that is assumed of the tag."""
 
     used: tuple[Observation, ...]
     """The messages that it rests on, one of each anchor."""
     rx_ticks_tag: int
-    whole_offset_ticks: int
     solution: NDArray[np.float64]
     """[position (dim), clock offset], metres."""
     covariance: NDArray[np.float64]
-    clock_rate_mps: float
-    clock_rate_variance: float
     speed_variance: float
     is_contradicted: bool = False
     """Whether the messages of all anchors contradict each other, ..."""
@@ -81,9 +104,9 @@ class Acquisition:
         self,
         height_m: float | None,
         stamp_variance_m2: float,
-        z_bounds_m: tuple[float, float] | None = None,
-        max_age_s: float = MAX_AGE_S,
-        speed_std_mps: float = SPEED_STD_MPS,
+        z_bounds_m: tuple[float, float] | None,
+        max_age_s: float,
+        speed_std_mps: float,
     ) -> None:
         self._max_age_s = max_age_s
         self._speed_variance = speed_std_mps**2
@@ -95,6 +118,23 @@ class Acquisition:
         """A tag that is taken for fast: its speed makes a start wide, and more anchors do not help."""
         self._possible_ticks: int | None = None
         """When a start was first possible."""
+        self._contradicted_ticks: int | None = None
+        """When packets first contradicted each other."""
+        self._links: dict[tuple[int, int], _Link] = {}
+
+    def packets(self) -> list[Observation]:
+        """The last two packets of each anchor, in the order of their receptions."""
+        kept = [observation for pair in self._heard.values() for observation in pair]
+        return sorted(kept, key=lambda observation: observation.rx_ticks_tag)
+
+    def learn(self, observation: Observation) -> None:
+        """Keep what an anchor relays; to be called before ``hear``."""
+        for anchor, sequence, rx_ticks in observation.all_relays():
+            for packet in self._heard.get(anchor, ()):
+                if packet.sequence == sequence:
+                    range_ticks = float(np.linalg.norm(observation.anchor_m - packet.anchor_m)) / TICK_M
+                    link = _Link(packet.rx_ticks_tag, rx_ticks - packet.tx_ticks_anchor, -range_ticks)
+                    self._links[observation.anchor, anchor] = link
 
     def hear(self, observation: Observation) -> Start | NoFixReason:
         """Take one observation; try to start each time an anchor comes around again."""
@@ -121,8 +161,64 @@ class Acquisition:
         return self._solve_without_one(pairs, now)
 
     def _on_one_scale(self, pairs: list[list[Observation]]) -> list[list[Observation]]:
-        """Messages whose TX times are all on one scale: as they are, on the master's."""
-        return pairs
+        """The packets on the scale of the anchor that reaches most others, or on the master's if that is more."""
+        with_master = [pair for pair in pairs if all(packet.tx_ticks_master is not None for packet in pair)]
+        if not pairs:
+            return with_master
+        now = pairs[-1][-1].rx_ticks_tag
+        self._links = {
+            ends: link
+            for ends, link in self._links.items()
+            if (now - link.rx_ticks_tag) * TICK_S < max(MAX_LINK_AGE_S, self._max_age_s)
+        }
+        by_anchor = {pair[0].anchor: pair for pair in pairs}
+        rates = {anchor: _rate(*pair) for anchor, pair in by_anchor.items()}
+        best: dict[int, _Scale] = {}
+        for reference in rates:
+            if reference not in best:  # it would reach the same anchors as before
+                reached = self._reach(reference, rates)
+                if len(reached) > len(best):
+                    best = reached
+        if len(best) < len(with_master):
+            return with_master
+        return [
+            [self._convert(packet, best[anchor]) for packet in by_anchor[anchor]] for anchor in rates if anchor in best
+        ]
+
+    def _reach(self, reference: int, rates: dict[int, float]) -> dict[int, _Scale]:
+        """The scale of every anchor to which links lead, by as few of them as can be."""
+        reached = {reference: _Scale(0, 0.0, (), 0)}
+        queue = deque([reference])
+        while queue:
+            known = queue.popleft()
+            for (listener, sender), link in self._links.items():
+                if known not in (listener, sender):
+                    continue
+                other, sign = (sender, 1) if known == listener else (listener, -1)
+                if other in reached or other not in rates:
+                    continue
+                scale = reached[known]
+                reached[other] = _Scale(
+                    scale.ticks + sign * link.ticks,
+                    scale.fraction_ticks + sign * link.fraction_ticks,
+                    (*scale.rates_at, (rates[known] - rates[other], link.rx_ticks_tag)),
+                    scale.links + 1,
+                )
+                queue.append(other)
+        return reached
+
+    def _convert(self, packet: Observation, scale: _Scale) -> Observation:
+        fraction = scale.fraction_ticks
+        variance = 2.0 * scale.links * self._variance_m2
+        for rate, rx_ticks in scale.rates_at:
+            fraction += rate * (packet.rx_ticks_tag - rx_ticks)
+        whole = int(np.floor(fraction))
+        return msgspec.structs.replace(
+            packet,
+            tx_ticks_master=packet.tx_ticks_anchor + scale.ticks + whole,
+            tx_fraction_ticks=fraction - whole,
+            tx_variance_m2=variance,
+        )
 
     def _unless_wide(self, start: Start) -> Start | NoFixReason:
         """Hold a start back while it is wide and more anchors may come."""
@@ -136,14 +232,24 @@ class Acquisition:
         return start if waited_s >= patience_s else NoFixReason.ACQUIRING
 
     def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
-        """Where one anchor alone contradicts all others, do without it; they must still be able to contradict."""
+        """Where one anchor alone contradicts all others, do without it; they must still be able to contradict.
+
+        Where no single one does for half a second, start from all of them as they are.
+        """
+        if self._contradicted_ticks is None:
+            self._contradicted_ticks = now
         results = [self._solve(pairs[:k] + pairs[k + 1 :], now) for k in range(len(pairs))]
         starts = [
             msgspec.structs.replace(result, is_contradicted=True, left_out=(pairs[k][0].anchor,))
             for k, result in enumerate(results)
             if isinstance(result, Start)
         ]
-        return starts[0] if len(starts) == 1 else NoFixReason.RESIDUALS
+        if len(starts) == 1:
+            return starts[0]
+        if (now - self._contradicted_ticks) * TICK_S < PATIENCE_S:
+            return NoFixReason.RESIDUALS
+        result = self._solve(pairs, now, residual_tail=0.0)
+        return msgspec.structs.replace(result, is_contradicted=True) if isinstance(result, Start) else result
 
     def _solve(
         self, pairs: list[list[Observation]], now: int, residual_tail: float = RESIDUAL_TAIL
@@ -173,11 +279,8 @@ class Acquisition:
         return Start(
             tuple(newest),
             now,
-            base,
             solution,
             result.covariance_joint_m2,
-            rate,
-            rate_variance,
             self._speed_variance,
         )
 
@@ -204,3 +307,9 @@ def _possible(first: Observation, second: Observation) -> bool:
     if second.rx_ticks_tag <= first.rx_ticks_tag:
         return False
     return abs(_clock_rate(first, second)) <= MAX_DRIFT * SPEED_OF_LIGHT_MPS
+
+
+def _rate(first: Observation, second: Observation) -> float:
+    """How much faster an anchor's clock runs than the tag's, as a fraction."""
+    elapsed = second.rx_ticks_tag - first.rx_ticks_tag
+    return (second.tx_ticks_anchor - first.tx_ticks_anchor - elapsed) / elapsed if elapsed > 0 else 0.0

@@ -18,6 +18,7 @@ from skyless.positioning.acquisition import (
     SLOW_SPREAD,
     SPEED_STD_GROWTH,
     SPEED_STD_MPS,
+    Acquisition,
     Start,
 )
 from skyless.positioning.estimator.estimator import (
@@ -35,7 +36,6 @@ from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_rows import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.in_use import AnchorsInUse
-from skyless.positioning.joint_start import JointStart
 from skyless.positioning.master_scale import MasterScale
 from skyless.positioning.observation import Observation
 from skyless.positioning.protection import UNAVAILABLE, IntegrityRequirement
@@ -99,7 +99,7 @@ class Estimation:
         self._estimator = Estimator(settings)
         self._index_of: dict[int, int] = {}
         self._known_m: dict[int, NDArray[np.float64]] = {}
-        self._start: JointStart | None = self._new_start()
+        self._start: Acquisition | None = self._new_start()
         self._open_range_errors = False
         self._is_open = self._is_doubted = False
         self._time = fix_time or FixTime()
@@ -140,9 +140,7 @@ class Estimation:
         ):
             self._start = self._new_start()
         if self._start is not None:
-            self._start.learn(observation)
-            start = self._start.hear(observation)
-            return start if isinstance(start, NoFixReason) else self._first_fix(start, observation)
+            return self._look_for_start(self._start, observation)
         outcome = self._process(observation)
         self._newest_ticks = max(self._newest_ticks, rx_ticks)
         if outcome in {REJECTED, STALE}:
@@ -156,6 +154,16 @@ class Estimation:
             self._start = self._new_start()
             return NoFixReason.ACQUIRING
         self._in_use.use(observation)
+        return self._fix(observation)
+
+    def _look_for_start(self, starting: Acquisition, observation: Observation) -> Fix | NoFixReason:
+        starting.learn(observation)
+        start = starting.hear(observation)
+        if isinstance(start, NoFixReason):
+            return start
+        if self._superframe_s > LONGEST_SUPERFRAME_S:
+            return self._fix_of(start, observation)
+        self._begin(start, starting.packets())
         return self._fix(observation)
 
     def coast(self, observation: Observation) -> Fix | NoFixReason:
@@ -194,13 +202,13 @@ class Estimation:
             return True
         return False
 
-    def _new_start(self) -> JointStart:
+    def _new_start(self) -> Acquisition:
         settings = self._settings
         max_age_s = max(MAX_AGE_S, 2.5 * self._superframe_s)
         variance = settings.tx_variance_m2 + settings.rx_variance_m2
         if self._superframe_s > LONGEST_SUPERFRAME_S:
             variance += settings.range_std_m**2 + settings.survey_std_m**2
-        return JointStart(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps)
+        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps)
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
@@ -262,7 +270,7 @@ class Estimation:
 
     def _report(self, observation: Observation) -> Report:
         """What the anchor says of its clock against the master's."""
-        claim, variance_m2 = observation.claim, observation.sync_variance_m2
+        claim, variance_m2 = observation.claim, observation.tx_variance_m2
         if claim is None or variance_m2 <= 0.0:
             return NO_REPORT
         master, subticks = self._index_of.get(claim.master), self._master_scale.difference(observation)
@@ -279,14 +287,6 @@ class Estimation:
                 self._estimator.move_anchor(index, anchor_m)
             self._known_m[anchor] = anchor_m
         return self._index_of[anchor]
-
-    def _first_fix(self, start: Start, observation: Observation) -> Fix | NoFixReason:
-        """Begin where a start is, if the filter can predict from there to the next packets at all."""
-        if self._superframe_s > LONGEST_SUPERFRAME_S:
-            return self._fix_of(start, observation)
-        assert self._start is not None
-        self._begin(start, self._start.packets())
-        return self._fix(observation)
 
     def _fix_of(self, start: Start, observation: Observation) -> Fix:
         """What a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""

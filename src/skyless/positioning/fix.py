@@ -10,9 +10,8 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.positioning.alert import Alert
-from skyless.positioning.fix_rows import MOTION_ROWS, POSITION, PROTECTION, QUALITY, VELOCITY, fill_motion
+from skyless.positioning.fix_rows import POSITION, PROTECTION, QUALITY, VELOCITY
 from skyless.positioning.protection import Integrity, IntegrityRequirement, integrity_of
-from skyless.positioning.tracker import CHI2, RESIDUAL_SQUARED
 from skyless.uncertainty.dop import Dops, dilution_of_precision
 
 
@@ -144,23 +143,3 @@ def _vector(rows: bytes, place: int) -> NDArray[np.float64]:
 
 def _matrix(rows: bytes, place: int) -> NDArray[np.float64]:
     return np.frombuffer(rows, count=9, offset=place * ROW_BYTES).reshape(3, 3)
-
-
-def motion_fix(
-    time_s: float,
-    x: NDArray[np.float64],
-    P: NDArray[np.float64],
-    height_m: float | None,
-    anchors: tuple[int, ...],
-    anchors_m: NDArray[np.float64],
-    statistics: NDArray[np.float64],
-    method: str,
-) -> Fix:
-    """Make the fix of a filter whose state begins with position and velocity (``fill_motion``).
-
-    ``statistics`` holds the running means of the normalised and of the plain squared innovation.
-    """
-    rows, known = np.zeros((MOTION_ROWS, 3)), height_m is not None
-    chi2, squared_m2 = statistics.item(CHI2), statistics.item(RESIDUAL_SQUARED)
-    fill_motion(rows, x, P, 2 if known else 3, chi2, squared_m2, height_m or 0.0)
-    return Fix(time_s, rows.tobytes(), anchors, anchors_m, method, known)

@@ -14,8 +14,6 @@ from skyless.positioning.fix_time import FixTime
 from skyless.positioning.observation import Method
 from skyless.positioning.protection import IntegrityRequirement
 from skyless.positioning.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
-from skyless.positioning.tracker import TrackerSettings
-from skyless.positioning.tracking import Tracking
 from skyless.ticks import to_seconds
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
@@ -52,15 +50,13 @@ def new_method(
             master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, wanted.z_bounds_m
         )
         return Snapshots(SnapshotMethod(wanted.method), settings, time)
-    if wanted.method == "joint":
-        assumed = replace(
-            estimator_settings(wanted.qa, schedule.tag_height_m, noise, accuracy, superframe_s),
-            max_acceleration_mps2=wanted.integrity.max_acceleration_mps2,
-            integrity_risk=wanted.integrity.risk,
-            alert_limit_m=wanted.integrity.alert_limit_m,
-        )
-        return Estimation(assumed, wanted.z_bounds_m, time, superframe_s)
-    return Tracking(_tracker_settings(wanted, schedule, noise), wanted.z_bounds_m, time, superframe_s)
+    assumed = replace(
+        estimator_settings(wanted.qa, schedule.tag_height_m, noise, accuracy, superframe_s),
+        max_acceleration_mps2=wanted.integrity.max_acceleration_mps2,
+        integrity_risk=wanted.integrity.risk,
+        alert_limit_m=wanted.integrity.alert_limit_m,
+    )
+    return Estimation(assumed, wanted.z_bounds_m, time, superframe_s)
 
 
 def _stamp_variances(noise: NoisePage) -> tuple[float, float]:
@@ -89,16 +85,4 @@ def estimator_settings(
         place_std_m=accuracy.place_std_m,
         place_distance_m=accuracy.place_distance_m,
         place_time_s=accuracy.place_time_s,
-    )
-
-
-def _tracker_settings(wanted: Wanted, schedule: SchedulePage, noise: NoisePage) -> TrackerSettings:
-    tx_variance, rx_variance = _stamp_variances(noise)
-    clock = clock_noise(noise.white_fm, noise.random_walk_fm)
-    return TrackerSettings(
-        qa=wanted.qa,
-        white=clock.white,
-        walk=clock.walk,
-        stamp_variance_m2=tx_variance + rx_variance,
-        height_m=schedule.tag_height_m,
     )

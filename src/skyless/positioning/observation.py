@@ -33,15 +33,13 @@ class Observation(Struct, frozen=True, gc=False):
     """TX time on the master's scale, whole ticks; None while the anchor does not know it."""
     tx_fraction_ticks: float
     tx_variance_m2: float
-    """Variance of the TX time on the master's scale, from the anchor's clock filter; more where errors repeat."""
+    """Variance of the TX time on the master's scale, from the anchor's clock filter."""
     relays: tuple[tuple[int, int, int], ...] = ()
     """When the anchor heard others: (anchor, sequence number, own RX stamp, unwrapped); for ``joint`` only."""
     claim: Claim | None = None
-    """Whose time ``tx_ticks_master`` is; for ``joint`` only, as is ..."""
-    sync_variance_m2: float = 0.0
-    """... what the anchor itself says of its variance."""
+    """Whose time ``tx_ticks_master`` is; for ``joint`` only."""
     rx_variance_factor: float = 1.0
-    """On the variance of this reception, at least 1: what the radio's diagnostics say (``first_path``); for filters."""
+    """On the variance of this reception, at least 1: what the radio's diagnostics say (``first_path``)."""
     packed_relays: bytes = b""
     """Relays beside ``relays``, as frames carry them (``codec.packed_relays``)."""
 

@@ -1,7 +1,5 @@
 """Observations out of beacons: the master's time unwrapped, and for each method what it asks for."""
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,28 +11,22 @@ from skyless.constants import MAX_DRIFT, TICK_M
 from skyless.positioning.estimation import Estimation
 from skyless.positioning.fix_time import SLACK_TICKS
 from skyless.positioning.observation import Method, Observation
-from skyless.positioning.snapshots import Snapshots
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, nearest
-
-MOST_REPEATS: Final = 4
-"""Beyond this beacons of an anchor that has lost the master weigh no less: what changes between them is still true."""
 
 
 class Observer:
     """What a tag must remember of beacons to make observations of those that follow."""
 
     def __init__(self) -> None:
-        self._for_joint = self._for_snapshots = False
+        self._for_joint = False
         self._schedule: Schedule | None = None
         self._master: int | None = None
         self._master_slot = 0
         self._scale: tuple[int, int] | None = None
         """The master's time and the tag's, both unwrapped, when they were compared last."""
-        self._synchronised: dict[int, tuple[Heard, int]] = {}
 
     def forget(self) -> None:
         """Start anew."""
-        self._synchronised.clear()
         self._scale = None
 
     def follow(self, master: int | None, master_slot: int) -> None:
@@ -44,7 +36,7 @@ class Observer:
     def serve(self, method: Method, schedule: Schedule) -> None:
         """Make what this method asks for."""
         self._schedule = schedule
-        self._for_joint, self._for_snapshots = isinstance(method, Estimation), isinstance(method, Snapshots)
+        self._for_joint = isinstance(method, Estimation)
 
     def observe(
         self,
@@ -59,54 +51,20 @@ class Observer:
         """One observation of a beacon in a frame; ``claim``, the one that is followed, is mostly the beacon's too."""
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
         if not self._for_joint:
-            timed = (ticks_master, fraction, variance_m2)
-            return self._plain(beacon, anchor_m, rx_ticks, tx_ticks, timed, rx_variance_factor)
+            heard = beacon.master_heard if beacon.master == self._master else None
+            master_sequence, master_rx_ticks = _stamp_of(heard, tx_ticks)
+            return Observation(
+                beacon.anchor, anchor_m, self._round(beacon), beacon.sequence, rx_ticks, tx_ticks, master_sequence,
+                master_rx_ticks, ticks_master, fraction, variance_m2, (), None, rx_variance_factor,
+            )  # fmt: skip
         if ticks_master is None:
             claim = None
         elif claim is None or claim.master != beacon.master or claim.term != beacon.term:
             claim = claim_of(beacon)
         return Observation(
             beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, ticks_master, fraction,
-            variance_m2, (), claim, variance_m2, rx_variance_factor, packed_relays(frame, beacon),
+            variance_m2, (), claim, rx_variance_factor, packed_relays(frame, beacon),
         )  # fmt: skip
-
-    def _plain(
-        self,
-        beacon: Beacon,
-        anchor_m: NDArray[np.float64],
-        rx_ticks: int,
-        tx_ticks: int,
-        timed: tuple[int | None, float, float],
-        rx_variance_factor: float,
-    ) -> Observation:
-        """For methods that rest on the master's time, and know nothing of relays."""
-        heard = beacon.master_heard if beacon.master == self._master else None
-        ticks_master, fraction, variance_m2 = timed
-        sync_variance_m2 = variance_m2
-        if heard is not None:
-            repeats = self._repeats(beacon.anchor, heard)
-            variance_m2 *= repeats * repeats
-        count, master_sequence, master_rx_ticks = 0, None, None
-        if self._for_snapshots:
-            count, (master_sequence, master_rx_ticks) = self._round(beacon), _stamp_of(heard, tx_ticks)
-        return Observation(
-            beacon.anchor, anchor_m, count, beacon.sequence, rx_ticks, tx_ticks, master_sequence, master_rx_ticks,
-            ticks_master, fraction, variance_m2, (), None, sync_variance_m2, rx_variance_factor,
-        )  # fmt: skip
-
-    def _repeats(self, anchor: int, heard: Heard) -> int:
-        """How many beacons of an anchor, this one included, rest on the same beacon of the master.
-
-        They share one clock error, which filters take for independent ones: their variances count times the square
-        of this number (``docs/maths.md`` section 6).
-        """
-        last, count = self._synchronised.get(anchor, (heard, 0))
-        if last.rx_ticks != heard.rx_ticks or last != heard:
-            count = 1
-        elif count < MOST_REPEATS:
-            count += 1
-        self._synchronised[anchor] = (heard, count)
-        return count
 
     def _round(self, beacon: Beacon) -> int:
         """Round of a frame, counted from the master's slot: what follows a frame of the master refers to it."""

@@ -18,13 +18,12 @@ from skyless.positioning.estimator.estimator import Estimator
 from skyless.positioning.estimator.soundness import is_sound
 from skyless.positioning.in_use import AnchorsInUse
 from skyless.positioning.observation import Observation
-from skyless.positioning.tracker import PseudorangeTracker
 from skyless.receiver import Receiver
 from skyless.recordings.checkpoint_graph import Arrays
 from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
 from skyless.recordings.checkpoint_writer import write_graph
 
-FORMAT: Final = 12
+FORMAT: Final = 13
 MAX_BYTES: Final = 1 << 23
 """Enough for an estimator of a hundred anchors."""
 
@@ -90,15 +89,6 @@ def _start(value: Start) -> bool:
     return n in (3, 4) and _floats(value.solution, n) and _floats(value.covariance, n, n)
 
 
-def _tracker(value: PseudorangeTracker) -> bool:
-    if value.dim not in (2, 3):
-        return False
-    n = 2 * value.dim + 2
-    vectors = all(_floats(vector, n) for vector in (value.x, value.h, value.ph))
-    whole = value.whole.shape == (5,) and value.whole.dtype == np.int64
-    return vectors and whole and _floats(value.P, n, n) and _floats(value.settings, 6) and _floats(value.statistics, 4)
-
-
 def _in_use(value: AnchorsInUse) -> bool:
     return _floats(value.anchors_m, len(value.anchors), 3)
 
@@ -118,7 +108,6 @@ def _receiver(value: Receiver) -> bool:
 _SOUND: Final[Arrays] = {
     Observation: _observation,
     Start: _start,
-    PseudorangeTracker: _tracker,
     AnchorsInUse: _in_use,
     Estimator: is_sound,
     Estimation: _estimation,

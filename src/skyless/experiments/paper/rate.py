@@ -19,7 +19,7 @@ from skyless.simulation.world import World
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, ScheduleSite, Site
 
-METHODS: Final = ("literal", "tracker")
+METHODS: Final = ("literal", "joint")
 PAPER_HZ: Final = 67.0
 FROM_S: Final = 1.0
 """Updates count from this true time on."""
@@ -74,7 +74,7 @@ def run_world(progress: Progress, name: str, seed: int, seconds: float) -> list[
                     times_s[method].append(broadcast.end_s)
         progress(broadcast.end_s / until_s)
     schedule, nodes = schedule_of(site), len(site.anchors)
-    foreseen = {"literal": schedule.superframe_rate_hz, "tracker": schedule.messages_per_s(nodes)}
+    foreseen = {"literal": schedule.superframe_rate_hz, "joint": schedule.messages_per_s(nodes)}
     return [
         Count(name, nodes, method, len(times), seconds, foreseen[method], float(np.diff(times).max()))
         for method, times in times_s.items()
@@ -97,7 +97,7 @@ def section(plan: Plan, results: Results) -> Section:
     counts: list[Count] = [count for name in sites() for count in results[f"rate/{name}"]]
     by = {(count.site, count.method): count for count in counts}
     lab, seven = sites()
-    verdict, reason = judge(by[lab, "literal"].rate_hz, by[seven, "tracker"].rate_hz)
+    verdict, reason = judge(by[lab, "literal"].rate_hz, by[seven, "joint"].rate_hz)
     rows = [("site", "method", "updates per s", "foreseen", "longest gap in ms")]
     rows += [
         (
@@ -116,7 +116,7 @@ def section(plan: Plan, results: Results) -> Section:
         claim="The highest update rate reached is 67 Hz; the number of active anchors limits it.",
         simulated=(
             f"Updates of one tag counted over {plan.rate_s:g} s: six nodes in slots of 2.5 ms, and seven nodes in "
-            "slots of 2.1 ms. The literal method makes one fix per superframe, the tracker one per message."
+            "slots of 2.1 ms. The literal method makes one fix per superframe, joint one per message."
         ),
         verdict=verdict,
         reason=reason,
@@ -136,7 +136,7 @@ def section(plan: Plan, results: Results) -> Section:
                 for c in counts
             ]
         },
-        command=f"skyless simulate --method tracker --position 3,4 --duration 10 --seed {plan.seed}",
+        command=f"skyless simulate --method joint --position 3,4 --duration 10 --seed {plan.seed}",
     )
 
 
@@ -152,6 +152,4 @@ def _bars(counts: list[Count]) -> Panel:
         xlabel="updates per second (dashed: the paper's 67)", xlim=(0, 1.15 * max(count.rate_hz for count in counts))
     )
     axes.grid(visible=False, axis="y")
-    return Panel(
-        "08-update-rate", "Counted updates: one per superframe (literal) and one per message (tracker).", figure
-    )
+    return Panel("08-update-rate", "Counted updates: one per superframe (literal) and one per message (joint).", figure)

@@ -69,7 +69,7 @@ def run_world(progress: Progress, tags: int, seed: int) -> FleetResult:
     world = World(
         site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(*P1))] * tags, lab_impairments(RADIO_PS), seed
     )
-    receivers = [Receiver("tracker") for _ in range(tags)]
+    receivers = [Receiver("joint") for _ in range(tags)]
     squares_m2, fixes = np.zeros(tags), np.zeros(tags, dtype=np.int64)
     digest, frames, cpu_s = hashlib.sha256(), 0, 0.0
     for broadcast in world.run(UNTIL_S):
@@ -167,7 +167,7 @@ def section(plan: Plan, results: Results) -> Section:
         claim="Any number of tags can be tracked without a lower update rate; the paper shows it with three.",
         simulated=(
             f"Fleets of {', '.join(grouped(tags) for tags in plan.fleet_sizes)} tags, all at P1 with radios and "
-            f"clocks of their own, {RADIO_PS:g} ps, tracker, from a cold start; judged from {FROM_S:g} to "
+            f"clocks of their own, {RADIO_PS:g} ps, joint, from a cold start; judged from {FROM_S:g} to "
             f"{UNTIL_S:g} s, so that the anchors' noise is the same for all sizes (a single short stretch: the RMSE "
             "belongs to it, figure 4 has the long run). Every tag is the real receiver, every message is decoded "
             "by every tag. The lines for uplink are arithmetic, not simulated."
@@ -200,7 +200,7 @@ def _accuracy(fleets: list[FleetResult]) -> Panel:
     axes.plot(tags, [100 * fleet.rmse_m for fleet in fleets], "o-", color=BLUE, label="all tags together")
     axes.set(ylabel="RMSE in cm", ylim=(0, 1.5 * float(high.max())))
     axes.legend(loc="upper left")
-    return Panel("10-accuracy", "RMSE of the tracker by the number of tags, over the same 0.6 s.", figure)
+    return Panel("10-accuracy", "RMSE of joint by the number of tags, over the same 0.6 s.", figure)
 
 
 def _rates(fleets: list[FleetResult]) -> Panel:

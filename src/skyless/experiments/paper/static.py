@@ -16,7 +16,7 @@ from skyless.experiments.paper.style import INK, METHOD_COLOURS, MUTED, RED, pan
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 
-METHODS: Final = ("literal", "tracker")
+METHODS: Final = ("literal", "joint")
 PLACES: Final = {"P1": P1, "P2": P2}
 
 BATCHES: Final = 30

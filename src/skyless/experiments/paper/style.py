@@ -24,7 +24,7 @@ GREEN: Final = "#1f9d73"
 PURPLE: Final = "#a56bc4"
 RED: Final = "#d1495b"
 
-METHOD_COLOURS: Final = {"literal": ORANGE, "weighted": PURPLE, "bracketed": GREEN, "tracker": BLUE}
+METHOD_COLOURS: Final = {"literal": ORANGE, "weighted": PURPLE, "bracketed": GREEN, "joint": BLUE}
 MAP: Final = "viridis"
 
 _RC: Final[dict[Any, Any]] = {

@@ -16,7 +16,7 @@ from skyless.simulation.trajectory import Waypoints
 from skyless.site.lab import ideal_lab_site
 from skyless.uncertainty.dop import dops_at
 
-METHODS: Final = ("literal", "tracker")
+METHODS: Final = ("literal", "joint")
 CORNERS_M: Final = ((1.0, 1.0), (5.0, 1.0), (5.0, 7.0), (1.0, 7.0))
 SPEED_MPS: Final = 1.0
 CORNER_S: Final = 1.0

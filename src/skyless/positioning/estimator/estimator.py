@@ -60,7 +60,6 @@ from skyless.positioning.estimator.state import (
     without_anchor,
 )
 from skyless.positioning.fix_rows import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
-from skyless.positioning.kalman import horizontal_variance
 from skyless.positioning.protection import CONTRADICTED, OBSTRUCTED, SOUND, UNAVAILABLE
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
@@ -696,9 +695,14 @@ class Estimator:
 
     def horizontal_variance_m2(self, ahead_s: float) -> float:
         """Sum of the variances of x and y so much later, if nothing is received until then."""
-        _, covariance = self.motion()
-        status = self._state.status[0]
-        return horizontal_variance(covariance, self.dim, ahead_s, self.settings.qa * float(status["q_scale"]))
+        dim, (_, covariance) = self.dim, self.motion()
+        total = 2.0 * self.settings.qa * float(self._state.status[0]["q_scale"]) * ahead_s**3 / 3.0
+        for axis in range(2):
+            speed = dim + axis
+            total += covariance[axis, axis] + ahead_s * (
+                2.0 * covariance[axis, speed] + ahead_s * covariance[speed, speed]
+            )
+        return float(total)
 
     def motion(self) -> tuple[Vector, Matrix]:
         """Position and velocity at the newest packet, shape (2·dim,), and their covariance."""
