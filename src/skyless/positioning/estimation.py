@@ -161,6 +161,8 @@ class Estimation:
         start = starting.hear(observation)
         if isinstance(start, NoFixReason):
             return start
+        if start.is_contradicted and not start.left_out and self._estimator.is_late_often:
+            return NoFixReason.RESIDUALS  # single packets are late: others will not be
         if self._superframe_s > LONGEST_SUPERFRAME_S:
             return self._fix_of(start, observation)
         self._begin(start, starting.packets())
@@ -186,6 +188,9 @@ class Estimation:
 
     def _is_contradicted(self, rx_ticks: int) -> bool:
         """Whether a new start is needed, as relays or faults contradict this one; says what that has to expect."""
+        if self._is_doubted and self._estimator.is_late_often:
+            self._open_range_errors = self._is_doubted = False  # the start was contradicted by single late packets
+            return True
         if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
             age_s = (rx_ticks - self._started_ticks) * TICK_S
             limit = SURE_CHI2 if age_s < DOUBT_S or self._is_doubted else UNCOVERED_CHI2
@@ -228,8 +233,9 @@ class Estimation:
         self._in_use.begin(start.used)
         dim, begin_ticks = self._estimator.dim, packets[0].rx_ticks_tag
         age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
-        self._is_open = self._open_range_errors or (start.is_contradicted and not start.left_out)
-        self._is_doubted = self._is_open or start.is_contradicted
+        is_contradicted = start.is_contradicted and not self._estimator.is_late_often
+        self._is_open = self._open_range_errors or (is_contradicted and not start.left_out)
+        self._is_doubted = self._is_open or is_contradicted
         error = OPEN_RANGE_STD_M if self._is_doubted else self._settings.range_std_m
         inflation = 1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
         if not self._is_doubted:
@@ -242,7 +248,7 @@ class Estimation:
             start.speed_variance,
             self._is_open,
             CONTRADICTED_STD_M if self._is_doubted else LASTING_STD_M,
-            [self._index(packet) for packet in packets if packet.anchor in start.left_out],
+            [self._index(packet) for packet in packets if is_contradicted and packet.anchor in start.left_out],
         )
         for packet in packets:
             self._process(packet)
