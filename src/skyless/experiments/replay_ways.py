@@ -16,7 +16,7 @@ Triple = tuple[float, float, float]
 
 SAMPLED: Final = 128
 SAMPLED_OF: Final = 1024
-"""Of so many packets so many show the noise of time differences, for which packets have no use."""
+"""Of each 1024 packets the first 128 are made into time differences as well, to measure the recording's noise."""
 
 
 class Way(Protocol):
@@ -105,7 +105,7 @@ class ByPairs:
 
 
 class ByPackets:
-    """Packets as they are; of a part of them differences as well, for the recording's noise to be told."""
+    """Packets as they are; a part of them is made into differences as well, to measure the recording's noise."""
 
     def __init__(self, tracking: PacketTracking, engine: PairEngine, noise: NoiseBook) -> None:
         self._tracking = tracking

@@ -31,8 +31,8 @@ TYPICAL_SLOPE_M: Final = 0.05
 """Of a DW1000 that nobody has calibrated: APS011 says 0.03 to 0.10 m, flights that told it 0.03 to 0.08 m."""
 
 KNOWN_STD_M: Final = 0.02
-"""Of a constant that was calibrated, beside what the survey is off: between recordings of the same anchors it differs
-by 3 cm in all."""
+"""Of a constant that was calibrated, without the error of the survey: with it, constants of the same anchors differ by
+3 cm between recordings."""
 
 
 class AnchorCalibration(Struct, frozen=True):

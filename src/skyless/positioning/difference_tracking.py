@@ -61,7 +61,7 @@ TRY_EVERY: Final = 6
 
 AFTER_LOSS: Final = 30
 AFTER_LOSS_S: Final = 1.0
-"""Where a state was just wrong, a new start waits for so many differences or so long."""
+"""After a state that was wrong, a new start waits for this number of differences, or for this time."""
 
 
 class DifferenceTracking:

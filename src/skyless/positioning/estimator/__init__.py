@@ -2,9 +2,12 @@
 
 settings    what it assumes of tag, clocks, stamps, survey and ranges
 state       what it keeps, by name; anchors join and leave
-kalman      time update, the scalar measurement update, and what undetected faults do to the state
+kalman      time update and the scalar measurement update
+faults      range errors that the state does not hold: what they do to it, and taking them into it
 monitor     which measurements are used, and how process noise follows what is seen
 kinds       the kinds of measurements, each with its Jacobian
+flatness    whether the anchors determine the height
 levels      protection levels
 estimator   packet by packet, or many in one loop
+soundness   whether an estimator from a recording can be run
 """

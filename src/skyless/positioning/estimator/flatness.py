@@ -1,4 +1,4 @@
-"""Whether the anchors tell the tag's height at all: those in one plane do not tell one side of it from the other."""
+"""Whether the anchors determine the tag's height: anchors in one plane give both sides of it the same ranges."""
 
 from typing import Final
 
@@ -8,10 +8,10 @@ from skyless.compiled import step
 from skyless.positioning.estimator.state import EstimatorState
 
 PROBE_M: Final = 1.0
-"""Places so far off the plane, or as far as the tag is, are to be told apart."""
+"""Least distance from the plane at which the two sides are compared; for a tag that is farther off it is its own."""
 
-TOLD_CHI2: Final = 25.0
-"""Sum of the squared differences between their ranges, over the variances of range errors: by five sigma."""
+DISTINCT_CHI2: Final = 25.0
+"""The sides differ where their ranges' squared differences, over the variance of range errors, sum to more."""
 
 LEAST_ANCHORS: Final = 3
 
@@ -54,7 +54,7 @@ def is_height_open(s: EstimatorState) -> bool:
             apart_m = _apart_m(s, anchor, off_m, max(abs(off_m), PROBE_M))
             total += apart_m
             square += apart_m * apart_m
-    is_flat = square - total * total / count < TOLD_CHI2 * variance
+    is_flat = square - total * total / count < DISTINCT_CHI2 * variance
     image_z_m = s.x[2] - 2.0 * off_m * normal[2]
     is_image_possible = settings["lowest_m"] <= image_z_m <= settings["highest_m"]
     is_near = off_m * off_m * normal[2] ** 2 <= s.P[2, 2]

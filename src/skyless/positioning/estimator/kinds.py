@@ -4,7 +4,6 @@
     relay            S − T  =  |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + pair's constant + noise      (anchor i received anchor j)
     report           bₘ − bᵢ as anchor i knows it                                       (its clock against the master's)
     difference       |p − b| − |p − a| + range errors + noise                           (ready-made, of a pair)
-    height           z                                                                  (a sensor, or known roughly)
     zero velocity    v                                                                  (the tag stands still)
 
 with offsets b, TX noise w, all in metres. ``docs/maths.md`` section 6 derives them.

@@ -71,7 +71,7 @@ HUBER: Final = 1.5
 """Where receptions are late often, innovations beyond so many standard deviations weigh less."""
 
 DIFFERENCE_HUBER: Final = 1.0
-"""Ready-made differences with innovations beyond so many standard deviations weigh less."""
+"""Number of standard deviations beyond which the innovations of ready-made differences weigh less."""
 
 MOST_PLACE_STD_M: Final = 0.5
 """Of what range errors change along the way; larger ones are jumps."""

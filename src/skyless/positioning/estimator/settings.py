@@ -62,7 +62,7 @@ class EstimatorSettings(Struct, frozen=True):
     max_acceleration_mps2: float = 0.0
     """The tag's largest acceleration, as far as levels are to cover it beyond ``qa``."""
     max_walk_scale: float = 1e4
-    """At most so many times ``walk`` counts where innovations show that oscillators wander more."""
+    """Largest factor on ``walk`` where innovations show that oscillators wander more."""
     integrity_risk: float = RISK
     alert_limit_m: float | None = None
     """Fixes with a higher horizontal protection level say so."""
