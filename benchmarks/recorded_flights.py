@@ -194,19 +194,20 @@ def recordings_in(folder):
     return found
 
 
-def replayed(path, anchors_m, judge, height_m, **options):
+def replayed(path, anchors_m, judge, height, **options):
     """Replay as the command does; the report, and everything that fixes said."""
     fixes = Fixes()
-    request = ReplayRequest(path=path, anchors_m=anchors_m, height_m=height_m, **options)
+    height_m, height_std_m = height
+    request = ReplayRequest(path, anchors_m, height_m=height_m, height_std_m=height_std_m, **options)
     return Replay(request, judge).run(fixes.add, lambda _: None), fixes.arrays()
 
 
 def known(recording):
-    """Anchors, truth, height that is given (or None), and height above which it is judged."""
+    """Anchors, truth, height that is given (or None) with its σ, and height above which it is judged."""
     places, _ = known_anchors(recording.anchors, None)
     truth = known_truth(recording.tdoa, recording.truth, LEVER_ARM, None, None)
-    height_m, _ = height_to_hold("auto", places, None, truth, format_of(recording.tdoa).name)
-    return places, truth, height_m, flight_height(None, truth)
+    *height, _ = height_to_hold("auto", places, None, truth, format_of(recording.tdoa).name)
+    return places, truth, height, flight_height(None, truth)
 
 
 def truth_at(truth, above_m, times_s):
@@ -220,14 +221,14 @@ def truth_at(truth, above_m, times_s):
 
 def judged(recording, calibration=None):
     """Score of a recording's replay."""
-    places, truth, height_m, above_m = known(recording)
-    judge = Keeper(truth, planar=height_m is not None, settle_s=SETTLE_FLIGHT_S, above_m=above_m)
+    places, truth, height, above_m = known(recording)
+    judge = Keeper(truth, planar=height[0] is not None, settle_s=SETTLE_FLIGHT_S, above_m=above_m)
     _, (position_m, covariance_m2, levels_m, alerted) = replayed(
-        recording.tdoa, places, judge, height_m, calibration=calibration
+        recording.tdoa, places, judge, height, calibration=calibration
     )
     true_m, here = truth_at(truth, above_m, judge.times_s)
     here &= np.array(judge.since_s) >= SETTLE_FLIGHT_S
-    error_m = (position_m - true_m)[here, : 2 if height_m is not None else 3]
+    error_m = (position_m - true_m)[here, : 2 if height[0] is not None else 3]
     return score(np.array(judge.times_s)[here], error_m, covariance_m2[here], levels_m[here], alerted[here])
 
 
@@ -253,9 +254,9 @@ def calibrations_of(recordings):
     found, trained_on = {}, set()
     for recording in recordings:
         if recording.trained_by and recording.trained_by not in found and "-trial1-" in f"{recording.name}-":
-            places, truth, height_m, above_m = known(recording)
+            places, truth, height, above_m = known(recording)
             request = CalibrationRequest(
-                recording.tdoa, truth=truth, above_m=above_m, anchors_m=places, height_m=height_m
+                recording.tdoa, truth=truth, above_m=above_m, anchors_m=places, height_m=height[0]
             )
             found[recording.trained_by] = calibrate_capture(request).estimate.calibration()
             trained_on.add(recording.name)
@@ -315,11 +316,11 @@ def placed(distances_m):
 
 def packets_judged(one, measurements):
     """Score of a recording of packets, the report, and the mean error."""
-    height_m, _ = height_to_hold(one.height, one.anchors_m, None, None, format_of(one.path).name)
-    judge = Keeper(None, planar=height_m is not None, settle_s=SETTLE_REST_S)
+    *height, _ = height_to_hold(one.height, one.anchors_m, None, None, format_of(one.path).name)
+    judge = Keeper(None, planar=height[0] is not None, settle_s=SETTLE_REST_S)
     options = {} if measurements is None else {"measurements": measurements}
     report, (position_m, covariance_m2, levels_m, alerted) = replayed(
-        one.path, one.anchors_m, judge, height_m, listener=one.listener, **options
+        one.path, one.anchors_m, judge, height, listener=one.listener, **options
     )
     here = np.array(judge.since_s) >= SETTLE_REST_S
     error_m = position_m[here, :2] - one.true_m

@@ -4,6 +4,7 @@ It needs nothing but beacons: anchors, schedule and noise figures come from the 
 """
 
 from collections import Counter
+from math import inf, isfinite
 from typing import Final
 
 import numpy as np
@@ -17,6 +18,7 @@ from skyless.air.reception import Diagnostics, Reception
 from skyless.air.schedule import schedule_from_page
 from skyless.clocks.stamps import AnchorStamps
 from skyless.methods import DEFAULT_METHOD, FILTERS, METHODS
+from skyless.positioning.estimation import Estimation
 from skyless.positioning.first_path import variance_factor
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import FixTime
@@ -116,6 +118,20 @@ class Receiver:
         if result is NoFixReason.RESIDUALS:
             self.counters["outlier"] += 1
         return None
+
+    def hear_height(self, height_m: float, std_m: float) -> bool:
+        """Take the tag's height above the site's origin as a sensor of the tag's tells it, now; True if it was used.
+
+        For ``joint``; a replay of a recording does not have it. Before the first fix it tells where to look for it.
+
+        Raises:
+            ValueError: the height is not finite, or its standard deviation not a length.
+        """
+        if not (isfinite(height_m) and 0.0 < std_m < inf):
+            told = f"{height_m!r} with the standard deviation {std_m!r}"
+            raise ValueError(f"a height is {told}; both should be finite numbers, the latter more than 0")
+        method = self._method
+        return isinstance(method, Estimation) and method.hear_height(height_m, std_m)
 
     def _admit(self, beacon: Beacon, rx_ticks: int) -> int | None:
         """TX stamp, unwrapped, of a beacon of the site, by the present master, and of an anchor that may be there."""

@@ -50,13 +50,20 @@ BIASED = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place
 
 @pytest.mark.parametrize("errors", [{}, BIASED], ids=["exact", "range errors"])
 @pytest.mark.parametrize(
-    ("case", "anchors_m", "height_m"),
-    [(PLAIN, LAB_M, 0.0), (MESH, LAB_M, 0.0), (MESH, ROOM_M, 0.0), (MESH, ROOM_M, None)],
-    ids=["plain", "mesh", "height above", "3-D"],
+    ("case", "anchors_m", "height_m", "height_std_m"),
+    [
+        (PLAIN, LAB_M, 0.0, 0.0),
+        (MESH, LAB_M, 0.0, 0.0),
+        (MESH, ROOM_M, 0.0, 0.0),
+        (MESH, ROOM_M, 0.1, 0.3),
+        (MESH, ROOM_M, None, 0.0),
+    ],
+    ids=["plain", "mesh", "height above", "height uncertain", "3-D"],
 )
-def test_a_textbook_filter_says_the_same(case, anchors_m, height_m, errors):
+def test_a_textbook_filter_says_the_same(case, anchors_m, height_m, height_std_m, errors):
     episode = episode_of(case, 25, 3, anchors_m)
-    estimator = begun(episode, settings_of(case, height_m, gate=1e3, **errors), anchors_m)
+    assumed = settings_of(case, height_m, gate=1e3, height_std_m=height_std_m, **errors)
+    estimator = begun(episode, assumed, anchors_m)
     s, dim = estimator.state, estimator.dim
     start = (s.x[:dim].copy(), s.P[:dim, :dim].copy(), SPEED_STD_MPS**2)
     textbook = TextbookFilter(estimator.settings, anchors_m, int(episode.packets.rx_ticks[0]), *start)
@@ -295,7 +302,8 @@ def states_of(dim, anchors):
     """Name of each state."""
     names = [("p", k) for k in range(dim)] + [("b", a) for a in anchors]
     names += [("v", k) for k in range(dim)] + [("f", a) for a in anchors]
-    names += [(block, a) for block in ("w", "change", "constant") for a in anchors] + [("slope", 0)]
+    names += [(block, a) for block in ("w", "change", "constant") for a in anchors]
+    names += [("slope", 0)] + [("height", 0)] * (dim == 2)
     return names + [(f"survey {k}", a) for a in anchors for k in range(dim)]
 
 

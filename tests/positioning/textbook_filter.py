@@ -24,14 +24,16 @@ class TextbookFilter:
         self.settings, self.anchors_m, self.ticks = settings, anchors_m, rx_ticks
         dim, n = settings.dim, len(anchors_m)
         self.dim, self.n = dim, n
-        edges = np.cumsum([0, dim, n, dim, n, n, n, n, 1, dim * n])
+        edges = np.cumsum([0, dim, n, dim, n, n, n, n, 1, 3 - dim, dim * n])
         blocks = [np.arange(*ends) for ends in pairwise(edges)]
-        self.p, self.b, self.v, self.f, self.w, self.change, self.constant, self.slope, self.surveys = blocks
+        self.p, self.b, self.v, self.f, self.w, *others = blocks
+        self.change, self.constant, self.slope, self.height, self.surveys = others
         self.size = edges[-1]
         self.x, variances = np.zeros(self.size), np.zeros(self.size)
         variances[self.v] = speed_variance
         variances[self.change], variances[self.constant] = settings.place_std_m**2, settings.range_std_m**2
         variances[self.slope], variances[self.surveys] = settings.slope_std_m**2, settings.survey_std_m**2
+        variances[self.height] = settings.height_std_m**2
         self.P = np.diag(variances)
         self.x[self.p], self.P[: self.dim, : self.dim] = position_m, covariance_m2
         self.slope_range_m = {}
@@ -81,7 +83,8 @@ class TextbookFilter:
     def _range(self, anchor, variance):
         """Jacobian of the range and its errors, the range, what it is longer by on average, and all that together."""
         h, survey = np.zeros(self.size), self.surveys[self.dim * anchor : self.dim * (anchor + 1)]
-        away = np.append(self.x[self.p], [] if self.dim == 3 else self.settings.height_m) - self.anchors_m[anchor]
+        up_m = [] if self.dim == 3 else self.settings.height_m + self.x[self.height]
+        away = np.append(self.x[self.p], up_m) - self.anchors_m[anchor]
         away[: self.dim] -= self.x[survey]
         range_m = float(np.linalg.norm(away))
         direction = away[: self.dim] / range_m
@@ -91,7 +94,7 @@ class TextbookFilter:
         errors = [self.w[anchor], self.change[anchor], self.constant[anchor]]
         h[errors], h[self.slope] = 1.0, np.clip(far, -1.0, 1.0)
         expected = range_m + h @ self.x
-        h[self.p], h[survey] = direction, -direction
+        h[self.p], h[survey], h[self.height] = direction, -direction, away[self.dim :] / range_m
         place = self.P[: self.dim, : self.dim]
         widest, bend_m = np.trace(place) / range_m, (np.trace(place) - direction @ place @ direction) / range_m / 2
         if min(widest**2 / 2, 2 * bend_m**2) < 0.01 * variance:

@@ -26,9 +26,13 @@ IntegrityRisk = Annotated[float, Parameter(validator=Number(gt=0, lte=0.1))]
 
 
 def integrity_of(
-    risk: float | None, alert_limit_m: float | None, max_acceleration_mps2: float | None, method: str | None = None
+    risk: float | None,
+    alert_limit_m: float | None,
+    max_acceleration_mps2: float | None,
+    method: str | None = None,
+    height_std_m: float | None = None,
 ) -> "IntegrityRequirement":
-    """What --integrity-risk, --alert-limit-m and --max-acceleration ask of protection levels.
+    """What --integrity-risk, --alert-limit-m, --max-acceleration and --height-std say of tags and their levels.
 
     Raises:
         SkylessError: the method gives none, so that a limit would be watched by nobody.
@@ -36,14 +40,18 @@ def integrity_of(
     from skyless.positioning.protection import RISK, IntegrityRequirement
 
     if method in METHODS and method != PROTECTED:
-        asked = {"integrity-risk": risk, "alert-limit-m": alert_limit_m, "max-acceleration": max_acceleration_mps2}
+        asked = {
+            "integrity-risk": risk, "alert-limit-m": alert_limit_m, "max-acceleration": max_acceleration_mps2,
+            "height-std": height_std_m,
+        }  # fmt: skip
         for option, value in asked.items():
             if value is not None:
                 raise SkylessError(
                     f"--{option} is {value:g}; it should be left out: {method} gives no protection levels"
                 )
 
-    return IntegrityRequirement(RISK if risk is None else risk, alert_limit_m, max_acceleration_mps2 or 0.0)
+    risk = RISK if risk is None else risk
+    return IntegrityRequirement(risk, alert_limit_m, max_acceleration_mps2 or 0.0, height_std_m or 0.0)
 
 
 def known_method(method: str, names: Sequence[str] = METHODS) -> None:

@@ -42,6 +42,7 @@ def replay(
     truth: Path | None = None,
     lever_arm: str | None = None,
     height: str = "auto",
+    height_std: NotNegative | None = None,
     format: str | None = None,  # noqa: A002 - the option's natural name
     listener: str | None = None,
     settle: NotNegative | None = None,
@@ -65,8 +66,8 @@ def replay(
     of time differences, MILUV passive ticks and Avalue receptions; the format is recognised by the content.
 
     A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
-    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --settle, --above,
-    --fixes, --plot and --json.
+    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --height-std,
+    --settle, --above, --fixes, --plot and --json.
 
     Parameters
     ----------
@@ -83,6 +84,9 @@ def replay(
         The antenna in the body's frame, x,y,z in metres, added to the truth.
     height
         The tag's height: metres, truth (its median), free (estimated), or auto: free where the anchors can tell it.
+    height_std
+        Standard deviation of the tag's height from the one that is given, in metres, which fixes and levels then
+        count; by default 0.5 where the height is only taken for the anchors', else 0.
     format
         Name of the format, if the content should not decide.
     listener
@@ -111,8 +115,8 @@ def replay(
     alert_limit_m
         Another alert limit than the tag's own, in metres.
     max_acceleration
-        Another largest acceleration than the tag's own, in m/s². With any of these three tags begin anew, as with
-        another method, and those that are not given are as of a tag of which nothing was asked.
+        Another largest acceleration than the tag's own, in m/s². With any of these, or --height-std, tags begin anew,
+        as with another method, and those that are not given are as of a tag of which nothing was asked.
     fixes
         Write every fix into this table.
     plot
@@ -137,8 +141,8 @@ def replay(
         }  # fmt: skip
         see_that_they_are_left_out(useless, "a recording of skyless record brings its own")
         asked = None
-        if not (integrity_risk is None and alert_limit_m is None and max_acceleration is None):
-            asked = integrity_of(integrity_risk, alert_limit_m, max_acceleration, method)
+        if (integrity_risk, alert_limit_m, max_acceleration, height_std) != (None,) * 4:
+            asked = integrity_of(integrity_risk, alert_limit_m, max_acceleration, method, height_std)
         replay_site(file, Options(tag, method, asked, settle, above, site, fixes, plot, json))
         return
     of_sites = {
@@ -150,7 +154,7 @@ def replay(
         raise SkylessError(f"--measurements is {measurements!r}; it should be one of {', '.join(MEASUREMENTS)}")
     places, site_height_m = known_anchors(anchors, site)
     known = known_truth(file, truth, lever_arm, format, listener)
-    height_m, note = height_to_hold(height, places, site_height_m, known, format_of(file, format).name)
+    height_m, std_m, note = height_to_hold(height, places, site_height_m, known, format_of(file, format).name)
     settle_s = settle if settle is not None else (2.0 if known is None else 3.0)
     judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=flight_height(above, known))
     request = ReplayRequest(
@@ -159,6 +163,7 @@ def replay(
         format=format,
         listener=listener,
         height_m=height_m,
+        height_std_m=std_m if height_std is None else height_std,
         qa=qa,
         tdoa_std_m=tdoa_std,
         calibration=None if anchors is None or uncalibrated else read_calibration(anchors),

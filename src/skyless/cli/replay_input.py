@@ -49,26 +49,27 @@ def known_truth(
 
 def height_to_hold(
     wish: str, places: "dict[int, Point]", site_m: float | None, truth: "Truth | None", format_name: str
-) -> tuple[float | None, str]:
-    """Height to hold, and what to tell the user about it."""
+) -> tuple[float | None, float, str]:
+    """Height to hold, its standard deviation, and what to tell the user about it."""
     import numpy as np
 
-    from skyless.experiments.observability import plane_height_m
+    from skyless.experiments.observability import GUESSED_STD_M, plane_height_m
 
     if wish == "free":
-        return None, "estimated"
+        return None, 0.0, "estimated"
     if wish == "truth" or (wish == "auto" and truth is not None and format_name == "miluv"):
         if truth is None:
             raise SkylessError("--height truth takes the height from the truth, which --truth must give")
-        return float(np.median(truth.position_m[:, 2])), "the truth's median"
+        return float(np.median(truth.position_m[:, 2])), 0.0, "the truth's median"
     if wish != "auto":
-        return _metres_of(wish), "given"
+        return _metres_of(wish), 0.0, "given"
     if site_m is not None:
-        return site_m, "from the site file"
+        return site_m, 0.0, "from the site file"
     plane_m = plane_height_m(places)
     if plane_m is None:
-        return None, "estimated"
-    return plane_m, "the anchors' mean: they lie too flat to tell the height (--height free estimates it all the same)"
+        return None, 0.0, "estimated"
+    note = "the anchors' mean: they lie too flat to tell the height (--height free estimates it all the same)"
+    return plane_m, GUESSED_STD_M, note
 
 
 def _metres_of(wish: str) -> float:

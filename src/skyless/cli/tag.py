@@ -33,6 +33,7 @@ def tag(
     integrity_risk: IntegrityRisk | None = None,
     alert_limit_m: Positive | None = None,
     max_acceleration: NotNegative | None = None,
+    height_std: NotNegative | None = None,
     publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0,
     site_id: Annotated[int | None, Parameter(validator=Number(gte=0, lt=0xFFFE))] = None,
     anchors: Path | None = None,
@@ -64,6 +65,9 @@ def tag(
         Fixes with a higher protection level than so many metres carry an alert (joint).
     max_acceleration
         The largest acceleration of the tags in m/s², for protection levels that cover their hardest turns (joint).
+    height_std
+        Standard deviation of the tags' height from the one that is given, in metres, which fixes and levels then
+        count (joint); 0 by default, for sniffers 0.5 where the height is only taken for the anchors'.
     publish_hz
         Fixes a second and tag on MQTT at most.
     site_id
@@ -92,11 +96,11 @@ def tag(
     if is_sniffer(radio):
         if not (integrity_risk is None and alert_limit_m is None and max_acceleration is None):
             raise SkylessError("--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers")
-        serve = _on_sniffers(radio, names, _system(anchors, height, site_id, qa, publish_hz), address)
+        serve = _on_sniffers(radio, names, _system(anchors, height, height_std, site_id, qa, publish_hz), address)
     elif anchors is not None or height is not None:
         raise SkylessError("--anchors and --height are for sniffers; other tags hear from the air where anchors stand")
     else:
-        asked = integrity_of(integrity_risk, alert_limit_m, max_acceleration, method)
+        asked = integrity_of(integrity_risk, alert_limit_m, max_acceleration, method, height_std)
         settings = TagSettings(method, qa, site_id, integrity=asked, publish_hz=publish_hz)
         serve = _on_radios(radio, names, settings, address)
     with contextlib.suppress(KeyboardInterrupt):
@@ -128,19 +132,20 @@ def _on_sniffers(
 
 
 def _system(
-    table: Path | None, height: str | None, site: int | None, qa: float, publish_hz: float
+    table: Path | None, height: str | None, height_std_m: float | None, site: int | None, qa: float, publish_hz: float
 ) -> "PacketTagSettings":
     """What sniffers cannot hear. Raises SkylessError."""
-    from skyless.experiments.observability import plane_height_m
+    from skyless.experiments.observability import GUESSED_STD_M, plane_height_m
     from skyless.nodes.packet_tags import TDOA_SITE, PacketTagSettings
     from skyless.recordings.anchors import read_anchors, read_calibration
 
     if table is None:
         raise SkylessError("--anchors is missing; a sniffer needs a table of the system's anchors: id,x_m,y_m,z_m")
-    places = read_anchors(table)
+    places, std_m = read_anchors(table), 0.0
     if height in (None, "auto"):
         height_m = plane_height_m(places)
         if height_m is not None:
+            std_m = GUESSED_STD_M
             say(f"the anchors lie too flat to tell the height; tags are taken to be at theirs: --height {height_m:.2f}")
     else:
         height_m = None if height == "free" else _metres(str(height))
@@ -149,6 +154,7 @@ def _system(
         site=TDOA_SITE if site is None else site,
         qa=qa,
         height_m=height_m,
+        height_std_m=std_m if height_std_m is None else height_std_m,
         calibration=read_calibration(table),
         publish_hz=publish_hz,
     )

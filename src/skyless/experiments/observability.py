@@ -16,6 +16,10 @@ FLIGHT_M: Final = 0.3
 """Above this height a drone flies."""
 
 
+GUESSED_STD_M: Final = 0.5
+"""Standard deviation of a tag's height from the anchors', where that is taken for it."""
+
+
 def plane_height_m(anchors_m: Mapping[int, Point]) -> float | None:
     """Mean height of anchors that lie too flat to tell the height; None where they can tell it, or are too few."""
     places = np.array(list(anchors_m.values()), dtype=np.float64).reshape(-1, 3)

@@ -48,6 +48,8 @@ class ReplayRequest(Struct, frozen=True):
     listener: str | None = None
     height_m: float | None = None
     """Height of the tag where it is known."""
+    height_std_m: float = 0.0
+    """Of a known one."""
     qa: float | None = None
     tdoa_std_m: float | None = None
     z_bounds_m: tuple[float, float] | None = None
@@ -129,6 +131,7 @@ class Replay:
     def _by_pairs(self) -> ByPairs:
         request = self._request
         asked = {"qa": request.qa, "difference_std_m": request.tdoa_std_m, "height_m": request.height_m}
+        asked["height_std_m"] = request.height_std_m
         known = {key: value for key, value in asked.items() if value is not None}
         settings = structs.replace(PROFILES.get(self.recording.format.name, DIFFERENCES), **known)
         tracking = DifferenceTracking(settings, request.anchors_m, request.z_bounds_m, request.calibration)
@@ -139,7 +142,8 @@ class Replay:
         assert engine is not None
         assert bits is not None
         qa = MASTERLESS.qa if request.qa is None else request.qa
-        settings = structs.replace(MASTERLESS, qa=qa, height_m=request.height_m)
+        known = {"height_m": request.height_m, "height_std_m": request.height_std_m}
+        settings = structs.replace(MASTERLESS, qa=qa, **known)
         tracking = PacketTracking(settings, request.anchors_m, bits, request.z_bounds_m, request.calibration)
         return ByPackets(tracking, engine, self._noise)
 

@@ -219,4 +219,5 @@ def _integrity_of(start: SegmentStart) -> IntegrityRequirement:
         start.settings.get("integrity_risk", RISK),  # type: ignore[arg-type]
         start.settings.get("alert_limit_m"),  # type: ignore[arg-type]
         start.settings.get("max_acceleration_mps2", 0.0),  # type: ignore[arg-type]
+        start.settings.get("height_std_m", 0.0),  # type: ignore[arg-type]
     )

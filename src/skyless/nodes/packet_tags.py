@@ -37,6 +37,8 @@ class PacketTagSettings(Struct, frozen=True):
     qa: float = MASTERLESS.qa
     height_m: float | None = None
     """Height of the tags where it is known; None to estimate it."""
+    height_std_m: float = 0.0
+    """Of a known one."""
     calibration: DifferenceCalibration | None = None
     publish_hz: float = 50.0
 
@@ -69,7 +71,8 @@ class PacketTagNode:
 
     def _new_tracking(self) -> PacketTracking:
         asked = self.settings
-        filter_settings = structs.replace(MASTERLESS, qa=asked.qa, height_m=asked.height_m)
+        known = {"height_m": asked.height_m, "height_std_m": asked.height_std_m}
+        filter_settings = structs.replace(MASTERLESS, qa=asked.qa, **known)
         return PacketTracking(filter_settings, asked.anchors_m, calibration=asked.calibration)
 
     @property

@@ -122,6 +122,10 @@ class Acquisition:
         """When packets first contradicted each other."""
         self._links: dict[tuple[int, int], _Link] = {}
 
+    def expect_height(self, low_m: float, high_m: float) -> None:
+        """Look only between these heights from now on."""
+        self._z_bounds_m = low_m, high_m
+
     def packets(self) -> list[Observation]:
         """The last two packets of each anchor, in the order of their receptions."""
         kept = [observation for pair in self._heard.values() for observation in pair]

@@ -22,6 +22,7 @@ from skyless.positioning.acquisition import (
     Start,
 )
 from skyless.positioning.estimator.estimator import (
+    ACCEPTED,
     NO_REPORT,
     REJECTED,
     STALE,
@@ -53,6 +54,12 @@ UNEXPLAINED_CHI2: Final = 30.0
 MANY_JUMPS: Final = 3
 EARLY_NIS: Final = 3.0
 """Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed."""
+
+HEIGHT_SIGMAS: Final = 5.0
+"""A sensor's height is not wrong by more standard deviations, ..."""
+
+MOST_HEIGHTS_REFUSED: Final = 20
+"""... so if this number of them in a row do not fit, it is the position that is wrong."""
 
 CALM: Final = 0.1
 """Range errors that have jumped more lately make faults of their own; a new start would not help."""
@@ -90,7 +97,7 @@ class Estimation:
         self._settings = settings
         self._height_known = settings.height_m is not None
         self._asked = IntegrityRequirement(
-            settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2
+            settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2, settings.height_std_m
         )
         self._superframe_s = superframe_s
         self._max_spread = MAX_SPREAD if superframe_s < SLOW_S else SLOW_SPREAD
@@ -109,6 +116,7 @@ class Estimation:
         self._newest_ticks = 0
         self._master_scale = MasterScale()
         self._relays_may_contradict = True
+        self._heights_refused = 0
 
     @property
     def estimator(self) -> Estimator:
@@ -167,6 +175,22 @@ class Estimation:
             return self._fix_of(start, observation)
         self._begin(start, starting.packets())
         return self._fix(observation)
+
+    def hear_height(self, height_m: float, std_m: float) -> bool:
+        """Take the tag's height as a sensor tells it, at the newest packet; True if it was used.
+
+        Before a start it narrows where that is looked for. Where many in a row do not fit, the start was wrong.
+        """
+        if self._start is not None:
+            margin_m = HEIGHT_SIGMAS * std_m
+            self._start.expect_height(height_m - margin_m, height_m + margin_m)
+            return False
+        used = self._estimator.process_height(height_m, std_m) == ACCEPTED
+        self._heights_refused = 0 if used else self._heights_refused + 1
+        if self._heights_refused >= MOST_HEIGHTS_REFUSED and not self._height_known:
+            self._heights_refused = 0
+            self._start = self._new_start()
+        return used
 
     def coast(self, observation: Observation) -> Fix | NoFixReason:
         """A fix when a packet came that was not used itself: by all others, and by what was relayed with it."""

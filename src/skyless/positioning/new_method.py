@@ -55,6 +55,7 @@ def new_method(
         max_acceleration_mps2=wanted.integrity.max_acceleration_mps2,
         integrity_risk=wanted.integrity.risk,
         alert_limit_m=wanted.integrity.alert_limit_m,
+        height_std_m=wanted.integrity.height_std_m,
     )
     return Estimation(assumed, wanted.z_bounds_m, time, superframe_s)
 

@@ -44,7 +44,8 @@ class IntegrityRequirement(Struct, frozen=True):
     """What an application asks of the levels.
 
     Raises:
-        ValueError: the risk is not between 0 and 0.1, the limit is not a length, or the acceleration none.
+        ValueError: the risk is not between 0 and 0.1, the limit or the height's is not a length, or the acceleration
+            none.
     """
 
     risk: float = RISK
@@ -53,14 +54,16 @@ class IntegrityRequirement(Struct, frozen=True):
     """Fixes with a higher horizontal protection level say so."""
     max_acceleration_mps2: float = 0.0
     """The tag's largest acceleration, which the levels then cover whatever its agility; 0 where it is not known."""
+    height_std_m: float = 0.0
+    """Standard deviation of the tag's height from the one that is given, which fixes then count."""
 
     def __post_init__(self) -> None:
         limits_of(self.risk)
         if self.alert_limit_m is not None and not 0.0 < self.alert_limit_m < np.inf:
             raise ValueError(f"alert_limit_m is {self.alert_limit_m!r}; it should be more than 0 m")
-        if not 0.0 <= self.max_acceleration_mps2 < np.inf:
-            told = repr(self.max_acceleration_mps2)
-            raise ValueError(f"max_acceleration_mps2 is {told}; it should be a finite number from 0 on")
+        for name in ("max_acceleration_mps2", "height_std_m"):
+            if not 0.0 <= (value := getattr(self, name)) < np.inf:
+                raise ValueError(f"{name} is {value!r}; it should be a finite number from 0 on")
 
 
 def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert_limit_m: float | None) -> Integrity:

@@ -23,7 +23,7 @@ from skyless.recordings.checkpoint_graph import Arrays
 from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
 from skyless.recordings.checkpoint_writer import write_graph
 
-FORMAT: Final = 13
+FORMAT: Final = 14
 MAX_BYTES: Final = 1 << 23
 """Enough for an estimator of a hundred anchors."""
 

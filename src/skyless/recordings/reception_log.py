@@ -145,6 +145,7 @@ def receiver_settings(
         "integrity_risk": integrity.risk,
         "alert_limit_m": integrity.alert_limit_m,
         "max_acceleration_mps2": integrity.max_acceleration_mps2,
+        "height_std_m": integrity.height_std_m,
     }
     return {"method": method, "site": site, "qa": qa, "z_low_m": low_m, "z_high_m": high_m, **asked}
 

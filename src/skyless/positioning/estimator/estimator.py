@@ -26,6 +26,7 @@ from skyless.positioning.estimator.kinds import (
     CLOCK_JUMPED,
     difference,
     first_reception,
+    height,
     own_reception,
     relay,
     report,
@@ -449,6 +450,14 @@ def _process_difference(
     return outcome
 
 
+@kernel
+def _process_height(s: EstimatorState, height_m: float, std_m: float, levels: Vector, rows: Matrix) -> int:
+    """Process a sensor's height of the tag, and all that a fix carries."""
+    outcome = ACCEPTED if height(s, height_m, std_m) == 1 else REJECTED
+    _fill_rows(s, levels, rows)
+    return outcome
+
+
 @step
 def fill_motion(s: EstimatorState, rows: Matrix) -> None:
     """Write position, velocity and their covariances as a fix carries them."""
@@ -593,6 +602,10 @@ class Estimator:
             if outcome < NEW_ANCHOR:
                 return outcome
             self._resize(outcome, table_a, rx_ticks)
+
+    def process_height(self, height_m: float, std_m: float) -> int:
+        """Process the tag's height at the newest packet, as a sensor tells it; ``ACCEPTED`` or ``REJECTED``."""
+        return _process_height(self._state, height_m, std_m, self._levels, self._rows)
 
     def track(
         self,

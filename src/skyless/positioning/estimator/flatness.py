@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import step
+from skyless.constants import TICK_S
 from skyless.positioning.estimator.state import EstimatorState
 
 PROBE_M: Final = 1.0
@@ -14,6 +15,9 @@ DISTINCT_CHI2: Final = 25.0
 """The sides differ where their ranges' squared differences, over the variance of range errors, sum to more."""
 
 LEAST_ANCHORS: Final = 3
+
+TOLD_S: Final = 1.0
+"""A sensor's height holds for so long."""
 
 
 def fit_plane(s: EstimatorState) -> None:
@@ -42,7 +46,7 @@ def is_height_open(s: EstimatorState) -> bool:
     """Whether the tag and its mirror image behind the anchors' plane explain the ranges alike.
 
     Range errors make up for what is left of the difference, and what all ranges have in common is the tag's clock.
-    Not where the image lies where the tag cannot be.
+    Not where the image lies where the tag cannot be, nor while a sensor tells the height.
     """
     status, settings = s.status[0], s.settings[0]
     normal, count, off_m, square, total = status["plane_normal"], len(s.anchors), 0.0, 0.0, 0.0
@@ -58,4 +62,5 @@ def is_height_open(s: EstimatorState) -> bool:
     image_z_m = s.x[2] - 2.0 * off_m * normal[2]
     is_image_possible = settings["lowest_m"] <= image_z_m <= settings["highest_m"]
     is_near = off_m * off_m * normal[2] ** 2 <= s.P[2, 2]
-    return bool(settings["dim"] == 3 and is_flat and (is_image_possible or is_near))
+    is_told = (status["epoch_ticks"] - status["height_ticks"]) * TICK_S < TOLD_S
+    return bool(settings["dim"] == 3 and is_flat and not is_told and (is_image_possible or is_near))

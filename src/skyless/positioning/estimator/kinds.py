@@ -4,6 +4,7 @@
     relay            S − T  =  |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + pair's constant + noise      (anchor i received anchor j)
     report           bₘ − bᵢ as anchor i knows it                                       (its clock against the master's)
     difference       |p − b| − |p − a| + range errors + noise                           (ready-made, of a pair)
+    height           z                                                                  (a sensor of the tag's)
     zero velocity    v                                                                  (the tag stands still)
 
 with offsets b, TX noise w, all in metres. ``docs/maths.md`` section 6 derives them.
@@ -39,7 +40,7 @@ from skyless.positioning.estimator.monitor import (
     open_range_error,
     variance_scale,
 )
-from skyless.positioning.estimator.state import EstimatorState, layout, uncertain_states
+from skyless.positioning.estimator.state import EstimatorState, direction_terms, layout, uncertain_states
 from skyless.ticks import TICK_MASK
 
 SUBTICKS: Final = 256
@@ -88,23 +89,27 @@ REST_STD_MPS: Final = 0.01
 def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> float:
     """Put the unit vector from an anchor to the tag into the measurement; returns their distance.
 
-    The anchor's survey error follows with the opposite sign: ``2·dim`` terms in all.
+    The anchor's survey error follows with the opposite sign, and the height's: ``direction_terms`` in all.
     """
     dim, count, x = s.settings[0]["dim"], len(s.anchors), s.x
-    a = s.anchors[anchor]
-    survey = layout(dim, count).survey + dim * anchor
+    a, where = s.anchors[anchor], layout(dim, count)
+    survey = where.survey + dim * anchor
     squared = 0.0
     for axis in range(dim):
         step_m = x[axis] - a["position_m"][axis] - x[survey + axis]
         s.h[term + axis] = step_m
         squared += step_m * step_m
+    up_m = 0.0
     if dim == 2:
-        squared += (s.settings[0]["height_m"] - a["position_m"][2]) ** 2
+        up_m = s.settings[0]["height_m"] + x[where.height] - a["position_m"][2]
+        squared += up_m * up_m
     range_m = max(np.sqrt(squared), 1e-6)
     for axis in range(dim):
         towards = sign * s.h[term + axis] / range_m
         s.h[term + axis], s.h_index[term + axis] = towards, axis
         s.h[term + dim + axis], s.h_index[term + dim + axis] = -towards, survey + axis
+    if dim == 2:
+        s.h[term + 2 * dim], s.h_index[term + 2 * dim] = sign * up_m / range_m, where.height
     return float(range_m)
 
 
@@ -164,7 +169,7 @@ def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[
     dim = s.settings[0]["dim"]
     where = layout(dim, len(s.anchors))
     range_m = _add_direction(s, 0, anchor, 1.0)
-    term = _set_term(s, 2 * dim, where.offset + anchor, 1.0)
+    term = _set_term(s, direction_terms(dim), where.offset + anchor, 1.0)
     if has_tx_noise:
         term = _set_term(s, term, where.tx_noise + anchor, 1.0)
     return _range_error_terms(s, term, anchor, range_m, 1.0), range_m
@@ -192,7 +197,8 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     terms, range_m = reception_terms(s, anchor, a["is_relayed"])
     bend_m = _bend_m(s, range_m, rx_variance)
     rx_variance += 2.0 * bend_m * bend_m
-    innovation = (rx_ticks - tx_ticks - a["offset_ticks"]) * TICK_M - range_m - bend_m - _along(s, 2 * dim, terms)
+    expected_m = range_m + bend_m + _along(s, direction_terms(dim), terms)
+    innovation = (rx_ticks - tx_ticks - a["offset_ticks"]) * TICK_M - expected_m
     innovation_variance = compute_ph(s, terms) + rx_variance
     a["range_m"] = range_m
     a["innovation"] = innovation / np.sqrt(innovation_variance)
@@ -261,7 +267,8 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     reset_state(s, rate, settings["clock_rate_variance"])
     reset_state(s, offset, 0.0)
     range_m = _add_direction(s, 0, anchor, 1.0)
-    terms = _range_error_terms(s, _set_term(s, 2 * dim, noise, 1.0), anchor, range_m, 1.0)
+    other = direction_terms(dim)
+    terms = _range_error_terms(s, _set_term(s, other, noise, 1.0), anchor, range_m, 1.0)
     variance = settings["rx_variance_m2"]
     bend_m = _bend_m(s, range_m, variance)
     variance += 2.0 * bend_m * bend_m + compute_ph(s, terms)
@@ -276,7 +283,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
         s.V[fault, offset] = s.fault_input[fault]
     whole = rx_ticks - tx_ticks - int(np.floor(range_m / TICK_M))
     a["offset_ticks"], a["has_tx_noise"] = whole, 1
-    s.x[offset] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m - bend_m - _along(s, 2 * dim, terms)
+    s.x[offset] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m - bend_m - _along(s, other, terms)
     a["range_m"] = range_m
 
 
@@ -410,13 +417,14 @@ def difference_terms(s: EstimatorState, a: int, b: int) -> tuple[int, float]:
     Its gradient stands in the first terms, as the other kinds' directions do.
     """
     dim = s.settings[0]["dim"]
+    near = direction_terms(dim)
     far_m = _add_direction(s, 0, b, 1.0)
-    near_m = _add_direction(s, 2 * dim, a, -1.0)
+    near_m = _add_direction(s, near, a, -1.0)
     s.anchors[b]["range_m"], s.anchors[a]["range_m"] = far_m, near_m
     for axis in range(dim):
-        s.h[axis] += s.h[2 * dim + axis]
-        s.h[2 * dim + axis] = 0.0
-    term = _range_error_terms(s, 4 * dim, b, far_m, 1.0)
+        s.h[axis] += s.h[near + axis]
+        s.h[near + axis] = 0.0
+    term = _range_error_terms(s, 2 * near, b, far_m, 1.0)
     return _range_error_terms(s, term, a, near_m, -1.0), far_m - near_m
 
 
@@ -434,7 +442,7 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
     relax_range_error(s, a, a_elapsed_s, walked_m - s.anchors[a]["walked_m"])
     relax_range_error(s, b, b_elapsed_s, walked_m - s.anchors[b]["walked_m"])
     terms, expected_m = difference_terms(s, a, b)
-    innovation = difference_m - expected_m - _along(s, 4 * dim, terms)
+    innovation = difference_m - expected_m - _along(s, 2 * direction_terms(dim), terms)
     innovation_variance = compute_ph(s, terms) + settings["difference_std_m"] ** 2
     scale = difference_scale(s, innovation, innovation_variance)
     if scale > 0.0:
@@ -449,6 +457,30 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
         adapt_place_noise(s, a, a_elapsed_s)
         adapt_place_noise(s, b, b_elapsed_s)
     return int(scale > 0.0)
+
+
+# The tag has a sensor of its height
+
+
+@step
+def height(s: EstimatorState, height_m: float, std_m: float) -> int:
+    """Process the tag's height as a sensor tells it: 1 if it was used, 0 if not.
+
+    Where a height is given, it corrects that.
+    """
+    settings, dim = s.settings[0], s.settings[0]["dim"]
+    state = layout(dim, len(s.anchors)).height
+    given_m = settings["height_m"] if dim == 2 else 0.0
+    term = _set_term(s, 0, state, 1.0)
+    innovation = height_m - given_m - s.x[state]
+    innovation_variance = compute_ph(s, term) + std_m * std_m
+    used = innovation * innovation <= settings["gate"] ** 2 * innovation_variance
+    if used:
+        compute_fault_input(s, term, -1)
+        gather_evidence(s, innovation, innovation_variance)
+        update(s, innovation, innovation_variance, 1.0, len(s.x))
+        s.status[0]["height_ticks"] = s.status[0]["epoch_ticks"]
+    return int(used)
 
 
 # The tag stands still

@@ -32,6 +32,8 @@ class EstimatorSettings(Struct, frozen=True):
     """Innovations beyond so many standard deviations are not used."""
     height_m: float | None = None
     """Height of the tag where it is given; None to estimate it."""
+    height_std_m: float = 0.0
+    """Of the given one."""
     lowest_m: float = -np.inf
     highest_m: float = np.inf
     """Between which the tag's height is known to be."""
@@ -92,6 +94,7 @@ _NAMES: Final = (
     "rx_variance_m2",
     "gate",
     "height_m",
+    "height_std_m",
     "lowest_m",
     "highest_m",
     "drop_s",

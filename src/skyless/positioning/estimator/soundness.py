@@ -21,6 +21,7 @@ from skyless.positioning.estimator.state import (
     EstimatorState,
     Integers,
     layout,
+    most_terms,
 )
 from skyless.positioning.fix_rows import PROTECTED_ROWS
 
@@ -54,7 +55,7 @@ def is_sound(estimator: Estimator) -> bool:
 
 def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[Wanted]:
     count = len(s.anchors)
-    n, faults, terms = layout(dim, count).room, 2 * count + dim, 4 * dim + 8
+    n, faults, terms = layout(dim, count).room, 2 * count + dim, most_terms(dim)
     yield s.x, (n,), np.float64
     yield s.P, (n, n), np.float64
     yield s.V, (faults, n), np.float64

@@ -9,6 +9,7 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
     changes     for each anchor the part of the tag's range error to it that changes along the way
     constants   the part that stays
     slope       how ranges lengthen with distance
+    height      the tag's true height − the one that is given, in two dimensions
     surveys     for each anchor (dim) its true position − its position in the almanac
 
 Everything before ``slope`` is updated by all measurements; what follows is updated by the tag's own receptions only
@@ -126,6 +127,7 @@ STATUS: Final = np.dtype(
         ("rest_s", np.float64),  # since the tag last showed motion ...
         ("rest_m", np.float64, (3,)),  # ... and where it was then
         ("withholds_levels", np.int64),  # whether the anchors' positions are known to be wrong
+        ("height_ticks", np.int64),  # the tag's reading when a sensor's height was used last
         ("plane_m", np.float64, (3,)),  # a point of the plane that lies closest to the anchors, ...
         ("plane_normal", np.float64, (3,)),  # ... and its normal
         ("open_range_errors", np.int64),  # whether anchors join with range errors beyond what the settings say
@@ -187,6 +189,8 @@ class Layout(NamedTuple):
     constant: int
     slope: int
     """States before it are updated by all measurements."""
+    height: int
+    """In two dimensions; in three it is one of the position."""
     survey: int
     """``dim`` states for each anchor."""
     end: int
@@ -200,11 +204,23 @@ def layout(dim: int, anchors: int) -> Layout:
     values = dim + anchors
     behind = 2 * values
     slope = behind + 3 * anchors
-    end = slope + 1 + dim * anchors
+    height, survey = (slope + 1, slope + 2) if dim == 2 else (2, slope + 1)
+    end = survey + dim * anchors
     return Layout(
-        dim, values, values + dim, behind, behind + anchors, behind + 2 * anchors, slope, slope + 1, end,
+        dim, values, values + dim, behind, behind + anchors, behind + 2 * anchors, slope, height, survey, end,
         -(-end // LANES) * LANES,
     )  # fmt: skip
+
+
+@jitted
+def direction_terms(dim: int) -> int:
+    """Of a distance: the position, the anchor's survey error and, in two dimensions, the height's error."""
+    return dim + 3
+
+
+def most_terms(dim: int) -> int:
+    """Of a measurement: those of a difference of two distances."""
+    return 2 * direction_terms(dim) + 8
 
 
 @step
@@ -220,7 +236,7 @@ def uncertain_states(s: EstimatorState) -> int:
 
 def _expected_range_errors(settings: Records, status: Records) -> int:
     """Which of them there are from the beginning."""
-    names = ("survey_std_m", "range_std_m", "slope_std_m")
+    names = ("survey_std_m", "range_std_m", "slope_std_m", "height_std_m")
     if status["open_range_errors"] or any(settings[name] > 0.0 for name in names):
         return LASTING
     return PASSING if settings["place_std_m"] > 0.0 else NONE
@@ -235,11 +251,14 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
     status["open_range_errors"] = open_range_errors
     status["range_errors"] = _expected_range_errors(settings.record()[0], status[0])
     status["q_scale"] = status["mean_nis"] = 1.0
+    status["height_ticks"] = NEVER
     status["walk_scale"] = min(START_WALK_SCALE, settings.max_walk_scale)
     status["fault_std_m"] = LASTING_STD_M
     status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
     P = np.zeros((n, n))
     P[where.slope, where.slope] = settings.slope_std_m**2
+    if dim == 2:
+        P[where.height, where.height] = settings.height_std_m**2
     return EstimatorState(
         x=np.zeros(n),
         P=P,
@@ -252,8 +271,8 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
         status=status,
         settings=settings.record(),
         index_of=np.full(table_size, -1, np.int64),
-        h=np.zeros(4 * dim + 8),
-        h_index=np.zeros(4 * dim + 8, np.uint32),
+        h=np.zeros(most_terms(dim)),
+        h_index=np.zeros(most_terms(dim), np.uint32),
         ph=np.zeros(n),
         fault_input=np.zeros(dim),
         work=np.zeros((1 + dim, 0)),
@@ -327,7 +346,7 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
     states += range(was.velocity, was.velocity + dim)
     for block in (was.rate, was.tx_noise, was.change, was.constant):
         states += [block + anchor if anchor >= 0 else -1 for anchor in kept]
-    states.append(was.slope)
+    states += range(was.slope, was.survey)
     for anchor in kept:
         first = was.survey + dim * anchor
         states += [-1] * dim if anchor < 0 else range(first, first + dim)
