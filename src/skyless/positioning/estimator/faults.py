@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from skyless.compiled import step
+from skyless.positioning.estimator.kalman import reset_state
 from skyless.positioning.estimator.state import (
     LASTING,
     LASTING_STD_M,
@@ -240,6 +241,15 @@ def _open_lasting_faults(s: EstimatorState, chi2: float) -> None:
             if second != first:
                 _open_fault(s, 0, second)
                 s.anchors[second]["has_fault"] = 1
+
+
+@step
+def end_lasting_fault(s: EstimatorState, anchor: int) -> None:
+    """Take it that an anchor's packets have been late since it joined, and are so no more."""
+    settings = s.settings[0]
+    _open_fault(s, 0, anchor)
+    reset_state(s, layout(settings["dim"], len(s.anchors)).constant + anchor, settings["range_std_m"] ** 2)
+    s.status[0]["obstruction"] = min(s.status[0]["obstruction"] + JUMP_RISE, 2.0)
 
 
 @step

@@ -16,7 +16,12 @@ import numpy as np
 
 from skyless.compiled import step
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.positioning.estimator.faults import compute_fault_input, gather_evidence, subtract_fault_input
+from skyless.positioning.estimator.faults import (
+    compute_fault_input,
+    end_lasting_fault,
+    gather_evidence,
+    subtract_fault_input,
+)
 from skyless.positioning.estimator.kalman import (
     OBSTRUCTED_STD_M,
     compute_ph,
@@ -94,22 +99,21 @@ def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> fl
     dim, count, x = s.settings[0]["dim"], len(s.anchors), s.x
     a, where = s.anchors[anchor], layout(dim, count)
     survey = where.survey + dim * anchor
-    squared = 0.0
+    up_m = 0.0
+    if dim == 2:
+        up_m = s.settings[0]["height_m"] + x[where.height] - a["position_m"][2]
+    squared = up_m * up_m
     for axis in range(dim):
         step_m = x[axis] - a["position_m"][axis] - x[survey + axis]
         s.h[term + axis] = step_m
         squared += step_m * step_m
-    up_m = 0.0
-    if dim == 2:
-        up_m = s.settings[0]["height_m"] + x[where.height] - a["position_m"][2]
-        squared += up_m * up_m
     range_m = max(np.sqrt(squared), 1e-6)
+    if dim == 2:
+        s.h[term + 2 * dim], s.h_index[term + 2 * dim] = sign * up_m / range_m, where.height
     for axis in range(dim):
         towards = sign * s.h[term + axis] / range_m
         s.h[term + axis], s.h_index[term + axis] = towards, axis
         s.h[term + dim + axis], s.h_index[term + dim + axis] = -towards, survey + axis
-    if dim == 2:
-        s.h[term + 2 * dim], s.h_index[term + 2 * dim] = sign * up_m / range_m, where.height
     return float(range_m)
 
 
@@ -235,15 +239,23 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
 def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_variance: float) -> tuple[float, float]:
     """An anchor's range error has jumped: back to what it was before it was obstructed, or to something new.
 
+    Obstacles make packets late: an early jump of an anchor that is not known to be obstructed ends an obstruction that
+    has been there since it joined, with which all that it said is considered again.
+
     Returns the innovation that is left, and its variance.
     """
     a, status, settings = s.anchors[anchor], s.status[0], s.settings[0]
-    change = layout(settings["dim"], len(s.anchors)).change + anchor
+    where = layout(settings["dim"], len(s.anchors))
+    change = where.change + anchor
     has_ended = False
-    if a["is_obstructed"] and innovation < 0.0:
-        innovation += s.x[change]
-        share = min(status["obstruction"], 1.0)
-        reset_state(s, change, a["place_variance_m2"] + share * OBSTRUCTED_STD_M**2)
+    if innovation < 0.0:
+        before_m = _along(s, 0, terms)
+        if a["is_obstructed"]:
+            share = min(status["obstruction"], 1.0)
+            reset_state(s, change, a["place_variance_m2"] + share * OBSTRUCTED_STD_M**2)
+        else:
+            end_lasting_fault(s, anchor)
+        innovation += before_m - _along(s, 0, terms)
         a["is_obstructed"] = a["outliers_in_row"] = 0
         status["ends_of_obstructions"] += 1
         left = compute_ph(s, terms) + rx_variance
