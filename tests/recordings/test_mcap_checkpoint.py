@@ -252,7 +252,7 @@ def test_estimators_that_would_lead_their_kernels_astray_are_refused(name, chang
 @pytest.mark.parametrize("index", [-1, 6, 0.0, None])
 def test_anchors_that_are_not_in_the_table_are_refused(index):
     receiver = joint_receiver()
-    anchors = vars(receiver.method)["_index_of"]
+    anchors = receiver.method.estimator.index_of
     anchors[next(iter(anchors))] = index
     assert refusal(save(receiver)) == "checkpoint-damaged"
 

@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from skyless.air.packet import PairTdoa
 from skyless.constants import TICK_RATE_HZ
@@ -93,8 +92,6 @@ class DifferenceTracking:
         self._places = {anchor: np.array(place) for anchor, place in anchors_m.items()}
         self._z_bounds_m = z_bounds_m
         self._estimator = Estimator(self._settings)
-        self._index_of: dict[int, int] = {}
-        self._known_m: dict[int, NDArray[np.float64]] = {}
         self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
         self._begin_s = self._newest_s = 0.0
         self._received_s: dict[int, float] = {}
@@ -158,15 +155,7 @@ class DifferenceTracking:
 
     def _index(self, anchor: int) -> int:
         """Index of an anchor in the estimator's table."""
-        anchor_m = self._places[anchor]
-        if self._known_m.get(anchor) is not anchor_m:
-            index = self._index_of.get(anchor)
-            if index is None:
-                self._index_of[anchor] = self._estimator.add_anchor(anchor_m, anchor)
-            else:
-                self._estimator.move_anchor(index, anchor_m)
-            self._known_m[anchor] = anchor_m
-        return self._index_of[anchor]
+        return self._estimator.place_anchor(anchor, self._places[anchor])
 
     def _is_out_of_reach(self, silent_s: float) -> bool:
         """Whether the filter cannot predict so far: too long a silence for it, or a clock that went back."""

@@ -4,7 +4,6 @@ from typing import Final
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
 from skyless.positioning.acquisition import (
@@ -104,8 +103,6 @@ class Estimation:
         self._z_bounds_m = z_bounds_m
         self._speed_std_mps = SPEED_STD_MPS
         self._estimator = Estimator(settings)
-        self._index_of: dict[int, int] = {}
-        self._known_m: dict[int, NDArray[np.float64]] = {}
         self._start: Acquisition | None = self._new_start()
         self._open_range_errors = False
         self._is_open = self._is_doubted = False
@@ -125,14 +122,13 @@ class Estimation:
 
     def clock(self, anchor: int) -> tuple[int, float, float] | None:
         """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""
-        index = self._index_of.get(anchor)
+        index = self._estimator.index_of.get(anchor)
         return None if index is None else self._estimator.clock(index)
 
     @property
     def excluded(self) -> tuple[int, ...]:
         """Anchors whose range error has jumped and not come back."""
-        obstructed = self._estimator.obstructed
-        return tuple(anchor for anchor, index in self._index_of.items() if index in obstructed) if obstructed else ()
+        return self._estimator.obstructed
 
     def hear(self, observation: Observation) -> Fix | NoFixReason:
         """Take one observation; a fix for every accepted packet once started."""
@@ -272,14 +268,18 @@ class Estimation:
             start.speed_variance,
             self._is_open,
             CONTRADICTED_STD_M if self._is_doubted else LASTING_STD_M,
-            [self._index(packet) for packet in packets if is_contradicted and packet.anchor in start.left_out],
+            [
+                self._estimator.place_anchor(packet.anchor, packet.anchor_m)
+                for packet in packets
+                if is_contradicted and packet.anchor in start.left_out
+            ],
         )
         for packet in packets:
             self._process(packet)
 
     def _process(self, observation: Observation) -> int:
         return self._estimator.process(
-            self._index(observation),
+            self._estimator.place_anchor(observation.anchor, observation.anchor_m),
             observation.sequence,
             observation.rx_ticks_tag,
             observation.tx_ticks_anchor,
@@ -291,11 +291,11 @@ class Estimation:
 
     def _listed(self, observation: Observation) -> list[list[int]]:
         """Relays of anchors that are known, as the estimator takes them."""
-        index, rows = self._index_of[observation.anchor], []
+        index_of, rows = self._estimator.index_of, []
         for anchor, sequence, rx_ticks in observation.relays:
-            sender = self._index_of.get(anchor)
+            sender = index_of.get(anchor)
             if sender is not None:
-                rows.append([index, sender, sequence, rx_ticks])
+                rows.append([index_of[observation.anchor], sender, sequence, rx_ticks])
         return rows
 
     def _report(self, observation: Observation) -> Report:
@@ -303,20 +303,8 @@ class Estimation:
         claim, variance_m2 = observation.claim, observation.tx_variance_m2
         if claim is None or variance_m2 <= 0.0:
             return NO_REPORT
-        master, subticks = self._index_of.get(claim.master), self._master_scale.difference(observation)
+        master, subticks = self._estimator.index_of.get(claim.master), self._master_scale.difference(observation)
         return NO_REPORT if master is None or subticks is None else Report(master, subticks, variance_m2)
-
-    def _index(self, observation: Observation) -> int:
-        """Index of the packet's anchor in the estimator's table."""
-        anchor, anchor_m = observation.anchor, observation.anchor_m
-        if self._known_m.get(anchor) is not anchor_m:
-            index = self._index_of.get(anchor)
-            if index is None:
-                self._index_of[anchor] = self._estimator.add_anchor(anchor_m, anchor)
-            else:
-                self._estimator.move_anchor(index, anchor_m)
-            self._known_m[anchor] = anchor_m
-        return self._index_of[anchor]
 
     def _fix_of(self, start: Start, observation: Observation) -> Fix:
         """What a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""

@@ -13,7 +13,6 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.positioning.acquisition import Start
-from skyless.positioning.estimation import Estimation
 from skyless.positioning.estimator.estimator import Estimator
 from skyless.positioning.estimator.soundness import is_sound
 from skyless.positioning.in_use import AnchorsInUse
@@ -93,14 +92,6 @@ def _in_use(value: AnchorsInUse) -> bool:
     return _floats(value.anchors_m, len(value.anchors), 3)
 
 
-def _estimation(value: Estimation) -> bool:
-    estimator, known_m = value.estimator, vars(value)["_known_m"]
-    if type(estimator) is not Estimator or not all(_floats(position_m, 3) for position_m in known_m.values()):
-        return False
-    count = len(estimator.state.index_of)
-    return all(type(index) is int and 0 <= index < count for index in vars(value)["_index_of"].values())
-
-
 def _receiver(value: Receiver) -> bool:
     return all(_floats(place, 3) for place in vars(value)["_positions"].values())
 
@@ -110,7 +101,6 @@ _SOUND: Final[Arrays] = {
     Start: _start,
     AnchorsInUse: _in_use,
     Estimator: is_sound,
-    Estimation: _estimation,
     Receiver: _receiver,
 }
 """The classes that hold arrays, and whether one's arrays have the shapes that its kernels count on."""

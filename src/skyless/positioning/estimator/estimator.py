@@ -476,11 +476,13 @@ class Estimator:
     """The filter of one tag."""
 
     def __init__(self, settings: EstimatorSettings, table_m: Matrix | None = None) -> None:
-        """``table_m``: positions of the site's anchors, shape (n, 3); more can be added."""
+        """``table_m``: positions of anchors that are called by their indices, shape (n, 3); others can be placed."""
         self.settings = settings
         self.dim = settings.dim
         self._table_m: list[Vector] = [] if table_m is None else [np.array(row, np.float64) for row in table_m]
-        self._identifiers = np.full(len(self._table_m), -1)
+        self._identifiers = np.arange(len(self._table_m))
+        self.index_of = {index: index for index in range(len(self._table_m))}
+        """Where in the table an anchor stands that relays in frames call so."""
         self._left_out: frozenset[int] = frozenset()
         self._levels = np.zeros(LEVELS)
         self._rows = np.zeros((PROTECTED_ROWS, 3))
@@ -498,20 +500,24 @@ class Estimator:
         """What a fix carries (``fix_rows``), as of the newest packet."""
         return self._rows
 
-    def add_anchor(self, position_m: Vector, identifier: int = -1) -> int:
-        """Add an anchor to the table; returns its index. ``identifier``: by which relays in frames call it."""
-        self._table_m.append(np.array(position_m, np.float64))
-        self._identifiers = np.append(self._identifiers, identifier)
-        self._state = with_table(self._state, len(self._table_m))
-        return len(self._table_m) - 1
+    def place_anchor(self, identifier: int, position_m: Vector) -> int:
+        """Index in the table of the anchor that relays in frames call so: a new one, or one that may have moved.
 
-    def move_anchor(self, table_index: int, position_m: Vector) -> None:
-        """Correct an anchor's position."""
-        self._table_m[table_index] = np.array(position_m, np.float64)
-        anchor = self._state.index_of[table_index]
-        if anchor >= 0:
-            self._state.anchors[anchor]["position_m"] = position_m
-            fit_plane(self._state)
+        ``position_m``, shape (3,), is taken for unchanged as long as it is the same array.
+        """
+        index = self.index_of.get(identifier)
+        if index is None:
+            index = self.index_of[identifier] = len(self._table_m)
+            self._table_m.append(position_m)
+            self._identifiers = np.append(self._identifiers, identifier)
+            self._state = with_table(self._state, len(self._table_m))
+        elif self._table_m[index] is not position_m:
+            self._table_m[index] = position_m
+            anchor = self._state.index_of[index]
+            if anchor >= 0:
+                self._state.anchors[anchor]["position_m"] = position_m
+                fit_plane(self._state)
+        return index
 
     def doubt_anchor(self, table_index: int) -> None:
         """Expect that the ranges to an anchor are wrong by metres."""
@@ -568,7 +574,7 @@ class Estimator:
         """Process one packet; returns what became of it (``ACCEPTED`` …) and leaves ``rows``.
 
         ``relays``: rows as in ``Packets``; ``packed``: relays as frames carry them (``codec.packed_relays``), anchors
-        by the identifiers that ``add_anchor`` was given; ``variance_factor``: on the variance of the tag's reception.
+        by the identifiers that ``place_anchor`` was given; ``variance_factor``: on the variance of the tag's reception.
         """
         listed = len(relays)
         if listed:
@@ -701,10 +707,10 @@ class Estimator:
 
     @property
     def obstructed(self) -> tuple[int, ...]:
-        """Indices in the table of the anchors whose range error has jumped and stayed, or has a lasting fault."""
+        """Identifiers of the anchors whose range error has jumped and stayed, or has a lasting fault."""
         anchors = self._state.anchors
         faulty = (anchors["is_obstructed"] != 0) | (anchors["has_fault"] != 0)
-        return tuple(anchors["table_index"][faulty].tolist())
+        return tuple(self._identifiers[anchors["table_index"][faulty]].tolist()) if faulty.any() else ()
 
     def horizontal_variance_m2(self, ahead_s: float) -> float:
         """Sum of the variances of x and y so much later, if nothing is received until then."""

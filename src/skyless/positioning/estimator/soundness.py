@@ -41,7 +41,8 @@ def is_sound(estimator: Estimator) -> bool:
     settings, state = own["settings"], own["_state"]
     if not isinstance(settings, EstimatorSettings) or not isinstance(state, EstimatorState):
         return False
-    if not isinstance(own["_left_out"], frozenset):
+    known = all(type(index) is int and 0 <= index < len(state.index_of) for index in own["index_of"].values())
+    if not isinstance(own["_left_out"], frozenset) or not known:
         return False
     if own["dim"] != settings.dim or not isinstance(own["_table_m"], list) or len(own["_table_m"]) > MOST:
         return False
