@@ -104,6 +104,10 @@ FIRST_PACKETS: Final = 3
 WIDE: Final = 0.05
 """Part of the mean range; ranges are curved within positions of a larger standard deviation, which have no level."""
 
+DOUBTED_S: Final = 5.0
+"""For so long nothing is promised after a start whose packets contradicted each other: where several anchors are late,
+those that agree may agree on a wrong place, until the tag's way shows it."""
+
 OPEN_WIDE: Final = 0.02
 """The same where all range errors are open: then only the tag's way tells its position, by directions that change, and
 a filter that is linearised at a wrong place learns too much from them (errors of 5 standard deviations)."""
@@ -319,9 +323,12 @@ def _soundness(s: EstimatorState, levels: Vector) -> int:
     for anchor in range(count):
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
             soundness = OBSTRUCTED
-    limit = SURE_CHI2 if status["fault_std_m"] > LASTING_STD_M else UNCOVERED_CHI2  # doubted: none are singled out
+    is_doubted = status["fault_std_m"] > LASTING_STD_M  # then none are singled out
+    limit = SURE_CHI2 if is_doubted else UNCOVERED_CHI2
     share = _spread(s)
     if status["withholds_levels"] or max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > limit:
+        soundness = CONTRADICTED
+    if is_doubted and (status["epoch_ticks"] - status["start_ticks"]) * TICK_S < DOUBTED_S:
         soundness = CONTRADICTED
     if status["open_range_errors"] and share > OPEN_WIDE:
         soundness = CONTRADICTED
@@ -556,7 +563,7 @@ class Estimator:
         state.x[:dim] = position_m
         state.P[:dim, :dim] = covariance_m2
         state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
-        state.status["epoch_ticks"] = rx_ticks
+        state.status["epoch_ticks"] = state.status["start_ticks"] = rx_ticks
         self._state = state
 
     def process(

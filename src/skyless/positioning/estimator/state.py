@@ -94,7 +94,8 @@ LINK: Final = np.dtype(
 
 STATUS: Final = np.dtype(
     [
-        ("epoch_ticks", np.int64),  # the tag's reading at the newest packet
+        ("epoch_ticks", np.int64),  # the tag's reading at the newest packet, ...
+        ("start_ticks", np.int64),  # ... and at the start
         ("outcome", np.int64),  # what became of it
         ("packets", np.int64),
         ("accepted", np.int64),
