@@ -5,6 +5,7 @@ import pytest
 from msgspec.structs import replace
 from scipy.linalg import solve_discrete_are
 
+from dense_covariance import position_covariance
 from skyless.clocks.filter import ClockNoise, clock_noise
 from skyless.methods import FILTERS
 from skyless.planning.anchor_clocks import offset_variances, stamp_variances
@@ -17,7 +18,6 @@ from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, NoiseSite, Site, TagsSite, WallSite
 from skyless.uncertainty.dop import dops_at
-from skyless.uncertainty.position import position_covariance
 from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance, literal_delayed_covariance
 
 LAB = ideal_lab_site(100.0)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dense_covariance import position_covariance
 from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.experiments.lab_bound import lab_tracking_bound_m, random_path
 from skyless.uncertainty.bounds import (
@@ -13,7 +14,6 @@ from skyless.uncertainty.bounds import (
     snapshot_bound,
     tracking_bound,
 )
-from skyless.uncertainty.position import position_covariance
 from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)

@@ -7,7 +7,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import kernel, threaded_kernel
 from skyless.simulation.channel import (
     FREE_SPACE_LOSS_1_M_DB,
     ChannelModel,
@@ -97,10 +97,24 @@ def hears(budget: Vector, walls: Matrix, a_m: Vector, b_m: Vector) -> tuple[floa
     return (1.0 - budget[3]) * delivery_probability(power_dbm, budget[1], budget[2]), delay_m
 
 
+@threaded_kernel
+def _fill_links(
+    senders_m: Matrix, listeners_m: Matrix, budget: Vector, walls: Matrix, share: Matrix, delay_m: Matrix
+) -> None:
+    for i in range(len(listeners_m)):
+        for j in range(len(senders_m)):
+            share[i, j], delay_m[i, j] = hears(budget, walls, senders_m[j], listeners_m[i])
+
+
+def links(senders_m: Matrix, listeners_m: Matrix, budget: Vector, walls: Matrix) -> tuple[Matrix, Matrix]:
+    """Share of each sender's frames that reach each listener, and their delay in metres; shape (listeners, senders)."""
+    share, delay_m = np.empty((2, len(listeners_m), len(senders_m)))
+    _fill_links(senders_m, listeners_m, budget, walls, share, delay_m)
+    return share, delay_m
+
+
 def anchor_links(anchors_m: Matrix, master: int, budget: Vector, walls: Matrix) -> AnchorLinks:
     """How anchors, shape (anchors, 3), hear the one in row ``master``."""
-    share, delay_m = np.ones(len(anchors_m)), np.zeros(len(anchors_m))
-    for row in range(len(anchors_m)):
-        if row != master:
-            share[row], delay_m[row] = hears(budget, walls, anchors_m[master], anchors_m[row])
-    return AnchorLinks(share, delay_m)
+    share, delay_m = links(anchors_m[master : master + 1], anchors_m, budget, walls)
+    share[master] = 1.0
+    return AnchorLinks(share[:, 0], delay_m[:, 0])

@@ -1,13 +1,10 @@
 """Dilutions of precision: how the anchors' geometry turns range noise into position noise."""
 
-import math
-
 import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
-from skyless.compiled import kernel
-from skyless.uncertainty.cholesky import factorise, invert
+from skyless.uncertainty.normal import inverse_of
 
 
 class Dops(Struct, frozen=True, gc=False):
@@ -33,82 +30,27 @@ def dilution_of_precision(anchors_m: ArrayLike, position_m: ArrayLike, *, height
     return Dops(*dops_at(anchors_m, np.asarray(position_m, np.float64)[None], height_known=height_known)[0].tolist())
 
 
-def dops_at(anchors_m: ArrayLike, positions_m: ArrayLike, *, height_known: bool) -> NDArray[np.float64]:
-    """DOPs at many positions, shape (m, 3): an array (m, 5) with columns in the order of ``Dops``."""
-    anchors = np.array(anchors_m, np.float64).reshape(-1, 3)
-    positions = np.array(positions_m, np.float64).reshape(-1, 3)
-    dops = np.full((len(positions), 5), math.inf)
-    if np.isfinite(anchors).all():
-        _fill_dops(anchors, positions, height_known, np.empty((4, 4)), np.empty((4, 4)), dops)
-    return dops
+def dops_at(
+    anchors_m: ArrayLike, positions_m: ArrayLike, *, height_known: bool, weights: ArrayLike = 1.0
+) -> NDArray[np.float64]:
+    """DOPs at many positions, shape (m, 3): an array (m, 5) with columns in the order of ``Dops``.
 
-
-@kernel
-def _fill_dops(
-    anchors: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    height_known: bool,
-    normal: NDArray[np.float64],
-    inverse: NDArray[np.float64],
-    dops: NDArray[np.float64],
-) -> None:
-    size = 3 if height_known else 4
-    for k in range(len(positions)):
-        if not (geometry_matrix(anchors, positions[k], normal) and factorise(normal, size)):
-            continue
-        invert(normal, size, inverse)
-        clock = inverse[0, 0]
-        horizontal = inverse[1, 1] + inverse[2, 2]
-        vertical = 0.0 if height_known else inverse[3, 3]
-        dops[k, 0] = math.sqrt(horizontal + vertical + clock)
-        dops[k, 1] = math.sqrt(horizontal + vertical)
-        dops[k, 2] = math.sqrt(horizontal)
-        dops[k, 3] = math.sqrt(vertical)
-        dops[k, 4] = math.sqrt(clock)
-
-
-@kernel
-def geometry_matrix(anchors: NDArray[np.float64], position: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
-    """Write HᵀH into ``normal``, shape (4, 4), lower triangle, rows of H being [1, unit vector].
-
-    The clock comes first, so that a factorisation removes the mean direction before anything else, and the
-    leading 3 × 3 block is the matrix of a known height. False where some anchor has no direction.
+    ``weights``: how much each anchor counts at each position, shape (m, n); zero leaves it out.
     """
-    normal[:] = 0.0
-    directed = True
-    for i in range(len(anchors)):
-        directed = directed and add_anchor(anchors, i, position, 1.0, normal)
-    return directed
-
-
-@kernel
-def add_anchor(
-    anchors: NDArray[np.float64], i: int, position: NDArray[np.float64], weight: float, normal: NDArray[np.float64]
-) -> bool:
-    """Add an anchor's row to the normal matrix of ``geometry_matrix``; False where it has no direction."""
-    x, y, z = direction(anchors, i, position)
-    if math.isnan(x):
-        return False
-    normal[0, 0] += weight
-    normal[1, 0] += weight * x
-    normal[2, 0] += weight * y
-    normal[3, 0] += weight * z
-    normal[1, 1] += weight * x * x
-    normal[2, 1] += weight * y * x
-    normal[3, 1] += weight * z * x
-    normal[2, 2] += weight * y * y
-    normal[3, 2] += weight * z * y
-    normal[3, 3] += weight * z * z
-    return True
-
-
-@kernel
-def direction(anchors: NDArray[np.float64], i: int, position: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Unit vector from anchor ``i`` to the position; NaNs where there is none."""
-    x = position[0] - anchors[i, 0]
-    y = position[1] - anchors[i, 1]
-    z = position[2] - anchors[i, 2]
-    distance = math.sqrt(x * x + y * y + z * z)
-    if distance == 0.0 or not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
-        return math.nan, math.nan, math.nan
-    return x / distance, y / distance, z / distance
+    anchors = np.array(anchors_m, np.float64).reshape(-1, 3)
+    away = np.array(positions_m, np.float64).reshape(-1, 1, 3) - np.where(np.isfinite(anchors), anchors, np.nan)
+    away = np.where(np.isfinite(away), away, np.nan)
+    distance = np.sqrt((away * away).sum(axis=2))
+    distance[distance == 0.0] = np.nan
+    counts = np.broadcast_to(np.asarray(weights, np.float64), distance.shape)[..., None]
+    rows = np.ones((*distance.shape, 3 if height_known else 4))
+    rows[..., 1:] = (away / distance[..., None])[..., : rows.shape[2] - 1]
+    weighted = np.where(counts > 0.0, rows * counts, 0.0)
+    inverse = inverse_of(weighted.transpose(0, 2, 1) @ np.where(counts > 0.0, rows, 0.0))
+    variances = np.zeros((len(rows), 4))
+    variances[:, : rows.shape[2]] = np.diagonal(inverse, axis1=1, axis2=2)
+    clock, x, y, z = variances.T
+    horizontal = x + y
+    dops: NDArray[np.float64] = np.sqrt([horizontal + z + clock, horizontal + z, horizontal, z, clock]).T
+    dops[np.isinf(clock)] = np.inf
+    return dops
