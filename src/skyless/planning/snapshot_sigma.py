@@ -46,24 +46,23 @@ def gains(towards: Array, weights: Matrix, common: float) -> Array:
     return gain
 
 
-def variances(gain: Array, own: Vector, common: Matrix) -> Matrix:
-    """The diagonal of G·(diag(own) + common·commonᵀ)·Gᵀ, shape (m, dim)."""
+def variances(gain: Array, own: Matrix, common: Array) -> Matrix:
+    """The diagonal of G·(diag(own) + common·commonᵀ)·Gᵀ, shape (m, dim); shapes (m, n) and (m, n, k)."""
     together = gain.transpose(0, 2, 1) @ common
-    found: Matrix = np.einsum("mna,mna,n->ma", gain, gain, own) + (together * together).sum(axis=2)
+    found: Matrix = np.einsum("mna,mna,mn->ma", gain, gain, own) + (together * together).sum(axis=2)
     return found
 
 
-def anchor_sets(part: Matrix, master: int) -> Iterator[tuple[Vector, Mask]]:
-    """Sets of anchors, without the master, from which points' fixes come: their probabilities (m,) and masks (m, n).
+def anchor_sets(part: Matrix) -> Iterator[tuple[Vector, Mask]]:
+    """Sets of anchors from which points' fixes come: their probabilities, shape (m,), and masks, shape (m, n).
 
     ``part``: each anchor's part in the rounds, shape (m, n).
     """
-    others = np.arange(part.shape[1]) != master
-    doubt = others & (part > DOUBT) & (part < 1.0 - DOUBT)
+    doubt = (part > DOUBT) & (part < 1.0 - DOUBT)
     order = np.argsort(np.where(doubt, np.abs(part - 0.5), np.inf), axis=1, kind="stable")[:, :MOST_DOUBTFUL]
     order = order[:, np.take_along_axis(doubt, order, axis=1).any(axis=0)]
     doubtful, there = np.take_along_axis(doubt, order, axis=1), np.take_along_axis(part, order, axis=1)
-    usual = others & (part >= 0.5)
+    usual = part >= 0.5
     usual_here = np.take_along_axis(usual, order, axis=1)
     for present in product((False, True), repeat=order.shape[1]):
         chances = np.where(doubtful, np.where(present, there, 1.0 - there), np.logical_not(present))
@@ -88,22 +87,23 @@ def fill_snapshot_sigma(
     """
     share, delay_m = scene.heard_at(points)
     fill_dops(scene, points, share, dim, table)
-    in_step = np.where(rounds.usable & scene.speaks, links.share**2, 0.0)
-    in_step[master] = 1.0
-    part = share * share * in_step
-    away = points[:, None] - scene.anchors
-    unit = away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-6)
-    towards = (unit - unit[:, master, None])[..., :dim]
-    late_m = delay_m - delay_m[:, master, None] + links.delay_m
-    weights = 1.0 / rounds.assumed_own if weighted else np.ones(len(scene.anchors))
-    assumed_common = np.full((len(scene.anchors), 1), rounds.assumed_common**0.5)
+    part = share * share * np.where(rounds.usable & scene.speaks, links.share**2, 0.0)
+    part[:, master] = 0.0
+    # of each point only the anchors that take part, in the order of how much
+    some = np.argsort(-part, axis=1, kind="stable")[:, : int((part > DOUBT).sum(axis=1).max())]
+    part = np.take_along_axis(part, some, axis=1)
+    towards = (_directions(scene.anchors[some], points) - _directions(scene.anchors[master], points))[..., :dim]
+    late_m = np.take_along_axis(delay_m, some, axis=1) - delay_m[:, master, None] + links.delay_m[some]
+    assumed, true, common = rounds.assumed_own[some], rounds.true_own[some], rounds.common[some]
+    assumed_common = np.full((*some.shape, 1), rounds.assumed_common**0.5)
+    weights = 1.0 / assumed if weighted else np.ones(some.shape)
     fixes, claimed = np.zeros((2, len(points)))
     total, bias = np.zeros((2, len(points), 3))
-    for probability, chosen in anchor_sets(part, master):
+    for probability, chosen in anchor_sets(part):
         rows = np.flatnonzero((probability > 0.0) & (chosen.sum(axis=1) >= dim))
-        gain = gains(towards[rows], chosen[rows] * weights, rounds.assumed_common if weighted else 0.0)
+        gain = gains(towards[rows], chosen[rows] * weights[rows], rounds.assumed_common if weighted else 0.0)
         with np.errstate(invalid="ignore"):
-            said = variances(gain, rounds.assumed_own, assumed_common).sum(axis=1)
+            said = variances(gain, assumed[rows], assumed_common[rows]).sum(axis=1)
         good = said < farthest_m**2
         rows, gain = rows[good], gain[good]
         chance = probability[rows]
@@ -111,10 +111,17 @@ def fill_snapshot_sigma(
         fixes[rows] += chance
         claimed[rows] += chance * said[good]
         bias[rows, :dim] += chance[:, None] * shift
-        total[rows, :dim] += chance[:, None] * (variances(gain, rounds.true_own, rounds.common) + shift * shift)
+        total[rows, :dim] += chance[:, None] * (variances(gain, true[rows], common[rows]) + shift * shift)
     table[:, SIGMA:] = np.inf
-    table[:, FIX_SHARE] = fixes * part[:, master]
+    table[:, FIX_SHARE] = fixes * share[:, master] ** 2
     _finish(table, total, bias, fixes, claimed)
+
+
+def _directions(anchors: Array, points: Matrix) -> Array:
+    """Unit vectors from anchors, shape (m, n, 3) or (3,), to points, shape (m, 3)."""
+    away = points[:, None] - anchors
+    unit: Array = away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-6)
+    return unit
 
 
 def _finish(table: Matrix, total: Matrix, bias: Matrix, fixes: Vector, claimed: Vector) -> None:

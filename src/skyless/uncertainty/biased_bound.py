@@ -29,13 +29,13 @@ from skyless.uncertainty.bounds import (
     BoundSettings,
     anchor_terms,
     diffuse,
-    direction,
     kernel_settings,
     new_packet,
     predict,
     tag_terms,
     update,
 )
+from skyless.uncertainty.dop import direction
 
 PerAnchor: TypeAlias = float | tuple[float, ...]
 """One value for all anchors, or one for each."""

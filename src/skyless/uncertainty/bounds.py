@@ -7,7 +7,6 @@ stamp, which everyone who hears the frame shares. The first anchor's oscillator 
 process noise is q·(I + 11ᵀ).
 """
 
-import math
 from typing import Final
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from skyless.compiled import kernel, threaded_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS
+from skyless.uncertainty.dop import direction
 
 Array = NDArray[np.float64]
 
@@ -302,15 +302,3 @@ def update(P: Array, h: Array, ph: Array, variance: float) -> None:
         for column in range(row, n):
             P[row, column] -= gain * ph[column]
             P[column, row] = P[row, column]
-
-
-@kernel
-def direction(anchors: Array, i: int, position: Array) -> tuple[float, float, float]:
-    """Unit vector from anchor ``i`` to the position; NaNs where there is none."""
-    x = position[0] - anchors[i, 0]
-    y = position[1] - anchors[i, 1]
-    z = position[2] - anchors[i, 2]
-    distance = math.sqrt(x * x + y * y + z * z)
-    if distance == 0.0 or not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
-        return math.nan, math.nan, math.nan
-    return x / distance, y / distance, z / distance

@@ -1,10 +1,13 @@
 """Dilutions of precision: how the anchors' geometry turns range noise into position noise."""
 
+import math
+
 import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
-from skyless.uncertainty.normal import inverse_of
+from skyless.compiled import kernel, threaded_kernel
+from skyless.uncertainty.cholesky import factorise, invert
 
 
 class Dops(Struct, frozen=True, gc=False):
@@ -38,19 +41,52 @@ def dops_at(
     ``weights``: how much each anchor counts at each position, shape (m, n); zero leaves it out.
     """
     anchors = np.array(anchors_m, np.float64).reshape(-1, 3)
-    away = np.array(positions_m, np.float64).reshape(-1, 1, 3) - np.where(np.isfinite(anchors), anchors, np.nan)
-    away = np.where(np.isfinite(away), away, np.nan)
-    distance = np.sqrt((away * away).sum(axis=2))
-    distance[distance == 0.0] = np.nan
-    counts = np.broadcast_to(np.asarray(weights, np.float64), distance.shape)[..., None]
-    rows = np.ones((*distance.shape, 3 if height_known else 4))
-    rows[..., 1:] = (away / distance[..., None])[..., : rows.shape[2] - 1]
-    weighted = np.where(counts > 0.0, rows * counts, 0.0)
-    inverse = inverse_of(weighted.transpose(0, 2, 1) @ np.where(counts > 0.0, rows, 0.0))
-    variances = np.zeros((len(rows), 4))
-    variances[:, : rows.shape[2]] = np.diagonal(inverse, axis1=1, axis2=2)
-    clock, x, y, z = variances.T
-    horizontal = x + y
-    dops: NDArray[np.float64] = np.sqrt([horizontal + z + clock, horizontal + z, horizontal, z, clock]).T
-    dops[np.isinf(clock)] = np.inf
+    positions = np.array(positions_m, np.float64).reshape(-1, 3)
+    counts = np.broadcast_to(np.asarray(weights, np.float64), (len(positions), len(anchors)))
+    dops = np.full((len(positions), 5), math.inf)
+    _fill_dops(anchors, positions, np.ascontiguousarray(counts), 3 if height_known else 4, dops)
     return dops
+
+
+@threaded_kernel
+def _fill_dops(
+    anchors: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    size: int,
+    dops: NDArray[np.float64],
+) -> None:
+    """From HᵀWH of rows [1, unit vector], where it is not singular and all anchors that count have a direction.
+
+    The clock comes first, so that a factorisation removes the mean direction before anything else.
+    """
+    normal, inverse, row = np.empty((4, 4)), np.zeros((4, 4)), np.ones(4)
+    for k in range(len(positions)):
+        normal[:] = 0.0
+        for i in range(len(anchors)):
+            if weights[k, i] > 0.0:
+                row[1], row[2], row[3] = direction(anchors, i, positions[k])
+                for p in range(size):
+                    for q in range(p + 1):
+                        normal[p, q] += weights[k, i] * row[p] * row[q]
+        if not factorise(normal, size):
+            continue
+        invert(normal, size, inverse)
+        clock, horizontal, vertical = inverse[0, 0], inverse[1, 1] + inverse[2, 2], inverse[3, 3]
+        dops[k, 0] = math.sqrt(horizontal + vertical + clock)
+        dops[k, 1] = math.sqrt(horizontal + vertical)
+        dops[k, 2] = math.sqrt(horizontal)
+        dops[k, 3] = math.sqrt(vertical)
+        dops[k, 4] = math.sqrt(clock)
+
+
+@kernel
+def direction(anchors: NDArray[np.float64], i: int, position: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Unit vector from anchor ``i`` to the position; NaNs where there is none."""
+    x = position[0] - anchors[i, 0]
+    y = position[1] - anchors[i, 1]
+    z = position[2] - anchors[i, 2]
+    distance = math.sqrt(x * x + y * y + z * z)
+    if distance == 0.0 or not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+        return math.nan, math.nan, math.nan
+    return x / distance, y / distance, z / distance
