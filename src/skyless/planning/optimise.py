@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import FIX_SHARE, SIGMA
 from skyless.planning.floor import Floor
-from skyless.planning.lattice import CLOSEST_M, Lattice, exchange, lattice_of, mean_and_worst, relative_score
+from skyless.planning.lattice import CLOSEST_M, exchange, lattice_of, mean_and_worst, relative_score
 from skyless.planning.links import link_budget
 from skyless.planning.mounts import (
     Layout,
@@ -41,6 +41,9 @@ REFINED: Final = 4
 """Starts that the method's own prediction improves further, the even layout among them."""
 
 FINEST_M: Final = 0.05
+
+PASSES: Final = 12
+"""Of an exchange on the lattice, at most."""
 
 
 class Scored(Struct, frozen=True):
@@ -117,12 +120,11 @@ class Search:
         places = mounts.at(all_ways, all_levels)
         lattice = lattice_of(places, *self._points, self._budget, self._walls, dim, noise_m)
         snapped = np.array([_nearest(places, place) for place in mounts.at(even.ways_m, even.levels)])
-        work = np.zeros((4, 4)), np.zeros((4, 4))
-        reference = mean_and_worst(snapped, lattice.rows, lattice.heard, lattice.weights, dim, lattice.cap_m, *work)
+        reference = mean_and_worst(snapped, lattice)
         found = []
         for number in range(STARTS):
             chosen = snapped.copy() if number == 0 else self._random.choice(len(places), self._anchors, replace=False)
-            score = _exchange(lattice, chosen, 0, reference)
+            score = exchange(chosen, 0, lattice, reference, PASSES)
             found.append((score, Layout(all_ways[chosen], all_levels[chosen])))
             if self._late():
                 break
@@ -202,11 +204,6 @@ def _nearest(places: Matrix, place: Vector) -> int:
     return int(np.argmin(np.linalg.norm(places - place, axis=1)))
 
 
-def _exchange(lattice: Lattice, chosen: NDArray[np.int64], fixed: int, reference: tuple[float, float]) -> float:
-    rows, heard, weights = lattice.rows, lattice.heard, lattice.weights
-    return exchange(chosen, fixed, lattice.places_m, rows, heard, weights, lattice.dim, lattice.cap_m, reference, 12)
-
-
 class OneMore(Struct, frozen=True):
     """Where one more anchor helps most, and how much: means and worst over the region, metres."""
 
@@ -238,11 +235,7 @@ def one_more(
     if not (gaps >= CLOSEST_M).any():
         return None
     chosen = np.append(np.arange(n), n + int(np.argmax(gaps)))
-    work = np.zeros((4, 4)), np.zeros((4, 4))
-    reference = mean_and_worst(
-        np.arange(n), lattice.rows, lattice.heard, lattice.weights, before.dim, lattice.cap_m, *work
-    )
-    _exchange(lattice, chosen, n, reference)
+    exchange(chosen, n, lattice, mean_and_worst(np.arange(n), lattice), PASSES)
     place = places[chosen[n]]
     after = Predictor(site_with_one_more(site, place), settings)
     (mean_before, worst_before), (mean_after, worst_after) = (

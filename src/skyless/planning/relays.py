@@ -1,14 +1,14 @@
 """What anchors relay of each other, as ``joint`` meets it: who tells whose packet, how old it is then, how often."""
 
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyless.air.codec import heard_capacity
-from skyless.compiled import kernel
 from skyless.planning.anchor_clocks import AnchorClocks
-from skyless.planning.links import hears
+from skyless.planning.links import links
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -37,74 +37,41 @@ def relays_of(anchors_m: Matrix, master: int, clocks: AnchorClocks, budget: Vect
 
     ``anchors_m``: shape (anchors, 3); ``master``: row of the master, whose packets have a place of their own.
     """
-    count, between = len(clocks.sender), (len(anchors_m), len(anchors_m))
-    share, delay_m = np.zeros(between), np.zeros(between)
-    _fill_links(anchors_m, clocks.speaks, budget, walls, share, delay_m)
-    ends, most = np.zeros(count, np.int64), count * len(anchors_m)
-    heard, values = np.zeros(most, np.int64), np.zeros((most, 3))
+    share, delay_m = links(anchors_m, anchors_m, budget, walls)
+    share *= clocks.speaks & clocks.speaks[:, None]
     room = heard_capacity(master_heard=True, master_time=True, page=True)
     masters_room = heard_capacity(master_heard=False, master_time=True, page=True)
-    told = _tell(clocks.sender, clocks.gap_s, master, share, delay_m, room, masters_room, ends, heard, values)
-    return Relays(ends, heard[:told].copy(), values[:told].copy())
+    ends, heard, values = [], [], []
+    for k, listener in enumerate(clocks.sender.tolist()):
+        for sender, age_s, part in _told(
+            clocks, k, share[listener], master, masters_room if listener == master else room
+        ):
+            heard.append(sender)
+            values.append((age_s, part, delay_m[listener, sender]))
+        ends.append(len(heard))
+    return Relays(np.array(ends, np.int64), np.array(heard, np.int64), np.array(values).reshape(-1, 3))
 
 
-@kernel
-def _fill_links(
-    anchors_m: Matrix, speaks: NDArray[np.bool_], budget: Vector, walls: Matrix, share: Matrix, delay_m: Matrix
-) -> None:
-    """Share of the frames of the anchor in the column that the one in the row hears, and their delay."""
-    for i in range(len(anchors_m)):
-        for j in range(i):
-            if speaks[i] and speaks[j]:
-                share[i, j], delay_m[i, j] = hears(budget, walls, anchors_m[j], anchors_m[i])
-                share[j, i], delay_m[j, i] = share[i, j], delay_m[i, j]
-
-
-@kernel
-def _tell(
-    sender: Integers,
-    gap_s: Vector,
-    master: int,
-    share: Matrix,
-    delay_m: Matrix,
-    room: int,
-    masters_room: int,
-    ends: Integers,
-    heard: Integers,
-    values: Matrix,
-) -> int:
-    """Fill in the relays of every message, [age, share, delay] in ``values``; return how many there are.
+def _told(clocks: AnchorClocks, k: int, share: Vector, master: int, room: int) -> Iterator[tuple[int, float, float]]:
+    """What message k relays: senders, how long ago they sent, and how often it tells.
 
     From an anchor's message back to its one before: a packet is told of if it was heard and there is room, as fewer
     that came later were heard than fit. Of an anchor that sent several only the last counts.
     """
-    count, told = len(sender), 0
-    more = np.zeros(room + masters_room)
-    seen = np.zeros(len(share), np.bool_)
-    for k in range(count):
-        i = sender[k]
-        places = masters_room if i == master else room
-        more[:] = 0.0
-        more[0] = 1.0
-        seen[:] = False
-        age_s = 0.0
-        for back in range(1, count):
-            age_s += gap_s[(k - back + 1) % count]
-            j = sender[(k - back) % count]
-            if j == i:
-                break
-            if seen[j] or share[i, j] == 0.0:
-                continue
-            seen[j] = True
-            part = share[i, j]
-            if j != master:
-                part *= more[:places].sum()
-                for c in range(places - 1, 0, -1):
-                    more[c] += share[i, j] * (more[c - 1] - more[c])
-                more[0] *= 1.0 - share[i, j]
-            if part >= LEAST_TOLD:
-                heard[told] = j
-                values[told, AGE_S], values[told, TOLD], values[told, LATE_M] = age_s, part, delay_m[i, j]
-                told += 1
-        ends[k] = told
-    return told
+    more = np.zeros(room + 1)  # probability that one less than so many later packets were heard
+    more[1] = 1.0
+    seen, age_s = {int(clocks.sender[k])}, 0.0
+    for back in range(1, len(clocks.sender)):
+        age_s += float(clocks.gap_s[k - back + 1])
+        sender = int(clocks.sender[k - back])
+        if sender == clocks.sender[k]:
+            break
+        if sender in seen or share[sender] == 0.0:
+            continue
+        seen.add(sender)
+        part = float(share[sender])
+        if sender != master:
+            part *= float(more.sum())
+            more[1:] += share[sender] * (more[:-1] - more[1:])
+        if part >= LEAST_TOLD:
+            yield sender, age_s, part
