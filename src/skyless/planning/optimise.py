@@ -111,15 +111,12 @@ class Search:
     # On the lattice
 
     def _lattice_starts(self, even: Layout) -> list[Layout]:
-        mounts, levels = self._mounts, len(self._mounts.heights_m)
-        count = max(MOST_CANDIDATES // levels, 2 * self._anchors)
-        ways, numbers = np.arange(count) * mounts.length_m / count, np.arange(levels)
-        all_ways, all_levels = np.repeat(ways, levels), np.tile(numbers, count)
+        all_ways, all_levels = _candidates(self._mounts, MOST_CANDIDATES, 2 * self._anchors)
         dim = 3 if self._site.tags.height_m is None else 2
         noise_m = sum(stamp_variances(with_noise(self._site, self._settings.noise_ps))) ** 0.5
-        places = mounts.at(all_ways, all_levels)
+        places = self._mounts.at(all_ways, all_levels)
         lattice = lattice_of(places, *self._points, self._budget, self._walls, dim, noise_m)
-        snapped = np.array([_nearest(places, place) for place in mounts.at(even.ways_m, even.levels)])
+        snapped = np.array([_nearest(places, place) for place in self._mounts.at(even.ways_m, even.levels)])
         reference = mean_and_worst(snapped, lattice)
         found = []
         for number in range(STARTS):
@@ -200,6 +197,13 @@ def _against(scored: Scored, even: Scored) -> float:
     return relative_score(scored.mean_sigma_m, scored.worst_sigma_m, even.mean_sigma_m, even.worst_sigma_m)
 
 
+def _candidates(mounts: Mounts, most: int, least: int = 1) -> tuple[Vector, NDArray[np.int64]]:
+    """Ways along the walls and levels of some candidates, evenly spaced at every height."""
+    levels = len(mounts.heights_m)
+    count = max(most // levels, least)
+    return np.repeat(np.arange(count) * mounts.length_m / count, levels), np.tile(np.arange(levels), count)
+
+
 def _nearest(places: Matrix, place: Vector) -> int:
     return int(np.argmin(np.linalg.norm(places - place, axis=1)))
 
@@ -223,10 +227,7 @@ def one_more(
     """
     before = Predictor(site, settings)
     points, weights = sample_points(floor, heights_m, SEARCH_POINTS)
-    levels = len(mounts.heights_m)
-    count = MOST_CANDIDATES // 2 // levels
-    ways = np.repeat(np.arange(count) * mounts.length_m / count, levels)
-    free = mounts.at(ways, np.tile(np.arange(levels), count))
+    free = mounts.at(*_candidates(mounts, MOST_CANDIDATES // 2))
     places = np.concatenate([before.anchors_m, free])
     noise_m = sum(stamp_variances(before.site)) ** 0.5
     lattice = lattice_of(places, points, weights, before.budget, before.walls, before.dim, noise_m)

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from skyless.air.schedule import first_slots, schedule_of
 from skyless.clocks.filter import ClockNoise, clock_noise
 from skyless.constants import TICK_S
+from skyless.planning.anchor_clocks import stamp_variances
 from skyless.positioning.snapshots import SnapshotMethod
 from skyless.site.model import Site
-from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance, stamp_variance_m2
+from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -43,8 +44,7 @@ class Rounds(Struct, frozen=True):
 def rounds_of(site: Site, method: SnapshotMethod) -> Rounds:
     """What the snapshot methods meet at a site whose noise figures hold."""
     noise = site.noise
-    tx_var = stamp_variance_m2(noise.tx_stamp_ps * 1e-12, rounded=False)
-    rx_var = stamp_variance_m2(noise.rx_stamp_ps * 1e-12, rounded=True)
+    tx_var, rx_var = stamp_variances(site)
     kappa, round_s = delays(site)
     first = method in {SnapshotMethod.LITERAL, SnapshotMethod.WEIGHTED}
     covariance_of = literal_covariance if first else bracketed_covariance
