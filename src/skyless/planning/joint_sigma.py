@@ -20,7 +20,7 @@ from skyless.compiled import kernel, threaded_kernel
 from skyless.constants import TICK_S
 from skyless.planning.anchor_clocks import AnchorClocks
 from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
-from skyless.planning.geometry import Scene, fill_dops
+from skyless.planning.links import Scene, fill_dops
 from skyless.planning.relays import AGE_S, LATE_M, TOLD, Relays
 from skyless.positioning.estimator.faults import compute_fault_input
 from skyless.positioning.estimator.kalman import (

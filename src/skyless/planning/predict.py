@@ -16,12 +16,18 @@ from skyless.air.schedule import schedule_of
 from skyless.methods import DEFAULT_METHOD, FILTERS
 from skyless.planning.anchor_clocks import anchor_clocks
 from skyless.planning.columns import COLUMNS, SIGMA
-from skyless.planning.geometry import Scene, fill_dops, weighted_pdop
 from skyless.planning.joint_sigma import fill_joint_sigma
-from skyless.planning.links import AnchorLinks, anchor_links, anchor_positions, link_budget
+from skyless.planning.links import (
+    AnchorLinks,
+    Scene,
+    anchor_links,
+    anchor_positions,
+    fill_dops,
+    link_budget,
+    weighted_pdop,
+)
 from skyless.planning.relays import relays_of
-from skyless.planning.rounds import rounds_of
-from skyless.planning.snapshot_sigma import fill_snapshot_sigma
+from skyless.planning.snapshot_sigma import fill_snapshot_sigma, rounds_of
 from skyless.positioning.new_method import estimator_settings
 from skyless.positioning.snapshots import SnapshotMethod
 from skyless.simulation.channel import ChannelModel, pack_walls
@@ -61,7 +67,7 @@ class Predictor:
         self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls)
         self.links: AnchorLinks = anchor_links(self.anchors_m, self.master, self.budget, self.walls)
         self.clocks = anchor_clocks(self.site, self.links.share)
-        self._scene = Scene(self.anchors_m, self.clocks.speaks, self.budget, self.walls)
+        self.scene = Scene(self.anchors_m, self.clocks.speaks, self.budget, self.walls)
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
         if settings.method in FILTERS:
             self._fill = self._joint()
@@ -74,7 +80,7 @@ class Predictor:
         rounds = rounds_of(self.site, method)
         weighted = method in {SnapshotMethod.WEIGHTED, SnapshotMethod.BRACKETED}
         return lambda points, table: fill_snapshot_sigma(
-            points, self.dim, self._scene, self.master, self.links, rounds, weighted, self.farthest_m, table
+            points, self.dim, self.scene, self.master, self.links, rounds, weighted, self.farthest_m, table
         )
 
     def _joint(self) -> Fill:
@@ -84,7 +90,7 @@ class Predictor:
         )
         relays = relays_of(self.anchors_m, self.master, self.clocks, self.budget, self.walls)
         return lambda points, table: fill_joint_sigma(
-            points, settings, self._scene, self.clocks, relays, self.farthest_m, table
+            points, settings, self.scene, self.clocks, relays, self.farthest_m, table
         )
 
     def at(self, points_m: Matrix, progress: Callable[[float], None] | None = None) -> Matrix:
@@ -96,9 +102,9 @@ class Predictor:
         return in_threads(self._geometry, np.ascontiguousarray(points_m, np.float64), CHUNK)
 
     def _geometry(self, points: Matrix, table: Matrix) -> None:
-        share, _ = self._scene.heard_at(points)
-        fill_dops(self._scene, points, share, self.dim, table)
-        table[:, SIGMA] = weighted_pdop(self._scene, points, share, self.dim)
+        share, _ = self.scene.heard_at(points)
+        fill_dops(self.scene, points, share, self.dim, table)
+        table[:, SIGMA] = weighted_pdop(self.scene, points, share, self.dim)
 
 
 def with_noise(site: Site, noise_ps: float | None) -> Site:
