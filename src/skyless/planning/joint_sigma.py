@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from skyless.compiled import kernel, threaded_kernel
 from skyless.constants import TICK_S
-from skyless.planning.anchor_clocks import AnchorClocks
-from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
+from skyless.planning.anchor_clocks import AGE_S, LATE_M, TOLD, AnchorClocks, Relays
+from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA, SIGMA_X, SIGMA_Z, fill_errors
 from skyless.planning.links import Scene, fill_dops
-from skyless.planning.relays import AGE_S, LATE_M, TOLD, Relays
 from skyless.positioning.estimator.faults import compute_fault_input
 from skyless.positioning.estimator.kalman import (
     compute_ph,
@@ -168,17 +167,26 @@ def _relay(s: EstimatorState, listener: int, sender: int, age_s: float, share: f
 
 @threaded_kernel
 def settle(
-    s: EstimatorState, clocks: AnchorClocks, relays: Relays, share: Vector, delay_m: Vector, row: Vector
+    s: EstimatorState,
+    clocks: AnchorClocks,
+    relays: Relays,
+    share: Vector,
+    delay_m: Vector,
+    motion: Vector,
+    row: Vector,
 ) -> None:
-    """Predict for a tag at the state's position; ``FIX_SHARE`` becomes the number of fixes in a superframe."""
-    dim, superframe_s = s.settings[0]["dim"], clocks.gap_s.sum()
+    """Predict for a tag at the state's position: sums over a superframe's fixes, whose number is in ``FIX_SHARE``.
+
+    ``motion``, which is zero before, becomes what accelerations have of each axis' variance.
+    """
+    superframe_s = clocks.gap_s.sum()
     most = max(LONGEST, math.ceil(LONGEST_S / superframe_s))
     step = max(1, math.ceil(SETTLING_S / superframe_s))
-    now, motion, before = 0, np.zeros(dim), 0.0
+    now, before = 0, 0.0
     for superframe in range(most):
         now = _superframe(s, clocks, relays, share, delay_m, now, NEVER, motion, row)
         if superframe % step == step - 1:
-            variance = row[SIGMA_X : SIGMA_X + dim].sum()
+            variance = row[SIGMA_X : SIGMA_Z + 1].sum()
             if abs(variance - before) <= SETTLED * variance:
                 break
             before = variance
@@ -190,22 +198,6 @@ def settle(
                 break
             before = motion.sum()
     motion *= s.settings[0]["qa"] * superframe_s / (KICKS * row[FIX_SHARE])
-    _finish(row, dim, motion)
-
-
-@kernel
-def _finish(row: Vector, dim: int, motion: Vector) -> None:
-    """Turn sums over a superframe into the columns; ``motion``: what accelerations have of each axis' variance."""
-    heard, squares, told = row[FIX_SHARE], 0.0, 0.0
-    for axis in range(dim):
-        variance = row[SIGMA_X + axis] / heard
-        told += variance
-        variance = max(variance - motion[axis], 0.0)
-        squares += variance
-        row[SIGMA_X + axis] = math.sqrt(variance)
-    row[SIGMA], row[CLAIMED] = math.sqrt(squares), math.sqrt(told)
-    row[RMSE] = math.sqrt(squares + row[BIAS] / heard)
-    row[BIAS] = math.sqrt(row[BIAS] / heard)
 
 
 def fill_joint_sigma(
@@ -224,7 +216,8 @@ def fill_joint_sigma(
     table[:, SIGMA:], table[:, FIX_SHARE] = math.inf, 0.0
     seen = np.zeros(0, np.int64)
     fresh = site_state(settings, scene.anchors, seen)
-    for point, share, delay_m, row in zip(points, shares, delays_m, table, strict=True):
+    motions = np.zeros((len(points), 3))
+    for point, share, delay_m, motion, row in zip(points, shares, delays_m, motions, table, strict=True):
         in_view = np.flatnonzero(share >= RARELY)
         if len(in_view) <= dim:
             continue
@@ -234,7 +227,12 @@ def fill_joint_sigma(
         s.x[:dim] = point[:dim]
         if dim == 2:
             s.settings["height_m"] = point[2]
-        settle(s, clocks, relays, share, delay_m, row)
-        row[FIX_SHARE] /= len(clocks.sender)
-        if not row[SIGMA] < farthest:
-            row[SIGMA:], row[FIX_SHARE] = math.inf, 0.0
+        settle(s, clocks, relays, share, delay_m, motion, row)
+    known = np.flatnonzero(table[:, FIX_SHARE] > 0.0)
+    heard = table[known, FIX_SHARE]
+    said = table[known, SIGMA_X : SIGMA_Z + 1] / heard[:, None]
+    variance = np.maximum(said - motions[known], 0.0)
+    fill_errors(table, known, variance, table[known, BIAS] / heard, said.sum(axis=1))
+    table[known, FIX_SHARE] = heard / len(clocks.sender)
+    lost = ~(table[:, SIGMA] < farthest)
+    table[lost, SIGMA:], table[lost, FIX_SHARE] = math.inf, 0.0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skyless.air.rotation import filter_pages_of
 from skyless.air.schedule import schedule_of
 from skyless.methods import DEFAULT_METHOD, FILTERS
-from skyless.planning.anchor_clocks import anchor_clocks
+from skyless.planning.anchor_clocks import anchor_clocks, relays_of
 from skyless.planning.columns import COLUMNS, SIGMA
 from skyless.planning.joint_sigma import fill_joint_sigma
 from skyless.planning.links import (
@@ -26,7 +26,6 @@ from skyless.planning.links import (
     link_budget,
     weighted_pdop,
 )
-from skyless.planning.relays import relays_of
 from skyless.planning.snapshot_sigma import fill_snapshot_sigma, rounds_of
 from skyless.positioning.new_method import estimator_settings
 from skyless.positioning.snapshots import SnapshotMethod

@@ -21,7 +21,7 @@ from skyless.air.schedule import first_slots, schedule_of
 from skyless.clocks.filter import ClockNoise, clock_noise
 from skyless.constants import TICK_S
 from skyless.planning.anchor_clocks import stamp_variances
-from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
+from skyless.planning.columns import FIX_SHARE, SIGMA, fill_errors
 from skyless.planning.links import AnchorLinks, Scene, fill_dops
 from skyless.positioning.snapshots import SnapshotMethod
 from skyless.site.model import Site
@@ -200,7 +200,10 @@ def fill_snapshot_sigma(
         total[rows, :dim] += chance[:, None] * (variances(gain, true[rows], common[rows]) + shift * shift)
     table[:, SIGMA:] = np.inf
     table[:, FIX_SHARE] = fixes * share[:, master] ** 2
-    _finish(table, total, bias, fixes, claimed)
+    known = np.flatnonzero(table[:, FIX_SHARE] >= DOUBT)
+    shift = bias[known] / fixes[known, None]
+    variance = np.maximum(total[known] / fixes[known, None] - shift * shift, 0.0)
+    fill_errors(table, known, variance, (shift * shift).sum(axis=1), claimed[known] / fixes[known])
 
 
 def _directions(anchors: Array, points: Matrix) -> Array:
@@ -208,15 +211,3 @@ def _directions(anchors: Array, points: Matrix) -> Array:
     away = points[:, None] - anchors
     unit: Array = away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-6)
     return unit
-
-
-def _finish(table: Matrix, total: Matrix, bias: Matrix, fixes: Vector, claimed: Vector) -> None:
-    """Turn sums over the sets of anchors into the columns."""
-    known = np.flatnonzero(table[:, FIX_SHARE] >= DOUBT)
-    shift = bias[known] / fixes[known, None]
-    variance = np.maximum(total[known] / fixes[known, None] - shift * shift, 0.0)
-    table[known, SIGMA_X : SIGMA_Z + 1] = np.sqrt(variance)
-    table[known, SIGMA] = np.sqrt(variance.sum(axis=1))
-    table[known, BIAS] = np.linalg.norm(shift, axis=1)
-    table[known, RMSE] = np.hypot(table[known, SIGMA], table[known, BIAS])
-    table[known, CLAIMED] = np.sqrt(claimed[known] / fixes[known])
