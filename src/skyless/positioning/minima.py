@@ -115,7 +115,7 @@ class Minimum(Struct, frozen=True, gc=False):
 def frame(anchors: Array, height: float | None, sigma: float) -> tuple[int, Array, float, Array]:
     """Kind of problem, anchors in its axes, their extent (0 if they are in one line), and the axes as rows."""
     flat = anchors if height is None else anchors * (1.0, 1.0, 0.0)
-    axes: Array = np.linalg.svd(flat)[2]
+    axes: Array = np.linalg.svd(flat, full_matrices=False)[2]
     along = flat @ axes.T
     extent, width = float(np.linalg.norm(flat, axis=1).max()), float(np.linalg.norm(along[:, 1:], axis=1).max())
     if not width > COLLINEAR * extent:
