@@ -7,11 +7,10 @@ from scipy.stats import binom
 
 from skyless.air.schedule import schedule_of
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.planning.anchor_clocks import anchor_clocks, stamp_variances
+from skyless.planning.anchor_clocks import AGE_S, LATE_M, TOLD, anchor_clocks, relays_of, stamp_variances
 from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
 from skyless.planning.links import anchor_links, anchor_positions, link_budget
 from skyless.planning.predict import PlanSettings, Predictor
-from skyless.planning.relays import AGE_S, LATE_M, TOLD, relays_of
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import ideal_lab_site, lab_site
 from skyless.site.model import EXACT, AnchorSite, Site, TagsSite, WallSite

@@ -76,17 +76,16 @@ def test_exchange_finds_what_trying_all_finds():
     floor = floor_of(lab_site(), FILE, None, None)
     points, weights = sample_points(floor, (0.0,), 60)
     lattice = lattice_of(places, points, weights, link_budget(ChannelModel()), pack_walls(()), 2, 0.04)
-    work = np.zeros((4, 4)), np.zeros((4, 4))
 
     def score(chosen):
-        return sum(mean_and_worst(np.array(chosen), lattice.rows, lattice.heard, weights, 2, lattice.cap_m, *work))
+        return sum(mean_and_worst(np.array(chosen), lattice))
 
     best = min(map(score, combinations(range(12), 4)))
     reference = (1e9, 1e9)  # far from any: then the score is the sum of both to a factor
     found = []
     for start in ([0, 1, 2, 3], [0, 3, 6, 9], [2, 5, 7, 11]):
         chosen = np.array(start)
-        exchange(chosen, 0, places, lattice.rows, lattice.heard, weights, 2, lattice.cap_m, reference, 20)
+        exchange(chosen, 0, lattice, reference, 20)
         found.append(score(chosen))
     assert min(found) == pytest.approx(best, rel=1e-9)
 

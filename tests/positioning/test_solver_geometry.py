@@ -12,8 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.least_squares import GAIN_TOLERANCE
-from skyless.positioning.minima import mean_if_positive
+from skyless.positioning.minima import GAIN_TOLERANCE, mean_if_positive
 from skyless.positioning.solver import NoSolution, PseudorangeSolution, Solution, locate, locate_pseudoranges
 from skyless.uncertainty.dop import dilution_of_precision
 
@@ -321,9 +320,8 @@ def test_a_singular_covariance_is_refused():
 
 def test_iterations_that_do_not_settle_are_told(monkeypatch):
     from skyless.positioning import minima
-    from skyless.positioning.least_squares import EXHAUSTED
 
-    monkeypatch.setattr(minima, "minimise", lambda *_: (EXHAUSTED, 100))
+    monkeypatch.setattr(minima, "descend", lambda *_: (minima.EXHAUSTED, 100))
     refused(locate(LAB, np.zeros(5), sigma(5), height_m=0), NoFixReason.NOT_CONVERGED)
 
 

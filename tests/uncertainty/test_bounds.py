@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dense_covariance import position_covariance
 from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.experiments.lab_bound import lab_tracking_bound_m, random_path
 from skyless.uncertainty.bounds import (
@@ -10,10 +11,8 @@ from skyless.uncertainty.bounds import (
     POSITION_STD_M,
     RATE_STD_MPS,
     bound_settings,
-    snapshot_bound,
     tracking_bound,
 )
-from skyless.uncertainty.position import position_covariance
 from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
@@ -26,6 +25,16 @@ TABLE = [
     (100e-12, 1e-9, 2.0, 0.02966, 0.02316, 2000),
     (100e-12, 1e-8, 0.5, 0.02339, 0.01732, 500),
 ]
+
+
+def snapshot_bound(place, *, superframes=2, mesh=False):
+    """Bound of a tag at rest from all raw stamps of these superframes; all clocks are unknown, straight lines."""
+    settings = bound_settings(
+        STAMP_S, white_fm=0.0, random_walk_fm=0.0, qa=0.0, slot_s=SLOT_S, speed_std_mps=0.0, mesh=mesh
+    )
+    return tracking_bound(LAB, np.tile(place, (superframes * len(LAB), 1)), settings)[-1]
+
+
 """Stamp, random walk, qa, bound without and with mesh; and how many paths average to well below 2 %."""
 
 
@@ -124,14 +133,14 @@ def test_a_snapshots_bound_is_that_of_least_squares_with_all_clocks_as_unknowns(
             rows.append(row)
     design = np.array(rows) / STAMP_M
     expected = np.linalg.inv(design.T @ design)[:2, :2]
-    found = snapshot_bound(LAB, place, STAMP_S, slot_s=SLOT_S, superframes=superframes, mesh=mesh)
+    found = snapshot_bound(place, superframes=superframes, mesh=mesh)
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-9)
 
 
 @pytest.mark.parametrize("place", [(3.0, 4.0, 0.0), (1.2, 1.6, 0.0), (5.0, 7.0, 0.0)])
 def test_no_snapshot_method_beats_its_bound(place):
     """The full-covariance methods use other parts of the same two superframes' stamps."""
-    bound = snapshot_bound(LAB, place, STAMP_S, slot_s=SLOT_S)
+    bound = snapshot_bound(place)
     kappa = np.arange(1, 6) / 6.0
     for covariance in (literal_covariance, bracketed_covariance):
         reached = position_covariance(

@@ -9,11 +9,11 @@ from skyless.methods import FILTERS
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA
 from skyless.planning.floor import Floor
-from skyless.planning.links import IN_VIEW, anchor_links, hears
+from skyless.planning.links import IN_VIEW, anchor_links
 from skyless.planning.maps import PlanMap
 from skyless.planning.mounts import masters_by_links, sample_points
 from skyless.planning.predict import Predictor
-from skyless.planning.rounds import delays
+from skyless.planning.snapshot_sigma import delays
 from skyless.positioning.fix import NoFixReason
 from skyless.positioning.solver import NoSolution, locate
 from skyless.site.advice import warnings_of
@@ -91,7 +91,12 @@ def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
     points, _ = sample_points(floor, tuple(plan.grid.heights_m.tolist()), MIRROR_POINTS)
     tx_var, rx_var = stamp_variances(predictor.site)
     height = predictor.site.tags.height_m
-    ambiguous = [point for point in points if _has_mirror(predictor, point, height, tx_var, rx_var)]
+    share, _ = predictor.scene.heard_at(points)
+    ambiguous = [
+        point
+        for point, seen in zip(points, share >= IN_VIEW, strict=True)
+        if _has_mirror(predictor.anchors_m[seen], point, height, tx_var, rx_var)
+    ]
     if not ambiguous:
         return []
     x, y, z = ambiguous[len(ambiguous) // 2]
@@ -101,17 +106,12 @@ def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
     ]
 
 
-def _has_mirror(predictor: Predictor, point: Array, height_m: float | None, tx_var: float, rx_var: float) -> bool:
-    seen = [
-        row
-        for row, place in enumerate(predictor.anchors_m)
-        if predictor.clocks.speaks[row] and hears(predictor.budget, predictor.walls, place, point)[0] >= IN_VIEW
-    ]
-    if len(seen) < predictor.dim + 1:
+def _has_mirror(anchors: Array, point: Array, height_m: float | None, tx_var: float, rx_var: float) -> bool:
+    """Whether the anchors in view, shape (n, 3), leave two places."""
+    if len(anchors) < (4 if height_m is None else 3):
         return False
-    anchors = predictor.anchors_m[seen]
     ranges = np.linalg.norm(anchors - point, axis=1)
-    covariance = literal_covariance(np.full(len(seen) - 1, 0.5), tx_var, rx_var)
+    covariance = literal_covariance(np.full(len(anchors) - 1, 0.5), tx_var, rx_var)
     solution = locate(anchors, ranges[1:] - ranges[0], covariance, height_m=height_m)
     return isinstance(solution, NoSolution) and solution.reason is NoFixReason.MIRROR
 

@@ -2,6 +2,9 @@
 
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 COLUMNS: Final = (
     "anchors",  # how many are in view
     "gdop",
@@ -21,3 +24,18 @@ COLUMNS: Final = (
 """Names of a prediction's columns, metres; infinite where there is no fix."""
 
 ANCHORS, GDOP, PDOP, HDOP, VDOP, TDOP, SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, BIAS, RMSE, FIX_SHARE, CLAIMED = range(14)
+
+
+def fill_errors(
+    table: NDArray[np.float64],
+    rows: NDArray[np.int64],
+    variance_m2: NDArray[np.float64],
+    square_bias_m2: NDArray[np.float64],
+    claimed_m2: NDArray[np.float64],
+) -> None:
+    """Fill the columns of errors in some rows of a table: variances of three axes, shape (k, 3), the others (k,)."""
+    table[rows, SIGMA_X : SIGMA_Z + 1] = np.sqrt(variance_m2)
+    table[rows, SIGMA] = np.sqrt(variance_m2.sum(axis=1))
+    table[rows, BIAS] = np.sqrt(square_bias_m2)
+    table[rows, RMSE] = np.hypot(table[rows, SIGMA], table[rows, BIAS])
+    table[rows, CLAIMED] = np.sqrt(claimed_m2)

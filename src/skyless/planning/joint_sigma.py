@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from skyless.compiled import kernel, threaded_kernel
 from skyless.constants import TICK_S
-from skyless.planning.anchor_clocks import AnchorClocks
-from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
-from skyless.planning.geometry import Scene, fill_dops, observe
-from skyless.planning.relays import AGE_S, LATE_M, TOLD, Relays
+from skyless.planning.anchor_clocks import AGE_S, LATE_M, TOLD, AnchorClocks, Relays
+from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA, SIGMA_X, SIGMA_Z, fill_errors
+from skyless.planning.links import Scene, fill_dops
 from skyless.positioning.estimator.faults import compute_fault_input
 from skyless.positioning.estimator.kalman import (
     compute_ph,
@@ -82,7 +81,7 @@ def _superframe(
     clocks: AnchorClocks,
     relays: Relays,
     share: Vector,
-    sight: Matrix,
+    delay_m: Vector,
     begin_ticks: int,
     kicks_ticks: int,
     motion: Vector,
@@ -104,7 +103,7 @@ def _superframe(
             continue
         _let_time_pass(s, now, kicks_ticks, clocks.gap_s.sum())
         arrives = share[clocks.sender[k]]
-        _own_reception(s, own, now, arrives, sight[clocks.sender[k], 3])
+        _own_reception(s, own, now, arrives, delay_m[clocks.sender[k]])
         for r in range(relays.ends[k - 1] if k > 0 else 0, relays.ends[k]):
             sender = s.index_of[relays.heard[r]]
             if sender >= 0 and s.anchors[sender]["packets"] > 0:
@@ -167,51 +166,38 @@ def _relay(s: EstimatorState, listener: int, sender: int, age_s: float, share: f
 
 
 @threaded_kernel
-def settle(s: EstimatorState, clocks: AnchorClocks, relays: Relays, share: Vector, sight: Matrix, row: Vector) -> None:
-    """Predict for a tag at the state's position; ``FIX_SHARE`` becomes the number of fixes in a superframe."""
-    dim, superframe_s = s.settings[0]["dim"], clocks.gap_s.sum()
+def settle(
+    s: EstimatorState,
+    clocks: AnchorClocks,
+    relays: Relays,
+    share: Vector,
+    delay_m: Vector,
+    motion: Vector,
+    row: Vector,
+) -> None:
+    """Predict for a tag at the state's position: sums over a superframe's fixes, whose number is in ``FIX_SHARE``.
+
+    ``motion``, which is zero before, becomes what accelerations have of each axis' variance.
+    """
+    superframe_s = clocks.gap_s.sum()
     most = max(LONGEST, math.ceil(LONGEST_S / superframe_s))
     step = max(1, math.ceil(SETTLING_S / superframe_s))
-    now, motion, before = 0, np.zeros(dim), 0.0
+    now, before = 0, 0.0
     for superframe in range(most):
-        now = _superframe(s, clocks, relays, share, sight, now, NEVER, motion, row)
+        now = _superframe(s, clocks, relays, share, delay_m, now, NEVER, motion, row)
         if superframe % step == step - 1:
-            variance = row[SIGMA_X : SIGMA_X + dim].sum()
+            variance = row[SIGMA_X : SIGMA_Z + 1].sum()
             if abs(variance - before) <= SETTLED * variance:
                 break
             before = variance
     kicks_ticks, before = now, 0.0
     for superframe in range(most):
-        now = _superframe(s, clocks, relays, share, sight, now, kicks_ticks, motion, row)
+        now = _superframe(s, clocks, relays, share, delay_m, now, kicks_ticks, motion, row)
         if superframe % step == step - 1:
             if superframe >= 1 and motion.sum() - before <= SETTLED * motion.sum():
                 break
             before = motion.sum()
     motion *= s.settings[0]["qa"] * superframe_s / (KICKS * row[FIX_SHARE])
-    _finish(row, dim, motion)
-
-
-@kernel
-def _finish(row: Vector, dim: int, motion: Vector) -> None:
-    """Turn sums over a superframe into the columns; ``motion``: what accelerations have of each axis' variance."""
-    heard, squares, told = row[FIX_SHARE], 0.0, 0.0
-    for axis in range(dim):
-        variance = row[SIGMA_X + axis] / heard
-        told += variance
-        variance = max(variance - motion[axis], 0.0)
-        squares += variance
-        row[SIGMA_X + axis] = math.sqrt(variance)
-    row[SIGMA], row[CLAIMED] = math.sqrt(squares), math.sqrt(told)
-    row[RMSE] = math.sqrt(squares + row[BIAS] / heard)
-    row[BIAS] = math.sqrt(row[BIAS] / heard)
-
-
-@kernel
-def _observe(scene: Scene, point: Vector, dim: int, share: Vector, sight: Matrix, row: Vector) -> None:
-    """What a point has in view, and its DOPs."""
-    n = len(scene.anchors)
-    observe(scene, point, share, sight)
-    fill_dops(scene.anchors, share, point, dim, np.zeros((n, 3)), np.zeros((4, 4)), np.zeros((4, 4)), row)
 
 
 def fill_joint_sigma(
@@ -224,12 +210,14 @@ def fill_joint_sigma(
     table: Matrix,
 ) -> None:
     """Fill ``table`` (points, columns) for the points, shape (m, 3)."""
-    n, dim = len(scene.anchors), settings.dim
-    share, sight, seen = np.zeros(n), np.zeros((n, 4)), np.zeros(0, np.int64)
+    dim = settings.dim
+    shares, delays_m = scene.heard_at(points)
+    fill_dops(scene, points, shares, dim, table)
+    table[:, SIGMA:], table[:, FIX_SHARE] = math.inf, 0.0
+    seen = np.zeros(0, np.int64)
     fresh = site_state(settings, scene.anchors, seen)
-    for point, row in zip(points, table, strict=True):
-        _observe(scene, point, dim, share, sight, row)
-        row[SIGMA:], row[FIX_SHARE] = math.inf, 0.0
+    motions = np.zeros((len(points), 3))
+    for point, share, delay_m, motion, row in zip(points, shares, delays_m, motions, table, strict=True):
         in_view = np.flatnonzero(share >= RARELY)
         if len(in_view) <= dim:
             continue
@@ -239,7 +227,12 @@ def fill_joint_sigma(
         s.x[:dim] = point[:dim]
         if dim == 2:
             s.settings["height_m"] = point[2]
-        settle(s, clocks, relays, share, sight, row)
-        row[FIX_SHARE] /= len(clocks.sender)
-        if not row[SIGMA] < farthest:
-            row[SIGMA:], row[FIX_SHARE] = math.inf, 0.0
+        settle(s, clocks, relays, share, delay_m, motion, row)
+    known = np.flatnonzero(table[:, FIX_SHARE] > 0.0)
+    heard = table[known, FIX_SHARE]
+    said = table[known, SIGMA_X : SIGMA_Z + 1] / heard[:, None]
+    variance = np.maximum(said - motions[known], 0.0)
+    fill_errors(table, known, variance, table[known, BIAS] / heard, said.sum(axis=1))
+    table[known, FIX_SHARE] = heard / len(clocks.sender)
+    lost = ~(table[:, SIGMA] < farthest)
+    table[lost, SIGMA:], table[lost, FIX_SHARE] = math.inf, 0.0

@@ -5,14 +5,13 @@ knows no method; what it finds is judged, and improved, by the method's own pred
 """
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import threaded_kernel
-from skyless.planning.links import hears
+from skyless.compiled import kernel, threaded_kernel
+from skyless.planning.links import links
 from skyless.uncertainty.cholesky import factorise, invert
 
 Vector = NDArray[np.float64]
@@ -32,18 +31,19 @@ BOTH: Final = 10.0
 CLEARLY: Final = 0.95
 
 
-class Lattice(Struct, frozen=True):
+class Lattice(NamedTuple):
     """Candidates for anchors' places, and what each is to the points."""
 
     places_m: Matrix
     """Shape (candidates, 3)."""
+    apart_m: Matrix
+    """Distances between them; shape (candidates, candidates)."""
     rows: Rows
-    """Weighted rows [1, unit vector] of H; shape (candidates, points, 4)."""
+    """Weighted rows [1, unit vector] of H; shape (candidates, points, 1 + dim)."""
     heard: Matrix
     """Share of each candidate's frames that reach each other one; shape (candidates, candidates)."""
     weights: Vector
     """Of the points in a mean; of sum 1."""
-    dim: int
     cap_m: float
     """Error that stands for "no position"."""
 
@@ -52,46 +52,23 @@ def lattice_of(
     places_m: Matrix, points_m: Matrix, weights: Vector, budget: Vector, walls: Matrix, dim: int, sigma_m: float
 ) -> Lattice:
     """Candidates at places, shape (c, 3), for points, shape (m, 3); ``sigma_m`` is a pseudorange's noise."""
-    rows = np.zeros((len(places_m), len(points_m), 4))
-    heard = np.ones((len(places_m), len(places_m)))
-    fill_lattice(places_m, points_m, budget, walls, sigma_m, rows, heard)
+    share, _ = links(points_m, places_m, budget, walls)
+    heard, _ = links(places_m, places_m, budget, walls)
+    np.fill_diagonal(heard, 1.0)
+    away = points_m - places_m[:, None]
+    unit = away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-3)
+    rows = np.concatenate([np.ones((*share.shape, 1)), unit[..., :dim]], axis=2) * (np.sqrt(share) / sigma_m)[..., None]
+    apart_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
     cap_m = float(np.linalg.norm(np.ptp(np.concatenate([places_m, points_m]), axis=0)))
-    return Lattice(places_m, rows, heard, weights, dim, cap_m)
+    return Lattice(places_m, apart_m, rows, heard, weights, cap_m)
 
 
 @threaded_kernel
-def fill_lattice(
-    places: Matrix, points: Matrix, budget: Vector, walls: Matrix, sigma: float, rows: Rows, heard: Matrix
-) -> None:
-    """Fill the rows of H and the links between the candidates."""
-    for c in range(len(places)):
-        for m in range(len(points)):
-            share, _ = hears(budget, walls, places[c], points[m])
-            distance = 0.0
-            for a in range(3):
-                distance += (points[m, a] - places[c, a]) ** 2
-            weight, distance = math.sqrt(share) / sigma, max(math.sqrt(distance), 1e-3)
-            rows[c, m, 0] = weight
-            for a in range(3):
-                rows[c, m, 1 + a] = weight * (points[m, a] - places[c, a]) / distance
-        for other in range(c):
-            share, _ = hears(budget, walls, places[c], places[other])
-            heard[c, other] = share
-            heard[other, c] = share
-
-
-@threaded_kernel
-def mean_and_worst(
-    chosen: Indices,
-    rows: Rows,
-    heard: Matrix,
-    weights: Vector,
-    dim: int,
-    cap: float,
-    normal: Matrix,
-    inverse: Matrix,
-) -> tuple[float, float]:
+def mean_and_worst(chosen: Indices, lattice: Lattice) -> tuple[float, float]:
     """Mean and largest error over the points for these candidates, the best heard of them being the master."""
+    rows, heard = lattice.rows, lattice.heard
+    size = rows.shape[2]
+    normal, inverse = np.zeros((size, size)), np.zeros((size, size))
     best, master = -1.0, 0
     for i in chosen:
         total = 0.0
@@ -104,74 +81,43 @@ def mean_and_worst(
         normal[:] = 0.0
         for i in chosen:
             factor = min(heard[i, master] / LEAST_HEARD, 1.0)
-            for a in range(dim + 1):
+            for a in range(size):
                 for b in range(a + 1):
                     normal[a, b] += factor * rows[i, m, a] * rows[i, m, b]
-        error = cap
-        if factorise(normal, dim + 1):
-            invert(normal, dim + 1, inverse)
+        error = lattice.cap_m
+        if factorise(normal, size):
+            invert(normal, size, inverse)
             trace = 0.0
-            for a in range(1, dim + 1):
+            for a in range(1, size):
                 trace += inverse[a, a]
-            error = min(math.sqrt(trace), cap)
-        mean += weights[m] * error
+            error = min(math.sqrt(trace), error)
+        mean += lattice.weights[m] * error
         worst = max(worst, error)
     return mean, worst
 
 
-@threaded_kernel
+@kernel
 def relative_score(mean: float, worst: float, mean_reference: float, worst_reference: float) -> float:
     """Mean and worst error against a reference's; dear where either is not clearly smaller."""
     a, b = mean / mean_reference, worst / worst_reference
     return 0.5 * (a + b) + BOTH * (max(a - CLEARLY, 0.0) + max(b - CLEARLY, 0.0))
 
 
-@threaded_kernel
-def exchange(
-    chosen: Indices,
-    fixed: int,
-    places: Matrix,
-    rows: Rows,
-    heard: Matrix,
-    weights: Vector,
-    dim: int,
-    cap: float,
-    reference: tuple[float, float],
-    passes: int,
-) -> float:
+def exchange(chosen: Indices, fixed: int, lattice: Lattice, reference: tuple[float, float], passes: int) -> float:
     """Move one anchor after the other to its best candidate until none moves; the first ``fixed`` stay. The score."""
-    normal, inverse = np.zeros((4, 4)), np.zeros((4, 4))
-    mean, worst = mean_and_worst(chosen, rows, heard, weights, dim, cap, normal, inverse)
-    score = relative_score(mean, worst, reference[0], reference[1])
+    score = relative_score(*mean_and_worst(chosen, lattice), *reference)
     for _ in range(passes):
-        moved = False
+        before = chosen.copy()
         for k in range(fixed, len(chosen)):
-            home = chosen[k]
-            best = home
-            for c in range(len(places)):
-                if c == home or too_close(places, chosen, k, c):
-                    continue
-                chosen[k] = c
-                mean, worst = mean_and_worst(chosen, rows, heard, weights, dim, cap, normal, inverse)
-                trial = relative_score(mean, worst, reference[0], reference[1])
+            best = chosen[k]
+            others = np.delete(chosen, k)
+            free = (lattice.apart_m[:, others] >= CLOSEST_M).all(axis=1)
+            for candidate in np.flatnonzero(free):
+                chosen[k] = candidate
+                trial = relative_score(*mean_and_worst(chosen, lattice), *reference)
                 if trial < score * (1.0 - 1e-9):
-                    score, best = trial, c
+                    score, best = trial, candidate
             chosen[k] = best
-            moved = moved or best != home
-        if not moved:
+        if (chosen == before).all():
             break
     return score
-
-
-@threaded_kernel
-def too_close(places: Matrix, chosen: Indices, moving: int, candidate: int) -> bool:
-    """Whether a candidate lies on another anchor of the choice."""
-    for k in range(len(chosen)):
-        if k == moving:
-            continue
-        squared = 0.0
-        for a in range(3):
-            squared += (places[chosen[k], a] - places[candidate, a]) ** 2
-        if squared < CLOSEST_M * CLOSEST_M:
-            return True
-    return False

@@ -1,13 +1,14 @@
-"""Who hears whom at a site: the simulated channel's own formulas, without its chance."""
+"""Who hears whom at a site, by the simulated channel's own formulas without its chance; and with which geometry."""
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import kernel, threaded_kernel
+from skyless.planning.columns import ANCHORS, GDOP, PDOP, TDOP
 from skyless.simulation.channel import (
     FREE_SPACE_LOSS_1_M_DB,
     ChannelModel,
@@ -16,6 +17,7 @@ from skyless.simulation.channel import (
     received_power_dbm,
 )
 from skyless.site.model import Site
+from skyless.uncertainty.dop import dops_at
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -97,10 +99,54 @@ def hears(budget: Vector, walls: Matrix, a_m: Vector, b_m: Vector) -> tuple[floa
     return (1.0 - budget[3]) * delivery_probability(power_dbm, budget[1], budget[2]), delay_m
 
 
+@threaded_kernel
+def _fill_links(
+    senders_m: Matrix, listeners_m: Matrix, budget: Vector, walls: Matrix, share: Matrix, delay_m: Matrix
+) -> None:
+    for i in range(len(listeners_m)):
+        for j in range(len(senders_m)):
+            share[i, j], delay_m[i, j] = hears(budget, walls, senders_m[j], listeners_m[i])
+
+
+def links(senders_m: Matrix, listeners_m: Matrix, budget: Vector, walls: Matrix) -> tuple[Matrix, Matrix]:
+    """Share of each sender's frames that reach each listener, and their delay in metres; shape (listeners, senders)."""
+    share, delay_m = np.empty((2, len(listeners_m), len(senders_m)))
+    _fill_links(senders_m, listeners_m, budget, walls, share, delay_m)
+    return share, delay_m
+
+
 def anchor_links(anchors_m: Matrix, master: int, budget: Vector, walls: Matrix) -> AnchorLinks:
     """How anchors, shape (anchors, 3), hear the one in row ``master``."""
-    share, delay_m = np.ones(len(anchors_m)), np.zeros(len(anchors_m))
-    for row in range(len(anchors_m)):
-        if row != master:
-            share[row], delay_m[row] = hears(budget, walls, anchors_m[master], anchors_m[row])
-    return AnchorLinks(share, delay_m)
+    share, delay_m = links(anchors_m[master : master + 1], anchors_m, budget, walls)
+    share[master] = 1.0
+    return AnchorLinks(share[:, 0], delay_m[:, 0])
+
+
+class Scene(NamedTuple):
+    """Anchors, and what stands between them and points."""
+
+    anchors: Matrix
+    """Positions, shape (anchors, 3)."""
+    speaks: NDArray[np.bool_]
+    """Those that send at all, shape (anchors,)."""
+    budget: Vector
+    """``link_budget``."""
+    walls: Matrix
+    """``pack_walls``."""
+
+    def heard_at(self, points: Matrix) -> tuple[Matrix, Matrix]:
+        """Share of each anchor's frames that arrives at points, and the walls' delay, metres; shape (m, anchors)."""
+        share, delay_m = links(self.anchors, points, self.budget, self.walls)
+        return share * self.speaks, delay_m
+
+
+def fill_dops(scene: Scene, points: Matrix, share: Matrix, dim: int, table: Matrix) -> None:
+    """Fill the number of anchors in view and the columns of their DOPs."""
+    in_view = share >= IN_VIEW
+    table[:, ANCHORS] = in_view.sum(axis=1)
+    table[:, GDOP : TDOP + 1] = dops_at(scene.anchors, points, height_known=dim == 2, weights=in_view)
+
+
+def weighted_pdop(scene: Scene, points: Matrix, share: Matrix, dim: int) -> Vector:
+    """PDOP with every anchor weighted by its share of frames, so that none comes or goes at once; may be infinite."""
+    return dops_at(scene.anchors, points, height_known=dim == 2, weights=share)[:, PDOP - GDOP]

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from skyless.planning.floor import Floor, along, inside, total_length
-from skyless.planning.links import Vector, anchor_links
+from skyless.planning.links import Vector, links
 from skyless.site.model import AnchorSite, Site
 
 Matrix = NDArray[np.float64]
@@ -64,10 +64,10 @@ def site_with_one_more(site: Site, place_m: Vector) -> Site:
 
 def masters_by_links(places_m: Matrix, budget: Vector, walls: Matrix) -> NDArray[np.int64]:
     """Rows of anchors, those first that all others hear best; equals by their distance from the middle."""
-    shares = [anchor_links(places_m, row, budget, walls).share for row in range(len(places_m))]
-    heard = [float(np.minimum(share, 0.99).sum()) for share in shares]
+    heard, _ = links(places_m, places_m, budget, walls)
+    total = np.round(np.minimum(heard, 0.99).sum(axis=0), 3)
     middle = np.linalg.norm(places_m[:, :2] - places_m[:, :2].mean(axis=0), axis=1)
-    return np.array(sorted(range(len(places_m)), key=lambda row: (-round(heard[row], 3), middle[row])))
+    return np.lexsort((middle, -total))
 
 
 def sample_points(floor: Floor, heights_m: tuple[float, ...], most: int) -> tuple[Matrix, Vector]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import FIX_SHARE, SIGMA
 from skyless.planning.floor import Floor
-from skyless.planning.lattice import CLOSEST_M, Lattice, exchange, lattice_of, mean_and_worst, relative_score
+from skyless.planning.lattice import CLOSEST_M, exchange, lattice_of, mean_and_worst, relative_score
 from skyless.planning.links import link_budget
 from skyless.planning.mounts import (
     Layout,
@@ -41,6 +41,9 @@ REFINED: Final = 4
 """Starts that the method's own prediction improves further, the even layout among them."""
 
 FINEST_M: Final = 0.05
+
+PASSES: Final = 12
+"""Of an exchange on the lattice, at most."""
 
 
 class Scored(Struct, frozen=True):
@@ -108,21 +111,17 @@ class Search:
     # On the lattice
 
     def _lattice_starts(self, even: Layout) -> list[Layout]:
-        mounts, levels = self._mounts, len(self._mounts.heights_m)
-        count = max(MOST_CANDIDATES // levels, 2 * self._anchors)
-        ways, numbers = np.arange(count) * mounts.length_m / count, np.arange(levels)
-        all_ways, all_levels = np.repeat(ways, levels), np.tile(numbers, count)
+        all_ways, all_levels = _candidates(self._mounts, MOST_CANDIDATES, 2 * self._anchors)
         dim = 3 if self._site.tags.height_m is None else 2
         noise_m = sum(stamp_variances(with_noise(self._site, self._settings.noise_ps))) ** 0.5
-        places = mounts.at(all_ways, all_levels)
+        places = self._mounts.at(all_ways, all_levels)
         lattice = lattice_of(places, *self._points, self._budget, self._walls, dim, noise_m)
-        snapped = np.array([_nearest(places, place) for place in mounts.at(even.ways_m, even.levels)])
-        work = np.zeros((4, 4)), np.zeros((4, 4))
-        reference = mean_and_worst(snapped, lattice.rows, lattice.heard, lattice.weights, dim, lattice.cap_m, *work)
+        snapped = np.array([_nearest(places, place) for place in self._mounts.at(even.ways_m, even.levels)])
+        reference = mean_and_worst(snapped, lattice)
         found = []
         for number in range(STARTS):
             chosen = snapped.copy() if number == 0 else self._random.choice(len(places), self._anchors, replace=False)
-            score = _exchange(lattice, chosen, 0, reference)
+            score = exchange(chosen, 0, lattice, reference, PASSES)
             found.append((score, Layout(all_ways[chosen], all_levels[chosen])))
             if self._late():
                 break
@@ -198,13 +197,15 @@ def _against(scored: Scored, even: Scored) -> float:
     return relative_score(scored.mean_sigma_m, scored.worst_sigma_m, even.mean_sigma_m, even.worst_sigma_m)
 
 
+def _candidates(mounts: Mounts, most: int, least: int = 1) -> tuple[Vector, NDArray[np.int64]]:
+    """Ways along the walls and levels of some candidates, evenly spaced at every height."""
+    levels = len(mounts.heights_m)
+    count = max(most // levels, least)
+    return np.repeat(np.arange(count) * mounts.length_m / count, levels), np.tile(np.arange(levels), count)
+
+
 def _nearest(places: Matrix, place: Vector) -> int:
     return int(np.argmin(np.linalg.norm(places - place, axis=1)))
-
-
-def _exchange(lattice: Lattice, chosen: NDArray[np.int64], fixed: int, reference: tuple[float, float]) -> float:
-    rows, heard, weights = lattice.rows, lattice.heard, lattice.weights
-    return exchange(chosen, fixed, lattice.places_m, rows, heard, weights, lattice.dim, lattice.cap_m, reference, 12)
 
 
 class OneMore(Struct, frozen=True):
@@ -226,10 +227,7 @@ def one_more(
     """
     before = Predictor(site, settings)
     points, weights = sample_points(floor, heights_m, SEARCH_POINTS)
-    levels = len(mounts.heights_m)
-    count = MOST_CANDIDATES // 2 // levels
-    ways = np.repeat(np.arange(count) * mounts.length_m / count, levels)
-    free = mounts.at(ways, np.tile(np.arange(levels), count))
+    free = mounts.at(*_candidates(mounts, MOST_CANDIDATES // 2))
     places = np.concatenate([before.anchors_m, free])
     noise_m = sum(stamp_variances(before.site)) ** 0.5
     lattice = lattice_of(places, points, weights, before.budget, before.walls, before.dim, noise_m)
@@ -238,11 +236,7 @@ def one_more(
     if not (gaps >= CLOSEST_M).any():
         return None
     chosen = np.append(np.arange(n), n + int(np.argmax(gaps)))
-    work = np.zeros((4, 4)), np.zeros((4, 4))
-    reference = mean_and_worst(
-        np.arange(n), lattice.rows, lattice.heard, lattice.weights, before.dim, lattice.cap_m, *work
-    )
-    _exchange(lattice, chosen, n, reference)
+    exchange(chosen, n, lattice, mean_and_worst(np.arange(n), lattice), PASSES)
     place = places[chosen[n]]
     after = Predictor(site_with_one_more(site, place), settings)
     (mean_before, worst_before), (mean_after, worst_after) = (

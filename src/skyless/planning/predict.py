@@ -13,16 +13,20 @@ from numpy.typing import NDArray
 
 from skyless.air.rotation import filter_pages_of
 from skyless.air.schedule import schedule_of
-from skyless.compiled import threaded_kernel
 from skyless.methods import DEFAULT_METHOD, FILTERS
-from skyless.planning.anchor_clocks import anchor_clocks
+from skyless.planning.anchor_clocks import anchor_clocks, relays_of
 from skyless.planning.columns import COLUMNS, SIGMA
-from skyless.planning.geometry import Scene, fill_dops, observe, weighted_pdop
 from skyless.planning.joint_sigma import fill_joint_sigma
-from skyless.planning.links import AnchorLinks, anchor_links, anchor_positions, link_budget
-from skyless.planning.relays import relays_of
-from skyless.planning.rounds import rounds_of
-from skyless.planning.snapshot_sigma import fill_snapshot_sigma
+from skyless.planning.links import (
+    AnchorLinks,
+    Scene,
+    anchor_links,
+    anchor_positions,
+    fill_dops,
+    link_budget,
+    weighted_pdop,
+)
+from skyless.planning.snapshot_sigma import fill_snapshot_sigma, rounds_of
 from skyless.positioning.new_method import estimator_settings
 from skyless.positioning.snapshots import SnapshotMethod
 from skyless.simulation.channel import ChannelModel, pack_walls
@@ -62,7 +66,7 @@ class Predictor:
         self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls)
         self.links: AnchorLinks = anchor_links(self.anchors_m, self.master, self.budget, self.walls)
         self.clocks = anchor_clocks(self.site, self.links.share)
-        self._scene = Scene(self.anchors_m, self.clocks.speaks, self.budget, self.walls)
+        self.scene = Scene(self.anchors_m, self.clocks.speaks, self.budget, self.walls)
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
         if settings.method in FILTERS:
             self._fill = self._joint()
@@ -73,26 +77,9 @@ class Predictor:
 
     def _snapshots(self, method: SnapshotMethod) -> Fill:
         rounds = rounds_of(self.site, method)
-        n = len(self.anchors_m)
-        in_step = np.where(rounds.usable & self.clocks.speaks, self.links.share**2, 0.0)
-        in_step[self.master] = 1.0
         weighted = method in {SnapshotMethod.WEIGHTED, SnapshotMethod.BRACKETED}
-        weights = 1.0 / rounds.assumed_own if weighted else np.ones(n)
         return lambda points, table: fill_snapshot_sigma(
-            points,
-            self.dim,
-            self._scene,
-            self.master,
-            in_step,
-            self.links.delay_m,
-            weights,
-            rounds.assumed_common if weighted else 0.0,
-            rounds.assumed_own,
-            np.full((n, 1), rounds.assumed_common**0.5),
-            rounds.true_own,
-            rounds.common,
-            self.farthest_m,
-            table,
+            points, self.dim, self.scene, self.master, self.links, rounds, weighted, self.farthest_m, table
         )
 
     def _joint(self) -> Fill:
@@ -102,13 +89,7 @@ class Predictor:
         )
         relays = relays_of(self.anchors_m, self.master, self.clocks, self.budget, self.walls)
         return lambda points, table: fill_joint_sigma(
-            points,
-            settings,
-            self._scene,
-            self.clocks,
-            relays,
-            self.farthest_m,
-            table,
+            points, settings, self.scene, self.clocks, relays, self.farthest_m, table
         )
 
     def at(self, points_m: Matrix, progress: Callable[[float], None] | None = None) -> Matrix:
@@ -117,19 +98,12 @@ class Predictor:
 
     def geometry_at(self, points_m: Matrix) -> Matrix:
         """The same table with anchors in view and DOPs only; in the place of ``sigma_m`` the weighted PDOP."""
-        fill = partial(_fill_geometry, self.dim, self._scene)
-        return in_threads(fill, np.ascontiguousarray(points_m, np.float64), CHUNK)
+        return in_threads(self._geometry, np.ascontiguousarray(points_m, np.float64), CHUNK)
 
-
-@threaded_kernel
-def _fill_geometry(dim: int, scene: Scene, points: Matrix, table: Matrix) -> None:
-    n = len(scene.anchors)
-    share, sight, seen = np.zeros(n), np.zeros((n, 4)), np.zeros((n, 3))
-    normal, inverse = np.zeros((4, 4)), np.zeros((4, 4))
-    for m in range(len(points)):
-        observe(scene, points[m], share, sight)
-        fill_dops(scene.anchors, share, points[m], dim, seen, normal, inverse, table[m])
-        table[m, SIGMA] = weighted_pdop(share, sight, dim, normal, inverse)
+    def _geometry(self, points: Matrix, table: Matrix) -> None:
+        share, _ = self.scene.heard_at(points)
+        fill_dops(self.scene, points, share, self.dim, table)
+        table[:, SIGMA] = weighted_pdop(self.scene, points, share, self.dim)
 
 
 def with_noise(site: Site, noise_ps: float | None) -> Site:

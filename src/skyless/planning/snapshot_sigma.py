@@ -2,29 +2,36 @@
 
 Where frames arrive only at times, fixes come from changing sets of anchors: the sets that the most doubtful anchors
 make are gone through one by one, each with its probability; other anchors count by whether they mostly take part.
+
+To the stamps' noise of ``uncertainty/tdoa.py`` comes what the crystals do between the stamps, which counts in long
+superframes: a TDoA with its pair at κ and κ + 1 rounds holds (1 + κ)·x(κ) − κ·x(κ + 1) − x(0) of a clock's phase x, and
+the anchor's own clock enters with the same weights. For the delayed messages and the bracketed form, which refer to
+the second message, it is (1 − κ)·x(κ + 1) + κ·x(κ) − x(1).
 """
 
-import math
+from collections.abc import Iterator
+from itertools import product
 from typing import Final
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel, threaded_kernel
-from skyless.planning.columns import (
-    BIAS,
-    CLAIMED,
-    FIX_SHARE,
-    RMSE,
-    SIGMA,
-    SIGMA_X,
-    SIGMA_Z,
-)
-from skyless.planning.geometry import Scene, fill_dops, observe
-from skyless.uncertainty.cholesky import factorise, invert
+from skyless.air.schedule import first_slots, schedule_of
+from skyless.clocks.filter import ClockNoise, clock_noise
+from skyless.constants import TICK_S
+from skyless.planning.anchor_clocks import stamp_variances
+from skyless.planning.columns import FIX_SHARE, SIGMA, fill_errors
+from skyless.planning.links import AnchorLinks, Scene, fill_dops
+from skyless.positioning.snapshots import SnapshotMethod
+from skyless.site.model import Site
+from skyless.uncertainty.normal import inverse_of
+from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 MOST_DOUBTFUL: Final = 4
 """Anchors whose coming and going is followed exactly."""
@@ -32,191 +39,175 @@ MOST_DOUBTFUL: Final = 4
 DOUBT: Final = 0.01
 """An anchor is sure to take part, or not to, beyond this."""
 
+_KEPT: Final = 1e-3
+"""Part of the largest eigenvalue below which a common error is left out."""
 
-@kernel
-def gains(
-    sight: Matrix,
-    chosen: NDArray[np.int64],
-    count: int,
-    dim: int,
-    master: int,
-    weights: Vector,
-    common: float,
-    normal: Matrix,
-    inverse: Matrix,
-    gain: Matrix,
-) -> bool:
-    """Fill ``gain`` (count, dim) with G of the least squares over the chosen anchors' TDoAs; False where singular.
 
-    The weight matrix is that of variances 1/weights and ``common`` in all (Sherman-Morrison).
+class Rounds(Struct, frozen=True):
+    """Errors of the TDoAs of a site's anchors (the master's row is not used), in the order of its file."""
+
+    usable: NDArray[np.bool_]
+    """Whether the anchor sends after the master within a round, as the snapshot methods need; shape (n,)."""
+    assumed_own: Vector
+    """Variance of each TDoA that the method assumes, beyond the common part; m², shape (n,)."""
+    assumed_common: float
+    true_own: Vector
+    """The same with the crystals' part."""
+    common: Matrix
+    """Errors that several TDoAs share: their covariance is common·commonᵀ; shape (n, k), metres."""
+
+
+def rounds_of(site: Site, method: SnapshotMethod) -> Rounds:
+    """What the snapshot methods meet at a site whose noise figures hold."""
+    noise = site.noise
+    tx_var, rx_var = stamp_variances(site)
+    kappa, round_s = delays(site)
+    first = method in {SnapshotMethod.LITERAL, SnapshotMethod.WEIGHTED}
+    covariance_of = literal_covariance if first else bracketed_covariance
+    covariance = covariance_of(kappa, tx_var, rx_var)
+    own = covariance.diagonal() - rx_var
+    clock = phase_covariance(
+        np.maximum(kappa, 0.0), round_s, clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1), first=first
+    )
+    return Rounds(
+        usable=kappa > 0.0,
+        assumed_own=own,
+        assumed_common=rx_var,
+        true_own=own + clock.diagonal(),
+        common=_factors(clock + rx_var),
+    )
+
+
+def delays(site: Site) -> tuple[Vector, float]:
+    """κ of each anchor, shape (n,), negative where it sends before the master; and the round's length in s."""
+    schedule = schedule_of(site)
+    first = first_slots(site)
+    spacing = schedule.slots // schedule.frames_per_node
+    slots = np.array([first[anchor.id] % spacing for anchor in site.anchors])
+    master = slots[[anchor.id for anchor in site.anchors].index(site.master)]
+    return (slots - master) / spacing, spacing * schedule.slot_ticks * TICK_S
+
+
+def phase_covariance(kappa: Vector, round_s: float, noise: ClockNoise, *, first: bool) -> Matrix:
+    """Covariance, m², of what one clock's noise does to TDoAs with these κ; shape (n, n)."""
+    reference = 0.0 if first else 1.0
+    near, far = (1.0 + kappa, -kappa) if first else (kappa, 1.0 - kappa)
+    times = np.array([kappa, kappa + 1.0, np.full_like(kappa, reference)]) * round_s
+    weights = np.array([near, far, -np.ones_like(kappa)])
+    total: Matrix = np.zeros((len(kappa), len(kappa)))
+    for a in range(3):
+        for b in range(3):
+            total += np.outer(weights[a], weights[b]) * _phase(times[a][:, None], times[b][None, :], noise)
+    return total
+
+
+def _phase(s: Matrix, t: Matrix, noise: ClockNoise) -> Matrix:
+    """Covariance of the phase of a clock at two times after an instant at which phase and rate are exact."""
+    low, high = np.maximum(np.minimum(s, t), 0.0), np.maximum(s, t)
+    covariance: Matrix = noise.white * low + noise.walk * low * low * (3.0 * high - low) / 6.0
+    return covariance
+
+
+def _factors(covariance: Matrix) -> Matrix:
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > _KEPT * values[-1]
+    factors: Matrix = np.ascontiguousarray(vectors[:, kept] * np.sqrt(values[kept]))
+    return factors
+
+
+def gains(towards: Array, weights: Matrix, common: float) -> Array:
+    """G of the least squares over TDoAs, shape (m, n, dim); infinite where singular.
+
+    ``towards``: rows of H, shape (m, n, dim). The weight matrix is that of variances 1/weights, shape (m, n), and
+    ``common`` in all (Sherman-Morrison).
     """
-    total = 0.0
-    mean = gain[count]
-    for a in range(dim):
-        mean[a] = 0.0
-        for b in range(dim):
-            normal[a, b] = 0.0
-    for k in range(count):
-        i = chosen[k]
-        total += weights[i]
-        for a in range(dim):
-            h = sight[i, a] - sight[master, a]
-            mean[a] += weights[i] * h
-            for b in range(a + 1):
-                normal[a, b] += weights[i] * h * (sight[i, b] - sight[master, b])
-    share = common / (1.0 + common * total)
-    for a in range(dim):
-        for b in range(a + 1):
-            normal[a, b] -= share * mean[a] * mean[b]
-    if not factorise(normal, dim):
-        return False
-    invert(normal, dim, inverse)
-    for k in range(count):
-        i = chosen[k]
-        for a in range(dim):
-            value = 0.0
-            for b in range(dim):
-                h = weights[i] * (sight[i, b] - sight[master, b] - share * mean[b])
-                value += inverse[a, b] * h
-            gain[k, a] = value
-    return True
+    weighted = weights[..., None] * towards
+    mean = weighted.sum(axis=1)
+    share = common / (1.0 + common * weights.sum(axis=1))[:, None, None]
+    normal = towards.transpose(0, 2, 1) @ weighted - share * (mean[:, :, None] * mean[:, None])
+    inverse = inverse_of(normal)
+    singular = np.isinf(inverse)
+    gain: Array = (weighted - share * (weights[..., None] * mean[:, None])) @ np.where(singular, 0.0, inverse)
+    gain[singular[:, 0, 0]] = np.inf
+    return gain
 
 
-@kernel
-def propagate(
-    gain: Matrix,
-    chosen: NDArray[np.int64],
-    count: int,
-    dim: int,
-    own: Vector,
-    common: Matrix,
-    variances: Vector,
-) -> None:
-    """Write the diagonal of G·(diag(own) + common·commonᵀ)·Gᵀ into ``variances``."""
-    for a in range(dim):
-        variances[a] = 0.0
-        for k in range(count):
-            variances[a] += own[chosen[k]] * gain[k, a] * gain[k, a]
-        for column in range(common.shape[1]):
-            total = 0.0
-            for k in range(count):
-                total += gain[k, a] * common[chosen[k], column]
-            variances[a] += total * total
+def variances(gain: Array, own: Matrix, common: Array) -> Matrix:
+    """The diagonal of G·(diag(own) + common·commonᵀ)·Gᵀ, shape (m, dim); shapes (m, n) and (m, n, k)."""
+    together = gain.transpose(0, 2, 1) @ common
+    found: Matrix = np.einsum("mna,mna,mn->ma", gain, gain, own) + (together * together).sum(axis=2)
+    return found
 
 
-@kernel
-def sort_doubtful(part: Vector, master: int, doubtful: NDArray[np.int64], chosen: NDArray[np.int64]) -> tuple[int, int]:
-    """Split anchors by their part in the rounds: the most doubtful, and those that count as always there."""
-    doubts = 0
-    for i in range(len(part)):
-        if i == master or not DOUBT < part[i] < 1.0 - DOUBT:
-            continue
-        place = min(doubts, MOST_DOUBTFUL)
-        while place > 0 and abs(part[i] - 0.5) < abs(part[doubtful[place - 1]] - 0.5):
-            doubtful[place] = doubtful[place - 1]
-            place -= 1
-        doubtful[place] = i
-        doubts = min(doubts + 1, MOST_DOUBTFUL)
-    sure = 0
-    for i in range(len(part)):
-        if i == master or part[i] < 0.5:
-            continue
-        listed = False
-        for k in range(doubts):
-            listed = listed or doubtful[k] == i
-        if not listed:
-            chosen[sure] = i
-            sure += 1
-    return doubts, sure
+def anchor_sets(part: Matrix) -> Iterator[tuple[Vector, Mask]]:
+    """Sets of anchors from which points' fixes come: their probabilities, shape (m,), and masks, shape (m, n).
+
+    ``part``: each anchor's part in the rounds, shape (m, n).
+    """
+    doubt = (part > DOUBT) & (part < 1.0 - DOUBT)
+    order = np.argsort(np.where(doubt, np.abs(part - 0.5), np.inf), axis=1, kind="stable")[:, :MOST_DOUBTFUL]
+    order = order[:, np.take_along_axis(doubt, order, axis=1).any(axis=0)]
+    doubtful, there = np.take_along_axis(doubt, order, axis=1), np.take_along_axis(part, order, axis=1)
+    usual = part >= 0.5
+    usual_here = np.take_along_axis(usual, order, axis=1)
+    for present in product((False, True), repeat=order.shape[1]):
+        chances = np.where(doubtful, np.where(present, there, 1.0 - there), np.logical_not(present))
+        np.put_along_axis(usual, order, np.where(doubtful, present, usual_here), axis=1)
+        yield chances.prod(axis=1), usual
 
 
-@threaded_kernel
 def fill_snapshot_sigma(
     points: Matrix,
     dim: int,
     scene: Scene,
     master: int,
-    in_step: Vector,
-    sync_delay: Vector,
-    weights: Vector,
-    weighing_common: float,
-    assumed_own: Vector,
-    assumed_common: Matrix,
-    true_own: Vector,
-    common: Matrix,
-    farthest: float,
+    links: AnchorLinks,
+    rounds: Rounds,
+    weighted: bool,
+    farthest_m: float,
     table: Matrix,
 ) -> None:
     """Fill ``table`` (points, columns) for the points, shape (m, 3).
 
-    ``in_step``: share of the rounds in which an anchor can be used at all; ``sync_delay``: by how much its time lags.
-    Sets of anchors whose error would exceed ``farthest`` metres give no fix.
+    Sets of anchors whose error would exceed ``farthest_m`` give no fix.
     """
-    n = len(scene.anchors)
-    share, part, sight = np.zeros(n), np.zeros(n), np.zeros((n, 4))
-    seen, gain = np.zeros((n, 3)), np.zeros((n + 1, 3))
-    normal, inverse = np.zeros((4, 4)), np.zeros((4, 4))
-    variances, total, claimed = np.zeros(3), np.zeros(3), 0.0
-    bias = np.zeros(3)
-    chosen, doubtful = np.zeros(n, np.int64), np.zeros(MOST_DOUBTFUL + 1, np.int64)
-    for m in range(len(points)):
-        row = table[m]
-        observe(scene, points[m], share, sight)
-        fill_dops(scene.anchors, share, points[m], dim, seen, normal, inverse, row)
-        for i in range(n):
-            part[i] = share[i] * share[i] * in_step[i]
-        doubts, sure = sort_doubtful(part, master, doubtful, chosen)
-        total[:] = 0.0
-        bias[:] = 0.0
-        fixes, claimed = 0.0, 0.0
-        for number in range(1 << doubts):
-            probability, count = 1.0, sure
-            for k in range(doubts):
-                i = doubtful[k]
-                if number >> k & 1:
-                    probability *= part[i]
-                    chosen[count] = i
-                    count += 1
-                else:
-                    probability *= 1.0 - part[i]
-            if count < dim or not gains(
-                sight, chosen, count, dim, master, weights, weighing_common, normal, inverse, gain
-            ):
-                continue
-            propagate(gain, chosen, count, dim, assumed_own, assumed_common, variances)
-            said = 0.0
-            for a in range(dim):
-                said += variances[a]
-            if not said < farthest * farthest:
-                continue
-            propagate(gain, chosen, count, dim, true_own, common, variances)
-            fixes += probability
-            claimed += probability * said
-            for a in range(dim):
-                shift = 0.0
-                for k in range(count):
-                    i = chosen[k]
-                    shift += gain[k, a] * (sight[i, 3] - sight[master, 3] + sync_delay[i])
-                bias[a] += probability * shift
-                total[a] += probability * (variances[a] + shift * shift)
-        row[SIGMA:] = math.inf
-        row[FIX_SHARE] = fixes * part[master]
-        if row[FIX_SHARE] >= DOUBT:
-            _finish(row, total, bias, dim, fixes, claimed)
+    share, delay_m = scene.heard_at(points)
+    fill_dops(scene, points, share, dim, table)
+    part = share * share * np.where(rounds.usable & scene.speaks, links.share**2, 0.0)
+    part[:, master] = 0.0
+    # of each point only the anchors that take part, in the order of how much
+    some = np.argsort(-part, axis=1, kind="stable")[:, : int((part > DOUBT).sum(axis=1).max())]
+    part = np.take_along_axis(part, some, axis=1)
+    towards = (_directions(scene.anchors[some], points) - _directions(scene.anchors[master], points))[..., :dim]
+    late_m = np.take_along_axis(delay_m, some, axis=1) - delay_m[:, master, None] + links.delay_m[some]
+    assumed, true, common = rounds.assumed_own[some], rounds.true_own[some], rounds.common[some]
+    assumed_common = np.full((*some.shape, 1), rounds.assumed_common**0.5)
+    weights = 1.0 / assumed if weighted else np.ones(some.shape)
+    fixes, claimed = np.zeros((2, len(points)))
+    total, bias = np.zeros((2, len(points), 3))
+    for probability, chosen in anchor_sets(part):
+        rows = np.flatnonzero((probability > 0.0) & (chosen.sum(axis=1) >= dim))
+        gain = gains(towards[rows], chosen[rows] * weights[rows], rounds.assumed_common if weighted else 0.0)
+        with np.errstate(invalid="ignore"):
+            said = variances(gain, assumed[rows], assumed_common[rows]).sum(axis=1)
+        good = said < farthest_m**2
+        rows, gain = rows[good], gain[good]
+        chance = probability[rows]
+        shift = np.einsum("mna,mn->ma", gain, late_m[rows])
+        fixes[rows] += chance
+        claimed[rows] += chance * said[good]
+        bias[rows, :dim] += chance[:, None] * shift
+        total[rows, :dim] += chance[:, None] * (variances(gain, true[rows], common[rows]) + shift * shift)
+    table[:, SIGMA:] = np.inf
+    table[:, FIX_SHARE] = fixes * share[:, master] ** 2
+    known = np.flatnonzero(table[:, FIX_SHARE] >= DOUBT)
+    shift = bias[known] / fixes[known, None]
+    variance = np.maximum(total[known] / fixes[known, None] - shift * shift, 0.0)
+    fill_errors(table, known, variance, (shift * shift).sum(axis=1), claimed[known] / fixes[known])
 
 
-@kernel
-def _finish(row: Vector, total: Vector, bias: Vector, dim: int, fixes: float, claimed: float) -> None:
-    """Turn sums over the sets of anchors into the columns."""
-    squares, shifts = 0.0, 0.0
-    row[SIGMA_Z] = 0.0
-    for a in range(dim):
-        shift = bias[a] / fixes
-        variance = max(total[a] / fixes - shift * shift, 0.0)
-        row[SIGMA_X + a] = math.sqrt(variance)
-        squares += variance
-        shifts += shift * shift
-    row[SIGMA] = math.sqrt(squares)
-    row[BIAS] = math.sqrt(shifts)
-    row[RMSE] = math.sqrt(squares + shifts)
-    row[CLAIMED] = math.sqrt(claimed / fixes)
+def _directions(anchors: Array, points: Matrix) -> Array:
+    """Unit vectors from anchors, shape (m, n, 3) or (3,), to points, shape (m, 3)."""
+    away = points[:, None] - anchors
+    unit: Array = away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-6)
+    return unit

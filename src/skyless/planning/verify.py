@@ -139,7 +139,8 @@ def verify(
                     batches[judged.tag].add(batch, judged.error_m)
             if progress is not None:
                 progress((world + now_s / end_s) / worlds)
-    per_round = len(predictor.clocks.sender) if settings.method in FILTERS else _frames(predictor)
+    # filters give a fix for every message, snapshots one for each frame of a node
+    per_round = len(predictor.clocks.sender) if settings.method in FILTERS else site.schedule.frames_per_node
     possible, rows = worlds * rounds * per_round, predictor.at(points_m)
     checks = [
         _check(point, row, batch, possible, has_range_errors=worlds > 1)
@@ -157,11 +158,6 @@ def _room(accuracy: AccuracySite, world: int) -> Room:
         correlation_s=accuracy.place_time_s,
     )
     return Room(axis_std_m=accuracy.survey_std_m, ranges=ranges)
-
-
-def _frames(predictor: Predictor) -> int:
-    """Snapshot methods give a fix in every round, of which a superframe has one for each frame of a node."""
-    return predictor.site.schedule.frames_per_node
 
 
 def _check(point: Matrix, row: Matrix, batch: _Batches, possible: int, *, has_range_errors: bool) -> PointCheck:

@@ -38,11 +38,6 @@ class AnchorFlights:
         self._ranging.hear(a, b, tx_a, rx_b)
         return self._ranging.flight_ticks(a, b)
 
-    def ticks(self, a: int, b: int) -> float | None:
-        """The flight between two anchors as far as it is known."""
-        median = self._told.get((a, b) if a < b else (b, a))
-        return median.value if median is not None else self._ranging.flight_ticks(a, b)
-
     def forget(self, anchor: int) -> None:
         """Drop the open exchanges of an anchor whose clock restarted; its flights stay."""
         self._ranging.forget(anchor)

@@ -1,16 +1,18 @@
-"""Where a tag is by a window of time differences of pairs, without a guess, and past one anchor that is wrong."""
+"""Where a tag is by a window of time differences of pairs, without a guess, and past one anchor that is wrong.
+
+The differences of arbitrary pairs, as systems without a master give them, are first brought against one reference.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from skyless.air.packet import PairTdoa
 from skyless.positioning.difference_calibration import DifferenceCalibration
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.pairs import against_reference
 from skyless.positioning.solver import NoSolution, Solution, locate
 
 NEIGHBOURHOOD: Final = 1.5
@@ -106,3 +108,65 @@ def _solve(
         return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
     anchors_m = np.array([places_m[anchor] for anchor in joined.anchors])
     return locate(anchors_m, joined.tdoa_m, joined.covariance_m2, height_m=height_m, z_bounds_m=z_bounds_m)
+
+
+class ReferencedTdoas(Struct, frozen=True, gc=False):
+    """What ``locate`` wants, from measurements of pairs; empty where there are none."""
+
+    anchors: tuple[int, ...]
+    """Identifiers of the anchors that are connected, the reference first: n + 1, or none."""
+    tdoa_m: NDArray[np.float64]
+    """|p − anchor i + 1| − |p − reference|, shape (n,)."""
+    covariance_m2: NDArray[np.float64]
+    """Shape (n, n)."""
+
+
+def against_reference(pairs: Sequence[tuple[int, int]], tdoa_m: ArrayLike, variances_m2: ArrayLike) -> ReferencedTdoas:
+    """Best linear estimate of all TDoAs against one anchor from measurements ``|p − b| − |p − a|`` of pairs (a, b).
+
+    ``tdoa_m`` and ``variances_m2``: shape (m,), errors independent. A pair may be measured more than once, in
+    either direction. Of a graph in several parts the largest is taken, of equally large ones that with the most
+    information. The anchor of most information serves as the reference (with the full covariance the choice does not
+    change a position). Pairs of one anchor with itself, values that are not finite and variances that are not positive
+    are left out.
+    """
+    measured, variances = np.array(tdoa_m, np.float64), np.array(variances_m2, np.float64)
+    if not (len(pairs),) == measured.shape == variances.shape:
+        raise ValueError(f"{len(pairs)} pairs, TDoAs {measured.shape}, variances {variances.shape}: expected one each")
+    usable = np.isfinite(measured) & np.isfinite(variances) & (variances > 0.0)
+    kept = [i for i, (a, b) in enumerate(pairs) if a != b and usable[i]]
+    information: dict[int, float] = {}
+    for i in kept:
+        for anchor in pairs[i]:
+            information[anchor] = information.get(anchor, 0.0) + float(1.0 / variances[i])
+    part = _largest_part([pairs[i] for i in kept], information)
+    if not part:
+        return ReferencedTdoas((), np.empty(0), np.empty((0, 0)))
+    reference = max(sorted(part), key=information.__getitem__)
+    anchors = (reference, *sorted(part - {reference}))
+    row = {anchor: i for i, anchor in enumerate(anchors)}
+    edges = [i for i in kept if pairs[i][0] in part]
+    sigma = np.sqrt(variances[edges])
+    H = np.zeros((len(edges), len(anchors)))
+    for k, i in enumerate(edges):
+        H[k, row[pairs[i][0]]], H[k, row[pairs[i][1]]] = -1.0 / sigma[k], 1.0 / sigma[k]
+    H = H[:, 1:]
+    covariance = np.linalg.inv(H.T @ H)
+    tdoa = covariance @ (H.T @ (measured[edges] / sigma))
+    return ReferencedTdoas(anchors, tdoa, 0.5 * (covariance + covariance.T))
+
+
+def _largest_part(pairs: Sequence[tuple[int, int]], information: dict[int, float]) -> set[int]:
+    """The connected part with most anchors, then with most information, then with the smallest identifier."""
+    part_of = {anchor: {anchor} for anchor in information}
+    for a, b in pairs:
+        joined, other = part_of[a], part_of[b]
+        if joined is not other:
+            joined |= other
+            for anchor in other:
+                part_of[anchor] = joined
+    return max(
+        part_of.values(),
+        key=lambda part: (len(part), sum(sorted(information[anchor] for anchor in part)), -min(part)),
+        default=set(),
+    )

@@ -110,10 +110,6 @@ class PairEngine:
                 tdoas.append(PairTdoa(time_s, relay.anchor, packet.anchor, tdoa_m))
         return tdoas
 
-    def flight_ticks(self, a: int, b: int) -> float | None:
-        """Time of flight between two anchors as far as it was told or measured, antenna delays included."""
-        return self._flights.ticks(a, b)
-
     def _follow(self, sender: _Anchor, packet: Packet, rx_ticks: int) -> bool:
         """Advance the sender's clock; False for a packet that cannot be used."""
         known = sender.packets.get(packet.sequence)

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from skyless.positioning.alert import Alert
 
 RISK: Final = 1e-4
-FALSE_ALARM: Final = 1e-6
-"""Of each anchor's test in each fix."""
 
 MARGIN: Final = 1.05
 """On all standard deviations, for errors that are not quite Gaussian and figures that are not quite the filter's."""
@@ -79,15 +77,12 @@ def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert
     return Integrity(hpl_m, vpl_m, risk, Alert.LIMIT if exceeded else _ALERTS[state])
 
 
-def limits_of(risk: float = RISK, false_alarm: float = FALSE_ALARM) -> NDArray[np.float64]:
-    """What the kernels compare with, for an integrity risk and a probability of false alarm, both of a fix.
+def limits_of(risk: float = RISK) -> NDArray[np.float64]:
+    """Multiples of the standard deviation, horizontal and vertical, that errors exceed with this risk, in a fix.
 
     Raises:
-        ValueError: a probability is not between 0 and 0.1.
+        ValueError: the probability is not between 0 and 0.1.
     """
-    for name, value in (("risk", risk), ("false_alarm", false_alarm)):
-        if not 0.0 < value <= 0.1:
-            raise ValueError(f"{name} is {value!r}; it should be above 0 and at most 0.1")
-    horizontal = np.sqrt(-2.0 * np.log(risk))
-    vertical = -NormalDist().inv_cdf(risk / 2.0)
-    return np.array([MARGIN * horizontal, MARGIN * vertical, -NormalDist().inv_cdf(false_alarm / 2.0)])
+    if not 0.0 < risk <= 0.1:
+        raise ValueError(f"risk is {risk!r}; it should be above 0 and at most 0.1")
+    return MARGIN * np.array([np.sqrt(-2.0 * np.log(risk)), -NormalDist().inv_cdf(risk / 2.0)])

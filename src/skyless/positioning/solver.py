@@ -8,12 +8,18 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
-from skyless.positioning.closed_form import PLANE
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.least_squares import EXHAUSTED
-from skyless.positioning.minima import Minimum, below_plane, distinct, find_minima, unfold
-from skyless.positioning.problem import Problem, frame
-from skyless.uncertainty.cholesky import factorise
+from skyless.positioning.minima import (
+    EXHAUSTED,
+    PLANE,
+    Minimum,
+    Problem,
+    below_plane,
+    distinct,
+    find_minima,
+    frame,
+    unfold,
+)
 
 Array = NDArray[np.float64]
 
@@ -27,6 +33,8 @@ IMPOSSIBLE_SIGMAS: Final = 6.0
 """A TDoA that exceeds its anchors' distance by these sigmas belongs to no position."""
 LARGEST: Final = 1e9
 """Metres (or m²); anything beyond is no site, and no number here overflows before it."""
+SINGULAR: Final = 1e-12
+"""A pivot of Cholesky's below this part of its diagonal element is rounding noise."""
 
 
 class Solution(Struct, frozen=True, gc=False):
@@ -193,15 +201,25 @@ def _prepare(
     sensible = all(np.abs(values).max() < LARGEST for values in (anchors, tdoa, covariance))
     if not (sensible and abs(height_m or 0.0) < LARGEST):
         return NoSolution(NoFixReason.BAD_GEOMETRY, "a coordinate or a measurement is not a sensible number")
-    factor = covariance.copy()
-    if not factorise(factor, count):
+    whitener = _whitener(covariance)
+    if whitener is None:
         return NoSolution(NoFixReason.BAD_GEOMETRY, "the TDoAs' covariance is not positive definite")
     origin = anchors[0].copy()
     height = None if height_m is None else height_m - float(origin[2])
     kind, local, extent, axes = frame(anchors - origin, height, math.sqrt(covariance.diagonal().min()))
     if not extent > 0.0:
         return NoSolution(NoFixReason.BAD_GEOMETRY, "the anchors are in one line or in one point")
-    return Problem(kind, local, tdoa, covariance, factor, weighted, extent, height or 0.0, origin, axes)
+    return Problem(kind, local, tdoa, covariance, whitener, weighted, extent, height or 0.0, origin, axes)
+
+
+def _whitener(covariance: Array) -> Array | None:
+    """W with W·Σ·Wᵀ = 1; None where Σ is not positive definite, to rounding."""
+    try:
+        factor = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return None
+    sound = (factor.diagonal() ** 2 > SINGULAR * covariance.diagonal()).all()
+    return np.linalg.inv(factor) if sound else None
 
 
 def _why_none(problem: Problem, status: int) -> NoSolution:

@@ -101,36 +101,6 @@ def tracking_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSetti
     return bound
 
 
-def snapshot_bound(
-    anchors_m: ArrayLike,
-    position_m: ArrayLike,
-    stamp_s: float,
-    *,
-    slot_s: float,
-    superframes: int = 2,
-    mesh: bool = False,
-    height_known: bool = True,
-) -> Array:
-    """Bound of a tag at rest from all raw stamps of ``superframes``, shape (dims, dims), in m².
-
-    Two are what a snapshot of the paper takes. All clocks are unknown, straight lines; nothing is known of them before.
-    """
-    settings = bound_settings(
-        stamp_s,
-        white_fm=0.0,
-        random_walk_fm=0.0,
-        qa=0.0,
-        slot_s=slot_s,
-        speed_std_mps=0.0,
-        mesh=mesh,
-        height_known=height_known,
-    )
-    frames = superframes * len(np.asarray(anchors_m))
-    path = np.tile(np.asarray(position_m, np.float64), (frames, 1))
-    bound: Array = tracking_bound(anchors_m, path, settings)[-1]
-    return bound
-
-
 def kernel_settings(settings: BoundSettings) -> Array:
     """The settings as the kernels take them."""
     noise = (settings.qa, settings.white, settings.walk, settings.tx_variance_m2, settings.rx_variance_m2)

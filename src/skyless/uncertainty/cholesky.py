@@ -39,17 +39,6 @@ def factorise(matrix: NDArray[np.float64], size: int) -> bool:
 
 
 @kernel
-def whiten(factor: NDArray[np.float64], size: int, rows: NDArray[np.float64], columns: int) -> None:
-    """Replace ``rows`` (``size``, at least ``columns``) by L⁻¹·rows, for L from ``factorise``."""
-    for i in range(size):
-        for j in range(columns):
-            total = rows[i, j]
-            for k in range(i):
-                total -= factor[i, k] * rows[k, j]
-            rows[i, j] = total / factor[i, i]
-
-
-@kernel
 def solve(factor: NDArray[np.float64], size: int, vector: NDArray[np.float64]) -> None:
     """Replace ``vector`` by (L·Lᵀ)⁻¹·vector."""
     for i in range(size):

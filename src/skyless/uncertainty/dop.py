@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
-from skyless.compiled import kernel
+from skyless.compiled import kernel, threaded_kernel
 from skyless.uncertainty.cholesky import factorise, invert
 
 
@@ -33,73 +33,51 @@ def dilution_of_precision(anchors_m: ArrayLike, position_m: ArrayLike, *, height
     return Dops(*dops_at(anchors_m, np.asarray(position_m, np.float64)[None], height_known=height_known)[0].tolist())
 
 
-def dops_at(anchors_m: ArrayLike, positions_m: ArrayLike, *, height_known: bool) -> NDArray[np.float64]:
-    """DOPs at many positions, shape (m, 3): an array (m, 5) with columns in the order of ``Dops``."""
+def dops_at(
+    anchors_m: ArrayLike, positions_m: ArrayLike, *, height_known: bool, weights: ArrayLike = 1.0
+) -> NDArray[np.float64]:
+    """DOPs at many positions, shape (m, 3): an array (m, 5) with columns in the order of ``Dops``.
+
+    ``weights``: how much each anchor counts at each position, shape (m, n); zero leaves it out.
+    """
     anchors = np.array(anchors_m, np.float64).reshape(-1, 3)
     positions = np.array(positions_m, np.float64).reshape(-1, 3)
+    counts = np.broadcast_to(np.asarray(weights, np.float64), (len(positions), len(anchors)))
     dops = np.full((len(positions), 5), math.inf)
-    if np.isfinite(anchors).all():
-        _fill_dops(anchors, positions, height_known, np.empty((4, 4)), np.empty((4, 4)), dops)
+    _fill_dops(anchors, positions, np.ascontiguousarray(counts), 3 if height_known else 4, dops)
     return dops
 
 
-@kernel
+@threaded_kernel
 def _fill_dops(
     anchors: NDArray[np.float64],
     positions: NDArray[np.float64],
-    height_known: bool,
-    normal: NDArray[np.float64],
-    inverse: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    size: int,
     dops: NDArray[np.float64],
 ) -> None:
-    size = 3 if height_known else 4
+    """From HᵀWH of rows [1, unit vector], where it is not singular and all anchors that count have a direction.
+
+    The clock comes first, so that a factorisation removes the mean direction before anything else.
+    """
+    normal, inverse, row = np.empty((4, 4)), np.zeros((4, 4)), np.ones(4)
     for k in range(len(positions)):
-        if not (geometry_matrix(anchors, positions[k], normal) and factorise(normal, size)):
+        normal[:] = 0.0
+        for i in range(len(anchors)):
+            if weights[k, i] > 0.0:
+                row[1], row[2], row[3] = direction(anchors, i, positions[k])
+                for p in range(size):
+                    for q in range(p + 1):
+                        normal[p, q] += weights[k, i] * row[p] * row[q]
+        if not factorise(normal, size):
             continue
         invert(normal, size, inverse)
-        clock = inverse[0, 0]
-        horizontal = inverse[1, 1] + inverse[2, 2]
-        vertical = 0.0 if height_known else inverse[3, 3]
+        clock, horizontal, vertical = inverse[0, 0], inverse[1, 1] + inverse[2, 2], inverse[3, 3]
         dops[k, 0] = math.sqrt(horizontal + vertical + clock)
         dops[k, 1] = math.sqrt(horizontal + vertical)
         dops[k, 2] = math.sqrt(horizontal)
         dops[k, 3] = math.sqrt(vertical)
         dops[k, 4] = math.sqrt(clock)
-
-
-@kernel
-def geometry_matrix(anchors: NDArray[np.float64], position: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
-    """Write HᵀH into ``normal``, shape (4, 4), lower triangle, rows of H being [1, unit vector].
-
-    The clock comes first, so that a factorisation removes the mean direction before anything else, and the
-    leading 3 × 3 block is the matrix of a known height. False where some anchor has no direction.
-    """
-    normal[:] = 0.0
-    directed = True
-    for i in range(len(anchors)):
-        directed = directed and add_anchor(anchors, i, position, 1.0, normal)
-    return directed
-
-
-@kernel
-def add_anchor(
-    anchors: NDArray[np.float64], i: int, position: NDArray[np.float64], weight: float, normal: NDArray[np.float64]
-) -> bool:
-    """Add an anchor's row to the normal matrix of ``geometry_matrix``; False where it has no direction."""
-    x, y, z = direction(anchors, i, position)
-    if math.isnan(x):
-        return False
-    normal[0, 0] += weight
-    normal[1, 0] += weight * x
-    normal[2, 0] += weight * y
-    normal[3, 0] += weight * z
-    normal[1, 1] += weight * x * x
-    normal[2, 1] += weight * y * x
-    normal[3, 1] += weight * z * x
-    normal[2, 2] += weight * y * y
-    normal[3, 2] += weight * z * y
-    normal[3, 3] += weight * z * z
-    return True
 
 
 @kernel

@@ -72,20 +72,6 @@ def bracketed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> M
     return literal_delayed_covariance(kappa, tx_var_m2, rx_var_m2)
 
 
-def own_and_common(covariance_m2: Matrix) -> tuple[Vector, float]:
-    """Split Σ = diag(own) + common, the form of every covariance here, into own (n,) and common.
-
-    Raises:
-        ValueError: it has another form.
-    """
-    n = len(covariance_m2)
-    apart = covariance_m2[~np.eye(n, dtype=bool)]
-    common = float(apart.mean()) if n > 1 else 0.0
-    if not np.allclose(apart, common, rtol=1e-3, atol=1e-9 * float(np.abs(covariance_m2).max(initial=0.0))):
-        raise ValueError("the TDoAs' covariance is not a diagonal plus one number common to all")
-    return np.diag(covariance_m2) - common, common
-
-
 def _shared_reference(q: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
     """Each TDoA holds its pair (factor Q) and one RX stamp of the anchor; the tag's reference stamp is common."""
     own = q * (tx_var_m2 + rx_var_m2) + rx_var_m2
