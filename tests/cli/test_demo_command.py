@@ -1,5 +1,6 @@
 """``skyless demo`` as its user meets it: real processes, in a pipe, in a terminal, stopped in every way, and hurt."""
 
+import asyncio
 import contextlib
 import json
 import os
@@ -15,6 +16,9 @@ from pathlib import Path
 import pytest
 
 from skyless.cli.main import main
+from skyless.outputs.address import mqtt_address
+from skyless.outputs.link import Link
+from skyless.outputs.topics import fix_topic, health_topic
 
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "demo"]
 START_S = 120.0
@@ -50,10 +54,12 @@ class Demo:
             assert time.monotonic() < until_s, self.said
             time.sleep(0.02)
 
-    def wait_until_it_runs(self, processes=6):
-        """Broker, ether, anchors, tags, page, recorder: and as long again as the tags need for their fixes."""
-        self.wait_for(lambda: len(self.children()) >= processes and Path(f"/proc/{self.process.pid}").exists())
-        time.sleep(4.0)
+    def wait_until_it_runs(self, tags=3):
+        """Broker, ether, anchors, tags, page, recorder; until each tag has told a fix and its health anew."""
+        self.wait_for(lambda: len(self.children()) >= 6 and Path(f"/proc/{self.process.pid}").exists())
+        words = next(words for words in self.children().values() if "ether" in words)
+        address = mqtt_address(words[words.index("--mqtt") + 1])
+        asyncio.run(asyncio.wait_for(until_tags_tell(address, tags), START_S))
 
     def children(self):
         """Process numbers and command lines of all that it has started, and these in turn."""
@@ -76,6 +82,18 @@ class Demo:
         out, _ = self.process.communicate(timeout=30)
         wait_until_gone(pids)
         return self.process.returncode, out
+
+
+async def until_tags_tell(address, tags):
+    """Until fixes and health of so many tags have come since now."""
+    heard, link = set(), Link(address, "test", site=1, kind="watch")
+    link.subscribe(fix_topic("+", "+"), lambda topic, _: heard.add(topic))
+    link.subscribe(health_topic("+", "tag", "+"), lambda topic, _: heard.add(topic))
+    running = asyncio.ensure_future(link.run())
+    while len(heard) < 2 * tags:
+        await asyncio.sleep(0.05)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
 
 
 def processes():
@@ -139,7 +157,7 @@ def test_json_also_where_ports_are_taken_and_nothing_can_be_written_at_home(tmp_
 
 def test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated(tmp_path):
     demo = Demo(tmp_path, "--tags", "2")
-    demo.wait_until_it_runs()
+    demo.wait_until_it_runs(tags=2)
     time.sleep(3.0)  # errors count from a second after the first fix, rates between two reports of health
     code, out = demo.end(signal.SIGTERM)
     assert code == 0
@@ -156,6 +174,7 @@ def test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated(t
 def test_programs_that_die_are_started_again_and_ctrl_c_ends_all_with_a_summary(tmp_path):
     demo = Demo(tmp_path, "--json")
     demo.wait_until_it_runs()
+    time.sleep(1.0)  # the demo hears of it a little later
     begin_s = time.monotonic()
     killed = {name: demo.child(word) for name, word in (("tags", "tag"), ("page", "dashboard"), ("anchors", "anchor"))}
     for pid in killed.values():
