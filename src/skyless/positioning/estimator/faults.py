@@ -236,11 +236,10 @@ def _open_lasting_faults(s: EstimatorState, chi2: float) -> None:
                         rival = explained
         if not opened and chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_CHI2:
             opened = True
-            _open_fault(s, 0, first)
-            s.anchors[first]["has_fault"] = 1
-            if second != first:
-                _open_fault(s, 0, second)
-                s.anchors[second]["has_fault"] = 1
+            for one in range(faults):
+                anchor = second if one else first
+                _open_fault(s, 0, anchor)
+                s.anchors[anchor]["has_fault"] = 1
 
 
 @step
