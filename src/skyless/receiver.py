@@ -120,16 +120,18 @@ class Receiver:
         return None
 
     def hear_height(self, height_m: float, std_m: float) -> bool:
-        """Take the tag's height above the site's origin as a sensor of the tag's tells it, now; True if it was used.
+        """Take a reading of the tag's height sensor, above the site's origin, at the present; True if it was used.
 
-        For ``joint``; a replay of a recording does not have it. Before the first fix it tells where to look for it.
+        Only ``joint`` uses it. Before the first fix it limits the heights at which a position is sought. Recordings do
+        not hold these readings, so a replay lacks them.
 
         Raises:
             ValueError: the height is not finite, or its standard deviation not a length.
         """
         if not (isfinite(height_m) and 0.0 < std_m < inf):
-            told = f"{height_m!r} with the standard deviation {std_m!r}"
-            raise ValueError(f"a height is {told}; both should be finite numbers, the latter more than 0")
+            raise ValueError(
+                f"height_m is {height_m!r} and std_m is {std_m!r}; both should be finite numbers, std_m above 0"
+            )
         method = self._method
         return isinstance(method, Estimation) and method.hear_height(height_m, std_m)
 

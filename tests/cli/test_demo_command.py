@@ -55,7 +55,7 @@ class Demo:
             time.sleep(0.02)
 
     def wait_until_it_runs(self, tags=3):
-        """Broker, ether, anchors, tags, page, recorder; until each tag has told a fix and its health anew."""
+        """Broker, ether, anchors, tags, page, recorder; until each tag has sent another fix and its health."""
         self.wait_for(lambda: len(self.children()) >= 6 and Path(f"/proc/{self.process.pid}").exists())
         words = next(words for words in self.children().values() if "ether" in words)
         address = mqtt_address(words[words.index("--mqtt") + 1])
@@ -85,7 +85,7 @@ class Demo:
 
 
 async def until_tags_tell(address, tags):
-    """Until fixes and health of so many tags have come since now."""
+    """Wait until fixes and health of this number of tags have arrived from now on."""
     heard, link = set(), Link(address, "test", site=1, kind="watch")
     link.subscribe(fix_topic("+", "+"), lambda topic, _: heard.add(topic))
     link.subscribe(health_topic("+", "tag", "+"), lambda topic, _: heard.add(topic))

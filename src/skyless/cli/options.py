@@ -54,6 +54,12 @@ def integrity_of(
     return IntegrityRequirement(risk, alert_limit_m, max_acceleration_mps2 or 0.0, height_std_m or 0.0)
 
 
+def see_that_a_height_is_given(height_std_m: float | None, height_m: float | None) -> None:
+    """See that --height-std has a height to be the standard deviation of. Raises SkylessError."""
+    if height_std_m is not None and height_m is None:
+        raise SkylessError(f"--height-std is {height_std_m:g}; it should be left out: the height is estimated")
+
+
 def known_method(method: str, names: Sequence[str] = METHODS) -> None:
     """See that a positioning method is one of these. Raises SkylessError."""
     if method not in names:

@@ -12,6 +12,7 @@ from skyless.cli.options import (
     NotNegative,
     Positive,
     integrity_of,
+    see_that_a_height_is_given,
     spare_inputs,
 )
 from skyless.cli.output import print_json
@@ -156,6 +157,7 @@ def replay(
     known = known_truth(file, truth, lever_arm, format, listener)
     height_m, std_m, note = height_to_hold(height, places, site_height_m, known, format_of(file, format).name)
     settle_s = settle if settle is not None else (2.0 if known is None else 3.0)
+    see_that_a_height_is_given(height_std, height_m)
     judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=flight_height(above, known))
     request = ReplayRequest(
         path=file,

@@ -10,7 +10,15 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, broker, say
-from skyless.cli.options import IntegrityRisk, NotNegative, Positive, finite_numbers, integrity_of, known_method
+from skyless.cli.options import (
+    IntegrityRisk,
+    NotNegative,
+    Positive,
+    finite_numbers,
+    integrity_of,
+    known_method,
+    see_that_a_height_is_given,
+)
 from skyless.errors import SkylessError
 from skyless.methods import DEFAULT_METHOD
 from skyless.radios.open import DEFAULT_RADIO, is_simulated, is_sniffer, open_radios, open_sniffers
@@ -149,6 +157,7 @@ def _system(
             say(f"the anchors lie too flat to tell the height; tags are taken to be at theirs: --height {height_m:.2f}")
     else:
         height_m = None if height == "free" else _metres(str(height))
+    see_that_a_height_is_given(height_std_m, height_m)
     return PacketTagSettings(
         places,
         site=TDOA_SITE if site is None else site,

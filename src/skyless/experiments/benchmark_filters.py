@@ -3,6 +3,7 @@
 They take the same measurements as the kernels and come to the same states (``tests/experiments/test_benchmarks.py``).
 """
 
+from functools import cached_property
 from importlib import import_module
 from typing import Any
 
@@ -129,20 +130,13 @@ class PlainJoint:
 class FilterpyJoint(PlainJoint):
     """The same through filterpy's extended Kalman filter.
 
-    Raises:
-        ImportError: filterpy is not installed.
+    It raises ImportError at the first packet where filterpy is not installed.
     """
 
-    def __init__(
-        self,
-        settings: EstimatorSettings,
-        anchors_m: Matrix,
-        rx_ticks: int,
-        start_m: Vector,
-        variances: tuple[float, float],
-    ) -> None:
-        super().__init__(settings, anchors_m, rx_ticks, start_m, variances)
-        self.filter: Any = import_module("filterpy.kalman").ExtendedKalmanFilter(dim_x=len(self.x), dim_z=1)
+    @cached_property
+    def filter(self) -> Any:  # noqa: ANN401 - filterpy has no types
+        """Made at the first use."""
+        return import_module("filterpy.kalman").ExtendedKalmanFilter(dim_x=len(self.x), dim_z=1)
 
     def _predict(self, F: Matrix, Q: Matrix) -> None:
         ekf = self.filter

@@ -144,10 +144,10 @@ def anchor_sets(part: Matrix) -> Iterator[tuple[Vector, Mask]]:
 
     ``part``: each anchor's part in the rounds, shape (m, n).
     """
-    doubt = (part > DOUBT) & (part < 1.0 - DOUBT)
-    order = np.argsort(np.where(doubt, np.abs(part - 0.5), np.inf), axis=1, kind="stable")[:, :MOST_DOUBTFUL]
-    order = order[:, np.take_along_axis(doubt, order, axis=1).any(axis=0)]
-    doubtful, there = np.take_along_axis(doubt, order, axis=1), np.take_along_axis(part, order, axis=1)
+    uncertain = (part > DOUBT) & (part < 1.0 - DOUBT)
+    order = np.argsort(np.where(uncertain, np.abs(part - 0.5), np.inf), axis=1, kind="stable")[:, :MOST_DOUBTFUL]
+    order = order[:, np.take_along_axis(uncertain, order, axis=1).any(axis=0)]
+    doubtful, there = np.take_along_axis(uncertain, order, axis=1), np.take_along_axis(part, order, axis=1)
     usual = part >= 0.5
     usual_here = np.take_along_axis(usual, order, axis=1)
     for present in product((False, True), repeat=order.shape[1]):

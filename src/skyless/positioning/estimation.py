@@ -55,7 +55,7 @@ EARLY_NIS: Final = 3.0
 """Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed."""
 
 HEIGHT_SIGMAS: Final = 5.0
-"""A sensor's height is not wrong by more standard deviations, ..."""
+"""A sensor's height is not wrong by more standard deviations than this, ..."""
 
 MOST_HEIGHTS_REFUSED: Final = 20
 """... so if this number of them in a row do not fit, it is the position that is wrong."""

@@ -105,8 +105,8 @@ WIDE: Final = 0.05
 """Part of the mean range; ranges are curved within positions of a larger standard deviation, which have no level."""
 
 DOUBTED_S: Final = 5.0
-"""For so long nothing is promised after a start whose packets contradicted each other: where several anchors are late,
-those that agree may agree on a wrong place, until the tag's way shows it."""
+"""There is no level for this time after a start whose packets contradicted each other: where several anchors are late,
+the others may agree on a wrong position, until the tag has moved enough to show it."""
 
 OPEN_WIDE: Final = 0.02
 """The same where all range errors are open: then only the tag's way tells its position, by directions that change, and

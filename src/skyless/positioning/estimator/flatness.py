@@ -16,8 +16,8 @@ DISTINCT_CHI2: Final = 25.0
 
 LEAST_ANCHORS: Final = 3
 
-TOLD_S: Final = 1.0
-"""A sensor's height holds for so long."""
+SENSOR_VALID_S: Final = 1.0
+"""Time for which a sensor's height resolves which side it is."""
 
 
 def fit_plane(s: EstimatorState) -> None:
@@ -46,7 +46,7 @@ def is_height_open(s: EstimatorState) -> bool:
     """Whether the tag and its mirror image behind the anchors' plane explain the ranges alike.
 
     Range errors make up for what is left of the difference, and what all ranges have in common is the tag's clock.
-    Not where the image lies where the tag cannot be, nor while a sensor tells the height.
+    Not where the image lies where the tag cannot be, nor while a sensor measures the height.
     """
     status, settings = s.status[0], s.settings[0]
     normal, count, off_m, square, total = status["plane_normal"], len(s.anchors), 0.0, 0.0, 0.0
@@ -62,5 +62,5 @@ def is_height_open(s: EstimatorState) -> bool:
     image_z_m = s.x[2] - 2.0 * off_m * normal[2]
     is_image_possible = settings["lowest_m"] <= image_z_m <= settings["highest_m"]
     is_near = off_m * off_m * normal[2] ** 2 <= s.P[2, 2]
-    is_told = (status["epoch_ticks"] - status["height_ticks"]) * TICK_S < TOLD_S
-    return bool(settings["dim"] == 3 and is_flat and not is_told and (is_image_possible or is_near))
+    has_sensor = (status["epoch_ticks"] - status["height_ticks"]) * TICK_S < SENSOR_VALID_S
+    return bool(settings["dim"] == 3 and is_flat and not has_sensor and (is_image_possible or is_near))
