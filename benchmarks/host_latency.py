@@ -6,8 +6,8 @@ python benchmarks/host_latency.py [SECONDS [SEEDS [SLOT_MS ...]]]
 import sys
 
 import numpy as np
+from host_latency_model import LatencyResult, run_hosts
 
-from skyless.experiments.host_latency import LatencyResult, run_hosts
 from skyless.simulation.dw1000.bus import HostLatency
 
 SLOTS_MS = (1.05, 2.1, 2.5, 5.0, 10.0)

@@ -18,13 +18,13 @@ from pathlib import Path
 
 import msgspec
 
-from skyless.nodes.broker import start_broker
-from skyless.nodes.broker_settings import BrokerSettings
-from skyless.nodes.children import Child, Program
-from skyless.nodes.ports import any_port
-from skyless.outputs.link import Link
-from skyless.outputs.messages import AnchorHealth, EtherHealth, TagHealth
-from skyless.outputs.topics import health_topic
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import AnchorHealth, EtherHealth, TagHealth
+from skyless.mqtt.topics import health_topic
+from skyless.nodes.broker.broker import start_broker
+from skyless.nodes.broker.settings import BrokerSettings
+from skyless.nodes.process.children import Child, Program
+from skyless.nodes.process.ports import any_port
 from skyless.site.lab import lab_site
 
 START_S = 120.0

@@ -7,8 +7,8 @@ import pytest
 from plain_filter import PlainFilter
 
 import synthetic_recordings as synthetic
-from skyless.experiments.judge import Judge
-from skyless.experiments.replay import Replay, ReplayRequest
+from skyless.evaluation.judge import Judge
+from skyless.replay.foreign import Replay, ReplayRequest
 
 ROWS = {"tdoa-table": 100_000, "miluv": 20_000, "avalue": 10_000}
 PACKETS = 20_000

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from skyless.air.reception import Reception, Transmission
     from skyless.anchor import Anchor
-    from skyless.experiments.fleet import Fleet
-    from skyless.experiments.scenarios import Request, fleet_of
-    from skyless.methods import METHODS
+    from skyless.evaluation.fleet import Fleet
+    from skyless.evaluation.scenarios import Request, fleet_of
+    from skyless.method_names import METHODS
     from skyless.positioning.fix import Fix, NoFixReason
-    from skyless.positioning.solver import locate
+    from skyless.positioning.solver.locate import locate
     from skyless.receiver import Receiver
-    from skyless.recordings.formats import open_recording
+    from skyless.recordings.foreign.formats import open_recording
     from skyless.site.lab import lab_site
     from skyless.site.load import load_site
     from skyless.site.model import Site
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
     __version__: str
 
 _PLACES: Final = {
-    "METHODS": "skyless.methods",
+    "METHODS": "skyless.method_names",
     "Anchor": "skyless.anchor",
     "Fix": "skyless.positioning.fix",
-    "Fleet": "skyless.experiments.fleet",
+    "Fleet": "skyless.evaluation.fleet",
     "NoFixReason": "skyless.positioning.fix",
     "Receiver": "skyless.receiver",
     "Reception": "skyless.air.reception",
-    "Request": "skyless.experiments.scenarios",
+    "Request": "skyless.evaluation.scenarios",
     "Site": "skyless.site.model",
     "Transmission": "skyless.air.reception",
-    "fleet_of": "skyless.experiments.scenarios",
+    "fleet_of": "skyless.evaluation.scenarios",
     "lab_site": "skyless.site.lab",
     "load_site": "skyless.site.load",
-    "locate": "skyless.positioning.solver",
-    "open_recording": "skyless.recordings.formats",
+    "locate": "skyless.positioning.solver.locate",
+    "open_recording": "skyless.recordings.foreign.formats",
 }
 
 __all__ = [

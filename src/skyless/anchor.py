@@ -12,18 +12,18 @@ from msgspec import Struct
 
 from skyless.air.almanac import Page
 from skyless.air.beacon import Beacon, Heard, MasterTime
-from skyless.air.claim import Claim
 from skyless.air.codec import decode_cached, encode, heard_capacity
 from skyless.air.malformed import Malformed
+from skyless.air.master_term import Claim
 from skyless.air.reception import Reception, Transmission
-from skyless.air.rotation import almanac_issue, page_for, pages_of
-from skyless.air.schedule import first_slots, schedule_of
 from skyless.clocks.filter import ClockFilter, clock_noise
 from skyless.clocks.site_clock import SiteClock
 from skyless.clocks.site_time import SUBTICKS
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.master_election import Role, Succession, Verdict
+from skyless.site.almanac_sending import almanac_issue, page_for, pages_of
 from skyless.site.model import AnchorSite, Site
-from skyless.succession import Role, Succession, Verdict
+from skyless.site.slots import first_slots, schedule_of
 from skyless.ticks import Unwrapper, difference, wrap
 from skyless.uncertainty.tdoa import stamp_variance_m2
 

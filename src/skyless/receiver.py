@@ -10,22 +10,22 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.air.almanac_book import AlmanacBook
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.followed_master import FollowedMaster
 from skyless.air.reception import Diagnostics, Reception
-from skyless.air.schedule import schedule_from_page
 from skyless.clocks.stamps import AnchorStamps
-from skyless.methods import DEFAULT_METHOD, FILTERS, METHODS
-from skyless.positioning.estimation import Estimation
-from skyless.positioning.first_path import variance_factor
+from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import FixTime
-from skyless.positioning.new_method import Wanted, new_method
+from skyless.positioning.integrity import IntegrityRequirement
+from skyless.positioning.methods.factory import Wanted, new_method
+from skyless.positioning.methods.joint import Estimation
+from skyless.positioning.methods.nlos_weighting import variance_factor
+from skyless.positioning.methods.observations import Observer
 from skyless.positioning.observation import Method
-from skyless.positioning.observing import Observer
-from skyless.positioning.protection import IntegrityRequirement
+from skyless.site.almanac_gathering import AlmanacBook
+from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)

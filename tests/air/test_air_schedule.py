@@ -3,9 +3,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.air.almanac import SchedulePage
-from skyless.air.schedule import Schedule, first_slots, schedule_from_page, schedule_of
 from skyless.constants import TICK_S
 from skyless.site.model import AnchorSite, ScheduleSite, Site
+from skyless.site.slots import Schedule, first_slots, schedule_from_page, schedule_of
 
 
 def site(first=(None,) * 7, master=11, **schedule):

@@ -13,7 +13,7 @@ from machines.bench import LAB, Heard, Stage
 from recordings import live_site
 from skyless.cli.main import main
 from skyless.constants import TICK_M
-from skyless.recordings.anchors import read_calibration
+from skyless.recordings.anchor_table import read_calibration
 from skyless.simulation.impairments import DelayError
 from skyless.site.load import load_site
 from skyless.site.template import site_template

@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 from skyless.cli.main import main
-from skyless.outputs.address import mqtt_address
-from skyless.outputs.link import Link
-from skyless.outputs.topics import fix_topic, health_topic
+from skyless.mqtt.address import mqtt_address
+from skyless.mqtt.link import Link
+from skyless.mqtt.topics import fix_topic, health_topic
 
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "demo"]
 START_S = 120.0

@@ -7,10 +7,10 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from skyless.cli.demo_screen import MOST_ALERTS, SHOWN_S, Screen
+from skyless.cli.nodes.demo_screen import MOST_ALERTS, SHOWN_S, Screen
+from skyless.mqtt.messages import AnchorHealth, Counters, FixMessage
 from skyless.nodes.watch import Watch
-from skyless.outputs.messages import AnchorHealth, Counters, FixMessage
-from skyless.positioning.alert import Alert
+from skyless.positioning.integrity import Alert
 
 UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from skyless.cli.demo_screen import _subscriber
 from skyless.cli.main import main
-from skyless.nodes.ports import any_port
-from skyless.outputs.address import MqttAddress
+from skyless.cli.nodes.demo_screen import _subscriber
+from skyless.mqtt.address import MqttAddress
+from skyless.nodes.process.ports import any_port
 
 
 @pytest.mark.parametrize(

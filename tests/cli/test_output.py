@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import Struct
 
-from skyless.cli.output import print_json, to_json, write_atomically
+from skyless.cli.common.output import print_json, to_json, write_atomically
 
 
 class Colour(StrEnum):

@@ -7,7 +7,7 @@ import sys
 import threading
 
 WORK = """
-from skyless.cli import progress
+from skyless.cli.common import progress
 progress._PATIENCE_S = {patience}
 with progress.progress_bar("replaying", 3) as bar:
     for done in range(4):

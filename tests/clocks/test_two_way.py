@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.clocks.two_way import Leg, TwoWayRanging, bracketed_flight_ticks
-from skyless.recordings.avalue import anchor_distances_m
+from skyless.recordings.foreign.avalue import anchor_distances_m
 
 SECOND = 63_897_600_000
 wrapped = st.integers(0, 2**40 - 1)

@@ -3,7 +3,7 @@
 import msgspec
 from paho.mqtt.client import topic_matches_sub
 
-from skyless.outputs.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
+from skyless.mqtt.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
 from skyless.site.lab import lab_site
 
 SITE = SiteMessage(lab_site(100.0), simulated=True, unix_s=1000.0)

@@ -14,7 +14,7 @@ from skyless.dashboard.guard import Guard, Rules
 from skyless.dashboard.live import Live
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import Playback
-from skyless.outputs import topics
+from skyless.mqtt import topics
 
 TOKEN = "correct-horse-battery"
 HERE = "http://localhost:8080"

@@ -14,11 +14,11 @@ import pytest
 import websockets
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix, truth
 
-from skyless.nodes.broker import start_broker
-from skyless.nodes.broker_settings import BrokerSettings
-from skyless.outputs import topics
-from skyless.outputs.link import Link
-from skyless.outputs.messages import ZonesMessage
+from skyless.mqtt import topics
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import ZonesMessage
+from skyless.nodes.broker.broker import start_broker
+from skyless.nodes.broker.settings import BrokerSettings
 
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "dashboard", "--json"]
 PATIENCE_S = 20.0

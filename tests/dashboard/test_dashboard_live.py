@@ -10,8 +10,8 @@ from msgspec.structs import replace
 from skyless.dashboard.live import Live
 from skyless.dashboard.mailbox import MOST_EVENTS
 from skyless.dashboard.zones import SILENCE_S
-from skyless.outputs import topics
-from skyless.outputs.messages import ZoneEvent, ZonesMessage
+from skyless.mqtt import topics
+from skyless.mqtt.messages import ZoneEvent, ZonesMessage
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from skyless.dashboard.overlay_process import overlay_grids
 from skyless.dashboard.overlays import MOST_CELLS, NoOverlayError, Overlays, levels, overlay_task
-from skyless.methods import DEFAULT_METHOD, METHODS
+from skyless.method_names import DEFAULT_METHOD, METHODS
 from skyless.planning.columns import HDOP, PDOP, SIGMA
 from skyless.planning.predict import PlanSettings, Predictor
 from skyless.site.lab import lab_site

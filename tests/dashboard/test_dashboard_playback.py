@@ -12,10 +12,10 @@ from skyless.dashboard.guard import Rules
 from skyless.dashboard.live import Live
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
-from skyless.outputs import topics
-from skyless.outputs.messages import ZonesMessage
-from skyless.recordings.mcap_file import McapFile
-from skyless.recordings.mcap_recorder import McapRecorder
+from skyless.mqtt import topics
+from skyless.mqtt.messages import ZonesMessage
+from skyless.recordings.mcap.file import McapFile
+from skyless.recordings.mcap.recorder import McapRecorder
 
 START_S = 1_700_000_000.0
 PLAN = b"\x89PNG\r\n\x1a\nplan"

@@ -6,7 +6,7 @@ import pytest
 from dashboard_builders import fix, status, truth
 
 from skyless.dashboard.state import FORGET_S, MOST_NAMES, Board
-from skyless.outputs.messages import AnchorHealth, Counters, EtherHealth
+from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
 ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y")

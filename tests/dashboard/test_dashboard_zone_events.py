@@ -4,7 +4,7 @@ from dashboard_builders import status
 from msgspec.structs import replace
 
 from skyless.dashboard.zone_events import PATIENCE_S, EventDesk, place_in_line
-from skyless.outputs.messages import ZoneEvent
+from skyless.mqtt.messages import ZoneEvent
 
 EVENT = ZoneEvent("desk", "Desk", "t1", "enter", 1000.0, (1.0, 2.0, 3.0))
 

@@ -11,7 +11,7 @@ from matplotlib.path import Path
 from msgspec.structs import replace
 
 from skyless.dashboard.zones import LEAST_MARGIN_M, SILENCE_S, STAY_S, BadZonesError, ZoneWatch, read_zones
-from skyless.outputs.messages import Zone
+from skyless.mqtt.messages import Zone
 
 INSIDE, OUTSIDE = (2.0, 2.0, 1.0), (8.0, 2.0, 1.0)
 

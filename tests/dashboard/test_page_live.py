@@ -8,7 +8,7 @@ import pytest
 from page_browser import until
 from PIL import Image
 
-from skyless.positioning.protection import Alert
+from skyless.positioning.integrity import Alert
 
 SHOWN = "document.getElementById('banner').hidden === false"
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from cobs import cobs
 
 from skyless.firmware import board, dw1000, link
-from skyless.radios.link_records import decode
+from skyless.radios.serial.link_records import decode
 
 VECTORS = Path(__file__).with_name("board_vectors.py")
 FOLDER = Path(board.__file__).parent

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.firmware import board, dw1000, link
-from skyless.radios.link_records import Done, Heard, Hello, NotDone, Status, TooLate
+from skyless.radios.serial.link_records import Done, Heard, Hello, NotDone, Status, TooLate
 
 MICROPYTHON = shutil.which("micropython", path=Path(sys.executable).parent) or shutil.which("micropython")
 FRAME = bytearray(range(127))

@@ -10,7 +10,7 @@ from skyless.air.beacon import Beacon
 from skyless.air.codec import decode, encode
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
-from skyless.experiments.scenarios import Request, impairments_of
+from skyless.evaluation.scenarios import Request, impairments_of
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World

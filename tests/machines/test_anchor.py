@@ -4,18 +4,18 @@ import math
 
 import numpy as np
 import pytest
-from bench import LAB, PAIRS, Stage, changed
 from msgspec.structs import replace
 
+from bench import LAB, PAIRS, Stage, changed
 from skyless.air.beacon import Beacon, Heard, MasterTime
 from skyless.air.codec import decode, encode
 from skyless.air.page_codec import decode_page, encode_page
 from skyless.air.reception import Reception
-from skyless.air.rotation import page_for, pages_of
-from skyless.air.schedule import first_slots, schedule_of
 from skyless.anchor import MAX_OFFSET_STD_M, Anchor
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.simulation.impairments import AnchorOutage, Outage
+from skyless.site.almanac_sending import page_for, pages_of
+from skyless.site.slots import first_slots, schedule_of
 from skyless.ticks import difference, wrap
 
 RANGE_TICKS = {anchor.id: math.hypot(anchor.x_m, anchor.y_m) / TICK_M for anchor in LAB.anchors}

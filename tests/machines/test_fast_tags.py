@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.experiments.fleet import Fleet, FleetSettings
-from skyless.experiments.scenarios import Request, impairments_of
+from skyless.evaluation.fleet import Fleet, FleetSettings
+from skyless.evaluation.scenarios import Request, impairments_of
 from skyless.positioning.estimator.monitor import INCONSISTENT_NIS
 from skyless.simulation.trajectory import Waypoints
 from skyless.site.lab import ideal_lab_site

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from bench import LAB, LOFT, tape
 
-from skyless.positioning.alert import Alert
+from bench import LAB, LOFT, tape
 from skyless.positioning.fix import Fix
+from skyless.positioning.integrity import Alert
 from skyless.receiver import Receiver
 
 STD_M = 0.03

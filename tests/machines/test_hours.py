@@ -6,12 +6,12 @@ Half an hour by default, ``SKYLESS_LONG=1`` for a whole day.
 import math
 import os
 
-from bench import LAB
 from msgspec.structs import replace
 
+from bench import LAB
 from skyless.anchor import Anchor
-from skyless.experiments.fleet import Fleet, FleetSettings
-from skyless.experiments.scenarios import Request, impairments_of
+from skyless.evaluation.fleet import Fleet, FleetSettings
+from skyless.evaluation.scenarios import Request, impairments_of
 from skyless.simulation.oscillator import OscillatorModel
 from skyless.simulation.trajectory import Static
 from skyless.ticks import WRAP_TICKS

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.experiments.scenarios import Request, fleet_of
-from skyless.methods import FILTERS
+from skyless.evaluation.scenarios import Request, fleet_of
+from skyless.method_names import FILTERS
 from skyless.site.lab import ideal_lab_site
 
 SIDES = 5.0

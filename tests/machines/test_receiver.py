@@ -4,17 +4,17 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from bench import EVERY_METHOD, LAB, LOFT, PAIRS, ROOM, Heard, Stage, assert_honest, changed, listen, tape
 from msgspec.structs import replace
 
+from bench import EVERY_METHOD, LAB, LOFT, PAIRS, ROOM, Heard, Stage, assert_honest, changed, listen, tape
 from skyless.air.almanac import AccuracyPage, AnchorPage, NoisePage, SchedulePage
 from skyless.air.beacon import MasterTime
 from skyless.air.codec import decode
 from skyless.anchor import Anchor
 from skyless.constants import TICK_RATE_HZ
-from skyless.methods import DEFAULT_METHOD, FILTERS, METHODS
+from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.snapshots import SnapshotMethod
+from skyless.positioning.methods.snapshots import SnapshotMethod
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import AnchorOutage, Outage
 from skyless.ticks import wrap

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.experiments.scenarios import Request, fleet_of
+from skyless.evaluation.scenarios import Request, fleet_of
 from skyless.positioning.estimator.estimator import Estimator
 from skyless.positioning.estimator.kalman import predict
 from skyless.positioning.estimator.settings import EstimatorSettings

@@ -5,19 +5,19 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from bench import EVERY_METHOD, LAB, ROOM, SNAPSHOTS, Stage, assert_honest
 from msgspec.structs import replace
 
-from skyless.air.claim import is_newer
+from bench import EVERY_METHOD, LAB, ROOM, SNAPSHOTS, Stage, assert_honest
 from skyless.air.codec import decode
+from skyless.air.master_term import is_newer
 from skyless.anchor import Anchor
 from skyless.clocks.site_time import continued
 from skyless.clocks.watch import MOST_CHANCE, MasterWatch
 from skyless.constants import TICK_S
-from skyless.experiments.scenarios import Request, impairments_of
+from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.master_election import Role
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import AnchorOutage, Outage
-from skyless.succession import Role
 from skyless.ticks import Unwrapper
 
 SUPERFRAME_S = 15e-3

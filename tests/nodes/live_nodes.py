@@ -5,14 +5,14 @@ import contextlib
 
 import numpy as np
 
-from skyless.experiments.scenarios import Request, impairments_of
+from skyless.evaluation.scenarios import Request, impairments_of
 from skyless.nodes.anchor import AnchorNode
-from skyless.nodes.board import Board
-from skyless.nodes.ether import Ether
+from skyless.nodes.emulation.board import Board
+from skyless.nodes.emulation.ether import Ether
+from skyless.nodes.open_radio import open_radios, open_sniffers
 from skyless.nodes.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.nodes.tag import TagNode, TagSettings
-from skyless.radios.open import open_radios, open_sniffers
-from skyless.radios.radio import AntennaDelays
+from skyless.radios.interface import AntennaDelays
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 

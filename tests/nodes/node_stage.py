@@ -9,8 +9,8 @@ from msgspec.structs import replace
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
 from skyless.constants import TICK_RATE_HZ
-from skyless.experiments.scenarios import Request, impairments_of
-from skyless.radios.radio import Sent
+from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.radios.interface import Sent
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World

@@ -9,9 +9,9 @@ from node_stage import LAB, FakeRadio, play, receptions
 
 from skyless.air.codec import decode
 from skyless.constants import TICK_RATE_HZ
+from skyless.master_election import SILENT_SUPERFRAMES
 from skyless.nodes.anchor import ASK_AGAIN_S, LEAD_S, LOST_ANSWER_S, AnchorNode
-from skyless.radios.radio import Gone, Late, Restarted, Sent
-from skyless.succession import SILENT_SUPERFRAMES
+from skyless.radios.interface import Gone, Late, Restarted, Sent
 from skyless.ticks import difference, wrap
 
 SUPERFRAME_S = 6 * 2.5e-3

@@ -7,16 +7,16 @@ import pytest
 
 from skyless.air.beacon import Beacon, Heard
 from skyless.air.codec import encode
-from skyless.air.packet import Packet, Relay
+from skyless.air.masterless_packets import Packet, Relay
 from skyless.air.reception import Reception, Transmission
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.firmware import link
-from skyless.nodes.board_speech import LinkSpeech, SnifferSpeech
-from skyless.radios.link_records import Done, Hello, NotDone, Status, TooLate, decode
-from skyless.radios.radio import Late, Restarted, Sent
-from skyless.radios.sniffer_radio import SnifferStream
-from skyless.simulation.scenario import lab_impairments
+from skyless.nodes.emulation.board_protocol import LinkSpeech, SnifferSpeech
+from skyless.radios.interface import Late, Restarted, Sent
+from skyless.radios.serial.link_records import Done, Hello, NotDone, Status, TooLate, decode
+from skyless.radios.serial.sniffer_radio import SnifferStream
+from skyless.simulation.lab_scenario import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World

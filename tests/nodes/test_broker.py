@@ -16,11 +16,11 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.errors import SkylessError
-from skyless.nodes import broker_place
-from skyless.nodes.broker import start_broker
-from skyless.nodes.broker_settings import BrokerSettings
-from skyless.outputs.link import Link
-from skyless.outputs.reaching import check_broker
+from skyless.mqtt.connect import check_broker
+from skyless.mqtt.link import Link
+from skyless.nodes.broker.broker import folder as broker_place
+from skyless.nodes.broker.broker import start_broker
+from skyless.nodes.broker.settings import BrokerSettings
 
 BROKER = (sys.executable, "-m", "skyless.cli.main", "broker")
 

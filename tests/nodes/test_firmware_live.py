@@ -7,7 +7,7 @@ import pytest
 from firmware_board import FirmwareBoard
 from live_nodes import LiveSite, are_right
 
-from skyless.experiments.warm import compile_kernels
+from skyless.evaluation.compile_ahead import compile_kernels
 from skyless.firmware.board import NONE
 
 

@@ -7,14 +7,14 @@ from msgspec.structs import replace
 from node_stage import LAB, FakeRadio, receptions
 
 import masterless_world as hall
-from skyless.air.packet import Packet
+from skyless.air.masterless_packets import Packet
 from skyless.nodes.anchor import AnchorNode
 from skyless.nodes.hearing import AGAIN_S, LOOK_S, Hearing
 from skyless.nodes.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.nodes.tag import TagNode, TagSettings
-from skyless.radios.listener_radio import ListenerRadio
-from skyless.radios.radio import Gone, Restarted
-from skyless.radios.sniffer_radio import SnifferRadio
+from skyless.radios.interface import Gone, Restarted
+from skyless.radios.serial.listener_radio import ListenerRadio
+from skyless.radios.serial.sniffer_radio import SnifferRadio
 
 HEARD = receptions(1.0)
 

@@ -16,10 +16,10 @@ from node_stage import receptions
 from skyless.air.codec import decode
 from skyless.errors import SkylessError
 from skyless.nodes.latency import Latencies, PhaseBook
-from skyless.nodes.places import data_folder, new_recording, recordings_folder
+from skyless.nodes.process.folders import data_folder, new_recording, recordings_folder
+from skyless.nodes.process.running import every, together
+from skyless.nodes.process.usage import Usage, resident_bytes
 from skyless.nodes.record import _own_name
-from skyless.nodes.running import every, together
-from skyless.nodes.usage import Usage, resident_bytes
 
 # Latencies and phases
 
@@ -213,7 +213,7 @@ def test_something_is_done_again_and_again():
 
 PROGRAM = """
 import asyncio, sys
-from skyless.nodes.loop import run
+from skyless.nodes.process.loop import run
 async def main():
     try:
         print("running", flush=True)
@@ -243,7 +243,7 @@ def test_a_program_ends_cleanly_when_it_is_asked_to(number, code):
 def test_a_program_ends_with_the_one_that_started_it_however_that_ends():
     parent = f"""
 import subprocess, sys, time
-from skyless.nodes.loop import end_with_parent
+from skyless.nodes.process.loop import end_with_parent
 child = subprocess.Popen([sys.executable, "-c", {PROGRAM!r}], preexec_fn=end_with_parent())
 time.sleep(60)
 """

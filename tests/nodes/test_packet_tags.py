@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 import masterless_world as hall
-from skyless.air.packet import Packet
+from skyless.air.masterless_packets import Packet
+from skyless.mqtt.messages import Counters, FixMessage, SiteMessage, TagHealth
 from skyless.nodes import packet_tags
+from skyless.nodes.open_radio import is_simulated, open_sniffers
 from skyless.nodes.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
-from skyless.outputs.messages import Counters, FixMessage, SiteMessage, TagHealth
-from skyless.radios.open import is_simulated, open_sniffers
-from skyless.radios.radio import Gone, Restarted
-from skyless.recordings.bitcraze_payload import decode
+from skyless.radios.interface import Gone, Restarted
+from skyless.recordings.foreign.bitcraze_payload import decode
 
 SETTINGS = PacketTagSettings(hall.ANCHORS_M, site=7, publish_hz=1e5)
 

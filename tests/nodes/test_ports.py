@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from skyless.nodes.ports import any_port, claim, claim_next, hold_any, is_free
+from skyless.nodes.process.ports import any_port, claim, claim_next, hold_any, is_free
 
 HOST = "127.0.0.1"
 

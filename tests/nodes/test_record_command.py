@@ -16,15 +16,15 @@ from mqtt_brokers import MOSQUITTO, Embedded, Mosquitto, until
 from machines.bench import LAB, tape
 from skyless.air.reception import Reception
 from skyless.cli.main import main
-from skyless.experiments.replay_site import SiteReplay
-from skyless.experiments.warm import compile_kernels
-from skyless.nodes.loop import end_with_parent
+from skyless.evaluation.compile_ahead import compile_kernels
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import SiteMessage
+from skyless.mqtt.topics import site_topic
+from skyless.nodes.process.loop import end_with_parent
 from skyless.nodes.tag import TagSettings
 from skyless.nodes.tags import Tags
-from skyless.outputs.link import Link
-from skyless.outputs.messages import SiteMessage
-from skyless.outputs.topics import site_topic
-from skyless.recordings.mcap_recording import McapRecording
+from skyless.recordings.mcap.recording import McapRecording
+from skyless.replay.site import SiteReplay
 
 SECONDS = 30.0
 PLACES = ((3.0, 4.0, 0.0), (2.0, 2.0, 0.0))

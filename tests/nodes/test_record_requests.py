@@ -4,12 +4,12 @@ import msgspec
 import pytest
 
 from machines.bench import LAB
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.messages import RawReception, ReceptionsMessage, SegmentStart, StatusMessage
+from skyless.mqtt.topics import receptions_topic, status_topic
 from skyless.nodes import record
 from skyless.nodes.record import RecorderNode
-from skyless.outputs.address import MqttAddress
-from skyless.outputs.messages import RawReception, ReceptionsMessage, SegmentStart, StatusMessage
-from skyless.outputs.topics import receptions_topic, status_topic
-from skyless.recordings.mcap_file import McapFile
+from skyless.recordings.mcap.file import McapFile
 
 ONE = RawReception(b"frame", 5, 1.0)
 START = SegmentStart(0, {"method": "joint"}, None)

@@ -9,9 +9,9 @@ import pytest
 from node_stage import PLACE_M, FakeRadio, receptions
 
 from skyless.air.reception import Reception
+from skyless.mqtt.messages import FixMessage
 from skyless.nodes.tag import TagNode, TagSettings
-from skyless.outputs.messages import FixMessage
-from skyless.radios.radio import Gone, Restarted
+from skyless.radios.interface import Gone, Restarted
 
 HEARD = receptions(6.0)
 

@@ -5,12 +5,13 @@ import asyncio
 import pytest
 from node_stage import LAB, FakeRadio, receptions_of
 
-from skyless.nodes import anchors, running, tags
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.messages import Counters, FixMessage, SiteMessage, TagHealth
+from skyless.nodes import anchors, tags
+from skyless.nodes.process import running
 from skyless.nodes.tag import TagSettings
 from skyless.nodes.tags import Tag
-from skyless.outputs.address import MqttAddress
-from skyless.outputs.messages import Counters, FixMessage, SiteMessage, TagHealth
-from skyless.radios.radio import Restarted
+from skyless.radios.interface import Restarted
 
 
 class FakeLink:

@@ -5,8 +5,8 @@ import time
 import msgspec
 import pytest
 
+from skyless.mqtt.messages import Counters, EtherHealth, FixMessage, TagHealth, TrueMotion, TruthMessage
 from skyless.nodes.watch import Watch
-from skyless.outputs.messages import Counters, EtherHealth, FixMessage, TagHealth, TrueMotion, TruthMessage
 
 NOW_S = time.time()
 UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)

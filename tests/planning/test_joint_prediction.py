@@ -5,7 +5,6 @@ import pytest
 from msgspec.structs import replace
 from scipy.stats import binom
 
-from skyless.air.schedule import schedule_of
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.planning.anchor_clocks import AGE_S, LATE_M, TOLD, anchor_clocks, relays_of, stamp_variances
 from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
@@ -14,6 +13,7 @@ from skyless.planning.predict import PlanSettings, Predictor
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import ideal_lab_site, lab_site
 from skyless.site.model import EXACT, AnchorSite, Site, TagsSite, WallSite
+from skyless.site.slots import schedule_of
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
 LAB = ideal_lab_site(100.0)

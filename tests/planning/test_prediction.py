@@ -7,13 +7,13 @@ from scipy.linalg import solve_discrete_are
 
 from dense_covariance import position_covariance
 from skyless.clocks.filter import ClockNoise, clock_noise
-from skyless.methods import FILTERS
+from skyless.method_names import FILTERS
 from skyless.planning.anchor_clocks import offset_variances, stamp_variances
 from skyless.planning.columns import CLAIMED, COLUMNS, FIX_SHARE, GDOP, RMSE, SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, TDOP
 from skyless.planning.links import anchor_positions, hears, link_budget, range_of, with_range
 from skyless.planning.predict import PlanSettings, Predictor, with_noise
 from skyless.planning.snapshot_sigma import delays, phase_covariance
-from skyless.positioning.snapshots import SnapshotMethod
+from skyless.positioning.methods.snapshots import SnapshotMethod
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, NoiseSite, Site, TagsSite, WallSite

@@ -8,9 +8,9 @@ from math import dist
 import numpy as np
 import pytest
 
-from skyless.air.packet import PairTdoa
-from skyless.positioning.difference_tracking import DIFFERENCES, DifferenceTracking
+from skyless.air.masterless_packets import PairTdoa
 from skyless.positioning.estimator.kalman import is_at_rest
+from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 
 ANCHORS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * ((n ^ n >> 1 ^ n >> 2) & 1)) for n in range(4)}
 ANCHORS_M |= {4 + n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 2.7 - ANCHORS_M[n][2] + 0.3) for n in range(4)}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.air.packet import PairTdoa
-from skyless.positioning.alert import Alert
-from skyless.positioning.difference_tracking import DIFFERENCES, DifferenceTracking
+from skyless.air.masterless_packets import PairTdoa
 from skyless.positioning.fix import NoFixReason
+from skyless.positioning.integrity import Alert
+from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 
 SEEN_FROM_ABOVE = ((0.0, 0.0), (8.0, 0.0), (8.0, 6.0), (0.0, 6.0), (4.0, 0.0), (4.0, 6.0))
 

@@ -19,13 +19,13 @@ from estimator_builders import (
 )
 from msgspec.structs import replace
 
-from skyless.air.claim import Claim
+from skyless.air.master_term import Claim
 from skyless.constants import TICK_M, TICK_RATE_HZ
-from skyless.positioning.alert import Alert
-from skyless.positioning.estimation import Estimation
 from skyless.positioning.estimator.kinds import SUBTICKS
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.master_scale import MasterScale
+from skyless.positioning.integrity import Alert
+from skyless.positioning.methods.joint import Estimation
+from skyless.positioning.methods.master_scale import MasterScale
 from skyless.positioning.observation import Observation
 from skyless.ticks import TICK_MASK
 

@@ -24,12 +24,11 @@ from msgspec.structs import replace
 from scipy.stats import binom, chi2
 
 from skyless.constants import TICK_M
-from skyless.positioning.alert import Alert
 from skyless.positioning.estimator import faults
 from skyless.positioning.estimator.faults import OPENED_STD_M, explained_chi2, open_faults, whiten
 from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LEVELS, RECENT_STD_M, protect
 from skyless.positioning.estimator.state import LASTING, LASTING_STD_M, with_anchor
-from skyless.positioning.protection import CONTRADICTED, IntegrityRequirement, integrity_of, limits_of
+from skyless.positioning.integrity import CONTRADICTED, Alert, IntegrityRequirement, integrity_of, limits_of
 
 RISK = 1e-4
 LATE_M = 4 * TICK_M

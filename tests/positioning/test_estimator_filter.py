@@ -36,7 +36,7 @@ from textbook_filter import TextbookFilter
 
 from skyless.air.beacon import HEARD
 from skyless.constants import TICK_RATE_HZ, TICK_S
-from skyless.experiments.lab_bound import SPEED_STD_MPS, WHITE_FM
+from skyless.evaluation.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.positioning.estimator.estimator import JOINED, REJECTED, STALE, Estimator, Packets
 from skyless.positioning.estimator.kalman import predict
 from skyless.positioning.estimator.levels import LASTING_CHI2

@@ -25,7 +25,7 @@ from msgspec.structs import replace
 
 from skyless.clocks.filter import ClockFilter, clock_noise
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.experiments.lab_bound import WHITE_FM
+from skyless.evaluation.lab_bound import WHITE_FM
 from skyless.positioning.estimator.estimator import ACCEPTED, REJECTED, Report
 from skyless.positioning.estimator.kinds import REPORT_GAIN, SUBTICKS
 from skyless.positioning.estimator.monitor import gate_of

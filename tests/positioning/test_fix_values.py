@@ -8,10 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from skyless.positioning.alert import Alert
-from skyless.positioning.fix import Fix
-from skyless.positioning.fix_rows import PROTECTED_ROWS, PROTECTION, QUALITY
-from skyless.positioning.protection import CONTRADICTED, IntegrityRequirement
+from skyless.positioning.fix import PROTECTED_ROWS, PROTECTION, QUALITY, Fix
+from skyless.positioning.integrity import CONTRADICTED, Alert, IntegrityRequirement
 
 ANCHORS_M = np.eye(4, 3)
 

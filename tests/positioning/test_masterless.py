@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 
-from skyless.air.packet import Packet, Relay
+from skyless.air.masterless_packets import Packet, Relay
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.positioning.masterless import MOST_ANCHORS, PairEngine
+from skyless.positioning.masterless.pair_engine import MOST_ANCHORS, PairEngine
 
 ANCHORS_M = {1: (0.0, 0.0, 1.0), 2: (0.0, 4.5, 1.0), 3: (4.5, 0.0, 1.2), 4: (4.5, 4.5, 1.5)}
 DELAY_TICKS = 16_475

@@ -8,10 +8,10 @@ import pytest
 from msgspec import structs
 
 import masterless_world as hall
-from skyless.positioning.difference_calibration import AnchorCalibration, DifferenceCalibration
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
-from skyless.recordings.bitcraze_payload import decode
+from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
+from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
+from skyless.recordings.foreign.bitcraze_payload import decode
 
 SECONDS = 6.0
 SPEED_MPS = 1.0

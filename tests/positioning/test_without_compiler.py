@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skyless.experiments.scenarios import Request, fleet_of
+from skyless.evaluation.scenarios import Request, fleet_of
 from skyless.site.lab import ideal_lab_site
 
 

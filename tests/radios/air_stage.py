@@ -3,9 +3,9 @@
 import asyncio
 
 from skyless.constants import TICK_RATE_HZ
-from skyless.experiments.scenarios import Request, impairments_of
-from skyless.nodes.ether import Ether
-from skyless.radios.ether_wire import Join, Joined, Send
+from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.nodes.emulation.ether import Ether
+from skyless.radios.emulated.ether_wire import Join, Joined, Send
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import lab_site
 from skyless.ticks import wrap

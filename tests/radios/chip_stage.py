@@ -4,8 +4,8 @@ from collections import Counter
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_S
-from skyless.radios.chip_session import ChipSession
-from skyless.radios.radio import AntennaDelays, Sent
+from skyless.radios.dw1000.chip_session import ChipSession
+from skyless.radios.interface import AntennaDelays, Sent
 from skyless.simulation.dw1000.bus import ModelBus
 from skyless.simulation.dw1000.chip import Chip
 from skyless.ticks import wrap

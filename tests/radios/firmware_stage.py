@@ -4,8 +4,8 @@ from collections import Counter
 
 from skyless.air.reception import Diagnostics
 from skyless.firmware import board, dw1000
-from skyless.radios.link_session import LinkSession
-from skyless.radios.radio import AntennaDelays, Reception
+from skyless.radios.interface import AntennaDelays, Reception
+from skyless.radios.serial.link_session import LinkSession
 from skyless.simulation.dw1000.bus import ModelBus
 from skyless.simulation.dw1000.chip import Chip
 

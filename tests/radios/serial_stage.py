@@ -5,10 +5,10 @@ from collections import Counter
 
 from radio_ears import ears
 
-from skyless.nodes.board_speech import LinkSpeech
-from skyless.nodes.pty import Pty
-from skyless.radios.radio import Restarted
-from skyless.radios.serial_radio import SerialRadio
+from skyless.nodes.emulation.board_protocol import LinkSpeech
+from skyless.nodes.process.pty import Pty
+from skyless.radios.interface import Restarted
+from skyless.radios.serial.serial_radio import SerialRadio
 
 
 class PlayedRadio:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skyless.constants import TICK_RATE_HZ
-from skyless.radios.board_clock import GIVEN_UP, BoardClock
+from skyless.radios.serial.board_clock import GIVEN_UP, BoardClock
 from skyless.ticks import difference, wrap
 
 

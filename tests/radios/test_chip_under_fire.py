@@ -9,7 +9,7 @@ from skyless.air.airtime import after_rmarker_s
 from skyless.air.fcs import fcs
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.firmware import dw1000
-from skyless.radios.radio import AntennaDelays, Late, Sent
+from skyless.radios.interface import AntennaDelays, Late, Sent
 from skyless.simulation.dw1000 import registers as r
 from skyless.ticks import from_seconds, wrap
 

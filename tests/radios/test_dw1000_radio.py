@@ -16,12 +16,12 @@ from skyless.air.fcs import fcs
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_RATE_HZ
 from skyless.errors import SkylessError
-from skyless.experiments.warm import compile_kernels
-from skyless.radios import chip_ports, spi_bus
-from skyless.radios.chip_ports import SpiPort
-from skyless.radios.dw1000_radio import Dw1000Radio
-from skyless.radios.open import is_simulated, open_radios
-from skyless.radios.radio import AntennaDelays, Gone, Hint, Late, Restarted, Sent
+from skyless.evaluation.compile_ahead import compile_kernels
+from skyless.nodes.open_radio import is_simulated, open_radios
+from skyless.radios.dw1000 import chip_ports, spi_bus
+from skyless.radios.dw1000.chip_ports import SpiPort
+from skyless.radios.dw1000.radio import Dw1000Radio
+from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
 from skyless.simulation.dw1000.bus import ModelBus
 from skyless.ticks import difference, wrap
 
@@ -117,7 +117,7 @@ def test_a_chip_on_spi_is_asked_where_it_has_no_interrupt_line_and_found_again(m
 
 def test_a_chip_whose_supply_failed_is_started_again_even_where_it_says_nothing(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
-    monkeypatch.setattr("skyless.radios.dw1000_radio.CARE_S", 0.01)
+    monkeypatch.setattr("skyless.radios.dw1000.radio.CARE_S", 0.01)
 
     async def play():
         async with ears(radio) as host:
@@ -134,7 +134,7 @@ def test_a_chip_whose_supply_failed_is_started_again_even_where_it_says_nothing(
 
 def test_a_chip_that_is_missed_by_the_looks_after_it_is_found_again(monkeypatch):
     radio, _, buses = spi_radio(monkeypatch)
-    monkeypatch.setattr("skyless.radios.dw1000_radio.CARE_S", 0.01)
+    monkeypatch.setattr("skyless.radios.dw1000.radio.CARE_S", 0.01)
     monkeypatch.setattr(chip_ports, "ASK_S", 0.2)  # so that the look after it comes first
 
     async def play():

@@ -12,10 +12,10 @@ from radio_ears import ears
 from skyless.air.reception import Reception, Transmission
 from skyless.constants import TICK_RATE_HZ
 from skyless.errors import SkylessError
-from skyless.nodes.ether_guests import Guest
-from skyless.radios.ether_wire import Join, Joined, Refused, Send, Unpacker, from_ether, pack
-from skyless.radios.open import host_and_port, is_simulated, open_radios
-from skyless.radios.radio import Gone, Late, Restarted, Sent
+from skyless.nodes.emulation.ether_clients import Guest
+from skyless.nodes.open_radio import host_and_port, is_simulated, open_radios
+from skyless.radios.emulated.ether_wire import Join, Joined, Refused, Send, Unpacker, from_ether, pack
+from skyless.radios.interface import Gone, Late, Restarted, Sent
 from skyless.ticks import difference, wrap
 
 HOST = "127.0.0.1"
@@ -307,7 +307,7 @@ def test_a_radio_says_that_what_answers_is_no_ether(answer):
 def test_of_another_machine_s_ether_the_clock_is_shifted_to_this_one(monkeypatch):
     async def play():
         async with OpenAir() as air:
-            monkeypatch.setattr("skyless.nodes.ether.this_machine", lambda: "another")
+            monkeypatch.setattr("skyless.nodes.emulation.ether.this_machine", lambda: "another")
             air.ether._origin_s -= 1000.0
             air.ether._clock = lambda: time.monotonic() - 1000.0
             async with nodes(air.port, "anchor", "1") as (anchor,), nodes(air.port, "tag", "tag1") as (tag,):

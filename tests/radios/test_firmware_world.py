@@ -6,8 +6,8 @@ from chip_stage import WorldAir
 from firmware_stage import FirmwareAnchor, FirmwareNode
 
 from skyless.anchor import Anchor
-from skyless.experiments.scenarios import Request, impairments_of
-from skyless.radios.radio import Late, Sent
+from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.radios.interface import Late, Sent
 from skyless.receiver import Receiver
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static

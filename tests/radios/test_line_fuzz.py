@@ -15,10 +15,10 @@ import pytest
 
 from recordings.capture_makers import binary_record, tdoa3, text_line
 from skyless.firmware import link
-from skyless.radios.link_session import LinkSession
-from skyless.radios.listener_radio import ListenerRadio
-from skyless.radios.radio import AntennaDelays
-from skyless.radios.sniffer_radio import SnifferStream
+from skyless.radios.interface import AntennaDelays
+from skyless.radios.serial.link_session import LinkSession
+from skyless.radios.serial.listener_radio import ListenerRadio
+from skyless.radios.serial.sniffer_radio import SnifferStream
 
 BYTES = int(os.environ.get("SKYLESS_FUZZ_BYTES", "300000"))
 ALPHABETS = (

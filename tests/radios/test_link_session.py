@@ -6,9 +6,9 @@ import pytest
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.firmware import link
-from skyless.radios.link_records import quantised
-from skyless.radios.link_session import PENDING, POLL_S, SILENCE_S, LinkSession
-from skyless.radios.radio import AntennaDelays, Gone, Hint, Late, Restarted, Sent
+from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
+from skyless.radios.serial.link_records import quantised
+from skyless.radios.serial.link_session import PENDING, POLL_S, SILENCE_S, LinkSession
 
 DELAYS = AntennaDelays(16_450, 16_500)
 COUNTS = [7, 1, 3, 2, 0, 5]

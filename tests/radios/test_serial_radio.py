@@ -15,15 +15,15 @@ from serial_stage import PlayedBoard, linked
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.anchor import Anchor
 from skyless.errors import SkylessError
-from skyless.experiments.scenarios import Request, impairments_of
+from skyless.evaluation.scenarios import Request, impairments_of
 from skyless.firmware import link
-from skyless.nodes.board_speech import ListenerSpeech
-from skyless.nodes.pty import Pty
-from skyless.radios.link_records import quantised
-from skyless.radios.listener_radio import ListenerRadio
-from skyless.radios.open import is_simulated, open_radios, open_sniffers
-from skyless.radios.radio import AntennaDelays, Gone, Late, Restarted, Sent
-from skyless.radios.serial_radio import SerialRadio
+from skyless.nodes.emulation.board_protocol import ListenerSpeech
+from skyless.nodes.open_radio import is_simulated, open_radios, open_sniffers
+from skyless.nodes.process.pty import Pty
+from skyless.radios.interface import AntennaDelays, Gone, Late, Restarted, Sent
+from skyless.radios.serial.link_records import quantised
+from skyless.radios.serial.listener_radio import ListenerRadio
+from skyless.radios.serial.serial_radio import SerialRadio
 from skyless.receiver import Receiver
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static

@@ -8,7 +8,7 @@ import pytest
 
 from skyless.errors import SkylessError
 from skyless.firmware import dw1000
-from skyless.radios.spi_bus import SpiBus
+from skyless.radios.dw1000.spi_bus import SpiBus
 
 
 class Value(enum.Enum):

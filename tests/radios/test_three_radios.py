@@ -13,9 +13,9 @@ from radio_ears import ears
 from serial_stage import PlayedBoard
 
 from skyless.anchor import Anchor
-from skyless.experiments.scenarios import Request, impairments_of
-from skyless.radios.radio import Reception, Restarted
-from skyless.radios.serial_radio import SerialRadio
+from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.radios.interface import Reception, Restarted
+from skyless.radios.serial.serial_radio import SerialRadio
 from skyless.receiver import Receiver
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static

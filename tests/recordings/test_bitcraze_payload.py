@@ -3,8 +3,8 @@ from capture_makers import tdoa2, tdoa3
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.packet import Packet, Relay
-from skyless.recordings.bitcraze_payload import decode
+from skyless.air.masterless_packets import Packet, Relay
+from skyless.recordings.foreign.bitcraze_payload import decode
 
 byte = st.integers(0, 255)
 seven_bits = st.integers(0, 127)

@@ -3,8 +3,8 @@
 import pytest
 
 from skyless.errors import ConfigurationError
-from skyless.positioning.difference_calibration import AnchorCalibration, DifferenceCalibration
-from skyless.recordings.anchors import calibrated_table, new_table, read_anchors, read_calibration
+from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
+from skyless.recordings.anchor_table import calibrated_table, new_table, read_anchors, read_calibration
 
 KNOWN = DifferenceCalibration({1: AnchorCalibration(0.1234, 0.08, 0.061), 16: AnchorCalibration(-0.1)})
 TABLE = 'name,id,x_m,y_m,z_m\n"door, left",1,0.10,0,2.5000\n\nwindow,0x10,6,0,2\nfar,3,6,8,2\n'

@@ -4,7 +4,7 @@ import pytest
 from capture_makers import binary_record, tdoa3, text_line, yaml_document
 
 from skyless.errors import ConfigurationError
-from skyless.recordings.formats import FORMATS, open_recording
+from skyless.recordings.foreign.formats import FORMATS, open_recording
 
 PACKET = (2, 12345, tdoa3(5, 6, [(1, 2, 3, 33000)]))
 SAMPLES = {

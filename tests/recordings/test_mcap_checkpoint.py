@@ -13,11 +13,11 @@ from msgspec.structs import replace
 from machines.bench import LAB, PAIRS, ROOM, tape
 from skyless.air.codec import decode, encode
 from skyless.air.reception import Reception
-from skyless.methods import METHODS
+from skyless.method_names import METHODS
 from skyless.receiver import Receiver
-from skyless.recordings.checkpoint import FORMAT, RefusedError, load, save
-from skyless.recordings.checkpoint_reader import DamagedGraphError, read_graph
-from skyless.recordings.checkpoint_writer import write_graph
+from skyless.recordings.mcap.checkpoint import FORMAT, RefusedError, load, save
+from skyless.recordings.mcap.checkpoint_reader import DamagedGraphError, read_graph
+from skyless.recordings.mcap.checkpoint_writer import write_graph
 
 RNG = np.random.default_rng(20)
 

@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from live_site import PLACES, SITE, UNIX_S, messages, record
 
 from skyless.errors import SkylessError
-from skyless.outputs import messages as outputs
-from skyless.outputs.messages import FixMessage
-from skyless.recordings import mcap_file
-from skyless.recordings.mcap_channels import place_of, schema_of
-from skyless.recordings.mcap_file import McapFile
-from skyless.recordings.mcap_foxglove import ellipse_of
-from skyless.recordings.mcap_recording import McapRecording
+from skyless.mqtt import messages as outputs
+from skyless.mqtt.messages import FixMessage
+from skyless.recordings.mcap import file as mcap_file
+from skyless.recordings.mcap.channels import place_of, schema_of
+from skyless.recordings.mcap.file import McapFile
+from skyless.recordings.mcap.foxglove import ellipse_of
+from skyless.recordings.mcap.recording import McapRecording
 
 PAYLOADS = (
     *(outputs.SiteMessage, outputs.FixMessage, outputs.ReceptionsMessage, outputs.TruthMessage, outputs.ZonesMessage),
@@ -231,8 +231,8 @@ WRITER = """
 import sys, time
 sys.path[:0] = [{tests!r}, {here!r}]
 from live_site import messages
-from skyless.recordings.mcap_file import McapFile
-from skyless.recordings.mcap_recorder import McapRecorder
+from skyless.recordings.mcap.file import McapFile
+from skyless.recordings.mcap.recorder import McapRecorder
 recorder = McapRecorder(McapFile(sys.argv[1]))
 for number, (s, topic, payload) in enumerate(messages(2.0)):
     recorder.take(topic, payload, s)

@@ -5,10 +5,10 @@ import pytest
 
 from machines.bench import LAB, tape
 from skyless.air.reception import Diagnostics, Reception
-from skyless.outputs.messages import RawReception, ReceptionsMessage, RequestMessage
+from skyless.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage
 from skyless.receiver import Receiver
-from skyless.recordings.checkpoint import load
-from skyless.recordings.reception_log import MOST_PENDING, ReceptionLog, raw, receiver_settings
+from skyless.recordings.mcap.checkpoint import load
+from skyless.recordings.mcap.reception_log import MOST_PENDING, ReceptionLog, raw, receiver_settings
 
 SETTINGS = receiver_settings("joint")
 HEARD = [one.reception for one in tape(LAB, 2.0)]

@@ -10,11 +10,11 @@ from msgspec.structs import replace
 
 from skyless.cli.main import main
 from skyless.errors import SkylessError
-from skyless.experiments.replay_site import SiteReplay
-from skyless.methods import METHODS
-from skyless.outputs.messages import ReceptionsMessage
-from skyless.positioning.protection import Alert, IntegrityRequirement
-from skyless.recordings.mcap_recording import McapRecording
+from skyless.method_names import METHODS
+from skyless.mqtt.messages import ReceptionsMessage
+from skyless.positioning.integrity import Alert, IntegrityRequirement
+from skyless.recordings.mcap.recording import McapRecording
+from skyless.replay.site import SiteReplay
 
 
 def replayed(path, **options):

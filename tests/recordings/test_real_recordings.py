@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from skyless.positioning.masterless import PairEngine
-from skyless.recordings.anchors import read_anchors
-from skyless.recordings.formats import open_recording
+from skyless.positioning.masterless.pair_engine import PairEngine
+from skyless.recordings.anchor_table import read_anchors
+from skyless.recordings.foreign.formats import open_recording
 from skyless.recordings.truth import read_truth
 
 KUIPMAN = {

@@ -9,8 +9,8 @@ from capture_makers import binary_record, tdoa2, tdoa3, text_line, yaml_document
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.air.packet import Packet
-from skyless.recordings import sniffer_binary, sniffer_text, sniffer_yaml
+from skyless.air.masterless_packets import Packet
+from skyless.recordings.foreign import sniffer_binary, sniffer_text, sniffer_yaml
 from skyless.recordings.source import CHUNK_BYTES, open_source
 
 READERS = {

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.packet import PairTdoa
+from skyless.air.masterless_packets import PairTdoa
 from skyless.errors import ConfigurationError
-from skyless.recordings import pair_table
-from skyless.recordings.anchors import read_anchors
+from skyless.recordings.anchor_table import read_anchors
+from skyless.recordings.foreign import tdoa_table as pair_table
 from skyless.recordings.truth import read_truth
 
 HEADER = b"t_s,idA,idB,tdoa_m\n"

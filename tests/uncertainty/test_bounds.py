@@ -5,7 +5,7 @@ import pytest
 
 from dense_covariance import position_covariance
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.experiments.lab_bound import lab_tracking_bound_m, random_path
+from skyless.evaluation.lab_bound import lab_tracking_bound_m, random_path
 from skyless.uncertainty.bounds import (
     OFFSET_STD_M,
     POSITION_STD_M,

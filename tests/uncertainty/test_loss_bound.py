@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from skyless.experiments.studies import loss
-from skyless.experiments.studies.plan import Plan
 from skyless.site.lab import lab_site
+from skyless.studies import loss
+from skyless.studies.plan import Plan
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 from skyless.uncertainty.loss_bound import known_receptions, received_bound
 

@@ -1,14 +1,14 @@
 """The paper's variances derived again: its algorithm run on symbols, linearised, and compared term by term.
 
-The functions that are linearised are the program's own (``clocks/paper.py``, ``positioning/paper.py``), fed with clock
-readings plus noise. Nothing of ``corrected`` or of the errata enters before the comparison.
+The functions that are linearised are the program's own (``clocks/paper.py``, ``positioning/solver/paper.py``), fed with
+clock readings plus noise. Nothing of ``corrected`` or of the errata enters before the comparison.
 """
 
 import pytest
 import sympy as sp
 
 from skyless.clocks.paper import averaged_offset, relative_offset, relative_rate, to_master
-from skyless.positioning.paper import protocol_interval, tag_rate
+from skyless.positioning.solver.paper import protocol_interval, tag_rate
 from skyless.uncertainty import corrected, printed
 from skyless.uncertainty.chain import Chain
 

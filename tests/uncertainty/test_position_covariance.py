@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dense_covariance import position_covariance
-from skyless.positioning.solver import Solution, locate
+from skyless.positioning.solver.locate import Solution, locate
 from skyless.uncertainty.tdoa import (
     bracketed_covariance,
     literal_covariance,

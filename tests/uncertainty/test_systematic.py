@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from skyless.bench.monte_carlo_speed import bench_chain
 from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.experiments.chain_draws import Quantity, Readings
-from skyless.experiments.yardstick import bench_chain
-from skyless.positioning.paper import bracketed_tdoa, literal_tdoa
+from skyless.paper.chain_draws import Quantity, Readings
+from skyless.positioning.solver.paper import bracketed_tdoa, literal_tdoa
 from skyless.uncertainty.systematic import (
     bracketed_motion_error_m,
     literal_motion_error_m,

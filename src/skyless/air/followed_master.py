@@ -3,7 +3,7 @@
 from typing import Final
 
 from skyless.air.beacon import Beacon
-from skyless.air.claim import Claim, Sightings, claim_of, is_newer
+from skyless.air.master_term import Claim, Sightings, claim_of, is_newer
 from skyless.ticks import from_seconds
 
 SIGHTINGS_WITHIN_TICKS: Final = from_seconds(0.5)

@@ -6,8 +6,8 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 if TYPE_CHECKING:
-    from skyless.experiments.benchmarks import Speed
-    from skyless.experiments.yardstick import MonteCarloSpeed
+    from skyless.bench.measure import Speed
+    from skyless.bench.monte_carlo_speed import MonteCarloSpeed
 
 QUICK_DRAWS: Final = 100_000
 
@@ -37,10 +37,10 @@ def bench(
     json
         Write one JSON object instead of a table.
     """
-    from skyless.cli.output import print_json
-    from skyless.cli.progress import status
-    from skyless.experiments.benchmarks import FULL, QUICK, measure_all
-    from skyless.experiments.yardstick import measure
+    from skyless.bench.measure import FULL, QUICK, measure_all
+    from skyless.bench.monte_carlo_speed import measure
+    from skyless.cli.common.output import print_json
+    from skyless.cli.common.progress import status
 
     draws = min(draws, QUICK_DRAWS) if quick else draws
     with status("filters"):
@@ -56,7 +56,7 @@ def bench(
 
 
 def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
-    from skyless.cli.output import console
+    from skyless.cli.common.output import console
 
     out = console()
     load = "" if speed.load is None else f", load {speed.load:.1f}"

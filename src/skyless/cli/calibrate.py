@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 from cyclopts import App
 
 from skyless.cli.calibrate_output import report_of, see_that_it_can_be_written, show, write
-from skyless.cli.options import Finite, finite_numbers, spare_inputs
-from skyless.cli.output import print_json
-from skyless.cli.progress import status
+from skyless.cli.common.options import Finite, finite_numbers, spare_inputs
+from skyless.cli.common.output import print_json
+from skyless.cli.common.progress import status
 from skyless.cli.replay_input import flight_height, known_anchors, known_truth
 from skyless.cli.replay_site import is_mcap, see_that_they_are_left_out
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.experiments.calibration_samples import First, Stay
+    from skyless.calibration.samples import First, Stay
 
 app = App(
     name="calibrate",
@@ -80,7 +80,7 @@ def calibrate(
     json
         Write one JSON object instead of the table.
     """
-    from skyless.experiments.calibration_run import CalibrationRequest, calibrate_capture, calibrate_site
+    from skyless.calibration.run import CalibrationRequest, calibrate_capture, calibrate_site
 
     spare_inputs("out", out, file, truth)
     own = is_mcap(file)
@@ -121,7 +121,7 @@ def _identifier_of(site: Path | None) -> int | None:
 
 def _stay(text: str) -> "Stay":
     """Place of a tag at rest: x,y[,z][@FROM:TO]. Raises SkylessError."""
-    from skyless.experiments.calibration_samples import Stay
+    from skyless.calibration.samples import Stay
 
     place, mark, span = text.partition("@")
     x_m, y_m, *z_m = finite_numbers("at", place, (2, 3))
@@ -135,7 +135,7 @@ def _stay(text: str) -> "Stay":
 
 def _first(text: str | None) -> "First":
     """How much of the beginning to use: a number, seconds with s, a part with %. Raises SkylessError."""
-    from skyless.experiments.calibration_samples import First
+    from skyless.calibration.samples import First
 
     if text is None:
         return First()

@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from skyless.cli.output import console, write_atomically
+from skyless.cli.common.output import console, write_atomically
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.experiments.calibration import CalibrationEstimate
-    from skyless.experiments.calibration_run import Calibrated
+    from skyless.calibration.estimate import CalibrationEstimate
+    from skyless.calibration.run import Calibrated
 
 MANY_OUTLIERS = 0.05
 UNEXPLAINED_SHARE = 0.5
@@ -40,7 +40,7 @@ def write(done: "Calibrated", anchors: Path | None, site: Path | None, out: Path
         delays_ticks = {anchor: new for anchor, (_, new) in done.tx_delays_ticks().items()}
         text = with_tx_delays(site.read_bytes().decode(), delays_ticks, site)
     else:
-        from skyless.recordings.anchors import calibrated_table, new_table
+        from skyless.recordings.anchor_table import calibrated_table, new_table
 
         known = done.estimate.calibration()
         text = new_table(done.samples.anchors_m, known) if anchors is None else calibrated_table(anchors, known)

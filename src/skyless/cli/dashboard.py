@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.nodes import DEFAULT_MQTT, Mqtt, MqttCa, listen_address, site_named
-from skyless.cli.output import print_json
+from skyless.cli.common.output import print_json
+from skyless.cli.nodes.options import DEFAULT_MQTT, Mqtt, MqttCa, listen_address, site_named
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
     from skyless.dashboard.guard import Rules
     from skyless.dashboard.serve import Listen
-    from skyless.outputs.messages import SiteMessage
+    from skyless.mqtt.messages import SiteMessage
 
 _SHORTEST_TOKEN = 12
 
@@ -65,7 +65,7 @@ def dashboard(
     from skyless.dashboard.overlays import Overlays
     from skyless.dashboard.playback import Playback
     from skyless.dashboard.serve import bind, serve
-    from skyless.outputs.address import mqtt_address
+    from skyless.mqtt.address import mqtt_address
 
     broker = mqtt_address(mqtt, mqtt_ca)
     broker.tls_context()
@@ -103,7 +103,7 @@ def _load(name: str) -> "tuple[SiteMessage, bytes | None]":
     """The site and the image of its floor. Raises SkylessError."""
     import time
 
-    from skyless.outputs.messages import SiteMessage
+    from skyless.mqtt.messages import SiteMessage
 
     site = site_named(name)
     image = None if site.floor_plan is None else (Path(name).parent / site.floor_plan.image).read_bytes()

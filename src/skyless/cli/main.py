@@ -10,23 +10,31 @@ from cyclopts import App, CycloptsError, Parameter
 from skyless.errors import SkylessError
 
 _COMMANDS = (
-    # name, where it is (imported only when it is called), what it does
-    ("demo", "skyless.cli.demo:app", "Show a site and walking tags in real time."),
-    ("simulate", "skyless.cli.simulate:app", "Run a site in the simulated world and judge it against the truth."),
-    ("replay", "skyless.cli.replay:app", "Turn a recording into fixes and judge them against the truth."),
-    ("calibrate", "skyless.cli.calibrate:app", "Find wrong antenna delays from a tag whose place is known."),
-    ("paper", "skyless.cli.paper:app", "Reproduce the paper's figures and claims in one report."),
-    ("study", "skyless.cli.study:app", "Measure the receiver's errors over many simulated runs."),
-    ("plan", "skyless.cli.plan:app", "Predict a site's errors before it is mounted, and place its anchors."),
-    ("site", "skyless.cli.site:app", "Write and check site files."),
-    ("broker", "skyless.cli.broker:app", "Run the MQTT broker that comes with Skyless."),
-    ("ether", "skyless.cli.ether:app", "Emulate a site's air in real time, for the programs of anchors and tags."),
-    ("board", "skyless.cli.board:app", "Emulate a board with a radio on a serial port, to try programs without one."),
-    ("anchor", "skyless.cli.anchor:app", "Run anchors of a site."),
-    ("tag", "skyless.cli.tag:app", "Run listening tags."),
-    ("dashboard", "skyless.cli.dashboard:app", "Show a site live in the browser."),
-    ("record", "skyless.cli.record:app", "Record a running site into a file."),
-    ("bench", "skyless.cli.bench:app", "Measure how fast Monte Carlo draws run on this machine."),
+    # name, module below skyless.cli (imported only when it is called), what it does
+    ("demo", "nodes.demo", "Show a site and walking tags in real time."),
+    ("simulate", "simulate", "Run a site in the simulated world and judge it against the truth."),
+    ("replay", "replay", "Turn a recording into fixes and judge them against the truth."),
+    ("calibrate", "calibrate", "Find wrong antenna delays from a tag whose place is known."),
+    ("paper", "paper", "Reproduce the paper's figures and claims in one report."),
+    ("study", "study", "Measure the receiver's errors over many simulated runs."),
+    ("plan", "plan", "Predict a site's errors before it is mounted, and place its anchors."),
+    ("site", "site", "Write and check site files."),
+    ("broker", "nodes.broker", "Run the MQTT broker that comes with Skyless."),
+    (
+        "ether",
+        "nodes.ether",
+        "Emulate a site's air in real time, for the programs of anchors and tags.",
+    ),
+    (
+        "board",
+        "nodes.board",
+        "Emulate a board with a radio on a serial port, to try programs without one.",
+    ),
+    ("anchor", "nodes.anchor", "Run anchors of a site."),
+    ("tag", "nodes.tag", "Run listening tags."),
+    ("dashboard", "dashboard", "Show a site live in the browser."),
+    ("record", "nodes.record", "Record a running site into a file."),
+    ("bench", "bench", "Measure how fast Monte Carlo draws run on this machine."),
 )
 
 _INTERRUPTED = 130
@@ -47,8 +55,8 @@ def program() -> App:
         result_action="return_value",
         default_parameter=Parameter(negative=()),
     )
-    for name, place, summary in _COMMANDS:
-        app.command(place, name=name, help=summary)
+    for name, module, summary in _COMMANDS:
+        app.command(f"skyless.cli.{module}:app", name=name, help=summary)
     return app
 
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.output import console, print_json
-from skyless.cli.progress import progress_bar, status
+from skyless.cli.common.output import console, print_json
+from skyless.cli.common.progress import progress_bar, status
 
 if TYPE_CHECKING:
-    from skyless.experiments.paper.run import Report
+    from skyless.paper.run import Report
 
 app = App(name="paper", help_epilogue="Example: skyless paper --out report --seed 1")
 
@@ -41,9 +41,9 @@ def paper(
     json
         Write one JSON object instead of the table.
     """
-    from skyless.experiments.paper.plan import plan_of
-    from skyless.experiments.paper.run import write_report
-    from skyless.experiments.warm import compile_kernels
+    from skyless.evaluation.compile_ahead import compile_kernels
+    from skyless.paper.plan import plan_of
+    from skyless.paper.run import write_report
 
     started_s = time.perf_counter()
     with status("loading the kernels; the first start compiles them, which takes some ten seconds"):

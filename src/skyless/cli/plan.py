@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import Positive
-from skyless.cli.output import print_json
+from skyless.cli.common.options import Positive
+from skyless.cli.common.output import print_json
+from skyless.cli.common.progress import progress_bar
 from skyless.cli.plan_files import write_files, write_site
 from skyless.cli.plan_input import (
     check_count,
@@ -20,9 +21,8 @@ from skyless.cli.plan_input import (
     tag_heights_of,
 )
 from skyless.cli.plan_output import report, show
-from skyless.cli.progress import progress_bar
 from skyless.errors import SkylessError
-from skyless.methods import DEFAULT_METHOD
+from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.planning.floor import Floor

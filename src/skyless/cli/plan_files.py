@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from skyless.cli.options import open_for_writing
-from skyless.cli.output import write_atomically
+from skyless.cli.common.options import open_for_writing
+from skyless.cli.common.output import write_atomically
 from skyless.cli.plan_output import described, html_page
 from skyless.errors import SkylessError
 
@@ -50,7 +50,7 @@ def write_files(
             table.writelines(_lines(mapped, grid, predictor.site))
     if plot is None and html is None:
         return
-    from skyless.experiments.figures import save_figure
+    from skyless.evaluation.figures import save_figure
     from skyless.planning.picture import RMSE_LAYER, SIGMA_LAYER, Background, draw_layer
 
     background = Background(predictor.site, floor, file, described(result))

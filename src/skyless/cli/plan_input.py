@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skyless.cli.options import finite_numbers, known_method, spare_inputs
+from skyless.cli.common.options import finite_numbers, known_method, spare_inputs
 from skyless.errors import ConfigurationError, SkylessError
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from skyless.cli.output import console
+from skyless.cli.common.output import console
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,11 +42,11 @@ def report(
     """All there is to say, SI units."""
     import numpy as np
 
-    from skyless.air.schedule import schedule_of
     from skyless.planning.advice import plan_warnings
     from skyless.planning.columns import BIAS
     from skyless.planning.links import range_of
     from skyless.planning.optimise import one_more
+    from skyless.site.slots import schedule_of
 
     site, settings = predictor.site, predictor.settings
     heights = tuple(mapped.grid.heights_m.tolist())

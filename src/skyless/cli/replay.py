@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from skyless.cli.options import (
+from skyless.cli.common.options import (
     Finite,
     IntegrityRisk,
     NotNegative,
@@ -15,17 +15,17 @@ from skyless.cli.options import (
     see_that_a_height_is_given,
     spare_inputs,
 )
-from skyless.cli.output import print_json
-from skyless.cli.progress import progress_bar, status
+from skyless.cli.common.output import print_json
+from skyless.cli.common.progress import progress_bar, status
 from skyless.cli.replay_input import flight_height, height_to_hold, known_anchors, known_truth
 from skyless.cli.replay_output import draw_track, fix_writer, see_that_it_can_be_drawn, show
 from skyless.cli.replay_site import Options, is_mcap, replay_site, see_that_they_are_left_out
 from skyless.errors import ConfigurationError, SkylessError
 
 if TYPE_CHECKING:
-    from skyless.experiments.judge import Judge
-    from skyless.experiments.replay import Replay, ReplayReport
+    from skyless.evaluation.judge import Judge
     from skyless.recordings.truth import Truth
+    from skyless.replay.foreign import Replay, ReplayReport
 
 app = App(
     name="replay",
@@ -125,10 +125,10 @@ def replay(
     json
         Write one JSON object instead of the table.
     """
-    from skyless.experiments.judge import Judge
-    from skyless.experiments.replay import MEASUREMENTS, Replay, ReplayRequest
-    from skyless.recordings.anchors import read_calibration
-    from skyless.recordings.formats import format_of
+    from skyless.evaluation.judge import Judge
+    from skyless.recordings.anchor_table import read_calibration
+    from skyless.recordings.foreign.formats import format_of
+    from skyless.replay.foreign import MEASUREMENTS, Replay, ReplayRequest
 
     spare_inputs("fixes", fixes, file, anchors, site, truth)
     spare_inputs("plot", plot, file, anchors, site, truth, fixes)
@@ -203,7 +203,7 @@ def _see_that_truth_matches(table: Path, truth: "Truth", judge: "Judge") -> None
 
 
 def _run(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
-    from skyless.experiments.warm import compile_packet_kernels, compile_pair_kernels
+    from skyless.evaluation.compile_ahead import compile_packet_kernels, compile_pair_kernels
 
     with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
         if run.measurements == "packets":
@@ -222,6 +222,6 @@ def _distances(file: Path, name: str) -> dict[str, float]:
         return {}
     from collections import Counter
 
-    from skyless.recordings.avalue import anchor_distances_m
+    from skyless.recordings.foreign.avalue import anchor_distances_m
 
     return {f"{a:X}-{b:X}": metres for (a, b), metres in sorted(anchor_distances_m(file, Counter()).items())}

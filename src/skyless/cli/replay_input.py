@@ -3,17 +3,17 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skyless.cli.options import finite_numbers
+from skyless.cli.common.options import finite_numbers
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.air.packet import Point
+    from skyless.air.masterless_packets import Point
     from skyless.recordings.truth import Truth
 
 
 def known_anchors(table: Path | None, site: Path | None) -> "tuple[dict[int, Point], float | None]":
     """Places of the anchors, and the tags' height where a site file tells it. Raises SkylessError."""
-    from skyless.recordings.anchors import read_anchors
+    from skyless.recordings.anchor_table import read_anchors
     from skyless.site.load import load_site
 
     if table is not None and site is not None:
@@ -30,8 +30,8 @@ def known_truth(
     file: Path, table: Path | None, arm: str | None, name: str | None, listener: str | None
 ) -> "Truth | None":
     """Where the antenna was, by a table or by the recording itself. Raises SkylessError."""
-    from skyless.experiments.judge import antenna_truth
-    from skyless.recordings.formats import format_of
+    from skyless.evaluation.judge import antenna_truth
+    from skyless.recordings.foreign.formats import format_of
     from skyless.recordings.truth import read_truth
 
     if table is None and format_of(file, name).name == "miluv":
@@ -53,7 +53,7 @@ def height_to_hold(
     """Height to hold, its standard deviation, and what to tell the user about it."""
     import numpy as np
 
-    from skyless.experiments.observability import GUESSED_STD_M, plane_height_m
+    from skyless.evaluation.observability import GUESSED_STD_M, plane_height_m
 
     if wish == "free":
         return None, 0.0, "estimated"
@@ -83,6 +83,6 @@ def flight_height(wish: float | None, truth: "Truth | None") -> float | None:
     """Judge flights in the air only: the truth begins on the floor and rises well above it."""
     if wish is not None or truth is None:
         return wish
-    from skyless.experiments.observability import FLIGHT_M, flies
+    from skyless.evaluation.observability import FLIGHT_M, flies
 
     return FLIGHT_M if flies(truth) else None

@@ -6,14 +6,14 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skyless.cli.options import open_for_writing
-from skyless.cli.output import console
+from skyless.cli.common.options import open_for_writing
+from skyless.cli.common.output import console
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.experiments.judge import Judge
-    from skyless.experiments.replay import ReplayReport
+    from skyless.evaluation.judge import Judge
     from skyless.positioning.fix import Fix
+    from skyless.replay.foreign import ReplayReport
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -45,7 +45,7 @@ def see_that_it_can_be_drawn(plot: Path | None) -> None:
 
 def draw_track(path: Path, judge: "Judge", report: "ReplayReport") -> None:
     """Draw what --plot asks for. Raises SkylessError."""
-    from skyless.experiments.replay_plot import draw
+    from skyless.replay.plot import draw
 
     try:
         draw(path, judge.track.rows, f"{report.format}, {report.fixes} fixes")

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
-from skyless.cli.options import known_method, open_for_writing
-from skyless.cli.output import print_json
-from skyless.cli.progress import progress_bar, status
+from skyless.cli.common.options import known_method, open_for_writing
+from skyless.cli.common.output import print_json
+from skyless.cli.common.progress import progress_bar, status
 from skyless.cli.replay_output import COLUMNS, draw_track, row_of, show
 from skyless.errors import SkylessError
-from skyless.methods import DEFAULT_METHOD
+from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
-    from skyless.experiments.replay_site import SiteReplay, TagReport
-    from skyless.experiments.replay_tag import Replayed
-    from skyless.positioning.protection import IntegrityRequirement
+    from skyless.positioning.integrity import IntegrityRequirement
+    from skyless.replay.site import SiteReplay, TagReport
+    from skyless.replay.tag import Replayed
 
 
 class Options(Struct, frozen=True):
@@ -38,7 +38,7 @@ class Options(Struct, frozen=True):
 
 def is_mcap(file: Path) -> bool:
     """Whether a file's content is an MCAP; one that cannot be opened is none."""
-    from skyless.recordings.mcap_scan import MAGIC
+    from skyless.recordings.mcap.scan import MAGIC
 
     try:
         with file.open("rb") as stream:
@@ -56,8 +56,8 @@ def see_that_they_are_left_out(options: Mapping[str, object], reason: str) -> No
 
 def replay_site(file: Path, options: Options) -> None:
     """Replay all tags of a recording, or one. Raises SkylessError."""
-    from skyless.experiments.replay_site import SiteReplay
-    from skyless.recordings.mcap_recording import McapRecording
+    from skyless.recordings.mcap.recording import McapRecording
+    from skyless.replay.site import SiteReplay
     from skyless.site.load import load_site
 
     if options.method is not None:
@@ -82,7 +82,7 @@ def replay_site(file: Path, options: Options) -> None:
 
 
 def _run(run: "SiteReplay", span_s: float, options: Options) -> "list[TagReport]":
-    from skyless.experiments.warm import compile_kernels
+    from skyless.evaluation.compile_ahead import compile_kernels
 
     with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
         compile_kernels(options.method or DEFAULT_METHOD)

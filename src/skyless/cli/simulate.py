@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import (
+from skyless.cli.common.options import (
     IntegrityRisk,
     NotNegative,
     Picoseconds,
@@ -19,16 +19,16 @@ from skyless.cli.options import (
     open_for_writing,
     spare_inputs,
 )
-from skyless.cli.output import print_json
-from skyless.cli.progress import progress_bar, status
+from skyless.cli.common.output import print_json
+from skyless.cli.common.progress import progress_bar, status
 from skyless.cli.simulate_input import ROOM, bias_of, delay_errors_of, outage_of, path_of, silence_of, site_of
 from skyless.cli.simulate_output import COLUMNS, row_of, show
 from skyless.errors import SkylessError
-from skyless.methods import DEFAULT_METHOD
+from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
-    from skyless.experiments.fleet import Fleet, FleetReport
-    from skyless.experiments.scenarios import Request
+    from skyless.evaluation.fleet import Fleet, FleetReport
+    from skyless.evaluation.scenarios import Request
 
 _Share = Annotated[float, Parameter(validator=Number(gte=0, lt=1))]
 
@@ -140,8 +140,8 @@ def simulate(
     json
         Write one JSON object instead of the table.
     """
-    from skyless.experiments.room import Room
-    from skyless.experiments.scenarios import Request
+    from skyless.evaluation.room_world import Room
+    from skyless.evaluation.scenarios import Request
 
     spare_inputs("fixes-csv", fixes_csv, site)
     if position and not waypoints and (tags is not None or speed is not None):
@@ -191,9 +191,9 @@ def simulate(
 
 
 def _run(request: "Request", until_s: float, fixes_csv: Path | None) -> "FleetReport":
-    from skyless.experiments.fleet import report
-    from skyless.experiments.scenarios import fleet_of
-    from skyless.experiments.warm import compile_kernels
+    from skyless.evaluation.compile_ahead import compile_kernels
+    from skyless.evaluation.fleet import report
+    from skyless.evaluation.scenarios import fleet_of
 
     try:
         fleet = fleet_of(request)

@@ -6,7 +6,7 @@ from math import dist
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from skyless.cli.options import finite_numbers
+from skyless.cli.common.options import finite_numbers
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:

@@ -2,10 +2,10 @@
 
 from typing import TYPE_CHECKING, Final
 
-from skyless.cli.output import console
+from skyless.cli.common.output import console
 
 if TYPE_CHECKING:
-    from skyless.experiments.fleet import FleetReport, JudgedFix
+    from skyless.evaluation.fleet import FleetReport, JudgedFix
 
 COLUMNS: Final = (
     *("t_s", "tag"),

@@ -7,7 +7,7 @@ import msgspec
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.output import console, print_json, write_atomically
+from skyless.cli.common.output import console, print_json, write_atomically
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -102,9 +102,9 @@ def _report(site: "Site") -> dict[str, Any]:
     """What there is to say of a valid site, SI units."""
     from skyless.air.airtime import air_time_s
     from skyless.air.codec import MAX_FRAME_BYTES
-    from skyless.air.schedule import first_slots, schedule_of
     from skyless.constants import TICK_S
     from skyless.site.advice import warnings_of
+    from skyless.site.slots import first_slots, schedule_of
 
     schedule = schedule_of(site)
     first = first_slots(site)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.options import IntegrityRisk, Picoseconds, Positive, integrity_of, known_method
-from skyless.cli.progress import progress_bar, status
+from skyless.cli.common.options import IntegrityRisk, Picoseconds, Positive, integrity_of, known_method
+from skyless.cli.common.progress import progress_bar, status
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.experiments.studies.plan import Plan, Row, Study
+    from skyless.studies.plan import Plan, Row, Study
 
 _Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "scale"]
 _Count = Annotated[int, Parameter(validator=Number(gte=1, lte=10**6))]
@@ -90,8 +90,8 @@ def study(
         Processes on this machine; by default one for each core.
     """
     from skyless.cli.study_output import print_rows, see_that_it_can_be_written, write
-    from skyless.experiments.studies.catalogue import STUDIES
-    from skyless.experiments.studies.plan import plan_of
+    from skyless.studies.catalogue import STUDIES
+    from skyless.studies.plan import plan_of
 
     asked = integrity_of(integrity_risk, alert_limit_m, None)
     if name != "integrity" and (integrity_risk is not None or alert_limit_m is not None):
@@ -135,8 +135,8 @@ def _see_that_it_applies(name: str, episodes: int | None, others: dict[str, floa
 
 
 def _run(chosen: "Study", plan: "Plan", scheduler: str | None, processes: int | None) -> "list[Row]":
-    from skyless.experiments.studies.runner import run_cells, run_cells_on_dask
-    from skyless.experiments.warm import compile_kernels
+    from skyless.evaluation.compile_ahead import compile_kernels
+    from skyless.studies.runner import run_cells, run_cells_on_dask
 
     known_method(plan.method)
     cells = chosen.cells(plan)

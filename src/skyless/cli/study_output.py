@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from skyless.cli.output import console, print_json, to_json, write_atomically
+from skyless.cli.common.output import console, print_json, to_json, write_atomically
 from skyless.cli.replay_output import see_that_it_can_be_drawn
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from skyless.experiments.studies.plan import Plan, Row, Study
+    from skyless.studies.plan import Plan, Row, Study
 
 WIDEST = 220
 """Columns of a table that is not shown on a terminal."""
@@ -66,7 +66,7 @@ def write(study: "Study", rows: "Sequence[Row]", plot: Path | None, out: Path | 
     """Write the files that were asked for, each whole or not at all. Raises SkylessError."""
     if plot is None and out is None:
         return
-    from skyless.experiments.figures import picture
+    from skyless.evaluation.figures import picture
 
     figure = study.draw(rows)
     files = {} if plot is None else {plot: plot.suffix.removeprefix(".")}

@@ -7,7 +7,7 @@ the first synchronisation message, which leaves the method as it stands and its 
 
 from dataclasses import dataclass
 
-from skyless.compiled import part
+from skyless.kernels.compiled import part
 
 
 @dataclass(frozen=True, slots=True)

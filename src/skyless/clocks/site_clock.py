@@ -4,10 +4,10 @@ from collections import Counter
 from typing import Final
 
 from skyless.air.beacon import Beacon
-from skyless.air.schedule import Schedule
 from skyless.clocks.filter import ClockFilter
 from skyless.clocks.site_time import SUBTICKS, SiteTime, continued, own_counter
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, MAX_DRIFT, TICK_M
+from skyless.site.slots import Schedule
 from skyless.ticks import nearest, wrap
 
 MISFITS_BEFORE_RESTART: Final = 3

@@ -10,7 +10,7 @@ _T = TypeVar("_T")
 
 
 class Bus(Protocol):
-    """What is needed of ``skyless.outputs.link.Link``."""
+    """What is needed of ``skyless.mqtt.link.Link``."""
 
     def publish(self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False) -> None:
         """Hand over a message; returns at once."""

@@ -18,8 +18,8 @@ from skyless.dashboard.state import Board, encode
 from skyless.dashboard.zone_events import EventDesk, place_in_line
 from skyless.dashboard.zones import BadZonesError, ZoneWatch, check_zones, read_zones
 from skyless.errors import ConfigurationError
-from skyless.outputs import topics
-from skyless.outputs.messages import (
+from skyless.mqtt import topics
+from skyless.mqtt.messages import (
     AnchorHealth,
     EtherHealth,
     FixMessage,

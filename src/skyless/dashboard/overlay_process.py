@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skyless.dashboard.overlays import OverlayGrids, OverlayTask
 from skyless.errors import SkylessError
-from skyless.methods import DEFAULT_METHOD, METHODS
+from skyless.method_names import DEFAULT_METHOD, METHODS
 from skyless.planning.columns import FIX_SHARE, HDOP, PDOP, SIGMA
 from skyless.planning.maps import Grid, plan_map
 from skyless.planning.predict import PlanSettings, Predictor

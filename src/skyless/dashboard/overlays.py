@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.methods import DEFAULT_METHOD
+from skyless.method_names import DEFAULT_METHOD
 from skyless.site.image import image_size
 from skyless.site.model import Site
 

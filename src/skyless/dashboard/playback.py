@@ -12,9 +12,9 @@ from msgspec import Struct
 
 from skyless.dashboard.state import Board
 from skyless.errors import SkylessError
-from skyless.outputs.messages import FixMessage, SiteMessage, TruthMessage, Zone
-from skyless.outputs.truths import REACH_S
-from skyless.recordings.mcap_recording import McapRecording
+from skyless.mqtt.messages import FixMessage, SiteMessage, TruthMessage, Zone
+from skyless.mqtt.truth_buffer import REACH_S
+from skyless.recordings.mcap.recording import McapRecording
 
 SUFFIX: Final = ".mcap"
 _KEPT_OPEN: Final = 8

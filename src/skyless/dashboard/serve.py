@@ -14,10 +14,10 @@ from msgspec import Struct
 from skyless.dashboard.app import DEAD_S, Parts, make_app
 from skyless.dashboard.guard import Rules
 from skyless.errors import SkylessError
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.link import Link
 from skyless.nodes.find_site import find_site
-from skyless.nodes.loop import ending_signals
-from skyless.outputs.address import MqttAddress
-from skyless.outputs.link import Link
+from skyless.nodes.process.loop import ending_signals
 
 PORT: Final = 8080
 _MORE_PORTS: Final = 50

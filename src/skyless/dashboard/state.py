@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import msgspec
 
-from skyless.outputs.messages import (
+from skyless.mqtt.messages import (
     AnchorHealth,
     EtherHealth,
     FixMessage,
@@ -15,8 +15,8 @@ from skyless.outputs.messages import (
     TruthMessage,
     Vector,
 )
-from skyless.outputs.truths import Truths
-from skyless.positioning.alert import Alert
+from skyless.mqtt.truth_buffer import Truths
+from skyless.positioning.integrity import Alert
 
 MOST_NAMES: Final = 2000
 """Tags, and nodes, that are remembered; a broker that makes up names fills no memory."""

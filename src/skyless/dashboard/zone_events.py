@@ -6,7 +6,7 @@ No I/O; the time is passed in.
 from collections import deque
 from typing import Final
 
-from skyless.outputs.messages import StatusMessage, ZoneEvent
+from skyless.mqtt.messages import StatusMessage, ZoneEvent
 
 MOST_EVENTS: Final = 50
 PATIENCE_S: Final = 1.0

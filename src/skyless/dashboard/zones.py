@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 
 from skyless.dashboard.polygon import Polygon, area_m2, depth_m, is_simple, perimeter_m
-from skyless.outputs.messages import FixMessage, Vector, Zone, ZoneEvent, ZonesMessage
+from skyless.mqtt.messages import FixMessage, Vector, Zone, ZoneEvent, ZonesMessage
 
 LEAST_MARGIN_M: Final = 0.05
 SIGMAS: Final = 3.0

@@ -12,7 +12,7 @@ from skyless.air.reception import Reception
 from skyless.anchor import Anchor
 from skyless.constants import TICK_RATE_HZ
 from skyless.nodes.hearing import Hearing
-from skyless.radios.radio import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
+from skyless.radios.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.site.model import Site
 from skyless.ticks import difference
 

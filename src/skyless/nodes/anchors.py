@@ -5,15 +5,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
+from skyless.master_election import Role
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import AnchorHealth, Counters, SiteMessage
+from skyless.mqtt.topics import floor_plan_topic, health_topic, site_topic
 from skyless.nodes.anchor import AnchorNode
-from skyless.nodes.running import HEALTH_S, AskedAgain, Say, every, keep, link_of, together
-from skyless.outputs.address import MqttAddress
-from skyless.outputs.link import Link
-from skyless.outputs.messages import AnchorHealth, Counters, SiteMessage
-from skyless.outputs.topics import floor_plan_topic, health_topic, site_topic
-from skyless.radios.radio import Radio
+from skyless.nodes.process.running import HEALTH_S, AskedAgain, Say, every, keep, link_of, together
+from skyless.radios.interface import Radio
 from skyless.site.model import Site
-from skyless.succession import Role
 
 _ROLES: Final[dict[Role, Literal["master", "anchor", "listening"]]] = {
     Role.MASTER: "master",

@@ -5,11 +5,11 @@ import logging
 from collections.abc import Callable
 from typing import Final
 
-from skyless.outputs.address import MqttAddress
-from skyless.outputs.connection import Reactions, RefusedError
-from skyless.outputs.paho_client import Introduction
-from skyless.outputs.reaching import open_connection, trouble_with
-from skyless.outputs.topics import EVERY_SITE, site_topic
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.connect import open_connection, trouble_with
+from skyless.mqtt.connection import Reactions, RefusedError
+from skyless.mqtt.paho_client import Introduction
+from skyless.mqtt.topics import EVERY_SITE, site_topic
 
 _KEEPALIVE_S: Final = 10
 _GATHER_S: Final = 0.2

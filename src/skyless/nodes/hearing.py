@@ -6,7 +6,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.nodes.running import Say
+from skyless.nodes.process.running import Say
 
 LOOK_S: Final = 5.0
 """So long is a node without anything of use before it says so."""

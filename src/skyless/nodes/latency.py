@@ -5,7 +5,7 @@ from typing import Final
 
 from skyless.air.codec import decode_cached
 from skyless.air.malformed import Malformed
-from skyless.outputs.messages import Phase
+from skyless.mqtt.messages import Phase
 
 _MOST: Final = 4096
 _MOST_PHASES: Final = 64

@@ -7,20 +7,20 @@ from pathlib import Path
 
 from msgspec import Struct, structs
 
-from skyless.air.packet import Packet, Point
+from skyless.air.masterless_packets import Packet, Point
 from skyless.errors import ConfigurationError
-from skyless.nodes.fix_book import FixBook, FixListener
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import Counters, FixMessage, SiteMessage
+from skyless.mqtt.topics import fix_topic, health_topic, site_topic
+from skyless.nodes.fix_log import FixBook, FixListener
 from skyless.nodes.hearing import Hearing
-from skyless.nodes.running import HEALTH_S, AskedAgain, Say, every, keep, link_of, together
-from skyless.nodes.usage import Usage
-from skyless.outputs.address import MqttAddress
-from skyless.outputs.link import Link
-from skyless.outputs.messages import Counters, FixMessage, SiteMessage
-from skyless.outputs.topics import fix_topic, health_topic, site_topic
-from skyless.positioning.difference_calibration import DifferenceCalibration
-from skyless.positioning.packet_tracking import MASTERLESS, PacketTracking
-from skyless.radios.radio import Gone, Restarted
-from skyless.radios.sniffer_radio import SnifferRadio
+from skyless.nodes.process.running import HEALTH_S, AskedAgain, Say, every, keep, link_of, together
+from skyless.nodes.process.usage import Usage
+from skyless.positioning.masterless.calibration import DifferenceCalibration
+from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
+from skyless.radios.interface import Gone, Restarted
+from skyless.radios.serial.sniffer_radio import SnifferRadio
 from skyless.site.check import check_site
 from skyless.site.model import AnchorSite, Site, TagsSite
 

@@ -13,14 +13,14 @@ from typing import IO, Final
 from msgspec import Struct
 
 from skyless.errors import SkylessError
-from skyless.nodes.running import Say, every
-from skyless.outputs.address import MqttAddress
-from skyless.outputs.link import Link
-from skyless.outputs.messages import ReceptionsMessage, RequestMessage, StatusMessage
-from skyless.outputs.topics import request_topic, site_topic
-from skyless.recordings.mcap_file import McapFile
-from skyless.recordings.mcap_recorder import McapRecorder
-from skyless.recordings.reception_log import EVERY_TAG
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage
+from skyless.mqtt.topics import request_topic, site_topic
+from skyless.nodes.process.running import Say, every
+from skyless.recordings.mcap.file import McapFile
+from skyless.recordings.mcap.reception_log import EVERY_TAG
+from skyless.recordings.mcap.recorder import McapRecorder
 
 LEASE_S: Final = 15.0
 ASK_S: Final = 5.0

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from msgspec import Struct
 
 from skyless.air.reception import Reception
-from skyless.methods import DEFAULT_METHOD
-from skyless.nodes.fix_book import FixBook, FixListener
+from skyless.method_names import DEFAULT_METHOD
+from skyless.nodes.fix_log import FixBook, FixListener
 from skyless.nodes.hearing import Hearing
 from skyless.nodes.latency import PhaseBook
-from skyless.positioning.protection import IntegrityRequirement
-from skyless.radios.radio import Gone, Hint, Radio, RadioEvent, Restarted
+from skyless.positioning.integrity import IntegrityRequirement
+from skyless.radios.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.receiver import NOT_DROPS, Receiver
 
 

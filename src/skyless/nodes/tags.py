@@ -8,15 +8,15 @@ from typing import Final
 
 import msgspec
 
-from skyless.nodes.running import HEALTH_S, Say, every, keep, together
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import Counters, FixMessage, RequestMessage, TagHealth
+from skyless.mqtt.topics import fix_topic, health_topic, receptions_topic, request_topic
+from skyless.nodes.process.running import HEALTH_S, Say, every, keep, together
+from skyless.nodes.process.usage import Usage
 from skyless.nodes.tag import TagNode, TagSettings
-from skyless.nodes.usage import Usage
-from skyless.outputs.address import MqttAddress
-from skyless.outputs.link import Link
-from skyless.outputs.messages import Counters, FixMessage, RequestMessage, TagHealth
-from skyless.outputs.topics import fix_topic, health_topic, receptions_topic, request_topic
-from skyless.radios.radio import Radio
-from skyless.recordings.reception_log import ReceptionLog, receiver_settings
+from skyless.radios.interface import Radio
+from skyless.recordings.mcap.reception_log import ReceptionLog, receiver_settings
 
 COLLECT_S: Final = 0.05
 _decode_request: Final = msgspec.json.Decoder(RequestMessage).decode

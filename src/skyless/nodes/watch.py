@@ -8,13 +8,13 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
-from skyless.experiments.statistics import ErrorStatistics
+from skyless.evaluation.statistics import ErrorStatistics
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, TagHealth, TruthMessage, Vector
+from skyless.mqtt.topics import EVERY_NODE, fix_topic, health_topic, truth_topic
+from skyless.mqtt.truth_buffer import Truths
 from skyless.nodes.latency import Latencies
-from skyless.outputs.link import Link
-from skyless.outputs.messages import AnchorHealth, EtherHealth, FixMessage, TagHealth, TruthMessage, Vector
-from skyless.outputs.topics import EVERY_NODE, fix_topic, health_topic, truth_topic
-from skyless.outputs.truths import Truths
-from skyless.positioning.alert import Alert
+from skyless.positioning.integrity import Alert
 
 WARMUP_S: Final = 1.0
 """Fixes of a tag count for the errors from so long after its first."""

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.methods import FILTERS
+from skyless.method_names import FILTERS
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA
 from skyless.planning.floor import Floor
@@ -15,7 +15,7 @@ from skyless.planning.mounts import masters_by_links, sample_points
 from skyless.planning.predict import Predictor
 from skyless.planning.snapshot_sigma import delays
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.solver import NoSolution, locate
+from skyless.positioning.solver.locate import NoSolution, locate
 from skyless.site.advice import warnings_of
 from skyless.uncertainty.tdoa import literal_covariance
 

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.air.codec import heard_capacity
-from skyless.air.schedule import first_slots, schedule_of
 from skyless.anchor import MAX_OFFSET_STD_M
 from skyless.clocks.filter import clock_noise
-from skyless.compiled import kernel
 from skyless.constants import TICK_S
+from skyless.kernels.compiled import kernel
 from skyless.planning.links import LEAST_SYNC, links
 from skyless.site.model import Site
+from skyless.site.slots import first_slots, schedule_of
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
 Vector = NDArray[np.float64]

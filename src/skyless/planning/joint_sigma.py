@@ -16,8 +16,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel, threaded_kernel
 from skyless.constants import TICK_S
+from skyless.kernels.compiled import kernel, threaded_kernel
 from skyless.planning.anchor_clocks import AGE_S, LATE_M, TOLD, AnchorClocks, Relays
 from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA, SIGMA_X, SIGMA_Z, fill_errors
 from skyless.planning.links import Scene, fill_dops

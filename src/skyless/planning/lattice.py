@@ -10,9 +10,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel, threaded_kernel
+from skyless.kernels.cholesky import factorise, invert
+from skyless.kernels.compiled import kernel, threaded_kernel
 from skyless.planning.links import links
-from skyless.uncertainty.cholesky import factorise, invert
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]

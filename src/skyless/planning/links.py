@@ -7,7 +7,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel, threaded_kernel
+from skyless.kernels.compiled import kernel, threaded_kernel
 from skyless.planning.columns import ANCHORS, GDOP, PDOP, TDOP
 from skyless.simulation.channel import (
     FREE_SPACE_LOSS_1_M_DB,

@@ -11,9 +11,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from skyless.air.rotation import filter_pages_of
-from skyless.air.schedule import schedule_of
-from skyless.methods import DEFAULT_METHOD, FILTERS
+from skyless.method_names import DEFAULT_METHOD, FILTERS
 from skyless.planning.anchor_clocks import anchor_clocks, relays_of
 from skyless.planning.columns import COLUMNS, SIGMA
 from skyless.planning.joint_sigma import fill_joint_sigma
@@ -27,10 +25,12 @@ from skyless.planning.links import (
     weighted_pdop,
 )
 from skyless.planning.snapshot_sigma import fill_snapshot_sigma, rounds_of
-from skyless.positioning.new_method import estimator_settings
-from skyless.positioning.snapshots import SnapshotMethod
+from skyless.positioning.methods.factory import estimator_settings
+from skyless.positioning.methods.snapshots import SnapshotMethod
 from skyless.simulation.channel import ChannelModel, pack_walls
+from skyless.site.almanac_sending import filter_pages_of
 from skyless.site.model import Site
+from skyless.site.slots import schedule_of
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]

@@ -17,15 +17,15 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.air.schedule import first_slots, schedule_of
 from skyless.clocks.filter import ClockNoise, clock_noise
 from skyless.constants import TICK_S
+from skyless.kernels.normal import inverse_of
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import FIX_SHARE, SIGMA, fill_errors
 from skyless.planning.links import AnchorLinks, Scene, fill_dops
-from skyless.positioning.snapshots import SnapshotMethod
+from skyless.positioning.methods.snapshots import SnapshotMethod
 from skyless.site.model import Site
-from skyless.uncertainty.normal import inverse_of
+from skyless.site.slots import first_slots, schedule_of
 from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
 
 Vector = NDArray[np.float64]

@@ -13,17 +13,17 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from skyless.air.schedule import schedule_of
-from skyless.experiments.fleet import Fleet, FleetSettings
-from skyless.experiments.room import Room
-from skyless.experiments.scenarios import Request, impairments_of
-from skyless.methods import FILTERS
+from skyless.evaluation.fleet import Fleet, FleetSettings
+from skyless.evaluation.room_world import Room
+from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.method_names import FILTERS
 from skyless.planning.columns import CLAIMED, FIX_SHARE, RMSE, SIGMA
 from skyless.planning.maps import PlanMap
 from skyless.planning.predict import Predictor
 from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Static
 from skyless.site.model import AccuracySite
+from skyless.site.slots import schedule_of
 
 Matrix = NDArray[np.float64]
 

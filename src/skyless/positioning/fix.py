@@ -3,16 +3,32 @@
 from enum import StrEnum
 from math import sqrt
 from struct import Struct as Format
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.positioning.alert import Alert
-from skyless.positioning.fix_rows import POSITION, PROTECTION, QUALITY, VELOCITY
-from skyless.positioning.protection import Integrity, IntegrityRequirement, integrity_of
-from skyless.uncertainty.dop import Dops, dilution_of_precision
+from skyless.positioning.integrity import Alert, Integrity, IntegrityRequirement, integrity_of
+
+if TYPE_CHECKING:
+    from skyless.uncertainty.dop import Dops
+
+# What fixes carry: rows of three numbers in one array, which costs less than an array for each.
+
+POSITION: Final = 0
+"""The position, then three rows of its covariance."""
+
+QUALITY: Final = 4
+"""Chi-square and mean squared residual in m²."""
+
+VELOCITY: Final = 5
+"""The velocity, then three rows of its covariance, for methods that know it."""
+
+PROTECTION: Final = 9
+"""The first three of the levels (``estimator/levels.py``), for methods that know some."""
+
+PROTECTED_ROWS: Final = 10
 
 
 class NoFixReason(StrEnum):
@@ -37,7 +53,7 @@ class Fix(Struct, frozen=True, gc=False):
     time_s: float
     """Master time at which the position holds, since the receiver's first fix."""
     rows: bytes
-    """Rows of float64 (``fix_rows``), without those of which the method knows nothing."""
+    """Rows of float64 (``POSITION`` and the following), without those of which the method knows nothing."""
     anchors: tuple[int, ...]
     """Identifiers of the anchors in use, the reference first."""
     anchors_m: NDArray[np.float64]
@@ -123,8 +139,10 @@ class Fix(Struct, frozen=True, gc=False):
         return float(np.sqrt(np.trace(self.covariance_m2)))
 
     @property
-    def dops(self) -> Dops:
+    def dops(self) -> "Dops":
         """Dilutions of precision of the anchors in use, seen from the position."""
+        from skyless.uncertainty.dop import dilution_of_precision  # noqa: PLC0415 (a value needs no compiler)
+
         return dilution_of_precision(self.anchors_m, self.position_m, height_known=self.height_known)
 
 

@@ -8,7 +8,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.air.beacon import HEARD
-from skyless.air.claim import Claim
+from skyless.air.master_term import Claim
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.ticks import nearest
 

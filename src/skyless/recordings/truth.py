@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from skyless.errors import ConfigurationError
 from skyless.recordings.source import read_lines
-from skyless.recordings.table import finite
+from skyless.recordings.tables import finite
 
 POSITION_COLUMNS: Final = ("t_s", "x_m", "y_m", "z_m")
 LISTENER_COLUMNS: Final = ("t_s", "gt_L_x_m", "gt_L_y_m", "gt_L_z_m")

@@ -11,8 +11,8 @@ import numpy as np
 from msgspec import Struct, structs
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel, part
 from skyless.constants import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS
+from skyless.kernels.compiled import kernel, part
 from skyless.site.model import WallSite
 
 FREE_SPACE_LOSS_1_M_DB: Final = 20.0 * math.log10(4.0 * math.pi * CHANNEL_5_HZ / SPEED_OF_LIGHT_MPS)

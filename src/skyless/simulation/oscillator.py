@@ -16,8 +16,8 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel, part
 from skyless.constants import TICK_RATE_HZ, TICK_S
+from skyless.kernels.compiled import kernel, part
 from skyless.simulation.streams import draw_normal
 from skyless.ticks import WRAP_TICKS
 

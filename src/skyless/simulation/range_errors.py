@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel
+from skyless.kernels.compiled import kernel
 from skyless.simulation.streams import TAG_KEY, stream
 
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.compiled import kernel, part
 from skyless.constants import TICK_S
+from skyless.kernels.compiled import kernel, part
 from skyless.simulation.impairments import Impairments, Outage
 from skyless.simulation.trajectory import Piece, Trajectory
 from skyless.site.model import AnchorSite

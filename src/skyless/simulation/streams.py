@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import part
+from skyless.kernels.compiled import part
 
 BLOCK: Final = 1024
 """Normals drawn ahead for each node."""

@@ -12,7 +12,7 @@ from typing import Final
 from skyless.air.reception import Reception
 from skyless.simulation.broadcast import Broadcast, Tally, diagnostics_of
 from skyless.simulation.impairments import Impairments
-from skyless.simulation.machines import AnchorFactory, AnchorMachine
+from skyless.simulation.machine_interface import AnchorFactory, AnchorMachine
 from skyless.simulation.medium import Delivery, Medium
 from skyless.simulation.stations import TagSpec
 from skyless.site.model import Site

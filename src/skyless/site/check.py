@@ -11,12 +11,12 @@ from msgspec import Struct
 
 from skyless.air.airtime import air_time_s
 from skyless.air.codec import MAX_FRAME_BYTES
-from skyless.air.schedule import Schedule, first_slots, schedule_of
 from skyless.constants import TICK_BITS, TICK_S
 from skyless.errors import ConfigurationError
 from skyless.site.image import image_size
 from skyless.site.limits import LIMITS, expected
 from skyless.site.model import AnchorSite, Site
+from skyless.site.slots import Schedule, first_slots, schedule_of
 
 HALF_WRAP_S: Final = (1 << (TICK_BITS - 1)) * TICK_S
 """Longest gap over which a stamp can be unwrapped without a host time."""

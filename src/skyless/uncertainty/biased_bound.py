@@ -20,7 +20,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from skyless.compiled import jitted, kernel, threaded_kernel
+from skyless.kernels.compiled import jitted, kernel, threaded_kernel
 from skyless.uncertainty.bounds import (
     DIM,
     RX,

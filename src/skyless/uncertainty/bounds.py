@@ -13,8 +13,8 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
-from skyless.compiled import kernel, threaded_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS
+from skyless.kernels.compiled import kernel, threaded_kernel
 from skyless.uncertainty.dop import direction
 
 Array = NDArray[np.float64]

@@ -1,9 +1,9 @@
 """The paper's section on uncertainties, corrected: variances in s², and of λ in m².
 
 The same names as in ``printed``. Each follows from the paper's own algorithm (``clocks/paper.py``,
-``positioning/paper.py``) by linearising it; ``tests/uncertainty/test_paper_derivation.py`` does that with symbols, and
-Monte Carlo draws of the algorithm as it is agree (``tests/experiments/test_paper_checks.py``). The reference packet is
-taken to be no synchronisation packet, as in the paper; the other cases: ``uncertainty/tdoa.py``.
+``positioning/solver/paper.py``) by linearising it; ``tests/uncertainty/test_paper_derivation.py`` does that with
+symbols, and Monte Carlo draws of the algorithm as it is agree (``tests/paper/test_paper_checks.py``). The reference
+packet is taken to be no synchronisation packet, as in the paper; the other cases: ``uncertainty/tdoa.py``.
 """
 
 from skyless.constants import SPEED_OF_LIGHT_MPS

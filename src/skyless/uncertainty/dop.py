@@ -6,8 +6,8 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
-from skyless.compiled import kernel, threaded_kernel
-from skyless.uncertainty.cholesky import factorise, invert
+from skyless.kernels.cholesky import factorise, invert
+from skyless.kernels.compiled import kernel, threaded_kernel
 
 
 class Dops(Struct, frozen=True, gc=False):

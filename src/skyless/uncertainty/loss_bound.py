@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 
-from skyless.compiled import threaded_kernel
+from skyless.kernels.compiled import threaded_kernel
 from skyless.uncertainty.bounds import (
     DIM,
     RX,

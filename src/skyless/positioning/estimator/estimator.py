@@ -11,8 +11,8 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.air.beacon import HEARD
-from skyless.compiled import kernel, step, threaded_kernel
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.kernels.compiled import kernel, step, threaded_kernel
 from skyless.positioning.estimator.faults import (
     SURE_CHI2,
     explained_chi2,
@@ -60,8 +60,8 @@ from skyless.positioning.estimator.state import (
     with_table,
     without_anchor,
 )
-from skyless.positioning.fix_rows import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
-from skyless.positioning.protection import CONTRADICTED, OBSTRUCTED, SOUND, UNAVAILABLE
+from skyless.positioning.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
+from skyless.positioning.integrity import CONTRADICTED, OBSTRUCTED, SOUND, UNAVAILABLE
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
 REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = range(7)
@@ -372,7 +372,7 @@ def _process_frame(
     levels: Vector,
     rows: Matrix,
 ) -> int:
-    """``_process`` for a packet whose relays are bytes of its frame, and all that a fix carries (``fix_rows``).
+    """``_process`` for a packet whose relays are bytes of its frame, and all that a fix carries.
 
     The state comes in pieces, as the compiler takes arrays from Python in half the time that a tuple of them takes.
     """
@@ -504,7 +504,7 @@ class Estimator:
 
     @property
     def rows(self) -> Matrix:
-        """What a fix carries (``fix_rows``), as of the newest packet."""
+        """What a fix carries (``POSITION`` and the following), as of the newest packet."""
         return self._rows
 
     def place_anchor(self, identifier: int, position_m: Vector) -> int:

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import step
+from skyless.kernels.compiled import step
 from skyless.positioning.estimator.kalman import reset_state
 from skyless.positioning.estimator.state import (
     LASTING,

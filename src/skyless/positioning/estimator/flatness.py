@@ -4,8 +4,8 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import step
 from skyless.constants import TICK_S
+from skyless.kernels.compiled import step
 from skyless.positioning.estimator.state import EstimatorState
 
 PROBE_M: Final = 1.0

@@ -4,8 +4,8 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import step
 from skyless.constants import TICK_S
+from skyless.kernels.compiled import step
 from skyless.positioning.estimator.state import EstimatorState, Matrix, layout, uncertain_states
 
 OBSTRUCTED_STD_M: Final = 0.08

@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import step
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.kernels.compiled import step
 from skyless.positioning.estimator.faults import (
     compute_fault_input,
     end_lasting_fault,

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import step
+from skyless.kernels.compiled import step
 from skyless.positioning.estimator.faults import whiten
 from skyless.positioning.estimator.monitor import covariance_scale
 from skyless.positioning.estimator.state import EstimatorState, Vector

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.compiled import step
+from skyless.kernels.compiled import step
 from skyless.positioning.estimator.faults import begin_obstruction
 from skyless.positioning.estimator.state import PASSING, EstimatorState, layout
 

@@ -7,7 +7,7 @@ from msgspec import Struct, structs
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.positioning.protection import limits_of
+from skyless.positioning.integrity import limits_of
 
 MAX_CLOCK_RATE: Final = 50e-6
 """Two crystals of ±20 ppm, and margin."""

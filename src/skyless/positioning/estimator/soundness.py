@@ -23,7 +23,7 @@ from skyless.positioning.estimator.state import (
     layout,
     most_terms,
 )
-from skyless.positioning.fix_rows import PROTECTED_ROWS
+from skyless.positioning.fix import PROTECTED_ROWS
 
 Wanted = tuple[object, tuple[int, ...], DTypeLike]
 """An array, its shape and its type."""

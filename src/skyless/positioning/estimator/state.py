@@ -24,7 +24,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.compiled import jitted, step
+from skyless.kernels.compiled import jitted, step
 from skyless.positioning.estimator.settings import EstimatorSettings
 
 Vector = NDArray[np.float64]

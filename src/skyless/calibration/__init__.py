@@ -1,0 +1,1 @@
+"""Antenna delays from a recording of a tag whose position is known."""

@@ -1,0 +1,165 @@
+"""What a recording gives a calibration: time differences while the tag's place is known, in bounded memory."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from math import dist, inf, log
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.air.masterless_packets import Packet, PairTdoa, Point
+from skyless.calibration.fit import Differences
+from skyless.errors import SkylessError
+from skyless.evaluation.judge import Judge
+from skyless.evaluation.statistics import EvenSample
+from skyless.positioning.masterless.pair_engine import PairEngine
+from skyless.recordings.foreign.formats import Recording
+from skyless.recordings.source import Drops
+
+MOST_ROWS: Final = 300_000
+"""Of a longer recording an even sample is used."""
+
+NEAREST_M: Final = 0.01
+
+PlaceAt = Callable[[float], Point | None]
+"""Where the tag's antenna was at a time of the recording; None where that is not known."""
+
+
+class Stay(Struct, frozen=True):
+    """A tag at rest at a known place."""
+
+    x_m: float
+    y_m: float
+    z_m: float | None = None
+    """None: at the height of the site's tags."""
+    from_s: float = -inf
+    """Since the first difference."""
+    to_s: float = inf
+
+
+class First(Struct, frozen=True):
+    """Only the beginning of a recording: so many differences, so many seconds, or such a part of its time."""
+
+    count: int | None = None
+    seconds: float | None = None
+    part: float | None = None
+
+
+class Samples(Struct, frozen=True):
+    """What was gathered."""
+
+    differences: Differences
+    anchors_m: dict[int, Point]
+    """Where the anchors stand, or last stood."""
+    seen: int
+    drops: dict[str, int]
+    """Differences that could not be used, by reason."""
+
+
+def place_of_truth(judge: Judge, above_m: float | None) -> PlaceAt:
+    """Truth by time, where it is high enough."""
+
+    def place(time_s: float) -> Point | None:
+        at_m = judge.at(time_s)
+        return None if at_m is None or (above_m is not None and at_m[2] <= above_m) else at_m
+
+    return place
+
+
+def place_of_stays(stays: Sequence[Stay], height_m: float | None, begin_s: float) -> PlaceAt:
+    """Known places by time; of stays that overlap the first counts.
+
+    Raises:
+        SkylessError: a stay has no height, and the site does not know it either.
+    """
+    places: list[tuple[Stay, Point]] = []
+    for stay in stays:
+        z_m = height_m if stay.z_m is None else stay.z_m
+        if z_m is None:
+            raise SkylessError(f"--at {stay.x_m:g},{stay.y_m:g} lacks its height: it should be x,y,z")
+        places.append((stay, (stay.x_m, stay.y_m, z_m)))
+
+    def place(time_s: float) -> Point | None:
+        since_s = time_s - begin_s
+        return next((place_m for stay, place_m in places if stay.from_s <= since_s <= stay.to_s), None)
+
+    return place
+
+
+def tdoas_of(recording: Recording, anchors_m: Mapping[int, Point]) -> Iterator[PairTdoa]:
+    """All time differences of a recording, whatever its format."""
+    bits = recording.format.tx_bits
+    engine = None if bits is None else PairEngine(bits, anchors_m=dict(anchors_m))
+    for record in recording:
+        if isinstance(record, Packet):
+            assert engine is not None
+            yield from engine.hear(record)
+        else:
+            yield record
+
+
+def gather(
+    pairs: Iterable[PairTdoa], anchors_m: Mapping[int, Point], place_from: Callable[[float], PlaceAt], first: First
+) -> Samples:
+    """Gather the differences at known places; ``place_from`` is told the time of the first difference."""
+    drops: Drops = Counter()
+    places_m = dict(anchors_m)
+    sample = EvenSample(5, MOST_ROWS)
+    place: PlaceAt | None = None
+    begin_s = last_s = 0.0
+    for pair in pairs:
+        if place is None:
+            place, begin_s = place_from(pair.time_s), pair.time_s
+        if first.seconds is not None and pair.time_s - begin_s > first.seconds:
+            break
+        last_s = max(last_s, pair.time_s)
+        row = _row(pair, places_m, place)
+        if isinstance(row, str):
+            drops[row] += 1
+            continue
+        sample.add(row)
+        if sample.seen == first.count:
+            break
+    rows = sample.rows
+    if first.part is not None:
+        rows = rows[rows[:, 0] <= begin_s + first.part * (last_s - begin_s)]
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    ids = rows[:, 1:3].astype(np.int64)
+    differences = Differences(rows[:, 0], ids[:, 0], ids[:, 1], rows[:, 3], rows[:, 4])
+    return Samples(differences, places_m, sample.seen, dict(sorted(drops.items())))
+
+
+def _row(pair: PairTdoa, places_m: dict[int, Point], place: PlaceAt) -> tuple[float, ...] | str:
+    """Time, anchors, excess over the geometry, logarithm of the ranges' ratio; or why there is none."""
+    if pair.a_m is not None:
+        places_m[pair.anchor_a] = pair.a_m
+    if pair.b_m is not None:
+        places_m[pair.anchor_b] = pair.b_m
+    a_m, b_m = places_m.get(pair.anchor_a), places_m.get(pair.anchor_b)
+    if a_m is None or b_m is None:
+        return "unknown-anchor"
+    at_m = place(pair.time_s)
+    if at_m is None:
+        return "place-unknown"
+    range_a, range_b = max(dist(at_m, a_m), NEAREST_M), max(dist(at_m, b_m), NEAREST_M)
+    excess_m = pair.tdoa_m - (range_b - range_a)
+    return pair.time_s, float(pair.anchor_a), float(pair.anchor_b), excess_m, log(range_b / range_a)
+
+
+def joined(samples: Sequence[Samples]) -> Samples:
+    """Samples of several tags as one, in the order of time."""
+    parts = [one.differences for one in samples]
+    t_s = np.concatenate([part.t_s for part in parts])
+    order = np.argsort(t_s, kind="stable")
+    differences = Differences(
+        t_s[order],
+        np.concatenate([part.anchor_a for part in parts])[order],
+        np.concatenate([part.anchor_b for part in parts])[order],
+        np.concatenate([part.excess_m for part in parts])[order],
+        np.concatenate([part.log_ratio for part in parts])[order],
+    )
+    drops: Drops = Counter()
+    for one in samples:
+        drops.update(one.drops)
+    return Samples(differences, samples[0].anchors_m, sum(one.seen for one in samples), dict(sorted(drops.items())))

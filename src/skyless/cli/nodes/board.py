@@ -1,0 +1,68 @@
+"""``skyless board``: an emulated board on a serial port that is none."""
+
+import contextlib
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from skyless.cli.common.output import print_json
+from skyless.cli.nodes.options import say
+from skyless.errors import SkylessError
+from skyless.nodes.open_radio import DEFAULT_RADIO
+
+app = App(name="board", help_epilogue="Example: skyless board tag1 --link /tmp/board")
+
+
+@app.default
+def board(
+    name: Annotated[str, Parameter(name="NAME")],
+    /,
+    *,
+    radio: str = DEFAULT_RADIO,
+    format: Literal["link", "sniffer", "sniffer-text", "listener"] = "link",  # noqa: A002 - the option's natural name
+    link: Path | None = None,
+    json: bool = False,
+) -> None:
+    """Emulate a board with a UWB radio on a pseudo-terminal, until Ctrl-C, to try programs without hardware.
+
+    The board is one node of the emulated air. Programs open it as they would open a real one:
+    skyless tag tag1 --radio serial:PATH.
+
+    Parameters
+    ----------
+    name
+        Whose radio it is: an anchor's number, or a tag of the air (tag1).
+    radio
+        The air: ether:HOST:PORT of skyless ether.
+    format
+        What it speaks: link (Skyless), sniffer or sniffer-text (Bitcraze; beacons become TDoA3 packets), listener
+        (uwb-apps, JSON).
+    link
+        A symbolic link to the pseudo-terminal, which keeps its name when the board is started again.
+    json
+        Tell path and format as one JSON object before it starts.
+    """
+    from skyless.nodes.emulation.board import RADIO_OF, Board
+    from skyless.nodes.open_radio import is_ether, open_radios
+    from skyless.nodes.process.loop import run
+
+    if not is_ether(radio):
+        raise SkylessError(f"--radio is {radio!r}; it should be the emulated air, ether:HOST[:PORT]")
+    kind: Literal["anchor", "tag"] = "anchor" if name.isdecimal() else "tag"
+    if kind == "anchor" and format != "link":
+        raise SkylessError(
+            f"--format is {format!r}; it should be link for an anchor, as boards of other formats only listen"
+        )
+    emulated = Board(open_radios(radio, kind, (name,))[0], kind, format, link, say)
+    place = emulated.pty.place
+    if json:
+        print_json({"board": name, "path": place, "format": format, "radio": f"{RADIO_OF[format]}:{place}"})
+        sys.stdout.flush()
+    else:
+        say(f"board {name}: emulated, at {place}")
+        rest = " --anchors anchors.csv" if RADIO_OF[format] == "sniffer" else ""
+        say(f"next: skyless {kind} {name} --radio {RADIO_OF[format]}:{place}{rest}")
+    with contextlib.suppress(KeyboardInterrupt):
+        run(emulated.run(), punctual=True)

@@ -1,0 +1,81 @@
+"""``skyless broker``: the embedded MQTT broker on its own."""
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+from cyclopts.validators import Number
+
+from skyless.cli.common.output import print_json
+from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from skyless.nodes.broker.settings import BrokerSettings
+
+app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
+
+
+@app.default
+def broker(
+    *,
+    port: Annotated[int | None, Parameter(validator=Number(gte=1, lte=65535))] = None,
+    listen: str = "127.0.0.1",
+    data: Path | None = None,
+    user: str | None = None,
+    certificate: Path | None = None,
+    key: Path | None = None,
+    json: bool = False,
+) -> None:
+    """Run an MQTT broker until Ctrl-C, and print its address when it is ready.
+
+    It serves this machine alone unless --listen says otherwise, and then asks for a name and a password.
+
+    Parameters
+    ----------
+    port
+        Where it listens; by default 1883, or the next port that is free.
+    listen
+        Address of this machine to listen on; 0.0.0.0 means all of them.
+    data
+        Folder for retained messages and sessions; by default skyless/broker in the user's data folder.
+    user
+        Name that clients must give; their password stands in SKYLESS_MQTT_PASSWORD.
+    certificate
+        Certificate in PEM form; with it and --key the broker speaks TLS.
+    key
+        Private key of the certificate in PEM form.
+    json
+        Print one JSON object instead of the address.
+    """
+    from skyless.mqtt.address import PASSWORD_VARIABLE
+    from skyless.nodes.broker.settings import BrokerSettings
+
+    password = None if user is None else os.environ.get(PASSWORD_VARIABLE)
+    settings = BrokerSettings(port, listen, data, user, password, certificate, key)
+    asyncio.run(_serve(settings, json=json))
+
+
+async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
+    from skyless.nodes.broker.broker import start_broker
+    from skyless.nodes.process.loop import ending_signals
+
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, *ending_signals()):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    async with await start_broker(settings) as running:
+        if json:
+            print_json({"mqtt": str(running.address), "data": running.data, "pid": running.pid})
+        else:
+            print(running.address)
+        sys.stdout.flush()
+        ended = asyncio.ensure_future(running.wait())
+        asked = asyncio.ensure_future(stop.wait())
+        await asyncio.wait((ended, asked), return_when=asyncio.FIRST_COMPLETED)
+        asked.cancel()
+        if ended.done():
+            raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may say why")
+        ended.cancel()

@@ -1,0 +1,63 @@
+"""What the commands of a running site share."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+from cyclopts import Parameter
+
+from skyless.cli.common.options import finite_numbers
+from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from skyless.mqtt.address import MqttAddress
+    from skyless.site.model import Site
+
+DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
+Mqtt = Annotated[str, Parameter(env_var="SKYLESS_MQTT")]
+MqttCa = Annotated[Path | None, Parameter(env_var="SKYLESS_MQTT_CA")]
+
+
+def broker(mqtt: str, mqtt_ca: Path | None) -> "MqttAddress | None":
+    """The broker of ``--mqtt``; None for ``none``. Raises SkylessError."""
+    from skyless.mqtt.address import mqtt_address
+
+    if mqtt == "none":
+        if mqtt_ca is not None:
+            raise SkylessError("--mqtt is 'none'; give a broker's address together with --mqtt-ca")
+        return None
+    return mqtt_address(mqtt, mqtt_ca)
+
+
+def site_named(site: str) -> "Site":
+    """The site in a file, or the built-in ``lab``, with other noise than 100 ps as ``lab:PS``. Raises SkylessError."""
+    from skyless.site.lab import lab_site
+    from skyless.site.load import load_site
+
+    name, colon, noise_ps = site.partition(":")
+    if name != "lab":
+        return load_site(Path(site))
+    try:
+        return lab_site(finite_numbers("site", noise_ps, (1,))[0]) if colon else lab_site()
+    except SkylessError:
+        raise SkylessError(f"--site is {site!r}; it should be a site file, lab, or lab:PICOSECONDS") from None
+
+
+def listen_address(text: str, usual_port: int) -> tuple[str, int | None]:
+    """HOST:PORT, or one of both; the port is None where it is not told. Raises SkylessError."""
+    host, colon, digits = text.rpartition(":")
+    if text.isdecimal():
+        host = "127.0.0.1"
+    elif not colon or text.endswith("]") or (":" in host and not host.startswith("[")):
+        host, digits = text, ""
+    host = host.strip("[]")
+    if not host or (digits and not (digits.isdecimal() and len(digits) < 6 and int(digits) < 65_536)):
+        raise SkylessError(
+            f"--listen is {text!r}; it should be HOST:PORT, as 127.0.0.1:{usual_port} or [::1]:{usual_port}"
+        )
+    return host, int(digits) if digits else None
+
+
+def say(line: str) -> None:
+    """Tell a person."""
+    print(line, file=sys.stderr, flush=True)

@@ -1,0 +1,1 @@
+"""Tags in a simulated site, and their errors against the truth."""

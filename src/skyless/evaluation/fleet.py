@@ -1,0 +1,212 @@
+"""A site in the simulated world with tags that compute, and their errors against the truth."""
+
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from skyless.air.reception import Reception
+from skyless.anchor import Anchor
+from skyless.evaluation.level_tally import LevelReport, LevelTally
+from skyless.evaluation.statistics import ErrorStatistics, ErrorSummary
+from skyless.method_names import DEFAULT_METHOD
+from skyless.positioning.fix import Fix
+from skyless.positioning.integrity import IntegrityRequirement
+from skyless.receiver import NOT_DROPS, Receiver
+from skyless.simulation.broadcast import Broadcast, Tally
+from skyless.simulation.impairments import Impairments
+from skyless.simulation.stations import TagSpec
+from skyless.simulation.trajectory import Trajectory
+from skyless.simulation.world import World
+from skyless.site.model import Site
+from skyless.site.slots import schedule_of
+
+
+class JudgedFix(Struct, frozen=True, gc=False):
+    """A fix beside the truth at the moment it was made."""
+
+    tag: int
+    time_s: float
+    """True time at which the last frame of the fix ended."""
+    fix: Fix
+    truth_m: NDArray[np.float64]
+    """Where the tag truly was when that frame was sent, shape (3,)."""
+
+    @property
+    def error_m(self) -> NDArray[np.float64]:
+        """Position less truth, shape (3,)."""
+        return self.fix.position_m - self.truth_m
+
+
+class FleetSettings(Struct, frozen=True):
+    """How the tags compute, and from when on they are judged."""
+
+    method: str = DEFAULT_METHOD
+    qa: float = 0.3
+    warmup_s: float = 2.0
+    """True time before which no fix counts for the errors; cold starts are told by ``first_fix_s``."""
+    most_fixes: int | None = None
+    """Judged fixes per tag after which no more are judged."""
+    integrity: IntegrityRequirement = IntegrityRequirement()
+
+
+class TagRecord(Struct):
+    """What one tag has done."""
+
+    messages: int = 0
+    fixes: int = 0
+    judged: int = 0
+    first_fix_s: float | None = None
+    last: JudgedFix | None = None
+
+
+class Fleet:
+    """Tags listening in a world; each frame that flies becomes fixes."""
+
+    def __init__(
+        self,
+        site: Site,
+        trajectories: Sequence[Trajectory],
+        impairments: Impairments,
+        seed: int,
+        settings: FleetSettings,
+    ) -> None:
+        self._settings = settings
+        self.site = site
+        self.anchors: dict[int, Anchor] = {}
+        specs = [TagSpec(trajectory) for trajectory in trajectories]
+        self.world = World(site, self._new_anchor, specs, impairments, seed)
+        self.receivers = [self._new_receiver() for _ in specs]
+        self.records = [TagRecord() for _ in specs]
+        self._judged_round: list[int] = [-1] * len(specs)
+        self._superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
+        self.errors = ErrorStatistics(planar=site.tags.height_m is not None)
+        self.sigma_squared_sum = 0.0
+        self.levels = LevelTally()
+
+    def _new_anchor(self, anchor: int) -> Anchor:
+        self.anchors[anchor] = Anchor(self.site, anchor)
+        return self.anchors[anchor]
+
+    def _new_receiver(self) -> Receiver:
+        return Receiver(self._settings.method, qa=self._settings.qa, integrity=self._settings.integrity)
+
+    def run(self, until_s: float) -> Iterator[JudgedFix]:
+        """Let true time pass; every fix of every tag, beside the truth."""
+        for broadcast in self.world.run(until_s):
+            for tag, reception, truth_m in broadcast.receptions():
+                judged = self._hear(tag, reception, truth_m, broadcast)
+                if judged is not None:
+                    yield judged
+
+    def _hear(
+        self, tag: int, reception: Reception, truth_m: NDArray[np.float64], broadcast: Broadcast
+    ) -> JudgedFix | None:
+        record = self.records[tag]
+        record.messages += 1
+        fix = self.receivers[tag].hear(reception)
+        if fix is None:
+            return None
+        record.fixes += 1
+        if record.first_fix_s is None:
+            record.first_fix_s = broadcast.end_s
+        judged = JudgedFix(tag, broadcast.end_s, fix, truth_m)
+        record.last = judged
+        if broadcast.end_s >= self._settings.warmup_s:
+            self._judge(judged)
+        return judged
+
+    def _judge(self, judged: JudgedFix) -> None:
+        """Count one fix per tag and superframe, so that all methods are judged at the same times."""
+        superframe = int(judged.time_s / self._superframe_s)
+        record = self.records[judged.tag]
+        if superframe == self._judged_round[judged.tag] or record.judged == self._settings.most_fixes:
+            return
+        self._judged_round[judged.tag] = superframe
+        record.judged += 1
+        error = judged.error_m
+        self.levels.add(judged.fix, error)
+        self.errors.add(float(error[0]), float(error[1]), float(error[2]))
+        self.sigma_squared_sum += float(np.trace(judged.fix.covariance_m2))
+
+    @property
+    def drops(self) -> dict[str, int]:
+        """Frames that the tags did not use, by reason."""
+        total: Counter[str] = Counter()
+        for receiver in self.receivers:
+            total.update(receiver.counters)
+        return {reason: count for reason, count in sorted(total.items()) if reason not in NOT_DROPS}
+
+
+class FleetReport(Struct, frozen=True):
+    """What a run came to; errors in metres, over one fix per tag and superframe after the warm-up."""
+
+    method: str
+    tags: int
+    messages: int
+    fixes: int
+    """Fixes that were judged."""
+    rmse_m: float | None
+    p95_m: float | None
+    max_m: float | None
+    updates_per_s: float
+    """Fixes per second and tag, all of them."""
+    dropped: int
+    std_m: float | None
+    """Root mean square error about the mean error."""
+    sigma_m: float | None
+    """What the fixes themselves said: the root of the mean trace of their covariances."""
+    bias_m: tuple[float, float, float] | None
+    first_fix_s: float | None
+    """Median over the tags of the true time of the first fix, from a cold start of the whole site."""
+    tags_without_fix: int
+    levels: LevelReport | None
+    """How the protection levels did; None for methods that give none."""
+    drops: dict[str, int]
+    air: Tally
+    simulated_s: float
+    wall_s: float
+    speed: float
+    """Simulated seconds per second."""
+
+
+def report(fleet: Fleet, method: str, started_s: float) -> FleetReport:
+    """Sum a run up; ``started_s`` is ``time.perf_counter()`` at its start."""
+    wall_s = time.perf_counter() - started_s
+    summary = fleet.errors.summary()
+    simulated_s = fleet.world.now_s
+    firsts = [record.first_fix_s for record in fleet.records if record.first_fix_s is not None]
+    fixes = sum(record.fixes for record in fleet.records)
+    listening_s = sum(simulated_s - first for first in firsts)
+    rmse_m = summary.rmse_2d_m if fleet.site.tags.height_m is not None else summary.rmse_3d_m
+    return FleetReport(
+        method=method,
+        tags=len(fleet.records),
+        messages=sum(record.messages for record in fleet.records),
+        fixes=summary.count,
+        rmse_m=rmse_m,
+        p95_m=summary.p95_m,
+        max_m=summary.max_m,
+        updates_per_s=fixes / listening_s if listening_s > 0.0 else 0.0,
+        dropped=sum(fleet.drops.values()),
+        std_m=_std_m(rmse_m, summary),
+        sigma_m=(fleet.sigma_squared_sum / summary.count) ** 0.5 if summary.count else None,
+        bias_m=summary.bias_m,
+        first_fix_s=float(np.median(firsts)) if firsts else None,
+        tags_without_fix=len(fleet.records) - len(firsts),
+        levels=fleet.levels.report(),
+        drops=fleet.drops,
+        air=fleet.world.tally,
+        simulated_s=simulated_s,
+        wall_s=wall_s,
+        speed=simulated_s / wall_s if wall_s > 0.0 else 0.0,
+    )
+
+
+def _std_m(rmse_m: float | None, summary: ErrorSummary) -> float | None:
+    if rmse_m is None or summary.bias_m is None:
+        return None
+    return float(np.sqrt(max(rmse_m**2 - sum(value * value for value in summary.bias_m), 0.0)))

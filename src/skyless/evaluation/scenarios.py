@@ -1,0 +1,197 @@
+"""Simulations by name and number: from what a person asks for to a fleet in a world."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.typing import ArrayLike, NDArray
+
+from skyless.evaluation.fleet import Fleet, FleetSettings
+from skyless.evaluation.receiver_with_outages import DeafReceiver
+from skyless.evaluation.room_world import Room, displacements, wanderer
+from skyless.method_names import DEFAULT_METHOD
+from skyless.positioning.integrity import IntegrityRequirement
+from skyless.simulation.channel import ChannelModel
+from skyless.simulation.impairments import AnchorBias, AnchorOutage, Body, DelayError, Impairments, Outage, WarmUp
+from skyless.simulation.oscillator import OscillatorModel, Temperature
+from skyless.simulation.range_errors import RangeErrorModel
+from skyless.simulation.trajectory import Static, Trajectory, Waypoints
+from skyless.site.model import Site
+
+WALL_MARGIN_M: Final = 0.5
+"""Walking tags keep this distance from the box around the anchors."""
+
+LEAST_WALK_M: Final = 1.0
+"""And have at least this much room along x and y, were there one anchor only."""
+
+WAYPOINTS: Final = 8
+
+COMFORT_MPS2: Final = 2.0
+"""Acceleration with which people and robots turn."""
+
+
+class Request(Struct, frozen=True):
+    """A simulation: what is asked of ``skyless simulate``."""
+
+    site: Site
+    method: str = DEFAULT_METHOD
+    seed: int = 1
+    noise_ps: float | None = None
+    """Noise of every TX and RX stamp, and what the filters assume; None for the site's own figures."""
+    positions_m: tuple[tuple[float, ...], ...] = ()
+    """Tags that lie still, (x, y) or (x, y, z) each."""
+    paths_m: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    """Tags that walk from point to point, each along its path: once, or round and round if it ends where it began."""
+    tags: int = 1
+    """How many tags walk about where neither positions nor paths are given."""
+    speed_mps: float = 1.0
+    """Speed of the tags that walk; those of a room wander with random acceleration instead."""
+    qa: float = 0.3
+    integrity: IntegrityRequirement = IntegrityRequirement()
+    warmup_s: float = 2.0
+    most_fixes: int | None = None
+    """Judged fixes per tag, one per superframe, after which no more are judged."""
+    loss: float = 0.0
+    nlos: float = 0.0
+    nlos_mean_m: float = 1.0
+    power_bias: bool = False
+    diagnostics: bool = False
+    """Whether receptions carry powers, of which the first path's is low where they are late."""
+    temperature: bool = False
+    biases: tuple[AnchorBias, ...] = ()
+    outages: tuple[AnchorOutage, ...] = ()
+    delay_errors: tuple[DelayError, ...] = ()
+    """Antenna delays that the site file has wrong, one entry an anchor at most."""
+    silences: tuple[Outage, ...] = ()
+    """When all tags' radios are deaf; their counters go on."""
+    room: Room | None = None
+    """Errors of survey and ranges; None for anchors that stand where the site file says and ranges without errors."""
+    body: Body | None = None
+    warm_ups: tuple[WarmUp, ...] = ()
+    walls_between_anchors: bool = True
+
+
+def fleet_of(request: Request) -> Fleet:
+    """Make the world and its tags.
+
+    Raises:
+        ValueError: the method, or an anchor that is to fail, does not exist; a path has points in one place.
+    """
+    site = request.site
+    if request.noise_ps is not None:
+        noise = replace(site.noise, tx_stamp_ps=request.noise_ps, rx_stamp_ps=request.noise_ps)
+        site = replace(site, noise=noise)
+    settings = FleetSettings(request.method, request.qa, request.warmup_s, request.most_fixes, request.integrity)
+    fleet = Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, settings)
+    if request.silences:
+        fleet.receivers = [
+            DeafReceiver(request.method, qa=request.qa, integrity=request.integrity, silences=request.silences)
+            for _ in fleet.receivers
+        ]
+    return fleet
+
+
+def impairments_of(request: Request, site: Site) -> Impairments:
+    """Noise and faults: the site's noise figures are taken for true."""
+    noise, room = site.noise, request.room
+    return Impairments(
+        tx_stamp_ps=noise.tx_stamp_ps,
+        rx_stamp_ps=noise.rx_stamp_ps,
+        oscillator=OscillatorModel(
+            white_fm=noise.white_fm,
+            random_walk_fm=noise.random_walk_fm,
+            temperature=Temperature() if request.temperature else None,
+        ),
+        channel=ChannelModel(
+            loss_probability=request.loss,
+            nlos_probability=request.nlos,
+            nlos_mean_m=request.nlos_mean_m,
+            walls_between_anchors=request.walls_between_anchors,
+            power_bias=request.power_bias,
+        ),
+        anchor_biases=request.biases,
+        delay_errors=request.delay_errors,
+        anchor_outages=request.outages,
+        anchor_displacements=() if room is None else displacements(room, site, request.seed),
+        range_errors=RangeErrorModel() if room is None else room.ranges,
+        body=request.body,
+        warm_ups=request.warm_ups,
+        diagnostics=request.diagnostics,
+    )
+
+
+def trajectories_of(request: Request) -> list[Trajectory]:
+    """Tags at the given positions and on the given paths, else walking about inside the box around the anchors.
+
+    Those of a room wander with random acceleration.
+    """
+    height_m = request.site.tags.height_m or 0.0
+    given: list[Trajectory] = [Static(*_with_height(point, height_m)) for point in request.positions_m]
+    given += [_path([_with_height(p, height_m) for p in path], request.speed_mps) for path in request.paths_m]
+    if given or request.room is None:
+        return given or [_walk(request, index) for index in range(request.tags)]
+    return wanderers(request.site, request.tags, request.seed)
+
+
+def wanderers(site: Site, tags: int, seed: int) -> list[Trajectory]:
+    """Tags that wander with random acceleration inside the box around the anchors."""
+    low, high = _walkable_box(site)
+    return [wanderer(low, high, seed, tag) for tag in range(tags)]
+
+
+def _with_height(point: tuple[float, ...], height_m: float) -> tuple[float, float, float]:
+    return point[0], point[1], point[2] if len(point) > 2 else height_m
+
+
+def _path(points: list[tuple[float, float, float]], speed_mps: float) -> Waypoints:
+    closed = len(points) > 2 and points[0] == points[-1]
+    return _smooth_path(points[:-1] if closed else points, speed_mps, loop=closed)
+
+
+def _walk(request: Request, index: int) -> Trajectory:
+    """Walk between random points inside the box, round and round, turning gently at each."""
+    low, high = _walkable_box(request.site)
+    generator = np.random.default_rng([request.seed, index])
+    points = [generator.uniform(low, high)]
+    while len(points) < WAYPOINTS:
+        point = generator.uniform(low, high)
+        if np.linalg.norm(point - points[-1]) > np.linalg.norm(high - low) / 4.0:
+            points.append(point)
+    return _smooth_path(points, request.speed_mps)
+
+
+def _smooth_path(points: Sequence[ArrayLike], speed_mps: float, *, loop: bool = True) -> Waypoints:
+    """Path whose corners are as gentle as the legs allow, at most ``COMFORT_MPS2``; ``loop``: round and round."""
+    places = np.array(points, dtype=np.float64)
+    steps_m = np.roll(places, -1, axis=0) - places
+    legs_m = np.linalg.norm(steps_m if loop else steps_m[:-1], axis=1)
+    corner_s = min(2.0 * speed_mps / COMFORT_MPS2, 0.9 * float(legs_m.min()) / speed_mps)
+    return Waypoints(places, speed_mps, loop=loop, corner_s=corner_s)
+
+
+def _walkable_box(site: Site) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    places = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    low, high = places.min(axis=0), places.max(axis=0)
+    margin = np.minimum(WALL_MARGIN_M, (high - low) / 4.0)
+    lacking = np.maximum((LEAST_WALK_M, LEAST_WALK_M, 0.0) - (high - low - 2.0 * margin), 0.0) / 2.0
+    low, high = low + margin - lacking, high - margin + lacking
+    if site.tags.height_m is not None:
+        low[2] = high[2] = site.tags.height_m
+    return low, high
+
+
+def patrols(site: Site, tags: int, speed_mps: float = 1.0) -> list[Trajectory]:
+    """Tags walking round the site one behind the other, each on a narrower path: what the demo shows."""
+    low, high = _walkable_box(site)
+    paths: list[Trajectory] = []
+    for index in range(tags):
+        inset = (high - low)[:2] * 0.12 * (index % 3)
+        x0, y0 = low[:2] + inset
+        x1, y1 = high[:2] - inset
+        z = float((low[2] + high[2]) / 2.0)
+        corners = [(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]
+        turned = corners[index % 4 :] + corners[: index % 4]
+        paths.append(_smooth_path(turned, speed_mps))
+    return paths

@@ -1,1 +1,0 @@
-"""The paper's figures and claims, simulated, judged and written as one report."""

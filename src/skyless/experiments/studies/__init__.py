@@ -1,1 +1,0 @@
-"""Studies: many episodes each, pure functions that a command or a cluster may call."""

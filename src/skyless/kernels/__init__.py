@@ -1,0 +1,1 @@
+"""What estimation computes with: the compiler, array types, small linear algebra."""

@@ -1,0 +1,1 @@
+"""MQTT: topics, messages, the link to a broker."""

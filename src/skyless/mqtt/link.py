@@ -1,0 +1,246 @@
+"""A link to an MQTT broker that never delays its owner."""
+
+import asyncio
+import logging
+import os
+import platform
+import random
+import secrets
+import time
+from collections.abc import Callable
+from typing import Final
+
+import msgspec
+from msgspec import Struct
+
+import skyless
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.connect import open_connection, trouble_with
+from skyless.mqtt.connection import Connection, Reactions, RefusedError
+from skyless.mqtt.messages import Counters, StatusMessage
+from skyless.mqtt.outbox import Limits, Outbox
+from skyless.mqtt.paho_client import Introduction, Will
+from skyless.mqtt.subscriptions import Handler, Routes
+from skyless.mqtt.topics import status_topic
+
+_log = logging.getLogger("skyless.mqtt")
+_encode: Final = msgspec.json.Encoder().encode
+
+_FIRST_WAIT_S: Final = 0.1
+_LONGEST_WAIT_S: Final = 5.0
+_LONGEST_WAIT_LOOPBACK_S: Final = 0.5
+_FAREWELL_S: Final = 1.0
+_SAME_TROUBLE_S: Final = 30.0
+_SOON_S: Final = 0.5
+"""A first connection that takes no longer is nothing to speak of."""
+
+
+class Link:
+    """One MQTT connection of a node, made again for as long as ``run`` runs.
+
+    It tells the node's status: retained, with a last will. Messages wait in an ``Outbox`` while the broker is slow or
+    away. All of it belongs to one event loop. Subscribers may get a message of QoS 1 twice, when a connection broke at
+    the wrong moment.
+    """
+
+    def __init__(
+        self,
+        address: MqttAddress,
+        name: int | str,
+        *,
+        site: int | str,
+        kind: str,
+        persistent: bool = False,
+        keepalive_s: int = 10,
+        limits: Limits | None = None,
+    ) -> None:
+        """``persistent`` lets the broker keep messages of QoS 1 for this name while it is away, until it is stopped.
+
+        Two persistent links of one name would push each other out.
+
+        Raises:
+            SkylessError: the address names a file of certificates that cannot be used.
+        """
+        self.address = address
+        self.connected = False
+        self.trouble: str | None = "not connected yet"
+        """Why there is no connection; None while there is one."""
+        self.on_state: list[Callable[[bool], None]] = []
+        """Called with ``connected`` whenever it changes."""
+        self._tls = address.tls_context()
+        self._keepalive_s = keepalive_s
+        self._client = f"skyless-{site}-{kind}-{name}" + ("" if persistent else f"-{secrets.token_hex(4)}")
+        self._persistent = persistent
+        self._status_topic = status_topic(site, kind, name)
+        self._offline = StatusMessage(online=False, kind=kind, name=str(name))
+        self._outbox = Outbox(limits or Limits())
+        self._routes = Routes()
+        self._reactions = Reactions(self._routes.receive, self._acknowledged, self._pump)
+        self._connection: Connection | None = None
+        self._reconnects = -1
+        self._told_dropped = 0
+        self._away_since_s = time.monotonic()
+        self._told: tuple[str, float] = ("", 0.0)
+        self._told_fault = False
+        self._stopping = False
+        self.subscribe(self._status_topic, self._correct_status)
+
+    @property
+    def counters(self) -> Counters:
+        """What it has done."""
+        return Counters(self._outbox.sent, self._outbox.dropped, max(0, self._reconnects))
+
+    @property
+    def unacknowledged(self) -> int:
+        """Messages of QoS 1, and retained ones, that the broker does not have for certain."""
+        return self._outbox.unacknowledged
+
+    def publish(self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False) -> None:
+        """Hand over a message; returns at once, whatever the broker does. A struct becomes JSON."""
+        payload = message if isinstance(message, bytes) else _encode(message)
+        fault = self._outbox.put(topic, payload, qos, retain=retain)
+        if fault is not None:
+            self._tell_once(fault)
+        self._pump()
+
+    def forget(self, topic: str) -> None:
+        """Stop repeating a retained message after reconnects, because another node has written a newer one."""
+        self._outbox.forget(topic)
+
+    def subscribe(self, topic_filter: str, handler: Handler, qos: int = 0) -> None:
+        """Call ``handler`` with every message of a filter, now and after every reconnect.
+
+        A second handler of the same filter takes the place of the first. Where filters of one link overlap, some
+        brokers send a message once for each, and all its handlers see it as often.
+        """
+        self._routes.add(topic_filter, handler, qos)
+        if self._connection is not None:
+            self._connection.subscribe({topic_filter: qos})
+
+    async def run(self) -> None:
+        """Stay connected until cancelled; then send what waits, for a second at most, and say goodbye."""
+        failures = 0
+        try:
+            while True:
+                begin_s = time.monotonic()
+                if await self._one_connection() and time.monotonic() - begin_s > _LONGEST_WAIT_S:
+                    failures = 0
+                await asyncio.sleep(self._wait_s(failures))
+                failures += 1
+        finally:
+            self._down("stopped")
+            if self.unacknowledged:
+                _log.warning("stopped; the broker %s has not taken %d messages", self.address, self.unacknowledged)
+
+    async def _one_connection(self) -> bool:
+        """Whether it came about; returns when it is lost."""
+        try:
+            connection = await open_connection(self.address, self._tls, self._introduction(), self._reactions)
+        except (OSError, RefusedError) as error:
+            self._tell_trouble(trouble_with(self.address, error))
+            return False
+        self._up(connection)
+        try:
+            await connection.lost.wait()
+        except asyncio.CancelledError:
+            await self._farewell(connection)
+            raise
+        self._down(connection.reason)
+        _log.warning("lost the broker %s: %s", self.address, connection.reason)
+        return True
+
+    def _introduction(self) -> Introduction:
+        will = Will(self._status_topic, _encode(self._offline))
+        return Introduction(self._client, self._keepalive_s, self._persistent, will)
+
+    def _up(self, connection: Connection) -> None:
+        self._connection = connection
+        self._stopping = False
+        self._reconnects += 1
+        self._tell_return()
+        self._outbox.restart()
+        self._say_online()
+        connection.subscribe(self._routes.filters)
+        self._set_state(connected=True, trouble=None)
+        self._pump()
+
+    def _down(self, reason: str) -> None:
+        self._connection = None
+        if self.connected:
+            self._away_since_s = time.monotonic()
+            self._set_state(connected=False, trouble=reason)
+
+    def _set_state(self, *, connected: bool, trouble: str | None) -> None:
+        self.connected, self.trouble = connected, trouble
+        for callback in self.on_state:
+            callback(connected)
+
+    def _say_online(self) -> None:
+        status = StatusMessage(
+            online=True,
+            kind=self._offline.kind,
+            name=self._offline.name,
+            version=skyless.__version__,
+            host=platform.node(),
+            pid=os.getpid(),
+            unix_s=time.time(),
+        )
+        self.publish(self._status_topic, status, qos=1, retain=True)
+
+    def _correct_status(self, _topic: str, payload: bytes) -> None:
+        """A last will of an earlier run comes late, from a connection that the broker took for alive: we are online."""
+        if not self._stopping and b'"online":false' in payload:
+            self._say_online()
+
+    async def _farewell(self, connection: Connection) -> None:
+        self._stopping = True
+        try:
+            async with asyncio.timeout(_FAREWELL_S):
+                self.publish(self._status_topic, self._offline, qos=1, retain=True)
+                while self._outbox.unacknowledged and not connection.lost.is_set():
+                    await asyncio.sleep(0.005)
+                if self._persistent:
+                    connection.unsubscribe(self._routes.filters)
+                await connection.leave()
+        except TimeoutError:
+            pass
+        finally:
+            connection.abort("stopped")
+
+    def _pump(self) -> None:
+        connection = self._connection
+        while connection is not None and connection.writable:
+            message = self._outbox.take()
+            if message is None:
+                return
+            number = connection.publish(message.topic, message.payload, message.qos, retain=message.retain)
+            self._outbox.gave(message, number)
+
+    def _acknowledged(self, number: int) -> None:
+        self._outbox.acknowledge(number)
+        self._pump()
+
+    def _wait_s(self, failures: int) -> float:
+        longest_s = _LONGEST_WAIT_LOOPBACK_S if self.address.loopback else _LONGEST_WAIT_S
+        return min(longest_s, _FIRST_WAIT_S * 2.0 ** min(failures, 10)) * random.uniform(0.6, 1.0)
+
+    def _tell_trouble(self, trouble: str) -> None:
+        """Once, and again every half minute while it lasts."""
+        self.trouble = trouble
+        now_s = time.monotonic()
+        if trouble != self._told[0] or now_s > self._told[1] + _SAME_TROUBLE_S:
+            self._told = (trouble, now_s)
+            _log.warning("%s", trouble)
+
+    def _tell_once(self, fault: str) -> None:
+        if not self._told_fault:
+            self._told_fault = True
+            _log.warning("not published: %s", fault)
+
+    def _tell_return(self) -> None:
+        dropped = self._outbox.dropped - self._told_dropped
+        away_s = time.monotonic() - self._away_since_s
+        if self._reconnects or (dropped and away_s > _SOON_S):
+            _log.warning("connected to %s after %.1f s; %d messages were dropped", self.address, away_s, dropped)
+        self._told_dropped += dropped
+        self._told = ("", 0.0)

@@ -1,0 +1,253 @@
+"""What flies over MQTT, version 1: JSON objects, one struct for each topic of ``mqtt/topics.py`` (``docs/mqtt.md``).
+
+SI units. ``unix_s`` is seconds since 1970 by the sender's clock. Fields may be added within a version; readers ignore
+those that they do not know.
+"""
+
+from typing import Literal
+
+from msgspec import Struct
+
+from skyless.site.model import Site
+
+Vector = tuple[float, float, float]
+Matrix = tuple[float, float, float, float, float, float, float, float, float]
+"""3 × 3, row by row."""
+
+
+class SiteMessage(Struct, frozen=True):
+    """The site as its file says it, retained, so that a new tag or page knows it at once."""
+
+    site: Site
+    simulated: bool
+    """True when its radios are emulated."""
+    unix_s: float
+
+
+class StatusMessage(Struct, frozen=True):
+    """Whether a node lives; retained, and the broker itself publishes ``online: false`` as its last will."""
+
+    online: bool
+    kind: str
+    name: str
+    version: str = ""
+    host: str = ""
+    pid: int = 0
+    unix_s: float = 0.0
+    """When it came online; 0 in a last will."""
+
+
+class FixMessage(Struct, frozen=True):
+    """One fix of one tag. A tag publishes as many a second as it is told; ``serial`` counts all that it made."""
+
+    tag: str
+    serial: int
+    """Number of the fix since the tag's start."""
+    unix_s: float
+    """When the last frame of the fix ended, by the clock of the tag's host."""
+    time_s: float
+    """Master time at which the position holds, since the receiver's first fix."""
+    position_m: Vector
+    covariance_m2: Matrix
+    velocity_mps: Vector | None
+    velocity_covariance: Matrix | None
+    std_m: float
+    """One-sigma radial error."""
+    gdop: float | None
+    pdop: float | None
+    hdop: float | None
+    vdop: float | None
+    anchors: tuple[int, ...]
+    chi2: float
+    dof: int
+    residual_rms_m: float
+    method: str
+    height_known: bool
+    latency_s: float
+    """From the end of the last frame to the computed fix."""
+    hpl_m: float | None = None
+    """Horizontal protection level; None where nothing can be promised, or the method has none."""
+    vpl_m: float | None = None
+    integrity_risk: float | None = None
+    """Probability, for each fix, that the error exceeds its level."""
+    alert: str | None = None
+    """As ``skyless.positioning.integrity.Alert`` has it."""
+
+
+class Counters(Struct, frozen=True):
+    """What a node's MQTT link has done."""
+
+    published: int
+    dropped: int
+    """Messages given up because the broker was away or slow."""
+    reconnects: int
+
+
+class Phase(Struct, frozen=True, array_like=True):
+    """One message of a tag's last superframe, times in s since that superframe's first message was heard."""
+
+    superframe: int
+    slot: int
+    anchor: int
+    heard_s: float
+    """The frame's end."""
+    done_s: float
+    """The end of its processing."""
+    fix: bool
+
+
+class TagHealth(Struct, frozen=True):
+    """How a tag does, once a second."""
+
+    tag: str
+    unix_s: float
+    uptime_s: float
+    method: str
+    receptions: int
+    fixes: int
+    updates_per_s: float
+    """Fixes in the last second."""
+    reason: str | None
+    """Why there is no fix; None where there is one."""
+    first_fix_s: float | None
+    """From the start to the first fix."""
+    latency_p50_s: float | None
+    latency_p99_s: float | None
+    """From a frame's end to its fix, over the last second."""
+    counters: dict[str, int]
+    """Dropped frames by reason."""
+    mqtt: Counters
+    cpu: float
+    """Share of a core that the process uses; a process with several tags divides it among them."""
+    memory_bytes: int
+    """Resident memory of the process."""
+    phases: tuple[Phase, ...]
+    """The messages of the last whole superframe."""
+
+
+class AnchorHealth(Struct, frozen=True):
+    """How an anchor does, once a second."""
+
+    anchor: int
+    unix_s: float
+    uptime_s: float
+    role: Literal["master", "anchor", "listening"]
+    master: int | None
+    """Whom it follows."""
+    term: int
+    synchronised: bool
+    offset_s: float | None
+    """Own counter less the master's scale, modulo the wrap, in (-8.6, 8.6]."""
+    rate_ppm: float | None
+    """Own rate against the master's scale."""
+    offset_std_m: float | None
+    sent: int
+    late: int
+    """Transmissions that came too late and were skipped."""
+    heard: int
+    superframe: int | None
+    heard_age_s: dict[str, float]
+    """Time since each other anchor was last heard."""
+    counters: dict[str, int]
+    mqtt: Counters
+
+
+class EtherHealth(Struct, frozen=True):
+    """What the emulated air has carried."""
+
+    unix_s: float
+    simulated_s: float
+    transmissions: int
+    late: int
+    at_anchors: dict[str, int]
+    at_tags: dict[str, int]
+    stalls: int
+    """How often the ether fell behind real time."""
+    overruns: int
+    """Receptions lost because a process did not read."""
+
+
+class TrueMotion(Struct, frozen=True, array_like=True):
+    """Where a simulated tag truly is."""
+
+    position_m: Vector
+    velocity_mps: Vector
+
+
+class TruthMessage(Struct, frozen=True):
+    """Where all simulated tags truly are at one moment."""
+
+    unix_s: float
+    tags: dict[str, TrueMotion]
+
+
+class RequestMessage(Struct, frozen=True):
+    """Somebody wants raw receptions; to be repeated before the lease ends."""
+
+    by: str
+    receptions: tuple[str, ...]
+    """Names of tags; ``*`` means all of them. Empty ends the request."""
+    lease_s: float
+
+
+class RawReception(Struct, frozen=True, array_like=True):
+    """One reception as the radio gave it; bytes as base64 in JSON."""
+
+    frame: bytes
+    rx_ticks: int
+    host_s: float | None
+    rx_power_dbm: float | None = None
+    first_path_power_dbm: float | None = None
+    carrier_offset_ppm: float | None = None
+
+
+class ReceptionsMessage(Struct, frozen=True):
+    """A run of receptions of one tag, none missing within a segment."""
+
+    tag: str
+    segment: str
+    """Another one begins when a run is interrupted; each begins with ``start``."""
+    first: int
+    """Number of the first reception within the segment; the next message goes on where this one ends."""
+    unix_less_host_s: float
+    """What to add to ``host_s`` to get ``unix_s``."""
+    receptions: tuple[RawReception, ...]
+    start: "SegmentStart | None" = None
+    """Only in the first message of a segment."""
+
+
+class SegmentStart(Struct, frozen=True):
+    """What the receiver was when a segment began."""
+
+    serial: int
+    """Number of fixes made before."""
+    settings: dict[str, str | float | int | None]
+    """How the receiver was made."""
+    state: bytes | None
+    """Its state (``skyless.recordings.mcap.checkpoint``); None for a receiver that had heard nothing yet."""
+
+
+class Zone(Struct, frozen=True):
+    """A polygon on the floor."""
+
+    id: str
+    name: str
+    polygon_m: tuple[tuple[float, float], ...]
+    colour: str | None = None
+
+
+class ZonesMessage(Struct, frozen=True):
+    """All zones of a site, retained."""
+
+    zones: tuple[Zone, ...]
+
+
+class ZoneEvent(Struct, frozen=True):
+    """A tag has entered or left a zone."""
+
+    zone: str
+    name: str
+    tag: str
+    kind: Literal["enter", "leave"]
+    unix_s: float
+    position_m: Vector

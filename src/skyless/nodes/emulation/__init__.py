@@ -1,0 +1,1 @@
+"""Programs that stand in for hardware: the emulated air, emulated boards."""

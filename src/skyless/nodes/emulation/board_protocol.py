@@ -1,0 +1,226 @@
+"""What an emulated board says on its serial line of what its radio hears, in each format of ``skyless board``."""
+
+import json
+import math
+import struct
+from collections import Counter
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from skyless.air.beacon import Beacon
+from skyless.air.codec import decode_cached
+from skyless.air.reception import Diagnostics, Reception, Transmission
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.firmware import link
+from skyless.radios.interface import Late, Radio, RadioEvent, Restarted, Sent
+from skyless.radios.serial.link_records import OFFSET_STEPS_PER_PPM, POWER_STEPS_PER_DB, to_steps
+from skyless.recordings.foreign.bitcraze_payload import TDOA3
+from skyless.site.almanac_gathering import AlmanacBook
+from skyless.ticks import wrap
+
+Send = Callable[[bytes], bool]
+_EMULATED_FIRMWARE: Final = (0, 0, 0)
+_LAST_ID: Final = 0xFF
+
+
+class Speech(Protocol):
+    """A format."""
+
+    def hear_radio(self, event: RadioEvent) -> None:
+        """Something happened on the air."""
+
+    def hear_host(self, data: bytes) -> None:
+        """The host says something."""
+
+
+class LinkSpeech:
+    """The serial link, as the firmware speaks it."""
+
+    def __init__(self, radio: Radio, send: Send, *, can_transmit: bool) -> None:
+        self._radio, self._send, self._can_transmit = radio, send, can_transmit
+        self._reader, self._writer = link.Reader(), link.Writer()
+        self._configured = self._receiving = False
+        self._tx_delay_ticks = 0
+        self._waiting: dict[int, bytearray] = {}
+        self.counts = dict.fromkeys(("received", "errors", "sent", "late", "garbled", "unsent"), 0)
+
+    def hear_radio(self, event: RadioEvent) -> None:
+        """Report it, if the host wants it."""
+        if isinstance(event, Reception):
+            self._report(event)
+        elif isinstance(event, Sent | Late):
+            dx = self._waiting.pop(event.tx_ticks, None)
+            if dx is not None and isinstance(event, Sent):
+                self.counts["sent"] += 1
+                self._say(self._writer.tx_done(dx, _stamp(event.tx_ticks)))
+            elif dx is not None:
+                self._late(dx, link.LATE_FOR_RADIO)
+        elif isinstance(event, Restarted):
+            self._configured = self._receiving = False
+            self._waiting.clear()
+            self._send(b"\0")
+            self._hello()
+
+    def _report(self, reception: Reception) -> None:
+        if not self._receiving:
+            return
+        self.counts["received"] += 1
+        told, frame = reception.diagnostics or Diagnostics(), bytearray(reception.frame)
+        powers = [to_steps(power, POWER_STEPS_PER_DB) for power in (told.rx_power_dbm, told.first_path_power_dbm)]
+        offset = to_steps(told.carrier_offset_ppm, OFFSET_STEPS_PER_PPM)
+        self._say(self._writer.rx(_stamp(reception.rx_ticks), powers[0], powers[1], offset, frame, len(frame)))
+
+    def hear_host(self, data: bytes) -> None:
+        """Follow commands; a board whose radio is dead does nothing."""
+        reader, buffer, at = self._reader, bytearray(data), 0
+        while at < len(buffer):
+            at = reader.take(buffer, at, len(buffer))
+            if reader.length and self._radio.now_ticks() is not None:
+                self._follow(reader.record, reader.length)
+
+    def _follow(self, record: bytearray, length: int) -> None:
+        kind = record[0]
+        if kind == link.ASK_HELLO:
+            self._hello()
+        elif kind == link.ASK_STATUS:
+            self._status()
+        elif kind == link.CONFIG:
+            self._configure(record, length)
+        elif kind == link.RX_ON and self._configured:
+            self._receiving = True
+            self._status()
+        elif kind == link.TX_AT and link.TX_FRAME_AT < length <= link.TX_FRAME_AT + link.MAX_FRAME_BYTES:
+            self._transmit(record[link.BODY_AT : link.TX_FRAME_AT], bytes(record[link.TX_FRAME_AT : length]))
+        elif kind in (link.RX_ON, link.TX_AT):
+            self._say(self._writer.refused(kind, link.REFUSED_MALFORMED))
+        else:
+            self.counts["garbled"] += 1
+
+    def _hello(self) -> None:
+        name = bytearray(self._radio.name.encode()[:8].ljust(8, b"\0"))
+        self._say(self._writer.hello(_EMULATED_FIRMWARE, name, link.CAN_TRANSMIT if self._can_transmit else 0))
+
+    def _status(self) -> None:
+        ticks = self._radio.now_ticks()
+        state = self._configured * link.IS_CONFIGURED | self._receiving * link.IS_RECEIVING
+        state |= bool(self._waiting) * link.HAS_FRAME_WAITING
+        counts = self.counts | {"garbled": self.counts["garbled"] + self._reader.garbled + self._reader.overlong}
+        self._say(self._writer.status(_stamp(ticks or 0), state, list(counts.values())))
+
+    def _configure(self, record: bytearray, length: int) -> None:
+        """Take antenna delays; all else is as the air is."""
+        if length < link.CONFIG_BYTES or record[2:8] != _CONFIG[2:8]:
+            reason = link.REFUSED_MALFORMED if length < link.CONFIG_BYTES else link.REFUSED_SETTING
+            self._say(self._writer.refused(link.CONFIG, reason))
+            return
+        self._tx_delay_ticks = link.unsigned(record, 8, 2)
+        self._configured, self._receiving = True, False
+        self._status()
+
+    def _transmit(self, dx: bytearray, frame: bytes) -> None:
+        if not (self._configured and self._can_transmit):
+            self._late(dx, link.LATE_NOT_READY)
+        elif self._waiting:
+            self._late(dx, link.LATE_BUSY)
+        else:
+            dx_ticks = int.from_bytes(dx, "little") & ~0x1FF
+            tx_ticks = wrap(dx_ticks + self._tx_delay_ticks)
+            self._waiting[tx_ticks] = dx
+            self._radio.transmit(Transmission(frame, tx_ticks))
+
+    def _late(self, dx: bytearray, reason: int) -> None:
+        self.counts["late"] += 1
+        self._say(self._writer.tx_late(dx, reason))
+
+    def _say(self, length: int) -> None:
+        if not self._send(bytes(self._writer.line[:length])):
+            self.counts["unsent"] += 1
+
+
+def _stamp(ticks: int) -> bytearray:
+    return bytearray(ticks.to_bytes(5, "little"))
+
+
+def _usual_config() -> bytes:
+    """The record of a CONFIG, without delays."""
+    writer, reader = link.Writer(), link.Reader()
+    reader.take(writer.line, 0, writer.config(0, 0))
+    return bytes(reader.record[: reader.length])
+
+
+_CONFIG: Final = _usual_config()
+
+
+class ListenerSpeech:
+    """The JSON lines of the uwb-apps listener."""
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+
+    def hear_radio(self, event: RadioEvent) -> None:
+        """One line for each frame."""
+        if not isinstance(event, Reception):
+            return
+        told, frame = event.diagnostics or Diagnostics(), event.frame
+        power_dbm = -90.0 if told.rx_power_dbm is None else told.rx_power_dbm
+        line = {
+            "utime": round((event.host_s or 0.0) * 1e6),
+            "ts": event.rx_ticks,
+            "rssi": round(power_dbm, 1),
+            "dlen": len(frame),
+            "d": frame.hex(),
+        }
+        self._send(json.dumps(line, separators=(",", ":")).encode() + b"\r\n")
+
+    def hear_host(self, data: bytes) -> None:
+        """It takes no commands."""
+
+
+class SnifferSpeech:
+    """A Bitcraze sniffer: beacons translated into packets of a TDoA3 system, as text until it is told ``b``."""
+
+    def __init__(self, send: Send, *, knows_binary: bool) -> None:
+        self._send, self._knows_binary = send, knows_binary
+        self._binary = False
+        self._almanac = AlmanacBook()
+        self.drops: Counter[str] = Counter()
+
+    def hear_radio(self, event: RadioEvent) -> None:
+        """One packet for each beacon."""
+        if not isinstance(event, Reception):
+            return
+        beacon = decode_cached(event.frame)
+        if not isinstance(beacon, Beacon) or beacon.anchor > _LAST_ID:
+            self.drops["not-translated"] += 1
+            return
+        self._almanac.hear(beacon.almanac_issue, beacon.page)
+        payload = self._payload(beacon)
+        if self._binary:
+            length = struct.pack("<H", len(payload))
+            self._send(b"\xbc" + _stamp(event.rx_ticks) + bytes((beacon.anchor, 0xFF)) + length + payload + length)
+        else:
+            self._send(b"From %02x to ff @%010x: %s\r\n" % (beacon.anchor, event.rx_ticks, payload.hex().encode()))
+
+    def hear_host(self, data: bytes) -> None:
+        """``b`` asks for binary."""
+        self._binary = self._binary or (self._knows_binary and b"b" in data)
+
+    def _payload(self, beacon: Beacon) -> bytes:
+        """Type, sequence, TX time, and whom the anchor heard when; the time of flight where both places are known."""
+        heard = [
+            entry for entry in (beacon.master_heard, *beacon.heard) if entry is not None and entry.anchor <= _LAST_ID
+        ]
+        payload = struct.pack("<BBIB", TDOA3, beacon.sequence & 0x7F, beacon.tx_ticks & 0xFFFFFFFF, len(heard))
+        for entry in heard:
+            tof_ticks = self._tof_ticks(beacon.anchor, entry.anchor)
+            flags = (entry.sequence & 0x7F) | (0x80 if tof_ticks else 0)
+            payload += struct.pack("<BBI", entry.anchor, flags, entry.rx_ticks & 0xFFFFFFFF)
+            payload += struct.pack("<H", tof_ticks) if tof_ticks else b""
+        return payload
+
+    def _tof_ticks(self, one: int, other: int) -> int:
+        places = self._almanac.anchors_m
+        if one not in places or other not in places:
+            return 0
+        squared_m2: float = sum((a - b) ** 2 for a, b in zip(places[one], places[other], strict=True))
+        return min(round(math.sqrt(squared_m2) / SPEED_OF_LIGHT_MPS * TICK_RATE_HZ), 0xFFFF)

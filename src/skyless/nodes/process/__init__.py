@@ -1,0 +1,1 @@
+"""What every program of a running site needs of its process."""

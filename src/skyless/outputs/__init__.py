@@ -1,1 +1,0 @@
-"""What Skyless tells others: MQTT topics and messages, and the link that carries them."""

@@ -1,0 +1,227 @@
+"""Fixes from ready-made time differences: a start from a window of them, then the estimator, and again when lost."""
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from math import dist
+from typing import Final
+
+import numpy as np
+from msgspec.structs import replace
+
+from skyless.air.masterless_packets import PairTdoa
+from skyless.constants import TICK_RATE_HZ
+from skyless.positioning.estimator.estimator import ACCEPTED, Estimator
+from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.fix import Fix, NoFixReason
+from skyless.positioning.integrity import IntegrityRequirement
+from skyless.positioning.masterless.calibration import KNOWN_STD_M, DifferenceCalibration
+from skyless.positioning.masterless.start import Start, find_start
+from skyless.positioning.solver.locate import NoSolution
+
+DIFFERENCES: Final = EstimatorSettings(
+    gate=3.0,
+    white=0.0,
+    walk=0.0,
+    drop_s=30.0,
+    range_std_m=0.04,
+    slope_std_m=0.02,
+    place_std_m=0.12,
+    place_distance_m=0.5,
+    place_time_s=30.0,
+    place_memory_s=1.5,
+    rest_s=3.0,
+)
+"""What recorded flights of DW1000s show (docs/recordings.md): reflections change within half a metre, and by how much
+differs from anchor to anchor."""
+
+WINDOW: Final = 60
+"""Differences that a start looks at, the newest ones ..."""
+
+WINDOW_S: Final = 20.0
+"""... and none older than this."""
+
+MAX_GAP_S: Final = 10.0
+"""After a longer silence the state says less than a new start would."""
+
+SPEED_STD_MPS: Final = 1.0
+"""Of the velocity at the start."""
+
+IN_USE_S: Final = 0.5
+"""An anchor counts as in use while its last accepted difference is younger."""
+
+MAX_STD_M: Final = 3.0
+"""While the horizontal standard deviation is larger, there is no fix; a silence that makes it so means a new start."""
+
+SHORT_SILENCE_S: Final = 0.1
+"""Over shorter silences no state grows much wider."""
+
+TRY_EVERY: Final = 6
+"""Differences between two attempts at a start."""
+
+AFTER_LOSS: Final = 30
+AFTER_LOSS_S: Final = 1.0
+"""After a state that was wrong, a new start waits for this number of differences, or for this time."""
+
+
+class DifferenceTracking:
+    """One tag that is given differences of its ranges to pairs of anchors."""
+
+    def __init__(
+        self,
+        settings: EstimatorSettings,
+        anchors_m: dict[int, tuple[float, float, float]],
+        z_bounds_m: tuple[float, float] | None = None,
+        calibration: DifferenceCalibration | None = None,
+    ) -> None:
+        """``anchors_m`` places the anchors; a difference that brings its own positions needs none.
+
+        ``calibration`` is taken off every difference; anchors that are not in it are taken for ordinary ones.
+        """
+        self._calibration = DifferenceCalibration({}) if calibration is None else calibration
+        self.counters: Counter[str] = Counter()
+        self.reason: NoFixReason = NoFixReason.NO_BEACONS
+        is_calibrated = bool(self._calibration.anchors)
+        self._settings = replace(
+            settings,
+            difference_std_m=self._calibration.difference_std_m(settings.difference_std_m),
+            range_std_m=min(settings.range_std_m, KNOWN_STD_M) if is_calibrated else settings.range_std_m,
+            lowest_m=settings.lowest_m if z_bounds_m is None else z_bounds_m[0],
+            highest_m=settings.highest_m if z_bounds_m is None else z_bounds_m[1],
+        )
+        self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit_m)
+        self._places = {anchor: np.array(place) for anchor, place in anchors_m.items()}
+        self._z_bounds_m = z_bounds_m
+        self._estimator = Estimator(self._settings)
+        self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
+        self._begin_s = self._newest_s = 0.0
+        self._received_s: dict[int, float] = {}
+        self._since_try = 0
+        self._start: Start | None = None
+        self._was_wrong = False
+
+    @property
+    def estimator(self) -> Estimator:
+        """The filter with all its states."""
+        return self._estimator
+
+    def hear(self, pairs: Sequence[PairTdoa]) -> bool:
+        """Take the differences of one reception, receptions in the order of time.
+
+        True if they made a fix, else ``reason`` says why not.
+        """
+        used = False
+        for pair in pairs:
+            if self._learn_places(pair):
+                used = self._take(pair) or used
+            else:
+                self.counters["unknown-anchor"] += 1
+                self.reason = NoFixReason.NO_ALMANAC
+        return used and self._start is not None and self._is_sane()
+
+    def _learn_places(self, pair: PairTdoa) -> bool:
+        """Whether it is known where both anchors stand."""
+        places = self._places
+        if pair.a_m is not None:
+            places[pair.anchor_a] = np.array(pair.a_m)
+        if pair.b_m is not None:
+            places[pair.anchor_b] = np.array(pair.b_m)
+        return pair.anchor_a in places and pair.anchor_b in places
+
+    def _take(self, pair: PairTdoa) -> bool:
+        if self._start is not None and self._is_out_of_reach(pair.time_s - self._newest_s):
+            self._stop()
+        self._newest_s = pair.time_s
+        if self._start is None:
+            return self._try_start(pair)
+        used = self._process(pair)
+        if used:
+            self._received_s[pair.anchor_a] = self._received_s[pair.anchor_b] = pair.time_s
+        else:
+            self.counters["outlier"] += 1
+            self.reason = NoFixReason.RESIDUALS
+        if self._estimator.refuses_most:
+            self._stop()
+            self._was_wrong = True
+        return used
+
+    def _process(self, pair: PairTdoa) -> bool:
+        """Give a difference to the filter, without what a calibration, or what is usual, says of its anchors."""
+        position_m = self.position_m
+        error_m = self._calibration.error_m(pair.anchor_b, dist(position_m, self._places[pair.anchor_b]))
+        error_m -= self._calibration.error_m(pair.anchor_a, dist(position_m, self._places[pair.anchor_a]))
+        a, b = self._index(pair.anchor_a), self._index(pair.anchor_b)
+        ticks = round((pair.time_s - self._begin_s) * TICK_RATE_HZ)
+        return self._estimator.process_difference(a, b, ticks, pair.tdoa_m - error_m) == ACCEPTED
+
+    def _index(self, anchor: int) -> int:
+        """Index of an anchor in the estimator's table."""
+        return self._estimator.place_anchor(anchor, self._places[anchor])
+
+    def _is_out_of_reach(self, silent_s: float) -> bool:
+        """Whether the filter cannot predict so far: too long a silence for it, or a clock that went back."""
+        if not 0.0 <= silent_s <= MAX_GAP_S:
+            return True
+        return silent_s > SHORT_SILENCE_S and self._estimator.horizontal_variance_m2(silent_s) > MAX_STD_M**2
+
+    def _is_sane(self) -> bool:
+        """Whether the state is near the anchors, beyond which differences tell nothing, and known well enough."""
+        start, state, dim = self._start, self._estimator.state, self._estimator.dim
+        if start is None or not start.holds(state.x[:dim]):
+            self.reason = NoFixReason.NOT_CONVERGED
+            self._stop()
+            return False
+        if state.P[0, 0] + state.P[1, 1] > MAX_STD_M**2:
+            self.reason = NoFixReason.ACQUIRING
+            return False
+        if dim == 3 and state.P[2, 2] > start.extent_m**2:
+            self.reason = NoFixReason.BAD_GEOMETRY
+            return False
+        return True
+
+    @property
+    def position_m(self) -> tuple[float, float, float]:
+        """The newest position."""
+        x, y, *z = self._estimator.state.x[: self._estimator.dim].tolist()
+        return x, y, z[0] if z else self._settings.height_m or 0.0
+
+    def fix(self) -> Fix:
+        """The newest position with all that is known of it; only after a ``hear`` that made one."""
+        used = [anchor for anchor, when_s in self._received_s.items() if self._newest_s - when_s <= IN_USE_S]
+        anchors_m = np.array([self._places[anchor] for anchor in used]).reshape(-1, 3)
+        rows, known = self._estimator.rows.tobytes(), self._settings.height_m is not None
+        return Fix(self._newest_s, rows, tuple(used), anchors_m, "joint", known, 1, self._asked)
+
+    def _stop(self) -> None:
+        """Forget the state; a new start is looked for."""
+        self.counters["restart"] += 1
+        self._start = None
+        self._was_wrong = False
+        self._window.clear()
+
+    def _try_start(self, pair: PairTdoa) -> bool:
+        """Look for a start at every sixth difference; medians of each pair keep single outliers out of it."""
+        self._window.append(pair)
+        while pair.time_s - self._window[0].time_s > WINDOW_S:
+            self._window.popleft()
+        self._since_try += 1
+        if self._since_try < TRY_EVERY or (self._was_wrong and not self._is_enough_after_loss()):
+            return False
+        self._since_try = 0
+        start = find_start(self._window, self._places, self._calibration, self._settings.height_m, self._z_bounds_m)
+        if isinstance(start, NoSolution):
+            self.reason = start.reason
+            return False
+        dim, solution = self._estimator.dim, start.solution
+        self._begin_s = pair.time_s
+        covariance = solution.covariance_m2[:dim, :dim]
+        self._estimator.start(0, solution.position_m[:dim], covariance, SPEED_STD_MPS**2)
+        self._start = start
+        if start.without is not None:
+            self._estimator.doubt_anchor(self._index(start.without))
+        self._received_s = {anchor: pair.time_s for kept in self._window for anchor in (kept.anchor_a, kept.anchor_b)}
+        self.counters["start"] += 1
+        self._window.clear()
+        return self._process(pair)
+
+    def _is_enough_after_loss(self) -> bool:
+        return len(self._window) >= AFTER_LOSS or self._newest_s - self._window[0].time_s >= AFTER_LOSS_S

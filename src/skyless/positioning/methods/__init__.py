@@ -1,0 +1,1 @@
+"""The positioning methods for a tag of a Skyless site, and what beacons become for them."""

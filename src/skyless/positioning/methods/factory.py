@@ -1,0 +1,89 @@
+"""A tag's positioning method as an almanac asks for it."""
+
+from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.air.almanac import AccuracyPage, NoisePage, SchedulePage
+from skyless.clocks.filter import clock_noise
+from skyless.method_names import FILTERS
+from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.fix_time import FixTime
+from skyless.positioning.integrity import IntegrityRequirement
+from skyless.positioning.methods.joint import Estimation
+from skyless.positioning.methods.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
+from skyless.positioning.observation import Method
+from skyless.ticks import to_seconds
+from skyless.uncertainty.tdoa import stamp_variance_m2
+
+DROP_S: Final = 2.0
+"""An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""
+
+
+RELAY_AGE_S: Final = 1.0
+RELAY_SUPERFRAMES: Final = 2.5
+"""Relays of packets that are older than the one, or than so many superframes, are not used."""
+
+
+class Wanted(Struct, frozen=True):
+    """What the tag's owner asks for."""
+
+    method: str
+    """One of ``METHODS``."""
+    qa: float
+    """The tag's agility in m²/s³ (filters)."""
+    z_bounds_m: tuple[float, float] | None
+    """Decides between mirror solutions."""
+    integrity: IntegrityRequirement
+    """What is asked of the protection levels (``joint``)."""
+
+
+def new_method(
+    wanted: Wanted, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage, time: FixTime
+) -> Method:
+    """Make the method for a site with this schedule and noise, where that anchor is the master."""
+    superframe_s = to_seconds(schedule.slot_ticks * schedule.slots)
+    if wanted.method not in FILTERS:
+        tx_variance, rx_variance = _stamp_variances(noise)
+        settings = SnapshotSettings(
+            master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, wanted.z_bounds_m
+        )
+        return Snapshots(SnapshotMethod(wanted.method), settings, time)
+    assumed = replace(
+        estimator_settings(wanted.qa, schedule.tag_height_m, noise, accuracy, superframe_s),
+        max_acceleration_mps2=wanted.integrity.max_acceleration_mps2,
+        integrity_risk=wanted.integrity.risk,
+        alert_limit_m=wanted.integrity.alert_limit_m,
+        height_std_m=wanted.integrity.height_std_m,
+    )
+    return Estimation(assumed, wanted.z_bounds_m, time, superframe_s)
+
+
+def _stamp_variances(noise: NoisePage) -> tuple[float, float]:
+    """Of a TX and of an RX stamp, m²."""
+    return stamp_variance_m2(noise.tx_stamp_s, rounded=False), stamp_variance_m2(noise.rx_stamp_s, rounded=True)
+
+
+def estimator_settings(
+    qa: float, height_m: float | None, noise: NoisePage, accuracy: AccuracyPage, superframe_s: float
+) -> EstimatorSettings:
+    """What the estimator assumes at a site with this noise and accuracy; of its integrity and the tag the defaults."""
+    tx_variance, rx_variance = _stamp_variances(noise)
+    own = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
+    return EstimatorSettings(
+        qa=qa,
+        white=own.white,
+        walk=own.walk,
+        tx_variance_m2=tx_variance,
+        rx_variance_m2=rx_variance,
+        height_m=height_m,
+        drop_s=max(DROP_S, 4.0 * superframe_s),
+        relay_age_s=max(RELAY_AGE_S, RELAY_SUPERFRAMES * superframe_s),
+        survey_std_m=accuracy.survey_std_m,
+        range_std_m=accuracy.range_std_m,
+        slope_std_m=accuracy.slope_std_m,
+        place_std_m=accuracy.place_std_m,
+        place_distance_m=accuracy.place_distance_m,
+        place_time_s=accuracy.place_time_s,
+    )

@@ -1,0 +1,331 @@
+"""``joint``: the estimator as a positioning method: cold start, packet by packet updates, new starts when lost."""
+
+from typing import Final
+
+import numpy as np
+from msgspec.structs import replace
+
+from skyless.constants import TICK_S
+from skyless.positioning.estimator.estimator import (
+    ACCEPTED,
+    NO_REPORT,
+    REJECTED,
+    STALE,
+    UNCOVERED_CHI2,
+    Estimator,
+    Report,
+)
+from skyless.positioning.estimator.faults import SURE_CHI2
+from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import CONTRADICTED_STD_M, LASTING_STD_M, OPEN_RANGE_STD_M
+from skyless.positioning.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY, Fix, NoFixReason
+from skyless.positioning.fix_time import FixTime
+from skyless.positioning.integrity import UNAVAILABLE, IntegrityRequirement
+from skyless.positioning.methods.acquisition import (
+    EARLY_S,
+    MAX_AGE_S,
+    MAX_GAP_S,
+    MAX_SPEED_STD_MPS,
+    MAX_SPREAD,
+    SHORT_SILENCE_S,
+    SLOW_S,
+    SLOW_SPREAD,
+    SPEED_STD_GROWTH,
+    SPEED_STD_MPS,
+    Acquisition,
+    Start,
+)
+from skyless.positioning.methods.anchors_in_use import AnchorsInUse
+from skyless.positioning.methods.master_scale import MasterScale
+from skyless.positioning.observation import Observation
+from skyless.ticks import from_seconds
+
+COVARIANCE_MARGIN: Final = 4.0
+"""Factor on the start's covariance, as the filter is then given the packets that it rests on."""
+
+DOUBT_S: Final = 2.0
+"""Faults that show so soon after a start, and of whose anchors nothing can be said, have led to a wrong place."""
+
+UNEXPLAINED_CHI2: Final = 30.0
+"""What faults of two anchors leave of the test where there are more."""
+
+MANY_JUMPS: Final = 3
+EARLY_NIS: Final = 3.0
+"""Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed."""
+
+HEIGHT_SIGMAS: Final = 5.0
+"""A sensor's height is not wrong by more standard deviations than this, ..."""
+
+MOST_HEIGHTS_REFUSED: Final = 20
+"""... so if this number of them in a row do not fit, it is the position that is wrong."""
+
+CALM: Final = 0.1
+"""Range errors that have jumped more lately make faults of their own; a new start would not help."""
+
+LONGEST_SUPERFRAME_S: Final = 2.0
+"""In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted so far, and each round
+of packets is a start of its own."""
+
+LATE_S: Final = 0.5
+"""By then it is known how often packets are late; a start that was wrong for that reason is repeated."""
+
+CAUTION_S: Final = 1.0
+"""A start with open range errors is not repeated for so long."""
+
+REORDERED_S: Final = 0.1
+"""Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
+
+SURELY_IN_REACH_TICKS: Final = from_seconds(SHORT_SILENCE_S) - 1
+"""After such a silence a filter need not be asked."""
+
+
+class Estimation:
+    """One tag's estimator from the first beacon on."""
+
+    def __init__(
+        self,
+        settings: EstimatorSettings,
+        z_bounds_m: tuple[float, float] | None = None,
+        fix_time: FixTime | None = None,
+        superframe_s: float = 0.0,
+    ) -> None:
+        """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites."""
+        if z_bounds_m is not None:
+            settings = replace(settings, lowest_m=z_bounds_m[0], highest_m=z_bounds_m[1])
+        self._settings = settings
+        self._height_known = settings.height_m is not None
+        self._asked = IntegrityRequirement(
+            settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2, settings.height_std_m
+        )
+        self._superframe_s = superframe_s
+        self._max_spread = MAX_SPREAD if superframe_s < SLOW_S else SLOW_SPREAD
+        self._z_bounds_m = z_bounds_m
+        self._speed_std_mps = SPEED_STD_MPS
+        self._estimator = Estimator(settings)
+        self._start: Acquisition | None = self._new_start()
+        self._open_range_errors = False
+        self._is_open = self._is_doubted = False
+        self._time = fix_time or FixTime()
+        self._in_use = AnchorsInUse(superframe_s)
+        self._master_less_tag_ticks = 0
+        self._started_ticks = 0
+        self._newest_ticks = 0
+        self._master_scale = MasterScale()
+        self._relays_may_contradict = True
+        self._heights_refused = 0
+
+    @property
+    def estimator(self) -> Estimator:
+        """The filter with all its states."""
+        return self._estimator
+
+    def clock(self, anchor: int) -> tuple[int, float, float] | None:
+        """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""
+        index = self._estimator.index_of.get(anchor)
+        return None if index is None else self._estimator.clock(index)
+
+    @property
+    def excluded(self) -> tuple[int, ...]:
+        """Anchors whose range error has jumped and not come back."""
+        return self._estimator.obstructed
+
+    def hear(self, observation: Observation) -> Fix | NoFixReason:
+        """Take one observation; a fix for every accepted packet once started."""
+        ticks_master, rx_ticks, claim = observation.tx_ticks_master, observation.rx_ticks_tag, observation.claim
+        if ticks_master is not None:
+            self._master_less_tag_ticks = ticks_master - rx_ticks
+            if claim is not None and claim.master == observation.anchor:
+                self._master_scale.hear(observation)
+        if (
+            self._start is None
+            and not 0 <= rx_ticks - self._newest_ticks < SURELY_IN_REACH_TICKS
+            and self._is_out_of_reach(observation)
+        ):
+            self._start = self._new_start()
+        if self._start is not None:
+            return self._look_for_start(self._start, observation)
+        outcome = self._process(observation)
+        self._newest_ticks = max(self._newest_ticks, rx_ticks)
+        if outcome in {REJECTED, STALE}:
+            if self._estimator.is_lost:
+                self._start_anew(rx_ticks)
+            return NoFixReason.RESIDUALS
+        if self._is_too_fast(rx_ticks):
+            self._start_anew(rx_ticks)
+            return NoFixReason.ACQUIRING
+        if self._is_contradicted(rx_ticks):
+            self._start = self._new_start()
+            return NoFixReason.ACQUIRING
+        self._in_use.use(observation)
+        return self._fix(observation)
+
+    def _look_for_start(self, starting: Acquisition, observation: Observation) -> Fix | NoFixReason:
+        starting.learn(observation)
+        start = starting.hear(observation)
+        if isinstance(start, NoFixReason):
+            return start
+        if start.is_contradicted and not start.left_out and self._estimator.is_late_often:
+            return NoFixReason.RESIDUALS  # single packets are late: others will not be
+        if self._superframe_s > LONGEST_SUPERFRAME_S:
+            return self._fix_of(start, observation)
+        self._begin(start, starting.packets())
+        return self._fix(observation)
+
+    def hear_height(self, height_m: float, std_m: float) -> bool:
+        """Take the tag's height as a sensor tells it, at the newest packet; True if it was used.
+
+        Before a start it narrows where that is looked for. Where many in a row do not fit, the start was wrong.
+        """
+        if self._start is not None:
+            margin_m = HEIGHT_SIGMAS * std_m
+            self._start.expect_height(height_m - margin_m, height_m + margin_m)
+            return False
+        used = self._estimator.process_height(height_m, std_m) == ACCEPTED
+        self._heights_refused = 0 if used else self._heights_refused + 1
+        if self._heights_refused >= MOST_HEIGHTS_REFUSED and not self._height_known:
+            self._heights_refused = 0
+            self._start = self._new_start()
+        return used
+
+    def coast(self, observation: Observation) -> Fix | NoFixReason:
+        """A fix when a packet came that was not used itself: by all others, and by what was relayed with it."""
+        return NoFixReason.RESIDUALS if self._start is not None else self._fix(observation)
+
+    def _start_anew(self, rx_ticks: int) -> None:
+        """Look for a new start; a filter that is lost early has a tag that is faster than assumed."""
+        early = (rx_ticks - self._started_ticks) * TICK_S < EARLY_S
+        faster = min(SPEED_STD_GROWTH * self._speed_std_mps, MAX_SPEED_STD_MPS)
+        self._speed_std_mps = faster if early else SPEED_STD_MPS
+        self._start = self._new_start()
+
+    def _is_too_fast(self, rx_ticks: int) -> bool:
+        """Whether the range errors of several anchors jump early, or nothing fits: it is the tag that has moved."""
+        if (rx_ticks - self._started_ticks) * TICK_S >= EARLY_S:
+            return False
+        several = self._estimator.jumps >= MANY_JUMPS or self._estimator.rows.item(QUALITY, 0) > EARLY_NIS
+        return several and self._speed_std_mps < MAX_SPEED_STD_MPS
+
+    def _is_contradicted(self, rx_ticks: int) -> bool:
+        """Whether a new start is needed, as relays or faults contradict this one; says what that has to expect."""
+        if self._is_doubted and self._estimator.is_late_often:
+            self._open_range_errors = self._is_doubted = False  # the start was contradicted by single late packets
+            return True
+        if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
+            age_s = (rx_ticks - self._started_ticks) * TICK_S
+            limit = SURE_CHI2 if age_s < DOUBT_S or self._is_doubted else UNCOVERED_CHI2
+            calm = self._estimator.obstruction < CALM
+            if not self._is_doubted and age_s < DOUBT_S and self._estimator.unexplained_test < UNEXPLAINED_CHI2:
+                limit = UNCOVERED_CHI2  # one or two anchors, which the estimator will find
+            if calm and self._estimator.fault_test > limit and (not self._is_open or age_s > CAUTION_S):
+                self._open_range_errors = not self._estimator.is_late_often
+                return age_s > LATE_S or self._open_range_errors
+        if not self._relays_may_contradict:
+            self._relays_may_contradict = self._estimator.relays_fit
+        elif self._estimator.is_contradicted:
+            self._relays_may_contradict = False  # if a new start does not help, the anchors are wrong, not the place
+            return True
+        return False
+
+    def _new_start(self) -> Acquisition:
+        settings = self._settings
+        max_age_s = max(MAX_AGE_S, 2.5 * self._superframe_s)
+        variance = settings.tx_variance_m2 + settings.rx_variance_m2
+        if self._superframe_s > LONGEST_SUPERFRAME_S:
+            variance += settings.range_std_m**2 + settings.survey_std_m**2
+        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps)
+
+    def _is_out_of_reach(self, observation: Observation) -> bool:
+        """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
+        silent_s = (observation.rx_ticks_tag - self._newest_ticks) * TICK_S
+        if not -REORDERED_S <= silent_s <= MAX_GAP_S:
+            return True
+        if silent_s < SHORT_SILENCE_S:
+            return False
+        std_m = self._estimator.horizontal_variance_m2(silent_s) ** 0.5
+        position_m = self._estimator.state.x[: self._estimator.dim]
+        return bool(std_m > self._max_spread * self._in_use.mean_range_m(position_m))
+
+    def _begin(self, start: Start, packets: list[Observation]) -> None:
+        """Begin at the start's position, and give the filter the packets that led there."""
+        self._start = None
+        self._newest_ticks = self._started_ticks = packets[-1].rx_ticks_tag
+        self._in_use.begin(start.used)
+        dim, begin_ticks = self._estimator.dim, packets[0].rx_ticks_tag
+        age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
+        is_contradicted = start.is_contradicted and not self._estimator.is_late_often
+        self._is_open = self._open_range_errors or (is_contradicted and not start.left_out)
+        self._is_doubted = self._is_open or is_contradicted
+        error = OPEN_RANGE_STD_M if self._is_doubted else self._settings.range_std_m
+        inflation = 1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
+        if not self._is_doubted:
+            inflation *= COVARIANCE_MARGIN
+        covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * start.speed_variance * np.eye(dim)
+        self._estimator.start(
+            begin_ticks,
+            start.solution[:dim],
+            covariance,
+            start.speed_variance,
+            self._is_open,
+            CONTRADICTED_STD_M if self._is_doubted else LASTING_STD_M,
+            [
+                self._estimator.place_anchor(packet.anchor, packet.anchor_m)
+                for packet in packets
+                if is_contradicted and packet.anchor in start.left_out
+            ],
+        )
+        for packet in packets:
+            self._process(packet)
+
+    def _process(self, observation: Observation) -> int:
+        return self._estimator.process(
+            self._estimator.place_anchor(observation.anchor, observation.anchor_m),
+            observation.sequence,
+            observation.rx_ticks_tag,
+            observation.tx_ticks_anchor,
+            self._listed(observation) if observation.relays else (),
+            packed=observation.packed_relays,
+            report=self._report(observation),
+            variance_factor=observation.rx_variance_factor,
+        )
+
+    def _listed(self, observation: Observation) -> list[list[int]]:
+        """Relays of anchors that are known, as the estimator takes them."""
+        index_of, rows = self._estimator.index_of, []
+        for anchor, sequence, rx_ticks in observation.relays:
+            sender = index_of.get(anchor)
+            if sender is not None:
+                rows.append([index_of[observation.anchor], sender, sequence, rx_ticks])
+        return rows
+
+    def _report(self, observation: Observation) -> Report:
+        """What the anchor says of its clock against the master's."""
+        claim, variance_m2 = observation.claim, observation.tx_variance_m2
+        if claim is None or variance_m2 <= 0.0:
+            return NO_REPORT
+        master, subticks = self._estimator.index_of.get(claim.master), self._master_scale.difference(observation)
+        return NO_REPORT if master is None or subticks is None else Report(master, subticks, variance_m2)
+
+    def _fix_of(self, start: Start, observation: Observation) -> Fix:
+        """What a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""
+        dim, rows = self._estimator.dim, np.zeros((PROTECTED_ROWS, 3))
+        rows[POSITION, :dim] = start.solution[:dim]
+        if self._settings.height_m is not None:
+            rows[POSITION, 2] = self._settings.height_m
+        rows[POSITION + 1 : POSITION + 1 + dim, :dim] = start.covariance[:dim, :dim]
+        rows[VELOCITY + 1 : VELOCITY + 1 + dim, :dim] = start.speed_variance * np.eye(dim)
+        rows[PROTECTION, 2] = UNAVAILABLE
+        self._in_use.begin(start.used)
+        rx_ticks, in_use = observation.rx_ticks_tag, self._in_use
+        time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
+        return Fix(
+            time_s, rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", self._height_known, 1, self._asked
+        )
+
+    def _fix(self, observation: Observation) -> Fix | NoFixReason:
+        in_use, estimator, known = self._in_use, self._estimator, self._height_known
+        if not known and estimator.state.P.item(2, 2) > in_use.extent_m**2:
+            return NoFixReason.BAD_GEOMETRY
+        rx_ticks = observation.rx_ticks_tag
+        time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
+        # in the order of the fields: with their names it takes as long as all the rest
+        return Fix(time_s, estimator.rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", known, 1, self._asked)

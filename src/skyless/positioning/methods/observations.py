@@ -1,0 +1,103 @@
+"""Observations out of beacons: the master's time unwrapped, and for each method what it asks for."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.air.beacon import Beacon, Heard
+from skyless.air.codec import packed_relays
+from skyless.air.master_term import Claim, claim_of
+from skyless.constants import MAX_DRIFT, TICK_M
+from skyless.positioning.fix_time import SLACK_TICKS
+from skyless.positioning.methods.joint import Estimation
+from skyless.positioning.observation import Method, Observation
+from skyless.site.slots import Schedule
+from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, nearest
+
+
+class Observer:
+    """What a tag must remember of beacons to make observations of those that follow."""
+
+    def __init__(self) -> None:
+        self._for_joint = False
+        self._schedule: Schedule | None = None
+        self._master: int | None = None
+        self._master_slot = 0
+        self._scale: tuple[int, int] | None = None
+        """The master's time and the tag's, both unwrapped, when they were compared last."""
+
+    def forget(self) -> None:
+        """Start anew."""
+        self._scale = None
+
+    def follow(self, master: int | None, master_slot: int) -> None:
+        """Go by this master, whose first slot in the superframe is given."""
+        self._master, self._master_slot = master, master_slot
+
+    def serve(self, method: Method, schedule: Schedule) -> None:
+        """Make what this method asks for."""
+        self._schedule = schedule
+        self._for_joint = isinstance(method, Estimation)
+
+    def observe(
+        self,
+        frame: bytes,
+        beacon: Beacon,
+        anchor_m: NDArray[np.float64],
+        rx_ticks: int,
+        tx_ticks: int,
+        rx_variance_factor: float,
+        claim: Claim | None,
+    ) -> Observation:
+        """One observation of a beacon in a frame; ``claim``, the one that is followed, is mostly the beacon's too."""
+        ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
+        if not self._for_joint:
+            heard = beacon.master_heard if beacon.master == self._master else None
+            master_sequence, master_rx_ticks = _stamp_of(heard, tx_ticks)
+            return Observation(
+                beacon.anchor, anchor_m, self._round(beacon), beacon.sequence, rx_ticks, tx_ticks, master_sequence,
+                master_rx_ticks, ticks_master, fraction, variance_m2, (), None, rx_variance_factor,
+            )  # fmt: skip
+        if ticks_master is None:
+            claim = None
+        elif claim is None or claim.master != beacon.master or claim.term != beacon.term:
+            claim = claim_of(beacon)
+        return Observation(
+            beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, ticks_master, fraction,
+            variance_m2, (), claim, rx_variance_factor, packed_relays(frame, beacon),
+        )  # fmt: skip
+
+    def _round(self, beacon: Beacon) -> int:
+        """Round of a frame, counted from the master's slot: what follows a frame of the master refers to it."""
+        schedule = self._schedule
+        assert schedule is not None
+        superframe, slot = beacon.superframe, beacon.slot - self._master_slot
+        if not 0 <= slot < schedule.slots:
+            steps, slot = divmod(slot, schedule.slots)
+            superframe += steps
+        return superframe if schedule.frames_per_node == 1 else schedule.round_of(superframe, slot)
+
+    def _master_time(self, beacon: Beacon, rx_ticks: int) -> tuple[int | None, float, float]:
+        """TX time on the master's scale: unwrapped whole ticks, fraction, variance in m².
+
+        Only the master, and anchors that agree with what was heard before, lead the scale on.
+        """
+        time, scale = beacon.master_time, self._scale
+        if time is None:
+            return None, 0.0, 0.0
+        subticks = time.tx_subticks_master
+        whole = subticks >> 8
+        follow = scale is None or beacon.anchor == self._master
+        if scale is not None:
+            elapsed = rx_ticks - scale[1]
+            expected = scale[0] + elapsed
+            least = expected - HALF_WRAP_TICKS
+            whole = least + ((whole - least) & TICK_MASK)
+            follow = follow or abs(whole - expected) <= MAX_DRIFT * elapsed + SLACK_TICKS
+        if follow:
+            self._scale = (whole, rx_ticks)
+        return whole, (subticks & 0xFF) / 256.0, (time.std_ticks * TICK_M) ** 2
+
+
+def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[None, None]:
+    """Sequence number and unwrapped RX stamp of what the sender of a beacon heard before that."""
+    return (None, None) if heard is None else (heard.sequence, nearest(heard.rx_ticks, tx_ticks))

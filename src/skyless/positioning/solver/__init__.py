@@ -1,0 +1,1 @@
+"""A position from time differences or pseudoranges of one moment, without a history."""

@@ -1,0 +1,1 @@
+"""A DW1000 on SPI, or a model of one."""

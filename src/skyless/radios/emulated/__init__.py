@@ -1,0 +1,1 @@
+"""Radios in an emulated ether, over TCP."""

@@ -1,0 +1,1 @@
+"""Radios on boards behind a serial port."""

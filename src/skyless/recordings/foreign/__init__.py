@@ -1,0 +1,1 @@
+"""Recordings of other systems: their formats as streams of packets or time differences."""

@@ -1,0 +1,176 @@
+"""The table of formats, and the one door to a recording of any of them."""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from io import BufferedIOBase
+from os import PathLike, fspath
+from typing import Final
+
+from skyless.air.masterless_packets import Packet, PairTdoa
+from skyless.constants import TICK_BITS
+from skyless.errors import ConfigurationError
+from skyless.recordings.foreign import avalue, bitcraze_payload, miluv, sniffer_binary, sniffer_text, sniffer_yaml
+from skyless.recordings.foreign import tdoa_table as pair_table
+from skyless.recordings.source import Drops, open_source, read_head
+
+Record = Packet | PairTdoa
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format: how to recognise and how to read it."""
+
+    name: str
+    summary: str
+    recognise: Callable[[bytes, str], bool]
+    """From the first bytes, decompressed, and the file's name."""
+    read: Callable[..., Iterator[Record]]
+    """From an open stream and a counter of drops; with ``listener`` where ``any_listener``."""
+    tx_bits: int | None
+    """Width of the anchors' stamps in its packets; None for a format of ready TDoAs."""
+    any_listener: bool = False
+    """One recording holds several listeners, one of which is chosen."""
+    hexadecimal: bool = False
+    """Identifiers are hexadecimal."""
+
+
+FORMATS: Final = (
+    Format(
+        "bitcraze-yaml",
+        "Bitcraze sniffer, YAML documents with base64 payloads (TDoA2, TDoA3)",
+        sniffer_yaml.recognise,
+        sniffer_yaml.read,
+        bitcraze_payload.STAMP_BITS,
+    ),
+    Format(
+        "bitcraze-text",
+        "Bitcraze sniffer, text lines 'From .. to .. @..: ..' (TDoA2, TDoA3)",
+        sniffer_text.recognise,
+        sniffer_text.read,
+        bitcraze_payload.STAMP_BITS,
+    ),
+    Format(
+        "miluv",
+        "MILUV passive ticks: three-message exchanges overheard by a listener",
+        miluv.recognise,
+        miluv.read,
+        None,
+        any_listener=True,
+    ),
+    Format(
+        "avalue",
+        "Avalue anchors' receptions of each other (ccp.csv); one of them plays the tag",
+        avalue.recognise,
+        avalue.read,
+        TICK_BITS,
+        any_listener=True,
+        hexadecimal=True,
+    ),
+    Format("tdoa-table", "Table t_s,idA,idB,tdoa_m", pair_table.recognise, pair_table.read, None),
+    Format(
+        "bitcraze-binary",
+        "Bitcraze sniffer, binary records BC .. (TDoA2, TDoA3)",
+        sniffer_binary.recognise,
+        sniffer_binary.read,
+        bitcraze_payload.STAMP_BITS,
+    ),
+)
+"""In the order in which they are tried: the more particular first."""
+
+
+@dataclass
+class Recording:
+    """An open recording: iterate over it once, and close it (or use ``with``)."""
+
+    format: Format
+    path: str
+    records: Iterator[Record]
+    stream: BufferedIOBase
+    drops: Drops = field(default_factory=Counter)
+    """What could not be used, by reason; complete once the records are exhausted."""
+
+    def __iter__(self) -> Iterator[Record]:
+        return self.records
+
+    def __enter__(self) -> "Recording":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def bytes_read(self) -> int:
+        """How far into the file the reading has come, compressed bytes where it is compressed."""
+        return os.lseek(self.stream.fileno(), 0, os.SEEK_CUR)
+
+    def close(self) -> None:
+        """Close the file."""
+        self.stream.close()
+
+
+def open_recording(path: str | PathLike[str], format_name: str | None = None, listener: str | None = None) -> Recording:
+    """Open a recording of a named format, or of the one that its first bytes show.
+
+    ``listener`` chooses whose ears to use where a recording holds several; by default those of the first row.
+
+    Raises:
+        ConfigurationError: the file cannot be opened, its format is not known, or the listener makes no sense.
+    """
+    chosen = format_of(path, format_name)
+    read = _listening(path, chosen, listener)
+    stream = open_source(path)
+    drops: Drops = Counter()
+    return Recording(chosen, fspath(path), read(stream, drops), stream, drops)
+
+
+def format_of(path: str | PathLike[str], name: str | None = None) -> Format:
+    """Format of that name, or the one that the file's first bytes show.
+
+    Raises:
+        ConfigurationError: the file cannot be opened, or its format is not known.
+    """
+    return _recognised(path) if name is None else _named(path, name)
+
+
+def _named(path: str | PathLike[str], name: str) -> Format:
+    for known in FORMATS:
+        if known.name == name:
+            return known
+    raise ConfigurationError(path, "format", name, f"one of {_names()}")
+
+
+def _recognised(path: str | PathLike[str]) -> Format:
+    head = read_head(path)
+    for known in FORMATS:
+        if known.recognise(head, fspath(path)):
+            return known
+    if not head:
+        raise ConfigurationError(path, "the file", "empty", f"a recording of one of the formats {_names()}")
+    if avalue.recognise_blinks(head, fspath(path)):
+        expected = "ccp.csv of the same system: what tags send up to anchors cannot be replayed as a tag's receptions"
+        raise ConfigurationError(path, "the format", "tag blinks", expected)
+    start = head[:24].decode("ascii", "backslashreplace")
+    raise ConfigurationError(path, "the beginning", start, f"that of one of the formats {_names()}")
+
+
+def _listening(
+    path: str | PathLike[str], chosen: Format, listener: str | None
+) -> Callable[[BufferedIOBase, Drops], Iterator[Record]]:
+    """Bind the reader to its listener."""
+    if listener is None:
+        return chosen.read
+    if not chosen.any_listener:
+        raise ConfigurationError(path, "listener", listener, f"left out: format {chosen.name} has one listener only")
+    try:
+        int(listener, 16 if chosen.hexadecimal else 10)
+    except ValueError as error:
+        kind = "hexadecimal" if chosen.hexadecimal else "decimal"
+        raise ConfigurationError(path, "listener", listener, f"a {kind} identifier") from error
+    return partial(chosen.read, listener=listener)
+
+
+def _names() -> str:
+    return ", ".join(known.name for known in FORMATS)

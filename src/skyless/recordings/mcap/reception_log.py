@@ -1,0 +1,165 @@
+"""What a tag keeps for those who record it: its receptions in runs, each with the receiver's state at its beginning.
+
+A run (segment) begins when somebody new asks, and whenever continuity was broken; within one, nothing is missing.
+No I/O and no clock: times are passed in, by any clock that does not go back.
+"""
+
+from collections import Counter, deque
+from typing import Final
+
+from skyless.air.reception import Reception
+from skyless.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage, SegmentStart
+from skyless.positioning.integrity import IntegrityRequirement
+from skyless.receiver import Receiver
+from skyless.recordings.mcap.checkpoint import save
+
+EVERY_TAG: Final = "*"
+INTERVAL_S: Final = 0.1
+"""Receptions of so long a time go into one message."""
+
+MOST_PENDING: Final = 4096
+"""Receptions; where nobody collects them, the segment ends instead of taking memory."""
+
+MOST_LEASES: Final = 64
+MAX_LEASE_S: Final = 60.0
+
+Settings = dict[str, str | float | int | None]
+
+
+class ReceptionLog:
+    """The receptions of one tag, for as long as somebody asks for them."""
+
+    def __init__(self, tag: str, settings: Settings, run: str) -> None:
+        """``settings``: how the receiver was made (``receiver_settings``); ``run`` names this start of the tag."""
+        self.counters: Counter[str] = Counter()
+        self._tag = tag
+        self._settings = settings
+        self._run = run
+        self._lease_until_s: dict[str, float] = {}
+        self._segments = 0
+        self._open = False
+        self._receiver: Receiver | None = None
+        self._start: SegmentStart | None = None
+        self._first = 0
+        self._pending: list[RawReception] = []
+        self._ready: deque[ReceptionsMessage] = deque()
+        self._sent_s = 0.0
+        self._unix_less_host_s = 0.0
+
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody holds a lease."""
+        return bool(self._lease_until_s)
+
+    def request(self, message: RequestMessage, now_s: float) -> None:
+        """Take a request; one who was not here before (or whose lease has ended) begins another segment."""
+        self._end_leases(now_s)
+        if not {self._tag, EVERY_TAG} & set(message.receptions):
+            self._lease_until_s.pop(message.by, None)
+            return
+        if message.by not in self._lease_until_s:
+            if len(self._lease_until_s) >= MOST_LEASES:
+                self.counters["lease-refused"] += 1
+                return
+            self.interrupt()
+        self._lease_until_s[message.by] = now_s + min(max(message.lease_s, 0.0), MAX_LEASE_S)
+
+    def hear(self, receiver: Receiver, reception: Reception, serial: int) -> None:
+        """Take a reception, before the receiver hears it; ``serial`` is the number of fixes made so far."""
+        if not self._lease_until_s:
+            return
+        if len(self._pending) >= MOST_PENDING:
+            self.counters["not-collected"] += len(self._pending)
+            self._pending.clear()
+            self._open = False
+        if receiver is not self._receiver:  # the radio started anew, and the tag with it
+            self.interrupt()
+            self._receiver = receiver
+        if not self._open:
+            self._begin(receiver, serial)
+        self._pending.append(raw(reception))
+
+    def collect(self, now_s: float, unix_less_host_s: float) -> ReceptionsMessage | None:
+        """The next message that is due; to be called until it returns None, some twenty times a second.
+
+        ``unix_less_host_s`` is what to add to the receptions' ``host_s`` to get Unix time.
+        """
+        self._unix_less_host_s = unix_less_host_s
+        self._end_leases(now_s)
+        if not 0.0 <= now_s - self._sent_s < INTERVAL_S:
+            self._sent_s = now_s
+            self._close_message()
+        return self._ready.popleft() if self._ready else None
+
+    def interrupt(self) -> None:
+        """A message was lost on its way, or somebody joined: what comes next is another segment."""
+        self._close_message()
+        self._open = False
+
+    def _begin(self, receiver: Receiver, serial: int) -> None:
+        self._open = True
+        self._segments += 1
+        self._first = 0
+        try:
+            state = save(receiver)
+        except TypeError:  # a fault of the program, which costs the replay its beginning and the tag nothing
+            self.counters["no-checkpoint"] += 1
+            state = None
+        self._start = SegmentStart(serial, self._settings, state)
+
+    def _close_message(self) -> None:
+        """Make a message of what is pending."""
+        if not self._pending:
+            return
+        self._ready.append(
+            ReceptionsMessage(
+                tag=self._tag,
+                segment=f"{self._run}-{self._segments}",
+                first=self._first,
+                unix_less_host_s=self._unix_less_host_s,
+                receptions=tuple(self._pending),
+                start=self._start,
+            )
+        )
+        self._first += len(self._pending)
+        self._pending.clear()
+        self._start = None
+
+    def _end_leases(self, now_s: float) -> None:
+        for by in [by for by, until_s in self._lease_until_s.items() if until_s <= now_s]:
+            del self._lease_until_s[by]
+        if not self._lease_until_s and self._open:
+            self.interrupt()
+
+
+def receiver_settings(
+    method: str,
+    site: int | None = None,
+    qa: float = 0.3,
+    z_bounds_m: tuple[float, float] | None = None,
+    integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
+) -> Settings:
+    """How a receiver is made, as a segment tells it."""
+    low_m, high_m = (None, None) if z_bounds_m is None else z_bounds_m
+    asked = {
+        "integrity_risk": integrity.risk,
+        "alert_limit_m": integrity.alert_limit_m,
+        "max_acceleration_mps2": integrity.max_acceleration_mps2,
+        "height_std_m": integrity.height_std_m,
+    }
+    return {"method": method, "site": site, "qa": qa, "z_low_m": low_m, "z_high_m": high_m, **asked}
+
+
+def raw(reception: Reception) -> RawReception:
+    """A reception as it travels."""
+    told = reception.diagnostics
+    if told is None:
+        return RawReception(reception.frame, reception.rx_ticks, reception.host_s)
+    return RawReception(
+        reception.frame,
+        reception.rx_ticks,
+        reception.host_s,
+        told.rx_power_dbm,
+        told.first_path_power_dbm,
+        told.carrier_offset_ppm,
+    )

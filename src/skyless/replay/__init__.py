@@ -1,0 +1,1 @@
+"""Recordings through the filter again, judged against the truth."""

@@ -1,0 +1,213 @@
+"""Replay of recordings: records in, fixes out, judged against the truth where there is one."""
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from itertools import islice
+from os import PathLike
+from typing import Final
+
+import numpy as np
+from msgspec import Struct, structs
+
+from skyless.air.masterless_packets import Point
+from skyless.errors import SkylessError
+from skyless.evaluation.judge import Judge, Judgement
+from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.fix import Fix, NoFixReason
+from skyless.positioning.masterless.calibration import DifferenceCalibration
+from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
+from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
+from skyless.positioning.masterless.pair_engine import PairEngine
+from skyless.recordings.foreign.formats import Recording, format_of, open_recording
+from skyless.replay.noise import NoiseBook, PairNoise
+from skyless.replay.pipelines import ByPackets, ByPairs, Way
+
+PROFILES: Final[Mapping[str, EstimatorSettings]] = {
+    "miluv": structs.replace(DIFFERENCES, qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),
+}
+"""Settings for formats whose nature asks for others: MILUV's exchanges come once or twice a second, among obstacles."""
+
+BATCH: Final = 512
+"""Records that are read at a time: reading and filtering by turns take each other's place in the processor's caches."""
+
+PACKETS, DIFFERENCES_MADE = "packets", "differences"
+MEASUREMENTS: Final = (PACKETS, DIFFERENCES_MADE)
+"""What the filter is given: anchors' packets as they are, or time differences made of them."""
+
+FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
+"""Formats of which packets are taken by default, which real captures showed to be better. Of Avalue's they were not."""
+
+
+class ReplayRequest(Struct, frozen=True):
+    """What is asked of a replay."""
+
+    path: str | PathLike[str]
+    anchors_m: dict[int, Point]
+    format: str | None = None
+    listener: str | None = None
+    height_m: float | None = None
+    """Height of the tag where it is known."""
+    height_std_m: float = 0.0
+    """Of a known one."""
+    qa: float | None = None
+    tdoa_std_m: float | None = None
+    z_bounds_m: tuple[float, float] | None = None
+    calibration: DifferenceCalibration | None = None
+    measurements: str | None = None
+    """One of ``MEASUREMENTS``; None: what suits the format."""
+
+
+class ReplayReport(Struct, frozen=True):
+    """What a replay came to; metres and seconds, None where it cannot be told."""
+
+    format: str
+    receptions: int
+    """Packets, or rows of a table of differences."""
+    fixes: int
+    dropped: int
+    median_m: tuple[float, float, float] | None
+    """Median position after the settling time."""
+    std_m: tuple[float, float, float] | None
+    """Standard deviation of the position after the settling time, for tags at rest."""
+    rmse_2d_m: float | None
+    rmse_3d_m: float | None
+    p95_m: float | None
+    max_m: float | None
+    rate_hz: float | None
+    """Fixes per second of recorded time, None without fixes."""
+    tdoa_noise_m: float | None
+    """Median over the pairs of anchors of their differences' noise (1.4826 MAD), about the truth or the median."""
+    bias_m: tuple[float, float, float] | None
+    first_fix_s: float | None
+    height_m: float | None
+    reason: str | None
+    """Why there is no fix at all."""
+    drops: dict[str, int]
+    pairs: tuple[PairNoise, ...]
+    wall_s: float
+    receptions_per_s: float
+    method: str | None
+    measurements: str | None
+    """What the filter was given, one of ``MEASUREMENTS``; None for the receptions of a site."""
+    contradictions_m: dict[str, float]
+    """Pairs of anchors whose own ranging contradicts the table: by how much they are farther (if negative, nearer)
+    than it says."""
+
+
+class Replay:
+    """One recording on its way through the filter."""
+
+    def __init__(self, request: ReplayRequest, judge: Judge) -> None:
+        self._request = request
+        self._judge = judge
+        self.measurements = self._measurements()
+        self.recording: Recording = open_recording(request.path, request.format, request.listener)
+        self._noise = NoiseBook(judge, request.anchors_m)
+        self._way: Way = self._by_packets() if self.measurements == PACKETS else self._by_pairs()
+        self.receptions = 0
+        self.fixes = 0
+        self._first_s: float | None = None
+        self._last_s = 0.0
+        self._first_fix_s: float | None = None
+
+    def _measurements(self) -> str:
+        """The measurements that were asked for, or that suit the recording."""
+        request, kind = self._request, format_of(self._request.path, self._request.format)
+        if request.measurements is None:
+            suits = kind.name in FORMATS_BY_PACKETS and request.anchors_m and request.tdoa_std_m is None
+            return PACKETS if suits else DIFFERENCES_MADE
+        if request.measurements == PACKETS and kind.tx_bits is None:
+            wanted = f"it should be 'differences': {kind.name} holds no anchors' packets"
+            raise SkylessError(f"--measurements is 'packets'; {wanted}")
+        if request.measurements == PACKETS and request.tdoa_std_m is not None:
+            raise SkylessError("--tdoa-std is the noise of differences; --measurements packets makes none")
+        return request.measurements
+
+    def _engine(self) -> PairEngine | None:
+        bits = self.recording.format.tx_bits
+        return None if bits is None else PairEngine(bits, anchors_m=self._request.anchors_m)
+
+    def _by_pairs(self) -> ByPairs:
+        request = self._request
+        asked = {"qa": request.qa, "difference_std_m": request.tdoa_std_m, "height_m": request.height_m}
+        asked["height_std_m"] = request.height_std_m
+        known = {key: value for key, value in asked.items() if value is not None}
+        settings = structs.replace(PROFILES.get(self.recording.format.name, DIFFERENCES), **known)
+        tracking = DifferenceTracking(settings, request.anchors_m, request.z_bounds_m, request.calibration)
+        return ByPairs(tracking, self._engine(), self._noise)
+
+    def _by_packets(self) -> ByPackets:
+        request, engine, bits = self._request, self._engine(), self.recording.format.tx_bits
+        assert engine is not None
+        assert bits is not None
+        qa = MASTERLESS.qa if request.qa is None else request.qa
+        known = {"height_m": request.height_m, "height_std_m": request.height_std_m}
+        settings = structs.replace(MASTERLESS, qa=qa, **known)
+        tracking = PacketTracking(settings, request.anchors_m, bits, request.z_bounds_m, request.calibration)
+        return ByPackets(tracking, engine, self._noise)
+
+    def run(self, on_fix: Callable[[Fix], None] | None, on_progress: Callable[[int], None]) -> ReplayReport:
+        """Read to the end; ``on_fix`` gets every fix, ``on_progress`` now and then the bytes read so far."""
+        started_s = time.perf_counter()
+        with closing(self.recording):
+            records = iter(self.recording)
+            while batch := list(islice(records, BATCH)):
+                for record in batch:
+                    self.receptions += 1
+                    time_s = self._way.hear(record)
+                    if time_s is not None:
+                        self._take(time_s, on_fix)
+                on_progress(self.recording.bytes_read)
+        return self._report(time.perf_counter() - started_s)
+
+    def _take(self, time_s: float, on_fix: Callable[[Fix], None] | None) -> None:
+        """Take what one reception gave: one fix at most."""
+        if self._first_s is None:
+            self._first_s = time_s
+        self._last_s = time_s
+        position_m = self._way.position_m
+        if position_m is None:
+            return
+        self.fixes += 1
+        if self._first_fix_s is None:
+            self._first_fix_s = time_s - self._first_s
+        self._judge.add(time_s, time_s - self._first_s, position_m)
+        if on_fix is not None:
+            on_fix(self._way.fix())
+
+    def _drops(self) -> dict[str, int]:
+        total = self.recording.drops + self._way.drops
+        return {name: count for name, count in sorted(total.items()) if count}
+
+    def _report(self, wall_s: float) -> ReplayReport:
+        judgement: Judgement = self._judge.judgement()
+        drops = self._drops()
+        pairs = self._noise.pairs()
+        span_s = self._last_s - (self._first_s or 0.0)
+        reason = self._way.reason if self._request.anchors_m or self.fixes else NoFixReason.NO_ALMANAC
+        return ReplayReport(
+            format=self.recording.format.name,
+            receptions=self.receptions,
+            fixes=self.fixes,
+            dropped=sum(drops.values()),
+            median_m=judgement.median_m,
+            std_m=judgement.std_m,
+            rmse_2d_m=judgement.errors.rmse_2d_m,
+            rmse_3d_m=judgement.errors.rmse_3d_m,
+            p95_m=judgement.errors.p95_m,
+            max_m=judgement.errors.max_m,
+            rate_hz=self.fixes / span_s if self.fixes and span_s > 0.0 else None,
+            tdoa_noise_m=float(np.median([pair.noise_m for pair in pairs])) if pairs else None,
+            bias_m=judgement.errors.bias_m,
+            first_fix_s=self._first_fix_s,
+            height_m=self._request.height_m,
+            reason=None if self.fixes else str(reason),
+            drops=drops,
+            pairs=pairs,
+            wall_s=wall_s,
+            receptions_per_s=self.receptions / wall_s if wall_s > 0.0 else 0.0,
+            method="joint",
+            measurements=self.measurements,
+            contradictions_m={f"{a}-{b}": by_m for (a, b), by_m in sorted(self._way.contradictions_m.items())},
+        )

@@ -1,0 +1,1 @@
+"""Errors of the receiver over many simulated runs, one module for each study."""

@@ -1,0 +1,71 @@
+"""The studies by name."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Final
+
+from msgspec.structs import replace
+
+from skyless.studies import (
+    efficiency_rows,
+    integrity,
+    integrity_picture,
+    loss,
+    motion,
+    nlos,
+    room,
+    scale,
+    sync,
+)
+from skyless.studies.picture import Look, draw
+from skyless.studies.plan import Cell, Plan, Row, Study
+from skyless.studies.summary import Case, world_cells, world_rows
+
+
+def _of_worlds(name: str, title: str, cases: Callable[[Plan], list[Case]], look: Look) -> Study:
+    def cells(plan: Plan) -> list[Cell]:
+        return world_cells(cases(plan))
+
+    def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
+        return world_rows(name, plan, cases(plan), results)
+
+    return Study(name, title, cells, rows, partial(draw, look))
+
+
+STUDIES: Final = {
+    study.name: study
+    for study in (
+        Study(
+            "efficiency",
+            "RMSE over the Cramér–Rao bound",
+            efficiency_rows.cells,
+            efficiency_rows.rows,
+            partial(draw, Look("RMSE over the Cramér–Rao bound", ("ratio", "nees"))),
+        ),
+        replace(
+            _of_worlds("loss", "lost messages", loss.cases, Look("Lost messages", ("rmse", "nees"), x="share lost")),
+            rows=loss.rows,
+        ),
+        _of_worlds("nlos", "late messages", nlos.cases, Look("Late messages", ("rmse", "nees"))),
+        _of_worlds("motion", "motion", motion.cases, Look("Speed and turns at 3 m/s²", ("rmse", "nees"))),
+        _of_worlds(
+            "sync",
+            "synchronisation",
+            sync.cases,
+            Look("Synchronisation", ("rmse", "nees"), x="superframe in ms", log=True),
+        ),
+        Study(
+            "integrity",
+            "protection levels with one faulty anchor",
+            integrity.cells,
+            integrity.rows,
+            integrity_picture.draw,
+        ),
+        replace(
+            _of_worlds("room", "the room", room.cases, Look("The room", ("rmse", "nees", "level", "exceeded"))),
+            cells=room.cells,
+            rows=room.rows,
+        ),
+        _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
+    )
+}

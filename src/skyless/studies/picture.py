@@ -1,0 +1,208 @@
+"""The picture of a study: a line of panels for each series, curves over numbers and rows beside names."""
+
+from collections.abc import Callable, Sequence
+from itertools import groupby
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from skyless.evaluation.plot_style import BLUE, GRID, INK, MUTED, ORANGE, RED, house_style
+from skyless.studies.plan import Row
+
+Array = NDArray[np.float64]
+
+WIDTH_IN: Final = 4.7
+BAR_IN: Final = 0.24
+CURVE_IN: Final = 2.6
+WIDE: Final = 15.0
+"""Values that lie farther apart are drawn on a logarithmic axis."""
+
+
+class Look(Struct, frozen=True):
+    """How a study is drawn."""
+
+    title: str
+    panels: tuple[str, ...]
+    """Names of ``_PANELS``, side by side."""
+    x: str = ""
+    """What the numbers of a series mean; by default the series says it."""
+    log: bool = False
+
+
+class _Panel(Struct, frozen=True):
+    label: str
+    value: Callable[[Row], float | None]
+    error: Callable[[Row], float | None]
+    target: float | None = None
+    """What a good receiver has; the values are then points about it, not lengths."""
+    limits: bool = False
+    """Whether limits on the ratio are drawn as limits on the RMSE."""
+    figure: str = ""
+    """Field of a row whose own limits are drawn, ``scale`` times as large."""
+    scale: float = 1.0
+    log: bool | None = None
+    """Whether the axis of bars is logarithmic; None for where values lie far apart."""
+
+
+def _cm(value_m: float | None) -> float | None:
+    return None if value_m is None else 100.0 * value_m
+
+
+LEAST: Final = 1e-6
+"""Smaller shares of exceeded levels are drawn here, none as well."""
+
+
+def _exceeded(row: Row) -> float | None:
+    return None if row.exceeded is None else 1e4 * max(row.exceeded, LEAST)
+
+
+_PANELS: Final = {
+    "rmse": _Panel(
+        "RMSE in cm",
+        lambda row: _cm(row.rmse_m),
+        lambda row: _cm(row.rmse_error_m),
+        limits=True,
+        figure="rmse_m",
+        scale=100.0,
+    ),
+    "ratio": _Panel("RMSE over bound", lambda row: row.ratio, lambda row: row.ratio_error, 1.0),
+    "nees": _Panel("NEES per dimension", lambda row: row.nees, lambda _: None, 1.0, figure="nees"),
+    "level": _Panel(
+        "fixes with a level in %",
+        lambda row: None if row.level is None else 100.0 * row.level,
+        lambda _: None,
+        figure="level",
+        scale=100.0,
+        log=False,
+    ),
+    "exceeded": _Panel("levels exceeded in 10⁻⁴", _exceeded, lambda _: None, figure="exceeded", scale=1e4, log=True),
+    "cpu": _Panel("CPU in µs a message", lambda row: row.cpu_us_per_message, lambda _: None),
+}
+
+
+def draw(look: Look, rows: Sequence[Row]) -> Figure:
+    """Draw the rows of a study; error bars are standard errors."""
+    with house_style():
+        series = [(name, list(group)) for name, group in groupby(rows, key=lambda row: row.series)]
+        heights = [CURVE_IN if _is_curve(group) else 0.8 + BAR_IN * len(group) for _, group in series]
+        figure = Figure(figsize=(WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
+        methods = ", ".join(dict.fromkeys(row.method for row in rows))
+        note = "; grey: where 99 % of honest ones lie" if "nees" in look.panels else ""
+        figure.suptitle(f"{look.title}: {methods}, simulated{note}", x=0.01, ha="left", fontsize=11.0)
+        grid = figure.subplots(len(series), len(look.panels), squeeze=False, height_ratios=heights)
+        for line, (name, group) in zip(grid, series, strict=True):
+            for axes, panel in zip(line, look.panels, strict=True):
+                _fill(axes, _PANELS[panel], group, look)
+            for axes in line[1:]:
+                if not _is_curve(group):
+                    axes.set_yticklabels([])
+            line[0].set_title(name, loc="left")
+    return figure
+
+
+def _is_curve(rows: Sequence[Row]) -> bool:
+    return all(row.x is not None for row in rows)
+
+
+def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
+    values = np.array([_or_nan(panel.value(row)) for row in rows])
+    errors = np.nan_to_num(np.array([_or_nan(panel.error(row)) for row in rows]))
+    curve = _is_curve(rows)
+    if curve:
+        _curve(axes, np.array([row.x for row in rows], dtype=np.float64), values, errors, look, rows[0].series)
+        if panel.target is not None:
+            axes.set_ylim(top=max(axes.get_ylim()[1], 1.3 * panel.target))
+        axes.set(ylabel=panel.label)
+    else:
+        _named(axes, panel, rows, values, errors)
+        axes.set(xlabel=panel.label)
+    if panel.target is not None:
+        (axes.axhline if curve else axes.axvline)(panel.target, color=MUTED, linewidth=1.0, linestyle="--", zorder=1.5)
+    if panel is _PANELS["nees"]:
+        _intervals(axes, rows, curve=curve)
+    if panel.limits:
+        _limits(axes, rows)
+    if panel.figure and not curve:
+        _own_limits(axes, panel, rows)
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+def _curve(axes: Axes, x: Array, values: Array, errors: Array, look: Look, series: str) -> None:
+    axes.errorbar(x, values, errors, fmt="o-", color=BLUE, markersize=4, capsize=2, zorder=3)
+    axes.set(xlabel=look.x or series)
+    if look.log:
+        axes.set_xscale("log")
+        axes.set_xticks(x, [f"{value:g}" for value in x])
+        axes.set_xticks([], minor=True)
+    highest = float(np.nanmax(values + errors, initial=0.0))
+    if highest > WIDE * float(np.nanmin(values, initial=np.inf)):
+        axes.set_yscale("log")
+        _plain_numbers(axes.yaxis)
+    else:
+        axes.set_ylim(0.0, 1.15 * max(highest, 1e-9))
+
+
+def _plain_numbers(axis: Axis, *, between: bool = True) -> None:
+    """Numbers at the powers of ten, and ``between`` them."""
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("{x:g}" if between else NullFormatter())
+    axis.set_tick_params(which="minor", labelsize=6.0)
+
+
+def _named(axes: Axes, panel: _Panel, rows: list[Row], values: Array, errors: Array) -> None:
+    places = np.arange(len(rows))
+    colours = [ORANGE if row.passed is False else BLUE for row in rows]
+    for place, value, error, colour in zip(places, values, errors, colours, strict=True):
+        if panel.target is not None:
+            axes.errorbar(value, place, xerr=error, fmt="o", color=colour, markersize=5, capsize=2, zorder=3)
+        else:
+            axes.barh(place, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
+    wide = np.nanmax(values, initial=0.0) > WIDE * np.nanmin(values, initial=np.inf)
+    if (wide if panel.log is None else panel.log) and np.isfinite(values).any():
+        axes.set_xscale("log")
+        axes.set_xlim(left=0.6 * float(np.nanmin(values)))
+        _plain_numbers(axes.xaxis, between=panel.log is None)
+    axes.set_yticks(places, [row.case for row in rows])
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.grid(visible=False, axis="y")
+
+
+def _intervals(axes: Axes, rows: list[Row], *, curve: bool) -> None:
+    for place, row in enumerate(rows):
+        if row.nees_interval is None:
+            continue
+        at = (row.x or 0.0) if curve else place
+        low, high = row.nees_interval
+        ends = ([at, at], [low, high]) if curve else ([low, high], [at, at])
+        axes.plot(*ends, color=GRID, linewidth=7.0, solid_capstyle="butt", zorder=1.2, scalex=False, scaley=False)
+
+
+def _limits(axes: Axes, rows: list[Row]) -> None:
+    """Mark the largest RMSE that is accepted."""
+    for place, row in enumerate(rows):
+        if row.limit is None or row.ratio is None or row.rmse_m is None:
+            continue
+        limit_cm = 100.0 * row.rmse_m / row.ratio * row.limit
+        x, y, mark = (limit_cm, place, "|") if row.x is None else (row.x, limit_cm, "_")
+        (line,) = axes.plot(x, y, mark, color=RED, markersize=14, markeredgewidth=1.6, linestyle="none", label="limit")
+        axes.legend(handles=[line])
+
+
+def _own_limits(axes: Axes, panel: _Panel, rows: list[Row]) -> None:
+    """Mark what a figure should be at least or at most."""
+    for place, row in enumerate(rows):
+        ends = [end for one in row.limits if one.figure == panel.figure for end in (one.least, one.most)]
+        values = [panel.scale * end for end in ends if end is not None]
+        if values:
+            places = [float(place)] * len(values)
+            (line,) = axes.plot(values, places, "|", color=RED, markersize=14, markeredgewidth=1.6, label="limit")
+            axes.legend(handles=[line])

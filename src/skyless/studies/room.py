@@ -1,0 +1,278 @@
+"""The study ``room``: a method judged where the errors of real rooms are, and where one thing more is wrong.
+
+The room is the lab with anchors, ranges and motions as in ``evaluation/room_world.py``. Each other case changes one
+thing in it. The worlds do not depend on the method.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from msgspec.structs import replace
+
+from skyless.evaluation.room_world import Room
+from skyless.evaluation.scenarios import wanderers
+from skyless.positioning.integrity import IntegrityRequirement
+from skyless.simulation.impairments import AnchorBias, Body, WarmUp
+from skyless.simulation.range_errors import RangeErrorModel
+from skyless.simulation.trajectory import Trajectory, Waypoints
+from skyless.site.lab import lab_site
+from skyless.site.model import AnchorSite, Site, TagsSite, WallSite
+from skyless.studies.clustered_intervals import rare_interval
+from skyless.studies.lab_setup import anchor_of, box, worlds
+from skyless.studies.level_counts import LevelCounts
+from skyless.studies.limits import judged
+from skyless.studies.motions import laps
+from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of
+from skyless.studies.room_bound import biases_of, bound_cells, with_bound
+from skyless.studies.summary import Case, world_cells, world_rows
+from skyless.studies.worlds import RunResult
+
+BASE: Final = "the room"
+AIR: Final = "unbiased air"
+WARMUP_S: Final = 1.5
+
+BOUND_RATIO: Final = 1.15
+"""Over the Cramér–Rao bound, at most, in the room itself."""
+
+SHARE: Final = 0.25
+"""Worlds of each case but the room itself, of those that the room has."""
+
+CHANGING_M: Final = 0.029
+"""As large as constants that are uniform within 5 cm."""
+
+HALL_M: Final = (12.0, 16.0)
+ROOM_3D_M: Final = (8.0, 6.0)
+HEIGHTS_M: Final = (0.2, 3.0)
+"""Of neighbouring anchors in the 3-D room."""
+
+WALL: Final = WallSite(4.0, 3.0, 4.0, 5.0, delay_m=0.25)
+"""Between the tags that walk past and three of the anchors, low enough for these to hear the others over it."""
+PAST_WALL_X_M: Final = (3.4, 3.7)
+PAST_WALL_Y_M: Final = (0.3, 7.7)
+
+SMALL_M: Final = (0.1, 0.4)
+LARGE_M: Final = (0.5, 2.0)
+"""By how much anchors are late, each by its own draw."""
+LATE_S: Final = (WARMUP_S + 3.0, WARMUP_S + 9.0)
+
+CRYSTALS: Final = ((1.0, 20.0), (-1.0, 20.0), (2.0, 20.0), (-2.0, 20.0), (5.0, 60.0))
+"""What tags' crystals gain in the end in ppm, and the time constant in s."""
+
+TURNS_MPS2: Final = (3.0, 6.0, 10.0, 30.0)
+TURNING_MPS: Final = 3.0
+STATED_MPS2: Final = 10.0
+"""Turns that are also driven with the tag's largest acceleration stated."""
+
+_LATE_KEY: Final = 23
+_PATH_KEY: Final = 29
+"""Of streams of random numbers, beside the worlds' own."""
+
+Paths = Callable[[int], Sequence[Trajectory]]
+
+
+def cases(plan: Plan) -> list[Case]:
+    """The room, and what differs from it in one thing."""
+    return [*_places(plan), *_errors(plan), *_obstacles(plan), *_late(plan), *_crystals(plan), *_turns(plan)]
+
+
+def _case(
+    plan: Plan,
+    name: str,
+    series: str,
+    *limits: Limit,
+    site: Site | None = None,
+    paths: Paths | None = None,
+    bounded: bool = False,
+    **faults: Any,  # noqa: ANN401 - of ``worlds``
+) -> Case:
+    """``bounded``: nothing is wrong but what the room's errors of survey and ranges are, so that there is a bound."""
+    place = site or lab_site(plan.noise_ps)
+    count = plan.worlds if name == BASE else max(2, round(SHARE * plan.worlds))
+    ways = paths or partial(wanderers, place, plan.tags)
+    faults = {"room": Room(), **faults}
+    runs = worlds(plan, place, ways, warmup_s=WARMUP_S, count=count, **faults)
+    return Case(name, series, None, runs, limits=limits, biases=biases_of(faults["room"]) if bounded else None)
+
+
+def _exceeded(most: float) -> Limit:
+    return Limit("exceeded", most=most)
+
+
+def _places(plan: Plan) -> list[Case]:
+    usual = (
+        Limit("rmse_m", most=0.029),
+        Limit("nees", 0.7, 1.3),
+        Limit("level", 0.99),
+        _exceeded(1e-4),
+        Limit("hpl_m", most=0.30),
+    )
+    return [
+        replace(_case(plan, BASE, "rooms", *usual, bounded=True), limit=BOUND_RATIO),
+        _case(plan, AIR, "rooms", Limit("rmse_m", most=0.019), room=None, bounded=True),
+        _case(plan, "hall, 8 anchors", "rooms", Limit("level", 0.97), site=hall_site(plan.noise_ps), bounded=True),
+        _case(plan, "3-D room, 8 anchors", "rooms", site=room_3d_site(plan.noise_ps), bounded=True),
+    ]
+
+
+def _errors(plan: Plan) -> list[Case]:
+    """Constants of the ranges, then anchors that stand elsewhere than their room's survey accounts for."""
+    ranges = {
+        "constants change in 10 s": {"constant_m": 0.0, "changing_m": CHANGING_M, "correlation_s": 10.0},
+        "constants change within 1 m": {"constant_m": 0.0, "changing_m": CHANGING_M, "correlation_m": 1.0},
+        "constants within 10 cm": {"constant_m": 0.10},
+    }
+    off = [(1, 0.10), (1, 0.15), (1, 0.20), (1, 0.30), (2, 0.20)]
+    return [
+        *(
+            _case(plan, name, "ranges", room=Room(ranges=RangeErrorModel(slope_m=0.05, **changes)), bounded=True)
+            for name, changes in ranges.items()
+        ),
+        *(
+            _case(
+                plan,
+                f"{'one anchor' if count == 1 else 'two anchors'} {100 * off_m:.0f} cm off",
+                "places of anchors",
+                _exceeded(3e-4),
+                room=Room(off_anchors=count, off_m=off_m),
+            )
+            for count, off_m in off
+        ),
+        _case(plan, "each axis N(5 cm)", "places of anchors", room=Room(axis_std_m=0.05), bounded=True),
+    ]
+
+
+def _obstacles(plan: Plan) -> list[Case]:
+    lab = lab_site(plan.noise_ps)
+    wall = (Limit("rmse_m", most=0.08), Limit("nees", most=3.0), _exceeded(1e-3))
+    body = (Limit("rmse_m", most=0.12), Limit("nees", most=4.0), _exceeded(1e-3))
+    past = partial(past_wall, plan.tags)
+    walled = replace(lab, walls=(WALL,))
+    return [
+        _case(plan, "past a wall", "obstacles", *wall, site=walled, paths=past, walls_between_anchors=False),
+        _case(plan, "a body", "obstacles", *body, body=Body()),
+    ]
+
+
+def _late(plan: Plan) -> list[Case]:
+    found = []
+    for span_m in (SMALL_M, LARGE_M):
+        for count in (1, 2, 3):
+            for when, (from_s, to_s) in {"": (0.0, np.inf), ", 6 s": LATE_S}.items():
+                name = f"{count} of 6 late, {span_m[0]:g}–{span_m[1]:g} m{when}"
+                limits = () if count == 1 else (_exceeded(1e-3),)
+                late = partial(late_anchors, plan, count, span_m, from_s, to_s)
+                found.append(_case(plan, name, "late anchors", *limits, biases=late))
+    return found
+
+
+def late_anchors(
+    plan: Plan, count: int, span_m: tuple[float, float], from_s: float, to_s: float, number: int
+) -> tuple[AnchorBias, ...]:
+    """Other anchors in each world; those that are late in twos are among those in threes, by the same amounts."""
+    draw = np.random.default_rng(seed_of(plan.seed, number, _LATE_KEY))
+    anchors = lab_site(plan.noise_ps).anchors
+    chosen, amounts_m = draw.permutation(len(anchors))[:count], draw.uniform(*span_m, len(anchors))
+    return tuple(AnchorBias(anchors[one].id, float(amounts_m[one]), from_s=from_s, to_s=to_s) for one in chosen)
+
+
+def _crystals(plan: Plan) -> list[Case]:
+    lab = lab_site(plan.noise_ps)
+
+    def of_an_anchor(number: int) -> tuple[WarmUp, ...]:
+        return (WarmUp(1.0, 20.0, WARMUP_S, anchor_of(lab, number).id),)
+
+    tags = [
+        _case(plan, f"tags' crystals {ppm:+g} ppm", "crystals", warm_ups=(WarmUp(ppm, tau_s, WARMUP_S),))
+        for ppm, tau_s in CRYSTALS
+    ]
+    return [
+        replace(case, of=BASE, limit=1.3)
+        for case in (*tags, _case(plan, "an anchor's crystal +1 ppm", "crystals", warm_ups=of_an_anchor))
+    ]
+
+
+def _turns(plan: Plan) -> list[Case]:
+    """Of tags that nobody has told of it, and of some that know how hard they turn."""
+    found = []
+    for turn, stated in (*((turn, False) for turn in TURNS_MPS2), (STATED_MPS2, True)):
+        name = f"turns of {turn:g} m/s² at {TURNING_MPS:g} m/s" + (", stated" if stated else "")
+        limits = (_exceeded(1e-3),) if turn == STATED_MPS2 else ()
+        asked = IntegrityRequirement(max_acceleration_mps2=turn if stated else 0.0)
+        found.append(_case(plan, name, "turns", *limits, paths=partial(turning, plan, turn), integrity=asked))
+    return found
+
+
+def turning(plan: Plan, acceleration_mps2: float, seed: int) -> Sequence[Trajectory]:
+    """Tags that go round and round the lab; all accelerations have the same rounds."""
+    draw, (low_m, high_m) = np.random.default_rng(seed_of(seed, _PATH_KEY)), box(lab_site(plan.noise_ps))
+    return [laps(draw, low_m, high_m, TURNING_MPS, acceleration_mps2) for _ in range(plan.tags)]
+
+
+def past_wall(tags: int, seed: int) -> Sequence[Trajectory]:
+    """Tags that walk to and fro along the wall at 1 m/s, from where it hides no anchor."""
+    lines_m = np.random.default_rng(seed_of(seed, _PATH_KEY)).uniform(*PAST_WALL_X_M, tags).tolist()
+    return [Waypoints([(x_m, y_m) for y_m in PAST_WALL_Y_M], 1.0, loop=True, corner_s=1.0) for x_m in lines_m]
+
+
+def hall_site(noise_ps: float) -> Site:
+    """Eight anchors on the walls of 12 m × 16 m: corners and middles, at the tags' height as in the lab."""
+    anchors = tuple(AnchorSite(id=k, x_m=x, y_m=y) for k, (x, y) in enumerate(_around(*HALL_M), start=1))
+    return replace(lab_site(noise_ps), name="hall", anchors=anchors)
+
+
+def room_3d_site(noise_ps: float) -> Site:
+    """Eight anchors on the walls of 8 m × 6 m, high and low by turns; the height of tags is not given."""
+    anchors = tuple(
+        AnchorSite(id=k, x_m=x, y_m=y, z_m=HEIGHTS_M[k % 2]) for k, (x, y) in enumerate(_around(*ROOM_3D_M), start=1)
+    )
+    return replace(lab_site(noise_ps), name="3-D room", anchors=anchors, tags=TagsSite())
+
+
+def _around(x_m: float, y_m: float) -> list[tuple[float, float]]:
+    along_x, along_y = (0.0, 0.5, 1.0, 1.0, 1.0, 0.5, 0.0, 0.0), (0.0, 0.0, 0.0, 0.5, 1.0, 1.0, 1.0, 0.5)
+    return [(x_m * a, y_m * b) for a, b in zip(along_x, along_y, strict=True)]
+
+
+def cells(plan: Plan) -> list[Cell]:
+    """The worlds of all cases, then their bounds where there are some."""
+    each = cases(plan)
+    return [*world_cells(each), *bound_cells(each)]
+
+
+def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
+    """A row for each case; the results stand in the order of ``cells``."""
+    each = cases(plan)
+    count = sum(len(case.runs) for case in each)
+    ran, bounds = iter(results[:count]), iter(results[count:])
+    found = []
+    for case, row in zip(each, world_rows("room", plan, each, results[:count]), strict=True):
+        own: list[RunResult] = [next(ran) for _ in case.runs]
+        bounded = row if case.biases is None else with_bound(row, own, [next(bounds) for _ in case.runs])
+        found.append(judged(_with_levels(bounded, own), case.limits))
+    return found
+
+
+def _with_levels(row: Row, own: Sequence[RunResult]) -> Row:
+    """What became of the protection levels, with tags as units; as it is where the method gives none."""
+    counts = [world.levels for world in own if world.levels is not None]
+    if not counts:
+        return row
+    levels, exceeded = _total(counts, "levels"), _total(counts, "exceeded")
+    row = replace(row, level=levels.sum() / row.fixes)
+    if not levels.any():
+        return row
+    low, high = rare_interval(exceeded, levels.sum())
+    return replace(
+        row,
+        exceeded=exceeded.sum() / levels.sum(),
+        exceeded_interval=(min(low, 1.0), min(high, 1.0)),
+        exceeded_unwarned=_total(counts, "unwarned").sum() / levels.sum(),
+        hpl_m=float(np.median(np.concatenate([one.hpl_m for one in counts]))),
+    )
+
+
+def _total(counts: Sequence[LevelCounts], name: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """A count of every tag of all worlds."""
+    return np.concatenate([getattr(one, name) for one in counts])

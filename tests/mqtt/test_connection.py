@@ -1,0 +1,66 @@
+"""A connection to what only plays the broker."""
+
+import asyncio
+import contextlib
+
+import pytest
+
+from skyless.errors import SkylessError
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.connect import check_broker, open_connection
+from skyless.mqtt.paho_client import Introduction
+
+
+@contextlib.asynccontextmanager
+async def player(answer):
+    """Where something gives one answer, whoever comes, and then listens without a word."""
+
+    async def serve(reader, writer):
+        writer.write(answer)
+        while await reader.read(65_536):
+            pass
+        writer.close()
+
+    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        yield MqttAddress("127.0.0.1", server.sockets[0].getsockname()[1])
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        (1, "does not speak MQTT"),
+        (2, "refuses: Client identifier not valid"),
+        (3, "refuses: Server unavailable"),
+        (4, "refuses: wrong user name or password; the password stands in SKYLESS_MQTT_PASSWORD"),
+        (5, "refuses: wrong user name or password, or no permission; the password stands in"),
+        (99, "refuses: "),
+    ],
+)
+def test_each_refusal_of_the_standard_is_told(code, reason):
+    """MQTT 3.1.1, table 3.1."""
+
+    async def check():
+        async with player(bytes((0x20, 2, 0, code))) as address:
+            with pytest.raises(SkylessError, match=reason):
+                await check_broker(address)
+
+    asyncio.run(check())
+
+
+def test_a_number_that_still_flies_is_not_given_again():
+    async def check():
+        async with player(b"\x20\x02\x00\x00") as address:
+            connection = await open_connection(address, None, Introduction("me", 60))
+            first = connection.publish("a", b"", 1, retain=False)
+            numbers = []
+            for count in range(65_540):
+                connection.publish("a", b"", 0, retain=False)
+                if count > 65_530:
+                    numbers.append(connection.publish("a", b"", 1, retain=False))
+                if count % 100 == 0:
+                    await asyncio.sleep(0)
+            assert first not in numbers
+            assert len(set(numbers)) == len(numbers)
+            connection.abort("enough")
+
+    asyncio.run(check())

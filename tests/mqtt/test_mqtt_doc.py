@@ -1,0 +1,69 @@
+"""``docs/mqtt.md``: every topic is in it, with an example that its struct reads, and a row in the table."""
+
+import inspect
+import json
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from skyless.mqtt import messages, topics
+
+TEXT = Path(__file__).parents[2].joinpath("docs", "mqtt.md").read_text(encoding="utf-8")
+EXAMPLES = dict(re.findall(r"### `(\S+)`\n(?:(?!###).)*?```json\n(.*?)```", TEXT, re.DOTALL))
+
+SITE, TAG = "<site>", "<tag>"
+STRUCTS = {
+    topics.site_topic(SITE): messages.SiteMessage,
+    topics.fix_topic(SITE, TAG): messages.FixMessage,
+    topics.status_topic(SITE, "<kind>", "<name>"): messages.StatusMessage,
+    topics.health_topic(SITE, "tag", TAG): messages.TagHealth,
+    topics.health_topic(SITE, "anchor", "<id>"): messages.AnchorHealth,
+    topics.health_topic(SITE, "ether", "<name>"): messages.EtherHealth,
+    topics.receptions_topic(SITE, TAG): messages.ReceptionsMessage,
+    topics.request_topic(SITE): messages.RequestMessage,
+    topics.truth_topic(SITE): messages.TruthMessage,
+    topics.zones_topic(SITE): messages.ZonesMessage,
+    topics.zone_event_topic(SITE, "<zone>"): messages.ZoneEvent,
+}
+
+
+@pytest.mark.parametrize("topic", STRUCTS)
+def test_an_example_is_what_the_struct_says(topic):
+    """The struct reads it, and holds all of it: no key is misspelt."""
+    example = EXAMPLES[topic]
+    value = msgspec.json.decode(example, type=STRUCTS[topic])
+    assert holds(json.loads(msgspec.json.encode(value)), json.loads(example))
+
+
+def holds(whole, part):
+    if isinstance(part, dict):
+        return all(key in whole and holds(whole[key], value) for key, value in part.items())
+    if isinstance(part, list):
+        return all(holds(*pair) for pair in zip(whole, part, strict=True))
+    return whole == part
+
+
+def test_examples_are_of_known_topics():
+    assert EXAMPLES.keys() == STRUCTS.keys()
+
+
+def test_the_table_has_every_topic():
+    rows = dict(re.findall(r"^\| `(\S+)` \| (.*?) \|", TEXT, re.MULTILINE))
+    named = {
+        topic.removeprefix(topics.site_topic(SITE).removesuffix("site")): struct for topic, struct in STRUCTS.items()
+    }
+    assert rows.keys() - {"floor_plan"} == named.keys()
+    assert all(rows[topic] == f"`{struct.__name__}`" for topic, struct in named.items())
+
+
+def test_no_topic_is_forgotten():
+    functions = {name for name, _ in inspect.getmembers(topics, inspect.isfunction)}
+    source = inspect.getsource(inspect.getmodule(test_no_topic_is_forgotten))
+    assert {name for name in functions if f"topics.{name}(" not in source} == {"floor_plan_topic"}
+
+
+def test_readers_ignore_fields_that_they_do_not_know():
+    example = json.loads(EXAMPLES[topics.fix_topic(SITE, TAG)]) | {"later": 1}
+    assert msgspec.convert(example, messages.FixMessage).tag == "tag1"

@@ -1,0 +1,132 @@
+"""Monte Carlo of the paper's chain: covariances against the theory, sums against other ways to make them."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from skyless.bench.monte_carlo_speed import bench_chain, numpy_draw, numpy_loop
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.paper.chain_draws import Quantity, Readings
+from skyless.paper.monte_carlo import CHUNK, draw_lambdas, draw_moments
+from skyless.uncertainty import corrected
+from skyless.uncertainty.chain import Chain
+from skyless.uncertainty.tdoa import Reference, chain_covariance
+
+SHARING = list(Reference)
+
+
+def chain_for(reference, **changes):
+    """Ten random anchors, stamps of master, anchors and tag of different noise."""
+    chain = bench_chain(10, seed=4)
+    t_m = {Reference.APART: 0.041, Reference.FIRST_SYNC: 0.0, Reference.SECOND_SYNC: chain.sync_spacing_s}[reference]
+    sigmas = {"sigma_master_s": 9e-12, "sigma_anchor_s": 4e-12, "sigma_tag_s": 6e-12}
+    fields = {name: getattr(chain, name) for name in Chain.__slots__}
+    return Chain(**(fields | sigmas | {"reference_s": t_m} | changes))
+
+
+@pytest.mark.parametrize("uniform", [False, True])
+@pytest.mark.parametrize("reference", SHARING)
+def test_the_covariance_of_all_tdoas_is_the_theorys(reference, uniform):
+    """All 100 elements within 5 standard errors of half a million draws; the variances then to 0.5 %."""
+    chain = chain_for(reference)
+    moments = draw_moments(chain, 3, 500_000, reference=reference, uniform=uniform)
+    excess = moments.lambda_covariance_m2 - chain_covariance(chain, reference)
+    assert (np.abs(excess) < 5.0 * moments.lambda_covariance_error_m2).all()
+    np.testing.assert_allclose(np.diag(excess), 0.0, atol=5e-3 * np.diag(moments.lambda_covariance_m2).max())
+
+
+def test_the_theorys_covariance_of_a_shared_packet_does_not_know_the_sync_spacing():
+    """As long as the reference is not apart from it: then the rate error grows with every second between."""
+    for reference, same in ((Reference.FIRST_SYNC, True), (Reference.APART, False)):
+        near, far = (chain_for(reference, sync_spacing_s=spacing_s) for spacing_s in (0.015, 0.3))
+        variances = [np.diag(chain_covariance(chain, reference)) for chain in (near, far)]
+        np.testing.assert_equal(np.isclose(*variances, rtol=1e-12), same)
+
+
+def test_a_reference_that_is_no_sync_packet_is_refused():
+    with pytest.raises(ValueError, match=r"reference_s is 0\.041, the first-sync packet is at 0\.0"):
+        chain_covariance(chain_for(Reference.APART), Reference.FIRST_SYNC)
+
+
+@pytest.mark.parametrize("reference", SHARING)
+def test_the_theorys_covariance_is_a_diagonal_and_a_common_number(reference):
+    """To the 40 ppm by which rates differ; the diagonal is FinalTDoAUnc's where the paper has it."""
+    chain = chain_for(reference)
+    covariance = chain_covariance(chain, reference)
+    common = covariance[0, 1]
+    own = covariance.diagonal() - common
+    np.testing.assert_allclose(np.diag(own) + common, covariance, rtol=1e-4)
+    if reference is Reference.APART:
+        np.testing.assert_allclose(np.diag(covariance), corrected.lambda_m2(chain), rtol=1e-12)
+
+
+def test_the_autocovariance_of_epsilon_is_the_theorys():
+    chain = chain_for(Reference.APART)
+    moments = draw_moments(chain, 5, 500_000)
+    excess = moments.epsilon_covariance_s2 - corrected.epsilon_covariance(chain)
+    assert (np.abs(excess) < 5.0 * moments.epsilon_covariance_error_s2).all()
+
+
+def test_sums_have_the_same_bits_for_any_number_of_threads():
+    draws = 5 * CHUNK + 77
+    one, three = (draw_moments(chain_for(Reference.APART), 8, draws, threads=threads) for threads in (1, 3))
+    assert one.draws == three.draws == draws
+    for name in ("mean", "variance", "fourth", "epsilon_covariance_s2", "lambda_covariance_m2"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+
+
+def test_moments_are_those_of_the_draws_one_by_one():
+    """Chunks merged against all draws at once, and standard errors against their own scatter over batches."""
+    chain, draws = chain_for(Reference.APART), 2 * CHUNK + 5
+    lambdas = draw_lambdas(chain, 8, 0, draws)
+    moments = draw_moments(chain, 8, draws)
+    np.testing.assert_allclose(moments.mean[Quantity.LAMBDA], lambdas.mean(axis=0), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(moments.variance[Quantity.LAMBDA], lambdas.var(axis=0, ddof=1), rtol=1e-9)
+    np.testing.assert_allclose(moments.lambda_covariance_m2, np.cov(lambdas.T, ddof=0), rtol=1e-6, atol=1e-12)
+    batches = np.array([batch.std(axis=0) for batch in np.array_split(lambdas, 256)])
+    scatter = batches.std(axis=0).mean() / batches.mean() / np.sqrt(256)
+    assert moments.std_relative_error[Quantity.LAMBDA].mean() == pytest.approx(scatter, rel=0.06)
+
+
+def test_progress_counts_every_draw():
+    seen = []
+    draw_moments(chain_for(Reference.APART), 1, 2 * CHUNK + 3, progress=seen.append)
+    assert seen == [CHUNK, 2 * CHUNK, 2 * CHUNK + 3]
+
+
+def test_the_numpy_loop_of_the_yardstick_computes_the_same_chain():
+    chain = chain_for(Reference.APART)
+    readings = Readings(chain, Reference.APART, uniform=False)
+    units = np.array([1.0, *[TICK_S] * 5, 1.0, TICK_S, TICK_S])[:, None]
+    ideal = numpy_draw(chain, np.zeros(64))
+    np.testing.assert_allclose(readings.ideal * units, ideal, rtol=1e-12, atol=2e-15)
+    _, variance = numpy_loop(chain, 4000, np.random.default_rng(2))
+    moments = draw_moments(chain, 2, 100_000)
+    scale = np.array([1.0] * 8 + [SPEED_OF_LIGHT_MPS])[:, None]
+    np.testing.assert_allclose(np.sqrt(variance) * scale, moments.std, rtol=5.0 / np.sqrt(2 * 4000))
+
+
+SIMULATED = """
+import numpy as np
+from skyless.paper.chain_draws import Readings
+from skyless.paper.gpu_draws import gpu_sums
+from skyless.paper.monte_carlo import draw_moments, gpu_available, sums_of
+from skyless.bench.monte_carlo_speed import bench_chain
+from skyless.uncertainty.tdoa import Reference
+assert gpu_available()
+for uniform in (False, True):
+    readings = Readings(bench_chain(2), Reference.SECOND_SYNC, uniform=uniform)
+    device, processor = gpu_sums(readings, 5, 3, 150, blocks=1), sums_of(readings, 5, 3, 150)
+    np.testing.assert_allclose(device, processor, rtol=1e-9)
+"""
+
+
+def test_the_device_makes_the_same_draws_in_the_simulator():
+    """Numba's simulator runs the device's function as Python, thread by thread; a real device is not needed."""
+    environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1"}
+    command = [sys.executable, "-c", SIMULATED]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

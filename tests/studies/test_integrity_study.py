@@ -1,0 +1,141 @@
+"""The study of protection levels: its faults, its intervals of rare shares, its rows and its picture."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from skyless.constants import TICK_M
+from skyless.errors import SkylessError
+from skyless.evaluation.figures import picture
+from skyless.site.lab import ideal_lab_site
+from skyless.studies.catalogue import STUDIES
+from skyless.studies.clustered_intervals import CLUSTER, rare_interval
+from skyless.studies.episodes import Case, draw_episode
+from skyless.studies.integrity import ALL, MOST_RATIO, Chunk, anchors_of, cells, rows, run_chunk
+from skyless.studies.integrity_faults import BURST_S, FAULTS, Fault, faulty
+from skyless.studies.plan import plan_of
+
+SLOT_S = ideal_lab_site().schedule.slot_s
+PLAN = plan_of("joint", 1, episodes=100)
+
+
+def episode_of(superframes=120):
+    return draw_episode(np.random.default_rng(1), anchors_of("lab"), SLOT_S, Case(mesh=True), superframes)
+
+
+@pytest.mark.parametrize(("kind", "sign"), [("step", 1.0), ("early", -1.0), ("delay", 1.0)])
+def test_a_fault_changes_what_is_heard_of_its_anchor_from_the_onset_on(kind, sign):
+    episode, anchor, onset = episode_of(), 3, 240
+    packets = faulty(episode, Fault("lab", 1.0, kind), anchor, onset, SLOT_S)
+    late_m = (packets.rx_ticks - episode.packets.rx_ticks) * TICK_M
+    touched = (packets.anchors == anchor) & (np.arange(len(late_m)) >= onset)
+    assert late_m[touched] == pytest.approx(sign, abs=TICK_M)
+    assert not late_m[~touched].any()
+    relayed_m = (packets.relays[:, 3] - episode.packets.relays[:, 3]) * TICK_M
+    of_anchor = (packets.relays[:, 1] == anchor) & (packets.relays[:, 2] >= onset // 6)
+    assert not relayed_m[~of_anchor].any()
+    assert relayed_m[of_anchor] == pytest.approx(1.0 if kind == "delay" else 0.0, abs=TICK_M)
+
+
+def test_ramps_grow_for_a_second_and_bursts_come_and_go():
+    episode, anchor, onset = episode_of(), 0, 60
+    own = episode.packets.anchors == anchor
+    since_s = (np.arange(len(own)) - onset)[own] * SLOT_S
+
+    def late_m(kind):
+        return (
+            (faulty(episode, Fault("lab", 2.0, kind), anchor, onset, SLOT_S).rx_ticks - episode.packets.rx_ticks)
+            * TICK_M
+        )[own]
+
+    assert late_m("ramp") == pytest.approx(2.0 * np.clip(since_s, 0.0, 1.0), abs=TICK_M)
+    on = (since_s >= 0.0) & (since_s % (2.0 * BURST_S) < BURST_S)
+    assert late_m("bursts") == pytest.approx(np.where(on, 2.0, 0.0), abs=TICK_M)
+
+
+@pytest.mark.parametrize("n", [1, 7])
+@pytest.mark.parametrize("size", [1.0, CLUSTER, 2.0 * CLUSTER])
+def test_intervals_of_equal_clusters_are_garwoods(n, size):
+    low, high = rare_interval(np.full(n, size), 1e4)
+    exact = size * chi2.ppf(0.995, 2 * n + 2) / 2e4
+    assert low == pytest.approx(size * chi2.ppf(0.005, 2 * n) / 2e4)
+    assert high == pytest.approx(exact) if size >= CLUSTER else high > exact
+
+
+def test_nothing_seen_proves_a_share_small_but_not_zero():
+    assert rare_interval(np.zeros(9), 1e4) == (0.0, pytest.approx(CLUSTER * chi2.ppf(0.995, 2) / 2e4))
+
+
+def test_intervals_of_clusters_hold_the_true_share():
+    """Clusters of 1 to 20 events, three of them on average: 99 % of the intervals should hold the mean."""
+    draw, runs, mean = np.random.default_rng(2), 1000, 3 * 10.5
+    missed = 0
+    for _ in range(runs):
+        events = np.array([draw.integers(1, 21) for _ in range(draw.poisson(3.0))], float)
+        low, high = rare_interval(events, 1.0)
+        missed += not low <= mean <= high
+    assert missed <= 23  # at most 10 are expected; more than 23 with a probability of 10⁻⁴
+
+
+def chunk(misleading, levels_m=(0.1, 0.2)):
+    """What 50 episodes of 100 fixes would have told."""
+    counts = np.tile([100.0, 90.0, 0.0, 0.0], (50, 1))
+    counts[0, 2] = misleading
+    return Chunk(counts, 1.0, levels_m, np.linspace(0.1, 0.8, 100), np.linspace(0.01, 0.1, 100))
+
+
+def test_rows_are_what_chunks_tell():
+    results = [chunk(0)] * 2 * len(FAULTS)
+    results[2] = chunk(100)  # of the second row
+    told = {row.case: row for row in rows(PLAN, results)}
+    assert len(told) == len(FAULTS) + 1
+    clean, step = told["lab, clean"], told["lab, step 0.05 m"]
+    assert (clean.runs, clean.fixes, clean.available, clean.hmi, clean.limit) == (100, 10_000, 0.9, 0.0, MOST_RATIO)
+    assert clean.ratio == pytest.approx(1.0 / 0.8, rel=0.01)
+    assert clean.passed
+    assert step.hmi == 0.01
+    assert step.hmi_interval[0] < 1e-4 < 0.01 < step.hmi_interval[1]  # one cluster proves little
+    assert step.passed
+    assert (step.hpl_m, step.vpl_m, told["room, clean"].vpl_m) == (pytest.approx(0.1), None, pytest.approx(0.2))
+    assert told[ALL].hmi == pytest.approx(100 / told[ALL].fixes)
+    assert told[ALL].fixes == 10_000 * (len(FAULTS) - 2)
+
+
+def test_levels_that_mislead_often_fail():
+    results = [chunk(0)] * 2 * len(FAULTS)
+    counts = np.tile([100.0, 90.0, 1.0, 0.0], (50, 1))
+    results[2] = Chunk(counts, 1.0, (0.1, 0.2), results[0].top, results[0].errors_m)
+    failed = [row.case for row in rows(PLAN, results) if not row.passed]
+    assert failed == ["lab, step 0.05 m"]
+
+
+@pytest.mark.parametrize("levels_m", [(0.1, 0.2), None])
+def test_it_can_be_drawn(levels_m):
+    study = STUDIES["integrity"]
+    told = study.rows(PLAN, [chunk(3, levels_m)] * 2 * len(FAULTS))
+    assert picture(study.draw(told), "png", 50.0).startswith(b"\x89PNG")
+
+
+def test_cells_carry_what_is_asked():
+    asked = plan_of("joint", 1, episodes=60, integrity_risk=1e-3, alert_limit_m=0.5)
+    found = cells(asked)
+    assert len(found) == 2 * len(FAULTS)
+    assert {(cell.argument[0].risk, cell.argument[0].alert_limit_m) for cell in found} == {(1e-3, 0.5)}
+    assert [len(cell.argument[1]) for cell in found[:2]] == [50, 10]
+
+
+@pytest.mark.parametrize("place", ["lab", "room"])
+def test_levels_hold_in_clean_episodes(place):
+    cell = next(cell for cell in cells(plan_of("joint", 1, episodes=3)) if cell.name == f"{place}, clean")
+    told = run_chunk(cell.argument)
+    fixes, promised, across, above = told.counts.T
+    assert (fixes > 350).all()
+    assert (promised == fixes).all()
+    assert not across.any()
+    assert not above.any()
+    assert 0.0 < told.top.max() < 1.0
+
+
+def test_other_methods_have_no_levels():
+    with pytest.raises(SkylessError, match="--method is 'literal'"):
+        cells(plan_of("literal", 1))

@@ -1,0 +1,291 @@
+"""The study of the room: what its cases are, how levels are counted, and which limits hold."""
+
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from skyless.cli.study_output import print_rows
+from skyless.evaluation.figures import picture
+from skyless.positioning.integrity import Alert
+from skyless.simulation.channel import cross_walls, pack_walls
+from skyless.simulation.impairments import Body
+from skyless.site.lab import lab_site
+from skyless.studies import room
+from skyless.studies.catalogue import STUDIES
+from skyless.studies.clustered_intervals import rare_interval
+from skyless.studies.lab_setup import box
+from skyless.studies.level_counts import LevelCounter, LevelCounts
+from skyless.studies.limits import judged
+from skyless.studies.plan import Limit, Row, plan_of
+from skyless.studies.room_bound import biases_of, bound_cells
+from skyless.studies.worlds import RunResult, run_world
+from skyless.uncertainty.biased_bound import Biases
+
+PLAN = plan_of("joint", 1, study="room")
+CASES = {case.name: case for case in room.cases(PLAN)}
+EMPTY = Row("room", "joint", "a", "s", None, True, 100.0, 2, 10, 0.03)
+
+
+def test_the_room_has_a_hundred_tags_in_twenty_draws_and_the_rest_a_quarter():
+    sizes = {name: (len(case.runs), len(case.runs[0].trajectories)) for name, case in CASES.items()}
+    assert sizes.pop(room.BASE) == (20, 5)
+    assert set(sizes.values()) == {(5, 5)}
+    run = CASES[room.BASE].runs[0]
+    assert (run.warmup_s, run.until_s, run.qa) == (1.5, 16.5, 0.3)
+    few = room.cases(plan_of("joint", 1, study="room", quick=True))
+    assert {(len(case.runs), len(case.runs[0].trajectories)) for case in few} == {(6, 2), (2, 2)}
+
+
+def test_worlds_are_the_same_for_every_method_and_of_one_seed_in_all_cases():
+    for case, other in zip(CASES.values(), room.cases(replace(PLAN, method="literal")), strict=True):
+        for a, b, base in zip(case.runs, other.runs, CASES[room.BASE].runs, strict=False):
+            assert (a.site, a.impairments, a.seed, a.until_s) == (b.site, b.impairments, b.seed, b.until_s)
+            assert a.seed == base.seed
+            ways = [[path.position(t_s).tolist() for path in run.trajectories for t_s in (0.0, 7.0)] for run in (a, b)]
+            assert ways[0] == ways[1]
+    assert len({run.seed for run in CASES[room.BASE].runs}) == 20
+
+
+def test_each_case_is_wrong_in_what_its_name_says():
+    def faults(name):
+        return CASES[name].runs[0].impairments
+
+    base = faults(room.BASE)
+    assert len(base.anchor_displacements) == 6
+    assert (base.range_errors.constant_m, base.range_errors.slope_m) == (0.05, 0.05)
+    assert (faults(room.AIR).anchor_displacements, faults(room.AIR).range_errors.constant_m) == ((), 0.0)
+    assert faults("constants change in 10 s").range_errors.correlation_s == 10.0
+    assert faults("constants change within 1 m").range_errors.correlation_m == 1.0
+    assert faults("constants within 10 cm").range_errors.constant_m == 0.1
+    assert faults("a body").body == Body(0.2, math.radians(100.0))
+    assert not faults("past a wall").channel.walls_between_anchors
+    assert CASES["past a wall"].runs[0].site.walls[0].delay_m == 0.25
+    for name, count, off_m in (("one anchor 10 cm off", 1, 0.1), ("two anchors 20 cm off", 2, 0.2)):
+        moved = [
+            math.dist((a.x_m, a.y_m), (b.x_m, b.y_m))
+            for a, b in zip(faults(name).anchor_displacements, base.anchor_displacements, strict=True)
+        ]
+        assert sorted(moved)[-count:] == pytest.approx([off_m] * count)
+        assert sorted(moved)[:-count] == [0.0] * (6 - count)
+    axes = np.array([(d.x_m, d.y_m) for run in CASES["each axis N(5 cm)"].runs for d in _moved(run)])
+    assert np.std(axes) == pytest.approx(0.05, rel=0.4)
+    (slow,) = faults("tags' crystals +5 ppm").warm_ups
+    assert (slow.ppm, slow.tau_s, slow.start_s, slow.anchor) == (5.0, 60.0, 1.5, None)
+    anchors = [run.impairments.warm_ups[0].anchor for run in CASES["an anchor's crystal +1 ppm"].runs]
+    assert anchors == [1, 2, 3, 4, 5]
+    hall, third = CASES["hall, 8 anchors"].runs[0].site, CASES["3-D room, 8 anchors"].runs[0].site
+    assert (len(hall.anchors), len(third.anchors), hall.tags.height_m, third.tags.height_m) == (8, 8, 0.0, None)
+    heights = {path.position(3.0)[2] for path in CASES["3-D room, 8 anchors"].runs[0].trajectories}
+    assert len(heights) == 5
+
+
+def _moved(run):
+    return run.impairments.anchor_displacements
+
+
+def test_anchors_are_late_by_amounts_of_their_own_from_the_start_or_for_six_seconds():
+    for span, low_m, high_m in (("0.1–0.4", 0.1, 0.4), ("0.5–2", 0.5, 2.0)):
+        biases = [
+            [run.impairments.anchor_biases for run in CASES[f"{count} of 6 late, {span} m"].runs] for count in (1, 2, 3)
+        ]
+        for one, two, three in zip(*biases, strict=True):
+            assert (len(one), len(two), len(three)) == (1, 2, 3)
+            assert set(one) < set(two) < set(three)
+            assert len({bias.anchor for bias in three}) == 3
+            assert all(low_m <= bias.bias_m <= high_m for bias in three)
+            assert all((bias.from_s, bias.to_s) == (0.0, math.inf) for bias in three)
+    brief = CASES["2 of 6 late, 0.5–2 m, 6 s"].runs[0].impairments.anchor_biases
+    assert {(bias.from_s, bias.to_s) for bias in brief} == {(4.5, 10.5)}
+    assert [(b.anchor, b.bias_m) for b in brief] == [
+        (b.anchor, b.bias_m) for b in CASES["2 of 6 late, 0.5–2 m"].runs[0].impairments.anchor_biases
+    ]
+
+
+def test_the_wall_hides_up_to_three_anchors_for_four_seconds_and_none_before_and_after():
+    walls = pack_walls((room.WALL,))
+    for path in room.past_wall(20, 5):
+        hidden = [
+            sum(cross_walls(walls, *path.position(t_s)[:2], a.x_m, a.y_m)[1] > 0.0 for a in lab_site().anchors)
+            for t_s in np.arange(0.0, 16.5, 0.05)
+        ]
+        changes = np.flatnonzero(np.diff(np.array(hidden) > 0))
+        first, last = 0.05 * changes[:2]
+        assert first > 1.5
+        assert 3.5 < last - first < 6.0
+        assert max(hidden) == 3
+        speeds = [np.linalg.norm(path.velocity(t_s)) for t_s in np.arange(1.0, 6.0, 0.1)]
+        assert max(speeds) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("acceleration_mps2", room.TURNS_MPS2)
+def test_tags_turn_as_hard_as_the_case_says_within_the_lab(acceleration_mps2):
+    low_m, high_m = box(lab_site())
+    for path in room.turning(PLAN, acceleration_mps2, 3):
+        places = np.array([path.position(0.002 * k) for k in range(8000)])
+        assert (places >= low_m - 1e-9).all()
+        assert (places <= high_m + 1e-9).all()
+        speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / 0.002
+        pushes = np.linalg.norm(np.diff(places, 2, axis=0), axis=1) / 0.002**2
+        assert speeds.max() == pytest.approx(3.0, rel=0.01)
+        assert pushes.max() == pytest.approx(acceleration_mps2, rel=0.01)
+
+
+def test_the_limits_are_those_of_the_acceptance():
+    found = {name: {str(limit) for limit in case.limits} for name, case in CASES.items() if case.limits}
+    late = {f"{n} of 6 late, {span} m{w}" for n in (2, 3) for span in ("0.1–0.4", "0.5–2") for w in ("", ", 6 s")}
+    off = {f"one anchor {cm} cm off" for cm in (10, 15, 20, 30)} | {"two anchors 20 cm off"}
+    assert found == {
+        "the room": {"rmse_m:..0.029", "nees:0.7..1.3", "level:0.99..", "exceeded:..0.0001", "hpl_m:..0.3"},
+        "unbiased air": {"rmse_m:..0.019"},
+        "hall, 8 anchors": {"level:0.97.."},
+        "past a wall": {"rmse_m:..0.08", "nees:..3", "exceeded:..0.001"},
+        "a body": {"rmse_m:..0.12", "nees:..4", "exceeded:..0.001"},
+        "turns of 10 m/s² at 3 m/s": {"exceeded:..0.001"},
+        "turns of 10 m/s² at 3 m/s, stated": {"exceeded:..0.001"},
+        **{name: {"exceeded:..0.001"} for name in late},
+        **{name: {"exceeded:..0.0003"} for name in off},
+    }
+    assert (CASES[room.BASE].of, CASES[room.BASE].limit) == (None, 1.15)
+    ratios = {name: (case.of, case.limit) for name, case in CASES.items() if case.of is not None}
+    assert set(ratios.values()) == {("the room", 1.3)}
+    assert len(ratios) == 6
+
+
+def test_limits_hold_at_their_ends_and_what_does_not_exist_exceeds_nothing():
+    most, least, both = Limit("rmse_m", most=0.03), Limit("level", 0.99), Limit("nees", 0.7, 1.3)
+    assert judged(EMPTY, ()) is EMPTY
+    row = judged(replace(EMPTY, nees=1.31, level=0.99), (most, least, both))
+    assert (row.missed, row.passed, row.limits) == (("nees",), False, (most, least, both))
+    assert judged(replace(EMPTY, nees=0.7, level=1.0), (most, least, both)).passed is True
+    assert judged(EMPTY, (most, least, Limit("exceeded", most=1e-4))).missed == ("level",)
+    assert judged(replace(EMPTY, fixes=0, rmse_m=None), (most,)).passed is False
+    assert judged(replace(EMPTY, limit=1.3, ratio=1.4, passed=False), ()).missed == ("ratio",)
+    assert judged(replace(EMPTY, limit=1.3, ratio=1.2, passed=True), (most,)).passed is True
+
+
+class Told:
+    """A fix that promises a level."""
+
+    def __init__(self, hpl_m, alert=Alert.NONE):
+        self.hpl_m, self.alert, self.asked = hpl_m, alert, object()
+
+
+def test_levels_are_counted_for_each_tag():
+    counter = LevelCounter(2)
+    assert counter.counts() is None
+    for tag, hpl_m, across_m, alert in (
+        (0, 0.1, 0.05, Alert.NONE),
+        (0, 0.1, 0.2, Alert.NONE),
+        (1, 0.3, 0.4, Alert.EXCLUDED),
+        (1, None, 9.0, Alert.UNAVAILABLE),
+    ):
+        counter.add(tag, Told(hpl_m, alert), across_m)
+    counts = counter.counts()
+    assert [list(part) for part in (counts.fixes, counts.levels, counts.exceeded, counts.unwarned)] == [
+        [2, 2],
+        [2, 1],
+        [1, 1],
+        [1, 0],
+    ]
+    assert sorted(counts.hpl_m) == [0.1, 0.1, 0.3]
+
+
+def _results(plan, levels):
+    one = RunResult(9, 9, 0.01, 0.01, 9.0, 0, 0.1, np.full(9, 0.03), 9, 1.0, 1e-3, levels)
+    each = room.cases(plan)
+    return [one] * sum(len(case.runs) for case in each) + [0.02**2] * len(bound_cells(each))
+
+
+def test_rows_have_shares_of_the_fixes_with_a_level_and_intervals_over_tags():
+    plan = plan_of("joint", 1, study="room", worlds=2)
+    counts = LevelCounts(*map(np.array, ([4.0, 5.0], [4.0, 2.0], [3.0, 0.0], [1.0, 0.0])), hpl_m=np.array([0.1, 0.4]))
+    rows = room.rows(plan, _results(plan, counts))
+    row = rows[0]
+    assert row.level == pytest.approx(12.0 / 18.0)
+    assert row.exceeded == pytest.approx(6.0 / 12.0)
+    assert row.exceeded_interval == (rare_interval(np.array([3.0, 0.0, 3.0, 0.0]), 12.0)[0], 1.0)
+    assert row.exceeded_unwarned == pytest.approx(2.0 / 12.0)
+    assert row.hpl_m == pytest.approx(0.25)
+    assert (row.bound_m, row.ratio) == (pytest.approx(0.02), pytest.approx(5.0 / 3.0))
+    assert row.missed == ("rmse_m", "level", "exceeded", "ratio")
+    assert {row.case for row in rows if row.bound_m is not None} == {
+        *("the room", "unbiased air", "hall, 8 anchors", "3-D room, 8 anchors", "constants change in 10 s"),
+        *("constants change within 1 m", "constants within 10 cm", "each axis N(5 cm)"),
+    }
+    none = LevelCounts(*map(np.array, ([4.0, 5.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0])), hpl_m=np.empty(0))
+    row = room.rows(plan, _results(plan, none))[0]
+    assert (row.level, row.exceeded, row.hpl_m) == (0.0, None, None)
+
+
+def test_the_table_and_the_picture_show_levels_and_what_is_missed(capsys):
+    plan = plan_of("joint", 1, study="room", worlds=2)
+    counts = LevelCounts(*map(np.array, ([4.0, 5.0], [4.0, 2.0], [3.0, 0.0], [1.0, 0.0])), hpl_m=np.array([0.1, 0.4]))
+    rows = room.rows(plan, _results(plan, counts))
+    print_rows(STUDIES["room"], plan, rows, 1.0, json=False)
+    out = capsys.readouterr().out
+    for words in (
+        "past a wall",
+        "3 of 6 late, 0.5–2 m, 6 s",
+        "missed: RMSE, level, exceeded, ratio",
+        "held",
+        "66.7 %",
+        "5000",
+    ):
+        assert words in out
+    assert picture(STUDIES["room"].draw(rows), "png", 40.0).startswith(b"\x89PNG")
+
+
+def test_the_bound_is_of_what_the_worlds_draw():
+    found = {name: case.biases for name, case in CASES.items() if case.biases is not None}
+    usual = found[room.BASE]
+    assert (usual.survey_std_m, usual.constant_std_m, usual.slope_std_m) == (
+        0.02,
+        pytest.approx(0.0289, rel=1e-2),
+        0.05,
+    )
+    assert (usual.changing_std_m, usual.pair_std_m) == (0.0, 0.0)
+    assert found["unbiased air"] == Biases()
+    assert (found["each axis N(5 cm)"].survey_std_m, found["constants within 10 cm"].constant_std_m) == (
+        0.05,
+        pytest.approx(0.0577, rel=1e-2),
+    )
+    slow, near = found["constants change in 10 s"], found["constants change within 1 m"]
+    assert (slow.constant_std_m, slow.changing_std_m, slow.correlation_s, slow.correlation_m) == (
+        0,
+        0.029,
+        10,
+        math.inf,
+    )
+    assert (near.correlation_s, near.correlation_m) == (math.inf, 1.0)
+    assert biases_of(None) == Biases()
+
+
+def test_the_bound_of_the_room():
+    """What ``docs/maths.md`` says of it, from the first six of the hundred tags."""
+    plan = replace(plan_of("joint", 11, study="room", worlds=2), tags=3)
+    base, air = room.cases(plan)[:2]
+    pairs = replace(base, biases=replace(base.biases, pair_std_m=0.05))
+    for case, bound_m in ((base, 0.0240), (air, 0.0156), (pairs, 0.0253)):
+        variances_m2 = [cell.function(cell.argument) for cell in bound_cells([case])]
+        assert math.sqrt(np.mean(variances_m2)) == pytest.approx(bound_m, rel=0.02)
+
+
+def test_tags_that_know_how_hard_they_turn_turn_as_those_that_do_not():
+    stated, other = CASES["turns of 10 m/s² at 3 m/s, stated"].runs, CASES["turns of 10 m/s² at 3 m/s"].runs
+    assert {run.integrity.max_acceleration_mps2 for run in stated} == {10.0}
+    assert {run.integrity.max_acceleration_mps2 for case in CASES.values() for run in case.runs} == {0.0, 10.0}
+    for a, b in zip(stated, other, strict=True):
+        assert (a.seed, a.impairments) == (b.seed, b.impairments)
+        assert [p.position(5.0).tolist() for p in a.trajectories] == [p.position(5.0).tolist() for p in b.trajectories]
+
+
+def test_one_world_of_the_room_judges_levels_beside_errors():
+    plan = plan_of("joint", 1, study="room", worlds=2, seconds=3.0)
+    result = run_world(room.cases(plan)[0].runs[0])
+    assert result.levels.fixes.sum() == result.fixes == 5 * 200
+    assert (result.levels.exceeded <= result.levels.levels).all()
+    assert (result.levels.levels <= result.levels.fixes).all()
+    assert len(result.levels.hpl_m) == result.levels.levels.sum()
+    assert run_world(room.cases(replace(plan, method="literal"))[0].runs[0]).levels is None

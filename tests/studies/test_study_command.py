@@ -1,0 +1,149 @@
+"""``skyless study`` as its user meets it."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from itertools import cycle
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from skyless.cli.main import main
+
+COMMAND = [sys.executable, "-m", "skyless.cli.main", "study"]
+SMALL = ["--method", "joint", "--quick", "--worlds", "2", "--seconds", "1", "--processes", "1"]
+
+
+@pytest.fixture
+def run(capsys, monkeypatch, tmp_path):
+    """The command in an empty folder: exit code, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        return main(["study", *map(str, arguments)]), *capsys.readouterr()
+
+    return call
+
+
+def test_a_study_tells_its_rows_and_writes_its_files(run, tmp_path):
+    code, out, err = run("loss", *SMALL, "--json", "--out", "deep/folder", "--plot", "loss.svg")
+    assert (code, err, out.count("\n")) == (0, "", 1)
+    told = json.loads(out)
+    assert (told["study"], told["method"], told["seed"], told["simulated"]) == ("loss", "joint", 1, True)
+    keys = {"method", "mesh", "noise_ps", "case", "rmse_m", "bound_m", "ratio", "limit", "passed", "nees"}
+    assert all(row.keys() >= keys for row in told["rows"])
+    half = next(row for row in told["rows"] if row["case"] == "50 % lost at tags")
+    assert half["passed"] == (half["ratio"] <= half["limit"])
+    folder = tmp_path / "deep" / "folder"
+    assert {file.name for file in folder.iterdir()} == {"loss.json", "loss.csv", "loss.png", "loss.svg"}
+    assert json.loads((folder / "loss.json").read_text()) == told["rows"]
+    with (folder / "loss.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [float(row["rmse_m"]) for row in table] == [row["rmse_m"] for row in told["rows"]]
+    assert (folder / "loss.png").read_bytes().startswith(b"\x89PNG")
+    for picture in (folder / "loss.svg", tmp_path / "loss.svg"):
+        assert ElementTree.fromstring(picture.read_bytes()).tag.endswith("svg")
+
+
+def test_people_get_a_table(run):
+    code, out, err = run("motion", *SMALL)
+    assert (code, err) == (0, "")
+    for words in ("rounds at 5 m/s", "zigzag at 3 m/s", "±", "Simulated."):
+        assert words in out
+
+
+def test_the_study_of_levels_tells_how_often_they_mislead(run):
+    code, out, err = run("integrity", "--episodes", "1", "--integrity-risk", "0.01", "--processes", "1")
+    assert (code, err) == (0, "")
+    for words in ("misleading", "HPL in cm", "room, ramp to 0.5 m", "all faults", "0.01 held", "in 10⁻⁴"):
+        assert words in out
+
+
+def test_the_study_of_the_room_tells_levels_and_what_is_missed(run, tmp_path):
+    """In worlds that are too small to find anything."""
+    small = ["--quick", "--worlds", "2", "--seconds", "1", "--processes", "1"]
+    code, out, err = run("room", *small, "--json", "--out", "folder")
+    assert (code, err, out.count("\n")) == (0, "", 1)
+    rows = json.loads(out)["rows"]
+    assert len(rows) == 38
+    first = rows[0]
+    assert (first["case"], first["method"], first["runs"]) == ("the room", "joint", 2)
+    assert {limit["figure"] for limit in first["limits"]} == {"rmse_m", "nees", "level", "exceeded", "hpl_m", "ratio"}
+    assert first["passed"] == (not first["missed"])
+    assert 0.024 < first["bound_m"] < 0.035
+    for row in rows:
+        assert 0.0 <= row["level"] <= 1.0
+        assert (row["exceeded"] is None) == (row["level"] == 0.0)
+        assert row["said_m"] > 0.0
+    with (tmp_path / "folder" / "room.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert table[0]["limits"].split()[:2] == ["rmse_m:..0.029", "nees:0.7..1.3"]
+    assert ElementTree.fromstring((tmp_path / "folder" / "room.svg").read_bytes()).tag.endswith("svg")
+
+
+@pytest.mark.parametrize("name", ["nlos", "sync", "room", "scale"])
+def test_every_study_can_be_drawn(name, tmp_path):
+    """From rows as they may be, without simulating: with numbers, without, with a single world."""
+    from skyless.evaluation.figures import picture
+    from skyless.studies.catalogue import STUDIES
+    from skyless.studies.plan import plan_of
+    from skyless.studies.worlds import RunResult, run_world
+
+    plan = plan_of("joint", 1, quick=True, worlds=2)
+    study = STUDIES[name]
+    some = RunResult(9, 9, 0.01, 0.01, 9.0, 0, 0.1, np.full(9, 0.03), 9, 1.0, 1e-3)
+    none = RunResult(0, 9, 0.0, 0.0, 0.0, 0, 0.0, np.empty(0), 9, 1.0, 1e-3)
+    for results in ([some], [none], [some, none]):
+        cells = study.cells(plan)
+        worlds = cycle(results)
+        rows = study.rows(plan, [next(worlds) if cell.function is run_world else 0.02**2 for cell in cells])
+        assert picture(study.draw(rows), "png", 50.0).startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["lost"], 'Choose from: "efficiency", "loss"'),
+        (["loss", "--episodes", "5"], "--episodes is for the stud"),
+        (["room", "--episodes", "5"], "room takes --worlds and --seconds"),
+        (["room", "--integrity-risk", "1e-3"], "are for the study integrity"),
+        (["room", "--method", "guess"], "it should be one of literal"),
+        (["efficiency", "--seconds", "5"], "--seconds is not for the study efficiency"),
+        (["efficiency", "--method", "literal"], "--method is 'literal'"),
+        (["loss", "--integrity-risk", "1e-3"], "are for the study integrity"),
+        (["loss", "--alert-limit-m", "1"], "are for the study integrity"),
+        (["integrity", "--integrity-risk", "0"], "--integrity-risk"),
+        (["integrity", "--alert-limit-m", "nan"], "--alert-limit-m"),
+        (["integrity", "--method", "literal"], "protection levels are given by joint"),
+        (["loss", "--method", "guess"], "it should be one of literal"),
+        (["loss", "--worlds", "1"], "--worlds"),
+        (["loss", "--seconds", "nan"], "--seconds"),
+        (["loss", "--plot", "loss.doc"], "--plot is 'loss.doc'"),
+        (["loss", "--plot", "nowhere/loss.png"], "a file in a folder that exists"),
+        (["loss", "--out", __file__], "which is a file"),
+        (["loss", "--scheduler", "here"], "it should be an address"),
+        (["loss", "--scheduler", "tcp://127.0.0.1:9", "--processes", "2"], "give either"),
+    ],
+)
+def test_wrong_input_is_one_line(run, arguments, said):
+    code, out, err = run(*arguments)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert said in err
+
+
+def test_an_interrupt_leaves_no_file_and_no_traceback(tmp_path):
+    """As a terminal sends it: to the whole group, workers among them, at the start and in the middle."""
+    for patience_s in (2.0, 12.0):
+        command = [*COMMAND, "loss", "--method", "joint", "--out", str(tmp_path / "out")]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+        time.sleep(patience_s)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+        assert (process.returncode, out) == (130, b"")
+        assert err in {b"", b"stopped; nothing was written\n"}
+        assert not (tmp_path / "out").exists()

@@ -1,0 +1,174 @@
+"""Cells over processes and over a Dask cluster: the same results, and what happens when something dies."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from distributed import Client, LocalCluster
+
+from skyless.errors import SkylessError
+from skyless.studies import loss
+from skyless.studies.plan import MEASURED, Cell, Plan
+from skyless.studies.runner import run_cells, run_cells_on_dask
+from skyless.studies.summary import world_cells, world_rows
+
+PLAN = Plan(method="joint", seed=3, quick=True, worlds=2, seconds=1.0, tags=1)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as made:
+        yield made
+
+
+CASES = loss.cases(PLAN)[:2]
+
+
+def rows_of(results):
+    rows = world_rows("loss", PLAN, CASES, results)
+    return [{name: getattr(row, name) for name in row.__struct_fields__ if name not in MEASURED} for row in rows]
+
+
+def double(number):
+    return 2 * number
+
+
+def die(number):
+    if number == 1:
+        os._exit(3)
+    time.sleep(0.2)
+
+
+def fail(number):
+    raise ValueError(f"cell {number} has gone wrong")
+
+
+def rest(seconds):
+    time.sleep(seconds)
+
+
+def cells(function, arguments):
+    return [Cell("cell", function, argument, 1.0 + argument) for argument in arguments]
+
+
+def test_the_same_rows_from_one_process_from_two_and_from_a_cluster(cluster):
+    work = world_cells(CASES)
+    told = []
+    one, two = (run_cells(work, told.append, processes) for processes in (1, 2))
+    assert told[-1] == pytest.approx(1.0)
+    third = run_cells_on_dask(work, told.append, cluster.scheduler_address)
+    assert rows_of(one) == rows_of(two) == rows_of(third)
+
+
+def test_another_seed_gives_other_rows():
+    work = [world_cells(loss.cases(Plan(method="joint", seed=seed, worlds=2, seconds=1.0)))[0] for seed in (3, 4)]
+    first, second = (cell.function(cell.argument) for cell in work)
+    assert first.squared_m2 != second.squared_m2
+
+
+def test_results_stand_in_the_order_of_the_cells():
+    assert run_cells(cells(double, range(7)), lambda share: None, 2) == [0, 2, 4, 6, 8, 10, 12]
+
+
+def test_a_process_that_dies_is_told():
+    with pytest.raises(SkylessError, match="a process of the study died"):
+        run_cells(cells(die, range(4)), lambda share: None, 2)
+
+
+def test_a_worker_of_a_cluster_that_dies_is_told(cluster):
+    with pytest.raises(SkylessError, match="the cluster failed, nothing was written"):
+        run_cells_on_dask(cells(die, [1]), lambda share: None, cluster.scheduler_address)
+
+
+def test_what_a_cell_raises_comes_through(cluster):
+    with pytest.raises(ValueError, match="cell 0 has gone wrong"):
+        run_cells(cells(fail, [0]), lambda share: None, 1)
+    with pytest.raises(SkylessError, match="cell 0 has gone wrong"):
+        run_cells_on_dask(cells(fail, [0]), lambda share: None, cluster.scheduler_address)
+
+
+@pytest.mark.parametrize("address", ["nowhere", "tcp://", "127.0.0.1", "tcp://127.0.0.1:x"])
+def test_what_is_no_address_is_told(address):
+    with pytest.raises(SkylessError, match=r"--scheduler is .* it should be an address"):
+        run_cells_on_dask(cells(double, [1]), lambda share: None, address)
+
+
+def test_a_scheduler_without_workers_is_told():
+    with (
+        LocalCluster(n_workers=0, dashboard_address=None, protocol="tcp") as empty,
+        pytest.raises(SkylessError, match="has no workers"),
+    ):
+        run_cells_on_dask(cells(double, [1]), lambda share: None, empty.scheduler_address)
+
+
+def test_a_scheduler_that_dies_is_told(tmp_path):
+    dask, told = [sys.executable, "-m", "distributed.cli.dask_scheduler"], tmp_path / "scheduler.json"
+    scheduler = subprocess.Popen([*dask, "--port", "0", "--no-dashboard", "--scheduler-file", str(told)])
+    work = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(told), "--no-nanny"]
+    wait_for(told.exists)
+    worker = subprocess.Popen([*work, "--no-dashboard"])
+    address = wait_for(lambda: json.loads(told.read_text())["address"])
+    try:
+        wait_for(lambda: has_workers(address))
+        with pytest.raises(SkylessError, match="the scheduler has gone"):
+            run_cells_on_dask(cells(time.sleep, [600.0]), lambda share: scheduler.kill(), address)
+    finally:
+        for process in (scheduler, worker):
+            process.kill()
+            process.wait()
+
+
+def has_workers(address):
+    with Client(address, set_as_default=False) as client:
+        return client.scheduler_info()["workers"]
+
+
+def test_an_interrupt_ends_cells_that_would_last_for_minutes():
+    def interrupt(share):
+        raise KeyboardInterrupt
+
+    begun_s = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        run_cells(cells(rest, [600.0, 600.0]), interrupt, 2)
+    assert time.monotonic() - begun_s < 60.0
+
+
+def test_processes_end_with_the_one_that_started_them(tmp_path):
+    """Killed without a word, it leaves nobody behind."""
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import test_study_runner as t\n"
+        "if __name__ == '__main__': t.run_cells(t.cells(t.tell_and_rest, [1.0, 2.0]), lambda share: None, 2)\n"
+    )
+    script = tmp_path / "parent.py"
+    script.write_text(code)
+    environment = {**os.environ, "TOLD": str(tmp_path)}
+    parent = subprocess.Popen([sys.executable, str(script), str(Path(__file__).parent)], env=environment)
+    pids = wait_for(lambda: found if len(found := list(tmp_path.glob("*.pid"))) == 2 else None)
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: not any(alive(int(path.stem)) for path in pids))
+
+
+def tell_and_rest(seconds):
+    (Path(os.environ["TOLD"]) / f"{os.getpid()}.pid").touch()
+    time.sleep(600.0)
+
+
+def alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait_for(condition, patience_s=60.0):
+    end_s = time.monotonic() + patience_s
+    while not (result := condition()):
+        assert time.monotonic() < end_s, "in vain"
+        time.sleep(0.05)
+    return result
