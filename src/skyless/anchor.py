@@ -14,13 +14,13 @@ from skyless.air.almanac import Page
 from skyless.air.beacon import Beacon, Heard, MasterTime
 from skyless.air.codec import decode_cached, encode, heard_capacity
 from skyless.air.malformed import Malformed
-from skyless.air.master_term import Claim
+from skyless.air.master_term import MasterTerm
 from skyless.air.reception import Reception, Transmission
 from skyless.clocks.filter import ClockFilter, clock_noise
 from skyless.clocks.site_clock import SiteClock
 from skyless.clocks.site_time import SUBTICKS
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.master_election import Role, Succession, Verdict
+from skyless.master_election import MasterElection, Role, Verdict
 from skyless.site.almanac_sending import almanac_issue, page_for, pages_of
 from skyless.site.model import AnchorSite, Site
 from skyless.site.slots import first_slots, schedule_of
@@ -69,7 +69,7 @@ class Anchor:
         self._pages: tuple[Page, ...] = pages_of(site)
         self._issue = almanac_issue(self._pages)
         self._own_ticks = Unwrapper()
-        self._succession = Succession(site, anchor_id, self._schedule)
+        self._succession = MasterElection(site, anchor_id, self._schedule)
         self._clock = SiteClock(_filter_of(site), self._schedule, self.counters)
         self._master_heard: Heard | None = None
         self._heard: dict[int, tuple[Heard, int]] = {}
@@ -176,7 +176,7 @@ class Anchor:
     def _beacon(self, tx_ticks: int, superframe: int, slot: int) -> Beacon:
         superframe &= 0xFFFFFFFF  # as the frame shows it: whoever reads it can tell the page
         page = page_for(self._pages, superframe, slot)
-        claim = self._succession.claim or Claim(0, self.id)
+        claim = self._succession.claim or MasterTerm(0, self.id)
         room = heard_capacity(master_heard=self._master_heard is not None, master_time=True, page=True)
         return Beacon(
             site=self._site.id,

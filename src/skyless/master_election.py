@@ -4,7 +4,7 @@ from enum import StrEnum
 from typing import Final
 
 from skyless.air.beacon import Beacon
-from skyless.air.master_term import TERMS, Claim, Sightings, claim_of, is_newer
+from skyless.air.master_term import TERMS, Confirmations, MasterTerm, is_newer, master_term_of
 from skyless.clocks.watch import MasterWatch
 from skyless.site.model import Site
 from skyless.site.slots import Schedule
@@ -23,7 +23,7 @@ LISTENING_TICKS: Final = from_seconds(0.5)
 LISTENING_STEP_TICKS: Final = from_seconds(0.25)
 """The others listen so long, and so much longer each; on slow sites 8 superframes, and 4 more each."""
 
-SIGHTINGS_WITHIN_SUPERFRAMES: Final = 16
+CONFIRMED_WITHIN_SUPERFRAMES: Final = 16
 """A newer claim is believed when it is heard twice within this."""
 
 
@@ -52,13 +52,13 @@ class Verdict(StrEnum):
     OTHER = "other"
 
 
-class Succession:
+class MasterElection:
     """Follows the claims that are heard. Times are the own counter's, unwrapped."""
 
     def __init__(self, site: Site, anchor_id: int, schedule: Schedule) -> None:
         order = [site.master, *(anchor.id for anchor in site.anchors if anchor.id != site.master)]
         self.role = Role.LISTENING
-        self.claim: Claim | None = None
+        self.claim: MasterTerm | None = None
         """The last one that was believed; that of the anchor itself while it is the master."""
         self._own = anchor_id
         self._place = {anchor: place for place, anchor in enumerate(order)}
@@ -67,12 +67,12 @@ class Succession:
         self._watch = MasterWatch()
         self._heard_ticks: dict[int, int] = {}
         self._waits_from_ticks: int | None = None
-        self._sightings = Sightings()
+        self._sightings = Confirmations()
         self._sent_ticks = 0
 
     def hear(self, beacon: Beacon, rx_ticks: int) -> Verdict:
         """Take what a beacon of another anchor of the site says of the master."""
-        claim, from_claimant = claim_of(beacon), beacon.anchor == beacon.master
+        claim, from_claimant = master_term_of(beacon), beacon.anchor == beacon.master
         self._heard_ticks[beacon.anchor] = rx_ticks
         if claim.master not in self._place:
             return Verdict.STRANGE
@@ -89,12 +89,12 @@ class Succession:
             return self._hear_stale(claim, rx_ticks) if from_claimant else Verdict.STALE
         self._waits_from_ticks = rx_ticks
         if from_claimant or self.role is Role.MASTER:
-            within = SIGHTINGS_WITHIN_SUPERFRAMES * self._superframe
+            within = CONFIRMED_WITHIN_SUPERFRAMES * self._superframe
             if self._sightings.again(claim, rx_ticks, within):
                 return self._depose(claim, from_claimant, rx_ticks)
         return Verdict.OTHER
 
-    def _hear_stale(self, claim: Claim, rx_ticks: int) -> Verdict:
+    def _hear_stale(self, claim: MasterTerm, rx_ticks: int) -> Verdict:
         """A master of an older claim is better than none: a follower does not take over, and follows it in the end."""
         if self.role is Role.MASTER:
             return Verdict.STALE
@@ -103,7 +103,7 @@ class Succession:
             return Verdict.STALE
         return self._follow(claim, rx_ticks, Verdict.FROM_FIRST_MASTER)
 
-    def _depose(self, claim: Claim, from_claimant: bool, rx_ticks: int) -> Verdict:
+    def _depose(self, claim: MasterTerm, from_claimant: bool, rx_ticks: int) -> Verdict:
         """Leave the present master, or the own role, for a newer claim; one known by hearsay is yet to be heard."""
         if not from_claimant:
             self.role, self.claim = Role.LISTENING, claim
@@ -111,12 +111,12 @@ class Succession:
         was_master = self.role is Role.MASTER
         return self._follow(claim, rx_ticks, Verdict.FROM_FIRST_MASTER if was_master else Verdict.FROM_NEW_MASTER)
 
-    def _follow(self, claim: Claim, rx_ticks: int, verdict: Verdict) -> Verdict:
+    def _follow(self, claim: MasterTerm, rx_ticks: int, verdict: Verdict) -> Verdict:
         self.role, self.claim = Role.FOLLOWER, claim
         self._watch.begin(rx_ticks)
         return verdict
 
-    def _is_newer(self, claim: Claim) -> bool:
+    def _is_newer(self, claim: MasterTerm) -> bool:
         assert self.claim is not None
         if claim.term == self.claim.term:
             return self._place[claim.master] < self._place[self.claim.master]
@@ -167,7 +167,7 @@ class Succession:
     def lead(self, now_ticks: int) -> None:
         """Become the master, in a term of its own."""
         term = 0 if self.claim is None else (self.claim.term + 1) % TERMS
-        self.role, self.claim = Role.MASTER, Claim(term, self._own)
+        self.role, self.claim = Role.MASTER, MasterTerm(term, self._own)
         self._sent_ticks = now_ticks
 
     def sent(self, tx_ticks: int) -> None:

@@ -19,12 +19,12 @@ from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.integrity import IntegrityRequirement
-from skyless.positioning.methods.factory import Wanted, new_method
+from skyless.positioning.methods.factory import MethodOptions, new_method
 from skyless.positioning.methods.joint import Estimation
 from skyless.positioning.methods.nlos_weighting import variance_factor
 from skyless.positioning.methods.observations import Observer
 from skyless.positioning.observation import Method
-from skyless.site.almanac_gathering import AlmanacBook
+from skyless.site.almanac_gathering import AlmanacAssembly
 from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 
@@ -63,8 +63,8 @@ class Receiver:
             raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
-        self.almanac = AlmanacBook()
-        self._wanted = Wanted(method, qa, z_bounds_m, integrity or IntegrityRequirement())
+        self.almanac = AlmanacAssembly()
+        self._wanted = MethodOptions(method, qa, z_bounds_m, integrity or IntegrityRequirement())
         self._site = site
         self._may_change_site = site is None
         self._site_heard_ticks = 0
@@ -175,7 +175,7 @@ class Receiver:
             if rx_ticks - self._site_heard_ticks < SITE_SILENCE_TICKS:
                 return False
             self.counters["site-change"] += 1
-            self.almanac = AlmanacBook()
+            self.almanac = AlmanacAssembly()
             self._positions = {}
             self._forget_stamps()
         self._site, self._site_heard_ticks = site, rx_ticks
@@ -202,9 +202,9 @@ class Receiver:
         self._master = master
         self._observer.follow(master, book.slot_of(master) or 0)
         method_master = None if self._wanted.method in FILTERS else master
-        made_of = (book.issue, book.schedule, book.noise, book.accuracy, method_master)
-        if made_of != self._made_of:
-            self._made_of, self._method = made_of, None
+        method_key = (book.issue, book.schedule, book.noise, book.accuracy, method_master)
+        if method_key != self._made_of:
+            self._made_of, self._method = method_key, None
             if master is not None and book.schedule is not None and book.noise is not None:
                 schedule = schedule_from_page(book.schedule)
                 self._superframe_ticks = schedule.superframe_ticks

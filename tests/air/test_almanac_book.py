@@ -2,7 +2,7 @@ import msgspec
 import pytest
 
 from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
-from skyless.site.almanac_gathering import AlmanacBook
+from skyless.site.almanac_gathering import AlmanacAssembly
 from skyless.site.model import AccuracySite
 
 SCHEDULE = SchedulePage(2**27, 3, 1, 1, 3, 1.2)
@@ -18,14 +18,14 @@ MOVED = msgspec.structs.replace(ANCHORS[1], x_m=9.0)
 @pytest.fixture
 def book():
     """A book filled under issue 7."""
-    book = AlmanacBook()
+    book = AlmanacAssembly()
     for page in PAGES:
         book.hear(7, page)
     return book
 
 
 def test_fills_page_by_page():
-    book = AlmanacBook()
+    book = AlmanacAssembly()
     assert (book.issue, book.anchors_m, book.schedule, book.noise, book.georeference) == (None, {}, None, None, None)
     changes = []
     for page in (None, *ANCHORS, SCHEDULE, NOISE):
@@ -92,7 +92,7 @@ def test_page_heard_twice_replaces_the_first(book):
 
 
 def test_book_that_began_with_a_corrupt_frame_heals():
-    book = AlmanacBook()
+    book = AlmanacAssembly()
     book.hear(99, MOVED)
     for _ in range(2):
         for page in PAGES:
@@ -103,7 +103,7 @@ def test_book_that_began_with_a_corrupt_frame_heals():
 
 def test_accuracy_is_the_rooms_until_it_is_heard(book):
     assert book.complete
-    assert AlmanacBook().accuracy == book.accuracy == ROOM
+    assert AlmanacAssembly().accuracy == book.accuracy == ROOM
     assert book.hear(7, SURVEYED)
     assert book.accuracy == SURVEYED
     assert not book.hear(7, SURVEYED)

@@ -12,7 +12,7 @@ from skyless.air.reception import Reception, Transmission
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.firmware import link
-from skyless.nodes.emulation.board_protocol import LinkSpeech, SnifferSpeech
+from skyless.nodes.emulation.board_protocol import LinkProtocol, SnifferProtocol
 from skyless.radios.interface import Late, Restarted, Sent
 from skyless.radios.serial.link_records import Done, Hello, NotDone, Status, TooLate, decode
 from skyless.radios.serial.sniffer_radio import SnifferStream
@@ -44,7 +44,7 @@ class Host:
     def __init__(self, can_transmit=True):
         self.radio, self.said, self.full = Radio(), [], False
         self._reader, self.writer = link.Reader(), link.Writer()
-        self.board = LinkSpeech(self.radio, self._take, can_transmit=can_transmit)
+        self.board = LinkProtocol(self.radio, self._take, can_transmit=can_transmit)
 
     def _take(self, data):
         at = 0
@@ -167,7 +167,7 @@ def frames():
 @pytest.mark.parametrize("knows_binary", [True, False])
 def test_a_beacon_becomes_a_packet_of_a_tdoa3_system(knows_binary):
     out = bytearray()
-    speech = SnifferSpeech(lambda data: out.extend(data) is None, knows_binary=knows_binary)
+    speech = SnifferProtocol(lambda data: out.extend(data) is None, knows_binary=knows_binary)
     speech.hear_host(b"b")
     for frame in frames():
         speech.hear_radio(Reception(frame, 1))

@@ -15,7 +15,7 @@ from node_stage import receptions
 
 from skyless.air.codec import decode
 from skyless.errors import SkylessError
-from skyless.nodes.latency import Latencies, PhaseBook
+from skyless.nodes.latency import Latencies, PhaseLog
 from skyless.nodes.process.folders import data_folder, new_recording, recordings_folder
 from skyless.nodes.process.running import every, together
 from skyless.nodes.process.usage import Usage, resident_bytes
@@ -53,7 +53,7 @@ def test_latencies_keep_the_newest_of_many():
 
 
 def test_the_book_of_phases_shows_the_last_whole_superframe():
-    book = PhaseBook()
+    book = PhaseLog()
     heard = receptions(0.2)
     for number, reception in enumerate(heard):
         book.hear(reception.frame, reception.host_s, reception.host_s + 1e-4, made_fix=number % 2 == 0)
@@ -71,7 +71,7 @@ def test_the_book_of_phases_shows_the_last_whole_superframe():
 
 
 def test_the_book_does_not_grow_while_one_superframe_goes_on_for_ever():
-    book = PhaseBook()
+    book = PhaseLog()
     first, *_ = receptions(0.1)
     for _ in range(1000):
         book.hear(first.frame, 0.0, 0.0, made_fix=False)

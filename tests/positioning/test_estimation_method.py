@@ -19,7 +19,7 @@ from estimator_builders import (
 )
 from msgspec.structs import replace
 
-from skyless.air.master_term import Claim
+from skyless.air.master_term import MasterTerm
 from skyless.constants import TICK_M, TICK_RATE_HZ
 from skyless.positioning.estimator.kinds import SUBTICKS
 from skyless.positioning.fix import Fix, NoFixReason
@@ -331,7 +331,7 @@ def packet(anchor, own_ticks, site_subticks, claim):
 
 def test_a_master_may_lead_the_sites_time_at_another_rate_than_its_own():
     """As one does that took over; the first packets of its term say at which."""
-    scale, claim = MasterScale(), Claim(3, 7)
+    scale, claim = MasterScale(), MasterTerm(3, 7)
     step, lead = 958_482_000, 1.0 + 17e-6
     own = [5_000 + k * step for k in range(4)]
     site = [123_456_789_012 + round(t * lead * SUBTICKS) for t in own]
@@ -342,7 +342,7 @@ def test_a_master_may_lead_the_sites_time_at_another_rate_than_its_own():
     for ticks, subticks in zip(own[1:], site[1:], strict=True):
         scale.hear(packet(7, ticks, subticks, claim))
     assert abs(scale.difference(other) - (77 - at) * SUBTICKS % MODULO) <= 3
-    assert scale.difference(replace(other, claim=Claim(4, 7))) is None
+    assert scale.difference(replace(other, claim=MasterTerm(4, 7))) is None
     scale.hear(packet(7, own[3] + step, site[3] + 3 * step, claim))
     assert scale.difference(replace(other, tx_ticks_master=other.tx_ticks_master + step)) is None
 
@@ -388,7 +388,7 @@ def test_reports_help_where_most_packets_are_lost():
         episode = episode_of(replace(PLAIN, qa=0.3), 300, seed)
         keep = np.random.default_rng(seed + 50).random(len(episode.path_m)) >= 0.85
         keep[:30] = True
-        told = list(with_site_time(episode.packets, Claim(1, 0)))
+        told = list(with_site_time(episode.packets, MasterTerm(1, 0)))
         silent = [replace(o, claim=None, tx_variance_m2=0.0, tx_ticks_master=None) for o in told]
         for k, observations in enumerate((silent, told)):
             method = Estimation(settings_of(replace(PLAIN, qa=0.3)))

@@ -5,7 +5,7 @@ from collections import Counter
 
 from radio_ears import ears
 
-from skyless.nodes.emulation.board_protocol import LinkSpeech
+from skyless.nodes.emulation.board_protocol import LinkProtocol
 from skyless.nodes.process.pty import Pty
 from skyless.radios.interface import Restarted
 from skyless.radios.serial.serial_radio import SerialRadio
@@ -31,7 +31,7 @@ class PlayedBoard:
     def __init__(self, link=None, can_transmit=True):
         self.radio = PlayedRadio()
         self.pty = Pty(link)
-        self.speech = LinkSpeech(self.radio, self.pty.send, can_transmit=can_transmit)
+        self.speech = LinkProtocol(self.radio, self.pty.send, can_transmit=can_transmit)
 
     async def __aenter__(self):
         self.pty.start(self.speech.hear_host)

@@ -12,7 +12,7 @@ from radio_ears import ears
 from skyless.air.reception import Reception, Transmission
 from skyless.constants import TICK_RATE_HZ
 from skyless.errors import SkylessError
-from skyless.nodes.emulation.ether_clients import Guest
+from skyless.nodes.emulation.ether_clients import Client
 from skyless.nodes.open_radio import host_and_port, is_simulated, open_radios
 from skyless.radios.emulated.ether_wire import Join, Joined, Refused, Send, Unpacker, from_ether, pack
 from skyless.radios.interface import Gone, Late, Restarted, Sent
@@ -31,7 +31,7 @@ class OpenAir:
 
     async def __aenter__(self):
         def guest():
-            self.guests.append(Guest(self.ether))
+            self.guests.append(Client(self.ether))
             return self.guests[-1]
 
         self._server = await asyncio.get_running_loop().create_server(guest, HOST, self.port)

@@ -17,7 +17,7 @@ from skyless.anchor import Anchor
 from skyless.errors import SkylessError
 from skyless.evaluation.scenarios import Request, impairments_of
 from skyless.firmware import link
-from skyless.nodes.emulation.board_protocol import ListenerSpeech
+from skyless.nodes.emulation.board_protocol import ListenerProtocol
 from skyless.nodes.open_radio import is_simulated, open_radios, open_sniffers
 from skyless.nodes.process.pty import Pty
 from skyless.radios.interface import AntennaDelays, Gone, Late, Restarted, Sent
@@ -77,7 +77,7 @@ def link_pair():
 class ListenerBoard(PlayedBoard):
     def __init__(self):
         super().__init__()
-        self.speech = ListenerSpeech(self.pty.send)
+        self.speech = ListenerProtocol(self.pty.send)
 
 
 def listener_pair():

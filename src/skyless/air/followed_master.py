@@ -3,10 +3,10 @@
 from typing import Final
 
 from skyless.air.beacon import Beacon
-from skyless.air.master_term import Claim, Sightings, claim_of, is_newer
+from skyless.air.master_term import Confirmations, MasterTerm, is_newer, master_term_of
 from skyless.ticks import from_seconds
 
-SIGHTINGS_WITHIN_TICKS: Final = from_seconds(0.5)
+CONFIRMED_WITHIN_TICKS: Final = from_seconds(0.5)
 """A newer term is believed when it is heard twice so soon."""
 
 OLDER_AFTER_TICKS: Final = from_seconds(0.5)
@@ -17,9 +17,9 @@ class FollowedMaster:
     """The claim that a listener goes by."""
 
     def __init__(self) -> None:
-        self.claim: Claim | None = None
+        self.claim: MasterTerm | None = None
         self._heard_ticks = 0
-        self._sightings = Sightings()
+        self._sightings = Confirmations()
 
     @property
     def master(self) -> int | None:
@@ -37,12 +37,12 @@ class FollowedMaster:
         if present is not None and beacon.term == present.term and beacon.master == present.master:
             self._heard_ticks = rx_ticks
             return True
-        claim = claim_of(beacon)
+        claim = master_term_of(beacon)
         if self.claim is None:
             self.claim, self._heard_ticks = claim, rx_ticks
             return True
         if is_newer(claim.term, self.claim.term):
-            if self._sightings.again(claim, rx_ticks, SIGHTINGS_WITHIN_TICKS):
+            if self._sightings.again(claim, rx_ticks, CONFIRMED_WITHIN_TICKS):
                 self.claim, self._heard_ticks = claim, rx_ticks
             return True
         patience = max(OLDER_AFTER_TICKS, 3 * superframe_ticks)

@@ -9,16 +9,16 @@ from skyless.air.beacon import Beacon
 TERMS: Final = 256
 
 
-class Claim(Struct, frozen=True, gc=False):
+class MasterTerm(Struct, frozen=True, gc=False):
     """The master that an anchor follows, and the term: how often the role has changed hands, modulo 256."""
 
     term: int
     master: int
 
 
-def claim_of(beacon: Beacon) -> Claim:
+def master_term_of(beacon: Beacon) -> MasterTerm:
     """Return what a beacon says of the master."""
-    return Claim(beacon.term, beacon.master)
+    return MasterTerm(beacon.term, beacon.master)
 
 
 def is_newer(term: int, other: int) -> bool:
@@ -26,13 +26,13 @@ def is_newer(term: int, other: int) -> bool:
     return 0 < (term - other) % TERMS < TERMS // 2
 
 
-class Sightings:
+class Confirmations:
     """Claims heard once, so that two frames are needed: one corrupted past its FCS makes no new master."""
 
     def __init__(self) -> None:
-        self._seen: dict[Claim, int] = {}
+        self._seen: dict[MasterTerm, int] = {}
 
-    def again(self, claim: Claim, rx_ticks: int, within_ticks: int) -> bool:
+    def again(self, claim: MasterTerm, rx_ticks: int, within_ticks: int) -> bool:
         """Take a claim; whether it was heard before, no longer ago than that."""
         self._seen = {other: ticks for other, ticks in self._seen.items() if 0 < rx_ticks - ticks < within_ticks}
         again = claim in self._seen

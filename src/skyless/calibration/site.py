@@ -37,7 +37,7 @@ class _Heard(Struct, frozen=True):
     unix_s: float
 
 
-class SiteEars:
+class SiteListener:
     """One tag's receptions, as they come, to time differences against the master."""
 
     def __init__(self, site: int) -> None:
@@ -92,7 +92,7 @@ class SiteEars:
 
 def site_tdoas(recording: McapRecording, tags: Sequence[str], site: int, drops: Counter[str]) -> Iterator[PairTdoa]:
     """All time differences of some tags under the first master that was heard; those under others are counted."""
-    ears = {tag: SiteEars(site) for tag in tags}
+    ears = {tag: SiteListener(site) for tag in tags}
     master: int | None = None
     for found in recording.messages({"receptions"}):
         if found.place.name not in ears:

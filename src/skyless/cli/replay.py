@@ -18,7 +18,7 @@ from skyless.cli.common.options import (
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import progress_bar, status
 from skyless.cli.replay_input import flight_height, height_to_hold, known_anchors, known_truth
-from skyless.cli.replay_output import draw_track, fix_writer, see_that_it_can_be_drawn, show
+from skyless.cli.replay_output import check_plot_path, draw_track, fix_writer, show
 from skyless.cli.replay_site import Options, is_mcap, replay_site, see_that_they_are_left_out
 from skyless.errors import ConfigurationError, SkylessError
 
@@ -132,7 +132,7 @@ def replay(
 
     spare_inputs("fixes", fixes, file, anchors, site, truth)
     spare_inputs("plot", plot, file, anchors, site, truth, fixes)
-    see_that_it_can_be_drawn(plot)
+    check_plot_path(plot)
     if is_mcap(file):
         useless = {
             "--anchors": anchors, "--truth": truth, "--lever-arm": lever_arm, "--format": format,

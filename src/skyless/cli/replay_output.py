@@ -33,7 +33,7 @@ def fix_writer(stack: ExitStack, path: Path) -> "Callable[[Fix], None]":
     return lambda fix: writer.writerow(row_of(fix))
 
 
-def see_that_it_can_be_drawn(plot: Path | None) -> None:
+def check_plot_path(plot: Path | None) -> None:
     """Look at the option --plot before the long work, not after it. Raises SkylessError."""
     if plot is None:
         return

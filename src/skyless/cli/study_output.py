@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from skyless.cli.common.output import console, print_json, to_json, write_atomically
-from skyless.cli.replay_output import see_that_it_can_be_drawn
+from skyless.cli.replay_output import check_plot_path
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ _FIGURES: Final = {
 
 def see_that_it_can_be_written(plot: Path | None, out: Path | None) -> None:
     """Look at --plot and --out before the long work, not after it. Raises SkylessError."""
-    see_that_it_can_be_drawn(plot)
+    check_plot_path(plot)
     if out is None:
         return
     if out.exists() and not out.is_dir():

@@ -15,7 +15,7 @@ from skyless.mqtt.messages import (
     TruthMessage,
     Vector,
 )
-from skyless.mqtt.truth_buffer import Truths
+from skyless.mqtt.truth_buffer import TruthBuffer
 from skyless.positioning.integrity import Alert
 
 MOST_NAMES: Final = 2000
@@ -48,7 +48,7 @@ class Board:
         self.unix_s = 0.0
         """What a ``state`` says of its time; whoever keeps the board sets it."""
         self._tags: dict[str, _Tag] = {}
-        self._truths = Truths()
+        self._truths = TruthBuffer()
         self._healths: dict[tuple[str, str], tuple[float, TagHealth | AnchorHealth | EtherHealth]] = {}
         self._encoded: dict[tuple[int, int], bytes] = {}
 

@@ -7,7 +7,7 @@ from skyless.receiver import Receiver
 from skyless.simulation.impairments import Outage
 
 
-class DeafReceiver(Receiver):
+class ReceiverWithOutages(Receiver):
     """Counts what it would have heard while deaf as dropped; unlike after an outage, its counter has gone on."""
 
     def __init__(

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike, NDArray
 
 from skyless.evaluation.fleet import Fleet, FleetSettings
-from skyless.evaluation.receiver_with_outages import DeafReceiver
+from skyless.evaluation.receiver_with_outages import ReceiverWithOutages
 from skyless.evaluation.room_world import Room, displacements, wanderer
 from skyless.method_names import DEFAULT_METHOD
 from skyless.positioning.integrity import IntegrityRequirement
@@ -87,7 +87,7 @@ def fleet_of(request: Request) -> Fleet:
     fleet = Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, settings)
     if request.silences:
         fleet.receivers = [
-            DeafReceiver(request.method, qa=request.qa, integrity=request.integrity, silences=request.silences)
+            ReceiverWithOutages(request.method, qa=request.qa, integrity=request.integrity, silences=request.silences)
             for _ in fleet.receivers
         ]
     return fleet

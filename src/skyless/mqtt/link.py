@@ -20,7 +20,7 @@ from skyless.mqtt.connection import Connection, Reactions, RefusedError
 from skyless.mqtt.messages import Counters, StatusMessage
 from skyless.mqtt.outbox import Limits, Outbox
 from skyless.mqtt.paho_client import Introduction, Will
-from skyless.mqtt.subscriptions import Handler, Routes
+from skyless.mqtt.subscriptions import Handler, Subscriptions
 from skyless.mqtt.topics import status_topic
 
 _log = logging.getLogger("skyless.mqtt")
@@ -74,7 +74,7 @@ class Link:
         self._status_topic = status_topic(site, kind, name)
         self._offline = StatusMessage(online=False, kind=kind, name=str(name))
         self._outbox = Outbox(limits or Limits())
-        self._routes = Routes()
+        self._routes = Subscriptions()
         self._reactions = Reactions(self._routes.receive, self._acknowledged, self._pump)
         self._connection: Connection | None = None
         self._reconnects = -1

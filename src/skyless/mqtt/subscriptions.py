@@ -14,7 +14,7 @@ _log = logging.getLogger("skyless.mqtt")
 _MOST_TOPICS: Final = 10_000
 
 
-class Routes:
+class Subscriptions:
     """The handlers of one link; those of each topic are looked for once."""
 
     def __init__(self) -> None:

@@ -11,7 +11,7 @@ REACH_S: Final = 0.25
 _KEPT: Final = 64
 
 
-class Truths:
+class TruthBuffer:
     """The newest messages of an ether."""
 
     def __init__(self) -> None:

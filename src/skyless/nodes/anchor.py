@@ -88,7 +88,7 @@ class AnchorNode:
             self._said(f"anchor {self.id}: {event.text}")
 
     def look(self, now_s: float) -> None:
-        """Say where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
+        """Log where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
         counters = self.machine.counters
         drops = Counter({reason: count for reason, count in counters.items() if reason not in _NOT_DROPS})
         self._hearing.look(now_s, self._came, counters["heard"], drops + self.radio.counters)

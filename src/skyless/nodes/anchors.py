@@ -11,7 +11,7 @@ from skyless.mqtt.link import Link
 from skyless.mqtt.messages import AnchorHealth, Counters, SiteMessage
 from skyless.mqtt.topics import floor_plan_topic, health_topic, site_topic
 from skyless.nodes.anchor import AnchorNode
-from skyless.nodes.process.running import HEALTH_S, AskedAgain, Say, every, keep, link_of, together
+from skyless.nodes.process.running import HEALTH_S, AskedAgain, Log, every, keep, link_of, together
 from skyless.radios.interface import Radio
 from skyless.site.model import Site
 
@@ -30,7 +30,7 @@ class Anchors:
         site: Site,
         radios: Sequence[Radio],
         address: MqttAddress | None,
-        say: Say,
+        say: Log,
         *,
         simulated: Callable[[], bool],
         floor_plan: Path | None = None,

@@ -13,7 +13,7 @@ from skyless.nodes.broker.broker import Broker, start_broker
 from skyless.nodes.broker.settings import BrokerSettings
 from skyless.nodes.process.children import Child, Program
 from skyless.nodes.process.ports import claim_next, hold_any
-from skyless.nodes.process.running import Say, outlasting, together
+from skyless.nodes.process.running import Log, outlasting, together
 from skyless.nodes.watch import Watch
 from skyless.positioning.integrity import RISK, IntegrityRequirement
 from skyless.site.model import Site
@@ -49,7 +49,7 @@ class SiteRun(Struct, frozen=True):
 class WholeSite:
     """Starts everything and keeps it alive; ``ready`` is set when the watch is connected."""
 
-    def __init__(self, asked: SiteRun, say: Say) -> None:
+    def __init__(self, asked: SiteRun, say: Log) -> None:
         self._asked, self._say = asked, say
         self.ether_port, self._ether_held = hold_any(HOST)
         self.page_port, self._page_claim = claim_next(HOST, PAGE_PORT)

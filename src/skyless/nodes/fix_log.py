@@ -12,7 +12,7 @@ from skyless.positioning.fix import Fix
 FixListener = Callable[[FixMessage], None]
 
 
-class FixBook:
+class FixLog:
     """Numbers, times and publishes the fixes of one tag, from the first one on, whatever its radio does."""
 
     def __init__(self, tag: str, publish: FixListener, publish_hz: float) -> None:

@@ -6,7 +6,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.nodes.process.running import Say
+from skyless.nodes.process.running import Log
 
 LOOK_S: Final = 5.0
 """So long is a node without anything of use before it says so."""
@@ -40,7 +40,7 @@ class _Counts(Struct, frozen=True):
 class Hearing:
     """Watches one node's counts. ``advice`` is asked of the radio when nothing at all has come from it."""
 
-    def __init__(self, who: str, say: Say, advice: Callable[[], str]) -> None:
+    def __init__(self, who: str, say: Log, advice: Callable[[], str]) -> None:
         self._who, self._say, self._advice = who, say, advice
         self._present = False
         self._since: _Counts | None = None
@@ -56,7 +56,7 @@ class Hearing:
         self._present = False
 
     def look(self, now_s: float, came: int, used: int, reasons: Mapping[str, int]) -> None:
-        """Say where to look if for ``LOOK_S`` nothing was of use; to be called every second or so.
+        """Log where to look if for ``LOOK_S`` nothing was of use; to be called every second or so.
 
         ``came`` and ``used`` count frames, ``reasons`` what could not be used; all since ``begin`` or before.
         """

@@ -30,7 +30,7 @@ class Latencies:
         return ordered[len(ordered) // 2], ordered[min(len(ordered) - 1, (99 * len(ordered)) // 100)], len(ordered)
 
 
-class PhaseBook:
+class PhaseLog:
     """What was heard and computed in the present superframe and in the last whole one."""
 
     def __init__(self) -> None:

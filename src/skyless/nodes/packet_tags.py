@@ -13,9 +13,9 @@ from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import Counters, FixMessage, SiteMessage
 from skyless.mqtt.topics import fix_topic, health_topic, site_topic
-from skyless.nodes.fix_log import FixBook, FixListener
+from skyless.nodes.fix_log import FixListener, FixLog
 from skyless.nodes.hearing import Hearing
-from skyless.nodes.process.running import HEALTH_S, AskedAgain, Say, every, keep, link_of, together
+from skyless.nodes.process.running import HEALTH_S, AskedAgain, Log, every, keep, link_of, together
 from skyless.nodes.process.usage import Usage
 from skyless.positioning.masterless.calibration import DifferenceCalibration
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
@@ -58,11 +58,11 @@ def site_of(settings: PacketTagSettings) -> Site | None:
 class PacketTagNode:
     """Runs ``PacketTracking`` on a sniffer. ``publish`` is given the fixes that are to be published."""
 
-    def __init__(self, settings: PacketTagSettings, radio: SnifferRadio, publish: FixListener, said: Say) -> None:
+    def __init__(self, settings: PacketTagSettings, radio: SnifferRadio, publish: FixListener, said: Log) -> None:
         self.settings, self.radio = settings, radio
         self.tracking = self._new_tracking()
         self.packets = self.restarts = 0
-        self.book = FixBook(radio.name, publish, settings.publish_hz)
+        self.book = FixLog(radio.name, publish, settings.publish_hz)
         self._drops: Counter[str] = Counter()
         self._said = said
         self._known = 0
@@ -81,7 +81,7 @@ class PacketTagNode:
         return self._drops + self.tracking.drops + self.radio.counters
 
     def look(self, now_s: float) -> None:
-        """Say where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
+        """Log where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
         self._hearing.look(now_s, self.packets, self._known, self.counters)
 
     async def run(self) -> None:
@@ -120,7 +120,7 @@ class PacketTags:
         settings: PacketTagSettings,
         radios: Sequence[SnifferRadio],
         address: MqttAddress | None,
-        say: Say,
+        say: Log,
         *,
         simulated: Callable[[], bool],
     ) -> None:

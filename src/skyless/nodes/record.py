@@ -17,7 +17,7 @@ from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage
 from skyless.mqtt.topics import request_topic, site_topic
-from skyless.nodes.process.running import Say, every
+from skyless.nodes.process.running import Log, every
 from skyless.recordings.mcap.file import McapFile
 from skyless.recordings.mcap.reception_log import EVERY_TAG
 from skyless.recordings.mcap.recorder import McapRecorder
@@ -51,7 +51,7 @@ class RecorderState(Struct, frozen=True):
 class RecorderNode:
     """Records one site until cancelled, or until the file cannot be written any more."""
 
-    def __init__(self, file: McapFile, address: MqttAddress, site: int, say: Say) -> None:
+    def __init__(self, file: McapFile, address: MqttAddress, site: int, say: Log) -> None:
         self.file = file
         self.recorder = McapRecorder(file)
         self._name, self._lock = _own_name(site)

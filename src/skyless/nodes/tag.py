@@ -8,9 +8,9 @@ from msgspec import Struct
 
 from skyless.air.reception import Reception
 from skyless.method_names import DEFAULT_METHOD
-from skyless.nodes.fix_log import FixBook, FixListener
+from skyless.nodes.fix_log import FixListener, FixLog
 from skyless.nodes.hearing import Hearing
-from skyless.nodes.latency import PhaseBook
+from skyless.nodes.latency import PhaseLog
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.radios.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.receiver import NOT_DROPS, Receiver
@@ -45,8 +45,8 @@ class TagNode:
         self.name = radio.name
         self.receiver = self.new_receiver()
         self.receptions = self.restarts = 0
-        self.book = FixBook(self.name, publish, settings.publish_hz)
-        self.phases = PhaseBook()
+        self.book = FixLog(self.name, publish, settings.publish_hz)
+        self.phases = PhaseLog()
         self._said, self._before = said, before
         self._hearing = Hearing(f"tag {self.name}", said, radio.advice)
 
@@ -64,7 +64,7 @@ class TagNode:
         return Counter({reason: count for reason, count in heard if reason not in NOT_DROPS}) + self.radio.counters
 
     def look(self, now_s: float) -> None:
-        """Say where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
+        """Log where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
         self._hearing.look(now_s, self.receptions, self.receiver.counters["heard"], self.drops)
 
     async def run(self) -> None:

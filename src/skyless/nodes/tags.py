@@ -12,7 +12,7 @@ from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import Counters, FixMessage, RequestMessage, TagHealth
 from skyless.mqtt.topics import fix_topic, health_topic, receptions_topic, request_topic
-from skyless.nodes.process.running import HEALTH_S, Say, every, keep, together
+from skyless.nodes.process.running import HEALTH_S, Log, every, keep, together
 from skyless.nodes.process.usage import Usage
 from skyless.nodes.tag import TagNode, TagSettings
 from skyless.radios.interface import Radio
@@ -25,7 +25,7 @@ _decode_request: Final = msgspec.json.Decoder(RequestMessage).decode
 class Tag:
     """A tag and its link, which comes about once the tag's site is known, and anew in another site."""
 
-    def __init__(self, settings: TagSettings, radio: Radio, address: MqttAddress | None, say: Say) -> None:
+    def __init__(self, settings: TagSettings, radio: Radio, address: MqttAddress | None, say: Log) -> None:
         self._address, self._say = address, say
         self.link: Link | None = None
         self._site: int | None = None
@@ -107,7 +107,7 @@ class Tag:
 class Tags:
     """The tags of one process."""
 
-    def __init__(self, settings: TagSettings, radios: Sequence[Radio], address: MqttAddress | None, say: Say) -> None:
+    def __init__(self, settings: TagSettings, radios: Sequence[Radio], address: MqttAddress | None, say: Log) -> None:
         self.tags = tuple(Tag(settings, radio, address, say) for radio in radios)
         self._usage = Usage()
 

@@ -12,7 +12,7 @@ from skyless.evaluation.statistics import ErrorStatistics
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, TagHealth, TruthMessage, Vector
 from skyless.mqtt.topics import EVERY_NODE, fix_topic, health_topic, truth_topic
-from skyless.mqtt.truth_buffer import Truths
+from skyless.mqtt.truth_buffer import TruthBuffer
 from skyless.nodes.latency import Latencies
 from skyless.positioning.integrity import Alert
 
@@ -62,7 +62,7 @@ class Watch:
         """From there to the computed fix, as the tags say."""
         self.wrong = 0
         """Messages that could not be read."""
-        self._truths = Truths()
+        self._truths = TruthBuffer()
         for topic, kind, take in (
             (fix_topic(site, EVERY_NODE), FixMessage, self._take_fix),
             (truth_topic(site), TruthMessage, self._truths.add),

@@ -20,8 +20,8 @@ from skyless.positioning.masterless.difference_tracking import DIFFERENCES, Diff
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.positioning.masterless.pair_engine import PairEngine
 from skyless.recordings.foreign.formats import Recording, format_of, open_recording
-from skyless.replay.noise import NoiseBook, PairNoise
-from skyless.replay.pipelines import ByPackets, ByPairs, Way
+from skyless.replay.noise import NoiseByPair, PairNoise
+from skyless.replay.pipelines import ByPackets, ByPairs, ReplayPipeline
 
 PROFILES: Final[Mapping[str, EstimatorSettings]] = {
     "miluv": structs.replace(DIFFERENCES, qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),
@@ -103,8 +103,8 @@ class Replay:
         self._judge = judge
         self.measurements = self._measurements()
         self.recording: Recording = open_recording(request.path, request.format, request.listener)
-        self._noise = NoiseBook(judge, request.anchors_m)
-        self._way: Way = self._by_packets() if self.measurements == PACKETS else self._by_pairs()
+        self._noise = NoiseByPair(judge, request.anchors_m)
+        self._way: ReplayPipeline = self._by_packets() if self.measurements == PACKETS else self._by_pairs()
         self.receptions = 0
         self.fixes = 0
         self._first_s: float | None = None

@@ -30,7 +30,7 @@ class PairNoise(Struct, frozen=True):
     against_truth: bool
 
 
-class NoiseBook:
+class NoiseByPair:
     """Keeps an even sample of every pair's differences, less what the truth predicts where it is known."""
 
     def __init__(self, judge: Judge, anchors_m: Mapping[int, Point]) -> None:

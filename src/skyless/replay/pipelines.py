@@ -9,7 +9,7 @@ from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.masterless.difference_tracking import DifferenceTracking
 from skyless.positioning.masterless.packet_tracking import PacketTracking
 from skyless.positioning.masterless.pair_engine import PairEngine
-from skyless.replay.noise import NoiseBook
+from skyless.replay.noise import NoiseByPair
 
 Record = Packet | PairTdoa
 Triple = tuple[float, float, float]
@@ -19,7 +19,7 @@ SAMPLED_OF: Final = 1024
 """Of each 1024 packets the first 128 are made into time differences as well, to measure the recording's noise."""
 
 
-class Way(Protocol):
+class ReplayPipeline(Protocol):
     """What a replay asks of either."""
 
     def hear(self, record: Record) -> float | None:
@@ -54,7 +54,7 @@ class Way(Protocol):
 class ByPairs:
     """Time differences of pairs, ready or made of packets, and the filter of pairs."""
 
-    def __init__(self, tracking: DifferenceTracking, engine: PairEngine | None, noise: NoiseBook) -> None:
+    def __init__(self, tracking: DifferenceTracking, engine: PairEngine | None, noise: NoiseByPair) -> None:
         self._tracking = tracking
         self._engine = engine
         self._noise = noise
@@ -107,7 +107,7 @@ class ByPairs:
 class ByPackets:
     """Packets as they are; a part of them is made into differences as well, to measure the recording's noise."""
 
-    def __init__(self, tracking: PacketTracking, engine: PairEngine, noise: NoiseBook) -> None:
+    def __init__(self, tracking: PacketTracking, engine: PairEngine, noise: NoiseByPair) -> None:
         self._tracking = tracking
         self._engine = engine
         self._noise = noise

@@ -16,7 +16,7 @@ _MOST_ANCHORS: Final = 255
 _ASSUMED_ACCURACY: Final = AccuracyPage(**asdict(AccuracySite()))
 
 
-class AlmanacBook:
+class AlmanacAssembly:
     """Gathers the pages of one site as its beacons bring them, page by page.
 
     What contradicts the book must be heard twice before it is believed. A new issue empties the book once two frames

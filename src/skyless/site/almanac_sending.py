@@ -60,7 +60,7 @@ def page_for(pages: tuple[Page, ...], superframe: int, slot: int) -> Page:
 def almanac_issue(pages: tuple[Page, ...]) -> int:
     """Return 8 bits that depend on the contents of all pages and on nothing else.
 
-    A changed almanac keeps its issue once in 256 times; then pages replace each other one by one (``AlmanacBook``).
+    A changed almanac keeps its issue once in 256 times; then pages replace each other one by one (``AlmanacAssembly``).
     """
     folded = crc32(b"".join(map(encode_page, pages)))
     folded ^= folded >> 16

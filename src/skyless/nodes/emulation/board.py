@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Final, Literal
 
-from skyless.nodes.emulation.board_protocol import LinkSpeech, ListenerSpeech, SnifferSpeech, Speech
+from skyless.nodes.emulation.board_protocol import BoardProtocol, LinkProtocol, ListenerProtocol, SnifferProtocol
 from skyless.nodes.process.pty import Pty
-from skyless.nodes.process.running import Say
+from skyless.nodes.process.running import Log
 from skyless.radios.interface import Gone, Hint, Radio, RadioEvent, Restarted
 
 BoardFormat = Literal["link", "sniffer", "sniffer-text", "listener"]
@@ -22,18 +22,18 @@ class Board:
     """A board from its radio to its serial port."""
 
     def __init__(
-        self, radio: Radio, kind: Literal["anchor", "tag"], speaks: BoardFormat, link: Path | None, say: Say
+        self, radio: Radio, kind: Literal["anchor", "tag"], speaks: BoardFormat, link: Path | None, say: Log
     ) -> None:
         """``say`` is told in words what a person should know. Raises SkylessError."""
         self.radio, self._say = radio, say
         self.pty = Pty(link)
-        self.speech: Speech
+        self.speech: BoardProtocol
         if speaks == "link":
-            self.speech = LinkSpeech(radio, self.pty.send, can_transmit=kind == "anchor")
+            self.speech = LinkProtocol(radio, self.pty.send, can_transmit=kind == "anchor")
         elif speaks == "listener":
-            self.speech = ListenerSpeech(self.pty.send)
+            self.speech = ListenerProtocol(self.pty.send)
         else:
-            self.speech = SnifferSpeech(self.pty.send, knows_binary=speaks == "sniffer")
+            self.speech = SnifferProtocol(self.pty.send, knows_binary=speaks == "sniffer")
 
     async def run(self) -> None:
         """Serve until cancelled."""

@@ -15,7 +15,7 @@ from skyless.firmware import link
 from skyless.radios.interface import Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radios.serial.link_records import OFFSET_STEPS_PER_PPM, POWER_STEPS_PER_DB, to_steps
 from skyless.recordings.foreign.bitcraze_payload import TDOA3
-from skyless.site.almanac_gathering import AlmanacBook
+from skyless.site.almanac_gathering import AlmanacAssembly
 from skyless.ticks import wrap
 
 Send = Callable[[bytes], bool]
@@ -23,7 +23,7 @@ _EMULATED_FIRMWARE: Final = (0, 0, 0)
 _LAST_ID: Final = 0xFF
 
 
-class Speech(Protocol):
+class BoardProtocol(Protocol):
     """A format."""
 
     def hear_radio(self, event: RadioEvent) -> None:
@@ -33,7 +33,7 @@ class Speech(Protocol):
         """The host says something."""
 
 
-class LinkSpeech:
+class LinkProtocol:
     """The serial link, as the firmware speaks it."""
 
     def __init__(self, radio: Radio, send: Send, *, can_transmit: bool) -> None:
@@ -151,7 +151,7 @@ def _usual_config() -> bytes:
 _CONFIG: Final = _usual_config()
 
 
-class ListenerSpeech:
+class ListenerProtocol:
     """The JSON lines of the uwb-apps listener."""
 
     def __init__(self, send: Send) -> None:
@@ -176,13 +176,13 @@ class ListenerSpeech:
         """It takes no commands."""
 
 
-class SnifferSpeech:
+class SnifferProtocol:
     """A Bitcraze sniffer: beacons translated into packets of a TDoA3 system, as text until it is told ``b``."""
 
     def __init__(self, send: Send, *, knows_binary: bool) -> None:
         self._send, self._knows_binary = send, knows_binary
         self._binary = False
-        self._almanac = AlmanacBook()
+        self._almanac = AlmanacAssembly()
         self.drops: Counter[str] = Counter()
 
     def hear_radio(self, event: RadioEvent) -> None:

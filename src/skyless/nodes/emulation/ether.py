@@ -11,7 +11,7 @@ from skyless.air.codec import MAX_FRAME_BYTES
 from skyless.air.reception import Transmission
 from skyless.constants import TICK_S
 from skyless.mqtt.messages import EtherHealth, TrueMotion, TruthMessage, Vector
-from skyless.nodes.emulation.ether_clients import Guest, Seat
+from skyless.nodes.emulation.ether_clients import Client, Session
 from skyless.radios.emulated.ether_wire import (
     Arrival,
     Clocks,
@@ -53,7 +53,7 @@ class Ether:
         self.medium: Medium[None] = Medium(site, specs, faults, seed, self._deliver)
         self._nodes = {("anchor", str(anchor)): node for anchor, node in self.medium.node_of.items()}
         self._nodes |= {("tag", name): len(site.anchors) + index for index, name in enumerate(tags)}
-        self._owners: dict[int, Seat] = {}
+        self._owners: dict[int, Session] = {}
         self._flying: dict[int, int] = {}
         self._origin_s = clock()
         self._timer: asyncio.TimerHandle | None = None
@@ -67,7 +67,7 @@ class Ether:
         """
         loop = asyncio.get_running_loop()
         self._origin_s = self._clock()
-        return await loop.create_server(lambda: Guest(self), host, port)
+        return await loop.create_server(lambda: Client(self), host, port)
 
     # Time
 
@@ -102,12 +102,12 @@ class Ether:
         """The host's monotonic time of the medium's present."""
         return self._origin_s + self.medium.now_s
 
-    def _counters(self, seat: Seat) -> tuple[int, ...]:
+    def _counters(self, seat: Session) -> tuple[int, ...]:
         return tuple(wrap(self.medium.read_counter(node)) for node in seat.nodes)
 
     # Guests
 
-    def join(self, guest: Guest, message: Join) -> Seat | str:
+    def join(self, guest: Client, message: Join) -> Session | str:
         """Put a process's nodes on the air; or why not."""
         nodes = [self._nodes.get((message.kind, name)) for name in message.names]
         for name, node in zip(message.names, nodes, strict=True):
@@ -117,21 +117,21 @@ class Ether:
             if node in self._owners or nodes.count(node) > 1:
                 return f"{message.kind} {name} is on the air already"
         self.advance()
-        seat = Seat(guest, tuple(node for node in nodes if node is not None))
+        seat = Session(guest, tuple(node for node in nodes if node is not None))
         for node in seat.nodes:
             self._owners[node] = seat
             self.medium.switch_on(node)
         seat.tell(Joined(this_machine(), self.now_host_s, self._counters(seat)))
         return seat
 
-    def leave(self, seat: Seat) -> None:
+    def leave(self, seat: Session) -> None:
         """Take a process's nodes off the air."""
         for node in seat.nodes:
             self._owners.pop(node, None)
             self._flying.pop(node, None)
             self.medium.switch_off(node)
 
-    def send(self, seat: Seat, message: Send) -> None:
+    def send(self, seat: Session, message: Send) -> None:
         """Plan a transmission, unless it is too late or the node's radio has one waiting already.
 
         Raises:
@@ -151,7 +151,7 @@ class Ether:
     def _deliver(self, delivery: Delivery) -> None:
         """Give a frame that has ended to all processes that have nodes that heard it, and tell its sender."""
         flight, host_s = delivery.flight, self.now_host_s
-        rows: dict[Seat, list[HeardRow]] = {}
+        rows: dict[Session, list[HeardRow]] = {}
         for heard in (delivery.by_anchors, delivery.by_tags):
             columns = ("node", "rx_ticks", "rx_power_dbm", "first_path_power_dbm", "carrier_offset_ppm")
             for node, *values in zip(*(heard[column].tolist() for column in columns), strict=True):

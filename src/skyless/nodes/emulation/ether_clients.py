@@ -16,20 +16,20 @@ OVERRUN_BYTES: Final = 1 << 16
 class Host(Protocol):
     """What receives the guests."""
 
-    def join(self, guest: "Guest", message: Join) -> "Seat | str":
+    def join(self, guest: "Client", message: Join) -> "Session | str":
         """Put a process's nodes on the air; or why not."""
 
-    def leave(self, seat: "Seat") -> None:
+    def leave(self, seat: "Session") -> None:
         """Take a process's nodes off the air."""
 
-    def send(self, seat: "Seat", message: Send) -> None:
+    def send(self, seat: "Session", message: Send) -> None:
         """Plan a transmission."""
 
 
-class Seat:
+class Session:
     """The nodes of one process."""
 
-    def __init__(self, guest: "Guest", nodes: tuple[int, ...]) -> None:
+    def __init__(self, guest: "Client", nodes: tuple[int, ...]) -> None:
         self._guest = guest
         self.nodes = nodes
         self.index = {node: index for index, node in enumerate(nodes)}
@@ -39,12 +39,12 @@ class Seat:
         return self._guest.tell(message)
 
 
-class Guest(asyncio.Protocol):
+class Client(asyncio.Protocol):
     """A process's connection."""
 
     def __init__(self, ether: Host) -> None:
         self._ether = ether
-        self._seat: Seat | None = None
+        self._seat: Session | None = None
         self._unpacker = Unpacker()
         self._transport: asyncio.Transport | None = None
 

@@ -6,7 +6,7 @@ from typing import Final
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.topics import health_topic, truth_topic
 from skyless.nodes.emulation.ether import Ether
-from skyless.nodes.process.running import HEALTH_S, Say, every, keep, link_of, together
+from skyless.nodes.process.running import HEALTH_S, Log, every, keep, link_of, together
 
 TRUTH_S: Final = 0.05
 
@@ -14,7 +14,7 @@ TRUTH_S: Final = 0.05
 class Air:
     """An ether that listens, and its link."""
 
-    def __init__(self, ether: Ether, host: str, port: int, address: MqttAddress | None, say: Say) -> None:
+    def __init__(self, ether: Ether, host: str, port: int, address: MqttAddress | None, say: Log) -> None:
         self._ether, self._host, self._port, self._say = ether, host, port, say
         self._site = ether.site.id
         self._link = link_of(address, "air", site=self._site, kind="ether")

@@ -11,7 +11,7 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.nodes.process.loop import end_with_parent
-from skyless.nodes.process.running import Say
+from skyless.nodes.process.running import Log
 
 _AGAIN_S: Final = 0.2
 _LONGEST_S: Final = 5.0
@@ -45,7 +45,7 @@ class Program(Struct, frozen=True):
 class Child:
     """One program, started again whenever it ends."""
 
-    def __init__(self, program: Program, say: Say) -> None:
+    def __init__(self, program: Program, say: Log) -> None:
         self.program = program
         self.starts = 0
         self.pid: int | None = None

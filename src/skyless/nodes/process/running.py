@@ -9,7 +9,7 @@ from skyless.mqtt.link import Link
 
 HEALTH_S: Final = 1.0
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 """Takes one line for a person."""
 
 
@@ -53,7 +53,7 @@ def link_of(address: MqttAddress | None, name: int | str, *, site: int, kind: st
     return None if address is None else Link(address, name, site=site, kind=kind)
 
 
-async def keep(link: Link, say: Say) -> None:
+async def keep(link: Link, say: Log) -> None:
     """Run a link for ever: a fault in it is told, and costs neither a fix nor a beacon."""
     while True:
         try:

@@ -25,7 +25,7 @@ from skyless.positioning.estimator.state import (
 )
 from skyless.positioning.fix import PROTECTED_ROWS
 
-Wanted = tuple[object, tuple[int, ...], DTypeLike]
+MethodOptions = tuple[object, tuple[int, ...], DTypeLike]
 """An array, its shape and its type."""
 
 MOST: Final = 4096
@@ -54,7 +54,7 @@ def is_sound(estimator: Estimator) -> bool:
     return _is_inverse(state.index_of, state.anchors["table_index"])
 
 
-def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[Wanted]:
+def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[MethodOptions]:
     count = len(s.anchors)
     n, faults, terms = layout(dim, count).room, 2 * count + dim, most_terms(dim)
     yield s.x, (n,), np.float64
@@ -75,7 +75,7 @@ def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[Wanted]:
     yield s.work, (count + 1 + dim, count), np.float64
 
 
-def _of_estimator(own: dict[str, Any]) -> Iterator[Wanted]:
+def _of_estimator(own: dict[str, Any]) -> Iterator[MethodOptions]:
     table_m, listed = own["_table_m"], own["_listed"]
     for position_m in table_m:
         yield position_m, (3,), np.float64

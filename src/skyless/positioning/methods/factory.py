@@ -26,7 +26,7 @@ RELAY_SUPERFRAMES: Final = 2.5
 """Relays of packets that are older than the one, or than so many superframes, are not used."""
 
 
-class Wanted(Struct, frozen=True):
+class MethodOptions(Struct, frozen=True):
     """What the tag's owner asks for."""
 
     method: str
@@ -40,7 +40,7 @@ class Wanted(Struct, frozen=True):
 
 
 def new_method(
-    wanted: Wanted, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage, time: FixTime
+    wanted: MethodOptions, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage, time: FixTime
 ) -> Method:
     """Make the method for a site with this schedule and noise, where that anchor is the master."""
     superframe_s = to_seconds(schedule.slot_ticks * schedule.slots)

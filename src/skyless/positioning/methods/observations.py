@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from skyless.air.beacon import Beacon, Heard
 from skyless.air.codec import packed_relays
-from skyless.air.master_term import Claim, claim_of
+from skyless.air.master_term import MasterTerm, master_term_of
 from skyless.constants import MAX_DRIFT, TICK_M
 from skyless.positioning.fix_time import SLACK_TICKS
 from skyless.positioning.methods.joint import Estimation
@@ -46,7 +46,7 @@ class Observer:
         rx_ticks: int,
         tx_ticks: int,
         rx_variance_factor: float,
-        claim: Claim | None,
+        claim: MasterTerm | None,
     ) -> Observation:
         """One observation of a beacon in a frame; ``claim``, the one that is followed, is mostly the beacon's too."""
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
@@ -60,7 +60,7 @@ class Observer:
         if ticks_master is None:
             claim = None
         elif claim is None or claim.master != beacon.master or claim.term != beacon.term:
-            claim = claim_of(beacon)
+            claim = master_term_of(beacon)
         return Observation(
             beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, ticks_master, fraction,
             variance_m2, (), claim, rx_variance_factor, packed_relays(frame, beacon),
