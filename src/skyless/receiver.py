@@ -8,13 +8,13 @@ from math import inf, isfinite
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.followed_master import FollowedMaster
 from skyless.air.reception import Diagnostics, Reception
 from skyless.clocks.stamps import AnchorStamps
+from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import FixTime
@@ -77,7 +77,7 @@ class Receiver:
         self._superframe_ticks = 0
         self._followed = FollowedMaster()
         self._master: int | None = None
-        self._positions: dict[int, NDArray[np.float64]] = {}
+        self._positions: dict[int, Array] = {}
 
     @property
     def site(self) -> int | None:

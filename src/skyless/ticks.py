@@ -7,9 +7,9 @@ float64 seconds lose 0.6 mm after an hour, integers lose nothing.
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.constants import TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.kernels.arrays import Integers
 
 WRAP_TICKS: Final = 1 << TICK_BITS
 HALF_WRAP_TICKS: Final = WRAP_TICKS // 2
@@ -91,7 +91,7 @@ class Unwrapper:
         return counter if self._last_ticks is None else nearest(counter, self._last_ticks, self._bits)
 
 
-def unwrap_array(counters: NDArray[np.int64], bits: int = TICK_BITS) -> NDArray[np.int64]:
+def unwrap_array(counters: Integers, bits: int = TICK_BITS) -> Integers:
     """Unwrapped ticks, shape (n,), of successive counter values, each within half a wrap of the one before."""
     half = np.int64(1) << (bits - 1)
     steps = ((np.diff(counters) + half) & ((half << 1) - 1)) - half

@@ -16,7 +16,8 @@ from skyless.air.codec import decode_cached
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
 from skyless.bench.many_tags import TagsSpeed, many_joints, one_core
-from skyless.bench.runs import ANCHORS_M, NODES, Array, JointRuns, Run
+from skyless.bench.runs import ANCHORS_M, NODES, JointRuns, Run
+from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
 from skyless.positioning.solver.locate import PseudorangeSolution, locate_pseudoranges
 from skyless.receiver import Receiver

@@ -7,15 +7,13 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
+from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
 from skyless.paper.chain_draws import QUANTITIES
 from skyless.paper.monte_carlo import draw_moments, gpu_available
 from skyless.uncertainty.chain import Chain
-
-Array = NDArray[np.float64]
 
 GPU_DRAWS_PER_CPU_DRAW: Final = 100
 ROUNDS: Final = 3

@@ -8,16 +8,13 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.kernels.arrays import Integers, Matrix, Vector
 from skyless.positioning.estimator.monitor import COMMON_GAIN, COMMON_LIMIT, WALK_GAIN, WALK_LOSS
 from skyless.positioning.estimator.settings import MAX_CLOCK_RATE, EstimatorSettings
 from skyless.positioning.estimator.state import START_WALK_SCALE
 from skyless.positioning.methods.factory import RELAY_AGE_S
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 
 
 class PlainJoint:
@@ -49,7 +46,7 @@ class PlainJoint:
         self._range_m: dict[int, float] = {}
         self._walk_scale, self._common_mean, self._count = START_WALK_SCALE, 0.0, 0
 
-    def hear(self, anchor: int, sequence: int, rx: int, tx: int, relays: NDArray[np.int64]) -> None:
+    def hear(self, anchor: int, sequence: int, rx: int, tx: int, relays: Integers) -> None:
         """Take one packet, as ``Estimator.process`` does."""
         self._elapse(rx)
         n, s = self._n, self._s

@@ -4,13 +4,9 @@ Nothing but the arithmetic: no gate, no running means, no epochs in integers, no
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Integers, Matrix, Vector
 from skyless.kernels.compiled import threaded_kernel
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 @threaded_kernel

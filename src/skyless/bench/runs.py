@@ -5,17 +5,15 @@ from typing import Any, Final
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from skyless.bench.reference_filters import FilterpyJoint, PlainJoint
 from skyless.bench.reference_loop import joint_filter
 from skyless.constants import SPEED_OF_LIGHT_MPS
+from skyless.kernels.arrays import Array, Integers
 from skyless.positioning.estimator.estimator import Estimator, Packets
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.studies.episodes import Case, draw_episode, settings_of
 
-Array = NDArray[np.float64]
-Ticks = NDArray[np.int64]
 Run = Callable[[], object]
 """Prepared before a clock starts, called once while it runs."""
 
@@ -86,7 +84,7 @@ class JointRuns:
         return lambda: joint_filter(x, P, ANCHORS_M, self.packets.anchors, steps, *measured, 2e-3, noise)
 
 
-def packets_of(packets: Packets, count: int) -> Iterable[tuple[int, int, int, int, Ticks]]:
+def packets_of(packets: Packets, count: int) -> Iterable[tuple[int, int, int, int, Integers]]:
     """The first packets as ``Estimator.process`` takes them."""
     begin = 0
     for k, end in enumerate(packets.ends[:count].tolist()):

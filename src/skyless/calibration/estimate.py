@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
-from skyless.calibration.fit import Differences, Fit, Vector, fit, moves
+from skyless.calibration.fit import Differences, Fit, fit, moves
+from skyless.kernels.arrays import Mask, Vector
 from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
 
 FEWEST: Final = 3
@@ -189,7 +189,7 @@ def _spent(differences: int, anchors: int) -> float:
     return float(np.sqrt(differences / max(differences - anchors + 1, 1)))
 
 
-def _in_gauge(found: Fit, good: NDArray[np.bool_], zero: int | None) -> tuple[Vector, Vector]:
+def _in_gauge(found: Fit, good: Mask, zero: int | None) -> tuple[Vector, Vector]:
     """Constants and their standard errors with the zero where it should be, each of shape (m,)."""
     count = len(found.anchors)
     place = np.zeros(count)

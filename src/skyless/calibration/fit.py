@@ -4,10 +4,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from skyless.kernels.arrays import Array, Integers, Mask, Vector
 
 HUBER: Final = 1.345
 """Standard deviations up to which a residual weighs in full: 95 % of the efficiency on Gaussian noise."""
@@ -29,8 +27,8 @@ class Differences:
 
     t_s: Vector
     """Shape (n,), not decreasing."""
-    anchor_a: Indices
-    anchor_b: Indices
+    anchor_a: Integers
+    anchor_b: Integers
     excess_m: Vector
     """Measured less what the geometry says."""
     log_ratio: Vector
@@ -41,21 +39,21 @@ class Differences:
 class Fit:
     """A regression: m anchors, n differences."""
 
-    anchors: Indices
+    anchors: Integers
     bias_m: Vector
     """Shape (m,), sum 0."""
-    covariance_m2: NDArray[np.float64]
+    covariance_m2: Array
     """Shape (m, m), or (m + 1, m + 1) with the slope."""
     slope_m: float | None
     residual_m: Vector
-    used: NDArray[np.bool_]
+    used: Mask
     scale_m: float
-    a: Indices
-    b: Indices
-    counts: Indices
+    a: Integers
+    b: Integers
+    counts: Integers
 
 
-def fit(data: Differences, anchors: Indices, *, slope: bool) -> Fit:
+def fit(data: Differences, anchors: Integers, *, slope: bool) -> Fit:
     """Fit one constant for each of the anchors, all of them tied together by the differences, perhaps with a slope."""
     a, b = np.searchsorted(anchors, data.anchor_a), np.searchsorted(anchors, data.anchor_b)
     x = data.log_ratio if slope else np.zeros(len(a))
@@ -90,7 +88,7 @@ def moves(data: Differences, found: Fit) -> bool:
     return float(np.sqrt(np.mean(change**2))) > LEAST_MOTION
 
 
-def _pair_medians(a: Indices, b: Indices, excess_m: Vector, count: int) -> Vector:
+def _pair_medians(a: Integers, b: Integers, excess_m: Vector, count: int) -> Vector:
     """Each difference replaced by the median of its pair: a start that outliers do not touch."""
     start = np.empty_like(excess_m)
     pair = a * count + b
@@ -100,24 +98,24 @@ def _pair_medians(a: Indices, b: Indices, excess_m: Vector, count: int) -> Vecto
     return start
 
 
-def _solve(normal: NDArray[np.float64], right: Vector) -> Vector:
+def _solve(normal: Array, right: Vector) -> Vector:
     solution: Vector = np.linalg.solve(normal, right).astype(np.float64)
     return solution
 
 
-def _model(solution: Vector, a: Indices, b: Indices, x: Vector) -> Vector:
+def _model(solution: Vector, a: Integers, b: Integers, x: Vector) -> Vector:
     values: Vector = solution[b] - solution[a] + solution[-1] * x
     return values
 
 
-def _right(a: Indices, b: Indices, x: Vector, values: Vector, count: int) -> Vector:
+def _right(a: Integers, b: Integers, x: Vector, values: Vector, count: int) -> Vector:
     """Hᵀ times values; the slope is the last column."""
     right: Vector = (np.bincount(b, values, count + 1) - np.bincount(a, values, count + 1)).astype(np.float64)
     right[-1] = x @ values
     return right
 
 
-def _normal(a: Indices, b: Indices, x: Vector, weights: Vector, count: int) -> NDArray[np.float64]:
+def _normal(a: Integers, b: Integers, x: Vector, weights: Vector, count: int) -> Array:
     """Hᵀ W H; the sum of the constants is held at zero, and the slope where nothing tells it."""
     normal = np.zeros((count + 1, count + 1))
     flat = normal.reshape(-1)
@@ -134,8 +132,8 @@ def _normal(a: Indices, b: Indices, x: Vector, weights: Vector, count: int) -> N
 
 
 def _covariance(
-    t_s: Vector, a: Indices, b: Indices, x: Vector, residual_m: Vector, scale_m: float, count: int
-) -> NDArray[np.float64]:
+    t_s: Vector, a: Integers, b: Integers, x: Vector, residual_m: Vector, scale_m: float, count: int
+) -> Array:
     """Errors within a block of time taken as one (sandwich); never less than independent ones would make it."""
     share = np.abs(residual_m) / scale_m
     influence = np.where(share <= REJECT, np.clip(residual_m, -HUBER * scale_m, HUBER * scale_m), 0.0)
@@ -147,5 +145,5 @@ def _covariance(
     white = _normal(a, b, x, influence**2, count)
     together, apart = bread @ meat @ bread, bread @ white @ bread
     grow = np.sqrt(np.maximum(np.diag(apart) / np.maximum(np.diag(together), 1e-30), 1.0))
-    result: NDArray[np.float64] = together * np.outer(grow, grow)
+    result: Array = together * np.outer(grow, grow)
     return result

@@ -7,7 +7,8 @@ from skyless.cli.common.options import finite_numbers, known_method, spare_input
 from skyless.errors import ConfigurationError, SkylessError
 
 if TYPE_CHECKING:
-    from skyless.planning.floor import Box, Floor, Matrix
+    from skyless.kernels.arrays import Matrix
+    from skyless.planning.floor import Box, Floor
     from skyless.planning.mounts import Mounts
     from skyless.planning.predict import PlanSettings
     from skyless.site.model import Site

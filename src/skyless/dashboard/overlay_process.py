@@ -6,10 +6,10 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.dashboard.overlays import OverlayGrids, OverlayTask
 from skyless.errors import SkylessError
+from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD, METHODS
 from skyless.planning.columns import FIX_SHARE, HDOP, PDOP, SIGMA
 from skyless.planning.maps import Grid, plan_map
@@ -52,13 +52,13 @@ def _grid(task: OverlayTask) -> Grid:
     height_m = task.site.tags.height_m
     if height_m is None:
         height_m = (min(heights) + max(heights)) / 2
-    xs: NDArray[np.float64] = x1 + (np.arange(task.columns, dtype=np.float64) + 0.5) * task.step_m
-    ys: NDArray[np.float64] = y1 + (np.arange(task.rows, dtype=np.float64) + 0.5) * task.step_m
+    xs: Array = x1 + (np.arange(task.columns, dtype=np.float64) + 0.5) * task.step_m
+    ys: Array = y1 + (np.arange(task.rows, dtype=np.float64) + 0.5) * task.step_m
     everywhere = np.ones((task.rows, task.columns), dtype=np.bool_)
     return Grid(xs, ys, np.array([height_m], dtype=np.float64), task.step_m, everywhere)
 
 
-def _values(column: NDArray[np.float64], digits: int) -> list[float | None]:
+def _values(column: Array, digits: int) -> list[float | None]:
     return [round(value, digits) if np.isfinite(value) else None for value in column.ravel().tolist()]
 
 

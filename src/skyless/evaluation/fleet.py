@@ -6,12 +6,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
 from skyless.evaluation.level_tally import LevelReport, LevelTally
 from skyless.evaluation.statistics import ErrorStatistics, ErrorSummary
+from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD
 from skyless.positioning.fix import Fix
 from skyless.positioning.integrity import IntegrityRequirement
@@ -32,11 +32,11 @@ class JudgedFix(Struct, frozen=True, gc=False):
     time_s: float
     """True time at which the last frame of the fix ended."""
     fix: Fix
-    truth_m: NDArray[np.float64]
+    truth_m: Array
     """Where the tag truly was when that frame was sent, shape (3,)."""
 
     @property
-    def error_m(self) -> NDArray[np.float64]:
+    def error_m(self) -> Array:
         """Position less truth, shape (3,)."""
         return self.fix.position_m - self.truth_m
 
@@ -102,9 +102,7 @@ class Fleet:
                 if judged is not None:
                     yield judged
 
-    def _hear(
-        self, tag: int, reception: Reception, truth_m: NDArray[np.float64], broadcast: Broadcast
-    ) -> JudgedFix | None:
+    def _hear(self, tag: int, reception: Reception, truth_m: Array, broadcast: Broadcast) -> JudgedFix | None:
         record = self.records[tag]
         record.messages += 1
         fix = self.receivers[tag].hear(reception)

@@ -4,9 +4,9 @@ from bisect import bisect_right
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.evaluation.statistics import ErrorStatistics, ErrorSummary, EvenSample
+from skyless.kernels.arrays import Array
 from skyless.recordings.truth import Truth
 
 Triple = tuple[float, float, float]
@@ -50,7 +50,7 @@ class Judge:
         self._above_m = above_m
         self._max_gap_s = max_gap_s
         self._times: list[float] = [] if truth is None else truth.t_s.tolist()
-        self._places: NDArray[np.float64] = np.empty((0, 3)) if truth is None else truth.position_m
+        self._places: Array = np.empty((0, 3)) if truth is None else truth.position_m
         self._errors = ErrorStatistics(planar=planar)
         self._settled = ErrorStatistics(planar=planar)
         self._places_settled = EvenSample(3)

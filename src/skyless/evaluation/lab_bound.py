@@ -5,13 +5,11 @@ from typing import Final
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
 from skyless.site.lab import ideal_lab_site
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
-
-Array = NDArray[np.float64]
 
 SUPERFRAMES: Final = 134
 """Two seconds, after which nothing of what was known before the first frame is left."""

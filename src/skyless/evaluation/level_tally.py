@@ -5,8 +5,8 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array
 from skyless.positioning.fix import Fix
 
 MOST_KEPT: Final = 1 << 16
@@ -37,7 +37,7 @@ class LevelTally:
         self._levels_m: list[float] = []
         self._stride = 1
 
-    def add(self, fix: Fix, error_m: NDArray[np.float64]) -> None:
+    def add(self, fix: Fix, error_m: Array) -> None:
         """Take a fix and its error, shape (3,)."""
         if fix.alert is None:
             return

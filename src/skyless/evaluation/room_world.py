@@ -8,15 +8,13 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array
 from skyless.simulation.impairments import AnchorDisplacement
 from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.streams import stream
 from skyless.simulation.trajectory import Roaming
 from skyless.site.model import Site
-
-Array = NDArray[np.float64]
 
 QA_M2PS3: Final = 0.3
 """Of the random accelerations of tags."""

@@ -6,11 +6,12 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skyless.evaluation.fleet import Fleet, FleetSettings
 from skyless.evaluation.receiver_with_outages import ReceiverWithOutages
 from skyless.evaluation.room_world import Room, displacements, wanderer
+from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.simulation.channel import ChannelModel
@@ -171,7 +172,7 @@ def _smooth_path(points: Sequence[ArrayLike], speed_mps: float, *, loop: bool = 
     return Waypoints(places, speed_mps, loop=loop, corner_s=corner_s)
 
 
-def _walkable_box(site: Site) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _walkable_box(site: Site) -> tuple[Array, Array]:
     places = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     low, high = places.min(axis=0), places.max(axis=0)
     margin = np.minimum(WALL_MARGIN_M, (high - low) / 4.0)

@@ -5,7 +5,8 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
+
+from skyless.kernels.arrays import Array
 
 SAMPLE_ROWS: Final = 1 << 17
 """Rows kept at most; with fewer, percentiles are exact."""
@@ -39,7 +40,7 @@ class EvenSample:
         self._stride *= 2
 
     @property
-    def rows(self) -> NDArray[np.float64]:
+    def rows(self) -> Array:
         """The rows kept, shape (kept, columns), in their order; a copy."""
         return np.array(self._store).reshape(-1, self._columns)
 

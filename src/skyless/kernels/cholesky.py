@@ -5,9 +5,7 @@ For the few unknowns of a position these beat LAPACK's call overhead, and they r
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import kernel
 
 SINGULAR = 1e-12
@@ -15,7 +13,7 @@ SINGULAR = 1e-12
 
 
 @kernel
-def factorise(matrix: NDArray[np.float64], size: int) -> bool:
+def factorise(matrix: Array, size: int) -> bool:
     """Replace the leading ``size`` × ``size`` block by its lower factor L, with L·Lᵀ = matrix.
 
     Only the lower triangle is read and written. False where the matrix is not positive definite (or not
@@ -39,7 +37,7 @@ def factorise(matrix: NDArray[np.float64], size: int) -> bool:
 
 
 @kernel
-def solve(factor: NDArray[np.float64], size: int, vector: NDArray[np.float64]) -> None:
+def solve(factor: Array, size: int, vector: Array) -> None:
     """Replace ``vector`` by (L·Lᵀ)⁻¹·vector."""
     for i in range(size):
         total = vector[i]
@@ -54,7 +52,7 @@ def solve(factor: NDArray[np.float64], size: int, vector: NDArray[np.float64]) -
 
 
 @kernel
-def invert(factor: NDArray[np.float64], size: int, inverse: NDArray[np.float64]) -> None:
+def invert(factor: Array, size: int, inverse: Array) -> None:
     """Write (L·Lᵀ)⁻¹ into the leading block of ``inverse``."""
     for j in range(size):
         for i in range(size):

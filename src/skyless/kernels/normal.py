@@ -3,9 +3,8 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from skyless.kernels.arrays import Array
 
 MOST_INFLATION: Final = 1e12
 """An unknown whose variance the others inflate by more is not determined: what tells it from them is rounding noise."""

@@ -6,13 +6,13 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.kernels.arrays import Array, Integers
 from skyless.paper.chain_draws import Quantity
 from skyless.paper.monte_carlo import ChainMoments, draw_lambdas, draw_moments
 from skyless.uncertainty import corrected, printed
-from skyless.uncertainty.chain import Array, Chain
+from skyless.uncertainty.chain import Chain
 
 QUANTITIES: Final = ("beta", "gamma_first", "gamma_delayed", "gamma_averaged", "epsilon", "xi", "phi", "lambda")
 """β, γ(t̄), γ(t̄+D), γ̄, ε(t_i), ξ, φ, λ, in the order in which the paper derives them."""
@@ -63,9 +63,9 @@ class LambdaDistribution(Struct, frozen=True):
     """Histogram of the error λ of one DTDoA (``eq:FinalTDoAUnc``), anchor 1."""
 
     noise: str
-    edges_m: NDArray[np.float64]
+    edges_m: Array
     """Shape (bins + 1,), to five sigma on both sides; the one draw in two million beyond is not counted."""
-    counts: NDArray[np.int64]
+    counts: Integers
     """Shape (bins,)."""
     std_m: float
     """Of the draws."""

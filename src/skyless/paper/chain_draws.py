@@ -10,17 +10,15 @@ from enum import IntEnum
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.clocks.paper import averaged_offset, relative_offset, relative_rate, to_master
 from skyless.constants import TICK_S
+from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import kernel, threaded_kernel
 from skyless.paper.counter_random import NUMBERS_PER_BLOCK, fill_noise
 from skyless.positioning.solver.paper import protocol_interval, tag_rate
 from skyless.uncertainty.chain import Chain
 from skyless.uncertainty.tdoa import Reference
-
-Array = NDArray[np.float64]
 
 
 class Quantity(IntEnum):

@@ -4,9 +4,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.evaluation.plot_style import GREEN, INK, METHOD_COLOURS, MUTED, panel
+from skyless.kernels.arrays import Array
 from skyless.paper.listening import listen
 from skyless.paper.plan import CLAIM_M, DW1000_PS, P1, PAPER_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict, grouped
@@ -69,7 +69,7 @@ def run_world(progress: Progress, noise_ps: float, seed: int, fixes: int) -> lis
     return [worst_of(method, noise_ps, seed, tracks[method].error_m) for method in METHODS]
 
 
-def worst_of(method: str, noise_ps: float, seed: int, error_m: NDArray[np.float64]) -> Worst:
+def worst_of(method: str, noise_ps: float, seed: int, error_m: Array) -> Worst:
     """Sum the errors of a run up, shape (n, 2)."""
     squared = (error_m**2).sum(axis=1)
     covariance_m2 = np.cov(error_m.T)
@@ -79,7 +79,7 @@ def worst_of(method: str, noise_ps: float, seed: int, error_m: NDArray[np.float6
     return Worst(method, noise_ps, seed, len(error_m), largest_m, rmse_m, growth, (low / middle, high / middle))
 
 
-def largest_of_m(covariance_m2: NDArray[np.float64], count: float, quantile: float) -> float:
+def largest_of_m(covariance_m2: Array, count: float, quantile: float) -> float:
     """Quantile of the largest radius of ``count`` independent zero-mean Gaussian vectors, covariance (2, 2).
 
     The radius' distribution is integrated over the angle: P(r > R) = mean over θ of exp(−R²/(2 s(θ)))·w(θ), with
@@ -105,7 +105,7 @@ class Trend(Struct, frozen=True):
     exponent: float
     scatter: tuple[float, float]
 
-    def largest_m(self, noise_ps: NDArray[np.float64], factor: float = 1.0) -> NDArray[np.float64]:
+    def largest_m(self, noise_ps: Array, factor: float = 1.0) -> Array:
         """Largest error of a run that is ``factor`` times a typical one."""
         return factor * self.coefficient * noise_ps**self.exponent
 

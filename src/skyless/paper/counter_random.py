@@ -8,9 +8,7 @@ compiled code and Python agree.
 import math
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import kernel
 
 NUMBERS_PER_BLOCK: Final = 4
@@ -85,7 +83,7 @@ def philox(a: int, b: int, c: int, d: int, key_a: int, key_b: int) -> tuple[int,
 
 
 @kernel
-def fill_noise(seed: int, draw: int, uniform: bool, noise: NDArray[np.float64]) -> None:
+def fill_noise(seed: int, draw: int, uniform: bool, noise: Array) -> None:
     """Fill ``noise``, a whole number of blocks, with the numbers of one draw, of mean 0 and variance 1."""
     for block in range(len(noise) // NUMBERS_PER_BLOCK):
         a, b, c, d = philox(draw & _MASK, (draw >> 32) & _MASK, block, 0, seed & _MASK, (seed >> 32) & _MASK)

@@ -3,10 +3,10 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.evaluation.plot_style import MAP, WHITE, floor, panel
+from skyless.kernels.arrays import Array
 from skyless.paper.plan import P1, P2, RADIO_PS, Plan, Results, Task
 from skyless.paper.section import Panel, Section, Verdict
 from skyless.site.lab import ideal_lab_site
@@ -25,7 +25,7 @@ def tasks(plan: Plan) -> list[Task]:  # noqa: ARG001 - nothing to simulate
     return []
 
 
-def literal_covariance_m2(place_m: NDArray[np.float64], noise_ps: float = RADIO_PS) -> NDArray[np.float64]:
+def literal_covariance_m2(place_m: Array, noise_ps: float = RADIO_PS) -> Array:
     """Covariance of one fix of ``literal`` at a place, shape (2, 2).
 
     G Σ Gᵀ with G = (JᵀJ)⁻¹Jᵀ of the unweighted least squares and Σ the full covariance of its TDoAs. Anchor i speaks
@@ -39,14 +39,14 @@ def literal_covariance_m2(place_m: NDArray[np.float64], noise_ps: float = RADIO_
     return np.asarray(gain @ literal_covariance(kappa, variance_m2, variance_m2) @ gain.T)
 
 
-def grid() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def grid() -> tuple[Array, Array, Array]:
     """Centres of the cells inside the walls: x (m,), y (n,), places (n·m, 2)."""
     low, high = ANCHORS_M.min(axis=0), ANCHORS_M.max(axis=0)
     x, y = (np.arange(low[k] + STEP_M / 2, high[k], STEP_M) for k in range(2))
     return x, y, np.stack([axis.ravel() for axis in np.meshgrid(x, y)], axis=1)
 
 
-def pdop_at(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def pdop_at(places_m: Array) -> Array:
     """PDoP for a known height at places of shape (n, 2)."""
     return dops_at(np.pad(ANCHORS_M, ((0, 0), (0, 1))), np.pad(places_m, ((0, 0), (0, 1))), height_known=True)[:, 1]
 
@@ -130,12 +130,12 @@ def section(plan: Plan, results: Results) -> Section:  # noqa: ARG001 - computed
     )
 
 
-def _three(values: NDArray[np.float64], form: str) -> tuple[str, str, str]:
+def _three(values: Array, form: str) -> tuple[str, str, str]:
     low, middle, high = (form.format(value) for value in (values.min(), np.median(values), values.max()))
     return low, middle, high
 
 
-def _map(name: str, title: str, field: tuple[NDArray[np.float64], ...], caption: str) -> Panel:
+def _map(name: str, title: str, field: tuple[Array, ...], caption: str) -> Panel:
     figure, axes = panel(title, 4.6)
     x, y, values = field
     grid_values = values.reshape(len(y), len(x))

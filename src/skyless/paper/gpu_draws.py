@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array
 from skyless.paper.chain_draws import QUANTITIES, Readings, add_draw, noise_size, sums_size
 
 cuda: Any = import_module("numba.cuda")
@@ -20,7 +20,7 @@ BLOCKS: Final = 264
 """Two for each multiprocessor of a large device; the sums of ten anchors then take 100 MB."""
 
 
-def gpu_sums(readings: Readings, seed: int, first: int, count: int, blocks: int = BLOCKS) -> NDArray[np.float64]:
+def gpu_sums(readings: Readings, seed: int, first: int, count: int, blocks: int = BLOCKS) -> Array:
     """Sums of ``count`` draws from number ``first`` on, as ``chain_draws.add_draws`` makes them, but for rounding."""
     n, threads = len(readings.anchors), blocks * THREADS_PER_BLOCK
     inputs = [cuda.to_device(a) for a in (readings.shared, readings.anchors, readings.settings, readings.ideal)]
@@ -28,7 +28,7 @@ def gpu_sums(readings: Readings, seed: int, first: int, count: int, blocks: int 
     errors = cuda.device_array((QUANTITIES, n, threads))
     sums = cuda.to_device(np.zeros((sums_size(n), threads)))
     add_share[blocks, THREADS_PER_BLOCK](seed, first, count, readings.uniform, *inputs, noise, errors, sums)
-    total: NDArray[np.float64] = sums.copy_to_host().sum(axis=1)
+    total: Array = sums.copy_to_host().sum(axis=1)
     return total
 
 
@@ -38,13 +38,13 @@ def add_share(
     first: int,
     count: int,
     uniform: bool,
-    shared: NDArray[np.float64],
-    anchors: NDArray[np.float64],
-    settings: NDArray[np.float64],
-    ideal: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    errors: NDArray[np.float64],
-    sums: NDArray[np.float64],
+    shared: Array,
+    anchors: Array,
+    settings: Array,
+    ideal: Array,
+    noise: Array,
+    errors: Array,
+    sums: Array,
 ) -> None:
     """What each thread runs: every draw whose turn it is.
 

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.anchor import Anchor
+from skyless.kernels.arrays import Array
 from skyless.paper.plan import Progress
 from skyless.positioning.fix import Fix
 from skyless.receiver import Receiver
@@ -24,17 +24,17 @@ WARMUP_S = 2.0
 class Track(Struct, frozen=True):
     """Fixes of one tag by one method, one per superframe, beside the truth."""
 
-    time_s: NDArray[np.float64]
+    time_s: Array
     """Shape (n,): true time at which the fix was made."""
-    position_m: NDArray[np.float64]
+    position_m: Array
     """Shape (n, 2)."""
-    truth_m: NDArray[np.float64]
+    truth_m: Array
     """Shape (n, 2): where the tag was at the emission of the last message."""
-    sigma_m: NDArray[np.float64]
+    sigma_m: Array
     """Shape (n,): what the fixes themselves say, root of the covariance's trace."""
 
     @property
-    def error_m(self) -> NDArray[np.float64]:
+    def error_m(self) -> Array:
         """Position less truth, shape (n, 2)."""
         return self.position_m - self.truth_m
 
@@ -47,7 +47,7 @@ class _Log:
         self._last = -1
         self.rows: list[tuple[float, ...]] = []
 
-    def add(self, time_s: float, fix: Fix, truth_m: NDArray[np.float64]) -> None:
+    def add(self, time_s: float, fix: Fix, truth_m: Array) -> None:
         superframe = int(time_s / self._superframe_s)
         if superframe == self._last:
             return

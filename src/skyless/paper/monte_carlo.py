@@ -11,16 +11,15 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.constants import TICK_M, TICK_S
 from skyless.errors import SkylessError
+from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
 from skyless.paper.chain_draws import QUANTITIES, Quantity, Readings, add_draws, list_lambdas, sums_size
 from skyless.uncertainty.chain import Chain
 from skyless.uncertainty.tdoa import Reference
 
-Array = NDArray[np.float64]
 Progress = Callable[[int], None]
 
 CHUNK: Final = 1 << 14

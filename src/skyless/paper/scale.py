@@ -7,10 +7,11 @@ from typing import Final
 import numpy as np
 from matplotlib.ticker import FuncFormatter
 from msgspec import Struct
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skyless.anchor import Anchor
 from skyless.evaluation.plot_style import BLUE, GREEN, INK, MUTED, ORANGE, panel
+from skyless.kernels.arrays import Array, Integers
 from skyless.paper.plan import P1, RADIO_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict, grouped
 from skyless.receiver import Receiver
@@ -92,9 +93,7 @@ def run_world(progress: Progress, tags: int, seed: int) -> FleetResult:
     return summarise(seed, squares_m2, fixes, frames, digest.hexdigest()[:16], cpu_s)
 
 
-def summarise(
-    seed: int, squares_m2: NDArray[np.float64], fixes: NDArray[np.int64], frames: int, digest: str, cpu_s: float
-) -> FleetResult:
+def summarise(seed: int, squares_m2: Array, fixes: Integers, frames: int, digest: str, cpu_s: float) -> FleetResult:
     """Sum a fleet up: squared errors and fixes of each tag, shape (tags,)."""
     tags, span_s = len(fixes), UNTIL_S - FROM_S
     own = np.sqrt(squares_m2 / np.maximum(fixes, 1))
@@ -234,9 +233,9 @@ def _cpu(fleets: list[FleetResult]) -> Panel:
     return Panel("10-load", "CPU time of one tag per second (measured on this machine) and frames on the air.", figure)
 
 
-def _frames_of_ms(cpu_ms: ArrayLike) -> NDArray[np.float64]:
+def _frames_of_ms(cpu_ms: ArrayLike) -> Array:
     return FRAMES_PER_MS * np.asarray(cpu_ms, np.float64)
 
 
-def _ms_of_frames(frames: ArrayLike) -> NDArray[np.float64]:
+def _ms_of_frames(frames: ArrayLike) -> Array:
     return np.asarray(frames, np.float64) / FRAMES_PER_MS

@@ -4,9 +4,9 @@ from typing import Final
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from skyless.constants import TICK_M
+from skyless.kernels.arrays import Array
 from skyless.paper.plan import RADIO_PS, Place
 from skyless.simulation.channel import ChannelModel, power_bias_m, received_power_dbm
 from skyless.simulation.impairments import DelayError, Impairments
@@ -32,7 +32,7 @@ def delay_errors(seed: int) -> tuple[DelayError, ...]:
     return tuple(DelayError(anchor.id, tx, rx) for anchor, (tx, rx) in zip(anchors, errors, strict=True))
 
 
-def expected_bias_m(name: str, place: Place, seed: int) -> NDArray[np.float64]:
+def expected_bias_m(name: str, place: Place, seed: int) -> Array:
     """Mean position error of ``literal`` to first order, shape (2,).
 
     A DTDoA is late by what its RX stamps at the tag are late, less the master's, plus what the anchor's stamp of the
@@ -53,6 +53,6 @@ def expected_bias_m(name: str, place: Place, seed: int) -> NDArray[np.float64]:
     return np.asarray(bias)
 
 
-def _power_bias_m(ranges_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _power_bias_m(ranges_m: Array) -> Array:
     power_dbm = ChannelModel().tx_power_dbm
     return np.array([power_bias_m(received_power_dbm(power_dbm, float(range_m), 0.0)) for range_m in ranges_m])

@@ -5,10 +5,10 @@ from typing import Final
 import numpy as np
 from matplotlib.lines import Line2D
 from msgspec import Struct
-from numpy.typing import NDArray
 from scipy.stats import kurtosis, norm, skew
 
 from skyless.evaluation.plot_style import INK, METHOD_COLOURS, MUTED, RED, panel
+from skyless.kernels.arrays import Array
 from skyless.paper.listening import Track, listen
 from skyless.paper.plan import CLAIM_M, P1, P2, RADIO_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict, grouped
@@ -58,7 +58,7 @@ def run_world(progress: Progress, name: str, seed: int, fixes: int) -> list[dict
     return listen(ideal_lab_site(RADIO_PS), paths, METHODS, impairments_of(name, seed), seed, progress, fixes=fixes)
 
 
-def moments_of(error_m: NDArray[np.float64]) -> Moments:
+def moments_of(error_m: Array) -> Moments:
     """Moments of a run of errors, shape (n,); the mean's standard error is from batches, as neighbours correlate."""
     batches = error_m[: len(error_m) // BATCHES * BATCHES].reshape(BATCHES, -1).mean(axis=1)
     standard_error_m = float(batches.std(ddof=1)) / BATCHES**0.5
@@ -195,7 +195,7 @@ def _histogram(place: str, axis: int, tracks: dict[str, Track]) -> Panel:
 def _means(
     place: str,
     moments: dict[tuple[str, str, str], list[Moments]],
-    expected: dict[tuple[str, str], NDArray[np.float64]],
+    expected: dict[tuple[str, str], Array],
     worlds: dict[str, list[dict[str, Track]]],
 ) -> Panel:
     figure, axes = panel(f"{place}: where the mean fix lies", 4.6)

@@ -4,9 +4,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.evaluation.plot_style import INK, METHOD_COLOURS, RED, floor, panel
+from skyless.kernels.arrays import Array
 from skyless.paper.dop_map import ANCHORS_M, literal_covariance_m2
 from skyless.paper.listening import Track, listen
 from skyless.paper.plan import RADIO_PS, Plan, Progress, Results, Task
@@ -31,12 +31,12 @@ EXPLAINS: Final = 0.8
 class AlongPath(Struct, frozen=True):
     """Errors of ``literal`` piece by piece of the path, and what could explain them; arrays of shape (BINS,)."""
 
-    place_m: NDArray[np.float64]
+    place_m: Array
     """True mean position, shape (BINS, 2)."""
-    rms_m: NDArray[np.float64]
+    rms_m: Array
     """About the piece's mean error, which holds the delay of a fix behind a moving tag."""
-    pdop: NDArray[np.float64]
-    predicted_m: NDArray[np.float64]
+    pdop: Array
+    predicted_m: Array
     """From the full covariance of the TDoAs."""
     pdop_correlation: float
     predicted_correlation: float

@@ -3,8 +3,8 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.method_names import FILTERS
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA
@@ -18,8 +18,6 @@ from skyless.positioning.fix import NoFixReason
 from skyless.positioning.solver.locate import NoSolution, locate
 from skyless.site.advice import warnings_of
 from skyless.uncertainty.tdoa import literal_covariance
-
-Array = NDArray[np.float64]
 
 RELIABLE: Final = 0.95
 """An anchor should hear at least this share of the master's frames."""
@@ -62,7 +60,7 @@ def _master(predictor: Predictor) -> list[str]:
     return told
 
 
-def _hears_badly(predictor: Predictor, rows: NDArray[np.int64], what: str) -> str:
+def _hears_badly(predictor: Predictor, rows: Integers, what: str) -> str:
     """One sentence for all anchors that do the same."""
     if len(rows) == 0:
         return ""
@@ -157,7 +155,7 @@ def _walls(predictor: Predictor, plan: PlanMap) -> list[str]:
     ]
 
 
-def _place(plan: PlanMap, where: NDArray[np.bool_]) -> tuple[float, float, float]:
+def _place(plan: PlanMap, where: Mask) -> tuple[float, float, float]:
     """The marked point that is nearest to the middle of all marked ones."""
     k, y, x = np.nonzero(where)
     places = np.column_stack([plan.grid.x_m[x], plan.grid.y_m[y], plan.grid.heights_m[k]])

@@ -4,21 +4,17 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.air.codec import heard_capacity
 from skyless.anchor import MAX_OFFSET_STD_M
 from skyless.clocks.filter import clock_noise
 from skyless.constants import TICK_S
+from skyless.kernels.arrays import Integers, Mask, Matrix, Vector
 from skyless.kernels.compiled import kernel
 from skyless.planning.links import LEAST_SYNC, links
 from skyless.site.model import Site
 from skyless.site.slots import first_slots, schedule_of
 from skyless.uncertainty.tdoa import stamp_variance_m2
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _SETTLED: Final = 1e-7
 _LONGEST: Final = 20_000
@@ -35,9 +31,9 @@ AGE_S, TOLD, LATE_M = range(3)
 class AnchorClocks(NamedTuple):
     """One superframe of a site, message by message: who sends, and when."""
 
-    speaks: NDArray[np.bool_]
+    speaks: Mask
     """Anchors whose clock is known well enough to send; shape (anchors,)."""
-    sender: NDArray[np.int64]
+    sender: Integers
     """Row of the sending anchor; shape (messages,)."""
     gap_s: Vector
     """Time since the message before."""
@@ -75,7 +71,7 @@ def stamp_variances(site: Site) -> tuple[float, float]:
     return tx_var, stamp_variance_m2(noise.rx_stamp_ps * 1e-12, rounded=True)
 
 
-def _messages(site: Site) -> tuple[NDArray[np.int64], Vector, float]:
+def _messages(site: Site) -> tuple[Integers, Vector, float]:
     """Rows of the anchors in the order in which they send in a superframe, their times, and its length."""
     schedule, first = schedule_of(site), first_slots(site)
     slot_s = schedule.slot_ticks * TICK_S
@@ -86,7 +82,7 @@ def _messages(site: Site) -> tuple[NDArray[np.int64], Vector, float]:
 
 @kernel
 def _settle(
-    sender: NDArray[np.int64],
+    sender: Integers,
     time_s: Vector,
     superframe_s: float,
     master: int,

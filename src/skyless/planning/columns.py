@@ -3,7 +3,8 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+
+from skyless.kernels.arrays import Array, Integers
 
 COLUMNS: Final = (
     "anchors",  # how many are in view
@@ -27,11 +28,11 @@ ANCHORS, GDOP, PDOP, HDOP, VDOP, TDOP, SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, BIAS, R
 
 
 def fill_errors(
-    table: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    variance_m2: NDArray[np.float64],
-    square_bias_m2: NDArray[np.float64],
-    claimed_m2: NDArray[np.float64],
+    table: Array,
+    rows: Integers,
+    variance_m2: Array,
+    square_bias_m2: Array,
+    claimed_m2: Array,
 ) -> None:
     """Fill the columns of errors in some rows of a table: variances of three axes, shape (k, 3), the others (k,)."""
     table[rows, SIGMA_X : SIGMA_Z + 1] = np.sqrt(variance_m2)

@@ -5,15 +5,13 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.errors import ConfigurationError
+from skyless.kernels.arrays import Mask, Matrix, Vector
 from skyless.planning.links import anchor_positions
 from skyless.site.image import image_size
 from skyless.site.model import Site
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 Box = tuple[float, float, float, float]
 
 OUTSIDE_M: Final = 0.5
@@ -76,7 +74,7 @@ def area(outline_m: Matrix) -> float:
     return float(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
-def inside(points_m: Matrix, outline_m: Matrix) -> NDArray[np.bool_]:
+def inside(points_m: Matrix, outline_m: Matrix) -> Mask:
     """Which points, shape (m, 2), lie inside a polygon (even-odd rule)."""
     x, y = points_m[:, 0], points_m[:, 1]
     within = np.zeros(len(points_m), dtype=np.bool_)

@@ -14,9 +14,9 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
+from skyless.kernels.arrays import Integers, Matrix, Vector
 from skyless.kernels.compiled import kernel, threaded_kernel
 from skyless.planning.anchor_clocks import AGE_S, LATE_M, TOLD, AnchorClocks, Relays
 from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA, SIGMA_X, SIGMA_Z, fill_errors
@@ -33,10 +33,6 @@ from skyless.positioning.estimator.kalman import (
 from skyless.positioning.estimator.kinds import first_reception, reception_terms, relay_terms, relay_variance
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.estimator.state import EstimatorState, layout, new_state, with_anchor
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 RARELY: Final = 0.1
 """An anchor of whose frames fewer arrive does not help the tag."""

@@ -8,16 +8,11 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Integers, Matrix, Vector
 from skyless.kernels.cholesky import factorise, invert
 from skyless.kernels.compiled import kernel, threaded_kernel
 from skyless.planning.links import links
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-Rows = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 CLOSEST_M: Final = 0.3
 """Anchors nearer to each other than this are not considered."""
@@ -38,7 +33,7 @@ class Lattice(NamedTuple):
     """Shape (candidates, 3)."""
     apart_m: Matrix
     """Distances between them; shape (candidates, candidates)."""
-    rows: Rows
+    rows: Matrix
     """Weighted rows [1, unit vector] of H; shape (candidates, points, 1 + dim)."""
     heard: Matrix
     """Share of each candidate's frames that reach each other one; shape (candidates, candidates)."""
@@ -64,7 +59,7 @@ def lattice_of(
 
 
 @threaded_kernel
-def mean_and_worst(chosen: Indices, lattice: Lattice) -> tuple[float, float]:
+def mean_and_worst(chosen: Integers, lattice: Lattice) -> tuple[float, float]:
     """Mean and largest error over the points for these candidates, the best heard of them being the master."""
     rows, heard = lattice.rows, lattice.heard
     size = rows.shape[2]
@@ -103,7 +98,7 @@ def relative_score(mean: float, worst: float, mean_reference: float, worst_refer
     return 0.5 * (a + b) + BOTH * (max(a - CLEARLY, 0.0) + max(b - CLEARLY, 0.0))
 
 
-def exchange(chosen: Indices, fixed: int, lattice: Lattice, reference: tuple[float, float], passes: int) -> float:
+def exchange(chosen: Integers, fixed: int, lattice: Lattice, reference: tuple[float, float], passes: int) -> float:
     """Move one anchor after the other to its best candidate until none moves; the first ``fixed`` stay. The score."""
     score = relative_score(*mean_and_worst(chosen, lattice), *reference)
     for _ in range(passes):

@@ -5,8 +5,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Mask, Matrix, Vector
 from skyless.kernels.compiled import kernel, threaded_kernel
 from skyless.planning.columns import ANCHORS, GDOP, PDOP, TDOP
 from skyless.simulation.channel import (
@@ -18,9 +18,6 @@ from skyless.simulation.channel import (
 )
 from skyless.site.model import Site
 from skyless.uncertainty.dop import dops_at
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 
 IN_VIEW: Final = 0.5
 """An anchor is in view where at least this share of its frames arrives."""
@@ -127,7 +124,7 @@ class Scene(NamedTuple):
 
     anchors: Matrix
     """Positions, shape (anchors, 3)."""
-    speaks: NDArray[np.bool_]
+    speaks: Mask
     """Those that send at all, shape (anchors,)."""
     budget: Vector
     """``link_budget``."""

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.planning.columns import (
     ANCHORS,
     BIAS,
@@ -27,10 +27,6 @@ from skyless.planning.columns import (
 )
 from skyless.planning.floor import Floor, inside
 from skyless.planning.predict import Predictor
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-Array = NDArray[np.float64]
 
 MOST_POINTS: Final = 5_000_000
 NICE_POINTS: Final = 12_000
@@ -52,7 +48,7 @@ class Grid(Struct, frozen=True):
     y_m: Vector
     heights_m: Vector
     step_m: float
-    within: NDArray[np.bool_]
+    within: Mask
     """Shape (ny, nx)."""
 
     @property
@@ -191,7 +187,7 @@ def _stride(predictor: Predictor, grid: Grid, points: Matrix) -> int:
     return max(1, math.ceil(math.sqrt(grid.points / most)))
 
 
-def _every(stride: int, count: int) -> NDArray[np.int64]:
+def _every(stride: int, count: int) -> Integers:
     """Every so many indices, the last one included."""
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
@@ -199,9 +195,9 @@ def _every(stride: int, count: int) -> NDArray[np.int64]:
 def _interpolate(
     coarse: Array,
     carrier: Matrix,
-    rows: NDArray[np.int64],
-    columns: NDArray[np.int64],
-    within: NDArray[np.bool_],
+    rows: Integers,
+    columns: Integers,
+    within: Mask,
     fine: Matrix,
 ) -> None:
     """Fill the method's columns of ``fine`` from a coarse table that holds these rows and columns of the grid.

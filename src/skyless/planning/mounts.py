@@ -3,13 +3,11 @@
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Integers, Matrix, Vector
 from skyless.planning.floor import Floor, along, inside, total_length
-from skyless.planning.links import Vector, links
+from skyless.planning.links import links
 from skyless.site.model import AnchorSite, Site
-
-Matrix = NDArray[np.float64]
 
 
 class Mounts(Struct, frozen=True):
@@ -24,7 +22,7 @@ class Mounts(Struct, frozen=True):
         """Length of all walls together."""
         return total_length(self.segments_m)
 
-    def at(self, ways_m: Vector, levels: NDArray[np.int64]) -> Matrix:
+    def at(self, ways_m: Vector, levels: Integers) -> Matrix:
         """Points so far along the walls at heights by their number, to the millimetre; shape (m, 3)."""
         places = np.column_stack([along(self.segments_m, ways_m), np.array(self.heights_m)[levels]])
         rounded: Matrix = np.round(places, 3)
@@ -35,7 +33,7 @@ class Layout(Struct, frozen=True):
     """Anchors on mounts."""
 
     ways_m: Vector
-    levels: NDArray[np.int64]
+    levels: Integers
     """Number of each one's height."""
 
 
@@ -62,7 +60,7 @@ def site_with_one_more(site: Site, place_m: Vector) -> Site:
     return replace(site, anchors=(*site.anchors, AnchorSite(number, x, y, z)), schedule=schedule)
 
 
-def masters_by_links(places_m: Matrix, budget: Vector, walls: Matrix) -> NDArray[np.int64]:
+def masters_by_links(places_m: Matrix, budget: Vector, walls: Matrix) -> Integers:
     """Rows of anchors, those first that all others hear best; equals by their distance from the middle."""
     heard, _ = links(places_m, places_m, budget, walls)
     total = np.round(np.minimum(heard, 0.99).sum(axis=0), 3)

@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Integers, Matrix, Vector
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import FIX_SHARE, SIGMA
 from skyless.planning.floor import Floor
@@ -29,9 +29,6 @@ from skyless.planning.mounts import (
 from skyless.planning.predict import PlanSettings, Predictor, with_noise
 from skyless.simulation.channel import pack_walls
 from skyless.site.model import Site
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 
 SEARCH_POINTS: Final = 140
 JUDGE_POINTS: Final = 1500
@@ -197,7 +194,7 @@ def _against(scored: Scored, even: Scored) -> float:
     return relative_score(scored.mean_sigma_m, scored.worst_sigma_m, even.mean_sigma_m, even.worst_sigma_m)
 
 
-def _candidates(mounts: Mounts, most: int, least: int = 1) -> tuple[Vector, NDArray[np.int64]]:
+def _candidates(mounts: Mounts, most: int, least: int = 1) -> tuple[Vector, Integers]:
     """Ways along the walls and levels of some candidates, evenly spaced at every height."""
     levels = len(mounts.heights_m)
     count = max(most // levels, least)

@@ -9,14 +9,12 @@ from matplotlib.colors import BoundaryNorm, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from msgspec import Struct
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array
 from skyless.planning.columns import ANCHORS, BIAS, FIX_SHARE, HDOP, PDOP, RMSE, SIGMA, VDOP
 from skyless.planning.floor import Floor, floor_plan_box
 from skyless.planning.maps import PlanMap
 from skyless.site.model import Site
-
-Array = NDArray[np.float64]
 
 NO_FIX: Final = "#d9d9d9"
 _EDGE: Final = "black"

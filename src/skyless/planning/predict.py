@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Matrix
 from skyless.method_names import DEFAULT_METHOD, FILTERS
 from skyless.planning.anchor_clocks import anchor_clocks, relays_of
 from skyless.planning.columns import COLUMNS, SIGMA
@@ -32,8 +32,6 @@ from skyless.site.almanac_sending import filter_pages_of
 from skyless.site.model import Site
 from skyless.site.slots import schedule_of
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 Fill = Callable[[Matrix, Matrix], None]
 
 CHUNK: Final = 2000

@@ -15,10 +15,10 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.clocks.filter import ClockNoise, clock_noise
 from skyless.constants import TICK_S
+from skyless.kernels.arrays import Array, Mask, Matrix, Vector
 from skyless.kernels.normal import inverse_of
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import FIX_SHARE, SIGMA, fill_errors
@@ -27,11 +27,6 @@ from skyless.positioning.methods.snapshots import SnapshotMethod
 from skyless.site.model import Site
 from skyless.site.slots import first_slots, schedule_of
 from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MOST_DOUBTFUL: Final = 4
 """Anchors whose coming and going is followed exactly."""
@@ -46,7 +41,7 @@ _KEPT: Final = 1e-3
 class Rounds(Struct, frozen=True):
     """Errors of the TDoAs of a site's anchors (the master's row is not used), in the order of its file."""
 
-    usable: NDArray[np.bool_]
+    usable: Mask
     """Whether the anchor sends after the master within a round, as the snapshot methods need; shape (n,)."""
     assumed_own: Vector
     """Variance of each TDoA that the method assumes, beyond the common part; m², shape (n,)."""

@@ -4,14 +4,12 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Matrix
 from skyless.planning.columns import ANCHORS, COLUMNS
 from skyless.planning.maps import PlanMap
 from skyless.site.georeference import to_wgs84
 from skyless.site.model import GeoreferenceSite
-
-Matrix = NDArray[np.float64]
 
 _ROWS: Final = 20_000
 

@@ -11,11 +11,11 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from skyless.evaluation.fleet import Fleet, FleetSettings
 from skyless.evaluation.room_world import Room
 from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.kernels.arrays import Matrix
 from skyless.method_names import FILTERS
 from skyless.planning.columns import CLAIMED, FIX_SHARE, RMSE, SIGMA
 from skyless.planning.maps import PlanMap
@@ -24,8 +24,6 @@ from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Static
 from skyless.site.model import AccuracySite
 from skyless.site.slots import schedule_of
-
-Matrix = NDArray[np.float64]
 
 WARM_UP_S: Final = 3.0
 BATCH_ROUNDS: Final = 60

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array
 from skyless.positioning.integrity import Alert, Integrity, IntegrityRequirement, integrity_of
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Fix(Struct, frozen=True, gc=False):
     """Rows of float64 (``POSITION`` and the following), without those of which the method knows nothing."""
     anchors: tuple[int, ...]
     """Identifiers of the anchors in use, the reference first."""
-    anchors_m: NDArray[np.float64]
+    anchors_m: Array
     """Their positions, shape (len(anchors), 3)."""
     method: str
     height_known: bool
@@ -73,22 +73,22 @@ class Fix(Struct, frozen=True, gc=False):
         )
 
     @property
-    def position_m(self) -> NDArray[np.float64]:
+    def position_m(self) -> Array:
         """Shape (3,)."""
         return _vector(self.rows, POSITION)
 
     @property
-    def covariance_m2(self) -> NDArray[np.float64]:
+    def covariance_m2(self) -> Array:
         """Of the position, shape (3, 3); a coordinate that was given (2-D, known height) has zeros."""
         return _matrix(self.rows, POSITION + 1)
 
     @property
-    def velocity_mps(self) -> NDArray[np.float64] | None:
+    def velocity_mps(self) -> Array | None:
         """Shape (3,), None where the method knows none."""
         return _vector(self.rows, VELOCITY) if len(self.rows) > VELOCITY * ROW_BYTES else None
 
     @property
-    def velocity_covariance(self) -> NDArray[np.float64] | None:
+    def velocity_covariance(self) -> Array | None:
         """Shape (3, 3) in (m/s)²."""
         return _matrix(self.rows, VELOCITY + 1) if len(self.rows) > VELOCITY * ROW_BYTES else None
 
@@ -155,9 +155,9 @@ def _row(rows: bytes, place: int) -> tuple[float, ...]:
     return _ROW.unpack_from(rows, place * ROW_BYTES)
 
 
-def _vector(rows: bytes, place: int) -> NDArray[np.float64]:
+def _vector(rows: bytes, place: int) -> Array:
     return np.frombuffer(rows, count=3, offset=place * ROW_BYTES)
 
 
-def _matrix(rows: bytes, place: int) -> NDArray[np.float64]:
+def _matrix(rows: bytes, place: int) -> Array:
     return np.frombuffer(rows, count=9, offset=place * ROW_BYTES).reshape(3, 3)

@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
+
+from skyless.kernels.arrays import Array
 
 RISK: Final = 1e-4
 
@@ -86,7 +87,7 @@ def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert
     return Integrity(hpl_m, vpl_m, risk, Alert.LIMIT if exceeded else _ALERTS[state])
 
 
-def limits_of(risk: float = RISK) -> NDArray[np.float64]:
+def limits_of(risk: float = RISK) -> Array:
     """Multiples of the standard deviation, horizontal and vertical, that errors exceed with this risk, in a fix.
 
     Raises:

@@ -3,12 +3,11 @@
 from collections.abc import Iterator
 from typing import Protocol
 
-import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.air.beacon import HEARD
 from skyless.air.master_term import MasterTerm
+from skyless.kernels.arrays import Array
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.ticks import nearest
 
@@ -17,7 +16,7 @@ class Observation(Struct, frozen=True, gc=False):
     """A beacon heard by the tag; integers never wrap."""
 
     anchor: int
-    anchor_m: NDArray[np.float64]
+    anchor_m: Array
     """Shape (3,)."""
     round: int
     """Counts the frames that each node sends: the superframe, or a fraction of it with several frames per node; for

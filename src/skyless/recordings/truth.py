@@ -8,9 +8,9 @@ from os import PathLike
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.errors import ConfigurationError
+from skyless.kernels.arrays import Array
 from skyless.recordings.source import read_lines
 from skyless.recordings.tables import finite
 
@@ -23,11 +23,11 @@ QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
 class Truth:
     """Positions over time, n of them, times never decreasing."""
 
-    t_s: NDArray[np.float64]
+    t_s: Array
     """Shape (n,), in the time of the recording."""
-    position_m: NDArray[np.float64]
+    position_m: Array
     """Shape (n, 3)."""
-    quaternion: NDArray[np.float64] | None
+    quaternion: Array | None
     """Shape (n, 4), x, y, z, w, body to site; None where the table has none."""
 
 
@@ -68,7 +68,7 @@ def _values(
     names: list[str],
     columns: tuple[str, ...],
     listener: str | None,
-) -> NDArray[np.float64]:
+) -> Array:
     """Wanted columns, shape (n, len(columns)); blank lines are passed over."""
     places = [names.index(column) for column in columns]
     chosen = names.index("listener") if columns == LISTENER_COLUMNS and "listener" in names else None

@@ -5,14 +5,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from skyless.evaluation.figures import save_figure
+from skyless.kernels.arrays import Matrix
 
-Rows = NDArray[np.float64]
 
-
-def draw(path: Path, rows: Rows, title: str) -> None:
+def draw(path: Path, rows: Matrix, title: str) -> None:
     """Draw rows of time, position (3) and true position (3, NaN where unknown) into a file; without rows, the title.
 
     Raises:
@@ -25,7 +23,7 @@ def draw(path: Path, rows: Rows, title: str) -> None:
     save_figure(figure, path)
 
 
-def _fill(figure: Figure, rows: Rows) -> None:
+def _fill(figure: Figure, rows: Matrix) -> None:
     axes = figure.subplots(2, 2)
     judged = rows[np.isfinite(rows[:, 4])]
     known = len(judged) > 0
@@ -36,7 +34,7 @@ def _fill(figure: Figure, rows: Rows) -> None:
     _distribution(axes[1, 1], np.linalg.norm(errors[:, :2], axis=1), known=known)
 
 
-def _track(axes: Axes, rows: Rows, judged: Rows) -> None:
+def _track(axes: Axes, rows: Matrix, judged: Matrix) -> None:
     if len(judged):
         axes.plot(judged[:, 4], judged[:, 5], color="black", linewidth=0.8, label="truth")
     axes.plot(rows[:, 1], rows[:, 2], ".", markersize=2, label="fixes")
@@ -44,14 +42,14 @@ def _track(axes: Axes, rows: Rows, judged: Rows) -> None:
     axes.legend()
 
 
-def _over_time(axes: Axes, time_s: Rows, errors: Rows, *, known: bool) -> None:
+def _over_time(axes: Axes, time_s: Matrix, errors: Matrix, *, known: bool) -> None:
     for axis, name in enumerate("xyz"):
         axes.plot(time_s - time_s[:1], errors[:, axis], linewidth=0.7, label=name)
     axes.set(xlabel="time in s", ylabel=_label(known=known), title="over time")
     axes.legend()
 
 
-def _histogram(axes: Axes, errors: Rows, names: tuple[str, ...], *, known: bool) -> None:
+def _histogram(axes: Axes, errors: Matrix, names: tuple[str, ...], *, known: bool) -> None:
     span = np.percentile(np.abs(errors), 99.5) if len(errors) else 1.0
     for axis, name in enumerate(names):
         axes.hist(errors[:, axis], bins=80, range=(-span, span), histtype="step", label=name)
@@ -59,7 +57,7 @@ def _histogram(axes: Axes, errors: Rows, names: tuple[str, ...], *, known: bool)
     axes.legend()
 
 
-def _distribution(axes: Axes, radial_m: Rows, *, known: bool) -> None:
+def _distribution(axes: Axes, radial_m: Matrix, *, known: bool) -> None:
     axes.plot(np.sort(radial_m), np.linspace(0.0, 100.0, len(radial_m)))
     axes.set(xlabel=f"horizontal {_label(known=known)}", ylabel="per cent of the fixes below", title="distribution")
     axes.grid(visible=True, linewidth=0.3)

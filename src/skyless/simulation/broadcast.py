@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.air.reception import Diagnostics, Reception
 from skyless.constants import TICK_S
+from skyless.kernels.arrays import Array, Integers
 from skyless.simulation.ether import OUTCOMES
 
 
@@ -29,13 +29,13 @@ class Broadcast:
     emission_fraction: float
     end_s: float
     """True time of the frame's end, which the receptions carry as the host's time."""
-    tags: NDArray[np.int64]
+    tags: Integers
     """Indices of the tags that heard it, shape (n,)."""
-    rx_ticks: NDArray[np.int64]
+    rx_ticks: Integers
     """Their RX stamps, 40 bits, shape (n,)."""
-    positions_m: NDArray[np.float64]
+    positions_m: Array
     """Where they truly were at the emission, shape (n, 3)."""
-    velocities_mps: NDArray[np.float64]
+    velocities_mps: Array
     """How they truly moved, shape (n, 3)."""
     diagnostics: tuple[Diagnostics, ...] | None
     """What their radios measured, where the world is asked for it."""
@@ -45,7 +45,7 @@ class Broadcast:
         """True time of the RMARKER's emission in seconds since the start."""
         return (self.emission_ticks + self.emission_fraction) * TICK_S
 
-    def receptions(self) -> Iterator[tuple[int, Reception, NDArray[np.float64]]]:
+    def receptions(self) -> Iterator[tuple[int, Reception, Array]]:
         """Tag index, reception and true position, shape (3,), of every tag that heard the frame."""
         frame, host_s = self.frame, self.end_s
         measured = self.diagnostics or (None,) * len(self.tags)
@@ -65,7 +65,7 @@ class Tally(Struct, frozen=True):
     at_tags: dict[str, int]
 
 
-def make_tally(transmissions: int, late: int, counts: NDArray[np.int64]) -> Tally:
+def make_tally(transmissions: int, late: int, counts: Integers) -> Tally:
     """Tally from the kernels' counts, shape (2, outcomes)."""
     at_anchors, at_tags = (dict(zip((str(o) for o in OUTCOMES), row.tolist(), strict=True)) for row in counts)
     return Tally(transmissions, late, at_anchors, at_tags)

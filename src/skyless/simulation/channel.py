@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct, structs
-from numpy.typing import NDArray
 
 from skyless.constants import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS
+from skyless.kernels.arrays import Array, Records
 from skyless.kernels.compiled import kernel, part
 from skyless.site.model import WallSite
 
@@ -68,18 +68,18 @@ CHANNEL: Final = np.dtype([(field.name, np.float64) for field in structs.fields(
 """A ``ChannelModel`` for the kernels; switches are 0 or 1."""
 
 
-def pack_channel(model: ChannelModel) -> NDArray[np.void]:
+def pack_channel(model: ChannelModel) -> Records:
     """Return the model for the kernels, shape (1,)."""
     return np.array([structs.astuple(model)], dtype=CHANNEL)
 
 
-def pack_walls(walls: tuple[WallSite, ...]) -> NDArray[np.float64]:
+def pack_walls(walls: tuple[WallSite, ...]) -> Array:
     """Walls for the kernels, shape (n, 6): x1, y1, x2, y2, loss in dB, delay in metres."""
     return np.array([structs.astuple(wall) for wall in walls], dtype=np.float64).reshape(-1, 6)
 
 
 @kernel
-def cross_walls(walls: NDArray[np.float64], ax_m: float, ay_m: float, bx_m: float, by_m: float) -> tuple[float, float]:
+def cross_walls(walls: Array, ax_m: float, ay_m: float, bx_m: float, by_m: float) -> tuple[float, float]:
     """Loss in dB and delay in metres of all walls that the straight line from a to b crosses."""
     loss_db = 0.0
     delay_m = 0.0

@@ -6,9 +6,9 @@ from enum import StrEnum
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.constants import TICK_RATE_HZ, TICK_S
+from skyless.kernels.arrays import Array
 
 
 class Outcome(StrEnum):
@@ -66,7 +66,7 @@ class OnAir:
         """Take back a frame that will not be sent after all."""
         self._flights.remove(flight)
 
-    def others(self, flight: Flight) -> NDArray[np.float64]:
+    def others(self, flight: Flight) -> Array:
         """Frames that may overlap this one, shape (n, 3): sending node, begin and end in s from this RMARKER."""
         first, last = flight.begin_ticks - _FARTHEST_TICKS, flight.end_ticks + _FARTHEST_TICKS
         rows = [

@@ -9,9 +9,9 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.kernels.arrays import Array, Integers, Records
 from skyless.kernels.compiled import kernel, part
 from skyless.simulation.channel import (
     cross_walls,
@@ -50,9 +50,9 @@ RECEIVED: Final = np.dtype(
 
 @kernel
 def link(
-    stations: NDArray[np.void],
-    channel: NDArray[np.void],
-    walls: NDArray[np.float64],
+    stations: Records,
+    channel: Records,
+    walls: Array,
     sender: int,
     listener: int,
     t_s: float,
@@ -81,10 +81,10 @@ def link(
 
 @part
 def overlapped(
-    stations: NDArray[np.void],
-    channel: NDArray[np.void],
-    walls: NDArray[np.float64],
-    others: NDArray[np.float64],
+    stations: Records,
+    channel: Records,
+    walls: Array,
+    others: Array,
     listener: int,
     t_s: float,
     arrival_s: tuple[float, float],
@@ -110,9 +110,7 @@ def overlapped(
 
 
 @part
-def received(
-    channel: NDArray[np.void], normals: NDArray[np.float64], cursors: NDArray[np.int64], node: int, power_dbm: float
-) -> int:
+def received(channel: Records, normals: Array, cursors: Integers, node: int, power_dbm: float) -> int:
     """Outcome at a listener of power and chance: heard, weak or lost. Draws only where chance decides."""
     sensitivity_dbm, width_db = channel[0]["sensitivity_dbm"], channel[0]["sensitivity_width_db"]
     margin = (power_dbm - sensitivity_dbm) / width_db
@@ -130,10 +128,10 @@ def received(
 
 @part
 def late_m(
-    stations: NDArray[np.void],
-    channel: NDArray[np.void],
-    normals: NDArray[np.float64],
-    cursors: NDArray[np.int64],
+    stations: Records,
+    channel: Records,
+    normals: Array,
+    cursors: Integers,
     node: int,
     bias_m: float,
 ) -> float:
@@ -149,10 +147,10 @@ def late_m(
 
 @part
 def stamp(
-    clocks: NDArray[np.void],
-    normals: NDArray[np.float64],
-    cursors: NDArray[np.int64],
-    stations: NDArray[np.void],
+    clocks: Records,
+    normals: Array,
+    cursors: Integers,
+    stations: Records,
     node: int,
     emission_ticks: int,
     arrival_ticks: float,
@@ -168,7 +166,7 @@ def stamp(
 
 
 @part
-def place(stations: NDArray[np.void], node: int, t_s: float, row: np.void) -> None:
+def place(stations: Records, node: int, t_s: float, row: np.void) -> None:
     """Fill in where a listener truly was and how it moved."""
     row["node"] = node
     for axis in range(3):
@@ -178,10 +176,10 @@ def place(stations: NDArray[np.void], node: int, t_s: float, row: np.void) -> No
 
 @part
 def measure(
-    clocks: NDArray[np.void],
-    channel: NDArray[np.void],
-    normals: NDArray[np.float64],
-    cursors: NDArray[np.int64],
+    clocks: Records,
+    channel: Records,
+    normals: Array,
+    cursors: Integers,
     sender: int,
     node: int,
     observed: tuple[float, float, float],
@@ -198,23 +196,23 @@ def measure(
 
 @kernel
 def hear(
-    clocks: NDArray[np.void],
-    normals: NDArray[np.float64],
-    cursors: NDArray[np.int64],
-    stations: NDArray[np.void],
-    channel: NDArray[np.void],
-    walls: NDArray[np.float64],
-    others: NDArray[np.float64],
+    clocks: Records,
+    normals: Array,
+    cursors: Integers,
+    stations: Records,
+    channel: Records,
+    walls: Array,
+    others: Array,
     sender: int,
     emission_ticks: int,
     emission_fraction: float,
     span_s: tuple[float, float],
     bias_m: float,
-    range_errors_m: NDArray[np.float64],
+    range_errors_m: Array,
     slope_m: float,
     diagnostics: bool,
-    heard: NDArray[np.void],
-    tally: NDArray[np.int64],
+    heard: Records,
+    tally: Integers,
 ) -> tuple[int, int, int]:
     """Let every node that is on listen to one frame.
 

@@ -12,11 +12,11 @@ from functools import partial
 from typing import Final, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.air.airtime import after_rmarker_s, preamble_s
 from skyless.air.reception import Transmission
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_S
+from skyless.kernels.arrays import Records
 from skyless.simulation.broadcast import Tally, make_tally
 from skyless.simulation.channel import pack_channel, pack_walls
 from skyless.simulation.ether import OUTCOMES, Flight, OnAir
@@ -48,8 +48,8 @@ class Delivery:
     """A frame that has just ended, and the rows (``RECEIVED``) of the nodes that heard it."""
 
     flight: Flight
-    by_anchors: NDArray[np.void]
-    by_tags: NDArray[np.void]
+    by_anchors: Records
+    by_tags: Records
 
 
 class Medium(Generic[Told]):

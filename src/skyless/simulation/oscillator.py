@@ -14,9 +14,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.constants import TICK_RATE_HZ, TICK_S
+from skyless.kernels.arrays import Array, Integers, Records
 from skyless.kernels.compiled import kernel, part
 from skyless.simulation.streams import draw_normal
 from skyless.ticks import WRAP_TICKS
@@ -71,7 +71,7 @@ class OscillatorModel(Struct, frozen=True, forbid_unknown_fields=True):
     temperature: Temperature | None = None
 
 
-def make_clocks(model: OscillatorModel, generators: list[np.random.Generator]) -> NDArray[np.void]:
+def make_clocks(model: OscillatorModel, generators: list[np.random.Generator]) -> Records:
     """Clocks, shape (len(generators),), at true time 0 with random counters and offsets, one generator each."""
     clocks = np.zeros(len(generators), dtype=CLOCK)
     for clock, generator in zip(clocks, generators, strict=True):
@@ -96,21 +96,21 @@ def _set_temperature(clock: np.void, temperature: Temperature | None, phase_rad:
     clock["swing_phase_rad"] = phase_rad
 
 
-def warm_up(clocks: NDArray[np.void], node: int, ppm: float, start_s: float, tau_s: float) -> None:
+def warm_up(clocks: Records, node: int, ppm: float, start_s: float, tau_s: float) -> None:
     """Let a node's crystal warm up from ``start_s`` on, with the time constant ``tau_s``, by ``ppm`` in the end."""
     clocks[node]["drift"] = ppm * 1e-6
     clocks[node]["drift_start_s"] = start_s
     clocks[node]["drift_tau_s"] = tau_s
 
 
-def restart_counter(clocks: NDArray[np.void], node: int, generator: np.random.Generator) -> None:
+def restart_counter(clocks: Records, node: int, generator: np.random.Generator) -> None:
     """Give a node that was switched on again a new counter; its crystal stays what it was."""
     clocks[node]["local_ticks"] = generator.integers(WRAP_TICKS)
     clocks[node]["local_fraction"] = generator.random()
 
 
 @part
-def clock_rate(clocks: NDArray[np.void], node: int) -> float:
+def clock_rate(clocks: Records, node: int) -> float:
     """Fractional frequency of the node's counter at its last instant, temperature included, dimensionless."""
     clock = clocks[node]
     rate: float = clock["rate"]
@@ -126,7 +126,7 @@ def clock_rate(clocks: NDArray[np.void], node: int) -> float:
 
 
 @part
-def temperature_phase_s(clocks: NDArray[np.void], node: int, from_s: float, to_s: float) -> float:
+def temperature_phase_s(clocks: Records, node: int, from_s: float, to_s: float) -> float:
     """Phase in seconds that the temperature adds between two true times: its rate, integrated in closed form."""
     clock = clocks[node]
     tau_s = clock["warm_up_s"]
@@ -140,7 +140,7 @@ def temperature_phase_s(clocks: NDArray[np.void], node: int, from_s: float, to_s
 
 
 @kernel
-def drift_phase_s(clocks: NDArray[np.void], node: int, from_s: float, to_s: float) -> float:
+def drift_phase_s(clocks: Records, node: int, from_s: float, to_s: float) -> float:
     """Phase in seconds that a warm-up adds between two true times: its rate, integrated in closed form."""
     clock = clocks[node]
     start_s, tau_s = clock["drift_start_s"], clock["drift_tau_s"]
@@ -153,9 +153,9 @@ def drift_phase_s(clocks: NDArray[np.void], node: int, from_s: float, to_s: floa
 
 @kernel
 def advance(
-    clocks: NDArray[np.void],
-    normals: NDArray[np.float64],
-    cursors: NDArray[np.int64],
+    clocks: Records,
+    normals: Array,
+    cursors: Integers,
     node: int,
     true_ticks: int,
     true_fraction: float,
@@ -190,7 +190,7 @@ def advance(
 
 
 @kernel
-def foresee(clocks: NDArray[np.void], node: int, local_ticks: int) -> int:
+def foresee(clocks: Records, node: int, local_ticks: int) -> int:
     """True time, in whole ticks, at which the node's unwrapped counter will show a value if its rate holds."""
     clock = clocks[node]
     ahead = (local_ticks - clock["local_ticks"]) / (1.0 + clock_rate(clocks, node))
@@ -200,9 +200,9 @@ def foresee(clocks: NDArray[np.void], node: int, local_ticks: int) -> int:
 
 @kernel
 def emit(
-    clocks: NDArray[np.void],
-    normals: NDArray[np.float64],
-    cursors: NDArray[np.int64],
+    clocks: Records,
+    normals: Array,
+    cursors: Integers,
     node: int,
     local_ticks: int,
     tx_noise_ticks: float,

@@ -12,10 +12,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array, Records
 from skyless.kernels.compiled import kernel
 from skyless.simulation.streams import TAG_KEY, stream
-
-Array = NDArray[np.float64]
 
 KNOTS: Final = 20
 """In a correlation length. Between two of them a straight line keeps 98.7 % of the standard deviation or more."""
@@ -95,7 +94,7 @@ class RangeErrors:
         gained_m = self._model.changing_m * math.sqrt(1.0 - kept**2)
         return np.asarray(kept * self._before_m[tag] + gained_m * self._draws[tag].standard_normal(self._anchors))
 
-    def pass_to(self, t_s: float, stations: NDArray[np.void]) -> None:
+    def pass_to(self, t_s: float, stations: Records) -> None:
         """Bring the errors to a true time at which ``stations`` say where the tags are."""
         if self._model.changing_m == 0.0:
             return

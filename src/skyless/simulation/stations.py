@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
+from skyless.kernels.arrays import Records
 from skyless.kernels.compiled import kernel, part
 from skyless.simulation.impairments import Impairments, Outage
 from skyless.simulation.trajectory import Piece, Trajectory
@@ -47,7 +47,7 @@ STATION: Final = np.dtype(
 """A node's antenna and radio, anchors first, then tags."""
 
 
-def make_stations(anchors: Sequence[AnchorSite], tags: Sequence[TagSpec], impairments: Impairments) -> NDArray[np.void]:
+def make_stations(anchors: Sequence[AnchorSite], tags: Sequence[TagSpec], impairments: Impairments) -> Records:
     """Stations of a world, shape (anchors + tags,), all off; the tags' positions are to be set yet."""
     stations = np.zeros(len(anchors) + len(tags), dtype=STATION)
     stations["tx_noise_ticks"] = impairments.tx_stamp_ps * 1e-12 / TICK_S
@@ -69,7 +69,7 @@ def make_stations(anchors: Sequence[AnchorSite], tags: Sequence[TagSpec], impair
     return stations
 
 
-def set_piece(stations: NDArray[np.void], node: int, piece: Piece) -> None:
+def set_piece(stations: Records, node: int, piece: Piece) -> None:
     """Let a node move along a piece of its trajectory."""
     stations[node]["origin_s"] = piece.origin_s
     stations[node]["position_m"] = piece.position_m
@@ -78,7 +78,7 @@ def set_piece(stations: NDArray[np.void], node: int, piece: Piece) -> None:
 
 
 @part
-def coordinate_m(stations: NDArray[np.void], node: int, axis: int, t_s: float) -> float:
+def coordinate_m(stations: Records, node: int, axis: int, t_s: float) -> float:
     """One coordinate of a node at a true time."""
     s = stations[node]
     dt_s = t_s - s["origin_s"]
@@ -88,7 +88,7 @@ def coordinate_m(stations: NDArray[np.void], node: int, axis: int, t_s: float) -
 
 
 @part
-def velocity_mps(stations: NDArray[np.void], node: int, axis: int, t_s: float) -> float:
+def velocity_mps(stations: Records, node: int, axis: int, t_s: float) -> float:
     """One component of a node's velocity at a true time."""
     s = stations[node]
     velocity: float = s["velocity_mps"][axis] + (t_s - s["origin_s"]) * s["acceleration_mps2"][axis]
@@ -96,7 +96,7 @@ def velocity_mps(stations: NDArray[np.void], node: int, axis: int, t_s: float) -
 
 
 @kernel
-def body_m(stations: NDArray[np.void], sender: int, node: int, t_s: float) -> float:
+def body_m(stations: Records, sender: int, node: int, t_s: float) -> float:
     """Delay of a sender's messages through the body that carries a listener, 0 where that does not stand between."""
     s = stations[node]
     delay_m: float = s["body_m"]

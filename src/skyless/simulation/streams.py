@@ -8,8 +8,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array, Integers
 from skyless.kernels.compiled import part
 
 BLOCK: Final = 1024
@@ -32,8 +32,8 @@ class Streams:
 
     def __init__(self, generators: list[np.random.Generator]) -> None:
         self._generators = generators
-        self.normals: NDArray[np.float64] = np.empty((len(generators), BLOCK))
-        self.cursors: NDArray[np.int64] = np.zeros(len(generators), dtype=np.int64)
+        self.normals: Array = np.empty((len(generators), BLOCK))
+        self.cursors: Integers = np.zeros(len(generators), dtype=np.int64)
         for node in range(len(generators)):
             self._refill(node)
 
@@ -49,7 +49,7 @@ class Streams:
 
 
 @part
-def draw_normal(normals: NDArray[np.float64], cursors: NDArray[np.int64], node: int) -> float:
+def draw_normal(normals: Array, cursors: Integers, node: int) -> float:
     """Next standard normal of the node."""
     value: float = normals[node, cursors[node]]
     cursors[node] += 1
@@ -57,6 +57,6 @@ def draw_normal(normals: NDArray[np.float64], cursors: NDArray[np.int64], node: 
 
 
 @part
-def draw_uniform(normals: NDArray[np.float64], cursors: NDArray[np.int64], node: int) -> float:
+def draw_uniform(normals: Array, cursors: Integers, node: int) -> float:
     """Next uniform number of the node in (0, 1): a normal through its own distribution function."""
     return 0.5 * math.erfc(-draw_normal(normals, cursors, node) / math.sqrt(2.0))

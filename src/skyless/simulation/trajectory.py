@@ -10,8 +10,9 @@ from abc import ABC, abstractmethod
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from skyless.kernels.arrays import Array
 from skyless.simulation.streams import stream
 
 _WALK_KEY: Final = 2
@@ -24,9 +25,9 @@ class Piece(NamedTuple):
     start_s: float
     end_s: float
     origin_s: float
-    position_m: NDArray[np.float64]
-    velocity_mps: NDArray[np.float64]
-    acceleration_mps2: NDArray[np.float64]
+    position_m: Array
+    velocity_mps: Array
+    acceleration_mps2: Array
 
 
 class Trajectory(ABC):
@@ -36,19 +37,19 @@ class Trajectory(ABC):
     def piece(self, t_s: float) -> Piece:
         """The piece that holds at a true time; cheapest when asked in the order of time."""
 
-    def position(self, t_s: float) -> NDArray[np.float64]:
+    def position(self, t_s: float) -> Array:
         """Position at a true time in metres, shape (3,)."""
         piece = self.piece(t_s)
         dt_s = t_s - piece.origin_s
         return piece.position_m + dt_s * (piece.velocity_mps + 0.5 * dt_s * piece.acceleration_mps2)
 
-    def velocity(self, t_s: float) -> NDArray[np.float64]:
+    def velocity(self, t_s: float) -> Array:
         """Velocity at a true time in m/s, shape (3,)."""
         piece = self.piece(t_s)
         return piece.velocity_mps + (t_s - piece.origin_s) * piece.acceleration_mps2
 
 
-def _rest(position_m: NDArray[np.float64], start_s: float = -math.inf, end_s: float = math.inf) -> Piece:
+def _rest(position_m: Array, start_s: float = -math.inf, end_s: float = math.inf) -> Piece:
     return Piece(start_s, end_s, 0.0, position_m, np.zeros(3), np.zeros(3))
 
 
@@ -129,16 +130,16 @@ class Waypoints(Trajectory):
         lap, within = divmod(corner, len(self._legs_mps))
         return self._first_s + lap * self._lap_s + self._passed_s[within]
 
-    def _corner(self, corner: int) -> NDArray[np.float64]:
+    def _corner(self, corner: int) -> Array:
         index = corner % len(self._points_m) if self._loop else min(corner, len(self._points_m) - 1)
-        point: NDArray[np.float64] = self._points_m[index]
+        point: Array = self._points_m[index]
         return point
 
-    def _leg(self, corner: int) -> NDArray[np.float64]:
+    def _leg(self, corner: int) -> Array:
         """Velocity after a corner; zero before the first and after the last."""
         if corner < 0 or (not self._loop and corner >= len(self._legs_mps)):
             return np.zeros(3)
-        leg: NDArray[np.float64] = self._legs_mps[corner % len(self._legs_mps)]
+        leg: Array = self._legs_mps[corner % len(self._legs_mps)]
         return leg
 
     def _bend(self, corner: int) -> Piece:
@@ -149,7 +150,7 @@ class Waypoints(Trajectory):
         return Piece(begin_s, end_s, begin_s, self._corner(corner) - before * self._half_s, before, turning)
 
 
-def _as_points(points_m: ArrayLike) -> NDArray[np.float64]:
+def _as_points(points_m: ArrayLike) -> Array:
     points = np.asarray(points_m, dtype=np.float64)
     if points.ndim != 2 or points.shape[0] < 2 or points.shape[1] not in {2, 3}:
         raise ValueError(f"waypoints should have shape (n, 2) or (n, 3) with n of 2 or more, not {points.shape}")
@@ -280,7 +281,7 @@ class Roaming(Trajectory):
         place, motion = self._generator.standard_normal((2, 3))
         self._push(self._middle_m + self._spread_m * place, np.where(self._free, self._speed_mps * motion, 0.0))
 
-    def _push(self, position_m: NDArray[np.float64], velocity_mps: NDArray[np.float64]) -> None:
+    def _push(self, position_m: Array, velocity_mps: Array) -> None:
         """Append a piece with an acceleration of its own."""
         away_m = position_m + 0.5 * self._step_s * velocity_mps - self._middle_m  # halfway through the piece
         held = -self._pull_per_s2 * away_m - velocity_mps / self._damping_s

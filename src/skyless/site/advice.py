@@ -4,8 +4,8 @@ from math import dist
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array
 from skyless.site.model import Site
 
 _FLATTEST: Final = 0.05
@@ -80,5 +80,5 @@ def _accuracy(site: Site) -> list[str]:
     ]
 
 
-def _points(site: Site) -> NDArray[np.float64]:
+def _points(site: Site) -> Array:
     return np.array([[anchor.x_m, anchor.y_m, anchor.z_m] for anchor in site.anchors])

@@ -4,11 +4,9 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Matrix
 from skyless.site.model import GeoreferenceSite
-
-Matrix = NDArray[np.float64]
 
 EARTH_A_M: Final = 6_378_137.0
 EARTH_E2: Final = 6.694379990141e-3

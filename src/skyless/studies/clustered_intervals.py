@@ -3,15 +3,16 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
+
+from skyless.kernels.arrays import Array
 
 ALPHA: Final = 0.01
 CLUSTER: Final = 25.0
 """Neighbouring fixes share their errors: so many may be misleading together, though such a cluster was not seen."""
 
 
-def rare_interval(events: NDArray[np.float64], count: float) -> tuple[float, float]:
+def rare_interval(events: Array, count: float) -> tuple[float, float]:
     """Where the true share lies, with 99 %, if ``count`` cases have so many events in each independent run.
 
     Runs with events are taken as a Poisson process of clusters: Fay and Feuer (Statistics in Medicine 16, 1997,

@@ -10,17 +10,15 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from skyless.evaluation.lab_bound import LAST, SPEED_STD_MPS, WHITE_FM
+from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
 from skyless.positioning.estimator.estimator import Estimator
 from skyless.site.lab import ideal_lab_site
 from skyless.studies.episodes import Case, Episode, draw_episode, settings_of
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
-
-Array = NDArray[np.float64]
 
 START_STD_M: Final = 0.3
 """The filter starts so far off, per axis; after two seconds nothing of it is left."""

@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.errors import SkylessError
+from skyless.kernels.arrays import Array
 from skyless.studies.efficiency import CHUNK, run_chunk, summary
 from skyless.studies.episodes import Case
 from skyless.studies.plan import Cell, Plan, Row
-
-Array = NDArray[np.float64]
 
 LIMIT: Final = 1.02
 EPISODE_S: Final = 0.02

@@ -9,15 +9,12 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.evaluation.lab_bound import SUPERFRAMES, WHITE_FM, random_path
+from skyless.kernels.arrays import Array, Integers
 from skyless.positioning.estimator.estimator import Packets
 from skyless.positioning.estimator.settings import EstimatorSettings
-
-Array = NDArray[np.float64]
-Ticks = NDArray[np.int64]
 
 CRYSTALS_PPM: Final = 10.0
 SPREAD_M: Final = 1e6
@@ -87,7 +84,7 @@ def settings_of(case: Case, height_m: float | None) -> EstimatorSettings:
     )
 
 
-def _ticks(metres: Array) -> Ticks:
+def _ticks(metres: Array) -> Integers:
     return np.rint(metres / TICK_M).astype(np.int64)
 
 
@@ -106,7 +103,7 @@ def _clocks(draw: Generator, frames: int, clocks: int, step_s: float, random_wal
     return offsets, rates
 
 
-def _relays(rx_ticks: Ticks, senders: Ticks, n: int, case: Case) -> tuple[Ticks, Ticks]:
+def _relays(rx_ticks: Integers, senders: Integers, n: int, case: Case) -> tuple[Integers, Integers]:
     """Who heard whom when, in the order in which the tag gets to know it, and where each frame's share ends."""
     frames = np.arange(len(senders))
     rows = []

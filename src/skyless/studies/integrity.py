@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from skyless.errors import SkylessError
 from skyless.evaluation.lab_bound import SPEED_STD_MPS
+from skyless.kernels.arrays import Array
 from skyless.positioning.estimator.estimator import ACCEPTED, JOINED, Estimator, Packets
 from skyless.positioning.estimator.levels import HPL, LEVELS, VPL
 from skyless.positioning.integrity import CONTRADICTED
@@ -25,8 +26,6 @@ from skyless.studies.clustered_intervals import rare_interval
 from skyless.studies.episodes import Case, draw_episode, settings_of
 from skyless.studies.integrity_faults import FAULTS, Fault, faulty
 from skyless.studies.plan import Cell, Plan, Row
-
-Array = NDArray[np.float64]
 
 SUPERFRAMES: Final = 134
 ONSETS: Final = (40, 67)

@@ -8,6 +8,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from skyless.constants import TICK_M
+from skyless.kernels.arrays import Array
 from skyless.positioning.estimator.estimator import Packets
 from skyless.studies.episodes import Episode
 
@@ -75,7 +76,7 @@ def faulty(episode: Episode, fault: Fault, anchor: int, onset: int, slot_s: floa
     return replace(packets, rx_ticks=packets.rx_ticks + late, relays=relays)
 
 
-def _share(since_s: NDArray[np.floating[Any]], kind: Kind) -> NDArray[np.float64]:
+def _share(since_s: NDArray[np.floating[Any]], kind: Kind) -> Array:
     """How much of the fault there is, from −1 to 1."""
     if kind == "ramp":
         return np.asarray(np.clip(since_s / RAMP_S, 0.0, 1.0), np.float64)

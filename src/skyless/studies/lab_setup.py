@@ -5,9 +5,9 @@ from typing import Any, Final
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from skyless.evaluation.scenarios import WALL_MARGIN_M, Request, impairments_of, trajectories_of
+from skyless.kernels.arrays import Array
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.trajectory import Trajectory
@@ -15,8 +15,6 @@ from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, Site
 from skyless.studies.plan import Plan, seed_of
 from skyless.studies.worlds import Run
-
-Array = NDArray[np.float64]
 
 WARMUP_S: Final = 4.0
 """No fix is judged before; cold starts of the lab take a tenth of a second, those with 90 % loss some seconds."""

@@ -4,9 +4,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.evaluation.statistics import EvenSample
+from skyless.kernels.arrays import Array
 from skyless.positioning.fix import Fix
 from skyless.positioning.integrity import Alert
 
@@ -16,14 +16,14 @@ SAMPLE_ROWS: Final = 1 << 13
 class LevelCounts(Struct, frozen=True):
     """Of each tag's judged fixes, shape (tags,)."""
 
-    fixes: NDArray[np.float64]
-    levels: NDArray[np.float64]
+    fixes: Array
+    levels: Array
     """Those with a horizontal protection level."""
-    exceeded: NDArray[np.float64]
+    exceeded: Array
     """Those whose horizontal error is larger than it."""
-    unwarned: NDArray[np.float64]
+    unwarned: Array
     """Those of them that carry no alert."""
-    hpl_m: NDArray[np.float64]
+    hpl_m: Array
     """Levels, an even sample of them."""
 
 

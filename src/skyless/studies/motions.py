@@ -4,11 +4,9 @@ import math
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array
 from skyless.simulation.trajectory import Piece, Static, Trajectory, Waypoints
-
-Array = NDArray[np.float64]
 
 LEG_S = (2.4, 2.8)
 """Time from corner to corner; at 3 m/s² a right angle at 5 m/s takes 2.36 s."""

@@ -10,12 +10,10 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.evaluation.plot_style import BLUE, GRID, INK, MUTED, ORANGE, RED, house_style
+from skyless.kernels.arrays import Array
 from skyless.studies.plan import Row
-
-Array = NDArray[np.float64]
 
 WIDTH_IN: Final = 4.7
 BAR_IN: Final = 0.24

@@ -12,16 +12,14 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from skyless.evaluation.room_world import QA_M2PS3, Room
+from skyless.kernels.arrays import Array
 from skyless.studies.plan import Cell, Row
 from skyless.studies.summary import Case, jackknife
 from skyless.studies.worlds import Run, RunResult
 from skyless.uncertainty.biased_bound import Biases, biased_bound
 from skyless.uncertainty.bounds import bound_settings
-
-Array = NDArray[np.float64]
 
 SPEED_STD_MPS: Final = 1.0
 """Before the first frame; after the second and a half for which nothing is judged nothing of it is left."""

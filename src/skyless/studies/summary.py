@@ -6,14 +6,12 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from skyless.kernels.arrays import Array
 from skyless.studies.plan import Cell, Limit, Plan, Row
 from skyless.studies.worlds import Run, RunResult, run_world
 from skyless.uncertainty.biased_bound import Biases
-
-Array = NDArray[np.float64]
 
 MESSAGE_S: Final = 40e-6
 """About what a tag takes for a message, and an anchor with all that is simulated around it."""

@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from skyless.air.codec import decode_cached, encode
 from skyless.air.malformed import Malformed
 from skyless.anchor import Anchor
 from skyless.evaluation.statistics import EvenSample
+from skyless.kernels.arrays import Array
 from skyless.positioning.fix import Fix
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.receiver import Receiver
@@ -69,7 +69,7 @@ class RunResult(Struct, frozen=True):
     """Sum of the normalised errors squared over their degrees of freedom."""
     outside: int
     max_m: float
-    sample_m: NDArray[np.float64]
+    sample_m: Array
     """Errors, an even sample of them."""
     messages: int
     """Heard by all tags."""
@@ -97,7 +97,7 @@ class _Judge:
         first, end = int(run.warmup_s / self._superframe_s), math.ceil(run.until_s / self._superframe_s - 1e-3)
         self._superframes = (end - first) * len(run.trajectories)
 
-    def add(self, tag: int, time_s: float, fix: Fix, truth_m: NDArray[np.float64]) -> None:
+    def add(self, tag: int, time_s: float, fix: Fix, truth_m: Array) -> None:
         superframe = int(time_s / self._superframe_s)
         if time_s < self._from_s or superframe == self._last[tag]:
             return

@@ -20,12 +20,12 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
+from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import jitted, kernel, threaded_kernel
 from skyless.uncertainty.bounds import (
     DIM,
     RX,
     TX,
-    Array,
     BoundSettings,
     anchor_terms,
     diffuse,

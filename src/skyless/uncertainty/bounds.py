@@ -11,13 +11,12 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
+from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import kernel, threaded_kernel
 from skyless.uncertainty.dop import direction
-
-Array = NDArray[np.float64]
 
 POSITION_STD_M: Final = 30.0
 OFFSET_STD_M: Final = 1e4

@@ -7,10 +7,7 @@ fields alone and hold element by element for many anchors; the derivation in ``t
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from skyless.kernels.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,8 @@ packet is taken to be no synchronisation packet, as in the paper; the other case
 """
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.uncertainty.chain import Array, Chain
+from skyless.kernels.arrays import Array
+from skyless.uncertainty.chain import Chain
 
 
 def beta(chain: Chain) -> Array:

@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from skyless.kernels.arrays import Array
 from skyless.kernels.cholesky import factorise, invert
 from skyless.kernels.compiled import kernel, threaded_kernel
 
@@ -33,9 +34,7 @@ def dilution_of_precision(anchors_m: ArrayLike, position_m: ArrayLike, *, height
     return Dops(*dops_at(anchors_m, np.asarray(position_m, np.float64)[None], height_known=height_known)[0].tolist())
 
 
-def dops_at(
-    anchors_m: ArrayLike, positions_m: ArrayLike, *, height_known: bool, weights: ArrayLike = 1.0
-) -> NDArray[np.float64]:
+def dops_at(anchors_m: ArrayLike, positions_m: ArrayLike, *, height_known: bool, weights: ArrayLike = 1.0) -> Array:
     """DOPs at many positions, shape (m, 3): an array (m, 5) with columns in the order of ``Dops``.
 
     ``weights``: how much each anchor counts at each position, shape (m, n); zero leaves it out.
@@ -50,11 +49,11 @@ def dops_at(
 
 @threaded_kernel
 def _fill_dops(
-    anchors: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    anchors: Array,
+    positions: Array,
+    weights: Array,
     size: int,
-    dops: NDArray[np.float64],
+    dops: Array,
 ) -> None:
     """From HᵀWH of rows [1, unit vector], where it is not singular and all anchors that count have a direction.
 
@@ -81,7 +80,7 @@ def _fill_dops(
 
 
 @kernel
-def direction(anchors: NDArray[np.float64], i: int, position: NDArray[np.float64]) -> tuple[float, float, float]:
+def direction(anchors: Array, i: int, position: Array) -> tuple[float, float, float]:
     """Unit vector from anchor ``i`` to the position; NaNs where there is none."""
     x = position[0] - anchors[i, 0]
     y = position[1] - anchors[i, 1]

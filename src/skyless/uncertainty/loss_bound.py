@@ -8,14 +8,14 @@ that has heard a newer one; they are known at once as well, so that no receiver 
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from skyless.kernels.arrays import Array, Mask
 from skyless.kernels.compiled import threaded_kernel
 from skyless.uncertainty.bounds import (
     DIM,
     RX,
     TX,
-    Array,
     BoundSettings,
     diffuse,
     hear_by_anchor,
@@ -25,12 +25,10 @@ from skyless.uncertainty.bounds import (
     predict,
 )
 
-Known = NDArray[np.bool_]
-
 
 def known_receptions(
     draw: Generator, frames: int, anchors: int, *, lost_at_tags: float, lost_at_anchors: float, mesh: bool
-) -> Known:
+) -> Mask:
     """Which receptions of each frame the tag gets to know, shape (frames, anchors + 1); its own are the last column.
 
     Anchors speak in turn, the reference first.
@@ -47,7 +45,7 @@ def known_receptions(
     return heard
 
 
-def received_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSettings, known: Known) -> Array:
+def received_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSettings, known: Mask) -> Array:
     """Posterior bound of the position after every frame, shape (frames, dims, dims), in m².
 
     ``anchors_m``: shape (n, 3), in the order of their slots, the reference first. ``path_m``: where the tag is at each
@@ -76,7 +74,7 @@ def _run_received(
     path: Array,
     slot_s: float,
     settings: Array,
-    known: Known,
+    known: Mask,
     P: Array,
     h: Array,
     ph: Array,

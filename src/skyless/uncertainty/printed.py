@@ -6,7 +6,8 @@ misprints are read as meant, because they have no other value: ν_{i,m} in σ_ξ
 """
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.uncertainty.chain import Array, Chain
+from skyless.kernels.arrays import Array
+from skyless.uncertainty.chain import Chain
 
 
 def beta(chain: Chain) -> Array:

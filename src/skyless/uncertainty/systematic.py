@@ -5,12 +5,11 @@ Formulas are first order in what they describe; errors are measured minus true T
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
+from skyless.kernels.arrays import Array
 from skyless.uncertainty.chain import Chain
-
-Array = NDArray[np.float64]
 
 
 def synchronisation_error_m(chain: Chain) -> Array:

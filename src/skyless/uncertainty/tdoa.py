@@ -8,13 +8,10 @@ spacing of its pair, and rates, which differ from one by less than 40 ppm, are l
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.kernels.arrays import Matrix, Vector
 from skyless.uncertainty.chain import Chain
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 
 
 class Reference(StrEnum):

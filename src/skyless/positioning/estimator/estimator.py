@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from skyless.air.beacon import HEARD
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.kernels.arrays import Array, Indices, Integers, Matrix, Records, Vector
 from skyless.kernels.compiled import kernel, step, threaded_kernel
 from skyless.positioning.estimator.faults import (
     SURE_CHI2,
@@ -47,13 +48,7 @@ from skyless.positioning.estimator.state import (
     LASTING_STD_M,
     NEVER,
     REMEMBERED,
-    Cube,
     EstimatorState,
-    Integers,
-    Matrix,
-    Places,
-    Records,
-    Vector,
     layout,
     new_state,
     with_anchor,
@@ -343,7 +338,7 @@ def _process_frame(
     x: Vector,
     P: Matrix,
     V: Matrix,
-    information: Cube,
+    information: Array,
     evidence: Matrix,
     anchors: Records,
     packets: Records,
@@ -352,7 +347,7 @@ def _process_frame(
     settings: Records,
     index_of: Integers,
     h: Vector,
-    h_index: Places,
+    h_index: Indices,
     ph: Vector,
     fault_input: Vector,
     work: Matrix,

@@ -15,6 +15,7 @@ from typing import Final
 
 import numpy as np
 
+from skyless.kernels.arrays import Matrix
 from skyless.kernels.compiled import step
 from skyless.positioning.estimator.kalman import reset_state
 from skyless.positioning.estimator.state import (
@@ -22,7 +23,6 @@ from skyless.positioning.estimator.state import (
     LASTING_STD_M,
     PASSING,
     EstimatorState,
-    Matrix,
     layout,
     uncertain_states,
 )

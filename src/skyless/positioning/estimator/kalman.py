@@ -5,8 +5,9 @@ from typing import Final
 import numpy as np
 
 from skyless.constants import TICK_S
+from skyless.kernels.arrays import Matrix
 from skyless.kernels.compiled import step
-from skyless.positioning.estimator.state import EstimatorState, Matrix, layout, uncertain_states
+from skyless.positioning.estimator.state import EstimatorState, layout, uncertain_states
 
 OBSTRUCTED_STD_M: Final = 0.08
 """Where range errors jump, those of all anchors change with this standard deviation, ..."""

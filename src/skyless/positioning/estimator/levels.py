@@ -14,10 +14,11 @@ from typing import Final
 
 import numpy as np
 
+from skyless.kernels.arrays import Vector
 from skyless.kernels.compiled import step
 from skyless.positioning.estimator.faults import whiten
 from skyless.positioning.estimator.monitor import covariance_scale
-from skyless.positioning.estimator.state import EstimatorState, Vector
+from skyless.positioning.estimator.state import EstimatorState
 
 RECENT_STD_M: Final = 0.08
 """Of a fault that has begun lately without a jump that shows."""

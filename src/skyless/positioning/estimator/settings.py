@@ -4,9 +4,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct, structs
-from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
+from skyless.kernels.arrays import Records
 from skyless.positioning.integrity import limits_of
 
 MAX_CLOCK_RATE: Final = 50e-6
@@ -74,7 +74,7 @@ class EstimatorSettings(Struct, frozen=True):
         """Dimensions of the position that are estimated."""
         return 3 if self.height_m is None else 2
 
-    def record(self) -> NDArray[np.void]:
+    def record(self) -> Records:
         """The settings as the kernels take them, shape (1,)."""
         record = np.zeros(1, SETTINGS)
         for name, value in structs.asdict(self).items():

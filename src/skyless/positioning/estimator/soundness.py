@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from skyless.air.beacon import HEARD
+from skyless.kernels.arrays import Integers
 from skyless.positioning.estimator.estimator import MOST_PACKED, Estimator
 from skyless.positioning.estimator.levels import LEVELS
 from skyless.positioning.estimator.settings import SETTINGS, EstimatorSettings
@@ -19,7 +20,6 @@ from skyless.positioning.estimator.state import (
     REMEMBERED,
     STATUS,
     EstimatorState,
-    Integers,
     layout,
     most_terms,
 )

@@ -24,16 +24,10 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array, Indices, Integers, Matrix, Records, Vector
 from skyless.kernels.compiled import jitted, step
 from skyless.positioning.estimator.settings import EstimatorSettings
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-Cube = NDArray[np.float64]
-Places = NDArray[np.uint32]
-"""Indices that cannot count from an array's end, for which kernels would have to look at each."""
-Integers = NDArray[np.int64]
-Records = NDArray[np.void]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 REMEMBERED: Final = 16
@@ -150,7 +144,7 @@ class EstimatorState(NamedTuple):
     V: Matrix
     """What faults do to x, shape (2·anchors + dim, n): for each metre by which the tag's receptions of an anchor have
     been late since it joined, the same lately, and for each m/s² of acceleration along an axis."""
-    information: Cube
+    information: Array
     """Of both kinds of faults of all anchors in the innovations, and of lasting (row) with recent ones (column), shape
     (3, anchors, anchors)."""
     evidence: Matrix
@@ -169,7 +163,7 @@ class EstimatorState(NamedTuple):
     """Index among ``anchors`` of each anchor of the site's table, −1 for those that are not in the state."""
     h: Vector
     """The measurement at hand where it is not zero, at the places in ``h_index``."""
-    h_index: Places
+    h_index: Indices
     ph: Vector
     """P·h of the measurement at hand, shape (n,)."""
     fault_input: Vector

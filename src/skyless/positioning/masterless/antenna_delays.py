@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+
+from skyless.kernels.arrays import Array
 
 EXCESS_STD_M: Final = 0.1
 """What is in the excess of a pair beside the delays of its nodes: places that are off, strong and weak signals."""
@@ -53,7 +54,7 @@ def contradictions_m(excess_m: Mapping[Pair, float], delays_m: Mapping[int, floa
     return wrong if min(wrong.values(), default=0.0) < 0.0 else {}
 
 
-def _design(pairs: Mapping[Pair, float], anchors: list[int]) -> NDArray[np.float64]:
+def _design(pairs: Mapping[Pair, float], anchors: list[int]) -> Array:
     """A row for each pair: its two anchors, and what all have in common in the last column."""
     place = {anchor: k for k, anchor in enumerate(anchors)}
     H = np.zeros((len(pairs), len(anchors) + 1))

@@ -8,9 +8,10 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skyless.air.masterless_packets import PairTdoa
+from skyless.kernels.arrays import Array
 from skyless.positioning.fix import NoFixReason
 from skyless.positioning.masterless.calibration import DifferenceCalibration
 from skyless.positioning.solver.locate import NoSolution, Solution, locate
@@ -39,21 +40,21 @@ class Start(Struct, frozen=True):
     solution: Solution
     without: int | None
     """The anchor that does not fit; None where all do."""
-    low_m: NDArray[np.float64]
+    low_m: Array
     """Corner of the neighbourhood of the anchors, shape (3,); ..."""
-    high_m: NDArray[np.float64]
+    high_m: Array
     """... and the opposite one."""
     extent_m: float
     """Longest edge of the anchors' bounding box."""
 
-    def holds(self, position_m: NDArray[np.float64]) -> bool:
+    def holds(self, position_m: Array) -> bool:
         """Whether a position, of two or three coordinates, lies in the neighbourhood of the anchors."""
         return all(self.low_m[axis] <= place <= self.high_m[axis] for axis, place in enumerate(position_m.tolist()))
 
 
 def find_start(
     window: Sequence[PairTdoa],
-    places_m: Mapping[int, NDArray[np.float64]],
+    places_m: Mapping[int, Array],
     calibration: DifferenceCalibration,
     height_m: float | None,
     z_bounds_m: tuple[float, float] | None,
@@ -99,7 +100,7 @@ def _is_suspect(found: Solution | NoSolution) -> bool:
 
 def _solve(
     medians: Mapping[tuple[int, int], float],
-    places_m: Mapping[int, NDArray[np.float64]],
+    places_m: Mapping[int, Array],
     height_m: float | None,
     z_bounds_m: tuple[float, float] | None,
 ) -> Solution | NoSolution:
@@ -115,9 +116,9 @@ class ReferencedTdoas(Struct, frozen=True, gc=False):
 
     anchors: tuple[int, ...]
     """Identifiers of the anchors that are connected, the reference first: n + 1, or none."""
-    tdoa_m: NDArray[np.float64]
+    tdoa_m: Array
     """|p − anchor i + 1| − |p − reference|, shape (n,)."""
-    covariance_m2: NDArray[np.float64]
+    covariance_m2: Array
     """Shape (n, n)."""
 
 

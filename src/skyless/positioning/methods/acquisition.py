@@ -13,9 +13,9 @@ from typing import Final
 import msgspec
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.kernels.arrays import Array
 from skyless.positioning.fix import NoFixReason
 from skyless.positioning.observation import Observation
 from skyless.positioning.solver.locate import RESIDUAL_TAIL, NoSolution, locate_pseudoranges
@@ -87,9 +87,9 @@ class Start(Struct, frozen=True):
     used: tuple[Observation, ...]
     """The messages that it rests on, one of each anchor."""
     rx_ticks_tag: int
-    solution: NDArray[np.float64]
+    solution: Array
     """[position (dim), clock offset], metres."""
-    covariance: NDArray[np.float64]
+    covariance: Array
     speed_variance: float
     is_contradicted: bool = False
     """Whether the messages of all anchors contradict each other, ..."""

@@ -3,9 +3,9 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.constants import TICK_S
+from skyless.kernels.arrays import Array
 from skyless.positioning.observation import Observation
 
 IN_USE_S: Final = 0.1
@@ -20,7 +20,7 @@ class AnchorsInUse:
         self._used: dict[int, Observation] = {}
         self._checked_ticks = 0
         self.anchors: tuple[int, ...] = ()
-        self.anchors_m: NDArray[np.float64] = np.empty((0, 3))
+        self.anchors_m: Array = np.empty((0, 3))
         """Their positions, shape (len(anchors), 3)."""
         self.extent_m = 0.0
         """The largest span in x, y or z that anchors in use have had since the start."""
@@ -48,7 +48,7 @@ class AnchorsInUse:
             self.anchors_m = np.array([o.anchor_m for o in self._used.values()])
             self.extent_m = max(self.extent_m, float(np.ptp(self.anchors_m, axis=0).max()))
 
-    def mean_range_m(self, position_m: NDArray[np.float64]) -> float:
+    def mean_range_m(self, position_m: Array) -> float:
         """From a position, shape (2,) or (3,), to the anchors."""
         away = self.anchors_m[:, : len(position_m)] - position_m
         return float(np.linalg.norm(away, axis=1).mean())

@@ -1,12 +1,10 @@
 """Observations out of beacons: the master's time unwrapped, and for each method what it asks for."""
 
-import numpy as np
-from numpy.typing import NDArray
-
 from skyless.air.beacon import Beacon, Heard
 from skyless.air.codec import packed_relays
 from skyless.air.master_term import MasterTerm, master_term_of
 from skyless.constants import MAX_DRIFT, TICK_M
+from skyless.kernels.arrays import Array
 from skyless.positioning.fix_time import SLACK_TICKS
 from skyless.positioning.methods.joint import Estimation
 from skyless.positioning.observation import Method, Observation
@@ -42,7 +40,7 @@ class Observer:
         self,
         frame: bytes,
         beacon: Beacon,
-        anchor_m: NDArray[np.float64],
+        anchor_m: Array,
         rx_ticks: int,
         tx_ticks: int,
         rx_variance_factor: float,

@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from skyless.constants import MAX_DRIFT, TICK_M
+from skyless.kernels.arrays import Array
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import SLACK_TICKS, FixTime
 from skyless.positioning.observation import Observation
@@ -126,7 +126,7 @@ class Snapshots:
         solution: Solution,
         reference: tuple[Observation, Observation],
         anchors: tuple[int, ...],
-        anchors_m: NDArray[np.float64],
+        anchors_m: Array,
     ) -> Fix:
         first_message = self._method in {SnapshotMethod.LITERAL, SnapshotMethod.WEIGHTED}
         message = reference[0 if first_message else 1]

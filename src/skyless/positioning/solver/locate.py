@@ -6,8 +6,9 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from skyless.kernels.arrays import Array
 from skyless.positioning.fix import NoFixReason
 from skyless.positioning.solver.minima import (
     EXHAUSTED,
@@ -20,8 +21,6 @@ from skyless.positioning.solver.minima import (
     frame,
     unfold,
 )
-
-Array = NDArray[np.float64]
 
 RESIDUAL_TAIL: Final = 1e-9
 """Residuals that noise exceeds this rarely are not noise."""

@@ -18,13 +18,11 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
+from skyless.kernels.arrays import Array
 from skyless.kernels.cholesky import factorise, solve
 from skyless.kernels.compiled import kernel, part
 from skyless.kernels.normal import inverse_of
-
-Array = NDArray[np.float64]
 
 FREE: Final = 0
 """Kind of problem: the state is (x, y, z)."""
