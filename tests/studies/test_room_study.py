@@ -21,7 +21,7 @@ from skyless.studies.limits import judged
 from skyless.studies.plan import Limit, Row, plan_of
 from skyless.studies.room_bound import biases_of, bound_cells
 from skyless.studies.worlds import RunResult, run_world
-from skyless.uncertainty.biased_bound import Biases
+from skyless.uncertainty.bounds import Biases
 
 PLAN = plan_of("joint", 1, study="room")
 CASES = {case.name: case for case in room.cases(PLAN)}

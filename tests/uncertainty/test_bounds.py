@@ -173,5 +173,5 @@ def test_a_path_must_have_whole_superframes():
     settings = bound_settings(
         STAMP_S, white_fm=0.0, random_walk_fm=0.0, qa=0.0, slot_s=SLOT_S, speed_std_mps=0.0, mesh=False
     )
-    with pytest.raises(ValueError, match="7 places, no multiple of 6 anchors"):
+    with pytest.raises(ValueError, match="7 positions, no multiple of 6 anchors"):
         tracking_bound(LAB, np.zeros((7, 3)), settings)
