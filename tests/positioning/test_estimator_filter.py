@@ -40,8 +40,7 @@ from skyless.evaluation.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.positioning.estimator.estimator import JOINED, REJECTED, STALE, Estimator, Packets
 from skyless.positioning.estimator.kalman import predict
 from skyless.positioning.estimator.levels import LASTING_CHI2
-from skyless.positioning.estimator.settings import EstimatorSettings
-from skyless.positioning.estimator.state import layout, new_state, with_anchor, without_anchor
+from skyless.positioning.estimator.state import EstimatorSettings, layout, new_state, with_anchor, without_anchor
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
 BIASED = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
@@ -71,7 +70,7 @@ def test_a_textbook_filter_says_the_same(case, anchors_m, height_m, height_std_m
         status, anchors = estimator.state.status[0].copy(), estimator.state.anchors
         scales = dict(zip(anchors["table_index"].tolist(), anchors["walk_scale"].tolist(), strict=True))
         estimator.process(*packet)
-        textbook.hear(packet, status["q_scale"], status["walk_scale"], scales)
+        textbook.update(packet, status["q_scale"], status["walk_scale"], scales)
         s, n = estimator.state, len(estimator.state.anchors)
         np.testing.assert_allclose(s.x[:dim], textbook.x[textbook.p], rtol=0.0, atol=1e-6)
         if n == len(anchors_m):

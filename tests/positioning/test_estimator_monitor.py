@@ -24,10 +24,10 @@ from estimator_builders import (
 from msgspec.structs import replace
 
 from skyless.clocks.filter import ClockFilter, clock_noise
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
 from skyless.evaluation.lab_bound import WHITE_FM
 from skyless.positioning.estimator.estimator import ACCEPTED, REJECTED, Report
-from skyless.positioning.estimator.kinds import REPORT_GAIN, SUBTICKS
+from skyless.positioning.estimator.measurements import REPORT_GAIN
 from skyless.positioning.estimator.monitor import gate_of
 from skyless.ticks import TICK_MASK
 
@@ -196,7 +196,7 @@ def reports_of(packets, case, anchors_m=LAB_M):
         for listener, sender, number, rx_ticks in relays.tolist():
             if sender == 0:
                 way_m = float(np.linalg.norm(anchors_m[listener] - anchors_m[0]))
-                filters[listener].hear(sent[number], rx_ticks, way_m)
+                filters[listener].update(sent[number], rx_ticks, way_m)
         said = Report(-1, 0, 0.0)
         if filters[anchor].updates > 1:
             ticks, fraction, variance_m2 = filters[anchor].to_master(tx_ticks)

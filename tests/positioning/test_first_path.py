@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from skyless.air.reception import Diagnostics
 from skyless.anchor import Anchor
 from skyless.positioning.fix import Fix
-from skyless.positioning.methods.nlos_weighting import MOST, variance_factor
+from skyless.positioning.methods.observations import MOST, variance_factor
 from skyless.receiver import Receiver
 from skyless.simulation.channel import ChannelModel, first_path_loss_db
 from skyless.simulation.impairments import AnchorBias, Impairments

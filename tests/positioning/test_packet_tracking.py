@@ -9,7 +9,7 @@ from msgspec import structs
 
 import masterless_world as hall
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.recordings.foreign.bitcraze_payload import decode
 
@@ -45,7 +45,7 @@ def follow(
     tracking = PacketTracking(structs.replace(settings, height_m=height_m), anchors_m, **options)
     rows, squared = [], []
     for t_s, packet in timed:
-        fix = tracking.hear(packet)
+        fix = tracking.on_packet(packet)
         if fix is not None and t_s >= settle_s:
             error_m = fix.position_m - np.array(hall.path_m(t_s, speed_mps))
             rows.append((t_s, *error_m, fix.time_s))
@@ -126,7 +126,7 @@ def test_a_blocked_anchor_does_not_pull_the_tag_away(system):
     assert tracking.drops["outlier"] >= 1
     excluded = {}
     for t_s, packet in timed:
-        again.hear(packet)
+        again.on_packet(packet)
         excluded[t_s] = again._tracking.excluded
     assert {told for t_s, told in excluded.items() if 3.3 < t_s < 4.9} == {(3,)}
     assert {told for t_s, told in excluded.items() if t_s > 5.3} == {()}

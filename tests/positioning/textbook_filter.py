@@ -41,7 +41,7 @@ class TextbookFilter:
         pair_variance = PAIR_STD_M**2 if settings.range_std_m or settings.survey_std_m else 0.0
         self.pairs = {frozenset((i, j)): [0.0, pair_variance] for i in range(n) for j in range(i)}
 
-    def hear(self, packet, q_scale, own_walk_scale, walk_scales):
+    def update(self, packet, q_scale, own_walk_scale, walk_scales):
         """``packet`` as ``Estimator.process`` takes it; what the process noise is multiplied by is told."""
         anchor, sequence, rx, tx, relays = packet
         walks = np.ones(self.n)

@@ -8,9 +8,16 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.evaluation.lab_bound import random_path
-from skyless.uncertainty.bounds import Biases, biased_bound
-from skyless.uncertainty.bounds import OFFSET_STD_M, POSITION_STD_M, RATE_STD_MPS, bound_settings, tracking_bound
-from skyless.uncertainty.bounds import received_bound
+from skyless.uncertainty.bounds import (
+    OFFSET_STD_M,
+    POSITION_STD_M,
+    RATE_STD_MPS,
+    Biases,
+    biased_bound,
+    bound_settings,
+    received_bound,
+    tracking_bound,
+)
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 RAISED = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])

@@ -6,6 +6,7 @@ import pytest
 from dense_covariance import position_covariance
 from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.evaluation.lab_bound import lab_tracking_bound_m, random_path
+from skyless.positioning.methods.snapshots import bracketed_covariance, literal_covariance
 from skyless.uncertainty.bounds import (
     OFFSET_STD_M,
     POSITION_STD_M,
@@ -13,7 +14,6 @@ from skyless.uncertainty.bounds import (
     bound_settings,
     tracking_bound,
 )
-from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 SLOT_S = 2.5e-3

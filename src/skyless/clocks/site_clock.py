@@ -1,12 +1,13 @@
-"""An anchor's own counter against the site's time: followed by the master's beacons, or led as the master."""
+"""An anchor's own counter against the site's time: by the master's beacons, or, as the master, by its own counter."""
 
 from collections import Counter
 from typing import Final
 
+from msgspec import Struct
+
 from skyless.air.beacon import Beacon
 from skyless.clocks.filter import ClockFilter
-from skyless.clocks.site_time import SUBTICKS, SiteTime, continued, own_counter
-from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, MAX_DRIFT, TICK_M
+from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, MAX_DRIFT, SUBTICKS, TICK_M
 from skyless.site.slots import Schedule
 from skyless.ticks import nearest, wrap
 
@@ -18,7 +19,7 @@ SLACK_TICKS: Final = 64
 GRID_SLACK_TICKS: Final = 8 * DELAYED_TX_GRANULARITY_TICKS
 """A master's frames lie on its radio's grid; so much they may be off their slots."""
 
-MASTER_CHANGE_DOUBT: Final = 2.0
+MASTER_CHANGE_INFLATION: Final = 2.0
 """A new master's clock was known as well as the own one: their difference has at most twice the variance."""
 
 
@@ -53,7 +54,7 @@ class SiteClock:
         """Standard deviation of the offset at the last beacon, in metres of light; 0 for the master."""
         return self._clock.offset_std_m if self._led is None else 0.0
 
-    def follow(self, range_m: float, afresh: bool) -> None:
+    def track_master(self, range_m: float, afresh: bool) -> None:
         """Go by another master, this far away; ``afresh``: what was known of the site's time counts no more."""
         self._range_m = range_m
         self._last_raw = self._last_frame = None
@@ -62,7 +63,7 @@ class SiteClock:
         if afresh:
             self._last = None
         else:
-            self._clock.doubt(MASTER_CHANGE_DOUBT)
+            self._clock.inflate_covariance(MASTER_CHANGE_INFLATION)
 
     def lead(self, ticks_own: int) -> None:
         """Become the master: the site's time goes on from here as far as it is known, else the own counter is it."""
@@ -89,7 +90,7 @@ class SiteClock:
         """Nearest own reading of a site time."""
         return self._clock.from_master(ticks_site) if self._led is None else self._led.ticks_own(ticks_site)
 
-    def hear(self, beacon: Beacon, rx_ticks: int) -> bool:
+    def on_master_beacon(self, beacon: Beacon, rx_ticks: int) -> bool:
         """Take a beacon of the master; one that does not fit changes nothing, unless others like it follow."""
         if self._last_frame == (beacon.tx_ticks, beacon.sequence):
             self._counters["duplicate"] += 1
@@ -132,7 +133,7 @@ class SiteClock:
         if abs(late) > GRID_SLACK_TICKS:
             self._counters["impossible-stamp"] += 1
             return None
-        self._clock.hear(ticks_site, rx_ticks, range_m)
+        self._clock.update(ticks_site, rx_ticks, range_m)
         if self._clock.rejected:
             self._counters["clock-outlier"] += 1
             return None
@@ -146,3 +147,41 @@ def _in_step(counter: int, last_ticks: int, last_rx_ticks: int, rx_ticks: int) -
     if elapsed <= 0 or abs(ticks - last_ticks - elapsed) > MAX_DRIFT * elapsed + SLACK_TICKS:
         return None
     return ticks
+
+
+_RATE_BITS: Final = 64
+
+
+class SiteTime(Struct, frozen=True):
+    """Own counter to site time and back, exact to 1/256 tick at any distance (``docs/maths.md`` section 6)."""
+
+    epoch_own_ticks: int
+    epoch_subticks: int
+    """Site time at that reading, in 1/256 tick."""
+    subticks_per_tick: int
+    """Site time that passes in one own tick, in 2⁻⁶⁴ of 1/256 tick."""
+
+    def subticks(self, ticks_own: int) -> int:
+        """Site time of an own reading, in 1/256 tick, both unwrapped."""
+        return self.epoch_subticks + ((ticks_own - self.epoch_own_ticks) * self.subticks_per_tick >> _RATE_BITS)
+
+    def ticks_own(self, ticks_site: int) -> int:
+        """Nearest own reading of a site time in whole ticks."""
+        elapsed = (ticks_site * SUBTICKS - self.epoch_subticks) << _RATE_BITS
+        return self.epoch_own_ticks + (elapsed + self.subticks_per_tick // 2) // self.subticks_per_tick
+
+    @property
+    def rate(self) -> float:
+        """Fractional rate of the own counter against the site's time."""
+        return (SUBTICKS << _RATE_BITS) / self.subticks_per_tick - 1.0
+
+
+def own_counter() -> SiteTime:
+    """Return the time of a site that its first master starts: the master's own counter."""
+    return SiteTime(0, 0, SUBTICKS << _RATE_BITS)
+
+
+def continued(ticks_own: int, ticks_site: int, fraction_ticks: float, rate: float) -> SiteTime:
+    """Return the map that goes on from a reading and the site time known for it; ``rate`` is the own clock's."""
+    subticks_per_tick = int(SUBTICKS / (1.0 + rate) * 2.0**_RATE_BITS)
+    return SiteTime(ticks_own, ticks_site * SUBTICKS + round(fraction_ticks * SUBTICKS), subticks_per_tick)

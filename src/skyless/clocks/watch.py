@@ -45,13 +45,13 @@ class MasterWatch:
         self.news_ticks, self._sequence = now_ticks, None
         self._links.clear()
 
-    def hear(self, teller: int, sequence: int, now_ticks: int) -> None:
+    def update(self, source: int, sequence: int, now_ticks: int) -> None:
         """Take the sequence number of the master's last beacon by the master itself, or by an anchor that heard it."""
         if self._sequence is None or 0 < (sequence - self._sequence) % SEQUENCES < SEQUENCES // 2:
             self._sequence, self.news_ticks = sequence, now_ticks
-        link = self._links.get(teller)
+        link = self._links.get(source)
         if link is None:
-            self._links[teller] = _Link(sequence)
+            self._links[source] = _Link(sequence)
             return
         turns = (sequence - link.sequence) % SEQUENCES
         if not 0 < turns < SEQUENCES // 2:

@@ -34,7 +34,8 @@ def _cache_folder() -> str:
     digest = hashlib.sha1(usedforsecurity=False)
     for source in sorted(_PACKAGE.rglob("*.py")):
         text = source.read_bytes()
-        if b"skyless.kernels.compiled" in text or source.name in {"constants.py", "compiled.py"}:
+        is_kernel = b"skyless.kernels.compiled" in text or source.parent.name == "kernels"
+        if is_kernel or source.name == "constants.py":
             digest.update(text)
     folder = _cache_home() / f"kernels-{digest.hexdigest()[:16]}"
     if not folder.exists():

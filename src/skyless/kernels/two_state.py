@@ -25,7 +25,10 @@ def predict(P: TwoState, dt: float, white: float, walk: float) -> TwoState:
 
 
 def update(P: TwoState, noise: float) -> tuple[float, float, TwoState]:
-    """Measure the value with that variance: gains of value and rate, and P in Joseph form, positive despite rounding."""
+    """Measure the value with that variance: the gains of value and rate, and P.
+
+    Joseph form, which keeps P positive whatever the rounding.
+    """
     variance, covariance, rate_variance = P
     innovation_variance = variance + noise
     gain = variance / innovation_variance

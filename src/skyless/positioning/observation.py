@@ -52,6 +52,9 @@ class Observation(Struct, frozen=True, gc=False):
 class Method(Protocol):
     """A positioning method: observations in, fixes out."""
 
-    def hear(self, observation: Observation) -> Fix | NoFixReason:
-        """Take one observation; a fix, or why there is none yet."""
+    needs_relays: bool
+    """Whether observations carry relays and the master's term, instead of rounds and stamps of the master's frames."""
+
+    def update(self, observation: Observation) -> Fix | NoFixReason:
+        """Process one observation; a fix, or why there is none yet."""
         ...

@@ -187,9 +187,7 @@ def known_receptions(
     return heard
 
 
-def _superframe_bound(
-    anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSettings, biases: Biases | None
-) -> Array:
+def _superframe_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSettings, biases: Biases | None) -> Array:
     anchors = np.ascontiguousarray(anchors_m, np.float64)
     path = np.ascontiguousarray(path_m, np.float64)
     n, frames = len(anchors), len(path)
@@ -243,7 +241,12 @@ def _of_each(name: str, std_m: PerAnchor, anchors: int) -> Array:
 def _prior(anchors: int, settings: BoundSettings, biases: Biases | None) -> Matrix:
     """Covariance before the first frame."""
     dims = settings.dims
-    stds = [[POSITION_STD_M] * dims, [OFFSET_STD_M] * anchors, [settings.speed_std_mps] * dims, [RATE_STD_MPS] * anchors]
+    stds = [
+        [POSITION_STD_M] * dims,
+        [OFFSET_STD_M] * anchors,
+        [settings.speed_std_mps] * dims,
+        [RATE_STD_MPS] * anchors,
+    ]
     parts = [np.array(part) for part in stds]
     if biases is not None:
         parts += [

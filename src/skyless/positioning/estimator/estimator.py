@@ -21,9 +21,19 @@ from skyless.positioning.estimator.faults import (
     fault_chi2,
     open_faults,
 )
-from skyless.positioning.estimator.flatness import fit_plane, is_height_open
 from skyless.positioning.estimator.kalman import is_at_rest, predict
-from skyless.positioning.estimator.kinds import (
+from skyless.positioning.estimator.levels import (
+    HPL,
+    LASTING_CHI2,
+    LEVELS,
+    RECENT_CHI2,
+    RECENT_STD_M,
+    VPL,
+    fit_plane,
+    is_height_open,
+    protect,
+)
+from skyless.positioning.estimator.measurements import (
     CLOCK_JUMPED,
     difference,
     first_reception,
@@ -33,21 +43,12 @@ from skyless.positioning.estimator.kinds import (
     report,
     zero_velocity,
 )
-from skyless.positioning.estimator.levels import (
-    HPL,
-    LASTING_CHI2,
-    LEVELS,
-    RECENT_CHI2,
-    RECENT_STD_M,
-    VPL,
-    protect,
-)
 from skyless.positioning.estimator.monitor import OFTEN_LATE, covariance_scale, follow_rest
-from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.estimator.state import (
     LASTING_STD_M,
     NEVER,
     REMEMBERED,
+    EstimatorSettings,
     EstimatorState,
     layout,
     new_state,

@@ -10,7 +10,6 @@ from skyless.air.beacon import HEARD
 from skyless.kernels.arrays import Integers
 from skyless.positioning.estimator.estimator import MOST_PACKED, Estimator
 from skyless.positioning.estimator.levels import LEVELS
-from skyless.positioning.estimator.settings import SETTINGS, EstimatorSettings
 from skyless.positioning.estimator.state import (
     ANCHOR,
     LASTING,
@@ -18,7 +17,9 @@ from skyless.positioning.estimator.state import (
     NONE,
     PACKET,
     REMEMBERED,
+    SETTINGS,
     STATUS,
+    EstimatorSettings,
     EstimatorState,
     layout,
     most_terms,

@@ -13,17 +13,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from skyless.air.masterless_packets import Packet, Point, Relay
-from skyless.clocks.stamps import NOISE_TICKS
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.fix_time import FixTime
-from skyless.positioning.masterless.calibration import NEAREST_M, NOTHING, DifferenceCalibration
-from skyless.positioning.masterless.difference_tracking import DIFFERENCES, MAX_STD_M
+from skyless.positioning.masterless.anchor_errors import NEAREST_M, NOTHING, DifferenceCalibration, RelayDelays
+from skyless.positioning.masterless.difference_tracking import DIFFERENCES, MAX_STD_M, NEIGHBOURHOOD
 from skyless.positioning.masterless.pair_engine import MOST_ANCHORS, remember
-from skyless.positioning.masterless.relay_delays import RelayDelays
-from skyless.positioning.masterless.start import NEIGHBOURHOOD
 from skyless.positioning.methods.joint import Estimation
+from skyless.positioning.methods.observations import NOISE_TICKS, FixTime
 from skyless.positioning.observation import Observation
 from skyless.ticks import LAST_TICKS, Unwrapper, nearest
 
@@ -133,7 +130,7 @@ class PacketTracking:
         """Pairs of anchors whose own ranging contradicts the positions; fixes then have no protection level."""
         return self._delays.contradictions_m
 
-    def hear(self, packet: Packet) -> Fix | None:
+    def on_packet(self, packet: Packet) -> Fix | None:
         """Take one packet; a fix, or None, and ``reason`` says why.
 
         A fix's ``time_s`` counts from the first packet, by the tag's clock.
@@ -165,7 +162,7 @@ class PacketTracking:
         )
         if self._delays.contradictions_m:
             self._tracking.estimator.withhold_levels()
-        fix = self._tracking.hear(observation)
+        fix = self._tracking.update(observation)
         if not isinstance(fix, Fix):
             self._count_relays()
             if fix is NoFixReason.RESIDUALS:

@@ -18,7 +18,7 @@ from typing import Final
 from skyless.air.masterless_packets import Packet, PairTdoa, Point, Relay
 from skyless.clocks.broadcast import BroadcastClock
 from skyless.constants import TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.positioning.masterless.anchor_flights import AnchorFlights, distance_ticks
+from skyless.positioning.masterless.anchor_errors import AnchorFlights, distance_ticks
 from skyless.ticks import Unwrapper
 
 MAX_AGE_S: Final = 0.25
@@ -79,7 +79,7 @@ class PairEngine:
         self._limits_m: dict[Pair, float] = {}
         self._flights = AnchorFlights()
 
-    def hear(self, packet: Packet) -> list[PairTdoa]:
+    def on_packet(self, packet: Packet) -> list[PairTdoa]:
         """Take one packet; return the TDoAs that it completes, in the order of its relays.
 
         Their ``time_s`` is when the tag heard this packet; each holds for the moment of the relayed packet, at
@@ -118,7 +118,7 @@ class PairEngine:
             return False
         clock = sender.clock
         restarts = clock.restarts
-        if clock.hear(packet.tx_ticks, rx_ticks):
+        if clock.update(packet.tx_ticks, rx_ticks):
             return True
         self.drops["stamp-off-its-clock"] += 1
         if clock.restarts != restarts:
@@ -153,7 +153,7 @@ class PairEngine:
 
     def _flight_ticks(self, a: int, b: int, tx_a: int, rx_b: int, told: float | None) -> float | None:
         """Time of flight of a pair: what anchors told, else what two-way ranging gave, else the known distance."""
-        flight = self._flights.hear(a, b, tx_a, rx_b, told)
+        flight = self._flights.update(a, b, tx_a, rx_b, told)
         return distance_ticks(self._anchors_m, a, b) if flight is None else flight
 
     def _limit_m(self, a: int, b: int) -> float:

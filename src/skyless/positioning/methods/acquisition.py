@@ -17,8 +17,8 @@ from msgspec import Struct
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.kernels.arrays import Array
 from skyless.positioning.fix import NoFixReason
+from skyless.positioning.methods.locate import RESIDUAL_TAIL, NoSolution, locate_pseudoranges
 from skyless.positioning.observation import Observation
-from skyless.positioning.solver.locate import RESIDUAL_TAIL, NoSolution, locate_pseudoranges
 
 MAX_AGE_S: Final = 0.5
 """Older messages no longer serve the start, unless superframes are so long; and then only for the rate of the clock, as
@@ -131,8 +131,8 @@ class Acquisition:
         kept = [observation for pair in self._heard.values() for observation in pair]
         return sorted(kept, key=lambda observation: observation.rx_ticks_tag)
 
-    def learn(self, observation: Observation) -> None:
-        """Keep what an anchor relays; to be called before ``hear``."""
+    def add_relays(self, observation: Observation) -> None:
+        """Keep what an anchor relays; to be called before ``add``."""
         for anchor, sequence, rx_ticks in observation.all_relays():
             for packet in self._heard.get(anchor, ()):
                 if packet.sequence == sequence:
@@ -140,8 +140,8 @@ class Acquisition:
                     link = _Link(packet.rx_ticks_tag, rx_ticks - packet.tx_ticks_anchor, -range_ticks)
                     self._links[observation.anchor, anchor] = link
 
-    def hear(self, observation: Observation) -> Start | NoFixReason:
-        """Take one observation; try to start each time an anchor comes around again."""
+    def add(self, observation: Observation) -> Start | NoFixReason:
+        """Add one observation; try to start each time an anchor comes around again."""
         now = observation.rx_ticks_tag
         for anchor, kept in list(self._heard.items()):
             if (now - kept[-1].rx_ticks_tag) * TICK_S > self._max_age_s:

@@ -6,16 +6,15 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.air.almanac import AccuracyPage, NoisePage, SchedulePage
-from skyless.clocks.filter import clock_noise
+from skyless.clocks.filter import clock_noise, stamp_variance_m2
 from skyless.method_names import FILTERS
-from skyless.positioning.estimator.settings import EstimatorSettings
-from skyless.positioning.fix_time import FixTime
+from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.positioning.methods.joint import Estimation
+from skyless.positioning.methods.observations import FixTime
 from skyless.positioning.methods.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.positioning.observation import Method
 from skyless.ticks import to_seconds
-from skyless.uncertainty.tdoa import stamp_variance_m2
 
 DROP_S: Final = 2.0
 """An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""

@@ -5,7 +5,8 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.constants import TICK_S
+from skyless.constants import SUBTICKS, TICK_S
+from skyless.kernels.arrays import Array
 from skyless.positioning.estimator.estimator import (
     ACCEPTED,
     NO_REPORT,
@@ -16,10 +17,8 @@ from skyless.positioning.estimator.estimator import (
     Report,
 )
 from skyless.positioning.estimator.faults import SURE_CHI2
-from skyless.positioning.estimator.settings import EstimatorSettings
-from skyless.positioning.estimator.state import CONTRADICTED_STD_M, LASTING_STD_M, OPEN_RANGE_STD_M
+from skyless.positioning.estimator.state import CONTRADICTED_STD_M, LASTING_STD_M, OPEN_RANGE_STD_M, EstimatorSettings
 from skyless.positioning.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY, Fix, NoFixReason
-from skyless.positioning.fix_time import FixTime
 from skyless.positioning.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.positioning.methods.acquisition import (
     EARLY_S,
@@ -35,10 +34,9 @@ from skyless.positioning.methods.acquisition import (
     Acquisition,
     Start,
 )
-from skyless.positioning.methods.anchors_in_use import AnchorsInUse
-from skyless.positioning.methods.master_scale import MasterScale
+from skyless.positioning.methods.observations import FixTime
 from skyless.positioning.observation import Observation
-from skyless.ticks import from_seconds
+from skyless.ticks import TICK_MASK, from_seconds
 
 COVARIANCE_MARGIN: Final = 4.0
 """Factor on the start's covariance, as the filter is then given the packets that it rests on."""
@@ -81,6 +79,8 @@ SURELY_IN_REACH_TICKS: Final = from_seconds(SHORT_SILENCE_S) - 1
 
 class Estimation:
     """One tag's estimator from the first beacon on."""
+
+    needs_relays = True
 
     def __init__(
         self,
@@ -129,13 +129,13 @@ class Estimation:
         """Anchors whose range error has jumped and not come back."""
         return self._estimator.obstructed
 
-    def hear(self, observation: Observation) -> Fix | NoFixReason:
-        """Take one observation; a fix for every accepted packet once started."""
+    def update(self, observation: Observation) -> Fix | NoFixReason:
+        """Process one observation; a fix for every accepted packet once started."""
         ticks_master, rx_ticks, claim = observation.tx_ticks_master, observation.rx_ticks_tag, observation.claim
         if ticks_master is not None:
             self._master_less_tag_ticks = ticks_master - rx_ticks
             if claim is not None and claim.master == observation.anchor:
-                self._master_scale.hear(observation)
+                self._master_scale.update(observation)
         if (
             self._start is None
             and not 0 <= rx_ticks - self._newest_ticks < SURELY_IN_REACH_TICKS
@@ -160,8 +160,8 @@ class Estimation:
         return self._fix(observation)
 
     def _look_for_start(self, starting: Acquisition, observation: Observation) -> Fix | NoFixReason:
-        starting.learn(observation)
-        start = starting.hear(observation)
+        starting.add_relays(observation)
+        start = starting.add(observation)
         if isinstance(start, NoFixReason):
             return start
         if start.is_contradicted and not start.left_out and self._estimator.is_late_often:
@@ -171,7 +171,7 @@ class Estimation:
         self._begin(start, starting.packets())
         return self._fix(observation)
 
-    def hear_height(self, height_m: float, std_m: float) -> bool:
+    def update_height(self, height_m: float, std_m: float) -> bool:
         """Take the tag's height as a sensor tells it, at the newest packet; True if it was used.
 
         Before a start it narrows where that is looked for. Where many in a row do not fit, the start was wrong.
@@ -329,3 +329,110 @@ class Estimation:
         time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
         # in the order of the fields: with their names it takes as long as all the rest
         return Fix(time_s, estimator.rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", known, 1, self._asked)
+
+
+# Anchors in use
+
+
+IN_USE_S: Final = 0.1
+"""An anchor counts as in use while its last accepted message is younger, or a superframe and a half."""
+
+
+class AnchorsInUse:
+    """The anchors whose messages were accepted of late; their list is made anew only when it changes."""
+
+    def __init__(self, superframe_s: float) -> None:
+        self._in_use_s = max(IN_USE_S, 1.5 * superframe_s)
+        self._used: dict[int, Observation] = {}
+        self._checked_ticks = 0
+        self.anchors: tuple[int, ...] = ()
+        self.anchors_m: Array = np.empty((0, 3))
+        """Their positions, shape (len(anchors), 3)."""
+        self.extent_m = 0.0
+        """The largest span in x, y or z that anchors in use have had since the start."""
+
+    def begin(self, observations: tuple[Observation, ...]) -> None:
+        """Forget all anchors but those of these observations."""
+        self._used.clear()
+        self.extent_m = 0.0
+        for observation in observations:
+            self.use(observation)
+
+    def use(self, observation: Observation) -> None:
+        """Take an accepted message."""
+        now = observation.rx_ticks_tag
+        changed = observation.anchor not in self._used
+        self._used[observation.anchor] = observation
+        if (now - self._checked_ticks) * TICK_S > self._in_use_s:
+            self._checked_ticks = now
+            stale = [a for a, o in self._used.items() if (now - o.rx_ticks_tag) * TICK_S > self._in_use_s]
+            changed = changed or bool(stale)
+            for anchor in stale:
+                del self._used[anchor]
+        if changed:
+            self.anchors = tuple(self._used)
+            self.anchors_m = np.array([o.anchor_m for o in self._used.values()])
+            self.extent_m = max(self.extent_m, float(np.ptp(self.anchors_m, axis=0).max()))
+
+    def mean_range_m(self, position_m: Array) -> float:
+        """From a position, shape (2,) or (3,), to the anchors."""
+        away = self.anchors_m[:, : len(position_m)] - position_m
+        return float(np.linalg.norm(away, axis=1).mean())
+
+
+# The master's own counter
+
+
+FARTHEST: Final = 16
+"""Lines go on for so many times their length."""
+
+MISFIT_SUBTICKS: Final = 64
+"""By which a master's packets may lie off the line: roundings, carried so far."""
+
+SUBTICKS_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
+
+
+class MasterScale:
+    """The master's own counter against the site's time, which it may lead on at another rate than its own."""
+
+    def __init__(self) -> None:
+        self._claim: object = None
+        self._points: tuple[tuple[int, int], ...] = ()
+        """Site time in subticks and its lead on the master's counter, of the first and the last packet of the term."""
+
+    def update(self, observation: Observation) -> None:
+        """Learn from a packet of the master."""
+        claim = observation.claim
+        if claim is None or observation.anchor != claim.master:
+            return
+        site, lead = _site_time(observation)
+        if claim != self._claim:
+            self._claim, self._points = claim, ((site, lead),)
+        elif site > self._points[-1][0]:
+            expected = self._lead(site)
+            fits = len(self._points) < 2 or (expected is not None and abs(expected - lead) <= MISFIT_SUBTICKS)
+            self._points = (self._points[0], (site, lead)) if fits else ((site, lead),)
+
+    def difference(self, observation: Observation) -> int | None:
+        """The sender's reading less the master's at its TX stamp, in subticks modulo 2⁴⁸; None while not known."""
+        claim, ticks = observation.claim, observation.tx_ticks_master
+        if claim is None or ticks is None or claim != self._claim:
+            return None
+        site = ticks * SUBTICKS + round(observation.tx_fraction_ticks * SUBTICKS)
+        lead = self._lead(site)
+        return None if lead is None else (lead - site + observation.tx_ticks_anchor * SUBTICKS) & SUBTICKS_MASK
+
+    def _lead(self, site: int) -> int | None:
+        """Lead of the site's time on the master's counter, on a straight line; None too far from what is known."""
+        if len(self._points) < 2:
+            return None
+        (first, before), (last, lead) = self._points
+        length, beyond = last - first, site - last
+        return lead + (lead - before) * beyond // length if 0 <= beyond <= FARTHEST * length else None
+
+
+def _site_time(observation: Observation) -> tuple[int, int]:
+    """Site time in subticks, and by how much it is ahead of the sender's counter."""
+    assert observation.tx_ticks_master is not None
+    site = observation.tx_ticks_master * SUBTICKS + round(observation.tx_fraction_ticks * SUBTICKS)
+    return site, site - observation.tx_ticks_anchor * SUBTICKS

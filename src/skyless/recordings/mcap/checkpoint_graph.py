@@ -11,8 +11,7 @@ from typing import Any, Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.positioning.estimator.settings import SETTINGS
-from skyless.positioning.estimator.state import ANCHOR, LINK, PACKET, STATUS
+from skyless.positioning.estimator.state import ANCHOR, LINK, PACKET, SETTINGS, STATUS
 
 PACKAGES: Final = (
     "skyless.air",

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
 from skyless.kernels.compiled import step
 from skyless.positioning.estimator.faults import (
     compute_fault_input,
@@ -47,9 +47,6 @@ from skyless.positioning.estimator.monitor import (
 )
 from skyless.positioning.estimator.state import EstimatorState, direction_terms, layout, uncertain_states
 from skyless.ticks import TICK_MASK
-
-SUBTICKS: Final = 256
-"""Of a tick; the air's unit of the site's time, of which it tells 48 bits."""
 
 SLOPE_FROM_M: Final = 4.0
 """Where the errors that grow with distance pass through zero, and by which range they change once (APS011)."""
