@@ -6,7 +6,7 @@ from scipy.linalg import solve_discrete_are
 
 from skyless.clocks.broadcast import (
     ACCELERATION_M2PS3,
-    RANDOM_WALK_FM,
+    BROADCAST_WALK_FM,
     RESTART_AFTER,
     STAMP_TICKS,
     WHITE_FM,
@@ -36,7 +36,7 @@ def test_32_bit_counters_are_followed_across_gaps_of_seconds(rate, offset, first
 
 def test_the_phase_is_as_good_as_an_optimal_filter_of_that_noise():
     rng = np.random.default_rng(4)
-    walk = (2 * RANDOM_WALK_FM**2 + ACCELERATION_M2PS3 / SPEED_OF_LIGHT_MPS**2) * TICK_S
+    walk = (2 * BROADCAST_WALK_FM**2 + ACCELERATION_M2PS3 / SPEED_OF_LIGHT_MPS**2) * TICK_S
     white = 2 * WHITE_FM**2 / TICK_S
     step = np.array([[1.0, PERIOD], [0.0, 1.0]])
     noise = np.array(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skyless.air.masterless_packets import PairTdoa
-from skyless.positioning.estimator.kalman import is_at_rest
+from skyless.positioning.estimator.kalman import is_stationary
 from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 
 ANCHORS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * ((n ^ n >> 1 ^ n >> 2) & 1)) for n in range(4)}
@@ -88,7 +88,7 @@ def test_covariances_hold_where_anchors_are_off_as_assumed(seed):
 def test_a_tag_at_rest_is_known_better_than_one_that_may_move_and_wakes_at_once():
     moving, _ = run(30.0)
     rows, tracking = run(30.0, still=True)
-    assert is_at_rest(tracking.estimator.state)
+    assert is_stationary(tracking.estimator.state)
     jitter = [np.std([error for time_s, error, _ in of if time_s >= 15.0], axis=0).max() for of in (rows, moving)]
     assert jitter[0] < 0.35 * jitter[1]
     for k in range(800):  # it goes on, at 1 m/s at once

@@ -320,32 +320,45 @@ def test_fixes_carry_levels_and_alert_limit():
 # Reports of the anchors' clocks
 
 
-def packet(anchor, own_ticks, site_subticks, claim):
+def packet(anchor, own_ticks, site_subticks, master_term):
     whole, fraction = divmod(site_subticks, SUBTICKS)
     return Observation(
-        anchor, np.zeros(3), 0, 0, own_ticks, own_ticks, None, None, whole, fraction / SUBTICKS, 0.0, (), claim, 1e-4
+        anchor,
+        np.zeros(3),
+        0,
+        0,
+        own_ticks,
+        own_ticks,
+        None,
+        None,
+        whole,
+        fraction / SUBTICKS,
+        0.0,
+        (),
+        master_term,
+        1e-4,
     )
 
 
 def test_a_master_may_lead_the_sites_time_at_another_rate_than_its_own():
     """As one does that took over; the first packets of its term say at which."""
-    scale, claim = MasterScale(), MasterTerm(3, 7)
+    scale, master_term = MasterScale(), MasterTerm(3, 7)
     step, lead = 958_482_000, 1.0 + 17e-6
     own = [5_000 + k * step for k in range(4)]
     site = [123_456_789_012 + round(t * lead * SUBTICKS) for t in own]
     at = own[-1] + step // 2
-    other = packet(1, 77, 123_456_789_012 + round(at * lead * SUBTICKS), claim)
-    scale.update(packet(7, own[0], site[0], claim))
+    other = packet(1, 77, 123_456_789_012 + round(at * lead * SUBTICKS), master_term)
+    scale.update(packet(7, own[0], site[0], master_term))
     assert scale.difference(other) is None
     for ticks, subticks in zip(own[1:], site[1:], strict=True):
-        scale.update(packet(7, ticks, subticks, claim))
+        scale.update(packet(7, ticks, subticks, master_term))
     assert abs(scale.difference(other) - (77 - at) * SUBTICKS % MODULO) <= 3
-    assert scale.difference(replace(other, claim=MasterTerm(4, 7))) is None
-    scale.update(packet(7, own[3] + step, site[3] + 3 * step, claim))
+    assert scale.difference(replace(other, master_term=MasterTerm(4, 7))) is None
+    scale.update(packet(7, own[3] + step, site[3] + 3 * step, master_term))
     assert scale.difference(replace(other, tx_ticks_master=other.tx_ticks_master + step)) is None
 
 
-def with_site_time(packets, claim):
+def with_site_time(packets, master_term):
     """Observations that tell the site's time as each anchor knows it: the first anchor's clock, to 5 mm."""
     relayed, ends = packets.relays, packets.ends
     master = {int(packets.sequences[k]): int(packets.tx_ticks[k]) for k in np.flatnonzero(packets.anchors == 0)}
@@ -376,7 +389,7 @@ def with_site_time(packets, claim):
             tx_ticks_master=int(ticks),
             tx_fraction_ticks=float(fraction),
             tx_variance_m2=variance,
-            claim=claim,
+            master_term=master_term,
         )
 
 
@@ -387,7 +400,7 @@ def test_reports_help_where_most_packets_are_lost():
         keep = np.random.default_rng(seed + 50).random(len(episode.path_m)) >= 0.85
         keep[:30] = True
         told = list(with_site_time(episode.packets, MasterTerm(1, 0)))
-        silent = [replace(o, claim=None, tx_variance_m2=0.0, tx_ticks_master=None) for o in told]
+        silent = [replace(o, master_term=None, tx_variance_m2=0.0, tx_ticks_master=None) for o in told]
         for k, observations in enumerate((silent, told)):
             method = Estimation(settings_of(replace(PLAIN, qa=0.3)))
             for n, observation in enumerate(observations):

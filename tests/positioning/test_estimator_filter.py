@@ -193,7 +193,7 @@ def test_packed_relays_are_those_listed():
     listed = begun(episode, settings_of(MESH))
     packed = begun(episode, settings_of(MESH), np.empty((0, 3)))
     for name, anchor_m in zip(names.tolist(), LAB_M, strict=True):
-        packed.place_anchor(name, anchor_m)
+        packed.anchor_index(name, anchor_m)
     for anchor, sequence, rx_ticks, tx_ticks, relays in one_by_one(episode.packets):
         told = b"".join(
             HEARD.pack(name, number & 0xFF, stamp & 0xFFFFFFFF, stamp >> 32 & 0xFF)
@@ -420,7 +420,7 @@ def test_an_anchor_whose_counter_starts_anew_is_taken_up_again():
 def test_a_new_anchor_is_told_of_first():
     estimator = Estimator(settings_of(PLAIN))
     estimator.start(0, np.array([3.0, 4.0]), np.eye(2), 1.0)
-    assert [estimator.place_anchor(7 + n, anchor_m) for n, anchor_m in enumerate(LAB_M)] == list(range(6))
+    assert [estimator.anchor_index(7 + n, anchor_m) for n, anchor_m in enumerate(LAB_M)] == list(range(6))
     assert estimator.process(0, 0, 100, 50) == JOINED
     assert estimator.clock(0) is not None
     assert estimator.clock(1) is None

@@ -306,8 +306,8 @@ def test_where_the_offset_is_for_now_agrees_with_the_stamps():
     now = int(episode.packets.rx_ticks[-1])
     for k in range(len(episode.path_m) - 6, len(episode.path_m)):
         anchor = int(episode.packets.anchors[k])
-        whole, rest_m, rate_mps = estimator.clock(anchor)
+        whole, stationary_m, rate_mps = estimator.clock(anchor)
         measured = int(episode.packets.rx_ticks[k] - episode.packets.tx_ticks[k]) - whole
         flight_m = np.linalg.norm(episode.path_m[k] - LAB_M[anchor])
         later_s = (now - int(episode.packets.rx_ticks[k])) * TICK_S
-        assert measured * TICK_M - flight_m + later_s * rate_mps == pytest.approx(rest_m, abs=0.2)
+        assert measured * TICK_M - flight_m + later_s * rate_mps == pytest.approx(stationary_m, abs=0.2)

@@ -16,8 +16,8 @@ from skyless.recordings.foreign.bitcraze_payload import decode
 SECONDS = 6.0
 SPEED_MPS = 1.0
 EXACT = structs.replace(
-    MASTERLESS, survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0, place_memory_s=0.0, rest_s=0.0,
-    rx_variance_m2=9e-4,
+    MASTERLESS, survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0, change_memory_s=0.0,
+    stationary_s=0.0, rx_variance_m2=9e-4,
 )  # fmt: skip
 """As the hall is where nothing else is asked for."""
 

@@ -35,7 +35,7 @@ class Observation(Struct, frozen=True, gc=False):
     """Variance of the TX time on the master's scale, from the anchor's clock filter."""
     relays: tuple[tuple[int, int, int], ...] = ()
     """When the anchor heard others: (anchor, sequence number, own RX stamp, unwrapped); for ``joint`` only."""
-    claim: MasterTerm | None = None
+    master_term: MasterTerm | None = None
     """Whose time ``tx_ticks_master`` is; for ``joint`` only."""
     rx_variance_factor: float = 1.0
     """On the variance of this reception, at least 1: what the radio's diagnostics say (``first_path``)."""

@@ -19,9 +19,9 @@ from skyless.kernels.arrays import Matrix
 from skyless.kernels.compiled import step
 from skyless.positioning.estimator.kalman import reset_state
 from skyless.positioning.estimator.state import (
-    LASTING,
+    ALL_RANGE_ERRORS,
+    CHANGING_RANGE_ERRORS,
     LASTING_STD_M,
-    PASSING,
     EstimatorState,
     layout,
     uncertain_states,
@@ -39,7 +39,7 @@ SURE_CHI2: Final = 50.0
 EXPLAINED_CHI2: Final = 20.0
 """Largest part of the test that the faults of the right anchors may leave unexplained."""
 
-RIVAL_CHI2: Final = 20.0
+RIVAL_FAULT_CHI2: Final = 20.0
 """Least difference to what the faults of any other anchors explain."""
 
 MOST_FAULTS: Final = 2
@@ -195,7 +195,7 @@ def _open_recent_faults(s: EstimatorState) -> None:
     for anchor in range(count):
         spare -= 1 if s.anchors[anchor]["is_obstructed"] else 0
         s.ph[anchor] = _explained_alone(s, 1, anchor)
-    limit = _largest(s, 1) - RIVAL_CHI2
+    limit = _largest(s, 1) - RIVAL_FAULT_CHI2
     first = 0
     while spare > 0 and first >= 0:
         first = -1
@@ -234,7 +234,7 @@ def _open_lasting_faults(s: EstimatorState, chi2: float) -> None:
                         first, second, most, rival = one, other, explained, most
                     elif explained > rival:
                         rival = explained
-        if not opened and chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_CHI2:
+        if not opened and chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_FAULT_CHI2:
             opened = True
             for one in range(faults):
                 anchor = second if one else first
@@ -255,7 +255,7 @@ def end_lasting_fault(s: EstimatorState, anchor: int) -> None:
 def _open_fault(s: EstimatorState, bank: int, anchor: int) -> None:
     """Take a fault into its anchor's range error; all other hypotheses are conditioned on it (Schur's complement)."""
     status = s.status[0]
-    status["range_errors"] = max(status["range_errors"], LASTING if bank == 0 else PASSING)
+    status["range_errors"] = max(status["range_errors"], ALL_RANGE_ERRORS if bank == 0 else CHANGING_RANGE_ERRORS)
     x, P, V, evidence, information, column = s.x, s.P, s.V, s.evidence, s.information, s.fault_input
     count, n = len(s.anchors), uncertain_states(s)
     where, chosen = layout(s.settings[0]["dim"], count), bank * count + anchor

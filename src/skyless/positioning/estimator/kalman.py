@@ -27,7 +27,7 @@ OBSTRUCTED_WALK: Final = 0.004
 
 OBSTRUCTION_MEMORY_S: Final = 10.0
 
-REST_SHARE: Final = 2e-7
+STATIONARY_NOISE_SHARE: Final = 2e-7
 """Part of the process noise of motion that is left at rest: 5 cm within half a minute."""
 
 
@@ -49,8 +49,8 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
         status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
     _advance(s, where.velocity, dt)
     motion = settings["qa"] * status["q_scale"]
-    if is_at_rest(s):
-        motion *= REST_SHARE
+    if is_stationary(s):
+        motion *= STATIONARY_NOISE_SHARE
     for axis in range(dim):
         add_process_noise(s.P, axis, where.velocity + axis, axis, where.velocity + axis, dt, 0.0, motion)
         s.V[2 * count + axis, axis] -= 0.5 * dt * dt  # an acceleration that the filter does not know of
@@ -69,10 +69,10 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
 
 
 @step
-def is_at_rest(s: EstimatorState) -> bool:
+def is_stationary(s: EstimatorState) -> bool:
     """Whether the tag has shown no motion for so long that it is taken to stand still."""
-    rest_s = s.settings[0]["rest_s"]
-    return bool(0.0 < rest_s < s.status[0]["rest_s"])
+    stationary_s = s.settings[0]["stationary_s"]
+    return bool(0.0 < stationary_s < s.status[0]["stationary_s"])
 
 
 @step
@@ -101,7 +101,7 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
     if s.anchors[anchor]["is_obstructed"]:
         s.P[change, change] += OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"] * dt
     else:
-        variance = s.anchors[anchor]["place_variance_m2"] + share * OBSTRUCTED_STD_M**2
+        variance = s.anchors[anchor]["change_variance_m2"] + share * OBSTRUCTED_STD_M**2
         usual = dt / settings["place_time_s"] + walked_m / settings["place_distance_m"]
         if variance > 0.0:
             _decay(s, change, np.exp(-obstructed - (1.0 - share) * usual), variance)

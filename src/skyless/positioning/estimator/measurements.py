@@ -32,13 +32,13 @@ from skyless.positioning.estimator.kalman import (
 )
 from skyless.positioning.estimator.monitor import (
     COMMON,
-    OFTEN_LATE,
+    LATE_OFTEN_SHARE,
+    adapt_change_noise,
+    adapt_change_variance,
     adapt_clock_noise,
-    adapt_place_noise,
     adapt_process_noise,
     difference_scale,
     end_small_obstruction,
-    follow_change,
     has_jumped,
     is_common,
     is_warm,
@@ -55,7 +55,7 @@ SLOPE_STEP_M: Final = 0.25
 """The slope counts at a range that follows in such steps: where it followed the estimate's noise, which is in the
 innovation as well, a tag at rest would learn the slope from nothing else (Huang and Roumeliotis 2008)."""
 
-BEND_SHARE: Final = 0.01
+CURVATURE_SHARE: Final = 0.01
 """Where ranges are so curved that it counts for more than this part of the stamps' variance, it is counted."""
 
 CLOCK_JUMP_RELAYS: Final = 4
@@ -83,7 +83,7 @@ STEADY_WALK_SCALE: Final = 4.0
 
 CLOCK_JUMPED: Final = 2
 
-REST_STD_MPS: Final = 0.01
+STATIONARY_STD_MPS: Final = 0.01
 """Of the velocity of a tag that stands still, each time a measurement is processed."""
 
 
@@ -134,7 +134,7 @@ def _range_error_terms(s: EstimatorState, term: int, anchor: int, range_m: float
 
 
 @step
-def _along(s: EstimatorState, begin: int, end: int) -> float:
+def _h_dot_x(s: EstimatorState, begin: int, end: int) -> float:
     """h·x of terms from ``begin`` to ``end``."""
     total = 0.0
     for term in range(begin, end):
@@ -143,7 +143,7 @@ def _along(s: EstimatorState, begin: int, end: int) -> float:
 
 
 @step
-def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
+def _curvature_m(s: EstimatorState, range_m: float, variance: float) -> float:
     """Half the position's variance across the direction, over the range: what the range is longer by on average.
 
     The second term of its Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 where that is
@@ -153,7 +153,7 @@ def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
     across = 0.0
     for axis in range(dim):
         across += P[axis, axis]
-    least = BEND_SHARE * variance * range_m * range_m
+    least = CURVATURE_SHARE * variance * range_m * range_m
     if 0.5 * across * across >= least:
         for one in range(dim):
             for other in range(dim):
@@ -196,9 +196,9 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     else:
         rx_variance += settings["tx_variance_m2"]
     terms, range_m = reception_terms(s, anchor, a["is_relayed"])
-    bend_m = _bend_m(s, range_m, rx_variance)
-    rx_variance += 2.0 * bend_m * bend_m
-    expected_m = range_m + bend_m + _along(s, direction_terms(dim), terms)
+    curvature_m = _curvature_m(s, range_m, rx_variance)
+    rx_variance += 2.0 * curvature_m * curvature_m
+    expected_m = range_m + curvature_m + _h_dot_x(s, direction_terms(dim), terms)
     innovation = (rx_ticks - tx_ticks - a["offset_ticks"]) * TICK_M - expected_m
     innovation_variance = compute_ph(s, terms) + rx_variance
     a["range_m"] = range_m
@@ -217,14 +217,14 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
         end_small_obstruction(s, anchor)
         normalised = innovation / np.sqrt(innovation_variance)
         if a["is_obstructed"]:
-            follow_change(s, anchor, normalised)
+            adapt_change_noise(s, anchor, normalised)
         if is_warm(s):
             adapt_process_noise(s, normalised / scale)
         used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]
         compute_fault_input(s, terms, anchor)
         gather_evidence(s, innovation, used_variance)
         update(s, innovation, used_variance, 1.0, len(s.x))
-        adapt_place_noise(s, anchor, elapsed_s)
+        adapt_change_variance(s, anchor, elapsed_s)
         steps = int(np.floor(s.x[offset] / TICK_M))
         a["offset_ticks"] += steps
         s.x[offset] -= steps * TICK_M
@@ -246,13 +246,13 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
     change = where.change + anchor
     has_ended = False
     if innovation < 0.0:
-        before_m = _along(s, 0, terms)
+        before_m = _h_dot_x(s, 0, terms)
         if a["is_obstructed"]:
             share = min(status["obstruction"], 1.0)
-            reset_state(s, change, a["place_variance_m2"] + share * OBSTRUCTED_STD_M**2)
+            reset_state(s, change, a["change_variance_m2"] + share * OBSTRUCTED_STD_M**2)
         else:
             end_lasting_fault(s, anchor)
-        innovation += before_m - _along(s, 0, terms)
+        innovation += before_m - _h_dot_x(s, 0, terms)
         a["is_obstructed"] = a["outliers_in_row"] = 0
         status["ends_of_obstructions"] += 1
         left = compute_ph(s, terms) + rx_variance
@@ -279,10 +279,10 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     other = direction_terms(dim)
     terms = _range_error_terms(s, _set_term(s, other, noise, 1.0), anchor, range_m, 1.0)
     variance = settings["rx_variance_m2"]
-    bend_m = _bend_m(s, range_m, variance)
-    variance += 2.0 * bend_m * bend_m + compute_ph(s, terms)
+    curvature_m = _curvature_m(s, range_m, variance)
+    variance += 2.0 * curvature_m * curvature_m + compute_ph(s, terms)
     compute_fault_input(s, terms, anchor)
-    if s.status[0]["late_share"] > OFTEN_LATE:
+    if s.status[0]["late_share"] > LATE_OFTEN_SHARE:
         variance += JOIN_VARIANCE_M2
     for state in range(n):
         P[state, offset] = -s.ph[state]
@@ -292,7 +292,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
         s.V[fault, offset] = s.fault_input[fault]
     whole = rx_ticks - tx_ticks - int(np.floor(range_m / TICK_M))
     a["offset_ticks"], a["has_tx_noise"] = whole, 1
-    s.x[offset] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m - bend_m - _along(s, other, terms)
+    s.x[offset] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m - curvature_m - _h_dot_x(s, other, terms)
     a["range_m"] = range_m
 
 
@@ -341,7 +341,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         variance += settings["tx_variance_m2"]
     link = s.links[min(listener, sender), max(listener, sender)]
     whole = j["offset_ticks"] - i["offset_ticks"]
-    innovation = (rx_ticks - tx_ticks - whole) * TICK_M - distance_m - link["constant_m"] - _along(s, 0, term)
+    innovation = (rx_ticks - tx_ticks - whole) * TICK_M - distance_m - link["constant_m"] - _h_dot_x(s, 0, term)
     pair_variance = link["variance_m2"]
     innovation_variance = compute_ph(s, term) + variance + pair_variance
     normalised = innovation / np.sqrt(innovation_variance)
@@ -360,7 +360,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
             link["variance_m2"] += PAIR_JUMP_M2
     else:
         status["relays_used"] += 1
-        status["relays_taken"] += 1.0
+        status["relays_accepted"] += 1.0
         i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = link["outliers_in_row"] = 0
         share = pair_variance / innovation_variance
         link["constant_m"] += share * innovation
@@ -401,7 +401,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     off = (subticks - SUBTICKS * whole) & (wrap - 1)
     if off >= wrap // 2:
         off -= wrap
-    innovation = off * (TICK_M / SUBTICKS) - _along(s, 0, term)
+    innovation = off * (TICK_M / SUBTICKS) - _h_dot_x(s, 0, term)
     # the filter of an anchor assumes what the almanac says of clocks; behind one that wanders more it lags as well
     steady = max(a["walk_scale"], s.anchors[master]["walk_scale"]) <= STEADY_WALK_SCALE
     is_news = steady and own_variance > REPORT_GAIN * variance
@@ -451,7 +451,7 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
     relax_range_error(s, a, a_elapsed_s, walked_m - s.anchors[a]["walked_m"])
     relax_range_error(s, b, b_elapsed_s, walked_m - s.anchors[b]["walked_m"])
     terms, expected_m = difference_terms(s, a, b)
-    innovation = difference_m - expected_m - _along(s, 2 * direction_terms(dim), terms)
+    innovation = difference_m - expected_m - _h_dot_x(s, 2 * direction_terms(dim), terms)
     innovation_variance = compute_ph(s, terms) + settings["difference_std_m"] ** 2
     scale = difference_scale(s, innovation, innovation_variance)
     if scale > 0.0:
@@ -463,8 +463,8 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
         update(s, innovation, innovation_variance * scale, 1.0, len(s.x))
         end_small_obstruction(s, a)
         end_small_obstruction(s, b)
-        adapt_place_noise(s, a, a_elapsed_s)
-        adapt_place_noise(s, b, b_elapsed_s)
+        adapt_change_variance(s, a, a_elapsed_s)
+        adapt_change_variance(s, b, b_elapsed_s)
     return int(scale > 0.0)
 
 
@@ -502,7 +502,7 @@ def zero_velocity(s: EstimatorState) -> None:
     velocity = layout(dim, len(s.anchors)).velocity
     for axis in range(dim):
         term = _set_term(s, 0, velocity + axis, 1.0)
-        variance = compute_ph(s, term) + REST_STD_MPS**2
+        variance = compute_ph(s, term) + STATIONARY_STD_MPS**2
         innovation = -s.x[velocity + axis]
         compute_fault_input(s, term, -1)
         update(s, innovation, variance, 1.0, len(s.x))

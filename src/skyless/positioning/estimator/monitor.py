@@ -12,7 +12,7 @@ import numpy as np
 
 from skyless.kernels.compiled import step
 from skyless.positioning.estimator.faults import begin_obstruction
-from skyless.positioning.estimator.state import PASSING, EstimatorState, layout
+from skyless.positioning.estimator.state import CHANGING_RANGE_ERRORS, EstimatorState, layout
 
 FORGETTING: Final = 0.02
 """Weight of the newest innovation in the running means, about the last 50."""
@@ -29,7 +29,7 @@ IN_ROW: Final = 2
 IN_ROW_WHERE_LATE: Final = 5
 """... or so many where single receptions are late often, ..."""
 
-OFTEN_LATE: Final = 0.02
+LATE_OFTEN_SHARE: Final = 0.02
 """... which is a larger share of them than this, ..."""
 
 TOGETHER: Final = 7.0
@@ -60,20 +60,20 @@ ENDED_STD_M: Final = 0.05
 ENDED: Final = 2.0
 """An obstruction has ended where its error is known to this, and less than so many standard deviations from none."""
 
-SETTLED: Final = 2.0
+SETTLED_CHANGE_SCALE: Final = 2.0
 """A range error whose process noise is raised by less does not change any more."""
 
 LATE_FORGETTING: Final = 0.005
-LATE_DENSITY: Final = 0.05
+LATE_PROBABILITY_DENSITY: Final = 0.05
 """Probability density of a late reception's normalised innovation: a standard deviation of 5 cm, a metre late."""
 
-HUBER: Final = 1.5
+RECEPTION_HUBER: Final = 1.5
 """Where receptions are late often, innovations beyond so many standard deviations weigh less."""
 
 DIFFERENCE_HUBER: Final = 1.0
 """Number of standard deviations beyond which the innovations of ready-made differences weigh less."""
 
-MOST_PLACE_STD_M: Final = 0.5
+MAX_CHANGE_STD_M: Final = 0.5
 """Of what range errors change along the way; larger ones are jumps."""
 
 MOVED: Final = 1.0
@@ -108,7 +108,7 @@ RELAY_WALK_LOSS: Final = 0.99
 def gate_of(s: EstimatorState) -> float:
     """Beyond how many standard deviations a reception is more likely late than not."""
     late = min(s.status[0]["late_share"], 0.9)
-    odds = late * LATE_DENSITY * 2.5066282746310002 / (1.0 - late)
+    odds = late * LATE_PROBABILITY_DENSITY * 2.5066282746310002 / (1.0 - late)
     gate = s.settings[0]["gate"]
     return float(min(gate, np.sqrt(-2.0 * np.log(odds)))) if odds > 1e-6 else float(gate)
 
@@ -140,7 +140,7 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
         agrees = agrees and both * both > together * together * innovation_variance
         a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
         a["outlier_m"] = innovation
-    needed = IN_ROW_WHERE_LATE if status["late_share"] > OFTEN_LATE else IN_ROW
+    needed = IN_ROW_WHERE_LATE if status["late_share"] > LATE_OFTEN_SHARE else IN_ROW
     return bool(a["outliers_in_row"] >= needed)
 
 
@@ -167,11 +167,11 @@ def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
     s.status[0]["obstructions"] += 1
     begin_obstruction(s, anchor)
     s.P[change, change] += max(JUMP_STD_M**2, innovation * innovation)
-    s.status[0]["range_errors"] = max(s.status[0]["range_errors"], PASSING)
+    s.status[0]["range_errors"] = max(s.status[0]["range_errors"], CHANGING_RANGE_ERRORS)
 
 
 @step
-def follow_change(s: EstimatorState, anchor: int, normalised: float) -> None:
+def adapt_change_noise(s: EstimatorState, anchor: int, normalised: float) -> None:
     """Raise the process noise of an obstructed anchor's range error where its innovations stay on one side."""
     a = s.anchors[anchor]
     a["change_mean"] += CHANGE_GAIN * (normalised - a["change_mean"])
@@ -186,7 +186,7 @@ def end_small_obstruction(s: EstimatorState, anchor: int) -> None:
     """End an obstruction that has gone without a jump back: the range error is known, and is hardly there."""
     a, change = s.anchors[anchor], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
     error_m, variance = s.x[change], s.P[change, change]
-    settled = a["is_obstructed"] and a["change_scale"] < SETTLED and variance < ENDED_STD_M**2
+    settled = a["is_obstructed"] and a["change_scale"] < SETTLED_CHANGE_SCALE and variance < ENDED_STD_M**2
     if settled and error_m * error_m < ENDED * ENDED * variance:
         a["is_obstructed"] = 0
         s.status[0]["ends_of_obstructions"] += 1
@@ -212,8 +212,8 @@ def variance_scale(s: EstimatorState, innovation: float, innovation_variance: fl
         status["rejected_in_row"] = 0
         status["mean_nis"] += FORGETTING * (normalised * normalised - status["mean_nis"])
         status["mean_square_m2"] += FORGETTING * (innovation * innovation - status["mean_square_m2"])
-        if status["late_share"] > OFTEN_LATE and abs(normalised) > HUBER:
-            scale = abs(normalised) / HUBER
+        if status["late_share"] > LATE_OFTEN_SHARE and abs(normalised) > RECEPTION_HUBER:
+            scale = abs(normalised) / RECEPTION_HUBER
     return float(scale)
 
 
@@ -239,32 +239,32 @@ def difference_scale(s: EstimatorState, innovation: float, innovation_variance: 
 
 
 @step
-def adapt_place_noise(s: EstimatorState, anchor: int, elapsed_s: float) -> None:
+def adapt_change_variance(s: EstimatorState, anchor: int, elapsed_s: float) -> None:
     """Let the variance of an anchor's changing range error follow its estimate: the mean of its square.
 
     The maximisation step of expectation maximisation (Shumway and Stoffer 1982) with a memory that fades.
     """
     settings, a = s.settings[0], s.anchors[anchor]
-    memory_s = settings["place_memory_s"]
+    memory_s = settings["change_memory_s"]
     if memory_s > 0.0:
         change = layout(settings["dim"], len(s.anchors)).change + anchor
         square = s.x[change] ** 2 + s.P[change, change]
-        variance = a["place_variance_m2"] + min(elapsed_s / memory_s, 0.5) * (square - a["place_variance_m2"])
-        a["place_variance_m2"] = min(max(variance, settings["least_place_std_m"] ** 2), MOST_PLACE_STD_M**2)
+        variance = a["change_variance_m2"] + min(elapsed_s / memory_s, 0.5) * (square - a["change_variance_m2"])
+        a["change_variance_m2"] = min(max(variance, settings["least_change_std_m"] ** 2), MAX_CHANGE_STD_M**2)
 
 
 @step
-def follow_rest(s: EstimatorState, dt: float) -> None:
+def update_stationary(s: EstimatorState, dt: float) -> None:
     """Count for how long the tag has shown no motion: neither its position, nor innovations that stay on one side."""
     status, dim = s.status[0], s.settings[0]["dim"]
     square = 0.0
     for axis in range(dim):
-        square += (s.x[axis] - status["rest_m"][axis]) ** 2 / s.P[axis, axis]
-    status["rest_s"] += dt
+        square += (s.x[axis] - status["stationary_m"][axis]) ** 2 / s.P[axis, axis]
+    status["stationary_s"] += dt
     if square > MOVED * dim or status["lag_square"] > LAG_LIMIT or status["rejected_in_row"] > 1:
-        status["rest_s"] = 0.0
+        status["stationary_s"] = 0.0
         for axis in range(dim):
-            status["rest_m"][axis] = s.x[axis]
+            status["stationary_m"][axis] = s.x[axis]
 
 
 @step

@@ -12,13 +12,13 @@ from skyless.clocks.two_way import RunningMedian, TwoWayRanging
 from skyless.constants import TICK_BITS, TICK_M
 from skyless.kernels.arrays import Array
 
-LEAST_NOISE_M: Final = 0.05
+MIN_NOISE_M: Final = 0.05
 """A quieter calibration is not believed further: places it has not seen are somewhat different."""
 
-NEAREST_M: Final = 0.5
+SLOPE_NEAREST_M: Final = 0.5
 """Below this range the slope is not followed any more."""
 
-SHARED: Final = 1.5
+SHARED_NOISE_SCALE: Final = 1.5
 """Differences that follow each other share receptions and reflections, which the filter counts as new in each."""
 
 TYPICAL_SLOPE_M: Final = 0.05
@@ -39,8 +39,8 @@ class AnchorCalibration(Struct, frozen=True):
     """Standard deviation of the differences that the anchor takes part in, outliers apart."""
 
 
-NOTHING: Final = AnchorCalibration(0.0)
-UNKNOWN: Final = AnchorCalibration(0.0, TYPICAL_SLOPE_M)
+NO_BIAS: Final = AnchorCalibration(0.0)
+TYPICAL_ANCHOR: Final = AnchorCalibration(0.0, TYPICAL_SLOPE_M)
 
 
 class DifferenceCalibration(Struct, frozen=True):
@@ -50,12 +50,12 @@ class DifferenceCalibration(Struct, frozen=True):
 
     def of(self, anchor: int) -> AnchorCalibration:
         """What is known of an anchor, or of any."""
-        return self.anchors.get(anchor, UNKNOWN)
+        return self.anchors.get(anchor, TYPICAL_ANCHOR)
 
     def error_m(self, anchor: int, range_m: float) -> float:
         """By how much an anchor seems too far away."""
         known = self.of(anchor)
-        return known.bias_m + known.slope_m * log(max(range_m, NEAREST_M))
+        return known.bias_m + known.slope_m * log(max(range_m, SLOPE_NEAREST_M))
 
     def constant_m(self, pair: PairTdoa) -> float:
         """By how much a difference is too large for its anchors' constants."""
@@ -64,13 +64,15 @@ class DifferenceCalibration(Struct, frozen=True):
     def difference_std_m(self, otherwise_m: float) -> float:
         """Of a difference, by the median of what was measured at the anchors, where that is less than otherwise."""
         known = [anchor.noise_m for anchor in self.anchors.values() if anchor.noise_m is not None]
-        return min(SHARED * max(float(np.median(known)), LEAST_NOISE_M), otherwise_m) if known else otherwise_m
+        return (
+            min(SHARED_NOISE_SCALE * max(float(np.median(known)), MIN_NOISE_M), otherwise_m) if known else otherwise_m
+        )
 
 
 # Flights between anchors
 
 
-RANGED: Final = 101
+RANGED_WINDOW: Final = 101
 """Exchanges over which the ranged flight of a pair is the median."""
 
 Pair = tuple[int, int]
@@ -80,20 +82,20 @@ class AnchorFlights:
     """The median of what either anchor of a pair told lately; of exchanges, where neither tells."""
 
     def __init__(self) -> None:
-        self._told: dict[Pair, RunningMedian] = {}
-        self._ranging = TwoWayRanging(TICK_BITS, window=RANGED)
+        self._stated: dict[Pair, RunningMedian] = {}
+        self._ranging = TwoWayRanging(TICK_BITS, window=RANGED_WINDOW)
 
-    def update(self, a: int, b: int, tx_a: int, rx_b: int, told_ticks: float | None) -> float | None:
+    def update(self, a: int, b: int, tx_a: int, rx_b: int, stated_ticks: float | None) -> float | None:
         """Take b's reception of a's packet, both stamps unwrapped, with the flight told of it if there is one.
 
         The flight between the two in ticks, None while it is unknown.
         """
         pair = (a, b) if a < b else (b, a)
-        median = self._told.get(pair)
-        if told_ticks is not None:
+        median = self._stated.get(pair)
+        if stated_ticks is not None:
             if median is None:
-                median = self._told[pair] = RunningMedian()
-            return median.add(told_ticks)
+                median = self._stated[pair] = RunningMedian()
+            return median.add(stated_ticks)
         if median is not None:
             return median.value
         self._ranging.add(a, b, tx_a, rx_b)
@@ -116,7 +118,7 @@ def distance_ticks(anchors_m: Mapping[int, Point], a: int, b: int) -> float | No
 EXCESS_STD_M: Final = 0.1
 """What is in the excess of a pair beside the delays of its nodes: places that are off, strong and weak signals."""
 
-DELAY_STD_M: Final = 0.07
+ANTENNA_DELAY_STD_M: Final = 0.07
 """How much the delays of nodes of one kind scatter: two of them as much as all else."""
 
 BLOCKED_M: Final = 0.5
@@ -132,7 +134,7 @@ def antenna_delays_m(excess_m: Mapping[Pair, float]) -> dict[int, float]:
     anchors = sorted({anchor for pair in kept for anchor in pair})
     H, excess = _design(kept, anchors), np.array(list(kept.values()))
     information = H.T @ H / EXCESS_STD_M**2
-    information[range(len(anchors)), range(len(anchors))] += 1.0 / DELAY_STD_M**2
+    information[range(len(anchors)), range(len(anchors))] += 1.0 / ANTENNA_DELAY_STD_M**2
     delays = np.linalg.solve(information, H.T @ excess / EXCESS_STD_M**2)
     return dict(zip(anchors, delays[:-1].tolist(), strict=True))
 
@@ -165,12 +167,12 @@ def _design(pairs: Mapping[Pair, float], anchors: list[int]) -> Array:
 # Delays of relayed receptions
 
 
-SETTLED: Final = 32
+ALWAYS_REFRESHED: Final = 32
 REFRESH: Final = 8
-"""After so many receptions of a pair, one way, only every eighth is asked for the flight."""
+"""After so many receptions of a pair, one direction, only every eighth is asked for the flight."""
 
 FIRST_ESTIMATE: Final = 128
-LONGEST_WAIT: Final = 1024
+MOST_BETWEEN_ESTIMATES: Final = 1024
 """Flights heard between two estimates of the antenna delays: twice as many each time, up to so many."""
 
 UNRANGED: Final = 20
@@ -179,7 +181,7 @@ UNRANGED: Final = 20
 EXCESSES: Final = 101
 
 
-class _Way:
+class _Direction:
     """Receptions by one anchor of another's packets."""
 
     __slots__ = ("delay_ticks", "heard", "skip", "unranged")
@@ -196,7 +198,7 @@ class RelayDelays:
         """``estimate``: the anchors' own delays too; otherwise a pair shares its delay equally."""
         self._anchors_m = anchors_m
         self._flights = AnchorFlights()
-        self._ways: dict[Pair, _Way] = {}
+        self._directions: dict[Pair, _Direction] = {}
         self._excess_m: dict[Pair, RunningMedian] = {}
         self.own_m: dict[int, float] = {}
         """The anchors' own delays, each half of TX and RX together, less what all have in common."""
@@ -205,45 +207,45 @@ class RelayDelays:
         self._estimates_own = estimate
         self._until_estimate = self._wait = FIRST_ESTIMATE
 
-    def ticks(self, listener: int, sender: int, tx_ticks: int, rx_ticks: int, told_ticks: float | None) -> int | None:
+    def ticks(self, listener: int, sender: int, tx_ticks: int, rx_ticks: int, stated_ticks: float | None) -> int | None:
         """What to take off this reception, whole ticks; None while the pair's flight is unknown.
 
         Stamps are unwrapped, each on its own clock.
         """
-        way = self._ways.get((listener, sender))
-        if way is None:
-            way = self._ways[listener, sender] = _Way()
-        if told_ticks is not None and way.skip > 0:
-            way.skip -= 1
-            return way.delay_ticks
-        flight = self._flights.update(sender, listener, tx_ticks, rx_ticks, told_ticks)
-        self._refresh(way, listener, sender, flight)
+        direction = self._directions.get((listener, sender))
+        if direction is None:
+            direction = self._directions[listener, sender] = _Direction()
+        if stated_ticks is not None and direction.skip > 0:
+            direction.skip -= 1
+            return direction.delay_ticks
+        flight = self._flights.update(sender, listener, tx_ticks, rx_ticks, stated_ticks)
+        self._refresh(direction, listener, sender, flight)
         self._until_estimate -= 1
         if self._until_estimate == 0:
             self._estimate()
-        return way.delay_ticks
+        return direction.delay_ticks
 
     def forget(self, anchor: int) -> None:
         """An anchor's clock restarted."""
         self._flights.forget(anchor)
 
-    def _refresh(self, way: _Way, listener: int, sender: int, flight: float | None) -> None:
+    def _refresh(self, direction: _Direction, listener: int, sender: int, flight: float | None) -> None:
         distance = distance_ticks(self._anchors_m, listener, sender)
         if distance is None:
             return
         if flight is None:
-            way.unranged += 1
-            if way.unranged < UNRANGED:
+            direction.unranged += 1
+            if direction.unranged < UNRANGED:
                 return
             excess_m = self._usual_excess_m()
         else:
             excess_m = (flight - distance) * TICK_M
             pair = (listener, sender) if listener < sender else (sender, listener)
             self._excess_m.setdefault(pair, RunningMedian(EXCESSES)).add(excess_m)
-        way.heard += 1
-        way.skip = REFRESH - 1 if way.heard > SETTLED else 0
+        direction.heard += 1
+        direction.skip = REFRESH - 1 if direction.heard > ALWAYS_REFRESHED else 0
         own_m = self.own_m.get(listener, 0.0) - self.own_m.get(sender, 0.0)
-        way.delay_ticks = round((excess_m + own_m) / TICK_M)
+        direction.delay_ticks = round((excess_m + own_m) / TICK_M)
 
     def _usual_excess_m(self) -> float:
         known = sorted(value for median in self._excess_m.values() if (value := median.value) is not None)
@@ -251,7 +253,7 @@ class RelayDelays:
 
     def _estimate(self) -> None:
         """Estimate the anchors' own delays; the pairs' follow with their next flights."""
-        self._wait = min(2 * self._wait, LONGEST_WAIT)
+        self._wait = min(2 * self._wait, MOST_BETWEEN_ESTIMATES)
         self._until_estimate = self._wait
         known = {pair: value for pair, median in self._excess_m.items() if (value := median.value) is not None}
         own_m = antenna_delays_m(known)

@@ -30,8 +30,8 @@ DIFFERENCES: Final = EstimatorSettings(
     place_std_m=0.12,
     place_distance_m=0.5,
     place_time_s=30.0,
-    place_memory_s=1.5,
-    rest_s=3.0,
+    change_memory_s=1.5,
+    stationary_s=3.0,
 )
 """What recorded flights of DW1000s show (docs/recordings.md): reflections change within half a metre, and by how much
 differs from anchor to anchor."""
@@ -42,16 +42,16 @@ WINDOW: Final = 60
 WINDOW_S: Final = 20.0
 """... and none older than this."""
 
-MAX_GAP_S: Final = 10.0
+MAX_DIFFERENCE_SILENCE_S: Final = 10.0
 """After a longer silence the state says less than a new start would."""
 
 SPEED_STD_MPS: Final = 1.0
 """Of the velocity at the start."""
 
-IN_USE_S: Final = 0.5
+DIFFERENCE_IN_USE_S: Final = 0.5
 """An anchor counts as in use while its last accepted difference is younger."""
 
-MAX_STD_M: Final = 3.0
+MAX_HORIZONTAL_STD_M: Final = 3.0
 """While the horizontal standard deviation is larger, there is no fix; a silence that makes it so means a new start."""
 
 SHORT_SILENCE_S: Final = 0.1
@@ -60,8 +60,8 @@ SHORT_SILENCE_S: Final = 0.1
 TRY_EVERY: Final = 6
 """Differences between two attempts at a start."""
 
-AFTER_LOSS: Final = 30
-AFTER_LOSS_S: Final = 1.0
+DIFFERENCES_AFTER_LOSS: Final = 30
+WAIT_AFTER_LOSS_S: Final = 1.0
 """After a state that was wrong, a new start waits for this number of differences, or for this time."""
 
 
@@ -91,7 +91,7 @@ class DifferenceTracking:
             highest_m=settings.highest_m if z_bounds_m is None else z_bounds_m[1],
         )
         self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit_m)
-        self._places = {anchor: np.array(place) for anchor, place in anchors_m.items()}
+        self._positions_m = {anchor: np.array(place) for anchor, place in anchors_m.items()}
         self._z_bounds_m = z_bounds_m
         self._estimator = Estimator(self._settings)
         self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
@@ -113,23 +113,23 @@ class DifferenceTracking:
         """
         used = False
         for pair in pairs:
-            if self._learn_places(pair):
-                used = self._take(pair) or used
+            if self._update_positions(pair):
+                used = self._add(pair) or used
             else:
                 self.counters["unknown-anchor"] += 1
                 self.reason = NoFixReason.NO_ALMANAC
-        return used and self._start is not None and self._is_sane()
+        return used and self._start is not None and self._is_plausible()
 
-    def _learn_places(self, pair: PairTdoa) -> bool:
+    def _update_positions(self, pair: PairTdoa) -> bool:
         """Whether it is known where both anchors stand."""
-        places = self._places
+        places = self._positions_m
         if pair.a_m is not None:
             places[pair.anchor_a] = np.array(pair.a_m)
         if pair.b_m is not None:
             places[pair.anchor_b] = np.array(pair.b_m)
         return pair.anchor_a in places and pair.anchor_b in places
 
-    def _take(self, pair: PairTdoa) -> bool:
+    def _add(self, pair: PairTdoa) -> bool:
         if self._start is not None and self._is_out_of_reach(pair.time_s - self._newest_s):
             self._stop()
         self._newest_s = pair.time_s
@@ -149,30 +149,30 @@ class DifferenceTracking:
     def _process(self, pair: PairTdoa) -> bool:
         """Give a difference to the filter, without what a calibration, or what is usual, says of its anchors."""
         position_m = self.position_m
-        error_m = self._calibration.error_m(pair.anchor_b, dist(position_m, self._places[pair.anchor_b]))
-        error_m -= self._calibration.error_m(pair.anchor_a, dist(position_m, self._places[pair.anchor_a]))
+        error_m = self._calibration.error_m(pair.anchor_b, dist(position_m, self._positions_m[pair.anchor_b]))
+        error_m -= self._calibration.error_m(pair.anchor_a, dist(position_m, self._positions_m[pair.anchor_a]))
         a, b = self._index(pair.anchor_a), self._index(pair.anchor_b)
         ticks = round((pair.time_s - self._begin_s) * TICK_RATE_HZ)
         return self._estimator.process_difference(a, b, ticks, pair.tdoa_m - error_m) == ACCEPTED
 
     def _index(self, anchor: int) -> int:
         """Index of an anchor in the estimator's table."""
-        return self._estimator.place_anchor(anchor, self._places[anchor])
+        return self._estimator.anchor_index(anchor, self._positions_m[anchor])
 
     def _is_out_of_reach(self, silent_s: float) -> bool:
         """Whether the filter cannot predict so far: too long a silence for it, or a clock that went back."""
-        if not 0.0 <= silent_s <= MAX_GAP_S:
+        if not 0.0 <= silent_s <= MAX_DIFFERENCE_SILENCE_S:
             return True
-        return silent_s > SHORT_SILENCE_S and self._estimator.horizontal_variance_m2(silent_s) > MAX_STD_M**2
+        return silent_s > SHORT_SILENCE_S and self._estimator.horizontal_variance_m2(silent_s) > MAX_HORIZONTAL_STD_M**2
 
-    def _is_sane(self) -> bool:
+    def _is_plausible(self) -> bool:
         """Whether the state is near the anchors, beyond which differences tell nothing, and known well enough."""
         start, state, dim = self._start, self._estimator.state, self._estimator.dim
         if start is None or not start.holds(state.x[:dim]):
             self.reason = NoFixReason.NOT_CONVERGED
             self._stop()
             return False
-        if state.P[0, 0] + state.P[1, 1] > MAX_STD_M**2:
+        if state.P[0, 0] + state.P[1, 1] > MAX_HORIZONTAL_STD_M**2:
             self.reason = NoFixReason.ACQUIRING
             return False
         if dim == 3 and state.P[2, 2] > start.extent_m**2:
@@ -188,8 +188,8 @@ class DifferenceTracking:
 
     def fix(self) -> Fix:
         """The newest position with all that is known of it; only after a ``hear`` that made one."""
-        used = [anchor for anchor, when_s in self._received_s.items() if self._newest_s - when_s <= IN_USE_S]
-        anchors_m = np.array([self._places[anchor] for anchor in used]).reshape(-1, 3)
+        used = [anchor for anchor, when_s in self._received_s.items() if self._newest_s - when_s <= DIFFERENCE_IN_USE_S]
+        anchors_m = np.array([self._positions_m[anchor] for anchor in used]).reshape(-1, 3)
         rows, known = self._estimator.rows.tobytes(), self._settings.height_m is not None
         return Fix(self._newest_s, rows, tuple(used), anchors_m, "joint", known, 1, self._asked)
 
@@ -209,7 +209,9 @@ class DifferenceTracking:
         if self._since_try < TRY_EVERY or (self._was_wrong and not self._is_enough_after_loss()):
             return False
         self._since_try = 0
-        start = find_start(self._window, self._places, self._calibration, self._settings.height_m, self._z_bounds_m)
+        start = find_start(
+            self._window, self._positions_m, self._calibration, self._settings.height_m, self._z_bounds_m
+        )
         if isinstance(start, NoSolution):
             self.reason = start.reason
             return False
@@ -219,14 +221,16 @@ class DifferenceTracking:
         self._estimator.start(0, solution.position_m[:dim], covariance, SPEED_STD_MPS**2)
         self._start = start
         if start.without is not None:
-            self._estimator.doubt_anchor(self._index(start.without))
+            self._estimator.inflate_range_error(self._index(start.without))
         self._received_s = {anchor: pair.time_s for kept in self._window for anchor in (kept.anchor_a, kept.anchor_b)}
         self.counters["start"] += 1
         self._window.clear()
         return self._process(pair)
 
     def _is_enough_after_loss(self) -> bool:
-        return len(self._window) >= AFTER_LOSS or self._newest_s - self._window[0].time_s >= AFTER_LOSS_S
+        return (
+            len(self._window) >= DIFFERENCES_AFTER_LOSS or self._newest_s - self._window[0].time_s >= WAIT_AFTER_LOSS_S
+        )
 
 
 # Start
@@ -235,18 +239,18 @@ class DifferenceTracking:
 NEIGHBOURHOOD: Final = 1.5
 """A tag farther from the anchors' centre than this part of their figure's diagonal, in x or y, is lost; ..."""
 
-STOREYS: Final = 0.5
+VERTICAL_NEIGHBOURHOOD: Final = 0.5
 """... and so is one farther above or below than this part."""
 
 LEAST_DIAGONAL_M: Final = 5.0
 
-START_STD_M: Final = 0.22
+START_DIFFERENCE_STD_M: Final = 0.22
 """Of a difference with all that is wrong with it, where nothing has been learnt yet."""
 
 MISFIT: Final = 4.0
 """A start with so much larger residuals than expected, chi² per degree of freedom, is tried without each anchor."""
 
-FITS: Final = 0.1
+REMAINING_MISFIT: Final = 0.1
 """Without the wrong anchor no more than this part of the misfit is left."""
 
 
@@ -270,7 +274,7 @@ class Start(Struct, frozen=True):
 
 def find_start(
     window: Sequence[PairTdoa],
-    places_m: Mapping[int, Array],
+    positions_m: Mapping[int, Array],
     calibration: DifferenceCalibration,
     height_m: float | None,
     z_bounds_m: tuple[float, float] | None,
@@ -285,22 +289,22 @@ def find_start(
         grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(without_bias_m)
     medians = {pair: float(np.median(group)) for pair, group in grouped.items()}
     anchors = sorted({anchor for pair in medians for anchor in pair})
-    found = _solve(medians, places_m, height_m, z_bounds_m)
+    found = _solve(medians, positions_m, height_m, z_bounds_m)
     best, without = found, None
-    least = np.inf if isinstance(found, NoSolution) else FITS * found.chi2
+    least = np.inf if isinstance(found, NoSolution) else REMAINING_MISFIT * found.chi2
     dim = 3 if height_m is None else 2
     if _is_suspect(found) and len(anchors) > dim + 2:
         for anchor in anchors:
             rest = {pair: median for pair, median in medians.items() if anchor not in pair}
-            other = _solve(rest, places_m, height_m, z_bounds_m)
+            other = _solve(rest, positions_m, height_m, z_bounds_m)
             if isinstance(other, Solution) and other.dof > 0 and other.chi2 < least:
                 best, without, least = other, anchor, other.chi2
     if isinstance(best, NoSolution):
         return best
-    anchors_m = np.array([places_m[anchor] for anchor in anchors])
+    anchors_m = np.array([positions_m[anchor] for anchor in anchors])
     low, high = anchors_m.min(axis=0), anchors_m.max(axis=0)
     diagonal_m = max(float(np.linalg.norm((high - low)[:2])), LEAST_DIAGONAL_M)
-    reach_m = diagonal_m * np.array([NEIGHBOURHOOD, NEIGHBOURHOOD, STOREYS])
+    reach_m = diagonal_m * np.array([NEIGHBOURHOOD, NEIGHBOURHOOD, VERTICAL_NEIGHBOURHOOD])
     centre_m = (low + high) / 2.0
     start = Start(best, without, centre_m - reach_m, centre_m + reach_m, float((high - low).max()))
     if not start.holds(best.position_m[:dim]):
@@ -316,14 +320,14 @@ def _is_suspect(found: Solution | NoSolution) -> bool:
 
 def _solve(
     medians: Mapping[tuple[int, int], float],
-    places_m: Mapping[int, Array],
+    positions_m: Mapping[int, Array],
     height_m: float | None,
     z_bounds_m: tuple[float, float] | None,
 ) -> Solution | NoSolution:
-    joined = against_reference(list(medians), list(medians.values()), [START_STD_M**2] * len(medians))
+    joined = against_reference(list(medians), list(medians.values()), [START_DIFFERENCE_STD_M**2] * len(medians))
     if not joined.anchors:
         return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
-    anchors_m = np.array([places_m[anchor] for anchor in joined.anchors])
+    anchors_m = np.array([positions_m[anchor] for anchor in joined.anchors])
     return locate(anchors_m, joined.tdoa_m, joined.covariance_m2, height_m=height_m, z_bounds_m=z_bounds_m)
 
 

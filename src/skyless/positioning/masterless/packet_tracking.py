@@ -16,22 +16,22 @@ from skyless.air.masterless_packets import Packet, Point, Relay
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
 from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.masterless.anchor_errors import NEAREST_M, NOTHING, DifferenceCalibration, RelayDelays
-from skyless.positioning.masterless.difference_tracking import DIFFERENCES, MAX_STD_M, NEIGHBOURHOOD
+from skyless.positioning.masterless.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
+from skyless.positioning.masterless.difference_tracking import DIFFERENCES, MAX_HORIZONTAL_STD_M, NEIGHBOURHOOD
 from skyless.positioning.masterless.pair_engine import MOST_ANCHORS, remember
 from skyless.positioning.methods.joint import Estimation
 from skyless.positioning.methods.observations import NOISE_TICKS, FixTime
 from skyless.positioning.observation import Observation
 from skyless.ticks import LAST_TICKS, Unwrapper, nearest
 
-RANDOM_WALK_FM: Final = 5e-9
+MASTERLESS_RANDOM_WALK_FM: Final = 5e-9
 """Of the oscillators, 1/√s. Between 1e-9 and 7e-9 on the captures of TDoA3 anchors; too much of it costs little."""
 
 MASTERLESS: Final = replace(
     DIFFERENCES,
     gate=4.0,
     white=EstimatorSettings().white,
-    walk=(RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2,
+    walk=(MASTERLESS_RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2,
     max_walk_scale=1.0,
     drop_s=EstimatorSettings().drop_s,
     rx_variance_m2=2e-3,
@@ -42,7 +42,7 @@ MASTERLESS: Final = replace(
 PERIOD_S: Final = 0.15
 """Anchors send 6 to 60 times a second; the filter is told the slowest."""
 
-MAX_AGE_S: Final = 0.5
+RELAY_MAX_AGE_S: Final = 0.5
 """How long ago a relayed packet may have been heard; a 7-bit sequence number recurs."""
 
 RESTART_IN_ROW: Final = 3
@@ -99,10 +99,10 @@ class PacketTracking:
         """Of the newest fix."""
         self._tx_bits = tx_bits
         self._half_wrap = 1 << (tx_bits - 1)
-        self._places = dict(anchors_m)
+        self._positions_m = dict(anchors_m)
         self._surveyed = frozenset(anchors_m)
         self._anchors: dict[int, _Anchor] = {}
-        self._delays = RelayDelays(self._places, estimate=calibration is None)
+        self._delays = RelayDelays(self._positions_m, estimate=calibration is None)
         self._calibration = calibration
         self._tag_clock = Unwrapper(TICK_BITS)
         self._newest_rx_ticks: int | None = None
@@ -135,7 +135,7 @@ class PacketTracking:
 
         A fix's ``time_s`` counts from the first packet, by the tag's clock.
         """
-        anchor = self._follow(packet)
+        anchor = self._unwrap(packet)
         if anchor is None:
             return None
         relays = []
@@ -169,12 +169,12 @@ class PacketTracking:
                 self._drops["outlier"] += 1
                 if packet.anchor in self._tracking.excluded:
                     fix = self._tracking.coast(observation)
-        return self._sane(fix)
+        return self._checked(fix)
 
     def _new_tracking(self) -> Estimation:
         return Estimation(self._settings, self._z_bounds_m, self._time, PERIOD_S)
 
-    def _sane(self, fix: Fix | NoFixReason) -> Fix | None:
+    def _checked(self, fix: Fix | NoFixReason) -> Fix | None:
         """A fix near the anchors, beyond which time differences tell nothing, that is known well enough."""
         if isinstance(fix, Fix):
             x_m, y_m, z_m = fix.position_m.tolist()
@@ -184,14 +184,14 @@ class PacketTracking:
             if abs(x_m - middle_x_m) > reach_m or abs(y_m - middle_y_m) > reach_m:
                 fix = NoFixReason.NOT_CONVERGED
                 self._tracking = self._new_tracking()
-            elif covariance.item(0) + covariance.item(4) > MAX_STD_M**2:
+            elif covariance.item(0) + covariance.item(4) > MAX_HORIZONTAL_STD_M**2:
                 fix = NoFixReason.ACQUIRING
             else:
                 return fix
         self.reason = fix
         return None
 
-    def _follow(self, packet: Packet) -> _Anchor | None:
+    def _unwrap(self, packet: Packet) -> _Anchor | None:
         """Unwrap both stamps of a packet; None if it cannot be used."""
         rx_ticks = self._tag_clock.unwrap(packet.rx_ticks, packet.host_s)
         if abs(rx_ticks) > LAST_TICKS:
@@ -203,7 +203,7 @@ class PacketTracking:
         elif rx_ticks <= self._newest_rx_ticks and not self._has_new_counter(packet, rx_ticks):
             return None
         self._back_in_row = 0
-        place = self._place(packet)
+        place = self._position_of(packet)
         anchor = self._anchors.get(packet.anchor)
         if place is None or (anchor is None and len(self._anchors) >= MOST_ANCHORS):
             self._drops["unknown-anchor" if place is None else "too-many-anchors"] += 1
@@ -218,10 +218,10 @@ class PacketTracking:
             anchor = None
         if anchor is None:
             anchor = self._anchors[packet.anchor] = _Anchor(place, packet.tx_ticks, rx_ticks)
-            self._learn_area()
+            self._update_area()
         elif anchor.place != place:
             anchor.place, anchor.anchor_m = place, np.array(place)
-            self._learn_area()
+            self._update_area()
         self._newest_rx_ticks = rx_ticks
         remember(anchor.heard, packet.sequence, anchor.tx_ticks, rx_ticks)
         return anchor
@@ -245,16 +245,16 @@ class PacketTracking:
         self._newest_rx_ticks = None
         self._anchors.clear()
 
-    def _place(self, packet: Packet) -> Point | None:
+    def _position_of(self, packet: Packet) -> Point | None:
         """Where the sender is: as surveyed, else where it says, or said last."""
-        known = self._places.get(packet.anchor)
+        known = self._positions_m.get(packet.anchor)
         told_m = None if packet.anchor in self._surveyed else packet.position_m
-        if told_m is None or (known is None and len(self._places) >= MOST_ANCHORS):
+        if told_m is None or (known is None and len(self._positions_m) >= MOST_ANCHORS):
             return known
-        self._places[packet.anchor] = told_m
+        self._positions_m[packet.anchor] = told_m
         return told_m
 
-    def _learn_area(self) -> None:
+    def _update_area(self) -> None:
         places = np.array([anchor.place[:2] for anchor in self._anchors.values()])
         low, high = places.min(axis=0), places.max(axis=0)
         x_m, y_m = ((low + high) / 2.0).tolist()
@@ -268,7 +268,7 @@ class PacketTracking:
             return "relay-of-unheard-packet"
         tx_ticks, rx_ticks_tag = heard
         age = anchor.rx_ticks - rx_ticks_tag
-        if age > MAX_AGE_S * TICK_RATE_HZ:
+        if age > RELAY_MAX_AGE_S * TICK_RATE_HZ:
             return "relay-too-old"
         expected, half = anchor.tx_ticks - age, self._half_wrap
         rx_ticks = expected + ((relay.rx_ticks - expected + half) & (2 * half - 1)) - half  # ``nearest`` in place
@@ -278,10 +278,10 @@ class PacketTracking:
     def _calibrated(self, name: int, anchor: _Anchor) -> int:
         """The tag's stamp of an anchor's newest packet without the bias that a calibration found."""
         assert self._calibration is not None
-        known = self._calibration.anchors.get(name, NOTHING)
+        known = self._calibration.anchors.get(name, NO_BIAS)
         bias_m = known.bias_m
         if known.slope_m and self.position_m is not None:
-            bias_m += known.slope_m * log(max(dist(self.position_m, anchor.place), NEAREST_M))
+            bias_m += known.slope_m * log(max(dist(self.position_m, anchor.place), SLOPE_NEAREST_M))
         return anchor.rx_ticks - round(bias_m / TICK_M)
 
     def _count_relays(self) -> None:

@@ -20,32 +20,32 @@ from skyless.positioning.fix import NoFixReason
 from skyless.positioning.methods.locate import RESIDUAL_TAIL, NoSolution, locate_pseudoranges
 from skyless.positioning.observation import Observation
 
-MAX_AGE_S: Final = 0.5
+START_MAX_AGE_S: Final = 0.5
 """Older messages no longer serve the start, unless superframes are so long; and then only for the rate of the clock, as
 the tag may be elsewhere by now."""
 
-WIDE: Final = 0.05
+WIDE_START: Final = 0.05
 """With a standard deviation above this part of the mean range, ranges are not linear in the state: updates would make
 the filter sure of a wrong place. More anchors are waited for, ..."""
 
-PATIENCE_S: Final = 0.5
+START_PATIENCE_S: Final = 0.5
 """... for so long after the first such start, and four times as long for one wider by four times."""
 
 CONTRADICTIONS: Final = frozenset({NoFixReason.RESIDUALS, NoFixReason.BAD_GEOMETRY, NoFixReason.NOT_CONVERGED})
 """What one lying anchor makes of a start; absurd pseudoranges count as bad geometry."""
 
-SPEED_STD_MPS: Final = 1.0
+TAG_SPEED_STD_MPS: Final = 1.0
 """Typical speed of a tag; it smears pseudoranges taken at different times and starts the velocity."""
 
-MAX_GAP_S: Final = 5.0
+MAX_SILENCE_S: Final = 5.0
 """After a longer silence the state says less than a new start would."""
 
-MAX_SPREAD: Final = 0.05
+MAX_RELATIVE_STD: Final = 0.05
 """With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
 state: updates would make it confident of a wrong place, so a new start is better."""
 
 SLOW_S: Final = 0.2
-SLOW_SPREAD: Final = 0.2
+SLOW_MAX_RELATIVE_STD: Final = 0.2
 """Borne in longer superframes, where a new start takes seconds."""
 
 SHORT_SILENCE_S: Final = 0.1
@@ -114,7 +114,7 @@ class Acquisition:
         self._variance_m2 = stamp_variance_m2
         self._z_bounds_m = z_bounds_m
         self._heard: dict[int, list[Observation]] = {}
-        self._hasty = speed_std_mps > SPEED_STD_MPS
+        self._is_fast = speed_std_mps > TAG_SPEED_STD_MPS
         """A tag that is taken for fast: its speed makes a start wide, and more anchors do not help."""
         self._possible_ticks: int | None = None
         """When a start was first possible."""
@@ -150,7 +150,7 @@ class Acquisition:
         came_around = len(kept) == 2
         self._heard[observation.anchor] = [*kept[-1:], observation]
         pairs = [kept for kept in self._heard.values() if len(kept) == 2]
-        pairs = [kept for kept in pairs if (now - kept[-1].rx_ticks_tag) * TICK_S < MAX_AGE_S]
+        pairs = [kept for kept in pairs if (now - kept[-1].rx_ticks_tag) * TICK_S < START_MAX_AGE_S]
         pairs = [kept for kept in self._on_one_scale(pairs) if _possible(*kept)]
         needed = 4 if self._height_m is None else 3
         if len(pairs) < needed:
@@ -231,8 +231,12 @@ class Acquisition:
         waited_s = (start.rx_ticks_tag - self._possible_ticks) * TICK_S
         dim = len(start.solution) - 1
         ranges_m = [np.linalg.norm(o.anchor_m[:dim] - start.solution[:dim]) for o in start.used]
-        spread = np.sqrt(np.trace(start.covariance[:2, :2])) / np.mean(ranges_m)
-        patience_s = PATIENCE_S * min(spread / WIDE, 4.0) if spread > WIDE and not self._hasty else 0.0
+        relative_std = np.sqrt(np.trace(start.covariance[:2, :2])) / np.mean(ranges_m)
+        patience_s = (
+            START_PATIENCE_S * min(relative_std / WIDE_START, 4.0)
+            if relative_std > WIDE_START and not self._is_fast
+            else 0.0
+        )
         return start if waited_s >= patience_s else NoFixReason.ACQUIRING
 
     def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
@@ -250,7 +254,7 @@ class Acquisition:
         ]
         if len(starts) == 1:
             return starts[0]
-        if (now - self._contradicted_ticks) * TICK_S < PATIENCE_S:
+        if (now - self._contradicted_ticks) * TICK_S < START_PATIENCE_S:
             return NoFixReason.RESIDUALS
         result = self._solve(pairs, now, residual_tail=0.0)
         return msgspec.structs.replace(result, is_contradicted=True) if isinstance(result, Start) else result

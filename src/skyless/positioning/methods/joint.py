@@ -12,25 +12,25 @@ from skyless.positioning.estimator.estimator import (
     NO_REPORT,
     REJECTED,
     STALE,
-    UNCOVERED_CHI2,
     Estimator,
     Report,
 )
 from skyless.positioning.estimator.faults import SURE_CHI2
+from skyless.positioning.estimator.levels import UNCOVERED_CHI2
 from skyless.positioning.estimator.state import CONTRADICTED_STD_M, LASTING_STD_M, OPEN_RANGE_STD_M, EstimatorSettings
 from skyless.positioning.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY, Fix, NoFixReason
 from skyless.positioning.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.positioning.methods.acquisition import (
     EARLY_S,
-    MAX_AGE_S,
-    MAX_GAP_S,
+    MAX_RELATIVE_STD,
+    MAX_SILENCE_S,
     MAX_SPEED_STD_MPS,
-    MAX_SPREAD,
     SHORT_SILENCE_S,
+    SLOW_MAX_RELATIVE_STD,
     SLOW_S,
-    SLOW_SPREAD,
     SPEED_STD_GROWTH,
-    SPEED_STD_MPS,
+    START_MAX_AGE_S,
+    TAG_SPEED_STD_MPS,
     Acquisition,
     Start,
 )
@@ -41,7 +41,7 @@ from skyless.ticks import TICK_MASK, from_seconds
 COVARIANCE_MARGIN: Final = 4.0
 """Factor on the start's covariance, as the filter is then given the packets that it rests on."""
 
-DOUBT_S: Final = 2.0
+EARLY_FAULT_S: Final = 2.0
 """Faults that show so soon after a start, and of whose anchors nothing can be said, have led to a wrong place."""
 
 UNEXPLAINED_CHI2: Final = 30.0
@@ -57,17 +57,17 @@ HEIGHT_SIGMAS: Final = 5.0
 MOST_HEIGHTS_REFUSED: Final = 20
 """... so if this number of them in a row do not fit, it is the position that is wrong."""
 
-CALM: Final = 0.1
+CALM_OBSTRUCTION: Final = 0.1
 """Range errors that have jumped more lately make faults of their own; a new start would not help."""
 
 LONGEST_SUPERFRAME_S: Final = 2.0
 """In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted so far, and each round
 of packets is a start of its own."""
 
-LATE_S: Final = 0.5
+LATE_SHARE_KNOWN_S: Final = 0.5
 """By then it is known how often packets are late; a start that was wrong for that reason is repeated."""
 
-CAUTION_S: Final = 1.0
+OPEN_START_HOLD_S: Final = 1.0
 """A start with open range errors is not repeated for so long."""
 
 REORDERED_S: Final = 0.1
@@ -98,13 +98,13 @@ class Estimation:
             settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2, settings.height_std_m
         )
         self._superframe_s = superframe_s
-        self._max_spread = MAX_SPREAD if superframe_s < SLOW_S else SLOW_SPREAD
+        self._max_relative_std = MAX_RELATIVE_STD if superframe_s < SLOW_S else SLOW_MAX_RELATIVE_STD
         self._z_bounds_m = z_bounds_m
-        self._speed_std_mps = SPEED_STD_MPS
+        self._speed_std_mps = TAG_SPEED_STD_MPS
         self._estimator = Estimator(settings)
         self._start: Acquisition | None = self._new_start()
         self._open_range_errors = False
-        self._is_open = self._is_doubted = False
+        self._is_open = self._start_was_contradicted = False
         self._time = fix_time or FixTime()
         self._in_use = AnchorsInUse(superframe_s)
         self._master_less_tag_ticks = 0
@@ -131,10 +131,14 @@ class Estimation:
 
     def update(self, observation: Observation) -> Fix | NoFixReason:
         """Process one observation; a fix for every accepted packet once started."""
-        ticks_master, rx_ticks, claim = observation.tx_ticks_master, observation.rx_ticks_tag, observation.claim
+        ticks_master, rx_ticks, master_term = (
+            observation.tx_ticks_master,
+            observation.rx_ticks_tag,
+            observation.master_term,
+        )
         if ticks_master is not None:
             self._master_less_tag_ticks = ticks_master - rx_ticks
-            if claim is not None and claim.master == observation.anchor:
+            if master_term is not None and master_term.master == observation.anchor:
                 self._master_scale.update(observation)
         if (
             self._start is None
@@ -143,15 +147,15 @@ class Estimation:
         ):
             self._start = self._new_start()
         if self._start is not None:
-            return self._look_for_start(self._start, observation)
+            return self._try_start(self._start, observation)
         outcome = self._process(observation)
         self._newest_ticks = max(self._newest_ticks, rx_ticks)
         if outcome in {REJECTED, STALE}:
             if self._estimator.is_lost:
-                self._start_anew(rx_ticks)
+                self._restart(rx_ticks)
             return NoFixReason.RESIDUALS
         if self._is_too_fast(rx_ticks):
-            self._start_anew(rx_ticks)
+            self._restart(rx_ticks)
             return NoFixReason.ACQUIRING
         if self._is_contradicted(rx_ticks):
             self._start = self._new_start()
@@ -159,7 +163,7 @@ class Estimation:
         self._in_use.use(observation)
         return self._fix(observation)
 
-    def _look_for_start(self, starting: Acquisition, observation: Observation) -> Fix | NoFixReason:
+    def _try_start(self, starting: Acquisition, observation: Observation) -> Fix | NoFixReason:
         starting.add_relays(observation)
         start = starting.add(observation)
         if isinstance(start, NoFixReason):
@@ -191,11 +195,11 @@ class Estimation:
         """A fix when a packet came that was not used itself: by all others, and by what was relayed with it."""
         return NoFixReason.RESIDUALS if self._start is not None else self._fix(observation)
 
-    def _start_anew(self, rx_ticks: int) -> None:
+    def _restart(self, rx_ticks: int) -> None:
         """Look for a new start; a filter that is lost early has a tag that is faster than assumed."""
         early = (rx_ticks - self._started_ticks) * TICK_S < EARLY_S
         faster = min(SPEED_STD_GROWTH * self._speed_std_mps, MAX_SPEED_STD_MPS)
-        self._speed_std_mps = faster if early else SPEED_STD_MPS
+        self._speed_std_mps = faster if early else TAG_SPEED_STD_MPS
         self._start = self._new_start()
 
     def _is_too_fast(self, rx_ticks: int) -> bool:
@@ -207,18 +211,24 @@ class Estimation:
 
     def _is_contradicted(self, rx_ticks: int) -> bool:
         """Whether a new start is needed, as relays or faults contradict this one; says what that has to expect."""
-        if self._is_doubted and self._estimator.is_late_often:
-            self._open_range_errors = self._is_doubted = False  # the start was contradicted by single late packets
+        if self._start_was_contradicted and self._estimator.is_late_often:
+            self._open_range_errors = self._start_was_contradicted = (
+                False  # the start was contradicted by single late packets
+            )
             return True
         if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
             age_s = (rx_ticks - self._started_ticks) * TICK_S
-            limit = SURE_CHI2 if age_s < DOUBT_S or self._is_doubted else UNCOVERED_CHI2
-            calm = self._estimator.obstruction < CALM
-            if not self._is_doubted and age_s < DOUBT_S and self._estimator.unexplained_test < UNEXPLAINED_CHI2:
+            limit = SURE_CHI2 if age_s < EARLY_FAULT_S or self._start_was_contradicted else UNCOVERED_CHI2
+            calm = self._estimator.obstruction < CALM_OBSTRUCTION
+            if (
+                not self._start_was_contradicted
+                and age_s < EARLY_FAULT_S
+                and self._estimator.unexplained_test < UNEXPLAINED_CHI2
+            ):
                 limit = UNCOVERED_CHI2  # one or two anchors, which the estimator will find
-            if calm and self._estimator.fault_test > limit and (not self._is_open or age_s > CAUTION_S):
+            if calm and self._estimator.fault_test > limit and (not self._is_open or age_s > OPEN_START_HOLD_S):
                 self._open_range_errors = not self._estimator.is_late_often
-                return age_s > LATE_S or self._open_range_errors
+                return age_s > LATE_SHARE_KNOWN_S or self._open_range_errors
         if not self._relays_may_contradict:
             self._relays_may_contradict = self._estimator.relays_fit
         elif self._estimator.is_contradicted:
@@ -228,7 +238,7 @@ class Estimation:
 
     def _new_start(self) -> Acquisition:
         settings = self._settings
-        max_age_s = max(MAX_AGE_S, 2.5 * self._superframe_s)
+        max_age_s = max(START_MAX_AGE_S, 2.5 * self._superframe_s)
         variance = settings.tx_variance_m2 + settings.rx_variance_m2
         if self._superframe_s > LONGEST_SUPERFRAME_S:
             variance += settings.range_std_m**2 + settings.survey_std_m**2
@@ -237,13 +247,13 @@ class Estimation:
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
         silent_s = (observation.rx_ticks_tag - self._newest_ticks) * TICK_S
-        if not -REORDERED_S <= silent_s <= MAX_GAP_S:
+        if not -REORDERED_S <= silent_s <= MAX_SILENCE_S:
             return True
         if silent_s < SHORT_SILENCE_S:
             return False
         std_m = self._estimator.horizontal_variance_m2(silent_s) ** 0.5
         position_m = self._estimator.state.x[: self._estimator.dim]
-        return bool(std_m > self._max_spread * self._in_use.mean_range_m(position_m))
+        return bool(std_m > self._max_relative_std * self._in_use.mean_range_m(position_m))
 
     def _begin(self, start: Start, packets: list[Observation]) -> None:
         """Begin at the start's position, and give the filter the packets that led there."""
@@ -254,10 +264,10 @@ class Estimation:
         age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
         is_contradicted = start.is_contradicted and not self._estimator.is_late_often
         self._is_open = self._open_range_errors or (is_contradicted and not start.left_out)
-        self._is_doubted = self._is_open or is_contradicted
-        error = OPEN_RANGE_STD_M if self._is_doubted else self._settings.range_std_m
+        self._start_was_contradicted = self._is_open or is_contradicted
+        error = OPEN_RANGE_STD_M if self._start_was_contradicted else self._settings.range_std_m
         inflation = 1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
-        if not self._is_doubted:
+        if not self._start_was_contradicted:
             inflation *= COVARIANCE_MARGIN
         covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * start.speed_variance * np.eye(dim)
         self._estimator.start(
@@ -266,9 +276,9 @@ class Estimation:
             covariance,
             start.speed_variance,
             self._is_open,
-            CONTRADICTED_STD_M if self._is_doubted else LASTING_STD_M,
+            CONTRADICTED_STD_M if self._start_was_contradicted else LASTING_STD_M,
             [
-                self._estimator.place_anchor(packet.anchor, packet.anchor_m)
+                self._estimator.anchor_index(packet.anchor, packet.anchor_m)
                 for packet in packets
                 if is_contradicted and packet.anchor in start.left_out
             ],
@@ -278,7 +288,7 @@ class Estimation:
 
     def _process(self, observation: Observation) -> int:
         return self._estimator.process(
-            self._estimator.place_anchor(observation.anchor, observation.anchor_m),
+            self._estimator.anchor_index(observation.anchor, observation.anchor_m),
             observation.sequence,
             observation.rx_ticks_tag,
             observation.tx_ticks_anchor,
@@ -299,10 +309,10 @@ class Estimation:
 
     def _report(self, observation: Observation) -> Report:
         """What the anchor says of its clock against the master's."""
-        claim, variance_m2 = observation.claim, observation.tx_variance_m2
-        if claim is None or variance_m2 <= 0.0:
+        master_term, variance_m2 = observation.master_term, observation.tx_variance_m2
+        if master_term is None or variance_m2 <= 0.0:
             return NO_REPORT
-        master, subticks = self._estimator.index_of.get(claim.master), self._master_scale.difference(observation)
+        master, subticks = self._estimator.index_of.get(master_term.master), self._master_scale.difference(observation)
         return NO_REPORT if master is None or subticks is None else Report(master, subticks, variance_m2)
 
     def _fix_of(self, start: Start, observation: Observation) -> Fix:
@@ -334,7 +344,7 @@ class Estimation:
 # Anchors in use
 
 
-IN_USE_S: Final = 0.1
+LEAST_IN_USE_S: Final = 0.1
 """An anchor counts as in use while its last accepted message is younger, or a superframe and a half."""
 
 
@@ -342,7 +352,7 @@ class AnchorsInUse:
     """The anchors whose messages were accepted of late; their list is made anew only when it changes."""
 
     def __init__(self, superframe_s: float) -> None:
-        self._in_use_s = max(IN_USE_S, 1.5 * superframe_s)
+        self._in_use_s = max(LEAST_IN_USE_S, 1.5 * superframe_s)
         self._used: dict[int, Observation] = {}
         self._checked_ticks = 0
         self.anchors: tuple[int, ...] = ()
@@ -383,7 +393,7 @@ class AnchorsInUse:
 # The master's own counter
 
 
-FARTHEST: Final = 16
+FARTHEST_LENGTHS: Final = 16
 """Lines go on for so many times their length."""
 
 MISFIT_SUBTICKS: Final = 64
@@ -396,18 +406,18 @@ class MasterScale:
     """The master's own counter against the site's time, which it may lead on at another rate than its own."""
 
     def __init__(self) -> None:
-        self._claim: object = None
+        self._master_term: object = None
         self._points: tuple[tuple[int, int], ...] = ()
         """Site time in subticks and its lead on the master's counter, of the first and the last packet of the term."""
 
     def update(self, observation: Observation) -> None:
         """Learn from a packet of the master."""
-        claim = observation.claim
-        if claim is None or observation.anchor != claim.master:
+        master_term = observation.master_term
+        if master_term is None or observation.anchor != master_term.master:
             return
         site, lead = _site_time(observation)
-        if claim != self._claim:
-            self._claim, self._points = claim, ((site, lead),)
+        if master_term != self._master_term:
+            self._master_term, self._points = master_term, ((site, lead),)
         elif site > self._points[-1][0]:
             expected = self._lead(site)
             fits = len(self._points) < 2 or (expected is not None and abs(expected - lead) <= MISFIT_SUBTICKS)
@@ -415,8 +425,8 @@ class MasterScale:
 
     def difference(self, observation: Observation) -> int | None:
         """The sender's reading less the master's at its TX stamp, in subticks modulo 2⁴⁸; None while not known."""
-        claim, ticks = observation.claim, observation.tx_ticks_master
-        if claim is None or ticks is None or claim != self._claim:
+        master_term, ticks = observation.master_term, observation.tx_ticks_master
+        if master_term is None or ticks is None or master_term != self._master_term:
             return None
         site = ticks * SUBTICKS + round(observation.tx_fraction_ticks * SUBTICKS)
         lead = self._lead(site)
@@ -428,7 +438,7 @@ class MasterScale:
             return None
         (first, before), (last, lead) = self._points
         length, beyond = last - first, site - last
-        return lead + (lead - before) * beyond // length if 0 <= beyond <= FARTHEST * length else None
+        return lead + (lead - before) * beyond // length if 0 <= beyond <= FARTHEST_LENGTHS * length else None
 
 
 def _site_time(observation: Observation) -> tuple[int, int]:

@@ -48,9 +48,9 @@ class Observer:
         rx_ticks: int,
         tx_ticks: int,
         rx_variance_factor: float,
-        claim: MasterTerm | None,
+        master_term: MasterTerm | None,
     ) -> Observation:
-        """One observation of a beacon in a frame; ``claim``, the one that is followed, is mostly the beacon's too."""
+        """One observation of a beacon in a frame; ``master_term``, that of the receiver, is mostly the beacon's too."""
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
         if not self._needs_relays:
             heard = beacon.master_heard if beacon.master == self._master else None
@@ -60,12 +60,12 @@ class Observer:
                 master_rx_ticks, ticks_master, fraction, variance_m2, (), None, rx_variance_factor,
             )  # fmt: skip
         if ticks_master is None:
-            claim = None
-        elif claim is None or claim.master != beacon.master or claim.term != beacon.term:
-            claim = master_term_of(beacon)
+            master_term = None
+        elif master_term is None or master_term.master != beacon.master or master_term.term != beacon.term:
+            master_term = master_term_of(beacon)
         return Observation(
             beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, ticks_master, fraction,
-            variance_m2, (), claim, rx_variance_factor, packed_relays(frame, beacon),
+            variance_m2, (), master_term, rx_variance_factor, packed_relays(frame, beacon),
         )  # fmt: skip
 
     def _round(self, beacon: Beacon) -> int:
@@ -94,7 +94,7 @@ class Observer:
             expected = scale[0] + elapsed
             least = expected - HALF_WRAP_TICKS
             whole = least + ((whole - least) & TICK_MASK)
-            follow = follow or abs(whole - expected) <= MAX_DRIFT * elapsed + SLACK_TICKS
+            follow = follow or abs(whole - expected) <= MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS
         if follow:
             self._scale = (whole, rx_ticks)
         return whole, (subticks & 0xFF) / 256.0, (time.std_ticks * TICK_M) ** 2
@@ -158,7 +158,7 @@ class AnchorStamps:
         least = track.tx_ticks + elapsed - HALF_WRAP_TICKS
         off = ((beacon.tx_ticks - least) & TICK_MASK) - HALF_WRAP_TICKS
         if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
-            self._refuse(beacon, track)
+            self._reject(beacon, track)
             return None
         track.rx_ticks_tag = self.newest_rx_ticks = rx_ticks
         track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
@@ -172,7 +172,7 @@ class AnchorStamps:
         tracks[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence)
         return beacon.tx_ticks
 
-    def _refuse(self, beacon: Beacon, track: _Track) -> None:
+    def _reject(self, beacon: Beacon, track: _Track) -> None:
         """Count the stamp; after a few that are impossible the anchor's next one is a beginning."""
         if _is_repeated(beacon, track):
             self._counters["duplicate"] += 1
@@ -196,12 +196,12 @@ BLOCKED_DB: Final = 11.0
 """Up to the former nothing changes, from the latter on all that can: the maker's 6 and 10, and 1 dB. Lines of sight of
 the UTIL data set have up to 8.4 dB, paths through metal, the only ones that are much later, from 11.3."""
 
-MOST: Final = 36.0
+MAX_VARIANCE_FACTOR: Final = 36.0
 """Factor on the variance of a blocked path: metal made messages 0.2 to 0.4 m late, 4 to 8 times what noise does."""
 
 
 def variance_factor(rx_power_dbm: float | None, first_path_power_dbm: float | None) -> float:
-    """Factor on the variance of a reception, from 1 to ``MOST``; it never falls as the difference of the powers grows.
+    """Factor on the variance of a reception, from 1 to ``MAX_VARIANCE_FACTOR``; it grows with the powers' difference.
 
     What is not told, not finite or impossible (a first path above the total) says nothing: the factor is then 1.
     """
@@ -211,13 +211,13 @@ def variance_factor(rx_power_dbm: float | None, first_path_power_dbm: float | No
     if not CLEAR_DB < difference_db < math.inf:
         return 1.0
     part = min((difference_db - CLEAR_DB) / (BLOCKED_DB - CLEAR_DB), 1.0)
-    return float(MOST ** (part * part * (3.0 - 2.0 * part)))
+    return float(MAX_VARIANCE_FACTOR ** (part * part * (3.0 - 2.0 * part)))
 
 
 # The time of fixes
 
 
-SLACK_TICKS: Final = from_seconds(1e-6)
+FLIGHT_SLACK_TICKS: Final = from_seconds(1e-6)
 """Flight times differ between anchors by less than this (300 m)."""
 
 
@@ -236,7 +236,7 @@ class FixTime:
         else:
             elapsed = rx_ticks_tag - self._last_rx_ticks_tag
             off = ticks_master - self._last_ticks_master - elapsed
-            if elapsed <= 0 or (abs(off) > SLACK_TICKS and abs(off) > MAX_DRIFT * elapsed + SLACK_TICKS):
+            if elapsed <= 0 or (abs(off) > FLIGHT_SLACK_TICKS and abs(off) > MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS):
                 self._first_ticks_master += off + elapsed - max(elapsed, 1)
         self._last_ticks_master, self._last_rx_ticks_tag = ticks_master, rx_ticks_tag
         return (ticks_master - self._first_ticks_master) * TICK_S

@@ -16,7 +16,7 @@ from skyless.kernels.arrays import Array, Matrix, Vector
 from skyless.kernels.compiled import kernel, part
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.methods.locate import NoSolution, Solution, locate
-from skyless.positioning.methods.observations import SLACK_TICKS, FixTime
+from skyless.positioning.methods.observations import FLIGHT_SLACK_TICKS, FixTime
 from skyless.positioning.observation import Observation
 
 
@@ -284,16 +284,16 @@ def _synchronised(first: Observation, second: Observation, reference: tuple[Obse
         and second.master_rx_ticks_anchor is not None
         and first.master_sequence == reference[0].sequence
         and second.master_sequence == reference[1].sequence
-        and _in_step(second.tx_ticks_anchor - first.tx_ticks_anchor, first, second)
-        and _in_step(second.master_rx_ticks_anchor - first.master_rx_ticks_anchor, *reference)
-        and _in_step(reference[1].tx_ticks_anchor - reference[0].tx_ticks_anchor, *reference)
+        and _is_plausible_interval(second.tx_ticks_anchor - first.tx_ticks_anchor, first, second)
+        and _is_plausible_interval(second.master_rx_ticks_anchor - first.master_rx_ticks_anchor, *reference)
+        and _is_plausible_interval(reference[1].tx_ticks_anchor - reference[0].tx_ticks_anchor, *reference)
     )
 
 
-def _in_step(elapsed_ticks: int, first: Observation, second: Observation) -> bool:
+def _is_plausible_interval(elapsed_ticks: int, first: Observation, second: Observation) -> bool:
     """Whether an interval on an anchor's clock can be the one that the tag measured between two receptions."""
     elapsed = second.rx_ticks_tag - first.rx_ticks_tag
-    return elapsed > 0 and abs(elapsed_ticks - elapsed) <= MAX_DRIFT * elapsed + SLACK_TICKS
+    return elapsed > 0 and abs(elapsed_ticks - elapsed) <= MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS
 
 
 def _kappa(first: Observation, second: Observation) -> float:

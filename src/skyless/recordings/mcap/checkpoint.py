@@ -12,8 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from skyless.positioning.estimator.estimator import Estimator
-from skyless.positioning.estimator.soundness import is_sound
+from skyless.positioning.estimator.estimator import Estimator, is_sound
 from skyless.positioning.methods.acquisition import Start
 from skyless.positioning.methods.joint import AnchorsInUse
 from skyless.positioning.observation import Observation
