@@ -126,7 +126,7 @@ class Anchor:
         if verdict in {Verdict.FROM_NEW_MASTER, Verdict.FROM_FIRST_MASTER}:
             self._master_heard = None
             range_m = _distance_m(self._own, self._anchors[beacon.anchor])
-            self._clock.track_master(range_m, afresh=verdict is Verdict.FROM_FIRST_MASTER)
+            self._clock.track_master(range_m, restart=verdict is Verdict.FROM_FIRST_MASTER)
         elif verdict is not Verdict.FROM_MASTER:
             return
         if self._clock.on_master_beacon(beacon, rx_ticks):
@@ -168,7 +168,7 @@ class Anchor:
         if self._succession.must_lead(now, good):
             self.counters["takeover"] += self._succession.claim is not None
             self._succession.lead(now)
-            self._clock.lead(now)
+            self._clock.become_master(now)
             self._master_heard = None
 
     def _beacon(self, tx_ticks: int, superframe: int, slot: int) -> Beacon:

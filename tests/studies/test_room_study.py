@@ -169,7 +169,7 @@ class Told:
     """A fix that promises a level."""
 
     def __init__(self, hpl_m, alert=Alert.NONE):
-        self.hpl_m, self.alert, self.asked = hpl_m, alert, object()
+        self.hpl_m, self.alert, self.requirement = hpl_m, alert, object()
 
 
 def test_levels_are_counted_for_each_tag():

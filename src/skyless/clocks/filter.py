@@ -1,9 +1,9 @@
 """The two-state clock filter: an anchor's offset and rate against the master (``docs/maths.md`` section 6).
 
 The offset is kept in two parts, whole ticks in an integer and a remainder below one tick in metres of light, so that
-nothing is lost however long the filter runs. One update takes one master beacon.
+nothing is lost however long the filter runs. One update processes one master beacon.
 
-This is plain Python: so little arithmetic a beacon takes no longer than a kernel takes to be called.
+Plain Python: so little arithmetic takes no longer than the call of a kernel.
 """
 
 import math

@@ -12,12 +12,12 @@ from skyless.site.slots import Schedule
 from skyless.ticks import nearest, wrap
 
 MISFITS_BEFORE_RESTART: Final = 3
-"""So many master beacons in a row that do not fit mean that the site's time, or the own clock, has jumped."""
+"""If this number of master beacons in a row do not fit, the site's time, or the own clock, has jumped."""
 
 STAMP_SLACK_TICKS: Final = 64
 
 GRID_SLACK_TICKS: Final = 8 * DELAYED_TX_GRANULARITY_TICKS
-"""A master's frames lie on its radio's grid; so much they may be off their slots."""
+"""By how much a master's frames, which lie on its radio's grid, may be off their slots."""
 
 MASTER_CHANGE_INFLATION: Final = 2.0
 """A new master's clock was known as well as the own one: their difference has at most twice the variance."""
@@ -54,18 +54,18 @@ class SiteClock:
         """Standard deviation of the offset at the last beacon, in metres of light; 0 for the master."""
         return self._clock.offset_std_m if self._own_site_time is None else 0.0
 
-    def track_master(self, range_m: float, afresh: bool) -> None:
-        """Go by another master, this far away; ``afresh``: what was known of the site's time counts no more."""
+    def track_master(self, range_m: float, restart: bool) -> None:
+        """Synchronise to another master at this distance; ``restart``: forget what was known of the site's time."""
         self._range_m = range_m
         self._last_raw = self._last_frame = None
         self._misfits = 0
         self._own_site_time = None
-        if afresh:
+        if restart:
             self._last = None
         else:
             self._clock.inflate_covariance(MASTER_CHANGE_INFLATION)
 
-    def lead(self, ticks_own: int) -> None:
+    def become_master(self, ticks_own: int) -> None:
         """Become the master: the site's time goes on from here as far as it is known, else the own counter is it."""
         if self._own_site_time is None:
             if self.updates > 1:
@@ -95,7 +95,7 @@ class SiteClock:
         )
 
     def on_master_beacon(self, beacon: Beacon, rx_ticks: int) -> bool:
-        """Take a beacon of the master; one that does not fit changes nothing, unless others like it follow."""
+        """Process a beacon of the master; one that does not fit changes nothing, unless others like it come."""
         if self._last_frame == (beacon.tx_ticks, beacon.sequence):
             self._counters["duplicate"] += 1
             return False
@@ -123,7 +123,7 @@ class SiteClock:
         return ticks_site, beacon.superframe
 
     def _filter(self, beacon: Beacon, whole: int, rx_ticks: int, range_m: float) -> tuple[int, int] | None:
-        """Give a beacon to the filter; its site time and superframe, unwrapped, or None where it does not fit."""
+        """Process a beacon by the filter; its site time and superframe, unwrapped, or None where it does not fit."""
         if self._last is None or self.epoch_ticks is None:
             return self._begin(beacon, whole, rx_ticks, range_m)
         ticks_site = _unwrapped(whole, *self._last, rx_ticks)

@@ -1,4 +1,4 @@
-"""The anchors of a site as tags hear them: who sends when, whose clock is good enough to send, and what is relayed."""
+"""The anchors of a site as tags receive them: who sends when, whose clock is good enough, and what is relayed."""
 
 from collections.abc import Iterator
 from typing import Final, NamedTuple
@@ -18,7 +18,7 @@ from skyless.site.slots import first_slots, schedule_of
 
 _STEADY_CHANGE: Final = 1e-7
 _MOST_SUPERFRAMES: Final = 20_000
-"""Superframes after which a filter counts as settled in any case."""
+"""Superframes after which a filter counts as steady in any case."""
 
 
 LEAST_SHARE: Final = 0.01
@@ -40,7 +40,7 @@ class AnchorClocks(NamedTuple):
 
 
 def anchor_clocks(site: Site, share: Vector) -> AnchorClocks:
-    """For anchors, in the order of the file, that hear these shares of the master's messages."""
+    """For anchors, in the order of the file, that receive these shares of the master's messages."""
     sender, time_s, superframe_s = _messages(site)
     variances = offset_variances(site, share)
     sends = share >= LEAST_SYNC

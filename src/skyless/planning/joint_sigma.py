@@ -1,10 +1,10 @@
-"""Predicted errors of ``joint`` for a tag at rest: the estimator's own kernels on a superframe, covariance only.
+"""Predicted errors of ``joint`` for a stationary tag: the estimator's own kernels on a superframe, covariance only.
 
 The filter's P, with constant errors of ranges and survey as the site configures them, is run through superframes until
-it repeats. It holds what the filter allows for accelerations, which a tag at rest does not have. That part follows from
-the estimator's sensitivities V: rows of V begin, at moments of a superframe, as a velocity that the filter does not
-know of, and the squares of what they do to the position, integrated over the time after that, are what accelerations
-add to P. Another row holds the walls' delays.
+it repeats. It holds what the filter allows for accelerations, which a stationary tag does not have. That part follows
+from the estimator's sensitivities V: rows of V begin, at moments of a superframe, as a velocity that the filter does
+not know of, and the squares of what they do to the position, integrated over the time after that, are what
+accelerations add to P. Another row holds the walls' delays.
 
 Where only a share of an anchor's packets arrives, the stamps of all count for as much less: their variances are divided
 by the share, and those of relayed receptions by the share of all three that they take.

@@ -58,7 +58,7 @@ class BoundSettings(Struct, frozen=True):
     speed_std_mps: float
     """Of each component of the velocity, before the first frame."""
     mesh: bool
-    """Whether anchors also relay when they heard each other, not only the first anchor."""
+    """Whether anchors also relay when they received each other, not only the first anchor."""
     height_known: bool = True
     at_once: bool = True
     """Whether anchors' receptions are known at once; else each comes with the listener's next frame, as on the air."""
@@ -106,7 +106,7 @@ class Biases(Struct, frozen=True):
     """Standard deviations of errors that nobody knows, in metres; each has a normal prior with mean zero.
 
     They are states behind the clocks, and every measurement updates all of them: what anchors receive of each other
-    says something of their positions as well. For priors that are not normal the bound is the least mean square error
+    informs about their positions as well. For priors that are not normal the bound is the least mean square error
     of all linear estimators.
     """
 
@@ -115,7 +115,7 @@ class Biases(Struct, frozen=True):
     constant_std_m: PerAnchor = 0.0
     """Of what all of the tag's ranges to an anchor are wrong by."""
     changing_std_m: PerAnchor = 0.0
-    """Of a part of that error that changes: Gauss–Markov along time, the tag's way, or both."""
+    """Of a part of that error that changes: Gauss–Markov along time, the tag's path, or both."""
     slope_std_m: float = 0.0
     """Of what ranges gain for each unit of clip((range − 4 m)/4 m, −1, 1)."""
     pair_std_m: float = 0.0
@@ -123,7 +123,7 @@ class Biases(Struct, frozen=True):
     correlation_s: float = math.inf
     """Time in which the correlation of the part that changes falls to 1/e ..."""
     correlation_m: float = math.inf
-    """... and way of the tag in which it does."""
+    """... and distance walked by the tag in which it does."""
 
 
 def tracking_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSettings) -> Array:
@@ -172,8 +172,8 @@ def known_receptions(
     Anchors send in turn, the reference first. The information is what there is on the air at most. What an anchor
     receives of the reference is known at once, whatever the tag receives of that anchor, as its next beacon states its
     clock, in which all of it is. Other receptions among anchors are known where the tag has received the packet itself,
-    without whose stamp they say nothing, and receives the listener before that has received a newer one; they are
-    known at once as well, so that no receiver can do better.
+    without whose stamp they give no information, and receives the listener before that has received a newer one; they
+    are known at once as well, so that no receiver can do better.
     """
     senders = np.arange(frames) % anchors
     heard = draw.random((frames, anchors + 1)) >= np.append(np.full(anchors, lost_at_anchors), lost_at_tags)
@@ -354,8 +354,8 @@ def _predict(m: _Model, P: Matrix) -> None:
 def _decay_changes(m: _Model, frame: int, P: Matrix) -> None:
     """Time update of the part of range errors that changes."""
     n, first = len(m.anchors), _layout(m.dims, len(m.anchors)).change
-    way_m = _distance_m(m.path[frame - 1], m.path[frame])
-    kept = math.exp(-m.slot_s * m.changes_per_s - way_m * m.changes_per_m)
+    walked_m = _distance_m(m.path[frame - 1], m.path[frame])
+    kept = math.exp(-m.slot_s * m.changes_per_s - walked_m * m.changes_per_m)
     for anchor in range(n):
         decay_state(P, len(P), first + anchor, kept, m.changing_m2[anchor])
 

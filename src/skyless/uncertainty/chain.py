@@ -17,7 +17,7 @@ from skyless.kernels.arrays import Array, Matrix
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """A master, n anchors that it synchronises with two messages, and a tag that hears two messages of each."""
+    """A master, n anchors that it synchronises with two messages, and a tag that receives two messages of each."""
 
     master_offset_s: float
     """o_m."""
@@ -76,7 +76,7 @@ class Chain:
 
     @property
     def V(self) -> float:
-        """ν̄_m = ν/ν_m for a tag at rest (``eq:TagSynchro``)."""
+        """ν̄_m = ν/ν_m for a stationary tag (``eq:TagSynchro``)."""
         return self.tag_rate / self.master_rate
 
     @property

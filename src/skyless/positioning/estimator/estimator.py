@@ -66,13 +66,13 @@ from skyless.positioning.integrity import HPL, VPL
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
 REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = range(7)
-"""What became of a packet; the last three ask for an anchor to join or leave, and for the packet again."""
+"""What became of a packet; the last three require an anchor to join or leave, and for the packet again."""
 
 RESTART_M: Final = 300.0
 """A path that seems longer than expected by more than this is a counter that has jumped, ..."""
 
 RESTART_IN_ROW: Final = 3
-"""... if this number of packets in a row say so."""
+"""... if this is so for this number of packets in a row."""
 
 MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS
 """Between two clocks that are still crystals."""
@@ -86,7 +86,7 @@ LOST_SHARE: Final = 0.5
 MISFIT_RANGE_STD_M: Final = 0.3
 """Of the range error of an anchor that did not fit at the start."""
 
-MOST_REFUSED: Final = 4.0
+MOST_RELAYS_REJECTED: Final = 4.0
 """Relays beyond the gate lately; fewer may be late ones."""
 
 FADING: Final = 0.95
@@ -97,10 +97,10 @@ MOST_PACKED: Final = 16
 
 
 class Report(Struct, frozen=True, gc=False):
-    """What an anchor says of its clock."""
+    """What an anchor reports of its clock."""
 
     master: int
-    """The master's index in the table; −1 where nothing is said."""
+    """The master's index in the table; −1 where nothing is reported."""
     subticks: int
     """The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸."""
     variance_m2: float
@@ -177,10 +177,10 @@ def _process(
             was_known = result != CLOCK_JUMPED
     if joins or was_known:
         status["packets"] += 1
-        _remember(s, anchor, sequence, rx_ticks, tx_ticks)
+        _keep_packet(s, anchor, sequence, rx_ticks, tx_ticks)
     if was_known:
-        status["relays_accepted"] *= FADING
-        status["relays_refused"] *= FADING
+        status["relays_lately_accepted"] *= FADING
+        status["relays_lately_rejected"] *= FADING
     _process_relays(s, relays, first, last if was_known else first)
     if was_known and report_variance_m2 > 0.0 and master >= 0 and s.index_of[master] not in (-1, anchor):
         report(s, anchor, s.index_of[master], subticks, report_variance_m2)
@@ -192,7 +192,7 @@ def _process(
 
 @step
 def _check_motion_and_faults(s: EstimatorState, elapsed_s: float) -> None:
-    """Look whether the tag stands still, and once in a round of packets for faults."""
+    """Check whether the tag stands still and, once in a round of packets, for faults."""
     if s.settings[0]["stationary_s"] > 0.0:
         update_stationary(s, elapsed_s)
         if is_stationary(s):
@@ -227,7 +227,7 @@ def _admit(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> int:
 
 
 @step
-def _remember(s: EstimatorState, anchor: int, sequence: int, rx_ticks: int, tx_ticks: int) -> None:
+def _keep_packet(s: EstimatorState, anchor: int, sequence: int, rx_ticks: int, tx_ticks: int) -> None:
     """Keep what later packets and relays of this one need."""
     a, packet = s.anchors[anchor], s.packets[anchor, sequence % PACKETS_KEPT]
     a["packets"] += 1
@@ -263,7 +263,7 @@ def _track(
     covariances: Matrix,
     levels: Matrix,
 ) -> int:
-    """Process packets from ``begin`` on; returns the first that asks for an anchor to join or leave, or their number.
+    """Process packets from ``begin`` on; returns the first that requires an anchor to join or leave, or their number.
 
     Rows of ``motions``, ``covariances`` and ``levels`` are filled in, where there are any.
     """
@@ -434,14 +434,14 @@ class Estimator:
     """The filter of one tag."""
 
     def __init__(self, settings: EstimatorSettings, table_m: Matrix | None = None) -> None:
-        """``table_m``: positions of anchors that are called by their indices, shape (n, 3); others can be placed."""
+        """``table_m``: positions of anchors with identifiers 0, 1, …, shape (n, 3); ``anchor_index`` adds others."""
         self.settings = settings
         self.dim = settings.dim
         self._table_m: list[Vector] = [] if table_m is None else [np.array(row, np.float64) for row in table_m]
         self._identifiers = np.arange(len(self._table_m))
         self.index_of = {index: index for index in range(len(self._table_m))}
-        """Where in the table an anchor stands that relays in frames call so."""
-        self._left_out: frozenset[int] = frozenset()
+        """Index in the table of each anchor identifier, by which frames name it."""
+        self._misfits: frozenset[int] = frozenset()
         self._levels = np.zeros(LEVELS)
         self._rows = np.zeros((PROTECTED_ROWS, 3))
         self._packed = np.zeros(MOST_PACKED * HEARD.size, np.uint8)
@@ -459,9 +459,9 @@ class Estimator:
         return self._rows
 
     def anchor_index(self, identifier: int, position_m: Vector) -> int:
-        """Index in the table of the anchor that relays in frames call so: a new one, or one that may have moved.
+        """Index in the table of an anchor: a new one, or one that may have moved.
 
-        ``position_m``, shape (3,), is taken for unchanged as long as it is the same array.
+        ``position_m``, shape (3,), counts as unchanged as long as it is the same array.
         """
         index = self.index_of.get(identifier)
         if index is None:
@@ -487,7 +487,7 @@ class Estimator:
         state.P[constant, constant] = MISFIT_RANGE_STD_M**2
 
     def withhold_levels(self) -> None:
-        """Promise nothing until a new start: the anchors do not stand where the table says."""
+        """State no levels until a new start: the anchors' positions are known to be wrong."""
         self._state.status["withholds_levels"] = 1
 
     def start(
@@ -498,19 +498,19 @@ class Estimator:
         speed_variance: float,
         open_range_errors: bool = False,
         fault_std_m: float = LASTING_STD_M,
-        left_out: Iterable[int] = (),
+        misfitting: Iterable[int] = (),
     ) -> None:
-        """Begin at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept.
+        """Start at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept.
 
         ``open_range_errors``: expect ranges to be wrong by half a metre and anchors to be misplaced, since what
-        the settings say of them has been contradicted. ``left_out``: do so of these anchors of the table alone.
+        the settings assume of them has been contradicted. ``misfitting``: do so of these anchors of the table alone.
         ``fault_std_m``: of range errors of all anchors that the levels are to cover.
         """
         settings, dim = self.settings, self.dim
         state = new_state(settings, len(self._table_m), open_range_errors=open_range_errors)
         state.status["late_share"] = self._state.status["late_share"]
         state.status["fault_std_m"] = fault_std_m
-        self._left_out = frozenset(left_out)
+        self._misfits = frozenset(misfitting)
         state.x[:dim] = position_m
         state.P[:dim, :dim] = covariance_m2
         state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
@@ -568,7 +568,7 @@ class Estimator:
             self._resize(outcome, table_a, rx_ticks)
 
     def process_height(self, height_m: float, std_m: float) -> int:
-        """Process the tag's height at the newest packet, as a sensor tells it; ``ACCEPTED`` or ``REJECTED``."""
+        """Process the tag's height at the newest packet, as a sensor measures it; ``ACCEPTED`` or ``REJECTED``."""
         return _process_height(self._state, height_m, std_m, self._levels, self._rows)
 
     def track(
@@ -582,7 +582,7 @@ class Estimator:
 
         Rows of ``motions``, shape (n, 2·dim), ``covariances``, shape (n, dim·dim), and ``levels``, shape
         (n, LEVELS + 2), are filled in after each packet; the last two columns of the levels are what became of the
-        packet and what can be said of the position.
+        packet and the state of the levels.
         """
         nothing, done = np.empty((0, 0)), 0
         motions = nothing if motions is None else motions
@@ -599,10 +599,10 @@ class Estimator:
             self._resize(NEW_ANCHOR if joins else SILENT_ANCHOR if silent else RESTARTED_CLOCK, index, rx_ticks)
 
     def _resize(self, outcome: int, table_index: int, rx_ticks: int) -> None:
-        """Let an anchor join or leave, as a packet asks for."""
+        """Let an anchor join or leave, as a packet requires."""
         state = self._state
         if outcome == NEW_ANCHOR:
-            is_open = table_index in self._left_out
+            is_open = table_index in self._misfits
             self._state = with_anchor(state, table_index, self._table_m[table_index], is_open)
         elif outcome == RESTARTED_CLOCK:
             state.status["clock_restarts"] += 1
@@ -647,21 +647,23 @@ class Estimator:
         return bool(status["rejected_share"] > LOST_SHARE or in_row * (1.0 - 2.0 * late) >= LOST_IN_ROW)
 
     @property
-    def refuses_most(self) -> bool:
+    def rejects_most(self) -> bool:
         """Whether most measurements lie beyond the gate."""
         return bool(self._state.status[0]["rejected_share"] > LOST_SHARE)
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether most of what anchors received of each other does not fit: a wrong place draws all clocks with it."""
-        refused = self._state.status["relays_refused"].item()
-        return refused > MOST_REFUSED and bool(refused > self._state.status["relays_accepted"].item())
+        """Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks."""
+        rejected = self._state.status["relays_lately_rejected"].item()
+        return rejected > MOST_RELAYS_REJECTED and bool(rejected > self._state.status["relays_lately_accepted"].item())
 
     @property
     def relays_fit(self) -> bool:
         """Whether most of what anchors received of each other fits, and that is more than a few receptions."""
         status = self._state.status[0]
-        return bool(status["relays_accepted"] > max(MOST_REFUSED, 4.0 * float(status["relays_refused"])))
+        return bool(
+            status["relays_lately_accepted"] > max(MOST_RELAYS_REJECTED, 4.0 * float(status["relays_lately_rejected"]))
+        )
 
     @property
     def obstructed(self) -> tuple[int, ...]:
@@ -671,7 +673,7 @@ class Estimator:
         return tuple(self._identifiers[anchors["table_index"][faulty]].tolist()) if faulty.any() else ()
 
     def horizontal_variance_m2(self, ahead_s: float) -> float:
-        """Sum of the variances of x and y so much later, if nothing is received until then."""
+        """Sum of the variances of x and y ``ahead_s`` later, if nothing is received until then."""
         dim, (_, covariance) = self.dim, self.motion()
         total = 2.0 * self.settings.qa * float(self._state.status[0]["q_scale"]) * ahead_s**3 / 3.0
         for axis in range(2):
@@ -717,7 +719,7 @@ def is_sound(estimator: Estimator) -> bool:
     if not isinstance(settings, EstimatorSettings) or not isinstance(state, EstimatorState):
         return False
     known = all(type(index) is int and 0 <= index < len(state.index_of) for index in own["index_of"].values())
-    if not isinstance(own["_left_out"], frozenset) or not known:
+    if not isinstance(own["_misfits"], frozenset) or not known:
         return False
     if (
         own["dim"] != settings.dim

@@ -28,7 +28,7 @@ OBSTRUCTED_WALK: Final = 0.004
 OBSTRUCTION_MEMORY_S: Final = 10.0
 
 STATIONARY_NOISE_SHARE: Final = 2e-7
-"""Part of the process noise of motion that is left at rest: 5 cm within half a minute."""
+"""Part of the process noise of motion that is left for a stationary tag: 5 cm within half a minute."""
 
 
 @step
@@ -70,7 +70,7 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
 
 @step
 def is_stationary(s: EstimatorState) -> bool:
-    """Whether the tag has shown no motion for so long that it is taken to stand still."""
+    """Whether the tag has shown no motion for long enough to count as stationary."""
     stationary_s = s.settings[0]["stationary_s"]
     return bool(0.0 < stationary_s < s.status[0]["stationary_s"])
 
@@ -91,8 +91,8 @@ def _advance(s: EstimatorState, values: int, dt: float) -> None:
 def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float) -> None:
     """Time update of an anchor's range errors over what has passed and was walked since its newest packet.
 
-    The changing part is a Gauss–Markov process of the way and of time. Where range errors jump, both parts forget
-    within seconds; one that has jumped itself wanders from where it is.
+    The changing part is a Gauss–Markov process of walked distance and of time. Where range errors jump, both parts
+    forget within seconds; one that has jumped itself wanders from where it is.
     """
     status, settings = s.status[0], s.settings[0]
     where, share = layout(settings["dim"], len(s.anchors)), min(status["obstruction"], 1.0)

@@ -5,7 +5,7 @@ faults b̂ and their sensitivities V (``faults``) the estimate under the hypothe
 
     x + V·b̂        P + V·(M + I/σ_f²)⁻¹·Vᵀ
 
-so the error exceeds |V·b̂| + k·σ with the stated risk only, whichever anchors are at fault. Two kinds are looked at:
+so the error exceeds |V·b̂| + k·σ with the stated risk only, whichever anchors are at fault. Two kinds are considered:
 constants since an anchor joined, and what has begun lately. What is larger than σ_f shows, as a jump or in
 yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then there is no number.
 """
@@ -103,7 +103,7 @@ def fit_plane(s: EstimatorState) -> None:
 
 @step
 def _apart_m(s: EstimatorState, anchor: int, off_m: float, probe_m: float) -> float:
-    """By how much an anchor is farther from a place above the tag's foot in the plane than from one below."""
+    """By how much an anchor is farther from a point above the tag's foot in the plane than from one below."""
     normal, a_m = s.status[0]["plane_normal"], s.anchors[anchor]["position_m"]
     above, below = 0.0, 0.0
     for axis in range(3):
@@ -145,7 +145,7 @@ UNCOVERED_CHI2: Final = 240.0
 """A test of faults beyond this shows one that the levels may not cover."""
 
 FIRST_PACKETS: Final = 3
-"""Of each anchor, before which nothing is promised."""
+"""Of each anchor, before which there are no levels."""
 
 
 MAX_LEVEL_STD: Final = 0.05
@@ -156,8 +156,8 @@ CONTRADICTED_START_S: Final = 5.0
 the others may agree on a wrong position, until the tag has moved enough to show it."""
 
 MAX_OPEN_LEVEL_STD: Final = 0.02
-"""The same where all range errors are open: then only the tag's way tells its position, by directions that change, and
-a filter that is linearised at a wrong place learns too much from them (errors of 5 standard deviations)."""
+"""The same where all range errors are open: then only the tag's motion determines its position, by directions that
+change, and a filter that is linearised at a wrong position becomes too certain (errors of 5 standard deviations)."""
 
 
 @step
@@ -171,13 +171,13 @@ def _relative_std(s: EstimatorState) -> float:
 
 @step
 def integrity_state(s: EstimatorState, levels: Vector) -> int:
-    """What can be said of a position with these levels."""
+    """Whether a position's levels can be relied on: ``SOUND``, ``OBSTRUCTED``, ``CONTRADICTED`` or ``UNAVAILABLE``."""
     count, status = len(s.anchors), s.status[0]
     state = SOUND
     for anchor in range(count):
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
             state = OBSTRUCTED
-    was_contradicted = status["fault_std_m"] > LASTING_STD_M  # then none are singled out
+    was_contradicted = status["fault_std_m"] > LASTING_STD_M  # then none are selected
     limit = SURE_CHI2 if was_contradicted else UNCOVERED_CHI2
     share = _relative_std(s)
     if status["withholds_levels"] or max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > limit:

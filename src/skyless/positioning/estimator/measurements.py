@@ -1,4 +1,4 @@
-"""The kinds of measurements. Each is linearised at the state, judged, and processed by one scalar update.
+"""The kinds of measurements. Each is linearised at the state, gated, and processed by one scalar update.
 
     own reception    R − T  =  |p − a| + b + w + range errors + noise                  (the tag receives an anchor)
     relay            S − T  =  |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + pair's constant + noise      (anchor i received anchor j)
@@ -52,8 +52,8 @@ SLOPE_FROM_M: Final = 4.0
 """Where the errors that grow with distance pass through zero, and by which range they change once (APS011)."""
 
 SLOPE_STEP_M: Final = 0.25
-"""The slope counts at a range that follows in such steps: where it followed the estimate's noise, which is in the
-innovation as well, a tag at rest would learn the slope from nothing else (Huang and Roumeliotis 2008)."""
+"""The slope counts at a range that is updated in steps of this: if it contained the estimate's noise, which is in the
+innovation as well, the slope would be estimated from noise alone at a stationary tag (Huang and Roumeliotis 2008)."""
 
 CURVATURE_SHARE: Final = 0.01
 """Where ranges are so curved that it counts for more than this part of the stamps' variance, it is counted."""
@@ -73,7 +73,7 @@ REPORT_GAIN: Final = 1.25
 """A report is used where the filter's own variance is larger by this factor."""
 
 LEAST_REPORT_VARIANCE: Final = 0.1
-"""Of that of a pair of stamps: no anchor knows its clock better, whatever it says."""
+"""Of that of a pair of stamps: no anchor knows its clock better, whatever it reports."""
 
 REJOIN_AFTER: Final = 20
 """An anchor with this number of rejected packets in a row joins again: its first was late, so its rate is wrong."""
@@ -89,7 +89,7 @@ STATIONARY_STD_MPS: Final = 0.01
 
 @step
 def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> float:
-    """Put the unit vector from an anchor to the tag into the measurement; returns their distance.
+    """Write the unit vector from an anchor to the tag into the measurement; returns their distance.
 
     The anchor's survey error follows with the opposite sign, and the height's: ``direction_terms`` in all.
     """
@@ -166,7 +166,7 @@ def _curvature_m(s: EstimatorState, range_m: float, variance: float) -> float:
 
 @step
 def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[int, float]:
-    """Put the tag's reception of an anchor into ``h``; its terms, and the distance."""
+    """Write the tag's reception of an anchor into ``h``; its terms, and the distance."""
     dim = s.settings[0]["dim"]
     where = layout(dim, len(s.anchors))
     range_m = _add_direction(s, 0, anchor, 1.0)
@@ -178,10 +178,10 @@ def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[
 
 @step
 def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, variance_factor: float) -> int:
-    """Process the tag's reception of an anchor's packet: 1 if it was used, 0 if not, ``CLOCK_JUMPED`` to join anew.
+    """Process the tag's reception of an anchor's packet: 1 if it was used, 0 if not, ``CLOCK_JUMPED`` to join again.
 
     R − T = |p − a − δa| + b + w + change + constant + slope·far + noise. A reception whose path looks blocked has
-    its variance multiplied; it is judged as any other, as it is late rather than noisy.
+    its variance multiplied; it is gated as any other, as it is late rather than noisy.
     """
     settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
     dim = settings["dim"]
@@ -237,7 +237,7 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
     """An anchor's range error has jumped: back to what it was before it was obstructed, or to something new.
 
     Obstacles make packets late: an early jump of an anchor that is not known to be obstructed ends an obstruction that
-    has been there since it joined, with which all that it said is considered again.
+    has been there since it joined, and all its earlier receptions are considered again.
 
     Returns the innovation that is left, and its variance.
     """
@@ -264,7 +264,7 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
 
 @step
 def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> None:
-    """Begin with an anchor's clock: the limit of an update of an offset of which nothing was known.
+    """Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
 
     Whatever is wrong with the position and with the range is then in the offset.
     """
@@ -301,7 +301,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
 
 @step
 def relay_terms(s: EstimatorState, listener: int, sender: int, age_s: float, has_tx_noise: bool) -> int:
-    """Put an anchor's reception of another, so long ago, into ``h``; its terms."""
+    """Write an anchor's reception of another, ``age_s`` ago, into ``h``; its terms."""
     where = layout(s.settings[0]["dim"], len(s.anchors))
     term = _set_term(s, 0, where.offset + sender, 1.0)
     term = _set_term(s, term, where.offset + listener, -1.0)
@@ -324,8 +324,8 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
 
     S − T = |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + constant of the pair + noise, when the packet reached anchor i. Both offsets go
     back to that moment by their rates; what their oscillators have done since counts as noise. The pair's constant,
-    in which the survey is, is followed beside the filter: as both directions of a pair hold it with the same sign
-    and the offsets with opposite ones, neither leans on the other.
+    in which the survey is, is estimated outside the filter: as both directions of a pair hold it with the same sign
+    and the offsets with opposite ones, neither depends on the other.
     """
     settings, status = s.settings[0], s.status[0]
     i, j = s.anchors[listener], s.anchors[sender]
@@ -351,7 +351,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         adapt_clock_noise(s, listener, -clipped)
     if not -settings["gate"] <= normalised <= settings["gate"]:
         status["relays_rejected"] += 1
-        status["relays_refused"] += 1.0
+        status["relays_lately_rejected"] += 1.0
         i["relay_outliers_in_row"] += 1
         j["relay_outliers_in_row"] += 1
         link["outliers_in_row"] += 1
@@ -360,7 +360,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
             link["variance_m2"] += PAIR_JUMP_M2
     else:
         status["relays_used"] += 1
-        status["relays_accepted"] += 1.0
+        status["relays_lately_accepted"] += 1.0
         i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = link["outliers_in_row"] = 0
         share = pair_variance / innovation_variance
         link["constant_m"] += share * innovation
@@ -371,7 +371,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
     s.anchors[sender]["is_relayed"] = 1
 
 
-# An anchor tells what its clock reads against the master's
+# An anchor reports what its clock reads against the master's
 
 
 @step
@@ -380,7 +380,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
 
     The anchor has received all packets of the master that were relayed to the tag, and more, so its error is
     uncorrelated with the difference of both estimates, of variance P − q (P: the filter's, q: the anchor's), and the
-    other states follow by P_xd/P times that difference. ``subticks``: the anchor's reading less the master's at the
+    other states change by P_xd/P times that difference. ``subticks``: the anchor's reading less the master's at the
     packet's TX stamp, modulo 2⁴⁸.
     """
     settings, a = s.settings[0], s.anchors[anchor]
@@ -402,7 +402,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     if off >= wrap // 2:
         off -= wrap
     innovation = off * (TICK_M / SUBTICKS) - _h_dot_x(s, 0, term)
-    # the filter of an anchor assumes what the almanac says of clocks; behind one that wanders more it lags as well
+    # the filter of an anchor assumes what the almanac states of clocks; behind one that wanders more it lags as well
     steady = max(a["walk_scale"], s.anchors[master]["walk_scale"]) <= STEADY_WALK_SCALE
     is_news = steady and own_variance > REPORT_GAIN * variance
     fits = innovation * innovation <= settings["gate"] ** 2 * (own_variance + variance)
@@ -421,7 +421,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
 
 @step
 def difference_terms(s: EstimatorState, a: int, b: int) -> tuple[int, float]:
-    """Put a difference of ranges, to anchor b less to anchor a, into ``h``; its terms, and the difference.
+    """Write a difference of ranges, to anchor b less to anchor a, into ``h``; its terms, and the difference.
 
     Its gradient stands in the first terms, as the other kinds' directions do.
     """
@@ -441,8 +441,8 @@ def difference_terms(s: EstimatorState, a: int, b: int) -> tuple[int, float]:
 def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: float) -> int:
     """Process a ready-made difference of ranges, to anchor b less to anchor a: 1 if it was used, 0 if not.
 
-    d = |p − b| − |p − a| + range errors of b − those of a + noise. Nothing is learnt of clocks, which whoever made
-    the difference has taken out of it.
+    d = |p − b| − |p − a| + range errors of b − those of a + noise. Nothing is estimated of clocks, which whoever made
+    the difference has removed.
     """
     settings, status = s.settings[0], s.status[0]
     dim, walked_m = settings["dim"], status["walked_m"]
@@ -473,7 +473,7 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
 
 @step
 def height(s: EstimatorState, height_m: float, std_m: float) -> int:
-    """Process the tag's height as a sensor tells it: 1 if it was used, 0 if not.
+    """Process the tag's height as a sensor measures it: 1 if it was used, 0 if not.
 
     Where a height is given, it corrects that.
     """
@@ -497,7 +497,7 @@ def height(s: EstimatorState, height_m: float, std_m: float) -> int:
 
 @step
 def zero_velocity(s: EstimatorState) -> None:
-    """Process the knowledge that a tag at rest has no velocity, one axis after the other."""
+    """Process the knowledge that a stationary tag has no velocity, one axis after the other."""
     dim = s.settings[0]["dim"]
     velocity = layout(dim, len(s.anchors)).velocity
     for axis in range(dim):

@@ -1,8 +1,8 @@
-"""Which measurements are used, and how process noise follows what innovations show.
+"""Which measurements are used, and how process noise is adapted to innovations.
 
-Late receptions are the rule where paths are blocked, early ones are not. A single late one is left out; where those
+Late receptions are the rule where paths are blocked, early ones are not. A single late one is rejected; where those
 that follow agree with it, the range error has jumped, and is estimated again from there. What is systematic in the
-innovations along an axis is motion, what all anchors have in common is the tag's clock, and what relays say of one
+innovations along an axis is motion, what all anchors have in common is the tag's clock, and what relays show of one
 anchor's clock is that clock.
 """
 
@@ -21,19 +21,19 @@ INCONSISTENT_NIS: Final = 1.6
 """Mean of the normalised innovations squared beyond which the tag moves more than assumed (noise alone: 1)."""
 
 SUSPECT: Final = 3.0
-"""Innovations beyond so many standard deviations, ..."""
+"""Innovations beyond this number of standard deviations, ..."""
 
 IN_ROW: Final = 2
-"""... so many of an anchor in a row, are a jump of its range error, ..."""
+"""... this number of an anchor in a row, are a jump of its range error, ..."""
 
 IN_ROW_WHERE_LATE: Final = 5
-"""... or so many where single receptions are late often, ..."""
+"""... or this number where single receptions are late often, ..."""
 
 LATE_OFTEN_SHARE: Final = 0.02
 """... which is a larger share of them than this, ..."""
 
 TOGETHER: Final = 7.0
-"""... together beyond so many (by chance once in some million packets), ..."""
+"""... together beyond this number (by chance once in some million packets), ..."""
 
 OBSTRUCTED_SUSPECT: Final = 2.2
 OBSTRUCTED_TOGETHER: Final = 5.0
@@ -42,7 +42,7 @@ once in some thousand packets), while enough other anchors are not obstructed:
 else what all of them share, as the tag's clock, would open one after another."""
 
 AGREEMENT: Final = 3.0
-"""... if they agree within so many standard deviations of two receptions."""
+"""... if they agree within this number of standard deviations of two receptions."""
 
 JUMP_STD_M: Final = 0.2
 """Of a range error that has jumped, beyond what it was, unless it has jumped by more."""
@@ -58,7 +58,7 @@ MOST_CHANGE_SCALE: Final = 250.0
 
 ENDED_STD_M: Final = 0.05
 ENDED: Final = 2.0
-"""An obstruction has ended where its error is known to this, and less than so many standard deviations from none."""
+"""An obstruction has ended where its error is known to this, and within this number of standard deviations of 0."""
 
 SETTLED_CHANGE_SCALE: Final = 2.0
 """A range error whose process noise is raised by less does not change any more."""
@@ -68,16 +68,16 @@ LATE_PROBABILITY_DENSITY: Final = 0.05
 """Probability density of a late reception's normalised innovation: a standard deviation of 5 cm, a metre late."""
 
 RECEPTION_HUBER: Final = 1.5
-"""Where receptions are late often, innovations beyond so many standard deviations weigh less."""
+"""Where receptions are late often, innovations beyond this number of standard deviations have less weight."""
 
 DIFFERENCE_HUBER: Final = 1.0
-"""Number of standard deviations beyond which the innovations of ready-made differences weigh less."""
+"""Number of standard deviations beyond which the innovations of ready-made differences have less weight."""
 
 MAX_CHANGE_STD_M: Final = 0.5
-"""Of what range errors change along the way; larger ones are jumps."""
+"""Of the part of range errors that changes as the tag moves; larger ones are jumps."""
 
 MOVED: Final = 1.0
-"""Mean square of what a tag is away from where it was, over the variances, beyond which it is taken to move."""
+"""Mean square of what a tag is away from where it was, over the variances, beyond which it counts as moving."""
 
 LAG_GAIN: Final = 0.05
 LAG_FORGETTING: Final = 0.01
@@ -93,7 +93,7 @@ COMMON_LIMIT: Final = 9.0
 """Of the square of the running mean of all innovations, 1 where the filter is right; those of the tag's clock."""
 
 COMMON: Final = 1.5
-"""Where the newest innovations of all anchors lie beyond so many standard deviations on one side, the tag's
+"""Where the newest innovations of all anchors lie beyond this number of standard deviations on one side, the tag's
 clock has left its rate: nothing else makes all of them late, or early, at once."""
 
 WALK_GAIN: Final = 1.1
@@ -146,7 +146,7 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
 
 @step
 def is_common(s: EstimatorState, normalised: float) -> bool:
-    """Whether the newest innovations of all anchors but one, which may say nothing, lie on the side of this one.
+    """Whether the newest innovations of all anchors but one, which may show nothing, lie on the side of this one.
 
     The tag's clock it is then. A faulty anchor draws the others to the opposite side of its own.
     """
@@ -221,7 +221,7 @@ def variance_scale(s: EstimatorState, innovation: float, innovation_variance: fl
 def difference_scale(s: EstimatorState, innovation: float, innovation_variance: float) -> float:
     """Factor on the innovation's variance of a time difference; 0 if it is not to be used. Counts it.
 
-    Either of its anchors may be late, so large ones weigh less on both sides.
+    Either of its anchors may be late, so large ones have less weight on both sides.
     """
     status, normalised = s.status[0], abs(innovation) / np.sqrt(innovation_variance)
     used = normalised <= s.settings[0]["gate"]
@@ -240,7 +240,7 @@ def difference_scale(s: EstimatorState, innovation: float, innovation_variance: 
 
 @step
 def adapt_change_variance(s: EstimatorState, anchor: int, elapsed_s: float) -> None:
-    """Let the variance of an anchor's changing range error follow its estimate: the mean of its square.
+    """Let the variance of an anchor's changing range error track its estimate: the mean of its square.
 
     The maximisation step of expectation maximisation (Shumway and Stoffer 1982) with a memory that fades.
     """
@@ -295,7 +295,7 @@ def adapt_process_noise(s: EstimatorState, normalised: float) -> None:
 def covariance_scale(s: EstimatorState) -> float:
     """Factor on the position's covariance while innovations are larger than the filter expects.
 
-    Most of an innovation is the stamps' noise, so the state errs by more than the innovations tell.
+    Most of an innovation is the stamps' noise, so the state errs by more than the innovations show.
     """
     nis = s.status[0]["mean_nis"]
     return float(nis * nis) if nis > INCONSISTENT_NIS else 1.0
@@ -303,7 +303,7 @@ def covariance_scale(s: EstimatorState) -> float:
 
 @step
 def adapt_clock_noise(s: EstimatorState, anchor: int, normalised: float) -> None:
-    """Raise the process noise of an anchor's clock where what relays say of it stays on one side, else lower it."""
+    """Raise the process noise of an anchor's clock where what relays show of it stays on one side, else lower it."""
     a = s.anchors[anchor]
     a["relay_mean"] += RELAY_GAIN * (normalised - a["relay_mean"])
     if a["relay_mean"] ** 2 * (2.0 - RELAY_GAIN) / RELAY_GAIN > RELAY_LIMIT:

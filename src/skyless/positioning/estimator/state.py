@@ -1,4 +1,4 @@
-"""The estimator's state: what is estimated, what is kept of each anchor, and how anchors join and leave.
+"""The estimator's state: what is estimated, data of each anchor, and how anchors join and leave.
 
 The state vector, all clocks against the tag's own counter, in metres and m/s:
 
@@ -6,14 +6,14 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
                 whole ticks stand in ``ANCHOR_DTYPE``)
     rates       velocity (dim), then the rate of each offset
     tx noises   of each anchor's newest TX stamp, which all who received it share
-    changes     for each anchor the part of the tag's range error to it that changes along the way
+    changes     for each anchor the part of the tag's range error to it that changes as the tag moves
     constants   the part that stays
     slope       how ranges lengthen with distance
     height      the tag's true height − the one that is given, in two dimensions
     surveys     for each anchor (dim) its true position − its position in the almanac
 
 Everything before ``slope`` is updated by all measurements; what follows is updated by the tag's own receptions only
-and is a consider parameter (Schmidt 1966) of the others, which say next to nothing of it.
+and is a consider parameter (Schmidt 1966) of the others, which have next to no information on it.
 
 Range errors and surveys stand last because many a site calls them exact. What is exact has no variance and no
 covariance, so ``uncertain_states`` leaves it out of all arithmetic, until a jump or a fault shows otherwise.
@@ -47,7 +47,7 @@ class EstimatorSettings(Struct, frozen=True):
     rx_variance_m2: float = 9e-4
     """Of one stamp each."""
     gate: float = 4.0
-    """Innovations beyond so many standard deviations are not used."""
+    """Innovations beyond this number of standard deviations are not used."""
     height_m: float | None = None
     """Height of the tag where it is given; None to estimate it."""
     height_std_m: float = 0.0
@@ -66,11 +66,11 @@ class EstimatorSettings(Struct, frozen=True):
     slope_std_m: float = 0.05
     """By how much ranges lengthen for each unit of clip((range − 4 m)/4 m, −1, 1)."""
     place_std_m: float = 0.005
-    """Of the part of a range's error that changes along the way."""
+    """Of the part of a range's error that changes as the tag moves (the site file's name)."""
     place_distance_m: float = 1.0
     """Distance over which that part changes, ..."""
     place_time_s: float = 100.0
-    """... and time over which it changes at rest."""
+    """... and time over which it changes while the tag is stationary."""
     change_memory_s: float = 0.0
     """Time within which the size of each anchor's changing part is estimated again; 0 where it is ``place_std_m``."""
     least_change_std_m: float = 0.05
@@ -78,14 +78,14 @@ class EstimatorSettings(Struct, frozen=True):
     difference_std_m: float = 0.12
     """Of what is new in each ready-made time difference."""
     stationary_s: float = 0.0
-    """A tag that has not shown any motion for so long is taken to stand still; 0: never."""
+    """A tag that has not shown any motion for this time counts as stationary; 0: never."""
     max_acceleration_mps2: float = 0.0
     """The tag's largest acceleration, as far as levels are to cover it beyond ``qa``."""
     max_walk_scale: float = 1e4
     """Largest factor on ``walk`` where innovations show that oscillators wander more."""
     integrity_risk: float = RISK
     alert_limit_m: float | None = None
-    """Fixes with a higher horizontal protection level say so."""
+    """Fixes with a higher horizontal protection level have an alert."""
 
     @property
     def dim(self) -> int:
@@ -93,7 +93,7 @@ class EstimatorSettings(Struct, frozen=True):
         return 3 if self.height_m is None else 2
 
     def record(self) -> Records:
-        """The settings as the kernels take them, shape (1,)."""
+        """The settings for the kernels, shape (1,)."""
         record = np.zeros(1, SETTINGS_DTYPE)
         for name, value in structs.asdict(self).items():
             if name in _NAMES:
@@ -147,7 +147,7 @@ ANCHOR_DTYPE: Final = np.dtype(
         ("offset_ticks", np.int64),  # whole ticks of the offset
         ("range_m", np.float64),  # at its newest packet
         ("slope_range_m", np.float64),  # at which its range errors' slope counts
-        ("walked_m", np.float64),  # the tag's way at its newest packet
+        ("walked_m", np.float64),  # the tag's walked distance at its newest packet
         ("is_relayed", np.int64),  # whether others relay its packets
         ("has_tx_noise", np.int64),  # whether its newest packet's TX noise is a state
         ("packets", np.int64),
@@ -158,15 +158,15 @@ ANCHOR_DTYPE: Final = np.dtype(
         ("is_obstructed", np.int64),  # whether its range error has jumped and not come back
         ("change_mean", np.float64),  # running mean of its innovations since then, normalised
         ("change_scale", np.float64),  # factor on the process noise of a range error that has jumped
-        ("has_fault", np.int64),  # whether a lasting fault of it was taken into the state
+        ("has_fault", np.int64),  # whether a lasting fault of it was added to the state
         ("relay_outliers_in_row", np.int64),
-        ("relay_mean", np.float64),  # running mean of what relays say of its clock, normalised
+        ("relay_mean", np.float64),  # running mean of what relays show of its clock, normalised
         ("walk_scale", np.float64),  # factor on its oscillator's random walk
-        ("change_variance_m2", np.float64),  # of the part of its range error that changes along the way
+        ("change_variance_m2", np.float64),  # of the part of its range error that changes as the tag moves
     ],
     align=True,
 )
-"""What is kept of an anchor beside its states."""
+"""What is kept of an anchor besides its states."""
 
 PACKET_DTYPE: Final = np.dtype([("sequence", np.int64), ("tx_ticks", np.int64), ("rx_ticks", np.int64)], align=True)
 """A packet that others may relay."""
@@ -206,8 +206,8 @@ STATUS_DTYPE: Final = np.dtype(
         ("mean_square_m2", np.float64),  # of innovations
         ("rejected_share", np.float64),
         ("late_share", np.float64),
-        ("relays_accepted", np.float64),  # lately, older ones counting less
-        ("relays_refused", np.float64),
+        ("relays_lately_accepted", np.float64),  # lately, older ones counting less
+        ("relays_lately_rejected", np.float64),
         ("lag", np.float64, (3,)),  # running mean of innovations along each axis
         ("lag_square", np.float64),
         ("q_scale", np.float64),  # factor on qa
@@ -221,7 +221,7 @@ STATUS_DTYPE: Final = np.dtype(
         ("height_ticks", np.int64),  # the tag's reading when a sensor's height was used last
         ("plane_m", np.float64, (3,)),  # a point of the plane that lies closest to the anchors, ...
         ("plane_normal", np.float64, (3,)),  # ... and its normal
-        ("open_range_errors", np.int64),  # whether anchors join with range errors beyond what the settings say
+        ("open_range_errors", np.int64),  # whether anchors join with range errors beyond those of the settings
         (
             "range_errors",
             np.int64,
@@ -234,7 +234,7 @@ STATUS_DTYPE: Final = np.dtype(
 
 
 class EstimatorState(NamedTuple):
-    """Everything that the kernels work on, for one tag with so many anchors and n states (``Layout.room``)."""
+    """Everything that the kernels work on, for one tag with its anchors and n states (``Layout.room``)."""
 
     x: Vector
     """Shape (n,)."""
@@ -247,7 +247,7 @@ class EstimatorState(NamedTuple):
     """Of both kinds of faults of all anchors in the innovations, and of lasting (row) with recent ones (column), shape
     (3, anchors, anchors)."""
     evidence: Matrix
-    """What innovations say of them, shape (2, anchors)."""
+    """What innovations show of them, shape (2, anchors)."""
     anchors: Records
     """``ANCHOR_DTYPE``, shape (anchors,)."""
     packets: Records
@@ -261,14 +261,14 @@ class EstimatorState(NamedTuple):
     index_of: Integers
     """Index among ``anchors`` of each anchor of the site's table, −1 for those that are not in the state."""
     h: Vector
-    """The measurement at hand where it is not zero, at the places in ``h_index``."""
+    """The measurement at hand where it is not zero, at the indices in ``h_index``."""
     h_index: Indices
     ph: Vector
     """P·h of the measurement at hand, shape (n,)."""
     fault_input: Vector
     """By how much each fault is in the innovation at hand, shape (2·anchors + dim,)."""
     work: Matrix
-    """Room for systems of equations of all faults of one kind, shape (anchors + 1 + dim, anchors)."""
+    """Scratch for systems of equations of all faults of one kind, shape (anchors + 1 + dim, anchors)."""
 
 
 class Layout(NamedTuple):
@@ -319,7 +319,7 @@ def most_terms(dim: int) -> int:
 
 @step
 def uncertain_states(s: EstimatorState) -> int:
-    """How many states count: all that follow are exact, and all that they have to do with others is zero.
+    """How many states count: all that follow are exact, and their covariances with others are zero.
 
     A multiple of ``LANES``.
     """
@@ -343,7 +343,7 @@ def _expected_range_errors(settings: Records, status: Records) -> int:
 
 
 def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors: bool = False) -> EstimatorState:
-    """A state without anchors at the origin, for a table of so many; see ``Estimator.start``."""
+    """A state without anchors at the origin, for a table of that size; see ``Estimator.start``."""
     dim = settings.dim
     where = layout(dim, 0)
     n = where.room
@@ -393,7 +393,7 @@ OPEN_SURVEY_STD_M: Final = 0.15
 """What a start expects of ranges and survey that follows one which was contradicted."""
 
 PAIR_STD_M: Final = 0.05
-"""Of the constant of a pair of anchors beside what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
+"""Of the constant of a pair of anchors besides what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
 
 
 def with_anchor(s: EstimatorState, table_index: int, position_m: Vector, is_open: bool = False) -> EstimatorState:
@@ -478,5 +478,5 @@ def _select(source: NDArray[Scalar], *indices: Integers) -> NDArray[Scalar]:
     shape, axes = source.shape, len(indices)
     with_zeros = np.zeros([length + 1 for length in shape[:axes]] + list(shape[axes:]), source.dtype)
     with_zeros[tuple(slice(-1) for _ in indices)] = source  # the last ones, of index −1, are left
-    places = [index.reshape([-1] + [1] * (axes - 1 - axis)) for axis, index in enumerate(indices)]
-    return with_zeros[tuple(places)]
+    grid = [index.reshape([-1] + [1] * (axes - 1 - axis)) for axis, index in enumerate(indices)]
+    return with_zeros[tuple(grid)]

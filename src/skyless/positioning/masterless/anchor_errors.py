@@ -13,16 +13,16 @@ from skyless.constants import TICK_BITS, TICK_M
 from skyless.kernels.arrays import Array
 
 MIN_NOISE_M: Final = 0.05
-"""A quieter calibration is not believed further: places it has not seen are somewhat different."""
+"""Smallest noise that is assumed: positions that a calibration has not seen differ somewhat."""
 
 SLOPE_NEAREST_M: Final = 0.5
-"""Below this range the slope is not followed any more."""
+"""Below this range the slope does not apply."""
 
 SHARED_NOISE_SCALE: Final = 1.5
-"""Differences that follow each other share receptions and reflections, which the filter counts as new in each."""
+"""Factor: successive differences share receptions and reflections, which the filter counts as new in each."""
 
 TYPICAL_SLOPE_M: Final = 0.05
-"""Of a DW1000 that nobody has calibrated: APS011 says 0.03 to 0.10 m, flights that told it 0.03 to 0.08 m."""
+"""Of a DW1000 that nobody has calibrated: APS011 gives 0.03 to 0.10 m, recorded flights 0.03 to 0.08 m."""
 
 KNOWN_STD_M: Final = 0.02
 """Of a constant that was calibrated, without the error of the survey: with it, constants of the same anchors differ by
@@ -44,7 +44,7 @@ TYPICAL_ANCHOR: Final = AnchorCalibration(0.0, TYPICAL_SLOPE_M)
 
 
 class DifferenceCalibration(Struct, frozen=True):
-    """What is known of the anchors; those that are not in it are taken as they are."""
+    """What is known of the anchors; others are typical ones."""
 
     anchors: dict[int, AnchorCalibration]
 
@@ -79,16 +79,16 @@ Pair = tuple[int, int]
 
 
 class AnchorFlights:
-    """The median of what either anchor of a pair told lately; of exchanges, where neither tells."""
+    """Median of the flights that either anchor of a pair stated lately; of exchanges, where neither states any."""
 
     def __init__(self) -> None:
         self._stated: dict[Pair, RunningMedian] = {}
         self._ranging = TwoWayRanging(TICK_BITS, window=RANGED_WINDOW)
 
     def update(self, a: int, b: int, tx_a: int, rx_b: int, stated_ticks: float | None) -> float | None:
-        """Take b's reception of a's packet, both stamps unwrapped, with the flight told of it if there is one.
+        """Process b's reception of a's packet, both stamps unwrapped, with the flight that b states if there is one.
 
-        The flight between the two in ticks, None while it is unknown.
+        Returns the flight between the two in ticks, None while it is unknown.
         """
         pair = (a, b) if a < b else (b, a)
         median = self._stated.get(pair)
@@ -116,7 +116,7 @@ def distance_ticks(anchors_m: Mapping[int, Point], a: int, b: int) -> float | No
 
 
 EXCESS_STD_M: Final = 0.1
-"""What is in the excess of a pair beside the delays of its nodes: places that are off, strong and weak signals."""
+"""What is in the excess of a pair besides the delays of its nodes: errors of positions, strong and weak signals."""
 
 ANTENNA_DELAY_STD_M: Final = 0.07
 """How much the delays of nodes of one kind scatter: two of them as much as all else."""
@@ -156,11 +156,11 @@ def contradictions_m(excess_m: Mapping[Pair, float], delays_m: Mapping[int, floa
 
 def _design(pairs: Mapping[Pair, float], anchors: list[int]) -> Array:
     """A row for each pair: its two anchors, and what all have in common in the last column."""
-    place = {anchor: k for k, anchor in enumerate(anchors)}
+    column = {anchor: k for k, anchor in enumerate(anchors)}
     H = np.zeros((len(pairs), len(anchors) + 1))
     H[:, -1] = 1.0
     for row, (a, b) in enumerate(pairs):
-        H[row, place[a]] = H[row, place[b]] = 1.0
+        H[row, column[a]] = H[row, column[b]] = 1.0
     return H
 
 
@@ -169,14 +169,14 @@ def _design(pairs: Mapping[Pair, float], anchors: list[int]) -> Array:
 
 ALWAYS_REFRESHED: Final = 32
 REFRESH: Final = 8
-"""After so many receptions of a pair, one direction, only every eighth is asked for the flight."""
+"""After this number of receptions of a pair in one direction, only every eighth updates the flight."""
 
 FIRST_ESTIMATE: Final = 128
 MOST_BETWEEN_ESTIMATES: Final = 1024
-"""Flights heard between two estimates of the antenna delays: twice as many each time, up to so many."""
+"""Flights received between two estimates of the antenna delays: twice as many each time, up to this number."""
 
 UNRANGED: Final = 20
-"""Receptions of a pair after which nobody is expected to range it any more: then it has the others' excess."""
+"""Receptions of a pair after which no ranging of it is expected: then it has the others' excess."""
 
 EXCESSES: Final = 101
 
@@ -192,7 +192,7 @@ class _Direction:
 
 
 class RelayDelays:
-    """Delays of all pairs, for anchors that stand where ``anchors_m`` says, or comes to say."""
+    """Delays of all pairs, for anchors at ``anchors_m``, which may grow."""
 
     def __init__(self, anchors_m: Mapping[int, Point], estimate: bool) -> None:
         """``estimate``: the anchors' own delays too; otherwise a pair shares its delay equally."""
@@ -203,12 +203,12 @@ class RelayDelays:
         self.own_m: dict[int, float] = {}
         """The anchors' own delays, each half of TX and RX together, less what all have in common."""
         self.contradictions_m: dict[Pair, float] = {}
-        """Pairs that range each other nearer, or farther, than the positions say while others seem nearer."""
+        """Pairs that range each other nearer, or farther, than their positions are while others seem nearer."""
         self._estimates_own = estimate
         self._until_estimate = self._wait = FIRST_ESTIMATE
 
     def ticks(self, listener: int, sender: int, tx_ticks: int, rx_ticks: int, stated_ticks: float | None) -> int | None:
-        """What to take off this reception, whole ticks; None while the pair's flight is unknown.
+        """What to subtract from this reception, whole ticks; None while the pair's flight is unknown.
 
         Stamps are unwrapped, each on its own clock.
         """

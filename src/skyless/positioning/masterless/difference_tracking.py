@@ -37,15 +37,15 @@ DIFFERENCES: Final = EstimatorSettings(
 differs from anchor to anchor."""
 
 WINDOW: Final = 60
-"""Differences that a start looks at, the newest ones ..."""
+"""Differences that a start uses, the newest ones ..."""
 
 WINDOW_S: Final = 20.0
 """... and none older than this."""
 
 MAX_DIFFERENCE_SILENCE_S: Final = 10.0
-"""After a longer silence the state says less than a new start would."""
+"""After a longer silence the state is worse than a new start."""
 
-SPEED_STD_MPS: Final = 1.0
+START_SPEED_STD_MPS: Final = 1.0
 """Of the velocity at the start."""
 
 DIFFERENCE_IN_USE_S: Final = 0.5
@@ -75,9 +75,9 @@ class DifferenceTracking:
         z_bounds_m: tuple[float, float] | None = None,
         calibration: DifferenceCalibration | None = None,
     ) -> None:
-        """``anchors_m`` places the anchors; a difference that brings its own positions needs none.
+        """``anchors_m``: the anchors' positions; a difference that carries positions needs none.
 
-        ``calibration`` is taken off every difference; anchors that are not in it are taken for ordinary ones.
+        ``calibration`` is subtracted from every difference; anchors that are not in it are typical ones.
         """
         self._calibration = DifferenceCalibration({}) if calibration is None else calibration
         self.counters: Counter[str] = Counter()
@@ -91,7 +91,7 @@ class DifferenceTracking:
             highest_m=settings.highest_m if z_bounds_m is None else z_bounds_m[1],
         )
         self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit_m)
-        self._positions_m = {anchor: np.array(place) for anchor, place in anchors_m.items()}
+        self._positions_m = {anchor: np.array(point) for anchor, point in anchors_m.items()}
         self._z_bounds_m = z_bounds_m
         self._estimator = Estimator(self._settings)
         self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
@@ -107,9 +107,9 @@ class DifferenceTracking:
         return self._estimator
 
     def update(self, pairs: Sequence[PairTdoa]) -> bool:
-        """Take the differences of one reception, receptions in the order of time.
+        """Process the differences of one reception, receptions in the order of time.
 
-        True if they made a fix, else ``reason`` says why not.
+        True if they made a fix, else ``reason`` states why not.
         """
         used = False
         for pair in pairs:
@@ -122,12 +122,12 @@ class DifferenceTracking:
 
     def _update_positions(self, pair: PairTdoa) -> bool:
         """Whether it is known where both anchors stand."""
-        places = self._positions_m
+        positions_m = self._positions_m
         if pair.a_m is not None:
-            places[pair.anchor_a] = np.array(pair.a_m)
+            positions_m[pair.anchor_a] = np.array(pair.a_m)
         if pair.b_m is not None:
-            places[pair.anchor_b] = np.array(pair.b_m)
-        return pair.anchor_a in places and pair.anchor_b in places
+            positions_m[pair.anchor_b] = np.array(pair.b_m)
+        return pair.anchor_a in positions_m and pair.anchor_b in positions_m
 
     def _add(self, pair: PairTdoa) -> bool:
         if self._start is not None and self._is_out_of_reach(pair.time_s - self._newest_s):
@@ -141,13 +141,13 @@ class DifferenceTracking:
         else:
             self.counters["outlier"] += 1
             self.reason = NoFixReason.RESIDUALS
-        if self._estimator.refuses_most:
+        if self._estimator.rejects_most:
             self._stop()
             self._was_wrong = True
         return used
 
     def _process(self, pair: PairTdoa) -> bool:
-        """Give a difference to the filter, without what a calibration, or what is usual, says of its anchors."""
+        """Process a difference by the filter, less the calibrated or typical errors of its anchors."""
         position_m = self.position_m
         error_m = self._calibration.error_m(pair.anchor_b, dist(position_m, self._positions_m[pair.anchor_b]))
         error_m -= self._calibration.error_m(pair.anchor_a, dist(position_m, self._positions_m[pair.anchor_a]))
@@ -160,13 +160,13 @@ class DifferenceTracking:
         return self._estimator.anchor_index(anchor, self._positions_m[anchor])
 
     def _is_out_of_reach(self, silent_s: float) -> bool:
-        """Whether the filter cannot predict so far: too long a silence for it, or a clock that went back."""
+        """Whether the filter cannot predict that far: too long a silence for it, or a clock that went back."""
         if not 0.0 <= silent_s <= MAX_DIFFERENCE_SILENCE_S:
             return True
         return silent_s > SHORT_SILENCE_S and self._estimator.horizontal_variance_m2(silent_s) > MAX_HORIZONTAL_STD_M**2
 
     def _is_plausible(self) -> bool:
-        """Whether the state is near the anchors, beyond which differences tell nothing, and known well enough."""
+        """Whether the state is near the anchors, where differences have information, and known well enough."""
         start, state, dim = self._start, self._estimator.state, self._estimator.dim
         if start is None or not start.holds(state.x[:dim]):
             self.reason = NoFixReason.NOT_CONVERGED
@@ -187,7 +187,7 @@ class DifferenceTracking:
         return x, y, z[0] if z else self._settings.height_m or 0.0
 
     def fix(self) -> Fix:
-        """The newest position with all that is known of it; only after a ``hear`` that made one."""
+        """The newest position with all that is known of it; only after an ``update`` that made one."""
         used = [anchor for anchor, when_s in self._received_s.items() if self._newest_s - when_s <= DIFFERENCE_IN_USE_S]
         anchors_m = np.array([self._positions_m[anchor] for anchor in used]).reshape(-1, 3)
         rows, known = self._estimator.rows.tobytes(), self._settings.height_m is not None
@@ -218,7 +218,7 @@ class DifferenceTracking:
         dim, solution = self._estimator.dim, start.solution
         self._begin_s = pair.time_s
         covariance = solution.covariance_m2[:dim, :dim]
-        self._estimator.start(0, solution.position_m[:dim], covariance, SPEED_STD_MPS**2)
+        self._estimator.start(0, solution.position_m[:dim], covariance, START_SPEED_STD_MPS**2)
         self._start = start
         if start.without is not None:
             self._estimator.inflate_range_error(self._index(start.without))
@@ -245,10 +245,10 @@ VERTICAL_NEIGHBOURHOOD: Final = 0.5
 LEAST_DIAGONAL_M: Final = 5.0
 
 START_DIFFERENCE_STD_M: Final = 0.22
-"""Of a difference with all that is wrong with it, where nothing has been learnt yet."""
+"""Of a difference with all its errors, before any are estimated."""
 
 MISFIT: Final = 4.0
-"""A start with so much larger residuals than expected, chi² per degree of freedom, is tried without each anchor."""
+"""A start whose chi² per degree of freedom is larger is tried without each anchor."""
 
 REMAINING_MISFIT: Final = 0.1
 """Without the wrong anchor no more than this part of the misfit is left."""
@@ -269,7 +269,7 @@ class Start(Struct, frozen=True):
 
     def holds(self, position_m: Array) -> bool:
         """Whether a position, of two or three coordinates, lies in the neighbourhood of the anchors."""
-        return all(self.low_m[axis] <= place <= self.high_m[axis] for axis, place in enumerate(position_m.tolist()))
+        return all(self.low_m[axis] <= value <= self.high_m[axis] for axis, value in enumerate(position_m.tolist()))
 
 
 def find_start(
@@ -332,7 +332,7 @@ def _solve(
 
 
 class ReferencedTdoas(Struct, frozen=True, gc=False):
-    """What ``locate`` wants, from measurements of pairs; empty where there are none."""
+    """What ``locate`` needs, from measurements of pairs; empty where there are none."""
 
     anchors: tuple[int, ...]
     """Identifiers of the anchors that are connected, the reference first: n + 1, or none."""
@@ -346,10 +346,10 @@ def against_reference(pairs: Sequence[tuple[int, int]], tdoa_m: ArrayLike, varia
     """Best linear estimate of all TDoAs against one anchor from measurements ``|p − b| − |p − a|`` of pairs (a, b).
 
     ``tdoa_m`` and ``variances_m2``: shape (m,), errors independent. A pair may be measured more than once, in
-    either direction. Of a graph in several parts the largest is taken, of equally large ones that with the most
+    either direction. Of a graph in several parts the largest is used, of equally large ones that with the most
     information. The anchor of most information serves as the reference (with the full covariance the choice does not
     change a position). Pairs of one anchor with itself, values that are not finite and variances that are not positive
-    are left out.
+    are omitted.
     """
     measured, variances = np.array(tdoa_m, np.float64), np.array(variances_m2, np.float64)
     if not (len(pairs),) == measured.shape == variances.shape:

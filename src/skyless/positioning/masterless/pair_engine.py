@@ -1,14 +1,14 @@
-"""Time differences without a master: any anchor that tells when it heard another is a reference for it.
+"""Time differences without a master: any anchor that relays when it received another is a reference for it.
 
-Anchor b relays that it heard anchor a's packet at ``r`` of its own clock. That packet left a one time of flight
-earlier, so had b sent at ``r - tof``, both packets would have left at once, and what the tag hears between them is
-the time difference of arrival. The tag knows b's clock from b's packets (:mod:`skyless.clocks.broadcast`), and with
-it when a packet that b sent at ``r - tof`` would have been heard:
+Anchor b relays that it received anchor a's packet at ``r`` of its own clock. That packet left a one time of flight
+earlier, so had b sent at ``r - tof``, both packets would have left at once, and the interval in which the tag receives
+them is the time difference of arrival. The tag knows b's clock from b's packets (:mod:`skyless.clocks.broadcast`), and
+with it when a packet that b sent at ``r - tof`` would have been received:
 
     TDoA = c·[(rx_b + phase_b − rx_a) − (1 + rate_b)·(tof + tx_b − r)]
 
 This is the textbook formula, in which ``phase_b`` is zero, with the noise of ``rx_b`` filtered. As the rate holds
-the tag's own motion, the TDoA is that of the moment at which the tag heard a.
+the tag's own motion, the TDoA is that of the moment at which the tag received a.
 """
 
 from collections import Counter
@@ -22,7 +22,7 @@ from skyless.positioning.masterless.anchor_errors import AnchorFlights, distance
 from skyless.ticks import Unwrapper
 
 PAIR_RELAY_MAX_AGE_S: Final = 0.25
-"""How long ago a relayed packet may have been heard. Older ones cost accuracy, and a 7-bit sequence number recurs."""
+"""Greatest age of a relayed packet. Older ones cost accuracy, and a 7-bit sequence number recurs."""
 
 MOST_ANCHORS: Final = 256
 """Further identifiers are ignored, so that memory stays bounded whatever is on the air."""
@@ -97,7 +97,7 @@ class PairEngine:
         if sender is None:
             clock = BroadcastClock(self._tx_bits, packet.tx_ticks, rx_ticks)
             sender = self._anchors[packet.anchor] = _Anchor(clock)
-        elif not self._follow(sender, packet, rx_ticks):
+        elif not self._update_clock(sender, packet, rx_ticks):
             return []
         remember(sender.packets, packet.sequence, sender.clock.tx_ticks, rx_ticks)
         tdoas = []
@@ -110,7 +110,7 @@ class PairEngine:
                 tdoas.append(PairTdoa(time_s, relay.anchor, packet.anchor, tdoa_m))
         return tdoas
 
-    def _follow(self, sender: _Anchor, packet: Packet, rx_ticks: int) -> bool:
+    def _update_clock(self, sender: _Anchor, packet: Packet, rx_ticks: int) -> bool:
         """Advance the sender's clock; False for a packet that cannot be used."""
         known = sender.packets.get(packet.sequence)
         if known is not None and known[1] == rx_ticks:
@@ -152,7 +152,7 @@ class PairEngine:
         return tdoa_m
 
     def _flight_ticks(self, a: int, b: int, tx_a: int, rx_b: int, carried: float | None) -> float | None:
-        """Time of flight of a pair: what anchors carried, else what two-way ranging gave, else the known distance."""
+        """Time of flight of a pair: as anchors state it, else what two-way ranging gave, else the known distance."""
         flight = self._flights.update(a, b, tx_a, rx_b, carried)
         return distance_ticks(self._anchors_m, a, b) if flight is None else flight
 
@@ -165,7 +165,7 @@ class PairEngine:
         return limit
 
     def _keep_position(self, anchor: int, position_m: Point) -> None:
-        """Keep the position that a packet carries; the limits of the anchor's pairs are worked out anew."""
+        """Keep the position that a packet carries; the limits of the anchor's pairs are computed again."""
         if self._carried_m.get(anchor) != position_m:
             self._carried_m[anchor] = position_m
             self._limits_m = {pair: limit for pair, limit in self._limits_m.items() if anchor not in pair}

@@ -1,10 +1,10 @@
 """The cold start: where the tag is, from packets alone and without a guess.
 
-Wherever anchor i tells when it heard a packet of anchor j that the tag heard as well, the difference of their clocks
-at that moment is known but for noise. Along such links all TX times are carried to the clock of one anchor, unless more
-anchors tell theirs on the master's. The tag's clock runs up to 20 ppm off, so pseudoranges of one superframe drift by
-tens of metres. Two messages of the same anchor tell the drift; then all anchors' newest pseudoranges are carried to one
-time and solved in closed form.
+Wherever anchor i relays when it received a packet of anchor j that the tag received as well, the difference of their
+clocks at that moment is known but for noise. Along such links all TX times are carried to the clock of one anchor,
+unless more anchors state theirs on the master's. The tag's clock runs up to 20 ppm off, so pseudoranges of one
+superframe drift by tens of metres. Two messages of the same anchor give the drift; then all anchors' newest
+pseudoranges are carried to one time and solved in closed form.
 """
 
 from collections import deque
@@ -21,38 +21,38 @@ from skyless.positioning.methods.locate import RESIDUAL_TAIL, NoSolution, locate
 from skyless.positioning.observation import Observation
 
 START_MAX_AGE_S: Final = 0.5
-"""Older messages no longer serve the start, unless superframes are so long; and then only for the rate of the clock, as
+"""Older messages are not used for the start, unless superframes are longer; and then only for the rate of the clock, as
 the tag may be elsewhere by now."""
 
 WIDE_START: Final = 0.05
 """With a standard deviation above this part of the mean range, ranges are not linear in the state: updates would make
-the filter sure of a wrong place. More anchors are waited for, ..."""
+the filter sure of a wrong position. It waits for more anchors, ..."""
 
 START_PATIENCE_S: Final = 0.5
-"""... for so long after the first such start, and four times as long for one wider by four times."""
+"""... for this time after the first such start, and four times as long for one wider by four times."""
 
 CONTRADICTIONS: Final = frozenset({NoFixReason.RESIDUALS, NoFixReason.BAD_GEOMETRY, NoFixReason.NOT_CONVERGED})
-"""What one lying anchor makes of a start; absurd pseudoranges count as bad geometry."""
+"""How a start fails with one faulty anchor; absurd pseudoranges count as bad geometry."""
 
 TAG_SPEED_STD_MPS: Final = 1.0
 """Typical speed of a tag; it smears pseudoranges taken at different times and starts the velocity."""
 
 MAX_SILENCE_S: Final = 5.0
-"""After a longer silence the state says less than a new start would."""
+"""After a longer silence the state is worse than a new start."""
 
 MAX_RELATIVE_STD: Final = 0.05
 """With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
-state: updates would make it confident of a wrong place, so a new start is better."""
+state: updates would make it confident of a wrong position, so a new start is better."""
 
 SLOW_S: Final = 0.2
 SLOW_MAX_RELATIVE_STD: Final = 0.2
-"""Borne in longer superframes, where a new start takes seconds."""
+"""Accepted in longer superframes, where a new start takes seconds."""
 
 SHORT_SILENCE_S: Final = 0.1
 """Over shorter silences no state grows much wider."""
 
 EARLY_S: Final = 1.0
-"""A filter that is lost so soon after its start may have a tag that is faster than assumed; ..."""
+"""A filter that is lost within this time of its start may have a tag that is faster than assumed; ..."""
 
 SPEED_STD_GROWTH: Final = 4.0
 MAX_SPEED_STD_MPS: Final = 32.0
@@ -72,7 +72,7 @@ class _Link(Struct, frozen=True):
 
 
 class _Scale(Struct, frozen=True):
-    """How an anchor's TX times become those of the reference: the sum of links on the way to it."""
+    """How an anchor's TX times become those of the reference: the sum of links on the path to it."""
 
     ticks: int
     fraction_ticks: float
@@ -85,7 +85,7 @@ class Start(Struct, frozen=True):
     """A first position, and the speed that is assumed of the tag."""
 
     used: tuple[Observation, ...]
-    """The messages that it rests on, one of each anchor."""
+    """The messages that it uses, one of each anchor."""
     rx_ticks_tag: int
     solution: Array
     """[position (dim), clock offset], metres."""
@@ -93,7 +93,7 @@ class Start(Struct, frozen=True):
     speed_variance: float
     is_contradicted: bool = False
     """Whether the messages of all anchors contradict each other, ..."""
-    left_out: tuple[int, ...] = ()
+    misfitting: tuple[int, ...] = ()
     """... but not without these, which are not in ``used``."""
 
 
@@ -115,7 +115,7 @@ class Acquisition:
         self._z_bounds_m = z_bounds_m
         self._heard: dict[int, list[Observation]] = {}
         self._is_fast = speed_std_mps > TAG_SPEED_STD_MPS
-        """A tag that is taken for fast: its speed makes a start wide, and more anchors do not help."""
+        """A tag that is assumed to be fast: its speed makes a start wide, and more anchors do not help."""
         self._possible_ticks: int | None = None
         """When a start was first possible."""
         self._contradicted_ticks: int | None = None
@@ -248,7 +248,7 @@ class Acquisition:
             self._contradicted_ticks = now
         results = [self._solve(pairs[:k] + pairs[k + 1 :], now) for k in range(len(pairs))]
         starts = [
-            msgspec.structs.replace(result, is_contradicted=True, left_out=(pairs[k][0].anchor,))
+            msgspec.structs.replace(result, is_contradicted=True, misfitting=(pairs[k][0].anchor,))
             for k, result in enumerate(results)
             if isinstance(result, Start)
         ]
@@ -294,7 +294,7 @@ class Acquisition:
 
 
 def _offset_ticks(observation: Observation) -> tuple[int, float]:
-    """Tag's reading minus the master's TX time: whole ticks and the fraction to take off."""
+    """Tag's reading minus the master's TX time: whole ticks and the fraction to subtract."""
     assert observation.tx_ticks_master is not None
     return observation.rx_ticks_tag - observation.tx_ticks_master, observation.tx_fraction_ticks
 

@@ -42,7 +42,7 @@ COVARIANCE_MARGIN: Final = 4.0
 """Factor on the start's covariance, as the filter is then given the packets that it rests on."""
 
 EARLY_FAULT_S: Final = 2.0
-"""Faults that show so soon after a start, and of whose anchors nothing can be said, have led to a wrong place."""
+"""Faults that show within this time of a start, and whose anchors are not clear, have led to a wrong position."""
 
 UNEXPLAINED_CHI2: Final = 30.0
 """What faults of two anchors leave of the test where there are more."""
@@ -54,27 +54,27 @@ EARLY_NIS: Final = 3.0
 HEIGHT_SIGMAS: Final = 5.0
 """A sensor's height is not wrong by more standard deviations than this, ..."""
 
-MOST_HEIGHTS_REFUSED: Final = 20
+MAX_HEIGHTS_REJECTED: Final = 20
 """... so if this number of them in a row do not fit, it is the position that is wrong."""
 
 CALM_OBSTRUCTION: Final = 0.1
 """Range errors that have jumped more lately make faults of their own; a new start would not help."""
 
 LONGEST_SUPERFRAME_S: Final = 2.0
-"""In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted so far, and each round
-of packets is a start of its own."""
+"""In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted over them, and each
+round of packets is a start of its own."""
 
 LATE_SHARE_KNOWN_S: Final = 0.5
 """By then it is known how often packets are late; a start that was wrong for that reason is repeated."""
 
 OPEN_START_HOLD_S: Final = 1.0
-"""A start with open range errors is not repeated for so long."""
+"""A start with open range errors is not repeated for this time."""
 
 REORDERED_S: Final = 0.1
 """Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
 
 SURELY_IN_REACH_TICKS: Final = from_seconds(SHORT_SILENCE_S) - 1
-"""After such a silence a filter need not be asked."""
+"""Silences up to this need no check of the filter."""
 
 
 class Estimation:
@@ -94,7 +94,7 @@ class Estimation:
             settings = replace(settings, lowest_m=z_bounds_m[0], highest_m=z_bounds_m[1])
         self._settings = settings
         self._height_known = settings.height_m is not None
-        self._asked = IntegrityRequirement(
+        self._requirement = IntegrityRequirement(
             settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2, settings.height_std_m
         )
         self._superframe_s = superframe_s
@@ -112,7 +112,7 @@ class Estimation:
         self._newest_ticks = 0
         self._master_scale = MasterScale()
         self._relays_may_contradict = True
-        self._heights_refused = 0
+        self._heights_rejected = 0
 
     @property
     def estimator(self) -> Estimator:
@@ -160,7 +160,7 @@ class Estimation:
         if self._is_contradicted(rx_ticks):
             self._start = self._new_start()
             return NoFixReason.ACQUIRING
-        self._in_use.use(observation)
+        self._in_use.add(observation)
         return self._fix(observation)
 
     def _try_start(self, starting: Acquisition, observation: Observation) -> Fix | NoFixReason:
@@ -168,7 +168,7 @@ class Estimation:
         start = starting.add(observation)
         if isinstance(start, NoFixReason):
             return start
-        if start.is_contradicted and not start.left_out and self._estimator.is_late_often:
+        if start.is_contradicted and not start.misfitting and self._estimator.is_late_often:
             return NoFixReason.RESIDUALS  # single packets are late: others will not be
         if self._superframe_s > LONGEST_SUPERFRAME_S:
             return self._fix_of(start, observation)
@@ -176,18 +176,18 @@ class Estimation:
         return self._fix(observation)
 
     def update_height(self, height_m: float, std_m: float) -> bool:
-        """Take the tag's height as a sensor tells it, at the newest packet; True if it was used.
+        """Process the tag's height as a sensor measures it, at the newest packet; True if it was used.
 
-        Before a start it narrows where that is looked for. Where many in a row do not fit, the start was wrong.
+        Before a start it bounds the heights of the search. Where many in a row do not fit, the start was wrong.
         """
         if self._start is not None:
             margin_m = HEIGHT_SIGMAS * std_m
             self._start.expect_height(height_m - margin_m, height_m + margin_m)
             return False
         used = self._estimator.process_height(height_m, std_m) == ACCEPTED
-        self._heights_refused = 0 if used else self._heights_refused + 1
-        if self._heights_refused >= MOST_HEIGHTS_REFUSED and not self._height_known:
-            self._heights_refused = 0
+        self._heights_rejected = 0 if used else self._heights_rejected + 1
+        if self._heights_rejected >= MAX_HEIGHTS_REJECTED and not self._height_known:
+            self._heights_rejected = 0
             self._start = self._new_start()
         return used
 
@@ -210,7 +210,7 @@ class Estimation:
         return several and self._speed_std_mps < MAX_SPEED_STD_MPS
 
     def _is_contradicted(self, rx_ticks: int) -> bool:
-        """Whether a new start is needed, as relays or faults contradict this one; says what that has to expect."""
+        """Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect."""
         if self._start_was_contradicted and self._estimator.is_late_often:
             self._open_range_errors = self._start_was_contradicted = (
                 False  # the start was contradicted by single late packets
@@ -232,7 +232,7 @@ class Estimation:
         if not self._relays_may_contradict:
             self._relays_may_contradict = self._estimator.relays_fit
         elif self._estimator.is_contradicted:
-            self._relays_may_contradict = False  # if a new start does not help, the anchors are wrong, not the place
+            self._relays_may_contradict = False  # if a new start does not help, the anchors are wrong, not the position
             return True
         return False
 
@@ -256,14 +256,14 @@ class Estimation:
         return bool(std_m > self._max_relative_std * self._in_use.mean_range_m(position_m))
 
     def _begin(self, start: Start, packets: list[Observation]) -> None:
-        """Begin at the start's position, and give the filter the packets that led there."""
+        """Begin at the start's position, and process the packets that led there."""
         self._start = None
         self._newest_ticks = self._started_ticks = packets[-1].rx_ticks_tag
         self._in_use.begin(start.used)
         dim, begin_ticks = self._estimator.dim, packets[0].rx_ticks_tag
         age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
         is_contradicted = start.is_contradicted and not self._estimator.is_late_often
-        self._is_open = self._open_range_errors or (is_contradicted and not start.left_out)
+        self._is_open = self._open_range_errors or (is_contradicted and not start.misfitting)
         self._start_was_contradicted = self._is_open or is_contradicted
         error = OPEN_RANGE_STD_M if self._start_was_contradicted else self._settings.range_std_m
         inflation = 1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
@@ -280,7 +280,7 @@ class Estimation:
             [
                 self._estimator.anchor_index(packet.anchor, packet.anchor_m)
                 for packet in packets
-                if is_contradicted and packet.anchor in start.left_out
+                if is_contradicted and packet.anchor in start.misfitting
             ],
         )
         for packet in packets:
@@ -299,7 +299,7 @@ class Estimation:
         )
 
     def _listed(self, observation: Observation) -> list[list[int]]:
-        """Relays of anchors that are known, as the estimator takes them."""
+        """Relays of anchors that are known, in the form of the estimator."""
         index_of, rows = self._estimator.index_of, []
         for anchor, sequence, rx_ticks in observation.relays:
             sender = index_of.get(anchor)
@@ -308,7 +308,7 @@ class Estimation:
         return rows
 
     def _report(self, observation: Observation) -> Report:
-        """What the anchor says of its clock against the master's."""
+        """What the anchor reports of its clock against the master's."""
         master_term, variance_m2 = observation.master_term, observation.tx_variance_m2
         if master_term is None or variance_m2 <= 0.0:
             return NO_REPORT
@@ -328,7 +328,7 @@ class Estimation:
         rx_ticks, in_use = observation.rx_ticks_tag, self._in_use
         time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
         return Fix(
-            time_s, rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", self._height_known, 1, self._asked
+            time_s, rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", self._height_known, 1, self._requirement
         )
 
     def _fix(self, observation: Observation) -> Fix | NoFixReason:
@@ -338,7 +338,9 @@ class Estimation:
         rx_ticks = observation.rx_ticks_tag
         time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
         # in the order of the fields: with their names it takes as long as all the rest
-        return Fix(time_s, estimator.rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", known, 1, self._asked)
+        return Fix(
+            time_s, estimator.rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", known, 1, self._requirement
+        )
 
 
 # Anchors in use
@@ -349,7 +351,7 @@ LEAST_IN_USE_S: Final = 0.1
 
 
 class AnchorsInUse:
-    """The anchors whose messages were accepted of late; their list is made anew only when it changes."""
+    """The anchors whose messages were accepted lately; their list is made again only when it changes."""
 
     def __init__(self, superframe_s: float) -> None:
         self._in_use_s = max(LEAST_IN_USE_S, 1.5 * superframe_s)
@@ -366,10 +368,10 @@ class AnchorsInUse:
         self._used.clear()
         self.extent_m = 0.0
         for observation in observations:
-            self.use(observation)
+            self.add(observation)
 
-    def use(self, observation: Observation) -> None:
-        """Take an accepted message."""
+    def add(self, observation: Observation) -> None:
+        """Add an accepted message."""
         now = observation.rx_ticks_tag
         changed = observation.anchor not in self._used
         self._used[observation.anchor] = observation
@@ -394,16 +396,16 @@ class AnchorsInUse:
 
 
 FARTHEST_LENGTHS: Final = 16
-"""Lines go on for so many times their length."""
+"""Lines are extended by this number of times their length."""
 
 MISFIT_SUBTICKS: Final = 64
-"""By which a master's packets may lie off the line: roundings, carried so far."""
+"""By which a master's packets may lie off the line: roundings, extended that far."""
 
-SUBTICKS_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
+SITE_TIME_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
 
 
 class MasterScale:
-    """The master's own counter against the site's time, which it may lead on at another rate than its own."""
+    """The master's own counter against the site's time, which it may continue at another rate than its own."""
 
     def __init__(self) -> None:
         self._master_term: object = None
@@ -411,7 +413,7 @@ class MasterScale:
         """Site time in subticks and its lead on the master's counter, of the first and the last packet of the term."""
 
     def update(self, observation: Observation) -> None:
-        """Learn from a packet of the master."""
+        """Process a packet of the master."""
         master_term = observation.master_term
         if master_term is None or observation.anchor != master_term.master:
             return
@@ -430,7 +432,7 @@ class MasterScale:
             return None
         site = ticks * SUBTICKS + round(observation.tx_fraction_ticks * SUBTICKS)
         lead = self._lead(site)
-        return None if lead is None else (lead - site + observation.tx_ticks_anchor * SUBTICKS) & SUBTICKS_MASK
+        return None if lead is None else (lead - site + observation.tx_ticks_anchor * SUBTICKS) & SITE_TIME_MASK
 
     def _lead(self, site: int) -> int | None:
         """Lead of the site's time on the master's counter, on a straight line; None too far from what is known."""

@@ -7,10 +7,10 @@ d_i = |x − a_i| − ρ, squaring ρ + d_i = |x − a_i| leaves equations that 
 
 *Spherical intersection* solves them for x as a function of ρ, and |x|² = ρ² is then a quadratic with two roots;
 *spherical interpolation* takes ρ as one more unknown (H. C. Schau and A. Z. Robinson 1987; J. O. Smith and
-J. S. Abel 1987). Anchors in one plane contain nothing of the coordinate w across it except w² = ρ² − x² − y².
+J. S. Abel 1987). Anchors in one plane determine nothing of the coordinate w across it except w² = ρ² − x² − y².
 
 From there Gauss–Newton steps, damped after Levenberg and Marquardt where they fail, lead to the minima, which are then
-told apart, unfolded from a plane, and decided between by the height's bounds.
+distinguished, unfolded from a plane, and decided between by the height's bounds.
 """
 
 import math
@@ -325,15 +325,15 @@ def _residuals_too_large(chi2: float) -> NoSolution:
 
 
 def _decide(problem: Problem, minima: list[Minimum], z_bounds_m: tuple[float, float] | None) -> Solution | NoSolution:
-    """Choose among rivals by the height's bounds, and refuse what is not resolved."""
+    """Choose among rivals by the height's bounds, and reject what is not resolved."""
     positions = [problem.origin + problem.axes.T @ minimum.state for minimum in minima]
     covariances = [problem.axes.T @ minimum.covariance @ problem.axes for minimum in minima]
     chosen = 0
     if len(minima) > 1:
         decided = _by_height(positions, covariances, z_bounds_m)
         if decided is None:
-            places = " and ".join("({:.2f}, {:.2f}, {:.2f}) m".format(*p) for p in positions[:2])
-            return NoSolution(NoFixReason.MIRROR, f"{places} explain the measurements equally well")
+            rivals = " and ".join("({:.2f}, {:.2f}, {:.2f}) m".format(*p) for p in positions[:2])
+            return NoSolution(NoFixReason.MIRROR, f"{rivals} explain the measurements equally well")
         chosen = decided
     minimum, covariance = minima[chosen], covariances[chosen]
     distance = float(np.abs(minimum.state).sum())
@@ -438,9 +438,9 @@ def _square_across(solution: Array) -> float:
 
 
 def _intersections(anchors: Array, tdoa: Array, known: Array, height: float) -> list[Array]:
-    """The points x = u − v·ρ for each non-negative root ρ of |x|² = ρ², with the height beside two coordinates.
+    """The points x = u − v·ρ for each non-negative root ρ of |x|² = ρ², with the height besides two coordinates.
 
-    Where noise leaves no real root, the vertex of the parabola is taken. The roots' form does not cancel.
+    Where noise leaves no real root, the vertex of the parabola is used. The roots' form does not cancel.
     """
     points = []
     for solution in _solved(anchors, np.column_stack([known, tdoa])):
@@ -547,15 +547,15 @@ def descend(
                 return UNDETERMINED, iteration
             damping = max(10.0 * damping, FIRST_DAMPING)
             continue
-        promised, longest = 0.0, 0.0
+        predicted, longest = 0.0, 0.0
         for j in range(dims):
             trial[j] = state[j] + step[j]
-            promised += step[j] * (normal[dims, j] + damping * normal[j, j] * step[j])
+            predicted += step[j] * (normal[dims, j] + damping * normal[j, j] * step[j])
             longest = max(longest, abs(step[j]) / scale[j])
-        small = longest <= STEP_TOLERANCE or promised <= GAIN_TOLERANCE * cost
+        small = longest <= STEP_TOLERANCE or predicted <= GAIN_TOLERANCE * cost
         next_cost = _assemble(anchors, tdoa, trial, kind, whitener, system, next_normal)
         if next_cost < cost:
-            damping, growth = _eased(damping, (cost - next_cost) / max(promised, 1e-300)), 2.0
+            damping, growth = _eased(damping, (cost - next_cost) / max(predicted, 1e-300)), 2.0
             cost, normal, next_normal = next_cost, next_normal, normal
             state[:] = trial
         else:
@@ -571,7 +571,7 @@ def descend(
 
 @part
 def _eased(damping: float, ratio: float) -> float:
-    """Next damping after a success, by the ratio of what it gained to what was promised (H. B. Nielsen 1999)."""
+    """Next damping after a success, by the ratio of what it gained to what was predicted (H. B. Nielsen 1999)."""
     if ratio < 0.5:
         damping = max(damping, FIRST_DAMPING)
     eased = damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
@@ -600,7 +600,7 @@ def _assess(problem: Problem, system: Array, state: Array, iterations: int) -> l
 
 
 def _same(one: Array, other: Array, scale: Array) -> bool:
-    """Whether two iterations ended in one place; a millionth of the extent is far above their tolerance."""
+    """Whether two iterations ended in one point; a millionth of the extent is far above their tolerance."""
     apart = np.abs(one - other)[: len(scale)] / scale
     return bool(apart.sum() < 1e-6)
 
@@ -626,7 +626,7 @@ def below_plane(minimum: Minimum) -> float:
 
 
 def unfold(minimum: Minimum) -> list[Minimum]:
-    """From s = w² to w: the two images, or one in the plane where s cannot be told from 0."""
+    """From s = w² to w: the two images, or one in the plane where s cannot be distinguished from 0."""
     s, variance = float(minimum.state[2]), float(minimum.covariance[2, 2])
     sigma = math.sqrt(variance)
     if s < MERGED_SIGMAS * sigma:
@@ -655,7 +655,7 @@ def mean_if_positive(mean: float, sigma: float) -> float:
 
 
 MOST_INFLATION: Final = 1e12
-"""An unknown whose variance the others inflate by more is not determined: what tells it from them is rounding noise."""
+"""An unknown whose variance the others inflate by more is not determined: the difference is rounding noise."""
 
 _RIDGE: Final = 1e-14
 """Part of the diagonal that is added to it, so that LAPACK meets no matrix that is exactly singular."""

@@ -28,7 +28,7 @@ class Observer:
         """The master's time and the tag's, both unwrapped, when they were compared last."""
 
     def forget(self) -> None:
-        """Start anew."""
+        """Start again."""
         self._scale = None
 
     def set_master(self, master: int | None, master_slot: int) -> None:
@@ -36,7 +36,7 @@ class Observer:
         self._master, self._master_slot = master, master_slot
 
     def set_method(self, method: Method, schedule: Schedule) -> None:
-        """Make what this method asks for."""
+        """Make observations with what this method needs."""
         self._schedule = schedule
         self._needs_relays = method.needs_relays
 
@@ -81,27 +81,27 @@ class Observer:
     def _master_time(self, beacon: Beacon, rx_ticks: int) -> tuple[int | None, float, float]:
         """TX time on the master's scale: unwrapped whole ticks, fraction, variance in m².
 
-        Only the master, and anchors that agree with what was heard before, lead the scale on.
+        Only the master, and anchors that agree with what was received before, continue the scale.
         """
         time, scale = beacon.master_time, self._scale
         if time is None:
             return None, 0.0, 0.0
         subticks = time.tx_subticks_master
         whole = subticks >> 8
-        follow = scale is None or beacon.anchor == self._master
+        updates = scale is None or beacon.anchor == self._master
         if scale is not None:
             elapsed = rx_ticks - scale[1]
             expected = scale[0] + elapsed
             least = expected - HALF_WRAP_TICKS
             whole = least + ((whole - least) & TICK_MASK)
-            follow = follow or abs(whole - expected) <= MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS
-        if follow:
+            updates = updates or abs(whole - expected) <= MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS
+        if updates:
             self._scale = (whole, rx_ticks)
         return whole, (subticks & 0xFF) / 256.0, (time.std_ticks * TICK_M) ** 2
 
 
 def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[None, None]:
-    """Sequence number and unwrapped RX stamp of what the sender of a beacon heard before that."""
+    """Sequence number and unwrapped RX stamp of what the sender of a beacon received before that."""
     return (None, None) if heard is None else (heard.sequence, nearest(heard.rx_ticks, tx_ticks))
 
 
@@ -109,10 +109,10 @@ def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[Non
 
 
 STAMPS_BEFORE_RESTART: Final = 3
-"""So many impossible stamps of one anchor in a row mean that its counter has started anew."""
+"""This number of impossible stamps of one anchor in a row mean that its counter has restarted."""
 
 MOST_TRACKS: Final = 256
-"""More anchors than a site can have; with more identifiers on the air, that heard longest ago is forgotten."""
+"""More anchors than a site can have; with more identifiers on the air, that received longest ago is forgotten."""
 
 NOISE_TICKS: Final = 64
 """0.3 m allow for the noise of two stamps."""
@@ -128,16 +128,16 @@ class _Track(Struct):
 
 
 class AnchorStamps:
-    """Follows every anchor's counter by the tag's own; counts what it refuses in ``counters``."""
+    """Unwraps every anchor's counter along the tag's own; counts what it rejects in ``counters``."""
 
     def __init__(self, counters: Counter[str]) -> None:
         self._counters = counters
         self._tracks: dict[int, _Track] = {}
         self.newest_rx_ticks: int | None = None
-        """RX stamp of the newest frame that was taken, unwrapped: one impossible stamp must not make others late."""
+        """RX stamp of the newest accepted frame, unwrapped: one impossible stamp must not make others late."""
 
     def forget(self) -> None:
-        """Start anew."""
+        """Start again."""
         self._tracks.clear()
         self.newest_rx_ticks = None
 
@@ -203,7 +203,7 @@ MAX_VARIANCE_FACTOR: Final = 36.0
 def variance_factor(rx_power_dbm: float | None, first_path_power_dbm: float | None) -> float:
     """Factor on the variance of a reception, from 1 to ``MAX_VARIANCE_FACTOR``; it grows with the powers' difference.
 
-    What is not told, not finite or impossible (a first path above the total) says nothing: the factor is then 1.
+    Where a power is missing, not finite or impossible (a first path above the total) the factor is 1.
     """
     if rx_power_dbm is None or first_path_power_dbm is None:
         return 1.0
@@ -222,7 +222,7 @@ FLIGHT_SLACK_TICKS: Final = from_seconds(1e-6)
 
 
 class FixTime:
-    """Counts from the first fix of a receiver and never goes back, whatever becomes of master and method."""
+    """Counts from the first fix of a receiver and never goes back, also where master or method change."""
 
     def __init__(self) -> None:
         self._first_ticks_master: int | None = None

@@ -121,7 +121,7 @@ def bracketed_tdoa(
 ) -> float:
     """TDoA in ticks against the master's second message, which the anchor's two enclose (``docs/maths.md`` section 5).
 
-    The anchor's own RX stamp of that message says where between its two transmissions it was sent; no
+    The anchor's own RX stamp of that message shows where between its two transmissions it was sent; no
     synchronisation parameter enters but the rate that scales the flight time.
     """
     rate = float(s2 - s1) / float(m2 - m1)
@@ -277,7 +277,7 @@ class Snapshots:
 
 
 def _synchronised(first: Observation, second: Observation, reference: tuple[Observation, Observation]) -> bool:
-    """Whether the anchor heard, before its two frames, the very master frames that the tag heard, and its clock ran."""
+    """Whether anchor and tag received the same two master frames, and no clock jumped in between."""
     return (
         first.anchor != reference[0].anchor
         and first.master_rx_ticks_anchor is not None
