@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.dashboard.overlay_process import overlay_grids
-from skyless.dashboard.overlays import MOST_CELLS, NoOverlayError, Overlays, levels, overlay_task
+from skyless.dashboard.overlays import MAX_CELLS, NoOverlayError, Overlays, levels, overlay_task
 from skyless.method_names import DEFAULT_METHOD, METHODS
 from skyless.planning.columns import HDOP, PDOP, SIGMA
 from skyless.planning.predict import PlanSettings, Predictor
@@ -34,7 +34,7 @@ def test_the_grid_covers_the_floor_plan_too():
 def test_a_large_hall_gets_a_coarser_grid_and_every_grid_is_bounded():
     anchors = tuple(replace(anchor, x_m=anchor.x_m * 100.0, y_m=anchor.y_m * 100.0) for anchor in LAB.anchors)
     task = overlay_task(replace(LAB, anchors=anchors), None, "joint", 0.25)
-    assert task.columns * task.rows <= MOST_CELLS
+    assert task.columns * task.rows <= MAX_CELLS
     assert task.step_m == 5.0
 
 

@@ -7,9 +7,9 @@ import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, fix, truth
 from starlette.testclient import TestClient
 
-from skyless.dashboard.app import Parts, make_app
-from skyless.dashboard.guard import Rules
-from skyless.dashboard.live import Live
+from skyless.dashboard.app import Services, make_app
+from skyless.dashboard.guard import AccessRules
+from skyless.dashboard.live import LiveSite
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.mqtt import topics
@@ -136,9 +136,9 @@ def test_a_recording_replaced_by_another_is_read_anew(folder):
 
 
 def test_the_server_gives_recordings(folder):
-    live = Live("here", "mqtt://broker:1")
+    live = LiveSite("here", "mqtt://broker:1")
     live.attach(Wire(), SITE_ID)
-    app = make_app(Parts(live, Overlays(), Playback(folder)), Rules())
+    app = make_app(Services(live, Overlays(), Playback(folder)), AccessRules())
     browser = TestClient(app, base_url="http://localhost")
     (listed,) = browser.get("/api/recordings").json()
     assert listed.keys() == {"name", "bytes", "start_unix_s", "duration_s", "complete"}
