@@ -14,10 +14,10 @@ const HEIGHT = 96;
 
 export class Chart {
   /**
-   * @param {string} title what is shown, with its unit
+   * @param {string} title the quantity, with its unit
    * @param {Array<{name: string, colour: string, steps?: boolean}>} series colours are names of the palette
-   * @param {(value: number) => string} write how values are written
-   * @param {{whole?: boolean, least?: number, zero?: boolean}} options whole numbers only; least span of y; from zero
+   * @param {(value: number) => string} write formats values
+   * @param {{whole?: boolean, span?: number, zero?: boolean}} options whole numbers only; minimum span of y; from zero
    */
   constructor(title, series, write, options = {}) {
     this.series = series;
@@ -63,7 +63,7 @@ export class Chart {
     this.plot = new uPlot(this.settings(), this.data, this.box);
   }
 
-  /** How a mark of the axis is written: without zeros that say nothing. */
+  /** Label of a mark on the axis, without trailing zeros. */
   tick(value) {
     return this.write(value).replace(/[.]0+(?=\D|$)/, "");
   }
@@ -75,11 +75,11 @@ export class Chart {
       ticks: { show: false },
       font: "10px system-ui, sans-serif",
     };
-    const { whole, least = 0, zero } = this.options;
+    const { whole, span = 0, zero } = this.options;
     const range = (_plot, low, high) => {
-      if (low === null || high === null || low === undefined) return [0, least || 1];
+      if (low === null || high === null || low === undefined) return [0, span || 1];
       const bottom = zero ? 0 : low;
-      const spare = Math.max(least - (high - bottom), 0.12 * (high - bottom), 1e-9);
+      const spare = Math.max(span - (high - bottom), 0.12 * (high - bottom), 1e-9);
       return [zero ? 0 : bottom - spare / 2, high + spare / (zero ? 1 : 2)];
     };
     return {

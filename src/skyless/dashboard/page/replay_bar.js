@@ -1,4 +1,4 @@
-/** The bar under the map while a recording is replayed. */
+/** The bar below the map while a recording is replayed. */
 
 import { on, state } from "./store.js";
 import { byId, h, s, text } from "./dom.js";

@@ -18,14 +18,14 @@ let dragged = null;
 
 /** @param {HTMLElement} target the focusable element over the canvases */
 export function listen(target, redraw, fitAll) {
-  const place = (event) => {
+  const pixel = (event) => {
     const box = target.getBoundingClientRect();
     return { x: event.clientX - box.left, y: event.clientY - box.top };
   };
   target.addEventListener("pointerdown", (event) => {
     if (event.button > 0) return;
     target.setPointerCapture(event.pointerId);
-    const at = place(event);
+    const at = pixel(event);
     pointers.set(event.pointerId, at);
     if (pointers.size > 1) return;
     travelled = 0;
@@ -33,7 +33,7 @@ export function listen(target, redraw, fitAll) {
     if (dragged) dragged.before = state.zones;
   });
   target.addEventListener("pointermove", (event) => {
-    const at = place(event);
+    const at = pixel(event);
     hover(at, event.pointerType);
     const before = pointers.get(event.pointerId);
     if (!before) return;
@@ -47,7 +47,7 @@ export function listen(target, redraw, fitAll) {
   const release = (event) => {
     if (!pointers.delete(event.pointerId) || pointers.size) return;
     if (dragged && travelled >= STILL) storeShown(dragged.before);
-    else if (event.type === "pointerup" && travelled < STILL) tap(place(event));
+    else if (event.type === "pointerup" && travelled < STILL) tap(pixel(event));
     dragged = null;
   };
   target.addEventListener("pointerup", release);
@@ -58,7 +58,7 @@ export function listen(target, redraw, fitAll) {
     "wheel",
     (event) => {
       event.preventDefault();
-      const at = place(event);
+      const at = pixel(event);
       zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), at.x, at.y);
       redraw(true);
     },
@@ -143,7 +143,7 @@ function drawingKey(event) {
   else return false;
   const [x_m, y_m] = editor.cursor ?? at;
   const corners = `${editor.points.length} corner${editor.points.length === 1 ? "" : "s"}`;
-  text(byId("said"), editor.drawing ? `x ${metres(x_m)}, y ${metres(y_m)}, ${corners}` : "Drawing ended");
+  text(byId("announcement"), editor.drawing ? `x ${metres(x_m)}, y ${metres(y_m)}, ${corners}` : "Drawing finished");
   changed("editor");
   return true;
 }

@@ -1,6 +1,6 @@
 /**
- * Trails on a canvas of their own, which is drawn a few times a second: their strokes are what costs most without a
- * graphics card. What has come since is a short stub that is drawn with the tag.
+ * Trails on a separate canvas, which is drawn a few times a second: without a graphics card their strokes cost most.
+ * The part since then is a short stub that is drawn with the tag.
  */
 
 import { faint } from "../theme.js";
@@ -13,13 +13,13 @@ const MANY_MS = 330;
 const CROWD = 40;
 /** Points nearer than this to the last one are left out, in pixels. */
 const NEAR = 2.5;
-/** Over a longer silence no line is drawn. */
+/** Over a longer gap no line is drawn. */
 const GAP_S = 1;
 
 let drawn_s = NaN;
 let strength = 0.4;
 
-/** Whether the trails are due for so many tags. */
+/** Whether the trails are due, for a number of tags. */
 export function due(since_ms, count) {
   return since_ms > (count > CROWD ? MANY_MS : FEW_MS);
 }
@@ -31,7 +31,7 @@ export function drawTrails(context, seen, shown, length_s) {
   for (const one of seen) path(context, one, px(one.row[X]), py(one.row[Y]), shown, shown - length_s);
 }
 
-/** Draw what a trail has grown since `drawTrails`, up to the tag. */
+/** Draw a trail from the last `drawTrails` to the tag. */
 export function drawStub(context, one, shown) {
   path(context, one, px(one.row[X]), py(one.row[Y]), shown, Math.min(drawn_s, shown) - 0.15);
 }
