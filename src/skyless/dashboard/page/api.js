@@ -1,7 +1,7 @@
 /** Requests to the server, relative to the page's own address. */
 
 /** Fetch JSON; throws an Error with the server's message. */
-export async function fetchJson(path, options = {}) {
+async function fetchJson(path, options = {}) {
   let answer;
   try {
     answer = await fetch(new URL(path, document.baseURI), { cache: "no-store", ...options });

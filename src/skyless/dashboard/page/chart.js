@@ -17,12 +17,13 @@ export class Chart {
    * @param {string} title the quantity, with its unit
    * @param {Array<{name: string, colour: string, steps?: boolean}>} series colours are names of the palette
    * @param {(value: number) => string} write formats values
-   * @param {{whole?: boolean, span?: number, zero?: boolean}} options whole numbers only; minimum span of y; from zero
+   * @param {number} span minimum of y's range
+   * @param {{zero?: boolean, whole?: boolean}} options whether y starts at zero, and whether its marks are whole numbers
    */
-  constructor(title, series, write, options = {}) {
+  constructor(title, series, write, span, { zero = true, whole = false } = {}) {
     this.series = series;
     this.write = write;
-    this.options = options;
+    this.axis = { span, zero, whole };
     this.plot = null;
     this.data = [[], ...series.map(() => [])];
     this.value = h("output", {});
@@ -75,9 +76,9 @@ export class Chart {
       ticks: { show: false },
       font: "10px system-ui, sans-serif",
     };
-    const { whole, span = 0, zero } = this.options;
+    const { span, zero, whole } = this.axis;
     const range = (_plot, low, high) => {
-      if (low === null || high === null || low === undefined) return [0, span || 1];
+      if (low === null || high === null || low === undefined) return [0, span];
       const bottom = zero ? 0 : low;
       const spare = Math.max(span - (high - bottom), 0.12 * (high - bottom), 1e-9);
       return [zero ? 0 : bottom - spare / 2, high + spare / (zero ? 1 : 2)];
@@ -93,8 +94,8 @@ export class Chart {
       axes: [
         {
           ...axis,
-          size: 18,
-          gap: 2,
+          size: 20,
+          gap: 6,
           values: (_plot, marks) => marks.map((mark) => `${mark || "now"}`.replace("-", "−")),
         },
         {

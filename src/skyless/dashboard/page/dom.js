@@ -26,6 +26,13 @@ export function s(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** A list of options, pairs of value and words; calls `choose` with the value of the one that is chosen. */
+export function options(properties, pairs, choose) {
+  const list = h("select", properties, ...pairs.map(([value, words]) => h("option", { value }, words)));
+  list.addEventListener("change", () => choose(list.value));
+  return list;
+}
+
 /** Set a node's text where it differs, which avoids needless layout. */
 export function text(element, value) {
   if (element.textContent !== value) element.textContent = value;

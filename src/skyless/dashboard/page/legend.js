@@ -1,7 +1,7 @@
 /** The meaning of the map's marks, and switches for its layers. */
 
 import { changed, on, saveSetting, savedSetting, state } from "./store.js";
-import { byId, h, text } from "./dom.js";
+import { byId, h, options, text } from "./dom.js";
 import { DELAY_S, GONE_S, GREY_S, stillMotion } from "./clock.js";
 import { length, number } from "./format.js";
 import { CONDITIONS, anchorMark } from "./map/anchors.js";
@@ -12,7 +12,7 @@ const KEY = "skyless-legend";
 const SWITCHES = {
   names: `Names (with more than ${NAMED} tags, only the selected one)`,
   ellipses: "Ellipse of 95 % of the errors, by the tag's reported σ",
-  levels: "Protection level, a dashed circle: the risk that the tag is outside is below the tag's limit",
+  levels: "Protection level, a dashed circle: the tag is outside with at most the configured probability",
   truth: "True position, a faint ring (simulated sites)",
 };
 
@@ -42,25 +42,17 @@ function switchFor([key, words]) {
 }
 
 function trails() {
-  const lengths = [0, 5, 15, 60];
-  const list = h(
-    "select",
-    { id: "trail-length" },
-    ...lengths.map((value) => h("option", { value }, value ? `${value} s` : "off")),
-  );
-  list.value = String(state.options.trails);
-  list.addEventListener("change", () => {
-    state.options.trails = Number(list.value);
+  const lengths = [0, 5, 15, 60].map((value) => [value, value ? `${value} s` : "off"]);
+  const list = options({ id: "trail-length" }, lengths, (value) => {
+    state.options.trails = Number(value);
     changed("options");
   });
+  list.value = String(state.options.trails);
   return h("label", { class: "choice" }, "Trails", list);
 }
 
 function overlays() {
-  const list = h("select", { id: "overlay" });
-  for (const [value, words] of Object.entries(KINDS)) list.append(h("option", { value }, words));
-  list.addEventListener("change", () => choose(list.value));
-  return h("label", { class: "choice" }, "Overlay", list);
+  return h("label", { class: "choice" }, "Overlay", options({ id: "overlay" }, Object.entries(KINDS), choose));
 }
 
 function scale() {

@@ -29,7 +29,7 @@ export const state = {
   health: { anchors: new Map(), tags: new Map(), ether: null, nodes: [], atMs: 0 },
   /** @type {any[]|null} */
   recordings: null,
-  /** @type {any} what `player.js` plays */
+  /** @type {any} the recording that `player.js` plays */
   player: null,
   selection: { tag: null, anchor: null, zone: null },
   options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none" },

@@ -20,8 +20,8 @@ export function start() {
   for (const [key, tab] of Object.entries(TABS)) {
     const button = { type: "button", role: "tab", id: `tab-${key}`, "aria-controls": `panel-${key}` };
     byId("tabs").append(h("button", { ...button, onclick: () => open(key) }, tab.title));
-    const about = { role: "tabpanel", id: `panel-${key}`, class: "tab-panel", "aria-labelledby": `tab-${key}` };
-    const panel = h("div", { ...about, tabindex: "0" });
+    const attributes = { role: "tabpanel", id: `panel-${key}`, class: "tab-panel", "aria-labelledby": `tab-${key}` };
+    const panel = h("div", { ...attributes, tabindex: "0" });
     byId("panels").append(panel);
     tab.start(panel);
     on(

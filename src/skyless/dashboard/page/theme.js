@@ -25,7 +25,7 @@ const TAGS = 8;
 export const palette = { tags: [] };
 
 /** Whether the page is dark. */
-export function isDark() {
+function isDark() {
   const chosen = document.documentElement.dataset.theme;
   return chosen ? chosen === "dark" : system.matches;
 }

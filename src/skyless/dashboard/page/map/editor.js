@@ -15,7 +15,7 @@ function snap([x, y]) {
   return [x, y].map((value) => Number((Math.round(value / SNAP_M) * SNAP_M).toFixed(3)));
 }
 
-/** Begin a new zone; with `at`, the keyboard's cursor stands there. */
+/** Begin a new zone; with `at`, the keyboard's cursor starts there. */
 export function begin(at = null) {
   if (state.mode !== "live") return toast("Zones can be drawn on the live site only.");
   select(null);

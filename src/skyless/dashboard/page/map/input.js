@@ -9,8 +9,9 @@ import { drawn } from "./tags.js";
 import { pan, px, py, toSite, view, zoom } from "./view.js";
 import { inside } from "./zones.js";
 
-const NEAR = 14;
-const STILL = 6;
+/** Distances in pixels: a pointer hits an item, and a press is no drag. */
+const HIT = 14;
+const MAX_TAP_TRAVEL = 6;
 /** @type {Map<number, {x: number, y: number}>} */
 const pointers = new Map();
 let travelled = 0;
@@ -39,15 +40,16 @@ export function listen(target, redraw, fitAll) {
     if (!before) return;
     if (pointers.size === 2) pinch(event.pointerId, before, at);
     else if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
-    else if (travelled + Math.hypot(at.x - before.x, at.y - before.y) >= STILL) pan(at.x - before.x, at.y - before.y);
+    else if (travelled + Math.hypot(at.x - before.x, at.y - before.y) >= MAX_TAP_TRAVEL)
+      pan(at.x - before.x, at.y - before.y);
     travelled += Math.hypot(at.x - before.x, at.y - before.y);
     pointers.set(event.pointerId, at);
     redraw(true);
   });
   const release = (event) => {
     if (!pointers.delete(event.pointerId) || pointers.size) return;
-    if (dragged && travelled >= STILL) storeShown(dragged.before);
-    else if (event.type === "pointerup" && travelled < STILL) tap(pixel(event));
+    if (dragged && travelled >= MAX_TAP_TRAVEL) storeShown(dragged.before);
+    else if (event.type === "pointerup" && travelled < MAX_TAP_TRAVEL) tap(pixel(event));
     dragged = null;
   };
   target.addEventListener("pointerup", release);
@@ -78,7 +80,7 @@ function pinch(moved, before, at) {
   const middle = { x: (at.x + other.x) / 2, y: (at.y + other.y) / 2 };
   pan((at.x - before.x) / 2, (at.y - before.y) / 2);
   if (apart > 1) zoom(Math.hypot(at.x - other.x, at.y - other.y) / apart, middle.x, middle.y);
-  travelled += STILL;
+  travelled += MAX_TAP_TRAVEL;
 }
 
 function tap({ x, y }) {
@@ -98,7 +100,7 @@ function tap({ x, y }) {
 }
 
 function near(x1, y1, x2, y2) {
-  return Math.hypot(x1 - x2, y1 - y2) <= NEAR;
+  return Math.hypot(x1 - x2, y1 - y2) <= HIT;
 }
 
 function cornerAt({ x, y }) {

@@ -88,27 +88,16 @@ function makeDetail() {
     "MQTT",
     "Other counters",
   ]);
-  const offsets = new Chart(
-    "Change of clock offset (µs)",
-    [{ name: "offset", colour: "accent" }],
-    (v) => number(v, 1),
-    {
-      span: 1,
-    },
-  );
-  const rates = new Chart(
-    "Clock rate relative to the master (ppm)",
-    [{ name: "rate", colour: "warn" }],
-    (v) => number(v, 3),
-    { span: 0.01 },
-  );
-  const sigmas = new Chart("σ of the clock offset (mm)", [{ name: "σ", colour: "good" }], (v) => number(v, 1), {
-    zero: true,
-    span: 1,
-  });
+  const tenths = (value) => number(value, 1);
+  const thousandths = (value) => number(value, 3);
+  const around = { zero: false };
+  const offsets = new Chart("Change of clock offset (µs)", [{ name: "offset", colour: "accent" }], tenths, 1, around);
+  const rate = { name: "rate", colour: "warn" };
+  const rates = new Chart("Clock rate relative to the master (ppm)", [rate], thousandths, 0.01, around);
+  const sigmas = new Chart("σ of the clock offset (mm)", [{ name: "σ", colour: "good" }], tenths, 1);
   const charts = h("div", {}, offsets.element, rates.element, sigmas.element);
-  const about = { class: "detail", "aria-label": "Selected anchor", hidden: true };
-  const element = h("section", about, heading, list.element, charts);
+  const attributes = { class: "detail", "aria-label": "Selected anchor", hidden: true };
+  const element = h("section", attributes, heading, list.element, charts);
   const showDetail = (id) => {
     const health = healthOf(id);
     element.hidden = !health;

@@ -91,25 +91,13 @@ function makeDetail() {
     "CPU",
     "Memory",
   ]);
-  const sigmaSeries = { name: "σ", colour: "accent" };
-  const errors = new Chart("Error and reported σ", [{ name: "error", colour: "bad" }, sigmaSeries], length, {
-    zero: true,
-    span: 0.02,
-  });
-  const sigmas = new Chart("Reported σ", [sigmaSeries], length, { zero: true, span: 0.02 });
-  const rates = new Chart("Fixes per second", [{ name: "rate", colour: "good", steps: true }], number, {
-    zero: true,
-    span: 4,
-  });
-  const used = new Chart("Anchors used", [{ name: "anchors", colour: "accent", steps: true }], number, {
-    whole: true,
-    zero: true,
-    span: 4,
-  });
-  const chi2 = new Chart("Residuals (χ² of each fix)", [{ name: "χ²", colour: "warn" }], (v) => number(v, 1), {
-    zero: true,
-    span: 1,
-  });
+  const sigma = { name: "σ", colour: "accent" };
+  const errors = new Chart("Error and reported σ", [{ name: "error", colour: "bad" }, sigma], length, 0.02);
+  const sigmas = new Chart("Reported σ", [sigma], length, 0.02);
+  const rates = new Chart("Fixes per second", [{ name: "rate", colour: "good", steps: true }], number, 4);
+  const anchors = { name: "anchors", colour: "accent", steps: true };
+  const used = new Chart("Anchors used", [anchors], number, 4, { whole: true });
+  const chi2 = new Chart("Residuals (χ² of each fix)", [{ name: "χ²", colour: "warn" }], (v) => number(v, 1), 1);
   const element = h(
     "section",
     { class: "detail", "aria-label": "Selected tag", hidden: true },
