@@ -91,14 +91,14 @@ def test_the_own_machine_may_call_it_by_any_of_its_names(browser, host):
 @pytest.mark.parametrize(
     "host", ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "192.168.1.5", "[::2]", "", "a b", "@"]
 )
-def test_a_rebound_name_is_turned_away(browser, host):
+def test_a_rebound_name_is_refused(browser, host):
     assert browser.get("/", headers={"host": host}).status_code == 421
     with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET, headers={"host": host}):
         pass
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:9999", "file://", "http://[bad"])
-def test_other_sites_pages_are_turned_away(browser, origin):
+def test_other_sites_pages_are_refused(browser, origin):
     assert browser.get("/api/recordings", headers={"origin": origin}).status_code == 403
     assert browser.put("/api/zones", json={"zones": []}, headers={"origin": origin}).status_code == 403
     with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET, headers={"origin": origin}):
@@ -231,7 +231,7 @@ def test_there_is_an_end_to_the_number_of_pages(browser, live):
     assert len(live.pages) == MAX_PAGES
 
 
-def test_hello_tells_the_site(browser, live):
+def test_hello_holds_the_site(browser, live):
     live.site = SITE
     with browser.websocket_connect(SOCKET) as socket:
         assert socket.receive_json()["site"]["site"]["name"] == SITE.site.name
@@ -244,12 +244,12 @@ VALUE = st.binary(max_size=60) | st.sampled_from(
 
 
 @given(st.lists(st.tuples(HEADER, VALUE), max_size=6), st.binary(max_size=40), st.sampled_from(["http", "websocket"]))
-def test_whatever_strangers_send_without_the_token_they_stay_outside(headers, query, kind):
-    """No header or query raises, or gets anybody in."""
+def test_without_the_token_every_request_of_a_stranger_is_refused(headers, query, kind):
+    """No header or query raises, or passes without the token."""
     sent = []
 
     async def inside(scope, receive, send):
-        raise AssertionError("somebody got in")
+        raise AssertionError("the request was let through")
 
     async def send(message):
         sent.append(message)

@@ -76,7 +76,7 @@ def test_the_address_that_is_printed_is_one_that_others_can_open():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "expected"),
     [
         (["--token", "short"], "--token has 5 characters"),
         (["--mqtt", "http://x"], "--mqtt is"),
@@ -86,10 +86,10 @@ def test_the_address_that_is_printed_is_one_that_others_can_open():
         (["--site-id", "70000"], "70000"),
     ],
 )
-def test_wrong_options_end_with_2_and_one_line(capsys, arguments, said):
+def test_wrong_options_end_with_2_and_one_line(capsys, arguments, expected):
     assert main(["dashboard", *arguments]) == 2
     error = capsys.readouterr().err
-    assert said in error
+    assert expected in error
     assert error.count("\n") == 1
 
 

@@ -51,7 +51,7 @@ def test_values_are_the_planners_row_by_row_from_the_lowest_y():
 
 
 def test_where_there_is_no_fix_there_is_no_value():
-    """One anchor a kilometre away: beyond the middle nobody hears three."""
+    """One anchor a kilometre away: beyond the middle no tag hears three."""
     far = AnchorSite(id=99, x_m=1000.0, y_m=4.0)
     task = overlay_task(replace(LAB, anchors=(*LAB.anchors, far)), None, "weighted", 10.0)
     grids = overlay_grids(task)
@@ -95,7 +95,7 @@ def test_one_process_answers_all_three_kinds():
     assert sigma["values"] == overlay_grids(overlay_task(LAB, None, "weighted", 1.0)).sigma
 
 
-def test_a_site_with_too_few_anchors_says_so():
+def test_too_few_anchors_are_an_error():
     site = replace(LAB, anchors=LAB.anchors[:3], tags=TagsSite())
     with pytest.raises(NoOverlayError, match="4 anchors or more"):
         get(Overlays(), site, None, [], "pdop", 1.0)

@@ -149,7 +149,7 @@ GOOD = {"id": "a", "name": "A", "polygon_m": [[0, 0], [1, 0], [1, 1]]}
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "expected"),
     [
         ({"polygon_m": [[0, 0], [1, 0]]}, "2 corners"),
         ({"polygon_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}, "crosses or touches itself"),
@@ -163,8 +163,8 @@ GOOD = {"id": "a", "name": "A", "polygon_m": [[0, 0], [1, 0], [1, 1]]}
         ({"polygon_m": [[0, 0], [1, "x"], [1, 1]]}, "no list of zones"),
     ],
 )
-def test_invalid_zones_are_refused_with_a_reason(change, said):
-    with pytest.raises(BadZonesError, match=said):
+def test_invalid_zones_are_refused_with_a_reason(change, expected):
+    with pytest.raises(BadZonesError, match=expected):
         read_zones(json.dumps({"zones": [GOOD | change]}).encode())
 
 
