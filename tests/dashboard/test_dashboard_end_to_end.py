@@ -68,8 +68,8 @@ async def walk(link, tags=1, step_s=0.05):
         await asyncio.sleep(step_s)
 
 
-def live(printed):
-    return websockets.connect(printed["page"].replace("http", "ws") + "live", max_size=None)
+def live(output):
+    return websockets.connect(output["page"].replace("http", "ws") + "live", max_size=None)
 
 
 async def next_of(page, kind_of_message, /, **fields):
@@ -99,7 +99,7 @@ async def a_site_is_found_shown_and_watched(tmp_path):
     async with site(broker.address) as link:
         link.subscribe(topics.zone_event_topic(SITE_ID, "+"), lambda _, payload: events.append(json.loads(payload)), 1)
         link.subscribe(topics.zones_topic(SITE_ID), lambda _, payload: zones.append(payload), 1)
-        async with dashboard("--mqtt", str(broker.address)) as (printed, process), live(printed) as page:
+        async with dashboard("--mqtt", str(broker.address)) as (output, process), live(output) as page:
             hello = await next_of(page, "hello")
             shown = hello["site"] or (await next_of(page, "site"))["site"]
             assert shown["site"]["id"] == SITE_ID
@@ -107,7 +107,7 @@ async def a_site_is_found_shown_and_watched(tmp_path):
             row = (await next_of(page, "state"))["tags"][0]
             assert row[0] == "t0"
             assert row[10] == pytest.approx(0.02, abs=1e-3)
-            async with httpx.AsyncClient(base_url=printed["page"]) as http:
+            async with httpx.AsyncClient(base_url=output["page"]) as http:
                 answer = await http.put("/api/zones", content=msgspec.json.encode(ZonesMessage((SQUARE,))))
                 assert answer.status_code == 200
                 overlay = await http.get("/api/overlay?kind=sigma&step_m=1", timeout=60.0)
@@ -124,8 +124,8 @@ async def a_site_is_found_shown_and_watched(tmp_path):
             process.send_signal(signal.SIGTERM)
             assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
         async with (
-            dashboard("--mqtt", str(broker.address), "--site-id", str(SITE_ID)) as (printed, _),
-            live(printed) as page,
+            dashboard("--mqtt", str(broker.address), "--site-id", str(SITE_ID)) as (output, _),
+            live(output) as page,
         ):
             greeted = (await next_of(page, "hello"))["zones"]
             assert (greeted or (await next_of(page, "zones"))["zones"])[0]["id"] == "desk", "zones survive a restart"
@@ -142,12 +142,12 @@ async def a_page_that_does_not_read_delays_no_other(tmp_path):
     async with (
         await start_broker(settings) as broker,
         site(broker.address) as link,
-        dashboard("--mqtt", str(broker.address)) as (printed, process),
+        dashboard("--mqtt", str(broker.address)) as (output, process),
     ):
         walking = asyncio.create_task(walk(link, tags=100))
-        port = int(printed["page"].rstrip("/").rsplit(":", 1)[1])
+        port = int(output["page"].rstrip("/").rsplit(":", 1)[1])
         unread = [await never_read(port) for _ in range(3)]
-        async with live(printed) as page:
+        async with live(output) as page:
             await next_of(page, "state")
             began_s, count = time.monotonic(), 0
             while time.monotonic() < began_s + 4.0:
@@ -185,8 +185,8 @@ async def never_read(port):
 def test_without_a_broker_the_page_opens_and_shows_it():
     async def check():
         nobody = f"mqtt://127.0.0.1:{free_port()}"
-        async with dashboard("--mqtt", nobody) as (printed, _), live(printed) as page:
-            assert printed["mqtt"] == nobody
+        async with dashboard("--mqtt", nobody) as (output, _), live(output) as page:
+            assert output["mqtt"] == nobody
             hello = await next_of(page, "hello")
             assert (hello["mqtt"], hello["site"]) == (False, None)
             assert await next_of(page, "mqtt") == {"type": "mqtt", "connected": False, "broker": nobody}
@@ -196,13 +196,13 @@ def test_without_a_broker_the_page_opens_and_shows_it():
 
 def test_other_machines_need_the_token_that_is_printed():
     async def check():
-        async with dashboard("--listen", f"0.0.0.0:{free_port()}") as (printed, _):
-            address = httpx.URL(printed["page"])
-            assert printed["page"].endswith(f"?token={printed['token']}")
-            assert len(printed["token"]) >= 20
+        async with dashboard("--listen", f"0.0.0.0:{free_port()}") as (output, _):
+            address = httpx.URL(output["page"])
+            assert output["page"].endswith(f"?token={output['token']}")
+            assert len(output["token"]) >= 20
             async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{address.port}") as http:
                 assert (await http.get("/api/recordings")).status_code == 401
-                assert (await http.get("/api/recordings", params={"token": printed["token"]})).status_code == 200
+                assert (await http.get("/api/recordings", params={"token": output["token"]})).status_code == 200
                 assert (await http.get("/api/recordings")).status_code == 200, "by the cookie"
                 assert (await http.get("/", headers={"host": "evil.example"})).status_code == 421
 
