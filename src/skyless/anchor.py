@@ -11,9 +11,8 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.air.almanac import Page
-from skyless.air.beacon import Beacon, Heard, MasterTime
+from skyless.air.beacon import Beacon, Heard, Malformed, MasterTime
 from skyless.air.codec import decode_cached, encode, heard_capacity
-from skyless.air.malformed import Malformed
 from skyless.air.master_term import MasterTerm
 from skyless.air.reception import Reception, Transmission
 from skyless.clocks.filter import ClockFilter, clock_noise
@@ -21,7 +20,7 @@ from skyless.clocks.site_clock import SiteClock
 from skyless.clocks.site_time import SUBTICKS
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.master_election import MasterElection, Role, Verdict
-from skyless.site.almanac_sending import almanac_issue, page_for, pages_of
+from skyless.site.almanac_pages import almanac_issue, page_for, pages_of
 from skyless.site.model import AnchorSite, Site
 from skyless.site.slots import first_slots, schedule_of
 from skyless.ticks import Unwrapper, difference, wrap

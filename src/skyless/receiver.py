@@ -11,7 +11,7 @@ import numpy as np
 
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
-from skyless.air.followed_master import FollowedMaster
+from skyless.air.master_term import FollowedMaster
 from skyless.air.reception import Diagnostics, Reception
 from skyless.clocks.stamps import AnchorStamps
 from skyless.kernels.arrays import Array
@@ -24,7 +24,7 @@ from skyless.positioning.methods.joint import Estimation
 from skyless.positioning.methods.nlos_weighting import variance_factor
 from skyless.positioning.methods.observations import Observer
 from skyless.positioning.observation import Method
-from skyless.site.almanac_gathering import AlmanacAssembly
+from skyless.site.almanac_pages import AlmanacAssembly
 from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 

@@ -2,7 +2,7 @@ import msgspec
 import pytest
 
 from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
-from skyless.site.almanac_gathering import AlmanacAssembly
+from skyless.site.almanac_pages import AlmanacAssembly
 from skyless.site.model import AccuracySite
 
 SCHEDULE = SchedulePage(2**27, 3, 1, 1, 3, 1.2)

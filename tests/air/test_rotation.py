@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.air.page_codec import decode_page, encode_page
-from skyless.site.almanac_sending import almanac_issue, page_for, pages_of
-from skyless.site.limits import LIMITS
+from skyless.site.almanac_pages import almanac_issue, page_for, pages_of
+from skyless.site.check import LIMITS
 from skyless.site.model import (
     EXACT,
     AccuracySite,

@@ -16,7 +16,7 @@ from skyless.nodes.emulation.board_protocol import LinkProtocol, SnifferProtocol
 from skyless.radios.interface import Late, Restarted, Sent
 from skyless.radios.serial.link_records import Done, Hello, NotDone, Status, TooLate, decode
 from skyless.radios.serial.sniffer_radio import SnifferStream
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World

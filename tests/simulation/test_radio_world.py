@@ -16,8 +16,7 @@ from scipy.stats import binom, chi2, expon, kstest
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.simulation.channel import ChannelModel, power_bias_m, received_power_dbm
-from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage, lab_impairments
 from skyless.simulation.oscillator import OscillatorModel
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import RandomWalk, Static, Waypoints

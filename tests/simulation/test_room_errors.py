@@ -13,8 +13,7 @@ from scipy.stats import chi2, kstest, uniform
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.simulation.channel import ChannelModel
-from skyless.simulation.impairments import AnchorBias, AnchorDisplacement, Body, Impairments, WarmUp
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import AnchorBias, AnchorDisplacement, Body, Impairments, WarmUp, lab_impairments
 from skyless.simulation.oscillator import OscillatorModel, clock_rate, drift_phase_s, make_clocks, warm_up
 from skyless.simulation.range_errors import RangeErrorModel, RangeErrors, slope_error_m
 from skyless.simulation.stations import TagSpec

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.errors import ConfigurationError
+from skyless.site.check import LIMITS
 from skyless.site.lab import lab_site
-from skyless.site.limits import LIMITS
 from skyless.site.load import load_site
 from skyless.site.model import AccuracySite
 from skyless.site.template import site_template

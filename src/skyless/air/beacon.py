@@ -1,7 +1,8 @@
-"""The beacon: what every anchor broadcasts in its slots (``docs/protocol.md``)."""
+"""The beacon: what every anchor broadcasts in its slots, and why bytes are none (``docs/protocol.md``)."""
 
 import struct
 from collections.abc import Iterator
+from enum import StrEnum
 from typing import Final
 
 from msgspec import Struct
@@ -83,3 +84,26 @@ class Beacon(Struct, frozen=True, gc=False):
     """The other anchors, the master excluded, in the order of the most recent first; as many as fit."""
     page: Page | None
     """One page of the almanac."""
+
+
+class Malformed(StrEnum):
+    """Reason why bytes are not a beacon of this version (``docs/protocol.md``, "What is dropped")."""
+
+    TOO_SHORT = "too-short"
+    """Shorter than any frame of IEEE 802.15.4, or a beacon that ends before its fixed part does."""
+    TOO_LONG = "too-long"
+    """Longer than the 127 bytes of a PSDU."""
+    BAD_FCS = "bad-fcs"
+    """The frame check sequence does not fit the bytes."""
+    NOT_A_BEACON = "not-a-beacon"
+    """An intact frame of somebody else's."""
+    UNKNOWN_VERSION = "unknown-version"
+    """A beacon of another version of the protocol."""
+    BAD_FLAGS = "bad-flags"
+    """A reserved flag is set."""
+    BAD_LENGTH = "bad-length"
+    """The length does not fit the flags and the number of relayed stamps."""
+    BAD_HEARD = "bad-heard"
+    """Stamps that cannot be: of the sender by itself, of the master in the wrong place, twice of one anchor."""
+    BAD_PAGE = "bad-page"
+    """A page of the almanac with a value out of all bounds."""

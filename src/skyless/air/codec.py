@@ -11,9 +11,8 @@ from functools import lru_cache
 from operator import index
 from typing import Final, SupportsIndex
 
-from skyless.air.beacon import HEARD, Beacon, Heard, MasterTime, PackedHeard
-from skyless.air.fcs import fcs, is_intact
-from skyless.air.malformed import Malformed
+from skyless.air.beacon import HEARD, Beacon, Heard, Malformed, MasterTime, PackedHeard
+from skyless.air.ieee802154 import fcs, is_intact
 from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
 
 MAX_FRAME_BYTES: Final = 127

@@ -5,7 +5,7 @@ from functools import lru_cache
 from typing import Final, Literal
 
 from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
-from skyless.air.malformed import Malformed
+from skyless.air.beacon import Malformed
 
 PAGE_BYTES: Final = 17
 

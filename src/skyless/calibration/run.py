@@ -28,7 +28,7 @@ from skyless.recordings.foreign.formats import open_recording
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.recordings.truth import Truth
 from skyless.replay.site import FORMAT, recorded_site, recorded_truth
-from skyless.site.limits import LIMITS
+from skyless.site.check import LIMITS
 from skyless.site.model import Site
 from skyless.site.rewrite import KEY
 

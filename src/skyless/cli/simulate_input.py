@@ -44,7 +44,7 @@ def site_of(scenario: str | None, file: Path | None) -> "Site":
 
 def path_of(text: str) -> tuple[tuple[float, ...], ...]:
     """Points of a path, x,y or x,y,z each, separated by semicolons or spaces. Raises SkylessError."""
-    from skyless.site.limits import FARTHEST_M
+    from skyless.site.check import FARTHEST_M
 
     points = tuple(finite_numbers("waypoints", part, (2, 3)) for part in text.replace(";", " ").split())
     if len(points) < 2:

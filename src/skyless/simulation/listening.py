@@ -6,6 +6,7 @@ would lose both, and that is not modelled.
 """
 
 import math
+from enum import StrEnum
 from typing import Final
 
 import numpy as np
@@ -20,13 +21,24 @@ from skyless.simulation.channel import (
     power_bias_m,
     received_power_dbm,
 )
-from skyless.simulation.ether import OUTCOMES, Outcome
 from skyless.simulation.oscillator import advance, clock_rate
 from skyless.simulation.range_errors import slope_error_m
 from skyless.simulation.stations import body_m, coordinate_m, velocity_mps
 from skyless.simulation.streams import draw_normal, draw_uniform
 from skyless.ticks import TICK_MASK
 
+
+class Outcome(StrEnum):
+    """What became of a frame at a listener; the values are what reports show."""
+
+    HEARD = "heard"
+    WEAK = "below-sensitivity"
+    HALF_DUPLEX = "half-duplex"
+    COLLISION = "collision"
+    LOST = "message-loss"
+
+
+OUTCOMES: Final = tuple(Outcome)
 _HEARD: Final = OUTCOMES.index(Outcome.HEARD)
 _WEAK: Final = OUTCOMES.index(Outcome.WEAK)
 _HALF_DUPLEX: Final = OUTCOMES.index(Outcome.HALF_DUPLEX)

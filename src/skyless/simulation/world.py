@@ -6,19 +6,85 @@ the frame ends, when the listeners get it.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Final, Protocol
 
-from skyless.air.reception import Reception
-from skyless.simulation.broadcast import Broadcast, Tally, diagnostics_of
+import numpy as np
+
+from skyless.air.reception import Diagnostics, Reception, Transmission
+from skyless.constants import TICK_S
+from skyless.kernels.arrays import Array, Integers
 from skyless.simulation.impairments import Impairments
-from skyless.simulation.machine_interface import AnchorFactory, AnchorMachine
-from skyless.simulation.medium import Delivery, Medium
+from skyless.simulation.medium import Delivery, Medium, Tally
 from skyless.simulation.stations import TagSpec
 from skyless.site.model import Site
 from skyless.ticks import difference, from_seconds, wrap
 
 _RETRY_TICKS: Final = from_seconds(5e-3)
+
+
+class AnchorMachine(Protocol):
+    """An anchor as its radio sees it (``skyless.anchor.Anchor`` is one)."""
+
+    @property
+    def id(self) -> int:
+        """Identifier of the anchor, 16 bits."""
+
+    def hear(self, reception: Reception) -> None:
+        """Take one frame off the air; never raises."""
+
+    def next_transmission_ticks(self, now_ticks: int) -> int | None:
+        """TX stamp (own 40-bit counter) of the next frame, at least a lead time after now; None: ask again."""
+
+    def transmission(self, tx_ticks: int) -> Transmission:
+        """The frame for that slot, made as late as possible so that it carries the latest receptions."""
+
+
+AnchorFactory = Callable[[int], AnchorMachine]
+"""Makes a machine for an anchor's identifier; called again when that anchor restarts."""
+
+
+@dataclass(slots=True, eq=False)
+class Broadcast:
+    """One frame, at the moment that its end arrived, with the tags that heard it and the truth about it."""
+
+    anchor: int
+    """Identifier of the sender."""
+    frame: bytes
+    emission_ticks: int
+    """True time at which the RMARKER left the antenna, in ideal ticks since the start; and its fraction."""
+    emission_fraction: float
+    end_s: float
+    """True time of the frame's end, which the receptions carry as the host's time."""
+    tags: Integers
+    """Indices of the tags that heard it, shape (n,)."""
+    rx_ticks: Integers
+    """Their RX stamps, 40 bits, shape (n,)."""
+    positions_m: Array
+    """Where they truly were at the emission, shape (n, 3)."""
+    velocities_mps: Array
+    """How they truly moved, shape (n, 3)."""
+    diagnostics: tuple[Diagnostics, ...] | None
+    """What their radios measured, where the world is asked for it."""
+
+    @property
+    def emission_s(self) -> float:
+        """True time of the RMARKER's emission in seconds since the start."""
+        return (self.emission_ticks + self.emission_fraction) * TICK_S
+
+    def receptions(self) -> Iterator[tuple[int, Reception, Array]]:
+        """Tag index, reception and true position, shape (3,), of every tag that heard the frame."""
+        frame, host_s = self.frame, self.end_s
+        measured = self.diagnostics or (None,) * len(self.tags)
+        rows = zip(self.tags.tolist(), self.rx_ticks.tolist(), self.positions_m, measured, strict=True)
+        for tag, rx_ticks, position_m, diagnostics in rows:
+            yield tag, Reception(frame, rx_ticks, host_s, diagnostics), position_m
+
+
+def diagnostics_of(row: np.void) -> Diagnostics:
+    """Diagnostics of one row of what the nodes received."""
+    return Diagnostics(float(row["rx_power_dbm"]), float(row["first_path_power_dbm"]), float(row["carrier_offset_ppm"]))
 
 
 class World:

@@ -10,8 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.errors import ConfigurationError
-from skyless.site.check import check_floor_plan, check_site, with_anchor
-from skyless.site.limits import expected
+from skyless.site.check import check_floor_plan, check_site, expected, with_anchor
 from skyless.site.model import (
     AccuracySite,
     AnchorSite,

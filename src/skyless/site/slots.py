@@ -6,8 +6,8 @@ So a frame's preamble flies in the last 138 µs of the slot before.
 
 from msgspec import Struct
 
-from skyless.air.airtime import air_time_s
 from skyless.air.almanac import SchedulePage
+from skyless.air.ieee802154 import air_time_s
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
 from skyless.site.model import Site
 
