@@ -22,19 +22,9 @@ Stamps are raw 40-bit ticks in 5 bytes, the lowest first, as the chip has them; 
 """
 
 try:
-    import micropython
-except ImportError:
-
-    class _Plain:
-        """Stands in for MicroPython's module where there is none."""
-
-        @staticmethod
-        def viper(function):  # noqa: ANN001, ANN205 - of any kind
-            """Leave the function as it is."""
-            return function
-
-    micropython = _Plain
-    ptr8 = bytearray
+    from skyless.firmware import micropython, ptr8
+except ImportError:  # a board, where MicroPython brings both
+    import micropython  # type: ignore[no-redef]
 
 OFF = 0
 IDLE = 1

@@ -6,19 +6,9 @@ sent and received lives in buffers that are made once; 40-bit stamps are 5 bytes
 """
 
 try:
-    import micropython
-except ImportError:
-
-    class _Plain:
-        """Stands in for MicroPython's module where there is none."""
-
-        @staticmethod
-        def viper(function):  # noqa: ANN001, ANN205 - of any kind
-            """Leave the function as it is."""
-            return function
-
-    micropython = _Plain
-    ptr8 = bytearray
+    from skyless.firmware import micropython, ptr8
+except ImportError:  # a board, where MicroPython brings both
+    import micropython  # type: ignore[no-redef]
 
 MAJOR = 1
 """Ends with different ones do not understand each other."""
