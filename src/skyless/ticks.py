@@ -6,10 +6,7 @@ float64 seconds lose 0.6 mm after an hour, integers lose nothing.
 
 from typing import Final
 
-import numpy as np
-
-from skyless.constants import TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.kernels.arrays import Integers
+from skyless.constants import TICK_BITS, TICK_RATE_HZ, TICK_S
 
 WRAP_TICKS: Final = 1 << TICK_BITS
 HALF_WRAP_TICKS: Final = WRAP_TICKS // 2
@@ -42,11 +39,6 @@ def nearest(counter: int, expected_ticks: int, bits: int = TICK_BITS) -> int:
 def to_seconds(ticks: int) -> float:
     """Seconds of a tick difference; of an epoch far from zero the result keeps only 53 bits."""
     return ticks * TICK_S
-
-
-def to_metres(ticks: float) -> float:
-    """Metres that light travels in that many ticks."""
-    return ticks * TICK_M
 
 
 def from_seconds(seconds: float) -> int:
@@ -89,14 +81,3 @@ class Unwrapper:
     def expect(self, counter: int) -> int:
         """Unwrapped ticks of a counter value near the last stamp, without taking it as a stamp."""
         return counter if self._last_ticks is None else nearest(counter, self._last_ticks, self._bits)
-
-
-def unwrap_array(counters: Integers, bits: int = TICK_BITS) -> Integers:
-    """Unwrapped ticks, shape (n,), of successive counter values, each within half a wrap of the one before."""
-    half = np.int64(1) << (bits - 1)
-    steps = ((np.diff(counters) + half) & ((half << 1) - 1)) - half
-    ticks = np.empty_like(counters)
-    ticks[:1] = counters[:1]
-    np.cumsum(steps, out=ticks[1:])
-    ticks[1:] += counters[:1]
-    return ticks

@@ -23,7 +23,7 @@ def exercise(writer, reader, ticks, frame, counts):
         else:
             end = writer.tx_at(ticks, frame, 100)
         reader.take(writer.line, 0, end)
-        total += reader.length + link.unsigned(reader.record, 2, 2) + link.signed16(reader.record, 7)
+        total += reader.length + link.unsigned(reader.record, 2, 2) + link.unsigned(reader.record, 7, 2)
     return total
 
 

@@ -5,6 +5,7 @@ import bisect
 import itertools
 import random
 import shutil
+import struct
 import subprocess
 import sys
 from binascii import crc_hqx
@@ -126,7 +127,7 @@ def test_a_reception_comes_back(ticks, rx_power, first_path, offset, frame):
     (record,), _ = read(bytes(writer.line[:end]))
     assert record[0] == link.RX
     assert record[2:7] == bytes(ticks)
-    assert [link.signed16(record, at) for at in (7, 9, 11)] == [rx_power, first_path, offset]
+    assert struct.unpack_from("<hhh", record, 7) == (rx_power, first_path, offset)
     assert record[link.RX_FRAME_AT :] == frame
 
 

@@ -169,12 +169,6 @@ def unsigned(record: bytearray, at: int, size: int) -> int:
     return value
 
 
-def signed16(record: bytearray, at: int) -> int:
-    """Little-endian number of two bytes with a sign."""
-    value = record[at] | record[at + 1] << 8
-    return value - 0x10000 if value & 0x8000 else value
-
-
 class Writer:
     """Makes records; each method returns the length of what then stands in ``line``, ready to be sent."""
 

@@ -7,8 +7,7 @@ So a frame's preamble flies in the last 138 µs of the slot before.
 from msgspec import Struct
 
 from skyless.air.almanac import SchedulePage
-from skyless.air.ieee802154 import air_time_s
-from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
+from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ
 from skyless.site.model import Site
 
 
@@ -32,10 +31,6 @@ class Schedule(Struct, frozen=True, gc=False):
     def messages_per_s(self, nodes: int) -> float:
         """Frames per second of so many nodes, each of them one update for a tag that tracks by message."""
         return nodes * self.frames_per_node * self.superframe_rate_hz
-
-    def quiet_s(self, psdu_bytes: int) -> float:
-        """Time that the air is free between the end of a frame of so many bytes and the next one's preamble."""
-        return self.slot_ticks * TICK_S - air_time_s(psdu_bytes)
 
     def slots_of(self, first_slot: int) -> tuple[int, ...]:
         """Slots of a node, ascending: its first and every ``slots // frames_per_node`` after it, modulo slots."""
