@@ -25,7 +25,7 @@ class Heard(Struct, frozen=True, gc=False):
 
 
 class PackedHeard(Struct, frozen=True, gc=False, eq=False):
-    """``heard`` entries as they stand in a frame, taken apart when looked at; equal to a tuple of them."""
+    """``heard`` entries as the bytes of a frame, decoded when they are read; equal to a tuple of them."""
 
     packed: bytes
 
@@ -67,15 +67,15 @@ class Beacon(Struct, frozen=True, gc=False):
     superframe: int
     """Number of the superframe, 32 bits, counted by the master."""
     slot: int
-    """Slot within the superframe in which this frame flies, 8 bits."""
+    """Slot within the superframe in which this frame is sent, 8 bits."""
     tx_ticks: int
     """TX stamp in the sender's own clock, 40 bits."""
     almanac_issue: int
-    """Changes when the almanac changes, 8 bits; a tag then forgets the old one."""
+    """Changes when the almanac changes, 8 bits; a tag then discards the old one."""
     master: int
-    """Identifier of the master that this anchor follows; its own for the master."""
+    """Identifier of the master whose time this anchor uses; its own for the master."""
     term: int
-    """Which reign the sender lives in, 8 bits: counts the takeovers of the master's role, modulo 256."""
+    """Counts the takeovers of the master's role, modulo 256 (8 bits)."""
     master_heard: Heard | None
     """The last master beacon that this anchor heard (raw stamp), None for the master or when none was heard."""
     master_time: MasterTime | None
@@ -96,7 +96,7 @@ class Malformed(StrEnum):
     BAD_FCS = "bad-fcs"
     """The frame check sequence does not fit the bytes."""
     NOT_A_BEACON = "not-a-beacon"
-    """An intact frame of somebody else's."""
+    """An intact frame of another system."""
     UNKNOWN_VERSION = "unknown-version"
     """A beacon of another version of the protocol."""
     BAD_FLAGS = "bad-flags"
@@ -104,6 +104,6 @@ class Malformed(StrEnum):
     BAD_LENGTH = "bad-length"
     """The length does not fit the flags and the number of relayed stamps."""
     BAD_HEARD = "bad-heard"
-    """Stamps that cannot be: of the sender by itself, of the master in the wrong place, twice of one anchor."""
+    """Impossible stamps: of the sender by itself, of the master in the wrong field, twice of one anchor."""
     BAD_PAGE = "bad-page"
-    """A page of the almanac with a value out of all bounds."""
+    """A page of the almanac with an impossible value."""

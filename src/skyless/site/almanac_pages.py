@@ -11,11 +11,11 @@ from skyless.air.page_codec import encode_page
 from skyless.site.model import AccuracySite, Site
 from skyless.site.slots import first_slots, schedule_of
 
-_SIGHTINGS: Final = 2
+_CONFIRMATIONS: Final = 2
 """A frame corrupted on the air passes its FCS once in 65,536 times; the same error twice in a row is not expected."""
 
 _MOST_ANCHORS: Final = 255
-"""As many as a site can have; forged pages beyond that take no memory."""
+"""The most that a site can have; forged pages beyond that use no memory."""
 
 _ASSUMED_ACCURACY: Final = AccuracyPage(**asdict(AccuracySite()))
 
@@ -46,7 +46,7 @@ def pages_of(site: Site) -> tuple[Page, ...]:
 
 
 def filter_pages_of(site: Site) -> tuple[NoisePage, AccuracyPage]:
-    """What the site tells the filters of its tags."""
+    """The pages for the filters of the site's tags."""
     noise = site.noise
     return (
         NoisePage(noise.tx_stamp_ps * 1e-12, noise.rx_stamp_ps * 1e-12, noise.white_fm, noise.random_walk_fm),
@@ -55,12 +55,12 @@ def filter_pages_of(site: Site) -> tuple[NoisePage, AccuracyPage]:
 
 
 def page_for(pages: tuple[Page, ...], superframe: int, slot: int) -> Page:
-    """Return the page that flies in a slot of a superframe; ``pages`` must not be empty.
+    """Return the page that the frame in a slot of a superframe carries; ``pages`` must not be empty.
 
     The rotation has a prime number P of positions, the first pages filling those beyond the last. A slot moves on by
     one position each superframe, and the next slot is ahead by about P/1.618 positions. As P is prime, a tag that
     hears one slot in every k-th superframe (k no multiple of P) hears all positions in P receptions, and any P slots
-    in a row carry all positions; the golden ratio spreads the slots of one superframe evenly, whichever are heard.
+    in a row carry all positions; the golden ratio distributes the slots of one superframe evenly, whichever are heard.
     """
     positions, stride = _rotation(len(pages))
     return pages[(superframe + stride * slot) % positions % len(pages)]
@@ -86,23 +86,23 @@ def _rotation(pages: int) -> tuple[int, int]:
 
 
 class AlmanacAssembly:
-    """Gathers the pages of one site as its beacons bring them, page by page.
+    """Collects the pages of one site from its beacons.
 
-    What contradicts the book must be heard twice before it is believed. A new issue empties the book once two frames
-    in a row carry it. A page that differs from the one held under the same issue replaces it once it was heard twice
-    with nothing else for its place in between. So one corrupt frame that passed its FCS cannot do lasting harm.
+    What contradicts the pages held must be received twice. A new issue replaces them all once two frames in a row
+    carry it. A page that differs from the one held under the same issue replaces it once it was received twice with no
+    other page of its key in between. So one corrupt frame that passed its FCS cannot do lasting harm.
     """
 
     def __init__(self) -> None:
         self._issue: int | None = None
-        self._rival_issue: int | None = None
-        self._rival_frames = 0
-        self._rival_pages: list[Page] = []
+        self._next_issue: int | None = None
+        self._next_frames = 0
+        self._next_pages: list[Page] = []
         self._clear()
 
     def _clear(self) -> None:
         self._pages: dict[object, Page] = {}
-        self._doubted: dict[object, Page] = {}
+        self._unconfirmed: dict[object, Page] = {}
         self._anchors_m: dict[int, tuple[float, float, float]] = {}
         self._schedule: SchedulePage | None = None
         self._noise: NoisePage | None = None
@@ -150,47 +150,47 @@ class AlmanacAssembly:
         schedule = self._schedule
         return schedule is not None and self._noise is not None and len(self._anchors_m) >= schedule.anchors
 
-    def hear(self, issue: int, page: Page | None) -> bool:
-        """Take in the issue and the page (if any) of one beacon; return whether the book changed."""
+    def add_page(self, issue: int, page: Page | None) -> bool:
+        """Process the issue and the page (if any) of one beacon; return whether the almanac changed."""
         if issue != self._issue:
             if self._issue is not None:
-                return self._hear_rival(issue, page)
+                return self._add_to_next_issue(issue, page)
             self._issue = issue
-        self._rival_issue = None
+        self._next_issue = None
         if page is None:
             return False
-        place = page.anchor if type(page) is AnchorPage else type(page)  # as _place does, here for every beacon
-        if self._pages.get(place) is page and not self._doubted:  # pages come from a cache, so mostly the very same
+        key = page.anchor if type(page) is AnchorPage else type(page)  # as _page_key does, here for every beacon
+        if self._pages.get(key) is page and not self._unconfirmed:  # pages come from a cache, so mostly the very same
             return False
-        return self._enter(place, page)
+        return self._add(key, page)
 
-    def _hear_rival(self, issue: int, page: Page | None) -> bool:
-        if issue != self._rival_issue:
-            self._rival_issue, self._rival_frames, self._rival_pages = issue, 0, []
-        self._rival_frames += 1
+    def _add_to_next_issue(self, issue: int, page: Page | None) -> bool:
+        if issue != self._next_issue:
+            self._next_issue, self._next_frames, self._next_pages = issue, 0, []
+        self._next_frames += 1
         if page is not None:
-            self._rival_pages.append(page)
-        if self._rival_frames < _SIGHTINGS:
+            self._next_pages.append(page)
+        if self._next_frames < _CONFIRMATIONS:
             return False
         self._clear()
-        self._issue, self._rival_issue = issue, None
-        for rival_page in self._rival_pages:
-            self._enter(_place(rival_page), rival_page)
+        self._issue, self._next_issue = issue, None
+        for next_page in self._next_pages:
+            self._add(_page_key(next_page), next_page)
         return True
 
-    def _enter(self, place: object, page: Page) -> bool:
-        held = self._pages.get(place)
+    def _add(self, key: object, page: Page) -> bool:
+        held = self._pages.get(key)
         if held == page:
-            if self._doubted:
-                self._doubted.pop(place, None)
+            if self._unconfirmed:
+                self._unconfirmed.pop(key, None)
             return False
-        if held is not None and self._doubted.get(place) != page:
-            self._doubted[place] = page
+        if held is not None and self._unconfirmed.get(key) != page:
+            self._unconfirmed[key] = page
             return False
         if held is None and isinstance(page, AnchorPage) and len(self._anchors_m) >= _MOST_ANCHORS:
             return False
-        self._doubted.pop(place, None)
-        self._pages[place] = page
+        self._unconfirmed.pop(key, None)
+        self._pages[key] = page
         match page:
             case AnchorPage():
                 self._anchors_m = self._anchors_m | {page.anchor: (page.x_m, page.y_m, page.z_m)}
@@ -205,6 +205,6 @@ class AlmanacAssembly:
         return True
 
 
-def _place(page: Page) -> object:
-    """What a page is kept by: another of the same place replaces it."""
+def _page_key(page: Page) -> object:
+    """Key of a page: another page of the same key replaces it."""
     return page.anchor if type(page) is AnchorPage else type(page)

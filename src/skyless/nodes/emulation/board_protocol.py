@@ -193,7 +193,7 @@ class SnifferProtocol:
         if not isinstance(beacon, Beacon) or beacon.anchor > _LAST_ID:
             self.drops["not-translated"] += 1
             return
-        self._almanac.hear(beacon.almanac_issue, beacon.page)
+        self._almanac.add_page(beacon.almanac_issue, beacon.page)
         payload = self._payload(beacon)
         if self._binary:
             length = struct.pack("<H", len(payload))
