@@ -150,7 +150,7 @@ def test_changing_errors_forget_with_their_correlation_length(along):
     history = []
     for step in range(301):
         world.medium._move_tags(0.5 * step)
-        errors.pass_to(0.5 * step, world.medium.stations)
+        errors.advance_to(0.5 * step, world.medium.stations)
         history.append(errors.present_m[2:].copy())
     walking, resting = np.array(history)[:, :-1], np.array(history)[:, -1]
     assert (np.ptp(resting, axis=0) == 0.0).all() == (along == "way")

@@ -1,8 +1,8 @@
-"""The medium: true time, the nodes' clocks and radios, and the frames that fly between them.
+"""The medium: true time, the nodes' clocks and radios, and the frames between them.
 
 A frame has two events: its RMARKER leaves, and it ends, when the listeners get it. The emulated radio takes the low
 nine bits off DX = TX stamp - configured antenna delay, as the DW1000 does, so a node that ignores the granularity
-sends with a wrong stamp. Who sends what and when is the affair of the medium's owner.
+sends with a wrong stamp. Who sends what and when is decided by the medium's owner.
 """
 
 import heapq
@@ -22,7 +22,7 @@ from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
 from skyless.kernels.arrays import Array, Integers, Records
 from skyless.simulation.channel import pack_channel, pack_walls
 from skyless.simulation.impairments import Impairments
-from skyless.simulation.listening import OUTCOMES, RECEIVED, hear
+from skyless.simulation.listening import OUTCOMES, RECEPTION_RECORD, receive_frame
 from skyless.simulation.oscillator import advance, emit, foresee, make_clocks, restart_counter, warm_up
 from skyless.simulation.range_errors import RangeErrors
 from skyless.simulation.stations import TagSpec, make_stations, set_piece
@@ -33,7 +33,7 @@ from skyless.ticks import difference, from_seconds, wrap
 TURNAROUND_S: Final = 0.2e-3
 """What a host needs to hand a frame to its radio; a preamble that should begin earlier is too late (HPDWARN).
 
-Longer than any frame after its RMARKER (177 µs), so that all that overlap it are known when the RMARKER leaves.
+Longer than any frame after its RMARKER (177 µs), so that all frames that overlap it are known when the RMARKER leaves.
 """
 
 _TURNAROUND_TICKS: Final = from_seconds(TURNAROUND_S)
@@ -62,25 +62,25 @@ class Timeline(Generic[Result]):
         return self._events[0][0] if self._events else None
 
     def at(self, ticks: int, happen: Callable[[], Result | None]) -> None:
-        """Plan an event; one that should have happened already happens now."""
+        """Plan an event; one in the past happens now."""
         self._serial += 1
         heapq.heappush(self._events, (max(ticks, self.now_ticks), self._serial, happen))
 
     def pass_to(self, ticks: int) -> bool:
-        """Let time pass up to ``ticks`` at once if nothing is to happen before, nor ``run`` to end; whether it did."""
+        """Let time pass up to ``ticks`` at once if no event and no end of ``run`` lies before; whether it did."""
         if ticks > self._until_ticks or (self._events and self._events[0][0] <= ticks):
             return False
         self.now_ticks = max(self.now_ticks, ticks)
         return True
 
     def run(self, until_ticks: int) -> Iterator[Result]:
-        """Let everything happen up to a time, and give what the events have to tell."""
+        """Run all events up to a time, and yield their results."""
         self._until_ticks = until_ticks
         while self._events and self._events[0][0] <= until_ticks:
             self.now_ticks, _, happen = heapq.heappop(self._events)
-            told = happen()
-            if told is not None:
-                yield told
+            result = happen()
+            if result is not None:
+                yield result
         self.now_ticks = max(self.now_ticks, until_ticks)
 
 
@@ -91,7 +91,7 @@ class Flight:
     sender: int
     """Node that sends."""
     boot: int
-    """How often the sender had been switched on, so that a frame of its last life is not sent."""
+    """How often the sender had been switched on, so that a frame from before a restart is not sent."""
     frame: bytes
     marker_local_ticks: int
     """Sender's unwrapped counter when the RMARKER leaves, noise and delay error apart."""
@@ -111,13 +111,13 @@ class OnAir:
         self._flights: deque[Flight] = deque()
 
     def add(self, flight: Flight, now_ticks: int) -> None:
-        """Announce a frame; those that ended long ago are forgotten."""
+        """Add a frame; those that ended long ago are removed."""
         while self._flights and self._flights[0].end_ticks < now_ticks - _KEPT_TICKS:
             self._flights.popleft()
         self._flights.append(flight)
 
     def withdraw(self, flight: Flight) -> None:
-        """Take back a frame that will not be sent after all."""
+        """Remove a frame that will not be sent."""
         self._flights.remove(flight)
 
     def others(self, flight: Flight) -> Array:
@@ -136,11 +136,11 @@ class OnAir:
 
 
 class Tally(Struct, frozen=True):
-    """What a world has counted so far."""
+    """Counts of a world so far."""
 
     transmissions: int
     late_transmissions: int
-    """Frames that came too late for their time and were not sent."""
+    """Frames that were too late and not sent."""
     at_anchors: dict[str, int]
     """Outcomes (``Outcome``) of frames at anchors that were on."""
     at_tags: dict[str, int]
@@ -154,7 +154,7 @@ def make_tally(transmissions: int, late: int, counts: Integers) -> Tally:
 
 @dataclass(slots=True, eq=False)
 class Delivery:
-    """A frame that has just ended, and the rows (``RECEIVED``) of the nodes that heard it."""
+    """A frame that has just ended, and the rows (``RECEPTION_RECORD``) of the nodes that received it."""
 
     flight: Flight
     by_anchors: Records
@@ -165,7 +165,7 @@ class Medium(Generic[Result]):
     """A site's air, deterministic by its seed; memory stays flat however long it runs.
 
     Nodes are numbered: the site's anchors in the order of its file, then the tags; all are off at first. A node's noise
-    depends on the seed and on its own key alone: more tags do not change what the others hear.
+    depends on the seed and on its own key alone: more tags do not change what the others receive.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class Medium(Generic[Result]):
         seed: int,
         deliver: Callable[[Delivery], Result | None],
     ) -> None:
-        """``deliver`` is given every frame when it ends; what it returns comes out of ``run``.
+        """``deliver`` is called with every frame when it ends; ``run`` yields what it returns.
 
         Raises ValueError when an impairment names an anchor that the site has not.
         """
@@ -198,7 +198,7 @@ class Medium(Generic[Result]):
         self.boots = [0] * len(keys)
         """How often each node was switched off."""
         self._air = OnAir()
-        self._heard = np.zeros(len(keys), dtype=RECEIVED)
+        self._received = np.zeros(len(keys), dtype=RECEPTION_RECORD)
         self._counts = np.zeros((2, len(OUTCOMES)), dtype=np.int64)
         self._transmissions = self._late = 0
         self._deliver = deliver
@@ -254,7 +254,7 @@ class Medium(Generic[Result]):
     # Tags
 
     def _move_tags(self, t_s: float) -> None:
-        """Take the next piece of every trajectory whose present one has ended."""
+        """Set the next piece of every trajectory whose present one has ended."""
         for tag in np.flatnonzero(self._piece_ends_s <= t_s).tolist():
             piece = self._tags[tag].trajectory.piece(t_s)
             set_piece(self.stations, len(self._anchors) + tag, piece)
@@ -280,7 +280,7 @@ class Medium(Generic[Result]):
         return True
 
     def _radiate(self, flight: Flight) -> None:
-        """Let the RMARKER leave, and every node that can hear the frame stamp it."""
+        """Let the RMARKER leave, and every node that can receive the frame stamp it."""
         node, streams = flight.sender, self._streams
         if flight.boot != self.boots[node]:
             self._air.withdraw(flight)
@@ -293,8 +293,8 @@ class Medium(Generic[Result]):
         flight.emission_ticks, flight.emission_fraction = ticks, fraction
         t_s = ticks * TICK_S
         self._move_tags(t_s)
-        self.range_errors.pass_to(t_s, self.stations)
-        anchors, count, highest = hear(
+        self.range_errors.advance_to(t_s, self.stations)
+        anchors, count, highest = receive_frame(
             self.clocks,
             normals,
             cursors,
@@ -310,12 +310,12 @@ class Medium(Generic[Result]):
             self.range_errors.present_m,
             self._impairments.range_errors.slope_m,
             self._impairments.diagnostics,
-            self._heard,
+            self._received,
             self._counts,
         )
         streams.refill(highest)
         self._transmissions += 1
-        delivery = Delivery(flight, self._heard[:anchors].copy(), self._heard[anchors:count].copy())
+        delivery = Delivery(flight, self._received[:anchors].copy(), self._received[anchors:count].copy())
         self.timeline.at(flight.end_ticks, partial(self._deliver, delivery))
 
     def _bias_m(self, node: int, t_s: float) -> float:
