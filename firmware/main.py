@@ -1,7 +1,7 @@
 """What a DWM1001 does when it starts: an anchor's radio, or a tag's, which only listens.
 
-A tag it is where the file ``role.txt`` begins with ``tag``, or without such a file where pin ROLE is tied to ground.
-Whatever goes wrong ends in a reset, for there is nobody to read an error message: the serial port speaks the link.
+It is a tag's where the file ``role.txt`` begins with ``tag``, or without such a file where pin ROLE is tied to ground.
+Whatever goes wrong ends in a reset, as there is no place for an error message: the serial port carries the link.
 """
 
 import gc
@@ -28,7 +28,7 @@ def can_transmit() -> bool:
 
 
 def main() -> None:
-    """Set up pins and buses, and turn until the power goes."""
+    """Set up pins and buses, and serve until the power goes."""
     Pin("UART_TX", Pin.OUT, value=1)
     Pin("UART_RX", Pin.IN, Pin.PULL_UP)
     select = Pin("DW_CS", Pin.OUT, value=1)

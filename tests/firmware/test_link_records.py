@@ -106,7 +106,7 @@ def read(data, cuts=()):
     for begin, end in itertools.pairwise([0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]):
         at = begin
         while at < end:
-            at = reader.take(data, at, end)
+            at = reader.read(data, at, end)
             if reader.length:
                 found.append(bytes(reader.record[: reader.length]))
     return found, reader

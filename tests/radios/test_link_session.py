@@ -34,7 +34,7 @@ class Talk:
     def _take(self, data):
         at = 0
         while at < len(data):
-            at = self._reader.take(bytearray(data), at, len(data))
+            at = self._reader.read(bytearray(data), at, len(data))
             if self._reader.length:
                 self.commands.append(bytes(self._reader.record[: self._reader.length]))
 
@@ -100,7 +100,7 @@ def test_receptions_come_through_with_their_measurements_in_the_line_s_units():
     talk = Talk().ready()
     frame = bytes(range(40))
     talk.say(talk.board.rx(stamp(2**40 - 1), -7953, -8312, -12_345, bytearray(frame), 40))
-    talk.say(talk.board.rx(stamp(0), link.NOT_TOLD, link.NOT_TOLD, link.NOT_TOLD, bytearray(frame), 1))
+    talk.say(talk.board.rx(stamp(0), link.NOT_MEASURED, link.NOT_MEASURED, link.NOT_MEASURED, bytearray(frame), 1))
     assert talk.told[1:] == [
         Reception(frame, 2**40 - 1, talk.now_s, Diagnostics(-79.53, -83.12, -12.345)),
         Reception(frame[:1], 0, talk.now_s, Diagnostics()),

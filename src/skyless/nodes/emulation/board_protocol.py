@@ -74,7 +74,7 @@ class LinkProtocol:
         """Follow commands; a board whose radio is dead does nothing."""
         reader, buffer, at = self._reader, bytearray(data), 0
         while at < len(buffer):
-            at = reader.take(buffer, at, len(buffer))
+            at = reader.read(buffer, at, len(buffer))
             if reader.length and self._radio.now_ticks() is not None:
                 self._follow(reader.record, reader.length)
 
@@ -144,7 +144,7 @@ def _stamp(ticks: int) -> bytearray:
 def _usual_config() -> bytes:
     """The record of a CONFIG, without delays."""
     writer, reader = link.Writer(), link.Reader()
-    reader.take(writer.line, 0, writer.config(0, 0))
+    reader.read(writer.line, 0, writer.config(0, 0))
     return bytes(reader.record[: reader.length])
 
 

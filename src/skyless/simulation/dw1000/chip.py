@@ -52,7 +52,7 @@ class Chip:
         self.clocking.in_reset = False
         self.clocking.restart()
         self._lock_shown = False
-        self.memory.put(r.SYS_STATUS, r.SLP2INIT)
+        self.memory.set(r.SYS_STATUS, r.SLP2INIT)
 
     @property
     def irq(self) -> bool:
@@ -100,10 +100,10 @@ class Chip:
 
     def _read(self, access: Access, length: int) -> bytes:
         if access.file == r.SYS_TIME.file:
-            self.memory.put(r.SYS_TIME, self._air.now_ticks() & _STEP_MASK)
+            self.memory.set(r.SYS_TIME, self._air.now_ticks() & _STEP_MASK)
         elif access.file == r.SYS_STATUS.file:
             status = self.memory.get(r.SYS_STATUS) & ~r.IRQS
-            self.memory.put(r.SYS_STATUS, status | (r.IRQS if self._is_pending() else 0))
+            self.memory.set(r.SYS_STATUS, status | (r.IRQS if self._is_pending() else 0))
         elif access.file == r.TX_BUFFER.file:
             self.misuse["tx-buffer-read"] += 1  # UM p. 77
             return bytes(length)
@@ -147,8 +147,8 @@ class Chip:
         """All registers but the bits that hold the chip in reset (UM 7.2.50.1)."""
         self.transceiver.reset()
         self.memory.reset()
-        self.memory.put(r.PMSC_CTRL0, r.PMSC_CTRL0.reset & ~(0xF << r.SOFTRESET_SHIFT))
-        self.memory.put(r.SYS_STATUS, r.SLP2INIT)
+        self.memory.set(r.PMSC_CTRL0, r.PMSC_CTRL0.reset & ~(0xF << r.SOFTRESET_SHIFT))
+        self.memory.set(r.SYS_STATUS, r.SLP2INIT)
         self._lock_shown = False
 
     # The air

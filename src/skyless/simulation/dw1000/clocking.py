@@ -103,13 +103,13 @@ class Clocking:
         control = self._memory.get(r.OTP_CTRL)
         if control & r.OTPREAD:
             address = self._memory.get(r.OTP_ADDR) & 0x7FF
-            self._memory.put(r.OTP_RDAT, self._sensors.otp().get(address, 0))
+            self._memory.set(r.OTP_RDAT, self._sensors.otp().get(address, 0))
         if control & r.LDELOAD:
             if self._memory.get(r.PMSC_CTRL0) & 0xFFFF == r.PMSC_FOR_LDE:
                 self._loaded_s = self._seconds() + _LOAD_S
             else:
                 self._misuse["microcode-without-its-clock"] += 1
-        self._memory.put(r.OTP_CTRL, control & ~(r.OTPREAD | r.LDELOAD))  # they clear themselves
+        self._memory.set(r.OTP_CTRL, control & ~(r.OTPREAD | r.LDELOAD))  # they clear themselves
 
     def on_sensor_written(self) -> None:
         """Apply TC_SARC: its bit 0 lets the converter sample (UM 6.4, 7.2.43.1)."""
@@ -117,4 +117,4 @@ class Clocking:
         ready = memory.get(r.RF_SENSOR_1) == 0x80 and memory.get(r.RF_SENSOR_2) == 0x0F
         if memory.get(r.TC_SARC) & 1 and ready:
             volts, kelvins = self._sensors.readings()
-            memory.put(r.TC_SARL, volts | kelvins << 8)
+            memory.set(r.TC_SARL, volts | kelvins << 8)

@@ -54,14 +54,14 @@ class Memory:
             octets[:] = bytes(len(octets))
         for one in ALL_REGISTERS.values():
             if one.reset:
-                self.put(one, one.reset)
+                self.set(one, one.reset)
 
     def get(self, register: Register) -> int:
         """A register's value."""
         octets = self._files[register.file]
         return int.from_bytes(octets[register.sub : register.sub + register.length], "little")
 
-    def put(self, register: Register, value: int) -> None:
+    def set(self, register: Register, value: int) -> None:
         """Set a register from within the chip."""
         value &= (1 << 8 * register.length) - 1
         octets = value.to_bytes(register.length, "little")

@@ -111,11 +111,11 @@ class Transceiver:
 
     def raise_bits(self, events: int) -> None:
         """Show events in SYS_STATUS."""
-        self._memory.put(r.SYS_STATUS, self._memory.get(r.SYS_STATUS) | events)
+        self._memory.set(r.SYS_STATUS, self._memory.get(r.SYS_STATUS) | events)
 
     def drop_bits(self, events: int) -> None:
         """Clear events."""
-        self._memory.put(r.SYS_STATUS, self._memory.get(r.SYS_STATUS) & ~events)
+        self._memory.set(r.SYS_STATUS, self._memory.get(r.SYS_STATUS) & ~events)
 
     # Commands (UM 7.2.15)
 
@@ -220,8 +220,8 @@ class Transceiver:
         shown = self._memory.get(r.SYS_STATUS)
         events = sum(event for ticks, event in steps if difference(now, wrap(ticks)) >= 0 and not shown & event)
         if difference(now, wrap(marker + _HEADER_TICKS)) >= 0:  # UM p. 102: there once the header is sent
-            self._memory.put(r.TX_STAMP, marker + self._memory.get(r.TX_ANTD))
-            self._memory.put(r.TX_RAWST, marker)
+            self._memory.set(r.TX_STAMP, marker + self._memory.get(r.TX_ANTD))
+            self._memory.set(r.TX_RAWST, marker)
         if difference(now, sending.end_ticks) >= 0:
             self.sending = None
             self.counts["sent"] += 1
@@ -265,14 +265,14 @@ class Transceiver:
         is_good = is_intact(frame)
         stamped = bool(memory.get(r.PMSC_CTRL1) & r.LDERUNE)
         self._fill_registers(frame, diagnostics)
-        memory.put(r.RX_RAWST, antenna_ticks & DX_MASK)
+        memory.set(r.RX_RAWST, antenna_ticks & DX_MASK)
         if stamped and not microcode:
             self._end_reception(_COMPLETE, is_error=False)  # neither good nor bad: it waits for the stamp for ever
             return "without-microcode"
         events = _COMPLETE | (r.RXFCG if is_good else r.RXFCE)
         if stamped:
             wrong = _SUSPECT_TICKS if self.suspect else 0
-            memory.put(r.RX_STAMP, wrap(antenna_ticks - memory.get(r.LDE_RXANTD) + wrong))
+            memory.set(r.RX_STAMP, wrap(antenna_ticks - memory.get(r.LDE_RXANTD) + wrong))
             events |= r.LDEERR if fault == "first-path" else r.LDEDONE
         self._end_reception(events, is_error=not is_good)
         if fault == "first-path" or not is_good:
@@ -305,20 +305,20 @@ class Transceiver:
         symbols, cir_power = _cir_power(diagnostics.rx_power_dbm)
         whole = symbols == _ACCUMULATED_SYMBOLS  # then symbols of the delimiter were counted, too (UM 7.2.18, table 18)
         counted = symbols + (_SFD_COUNTED if whole else 0)
-        memory.put(r.RX_FINFO, len(frame) | settings | counted << 20)
-        memory.put(r.RXPACC_NOSAT, counted if whole else _ACCUMULATED_SYMBOLS)
+        memory.set(r.RX_FINFO, len(frame) | settings | counted << 20)
+        memory.set(r.RXPACC_NOSAT, counted if whole else _ACCUMULATED_SYMBOLS)
         memory.fill(r.RX_BUFFER, frame)
         amplitudes = _first_path(diagnostics.first_path_power_dbm, symbols)
         for register, value in zip((r.FP_AMPL1, r.FP_AMPL2, r.FP_AMPL3), amplitudes, strict=True):
-            memory.put(register, value)
-        memory.put(r.CIR_PWR, cir_power)
-        memory.put(r.STD_NOISE, 40)
-        memory.put(r.FP_INDEX, 745 << 6)
+            memory.set(register, value)
+        memory.set(r.CIR_PWR, cir_power)
+        memory.set(r.STD_NOISE, 40)
+        memory.set(r.FP_INDEX, 745 << 6)
         offset = 1e-6 * (diagnostics.carrier_offset_ppm or 0.0)
         carrier = round(-offset * CHANNEL_5_HZ / HZ_PER_STEP)  # UM p. 151: the minus comes from how it is measured
-        memory.put(r.DRX_CAR_INT, _twos_complement(carrier, 21))
-        memory.put(r.RX_TTCKI, _TRACKING_INTERVAL)
-        memory.put(r.RX_TTCKO, _twos_complement(round(offset * _TRACKING_INTERVAL), 19))
+        memory.set(r.DRX_CAR_INT, _twos_complement(carrier, 21))
+        memory.set(r.RX_TTCKI, _TRACKING_INTERVAL)
+        memory.set(r.RX_TTCKO, _twos_complement(round(offset * _TRACKING_INTERVAL), 19))
 
 
 def _cir_power(power_dbm: float | None) -> tuple[int, int]:
