@@ -36,7 +36,7 @@ def main() -> None:
     bus = nrf52.SpiBus(SPI(1, baudrate=nrf52.SLOW_HZ), select, Pin("DW_RST", Pin.IN), time.sleep_us)
     uart = nrf52.Uarte(time.sleep_us)
     identity = bytearray(8)
-    link.copy(DEVICE_ID, 0, 8, identity, 0)  # machine code takes a number for an address
+    link.copy(DEVICE_ID, 0, 8, identity, 0)  # machine code treats a number as an address
     made = board.Board(dw1000.DW1000(bus), uart, time, gc, can_transmit(), identity, interrupt)
     gc.collect()
     made.begin()

@@ -50,7 +50,7 @@ class AccuracyPage(Struct, frozen=True, gc=False, tag="accuracy"):
 
 
 class GeoreferencePage(Struct, frozen=True, gc=False, tag="georeference"):
-    """Where the site's origin lies on the Earth (WGS 84) and how its x axis points."""
+    """Position of the site's origin on the Earth (WGS 84), and azimuth of its axes."""
 
     latitude_deg: float
     longitude_deg: float

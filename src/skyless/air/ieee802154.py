@@ -27,7 +27,7 @@ _BLOCK_BITS: Final = 330
 _PARITY_BITS: Final = 48
 
 _REVERSED: Final = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-"""Each byte with its bits in reverse order: the radio sends bit 0 first, ``crc_hqx`` takes bit 7 first."""
+"""Each byte with its bits in reverse order: the radio sends bit 0 first, ``crc_hqx`` processes bit 7 first."""
 
 
 def preamble_s(preamble_symbols: int = PREAMBLE_SYMBOLS, sfd_symbols: int = SFD_SYMBOLS) -> float:

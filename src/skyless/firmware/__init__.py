@@ -1,6 +1,6 @@
 """Files that run unchanged on a board under MicroPython and here; they import nothing else of Skyless.
 
-A board has only the files beside this one; here it stands in for what MicroPython brings.
+A board has only the other files of this folder; this one replaces what MicroPython brings.
 """
 
 ptr8 = bytearray

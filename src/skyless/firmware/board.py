@@ -29,7 +29,7 @@ CLEARANCE_US = 5000
 """Nothing long is begun in this time before a frame is due."""
 MEASURE_US = 10_000_000
 """How often temperature and supply are measured, which takes 1.1 ms without the receiver, and the chip is checked for
-its settings: one whose supply failed may receive nothing for ever and look normal."""
+its settings: after a failed supply it may receive nothing for ever and look normal."""
 GARBLED_IN_A_ROW = 20
 """After this many the UART is restarted: it may have lost count."""
 READ_BYTES = 64
@@ -75,7 +75,7 @@ class Collector:
     """MicroPython's module ``gc``, as far as it is needed."""
 
     def collect(self) -> None:
-        """Collect garbage, which takes a board over a millisecond."""
+        """Collect garbage, which needs over a millisecond on a board."""
 
 
 class Pin:

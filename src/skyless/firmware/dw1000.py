@@ -98,7 +98,7 @@ TX_FCTRL = 0x0016_C000
 
 TX_POWER = 0x2545_6585
 """Smart power, channel 5, PRF 64 MHz: the manual's reference values (UM 7.2.31, Tables 19 and 20). A beacon of up to
-67 bytes takes the third octet; the rule behind it is one frame per millisecond."""
+67 bytes uses the third octet; the rule behind it is one frame per millisecond."""
 
 CONFIGURATION = (
     # file, sub-address, octets, value; channel 5, PRF 64 MHz, 6.8 Mbit/s, preamble of 128 symbols with code 9
@@ -162,7 +162,7 @@ _BIAS_MM = (-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71
 
 
 class ChipError(Exception):
-    """There is no DW1000 on the bus, or it does not start; the message says what was found."""
+    """There is no DW1000 on the bus, or it does not start; the message states what was found."""
 
 
 class Bus:
@@ -422,7 +422,7 @@ class DW1000:
         self.state = IDLE
 
     def set_antenna_delays(self, tx_ticks: int, rx_ticks: int) -> None:
-        """TX_ANTD (UM 7.2.26, p. 103) and LDE_RXANTD (7.2.47.5), which the chip takes into all its stamps."""
+        """TX_ANTD (UM 7.2.26, p. 103) and LDE_RXANTD (7.2.47.5), which the chip includes in all its stamps."""
         self._write(0x18, 0, 2, tx_ticks)
         self._write(0x2E, 0x1804, 2, rx_ticks)
 
@@ -586,7 +586,7 @@ class DW1000:
     def check(self) -> bool:
         """Whether the chip still has its configuration; if not it is OFF.
 
-        ``poll`` asks when SYS_STATUS looks strange. A chip whose supply failed may lock again unseen and report nothing
+        ``poll`` calls this when SYS_STATUS looks implausible. A chip whose supply failed may lock again unseen and report nothing
         for ever, so this is to be called periodically where nothing is received for long.
         """
         if self.state == OFF:

@@ -170,7 +170,7 @@ def unsigned(record: bytearray, at: int, size: int) -> int:
 
 
 class Writer:
-    """Makes records; each method returns the length of what then stands in ``line``, ready to be sent."""
+    """Writes records; each method returns the length of what is then in ``line``, ready to be sent."""
 
     def __init__(self) -> None:
         self.line = bytearray(MAX_RECORD_BYTES + 3)

@@ -1,7 +1,7 @@
 """The medium: true time, the nodes' clocks and radios, and the frames between them.
 
-A frame has two events: its RMARKER leaves, and it ends, when the listeners get it. The emulated radio takes the low
-nine bits off DX = TX stamp - configured antenna delay, as the DW1000 does, so a node that ignores the granularity
+A frame has two events: its RMARKER leaves, and it ends, when the listeners get it. The emulated radio clears the low
+nine bits of DX = TX stamp - configured antenna delay, as the DW1000 does, so a node that ignores the granularity
 sends with a wrong stamp. Who sends what and when is decided by the medium's owner.
 """
 
@@ -221,12 +221,12 @@ class Medium(Generic[Result]):
     # Power
 
     def switch_off(self, node: int) -> None:
-        """Take a node off the air; a frame of its whose RMARKER has not left is not sent."""
+        """Switch a node off; its frame is not sent if the RMARKER has not left."""
         self.stations[node]["on"] = 0
         self.boots[node] += 1
 
     def switch_on(self, node: int) -> None:
-        """Put a node on the air, with a new counter unless time has only begun."""
+        """Switch a node on, with a new counter except at time 0."""
         self.stations[node]["on"] = 1
         if self.timeline.now_ticks > 0:
             restart_counter(self.clocks, node, self._setups[node])

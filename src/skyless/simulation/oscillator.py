@@ -1,6 +1,6 @@
 """Crystal oscillators and the 40-bit counters that they drive.
 
-A node's state is where its counter stands at one instant of true time. Both are a whole number of ticks and a
+A node's state is its counter's value at one instant of true time. Both are a whole number of ticks and a
 fraction: true time counts ideal ticks from the start of the world, the counter is kept unwrapped, so that
 no precision is lost over months (``docs/maths.md`` section 3).
 

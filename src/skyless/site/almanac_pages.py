@@ -136,7 +136,7 @@ class AlmanacAssembly:
 
     @property
     def georeference(self) -> GeoreferencePage | None:
-        """Where the site lies on the Earth, once heard; many sites send none."""
+        """Position of the site on the Earth, once heard; many sites send none."""
         return self._georeference
 
     def slot_of(self, anchor: int | None) -> int | None:

@@ -13,7 +13,7 @@ _HEAD = """\
 
 name = {name}
 id = {id}                          # of the site on the air, 0 to 65533; neighbouring sites need different ones
-master = {master}                      # the anchor whose clock is the site's time; best in the middle, heard by all
+master = {master}                      # the anchor whose clock is the site's time; best in the middle, in range of all
 
 [schedule]                      # the anchors send in turn, one in each slot; all slots make a superframe
 slot_s = {slot_s}                 # length of a slot in seconds
@@ -93,12 +93,12 @@ _FLOOR_PLAN = """
 {off}[floor_plan]
 {off}image = {image}           # PNG or JPEG, relative to this file
 {off}width_m = {width_m}                 # what the image's width measures on the floor
-{off}x_m = {x_m}                     # where its lower left corner lies
+{off}x_m = {x_m}                     # position of its lower left corner
 {off}y_m = {y_m}
 """
 
 _GEOREFERENCE = """
-# Where the site's origin lies on the Earth (WGS 84).
+# Position of the site's origin on the Earth (WGS 84).
 {off}[georeference]
 {off}latitude_deg = {latitude_deg}
 {off}longitude_deg = {longitude_deg}

@@ -1,6 +1,6 @@
-"""Registers of the DW1000 as the model has them, from the User Manual v2.12 ("UM"): section 7.2 and the tables of 2.5.
+"""Registers of the DW1000 and their bits as the model has them, from the User Manual v2.12 ("UM"), sections 7.2 and 2.5.
 
-The driver has a table of its own; ``tests/simulation/test_dw1000_tables.py`` holds both against a third.
+The driver has a table of its own; ``tests/simulation/test_dw1000_tables.py`` compares both with a third.
 """
 
 from typing import Final
@@ -16,7 +16,7 @@ class Register(Struct, frozen=True):
     length: int
     """Octets."""
     reset: int = 0
-    """Value after a reset; of tuning registers only those that section 2.5 tells to change are known exactly."""
+    """Value after a reset; of tuning registers only those that section 2.5 names for a change are known exactly."""
     access: str = "RW"
     """RW; RO, which writing does not change; WO, which reads as zeros."""
 
@@ -138,7 +138,7 @@ RXENAB: Final = 1 << 8
 RXDLYE: Final = 1 << 9
 HRBPT: Final = 1 << 24
 
-# SYS_STATUS (UM 7.2.17, pp. 86-93); SYS_MASK has the same places
+# SYS_STATUS (UM 7.2.17, pp. 86-93); SYS_MASK has the same bits
 IRQS: Final = 1 << 0
 CPLOCK: Final = 1 << 1
 ESYNCR: Final = 1 << 2

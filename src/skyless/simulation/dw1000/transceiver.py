@@ -344,6 +344,6 @@ def _first_path(power_dbm: float | None, symbols: int) -> tuple[int, int, int]:
 
 
 def _twos_complement(value: int, bits: int) -> int:
-    """Two's complement, limited to the range of so many bits."""
+    """Two's complement, limited to the range of that many bits."""
     half = 1 << (bits - 1)
     return min(max(value, -half), half - 1) & ((1 << bits) - 1)
