@@ -586,8 +586,8 @@ class DW1000:
     def check(self) -> bool:
         """Whether the chip still has its configuration; if not it is OFF.
 
-        ``poll`` calls this when SYS_STATUS looks implausible. A chip whose supply failed may lock again unseen and report nothing
-        for ever, so this is to be called periodically where nothing is received for long.
+        ``poll`` calls this when SYS_STATUS looks implausible. A chip whose supply failed may lock again unnoticed and
+        report nothing for ever, so this is to be called periodically where nothing is received for long.
         """
         if self.state == OFF:
             return False

@@ -1,4 +1,4 @@
-"""Registers of the DW1000 and their bits as the model has them, from the User Manual v2.12 ("UM"), sections 7.2 and 2.5.
+"""Registers of the DW1000 and their bits, from sections 7.2 and 2.5 of the User Manual v2.12 ("UM").
 
 The driver has a table of its own; ``tests/simulation/test_dw1000_tables.py`` compares both with a third.
 """
