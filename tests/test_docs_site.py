@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted(
-    [*ROOT.glob("docs/*.md"), *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md"))]
-) + [ROOT / "firmware" / "README.md"]
+PAGES = [
+    *sorted(ROOT.glob("docs/*.md")),
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "firmware/README.md")),
+]
 CURRENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
 """Those that describe the code as it is."""
 SOURCES = ("src", "tests", "benchmarks", "scripts", "firmware", "docs")
