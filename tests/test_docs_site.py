@@ -136,6 +136,15 @@ def test_every_picture_is_shown():
     assert shown == {path.name for path in (ROOT / "docs" / "pictures").glob("*.svg")}
 
 
+def test_pictures_show_what_the_documents_and_the_code_say():
+    spec = importlib.util.spec_from_file_location("make", ROOT / "docs" / "pictures" / "make.py")
+    make = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(make)
+    for name, draw in make.PICTURES.items():
+        drawn = (make.FOLDER / f"{name}.svg").read_text(encoding="utf-8")
+        assert f">{make.content_of(draw())}<" in drawn, f"run docs/pictures/make.py {name}"
+
+
 @pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in GENERATOR), reason="the dependency group docs is missing"
 )
