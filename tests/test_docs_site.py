@@ -104,25 +104,22 @@ def test_rows_of_a_table_have_as_many_cells_as_its_head(page):
 
 @current_pages
 def test_files_that_are_named_exist(page):
-    for span in code_spans(page):
-        name = span.removeprefix("./")
-        if re.fullmatch(r"[\w./-]+\.(py|js)|[\w-]+(/[\w-]+)*/", name):
-            assert any(path.endswith(f"/{name}") for path in files()), f"{page.name}: `{span}`"
+    names = [name for name in code_spans(page) if re.fullmatch(r"[\w./-]+\.(py|js)|[\w-]+(/[\w-]+)*/", name)]
+    assert [name for name in names if not any(path.endswith(f"/{name}") for path in files())] == []
 
 
 @current_pages
 def test_names_of_the_code_exist(page):
-    for span in code_spans(page):
-        if re.fullmatch(r"_?[A-Z][A-Z0-9]*_[A-Z0-9_]+|([A-Z][a-z0-9]+){2,}(\.\w+)*", span):
-            missing = [name for name in span.split(".") if name not in words()]
-            assert not missing, f"{page.name}: `{span}`"
+    pattern = r"_?[A-Z][A-Z0-9]*_[A-Z0-9_]+|([A-Z][a-z0-9]+){2,}(\.\w+)*"
+    names = [name for name in code_spans(page) if re.fullmatch(pattern, name)]
+    assert [name for name in names if not words().issuperset(name.split("."))] == []
 
 
 @current_pages
 def test_options_that_are_named_exist(page):
     text = page.read_text(encoding="utf-8")
-    for option in set(re.findall(r"(?<![\w-])--[a-z][a-z-]+[a-z]", text)) - OTHER_PROGRAMS:
-        assert option[2:].replace("-", "_") in words(), f"{page.name}: {option}"
+    options = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+[a-z]", text)) - OTHER_PROGRAMS
+    assert sorted(option for option in options if option[2:].replace("-", "_") not in words()) == []
 
 
 def test_every_page_is_in_the_navigation():
