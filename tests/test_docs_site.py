@@ -110,7 +110,7 @@ def test_files_that_are_named_exist(page):
 
 @current_pages
 def test_names_of_the_code_exist(page):
-    pattern = r"_?[A-Z][A-Z0-9]*_[A-Z0-9_]+|([A-Z][a-z0-9]+){2,}(\.\w+)*"
+    pattern = r"_?[A-Z][A-Z0-9_]{3,}|[a-z]+(_[a-z0-9]+)+|([A-Z][a-z0-9]+)+(\.\w+)*"
     names = [name for name in code_spans(page) if re.fullmatch(pattern, name)]
     assert [name for name in names if not words().issuperset(name.split("."))] == []
 

@@ -81,9 +81,9 @@ class MasterElection:
             return self._follow(claim, rx_ticks, Verdict.FROM_FIRST_MASTER) if from_claimant else Verdict.OTHER
         if claim == self.claim:
             if from_claimant:
-                self._watch.hear(beacon.anchor, beacon.sequence, rx_ticks)
+                self._watch.update(beacon.anchor, beacon.sequence, rx_ticks)
             elif beacon.master_heard is not None:
-                self._watch.hear(beacon.anchor, beacon.master_heard.sequence, rx_ticks)
+                self._watch.update(beacon.anchor, beacon.master_heard.sequence, rx_ticks)
             return Verdict.FROM_MASTER if from_claimant else Verdict.OTHER
         if not self._is_newer(claim):
             return self._hear_stale(claim, rx_ticks) if from_claimant else Verdict.STALE

@@ -13,16 +13,13 @@ from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.followed_master import FollowedMaster
 from skyless.air.reception import Diagnostics, Reception
-from skyless.clocks.stamps import AnchorStamps
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.fix_time import FixTime
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.positioning.methods.factory import MethodOptions, new_method
 from skyless.positioning.methods.joint import Estimation
-from skyless.positioning.methods.nlos_weighting import variance_factor
-from skyless.positioning.methods.observations import Observer
+from skyless.positioning.methods.observations import AnchorStamps, FixTime, Observer, variance_factor
 from skyless.positioning.observation import Method
 from skyless.site.almanac_gathering import AlmanacAssembly
 from skyless.site.slots import schedule_from_page
@@ -110,7 +107,7 @@ class Receiver:
             self.reason = NoFixReason.NO_ALMANAC
             return None
         factor, claim = 1.0 if told is None else _trust(told), self._followed.claim
-        result = method.hear(self._observer.observe(frame, beacon, anchor_m, rx_ticks, tx_ticks, factor, claim))
+        result = method.update(self._observer.observe(frame, beacon, anchor_m, rx_ticks, tx_ticks, factor, claim))
         if isinstance(result, Fix):
             self.counters["fixes"] += 1
             return result
@@ -133,7 +130,7 @@ class Receiver:
                 f"height_m is {height_m!r} and std_m is {std_m!r}; both should be finite numbers, std_m above 0"
             )
         method = self._method
-        return isinstance(method, Estimation) and method.hear_height(height_m, std_m)
+        return isinstance(method, Estimation) and method.update_height(height_m, std_m)
 
     def _admit(self, beacon: Beacon, rx_ticks: int) -> int | None:
         """TX stamp, unwrapped, of a beacon of the site, by the present master, and of an anchor that may be there."""
@@ -200,7 +197,7 @@ class Receiver:
         elif self._method is not None and master == self._master:
             return
         self._master = master
-        self._observer.follow(master, book.slot_of(master) or 0)
+        self._observer.set_master(master, book.slot_of(master) or 0)
         method_master = None if self._wanted.method in FILTERS else master
         method_key = (book.issue, book.schedule, book.noise, book.accuracy, method_master)
         if method_key != self._made_of:
@@ -209,7 +206,7 @@ class Receiver:
                 schedule = schedule_from_page(book.schedule)
                 self._superframe_ticks = schedule.superframe_ticks
                 self._method = new_method(self._wanted, master, book.schedule, book.noise, book.accuracy, self._time)
-                self._observer.serve(self._method, schedule)
+                self._observer.set_method(self._method, schedule)
 
 
 def _trust(told: Diagnostics) -> float:

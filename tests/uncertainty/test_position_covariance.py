@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from dense_covariance import position_covariance
-from skyless.positioning.solver.locate import Solution, locate
-from skyless.uncertainty.tdoa import (
-    bracketed_covariance,
-    literal_covariance,
-    literal_delayed_covariance,
-    stamp_variance_m2,
-)
+from skyless.clocks.filter import stamp_variance_m2
+from skyless.positioning.methods.locate import Solution, locate
+from skyless.positioning.methods.snapshots import bracketed_covariance, literal_covariance, literal_delayed_covariance
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 LAB_3D = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])

@@ -6,7 +6,7 @@ from msgspec import Struct
 class Diagnostics(Struct, frozen=True, gc=False):
     """What a radio measured of one frame beside its time; a value is None where the radio does not tell.
 
-    Powers are those of the chip's formulas as they stand; ``positioning/methods/nlos_weighting.py`` says what drivers
+    Powers are those of the chip's formulas as they stand; ``positioning/methods/observations.py`` says what drivers
     make of them.
     """
 

@@ -17,7 +17,7 @@ from skyless.nodes.fix_log import FixListener, FixLog
 from skyless.nodes.hearing import Hearing
 from skyless.nodes.process.running import HEALTH_S, AskedAgain, Log, every, keep, link_of, together
 from skyless.nodes.process.usage import Usage
-from skyless.positioning.masterless.calibration import DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.radios.interface import Gone, Restarted
 from skyless.radios.serial.sniffer_radio import SnifferRadio
@@ -106,7 +106,7 @@ class PacketTagNode:
     def _receive(self, packet: Packet) -> None:
         self.packets += 1
         self._known += packet.anchor in self.settings.anchors_m
-        fix = self.tracking.hear(packet)
+        fix = self.tracking.on_packet(packet)
         if fix is not None:
             done_s = time.monotonic()
             self.book.take(fix, done_s if packet.host_s is None else packet.host_s, done_s)
