@@ -309,7 +309,7 @@ def test_fixes_carry_levels_and_alert_limit():
     episode = episode_of(CALM, 60)
     for limit_m, alert in ((None, Alert.NONE), (0.01, Alert.LIMIT), (10.0, Alert.NONE)):
         method = Estimation(settings_of(CALM, alert_limit_m=limit_m))
-        fixes = [fix for fix in map(method.hear, observations_of(episode.packets)) if isinstance(fix, Fix)]
+        fixes = [fix for fix in map(method.update, observations_of(episode.packets)) if isinstance(fix, Fix)]
         assert fixes[0].alert is Alert.UNAVAILABLE
         assert fixes[-1].alert is alert
         assert 0.02 < fixes[-1].hpl_m < 0.4
