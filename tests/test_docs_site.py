@@ -1,6 +1,7 @@
 """The documents: links lead somewhere, names exist in the code, every page is in the site, and the site builds."""
 
 import ast
+import importlib
 import importlib.util
 import re
 import subprocess
@@ -113,6 +114,18 @@ def test_names_of_the_code_exist(page):
     pattern = r"_?[A-Z][A-Z0-9_]{3,}|[a-z]+(_[a-z0-9]+)+|([A-Z][a-z0-9]+)+(\.\w+)*"
     names = [name for name in code_spans(page) if re.fullmatch(pattern, name)]
     assert [name for name in names if not words().issuperset(name.split("."))] == []
+
+
+@current_pages
+def test_examples_import_and_call_what_exists(page):
+    for example in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
+        tree = ast.parse(example)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                module = importlib.import_module(node.module)
+                assert [name.name for name in node.names if not hasattr(module, name.name)] == []
+            elif isinstance(node, ast.Attribute):
+                assert node.attr in words(), node.attr
 
 
 @current_pages
