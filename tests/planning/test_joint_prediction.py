@@ -208,5 +208,5 @@ def test_lost_packets_cost_and_fixes_come_with_those_that_arrive():
     ]
     assert [row[FIX_SHARE] for row in rows] == pytest.approx([1.0, 0.8, 0.5], abs=1e-5)
     assert rows[0][SIGMA] < rows[1][SIGMA] < rows[2][SIGMA]
-    # anchors lose half as well here: more than the 1.39 of tags alone (docs/maths.md section 6)
+    # anchors lose half as well here: more than the 1.39 of tags alone (docs/maths.md section 7)
     assert 1.39 < rows[2][CLAIMED] / rows[0][CLAIMED] < 1.6
