@@ -14,7 +14,7 @@ from mqtt_brokers import free_port, running, stopped, until
 from skyless.errors import SkylessError
 from skyless.mqtt import connection
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.connect import check_broker
+from skyless.mqtt.connection import check_broker
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import StatusMessage, Zone, ZonesMessage
 from skyless.mqtt.topics import fix_topic, receptions_topic, status_topic, zones_topic
@@ -377,9 +377,9 @@ def certificate(tmp_path):
     ("answer", "trouble"),
     [
         (b"", "no answer within 0.2 s"),
-        (b"\x00\x00", "does not speak MQTT"),
-        (b"HTTP/1.1 400 Bad Request\r\n\r\n" * 9, "does not speak MQTT"),
-        (b"\x20\x02\x00\x00\x30\x01\xff", "does not speak MQTT"),
+        (b"\x00\x00", "answer is not MQTT"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n" * 9, "answer is not MQTT"),
+        (b"\x20\x02\x00\x00\x30\x01\xff", "answer is not MQTT"),
         (b"\x20\x02\x00\x00\x30\x05\x00", "closed the connection"),
     ],
 )

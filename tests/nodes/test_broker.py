@@ -16,11 +16,10 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.errors import SkylessError
-from skyless.mqtt.connect import check_broker
+from skyless.mqtt.connection import check_broker
 from skyless.mqtt.link import Link
-from skyless.nodes.broker.broker import folder as broker_place
-from skyless.nodes.broker.broker import start_broker
-from skyless.nodes.broker.settings import BrokerSettings
+from skyless.nodes import broker as broker_module
+from skyless.nodes.broker import BrokerSettings, start_broker
 
 BROKER = (sys.executable, "-m", "skyless.cli.main", "broker")
 
@@ -127,7 +126,7 @@ def test_a_taken_port_is_an_error_when_it_was_asked_for(taken, tmp_path, capsys)
 
 
 def test_without_a_port_the_next_free_one_is_taken(taken, tmp_path, monkeypatch):
-    monkeypatch.setattr(broker_place, "FIRST_PORT", taken)
+    monkeypatch.setattr(broker_module, "FIRST_PORT", taken)
 
     async def check():
         async with await start_broker(BrokerSettings(data=tmp_path / "store")) as broker:

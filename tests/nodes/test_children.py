@@ -8,8 +8,8 @@ import sys
 
 from mqtt_brokers import free_port, until
 
+from skyless.nodes.children import Child, Program, end
 from skyless.nodes.process import children
-from skyless.nodes.process.children import Child, Program, end
 
 
 def alive(pid):
@@ -36,7 +36,7 @@ def test_a_program_that_is_killed_is_started_again_and_said_so():
         await until(lambda: child.pid is not None and child.pid != first)
         second = child.pid
         assert child.starts == 2
-        assert said == ["air ended (signal 9): it said nothing; started again"]
+        assert said == ["air ended (signal 9): no message; started again"]
         assert not alive(first)
         assert alive(second)
         await stop(task)

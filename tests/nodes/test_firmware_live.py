@@ -46,7 +46,7 @@ def test_anchor_and_tag_on_the_firmware_make_right_fixes_and_survive_noise_and_p
             assert are_right(await site.fixes("tag1", 200))
 
             await site.stop("board tag1")
-            await site.until(lambda: any("pulled out" in line for line in site.said))
+            await site.until(lambda: any("unplugged" in line for line in site.said))
             plug_in(site, "tag1")
             assert are_right(await site.fixes("tag1", 200))
             assert node.restarts == 2

@@ -20,9 +20,8 @@ from skyless.evaluation.compile_ahead import compile_kernels
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import SiteMessage
 from skyless.mqtt.topics import site_topic
-from skyless.nodes.process.loop import end_with_parent
-from skyless.nodes.tag import TagSettings
-from skyless.nodes.tags import Tags
+from skyless.nodes.process import end_with_parent
+from skyless.nodes.tag import Tags, TagSettings
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.replay.site import SiteReplay
 

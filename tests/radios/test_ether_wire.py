@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.radios.emulated.ether_wire import (
+from skyless.radios import ether_wire
+from skyless.radios.ether_wire import (
     MAX_MESSAGE_BYTES,
     Arrival,
     Clocks,
@@ -23,7 +24,6 @@ from skyless.radios.emulated.ether_wire import (
     pack,
     to_ether,
 )
-from skyless.radios.emulated.radio import ether_wire
 
 TICKS = st.integers(0, 2**40 - 1)
 NODES = st.integers(0, 300)

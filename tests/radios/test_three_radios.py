@@ -9,7 +9,7 @@ import asyncio
 import msgspec
 import pytest
 from chip_stage import ChipAnchor, TimedNode, WorldAir
-from radio_ears import ears
+from radio_events import radio_events
 from serial_stage import PlayedBoard
 
 from skyless.anchor import Anchor
@@ -61,7 +61,7 @@ def through_the_chip():
 async def over_the_line(heard):
     """The same receptions behind a board and a serial port."""
     board = PlayedBoard()
-    async with board, ears(SerialRadio(board.pty.place, 1_000_000, "tag1")) as host:
+    async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
         await host.until(Restarted)
         for at in range(0, len(heard), 20):
             for reception in heard[at : at + 20]:

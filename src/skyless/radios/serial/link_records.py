@@ -1,4 +1,4 @@
-"""Records of the serial link as values; what is rounded to the line's units is rounded here, for all who ask."""
+"""Records of the serial link as values, and the rounding of measured values to the link's units."""
 
 from typing import Final
 
@@ -13,7 +13,7 @@ _GREATEST: Final = 0x7FFF
 
 
 class Hello(Struct, frozen=True):
-    """Who the board is."""
+    """The board's version and abilities."""
 
     major: int
     minor: int
@@ -47,7 +47,7 @@ class TooLate(Struct, frozen=True, gc=False):
 
 
 class Status(Struct, frozen=True):
-    """How the board does."""
+    """The board's state and counts."""
 
     ticks: int
     configured: bool
@@ -63,7 +63,7 @@ class Status(Struct, frozen=True):
 
 
 class NotDone(Struct, frozen=True):
-    """The board does not follow a command."""
+    """The board has refused a command."""
 
     command: int
     reason: int
@@ -82,7 +82,7 @@ def decode(record: bytes) -> Record | str:
 
 
 def quantised(diagnostics: Diagnostics) -> Diagnostics:
-    """What is left of measured values after the serial link."""
+    """Measured values as rounded by the serial link."""
     powers = (diagnostics.rx_power_dbm, diagnostics.first_path_power_dbm)
     rx_power, first_path = (_value(to_steps(power, POWER_STEPS_PER_DB), POWER_STEPS_PER_DB) for power in powers)
     offset = to_steps(diagnostics.carrier_offset_ppm, OFFSET_STEPS_PER_PPM)
