@@ -153,8 +153,8 @@ def test_a_link_stopped_without_a_broker_ends_at_once_and_says_what_is_lost(capl
         await until(lambda: "cannot be reached" in caplog.text)
         await stopped(task)
         assert task.cancelled()
-        assert "has not taken 1 messages" in caplog.text
-        assert "'not a topic' is not one that every broker takes" in caplog.text
+        assert "has not accepted 1 messages" in caplog.text
+        assert "'not a topic' is not one that every broker accepts" in caplog.text
         assert link.counters.dropped == 1
 
     asyncio.run(check())
@@ -385,7 +385,7 @@ def certificate(tmp_path):
 )
 def test_what_is_no_broker_is_told_and_tried_again(answer, trouble, monkeypatch):
     """Silence, garbage, another protocol, a wrong packet, half a packet."""
-    monkeypatch.setattr(connection, "ANSWER_S", 0.2)
+    monkeypatch.setattr(connection, "BROKER_ANSWER_S", 0.2)
     visits = []
 
     async def serve(_, writer):

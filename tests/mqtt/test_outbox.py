@@ -24,11 +24,11 @@ class Broker:
         self.number = 0
 
     def take(self):
-        message = self.box.take()
+        message = self.box.next_message()
         if message is None:
             return None
         self.number += 1
-        self.box.gave(message, self.number)
+        self.box.mark_sent(message, self.number)
         self.got.append((message.topic, message.payload, message.qos > 0, message.retain))
         if message.qos:
             self.flying.append(self.number)
@@ -56,14 +56,14 @@ def test_its_bounds_hold_and_all_losses_are_counted(steps):
             box.put(topic, b"%04d" % number + b"." * size, qos, retain=retain)
             put[qos, retain] += 1
         assert len(box._newest) <= LIMITS.topics
-        assert len(box._kept) <= LIMITS.topics
+        assert len(box._retained) <= LIMITS.topics
         assert len(box._flying) <= LIMITS.window
         assert len(box._queue) <= LIMITS.messages
         assert box.waiting_bytes <= 2 * LIMITS.topic_bytes + LIMITS.bytes + LIMITS.window * LIMITS.payload
     broker.restart()
     while broker.take() is not None or broker.flying:
         broker.acknowledge()
-    assert box.waiting_bytes == sum(len(message.payload) for message in box._kept.values())
+    assert box.waiting_bytes == sum(len(message.payload) for message in box._retained.values())
     assert box.unacknowledged == 0
     unretained = {message for message in broker.got if not message[3]}
     lost = put[0, False] + put[1, False] - len(unretained)
@@ -138,4 +138,4 @@ def test_a_topic_that_a_broker_would_not_take_is_dropped(topic):
     box = Outbox(Limits())
     box.put(topic, b"", 1, retain=False)
     assert box.dropped == 1
-    assert box.take() is None
+    assert box.next_message() is None

@@ -8,8 +8,8 @@ import sys
 
 from mqtt_brokers import free_port, until
 
+from skyless.nodes import children
 from skyless.nodes.children import Child, Program, end
-from skyless.nodes.process import children
 
 
 def alive(pid):
