@@ -7,7 +7,13 @@ from radio_events import radio_events
 
 from skyless.nodes.board import LinkProtocol, Pty
 from skyless.radios.interface import Restarted
+from skyless.radios.serial.link_records import from_steps, to_steps
 from skyless.radios.serial.serial_radio import SerialRadio
+
+
+def quantised(diagnostics):
+    """Measured values as the serial link rounds them."""
+    return from_steps(*to_steps(diagnostics))
 
 
 class PlayedRadio:

@@ -307,7 +307,7 @@ def test_a_radio_says_that_what_answers_is_no_ether(answer):
 def test_of_another_machine_s_ether_the_clock_is_shifted_to_this_one(monkeypatch):
     async def play():
         async with OpenAir() as air:
-            monkeypatch.setattr("skyless.nodes.ether.this_machine", lambda: "another")
+            air.ether.machine = "another"
             air.ether._origin_s -= 1000.0
             air.ether._clock = lambda: time.monotonic() - 1000.0
             async with nodes(air.port, "anchor", "1") as (anchor,), nodes(air.port, "tag", "tag1") as (tag,):

@@ -3,11 +3,11 @@
 from collections import Counter
 
 import pytest
+from serial_stage import quantised
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.firmware import link
 from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
-from skyless.radios.serial.link_records import quantised
 from skyless.radios.serial.serial_radio import BOARD_SILENCE_S, MOST_PENDING_FRAMES, STATUS_S, LinkSession
 
 DELAYS = AntennaDelays(16_450, 16_500)

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from radio_events import radio_events
-from serial_stage import PlayedBoard, linked
+from serial_stage import PlayedBoard, linked, quantised
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.anchor import Anchor
@@ -21,7 +21,6 @@ from skyless.nodes.board import ListenerProtocol, Pty
 from skyless.nodes.open_radio import is_simulated, open_radios, open_sniffers
 from skyless.radios.interface import AntennaDelays, Gone, Late, Restarted, Sent
 from skyless.radios.serial.foreign_radios import ListenerRadio
-from skyless.radios.serial.link_records import quantised
 from skyless.radios.serial.serial_radio import SerialRadio
 from skyless.receiver import Receiver
 from skyless.simulation.stations import TagSpec

@@ -108,7 +108,7 @@ class Link:
     def publish(self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False) -> None:
         """Hand over a message; returns at once, whatever the broker does. A struct becomes JSON."""
         payload = message if isinstance(message, bytes) else _encode(message)
-        fault = self._outbox.put(topic, payload, qos, retain=retain)
+        fault = self._outbox.add(topic, payload, qos, retain=retain)
         if fault is not None:
             self._log_fault(fault)
         self._pump()

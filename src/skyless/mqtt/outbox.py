@@ -57,7 +57,7 @@ class Outbox:
         self.sent = 0
         """Messages of QoS 0 given to the connection, and messages of QoS 1 acknowledged."""
 
-    def put(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> str | None:
+    def add(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> str | None:
         """Add a message; returns the fault of one that no broker would accept."""
         fault = self._fault(topic, payload)
         if fault is not None:
@@ -121,11 +121,6 @@ class Outbox:
     def unacknowledged(self) -> int:
         """Messages of QoS 1, and retained ones, that the broker does not have for certain."""
         return len(self._flying) + len(self._again) + len(self._queue) + len(self._to_retain)
-
-    @property
-    def waiting_bytes(self) -> int:
-        """Payload of all messages that wait or are kept."""
-        return self._newest_bytes + self._queue_bytes + self._retained_bytes
 
     def _fault(self, topic: str, payload: bytes) -> str | None:
         if not _TOPIC.fullmatch(topic):

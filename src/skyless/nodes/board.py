@@ -21,7 +21,7 @@ from skyless.errors import SkylessError
 from skyless.firmware import link
 from skyless.nodes.process import Log
 from skyless.radios.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
-from skyless.radios.serial.link_records import OFFSET_STEPS_PER_PPM, POWER_STEPS_PER_DB, to_steps
+from skyless.radios.serial.link_records import to_steps
 from skyless.recordings.foreign.bitcraze_payload import TDOA3
 from skyless.site.almanac_gathering import AlmanacAssembly
 from skyless.ticks import wrap
@@ -87,10 +87,7 @@ class LinkProtocol:
             return
         self.counts["received"] += 1
         measured, frame = reception.diagnostics or Diagnostics(), bytearray(reception.frame)
-        powers = (measured.rx_power_dbm, measured.first_path_power_dbm)
-        rx_power, first_path = (to_steps(power, POWER_STEPS_PER_DB) for power in powers)
-        offset = to_steps(measured.carrier_offset_ppm, OFFSET_STEPS_PER_PPM)
-        self._write(self._writer.rx(_stamp(reception.rx_ticks), rx_power, first_path, offset, frame, len(frame)))
+        self._write(self._writer.rx(_stamp(reception.rx_ticks), *to_steps(measured), frame, len(frame)))
 
     def on_host_data(self, data: bytes) -> None:
         """Execute commands; a board whose radio is dead does nothing."""

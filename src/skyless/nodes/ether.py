@@ -15,21 +15,7 @@ from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import EtherHealth, TrueMotion, TruthMessage, Vector
 from skyless.mqtt.topics import health_topic, truth_topic
 from skyless.nodes.process import HEALTH_S, Log, every, keep, link_of, together
-from skyless.radios.ether_wire import (
-    Arrival,
-    Clocks,
-    Done,
-    HeardRow,
-    Join,
-    Joined,
-    Refused,
-    Send,
-    Unpacker,
-    WireError,
-    pack,
-    this_machine,
-    to_ether,
-)
+from skyless.radios import ether_wire as wire
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.medium import Delivery, Medium
 from skyless.simulation.stations import TagSpec
@@ -68,7 +54,7 @@ class Client(asyncio.Protocol):
     def __init__(self, ether: "Ether") -> None:
         self._ether = ether
         self._session: Session | None = None
-        self._unpacker = Unpacker()
+        self._unpacker = wire.Unpacker()
         self._transport: asyncio.Transport | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -84,7 +70,7 @@ class Client(asyncio.Protocol):
         transport = self._transport
         if transport is None or transport.is_closing() or transport.get_write_buffer_size() > _OVERRUN_BYTES:
             return False
-        transport.write(pack(message))
+        transport.write(wire.pack(message))
         return True
 
     def data_received(self, data: bytes) -> None:
@@ -92,24 +78,24 @@ class Client(asyncio.Protocol):
         try:
             for body in self._unpacker.feed(data):
                 self._process(body)
-        except (WireError, msgspec.MsgspecError) as error:
+        except (wire.WireError, msgspec.MsgspecError) as error:
             self._refuse(f"not understood: {error}")
 
     def _process(self, body: bytes) -> None:
-        message = to_ether.decode(body)
-        if isinstance(message, Join) and self._session is None:
+        message = wire.to_ether.decode(body)
+        if isinstance(message, wire.Join) and self._session is None:
             answer = self._ether.join(self, message)
             if isinstance(answer, str):
                 self._refuse(answer)
             else:
                 self._session = answer
-        elif isinstance(message, Send) and self._session is not None and 0 <= message.node < len(self._session.nodes):
+        elif isinstance(message, wire.Send) and self._session and 0 <= message.node < len(self._session.nodes):
             self._ether.transmit(self._session, message)
         else:
-            raise WireError("a message that does not belong here")
+            raise wire.WireError("a message that does not belong here")
 
     def _refuse(self, reason: str) -> None:
-        self.send(Refused(reason))
+        self.send(wire.Refused(reason))
         if self._transport is not None:
             self._transport.close()
 
@@ -141,6 +127,7 @@ class Ether:
         self._origin_s = clock()
         self._timer: asyncio.TimerHandle | None = None
         self.stalls = self.overruns = 0
+        self.machine = wire.this_machine()
 
     async def serve(self, host: str, port: int) -> asyncio.Server:
         """Listen; port 0 takes any free one.
@@ -178,7 +165,7 @@ class Ether:
             await asyncio.sleep(_CLOCKS_S)
             self.advance()
             for session in set(self._owners.values()):
-                session.send(Clocks(self.now_host_s, self._counters(session)))
+                session.send(wire.Clocks(self.now_host_s, self._counters(session)))
 
     @property
     def now_host_s(self) -> float:
@@ -190,7 +177,7 @@ class Ether:
 
     # Clients
 
-    def join(self, client: Client, message: Join) -> Session | str:
+    def join(self, client: Client, message: wire.Join) -> Session | str:
         """Put a process's nodes on the air; or why not."""
         nodes = [self._nodes.get((message.kind, name)) for name in message.names]
         for name, node in zip(message.names, nodes, strict=True):
@@ -204,7 +191,7 @@ class Ether:
         for node in session.nodes:
             self._owners[node] = session
             self.medium.switch_on(node)
-        session.send(Joined(this_machine(), self.now_host_s, self._counters(session)))
+        session.send(wire.Joined(self.machine, self.now_host_s, self._counters(session)))
         return session
 
     def leave(self, session: Session) -> None:
@@ -214,7 +201,7 @@ class Ether:
             self._flying.pop(node, None)
             self.medium.switch_off(node)
 
-    def transmit(self, session: Session, message: Send) -> None:
+    def transmit(self, session: Session, message: wire.Send) -> None:
         """Plan a transmission, unless it is too late or the node's radio has one waiting already.
 
         Raises:
@@ -222,7 +209,7 @@ class Ether:
         """
         node = session.nodes[message.node]
         if node >= len(self.site.anchors) or len(message.frame) > MAX_FRAME_BYTES:
-            raise WireError("a transmission by a tag, or of a frame that is too long")
+            raise wire.WireError("a transmission by a tag, or of a frame that is too long")
         self.advance()
         is_planned = node not in self._flying and self.medium.transmit(
             node, Transmission(message.frame, message.tx_ticks)
@@ -231,27 +218,27 @@ class Ether:
             self._flying[node] = message.tx_ticks
             self._arm()
         else:
-            session.send(Done(message.node, message.tx_ticks, late=True))
+            session.send(wire.Done(message.node, message.tx_ticks, late=True))
 
     def _deliver(self, delivery: Delivery) -> None:
         """Send a frame that has ended to all processes with nodes that heard it, and its end to the sender."""
         flight, host_s = delivery.flight, self.now_host_s
-        rows: dict[Session, list[HeardRow]] = {}
+        rows: dict[Session, list[wire.HeardRow]] = {}
         for heard in (delivery.by_anchors, delivery.by_tags):
             columns = ("node", "rx_ticks", "rx_power_dbm", "first_path_power_dbm", "carrier_offset_ppm")
             for node, *values in zip(*(heard[column].tolist() for column in columns), strict=True):
                 session = self._owners.get(node)
                 if session is not None:
-                    rows.setdefault(session, []).append(HeardRow(session.index[node], *values))
+                    rows.setdefault(session, []).append(wire.HeardRow(session.index[node], *values))
         for session, heard_rows in rows.items():
-            if not session.send(Arrival(flight.frame, host_s, tuple(heard_rows))):
+            if not session.send(wire.Arrival(flight.frame, host_s, tuple(heard_rows))):
                 self.overruns += len(heard_rows)
         if flight.boot != self.medium.boots[flight.sender]:
             return  # the process that sent it has gone meanwhile
         sender = self._owners.get(flight.sender)
         tx_ticks = self._flying.pop(flight.sender, None)
         if sender is not None and tx_ticks is not None:
-            sender.send(Done(sender.index[flight.sender], tx_ticks, late=False))
+            sender.send(wire.Done(sender.index[flight.sender], tx_ticks, late=False))
 
     # Truth and health
 

@@ -68,7 +68,6 @@ class RecorderNode:
         self._new_run_s = 0.0
         self._next: dict[str, tuple[str, int]] = {}
         """For each tag: the segment, and the number of its next reception."""
-        self._flushing: asyncio.Future[None] | None = None
         self.link.subscribe(f"{site_topic(site).removesuffix('site')}#", self._on_message, qos=1)
         self.link.on_state.append(self._on_state)
 

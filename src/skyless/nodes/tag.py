@@ -36,7 +36,6 @@ class TagSettings(Struct, frozen=True):
     qa: float = 0.3
     site: int | None = None
     """The only site to listen to; None for the first that is heard."""
-    z_bounds_m: tuple[float, float] | None = None
     integrity: IntegrityRequirement = IntegrityRequirement()
     publish_hz: float = 50.0
     """Largest rate of fixes on MQTT; all of them count."""
@@ -66,9 +65,7 @@ class TagNode:
     def new_receiver(self) -> Receiver:
         """A receiver that has heard nothing yet."""
         asked = self.settings
-        return Receiver(
-            asked.method, site=asked.site, qa=asked.qa, z_bounds_m=asked.z_bounds_m, integrity=asked.integrity
-        )
+        return Receiver(asked.method, site=asked.site, qa=asked.qa, integrity=asked.integrity)
 
     @property
     def drops(self) -> Counter[str]:
@@ -114,7 +111,7 @@ class Tag:
         self._site: int | None = None
         self._link_tasks: list[asyncio.Task[None]] = []
         self._fix_topic = self._health_topic = self._receptions_topic = ""
-        asked = receiver_settings(settings.method, settings.site, settings.qa, settings.z_bounds_m, settings.integrity)
+        asked = receiver_settings(settings.method, settings.site, settings.qa, integrity=settings.integrity)
         self.reception_log = ReceptionLog(radio.name, asked, secrets.token_hex(4))
         self.node = TagNode(settings, radio, self._publish, log, self.reception_log.hear)
 

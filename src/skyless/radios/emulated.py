@@ -11,21 +11,8 @@ import msgspec
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_RATE_HZ
-from skyless.radios.ether_wire import (
-    Arrival,
-    Clocks,
-    Done,
-    Join,
-    Joined,
-    Refused,
-    Send,
-    Unpacker,
-    WireError,
-    from_ether,
-    pack,
-    this_machine,
-)
-from skyless.radios.interface import Gone, Late, Listener, RadioEvent, Restarted, Sent, ignore_event
+from skyless.radios import ether_wire as wire
+from skyless.radios.interface import Gone, Late, Listener, RadioEvent, Restarted, Sent, ignore
 from skyless.ticks import wrap
 
 _RECONNECT_S: Final = 0.2
@@ -41,7 +28,7 @@ class EmulatedRadio:
         self.counters: Counter[str] = Counter()
         self._connection = connection
         self._node = node
-        self._listener: Listener = ignore_event
+        self._listener: Listener = ignore
         self._ticks: int | None = None
         self._ticks_s = 0.0
 
@@ -62,7 +49,7 @@ class EmulatedRadio:
 
     def transmit(self, transmission: Transmission) -> None:
         """Send a frame; without an ether it is late."""
-        if not self._connection.send(Send(self._node, transmission.tx_ticks, transmission.frame)):
+        if not self._connection.send(wire.Send(self._node, transmission.tx_ticks, transmission.frame)):
             self.notify(Late(transmission.tx_ticks))
 
     def notify(self, event: RadioEvent) -> None:
@@ -77,7 +64,7 @@ class EmulatedRadio:
 class EtherConnection:
     """The connection of one process; it is made again by itself."""
 
-    def __init__(self, host: str, port: int, join: Join) -> None:
+    def __init__(self, host: str, port: int, join: wire.Join) -> None:
         self._host, self._port, self._join = host, port, join
         self.radios = tuple(EmulatedRadio(self, node, name) for node, name in enumerate(join.names))
         self._transport: asyncio.Transport | None = None
@@ -98,11 +85,11 @@ class EtherConnection:
                 self._task = None
                 task.cancel()
 
-    def send(self, message: Send) -> bool:
+    def send(self, message: wire.Send) -> bool:
         """Whether the message could be handed to the connection."""
         if self._transport is None:
             return False
-        self._transport.write(pack(message))
+        self._transport.write(wire.pack(message))
         return True
 
     async def _connect_again(self) -> None:
@@ -115,7 +102,7 @@ class EtherConnection:
             except OSError as error:
                 reason = f"no ether at {self._host}:{self._port} ({_why(error)})"
             else:
-                transport.write(pack(self._join))
+                transport.write(wire.pack(self._join))
                 try:
                     reason = await protocol.ended
                 finally:
@@ -126,7 +113,7 @@ class EtherConnection:
                 self._notify_all(Gone(reason))
             await asyncio.sleep(_RECONNECT_S)
 
-    def on_joined(self, message: Joined, transport: asyncio.Transport) -> None:
+    def on_joined(self, message: wire.Joined, transport: asyncio.Transport) -> None:
         """The nodes are on the air."""
         self._transport = transport
         self._set_clocks(message.host_s, message.ticks)
@@ -145,14 +132,14 @@ class EtherConnection:
         for radio, reading in zip(self.radios, ticks, strict=True):
             radio.set_clock(reading, host_s)
 
-    def on_message(self, message: Clocks | Arrival | Done, shift_s: float) -> None:
+    def on_message(self, message: wire.Clocks | wire.Arrival | wire.Done, shift_s: float) -> None:
         """Pass a message on to the radios; ``shift_s`` converts the ether's clock into this machine's."""
-        if isinstance(message, Arrival):
+        if isinstance(message, wire.Arrival):
             host_s = message.host_s + shift_s
             for row in message.rows:
                 measured = Diagnostics(row.rx_power_dbm, row.first_path_power_dbm, row.carrier_offset_ppm)
                 self.radios[row.node].notify(Reception(message.frame, row.rx_ticks, host_s, measured))
-        elif isinstance(message, Done):
+        elif isinstance(message, wire.Done):
             event = Late(message.tx_ticks) if message.late else Sent(message.tx_ticks)
             self.radios[message.node].notify(event)
         else:
@@ -164,7 +151,7 @@ class _Attempt(asyncio.Protocol):
 
     def __init__(self, connection: EtherConnection) -> None:
         self._connection = connection
-        self._unpacker = Unpacker()
+        self._unpacker = wire.Unpacker()
         self._transport: asyncio.Transport | None = None
         self._shift_s = 0.0
         self.ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -177,16 +164,16 @@ class _Attempt(asyncio.Protocol):
         try:
             for body in self._unpacker.feed(data):
                 self._process(body)
-        except (WireError, msgspec.MsgspecError) as error:
+        except (wire.WireError, msgspec.MsgspecError) as error:
             self._end(f"what answers is no ether ({error})")
 
     def _process(self, body: bytes) -> None:
-        message = from_ether.decode(body)
-        if isinstance(message, Refused):
+        message = wire.from_ether.decode(body)
+        if isinstance(message, wire.Refused):
             self._end(message.reason)
-        elif isinstance(message, Joined):
+        elif isinstance(message, wire.Joined):
             assert self._transport is not None
-            if message.machine != this_machine():
+            if message.machine != wire.this_machine():
                 self._shift_s = time.monotonic() - message.host_s
             self._connection.on_joined(
                 msgspec.structs.replace(message, host_s=message.host_s + self._shift_s), self._transport

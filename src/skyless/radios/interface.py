@@ -50,7 +50,7 @@ Listener = Callable[[RadioEvent], None]
 """Called from the event loop as soon as something happens; must return quickly and not raise."""
 
 
-def ignore_event(_event: object) -> None:
+def ignore(_event: object) -> None:
     """The listener of a radio that does not run yet."""
 
 

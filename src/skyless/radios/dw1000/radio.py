@@ -9,17 +9,7 @@ from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_S
 from skyless.firmware import dw1000
 from skyless.firmware.dw1000 import DW1000, Bus, ChipError
-from skyless.radios.interface import (
-    AntennaDelays,
-    Gone,
-    Hint,
-    Late,
-    Listener,
-    RadioEvent,
-    Restarted,
-    Sent,
-    ignore_event,
-)
+from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
 from skyless.ticks import difference, from_seconds, wrap
 
 OVERDUE_TICKS: Final = from_seconds(1e-3)
@@ -144,7 +134,7 @@ class Dw1000Radio:
         self.name = name
         self.counters: Counter[str] = Counter()
         self._port, self._delays = port, delays
-        self._listener: Listener = ignore_event
+        self._listener: Listener = ignore
         self._session: ChipSession | None = None
         self._reported = ""
         """The reason of the newest ``Gone``; empty once the chip works."""

@@ -10,7 +10,7 @@ from msgspec import structs
 
 from skyless.air.masterless_packets import Packet
 from skyless.air.reception import Reception, Transmission
-from skyless.radios.interface import Gone, Late, RadioEvent, Restarted, ignore_event
+from skyless.radios.interface import Gone, Late, RadioEvent, Restarted, ignore
 from skyless.radios.serial.serial_port import BoardClock, SerialPort, line_advice
 from skyless.recordings.foreign import sniffer_binary, sniffer_text
 from skyless.recordings.foreign.listener_lines import reception_of
@@ -35,7 +35,7 @@ class _ListeningBoard(ABC, Generic[_Event]):
         self.name = name
         self.counters: Counter[str] = Counter()
         self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
-        self._listener: Callable[[_Event | Restarted | Gone], None] = ignore_event
+        self._listener: Callable[[_Event | Restarted | Gone], None] = ignore
         self._silent = True
         """Whether no byte has come since the last event."""
 

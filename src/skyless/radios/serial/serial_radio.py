@@ -8,17 +8,7 @@ from typing import Final
 
 from skyless.air.reception import Reception, Transmission
 from skyless.firmware import link
-from skyless.radios.interface import (
-    AntennaDelays,
-    Gone,
-    Hint,
-    Late,
-    Listener,
-    RadioEvent,
-    Restarted,
-    Sent,
-    ignore_event,
-)
+from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
 from skyless.radios.serial.link_records import Done, Heard, Hello, NotDone, Record, Status, TooLate, decode
 from skyless.radios.serial.serial_port import BoardClock, SerialPort
 from skyless.ticks import wrap
@@ -295,7 +285,7 @@ class SerialRadio:
         self._delays = AntennaDelays() if delays is None else delays
         self._transmits = transmits
         self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
-        self._listener: Listener = ignore_event
+        self._listener: Listener = ignore
         self._session: LinkSession | None = None
 
     async def run(self, listener: Listener) -> None:
