@@ -35,7 +35,7 @@ async def player(answer):
         (99, "refuses: "),
     ],
 )
-def test_each_refusal_of_the_standard_is_told(code, reason):
+def test_each_refusal_of_the_standard_is_reported(code, reason):
     """MQTT 3.1.1, table 3.1."""
 
     async def check():

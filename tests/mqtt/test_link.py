@@ -92,7 +92,7 @@ async def start_node(broker):
     return await asyncio.create_subprocess_exec(sys.executable, "-c", NODE, str(broker.address.port))
 
 
-def test_a_killed_process_is_told_offline_by_its_last_will(make_broker):
+def test_a_killed_process_is_reported_offline_by_its_last_will(make_broker):
     async def check():
         broker = make_broker()
         inbox = Inbox(broker.address, status_topic(7, "tag", "+"))
@@ -127,7 +127,7 @@ def test_a_process_frozen_for_longer_than_the_broker_waits_comes_back(make_broke
     asyncio.run(check())
 
 
-def test_a_stopped_link_says_so_and_sends_what_waits(make_broker):
+def test_a_stopped_link_logs_it_and_sends_what_waits(make_broker):
     async def check():
         broker = make_broker()
         inbox = Inbox(broker.address, "skyless/v1/7/#", qos=1)
@@ -339,7 +339,7 @@ def test_tls_trusts_only_the_given_certificate(make_broker, certificate):
     asyncio.run(check())
 
 
-def test_a_wrong_password_is_told_without_showing_it(make_broker, caplog):
+def test_a_wrong_password_is_reported_without_showing_it(make_broker, caplog):
     async def check():
         broker = make_broker(user="ann", password="right-word")
         wrong = msgspec.structs.replace(broker.address, password="wrong-word")
@@ -383,7 +383,7 @@ def certificate(tmp_path):
         (b"\x20\x02\x00\x00\x30\x05\x00", "closed the connection"),
     ],
 )
-def test_what_is_no_broker_is_told_and_tried_again(answer, trouble, monkeypatch):
+def test_what_is_no_broker_is_reported_and_tried_again(answer, trouble, monkeypatch):
     """Silence, garbage, another protocol, a wrong packet, half a packet."""
     monkeypatch.setattr(connection, "BROKER_ANSWER_S", 0.2)
     visits = []

@@ -44,7 +44,7 @@ async def first_words(radio):
     raise AssertionError("the master never speaks")
 
 
-def test_a_master_speaks_once_in_a_superframe_and_hands_over_each_frame_as_late_as_it_may():
+def test_a_master_transmits_once_in_a_superframe_and_hands_over_each_frame_as_late_as_it_may():
     async def main():
         async with running() as (node, radio, said):
             radio.sends = True
@@ -124,7 +124,7 @@ def test_a_radio_that_starts_again_gets_a_new_machine_and_no_frame_of_the_old_on
     play(main())
 
 
-def test_an_anchor_that_knows_no_time_does_not_speak():
+def test_an_anchor_that_knows_no_time_does_not_transmit():
     async def main():
         async with running(anchor=4) as (node, radio, _):
             await asyncio.sleep(0.02)

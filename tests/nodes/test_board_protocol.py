@@ -127,7 +127,7 @@ def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later()
     assert silent.say(silent.writer.tx_at(dx(512), frame, 7)) == [TooLate(512, link.LATE_NOT_READY)]
 
 
-def test_a_board_whose_radio_is_dead_says_nothing_and_one_that_is_not_fetched_counts():
+def test_a_board_whose_radio_is_dead_logs_nothing_and_one_that_is_not_fetched_counts():
     host = Host()
     host.radio.ticks = None
     assert host.say(host.writer.ask(link.ASK_HELLO)) == []

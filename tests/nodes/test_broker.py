@@ -171,14 +171,14 @@ def test_a_home_that_cannot_be_written_costs_nothing(tmp_path, monkeypatch):
         (["--data", "/proc/nothing"], "--data is '/proc/nothing', which cannot be used"),
     ],
 )
-def test_wrong_options_are_told_with_what_would_be_right(options, right, tmp_path, monkeypatch, capsys):
+def test_wrong_options_are_reported_with_what_would_be_right(options, right, tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("SKYLESS_MQTT_PASSWORD", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     assert main(["broker", *options]) == 2
     assert re.search(right, capsys.readouterr().err)
 
 
-def test_an_address_of_another_machine_is_told(tmp_path, monkeypatch, capsys):
+def test_an_address_of_another_machine_is_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("SKYLESS_MQTT_PASSWORD", "word")
     for listen in ("192.0.2.1", "nowhere.invalid"):
         assert main(["broker", "--listen", listen, "--user", "ann", "--data", str(tmp_path)]) == 2

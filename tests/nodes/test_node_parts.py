@@ -23,7 +23,7 @@ from skyless.nodes.record import _own_name
 
 
 @given(st.lists(st.floats(0.0, 10.0), max_size=300))
-def test_latencies_are_told_once_by_their_order(values):
+def test_latencies_are_reported_once_by_their_order(values):
     latencies = Latencies()
     for value in values:
         latencies.add(value)

@@ -23,7 +23,7 @@ def packets():
     return [decode(payload, 100.0 + t_s, sender, rx_ticks) for t_s, sender, rx_ticks, payload in told]
 
 
-def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_anew(packets):
+def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_again(packets):
     published, said = [], []
     (radio,) = open_sniffers("sniffer:/dev/nothing", ("drone",))
     node = PacketTagNode(SETTINGS, radio, published.append, said.append)
@@ -98,7 +98,7 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     assert (topic, silent.reason, silent.fixes) == ("skyless/v1/7/tag/two/health", "no-beacons", 0)
 
 
-def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_told_as_such(monkeypatch, tmp_path):
+def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_reported_as_such(monkeypatch, tmp_path):
     links, path = [], tmp_path / "sniffer"
     monkeypatch.setattr(packet_tags, "link_of", lambda *_, **__: links.append(Link()) or links[-1])
     spec = f"sniffer:{path}"
@@ -117,5 +117,5 @@ def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_told_as_such(m
     assert [site.simulated for site in sites] == [False, True, False]
 
 
-def test_a_table_that_no_site_can_have_is_not_told():
+def test_a_table_that_no_site_can_have_is_not_reported():
     assert packet_tags.site_of(PacketTagSettings({1: (0.0, 0.0, 0.0), 99_999: (1.0, 2.0, 0.0)})) is None

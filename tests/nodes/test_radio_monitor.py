@@ -45,7 +45,7 @@ class Watched:
             self.monitor.check(self.now_s, self.received, self.used, self.drops)
 
 
-def test_what_is_the_matter_is_said_once_and_again_when_it_changes():
+def test_what_is_the_matter_is_logged_once_and_again_when_it_changes():
     watched = Watched()
     watched.pass_s(60)
     assert watched.logged == []  # there is no radio yet, as was logged
@@ -65,7 +65,7 @@ def test_what_is_the_matter_is_said_once_and_again_when_it_changes():
     ]
 
 
-def test_who_hears_says_nothing_whatever_else_is_dropped():
+def test_a_node_that_receives_logs_nothing_whatever_else_is_dropped():
     watched = Watched()
     watched.restart()
     watched.pass_s(300, received=100, used=1, foreign_site=99)
@@ -106,7 +106,7 @@ def tag(radio=None, **settings):
     return node, logged
 
 
-def test_a_tag_that_hears_nothing_asks_its_radio_where_to_look():
+def test_a_tag_that_receives_nothing_asks_its_radio_where_to_look():
     node, logged = tag()
     looks(node)
     assert logged == ["tag t1: listening", "tag t1: nothing usable for 5 s; the radio says where to look"]
@@ -123,7 +123,7 @@ def test_a_tag_that_hears_nothing_asks_its_radio_where_to_look():
         ({}, lambda frame: b"\x02\x00\x07", "too-short"),
     ],
 )
-def test_a_tag_whose_frames_are_all_dropped_says_why(settings, spoil, reason):
+def test_a_tag_whose_frames_are_all_dropped_logs_why(settings, spoil, reason):
     node, logged = tag(**settings)
     for one in HEARD:
         node.on_event(replace(one, frame=spoil(one.frame)))
@@ -133,7 +133,7 @@ def test_a_tag_whose_frames_are_all_dropped_says_why(settings, spoil, reason):
     )
 
 
-def test_a_tag_that_hears_says_nothing():
+def test_a_tag_that_receives_logs_nothing():
     node, logged = tag()
     for second in range(6):
         for one in HEARD[second::6]:
@@ -142,7 +142,7 @@ def test_a_tag_that_hears_says_nothing():
     assert logged == ["tag t1: listening"]
 
 
-def test_an_anchor_that_hears_nobody_says_so_and_what_is_dropped():
+def test_an_anchor_that_receives_nobody_logs_it_and_what_is_dropped():
     logged = []
     node = AnchorNode(replace(LAB, id=LAB.id + 1), 3, FakeRadio("3"), logged.append)
     node._wait = lambda seconds, then: None  # it has no loop
@@ -159,7 +159,7 @@ def test_an_anchor_that_hears_nobody_says_so_and_what_is_dropped():
     assert "most counted: foreign-site" in logged[2]
 
 
-def test_a_sniffer_whose_anchors_are_not_in_the_table_says_so():
+def test_a_sniffer_whose_anchors_are_not_in_the_table_logs_it():
     logged = []
     radio = SnifferRadio("/dev/sniffer", 115_200, "drone")
     node = PacketTagNode(PacketTagSettings(hall.ANCHORS_M), radio, lambda fix: None, logged.append)
@@ -178,7 +178,7 @@ def test_a_sniffer_whose_anchors_are_not_in_the_table_says_so():
         (SnifferRadio, "a Bitcraze sniffer", bytes(20_000)),
     ],
 )
-def test_a_line_that_is_silent_and_one_of_another_sender_are_told_apart(kind, sender, garbage):
+def test_a_line_that_is_silent_and_one_of_another_sender_are_reported_apart(kind, sender, garbage):
     radio = kind("/dev/ttyACM7", 115_200, "t1")
     node, logged = tag(radio)
     radio.on_open(lambda data: None)

@@ -215,7 +215,7 @@ def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_o
     assert json.loads(out)["receptions"] > 400
 
 
-def test_a_disk_that_takes_no_more_is_told_once_and_leaves_a_whole_file(broker, tmp_path):
+def test_a_disk_that_takes_no_more_is_reported_once_and_leaves_a_whole_file(broker, tmp_path):
     recorder = Recorder(broker.address, tmp_path / "full.mcap", limit_bytes=250_000)
 
     async def scenario():
@@ -231,7 +231,7 @@ def test_a_disk_that_takes_no_more_is_told_once_and_leaves_a_whole_file(broker, 
     assert 100_000 < recorder.size() <= 250_000
 
 
-def test_mistakes_are_told_in_one_line(tmp_path, capsys):
+def test_mistakes_are_reported_in_one_line(tmp_path, capsys):
     path = tmp_path / "there.mcap"
     path.write_text("precious")
     for arguments, words in (

@@ -36,7 +36,7 @@ class FakeLink:
             self.state = "left"
 
 
-def test_anchors_behind_a_port_that_leads_elsewhere_tell_again_whether_they_are_simulated(monkeypatch):
+def test_anchors_behind_a_port_that_leads_elsewhere_publish_again_whether_they_are_simulated(monkeypatch):
     told, answers = [], [False, True]
 
     class SiteLink(FakeLink):
@@ -116,7 +116,7 @@ def test_the_link_comes_with_the_site_and_goes_with_it(links):
     asyncio.run(main())
 
 
-def test_without_a_broker_it_works_and_tells_nobody(links):
+def test_without_a_broker_it_works_and_publishes_nothing(links):
     async def main():
         tag = Tag(TagSettings(), FakeRadio("t1"), None, lambda line: None)
         for reception in receptions_of(LAB.id, 2.0):
@@ -129,7 +129,7 @@ def test_without_a_broker_it_works_and_tells_nobody(links):
     asyncio.run(main())
 
 
-def test_a_link_that_fails_is_told_of_and_started_again(monkeypatch):
+def test_a_link_that_fails_is_reported_of_and_started_again(monkeypatch):
     monkeypatch.setattr(process, "HEALTH_S", 0.01)
     said = []
 

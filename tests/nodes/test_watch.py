@@ -1,4 +1,4 @@
-"""Who watches a site: fixes beside the truth, rates, latencies, and messages that make no sense."""
+"""Watches a site: fixes beside the truth, rates, latencies, and messages that make no sense."""
 
 import time
 
@@ -93,7 +93,7 @@ def test_errors_count_from_a_second_after_a_tag_s_first_fix(site):
     assert (watch.variance_sum_m2 / watch.judged) ** 0.5 == pytest.approx(0.1)
 
 
-def test_the_rate_counts_between_health_messages_and_anew_after_a_tag_s_restart(site):
+def test_the_rate_counts_between_health_messages_and_again_after_a_tag_s_restart(site):
     link, watch = site
     link.send("tag/+/health", health(NOW_S, 100))  # before its first fix was heard it is unknown
     assert watch.tags == {}

@@ -25,7 +25,7 @@ def test_it_lags_by_the_shortest_way_and_never_leads(drift_ppm):
     assert np.quantile(settled_s, 0.01) > -0.4e-3 - 0.5e-3
 
 
-def test_it_follows_a_counter_that_began_anew_and_knows_nothing_at_first():
+def test_it_follows_a_counter_that_began_again_and_knows_nothing_at_first():
     clock = BoardClock()
     assert clock.read(1.0) is None
     clock.update(10**11 * 5, 1.0)

@@ -115,7 +115,7 @@ def test_a_chip_on_spi_is_asked_where_it_has_no_interrupt_line_and_found_again(m
     asyncio.run(play())
 
 
-def test_a_chip_whose_supply_failed_is_started_again_even_where_it_says_nothing(monkeypatch):
+def test_a_chip_whose_supply_failed_is_started_again_even_where_it_logs_nothing(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
     monkeypatch.setattr("skyless.radios.dw1000.radio.CHECK_S", 0.01)
 
@@ -148,7 +148,7 @@ def test_a_chip_that_is_missed_by_the_looks_after_it_is_found_again(monkeypatch)
     asyncio.run(play())
 
 
-def test_a_bus_that_fails_while_a_frame_is_overdue_is_opened_anew(monkeypatch):
+def test_a_bus_that_fails_while_a_frame_is_overdue_is_opened_again(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
     faults = []
 
@@ -209,7 +209,7 @@ def hear(node, data):
     node.chip.hear(data + fcs(data), node.air.now_ticks(), Diagnostics(-80.0))
 
 
-def test_an_interrupt_line_that_is_stuck_is_told_once_and_the_chip_is_asked_at_intervals(monkeypatch):
+def test_an_interrupt_line_that_is_stuck_is_reported_once_and_the_chip_is_asked_at_intervals(monkeypatch):
     """Without a bound every turn of the loop asks the chip: thousands of times in these 0.2 s."""
     radio, node, buses = spi_radio(monkeypatch, LinedSpi)
     monkeypatch.setattr(spi, "CHIP_POLL_S", 0.02)
@@ -240,7 +240,7 @@ def test_an_interrupt_line_that_is_stuck_is_told_once_and_the_chip_is_asked_at_i
     asyncio.run(play())
 
 
-def test_an_interrupt_line_that_picks_up_noise_is_told_and_does_not_make_the_program_spin(monkeypatch):
+def test_an_interrupt_line_that_picks_up_noise_is_reported_and_does_not_make_the_program_spin(monkeypatch):
     radio, _, buses = spi_radio(monkeypatch, LinedSpi)
     monkeypatch.setattr(spi, "CHIP_POLL_S", 0.02)
 
@@ -274,7 +274,7 @@ def test_an_interrupt_line_that_is_high_for_good_reason_is_not_called_stuck(monk
     asyncio.run(play())
 
 
-def test_what_answers_but_is_no_dw1000_is_told_in_words(monkeypatch):
+def test_what_answers_but_is_no_dw1000_is_reported_in_words(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
     monkeypatch.setattr(node.chip, "transfer", lambda out, _hz: b"\xff" * len(out))
 
@@ -340,7 +340,7 @@ def pi(monkeypatch):
     ],
 )
 @pytest.mark.usefixtures("pi")
-def test_a_package_that_is_missing_is_told_at_the_start(monkeypatch, package, spec, refused):
+def test_a_package_that_is_missing_is_reported_at_the_start(monkeypatch, package, spec, refused):
     monkeypatch.setitem(sys.modules, package, None)
     if not refused:
         assert open_radios(spec, "tag", ("tag1",))
@@ -358,14 +358,14 @@ def test_a_package_that_is_missing_is_told_at_the_start(monkeypatch, package, sp
     ],
 )
 @pytest.mark.usefixtures("pi")
-def test_a_device_file_that_is_missing_is_told_at_the_start(spec, words):
+def test_a_device_file_that_is_missing_is_reported_at_the_start(spec, words):
     with pytest.raises(SkylessError, match=f"--radio is '{spec}'; {words}"):
         open_radios(spec, "tag", ("tag1",))
 
 
 @pytest.mark.parametrize(("path", "group"), [("/dev/spidev0.0", "spi"), ("/dev/gpiochip0", "gpio")])
 @pytest.mark.usefixtures("pi")
-def test_a_device_file_that_may_not_be_opened_is_told_at_the_start(monkeypatch, path, group):
+def test_a_device_file_that_may_not_be_opened_is_reported_at_the_start(monkeypatch, path, group):
     monkeypatch.setattr(spi.os, "access", lambda asked, mode: asked != path)
     with pytest.raises(SkylessError, match=f"{path} may not be opened: its group, usually {group}"):
         open_radios("spi:0.0,irq=25", "tag", ("tag1",))

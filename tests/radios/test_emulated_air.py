@@ -11,7 +11,7 @@ from skyless.ticks import difference
 FRAME = b"a frame" * 10
 
 
-def test_a_frame_reaches_all_that_are_on_the_air_and_its_sender_is_told():
+def test_a_frame_reaches_all_that_are_on_the_air_and_its_sender_is_reported():
     def play():
         stage = Stage()
         sender, session = stage.join("anchor", "1")
@@ -61,7 +61,7 @@ def test_stamps_are_the_flight_time_apart():
     in_loop(play)
 
 
-def test_a_frame_that_comes_too_late_is_not_sent_and_said_to_be_late():
+def test_a_frame_that_comes_too_late_is_not_sent_and_reported_late():
     def play():
         stage = Stage()
         sender, session = stage.join("anchor", "1")
@@ -135,7 +135,7 @@ def test_the_same_seed_and_the_same_doings_give_the_same_bits():
         ("tag", ("tag1", "tag1"), "tag tag1 is on the air already"),
     ],
 )
-def test_who_may_not_join_is_told_why(kind, names, said):
+def test_who_may_not_join_is_reported_why(kind, names, said):
     def play():
         stage = Stage()
         stage.join("anchor", "2")

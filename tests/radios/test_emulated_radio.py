@@ -129,7 +129,7 @@ def test_a_counter_goes_with_its_crystal():
     asyncio.run(play())
 
 
-def test_a_late_frame_is_said_to_be_late_and_the_radio_goes_on():
+def test_a_late_frame_is_reported_late_and_the_radio_goes_on():
     async def play():
         async with anchor_and_tag("1") as (air, anchor, tag):
             tx_ticks = ahead(anchor.radio, -1e-3)
@@ -194,7 +194,7 @@ def test_a_cancelled_radio_leaves_the_air():
     asyncio.run(play())
 
 
-def test_a_name_that_the_ether_has_not_or_that_is_taken_is_told_and_asked_for_again():
+def test_a_name_that_the_ether_has_not_or_that_is_taken_is_reported_and_asked_for_again():
     async def play():
         async with OpenAir() as air, nodes(air.port, "tag", "tag1") as (first,):
             await first.until(Restarted)
@@ -335,6 +335,6 @@ def test_a_radio_s_name_tells_where_its_ether_is(spec, host, port):
 
 
 @pytest.mark.parametrize("spec", ["", "dw1000:/dev/spidev0.0", "ether:box:0", "ether:box:65536", "ether:box:x"])
-def test_a_radio_that_there_is_not_is_told_with_what_would_be_right(spec):
+def test_a_radio_that_there_is_not_is_reported_with_what_would_be_right(spec):
     with pytest.raises(SkylessError, match="ether:HOST"):
         open_radios(spec, "tag", ("tag1",))

@@ -110,7 +110,7 @@ def test_receptions_come_through_with_their_measurements_in_the_line_s_units():
     assert quantised(quantised(told)) == quantised(told)
 
 
-def test_transmissions_are_asked_for_by_dx_and_their_end_is_told_by_tx_ticks():
+def test_transmissions_are_asked_for_by_dx_and_their_end_is_reported_by_tx_ticks():
     talk = Talk().ready()
     tx_ticks = (T0 & ~0x1FF) + DELAYS.tx_ticks
     for number, frame in enumerate((b"one", b"two")):
@@ -222,7 +222,7 @@ def test_a_board_that_refuses_its_configuration_or_counts_otherwise_cannot_be_us
     assert "counts 1000 kHz in 32 bits" in talk.events[0].reason
 
 
-def test_a_board_whose_radio_does_not_start_is_told_of_once_and_taken_when_it_does():
+def test_a_board_whose_radio_does_not_start_is_reported_of_once_and_taken_when_it_does():
     talk = Talk()
     for _ in range(4):
         talk.hello()
@@ -258,7 +258,7 @@ def test_an_anchor_needs_a_board_that_can_transmit():
     assert talk.events == [Restarted()]
 
 
-def test_a_board_that_starts_anew_is_configured_again_and_its_numbers_begin_anew():
+def test_a_board_that_starts_again_is_configured_again_and_its_numbers_begin_again():
     talk = Talk().ready()
     tx_ticks = (T0 & ~0x1FF) + DELAYS.tx_ticks
     talk.session.transmit(Transmission(b"one", tx_ticks))
@@ -275,7 +275,7 @@ def test_a_board_that_starts_anew_is_configured_again_and_its_numbers_begin_anew
     assert talk.counters == {"board-restart": 1}
 
 
-def test_a_board_that_starts_again_and_again_is_counted_and_told_once():
+def test_a_board_that_starts_again_and_again_is_counted_and_reported_once():
     """It falls over its configuration each time, is never ready, and is never silent."""
     talk = Talk()
     talk.hello()
@@ -290,7 +290,7 @@ def test_a_board_that_starts_again_and_again_is_counted_and_told_once():
     assert talk.counters == {"board-restart": 6}
 
 
-def test_a_board_that_answers_and_never_listens_is_told_once():
+def test_a_board_that_answers_and_never_listens_is_reported_once():
     talk = Talk()
     talk.hello()
     for _ in range(30):
@@ -316,7 +316,7 @@ def test_a_board_that_works_and_starts_again_now_and_then_is_counted_and_said_no
     assert talk.counters == {"board-restart": 5}
 
 
-def test_a_loop_that_comes_back_after_a_calm_time_is_told_again():
+def test_a_loop_that_comes_back_after_a_calm_time_is_reported_again():
     talk = Talk().ready()
     for calm_s in (0, 90):
         for _ in range(calm_s):

@@ -96,7 +96,7 @@ def test_fixes_over_a_serial_port_are_those_of_the_radio_itself_bit_for_bit(pair
     assert sum(fix != "None" for fix in here[0]) > 100
 
 
-def test_frames_are_sent_at_their_tick_and_their_end_is_told():
+def test_frames_are_sent_at_their_tick_and_their_end_is_reported():
     async def play():
         async with linked() as (board, host):
             ticks = 512 * 10**6 + AntennaDelays().tx_ticks
@@ -161,7 +161,7 @@ def test_a_board_that_is_pulled_out_and_plugged_in_is_found_again(tmp_path):
     asyncio.run(play())
 
 
-def test_a_board_that_starts_anew_behind_an_open_port_is_set_up_again():
+def test_a_board_that_starts_again_behind_an_open_port_is_set_up_again():
     async def play():
         async with linked() as (board, host):
             board.protocol.on_radio_event(Restarted())
@@ -214,7 +214,7 @@ def test_a_board_of_another_version_is_refused_in_words():
     asyncio.run(play())
 
 
-def test_a_port_that_is_taken_or_no_port_is_told_in_words():
+def test_a_port_that_is_taken_or_no_port_is_reported_in_words():
     async def play():
         async with linked() as (board, _), radio_events(SerialRadio(board.pty.name, 1_000_000, "tag2")) as second:
             assert "is used by another program" in (await second.until(Gone)).reason
@@ -225,7 +225,7 @@ def test_a_port_that_is_taken_or_no_port_is_told_in_words():
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
-def test_a_port_that_may_not_be_opened_is_told_in_words():
+def test_a_port_that_may_not_be_opened_is_reported_in_words():
     async def play():
         async with PlayedBoard() as board:
             Path(board.pty.path).chmod(0)
@@ -235,7 +235,7 @@ def test_a_port_that_may_not_be_opened_is_told_in_words():
     asyncio.run(play())
 
 
-def test_what_nobody_fetches_is_dropped_and_who_comes_later_hears_the_present():
+def test_what_nobody_fetches_is_dropped_and_who_comes_later_receives_the_present():
     async def play():
         async with PlayedBoard() as board:
             board.protocol._configured = board.protocol._receiving = True
@@ -289,7 +289,7 @@ def test_a_link_keeps_its_name_and_goes_with_the_board(tmp_path):
         ("usb:/dev/a", "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN]"),
     ],
 )
-def test_ports_that_cannot_be_are_told_at_once(spec, right):
+def test_ports_that_cannot_be_are_reported_at_once(spec, right):
     with pytest.raises(SkylessError) as told:
         open_radios(spec, "tag", ("tag1",))
     assert right in str(told.value)
@@ -301,7 +301,7 @@ def test_a_sniffer_s_port_is_one_of_this_computer_too():
         open_sniffers("sniffer:socket://10.0.0.1:4000", ("drone",))
 
 
-def test_ports_that_nobody_can_look_at_are_opened_to_be_told_why(tmp_path, monkeypatch):
+def test_ports_that_nobody_can_look_at_are_opened_to_be_reported_why(tmp_path, monkeypatch):
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
 
     def forbidden(_path):
@@ -335,7 +335,7 @@ def test_names_of_ports():
     assert is_simulated("serial:/dev/pts/7@1000000")
 
 
-def test_a_listener_hears_whole_lines_only_and_transmits_nothing():
+def test_a_listener_receives_whole_lines_only_and_transmits_nothing():
     async def play():
         board, radio = listener_pair()
         async with board, radio_events(radio) as host:

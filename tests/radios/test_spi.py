@@ -148,7 +148,7 @@ def test_without_an_interrupt_line_the_chip_is_always_asked(log):
         ((0, 0), {"fast_hz": 21_000_000}, "SPI at 21000000 Hz: it should be 2000000 to 20000000"),
     ],
 )
-def test_what_cannot_be_opened_says_why_and_what_would_be_right(log, arguments, options, words):
+def test_what_cannot_be_opened_logs_why_and_what_would_be_right(log, arguments, options, words):
     with pytest.raises(SkylessError) as raised:
         SpiBus(*arguments, **options)
     assert words in str(raised.value)
