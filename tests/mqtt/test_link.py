@@ -144,7 +144,7 @@ def test_a_stopped_link_logs_it_and_sends_what_waits(make_broker):
     asyncio.run(check())
 
 
-def test_a_link_stopped_without_a_broker_ends_at_once_and_says_what_is_lost(caplog):
+def test_a_link_stopped_without_a_broker_ends_at_once_and_logs_what_is_lost(caplog):
     async def check():
         link = tag_link(MqttAddress("127.0.0.1", free_port()))
         task = asyncio.ensure_future(link.run())
@@ -175,7 +175,7 @@ def test_a_link_can_run_again(make_broker):
     asyncio.run(check())
 
 
-def test_a_will_that_comes_late_does_not_tell_a_living_node_offline(make_broker):
+def test_a_will_that_comes_late_does_not_show_a_running_node_as_offline(make_broker):
     async def check():
         broker = make_broker()
         inbox = Inbox(broker.address, status_topic(7, "tag", "+"))
@@ -191,7 +191,7 @@ def test_a_will_that_comes_late_does_not_tell_a_living_node_offline(make_broker)
     asyncio.run(check())
 
 
-def test_after_a_broker_s_death_it_reconnects_and_says_what_was_dropped(make_broker, caplog):
+def test_after_a_broker_s_death_it_reconnects_and_logs_what_was_dropped(make_broker, caplog):
     caplog.set_level(logging.WARNING, "skyless.mqtt")
 
     async def check():

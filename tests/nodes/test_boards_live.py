@@ -73,7 +73,7 @@ def test_a_frame_that_reaches_the_board_too_late_is_skipped_and_the_anchor_makes
 
 
 @pytest.mark.parametrize("speaks", ["sniffer", "sniffer-text", "listener"])
-def test_boards_that_speak_other_people_s_formats_give_right_fixes(speaks, tmp_path):
+def test_boards_of_other_formats_give_right_fixes(speaks, tmp_path):
     async def play():
         async with LiveSite(tmp_path) as site:
             for number in PLACES:

@@ -187,7 +187,7 @@ def test_a_frame_of_a_process_that_dies_before_it_leaves_is_not_sent():
     in_loop(play)
 
 
-def test_the_end_of_a_dead_process_s_frame_is_not_told_to_the_next_one():
+def test_the_end_of_a_dead_process_s_frame_is_not_sent_to_the_next_one():
     def play():
         stage = Stage()
         sender, session = stage.join("anchor", "1")
@@ -240,7 +240,7 @@ def test_an_ether_that_was_stopped_lets_true_time_stand_still_meanwhile():
     in_loop(play)
 
 
-def test_the_counters_that_it_tells_are_those_of_its_radios(monkeypatch):
+def test_the_counters_that_it_sends_are_those_of_its_radios(monkeypatch):
     """20 ppm of crystal either way, and the counter that a frame's stamp shows."""
 
     def play():

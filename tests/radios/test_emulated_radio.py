@@ -286,7 +286,7 @@ def test_a_process_that_does_not_read_loses_frames_which_are_counted_and_the_oth
 @pytest.mark.parametrize(
     "answer", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\xff\xff\xff\xff", b"\x01\x00\x00\x00\xc1", b""]
 )
-def test_a_radio_says_that_what_answers_is_no_ether(answer):
+def test_a_radio_reports_that_what_answers_is_no_ether(answer):
     async def play():
         async def serve(reader, writer):
             await reader.read(4)
@@ -329,7 +329,7 @@ def test_of_another_machine_s_ether_the_clock_is_shifted_to_this_one(monkeypatch
         ("ether:[::1]:99", "::1", 99),
     ],
 )
-def test_a_radio_s_name_tells_where_its_ether_is(spec, host, port):
+def test_a_radio_s_name_holds_the_address_of_its_ether(spec, host, port):
     assert host_and_port(spec, spec.partition(":")[2], 7784) == (host, port)
     assert is_simulated(spec)
 

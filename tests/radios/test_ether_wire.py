@@ -56,7 +56,7 @@ def test_what_processes_say_arrives_however_the_stream_is_cut(messages, cuts):
 
 
 @given(st.lists(FROM_ETHER, max_size=8), st.lists(st.integers(0, 10_000), max_size=30))
-def test_what_the_ether_says_arrives_however_the_stream_is_cut(messages, cuts):
+def test_what_the_ether_sends_arrives_however_the_stream_is_cut(messages, cuts):
     unpacker = Unpacker()
     stream = b"".join(pack(message) for message in messages)
     bodies = [body for piece in pieces_of(stream, cuts) for body in unpacker.feed(piece)]

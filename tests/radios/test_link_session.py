@@ -302,7 +302,7 @@ def test_a_board_that_answers_and_never_listens_is_reported_once():
     assert talk.events[1:] == [Restarted()]
 
 
-def test_a_board_that_works_and_starts_again_now_and_then_is_counted_and_said_nothing_of():
+def test_a_board_that_works_and_starts_again_now_and_then_is_counted_and_not_reported():
     talk = Talk().ready()
     for _ in range(5):
         for _ in range(31):
@@ -331,7 +331,7 @@ def test_a_loop_that_comes_back_after_a_calm_time_is_reported_again():
     assert sum(isinstance(event, Hint) for event in talk.events) == 2
 
 
-def test_receptions_with_errors_that_the_board_tells_of_are_counted_since_the_first_status():
+def test_receptions_with_errors_that_the_board_reports_are_counted_since_the_first_status():
     talk = Talk().ready()
     for errors in (1, 5, 9, 2):  # the last one after a start
         talk.say(talk.board.status(stamp(T0), ON, [7, errors, 0, 0, 0, 0], 2150, 3300))

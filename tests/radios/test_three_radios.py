@@ -106,7 +106,7 @@ def test_the_same_frames_at_the_same_ticks_from_a_whole_site_on_driver_and_model
     assert sum(machine.sent for machine in machines.values()) == pytest.approx(len(emulated), abs=7)
 
 
-def test_what_the_chip_measures_is_what_the_air_tells_but_for_rounding(ways):
+def test_what_the_chip_measures_is_what_the_air_gives_but_for_rounding(ways):
     emulated, _, _, chip, _, _ = ways
     for one, other in zip(emulated, chip, strict=True):
         assert other.diagnostics.rx_power_dbm == pytest.approx(one.diagnostics.rx_power_dbm, abs=0.03)
