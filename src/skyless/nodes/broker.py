@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import fcntl
 import json
 import os
 import shutil
@@ -23,7 +22,7 @@ from skyless.mqtt.address import PASSWORD_VARIABLE, MqttAddress
 from skyless.mqtt.connection import check_broker
 from skyless.nodes.children import end
 from skyless.nodes.ports import claim, is_free
-from skyless.nodes.process import data_folder, end_with_parent
+from skyless.nodes.process import data_folder, end_with_parent, locked
 
 FIRST_PORT: Final = 1883
 _PORTS_TO_TRY: Final = 100
@@ -124,13 +123,7 @@ def _locked_folder(settings: BrokerSettings) -> tuple[Path, IO[str]]:
 def _lock(folder: Path) -> IO[str]:
     folder.mkdir(parents=True, exist_ok=True)
     folder.chmod(0o700)
-    file = (folder / "lock").open("w", encoding="utf-8")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
-        raise
-    return file
+    return locked(folder / "lock")
 
 
 def _ports(settings: BrokerSettings) -> Iterator[int]:

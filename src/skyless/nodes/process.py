@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import ctypes
+import fcntl
 import gc
 import os
 import resource
@@ -13,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
@@ -166,7 +167,7 @@ class SitePublisher:
             link.publish(floor_plan_topic(self._site.id), self._floor_plan.read_bytes(), qos=1, retain=True)
 
 
-# Folders
+# Folders and files
 
 
 def data_folder() -> Path:
@@ -196,6 +197,17 @@ def recordings_folder() -> Path:
 def new_recording(folder: Path, kind: str) -> Path:
     """File name for a recording that begins at this moment."""
     return folder / f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
+
+
+def locked(file: Path) -> IO[str]:
+    """The file, locked for this process until it is closed. Raises OSError."""
+    lock = file.open("a", encoding="utf-8")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        raise
+    return lock
 
 
 # Use of the machine

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import fcntl
 import re
 import socket
 import tempfile
@@ -17,7 +16,7 @@ from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage
 from skyless.mqtt.topics import request_topic, site_topic
-from skyless.nodes.process import Log, every
+from skyless.nodes.process import Log, every, locked
 from skyless.recordings.mcap.file import McapFile
 from skyless.recordings.mcap.reception_log import EVERY_TAG
 from skyless.recordings.mcap.recorder import McapRecorder
@@ -168,7 +167,7 @@ def _own_name(site: int) -> tuple[str, IO[str]]:
     folder = _temporary_folder()
     for number in range(1, _MOST_RECORDERS + 1):
         with contextlib.suppress(OSError):
-            return f"{host}-{number}", _locked(folder / f"skyless-record-{site}-{number}.lock")
+            return f"{host}-{number}", locked(folder / f"skyless-record-{site}-{number}.lock")
     raise SkylessError(f"no name is left for a recorder: {folder}/skyless-record-{site}-*.lock cannot be locked")
 
 
@@ -177,14 +176,3 @@ def _temporary_folder() -> Path:
         return Path(tempfile.gettempdir())
     except OSError as error:
         raise SkylessError(f"a recorder needs a folder for temporary files: {error.strerror}") from None
-
-
-def _locked(file: Path) -> IO[str]:
-    """The file, locked until it is closed. Raises OSError."""
-    lock = file.open("a", encoding="utf-8")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.close()
-        raise
-    return lock

@@ -75,7 +75,7 @@ class EtherConnection:
         """Stay connected until cancelled; all radios share one connection, which ends with the last of them."""
         self._users += 1
         if self._task is None:
-            self._task = asyncio.create_task(self._connect_again())
+            self._task = asyncio.create_task(self._keep_connected())
         task = self._task
         try:
             await asyncio.shield(task)
@@ -92,13 +92,13 @@ class EtherConnection:
         self._transport.write(wire.pack(message))
         return True
 
-    async def _connect_again(self) -> None:
+    async def _keep_connected(self) -> None:
         loop = asyncio.get_running_loop()
         reported = ""
         while True:
             try:
                 endpoint = _connect(self._host, self._port)
-                transport, protocol = await loop.create_connection(lambda: _Attempt(self), sock=await endpoint)
+                transport, protocol = await loop.create_connection(lambda: _Stream(self), sock=await endpoint)
             except OSError as error:
                 reason = f"no ether at {self._host}:{self._port} ({_why(error)})"
             else:
@@ -113,10 +113,10 @@ class EtherConnection:
                 self._notify_all(Gone(reason))
             await asyncio.sleep(_RECONNECT_S)
 
-    def on_joined(self, message: wire.Joined, transport: asyncio.Transport) -> None:
+    def on_joined(self, message: wire.Joined, shift_s: float, transport: asyncio.Transport) -> None:
         """The nodes are on the air."""
         self._transport = transport
-        self._set_clocks(message.host_s, message.ticks)
+        self._set_clocks(message.host_s + shift_s, message.ticks)
         self._notify_all(Restarted())
 
     def _on_lost(self) -> None:
@@ -146,7 +146,7 @@ class EtherConnection:
             self._set_clocks(message.host_s + shift_s, message.ticks)
 
 
-class _Attempt(asyncio.Protocol):
+class _Stream(asyncio.Protocol):
     """The connection from its beginning until it ends; ``ended`` gives the reason."""
 
     def __init__(self, connection: EtherConnection) -> None:
@@ -175,9 +175,7 @@ class _Attempt(asyncio.Protocol):
             assert self._transport is not None
             if message.machine != wire.this_machine():
                 self._shift_s = time.monotonic() - message.host_s
-            self._connection.on_joined(
-                msgspec.structs.replace(message, host_s=message.host_s + self._shift_s), self._transport
-            )
+            self._connection.on_joined(message, self._shift_s, self._transport)
         else:
             self._connection.on_message(message, self._shift_s)
 
