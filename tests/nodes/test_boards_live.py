@@ -38,13 +38,13 @@ def test_anchors_and_tags_on_boards_make_the_fixes_of_those_on_the_air_and_survi
             assert len(site.published["tag1"]) == told
             site.plug_in("tag1")
             assert are_right(await site.fixes("tag1", 300))
-            assert node.restarts == 2
+            assert node.monitor.restarts == 2
 
             await site.stop("board 4")
             await site.until(lambda: any("anchor 4" in line and "unplugged" in line for line in site.said))
             again = site.plug_in("4")
             await site.until(lambda: again.protocol.counts["sent"] > 20)
-            assert anchors[4].restarts == 2
+            assert anchors[4].monitor.restarts == 2
             assert are_right(await site.fixes("tag1", 300))
 
     asyncio.run(play())
@@ -90,6 +90,6 @@ def test_boards_of_other_formats_give_right_fixes(speaks, tmp_path):
             await site.until(lambda: any("unplugged" in line for line in site.said))
             site.plug_in("tag2", speaks)
             assert are_right(await site.fixes("tag2", 400))
-            assert node.restarts == 2
+            assert node.monitor.restarts == 2
 
     asyncio.run(play())
