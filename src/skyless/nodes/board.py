@@ -23,7 +23,7 @@ from skyless.nodes.process import Log
 from skyless.radios.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radios.serial.link_records import to_steps
 from skyless.recordings.foreign.bitcraze_payload import TDOA3
-from skyless.site.almanac_gathering import AlmanacAssembly
+from skyless.site.almanac_pages import AlmanacAssembly
 from skyless.ticks import wrap
 
 Send = Callable[[bytes], bool]
@@ -93,7 +93,7 @@ class LinkProtocol:
         """Execute commands; a board whose radio is dead does nothing."""
         reader, buffer, at = self._reader, bytearray(data), 0
         while at < len(buffer):
-            at = reader.take(buffer, at, len(buffer))
+            at = reader.read(buffer, at, len(buffer))
             if reader.length and self._radio.now_ticks() is not None:
                 self._execute(reader.record, reader.length)
 
@@ -163,7 +163,7 @@ def _stamp(ticks: int) -> bytearray:
 def _usual_config() -> bytes:
     """The record of a CONFIG, without delays."""
     writer, reader = link.Writer(), link.Reader()
-    reader.take(writer.line, 0, writer.config(0, 0))
+    reader.read(writer.line, 0, writer.config(0, 0))
     return bytes(reader.record[: reader.length])
 
 
@@ -212,7 +212,7 @@ class SnifferProtocol:
         if not isinstance(beacon, Beacon) or beacon.anchor > _LAST_ID:
             self.drops["not-translated"] += 1
             return
-        self._almanac.hear(beacon.almanac_issue, beacon.page)
+        self._almanac.add_page(beacon.almanac_issue, beacon.page)
         payload = self._payload(beacon)
         if self._binary:
             length = struct.pack("<H", len(payload))

@@ -5,8 +5,8 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from skyless.air.beacon import Malformed
 from skyless.air.codec import decode_cached
-from skyless.air.malformed import Malformed
 from skyless.mqtt.messages import Counters, FixMessage, Matrix, Phase, TagHealth, Vector
 from skyless.nodes.process import HEALTH_S
 from skyless.positioning.fix import Fix

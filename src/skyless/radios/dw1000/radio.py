@@ -117,7 +117,7 @@ def _ticks(stamp: memoryview) -> int:
 
 
 def _value(steps: int, per_unit: int) -> float | None:
-    return None if steps == dw1000.NOT_TOLD else steps / per_unit
+    return None if steps == dw1000.NOT_MEASURED else steps / per_unit
 
 
 class Port(Protocol):

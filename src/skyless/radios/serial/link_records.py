@@ -86,7 +86,7 @@ def to_steps(measured: Diagnostics) -> tuple[int, int, int]:
     """Received and first-path power and carrier offset, rounded to the link's units."""
     values = (measured.rx_power_dbm, measured.first_path_power_dbm, measured.carrier_offset_ppm)
     whole = [None if value is None else round(value * per_unit) for value, per_unit in zip(values, _STEPS, strict=True)]
-    rx_power, first_path, offset = (link.NOT_TOLD if n is None or abs(n) > _GREATEST else n for n in whole)
+    rx_power, first_path, offset = (link.NOT_MEASURED if n is None or abs(n) > _GREATEST else n for n in whole)
     return rx_power, first_path, offset
 
 
@@ -98,7 +98,7 @@ def from_steps(rx_power: int, first_path: int, offset: int) -> Diagnostics:
 
 
 def _value(steps: int, per_unit: int) -> float | None:
-    return None if steps == link.NOT_TOLD else steps / per_unit
+    return None if steps == link.NOT_MEASURED else steps / per_unit
 
 
 def _ticks(record: bytes, at: int = link.BODY_AT) -> int:
