@@ -1,4 +1,4 @@
-"""What processes and the emulated air say to each other over TCP: msgpack, each message after its length (u32, LE)."""
+"""Messages between processes and the emulated air over TCP: msgpack, each message after its length (u32, LE)."""
 
 import struct
 from collections.abc import Iterator
@@ -14,11 +14,11 @@ _LENGTH: Final = struct.Struct("<I")
 
 
 class WireError(ValueError):
-    """The other side does not speak this protocol; the connection is to be closed."""
+    """The other side does not use this protocol; the connection is to be closed."""
 
 
 class Join(Struct, frozen=True, tag="join"):
-    """A process puts its nodes on the air; from now on they are numbered in this order, from 0."""
+    """A process puts its nodes on the air; later messages number them in this order, from 0."""
 
     kind: Literal["anchor", "tag"]
     names: tuple[str, ...]
@@ -49,7 +49,7 @@ class Refused(Struct, frozen=True, tag="refused"):
 
 
 class Clocks(Struct, frozen=True, tag="clocks"):
-    """The nodes' counters, again."""
+    """The nodes' counters at a later time."""
 
     host_s: float
     ticks: tuple[int, ...]
@@ -74,7 +74,7 @@ class Arrival(Struct, frozen=True, tag="arrival"):
 
 
 class Done(Struct, frozen=True, tag="done", gc=False):
-    """What became of a transmission."""
+    """The end of a transmission."""
 
     node: int
     tx_ticks: int
@@ -123,7 +123,7 @@ class Unpacker:
 
 
 def this_machine() -> str:
-    """Identifier of this machine's present run; processes with the same one share the monotonic clock."""
+    """Identifier of this machine's present run; processes with an equal one share the monotonic clock."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:

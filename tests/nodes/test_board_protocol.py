@@ -12,10 +12,10 @@ from skyless.air.reception import Reception, Transmission
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.firmware import link
-from skyless.nodes.emulation.board_protocol import LinkProtocol, SnifferProtocol
+from skyless.nodes.board import LinkProtocol, SnifferProtocol
 from skyless.radios.interface import Late, Restarted, Sent
+from skyless.radios.serial.foreign_radios import SnifferStream
 from skyless.radios.serial.link_records import Done, Hello, NotDone, Status, TooLate, decode
-from skyless.radios.serial.sniffer_radio import SnifferStream
 from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
@@ -57,7 +57,7 @@ class Host:
     def say(self, end):
         """What the board answers."""
         self.said.clear()
-        self.board.hear_host(bytes(self.writer.line[:end]))
+        self.board.on_host_data(bytes(self.writer.line[:end]))
         return list(self.said)
 
     def ready(self):
@@ -79,11 +79,11 @@ def test_it_greets_and_is_configured_step_by_step():
     assert host.say(host.writer.ask(link.RX_ON)) == [NotDone(link.RX_ON, link.REFUSED_MALFORMED)]
     (status,) = host.say(host.writer.config(DELAY, DELAY))
     assert (status.configured, status.receiving) == (True, False)
-    host.board.hear_radio(Reception(b"not wanted yet", 5))
+    host.board.on_radio_event(Reception(b"not wanted yet", 5))
     (status,) = host.say(host.writer.ask(link.RX_ON))
     assert (status.configured, status.receiving, status.received) == (True, True, 0)
     host.said.clear()
-    host.board.hear_radio(Restarted())
+    host.board.on_radio_event(Restarted())
     (hello,) = host.said
     assert isinstance(hello, Hello)
     (status,) = host.say(host.writer.ask(link.ASK_STATUS))
@@ -111,12 +111,12 @@ def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later()
     assert host.radio.transmissions == [Transmission(b"a frame", tx_ticks)]
     assert host.say(host.writer.tx_at(dx(512), frame, 7)) == [TooLate(512, link.LATE_BUSY)]
     host.said.clear()
-    host.board.hear_radio(Sent(tx_ticks))
+    host.board.on_radio_event(Sent(tx_ticks))
     assert host.said == [Done(2**40 - 1, tx_ticks)]
     host.say(host.writer.tx_at(dx(512), frame, 7))
-    host.board.hear_radio(Late(512 + DELAY))
+    host.board.on_radio_event(Late(512 + DELAY))
     assert host.said == [TooLate(512, link.LATE_FOR_RADIO)]
-    host.board.hear_radio(Sent(5))  # none of its own
+    host.board.on_radio_event(Sent(5))  # none of its own
     (status,) = host.say(host.writer.ask(link.ASK_STATUS))
     assert (status.sent, status.late) == (1, 2)
     for length in (0, 128):
@@ -127,14 +127,14 @@ def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later()
     assert silent.say(silent.writer.tx_at(dx(512), frame, 7)) == [TooLate(512, link.LATE_NOT_READY)]
 
 
-def test_a_board_whose_radio_is_dead_says_nothing_and_one_that_is_not_fetched_counts():
+def test_a_board_whose_radio_is_dead_logs_nothing_and_one_that_is_not_fetched_counts():
     host = Host()
     host.radio.ticks = None
     assert host.say(host.writer.ask(link.ASK_HELLO)) == []
     host.radio.ticks = 5
     host.ready()
     host.full = True
-    host.board.hear_radio(Reception(b"lost", 5))
+    host.board.on_radio_event(Reception(b"lost", 5))
     host.full = False
     (status,) = host.say(host.writer.ask(link.ASK_STATUS))
     assert isinstance(status, Status)
@@ -146,8 +146,8 @@ def test_garbage_from_the_host_is_counted_and_hurts_nothing():
     for _ in range(500):
         record = bytearray(host.writer.line[: host.writer.tx_at(dx(512), bytearray(b"frame"), 5)])
         record[rng.randrange(len(record))] ^= 1 << rng.randrange(8)
-        host.board.hear_host(rng.randbytes(rng.randrange(200)) + b"\0" + bytes(record))
-    host.board.hear_host(b"\0")
+        host.board.on_host_data(rng.randbytes(rng.randrange(200)) + b"\0" + bytes(record))
+    host.board.on_host_data(b"\0")
     host.say(host.writer.ask(0x7F))
     (status,) = host.say(host.writer.ask(link.ASK_STATUS))
     assert status.receiving
@@ -168,14 +168,14 @@ def frames():
 def test_a_beacon_becomes_a_packet_of_a_tdoa3_system(knows_binary):
     out = bytearray()
     speech = SnifferProtocol(lambda data: out.extend(data) is None, knows_binary=knows_binary)
-    speech.hear_host(b"b")
+    speech.on_host_data(b"b")
     for frame in frames():
-        speech.hear_radio(Reception(frame, 1))
+        speech.on_radio_event(Reception(frame, 1))
     out.clear()
     heard = (Heard(3, 250, 2**39 + 7), Heard(300, 1, 5))
     beacon = Beacon(LAB.id, 2, 200, 9, 1, 2**40 - 5, 1, 1, 0, Heard(1, 130, 9), None, heard, None)
-    speech.hear_radio(Reception(encode(beacon), 2**40 - 1))
-    speech.hear_radio(Reception(b"no beacon", 4))
+    speech.on_radio_event(Reception(encode(beacon), 2**40 - 1))
+    speech.on_radio_event(Reception(b"no beacon", 4))
     assert out.startswith(b"\xbc" if knows_binary else b"From 02 to ff @ffffffffff: 30")
     drops = Counter()
     (packet,) = SnifferStream(drops).feed(bytes(out))

@@ -1,24 +1,41 @@
 """A DW1000 on the pins of a Raspberry Pi or another Linux board: ``/dev/spidev*`` and GPIO lines (extra ``pi``)."""
 
+import asyncio
+import contextlib
 import importlib
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
 from skyless.errors import SkylessError
-from skyless.firmware.dw1000 import Bus
+from skyless.firmware.dw1000 import Bus, ChipError
+from skyless.radios.dw1000.radio import Dw1000Radio
 
-SLOW_HZ: Final = 2_000_000
-"""Below the 3 MHz that the chip takes before its PLL has lock."""
+START_HZ: Final = 2_000_000
+"""Below the 3 MHz that the chip accepts before its PLL has lock."""
 DEFAULT_FAST_HZ: Final = 8_000_000
 MAX_FAST_HZ: Final = 20_000_000
-"""Wires of a hand's length carry some 8 MHz; the chip takes 20."""
-RESET_S: Final = 0.001
-MOST_EDGE_READS: Final = 8
-"""Each takes all that the kernel keeps; a line that rises faster than it is read is not waited for."""
+"""Wires of 10 cm carry some 8 MHz; the chip accepts 20."""
 DEFAULT_CHIP: Final = "/dev/gpiochip0"
+
+REOPEN_S: Final = 1.0
+CHIP_POLL_S: Final = 0.5e-3
+"""Interval at which a chip without an interrupt line is served."""
+_LINE_CHECK_S: Final = 0.02
+"""And one with a line, should an edge have been missed."""
+MOST_VAIN_INTERRUPTS: Final = 8
+"""After so many interrupts in a row without an event the chip is polled instead."""
+
+_VAIN: Final = (
+    "rises though the chip has no event: is irq= the right pin, the wire sound? "
+    "The chip is polled every 0.5 ms meanwhile"
+)
+_RESET_S: Final = 0.001
+_MOST_EDGE_READS: Final = 8
+"""Each reads all that the kernel keeps; a line that rises faster than it is read is not waited for."""
 
 
 class SpiBus(Bus):
@@ -39,8 +56,8 @@ class SpiBus(Bus):
         Raises:
             SkylessError: a package of the extra ``pi`` is missing, a device cannot be opened, or a speed is too high.
         """
-        if not SLOW_HZ <= fast_hz <= MAX_FAST_HZ:
-            raise SkylessError(f"SPI at {fast_hz} Hz: it should be {SLOW_HZ} to {MAX_FAST_HZ}")
+        if not START_HZ <= fast_hz <= MAX_FAST_HZ:
+            raise SkylessError(f"SPI at {fast_hz} Hz: it should be {START_HZ} to {MAX_FAST_HZ}")
         self._fast_hz = fast_hz
         self._spi: Any = None
         self._irq: Any = None
@@ -82,7 +99,7 @@ class SpiBus(Bus):
                 self._reset = gpiod.request_lines(chip, {self._reset_pin: self._floating}, consumer="skyless reset")
         except (OSError, ValueError) as error:
             raise SkylessError(
-                f"GPIO lines {irq_pin} (irq) and {self._reset_pin} (reset) of {chip} cannot be had ({error}); they "
+                f"GPIO lines {irq_pin} (irq) and {self._reset_pin} (reset) of {chip} cannot be used ({error}); they "
                 "should be free, and the user in the group gpio"
             ) from None
 
@@ -95,11 +112,11 @@ class SpiBus(Bus):
         self._spi.xfer2([*header, *data])
 
     def slow(self) -> None:
-        """2 MHz from now on."""
-        self._spi.max_speed_hz = SLOW_HZ
+        """2 MHz from the next transfer on."""
+        self._spi.max_speed_hz = START_HZ
 
     def fast(self) -> None:
-        """The configured speed from now on."""
+        """The configured speed from the next transfer on."""
         self._spi.max_speed_hz = self._fast_hz
 
     def reset(self) -> bool:
@@ -107,7 +124,7 @@ class SpiBus(Bus):
         if self._reset is None:
             return False
         self._reset.reconfigure_lines({self._reset_pin: self._low})
-        time.sleep(RESET_S)
+        time.sleep(_RESET_S)
         self._reset.reconfigure_lines({self._reset_pin: self._floating})
         return True
 
@@ -125,13 +142,13 @@ class SpiBus(Bus):
 
     def forget_edges(self) -> None:
         """Make ``fileno`` unreadable until the line rises again; look at ``is_raised`` after it."""
-        for _ in range(MOST_EDGE_READS):
+        for _ in range(_MOST_EDGE_READS):
             if self._irq is None or not self._irq.wait_edge_events(0):
                 return
             self._irq.read_edge_events()
 
     def close(self) -> None:
-        """Let go of device and lines."""
+        """Release device and lines."""
         for line in (self._irq, self._reset):
             if line is not None:
                 line.release()
@@ -141,30 +158,95 @@ class SpiBus(Bus):
             self._spi = None
 
 
-def check_place(spec: str, bus: int, device: int, gpio_chip: str | None) -> None:
-    """See that packages and device files are there and may be used; what fails later may pass by itself.
+class SpiPort:
+    """A chip on SPI (``skyless.radios.dw1000.radio.Port``)."""
+
+    def __init__(self, name: str, open_bus: Callable[[], SpiBus]) -> None:
+        """``open_bus`` is is_high again after each failure."""
+        self._name, self._open_bus = name, open_bus
+
+    async def run(self, radio: Dw1000Radio) -> None:
+        """Serve the chip, and look for it again when it does not answer, until cancelled."""
+        while True:
+            try:
+                bus = self._open_bus()
+            except SkylessError as error:
+                radio.end(str(error))
+            else:
+                try:
+                    await self._serve(bus, radio)
+                except (OSError, ChipError) as error:
+                    radio.end(f"{self._name}: {error}")
+                finally:
+                    bus.close()
+            await asyncio.sleep(REOPEN_S)
+
+    async def _serve(self, bus: SpiBus, radio: Dw1000Radio) -> None:
+        """Serve the chip when its interrupt line rises; without a line at short intervals."""
+        radio.begin(bus)
+        loop, line = asyncio.get_running_loop(), bus.fileno()
+        if line is None:
+            while True:
+                await asyncio.sleep(CHIP_POLL_S)
+                radio.serve()
+        risen = asyncio.Event()
+        loop.add_reader(line, risen.set)
+        try:
+            await self._serve_line(bus, radio, risen)
+        finally:
+            loop.remove_reader(line)
+
+    async def _serve_line(self, bus: SpiBus, radio: Dw1000Radio, risen: asyncio.Event) -> None:
+        """Serve the chip when its line has risen and until it is low; a line without events is polled instead."""
+        vain = 0
+        while True:
+            is_high = await _is_set(risen, _LINE_CHECK_S)
+            bus.forget_edges()
+            risen.clear()
+            while True:
+                vain = 0 if radio.serve() or not is_high else vain + 1
+                if vain == MOST_VAIN_INTERRUPTS:
+                    radio.report_fault("irq-in-vain", f"the interrupt line of {self._name} {_VAIN}")
+                if vain >= MOST_VAIN_INTERRUPTS:
+                    await asyncio.sleep(CHIP_POLL_S)
+                is_high = bus.is_raised()
+                if not is_high:
+                    break
+                await asyncio.sleep(0)
+
+
+async def _is_set(event: asyncio.Event, seconds: float) -> bool:
+    """Whether it was set within that time."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            await event.wait()
+    return event.is_set()
+
+
+def check_spi(spec: str, bus: int, device: int, gpio_chip: str | None) -> None:
+    """Check that packages and device files exist and may be used; a later failure may pass by itself.
 
     ``gpio_chip`` is None where no lines are wanted.
 
     Raises:
-        SkylessError: nothing will come of this until somebody mends it; naming what.
+        SkylessError: naming what a person has to change before this can work.
     """
     try:
         for package in ("spidev",) if gpio_chip is None else ("spidev", "gpiod", "gpiod.line"):
             _package(package)
     except SkylessError as error:
         raise SkylessError(f"--radio is {spec!r}; {error}") from None
-    mend = "SPI should be switched on (Raspberry Pi: dtparam=spi=on in config.txt), spi:BUS.DEVICE name one"
-    _check_file(spec, f"/dev/spidev{bus}.{device}", "spi", mend)
+    remedy = "SPI should be switched on (Raspberry Pi: dtparam=spi=on in config.txt), spi:BUS.DEVICE name one"
+    _check_file(spec, f"/dev/spidev{bus}.{device}", "spi", remedy)
     if gpio_chip is not None:
         _check_file(spec, gpio_chip, "gpio", "chip= should name the GPIO chip of irq and reset")
 
 
-def _check_file(spec: str, path: str, group: str, mend: str) -> None:
-    if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises where nobody may look
+def _check_file(spec: str, path: str, group: str, remedy: str) -> None:
+    if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises where the folder may not be read
         kind = path.rstrip("0123456789.")
         there = ", ".join(map(str, sorted(Path(kind).parent.glob(f"{Path(kind).name}*")))) or "none"
-        raise SkylessError(f"--radio is {spec!r}; there is no {path} (here: {there}); {mend}")
+        raise SkylessError(f"--radio is {spec!r}; there is no {path} (here: {there}); {remedy}")
     if not os.access(path, os.R_OK | os.W_OK):
         raise SkylessError(
             f"--radio is {spec!r}; {path} may not be opened: its group, usually {group}, must be one of yours "

@@ -1,4 +1,4 @@
-"""A whole site from one command: broker, ether, anchors, tags, page and recorder as processes, and one who watches."""
+"""``skyless demo``: a whole site, with broker, ether, anchors, tags, page and recorder as processes, and its watch."""
 
 import asyncio
 from pathlib import Path
@@ -9,19 +9,18 @@ from msgspec.structs import replace
 
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
-from skyless.nodes.broker.broker import Broker, start_broker
-from skyless.nodes.broker.settings import BrokerSettings
-from skyless.nodes.process.children import Child, Program
-from skyless.nodes.process.ports import claim_next, hold_any
-from skyless.nodes.process.running import Log, outlasting, together
+from skyless.nodes.broker import Broker, BrokerSettings, start_broker
+from skyless.nodes.children import Child, Program
+from skyless.nodes.ports import claim_next, hold_any
+from skyless.nodes.process import Log, outlasting, together
 from skyless.nodes.watch import Watch
 from skyless.positioning.integrity import RISK, IntegrityRequirement
 from skyless.site.model import Site
 
-HOST: Final = "127.0.0.1"
-PAGE_PORT: Final = 8080
-TAGS_PER_PROCESS: Final = 25
-_BROKER_AGAIN_S: Final = 0.2
+_HOST: Final = "127.0.0.1"
+_PAGE_PORT: Final = 8080
+_TAGS_PER_PROCESS: Final = 25
+_BROKER_RESTART_S: Final = 0.2
 
 
 class SiteRun(Struct, frozen=True):
@@ -29,7 +28,7 @@ class SiteRun(Struct, frozen=True):
 
     site: Site
     site_name: str
-    """How the programs' ``--site`` calls it."""
+    """Argument of the programs' ``--site``."""
     tags: int
     speed_mps: float
     noise_ps: float | None
@@ -49,10 +48,10 @@ class SiteRun(Struct, frozen=True):
 class WholeSite:
     """Starts everything and keeps it alive; ``ready`` is set when the watch is connected."""
 
-    def __init__(self, asked: SiteRun, say: Log) -> None:
-        self._asked, self._say = asked, say
-        self.ether_port, self._ether_held = hold_any(HOST)
-        self.page_port, self._page_claim = claim_next(HOST, PAGE_PORT)
+    def __init__(self, asked: SiteRun, log: Log) -> None:
+        self._asked, self._log = asked, log
+        self.ether_port, self._ether_held = hold_any(_HOST)
+        self.page_port, self._page_claim = claim_next(_HOST, _PAGE_PORT)
         self.address: MqttAddress | None = asked.broker
         self.watch: Watch | None = None
         self.children: list[Child] = []
@@ -62,7 +61,7 @@ class WholeSite:
     @property
     def page(self) -> str:
         """Address of the page."""
-        return f"http://{HOST}:{self.page_port}"
+        return f"http://{_HOST}:{self.page_port}"
 
     async def run(self) -> None:
         """Keep everything alive until cancelled.
@@ -82,10 +81,10 @@ class WholeSite:
         site = self._asked.site
         link = Link(address, "demo", site=site.id, kind="watch")
         self.watch = Watch(link, site.id, planar=site.tags.height_m is not None)
-        self.children = [Child(program, self._say) for program in self._programs(address)]
+        self.children = [Child(program, self._log) for program in self._programs(address)]
         self.ready.set()
         nodes = together(link.run(), *(child.run() for child in self.children))
-        await (nodes if broker is None else outlasting(self._keep(broker), nodes))  # they say goodbye to it
+        await (nodes if broker is None else outlasting(self._keep(broker), nodes))  # they publish their end to it
 
     async def _keep(self, broker: Broker) -> None:
         """Start the embedded broker again, on the same port and with the same store, whenever it ends."""
@@ -93,9 +92,9 @@ class WholeSite:
         try:
             while True:
                 code = await broker.wait()
-                self._say(f"broker ended (exit code {code}); started again")
+                self._log(f"broker ended (exit code {code}); started again")
                 await broker.stop()
-                await asyncio.sleep(_BROKER_AGAIN_S)
+                await asyncio.sleep(_BROKER_RESTART_S)
                 broker = await start_broker(settings)
         finally:
             await asyncio.shield(broker.stop())
@@ -105,9 +104,9 @@ class WholeSite:
         mqtt: tuple[str, ...] = ("--mqtt", str(replace(address, password=None)))
         if address.ca is not None:
             mqtt += ("--mqtt-ca", str(address.ca))
-        radio = ("--radio", f"ether:{HOST}:{self.ether_port}")
+        radio = ("--radio", f"ether:{_HOST}:{self.ether_port}")
         site = ("--site", asked.site_name)
-        ether = ["ether", *site, *mqtt, "--listen", f"{HOST}:{self.ether_port}", "--tags", str(asked.tags)]
+        ether = ["ether", *site, *mqtt, "--listen", f"{_HOST}:{self.ether_port}", "--tags", str(asked.tags)]
         ether += ["--speed", str(asked.speed_mps), "--seed", str(asked.seed)]
         if asked.noise_ps is not None:
             ether += ["--noise-ps", str(asked.noise_ps)]
@@ -127,9 +126,9 @@ class WholeSite:
         tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
         programs += [
             Program(_named("tag", some), ("tag", *some, *radio, *mqtt, *computing))
-            for some in _groups(tags, 1 if asked.apart else TAGS_PER_PROCESS)
+            for some in _groups(tags, 1 if asked.apart else _TAGS_PER_PROCESS)
         ]
-        page = ("dashboard", *mqtt, "--listen", f"{HOST}:{self.page_port}", "--recordings", str(asked.recordings))
+        page = ("dashboard", *mqtt, "--listen", f"{_HOST}:{self.page_port}", "--recordings", str(asked.recordings))
         programs.append(Program("page", (*page, "--site-id", str(asked.site.id))))
         if asked.record is not None:
             limit = ("--limit-mb", str(asked.record_limit_mb))
@@ -144,5 +143,5 @@ def _groups(names: list[str], size: int) -> list[list[str]]:
 
 
 def _named(kind: str, names: list[str]) -> str:
-    """What a process is called when something is said of it."""
+    """The name of a process in messages."""
     return f"{kind} {names[0]}" if len(names) == 1 else f"{kind}s {names[0]} to {names[-1]}"

@@ -1,4 +1,4 @@
-"""Ports of this machine: which are free, and which of several programs that start at once may have one."""
+"""Ports of this machine: which are free, and which of several programs that start together may have one."""
 
 import errno
 import socket
@@ -6,14 +6,14 @@ import sys
 from typing import Final
 
 _CLAIM: Final = "\0skyless-{}:{}"
-"""Linux's abstract sockets have one owner each, in the same namespace as its ports, and go with their process."""
+"""Linux's abstract sockets have one owner each, in the same namespace as its ports, and end with their process."""
 
 
 def is_free(host: str, port: int) -> bool:
-    """Whether one could listen there.
+    """Whether a program could listen there.
 
     Raises:
-        OSError: nobody could: no address of this machine, or a port that only the system may use.
+        OSError: none could: no address of this machine, or a port that only the system may use.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -28,7 +28,7 @@ def is_free(host: str, port: int) -> bool:
 
 
 def claim(host: str, port: int) -> socket.socket | None:
-    """What keeps other programs of Skyless from taking a port as long as it is open; None: one of them has it."""
+    """A socket that reserves a port among the programs of Skyless while it is open; None: one of them has it."""
     held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     if sys.platform.startswith("linux"):
         try:
@@ -52,15 +52,8 @@ def claim_next(host: str, first: int) -> tuple[int, socket.socket]:
 
 
 def hold_any(host: str) -> tuple[int, socket.socket]:
-    """A free port, which the system gives to nobody as long as the socket is open, but to who asks for this one."""
+    """A free port and its socket: while that is open, the system assigns the port to no program by itself."""
     held = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     held.bind((host, 0))
     return int(held.getsockname()[1]), held
-
-
-def any_port(host: str) -> int:
-    """A port that is free now."""
-    port, held = hold_any(host)
-    held.close()
-    return port

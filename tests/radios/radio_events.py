@@ -4,15 +4,15 @@ import asyncio
 import contextlib
 
 
-class Ears:
+class RadioEvents:
     """A radio that runs, and all that it has told."""
 
     def __init__(self, radio):
-        self.radio, self.told = radio, []
-        self.task = asyncio.ensure_future(radio.run(self.told.append))
+        self.radio, self.events = radio, []
+        self.task = asyncio.ensure_future(radio.run(self.events.append))
 
     def of(self, kind):
-        return [event for event in self.told if isinstance(event, kind)]
+        return [event for event in self.events if isinstance(event, kind)]
 
     async def until(self, kind, count=1):
         async with asyncio.timeout(30):
@@ -27,8 +27,8 @@ class Ears:
 
 
 @contextlib.asynccontextmanager
-async def ears(radio):
-    node = Ears(radio)
+async def radio_events(radio):
+    node = RadioEvents(radio)
     try:
         yield node
     finally:

@@ -8,7 +8,7 @@ import pytest
 
 from skyless.errors import SkylessError
 from skyless.firmware import dw1000
-from skyless.radios.dw1000.spi_bus import SpiBus
+from skyless.radios.dw1000.spi import SpiBus
 
 
 class Value(enum.Enum):
@@ -144,11 +144,11 @@ def test_without_an_interrupt_line_the_chip_is_always_asked(log):
     ("arguments", "options", "words"),
     [
         ((9, 0), {}, "/dev/spidev9.0 cannot be opened (No such file or directory)"),
-        ((0, 0), {"irq_pin": 99}, "GPIO lines 99 (irq) and None (reset) of /dev/gpiochip0 cannot be had"),
+        ((0, 0), {"irq_pin": 99}, "GPIO lines 99 (irq) and None (reset) of /dev/gpiochip0 cannot be used"),
         ((0, 0), {"fast_hz": 21_000_000}, "SPI at 21000000 Hz: it should be 2000000 to 20000000"),
     ],
 )
-def test_what_cannot_be_opened_says_why_and_what_would_be_right(log, arguments, options, words):
+def test_what_cannot_be_opened_logs_why_and_what_would_be_right(log, arguments, options, words):
     with pytest.raises(SkylessError) as raised:
         SpiBus(*arguments, **options)
     assert words in str(raised.value)
