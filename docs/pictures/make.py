@@ -15,8 +15,8 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
-from skyless.air.airtime import air_time_s
 
+from skyless.air.ieee802154 import air_time_s
 from skyless.evaluation.plot_style import BLUE, GREEN, GRID, INK, MUTED, ORANGE
 from skyless.site.lab import lab_site
 
