@@ -16,7 +16,7 @@ from skyless.mqtt.topics import fix_topic, health_topic
 from skyless.nodes.fix_log import FixListener, FixLog
 from skyless.nodes.process import HEALTH_S, Log, SitePublisher, Usage, every, keep, link_of, together
 from skyless.nodes.radio_monitor import RadioMonitor
-from skyless.positioning.masterless.calibration import DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.radios.interface import Gone, Restarted
 from skyless.radios.serial.foreign_radios import SnifferRadio
@@ -100,7 +100,7 @@ class PacketTagNode:
     def _receive(self, packet: Packet) -> None:
         self.packets += 1
         self._known += packet.anchor in self.settings.anchors_m
-        fix = self.tracking.hear(packet)
+        fix = self.tracking.on_packet(packet)
         if fix is not None:
             done_s = time.monotonic()
             self.fix_log.add(fix, done_s if packet.host_s is None else packet.host_s, done_s)

@@ -8,7 +8,7 @@ import math
 from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import kernel
 
-SINGULAR = 1e-12
+SINGULAR_PIVOT = 1e-12
 """A pivot below this part of its diagonal element is rounding noise: the matrix is singular."""
 
 
@@ -24,7 +24,7 @@ def factorise(matrix: Array, size: int) -> bool:
         pivot = diagonal
         for k in range(j):
             pivot -= matrix[j, k] * matrix[j, k]
-        if not (pivot > SINGULAR * diagonal and diagonal > 0.0):
+        if not (pivot > SINGULAR_PIVOT * diagonal and diagonal > 0.0):
             return False
         root = math.sqrt(pivot)
         matrix[j, j] = root

@@ -1,4 +1,4 @@
-"""The kinds of measurements. Each is linearised at the state, judged, and processed by one scalar update.
+"""The kinds of measurements. Each is linearised at the state, gated, and processed by one scalar update.
 
     own reception    R − T  =  |p − a| + b + w + range errors + noise                  (the tag receives an anchor)
     relay            S − T  =  |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + pair's constant + noise      (anchor i received anchor j)
@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
 from skyless.kernels.compiled import step
 from skyless.positioning.estimator.faults import (
     compute_fault_input,
@@ -32,13 +32,13 @@ from skyless.positioning.estimator.kalman import (
 )
 from skyless.positioning.estimator.monitor import (
     COMMON,
-    OFTEN_LATE,
+    LATE_OFTEN_SHARE,
+    adapt_change_noise,
+    adapt_change_variance,
     adapt_clock_noise,
-    adapt_place_noise,
     adapt_process_noise,
     difference_scale,
     end_small_obstruction,
-    follow_change,
     has_jumped,
     is_common,
     is_warm,
@@ -48,17 +48,14 @@ from skyless.positioning.estimator.monitor import (
 from skyless.positioning.estimator.state import EstimatorState, direction_terms, layout, uncertain_states
 from skyless.ticks import TICK_MASK
 
-SUBTICKS: Final = 256
-"""Of a tick; the air's unit of the site's time, of which it tells 48 bits."""
-
 SLOPE_FROM_M: Final = 4.0
 """Where the errors that grow with distance pass through zero, and by which range they change once (APS011)."""
 
 SLOPE_STEP_M: Final = 0.25
-"""The slope counts at a range that follows in such steps: where it followed the estimate's noise, which is in the
-innovation as well, a tag at rest would learn the slope from nothing else (Huang and Roumeliotis 2008)."""
+"""The slope counts at a range that is updated in steps of this: if it contained the estimate's noise, which is in the
+innovation as well, the slope would be estimated from noise alone at a stationary tag (Huang and Roumeliotis 2008)."""
 
-BEND_SHARE: Final = 0.01
+CURVATURE_SHARE: Final = 0.01
 """Where ranges are so curved that it counts for more than this part of the stamps' variance, it is counted."""
 
 CLOCK_JUMP_RELAYS: Final = 4
@@ -76,7 +73,7 @@ REPORT_GAIN: Final = 1.25
 """A report is used where the filter's own variance is larger by this factor."""
 
 LEAST_REPORT_VARIANCE: Final = 0.1
-"""Of that of a pair of stamps: no anchor knows its clock better, whatever it says."""
+"""Of that of a pair of stamps: no anchor knows its clock better, whatever it reports."""
 
 REJOIN_AFTER: Final = 20
 """An anchor with this number of rejected packets in a row joins again: its first was late, so its rate is wrong."""
@@ -86,13 +83,13 @@ STEADY_WALK_SCALE: Final = 4.0
 
 CLOCK_JUMPED: Final = 2
 
-REST_STD_MPS: Final = 0.01
+STATIONARY_STD_MPS: Final = 0.01
 """Of the velocity of a tag that stands still, each time a measurement is processed."""
 
 
 @step
 def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> float:
-    """Put the unit vector from an anchor to the tag into the measurement; returns their distance.
+    """Write the unit vector from an anchor to the tag into the measurement; returns their distance.
 
     The anchor's survey error follows with the opposite sign, and the height's: ``direction_terms`` in all.
     """
@@ -137,7 +134,7 @@ def _range_error_terms(s: EstimatorState, term: int, anchor: int, range_m: float
 
 
 @step
-def _along(s: EstimatorState, begin: int, end: int) -> float:
+def _h_dot_x(s: EstimatorState, begin: int, end: int) -> float:
     """h·x of terms from ``begin`` to ``end``."""
     total = 0.0
     for term in range(begin, end):
@@ -146,7 +143,7 @@ def _along(s: EstimatorState, begin: int, end: int) -> float:
 
 
 @step
-def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
+def _curvature_m(s: EstimatorState, range_m: float, variance: float) -> float:
     """Half the position's variance across the direction, over the range: what the range is longer by on average.
 
     The second term of its Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 where that is
@@ -156,7 +153,7 @@ def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
     across = 0.0
     for axis in range(dim):
         across += P[axis, axis]
-    least = BEND_SHARE * variance * range_m * range_m
+    least = CURVATURE_SHARE * variance * range_m * range_m
     if 0.5 * across * across >= least:
         for one in range(dim):
             for other in range(dim):
@@ -169,7 +166,7 @@ def _bend_m(s: EstimatorState, range_m: float, variance: float) -> float:
 
 @step
 def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[int, float]:
-    """Put the tag's reception of an anchor into ``h``; its terms, and the distance."""
+    """Write the tag's reception of an anchor into ``h``; its terms, and the distance."""
     dim = s.settings[0]["dim"]
     where = layout(dim, len(s.anchors))
     range_m = _add_direction(s, 0, anchor, 1.0)
@@ -181,10 +178,10 @@ def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[
 
 @step
 def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, variance_factor: float) -> int:
-    """Process the tag's reception of an anchor's packet: 1 if it was used, 0 if not, ``CLOCK_JUMPED`` to join anew.
+    """Process the tag's reception of an anchor's packet: 1 if it was used, 0 if not, ``CLOCK_JUMPED`` to join again.
 
     R − T = |p − a − δa| + b + w + change + constant + slope·far + noise. A reception whose path looks blocked has
-    its variance multiplied; it is judged as any other, as it is late rather than noisy.
+    its variance multiplied; it is gated as any other, as it is late rather than noisy.
     """
     settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
     dim = settings["dim"]
@@ -199,9 +196,9 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     else:
         rx_variance += settings["tx_variance_m2"]
     terms, range_m = reception_terms(s, anchor, a["is_relayed"])
-    bend_m = _bend_m(s, range_m, rx_variance)
-    rx_variance += 2.0 * bend_m * bend_m
-    expected_m = range_m + bend_m + _along(s, direction_terms(dim), terms)
+    curvature_m = _curvature_m(s, range_m, rx_variance)
+    rx_variance += 2.0 * curvature_m * curvature_m
+    expected_m = range_m + curvature_m + _h_dot_x(s, direction_terms(dim), terms)
     innovation = (rx_ticks - tx_ticks - a["offset_ticks"]) * TICK_M - expected_m
     innovation_variance = compute_ph(s, terms) + rx_variance
     a["range_m"] = range_m
@@ -220,14 +217,14 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
         end_small_obstruction(s, anchor)
         normalised = innovation / np.sqrt(innovation_variance)
         if a["is_obstructed"]:
-            follow_change(s, anchor, normalised)
+            adapt_change_noise(s, anchor, normalised)
         if is_warm(s):
             adapt_process_noise(s, normalised / scale)
         used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]
         compute_fault_input(s, terms, anchor)
         gather_evidence(s, innovation, used_variance)
         update(s, innovation, used_variance, 1.0, len(s.x))
-        adapt_place_noise(s, anchor, elapsed_s)
+        adapt_change_variance(s, anchor, elapsed_s)
         steps = int(np.floor(s.x[offset] / TICK_M))
         a["offset_ticks"] += steps
         s.x[offset] -= steps * TICK_M
@@ -240,7 +237,7 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
     """An anchor's range error has jumped: back to what it was before it was obstructed, or to something new.
 
     Obstacles make packets late: an early jump of an anchor that is not known to be obstructed ends an obstruction that
-    has been there since it joined, with which all that it said is considered again.
+    has been there since it joined, and all its earlier receptions are considered again.
 
     Returns the innovation that is left, and its variance.
     """
@@ -249,13 +246,13 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
     change = where.change + anchor
     has_ended = False
     if innovation < 0.0:
-        before_m = _along(s, 0, terms)
+        before_m = _h_dot_x(s, 0, terms)
         if a["is_obstructed"]:
             share = min(status["obstruction"], 1.0)
-            reset_state(s, change, a["place_variance_m2"] + share * OBSTRUCTED_STD_M**2)
+            reset_state(s, change, a["change_variance_m2"] + share * OBSTRUCTED_STD_M**2)
         else:
             end_lasting_fault(s, anchor)
-        innovation += before_m - _along(s, 0, terms)
+        innovation += before_m - _h_dot_x(s, 0, terms)
         a["is_obstructed"] = a["outliers_in_row"] = 0
         status["ends_of_obstructions"] += 1
         left = compute_ph(s, terms) + rx_variance
@@ -267,7 +264,7 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
 
 @step
 def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> None:
-    """Begin with an anchor's clock: the limit of an update of an offset of which nothing was known.
+    """Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
 
     Whatever is wrong with the position and with the range is then in the offset.
     """
@@ -282,10 +279,10 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     other = direction_terms(dim)
     terms = _range_error_terms(s, _set_term(s, other, noise, 1.0), anchor, range_m, 1.0)
     variance = settings["rx_variance_m2"]
-    bend_m = _bend_m(s, range_m, variance)
-    variance += 2.0 * bend_m * bend_m + compute_ph(s, terms)
+    curvature_m = _curvature_m(s, range_m, variance)
+    variance += 2.0 * curvature_m * curvature_m + compute_ph(s, terms)
     compute_fault_input(s, terms, anchor)
-    if s.status[0]["late_share"] > OFTEN_LATE:
+    if s.status[0]["late_share"] > LATE_OFTEN_SHARE:
         variance += JOIN_VARIANCE_M2
     for state in range(n):
         P[state, offset] = -s.ph[state]
@@ -295,7 +292,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
         s.V[fault, offset] = s.fault_input[fault]
     whole = rx_ticks - tx_ticks - int(np.floor(range_m / TICK_M))
     a["offset_ticks"], a["has_tx_noise"] = whole, 1
-    s.x[offset] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m - bend_m - _along(s, other, terms)
+    s.x[offset] = (rx_ticks - tx_ticks - whole) * TICK_M - range_m - curvature_m - _h_dot_x(s, other, terms)
     a["range_m"] = range_m
 
 
@@ -304,7 +301,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
 
 @step
 def relay_terms(s: EstimatorState, listener: int, sender: int, age_s: float, has_tx_noise: bool) -> int:
-    """Put an anchor's reception of another, so long ago, into ``h``; its terms."""
+    """Write an anchor's reception of another, ``age_s`` ago, into ``h``; its terms."""
     where = layout(s.settings[0]["dim"], len(s.anchors))
     term = _set_term(s, 0, where.offset + sender, 1.0)
     term = _set_term(s, term, where.offset + listener, -1.0)
@@ -327,8 +324,8 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
 
     S − T = |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + constant of the pair + noise, when the packet reached anchor i. Both offsets go
     back to that moment by their rates; what their oscillators have done since counts as noise. The pair's constant,
-    in which the survey is, is followed beside the filter: as both directions of a pair hold it with the same sign
-    and the offsets with opposite ones, neither leans on the other.
+    in which the survey is, is estimated outside the filter: as both directions of a pair hold it with the same sign
+    and the offsets with opposite ones, neither depends on the other.
     """
     settings, status = s.settings[0], s.status[0]
     i, j = s.anchors[listener], s.anchors[sender]
@@ -344,7 +341,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         variance += settings["tx_variance_m2"]
     link = s.links[min(listener, sender), max(listener, sender)]
     whole = j["offset_ticks"] - i["offset_ticks"]
-    innovation = (rx_ticks - tx_ticks - whole) * TICK_M - distance_m - link["constant_m"] - _along(s, 0, term)
+    innovation = (rx_ticks - tx_ticks - whole) * TICK_M - distance_m - link["constant_m"] - _h_dot_x(s, 0, term)
     pair_variance = link["variance_m2"]
     innovation_variance = compute_ph(s, term) + variance + pair_variance
     normalised = innovation / np.sqrt(innovation_variance)
@@ -354,7 +351,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         adapt_clock_noise(s, listener, -clipped)
     if not -settings["gate"] <= normalised <= settings["gate"]:
         status["relays_rejected"] += 1
-        status["relays_refused"] += 1.0
+        status["relays_lately_rejected"] += 1.0
         i["relay_outliers_in_row"] += 1
         j["relay_outliers_in_row"] += 1
         link["outliers_in_row"] += 1
@@ -363,7 +360,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
             link["variance_m2"] += PAIR_JUMP_M2
     else:
         status["relays_used"] += 1
-        status["relays_taken"] += 1.0
+        status["relays_lately_accepted"] += 1.0
         i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = link["outliers_in_row"] = 0
         share = pair_variance / innovation_variance
         link["constant_m"] += share * innovation
@@ -374,7 +371,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
     s.anchors[sender]["is_relayed"] = 1
 
 
-# An anchor tells what its clock reads against the master's
+# An anchor reports what its clock reads against the master's
 
 
 @step
@@ -383,7 +380,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
 
     The anchor has received all packets of the master that were relayed to the tag, and more, so its error is
     uncorrelated with the difference of both estimates, of variance P − q (P: the filter's, q: the anchor's), and the
-    other states follow by P_xd/P times that difference. ``subticks``: the anchor's reading less the master's at the
+    other states change by P_xd/P times that difference. ``subticks``: the anchor's reading less the master's at the
     packet's TX stamp, modulo 2⁴⁸.
     """
     settings, a = s.settings[0], s.anchors[anchor]
@@ -404,8 +401,8 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     off = (subticks - SUBTICKS * whole) & (wrap - 1)
     if off >= wrap // 2:
         off -= wrap
-    innovation = off * (TICK_M / SUBTICKS) - _along(s, 0, term)
-    # the filter of an anchor assumes what the almanac says of clocks; behind one that wanders more it lags as well
+    innovation = off * (TICK_M / SUBTICKS) - _h_dot_x(s, 0, term)
+    # the filter of an anchor assumes what the almanac states of clocks; behind one that wanders more it lags as well
     steady = max(a["walk_scale"], s.anchors[master]["walk_scale"]) <= STEADY_WALK_SCALE
     is_news = steady and own_variance > REPORT_GAIN * variance
     fits = innovation * innovation <= settings["gate"] ** 2 * (own_variance + variance)
@@ -424,7 +421,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
 
 @step
 def difference_terms(s: EstimatorState, a: int, b: int) -> tuple[int, float]:
-    """Put a difference of ranges, to anchor b less to anchor a, into ``h``; its terms, and the difference.
+    """Write a difference of ranges, to anchor b less to anchor a, into ``h``; its terms, and the difference.
 
     Its gradient stands in the first terms, as the other kinds' directions do.
     """
@@ -444,8 +441,8 @@ def difference_terms(s: EstimatorState, a: int, b: int) -> tuple[int, float]:
 def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: float) -> int:
     """Process a ready-made difference of ranges, to anchor b less to anchor a: 1 if it was used, 0 if not.
 
-    d = |p − b| − |p − a| + range errors of b − those of a + noise. Nothing is learnt of clocks, which whoever made
-    the difference has taken out of it.
+    d = |p − b| − |p − a| + range errors of b − those of a + noise. Nothing is estimated of clocks, which whoever made
+    the difference has removed.
     """
     settings, status = s.settings[0], s.status[0]
     dim, walked_m = settings["dim"], status["walked_m"]
@@ -454,7 +451,7 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
     relax_range_error(s, a, a_elapsed_s, walked_m - s.anchors[a]["walked_m"])
     relax_range_error(s, b, b_elapsed_s, walked_m - s.anchors[b]["walked_m"])
     terms, expected_m = difference_terms(s, a, b)
-    innovation = difference_m - expected_m - _along(s, 2 * direction_terms(dim), terms)
+    innovation = difference_m - expected_m - _h_dot_x(s, 2 * direction_terms(dim), terms)
     innovation_variance = compute_ph(s, terms) + settings["difference_std_m"] ** 2
     scale = difference_scale(s, innovation, innovation_variance)
     if scale > 0.0:
@@ -466,8 +463,8 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
         update(s, innovation, innovation_variance * scale, 1.0, len(s.x))
         end_small_obstruction(s, a)
         end_small_obstruction(s, b)
-        adapt_place_noise(s, a, a_elapsed_s)
-        adapt_place_noise(s, b, b_elapsed_s)
+        adapt_change_variance(s, a, a_elapsed_s)
+        adapt_change_variance(s, b, b_elapsed_s)
     return int(scale > 0.0)
 
 
@@ -476,7 +473,7 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
 
 @step
 def height(s: EstimatorState, height_m: float, std_m: float) -> int:
-    """Process the tag's height as a sensor tells it: 1 if it was used, 0 if not.
+    """Process the tag's height as a sensor measures it: 1 if it was used, 0 if not.
 
     Where a height is given, it corrects that.
     """
@@ -500,12 +497,12 @@ def height(s: EstimatorState, height_m: float, std_m: float) -> int:
 
 @step
 def zero_velocity(s: EstimatorState) -> None:
-    """Process the knowledge that a tag at rest has no velocity, one axis after the other."""
+    """Process the knowledge that a stationary tag has no velocity, one axis after the other."""
     dim = s.settings[0]["dim"]
     velocity = layout(dim, len(s.anchors)).velocity
     for axis in range(dim):
         term = _set_term(s, 0, velocity + axis, 1.0)
-        variance = compute_ph(s, term) + REST_STD_MPS**2
+        variance = compute_ph(s, term) + STATIONARY_STD_MPS**2
         innovation = -s.x[velocity + axis]
         compute_fault_input(s, term, -1)
         update(s, innovation, variance, 1.0, len(s.x))
