@@ -8,7 +8,7 @@ from firmware_board import FirmwareBoard
 from live_nodes import LiveSite, are_right
 
 from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.firmware.board import NONE
+from skyless.firmware.board import NO_FRAME
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,7 +53,7 @@ def test_anchor_and_tag_on_the_firmware_make_right_fixes_and_survive_noise_and_p
 
             await site.stop("anchor 4")  # the host vanishes, and comes back
             await asyncio.sleep(0.5)
-            await site.until(lambda: anchor_board.board._stage == NONE)
+            await site.until(lambda: anchor_board.board._stage == NO_FRAME)
             sent = anchor_board.board._chip.sent
             await asyncio.sleep(0.3)
             assert anchor_board.board._chip.sent == sent
