@@ -9,7 +9,18 @@ from dense_covariance import position_covariance
 from skyless.clocks.filter import ClockNoise, clock_noise
 from skyless.method_names import FILTERS
 from skyless.planning.anchor_clocks import offset_variances, stamp_variances
-from skyless.planning.columns import CLAIMED, COLUMNS, FIX_SHARE, GDOP, RMSE, SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, TDOP
+from skyless.planning.columns import (
+    CLAIMED,
+    FIX_SHARE,
+    GDOP,
+    PLAN_COLUMNS,
+    RMSE,
+    SIGMA,
+    SIGMA_X,
+    SIGMA_Y,
+    SIGMA_Z,
+    TDOP,
+)
 from skyless.planning.links import anchor_positions, hears, link_budget, range_of, with_range
 from skyless.planning.predict import PlanSettings, Predictor, with_noise
 from skyless.planning.snapshot_sigma import delays, phase_covariance
@@ -167,7 +178,7 @@ def test_a_walls_delay_shifts_positions_as_the_tdoas_shift():
     H = (unit[1:] - unit[0])[:, :2]
     expected = np.linalg.norm(np.linalg.lstsq(H, shift[1:], rcond=None)[0])
     row = Predictor(site, PlanSettings("literal")).at(point)[0]
-    assert row[COLUMNS.index("bias_m")] == pytest.approx(expected, rel=1e-6)
+    assert row[PLAN_COLUMNS.index("bias_m")] == pytest.approx(expected, rel=1e-6)
     assert row[RMSE] ** 2 == pytest.approx(row[SIGMA] ** 2 + expected**2, rel=1e-6)
 
 

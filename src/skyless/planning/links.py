@@ -1,4 +1,4 @@
-"""Who hears whom at a site, by the simulated channel's own formulas without its chance; and with which geometry."""
+"""Which anchors are received where at a site, by the simulated channel's own formulas without its chance."""
 
 import math
 from typing import Final, NamedTuple
@@ -6,9 +6,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from msgspec import Struct
 
-from skyless.kernels.arrays import Mask, Matrix, Vector
+from skyless.kernels.arrays import Integers, Mask, Matrix, Vector
 from skyless.kernels.compiled import kernel, threaded_kernel
-from skyless.planning.columns import ANCHORS, GDOP, PDOP, TDOP
+from skyless.planning.columns import ANCHORS_IN_VIEW, GDOP, PDOP, TDOP
 from skyless.simulation.channel import (
     FREE_SPACE_LOSS_1_M_DB,
     ChannelModel,
@@ -48,7 +48,7 @@ def range_of(channel: ChannelModel) -> float:
 
 
 def with_range(channel: ChannelModel, range_m: float) -> ChannelModel:
-    """A channel like this one that carries so far: its sensitivity follows."""
+    """A channel like this one with another range, by another sensitivity."""
     sensitivity_dbm = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 20.0 * math.log10(range_m)
     values = {name: getattr(channel, name) for name in channel.__struct_fields__}
     return ChannelModel(**{**values, "sensitivity_dbm": sensitivity_dbm})
@@ -119,6 +119,14 @@ def anchor_links(anchors_m: Matrix, master: int, budget: Vector, walls: Matrix) 
     return AnchorLinks(share[:, 0], delay_m[:, 0])
 
 
+def masters_by_links(anchors_m: Matrix, budget: Vector, walls: Matrix) -> Integers:
+    """Rows of anchors, best master first: that which all others hear best; equals by distance from the middle."""
+    heard, _ = links(anchors_m, anchors_m, budget, walls)
+    total = np.round(np.minimum(heard, 0.99).sum(axis=0), 3)
+    middle = np.linalg.norm(anchors_m[:, :2] - anchors_m[:, :2].mean(axis=0), axis=1)
+    return np.lexsort((middle, -total))
+
+
 class Scene(NamedTuple):
     """Anchors, and what stands between them and points."""
 
@@ -140,7 +148,7 @@ class Scene(NamedTuple):
 def fill_dops(scene: Scene, points: Matrix, share: Matrix, dim: int, table: Matrix) -> None:
     """Fill the number of anchors in view and the columns of their DOPs."""
     in_view = share >= IN_VIEW
-    table[:, ANCHORS] = in_view.sum(axis=1)
+    table[:, ANCHORS_IN_VIEW] = in_view.sum(axis=1)
     table[:, GDOP : TDOP + 1] = dops_at(scene.anchors, points, height_known=dim == 2, weights=in_view)
 
 

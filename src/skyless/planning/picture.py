@@ -11,7 +11,7 @@ from matplotlib.image import AxesImage
 from msgspec import Struct
 
 from skyless.kernels.arrays import Array
-from skyless.planning.columns import ANCHORS, BIAS, FIX_SHARE, HDOP, PDOP, RMSE, SIGMA, VDOP
+from skyless.planning.columns import ANCHORS_IN_VIEW, BIAS, FIX_SHARE, HDOP, PDOP, RMSE, SIGMA, VDOP
 from skyless.planning.floor import Floor, floor_plan_box
 from skyless.planning.maps import PlanMap
 from skyless.site.model import Site
@@ -33,7 +33,7 @@ SIGMA_LAYER: Final = Layer(SIGMA, "predicted standard deviation", "cm", 100.0)
 RMSE_LAYER: Final = Layer(RMSE, "predicted RMSE, walls' delays included", "cm", 100.0)
 LAYERS: Final = (
     SIGMA_LAYER,
-    Layer(ANCHORS, "anchors in view", "anchors"),
+    Layer(ANCHORS_IN_VIEW, "anchors in view", "anchors"),
     Layer(HDOP, "horizontal dilution of precision (HDOP)", ""),
     Layer(FIX_SHARE, "fixes of those possible", "%", 100.0),
 )
@@ -45,7 +45,7 @@ class Background(Struct, frozen=True):
     site: Site
     floor: Floor
     file: Path
-    """The site's file, beside which the image of the floor lies."""
+    """The site's file, next to which the image of the floor lies."""
     described: str
     """Method, noise and schedule, in words."""
 
@@ -89,7 +89,7 @@ def draw_layer(plan: PlanMap, layer: Layer, background: Background) -> Figure:
 def _norm(values: Array, layer: Layer) -> tuple[LogNorm | BoundaryNorm | None, Array | None]:
     """Colours: whole numbers for anchors, per cent from 0 to 100, else logarithmic between percentiles."""
     known = values[np.isfinite(values)]
-    if layer.column == ANCHORS:
+    if layer.column == ANCHORS_IN_VIEW:
         most = int(known.max(initial=1))
         every = max(1, (most + 1) // 12)
         bounds = np.arange(-0.5, most + every, every)
