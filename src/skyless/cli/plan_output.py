@@ -75,7 +75,7 @@ def report(
                 "y_m": anchor.y_m,
                 "z_m": anchor.z_m,
                 "hears_master": float(predictor.links.share[row]),
-                "speaks": bool(predictor.clocks.speaks[row]),
+                "sends": bool(predictor.clocks.speaks[row]),
             }
             for row, anchor in enumerate(site.anchors)
         ],
@@ -198,7 +198,7 @@ def _page(result: dict[str, Any], mapped: "PlanMap", background: "Background") -
     facts = _facts(result)
     for anchor in result["anchors"]:
         position = f"({anchor['x_m']:g}, {anchor['y_m']:g}, {anchor['z_m']:g}) m"
-        silent = "" if anchor["speaks"] else ", silent"
+        silent = "" if anchor["sends"] else ", silent"
         facts[f"anchor {anchor['id']}"] = (
             f"{position}, hears {anchor['hears_master']:.0%} of the master's frames{silent}"
         )

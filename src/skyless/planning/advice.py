@@ -45,21 +45,21 @@ def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str
 
 def _master(predictor: Predictor) -> list[str]:
     """Anchors that hear the master badly have a poor clock, or none and stay silent; a better master, if any."""
-    share, speaks = predictor.links.share, predictor.clocks.speaks
+    share, sends = predictor.links.share, predictor.clocks.speaks
     found = [
-        _hears_badly(predictor, np.flatnonzero(~speaks), "stay silent"),
-        _hears_badly(predictor, np.flatnonzero(speaks & (share < _RELIABLE)), "follow its clock badly"),
+        _poor_reception(predictor, np.flatnonzero(~sends), "stay silent"),
+        _poor_reception(predictor, np.flatnonzero(sends & (share < _RELIABLE)), "follow its clock badly"),
     ]
     warnings = [text for text in found if text]
     best = int(masters_by_links(predictor.anchors_m, predictor.budget, predictor.walls)[0])
-    hear_best = anchor_links(predictor.anchors_m, best, predictor.budget, predictor.walls).share
-    if warnings and (hear_best >= _RELIABLE).sum() > (share >= _RELIABLE).sum():
+    best_share = anchor_links(predictor.anchors_m, best, predictor.budget, predictor.walls).share
+    if warnings and (best_share >= _RELIABLE).sum() > (share >= _RELIABLE).sum():
         number = predictor.site.anchors[best].id
-        warnings[0] += f"; with anchor {number} as the master {(hear_best < _RELIABLE).sum()} would hear it that badly"
+        warnings[0] += f"; with anchor {number} as the master {(best_share < _RELIABLE).sum()} would hear it that badly"
     return warnings
 
 
-def _hears_badly(predictor: Predictor, rows: Integers, what: str) -> str:
+def _poor_reception(predictor: Predictor, rows: Integers, what: str) -> str:
     """One sentence for all anchors that do the same."""
     if len(rows) == 0:
         return ""

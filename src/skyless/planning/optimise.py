@@ -1,10 +1,10 @@
 """Where anchors should hang: the best of several starts, first on a lattice, then by the method's own prediction.
 
 A quick search exchanges anchors on a lattice of mounts. The error that counts there is that of (HᵀWH)⁻¹ with each
-anchor weighted by the share of its frames that arrives: it knows no method. What it finds is judged, and improved, by
-the method's own prediction. The evenly spaced layout is one of the starts, so the result is never worse than it. Mean
-and worst error over the region count alike, relative to that layout's. Same seed, same result, unless the time runs
-out before the search ends.
+anchor weighted by the share of its frames that arrives: independent of the method. What it finds is judged, and
+improved, by the method's own prediction. The evenly spaced layout is one of the starts, so the result is never worse
+than it. Mean and worst error over the region count alike, relative to that layout's. Same seed, same result, unless
+the time runs out before the search ends.
 """
 
 import math
@@ -193,7 +193,7 @@ class Scored(Struct, frozen=True):
 
 
 class Optimised(Struct, frozen=True):
-    """The result beside the even layout of as many anchors."""
+    """The result and the even layout of as many anchors."""
 
     best: Scored
     even: Scored

@@ -168,7 +168,7 @@ def fill_snapshot_sigma(
     """
     share, delay_m = scene.heard_at(points)
     fill_dops(scene, points, share, dim, table)
-    part = share * share * np.where(rounds.usable & scene.speaks, links.share**2, 0.0)
+    part = share * share * np.where(rounds.usable & scene.sends, links.share**2, 0.0)
     part[:, master] = 0.0
     # of each point only the anchors that take part, in the order of how much
     some = np.argsort(-part, axis=1, kind="stable")[:, : int((part > _UNCERTAIN).sum(axis=1).max())]
