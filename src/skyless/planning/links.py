@@ -153,5 +153,5 @@ def fill_dops(scene: Scene, points: Matrix, share: Matrix, dim: int, table: Matr
 
 
 def weighted_pdop(scene: Scene, points: Matrix, share: Matrix, dim: int) -> Vector:
-    """PDOP with anchors weighted by their shares of frames, so without steps where one comes into view; may be infinite."""
+    """PDOP of anchors weighted by their shares of frames, without steps where one comes into view; may be infinite."""
     return dops_at(scene.anchors, points, height_known=dim == 2, weights=share)[:, PDOP - GDOP]
