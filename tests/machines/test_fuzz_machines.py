@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from bench import EVERY_METHOD, LAB, ROOM, assert_honest, tape
 from skyless.air.codec import MAX_FRAME_BYTES
-from skyless.air.fcs import fcs
+from skyless.air.ieee802154 import fcs
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
 from skyless.constants import TICK_RATE_HZ
