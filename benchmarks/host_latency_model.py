@@ -24,8 +24,7 @@ from skyless.simulation.world import diagnostics_of
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import ScheduleSite, Site
 from skyless.ticks import wrap
-from skyless.uncertainty.bounds import bound_settings
-from skyless.uncertainty.loss_bound import received_bound
+from skyless.uncertainty.bounds import bound_settings, received_bound
 
 QA: Final = 0.3
 SPEED_STD_MPS: Final = 1.0

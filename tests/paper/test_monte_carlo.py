@@ -11,9 +11,7 @@ from skyless.bench.monte_carlo_speed import bench_chain, numpy_draw, numpy_loop
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.paper.chain_draws import Quantity, Readings
 from skyless.paper.monte_carlo import CHUNK, draw_lambdas, draw_moments
-from skyless.uncertainty import corrected
-from skyless.uncertainty.chain import Chain
-from skyless.uncertainty.tdoa import Reference, chain_covariance
+from skyless.uncertainty.chain import CORRECTED, Chain, Reference, chain_covariance
 
 SHARING = list(Reference)
 
@@ -60,13 +58,13 @@ def test_the_theorys_covariance_is_a_diagonal_and_a_common_number(reference):
     own = covariance.diagonal() - common
     np.testing.assert_allclose(np.diag(own) + common, covariance, rtol=1e-4)
     if reference is Reference.APART:
-        np.testing.assert_allclose(np.diag(covariance), corrected.lambda_m2(chain), rtol=1e-12)
+        np.testing.assert_allclose(np.diag(covariance), CORRECTED.lambda_m2(chain), rtol=1e-12)
 
 
 def test_the_autocovariance_of_epsilon_is_the_theorys():
     chain = chain_for(Reference.APART)
     moments = draw_moments(chain, 5, 500_000)
-    excess = moments.epsilon_covariance_s2 - corrected.epsilon_covariance(chain)
+    excess = moments.epsilon_covariance_s2 - CORRECTED.epsilon_covariance(chain)
     assert (np.abs(excess) < 5.0 * moments.epsilon_covariance_error_s2).all()
 
 
@@ -115,7 +113,7 @@ from skyless.paper.chain_draws import Readings
 from skyless.paper.gpu_draws import gpu_sums
 from skyless.paper.monte_carlo import draw_moments, gpu_available, sums_of
 from skyless.bench.monte_carlo_speed import bench_chain
-from skyless.uncertainty.tdoa import Reference
+from skyless.uncertainty.chain import Reference
 assert gpu_available()
 for uniform in (False, True):
     readings = Readings(bench_chain(2), Reference.SECOND_SYNC, uniform=uniform)

@@ -21,7 +21,7 @@ from skyless.studies.limits import judged
 from skyless.studies.plan import Limit, Row, plan_of
 from skyless.studies.room_bound import biases_of, bound_cells
 from skyless.studies.worlds import RunResult, run_world
-from skyless.uncertainty.biased_bound import Biases
+from skyless.uncertainty.bounds import Biases
 
 PLAN = plan_of("joint", 1, study="room")
 CASES = {case.name: case for case in room.cases(PLAN)}
@@ -169,7 +169,7 @@ class Told:
     """A fix that promises a level."""
 
     def __init__(self, hpl_m, alert=Alert.NONE):
-        self.hpl_m, self.alert, self.asked = hpl_m, alert, object()
+        self.hpl_m, self.alert, self.requirement = hpl_m, alert, object()
 
 
 def test_levels_are_counted_for_each_tag():

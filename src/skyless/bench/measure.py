@@ -19,7 +19,7 @@ from skyless.bench.many_tags import TagsSpeed, many_joints, one_core
 from skyless.bench.runs import ANCHORS_M, NODES, JointRuns, Run
 from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
-from skyless.positioning.solver.locate import PseudorangeSolution, locate_pseudoranges
+from skyless.positioning.methods.locate import PseudorangeSolution, locate_pseudoranges
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.stations import TagSpec

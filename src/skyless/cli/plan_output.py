@@ -75,7 +75,7 @@ def report(
                 "y_m": anchor.y_m,
                 "z_m": anchor.z_m,
                 "hears_master": float(predictor.links.share[row]),
-                "sends": bool(predictor.clocks.speaks[row]),
+                "sends": bool(predictor.clocks.sends[row]),
             }
             for row, anchor in enumerate(site.anchors)
         ],

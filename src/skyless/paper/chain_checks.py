@@ -11,8 +11,7 @@ from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.kernels.arrays import Array, Integers
 from skyless.paper.chain_draws import Quantity
 from skyless.paper.monte_carlo import ChainMoments, draw_lambdas, draw_moments
-from skyless.uncertainty import corrected, printed
-from skyless.uncertainty.chain import Chain
+from skyless.uncertainty.chain import CORRECTED, PRINTED, Chain
 
 QUANTITIES: Final = ("beta", "gamma_first", "gamma_delayed", "gamma_averaged", "epsilon", "xi", "phi", "lambda")
 """β, γ(t̄), γ(t̄+D), γ̄, ε(t_i), ξ, φ, λ, in the order in which the paper derives them."""
@@ -26,14 +25,14 @@ SIGMAS_S: Final = {"gaussian": TICK_S / 3.0, "uniform": TICK_S / 3.0**0.5}
 """Of every stamp: "plus/minus 15.65 ps" read as three sigma, or as the half width of the uniform noise."""
 
 _ROWS: Final = {
-    "beta": (Quantity.BETA, printed.beta, corrected.beta),
-    "gamma_first": (Quantity.GAMMA_FIRST, printed.gamma_first, corrected.gamma_first),
-    "gamma_delayed": (Quantity.GAMMA_DELAYED, printed.gamma_delayed, corrected.gamma_delayed),
-    "gamma_averaged": (Quantity.GAMMA_AVERAGED, printed.gamma_averaged, corrected.gamma_averaged),
-    "epsilon": (Quantity.EPSILON_FIRST, printed.epsilon_first, corrected.epsilon_first),
-    "xi": (Quantity.XI, printed.xi, corrected.xi),
-    "phi": (Quantity.PHI, printed.phi, corrected.phi),
-    "lambda": (Quantity.LAMBDA, printed.lambda_m2, corrected.lambda_m2),
+    "beta": (Quantity.BETA, PRINTED.beta, CORRECTED.beta),
+    "gamma_first": (Quantity.GAMMA_FIRST, PRINTED.gamma_first, CORRECTED.gamma_first),
+    "gamma_delayed": (Quantity.GAMMA_DELAYED, PRINTED.gamma_delayed, CORRECTED.gamma_delayed),
+    "gamma_averaged": (Quantity.GAMMA_AVERAGED, PRINTED.gamma_averaged, CORRECTED.gamma_averaged),
+    "epsilon": (Quantity.EPSILON_FIRST, PRINTED.epsilon_first, CORRECTED.epsilon_first),
+    "xi": (Quantity.XI, PRINTED.xi, CORRECTED.xi),
+    "phi": (Quantity.PHI, PRINTED.phi, CORRECTED.phi),
+    "lambda": (Quantity.LAMBDA, PRINTED.lambda_m2, CORRECTED.lambda_m2),
 }
 
 _CHUNK: Final = 1 << 16
@@ -185,8 +184,8 @@ def lambda_distributions(
 
 def _distribution(seed: int, noise: str, draws: int, bins: int) -> LambdaDistribution:
     chain = paper_chain(seed, 1, noise)
-    theory_m = math.sqrt(_number(corrected.lambda_m2(chain)))
-    printed_variance = _number(printed.lambda_m2(chain))
+    theory_m = math.sqrt(_number(CORRECTED.lambda_m2(chain)))
+    printed_variance = _number(PRINTED.lambda_m2(chain))
     edges = np.linspace(-_REACH_SIGMAS, _REACH_SIGMAS, bins + 1) * theory_m
     counts = np.zeros(bins, np.int64)
     squares = 0.0

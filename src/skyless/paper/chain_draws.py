@@ -2,8 +2,8 @@
 
 One draw is one synchronisation of n anchors and one DTDoA of each, with a noise number for every stamp. Ideal
 readings are float ticks; a hundred-thousandth of a tick is lost where clocks stand a second from their origins. Errors
-are taken against the same chain without noise. The scalar functions are those of ``clocks/paper.py`` and
-``positioning/solver/paper.py``, on the processor and on a GPU alike.
+are taken against the same chain without noise. The scalar functions are those of
+``positioning/methods/snapshots.py``, on the processor and on a GPU alike.
 """
 
 from enum import IntEnum
@@ -11,14 +11,19 @@ from typing import Final
 
 import numpy as np
 
-from skyless.clocks.paper import averaged_offset, relative_offset, relative_rate, to_master
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import kernel, threaded_kernel
 from skyless.paper.counter_random import NUMBERS_PER_BLOCK, fill_noise
-from skyless.positioning.solver.paper import protocol_interval, tag_rate
-from skyless.uncertainty.chain import Chain
-from skyless.uncertainty.tdoa import Reference
+from skyless.positioning.methods.snapshots import (
+    averaged_offset,
+    protocol_interval,
+    relative_offset,
+    relative_rate,
+    tag_rate,
+    to_master,
+)
+from skyless.uncertainty.chain import Chain, Reference
 
 
 class Quantity(IntEnum):

@@ -9,9 +9,9 @@ from skyless.evaluation.plot_style import MAP, WHITE, floor, panel
 from skyless.kernels.arrays import Array
 from skyless.paper.plan import P1, P2, RADIO_PS, Plan, Results, Task
 from skyless.paper.section import Panel, Section, Verdict
+from skyless.positioning.methods.snapshots import literal_covariance
 from skyless.site.lab import ideal_lab_site
 from skyless.uncertainty.dop import dops_at
-from skyless.uncertainty.tdoa import literal_covariance
 
 ANCHORS_M: Final = np.array([(anchor.x_m, anchor.y_m) for anchor in ideal_lab_site().anchors])
 """The lab's anchors, shape (6, 2), the master first, in the order in which they speak."""

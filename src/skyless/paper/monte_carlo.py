@@ -17,8 +17,7 @@ from skyless.errors import SkylessError
 from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
 from skyless.paper.chain_draws import QUANTITIES, Quantity, Readings, add_draws, list_lambdas, sums_size
-from skyless.uncertainty.chain import Chain
-from skyless.uncertainty.tdoa import Reference
+from skyless.uncertainty.chain import Chain, Reference
 
 Progress = Callable[[int], None]
 

@@ -17,8 +17,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.kernels.arrays import Integers, Matrix, Vector
-from skyless.kernels.cholesky import factorise, invert
 from skyless.kernels.compiled import kernel, threaded_kernel
+from skyless.kernels.linear_algebra import factorise, invert
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import FIX_SHARE, SIGMA
 from skyless.planning.floor import Floor, Mounts, sample_points

@@ -14,7 +14,7 @@ from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.evaluation.lab_bound import SUPERFRAMES, WHITE_FM, random_path
 from skyless.kernels.arrays import Array, Integers
 from skyless.positioning.estimator.estimator import Packets
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings
 
 CRYSTALS_PPM: Final = 10.0
 SPREAD_M: Final = 1e6

@@ -19,8 +19,8 @@ from skyless.errors import SkylessError
 from skyless.evaluation.lab_bound import SPEED_STD_MPS
 from skyless.kernels.arrays import Array
 from skyless.positioning.estimator.estimator import ACCEPTED, JOINED, Estimator, Packets
-from skyless.positioning.estimator.levels import HPL, LEVELS, VPL
-from skyless.positioning.integrity import CONTRADICTED
+from skyless.positioning.estimator.levels import LEVELS
+from skyless.positioning.integrity import CONTRADICTED, HPL, VPL
 from skyless.site.lab import ideal_lab_site
 from skyless.studies.clustered_intervals import rare_interval
 from skyless.studies.episodes import Case, draw_episode, settings_of

@@ -37,7 +37,7 @@ class LevelCounter:
 
     def add(self, tag: int, fix: Fix, across_m: float) -> None:
         """Take a fix and its horizontal error."""
-        self._told |= fix.asked is not None
+        self._told |= fix.requirement is not None
         self._counts[0, tag] += 1
         hpl_m = fix.hpl_m
         if hpl_m is None:

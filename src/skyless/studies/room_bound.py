@@ -18,8 +18,7 @@ from skyless.kernels.arrays import Array
 from skyless.studies.plan import Cell, Row
 from skyless.studies.summary import Case, jackknife
 from skyless.studies.worlds import Run, RunResult
-from skyless.uncertainty.biased_bound import Biases, biased_bound
-from skyless.uncertainty.bounds import bound_settings
+from skyless.uncertainty.bounds import Biases, biased_bound, bound_settings
 
 SPEED_STD_MPS: Final = 1.0
 """Before the first frame; after the second and a half for which nothing is judged nothing of it is left."""

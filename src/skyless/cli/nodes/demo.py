@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from skyless.mqtt.address import MqttAddress
     from skyless.mqtt.messages import FixMessage
-    from skyless.nodes.demo_site import SiteRun, WholeSite
-    from skyless.nodes.watch import Watch, Watched
+    from skyless.nodes.demo import SiteRun, WholeSite
+    from skyless.nodes.watch import Watch, WatchedTag
 
 _LONGEST_START_S: Final = 60.0
 """Programs that have not made a fix for every tag by then will not."""
@@ -93,8 +93,8 @@ def demo(*, asked: DemoOptions = DemoOptions()) -> None:
     simulated. Watch it on the page, or with: mosquitto_sub -t 'skyless/#' -v
     """
     from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.nodes.demo_site import WholeSite
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.demo import WholeSite
+    from skyless.nodes.process import run
 
     settings = _settings(asked)
     with loading_kernels():
@@ -108,8 +108,8 @@ def demo(*, asked: DemoOptions = DemoOptions()) -> None:
 
 def _settings(asked: DemoOptions) -> "SiteRun":
     from skyless.mqtt.address import mqtt_address
-    from skyless.nodes.demo_site import SiteRun
-    from skyless.nodes.process.folders import recordings_folder
+    from skyless.nodes.demo import SiteRun
+    from skyless.nodes.process import recordings_folder
 
     check_method(asked.method)
     if asked.mqtt == "none":
@@ -137,7 +137,7 @@ def _settings(asked: DemoOptions) -> "SiteRun":
 
 def _recording(asked: str | None, folder: Path) -> Path | None:
     """Where to record; None: nowhere. Raises SkylessError."""
-    from skyless.nodes.process.folders import new_recording
+    from skyless.nodes.process import new_recording
 
     if asked == "none":
         return None
@@ -262,7 +262,7 @@ class Screen:
     def _watch(self) -> "Watch | None":
         return self._whole.watch
 
-    def _tags(self) -> "list[tuple[str, Watched]]":
+    def _tags(self) -> "list[tuple[str, WatchedTag]]":
         known = [] if self._watch is None else list(self._watch.tags.items())
         return sorted(known, key=lambda item: (len(item[0]), item[0]))
 
@@ -377,8 +377,8 @@ class Screen:
         """From the end of a frame on the air to the fix, and to a subscriber of the broker."""
         if self._watch is None:
             return {}
-        fix_p50_s, fix_p99_s, _ = self._watch.latencies.take()
-        here_p50_s, here_p99_s, _ = self._watch.arrivals.take()
+        fix_p50_s, fix_p99_s, _ = self._watch.latencies.drain()
+        here_p50_s, here_p99_s, _ = self._watch.arrivals.drain()
         return {
             "fix_latency_p50_s": fix_p50_s,
             "fix_latency_p99_s": fix_p99_s,

@@ -9,7 +9,7 @@ from cyclopts.validators import Number
 from skyless.cli.common.options import Picoseconds, Seed, options
 from skyless.cli.nodes.options import MqttOptions, WalkingSpeed, listen_address, log, site_named
 from skyless.errors import SkylessError
-from skyless.radios.emulated.ether_wire import DEFAULT_PORT
+from skyless.radios.ether_wire import DEFAULT_PORT
 
 _Share = Annotated[float, Parameter(validator=Number(gte=0, lte=1))]
 
@@ -51,9 +51,8 @@ def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOpt
     """
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.evaluation.scenarios import Request, impairments_of, patrols
-    from skyless.nodes.emulation.ether import Ether
-    from skyless.nodes.emulation.ether_program import Air
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.ether import Ether, EtherNode
+    from skyless.nodes.process import run
 
     site, address = site_named(asked.site), broker.address()
     host, port = listen_address(asked.listen, DEFAULT_PORT)
@@ -63,6 +62,6 @@ def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOpt
     emulated = Ether(site, bodies, impairments_of(request, site), asked.seed)
     try:
         with contextlib.suppress(KeyboardInterrupt):
-            run(Air(emulated, host, DEFAULT_PORT if port is None else port, address, log).run(), punctual=True)
+            run(EtherNode(emulated, host, DEFAULT_PORT if port is None else port, address, log).run(), punctual=True)
     except OSError as error:
         raise SkylessError(f"--listen is {asked.listen!r}, which cannot be used: {error.strerror or error}") from None

@@ -54,7 +54,7 @@ def record(
     json
         Write one JSON object at the end instead of text.
     """
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.process import run
     from skyless.recordings.mcap.file import McapFile
 
     address = broker.address()

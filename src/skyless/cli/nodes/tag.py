@@ -79,7 +79,7 @@ def tag(
     broker.mqtt
         Broker for fixes and health, or none.
     """
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.process import run
 
     address = broker.address()
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
@@ -103,8 +103,7 @@ def tag(
 def _on_radios(names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None") -> "Coroutine[Any, Any, None]":
     """Tags that hear beacons."""
     from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.nodes.tag import TagSettings
-    from skyless.nodes.tags import Tags
+    from skyless.nodes.tag import Tags, TagSettings
 
     required = asked.protection.requirement(asked.method, asked.height_std)
     settings = TagSettings(asked.method, asked.qa, asked.site_id, integrity=required, publish_hz=asked.publish_hz)
