@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from skyless.cli.nodes.demo_screen import MOST_ALERTS, SHOWN_S, Screen
+from skyless.cli.nodes.demo import ALERT_SHOWN_S, MOST_ALERTS, Screen
 from skyless.mqtt.messages import AnchorHealth, Counters, FixMessage
 from skyless.nodes.watch import Watch
 from skyless.positioning.integrity import Alert
@@ -76,14 +76,14 @@ def test_alerts_of_the_newest_fixes_are_named_with_the_anchors_left_out_and_all_
     screen, watch = stage
     for _ in range(3):
         watch._on_fix(fix("t1", "unavailable"))
-    watch.tags["t1"].alerted_s -= SHOWN_S
+    watch.tags["t1"].alerted_s -= ALERT_SHOWN_S
     watch._on_fix(fix("t1", "none"))
     watch._on_fix(fix("t2", "detected-excluded", (1, 2, 3, 5)))
     watch._on_fix(fix("t2", "none"))  # it comes and goes with each message of the anchor
     assert drawn(screen) == (
         "alerts: t2 detected-excluded (without 4), 1 of 2 tags now; so far detected-excluded 1, unavailable 3"
     )
-    watch.tags["t2"].alerted_s -= SHOWN_S
+    watch.tags["t2"].alerted_s -= ALERT_SHOWN_S
     assert drawn(screen) == "alerts: none now; so far detected-excluded 1, unavailable 3"
     assert screen.summary()["alerts"] == {"detected-excluded": 1, "none": 2, "unavailable": 3}
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from skyless.cli.main import main
-from skyless.cli.nodes.demo_screen import _subscriber
+from skyless.cli.nodes.demo import _subscriber
 from skyless.mqtt.address import MqttAddress
 from skyless.nodes.ports import hold_any
 

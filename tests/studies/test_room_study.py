@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.cli.study_output import print_rows
+from skyless.cli.study import print_rows
 from skyless.evaluation.figures import picture
 from skyless.positioning.integrity import Alert
 from skyless.simulation.channel import cross_walls, pack_walls

@@ -1,4 +1,4 @@
-"""``skyless bench``: how fast the heavy parts run here."""
+"""``skyless bench``: how fast filters and Monte Carlo draws run on this machine."""
 
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from skyless.bench.measure import Speed
     from skyless.bench.monte_carlo_speed import MonteCarloSpeed
 
-QUICK_DRAWS: Final = 100_000
+_QUICK_DRAWS: Final = 100_000
 
 app = App(name="bench", help_epilogue="Example: skyless bench --json")
 
@@ -22,9 +22,9 @@ def bench(
     quick: bool = False,
     json: bool = False,
 ) -> None:
-    """Measure filters and Monte Carlo draws beside plain NumPy, filterpy, scipy and plain compiled loops.
+    """Measure filters and Monte Carlo draws next to plain NumPy, filterpy, scipy and plain compiled loops.
 
-    The filters' figures are medians of several short runs on one core, by the time that the core gave them.
+    The filters' figures are medians of several short runs on one core, in CPU time.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def bench(
     anchors
         Anchors in each draw.
     quick
-        A look in a few seconds, with fewer and shorter runs and at most a tenth of a million draws.
+        A few seconds only, with fewer and shorter runs and at most a tenth of a million draws.
     json
         Write one JSON object instead of a table.
     """
@@ -42,7 +42,7 @@ def bench(
     from skyless.cli.common.output import print_json
     from skyless.cli.common.progress import status
 
-    draws = min(draws, QUICK_DRAWS) if quick else draws
+    draws = min(draws, _QUICK_DRAWS) if quick else draws
     with status("filters"):
         speed = measure_all(QUICK if quick else FULL)
     with status(f"{draws:,} draws of {anchors} anchors"):
@@ -52,10 +52,10 @@ def bench(
 
         print_json({**asdict(speed), "monte_carlo": chain})
         return
-    _tell(speed, chain)
+    _show(speed, chain)
 
 
-def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
+def _show(speed: "Speed", chain: "MonteCarloSpeed") -> None:
     from skyless.cli.common.output import console
 
     out = console()

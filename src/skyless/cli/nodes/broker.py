@@ -32,20 +32,20 @@ def broker(
 ) -> None:
     """Run an MQTT broker until Ctrl-C, and print its address when it is ready.
 
-    It serves this machine alone unless --listen says otherwise, and then asks for a name and a password.
+    It serves this machine alone unless --listen is given, and then asks for a name and a password.
 
     Parameters
     ----------
     port
-        Where it listens; by default 1883, or the next port that is free.
+        Port to listen on; by default 1883, or the next port that is free.
     listen
         Address of this machine to listen on; 0.0.0.0 means all of them.
     data
         Folder for retained messages and sessions; by default skyless/broker in the user's data folder.
     user
-        Name that clients must give; their password stands in SKYLESS_MQTT_PASSWORD.
+        Name that clients must give; their password is taken from SKYLESS_MQTT_PASSWORD.
     certificate
-        Certificate in PEM form; with it and --key the broker speaks TLS.
+        Certificate in PEM form; with it and --key the broker uses TLS.
     key
         Private key of the certificate in PEM form.
     json
@@ -77,5 +77,5 @@ async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
         await asyncio.wait((ended, asked), return_when=asyncio.FIRST_COMPLETED)
         asked.cancel()
         if ended.done():
-            raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may say why")
+            raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may show why")
         ended.cancel()

@@ -1,9 +1,9 @@
-"""What ``skyless replay`` and ``skyless calibrate`` are told beside a recording: anchors, truth and heights."""
+"""What ``skyless replay`` and ``skyless calibrate`` are given with a recording: anchors, truth and heights."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skyless.cli.common.options import finite_numbers
+from skyless.cli.common.options import finite_numbers, height_number
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -11,8 +11,19 @@ if TYPE_CHECKING:
     from skyless.recordings.truth import Truth
 
 
+def is_mcap(file: Path) -> bool:
+    """Whether a file's content is an MCAP; one that cannot be opened is none."""
+    from skyless.recordings.mcap.scan import MAGIC
+
+    try:
+        with file.open("rb") as stream:
+            return stream.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
 def known_anchors(table: Path | None, site: Path | None) -> "tuple[dict[int, Point], float | None]":
-    """Places of the anchors, and the tags' height where a site file tells it. Raises SkylessError."""
+    """Positions of the anchors, and the tags' height where a site file states it. Raises SkylessError."""
     from skyless.recordings.anchor_table import read_anchors
     from skyless.site.load import load_site
 
@@ -48,9 +59,9 @@ def known_truth(
 
 
 def height_to_hold(
-    wish: str, places: "dict[int, Point]", site_m: float | None, truth: "Truth | None", format_name: str
+    wish: str, anchors_m: "dict[int, Point]", site_m: float | None, truth: "Truth | None", format_name: str
 ) -> tuple[float | None, float, str]:
-    """Height to hold, its standard deviation, and what to tell the user about it."""
+    """Height to hold (None where it is estimated), its standard deviation, and where it is from."""
     import numpy as np
 
     from skyless.evaluation.observability import GUESSED_STD_M, plane_height_m
@@ -62,25 +73,18 @@ def height_to_hold(
             raise SkylessError("--height truth takes the height from the truth, which --truth must give")
         return float(np.median(truth.position_m[:, 2])), 0.0, "the truth's median"
     if wish != "auto":
-        return _metres_of(wish), 0.0, "given"
+        return height_number(wish, "or truth, free or auto"), 0.0, "given"
     if site_m is not None:
         return site_m, 0.0, "from the site file"
-    plane_m = plane_height_m(places)
+    plane_m = plane_height_m(anchors_m)
     if plane_m is None:
         return None, 0.0, "estimated"
-    note = "the anchors' mean: they lie too flat to tell the height (--height free estimates it all the same)"
+    note = "the anchors' mean: they lie too flat to determine the height (--height free estimates it all the same)"
     return plane_m, GUESSED_STD_M, note
 
 
-def _metres_of(wish: str) -> float:
-    try:
-        return finite_numbers("height", wish, (1,))[0]
-    except SkylessError:
-        raise SkylessError(f"--height is {wish!r}; it should be metres, or truth, free or auto") from None
-
-
 def flight_height(wish: float | None, truth: "Truth | None") -> float | None:
-    """Judge flights in the air only: the truth begins on the floor and rises well above it."""
+    """Height above which fixes are judged: the wish, or where the truth begins on the floor and rises well above it."""
     if wish is not None or truth is None:
         return wish
     from skyless.evaluation.observability import FLIGHT_M, flies
