@@ -36,7 +36,6 @@ def test_the_table_names_every_way(capsys):
             "least_squares",
             "NumPy loop, one core",
             "compiled, one core",
-            "GPU",
         )
     )
 

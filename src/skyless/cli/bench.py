@@ -87,8 +87,7 @@ def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
         ("NumPy loop, one core", chain.numpy_loop_draws_per_s),
         ("compiled, one core", chain.one_core_draws_per_s),
         (f"compiled, {chain.cores} cores", chain.all_cores_draws_per_s),
-        ("GPU", chain.gpu_draws_per_s),
     ]
     for name, rate in rows:
-        out.print(f"{name:<24}" + (f"{rate:>14,.0f} draws/s" if rate is not None else f"{'none here':>14}"))
+        out.print(f"{name:<24}{rate:>14,.0f} draws/s")
     out.print(f"compiled over NumPy loop, one core: {chain.ratio:.1f} times")

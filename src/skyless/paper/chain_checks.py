@@ -9,8 +9,7 @@ from msgspec import Struct
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.kernels.arrays import Array, Integers
-from skyless.paper.chain_draws import Quantity
-from skyless.paper.monte_carlo import ChainMoments, draw_lambdas, draw_moments
+from skyless.paper.monte_carlo import ChainMoments, Quantity, draw_lambdas, draw_moments
 from skyless.uncertainty import corrected, printed
 from skyless.uncertainty.chain import Chain
 
@@ -36,7 +35,6 @@ _ROWS: Final = {
     "lambda": (Quantity.LAMBDA, printed.lambda_m2, corrected.lambda_m2),
 }
 
-_CHUNK: Final = 1 << 16
 _REACH_SIGMAS: Final = 5.0
 
 
@@ -116,7 +114,6 @@ def paper_checks(
     progress: Callable[[int], None] | None = None,
     *,
     origin_s: float | None = None,
-    gpu: bool = False,
 ) -> tuple[PaperCheck, ...]:
     """Every quantity of ``QUANTITIES`` for ten random anchors, Gaussian and uniform noise.
 
@@ -133,9 +130,7 @@ def paper_checks(
     for noise in NOISES:
         for anchor in range(1, ANCHORS + 1):
             chain = paper_chain(seed, anchor, noise, origin_s=origin_s)
-            moments = draw_moments(
-                chain, _key(seed, anchor), draws, uniform=noise == "uniform", gpu=gpu, progress=report
-            )
+            moments = draw_moments(chain, _key(seed, anchor), draws, uniform=noise == "uniform", progress=report)
             done += draws
             checks.extend(_checks(chain, moments, noise, anchor))
     return tuple(checks)
@@ -190,9 +185,8 @@ def _distribution(seed: int, noise: str, draws: int, bins: int) -> LambdaDistrib
     edges = np.linspace(-_REACH_SIGMAS, _REACH_SIGMAS, bins + 1) * theory_m
     counts = np.zeros(bins, np.int64)
     squares = 0.0
-    for first in range(0, draws, _CHUNK):
-        count = min(_CHUNK, draws - first)
-        values = draw_lambdas(chain, _key(seed, 1), first, count, uniform=noise == "uniform")[:, 0]
+    for lambdas in draw_lambdas(chain, _key(seed, 1), draws, uniform=noise == "uniform"):
+        values = lambdas[:, 0]
         counts += np.histogram(values, edges)[0]
         squares += float(values @ values)
     return LambdaDistribution(
