@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.evaluation.lab_bound import random_path
+from skyless.studies.episodes import random_path
 from skyless.uncertainty.biased_bound import Biases, biased_bound
 from skyless.uncertainty.bounds import OFFSET_STD_M, POSITION_STD_M, RATE_STD_MPS, bound_settings, tracking_bound
 from skyless.uncertainty.loss_bound import received_bound

@@ -140,8 +140,7 @@ def simulate(
     json
         Write one JSON object instead of the table.
     """
-    from skyless.evaluation.room_world import Room
-    from skyless.evaluation.scenarios import Request
+    from skyless.evaluation.scenarios import Request, Room
 
     spare_inputs("fixes-csv", fixes_csv, site)
     if position and not waypoints and (tags is not None or speed is not None):

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 
-from skyless.evaluation.plot_style import BLUE, INK, RED, panel
+from skyless.evaluation.figures import BLUE, INK, RED, panel
 from skyless.paper.chain_checks import ANCHORS, PaperCheck, paper_checks
 from skyless.paper.plan import Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict, grouped

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.evaluation.plot_style import GREEN, INK, METHOD_COLOURS, MUTED, panel
+from skyless.evaluation.figures import GREEN, INK, METHOD_COLOURS, MUTED, panel
 from skyless.kernels.arrays import Array
 from skyless.paper.listening import listen
 from skyless.paper.plan import CLAIM_M, DW1000_PS, P1, PAPER_PS, Plan, Progress, Results, Task

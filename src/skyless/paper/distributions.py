@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import norm
 
-from skyless.evaluation.plot_style import BLUE, INK, RED, panel
+from skyless.evaluation.figures import BLUE, INK, RED, panel
 from skyless.paper.chain_checks import LambdaDistribution, lambda_distributions
 from skyless.paper.plan import Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict, grouped

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.evaluation.plot_style import MAP, WHITE, floor, panel
+from skyless.evaluation.figures import MAP, WHITE, draw_floor_plan, panel
 from skyless.kernels.arrays import Array
 from skyless.paper.plan import P1, P2, RADIO_PS, Plan, Results, Task
 from skyless.paper.section import Panel, Section, Verdict
@@ -145,7 +145,7 @@ def _map(name: str, title: str, field: tuple[Array, ...], caption: str) -> Panel
     lines = axes.contour(x, y, grid_values, 7, colors=WHITE, linewidths=0.7)
     axes.clabel(lines, fontsize=7.5)
     figure.colorbar(image, ax=axes, shrink=0.75, label=title, extend="max")
-    floor(axes, [(x, y) for x, y in ANCHORS_M.tolist()], labels=False)
+    draw_floor_plan(axes, [(x, y) for x, y in ANCHORS_M.tolist()], labels=False)
     for label, spot in (("P1", P1), ("P2", P2)):
         axes.plot(*spot, "+", color=WHITE, markersize=9)
         axes.annotate(label, spot, (5, 5), textcoords="offset points", color=WHITE, fontsize=8.5)

@@ -7,7 +7,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.evaluation.plot_style import GRID, INK, MUTED, PAPER
+from skyless.evaluation.figures import GRID, INK, MUTED, PAPER
 from skyless.paper.section import Panel, Section, Verdict
 
 _STYLE: Final = """

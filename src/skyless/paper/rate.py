@@ -7,7 +7,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.anchor import Anchor
-from skyless.evaluation.plot_style import INK, METHOD_COLOURS, panel
+from skyless.evaluation.figures import INK, METHOD_COLOURS, panel
 from skyless.paper.plan import RADIO_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict
 from skyless.receiver import Receiver

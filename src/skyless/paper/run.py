@@ -17,8 +17,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.errors import SkylessError
-from skyless.evaluation.figures import picture
-from skyless.evaluation.plot_style import house_style
+from skyless.evaluation.figures import picture, report_style
 from skyless.paper import (
     checks,
     claim,
@@ -77,7 +76,7 @@ def write_report(plan: Plan, out: Path, reached: Callable[[float], None], proces
     """
     with _scratch(out) as folder:
         results = run_tasks([task for figure in FIGURES for task in figure.tasks(plan)], reached, processes)
-        with house_style():
+        with report_style():
             sections = [figure.section(plan, results) for figure in FIGURES]
             report = _write(plan, sections, results, folder, out)
         _move(folder, out)

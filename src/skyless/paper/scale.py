@@ -10,7 +10,7 @@ from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from skyless.anchor import Anchor
-from skyless.evaluation.plot_style import BLUE, GREEN, INK, MUTED, ORANGE, panel
+from skyless.evaluation.figures import BLUE, GREEN, INK, MUTED, ORANGE, panel
 from skyless.kernels.arrays import Array, Integers
 from skyless.paper.plan import P1, RADIO_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict, grouped

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 
-from skyless.evaluation.plot_style import BLUE, GREEN, ORANGE, PAPER, RED, floor, panel
+from skyless.evaluation.figures import BLUE, GREEN, ORANGE, PAPER, RED, draw_floor_plan, panel
 from skyless.evaluation.scenarios import Request, fleet_of
 from skyless.paper.dop_map import ANCHORS_M
 from skyless.paper.plan import P1, P2, Plan, Progress, Results, Task
@@ -99,7 +99,7 @@ def _downlink() -> Panel:
 
 
 def _finish(axes: Axes) -> None:
-    floor(axes, [(x, y) for x, y in ANCHORS_M.tolist()])
+    draw_floor_plan(axes, [(x, y) for x, y in ANCHORS_M.tolist()])
     axes.plot(*np.array(TAGS_M).T, "o", color=RED, markersize=7, zorder=6)
     backed = {"facecolor": PAPER, "edgecolor": "none", "pad": 1.0, "alpha": 0.85}
     axes.annotate("tags", TAGS_M[1], (8, 8), textcoords="offset points", fontsize=8.5, color=RED, bbox=backed)

@@ -7,7 +7,7 @@ from matplotlib.lines import Line2D
 from msgspec import Struct
 from scipy.stats import kurtosis, norm, skew
 
-from skyless.evaluation.plot_style import INK, METHOD_COLOURS, MUTED, RED, panel
+from skyless.evaluation.figures import INK, METHOD_COLOURS, MUTED, RED, panel
 from skyless.kernels.arrays import Array
 from skyless.paper.listening import Track, listen
 from skyless.paper.plan import CLAIM_M, P1, P2, RADIO_PS, Plan, Progress, Results, Task

@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.evaluation.plot_style import GREEN, GRID, INK, METHOD_COLOURS, MUTED, RED, panel
+from skyless.evaluation.figures import GREEN, GRID, INK, METHOD_COLOURS, MUTED, RED, panel
 from skyless.paper.plan import RADIO_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict
 from skyless.receiver import Receiver

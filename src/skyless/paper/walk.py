@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.evaluation.plot_style import INK, METHOD_COLOURS, RED, floor, panel
+from skyless.evaluation.figures import INK, METHOD_COLOURS, RED, draw_floor_plan, panel
 from skyless.kernels.arrays import Array
 from skyless.paper.dop_map import ANCHORS_M, literal_covariance_m2
 from skyless.paper.listening import Track, listen
@@ -142,7 +142,7 @@ def _path(method: str, track: Track) -> Panel:
     axes.plot(x, y, ".", color=METHOD_COLOURS[method], markersize=3, label=f"{method}, {first.sum()} fixes", zorder=2)
     corners = np.array([*CORNERS_M, CORNERS_M[0]])
     axes.plot(*corners.T, "--", color=INK, linewidth=1.1, label="planned path", zorder=3)
-    floor(axes, [(x, y) for x, y in ANCHORS_M.tolist()])
+    draw_floor_plan(axes, [(x, y) for x, y in ANCHORS_M.tolist()])
     axes.set(xlim=(-0.4, 6.4), ylim=(-0.4, 8.4))
     figure.legend(loc="outside lower center", ncols=2)
     return Panel(

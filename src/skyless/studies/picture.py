@@ -1,4 +1,4 @@
-"""The picture of a study: a line of panels for each series, curves over numbers and rows beside names."""
+"""The picture of a study: a line of panels for each series, curves over numbers and bars for named cases."""
 
 from collections.abc import Callable, Sequence
 from itertools import groupby
@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from msgspec import Struct
 
-from skyless.evaluation.plot_style import BLUE, GRID, INK, MUTED, ORANGE, RED, house_style
+from skyless.evaluation.figures import BLUE, GRID, INK, MUTED, ORANGE, RED, report_style
 from skyless.kernels.arrays import Array
 from skyless.studies.plan import Row
 
-WIDTH_IN: Final = 4.7
-BAR_IN: Final = 0.24
-CURVE_IN: Final = 2.6
-WIDE: Final = 15.0
+_WIDTH_IN: Final = 4.7
+_BAR_IN: Final = 0.24
+_CURVE_IN: Final = 2.6
+_WIDE_RATIO: Final = 15.0
 """Values that lie farther apart are drawn on a logarithmic axis."""
 
 
@@ -48,23 +48,24 @@ class _Panel(Struct, frozen=True):
     """Whether the axis of bars is logarithmic; None for where values lie far apart."""
 
 
-def _cm(value_m: float | None) -> float | None:
+def centimetres(value_m: float | None) -> float | None:
+    """A length in centimetres."""
     return None if value_m is None else 100.0 * value_m
 
 
-LEAST: Final = 1e-6
-"""Smaller shares of exceeded levels are drawn here, none as well."""
+LEAST_SHARE: Final = 1e-6
+"""Smaller shares of exceeded levels, and none, are drawn here."""
 
 
 def _exceeded(row: Row) -> float | None:
-    return None if row.exceeded is None else 1e4 * max(row.exceeded, LEAST)
+    return None if row.exceeded is None else 1e4 * max(row.exceeded, LEAST_SHARE)
 
 
 _PANELS: Final = {
     "rmse": _Panel(
         "RMSE in cm",
-        lambda row: _cm(row.rmse_m),
-        lambda row: _cm(row.rmse_error_m),
+        lambda row: centimetres(row.rmse_m),
+        lambda row: centimetres(row.rmse_error_m),
         limits=True,
         figure="rmse_m",
         scale=100.0,
@@ -86,10 +87,10 @@ _PANELS: Final = {
 
 def draw(look: Look, rows: Sequence[Row]) -> Figure:
     """Draw the rows of a study; error bars are standard errors."""
-    with house_style():
+    with report_style():
         series = [(name, list(group)) for name, group in groupby(rows, key=lambda row: row.series)]
-        heights = [CURVE_IN if _is_curve(group) else 0.8 + BAR_IN * len(group) for _, group in series]
-        figure = Figure(figsize=(WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
+        heights = [_CURVE_IN if _is_curve(group) else 0.8 + _BAR_IN * len(group) for _, group in series]
+        figure = Figure(figsize=(_WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
         methods = ", ".join(dict.fromkeys(row.method for row in rows))
         note = "; grey: where 99 % of honest ones lie" if "nees" in look.panels else ""
         figure.suptitle(f"{look.title}: {methods}, simulated{note}", x=0.01, ha="left", fontsize=11.0)
@@ -142,7 +143,7 @@ def _curve(axes: Axes, x: Array, values: Array, errors: Array, look: Look, serie
         axes.set_xticks(x, [f"{value:g}" for value in x])
         axes.set_xticks([], minor=True)
     highest = float(np.nanmax(values + errors, initial=0.0))
-    if highest > WIDE * float(np.nanmin(values, initial=np.inf)):
+    if highest > _WIDE_RATIO * float(np.nanmin(values, initial=np.inf)):
         axes.set_yscale("log")
         _plain_numbers(axes.yaxis)
     else:
@@ -164,7 +165,7 @@ def _named(axes: Axes, panel: _Panel, rows: list[Row], values: Array, errors: Ar
             axes.errorbar(value, place, xerr=error, fmt="o", color=colour, markersize=5, capsize=2, zorder=3)
         else:
             axes.barh(place, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
-    wide = np.nanmax(values, initial=0.0) > WIDE * np.nanmin(values, initial=np.inf)
+    wide = np.nanmax(values, initial=0.0) > _WIDE_RATIO * np.nanmin(values, initial=np.inf)
     if (wide if panel.log is None else panel.log) and np.isfinite(values).any():
         axes.set_xscale("log")
         axes.set_xlim(left=0.6 * float(np.nanmin(values)))

@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.positioning.integrity import RISK
 
@@ -172,6 +173,24 @@ class Row(Struct, frozen=True):
     """Share of the fixes with a level whose error is larger, and which carry no alert."""
     smallest_m: float | None = None
     """Horizontal error that the share ``risk`` of fixes exceeds, with or without a level."""
+
+
+def with_limits(row: Row, limits: Sequence[Limit]) -> Row:
+    """The row with its limits and the figures that miss them; one without a fix misses all."""
+    if row.limit is not None:
+        limits = (*limits, Limit("ratio", most=row.limit))
+    if not limits:
+        return row
+    missed = tuple(limit.figure for limit in limits if row.fixes == 0 or not _holds(row, limit))
+    return replace(row, limits=tuple(limits), missed=missed, passed=not missed)
+
+
+def _holds(row: Row, limit: Limit) -> bool:
+    """What does not exist exceeds nothing (levels that no fix gives), and reaches nothing."""
+    value = getattr(row, limit.figure)
+    if value is None:
+        return limit.least is None
+    return (limit.least is None or value >= limit.least) and (limit.most is None or value <= limit.most)
 
 
 class Study(Struct, frozen=True):

@@ -26,9 +26,9 @@ Reached = Callable[[float], None]
 
 
 def run_cells(cells: Sequence[Cell], reached: Reached, processes: int | None = None) -> list[Any]:
-    """Results in the order of the cells, computed by so many processes, by default one for each core.
+    """Results in the order of the cells, computed by ``processes`` processes, by default one for each core.
 
-    ``reached`` is told the share of the work that is done. An interrupt ends all processes at once.
+    ``reached`` is called with the share of the work that is done. An interrupt ends all processes at once.
 
     Raises:
         SkylessError: a process died.
@@ -54,9 +54,11 @@ def run_cells_on_dask(cells: Sequence[Cell], reached: Reached, scheduler: str) -
         except SkylessError:
             raise
         except (CancelledError, Exception) as error:  # noqa: BLE001 - whatever a worker raised, or the network
-            told = "the scheduler has gone" if isinstance(error, CancelledError) else str(error) or type(error).__name__
+            reason = (
+                "the scheduler has gone" if isinstance(error, CancelledError) else str(error) or type(error).__name__
+            )
             raise SkylessError(
-                f"--scheduler {scheduler}: the cluster failed, nothing was written: {' '.join(told.split())}"
+                f"--scheduler {scheduler}: the cluster failed, nothing was written: {' '.join(reason.split())}"
             ) from None
 
 
@@ -131,7 +133,7 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
         from distributed import Client  # noqa: PLC0415 - an extra, and slow to import
     except ImportError:
         raise SkylessError("--scheduler needs the package distributed: pip install 'skyless[dask]'") from None
-    logging.disable(logging.ERROR)  # what goes wrong is told once, by an exception
+    logging.disable(logging.ERROR)  # what goes wrong is reported once, by an exception
     try:
         yield from _connected(Client, scheduler)
     finally:
