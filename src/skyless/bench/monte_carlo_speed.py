@@ -1,4 +1,4 @@
-"""How fast the Monte Carlo of ``monte_carlo`` is, beside a plain NumPy loop over draws of the same chain."""
+"""How fast ``paper/monte_carlo.py`` is, compared with a plain NumPy loop over draws of the same chain."""
 
 import time
 from collections.abc import Callable
@@ -14,8 +14,8 @@ from skyless.kernels.compiled import cores
 from skyless.paper.monte_carlo import Quantity, draw_moments
 from skyless.uncertainty.chain import Chain
 
-ROUNDS: Final = 3
-"""Each is measured so often in turn, and its best counts: other work on the machine only ever takes away."""
+_ROUNDS: Final = 3
+"""Measurements of each in turn; the best counts, as other work on the machine only slows down."""
 
 
 class MonteCarloSpeed(Struct, frozen=True):
@@ -97,11 +97,11 @@ def numpy_draw(chain: Chain, noise: Array) -> Array:
 
 
 def measure(draws: int, anchors: int = 10) -> MonteCarloSpeed:
-    """Measure side by side; the NumPy loop takes a hundredth of ``draws``, and all is compiled before."""
+    """Measure both; the NumPy loop makes a hundredth of ``draws``, and all is compiled before."""
     chain = bench_chain(anchors)
     draw_moments(chain, 1, 2)
     loops, ones, boths = [], [], []
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         loops.append(_rate(max(draws // 100, 100), lambda n: numpy_loop(chain, n, np.random.default_rng(1))))
         ones.append(_rate(draws, lambda n: draw_moments(chain, 1, n, threads=1)))
         boths.append(_rate(draws, lambda n: draw_moments(chain, 1, n)))

@@ -37,14 +37,14 @@ def bench(
     json
         Write one JSON object instead of a table.
     """
-    from skyless.bench.measure import FULL, QUICK, measure_all
+    from skyless.bench.measure import FULL_EFFORT, QUICK_EFFORT, measure_all
     from skyless.bench.monte_carlo_speed import measure
     from skyless.cli.common.output import print_json
     from skyless.cli.common.progress import status
 
     draws = min(draws, QUICK_DRAWS) if quick else draws
     with status("filters"):
-        speed = measure_all(QUICK if quick else FULL)
+        speed = measure_all(QUICK_EFFORT if quick else FULL_EFFORT)
     with status(f"{draws:,} draws of {anchors} anchors"):
         chain = measure(draws, anchors)
     if json:

@@ -17,8 +17,8 @@ from skyless.studies.plan import Plan
 from skyless.studies.summary import Case
 from skyless.studies.worlds import box, large_lab_site, worlds
 
-ACCELERATION_MPS2: Final = 3.0
-STILL: Final = "still"
+_ACCELERATION_MPS2: Final = 3.0
+_STILL: Final = "still"
 
 _LEG_S: Final = (2.4, 2.8)
 """Time from corner to corner; at 3 m/s² a right angle at 5 m/s takes 2.36 s."""
@@ -37,10 +37,10 @@ def cases(plan: Plan) -> list[Case]:
         return [kind(draw, low_m, high_m) for _ in range(plan.tags)]
 
     def moving(kind: Callable[..., Trajectory], speed_mps: float) -> Callable[..., Trajectory]:
-        return partial(kind, speed_mps=speed_mps, acceleration_mps2=ACCELERATION_MPS2)
+        return partial(kind, speed_mps=speed_mps, acceleration_mps2=_ACCELERATION_MPS2)
 
     kinds = {
-        STILL: still,
+        _STILL: still,
         "rounds at 1 m/s": moving(rounds, 1.0),
         "rounds at 3 m/s": moving(rounds, 3.0),
         "rounds at 5 m/s": moving(rounds, 5.0),
@@ -48,7 +48,9 @@ def cases(plan: Plan) -> list[Case]:
         "stop and go, 3 m/s": moving(stop_and_go, 3.0),
         "stop and go, 5 m/s": moving(stop_and_go, 5.0),
     }
-    return [Case(name, "motion", None, worlds(plan, site, partial(paths, kind)), STILL) for name, kind in kinds.items()]
+    return [
+        Case(name, "motion", None, worlds(plan, site, partial(paths, kind)), _STILL) for name, kind in kinds.items()
+    ]
 
 
 class StopAndGo(Trajectory):

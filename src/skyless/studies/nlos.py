@@ -14,7 +14,7 @@ _BURST_S: Final = 5.0
 _LEAST_S: Final = 3 * _BURST_S
 """Judged time in which a burst fits wherever the judging begins."""
 
-NOTHING_LATE: Final = "clean"
+_NOTHING_LATE: Final = "clean"
 _DIAGNOSTICS: Final = {"diagnostics": True}
 """Radios that report powers: those of the emulated air, where late messages have a weak first path."""
 
@@ -22,7 +22,7 @@ _DIAGNOSTICS: Final = {"diagnostics": True}
 def cases(plan: Plan) -> list[Case]:
     """Single messages, then anchors; in each world it is another anchor's turn, the master's among them."""
     late: list[tuple[str, str, dict[str, Any], float | None]] = [
-        (NOTHING_LATE, "single messages", {}, None),
+        (_NOTHING_LATE, "single messages", {}, None),
         ("5 % late by exp(1 m)", "single messages", {"nlos": 0.05}, None),
         ("20 % late by exp(1 m)", "single messages", {"nlos": 0.2}, _MAX_RATIO),
         ("40 % late by exp(1 m)", "single messages", {"nlos": 0.4}, None),
@@ -53,10 +53,10 @@ def cases(plan: Plan) -> list[Case]:
         ),
     ]
     if plan.quick:
-        late = [case for case in late if case[0] == NOTHING_LATE or case[3] is not None]
+        late = [case for case in late if case[0] == _NOTHING_LATE or case[3] is not None]
     seconds = max(plan.seconds, _LEAST_S)
     return [
-        Case(name, series, None, walking(plan, seconds=seconds, **faults), NOTHING_LATE, limit)
+        Case(name, series, None, walking(plan, seconds=seconds, **faults), _NOTHING_LATE, limit)
         for name, series, faults, limit in late
     ]
 

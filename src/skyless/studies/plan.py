@@ -37,9 +37,9 @@ class Plan(Struct, frozen=True):
     """Fixes with a higher level count as not available (``integrity``)."""
 
 
-QUICK: Final = Plan(worlds=6, seconds=10.0, tags=2, episodes=200)
+_QUICK_PLAN: Final = Plan(worlds=6, seconds=10.0, tags=2, episodes=200)
 
-USUAL: Final = {"room": Plan(worlds=20, seconds=15.0, tags=5)}
+_USUAL: Final = {"room": Plan(worlds=20, seconds=15.0, tags=5)}
 """Of studies that do not take the usual amounts; those of ``room`` are the room's own, its other cases have fewer."""
 
 
@@ -59,7 +59,7 @@ def plan_of(
     alert_limit_m: float | None = None,
 ) -> Plan:
     """The usual amounts, or with ``quick`` few, where none are given."""
-    usual = QUICK if quick else USUAL.get(study or "", Plan())
+    usual = _QUICK_PLAN if quick else _USUAL.get(study or "", Plan())
     return Plan(
         method=method,
         seed=seed,

@@ -65,7 +65,7 @@ _CRYSTALS: Final = ((1.0, 20.0), (-1.0, 20.0), (2.0, 20.0), (-2.0, 20.0), (5.0, 
 """What tags' crystals gain in the end in ppm, and the time constant in s."""
 
 TURNS_MPS2: Final = (3.0, 6.0, 10.0, 30.0)
-TURNING_MPS: Final = 3.0
+_TURNING_MPS: Final = 3.0
 _STATED_MPS2: Final = 10.0
 """Turns that are also driven with the tag's largest acceleration stated."""
 
@@ -207,7 +207,7 @@ def _turns(plan: Plan) -> list[Case]:
     """Of tags whose largest acceleration is not stated, and of some for which it is."""
     found = []
     for turn, stated in (*((turn, False) for turn in TURNS_MPS2), (_STATED_MPS2, True)):
-        name = f"turns of {turn:g} m/s² at {TURNING_MPS:g} m/s" + (", stated" if stated else "")
+        name = f"turns of {turn:g} m/s² at {_TURNING_MPS:g} m/s" + (", stated" if stated else "")
         limits = (_exceeded(1e-3),) if turn == _STATED_MPS2 else ()
         asked = IntegrityRequirement(max_acceleration_mps2=turn if stated else 0.0)
         found.append(_case(plan, name, "turns", *limits, paths=partial(turning, plan, turn), integrity=asked))
@@ -217,7 +217,7 @@ def _turns(plan: Plan) -> list[Case]:
 def turning(plan: Plan, acceleration_mps2: float, seed: int) -> Sequence[Trajectory]:
     """Tags that go round and round the lab; all accelerations have the same rounds."""
     draw, (low_m, high_m) = np.random.default_rng(seed_of(seed, _PATH_KEY)), box(lab_site(plan.noise_ps))
-    return [laps(draw, low_m, high_m, TURNING_MPS, acceleration_mps2) for _ in range(plan.tags)]
+    return [laps(draw, low_m, high_m, _TURNING_MPS, acceleration_mps2) for _ in range(plan.tags)]
 
 
 def past_wall(tags: int, seed: int) -> Sequence[Trajectory]:

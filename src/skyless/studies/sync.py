@@ -13,7 +13,7 @@ from skyless.studies.plan import Plan
 from skyless.studies.summary import Case
 from skyless.studies.worlds import LAB_WARMUP_S, Run, walking
 
-STEADY: Final = "steady"
+_STEADY: Final = "steady"
 _SUPERFRAMES_MS: Final = (15.0, 30.0, 60.0, 120.0, 300.0, 1000.0)
 _LONGEST_SLOT_S: Final = 0.06
 """A site file may say 67 ms."""
@@ -31,9 +31,9 @@ def _outages(plan: Plan) -> list[Case]:
     masters = tuple(_off(lab, number, LAB_WARMUP_S + 1.0 + every_s * number, 2.0) for number in range(rounds or 1))
     last = tuple(_off(lab, 5, LAB_WARMUP_S + 1.0 + every_s * number, 2.0) for number in range(rounds or 1))
     return [
-        Case(STEADY, "outages", None, walking(plan), STEADY),
-        Case("an anchor gone for 2 s of every 5 s", "outages", None, walking(plan, outages=last), STEADY),
-        Case("the master gone for 2 s of every 5 s", "outages", None, walking(plan, outages=masters), STEADY),
+        Case(_STEADY, "outages", None, walking(plan), _STEADY),
+        Case("an anchor gone for 2 s of every 5 s", "outages", None, walking(plan, outages=last), _STEADY),
+        Case("the master gone for 2 s of every 5 s", "outages", None, walking(plan, outages=masters), _STEADY),
     ]
 
 
@@ -57,7 +57,7 @@ def _crystals(plan: Plan) -> list[Case]:
         "draughts, ±0.1 ppm in 60 s": walking(plan, change=partial(_draughty, 1.0)),
         "draughts, ±0.5 ppm in 60 s": walking(plan, change=partial(_draughty, 5.0)),
     }
-    return [Case(name, "crystals", None, worlds, STEADY) for name, worlds in runs.items()]
+    return [Case(name, "crystals", None, worlds, _STEADY) for name, worlds in runs.items()]
 
 
 def _draughty(swing_k: float, impairments: Impairments) -> Impairments:
@@ -69,7 +69,7 @@ def _draughty(swing_k: float, impairments: Impairments) -> Impairments:
 def _superframes(plan: Plan) -> list[Case]:
     lengths_ms = _SUPERFRAMES_MS[::2] if plan.quick else _SUPERFRAMES_MS[1:]
     return [
-        Case(f"superframe of {ms:.0f} ms", "superframes", ms, walking(plan, _slow(plan, ms * 1e-3)), STEADY)
+        Case(f"superframe of {ms:.0f} ms", "superframes", ms, walking(plan, _slow(plan, ms * 1e-3)), _STEADY)
         for ms in lengths_ms
     ]
 
