@@ -52,10 +52,10 @@ def bench(
 
         print_json({**asdict(speed), "monte_carlo": chain})
         return
-    _tell(speed, chain)
+    _print_table(speed, chain)
 
 
-def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
+def _print_table(speed: "Speed", chain: "MonteCarloSpeed") -> None:
     from skyless.cli.common.output import console
 
     out = console()

@@ -21,7 +21,7 @@ GRID: Final = "#d9dee5"
 PAPER: Final = "#ffffff"
 """These four turn on a dark page; the others can be seen on both."""
 
-WHITE: Final = "#fdfdfd"
+MAP_WHITE: Final = "#fdfdfd"
 """On maps, on either page."""
 
 BLUE: Final = "#2f86d0"

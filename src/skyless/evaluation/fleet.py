@@ -75,7 +75,7 @@ class ReceiverWithOutages(Receiver):
         """See ``Receiver``."""
         host_s = reception.host_s
         if host_s is not None and any(silence.off_s <= host_s < silence.on_s for silence in self._silences):
-            self.counters["deaf"] += 1
+            self.counters["radio-off"] += 1
             return None
         return super().hear(reception)
 

@@ -112,7 +112,7 @@ def fleet_of(request: Request) -> Fleet:
     """Make the world and its tags.
 
     Raises:
-        ValueError: the method, or an anchor that is to fail, does not exist; a path has points in one place.
+        ValueError: the method, or an anchor that is to fail, does not exist; a path has equal neighbouring points.
     """
     site = request.site
     if request.noise_ps is not None:
@@ -216,16 +216,16 @@ def _walk(request: Request, index: int) -> Trajectory:
 
 def _smooth_path(points: Sequence[ArrayLike], speed_mps: float, *, loop: bool = True) -> Waypoints:
     """Path whose corners are as gentle as the legs allow, at most ``COMFORT_MPS2``; ``loop``: round and round."""
-    places = np.array(points, dtype=np.float64)
-    steps_m = np.roll(places, -1, axis=0) - places
+    points_m = np.array(points, dtype=np.float64)
+    steps_m = np.roll(points_m, -1, axis=0) - points_m
     legs_m = np.linalg.norm(steps_m if loop else steps_m[:-1], axis=1)
     corner_s = min(2.0 * speed_mps / COMFORT_MPS2, 0.9 * float(legs_m.min()) / speed_mps)
-    return Waypoints(places, speed_mps, loop=loop, corner_s=corner_s)
+    return Waypoints(points_m, speed_mps, loop=loop, corner_s=corner_s)
 
 
 def _walkable_box(site: Site) -> tuple[Array, Array]:
-    places = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
-    low, high = places.min(axis=0), places.max(axis=0)
+    points_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
     margin = np.minimum(WALL_MARGIN_M, (high - low) / 4.0)
     lacking = np.maximum((LEAST_WALK_M, LEAST_WALK_M, 0.0) - (high - low - 2.0 * margin), 0.0) / 2.0
     low, high = low + margin - lacking, high - margin + lacking

@@ -247,7 +247,7 @@ def section(plan: Plan, results: Results) -> Section:
             "draws very well, whichever is considered; the same is said of all other quantities."
         ),
         simulated=(
-            f"{grouped(plan.draws)} draws of the exact algorithm for each of ten anchors with random clocks, places "
+            f"{grouped(plan.draws)} draws of the exact algorithm for each of ten anchors with random clocks, positions "
             "and delays, stamps Gaussian and uniform within ±15.65 ps. Shown is the absolute relative error of "
             "each standard deviation, as the paper defines it. 10 000 draws have a standard error of 0.7 %; these "
             f"have {checks[0].standard_error_pct:.3f} %. The printed terms depend on when the clocks started, which "
@@ -285,15 +285,15 @@ def _by_anchor(checks: tuple[PaperCheck, ...], quantity: str) -> Panel:
 
 def _by_quantity(name: str, title: str, checks: tuple[PaperCheck, ...]) -> Panel:
     figure, axes = panel(title, 2.9)
-    for place, quantity in enumerate(_SYMBOLS):
+    for column, quantity in enumerate(_SYMBOLS):
         mine = [check for check in checks if check.quantity == quantity and check.noise == "gaussian"]
         printed = [_shown(check.printed_error_pct) for check in mine]
         corrected = [_shown(check.corrected_error_pct) for check in mine]
         axes.plot(
-            [place - 0.12] * len(mine), printed, "o", color=RED, markersize=4, label=None if place else "as printed"
+            [column - 0.12] * len(mine), printed, "o", color=RED, markersize=4, label=None if column else "as printed"
         )
         axes.plot(
-            [place + 0.12] * len(mine), corrected, "o", color=BLUE, markersize=4, label=None if place else "corrected"
+            [column + 0.12] * len(mine), corrected, "o", color=BLUE, markersize=4, label=None if column else "corrected"
         )
     axes.set_xticks(range(len(_SYMBOLS)), list(_SYMBOLS.values()))
     _logarithmic(axes)
@@ -306,7 +306,7 @@ def _by_quantity(name: str, title: str, checks: tuple[PaperCheck, ...]) -> Panel
 
 
 def _logarithmic(axes: Axes) -> None:
-    """Per cent on a logarithmic axis with room for the legend."""
+    """Per cent on a logarithmic axis with space for the legend."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     axes.set_ylim(max(low, _FLOOR_PCT), 30.0 * high)

@@ -34,10 +34,10 @@ _FIT_FROM_PS: Final = 50.0
 """Below, rounding to ticks and the crystals' own noise flatten the curve."""
 
 
-_CARRIED_ON: Final = " Where the limit is reached by {}, beyond {:g} ps, the power law is carried on."
+_EXTRAPOLATED: Final = " Where the limit is reached by {}, beyond {:g} ps, the power law is extrapolated."
 
 _SCALED: Final = (
-    " The largest of {} errors is carried on to {} as Gaussian errors grow; the table has what was simulated."
+    " The largest of {} errors is extrapolated to {} as Gaussian errors grow; the table has what was simulated."
 )
 
 
@@ -99,13 +99,13 @@ def largest_of_m(covariance_m2: Array, count: float, quantile: float) -> float:
     """
     angles = np.linspace(0.0, np.pi, 721)[:-1]
     along = np.stack([np.cos(angles), np.sin(angles)])
-    spread = 1.0 / np.einsum("ia,ij,ja->a", along, np.linalg.inv(covariance_m2), along)
-    weight = spread / np.sqrt(np.linalg.det(covariance_m2))
+    variances_m2 = 1.0 / np.einsum("ia,ij,ja->a", along, np.linalg.inv(covariance_m2), along)
+    weight = variances_m2 / np.sqrt(np.linalg.det(covariance_m2))
     exceed = -np.expm1(np.log(quantile) / count)
     low, high = 0.0, 12.0 * float(np.sqrt(np.trace(covariance_m2)))
     for _ in range(60):
         middle = 0.5 * (low + high)
-        tail = float(np.mean(np.exp(-0.5 * middle**2 / spread) * weight))
+        tail = float(np.mean(np.exp(-0.5 * middle**2 / variances_m2) * weight))
         low, high = (middle, high) if tail > exceed else (low, middle)
     return 0.5 * (low + high)
 
@@ -172,7 +172,7 @@ def section(plan: Plan, results: Results) -> Section:
         )
     table.append(("reaches 20 cm at", "", *(_range(crossings[method]) for method in _METHODS)))
     beyond = [method for method in _METHODS if crossings[method][1] > max(plan.noises_ps)]
-    carried_on = _CARRIED_ON.format(" and ".join(beyond), max(plan.noises_ps)) if beyond else ""
+    extrapolated = _EXTRAPOLATED.format(" and ".join(beyond), max(plan.noises_ps)) if beyond else ""
     scaled = "" if plan.fixes == _CLAIM_FIXES else _SCALED.format(grouped(plan.fixes), grouped(_CLAIM_FIXES))
     return Section(
         key="largest-error",
@@ -182,8 +182,8 @@ def section(plan: Plan, results: Results) -> Section:
         simulated=(
             f"{grouped(plan.fixes)} fixes at P1 for each of {len(plan.noises_ps)} stamp noises, each in a world of its "
             "own; four methods on the same receptions. A largest error scatters from run to run, so a power law is "
-            f"fitted from {_FIT_FROM_PS:g} ps on; the bands hold 90 % of the largest of so many independent Gaussian "
-            f"errors. No obstacles and no biased stamps.{carried_on}{scaled}"
+            f"fitted from {_FIT_FROM_PS:g} ps on; the bands hold 90 % of the largest of as many independent Gaussian "
+            f"errors. No obstacles and no biased stamps.{extrapolated}{scaled}"
         ),
         verdict=verdict,
         reason=reason,
@@ -233,11 +233,11 @@ def _all(by_method: dict[str, list[Worst]], trends: dict[str, Trend]) -> Panel:
 def _limits(crossings: dict[str, tuple[float, float, float]]) -> Panel:
     figure, axes = panel("Stamp noise that keeps the claim", 2.6)
     names = list(crossings)
-    for place, method in enumerate(reversed(names)):
+    for row, method in enumerate(reversed(names)):
         low, typical, high = crossings[method]
-        axes.barh(place, typical, color=METHOD_COLOURS[method], height=0.62)
-        axes.plot([low, high], [place, place], color=INK, linewidth=1.4)
-        axes.annotate(f"{typical:.0f} ps", (high, place), (5, 0), textcoords="offset points", va="center", fontsize=8.5)
+        axes.barh(row, typical, color=METHOD_COLOURS[method], height=0.62)
+        axes.plot([low, high], [row, row], color=INK, linewidth=1.4)
+        axes.annotate(f"{typical:.0f} ps", (high, row), (5, 0), textcoords="offset points", va="center", fontsize=8.5)
     axes.axvspan(*DW1000_PS, color=MUTED, alpha=0.16, linewidth=0)
     axes.axvline(PAPER_PS, color=GREEN, linestyle=":", linewidth=1.4)
     axes.set_yticks(range(len(names)), list(reversed(names)))

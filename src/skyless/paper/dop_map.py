@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.evaluation.figures import MAP, WHITE, draw_floor_plan, panel
+from skyless.evaluation.figures import MAP, MAP_WHITE, draw_floor_plan, panel
 from skyless.kernels.arrays import Array
 from skyless.paper.plan import P1, P2, RADIO_PS, Panel, Plan, Results, Section, Task, Verdict
 from skyless.site.lab import ideal_lab_site
@@ -57,7 +57,7 @@ def judge(correlation: float, asymmetry: float) -> tuple[Verdict, str]:
     """Whether PDoP ranks the positions on the floor as the predicted deviation of the paper's method does."""
     comparison = (
         "over the floor the PDoP and the predicted deviation of the paper's method correlate with "
-        f"{correlation:.2f}; mirrored places differ by up to {100 * asymmetry:.0f} % in deviation, and by nothing "
+        f"{correlation:.2f}; mirrored positions differ by up to {100 * asymmetry:.0f} % in deviation, and by nothing "
         "in PDoP"
     )
     if correlation >= EXPLAINING_CORRELATION and asymmetry < 0.1:
@@ -144,12 +144,12 @@ def _map(name: str, title: str, field: tuple[Array, ...], caption: str) -> Panel
     low, high = float(values.min()), float(np.percentile(values, 98))
     extent = (0.0, float(x[-1] + _STEP_M / 2), 0.0, float(y[-1] + _STEP_M / 2))
     image = axes.imshow(grid_values, MAP, origin="lower", extent=extent, vmin=low, vmax=high, interpolation="bilinear")
-    lines = axes.contour(x, y, grid_values, 7, colors=WHITE, linewidths=0.7)
+    lines = axes.contour(x, y, grid_values, 7, colors=MAP_WHITE, linewidths=0.7)
     axes.clabel(lines, fontsize=7.5)
     figure.colorbar(image, ax=axes, shrink=0.75, label=title, extend="max")
     draw_floor_plan(axes, [(x, y) for x, y in LAB_ANCHORS_M.tolist()], labels=False)
     for label, spot in (("P1", P1), ("P2", P2)):
-        axes.plot(*spot, "+", color=WHITE, markersize=9)
-        axes.annotate(label, spot, (5, 5), textcoords="offset points", color=WHITE, fontsize=8.5)
+        axes.plot(*spot, "+", color=MAP_WHITE, markersize=9)
+        axes.annotate(label, spot, (5, 5), textcoords="offset points", color=MAP_WHITE, fontsize=8.5)
     axes.set(xlim=(-0.4, 6.4), ylim=(-0.4, 8.4))
     return Panel(name, caption, figure)

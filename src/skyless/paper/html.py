@@ -40,7 +40,7 @@ def _introduction(heading: Heading) -> str:
         "<header>\n<p class='label'>Skyless " + escape(heading.version) + "</p>\n"
         "<h1>The paper, reproduced and corrected</h1>\n<p>Every figure and claim of L. Santoro, M. Nardello, D. "
         "Brunelli and D. Fontanelli, <cite>Scale up to infinity: the UWB Indoor Global Positioning System</cite> "
-        "(ROSE 2021), reproduced in a simulated radio world and by Monte Carlo, each beside the statement that it "
+        "(ROSE 2021), reproduced in a simulated radio world and by Monte Carlo, each with the statement that it "
         "tests. Anchors and tags run the programs that would run on radios; clocks, noise, air and motion are "
         "simulated, and no radio was measured. Claims are in other words, with the paper’s labels.</p>\n<p>Made by "
         f"<code>{escape(heading.command)}</code>. The same seed gives the same numbers, times measured on this "

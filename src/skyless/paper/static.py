@@ -52,7 +52,7 @@ _DELAY_STD_M: Final = 0.05
 
 
 class Moments(Struct, frozen=True):
-    """One axis of the errors at one place."""
+    """One axis of the errors at one position."""
 
     count: int
 
@@ -64,7 +64,7 @@ class Moments(Struct, frozen=True):
 
 
 def tasks(plan: Plan) -> list[Task]:
-    """One world for each kind of stamp error, a tag at each place."""
+    """One world for each kind of stamp error, a tag at each position."""
     weight_s = plan.fixes * 1e-3
     return [
         Task(f"static/{name}", run_world, {"name": name, "seed": plan.seed, "fixes": plan.fixes}, weight_s)
@@ -73,8 +73,8 @@ def tasks(plan: Plan) -> list[Task]:
 
 
 def run_world(progress: Progress, name: str, seed: int, fixes: int) -> list[dict[str, Track]]:
-    """Two tags at rest, heard by ``_METHODS``."""
-    paths = [Static(*place) for place in _POSITIONS.values()]
+    """Two tags at rest that compute with ``_METHODS``."""
+    paths = [Static(*point) for point in _POSITIONS.values()]
     return listen(
         ideal_lab_site(RADIO_PS), paths, _METHODS, biased_impairments(name, seed), seed, progress, fixes=fixes
     )
@@ -162,32 +162,32 @@ def section(plan: Plan, results: Results) -> Section:
     """The figure with its verdict."""
     worlds: dict[str, list[dict[str, Track]]] = {name: results[f"static/{name}"] for name in _WORLDS}
     moments = {
-        (name, place, method): [moments_of(axis) for axis in tracks[method].error_m.T]
+        (name, point, method): [moments_of(axis) for axis in tracks[method].error_m.T]
         for name, world in worlds.items()
-        for place, tracks in zip(_POSITIONS, world, strict=True)
+        for point, tracks in zip(_POSITIONS, world, strict=True)
         for method in _METHODS
     }
-    literal = {name: [m for place in _POSITIONS for m in moments[name, place, "literal"]] for name in _WORLDS}
+    literal = {name: [m for point in _POSITIONS for m in moments[name, point, "literal"]] for name in _WORLDS}
     verdict, reason = judge(literal["noise"], literal["power"] + literal["delay"])
     panels = [
-        _histogram(place, axis, tracks)
-        for place, tracks in zip(_POSITIONS, worlds["noise"], strict=True)
+        _histogram(point, axis, tracks)
+        for point, tracks in zip(_POSITIONS, worlds["noise"], strict=True)
         for axis in range(2)
     ]
     expected = {
-        (name, place): expected_bias_m(name, at, plan.seed) for name in _WORLDS for place, at in _POSITIONS.items()
+        (name, point): expected_bias_m(name, at, plan.seed) for name in _WORLDS for point, at in _POSITIONS.items()
     }
-    panels += [_means(place, moments, expected, worlds) for place in _POSITIONS]
+    panels += [_means(point, moments, expected, worlds) for point in _POSITIONS]
     rows = [("stamps", "position", "method", "mean x, y in cm", "expected", "σ x, y in cm", "largest in cm")]
     numbers: list[dict[str, object]] = []
-    for (name, place, method), (x, y) in moments.items():
-        error_m = worlds[name][list(_POSITIONS).index(place)][method].error_m
+    for (name, point, method), (x, y) in moments.items():
+        error_m = worlds[name][list(_POSITIONS).index(point)][method].error_m
         largest_m = float(np.linalg.norm(error_m, axis=1).max())
-        foreseen = expected[name, place] if method == "literal" else None
+        foreseen = expected[name, point] if method == "literal" else None
         rows.append(
             (
                 _WORLDS[name],
-                place,
+                point,
                 method,
                 f"{100 * x.mean_m:+.2f}, {100 * y.mean_m:+.2f}",
                 "" if foreseen is None else f"{100 * foreseen[0]:+.2f}, {100 * foreseen[1]:+.2f}",
@@ -198,8 +198,8 @@ def section(plan: Plan, results: Results) -> Section:
         numbers.append(
             {
                 "stamps": name,
-                "position": place,
-                "position_m": _POSITIONS[place],
+                "position": point,
+                "position_m": _POSITIONS[point],
                 "method": method,
                 "fixes": len(error_m),
                 "rmse_m": float(np.sqrt((error_m**2).sum(axis=1).mean())),
@@ -235,9 +235,9 @@ def section(plan: Plan, results: Results) -> Section:
     )
 
 
-def _histogram(place: str, axis: int, tracks: dict[str, Track]) -> Panel:
+def _histogram(point: str, axis: int, tracks: dict[str, Track]) -> Panel:
     name = "xy"[axis]
-    figure, axes = panel(f"{place}: error along {name.upper()}", 2.9)
+    figure, axes = panel(f"{point}: error along {name.upper()}", 2.9)
     span = 100 * max(float(np.abs(track.error_m[:, axis]).max()) for track in tracks.values())
     edges = np.linspace(-span, span, 90)
     for method, track in tracks.items():
@@ -251,36 +251,36 @@ def _histogram(place: str, axis: int, tracks: dict[str, Track]) -> Panel:
     axes.legend(loc="upper left")
     count = len(next(iter(tracks.values())).time_s)
     caption = (
-        f"{grouped(count)} errors along {name.upper()} at {place}, stamp noise only; lines: Gaussians of that mean "
+        f"{grouped(count)} errors along {name.upper()} at {point}, stamp noise only; lines: Gaussians of that mean "
         "and σ."
     )
-    return Panel(f"04-{place.lower()}-{name}", caption, figure)
+    return Panel(f"04-{point.lower()}-{name}", caption, figure)
 
 
 def _means(
-    place: str,
+    point: str,
     moments: dict[tuple[str, str, str], list[Moments]],
     expected: dict[tuple[str, str], Array],
     worlds: dict[str, list[dict[str, Track]]],
 ) -> Panel:
-    figure, axes = panel(f"{place}: where the mean fix lies", 4.6)
-    index = list(_POSITIONS).index(place)
+    figure, axes = panel(f"{point}: where the mean fix lies", 4.6)
+    index = list(_POSITIONS).index(point)
     cloud = 100 * worlds["noise"][index]["literal"].error_m[:400]
     axes.plot(cloud[:, 0], cloud[:, 1], ".", color=MUTED, markersize=2, alpha=0.35)
     for world, marker in _MARKERS.items():
         for method in _METHODS:
-            x, y = moments[world, place, method]
+            x, y = moments[world, point, method]
             (mean,) = axes.plot([100 * x.mean_m], [100 * y.mean_m], marker, color=METHOD_COLOURS[method])
             mean.set(markeredgecolor=INK, markeredgewidth=0.5, markersize=6)
         if world != "noise":
-            axes.plot(*(100 * expected[world, place]), "x", color=RED, markersize=7)
+            axes.plot(*(100 * expected[world, point]), "x", color=RED, markersize=7)
     axes.set(xlabel="X in cm", ylabel="Y in cm", xlim=(-10.5, 10.5), ylim=(-10.5, 10.5), aspect="equal")
     figure.legend(handles=_keys(), loc="outside lower center", ncols=2)
     caption = (
-        f"Mean error at {place} by kind of stamp error, over single fixes of literal with stamp noise only. "
+        f"Mean error at {point} by kind of stamp error, over single fixes of literal with stamp noise only. "
         "Crosses: what the stamps' errors make of literal to first order."
     )
-    return Panel(f"04-{place.lower()}-means", caption, figure)
+    return Panel(f"04-{point.lower()}-means", caption, figure)
 
 
 def _keys() -> list[Line2D]:

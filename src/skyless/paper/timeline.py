@@ -67,8 +67,8 @@ def run_world(progress: Progress, seed: int, until_s: float) -> list[TimedRecept
     """All receptions of the receivers, and which gave a fix."""
     site = ideal_lab_site(RADIO_PS)
     specs = [
-        TagSpec(Static(*place), outages=(Outage(0.0, on_s),))
-        for place, on_s in zip(_POSITIONS_M, _SWITCHED_ON_S, strict=True)
+        TagSpec(Static(*position_m), outages=(Outage(0.0, on_s),))
+        for position_m, on_s in zip(_POSITIONS_M, _SWITCHED_ON_S, strict=True)
     ]
     world = World(site, lambda anchor: Anchor(site, anchor), specs, lab_impairments(RADIO_PS), seed)
     receivers = [Receiver(_METHOD) for _ in specs]

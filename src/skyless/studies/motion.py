@@ -120,7 +120,7 @@ def zigzag(draw: Generator, low_m: Array, high_m: Array, speed_mps: float, accel
 
 
 def stop_and_go(draw: Generator, low_m: Array, high_m: Array, speed_mps: float, acceleration_mps2: float) -> Trajectory:
-    """To eight places in the box, with rests of a second."""
+    """To eight points in the box, with rests of a second."""
     return StopAndGo(draw.uniform(low_m, high_m, (8, 3)), speed_mps, acceleration_mps2, 1.0)
 
 

@@ -92,7 +92,7 @@ def draw(look: Look, rows: Sequence[Row]) -> Figure:
         heights = [_CURVE_IN if _is_curve(group) else 0.8 + _BAR_IN * len(group) for _, group in series]
         figure = Figure(figsize=(_WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
         methods = ", ".join(dict.fromkeys(row.method for row in rows))
-        note = "; grey: where 99 % of honest ones lie" if "nees" in look.panels else ""
+        note = "; grey: where 99 % of consistent ones lie" if "nees" in look.panels else ""
         figure.suptitle(f"{look.title}: {methods}, simulated{note}", x=0.01, ha="left", fontsize=11.0)
         grid = figure.subplots(len(series), len(look.panels), squeeze=False, height_ratios=heights)
         for line, (name, group) in zip(grid, series, strict=True):
@@ -158,28 +158,28 @@ def _plain_numbers(axis: Axis, *, between: bool = True) -> None:
 
 
 def _named(axes: Axes, panel: _Panel, rows: list[Row], values: Array, errors: Array) -> None:
-    places = np.arange(len(rows))
+    rows_y = np.arange(len(rows))
     colours = [ORANGE if row.passed is False else BLUE for row in rows]
-    for place, value, error, colour in zip(places, values, errors, colours, strict=True):
+    for row_y, value, error, colour in zip(rows_y, values, errors, colours, strict=True):
         if panel.target is not None:
-            axes.errorbar(value, place, xerr=error, fmt="o", color=colour, markersize=5, capsize=2, zorder=3)
+            axes.errorbar(value, row_y, xerr=error, fmt="o", color=colour, markersize=5, capsize=2, zorder=3)
         else:
-            axes.barh(place, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
+            axes.barh(row_y, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
     wide = np.nanmax(values, initial=0.0) > _WIDE_RATIO * np.nanmin(values, initial=np.inf)
     if (wide if panel.log is None else panel.log) and np.isfinite(values).any():
         axes.set_xscale("log")
         axes.set_xlim(left=0.6 * float(np.nanmin(values)))
         _plain_numbers(axes.xaxis, between=panel.log is None)
-    axes.set_yticks(places, [row.case for row in rows])
+    axes.set_yticks(rows_y, [row.case for row in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
 
 
 def _intervals(axes: Axes, rows: list[Row], *, curve: bool) -> None:
-    for place, row in enumerate(rows):
+    for row_y, row in enumerate(rows):
         if row.nees_interval is None:
             continue
-        at = (row.x or 0.0) if curve else place
+        at = (row.x or 0.0) if curve else row_y
         low, high = row.nees_interval
         ends = ([at, at], [low, high]) if curve else ([low, high], [at, at])
         axes.plot(*ends, color=GRID, linewidth=7.0, solid_capstyle="butt", zorder=1.2, scalex=False, scaley=False)
@@ -187,21 +187,21 @@ def _intervals(axes: Axes, rows: list[Row], *, curve: bool) -> None:
 
 def _limits(axes: Axes, rows: list[Row]) -> None:
     """Mark the largest RMSE that is accepted."""
-    for place, row in enumerate(rows):
+    for row_y, row in enumerate(rows):
         if row.limit is None or row.ratio is None or row.rmse_m is None:
             continue
         limit_cm = 100.0 * row.rmse_m / row.ratio * row.limit
-        x, y, mark = (limit_cm, place, "|") if row.x is None else (row.x, limit_cm, "_")
+        x, y, mark = (limit_cm, row_y, "|") if row.x is None else (row.x, limit_cm, "_")
         (line,) = axes.plot(x, y, mark, color=RED, markersize=14, markeredgewidth=1.6, linestyle="none", label="limit")
         axes.legend(handles=[line])
 
 
 def _own_limits(axes: Axes, panel: _Panel, rows: list[Row]) -> None:
     """Mark what a figure should be at least or at most."""
-    for place, row in enumerate(rows):
+    for row_y, row in enumerate(rows):
         ends = [end for one in row.limits if one.figure == panel.figure for end in (one.least, one.most)]
         values = [panel.scale * end for end in ends if end is not None]
         if values:
-            places = [float(place)] * len(values)
-            (line,) = axes.plot(values, places, "|", color=RED, markersize=14, markeredgewidth=1.6, label="limit")
+            rows_y = [float(row_y)] * len(values)
+            (line,) = axes.plot(values, rows_y, "|", color=RED, markersize=14, markeredgewidth=1.6, label="limit")
             axes.legend(handles=[line])

@@ -20,7 +20,7 @@ class Plan(Struct, frozen=True):
     noise_ps: float = 100.0
     """Noise of every TX and RX stamp, which filters know."""
     qa: float = 0.3
-    """Agility that filters assume at rest, m²/s³."""
+    """Process noise that filters assume at rest, m²/s³."""
     mesh: bool = True
     """Whether anchors also relay when they heard anchors that are not the master."""
     worlds: int = 12
@@ -102,7 +102,7 @@ class Limit(Struct, frozen=True):
 
 
 class Row(Struct, frozen=True):
-    """What a case came to; lengths in metres, None where it does not apply. All is simulated.
+    """Results of a case; lengths in metres, None where it does not apply. All is simulated.
 
     All depends on the plan alone, except for ``cpu_us_per_message``, which is measured where the cells ran.
     """
@@ -127,11 +127,11 @@ class Row(Struct, frozen=True):
     p95_m: float | None = None
     max_m: float | None = None
     said_m: float | None = None
-    """What the fixes themselves say: the root of the mean trace of their covariances."""
+    """Predicted by the fixes: the root of the mean trace of their covariances."""
     nees: float | None = None
-    """Mean normalised error squared over the degrees of freedom: 1 for fixes that tell their errors truly."""
+    """Mean normalised error squared over the degrees of freedom: 1 for fixes whose covariances are right."""
     nees_interval: tuple[float, float] | None = None
-    """Where ``nees`` lies with a probability of 99 % if they do."""
+    """Where ``nees`` lies with a probability of 99 % if they are."""
     outside: float | None = None
     """Share of fixes that lie outside of their own 99.9 % ellipse; 0.001 for true ones with Gaussian errors."""
     available: float | None = None

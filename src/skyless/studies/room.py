@@ -71,7 +71,7 @@ _STATED_MPS2: Final = 10.0
 
 _LATE_KEY: Final = 23
 _PATH_KEY: Final = 29
-"""Of streams of random numbers, beside the worlds' own."""
+"""Of streams of random numbers, next to the worlds' own."""
 
 _BOUND_SPEED_STD_MPS: Final = 1.0
 """Before the first frame; after the second and a half for which nothing is judged nothing of it is left."""
@@ -143,13 +143,13 @@ def _errors(plan: Plan) -> list[Case]:
             _case(
                 plan,
                 f"{'one anchor' if count == 1 else 'two anchors'} {100 * off_m:.0f} cm off",
-                "places of anchors",
+                "positions of anchors",
                 _exceeded(3e-4),
                 room=Room(off_anchors=count, off_m=off_m),
             )
             for count, off_m in off
         ),
-        _case(plan, "each axis N(5 cm)", "places of anchors", room=Room(axis_std_m=0.05), bounded=True),
+        _case(plan, "each axis N(5 cm)", "positions of anchors", room=Room(axis_std_m=0.05), bounded=True),
     ]
 
 
