@@ -20,7 +20,7 @@ _STYLE: Final = """
 body { margin: 0 auto; padding: 1.2rem clamp(0.9rem, 4vw, 2.5rem) 4rem; max-width: 68rem; overflow-wrap: break-word;
   background: var(--paper); color: var(--ink); font: 1rem/1.55 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; }
 h1 { font-size: clamp(1.5rem, 5vw, 2.1rem); line-height: 1.2; margin: 0.6rem 0; }
-h2 { font-size: 1.3rem; line-height: 1.3; margin: 0 0 0.4rem; }
+h2 { font-size: 1.3rem; line-height: 1.3; margin: 1.4rem 0 0.4rem; } section h2 { margin-top: 0; }
 p { margin: 0.5rem 0; max-width: 46rem; }
 a { color: var(--link); }
 code { font: 0.86em ui-monospace, "DejaVu Sans Mono", monospace; background: var(--soft); padding: 0.1em 0.35em;
