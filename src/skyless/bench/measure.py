@@ -22,7 +22,7 @@ from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
 from skyless.positioning.solver.locate import PseudorangeSolution, locate_pseudoranges
 from skyless.receiver import Receiver
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 

@@ -10,9 +10,8 @@ from typing import Final, cast
 
 from msgspec import Struct
 
-from skyless.air.beacon import Beacon, MasterTime
+from skyless.air.beacon import Beacon, Malformed, MasterTime
 from skyless.air.codec import decode_cached
-from skyless.air.malformed import Malformed
 from skyless.air.masterless_packets import PairTdoa
 from skyless.air.reception import Reception
 from skyless.constants import TICK_M

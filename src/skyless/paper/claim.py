@@ -22,7 +22,7 @@ from skyless.paper.plan import (
     Verdict,
     grouped,
 )
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 

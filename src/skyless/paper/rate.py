@@ -10,7 +10,7 @@ from skyless.evaluation.figures import INK, METHOD_COLOURS, panel
 from skyless.evaluation.fleet import world_of
 from skyless.paper.plan import RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict
 from skyless.receiver import Receiver
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, ScheduleSite, Site

@@ -14,7 +14,7 @@ from skyless.evaluation.fleet import world_of
 from skyless.kernels.arrays import Array, Integers
 from skyless.paper.plan import P1, RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
 from skyless.receiver import Receiver
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 

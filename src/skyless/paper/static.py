@@ -28,8 +28,7 @@ from skyless.paper.plan import (
     grouped,
 )
 from skyless.simulation.channel import ChannelModel, power_bias_m, received_power_dbm
-from skyless.simulation.impairments import DelayError, Impairments
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import DelayError, Impairments, lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 

@@ -12,12 +12,10 @@ from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.evaluation.figures import GREEN, GRID, INK, METHOD_COLOURS, MUTED, RED, panel
 from skyless.paper.plan import RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict
 from skyless.receiver import Receiver
-from skyless.simulation.broadcast import Broadcast
-from skyless.simulation.impairments import Outage
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import Outage, lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
+from skyless.simulation.world import Broadcast, World
 from skyless.site.lab import ideal_lab_site
 from skyless.site.slots import schedule_of
 

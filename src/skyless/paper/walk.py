@@ -10,7 +10,7 @@ from skyless.kernels.arrays import Array
 from skyless.paper.dop_map import EXPLAINING_CORRELATION, LAB_ANCHORS_M, literal_covariance_m2, pdop_at
 from skyless.paper.listening import Track, listen
 from skyless.paper.plan import RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Waypoints
 from skyless.site.lab import ideal_lab_site
 

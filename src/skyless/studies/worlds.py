@@ -15,8 +15,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 from scipy.stats import chi2
 
+from skyless.air.beacon import Malformed
 from skyless.air.codec import decode_cached, encode
-from skyless.air.malformed import Malformed
 from skyless.evaluation.fleet import world_of
 from skyless.evaluation.scenarios import WALL_MARGIN_M, Request, impairments_of, trajectories_of
 from skyless.evaluation.statistics import EvenSample, FirstFixes, LevelCounts, LevelTally
