@@ -13,7 +13,7 @@ from skyless.anchor import Anchor
 from skyless.constants import TICK_S
 from skyless.method_names import DEFAULT_METHOD
 from skyless.nodes.anchor import ASK_AGAIN_S, LEAD_GAIN, LEAD_LOSS, LEAD_S, MAX_LEAD_S
-from skyless.radios.dw1000.chip_session import ChipSession
+from skyless.radios.dw1000.radio import ChipSession
 from skyless.radios.interface import AntennaDelays, Late, RadioEvent, Sent
 from skyless.receiver import Receiver
 from skyless.simulation.dw1000.chip import Chip, ModelBus
@@ -133,7 +133,7 @@ class AnchorHost(Host):
             overdue = self.session.overdue_ticks
             ahead_s = _POLL_S if overdue is None else difference(overdue, self.air.now_ticks()) * TICK_S
             if ahead_s <= 0.0:
-                self.session.give_up()
+                self.session.cancel_overdue()
             self.serve(max(ahead_s, 0.0) + 1e-6)
 
     def hear(self, event: RadioEvent) -> None:

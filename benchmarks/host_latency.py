@@ -28,8 +28,7 @@ from skyless.simulation.world import diagnostics_of
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import ScheduleSite, Site
 from skyless.ticks import wrap
-from skyless.uncertainty.bounds import bound_settings
-from skyless.uncertainty.loss_bound import received_bound
+from skyless.uncertainty.bounds import bound_settings, received_bound
 
 _SLOTS_MS: Final = (1.05, 2.1, 2.5, 5.0, 10.0)
 _QA: Final = 0.3

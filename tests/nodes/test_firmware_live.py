@@ -46,10 +46,10 @@ def test_anchor_and_tag_on_the_firmware_make_right_fixes_and_survive_noise_and_p
             assert are_right(await site.fixes("tag1", 200))
 
             await site.stop("board tag1")
-            await site.until(lambda: any("pulled out" in line for line in site.said))
+            await site.until(lambda: any("unplugged" in line for line in site.said))
             plug_in(site, "tag1")
             assert are_right(await site.fixes("tag1", 200))
-            assert node.restarts == 2
+            assert node.monitor.restarts == 2
 
             await site.stop("anchor 4")  # the host vanishes, and comes back
             await asyncio.sleep(0.5)
@@ -59,7 +59,7 @@ def test_anchor_and_tag_on_the_firmware_make_right_fixes_and_survive_noise_and_p
             assert anchor_board.board._chip.sent == sent
             site.anchor(4, f"serial:{tmp_path / '4'}")
             await site.until(lambda: anchor_board.board._chip.sent > sent + 20)
-            assert anchor.restarts == 1
+            assert anchor.monitor.restarts == 1
             assert not +anchor_board.chip.misuse
 
     asyncio.run(play())

@@ -14,9 +14,7 @@ from skyless.paper.monte_carlo import (
     noise_batches,
     readings_of,
 )
-from skyless.uncertainty import corrected
-from skyless.uncertainty.chain import Chain
-from skyless.uncertainty.tdoa import Reference, chain_covariance
+from skyless.uncertainty.chain import CORRECTED, Chain, Reference, chain_covariance
 
 SHARING = list(Reference)
 
@@ -63,13 +61,13 @@ def test_the_theorys_covariance_is_a_diagonal_and_a_common_number(reference):
     own = covariance.diagonal() - common
     np.testing.assert_allclose(np.diag(own) + common, covariance, rtol=1e-4)
     if reference is Reference.APART:
-        np.testing.assert_allclose(np.diag(covariance), corrected.lambda_m2(chain), rtol=1e-12)
+        np.testing.assert_allclose(np.diag(covariance), CORRECTED.lambda_m2(chain), rtol=1e-12)
 
 
 def test_the_autocovariance_of_epsilon_is_the_theorys():
     chain = chain_for(Reference.APART)
     moments = draw_moments(chain, 5, 500_000)
-    excess = moments.epsilon_covariance_s2 - corrected.epsilon_covariance(chain)
+    excess = moments.epsilon_covariance_s2 - CORRECTED.epsilon_covariance(chain)
     assert (np.abs(excess) < 5.0 * moments.epsilon_covariance_error_s2).all()
 
 

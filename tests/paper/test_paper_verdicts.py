@@ -137,7 +137,7 @@ def test_the_paper_keeps_20_cm_up_to_the_published_noise():
 
 
 def test_predicted_deviations_are_the_published_ones():
-    """5.36 cm at P1 and 5.46 cm at P2 (docs/maths.md: said by the fixes), rounding included."""
+    """5.36 cm at P1 and 5.46 cm at P2 (docs/maths.md: predicted σ), rounding included."""
     for place, published_cm in ((P1, 5.36), (P2, 5.46)):
         predicted_cm = 100.0 * math.sqrt(np.trace(dop_map.literal_covariance_m2(np.array(place))))
         assert predicted_cm == pytest.approx(published_cm, abs=0.02)

@@ -13,12 +13,16 @@ from skyless.planning.columns import CLAIMED, COLUMNS, FIX_SHARE, GDOP, RMSE, SI
 from skyless.planning.links import anchor_positions, hears, link_budget, range_of, with_range
 from skyless.planning.predict import PlanSettings, Predictor, with_noise
 from skyless.planning.snapshot_sigma import delays, phase_covariance
-from skyless.positioning.methods.snapshots import SnapshotMethod
+from skyless.positioning.methods.snapshots import (
+    SnapshotMethod,
+    bracketed_covariance,
+    literal_covariance,
+    literal_delayed_covariance,
+)
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, NoiseSite, Site, TagsSite, WallSite
 from skyless.uncertainty.dop import dops_at
-from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance, literal_delayed_covariance
 
 LAB = ideal_lab_site(100.0)
 QUIET = replace(LAB, noise=NoiseSite(100.0, 100.0, 1e-15, 1e-15))
@@ -193,5 +197,5 @@ def test_a_site_out_of_its_masters_reach_is_silent():
     anchors = (AnchorSite(1, 0.0, 0.0), AnchorSite(2, 5.0, 0.0), AnchorSite(3, 0.0, 5.0), AnchorSite(4, 90.0, 5.0))
     site = Site("far", 1, 1, anchors, tags=TagsSite(0.0))
     predictor = Predictor(site, PlanSettings())
-    assert predictor.clocks.speaks.tolist() == [True, True, True, False]
+    assert predictor.clocks.sends.tolist() == [True, True, True, False]
     assert 3 not in predictor.clocks.sender

@@ -11,8 +11,7 @@ from msgspec.structs import replace
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.positioning.estimator.estimator import LEVELS, Estimator, Packets
-from skyless.positioning.estimator.settings import EstimatorSettings
-from skyless.positioning.estimator.state import layout
+from skyless.positioning.estimator.state import EstimatorSettings, layout
 from skyless.positioning.observation import Observation
 from skyless.site.lab import ideal_lab_site
 from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path

@@ -19,7 +19,7 @@ from skyless.studies.plan import Limit, Row, plan_of, with_limits
 from skyless.studies.room import biases_of, bound_cells
 from skyless.studies.summary import clustered_interval
 from skyless.studies.worlds import RunResult, box, run_world
-from skyless.uncertainty.biased_bound import Biases
+from skyless.uncertainty.bounds import Biases
 
 PLAN = plan_of("joint", 1, study="room")
 CASES = {case.name: case for case in room.cases(PLAN)}

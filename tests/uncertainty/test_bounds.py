@@ -8,6 +8,7 @@ import pytest
 from dense_covariance import position_covariance
 from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.kernels.compiled import cores
+from skyless.positioning.methods.snapshots import bracketed_covariance, literal_covariance
 from skyless.site.lab import ideal_lab_site
 from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path
 from skyless.uncertainty.bounds import (
@@ -17,7 +18,6 @@ from skyless.uncertainty.bounds import (
     bound_settings,
     tracking_bound,
 )
-from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 SLOT_S = 2.5e-3
@@ -215,5 +215,5 @@ def test_a_path_must_have_whole_superframes():
     settings = bound_settings(
         STAMP_S, white_fm=0.0, random_walk_fm=0.0, qa=0.0, slot_s=SLOT_S, speed_std_mps=0.0, mesh=False
     )
-    with pytest.raises(ValueError, match="7 places, no multiple of 6 anchors"):
+    with pytest.raises(ValueError, match="7 positions, no multiple of 6 anchors"):
         tracking_bound(LAB, np.zeros((7, 3)), settings)

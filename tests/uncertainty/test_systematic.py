@@ -2,12 +2,7 @@
 
 import numpy as np
 import pytest
-
-from skyless.bench.monte_carlo_speed import bench_chain
-from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.paper.monte_carlo import Quantity, ideal_values, readings_of
-from skyless.positioning.solver.paper import bracketed_tdoa, literal_tdoa
-from skyless.uncertainty.systematic import (
+from systematic import (
     bracketed_motion_error_m,
     literal_motion_error_m,
     motion_seen,
@@ -15,7 +10,12 @@ from skyless.uncertainty.systematic import (
     smoothed_rate_motion_error_m,
     synchronisation_error_m,
 )
-from skyless.uncertainty.tdoa import Reference
+
+from skyless.bench.monte_carlo_speed import bench_chain
+from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.paper.monte_carlo import Quantity, ideal_values, readings_of
+from skyless.positioning.methods.snapshots import bracketed_tdoa, literal_tdoa
+from skyless.uncertainty.chain import Reference
 
 MASTER, ANCHORS = np.array([0.0, 0.0, 0.5]), np.array([(6, 0, 2.5), (6, 8, 0.5), (0, 8, 2.5)], float)
 SPACING_S = 15e-3

@@ -15,8 +15,7 @@ from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.kernels.arrays import Integers, Matrix, Vector
 from skyless.kernels.compiled import threaded_kernel
 from skyless.positioning.estimator.monitor import COMMON_GAIN, COMMON_LIMIT, WALK_GAIN, WALK_LOSS
-from skyless.positioning.estimator.settings import MAX_CLOCK_RATE, EstimatorSettings
-from skyless.positioning.estimator.state import START_WALK_SCALE
+from skyless.positioning.estimator.state import MAX_CLOCK_RATE, START_WALK_SCALE, EstimatorSettings
 from skyless.positioning.methods.factory import RELAY_AGE_S
 
 

@@ -10,7 +10,7 @@ from skyless.bench.baselines import FilterpyJoint, PlainJoint, joint_filter
 from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.kernels.arrays import Array, Integers
 from skyless.positioning.estimator.estimator import Estimator, Packets
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.studies.episodes import Case, draw_episode, settings_of
 
 Run = Callable[[], object]

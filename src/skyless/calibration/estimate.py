@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from skyless.calibration.fit import Differences, Fit, fit, moves
 from skyless.kernels.arrays import Mask, Vector
-from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
 
 FEWEST: Final = 3
 """Accepted differences below which nothing is said of an anchor."""

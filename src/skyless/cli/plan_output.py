@@ -75,7 +75,7 @@ def report(
                 "y_m": anchor.y_m,
                 "z_m": anchor.z_m,
                 "hears_master": float(predictor.links.share[row]),
-                "speaks": bool(predictor.clocks.speaks[row]),
+                "speaks": bool(predictor.clocks.sends[row]),
             }
             for row, anchor in enumerate(site.anchors)
         ],

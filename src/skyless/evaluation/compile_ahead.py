@@ -30,7 +30,7 @@ def compile_pair_kernels() -> None:
     tag_m = (2.0, 3.0, 0.0)
     for k in range(24):
         a, b = 1 + k % 6, 1 + (k + 1) % 6
-        tracking.hear((PairTdoa(0.01 * k, a, b, dist(tag_m, anchors_m[b]) - dist(tag_m, anchors_m[a])),))
+        tracking.update((PairTdoa(0.01 * k, a, b, dist(tag_m, anchors_m[b]) - dist(tag_m, anchors_m[a])),))
 
 
 def compile_packet_kernels() -> None:
@@ -43,6 +43,6 @@ def compile_packet_kernels() -> None:
         anchor, follower = names[k % len(names)], names[(k + 1) % len(names)]
         sequence, tx_ticks = k // len(names), from_seconds(0.002 * k)
         rx_ticks = tx_ticks + round(dist((2.0, 3.0, 0.0), anchors_m[anchor]) / TICK_M)
-        tracking.hear(Packet(None, anchor, sequence, wrap(tx_ticks, 32), rx_ticks, heard))
+        tracking.on_packet(Packet(None, anchor, sequence, wrap(tx_ticks, 32), rx_ticks, heard))
         flight = round(dist(anchors_m[anchor], anchors_m[follower]) / TICK_M)
         heard = (Relay(anchor, sequence, wrap(tx_ticks + flight, 32), flight),)

@@ -13,8 +13,7 @@ from skyless.evaluation.figures import BLUE, INK, RED, panel
 from skyless.kernels.arrays import Array
 from skyless.paper.monte_carlo import ChainMoments, Quantity, draw_moments
 from skyless.paper.plan import Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
-from skyless.uncertainty import corrected, printed
-from skyless.uncertainty.chain import Chain
+from skyless.uncertainty.chain import CORRECTED, PRINTED, Chain
 
 QUANTITY_NAMES: Final = ("beta", "gamma_first", "gamma_delayed", "gamma_averaged", "epsilon", "xi", "phi", "lambda")
 """β, γ(t̄), γ(t̄+D), γ̄, ε(t_i), ξ, φ, λ, in the order in which the paper derives them."""
@@ -28,14 +27,14 @@ _SIGMAS_S: Final = {"gaussian": TICK_S / 3.0, "uniform": TICK_S / 3.0**0.5}
 """Of every stamp: "plus/minus 15.65 ps" read as three sigma, or as the half width of the uniform noise."""
 
 _ROWS: Final = {
-    "beta": (Quantity.BETA, printed.beta, corrected.beta),
-    "gamma_first": (Quantity.GAMMA_FIRST, printed.gamma_first, corrected.gamma_first),
-    "gamma_delayed": (Quantity.GAMMA_DELAYED, printed.gamma_delayed, corrected.gamma_delayed),
-    "gamma_averaged": (Quantity.GAMMA_AVERAGED, printed.gamma_averaged, corrected.gamma_averaged),
-    "epsilon": (Quantity.EPSILON_FIRST, printed.epsilon_first, corrected.epsilon_first),
-    "xi": (Quantity.XI, printed.xi, corrected.xi),
-    "phi": (Quantity.PHI, printed.phi, corrected.phi),
-    "lambda": (Quantity.LAMBDA, printed.lambda_m2, corrected.lambda_m2),
+    "beta": (Quantity.BETA, PRINTED.beta, CORRECTED.beta),
+    "gamma_first": (Quantity.GAMMA_FIRST, PRINTED.gamma_first, CORRECTED.gamma_first),
+    "gamma_delayed": (Quantity.GAMMA_DELAYED, PRINTED.gamma_delayed, CORRECTED.gamma_delayed),
+    "gamma_averaged": (Quantity.GAMMA_AVERAGED, PRINTED.gamma_averaged, CORRECTED.gamma_averaged),
+    "epsilon": (Quantity.EPSILON_FIRST, PRINTED.epsilon_first, CORRECTED.epsilon_first),
+    "xi": (Quantity.XI, PRINTED.xi, CORRECTED.xi),
+    "phi": (Quantity.PHI, PRINTED.phi, CORRECTED.phi),
+    "lambda": (Quantity.LAMBDA, PRINTED.lambda_m2, CORRECTED.lambda_m2),
 }
 
 _SYMBOLS: Final = {

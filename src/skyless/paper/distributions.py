@@ -13,7 +13,7 @@ from skyless.kernels.arrays import Array, Integers
 from skyless.paper.checks import NOISES, draw_seed, first_number, paper_chain
 from skyless.paper.monte_carlo import draw_lambdas
 from skyless.paper.plan import Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
-from skyless.uncertainty import corrected, printed
+from skyless.uncertainty.chain import CORRECTED, PRINTED
 
 _AGREES_SIGMAS: Final = 5.0
 _REACH_SIGMAS: Final = 5.0
@@ -48,8 +48,8 @@ def lambda_distributions(
 
 def _distribution(seed: int, noise: str, draws: int, bins: int) -> LambdaDistribution:
     chain = paper_chain(seed, 1, noise)
-    theory_m = math.sqrt(first_number(corrected.lambda_m2(chain)))
-    printed_variance = first_number(printed.lambda_m2(chain))
+    theory_m = math.sqrt(first_number(CORRECTED.lambda_m2(chain)))
+    printed_variance = first_number(PRINTED.lambda_m2(chain))
     edges = np.linspace(-_REACH_SIGMAS, _REACH_SIGMAS, bins + 1) * theory_m
     counts = np.zeros(bins, np.int64)
     squares = 0.0

@@ -8,9 +8,9 @@ from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.evaluation.figures import MAP, MAP_WHITE, draw_floor_plan, panel
 from skyless.kernels.arrays import Array
 from skyless.paper.plan import P1, P2, RADIO_PS, Panel, Plan, Results, Section, Task, Verdict
+from skyless.positioning.methods.snapshots import literal_covariance
 from skyless.site.lab import ideal_lab_site
 from skyless.uncertainty.dop import dops_at
-from skyless.uncertainty.tdoa import literal_covariance
 
 LAB_ANCHORS_M: Final = np.array([(anchor.x_m, anchor.y_m) for anchor in ideal_lab_site().anchors])
 """The lab's anchors, shape (6, 2), the master first, in the order in which they send."""

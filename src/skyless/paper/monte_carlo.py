@@ -1,7 +1,7 @@
 """Monte Carlo of the paper's chain: means, variances and covariances of any number of draws, in constant memory.
 
 One draw is one synchronisation of n anchors and one DTDoA of each, with noise on every stamp. The scalar functions are
-the program's own, of ``clocks/paper.py`` and ``positioning/solver/paper.py``. Errors are taken against the same chain
+the program's own, of ``positioning/methods/snapshots.py``. Errors are taken against the same chain
 without noise. Ideal readings are float ticks; a hundred-thousandth of a tick is lost where clocks stand a second from
 their origins.
 
@@ -19,13 +19,18 @@ from typing import Final, NamedTuple
 import numpy as np
 from msgspec import Struct
 
-from skyless.clocks.paper import averaged_offset, relative_offset, relative_rate, to_master
 from skyless.constants import TICK_M, TICK_S
 from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores, kernel, threaded_kernel
-from skyless.positioning.solver.paper import protocol_interval, tag_rate
-from skyless.uncertainty.chain import Chain
-from skyless.uncertainty.tdoa import Reference
+from skyless.positioning.methods.snapshots import (
+    averaged_offset,
+    protocol_interval,
+    relative_offset,
+    relative_rate,
+    tag_rate,
+    to_master,
+)
+from skyless.uncertainty.chain import Chain, Reference
 
 Progress = Callable[[int], None]
 

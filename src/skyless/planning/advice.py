@@ -15,9 +15,9 @@ from skyless.planning.mounts import masters_by_links, sample_points
 from skyless.planning.predict import Predictor
 from skyless.planning.snapshot_sigma import delays
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.solver.locate import NoSolution, locate
+from skyless.positioning.methods.locate import NoSolution, locate
+from skyless.positioning.methods.snapshots import literal_covariance
 from skyless.site.advice import warnings_of
-from skyless.uncertainty.tdoa import literal_covariance
 
 RELIABLE: Final = 0.95
 """An anchor should hear at least this share of the master's frames."""
@@ -46,7 +46,7 @@ def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str
 
 def _master(predictor: Predictor) -> list[str]:
     """Anchors that hear the master badly have a poor clock, or none and stay silent; a better master, if there is."""
-    share, speaks = predictor.links.share, predictor.clocks.speaks
+    share, speaks = predictor.links.share, predictor.clocks.sends
     found = [
         _hears_badly(predictor, np.flatnonzero(~speaks), "stay silent"),
         _hears_badly(predictor, np.flatnonzero(speaks & (share < RELIABLE)), "follow its clock badly"),

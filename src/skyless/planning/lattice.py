@@ -10,8 +10,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from skyless.kernels.arrays import Integers, Matrix, Vector
-from skyless.kernels.cholesky import factorise, invert
 from skyless.kernels.compiled import kernel, threaded_kernel
+from skyless.kernels.linear_algebra import factorise, invert
 from skyless.planning.links import links
 
 CLOSEST_M: Final = 0.3

@@ -64,7 +64,7 @@ class Predictor:
         self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls)
         self.links: AnchorLinks = anchor_links(self.anchors_m, self.master, self.budget, self.walls)
         self.clocks = anchor_clocks(self.site, self.links.share)
-        self.scene = Scene(self.anchors_m, self.clocks.speaks, self.budget, self.walls)
+        self.scene = Scene(self.anchors_m, self.clocks.sends, self.budget, self.walls)
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
         if settings.method in FILTERS:
             self._fill = self._joint()

@@ -19,14 +19,13 @@ from msgspec import Struct
 from skyless.clocks.filter import ClockNoise, clock_noise
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Array, Mask, Matrix, Vector
-from skyless.kernels.normal import inverse_of
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import FIX_SHARE, SIGMA, fill_errors
 from skyless.planning.links import AnchorLinks, Scene, fill_dops
-from skyless.positioning.methods.snapshots import SnapshotMethod
+from skyless.positioning.methods.locate import inverse_of
+from skyless.positioning.methods.snapshots import SnapshotMethod, bracketed_covariance, literal_covariance
 from skyless.site.model import Site
 from skyless.site.slots import first_slots, schedule_of
-from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
 
 MOST_DOUBTFUL: Final = 4
 """Anchors whose coming and going is followed exactly."""

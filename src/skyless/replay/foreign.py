@@ -13,9 +13,9 @@ from msgspec import Struct, structs
 from skyless.air.masterless_packets import Point
 from skyless.errors import SkylessError
 from skyless.evaluation.judge import Judge, Judgement
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.masterless.calibration import DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
 from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.positioning.masterless.pair_engine import PairEngine

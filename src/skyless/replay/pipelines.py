@@ -65,7 +65,7 @@ class ByPairs:
         pairs: Sequence[PairTdoa]
         if isinstance(record, Packet):
             assert self._engine is not None
-            pairs = self._engine.hear(record)
+            pairs = self._engine.on_packet(record)
         else:
             pairs = (record,)
         self._made = False
@@ -73,7 +73,7 @@ class ByPairs:
             return None
         for pair in pairs:
             self._noise.add(pair)
-        self._made = self._tracking.hear(pairs)
+        self._made = self._tracking.update(pairs)
         return pairs[0].time_s
 
     @property
@@ -118,10 +118,10 @@ class ByPackets:
         """Take one packet; its time."""
         assert isinstance(record, Packet)
         if self._heard % SAMPLED_OF < SAMPLED:
-            for pair in self._engine.hear(record):
+            for pair in self._engine.on_packet(record):
                 self._noise.add(pair)
         self._heard += 1
-        self._fix = self._tracking.hear(record)
+        self._fix = self._tracking.on_packet(record)
         return self._tracking.time_s
 
     @property

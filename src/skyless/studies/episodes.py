@@ -13,7 +13,7 @@ from numpy.random import Generator
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.kernels.arrays import Array, Integers
 from skyless.positioning.estimator.estimator import Packets
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings
 
 EPISODE_SUPERFRAMES: Final = 134
 """Two seconds, after which nothing of what was known before the first frame is left."""

@@ -22,8 +22,8 @@ from skyless.errors import SkylessError
 from skyless.evaluation.figures import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, RED, report_style
 from skyless.kernels.arrays import Array
 from skyless.positioning.estimator.estimator import ACCEPTED, JOINED, Estimator, Packets
-from skyless.positioning.estimator.levels import HPL, LEVELS, VPL
-from skyless.positioning.integrity import CONTRADICTED
+from skyless.positioning.estimator.levels import LEVELS
+from skyless.positioning.integrity import CONTRADICTED, HPL, VPL
 from skyless.site.lab import ideal_lab_site
 from skyless.studies.episodes import (
     EPISODE_SPEED_STD_MPS,

@@ -30,8 +30,7 @@ from skyless.studies.motion import laps
 from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.studies.summary import Case, clustered_interval, jackknife, world_cells, world_rows
 from skyless.studies.worlds import Run, RunResult, anchor_of, box, worlds
-from skyless.uncertainty.biased_bound import Biases, biased_bound
-from skyless.uncertainty.bounds import bound_settings
+from skyless.uncertainty.bounds import Biases, biased_bound, bound_settings
 
 BASE: Final = "the room"
 AIR: Final = "unbiased air"

@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from skyless.kernels.arrays import Array
 from skyless.studies.plan import Cell, Limit, Plan, Row
 from skyless.studies.worlds import Run, RunResult, run_world
-from skyless.uncertainty.biased_bound import Biases
+from skyless.uncertainty.bounds import Biases
 
 _MESSAGE_S: Final = 40e-6
 """About what a tag takes for a message, and an anchor with all that is simulated around it."""

@@ -41,9 +41,9 @@ def anchor(
         Certificates (PEM) to trust for mqtts.
     """
     from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.nodes.anchors import Anchors
+    from skyless.nodes.anchor import Anchors
     from skyless.nodes.open_radio import is_simulated, open_radios
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.process import run
     from skyless.radios.interface import AntennaDelays
 
     plan, address = site_named(site), broker(mqtt, mqtt_ca)

@@ -44,9 +44,9 @@ def board(
     json
         Tell path and format as one JSON object before it starts.
     """
-    from skyless.nodes.emulation.board import RADIO_OF, Board
+    from skyless.nodes.board import RADIO_OF, Board
     from skyless.nodes.open_radio import is_ether, open_radios
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.process import run
 
     if not is_ether(radio):
         raise SkylessError(f"--radio is {radio!r}; it should be the emulated air, ether:HOST[:PORT]")
@@ -56,7 +56,7 @@ def board(
             f"--format is {format!r}; it should be link for an anchor, as boards of other formats only listen"
         )
     emulated = Board(open_radios(radio, kind, (name,))[0], kind, format, link, say)
-    place = emulated.pty.place
+    place = emulated.pty.name
     if json:
         print_json({"board": name, "path": place, "format": format, "radio": f"{RADIO_OF[format]}:{place}"})
         sys.stdout.flush()

@@ -14,7 +14,7 @@ from skyless.cli.common.output import print_json
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.nodes.broker.settings import BrokerSettings
+    from skyless.nodes.broker import BrokerSettings
 
 app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
 
@@ -52,7 +52,7 @@ def broker(
         Print one JSON object instead of the address.
     """
     from skyless.mqtt.address import PASSWORD_VARIABLE
-    from skyless.nodes.broker.settings import BrokerSettings
+    from skyless.nodes.broker import BrokerSettings
 
     password = None if user is None else os.environ.get(PASSWORD_VARIABLE)
     settings = BrokerSettings(port, listen, data, user, password, certificate, key)
@@ -60,8 +60,8 @@ def broker(
 
 
 async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
-    from skyless.nodes.broker.broker import start_broker
-    from skyless.nodes.process.loop import ending_signals
+    from skyless.nodes.broker import start_broker
+    from skyless.nodes.process import ending_signals
 
     stop = asyncio.Event()
     for number in (signal.SIGINT, *ending_signals()):

@@ -19,7 +19,7 @@ from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.cli.nodes.demo_screen import Screen
-    from skyless.nodes.demo_site import SiteRun, WholeSite
+    from skyless.nodes.demo import SiteRun, WholeSite
 
 _START_S: Final = 60.0
 """Programs that have not made a fix for every tag by then will not."""
@@ -89,9 +89,8 @@ def demo(
     """
     from skyless.cli.nodes.demo_screen import Screen
     from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.nodes.demo_site import SiteRun, WholeSite
-    from skyless.nodes.process.folders import recordings_folder
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.demo import SiteRun, WholeSite
+    from skyless.nodes.process import recordings_folder, run
 
     known_method(method)
     if mqtt == "none":
@@ -126,7 +125,7 @@ def demo(
 
 def _recording(asked: str | None, folder: Path) -> Path | None:
     """Where to record; None: nowhere. Raises SkylessError."""
-    from skyless.nodes.process.folders import new_recording
+    from skyless.nodes.process import new_recording
 
     if asked == "none":
         return None

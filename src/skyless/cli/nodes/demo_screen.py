@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from skyless.mqtt.address import MqttAddress
     from skyless.mqtt.messages import FixMessage
-    from skyless.nodes.demo_site import SiteRun, WholeSite
-    from skyless.nodes.watch import Watch, Watched
+    from skyless.nodes.demo import SiteRun, WholeSite
+    from skyless.nodes.watch import Watch, WatchedTag
 
 
 MOST_ALERTS: Final = 3
@@ -90,7 +90,7 @@ class Screen:
     def _watch(self) -> "Watch | None":
         return self._whole.watch
 
-    def _tags(self) -> "list[tuple[str, Watched]]":
+    def _tags(self) -> "list[tuple[str, WatchedTag]]":
         known = [] if self._watch is None else list(self._watch.tags.items())
         return sorted(known, key=lambda item: (len(item[0]), item[0]))
 
@@ -205,8 +205,8 @@ class Screen:
         """From the end of a frame on the air to the fix, and to a subscriber of the broker."""
         if self._watch is None:
             return {}
-        fix_p50_s, fix_p99_s, _ = self._watch.latencies.take()
-        here_p50_s, here_p99_s, _ = self._watch.arrivals.take()
+        fix_p50_s, fix_p99_s, _ = self._watch.latencies.drain()
+        here_p50_s, here_p99_s, _ = self._watch.arrivals.drain()
         return {
             "fix_latency_p50_s": fix_p50_s,
             "fix_latency_p99_s": fix_p99_s,

@@ -9,7 +9,7 @@ from cyclopts.validators import Number
 from skyless.cli.common.options import Picoseconds
 from skyless.cli.nodes.options import DEFAULT_MQTT, Mqtt, MqttCa, broker, listen_address, say, site_named
 from skyless.errors import SkylessError
-from skyless.radios.emulated.ether_wire import DEFAULT_PORT
+from skyless.radios.ether_wire import DEFAULT_PORT
 
 app = App(name="ether", help_epilogue="Example: skyless ether --site lab --tags 3")
 Share = Annotated[float, Parameter(validator=Number(gte=0, lte=1))]
@@ -58,9 +58,8 @@ def ether(
     """
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.evaluation.scenarios import Request, impairments_of, patrols
-    from skyless.nodes.emulation.ether import Ether
-    from skyless.nodes.emulation.ether_program import Air
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.ether import Ether, EtherNode
+    from skyless.nodes.process import run
 
     plan, address = site_named(site), broker(mqtt, mqtt_ca)
     host, port = listen_address(listen, DEFAULT_PORT)
@@ -70,6 +69,6 @@ def ether(
     emulated = Ether(plan, bodies, impairments_of(request, plan), seed)
     try:
         with contextlib.suppress(KeyboardInterrupt):
-            run(Air(emulated, host, DEFAULT_PORT if port is None else port, address, say).run(), punctual=True)
+            run(EtherNode(emulated, host, DEFAULT_PORT if port is None else port, address, say).run(), punctual=True)
     except OSError as error:
         raise SkylessError(f"--listen is {listen!r}, which cannot be used: {error.strerror or error}") from None

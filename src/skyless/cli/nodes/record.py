@@ -58,7 +58,7 @@ def record(
     json
         Write one JSON object at the end instead of text.
     """
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.process import run
     from skyless.recordings.mcap.file import McapFile
 
     address = broker(mqtt, mqtt_ca)

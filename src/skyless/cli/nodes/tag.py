@@ -91,7 +91,7 @@ def tag(
     mqtt_ca
         Certificates (PEM) to trust for mqtts.
     """
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.process import run
     from skyless.nodes.tag import TagSettings
 
     address = broker(mqtt, mqtt_ca)
@@ -120,7 +120,7 @@ def _on_radios(
 ) -> "Coroutine[Any, Any, None]":
     """Tags that hear beacons."""
     from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.nodes.tags import Tags
+    from skyless.nodes.tag import Tags
 
     radios = open_radios(radio, "tag", names)
     compile_kernels(settings.method)

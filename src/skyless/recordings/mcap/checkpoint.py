@@ -12,10 +12,9 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from skyless.positioning.estimator.estimator import Estimator
-from skyless.positioning.estimator.soundness import is_sound
+from skyless.positioning.estimator.estimator import Estimator, is_sound
 from skyless.positioning.methods.acquisition import Start
-from skyless.positioning.methods.anchors_in_use import AnchorsInUse
+from skyless.positioning.methods.joint import AnchorsInUse
 from skyless.positioning.observation import Observation
 from skyless.receiver import Receiver
 from skyless.recordings.mcap.checkpoint_graph import Arrays

@@ -11,8 +11,7 @@ from typing import Any, Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.positioning.estimator.settings import SETTINGS
-from skyless.positioning.estimator.state import ANCHOR, LINK, PACKET, STATUS
+from skyless.positioning.estimator.state import ANCHOR_DTYPE, LINK_DTYPE, PACKET_DTYPE, SETTINGS_DTYPE, STATUS_DTYPE
 
 PACKAGES: Final = (
     "skyless.air",
@@ -26,7 +25,13 @@ PACKAGES: Final = (
 
 PLAIN: Final[tuple[type, ...]] = (type(None), bool, float, str, bytes)
 
-RECORDS: Final = {"anchor": ANCHOR, "packet": PACKET, "link": LINK, "status": STATUS, "settings": SETTINGS}
+RECORDS: Final = {
+    "anchor": ANCHOR_DTYPE,
+    "packet": PACKET_DTYPE,
+    "link": LINK_DTYPE,
+    "status": STATUS_DTYPE,
+    "settings": SETTINGS_DTYPE,
+}
 """Types of the records that arrays may consist of."""
 
 Node = list[Any]
