@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
 from skyless.air.ieee802154 import air_time_s
-from skyless.evaluation.plot_style import BLUE, GREEN, GRID, INK, MUTED, ORANGE
+from skyless.evaluation.figures import BLUE, GREEN, GRID, INK, MUTED, ORANGE
 from skyless.site.lab import lab_site
 
 FOLDER = Path(__file__).parent

@@ -144,7 +144,7 @@ def test_the_room_is_the_lab_with_the_errors_of_rooms(run):
 def test_deaf_tags_make_no_fix_and_find_themselves_again(run, tmp_path, method):
     base = ["--method", method, "--duration", "8", "--fixes-csv", "fixes.csv", "--json"]
     told = report(run(*base, "--deaf", "3:4.5", "--deaf", "5:5.5"))
-    assert told["drops"]["deaf"] == pytest.approx(2.0 * 400, abs=2)
+    assert told["drops"]["radio-off"] == pytest.approx(2.0 * 400, abs=2)
     with (tmp_path / "fixes.csv").open(newline="") as file:
         times_s = [float(row["t_s"]) for row in csv.DictReader(file)]
     assert not any(3.0 <= time_s < 4.5 or 5.0 <= time_s < 5.5 for time_s in times_s)

@@ -36,11 +36,11 @@ from textbook_filter import TextbookFilter
 
 from skyless.air.beacon import HEARD
 from skyless.constants import TICK_RATE_HZ, TICK_S
-from skyless.evaluation.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.positioning.estimator.estimator import JOINED, REJECTED, STALE, Estimator, Packets
 from skyless.positioning.estimator.kalman import predict
 from skyless.positioning.estimator.levels import LASTING_CHI2
 from skyless.positioning.estimator.state import EstimatorSettings, layout, new_state, with_anchor, without_anchor
+from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
 BIASED = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
@@ -64,7 +64,7 @@ def test_a_textbook_filter_says_the_same(case, anchors_m, height_m, height_std_m
     assumed = settings_of(case, height_m, gate=1e3, height_std_m=height_std_m, **errors)
     estimator = begun(episode, assumed, anchors_m)
     s, dim = estimator.state, estimator.dim
-    start = (s.x[:dim].copy(), s.P[:dim, :dim].copy(), SPEED_STD_MPS**2)
+    start = (s.x[:dim].copy(), s.P[:dim, :dim].copy(), EPISODE_SPEED_STD_MPS**2)
     textbook = TextbookFilter(estimator.settings, anchors_m, int(episode.packets.rx_ticks[0]), *start)
     for packet in one_by_one(episode.packets):
         status, anchors = estimator.state.status[0].copy(), estimator.state.anchors
@@ -103,7 +103,12 @@ def test_the_covariance_is_the_bound_of_what_has_come_in(case):
     run = tracked(begun(episode, settings_of(case)), episode.packets)
     noise = {"white_fm": WHITE_FM, "random_walk_fm": case.random_walk_fm, "qa": case.qa}
     stage = bound_settings(
-        case.noise_ps * 1e-12, **noise, slot_s=SLOT_S, speed_std_mps=SPEED_STD_MPS, mesh=case.mesh, at_once=False
+        case.noise_ps * 1e-12,
+        **noise,
+        slot_s=SLOT_S,
+        speed_std_mps=EPISODE_SPEED_STD_MPS,
+        mesh=case.mesh,
+        at_once=False,
     )
     bound = tracking_bound(LAB_M, episode.path_m, stage)
     ratio = np.trace(run.covariances[5::6][-20:], axis1=1, axis2=2) / np.trace(bound[-20:], axis1=1, axis2=2)

@@ -25,10 +25,10 @@ from msgspec.structs import replace
 
 from skyless.clocks.filter import ClockFilter, clock_noise
 from skyless.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
-from skyless.evaluation.lab_bound import WHITE_FM
 from skyless.positioning.estimator.estimator import ACCEPTED, REJECTED, Report
 from skyless.positioning.estimator.measurements import REPORT_GAIN
 from skyless.positioning.estimator.monitor import gate_of
+from skyless.studies.episodes import WHITE_FM
 from skyless.ticks import TICK_MASK
 
 ROOM_ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}

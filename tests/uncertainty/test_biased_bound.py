@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.evaluation.lab_bound import random_path
+from skyless.studies.episodes import random_path
 from skyless.uncertainty.bounds import (
     OFFSET_STD_M,
     POSITION_STD_M,

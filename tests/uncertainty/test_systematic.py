@@ -13,7 +13,7 @@ from systematic import (
 
 from skyless.bench.monte_carlo_speed import bench_chain
 from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.paper.chain_draws import Quantity, Readings
+from skyless.paper.monte_carlo import Quantity, ideal_values, readings_of
 from skyless.positioning.methods.snapshots import bracketed_tdoa, literal_tdoa
 from skyless.uncertainty.chain import Reference
 
@@ -82,7 +82,7 @@ def test_a_smoothed_rate_keeps_the_velocity():
 def test_what_the_ideal_chain_leaves_is_e_and_the_tags_scale():
     """``eq:GPSTDoA`` without noise, through the program's kernels, to a ten-thousandth of a tick."""
     chain = bench_chain(10, seed=6)
-    left_m = Readings(chain, Reference.APART, uniform=False).ideal[Quantity.LAMBDA] * TICK_M
+    left_m = ideal_values(readings_of(chain, Reference.APART))[Quantity.LAMBDA] * TICK_M
     left_m -= (chain.tag_tof_s - chain.tag_master_tof_s) / TICK_S * TICK_M  # the true difference
     np.testing.assert_allclose(left_m, synchronisation_error_m(chain) + scale_error_m(chain), atol=1e-4 * TICK_M)
 

@@ -37,14 +37,14 @@ def bench(
     json
         Write one JSON object instead of a table.
     """
-    from skyless.bench.measure import FULL, QUICK, measure_all
+    from skyless.bench.measure import FULL_EFFORT, QUICK_EFFORT, measure_all
     from skyless.bench.monte_carlo_speed import measure
     from skyless.cli.common.output import print_json
     from skyless.cli.common.progress import status
 
     draws = min(draws, _QUICK_DRAWS) if quick else draws
     with status("filters"):
-        speed = measure_all(QUICK if quick else FULL)
+        speed = measure_all(QUICK_EFFORT if quick else FULL_EFFORT)
     with status(f"{draws:,} draws of {anchors} anchors"):
         chain = measure(draws, anchors)
     if json:
@@ -52,10 +52,10 @@ def bench(
 
         print_json({**asdict(speed), "monte_carlo": chain})
         return
-    _show(speed, chain)
+    _print_table(speed, chain)
 
 
-def _show(speed: "Speed", chain: "MonteCarloSpeed") -> None:
+def _print_table(speed: "Speed", chain: "MonteCarloSpeed") -> None:
     from skyless.cli.common.output import console
 
     out = console()
@@ -87,8 +87,7 @@ def _show(speed: "Speed", chain: "MonteCarloSpeed") -> None:
         ("NumPy loop, one core", chain.numpy_loop_draws_per_s),
         ("compiled, one core", chain.one_core_draws_per_s),
         (f"compiled, {chain.cores} cores", chain.all_cores_draws_per_s),
-        ("GPU", chain.gpu_draws_per_s),
     ]
     for name, rate in rows:
-        out.print(f"{name:<24}" + (f"{rate:>14,.0f} draws/s" if rate is not None else f"{'none here':>14}"))
+        out.print(f"{name:<24}{rate:>14,.0f} draws/s")
     out.print(f"compiled over NumPy loop, one core: {chain.ratio:.1f} times")

@@ -174,8 +174,7 @@ def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
 
 
 def _request(asked: SimulateOptions) -> "Request":
-    from skyless.evaluation.room_world import Room
-    from skyless.evaluation.scenarios import Request
+    from skyless.evaluation.scenarios import Request, Room
 
     return Request(
         site=_site(asked),

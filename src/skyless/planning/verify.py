@@ -13,8 +13,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.evaluation.fleet import Fleet, FleetSettings
-from skyless.evaluation.room_world import Room
-from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.evaluation.scenarios import Request, Room, impairments_of
 from skyless.kernels.arrays import Matrix
 from skyless.method_names import FILTERS
 from skyless.planning.columns import CLAIMED, FIX_SHARE, RMSE, SIGMA

@@ -1,6 +1,8 @@
-"""The yardsticks of ``skyless bench``: ``joint`` in plain NumPy, matrix by matrix, and by filterpy's EKF.
+"""The baselines of ``skyless bench``: ``joint`` in plain NumPy, matrix by matrix, by filterpy's EKF, and a plain loop.
 
-They take the same measurements as the kernels and come to the same states (``tests/experiments/test_benchmarks.py``).
+The two filters process the same measurements as the kernels and reach the same states
+(``tests/bench/test_benchmarks.py``). The loop is what plain loops under Numba take: nothing but the arithmetic, without
+gate, running means, epochs in integers, and anchors that join or leave.
 """
 
 from functools import cached_property
@@ -11,6 +13,7 @@ import numpy as np
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.kernels.arrays import Integers, Matrix, Vector
+from skyless.kernels.compiled import threaded_kernel
 from skyless.positioning.estimator.monitor import COMMON_GAIN, COMMON_LIMIT, WALK_GAIN, WALK_LOSS
 from skyless.positioning.estimator.state import MAX_CLOCK_RATE, START_WALK_SCALE, EstimatorSettings
 from skyless.positioning.methods.factory import RELAY_AGE_S
@@ -20,7 +23,7 @@ class PlainJoint:
     """``joint`` as one would write it first: all anchors from the start, a wide prior, nothing exploited.
 
     The states are position and velocity (the height is given), then of every anchor the offset of its clock, then the
-    rates, then the noise of each last TX stamp. Survey and ranges are taken for exact, no packet for late, and of the
+    rates, then the noise of each last TX stamp. Survey and ranges are assumed exact, no packet late, and of the
     process noise only that of the tag's clock adapts.
     """
 
@@ -45,9 +48,9 @@ class PlainJoint:
         self._range_m: dict[int, float] = {}
         self._walk_scale, self._common_mean, self._count = START_WALK_SCALE, 0.0, 0
 
-    def hear(self, anchor: int, sequence: int, rx: int, tx: int, relays: Integers) -> None:
-        """Take one packet, as ``Estimator.process`` does."""
-        self._elapse(rx)
+    def process(self, anchor: int, sequence: int, rx: int, tx: int, relays: Integers) -> None:
+        """Process one packet, as ``Estimator.process`` does."""
+        self._time_update(rx)
         n, s = self._n, self._s
         noise = 4 + 2 * n + anchor
         self.P[noise, :] = self.P[:, noise] = 0.0
@@ -66,9 +69,9 @@ class PlainJoint:
         self._newest[anchor], self._range_m[anchor] = tx, range_m
         self._packets[anchor, sequence] = (tx, rx)
         for listener, of, number, heard in relays.tolist():
-            self._hear_relay(listener, of, number, heard)
+            self._process_relay(listener, of, number, heard)
 
-    def _elapse(self, rx: int) -> None:
+    def _time_update(self, rx: int) -> None:
         n, s = self._n, self._s
         dt = (rx - self._epoch) * TICK_S
         self._epoch = rx
@@ -94,7 +97,7 @@ class PlainJoint:
         square = self._common_mean**2 * (2.0 - COMMON_GAIN) / COMMON_GAIN
         self._walk_scale = max(self._walk_scale * (WALK_GAIN if square > COMMON_LIMIT else WALK_LOSS), 1.0)
 
-    def _hear_relay(self, listener: int, of: int, sequence: int, heard: int) -> None:
+    def _process_relay(self, listener: int, of: int, sequence: int, heard: int) -> None:
         n, s = self._n, self._s
         tx, rx = self._packets.get((of, sequence), (0, 0))
         known = tx > self._relayed.get((listener, of), -1) and listener in self._whole
@@ -115,12 +118,12 @@ class PlainJoint:
         self._update(h, measured - h @ self.x, variance)
 
     def _update(self, h: Vector, innovation: float, variance: float) -> float:
-        spread = float(h @ self.P @ h) + variance
-        gain = self.P @ h / spread
+        innovation_variance = float(h @ self.P @ h) + variance
+        gain = self.P @ h / innovation_variance
         self.x = self.x + gain * innovation
         keep = np.eye(len(self.x)) - np.outer(gain, h)
         self.P = keep @ self.P @ keep.T + variance * np.outer(gain, gain)
-        return innovation / float(np.sqrt(spread))
+        return innovation / float(np.sqrt(innovation_variance))
 
 
 class FilterpyJoint(PlainJoint):
@@ -147,3 +150,78 @@ class FilterpyJoint(PlainJoint):
         ekf.update(np.array([[innovation]]), lambda _: h.reshape(1, -1), lambda _: np.zeros((1, 1)))
         self.x, self.P = ekf.x[:, 0], ekf.P
         return innovation / float(np.sqrt(ekf.S[0, 0]))
+
+
+@threaded_kernel
+def joint_filter(
+    x: Vector,
+    P: Matrix,
+    anchors_m: Matrix,
+    senders: Integers,
+    dt_s: Vector,
+    pseudoranges_m: Vector,
+    sync_m: Vector,
+    variance: float,
+    noise: Vector,
+) -> float:
+    """Four states of motion and an offset and a rate of seven anchors: own reception, and the sender's of anchor 0.
+
+    ``pseudoranges_m`` are those of the tag, ``sync_m`` the sender's clock less anchor 0's as the sender measured it.
+    ``x`` is [x, y, vx, vy, (offset, rate) of each], shape (18,), ``P`` (18, 18).
+    """
+    n = 18
+    h, ph = np.zeros(n), np.zeros(n)
+    for k in range(len(dt_s)):
+        _loop_time_update(x, P, 2, 7, dt_s[k], noise)
+        sender = senders[k]
+        dx, dy = x[0] - anchors_m[sender, 0], x[1] - anchors_m[sender, 1]
+        dz = anchors_m[sender, 2]
+        range_m = np.sqrt(dx * dx + dy * dy + dz * dz)
+        for state in range(n):
+            h[state] = 0.0
+        h[0], h[1] = dx / range_m, dy / range_m
+        h[4 + 2 * sender] = 1.0
+        _loop_update(x, P, h, ph, pseudoranges_m[k] - range_m - x[4 + 2 * sender], variance)
+        if sender != 0:
+            h[0] = h[1] = 0.0
+            h[4] = -1.0
+            _loop_update(x, P, h, ph, sync_m[k] - (x[4 + 2 * sender] - x[4]), variance)
+    return float(x[0])
+
+
+@threaded_kernel
+def _loop_time_update(x: Vector, P: Matrix, dim: int, clocks: int, dt: float, noise: Vector) -> None:
+    """F·P·Fᵀ + Q, pair by pair of a value and its rate."""
+    n = len(x)
+    for pair in range(dim + clocks):
+        value = pair if pair < dim else 2 * dim + 2 * (pair - dim)
+        rate = dim + pair if pair < dim else value + 1
+        x[value] += dt * x[rate]
+        for column in range(n):
+            P[value, column] += dt * P[rate, column]
+        for row in range(n):
+            P[row, value] += dt * P[row, rate]
+        white = 0.0 if pair < dim else noise[1]
+        walk = noise[0] if pair < dim else noise[2]
+        P[value, value] += white * dt + walk * dt * dt * dt / 3.0
+        P[value, rate] += walk * dt * dt / 2.0
+        P[rate, value] += walk * dt * dt / 2.0
+        P[rate, rate] += walk * dt
+
+
+@threaded_kernel
+def _loop_update(x: Vector, P: Matrix, h: Vector, ph: Vector, innovation: float, variance: float) -> None:
+    n = len(x)
+    ph[:] = 0.0
+    for row in range(n):
+        if h[row] != 0.0:  # of P, symmetric, the few rows that count
+            for column in range(n):
+                ph[column] += h[row] * P[row, column]
+    innovation_variance = variance
+    for row in range(n):
+        innovation_variance += h[row] * ph[row]
+    for row in range(n):
+        gain = ph[row] / innovation_variance
+        x[row] += gain * innovation
+        for column in range(n):
+            P[row, column] -= gain * ph[column]
