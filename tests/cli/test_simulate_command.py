@@ -143,7 +143,7 @@ def test_the_room_is_the_lab_with_the_errors_of_rooms(run):
 @pytest.mark.parametrize("method", ["weighted", "joint"])
 def test_deaf_tags_make_no_fix_and_find_themselves_again(run, tmp_path, method):
     base = ["--method", method, "--duration", "8", "--fixes-csv", "fixes.csv", "--json"]
-    told = report(run(*base, "--deaf", "3:4.5", "--deaf", "5:5.5"))
+    told = report(run(*base, "--silence", "3:4.5", "--silence", "5:5.5"))
     assert told["drops"]["radio-off"] == pytest.approx(2.0 * 400, abs=2)
     with (tmp_path / "fixes.csv").open(newline="") as file:
         times_s = [float(row["t_s"]) for row in csv.DictReader(file)]
@@ -157,7 +157,7 @@ def test_deaf_tags_make_no_fix_and_find_themselves_again(run, tmp_path, method):
 SITE_OFF = [argument for anchor in range(1, 7) for argument in ("--outage", f"{anchor}:3")]
 
 
-@pytest.mark.parametrize(("fault", "end_s"), [(["--deaf", "3"], 63), (SITE_OFF, 63), (["--deaf", "3:70"], 70.5)])
+@pytest.mark.parametrize(("fault", "end_s"), [(["--silence", "3"], 63), (SITE_OFF, 63), (["--silence", "3:70"], 70.5)])
 def test_a_goal_that_cannot_be_reached_is_given_up(run, fault, end_s):
     told = report(run("--method", "literal", "--position", "3,4", "--fixes", "100", *fault, "--json"))
     assert told["simulated_s"] == pytest.approx(end_s, abs=0.5)
@@ -246,10 +246,10 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--delay-error", "2.5:1:1"], ["--delay-error", "2.5:1:1", "whole number"]),
         (["--delay-error", "2:1:1e4"], ["--delay-error", "2:1:1e4", "within 1000 ns"]),
         (["--delay-error", "2:1:1", "--delay-error", "2:0:1"], ["--delay-error", "2:0:1", "already"]),
-        (["--deaf", "now"], ["--deaf", "now", "1 or 2"]),
-        (["--deaf", "3:3"], ["--deaf", "3:3", "end after"]),
-        (["--deaf", "-1:3"], ["--deaf", "-1:3"]),
-        (["--deaf", "1e300"], ["--deaf", "1e300", "at most"]),
+        (["--silence", "now"], ["--silence", "now", "1 or 2"]),
+        (["--silence", "3:3"], ["--silence", "3:3", "end after"]),
+        (["--silence", "-1:3"], ["--silence", "-1:3"]),
+        (["--silence", "1e300"], ["--silence", "1e300", "at most"]),
         (["--speed", "1e300"], ["--speed", "1e+300"]),
         (["--fixes-csv", "no/fixes.csv"], ["no/fixes.csv", "cannot be written"]),
         (["--fixes-csv", "."], ["cannot be written"]),

@@ -113,7 +113,7 @@ class SimulateOptions:
     """ANCHOR:OFF_S or ANCHOR:OFF_S:ON_S: an anchor that stops, and restarts."""
     delay_error: list[str] | None = None
     """ANCHOR:TX_NS:RX_NS: by how much this anchor's antenna delays are longer than in its site file."""
-    deaf: list[str] | None = None
+    silence: list[str] | None = None
     """FROM_S or FROM_S:TO_S: the tags' radios hear nothing from then on, or for that time."""
     power_bias: bool = False
     """Give RX stamps the DW1000's bias by received power."""
@@ -197,7 +197,7 @@ def _request(asked: SimulateOptions) -> "Request":
         biases=tuple(map(_bias, asked.bias or ())),
         outages=tuple(map(_outage, asked.outage or ())),
         delay_errors=_delay_errors(asked.delay_error or []),
-        silences=tuple(map(_silence, asked.deaf or ())),
+        silences=tuple(map(_silence, asked.silence or ())),
         room=Room() if asked.scenario == _ROOM else None,
     )
 
@@ -257,7 +257,7 @@ def _outage(text: str) -> "AnchorOutage":
 
 def _silence(text: str) -> "Outage":
     """FROM_S or FROM_S:TO_S. Raises SkylessError."""
-    return _off_and_on("deaf", text, finite_numbers("deaf", text, (1, 2), ":"), "it should end after it has begun")
+    return _off_and_on("silence", text, finite_numbers("silence", text, (1, 2), ":"), "it should end after it has begun")
 
 
 def _off_and_on(option: str, text: str, times_s: Sequence[float], order: str) -> "Outage":
