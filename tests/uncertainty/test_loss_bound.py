@@ -54,7 +54,7 @@ def test_the_limits_of_the_study_lie_below_the_bound():
         (case.series, case.x): loss.bound_m(case.runs, plan) for case in loss.cases(plan) if case.x in (0, 0.5, 0.9)
     }
     clean = bounds[loss.AT_TAGS, 0.0]
-    for share, limit in loss.LIMITS.items():
+    for share, limit in loss.MAX_RATIOS.items():
         at_tags, everywhere = (bounds[kind, share] / clean for kind in (loss.AT_TAGS, loss.EVERYWHERE))
         assert limit < at_tags < everywhere
         assert everywhere < 1.9 * limit

@@ -13,7 +13,7 @@ from skyless.uncertainty.bounds import bound_settings, known_receptions, receive
 
 _SHARES: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _QUICK_SHARES: Final = (0.3, 0.5, 0.7, 0.9)
-_MAX_RATIOS: Final = {0.5: 1.3, 0.9: 2.5}
+MAX_RATIOS: Final = {0.5: 1.3, 0.9: 2.5}
 _NOTHING_LOST: Final = "nothing lost"
 
 AT_TAGS: Final = "lost at tags"
@@ -27,11 +27,11 @@ def cases(plan: Plan) -> list[Case]:
     return [
         Case(_NOTHING_LOST, AT_TAGS, 0.0, nothing_lost, _NOTHING_LOST),
         *(
-            Case(_name(s, AT_TAGS), AT_TAGS, s, walking(plan, lost_at_tags=s), _NOTHING_LOST, _MAX_RATIOS.get(s))
+            Case(_name(s, AT_TAGS), AT_TAGS, s, walking(plan, lost_at_tags=s), _NOTHING_LOST, MAX_RATIOS.get(s))
             for s in shares
         ),
         *(
-            Case(_name(s, EVERYWHERE), EVERYWHERE, s, walking(plan, loss=s), _NOTHING_LOST, _MAX_RATIOS.get(s))
+            Case(_name(s, EVERYWHERE), EVERYWHERE, s, walking(plan, loss=s), _NOTHING_LOST, MAX_RATIOS.get(s))
             for s in shares
         ),
     ]
