@@ -16,8 +16,13 @@ if TYPE_CHECKING:
 
 
 def print_json(value: object) -> None:
-    """Write a value as one line of JSON on standard output; NaN and infinities become null."""
-    print(to_json(value))
+    """Write a struct or mapping as one line of JSON on standard output; NaN and infinities become null.
+
+    The first key is the version of Skyless, to which the names of the others belong (``CHANGELOG.md``).
+    """
+    from skyless import __version__
+
+    print(f'{{"skyless_version":"{__version__}",{to_json(value)[1:]}')
 
 
 def to_json(value: object) -> str:
