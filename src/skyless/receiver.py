@@ -8,23 +8,24 @@ from math import inf, isfinite
 from typing import Final
 
 import numpy as np
+from msgspec import Struct
 
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.followed_master import FollowedMaster
 from skyless.air.reception import Diagnostics, Reception
-from skyless.clocks.stamps import AnchorStamps
+from skyless.clocks.stamps import AnchorStamps, StampTracks
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.fix_time import FixTime
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.positioning.methods.factory import MethodOptions, new_method
-from skyless.positioning.methods.joint import Estimation
+from skyless.positioning.methods.joint import Estimation, EstimationState
 from skyless.positioning.methods.nlos_weighting import variance_factor
 from skyless.positioning.methods.observations import Observer
-from skyless.positioning.observation import Method
-from skyless.site.almanac_gathering import AlmanacAssembly
+from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
+from skyless.site.almanac_gathering import AlmanacAssembly, AlmanacState
 from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 
@@ -36,6 +37,28 @@ NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump"
 
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
 """Stamps that go back farther than radios and hosts reorder mean that the tag's own counter has started anew."""
+
+
+class ReceiverState(Struct, frozen=True):
+    """All that a ``Receiver`` remembers; to be used or encoded before it hears more, as they share some parts."""
+
+    options: MethodOptions
+    site: int | None
+    may_change_site: bool
+    site_heard_ticks: int
+    counters: dict[str, int]
+    reason: NoFixReason
+    almanac: AlmanacState
+    time: FixTime
+    own_ticks: Unwrapper
+    stamps: StampTracks
+    followed: FollowedMaster
+    master: int | None
+    master_scale: tuple[int, int] | None
+    superframe_ticks: int
+    has_key: bool
+    """Whether the almanac has been looked at for a method."""
+    method: EstimationState | SnapshotsState | None
 
 
 class Receiver:
@@ -72,12 +95,65 @@ class Receiver:
         self._own_ticks = Unwrapper()
         self._stamps = AnchorStamps(self.counters)
         self._observer = Observer()
-        self._method: Method | None = None
+        self._method: Estimation | Snapshots | None = None
         self._made_of: object = None
         self._superframe_ticks = 0
         self._followed = FollowedMaster()
         self._master: int | None = None
         self._positions: dict[int, Array] = {}
+
+    def state(self) -> ReceiverState:
+        """All that it remembers, as it is now."""
+        return ReceiverState(
+            options=self._wanted,
+            site=self._site,
+            may_change_site=self._may_change_site,
+            site_heard_ticks=self._site_heard_ticks,
+            counters=dict(self.counters),
+            reason=self.reason,
+            almanac=self.almanac.state(),
+            time=self._time,
+            own_ticks=self._own_ticks,
+            stamps=self._stamps.tracks,
+            followed=self._followed,
+            master=self._master,
+            master_scale=self._observer.scale,
+            superframe_ticks=self._superframe_ticks,
+            has_key=self._made_of is not None,
+            method=None if self._method is None else self._method.state(),
+        )
+
+    @classmethod
+    def from_state(cls, state: ReceiverState) -> "Receiver":
+        """A receiver that goes on with the same bits as the one whose state it is.
+
+        Raises:
+            ValueError: no receiver has such a state.
+        """
+        asked = state.options
+        made = cls(asked.method, qa=asked.qa, z_bounds_m=asked.z_bounds_m, integrity=asked.integrity)
+        made._site, made._may_change_site = state.site, state.may_change_site
+        made._site_heard_ticks, made._superframe_ticks = state.site_heard_ticks, state.superframe_ticks
+        made.counters.update(state.counters)
+        made.reason = state.reason
+        made._time, made._own_ticks, made._followed = state.time, state.own_ticks, state.followed
+        made._stamps = AnchorStamps(made.counters, state.stamps)
+        made.almanac.restore(state.almanac)
+        made._read_positions()
+        made._master, made._observer.scale = state.master, state.master_scale
+        made._observer.follow(state.master, made.almanac.slot_of(state.master) or 0)
+        if state.has_key:
+            made._choose_method()
+        match made._method, state.method:
+            case Estimation() as method, EstimationState() as saved:
+                method.restore(saved)
+            case Snapshots() as method, SnapshotsState() as saved:
+                method.restore(saved)
+            case None, None:
+                pass
+            case other, saved:
+                raise ValueError(f"{type(saved).__name__} is not a state of {type(other).__name__}")
+        return made
 
     @property
     def site(self) -> int | None:
@@ -85,7 +161,7 @@ class Receiver:
         return self._site
 
     @property
-    def method(self) -> Method | None:
+    def method(self) -> Estimation | Snapshots | None:
         """The positioning method at work, None before the almanac is known."""
         return self._method
 
@@ -137,7 +213,7 @@ class Receiver:
 
     def _admit(self, beacon: Beacon, rx_ticks: int) -> int | None:
         """TX stamp, unwrapped, of a beacon of the site, by the present master, and of an anchor that may be there."""
-        newest = self._stamps.newest_rx_ticks
+        newest = self._stamps.tracks.newest_rx_ticks
         jumped = newest is not None and rx_ticks < newest - COUNTER_JUMP_TICKS
         if (jumped or not -LAST_TICKS <= rx_ticks <= LAST_TICKS) and not self._begin_anew(rx_ticks):
             return None
@@ -196,11 +272,19 @@ class Receiver:
         book, claim = self.almanac, self._followed.claim
         master = None if claim is None else claim.master
         if book.hear(beacon.almanac_issue, beacon.page):
-            self._positions = {anchor: np.array(place) for anchor, place in book.anchors_m.items()}
+            self._read_positions()
         elif self._method is not None and master == self._master:
             return
         self._master = master
         self._observer.follow(master, book.slot_of(master) or 0)
+        self._choose_method()
+
+    def _read_positions(self) -> None:
+        self._positions = {anchor: np.array(position_m) for anchor, position_m in self.almanac.anchors_m.items()}
+
+    def _choose_method(self) -> None:
+        """Make the method that almanac and master ask for, unless it is at work already."""
+        book, master = self.almanac, self._master
         method_master = None if self._wanted.method in FILTERS else master
         method_key = (book.issue, book.schedule, book.noise, book.accuracy, method_master)
         if method_key != self._made_of:

@@ -2,6 +2,8 @@
 
 from typing import Final
 
+from msgspec import Struct, field
+
 from skyless.air.beacon import Beacon
 from skyless.air.master_term import Confirmations, MasterTerm, is_newer, master_term_of
 from skyless.ticks import from_seconds
@@ -13,13 +15,12 @@ OLDER_AFTER_TICKS: Final = from_seconds(0.5)
 """A whole site that was switched off and on counts its terms from 0 again."""
 
 
-class FollowedMaster:
+class FollowedMaster(Struct):
     """The claim that a listener goes by."""
 
-    def __init__(self) -> None:
-        self.claim: MasterTerm | None = None
-        self._heard_ticks = 0
-        self._sightings = Confirmations()
+    claim: MasterTerm | None = None
+    heard_ticks: int = 0
+    sightings: Confirmations = field(default_factory=Confirmations)
 
     @property
     def master(self) -> int | None:
@@ -35,20 +36,20 @@ class FollowedMaster:
         """
         present = self.claim
         if present is not None and beacon.term == present.term and beacon.master == present.master:
-            self._heard_ticks = rx_ticks
+            self.heard_ticks = rx_ticks
             return True
         claim = master_term_of(beacon)
         if self.claim is None:
-            self.claim, self._heard_ticks = claim, rx_ticks
+            self.claim, self.heard_ticks = claim, rx_ticks
             return True
         if is_newer(claim.term, self.claim.term):
-            if self._sightings.again(claim, rx_ticks, CONFIRMED_WITHIN_TICKS):
-                self.claim, self._heard_ticks = claim, rx_ticks
+            if self.sightings.again(claim, rx_ticks, CONFIRMED_WITHIN_TICKS):
+                self.claim, self.heard_ticks = claim, rx_ticks
             return True
         patience = max(OLDER_AFTER_TICKS, 3 * superframe_ticks)
         if claim.term == self.claim.term and superframe_ticks:
             patience = 3 * superframe_ticks // 2
-        if 0 <= rx_ticks - self._heard_ticks < patience:
+        if 0 <= rx_ticks - self.heard_ticks < patience:
             return False
-        self.claim, self._heard_ticks = claim, rx_ticks
+        self.claim, self.heard_ticks = claim, rx_ticks
         return True

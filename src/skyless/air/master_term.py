@@ -26,15 +26,14 @@ def is_newer(term: int, other: int) -> bool:
     return 0 < (term - other) % TERMS < TERMS // 2
 
 
-class Confirmations:
+class Confirmations(Struct):
     """Claims heard once, so that two frames are needed: one corrupted past its FCS makes no new master."""
 
-    def __init__(self) -> None:
-        self._seen: dict[MasterTerm, int] = {}
+    seen: dict[MasterTerm, int] = {}
 
     def again(self, claim: MasterTerm, rx_ticks: int, within_ticks: int) -> bool:
         """Take a claim; whether it was heard before, no longer ago than that."""
-        self._seen = {other: ticks for other, ticks in self._seen.items() if 0 < rx_ticks - ticks < within_ticks}
-        again = claim in self._seen
-        self._seen[claim] = rx_ticks
+        self.seen = {other: ticks for other, ticks in self.seen.items() if 0 < rx_ticks - ticks < within_ticks}
+        again = claim in self.seen
+        self.seen[claim] = rx_ticks
         return again

@@ -28,32 +28,39 @@ class _Track(Struct):
     impossible: int = 0
 
 
+class StampTracks(Struct):
+    """What ``AnchorStamps`` remembers."""
+
+    newest_rx_ticks: int | None = None
+    """RX stamp of the newest frame that was taken, unwrapped: one impossible stamp must not make others late."""
+    of_anchor: dict[int, _Track] = {}
+
+
 class AnchorStamps:
     """Follows every anchor's counter by the tag's own; counts what it refuses in ``counters``."""
 
-    def __init__(self, counters: Counter[str]) -> None:
+    def __init__(self, counters: Counter[str], tracks: StampTracks | None = None) -> None:
+        """``tracks``: those to continue with."""
         self._counters = counters
-        self._tracks: dict[int, _Track] = {}
-        self.newest_rx_ticks: int | None = None
-        """RX stamp of the newest frame that was taken, unwrapped: one impossible stamp must not make others late."""
+        self.tracks = tracks or StampTracks()
 
     def forget(self) -> None:
         """Start anew."""
-        self._tracks.clear()
-        self.newest_rx_ticks = None
+        self.tracks = StampTracks()
 
     def unwrap(self, beacon: Beacon, rx_ticks: int) -> int | None:
         """TX stamp on the anchor's own unwrapped scale; None if the frame is repeated, late, or its stamp impossible.
 
         ``rx_ticks`` is the tag's own reading, unwrapped. An anchor's first stamp keeps its own value.
         """
-        track, newest = self._tracks.get(beacon.anchor), self.newest_rx_ticks
+        tracks = self.tracks
+        track, newest = tracks.of_anchor.get(beacon.anchor), tracks.newest_rx_ticks
         if newest is not None and rx_ticks <= newest:
             repeated = track is not None and _is_repeated(beacon, track)
             self._counters["duplicate" if repeated else "out-of-order"] += 1
             return None
         if track is None:
-            self.newest_rx_ticks = rx_ticks
+            tracks.newest_rx_ticks = rx_ticks
             return self._begin(beacon, rx_ticks)
         elapsed = rx_ticks - track.rx_ticks_tag
         least = track.tx_ticks + elapsed - HALF_WRAP_TICKS
@@ -61,13 +68,13 @@ class AnchorStamps:
         if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
             self._refuse(beacon, track)
             return None
-        track.rx_ticks_tag = self.newest_rx_ticks = rx_ticks
+        track.rx_ticks_tag = tracks.newest_rx_ticks = rx_ticks
         track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
         track.sequence, track.impossible = beacon.sequence, 0
         return tx_ticks
 
     def _begin(self, beacon: Beacon, rx_ticks: int) -> int:
-        tracks = self._tracks
+        tracks = self.tracks.of_anchor
         if len(tracks) >= MOST_TRACKS:
             del tracks[min(tracks, key=lambda anchor: tracks[anchor].rx_ticks_tag)]
         tracks[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence)
@@ -81,7 +88,7 @@ class AnchorStamps:
         self._counters["impossible-stamp"] += 1
         track.impossible += 1
         if track.impossible >= STAMPS_BEFORE_RESTART:
-            del self._tracks[beacon.anchor]
+            del self.tracks.of_anchor[beacon.anchor]
             self._counters["anchor-restart"] += 1
 
 

@@ -1,10 +1,14 @@
 """What a listener has gathered of a site's almanac."""
 
-from typing import Final
+from collections.abc import Iterable
+from typing import Annotated, Final
 
+from msgspec import Meta, Struct
 from msgspec.structs import asdict
 
 from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
+from skyless.air.malformed import Malformed
+from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
 from skyless.site.model import AccuracySite
 
 _SIGHTINGS: Final = 2
@@ -14,6 +18,20 @@ _MOST_ANCHORS: Final = 255
 """As many as a site can have; forged pages beyond that take no memory."""
 
 _ASSUMED_ACCURACY: Final = AccuracyPage(**asdict(AccuracySite()))
+
+
+_PageBytes = Annotated[bytes, Meta(min_length=PAGE_BYTES, max_length=PAGE_BYTES)]
+
+
+class AlmanacState(Struct, frozen=True):
+    """What an ``AlmanacAssembly`` has gathered, pages as they are on the air."""
+
+    issue: int | None
+    pages: tuple[_PageBytes, ...]
+    doubted: tuple[_PageBytes, ...]
+    rival_issue: int | None
+    rival_frames: int
+    rival_pages: tuple[_PageBytes, ...]
 
 
 class AlmanacAssembly:
@@ -39,6 +57,27 @@ class AlmanacAssembly:
         self._noise: NoisePage | None = None
         self._accuracy = _ASSUMED_ACCURACY
         self._georeference: GeoreferencePage | None = None
+
+    def state(self) -> AlmanacState:
+        """What was gathered."""
+        held, doubted, rivals = (
+            tuple(map(encode_page, pages))
+            for pages in (self._pages.values(), self._doubted.values(), self._rival_pages)
+        )
+        return AlmanacState(self._issue, held, doubted, self._rival_issue, self._rival_frames, rivals)
+
+    def restore(self, state: AlmanacState) -> None:
+        """Continue from a state.
+
+        Raises:
+            ValueError: it holds something that is not a page.
+        """
+        self._clear()
+        for page in _decoded(state.pages):
+            self._enter(_place(page), page)
+        self._doubted = {_place(page): page for page in _decoded(state.doubted)}
+        self._issue, self._rival_issue, self._rival_frames = state.issue, state.rival_issue, state.rival_frames
+        self._rival_pages = _decoded(state.rival_pages)
 
     @property
     def issue(self) -> int | None:
@@ -134,6 +173,13 @@ class AlmanacAssembly:
             case GeoreferencePage():
                 self._georeference = page
         return True
+
+
+def _decoded(pages: Iterable[bytes]) -> list[Page]:
+    found = [page for page in map(decode_page, pages) if page is not None and page is not Malformed.BAD_PAGE]
+    if len(found) < len(tuple(pages)):
+        raise ValueError("a page of the almanac is damaged")
+    return found
 
 
 def _place(page: Page) -> object:

@@ -4,10 +4,10 @@ Anchors join and leave between packets, in NumPy; everything else is one kernel 
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from skyless.air.beacon import HEARD
@@ -51,6 +51,8 @@ from skyless.positioning.estimator.state import (
     EstimatorState,
     layout,
     new_state,
+    packed_state,
+    unpacked_state,
     with_anchor,
     with_table,
     without_anchor,
@@ -91,6 +93,9 @@ FADING: Final = 0.95
 
 MOST_PACKED: Final = 16
 """Relays in a frame; 13 fit."""
+
+MOST_PLACED: Final = 4096
+"""Anchors in the table of an estimator that is restored."""
 
 FIRST_PACKETS: Final = 3
 """Of each anchor, before which nothing is promised."""
@@ -474,6 +479,15 @@ def fill_motion(s: EstimatorState, rows: Matrix) -> None:
         rows[POSITION, 2] = s.settings[0]["height_m"]
 
 
+class SavedEstimator(Struct, frozen=True):
+    """An ``Estimator`` in plain values: its table of anchors, and the arrays of its state as bytes."""
+
+    table: Annotated[tuple[tuple[int, float, float, float], ...], Meta(max_length=MOST_PLACED)]
+    """Identifier and position of each anchor."""
+    left_out: tuple[int, ...]
+    arrays: dict[str, bytes]
+
+
 class Estimator:
     """The filter of one tag."""
 
@@ -491,6 +505,24 @@ class Estimator:
         self._packed = np.zeros(MOST_PACKED * HEARD.size, np.uint8)
         self._listed = np.zeros((MOST_PACKED, 4), np.int64)
         self._state = new_state(settings, len(self._table_m))
+
+    def save(self) -> SavedEstimator:
+        """All that ``restore`` needs to continue with the same bits."""
+        table = tuple((anchor, *self._table_m[index].tolist()) for anchor, index in self.index_of.items())
+        return SavedEstimator(table, tuple(self._left_out), packed_state(self._state))
+
+    def restore(self, saved: SavedEstimator) -> None:
+        """Continue from what an estimator with the same settings has saved.
+
+        Raises:
+            ValueError: it would lead the kernels astray.
+        """
+        for anchor, *position_m in saved.table:
+            self.place_anchor(anchor, np.array(position_m))
+        if len(self._table_m) != len(saved.table):
+            raise ValueError("an anchor stands in the estimator's table twice")
+        self._left_out = frozenset(saved.left_out)
+        self._state = unpacked_state(self.settings, len(self._table_m), saved.arrays)
 
     @property
     def state(self) -> EstimatorState:

@@ -3,6 +3,7 @@
 from typing import Final
 
 import numpy as np
+from msgspec import Struct
 
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Array
@@ -10,6 +11,15 @@ from skyless.positioning.observation import Observation
 
 IN_USE_S: Final = 0.1
 """An anchor counts as in use while its last accepted message is younger, or a superframe and a half."""
+
+
+class AnchorsInUseState(Struct, frozen=True):
+    """What an ``AnchorsInUse`` remembers."""
+
+    used: tuple[Observation, ...]
+    checked_ticks: int
+    anchors_m: tuple[tuple[float, float, float], ...]
+    extent_m: float
 
 
 class AnchorsInUse:
@@ -24,6 +34,17 @@ class AnchorsInUse:
         """Their positions, shape (len(anchors), 3)."""
         self.extent_m = 0.0
         """The largest span in x, y or z that anchors in use have had since the start."""
+
+    def state(self) -> AnchorsInUseState:
+        """What it remembers."""
+        anchors_m = tuple((x, y, z) for x, y, z in self.anchors_m.tolist())
+        return AnchorsInUseState(tuple(self._used.values()), self._checked_ticks, anchors_m, self.extent_m)
+
+    def restore(self, state: AnchorsInUseState) -> None:
+        """Continue from a state."""
+        self._used = {observation.anchor: observation for observation in state.used}
+        self._checked_ticks, self.extent_m = state.checked_ticks, state.extent_m
+        self.anchors, self.anchors_m = tuple(self._used), np.array(state.anchors_m).reshape(len(self._used), 3)
 
     def begin(self, observations: tuple[Observation, ...]) -> None:
         """Forget all anchors but those of these observations."""

@@ -3,7 +3,8 @@
 from typing import Final
 
 import numpy as np
-from msgspec.structs import replace
+from msgspec import Struct
+from msgspec.structs import astuple, replace
 
 from skyless.constants import TICK_S
 from skyless.positioning.estimator.estimator import (
@@ -14,6 +15,7 @@ from skyless.positioning.estimator.estimator import (
     UNCOVERED_CHI2,
     Estimator,
     Report,
+    SavedEstimator,
 )
 from skyless.positioning.estimator.faults import SURE_CHI2
 from skyless.positioning.estimator.settings import EstimatorSettings
@@ -35,8 +37,8 @@ from skyless.positioning.methods.acquisition import (
     Acquisition,
     Start,
 )
-from skyless.positioning.methods.anchors_in_use import AnchorsInUse
-from skyless.positioning.methods.master_scale import MasterScale
+from skyless.positioning.methods.anchors_in_use import AnchorsInUse, AnchorsInUseState
+from skyless.positioning.methods.master_scale import MasterScale, MasterScaleState
 from skyless.positioning.observation import Observation
 from skyless.ticks import from_seconds
 
@@ -79,6 +81,24 @@ SURELY_IN_REACH_TICKS: Final = from_seconds(SHORT_SILENCE_S) - 1
 """After such a silence a filter need not be asked."""
 
 
+class EstimationState(Struct, frozen=True, tag="joint"):
+    """All that an ``Estimation`` remembers."""
+
+    estimator: SavedEstimator
+    start: Acquisition | None
+    in_use: AnchorsInUseState
+    master_scale: MasterScaleState
+    speed_std_mps: float
+    open_range_errors: bool
+    is_open: bool
+    is_doubted: bool
+    relays_may_contradict: bool
+    master_less_tag_ticks: int
+    started_ticks: int
+    newest_ticks: int
+    heights_refused: int
+
+
 class Estimation:
     """One tag's estimator from the first beacon on."""
 
@@ -113,6 +133,31 @@ class Estimation:
         self._master_scale = MasterScale()
         self._relays_may_contradict = True
         self._heights_refused = 0
+
+    def state(self) -> EstimationState:
+        """All that it remembers, as it is now."""
+        return EstimationState(
+            self._estimator.save(), self._start, self._in_use.state(), self._master_scale.state(),
+            self._speed_std_mps, self._open_range_errors, self._is_open, self._is_doubted,
+            self._relays_may_contradict, self._master_less_tag_ticks, self._started_ticks, self._newest_ticks,
+            self._heights_refused,
+        )  # fmt: skip
+
+    def restore(self, state: EstimationState) -> None:
+        """Continue from the state of one with the same settings.
+
+        Raises:
+            ValueError: the estimator's arrays are not sound.
+        """
+        self._start = state.start
+        self._estimator.restore(state.estimator)
+        self._in_use.restore(state.in_use)
+        self._master_scale.restore(state.master_scale)
+        (
+            self._speed_std_mps, self._open_range_errors, self._is_open, self._is_doubted,
+            self._relays_may_contradict, self._master_less_tag_ticks, self._started_ticks, self._newest_ticks,
+            self._heights_refused,
+        ) = astuple(state)[4:]  # fmt: skip
 
     @property
     def estimator(self) -> Estimator:

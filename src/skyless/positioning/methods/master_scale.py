@@ -2,6 +2,9 @@
 
 from typing import Final
 
+from msgspec import Struct
+
+from skyless.air.master_term import MasterTerm
 from skyless.positioning.estimator.kinds import SUBTICKS
 from skyless.positioning.observation import Observation
 from skyless.ticks import TICK_MASK
@@ -15,13 +18,30 @@ MISFIT_SUBTICKS: Final = 64
 SUBTICKS_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
 
 
+class MasterScaleState(Struct, frozen=True):
+    """What a ``MasterScale`` remembers: of each packet site time and its lead, each in ticks and subticks."""
+
+    claim: MasterTerm | None
+    points: tuple[tuple[int, int, int, int], ...]
+
+
 class MasterScale:
     """The master's own counter against the site's time, which it may lead on at another rate than its own."""
 
     def __init__(self) -> None:
-        self._claim: object = None
+        self._claim: MasterTerm | None = None
         self._points: tuple[tuple[int, int], ...] = ()
         """Site time in subticks and its lead on the master's counter, of the first and the last packet of the term."""
+
+    def state(self) -> MasterScaleState:
+        """What it remembers; in 64 bits, which subticks exceed."""
+        points = ((*divmod(site, SUBTICKS), *divmod(lead, SUBTICKS)) for site, lead in self._points)
+        return MasterScaleState(self._claim, tuple(points))
+
+    def restore(self, state: MasterScaleState) -> None:
+        """Continue from a state."""
+        self._claim = state.claim
+        self._points = tuple((site * SUBTICKS + a, lead * SUBTICKS + b) for site, a, lead, b in state.points)
 
     def hear(self, observation: Observation) -> None:
         """Learn from a packet of the master."""

@@ -20,12 +20,12 @@ class Observer:
         self._schedule: Schedule | None = None
         self._master: int | None = None
         self._master_slot = 0
-        self._scale: tuple[int, int] | None = None
+        self.scale: tuple[int, int] | None = None
         """The master's time and the tag's, both unwrapped, when they were compared last."""
 
     def forget(self) -> None:
         """Start anew."""
-        self._scale = None
+        self.scale = None
 
     def follow(self, master: int | None, master_slot: int) -> None:
         """Go by this master, whose first slot in the superframe is given."""
@@ -79,7 +79,7 @@ class Observer:
 
         Only the master, and anchors that agree with what was heard before, lead the scale on.
         """
-        time, scale = beacon.master_time, self._scale
+        time, scale = beacon.master_time, self.scale
         if time is None:
             return None, 0.0, 0.0
         subticks = time.tx_subticks_master
@@ -92,7 +92,7 @@ class Observer:
             whole = least + ((whole - least) & TICK_MASK)
             follow = follow or abs(whole - expected) <= MAX_DRIFT * elapsed + SLACK_TICKS
         if follow:
-            self._scale = (whole, rx_ticks)
+            self.scale = (whole, rx_ticks)
         return whole, (subticks & 0xFF) / 256.0, (time.std_ticks * TICK_M) ** 2
 
 

@@ -52,6 +52,14 @@ class SnapshotSettings(Struct, frozen=True):
     z_bounds_m: tuple[float, float] | None = None
 
 
+class SnapshotsState(Struct, frozen=True, tag="snapshots"):
+    """What ``Snapshots`` remembers."""
+
+    round: int | None
+    previous: dict[int, Observation]
+    current: dict[int, Observation]
+
+
 class Snapshots:
     """Collects two rounds of beacons and solves them."""
 
@@ -63,6 +71,14 @@ class Snapshots:
         self._current: dict[int, Observation] = {}
         self._round: int | None = None
         self._time = fix_time or FixTime()
+
+    def state(self) -> SnapshotsState:
+        """What it remembers, as it is now."""
+        return SnapshotsState(self._round, self._previous, self._current)
+
+    def restore(self, state: SnapshotsState) -> None:
+        """Continue from a state."""
+        self._round, self._previous, self._current = state.round, state.previous, state.current
 
     def hear(self, observation: Observation) -> Fix | NoFixReason:
         """Take one observation; a fix when it completes its round or is the first of the next one."""
