@@ -14,8 +14,7 @@ from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.mqtt import topics
 from skyless.mqtt.messages import ZonesMessage
-from skyless.recordings.mcap.file import McapFile
-from skyless.recordings.mcap.recorder import McapRecorder
+from skyless.recordings.mcap.recorder import McapFile, McapRecorder
 
 START_S = 1_700_000_000.0
 PLAN = b"\x89PNG\r\n\x1a\nplan"

@@ -5,13 +5,12 @@ from msgspec.structs import replace
 
 from machines.bench import LAB, tape
 from skyless.mqtt import topics
+from skyless.mqtt.fix_message import fix_message
 from skyless.mqtt.messages import RequestMessage, SiteMessage, TrueMotion, TruthMessage
-from skyless.nodes.fix_log import fix_message
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.receiver import Receiver
-from skyless.recordings.mcap.file import McapFile
 from skyless.recordings.mcap.reception_log import ReceptionLog, receiver_settings
-from skyless.recordings.mcap.recorder import McapRecorder
+from skyless.recordings.mcap.recorder import McapFile, McapRecorder
 from skyless.site.model import GeoreferenceSite
 
 SITE = replace(LAB, georeference=GeoreferenceSite(52.5, 13.4, 34.0, 30.0))

@@ -19,10 +19,9 @@ from live_site import PLACES, SITE, UNIX_S, messages, record
 from skyless.errors import SkylessError
 from skyless.mqtt import messages as outputs
 from skyless.mqtt.messages import FixMessage
-from skyless.recordings.mcap import file as mcap_file
 from skyless.recordings.mcap.channels import place_of, schema_of
-from skyless.recordings.mcap.file import McapFile
 from skyless.recordings.mcap.foxglove import ellipse_of
+from skyless.recordings.mcap.recorder import McapFile
 from skyless.recordings.mcap.recording import McapRecording
 
 PAYLOADS = (
@@ -231,7 +230,7 @@ WRITER = """
 import sys, time
 sys.path[:0] = [{tests!r}, {here!r}]
 from live_site import messages
-from skyless.recordings.mcap.file import McapFile
+from skyless.recordings.mcap.recorder import McapFile
 from skyless.recordings.mcap.recorder import McapRecorder
 recorder = McapRecorder(McapFile(sys.argv[1]))
 for number, (s, topic, payload) in enumerate(messages(2.0)):
@@ -270,7 +269,7 @@ def test_a_full_disk_ends_the_recording_once_and_leaves_a_whole_file(tmp_path, m
             raise OSError(errno.ENOSPC, "No space left on device")
         return write(handle, bytes(data)[:left])
 
-    monkeypatch.setattr(mcap_file.os, "write", full)
+    monkeypatch.setattr(os, "write", full)
     recorder = record(path, SAID, flush_s=0.1)
     assert "No space left" in recorder.file.ended
     assert recorder.file.lost > 0

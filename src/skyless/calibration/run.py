@@ -18,16 +18,16 @@ from skyless.calibration.samples import (
     joined,
     place_of_stays,
     place_of_truth,
+    site_tdoas,
     tdoas_of,
 )
-from skyless.calibration.site import site_tdoas
 from skyless.constants import TICK_M
 from skyless.errors import ConfigurationError, SkylessError
 from skyless.evaluation.judge import Judge
 from skyless.recordings.foreign.formats import open_recording
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.recordings.truth import Truth
-from skyless.replay.site import FORMAT, recorded_site, recorded_truth
+from skyless.replay.site import SITE_FORMAT, recorded_site, recorded_truth
 from skyless.site.limits import LIMITS
 from skyless.site.model import Site
 from skyless.site.rewrite import KEY
@@ -109,7 +109,7 @@ def calibrate_site(request: CalibrationRequest, identifier: int | None) -> Calib
         samples = joined([_of_tag(recording, site, tag, request) for tag in _tags(recording, request)])
     _see_that_there_are_some(samples)
     master = int(samples.differences.anchor_a[0])
-    return Calibrated(FORMAT, estimate(samples.differences, zero=master, slope=False), samples, site)
+    return Calibrated(SITE_FORMAT, estimate(samples.differences, zero=master, slope=False), samples, site)
 
 
 def _tags(recording: McapRecording, request: CalibrationRequest) -> tuple[str, ...]:

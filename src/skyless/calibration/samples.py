@@ -3,24 +3,134 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from math import dist, inf, log
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from msgspec import Struct
 
+from skyless.air.beacon import Beacon, MasterTime
+from skyless.air.codec import decode_cached
+from skyless.air.malformed import Malformed
 from skyless.air.masterless_packets import Packet, PairTdoa, Point
-from skyless.calibration.fit import Differences
+from skyless.air.reception import Reception
+from skyless.calibration.estimate import Differences
+from skyless.constants import TICK_M
 from skyless.errors import SkylessError
 from skyless.evaluation.judge import Judge
 from skyless.evaluation.statistics import EvenSample
+from skyless.mqtt.messages import RawReception, ReceptionsMessage
 from skyless.positioning.masterless.pair_engine import PairEngine
 from skyless.recordings.foreign.formats import Recording
+from skyless.recordings.mcap.recording import McapRecording
 from skyless.recordings.source import Drops
+from skyless.replay.site import HostClock, reception_of
+from skyless.ticks import difference, from_seconds
 
-MOST_ROWS: Final = 300_000
+# Time differences out of a tag's recorded receptions: every anchor against the master, both as the site tells time.
+#
+# Between two beacons of the master the tag's clock runs evenly, so the master's range less the clock is interpolated
+# to the moment of the anchor's beacon.
+
+_LONGEST_TICKS: Final = from_seconds(0.2)
+"""Over a longer time between two beacons of the master the tag's clock does not run evenly enough."""
+
+_WORST_CLOCK_TICKS: Final = 40.0
+"""An anchor whose clock is known worse, 0.19 m, is not used."""
+
+
+class _TimedBeacon(Struct, frozen=True):
+    """A beacon with the tag's stamp and the time on the master's scale."""
+
+    beacon: Beacon
+    time: MasterTime
+    rx_ticks: int
+    unix_s: float
+
+
+class SiteListener:
+    """One tag's receptions, as they come, to time differences against the master."""
+
+    def __init__(self, site: int) -> None:
+        self._site = site
+        self._clock = HostClock()
+        self._segment = ""
+        self._next = 0
+        self._before: _TimedBeacon | None = None
+        self._between: list[_TimedBeacon] = []
+
+    def hear(self, message: ReceptionsMessage) -> Iterator[PairTdoa]:
+        """Take a run of receptions, some of which may have come before; times are Unix seconds."""
+        if message.segment != self._segment:
+            self._segment, self._next = message.segment, message.first
+            self._clock, self._before, self._between = HostClock(), None, []
+        new = message.receptions[max(self._next - message.first, 0) :]
+        self._next = max(self._next, message.first + len(message.receptions))
+        for raw in new:
+            heard = self._beacon(raw, message.unix_less_host_s)
+            if heard is not None:
+                yield from self._differences(heard)
+
+    def _beacon(self, raw: RawReception, unix_less_host_s: float) -> _TimedBeacon | None:
+        reception: Reception | None = reception_of(raw)
+        beacon = Malformed.NOT_A_BEACON if reception is None else decode_cached(reception.frame)
+        if reception is None or isinstance(beacon, Malformed) or beacon.site != self._site:
+            return None
+        unix_s = self._clock.unix_s(reception, unix_less_host_s)
+        time = beacon.master_time
+        if time is None or time.std_ticks > _WORST_CLOCK_TICKS:
+            return None
+        return _TimedBeacon(beacon, time, reception.rx_ticks, unix_s)
+
+    def _differences(self, heard: _TimedBeacon) -> Iterator[PairTdoa]:
+        if heard.beacon.anchor != heard.beacon.master:
+            self._between.append(heard)
+            return
+        before, between = self._before, self._between
+        self._before, self._between = heard, []
+        if before is None or _master_term(before) != _master_term(heard):
+            return
+        span_ticks = difference(heard.rx_ticks, before.rx_ticks)
+        if not 0 < span_ticks <= _LONGEST_TICKS:
+            return
+        slip_ticks = _late_ticks(heard, before)
+        for one in between:
+            elapsed = difference(one.rx_ticks, before.rx_ticks)
+            if _master_term(one) == _master_term(heard) and 0 < elapsed < span_ticks:
+                late_ticks = _late_ticks(one, before) - slip_ticks * elapsed / span_ticks
+                yield PairTdoa(one.unix_s, heard.beacon.master, one.beacon.anchor, late_ticks * TICK_M)
+
+
+def site_tdoas(recording: McapRecording, tags: Sequence[str], site: int, drops: Counter[str]) -> Iterator[PairTdoa]:
+    """All time differences of some tags under the first master that was heard; those under others are counted."""
+    ears = {tag: SiteListener(site) for tag in tags}
+    master: int | None = None
+    for found in recording.messages({"receptions"}):
+        if found.place.name not in ears:
+            continue
+        for pair in ears[found.place.name].hear(cast("ReceptionsMessage", found.message)):
+            master = pair.anchor_a if master is None else master
+            if pair.anchor_a == master:
+                yield pair
+            else:
+                drops["another-master"] += 1
+
+
+def _master_term(heard: _TimedBeacon) -> tuple[int, int]:
+    return heard.beacon.master, heard.beacon.term
+
+
+def _late_ticks(heard: _TimedBeacon, before: _TimedBeacon) -> float:
+    """By how much more the tag's counter went on than the site's time, from one beacon to another."""
+    whole, fraction = divmod(heard.time.tx_subticks_master - before.time.tx_subticks_master, 256)
+    return difference(heard.rx_ticks, before.rx_ticks) - difference(whole, 0) - fraction / 256.0
+
+
+# What a recording gives a calibration: time differences while the tag's place is known, in bounded memory.
+
+_MOST_ROWS: Final = 300_000
 """Of a longer recording an even sample is used."""
 
-NEAREST_M: Final = 0.01
+_NEAREST_M: Final = 0.01
 
 PlaceAt = Callable[[float], Point | None]
 """Where the tag's antenna was at a time of the recording; None where that is not known."""
@@ -105,7 +215,7 @@ def gather(
     """Gather the differences at known places; ``place_from`` is told the time of the first difference."""
     drops: Drops = Counter()
     places_m = dict(anchors_m)
-    sample = EvenSample(5, MOST_ROWS)
+    sample = EvenSample(5, _MOST_ROWS)
     place: PlaceAt | None = None
     begin_s = last_s = 0.0
     for pair in pairs:
@@ -142,7 +252,7 @@ def _row(pair: PairTdoa, places_m: dict[int, Point], place: PlaceAt) -> tuple[fl
     at_m = place(pair.time_s)
     if at_m is None:
         return "place-unknown"
-    range_a, range_b = max(dist(at_m, a_m), NEAREST_M), max(dist(at_m, b_m), NEAREST_M)
+    range_a, range_b = max(dist(at_m, a_m), _NEAREST_M), max(dist(at_m, b_m), _NEAREST_M)
     excess_m = pair.tdoa_m - (range_b - range_a)
     return pair.time_s, float(pair.anchor_a), float(pair.anchor_b), excess_m, log(range_b / range_a)
 

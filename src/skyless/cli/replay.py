@@ -25,7 +25,7 @@ from skyless.errors import ConfigurationError, SkylessError
 if TYPE_CHECKING:
     from skyless.evaluation.judge import Judge
     from skyless.recordings.truth import Truth
-    from skyless.replay.foreign import Replay, ReplayReport
+    from skyless.replay.captures import Replay, ReplayReport
 
 app = App(
     name="replay",
@@ -128,7 +128,7 @@ def replay(
     from skyless.evaluation.judge import Judge
     from skyless.recordings.anchor_table import read_calibration
     from skyless.recordings.foreign.formats import format_of
-    from skyless.replay.foreign import MEASUREMENTS, Replay, ReplayRequest
+    from skyless.replay.captures import MEASUREMENTS, Replay, ReplayRequest
 
     spare_inputs("fixes", fixes, file, anchors, site, truth)
     spare_inputs("plot", plot, file, anchors, site, truth, fixes)

@@ -13,7 +13,7 @@ from skyless.errors import SkylessError
 if TYPE_CHECKING:
     from skyless.evaluation.judge import Judge
     from skyless.positioning.fix import Fix
-    from skyless.replay.foreign import ReplayReport
+    from skyless.replay.captures import ReplayReport
 
 PICTURES = (".png", ".svg", ".pdf")
 

@@ -17,8 +17,7 @@ from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.positioning.integrity import IntegrityRequirement
-    from skyless.replay.site import SiteReplay, TagReport
-    from skyless.replay.tag import Replayed
+    from skyless.replay.site import Replayed, SiteReplay, TagReport
 
 
 class Options(Struct, frozen=True):
@@ -38,7 +37,7 @@ class Options(Struct, frozen=True):
 
 def is_mcap(file: Path) -> bool:
     """Whether a file's content is an MCAP; one that cannot be opened is none."""
-    from skyless.recordings.mcap.scan import MAGIC
+    from skyless.recordings.mcap.recording import MAGIC
 
     try:
         with file.open("rb") as stream:

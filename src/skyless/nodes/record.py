@@ -18,9 +18,8 @@ from skyless.mqtt.link import Link
 from skyless.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage
 from skyless.mqtt.topics import request_topic, site_topic
 from skyless.nodes.process.running import Log, every
-from skyless.recordings.mcap.file import McapFile
 from skyless.recordings.mcap.reception_log import EVERY_TAG
-from skyless.recordings.mcap.recorder import McapRecorder
+from skyless.recordings.mcap.recorder import McapFile, McapRecorder
 
 LEASE_S: Final = 15.0
 ASK_S: Final = 5.0

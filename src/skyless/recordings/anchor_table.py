@@ -9,8 +9,7 @@ from typing import Final
 from skyless.air.masterless_packets import Point
 from skyless.errors import ConfigurationError
 from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
-from skyless.recordings.source import read_lines
-from skyless.recordings.tables import finite
+from skyless.recordings.source import finite, read_lines
 
 COLUMNS: Final = ("id", "x_m", "y_m", "z_m")
 BIAS, SLOPE, NOISE = CALIBRATION_COLUMNS = ("bias_m", "bias_slope_m", "noise_m")

@@ -11,8 +11,7 @@ import numpy as np
 
 from skyless.errors import ConfigurationError
 from skyless.kernels.arrays import Array
-from skyless.recordings.source import read_lines
-from skyless.recordings.tables import finite
+from skyless.recordings.source import finite, read_lines
 
 POSITION_COLUMNS: Final = ("t_s", "x_m", "y_m", "z_m")
 LISTENER_COLUMNS: Final = ("t_s", "gt_L_x_m", "gt_L_y_m", "gt_L_z_m")

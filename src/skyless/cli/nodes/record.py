@@ -18,7 +18,7 @@ from skyless.errors import SkylessError
 if TYPE_CHECKING:
     from skyless.mqtt.address import MqttAddress
     from skyless.nodes.record import RecorderNode, RecorderState
-    from skyless.recordings.mcap.file import McapFile
+    from skyless.recordings.mcap.recorder import McapFile
 
 _STATUS_S = 0.5
 
@@ -59,7 +59,7 @@ def record(
         Write one JSON object at the end instead of text.
     """
     from skyless.nodes.process.loop import run
-    from skyless.recordings.mcap.file import McapFile
+    from skyless.recordings.mcap.recorder import McapFile
 
     address = broker(mqtt, mqtt_ca)
     if address is None:

@@ -14,7 +14,7 @@ from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.firmware import link
 from skyless.radios.interface import Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radios.serial.link_records import OFFSET_STEPS_PER_PPM, POWER_STEPS_PER_DB, to_steps
-from skyless.recordings.foreign.bitcraze_payload import TDOA3
+from skyless.recordings.foreign.bitcraze import TDOA3
 from skyless.site.almanac_gathering import AlmanacAssembly
 from skyless.ticks import wrap
 

@@ -3,13 +3,17 @@
 import time
 from collections import Counter
 from collections.abc import Callable
+from typing import Final
 
-from skyless.air.reception import Transmission
+import msgspec
+
+from skyless.air.codec import MAX_FRAME_BYTES
+from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.radios.interface import Gone, Late, Listener, RadioEvent, Restarted
 from skyless.radios.serial.board_clock import BoardClock
 from skyless.radios.serial.serial_port import SerialPort, line_advice
-from skyless.recordings.foreign.listener_lines import reception_of
-from skyless.recordings.source import LineCutter
+from skyless.recordings.source import Drops, LineCutter
+from skyless.ticks import wrap
 
 
 class ListenerRadio:
@@ -72,3 +76,39 @@ class ListenerRadio:
 
 def _nobody(event: RadioEvent) -> None:
     pass
+
+
+# Lines of the uwb-apps listener (Mynewt): one JSON object for each frame, as it was received.
+#
+# Used keys: ``ts`` (RX stamp), ``rssi`` (dBm), ``d`` (the whole PSDU, hexadecimal) and ``dlen``, its length.
+
+
+class _Line(msgspec.Struct):
+    """What a line must hold; further keys are of no interest."""
+
+    ts: int
+    dlen: int
+    d: str
+    rssi: float | None = None
+
+
+_decode: Final = msgspec.json.Decoder(_Line).decode
+
+
+def reception_of(line: bytes, host_s: float, drops: Drops) -> Reception | None:
+    """Reception of a line that arrived then; None, and a count, for what is none."""
+    if not line:
+        return None
+    try:
+        told = _decode(line)
+        frame = bytes.fromhex(told.d)
+    except (msgspec.MsgspecError, ValueError):
+        drops["malformed-line"] += 1
+        return None
+    if len(frame) != told.dlen or not 1 <= len(frame) <= MAX_FRAME_BYTES:
+        drops["wrong-length"] += 1
+        return None
+    if told.ts < 0:
+        drops["impossible-stamp"] += 1
+        return None
+    return Reception(frame, wrap(told.ts), host_s, Diagnostics(rx_power_dbm=told.rssi))

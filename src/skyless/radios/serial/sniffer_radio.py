@@ -10,7 +10,7 @@ from msgspec import structs
 from skyless.air.masterless_packets import Packet
 from skyless.radios.interface import Gone, Restarted
 from skyless.radios.serial.serial_port import SerialPort, line_advice
-from skyless.recordings.foreign import sniffer_binary, sniffer_text
+from skyless.recordings.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
 from skyless.recordings.source import LineCutter
 
 PacketListener = Callable[[Packet | Restarted | Gone], None]
@@ -30,7 +30,7 @@ class SnifferStream:
         self._head = b""
         self._in_vain = 0
         self._lines = LineCutter(drops)
-        self._binary = sniffer_binary.BinaryCutter(drops)
+        self._binary = BinaryCutter(drops)
         self._is_text: bool | None = None
 
     def feed(self, data: bytes) -> Iterator[Packet]:
@@ -48,12 +48,12 @@ class SnifferStream:
     def _decide(self, data: bytes) -> bytes:
         """All bytes that are to be read in the form found, or none as long as none is found."""
         self._head += data
-        text, binary = sniffer_text.recognise(self._head, ""), sniffer_binary.recognise(self._head, "")
+        text, binary = recognise_text(self._head), recognise_binary(self._head)
         if text or binary:
             data, self._head = self._head, b""
             self._is_text = text and not binary
             self._lines = LineCutter(self._drops)
-            self._binary = sniffer_binary.BinaryCutter(self._drops)
+            self._binary = BinaryCutter(self._drops)
             return data
         if len(self._head) > 2 * UNDECIDED_BYTES:
             self._drops["bytes-of-no-record"] += 1
@@ -65,7 +65,7 @@ class SnifferStream:
             yield from self._binary.feed(data)
             return
         for line in self._lines.feed(data):
-            packet = sniffer_text.packet_of(line, self._drops)
+            packet = packet_of_line(line, self._drops)
             if packet is not None:
                 yield packet
 

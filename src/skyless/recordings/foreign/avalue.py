@@ -16,8 +16,7 @@ from msgspec import Struct
 from skyless.air.masterless_packets import Packet, Relay
 from skyless.clocks.two_way import TwoWayRanging
 from skyless.constants import TICK_BITS, TICK_M
-from skyless.recordings.source import Drops, open_source
-from skyless.recordings.tables import header_of, rows
+from skyless.recordings.source import Drops, header_of, open_source, rows
 
 COLUMNS: Final = ("t_host", "order", "slave", "master", "status", "tx_ticks_u40", "rx_ticks_u40")
 BLINK_COLUMNS: Final = ("tag", "anchor", "rx_ticks_u40")
@@ -51,15 +50,13 @@ class _Transmission(Struct):
     rx_ticks: dict[int, int]
 
 
-def recognise(head: bytes, name: str) -> bool:
+def recognise(head: bytes) -> bool:
     """Tell whether the first line names the columns of the anchors' receptions."""
-    del name
     return set(COLUMNS) <= set(header_of(head))
 
 
-def recognise_blinks(head: bytes, name: str) -> bool:
+def recognise_blinks(head: bytes) -> bool:
     """Tell whether this is the same system's table of tag blinks, which go the other way."""
-    del name
     return set(BLINK_COLUMNS) <= set(header_of(head))
 
 

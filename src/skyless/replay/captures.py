@@ -1,18 +1,21 @@
 """Replay of recordings: records in, fixes out, judged against the truth where there is one."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from itertools import islice
+from math import dist
 from os import PathLike
 from typing import Final
 
 import numpy as np
 from msgspec import Struct, structs
 
-from skyless.air.masterless_packets import Point
+from skyless.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.errors import SkylessError
 from skyless.evaluation.judge import Judge, Judgement
+from skyless.evaluation.statistics import EvenSample
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.masterless.calibration import DifferenceCalibration
@@ -20,8 +23,176 @@ from skyless.positioning.masterless.difference_tracking import DIFFERENCES, Diff
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.positioning.masterless.pair_engine import PairEngine
 from skyless.recordings.foreign.formats import Recording, format_of, open_recording
-from skyless.replay.noise import NoiseByPair, PairNoise
-from skyless.replay.pipelines import ByPackets, ByPairs, ReplayPipeline
+
+# Noise of the time differences of a recording, pair by pair, in bounded memory.
+
+MOST_PAIRS: Final = 256
+ROWS_PER_PAIR: Final = 4096
+MIN_PAIR_DIFFERENCES: Final = 20
+"""Differences of a pair from which its noise can be told."""
+
+
+class PairNoise(Struct, frozen=True):
+    """Differences of one pair of anchors."""
+
+    anchor_a: int
+    anchor_b: int
+    count: int
+    median_m: float
+    """Of the difference, or of its error where the truth is known."""
+    noise_m: float
+    """1.4826 times the median absolute deviation, a standard deviation that outliers do not touch."""
+    against_truth: bool
+
+
+class NoiseByPair:
+    """Keeps an even sample of every pair's differences, less what the truth predicts where it is known."""
+
+    def __init__(self, judge: Judge, anchors_m: Mapping[int, Point]) -> None:
+        self._judge = judge
+        self._anchors_m = anchors_m
+        self._samples: dict[tuple[int, int, bool], EvenSample] = {}
+
+    def add(self, pair: PairTdoa) -> None:
+        """Take one difference."""
+        predicted_m = self._predicted_m(pair) if self._judge.has_truth else None
+        key = (pair.anchor_a, pair.anchor_b, predicted_m is not None)
+        sample = self._samples.get(key)
+        if sample is None:
+            if len(self._samples) >= MOST_PAIRS:
+                return
+            sample = self._samples[key] = EvenSample(1, ROWS_PER_PAIR)
+        sample.add((pair.tdoa_m if predicted_m is None else pair.tdoa_m - predicted_m,))
+
+    def _predicted_m(self, pair: PairTdoa) -> float | None:
+        truth = self._judge.at(pair.time_s)
+        a_m = pair.a_m or self._anchors_m.get(pair.anchor_a)
+        b_m = pair.b_m or self._anchors_m.get(pair.anchor_b)
+        if truth is None or a_m is None or b_m is None:
+            return None
+        return dist(truth, b_m) - dist(truth, a_m)
+
+    def pairs(self) -> tuple[PairNoise, ...]:
+        """What is known of each pair that was heard often enough."""
+        found = []
+        for (a, b, against_truth), sample in sorted(self._samples.items()):
+            if len(sample.rows) >= MIN_PAIR_DIFFERENCES:
+                median = float(np.median(sample.rows))
+                noise = 1.4826 * float(np.median(np.abs(sample.rows - median)))
+                found.append(PairNoise(a, b, sample.seen, median, noise, against_truth))
+        return tuple(found)
+
+
+# The two ways from records to fixes: time differences of pairs, or the packets themselves.
+
+Record = Packet | PairTdoa
+Triple = tuple[float, float, float]
+
+_SAMPLED: Final = 128
+_SAMPLED_OF: Final = 1024
+"""Of each 1024 packets the first 128 are made into time differences as well, to measure the recording's noise."""
+
+
+class ByPairs:
+    """Time differences of pairs, ready or made of packets, and the filter of pairs."""
+
+    def __init__(self, tracking: DifferenceTracking, engine: PairEngine | None, noise: NoiseByPair) -> None:
+        self._tracking = tracking
+        self._engine = engine
+        self._noise = noise
+        self._made = False
+
+    def hear(self, record: Record) -> float | None:
+        """Take one record; the time of its differences."""
+        pairs: Sequence[PairTdoa]
+        if isinstance(record, Packet):
+            assert self._engine is not None
+            pairs = self._engine.hear(record)
+        else:
+            pairs = (record,)
+        self._made = False
+        if not pairs:
+            return None
+        for pair in pairs:
+            self._noise.add(pair)
+        self._made = self._tracking.hear(pairs)
+        return pairs[0].time_s
+
+    @property
+    def position_m(self) -> Triple | None:
+        """Where the record put the tag, None if it made no fix."""
+        return self._tracking.position_m if self._made else None
+
+    def fix(self) -> Fix:
+        """The newest position with all that is known of it."""
+        return self._tracking.fix()
+
+    @property
+    def reason(self) -> NoFixReason:
+        """Why there was no fix of late."""
+        return self._tracking.reason
+
+    @property
+    def drops(self) -> Counter[str]:
+        """What could not be used, by reason."""
+        total = Counter({name: self._tracking.counters[name] for name in ("outlier", "unknown-anchor")})
+        if self._engine is not None:
+            total.update(self._engine.drops)
+        return total
+
+    @property
+    def contradictions_m(self) -> Mapping[tuple[int, int], float]:
+        """Pairs of anchors whose own ranging contradicts the table: differences do not tell."""
+        return {}
+
+
+class ByPackets:
+    """Packets as they are; a part of them is made into differences as well, to measure the recording's noise."""
+
+    def __init__(self, tracking: PacketTracking, engine: PairEngine, noise: NoiseByPair) -> None:
+        self._tracking = tracking
+        self._engine = engine
+        self._noise = noise
+        self._heard = 0
+        self._fix: Fix | None = None
+
+    def hear(self, record: Record) -> float | None:
+        """Take one packet; its time."""
+        assert isinstance(record, Packet)
+        if self._heard % _SAMPLED_OF < _SAMPLED:
+            for pair in self._engine.hear(record):
+                self._noise.add(pair)
+        self._heard += 1
+        self._fix = self._tracking.hear(record)
+        return self._tracking.time_s
+
+    @property
+    def position_m(self) -> Triple | None:
+        """Where the packet put the tag, None if it made no fix."""
+        return None if self._fix is None else self._tracking.position_m
+
+    def fix(self) -> Fix:
+        """The newest position with all that is known of it."""
+        assert self._fix is not None
+        return self._fix
+
+    @property
+    def reason(self) -> NoFixReason:
+        """Why there was no fix of late."""
+        return self._tracking.reason
+
+    @property
+    def drops(self) -> Counter[str]:
+        """What could not be used, by reason."""
+        return self._tracking.drops
+
+    @property
+    def contradictions_m(self) -> Mapping[tuple[int, int], float]:
+        """Pairs of anchors whose own ranging contradicts the table."""
+        return self._tracking.contradictions_m
+
+
+# Replay of recordings: records in, fixes out, judged against the truth where there is one.
 
 PROFILES: Final[Mapping[str, EstimatorSettings]] = {
     "miluv": structs.replace(DIFFERENCES, qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),
@@ -104,7 +275,7 @@ class Replay:
         self.measurements = self._measurements()
         self.recording: Recording = open_recording(request.path, request.format, request.listener)
         self._noise = NoiseByPair(judge, request.anchors_m)
-        self._way: ReplayPipeline = self._by_packets() if self.measurements == PACKETS else self._by_pairs()
+        self._pipeline: ByPairs | ByPackets = self._by_packets() if self.measurements == PACKETS else self._by_pairs()
         self.receptions = 0
         self.fixes = 0
         self._first_s: float | None = None
@@ -155,7 +326,7 @@ class Replay:
             while batch := list(islice(records, BATCH)):
                 for record in batch:
                     self.receptions += 1
-                    time_s = self._way.hear(record)
+                    time_s = self._pipeline.hear(record)
                     if time_s is not None:
                         self._take(time_s, on_fix)
                 on_progress(self.recording.bytes_read)
@@ -166,7 +337,7 @@ class Replay:
         if self._first_s is None:
             self._first_s = time_s
         self._last_s = time_s
-        position_m = self._way.position_m
+        position_m = self._pipeline.position_m
         if position_m is None:
             return
         self.fixes += 1
@@ -174,10 +345,10 @@ class Replay:
             self._first_fix_s = time_s - self._first_s
         self._judge.add(time_s, time_s - self._first_s, position_m)
         if on_fix is not None:
-            on_fix(self._way.fix())
+            on_fix(self._pipeline.fix())
 
     def _drops(self) -> dict[str, int]:
-        total = self.recording.drops + self._way.drops
+        total = self.recording.drops + self._pipeline.drops
         return {name: count for name, count in sorted(total.items()) if count}
 
     def _report(self, wall_s: float) -> ReplayReport:
@@ -185,7 +356,7 @@ class Replay:
         drops = self._drops()
         pairs = self._noise.pairs()
         span_s = self._last_s - (self._first_s or 0.0)
-        reason = self._way.reason if self._request.anchors_m or self.fixes else NoFixReason.NO_ALMANAC
+        reason = self._pipeline.reason if self._request.anchors_m or self.fixes else NoFixReason.NO_ALMANAC
         return ReplayReport(
             format=self.recording.format.name,
             receptions=self.receptions,
@@ -209,5 +380,5 @@ class Replay:
             receptions_per_s=self.receptions / wall_s if wall_s > 0.0 else 0.0,
             method="joint",
             measurements=self.measurements,
-            contradictions_m={f"{a}-{b}": by_m for (a, b), by_m in sorted(self._way.contradictions_m.items())},
+            contradictions_m={f"{a}-{b}": by_m for (a, b), by_m in sorted(self._pipeline.contradictions_m.items())},
         )
