@@ -4,6 +4,7 @@ The layers are those of ``docs/architecture.md``. A name in quotes is a folder o
 """
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -109,6 +110,27 @@ def test_folders_import_each_other_in_no_circle():
         others = {folder(other) for other in imported_modules(path)}
         graph.setdefault(folder(module), set()).update(others - {folder(module)})
     assert circles(graph) is None
+
+
+PAGE = (SOURCE / "dashboard" / "page").resolve()
+
+
+def test_the_pages_modules_import_each_other_in_no_circle():
+    """Neither the files of JavaScript nor their folders; those directly in ``page`` stand for themselves."""
+    files, folders = {}, {}
+    for path in PAGE.rglob("*.js"):
+        if "vendor" in path.parts:
+            continue
+        found = re.findall(r'^import (?:[^"]* from )?"(\..*)";', path.read_text(encoding="utf-8"), re.MULTILINE)
+        others = {(path.parent / name).resolve() for name in found}
+        assert all(other.is_file() for other in others), path
+        files[str(path)] = {str(other) for other in others}
+        group, *groups = (file if file.parent == PAGE else file.parent for file in (path, *others))
+        folders.setdefault(str(group), set()).update(str(other) for other in groups if other != group)
+    assert files
+    assert any(files.values())
+    assert circles(files) is None
+    assert circles(folders) is None
 
 
 def test_a_circle_is_found():

@@ -28,7 +28,7 @@ def serve():
 
 @pytest.fixture
 def visit(chromium):
-    """Open the page; in the end, nothing has gone wrong in it, and it has asked nobody but its server."""
+    """Open the page; in the end, it has reported no problem and sent requests to its server only."""
     visits = []
 
     def open_page(server, **context):

@@ -1,4 +1,4 @@
-"""A server that speaks the page's contract over a made-up site, for its tests and for work on the page.
+"""A server of a made-up site for the page's tests and for work on the page.
 
 By hand: ``.venv/bin/python tests/dashboard/page_fake_server.py [tags]``, then open the address that it prints.
 """
@@ -170,7 +170,7 @@ class FakeServer:
             await asyncio.sleep(1.0)
 
     def health(self, now):
-        """A health message: one anchor is not in step, and one has not been heard of for a while."""
+        """A health message: one anchor is not synchronised, and one is offline."""
         since = now - self.started
         anchors = [made_up.anchor_health(n, since, now - (20 if n == 8 else 0), n != 5) for n in range(1, 9)]
         tags = []

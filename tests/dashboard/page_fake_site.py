@@ -6,9 +6,10 @@ WIDTH_M, DEPTH_M = 24.0, 14.0
 SLOT_S = 2.1e-3
 SUPERFRAME = 8
 COLUMNS_X = (1.0, 8.5, 15.5, 23.0)
+ALERTS = ("none", "detected-excluded", "detected-not-excluded", "unavailable", "alert-limit-exceeded")
 
 
-def anchor_places():
+def anchor_positions():
     return [(number, x, y) for number, (x, y) in enumerate(((x, y) for y in (1.0, 13.0) for x in COLUMNS_X), start=1)]
 
 
@@ -18,7 +19,7 @@ def site_message(unix_s, floor_plan=None):
         "name": "Hall 7",
         "id": 7,
         "master": 2,
-        "anchors": [{"id": n, "x_m": x, "y_m": y, "z_m": 2.8, "slot": None} for n, x, y in anchor_places()],
+        "anchors": [{"id": n, "x_m": x, "y_m": y, "z_m": 2.8, "slot": None} for n, x, y in anchor_positions()],
         "schedule": {"slot_s": SLOT_S, "slots": None, "frames_per_node": 1, "guard_s": 0.5e-3},
         "noise": {},
         "tags": {"height_m": 1.2},
@@ -45,7 +46,7 @@ def truth(number, time_s):
 
 
 def state_row(name, number, time_s, unix_s):
-    """A row of a state message, fields in the order of the contract."""
+    """A row of a state message, fields in the order of ``page/tracks.js``."""
     x, y, vx, vy = truth(number, time_s)
     ease = 1.0 + 0.5 * math.sin(0.3 * time_s + number)
     dx = 0.05 * ease * math.sin(9.1 * time_s + number)
@@ -54,7 +55,7 @@ def state_row(name, number, time_s, unix_s):
     used = 8 - (1 if math.sin(0.7 * time_s + number) > 0.6 else 0)
     chi2 = used * (0.8 + 0.6 * math.sin(5.3 * time_s + number) ** 2)
     numbers = [x + dx, y + dy, 1.2, vx, vy, xx, xy, yy, math.sqrt(xx + yy), math.hypot(dx, dy), x, y]
-    return [name, *(round(value, 5) for value in numbers), used, round(chi2, 3), unix_s, 0.6 * ease, number % 5]
+    return [name, *(round(value, 5) for value in numbers), used, round(chi2, 3), unix_s, 0.6 * ease, ALERTS[number % 5]]
 
 
 def mqtt():

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from skyless.dashboard.app import MOST_PAGES, Parts, make_app
-from skyless.dashboard.guard import Guard, Rules
-from skyless.dashboard.live import Live
+from skyless.dashboard.app import MAX_PAGES, Services, make_app
+from skyless.dashboard.guard import AccessRules, Guard
+from skyless.dashboard.live import LiveSite
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import Playback
 from skyless.mqtt import topics
@@ -24,7 +24,7 @@ STRANGE_SOCKET = "ws://192.168.1.5:8080/live"
 
 @pytest.fixture
 def live():
-    live = Live("here", "mqtt://broker:1")
+    live = LiveSite("here", "mqtt://broker:1")
     live.attach(Wire(), SITE_ID)
     return live
 
@@ -41,7 +41,9 @@ def page(tmp_path):
 
 
 def client(live, page, rules=None, base_url=HERE):
-    return TestClient(make_app(Parts(live, Overlays(), Playback(None)), rules or Rules(), page), base_url=base_url)
+    return TestClient(
+        make_app(Services(live, Overlays(), Playback(None)), rules or AccessRules(), page), base_url=base_url
+    )
 
 
 @pytest.fixture
@@ -52,7 +54,7 @@ def browser(live, page):
 @pytest.fixture
 def stranger(live, page):
     """Somebody on another machine."""
-    rules = Rules(TOKEN, frozenset({"hall.example"}), elsewhere=True, cookie="skyless-8080")
+    rules = AccessRules(TOKEN, frozenset({"hall.example"}), remote=True, cookie="skyless-8080")
     return client(live, page, rules, "http://192.168.1.5:8080")
 
 
@@ -89,14 +91,14 @@ def test_the_own_machine_may_call_it_by_any_of_its_names(browser, host):
 @pytest.mark.parametrize(
     "host", ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "192.168.1.5", "[::2]", "", "a b", "@"]
 )
-def test_a_rebound_name_is_turned_away(browser, host):
+def test_a_rebound_name_is_refused(browser, host):
     assert browser.get("/", headers={"host": host}).status_code == 421
     with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET, headers={"host": host}):
         pass
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:9999", "file://", "http://[bad"])
-def test_other_sites_pages_are_turned_away(browser, origin):
+def test_other_sites_pages_are_refused(browser, origin):
     assert browser.get("/api/recordings", headers={"origin": origin}).status_code == 403
     assert browser.put("/api/zones", json={"zones": []}, headers={"origin": origin}).status_code == 403
     with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET, headers={"origin": origin}):
@@ -149,18 +151,18 @@ def test_zones_are_stored(browser, live):
     answer = browser.put("/api/zones", json={"zones": [zone]})
     assert answer.status_code == 200
     assert answer.json() == {"zones": [zone]}
-    assert live.watch.zones[0].id == "desk"
+    assert live.monitor.zones[0].id == "desk"
 
 
 def test_wrong_zones_are_refused_and_nothing_changes(browser, live):
-    live.draw_zones((SQUARE,))
+    live.store_zones((SQUARE,))
     for body in (b"", b"{}", b'{"zones":[{"id":"a","name":"A","polygon_m":[[0,0],[1,1]]}]}', b"\xff"):
         answer = browser.put("/api/zones", content=body)
         assert answer.status_code == 400
         assert answer.json()["error"]
     assert browser.put("/api/zones", content=b" " * 1_000_001).status_code == 413
     assert browser.post("/api/zones", json={"zones": []}).status_code == 405
-    assert live.watch.zones == (SQUARE,)
+    assert live.monitor.zones == (SQUARE,)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +207,7 @@ def test_the_live_stream(browser, live):
 
 
 async def _fix_and_tick(live):
-    live._bus.deliver(topics.fix_topic(SITE_ID, "t1"), fix())
+    live._link.deliver(topics.fix_topic(SITE_ID, "t1"), fix())
     live.tick()
 
 
@@ -222,14 +224,14 @@ def test_a_page_that_went_away_is_forgotten(browser, live):
 
 
 def test_there_is_an_end_to_the_number_of_pages(browser, live):
-    for _ in range(MOST_PAGES):
-        live.join()
+    for _ in range(MAX_PAGES):
+        live.open_page()
     with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET):
         pass
-    assert len(live.pages) == MOST_PAGES
+    assert len(live.pages) == MAX_PAGES
 
 
-def test_hello_tells_the_site(browser, live):
+def test_hello_holds_the_site(browser, live):
     live.site = SITE
     with browser.websocket_connect(SOCKET) as socket:
         assert socket.receive_json()["site"]["site"]["name"] == SITE.site.name
@@ -242,12 +244,12 @@ VALUE = st.binary(max_size=60) | st.sampled_from(
 
 
 @given(st.lists(st.tuples(HEADER, VALUE), max_size=6), st.binary(max_size=40), st.sampled_from(["http", "websocket"]))
-def test_whatever_strangers_send_without_the_token_they_stay_outside(headers, query, kind):
-    """No header or query raises, or gets anybody in."""
+def test_without_the_token_every_request_of_a_stranger_is_refused(headers, query, kind):
+    """No header or query raises, or passes without the token."""
     sent = []
 
     async def inside(scope, receive, send):
-        raise AssertionError("somebody got in")
+        raise AssertionError("the request was let through")
 
     async def send(message):
         sent.append(message)
@@ -258,6 +260,6 @@ def test_whatever_strangers_send_without_the_token_they_stay_outside(headers, qu
         "query_string": query,
         "headers": [(b"host", b"192.168.1.5")] + [(name.encode(), value) for name, value in headers],
     }
-    asyncio.run(Guard(inside, Rules(TOKEN, elsewhere=True))(scope, None, send))
+    asyncio.run(Guard(inside, AccessRules(TOKEN, remote=True))(scope, None, send))
     assert sent[0].get("status", 403) in {401, 403, 421}
     assert sent[0]["type"] in {"http.response.start", "websocket.close"}

@@ -8,7 +8,7 @@ import pytest
 
 from skyless.cli.dashboard import _address, _place, _rules
 from skyless.cli.main import main
-from skyless.dashboard.serve import PORT, Listen, bind
+from skyless.dashboard.serve import PORT, ListenAddress, bind
 from skyless.errors import SkylessError
 
 
@@ -26,7 +26,7 @@ from skyless.errors import SkylessError
     ],
 )
 def test_where_to_listen(text, host, port):
-    assert _place(text) == Listen(host, port)
+    assert _place(text) == ListenAddress(host, port)
 
 
 @pytest.mark.parametrize("text", ["", ":8080", "127.0.0.1:x", "127.0.0.1:70000", "127.0.0.1:-1", "localhost:8080x"])
@@ -40,20 +40,20 @@ def test_a_taken_port_is_an_error_when_it_was_asked_for():
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        with pytest.raises(SkylessError, match=f"--listen is '127.0.0.1:{port}'; another program has this port"):
-            bind(Listen("127.0.0.1", port))
+        with pytest.raises(SkylessError, match=f"--listen is '127.0.0.1:{port}'; another program uses this port"):
+            bind(ListenAddress("127.0.0.1", port))
 
 
 def test_the_next_free_port_is_taken_when_none_was_asked_for():
-    with bind(Listen("127.0.0.1", None)) as first, bind(Listen("127.0.0.1", None)) as second:
+    with bind(ListenAddress("127.0.0.1", None)) as first, bind(ListenAddress("127.0.0.1", None)) as second:
         assert PORT <= first.getsockname()[1] < second.getsockname()[1]
 
 
 def test_an_address_of_another_machine_is_refused():
     with pytest.raises(SkylessError, match="cannot listen"):
-        bind(Listen("192.0.2.1", 8080))
+        bind(ListenAddress("192.0.2.1", 8080))
     with pytest.raises(SkylessError, match="cannot listen"):
-        bind(Listen("no such host", 8080))
+        bind(ListenAddress("no such host", 8080))
 
 
 def test_loopback_needs_no_token_and_all_else_gets_one():
@@ -61,7 +61,7 @@ def test_loopback_needs_no_token_and_all_else_gets_one():
     assert _rules("::1", "::1", 1, None).token is None
     assert _rules("127.0.0.1", "127.0.0.1", 1, "a-token-of-my-own").token == "a-token-of-my-own"
     first, second = (_rules("0.0.0.0", "0.0.0.0", 1, None) for _ in range(2))
-    assert first.elsewhere
+    assert first.remote
     assert first.token
     assert first.token != second.token
     assert _rules("0.0.0.0", "0.0.0.0", 1, "a-token-of-my-own").token == "a-token-of-my-own"
@@ -76,7 +76,7 @@ def test_the_address_that_is_printed_is_one_that_others_can_open():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "expected"),
     [
         (["--token", "short"], "--token has 5 characters"),
         (["--mqtt", "http://x"], "--mqtt is"),
@@ -86,10 +86,10 @@ def test_the_address_that_is_printed_is_one_that_others_can_open():
         (["--site-id", "70000"], "70000"),
     ],
 )
-def test_wrong_options_end_with_2_and_one_line(capsys, arguments, said):
+def test_wrong_options_end_with_2_and_one_line(capsys, arguments, expected):
     assert main(["dashboard", *arguments]) == 2
     error = capsys.readouterr().err
-    assert said in error
+    assert expected in error
     assert error.count("\n") == 1
 
 

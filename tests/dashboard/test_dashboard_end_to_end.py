@@ -44,7 +44,7 @@ async def dashboard(*arguments):
 
 @contextlib.asynccontextmanager
 async def site(address):
-    """A node of the site, which has told what the site is."""
+    """A node of the site, which has published the site."""
     link = Link(address, "air", site=SITE_ID, kind="ether")
     running = asyncio.create_task(link.run())
     link.publish(topics.site_topic(SITE_ID), SITE, qos=1, retain=True)
@@ -57,7 +57,7 @@ async def site(address):
 
 
 async def walk(link, tags=1, step_s=0.05):
-    """Fixes and truths for ever; everybody walks through the square and back."""
+    """Fixes and truths for ever; every tag walks through the square and back."""
     for k in range(1_000_000):
         x = 2.0 if k // 40 % 2 else 8.0
         now_s = time.time()
@@ -68,8 +68,8 @@ async def walk(link, tags=1, step_s=0.05):
         await asyncio.sleep(step_s)
 
 
-def live(told):
-    return websockets.connect(told["page"].replace("http", "ws") + "live", max_size=None)
+def live(output):
+    return websockets.connect(output["page"].replace("http", "ws") + "live", max_size=None)
 
 
 async def next_of(page, kind_of_message, /, **fields):
@@ -99,7 +99,7 @@ async def a_site_is_found_shown_and_watched(tmp_path):
     async with site(broker.address) as link:
         link.subscribe(topics.zone_event_topic(SITE_ID, "+"), lambda _, payload: events.append(json.loads(payload)), 1)
         link.subscribe(topics.zones_topic(SITE_ID), lambda _, payload: zones.append(payload), 1)
-        async with dashboard("--mqtt", str(broker.address)) as (told, process), live(told) as page:
+        async with dashboard("--mqtt", str(broker.address)) as (output, process), live(output) as page:
             hello = await next_of(page, "hello")
             shown = hello["site"] or (await next_of(page, "site"))["site"]
             assert shown["site"]["id"] == SITE_ID
@@ -107,14 +107,14 @@ async def a_site_is_found_shown_and_watched(tmp_path):
             row = (await next_of(page, "state"))["tags"][0]
             assert row[0] == "t0"
             assert row[10] == pytest.approx(0.02, abs=1e-3)
-            async with httpx.AsyncClient(base_url=told["page"]) as http:
+            async with httpx.AsyncClient(base_url=output["page"]) as http:
                 answer = await http.put("/api/zones", content=msgspec.json.encode(ZonesMessage((SQUARE,))))
                 assert answer.status_code == 200
                 overlay = await http.get("/api/overlay?kind=sigma&step_m=1", timeout=60.0)
                 assert len(overlay.json()["values"]) == 48
             event = await next_of(page, "zone_event", kind="enter")
             assert (event["zone"], event["tag"]) == ("desk", "t0")
-            await settled(lambda: event | {"type": "zone_event"} in [told | {"type": "zone_event"} for told in events])
+            await settled(lambda: event | {"type": "zone_event"} in [seen | {"type": "zone_event"} for seen in events])
             assert json.loads(zones[-1])["zones"][0]["id"] == "desk"
             await broker.stop()
             assert (await next_of(page, "mqtt"))["connected"] is False
@@ -123,28 +123,31 @@ async def a_site_is_found_shown_and_watched(tmp_path):
             await next_of(page, "state")
             process.send_signal(signal.SIGTERM)
             assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
-        async with dashboard("--mqtt", str(broker.address), "--site-id", str(SITE_ID)) as (told, _), live(told) as page:
+        async with (
+            dashboard("--mqtt", str(broker.address), "--site-id", str(SITE_ID)) as (output, _),
+            live(output) as page,
+        ):
             greeted = (await next_of(page, "hello"))["zones"]
             assert (greeted or (await next_of(page, "zones"))["zones"])[0]["id"] == "desk", "zones survive a restart"
         walking.cancel()
     await broker.stop()
 
 
-def test_a_page_that_does_not_read_holds_up_nobody(tmp_path):
-    asyncio.run(a_page_that_does_not_read_holds_up_nobody(tmp_path))
+def test_a_page_that_does_not_read_delays_no_other(tmp_path):
+    asyncio.run(a_page_that_does_not_read_delays_no_other(tmp_path))
 
 
-async def a_page_that_does_not_read_holds_up_nobody(tmp_path):
+async def a_page_that_does_not_read_delays_no_other(tmp_path):
     settings = BrokerSettings(port=free_port(), data=tmp_path / "broker")
     async with (
         await start_broker(settings) as broker,
         site(broker.address) as link,
-        dashboard("--mqtt", str(broker.address)) as (told, process),
+        dashboard("--mqtt", str(broker.address)) as (output, process),
     ):
         walking = asyncio.create_task(walk(link, tags=100))
-        port = int(told["page"].rstrip("/").rsplit(":", 1)[1])
-        deaf = [await never_read(port) for _ in range(3)]
-        async with live(told) as page:
+        port = int(output["page"].rstrip("/").rsplit(":", 1)[1])
+        unread = [await never_read(port) for _ in range(3)]
+        async with live(output) as page:
             await next_of(page, "state")
             began_s, count = time.monotonic(), 0
             while time.monotonic() < began_s + 4.0:
@@ -157,7 +160,7 @@ async def a_page_that_does_not_read_holds_up_nobody(tmp_path):
             assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
             assert time.monotonic() - stopped_s < 5.0, "half a second on an idle machine"
         walking.cancel()
-        for sock in deaf:
+        for sock in unread:
             sock.close()
 
 
@@ -179,11 +182,11 @@ async def never_read(port):
     return sock
 
 
-def test_without_a_broker_the_page_stands_and_says_so():
+def test_without_a_broker_the_page_opens_and_shows_it():
     async def check():
         nobody = f"mqtt://127.0.0.1:{free_port()}"
-        async with dashboard("--mqtt", nobody) as (told, _), live(told) as page:
-            assert told["mqtt"] == nobody
+        async with dashboard("--mqtt", nobody) as (output, _), live(output) as page:
+            assert output["mqtt"] == nobody
             hello = await next_of(page, "hello")
             assert (hello["mqtt"], hello["site"]) == (False, None)
             assert await next_of(page, "mqtt") == {"type": "mqtt", "connected": False, "broker": nobody}
@@ -193,13 +196,13 @@ def test_without_a_broker_the_page_stands_and_says_so():
 
 def test_other_machines_need_the_token_that_is_printed():
     async def check():
-        async with dashboard("--listen", f"0.0.0.0:{free_port()}") as (told, _):
-            address = httpx.URL(told["page"])
-            assert told["page"].endswith(f"?token={told['token']}")
-            assert len(told["token"]) >= 20
+        async with dashboard("--listen", f"0.0.0.0:{free_port()}") as (output, _):
+            address = httpx.URL(output["page"])
+            assert output["page"].endswith(f"?token={output['token']}")
+            assert len(output["token"]) >= 20
             async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{address.port}") as http:
                 assert (await http.get("/api/recordings")).status_code == 401
-                assert (await http.get("/api/recordings", params={"token": told["token"]})).status_code == 200
+                assert (await http.get("/api/recordings", params={"token": output["token"]})).status_code == 200
                 assert (await http.get("/api/recordings")).status_code == 200, "by the cookie"
                 assert (await http.get("/", headers={"host": "evil.example"})).status_code == 421
 

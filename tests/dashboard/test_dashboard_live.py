@@ -7,9 +7,8 @@ import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, fix, status, truth
 from msgspec.structs import replace
 
-from skyless.dashboard.live import Live
-from skyless.dashboard.mailbox import MOST_EVENTS
-from skyless.dashboard.zones import SILENCE_S
+from skyless.dashboard.live import LiveSite
+from skyless.dashboard.zones import MAX_EVENTS, TAG_TIMEOUT_S
 from skyless.mqtt import topics
 from skyless.mqtt.messages import ZoneEvent, ZonesMessage
 
@@ -30,13 +29,13 @@ def wire():
 
 @pytest.fixture
 def live(times, wire):
-    live = Live("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
+    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
     live.attach(wire, SITE_ID)
     return live
 
 
-def taken(live, page):
-    return [json.loads(message) for message in asyncio.run(asyncio.wait_for(page.take(live.board), 1.0))]
+def drained(live, page):
+    return [json.loads(message) for message in asyncio.run(asyncio.wait_for(page.drain(live.state), 1.0))]
 
 
 def of(kind, messages):
@@ -44,42 +43,42 @@ def of(kind, messages):
 
 
 def enter_the_desk(live, wire):
-    live.draw_zones((SQUARE,))
+    live.store_zones((SQUARE,))
     wire.deliver(FIX, fix())
     live.tick()
 
 
-def test_a_page_is_greeted_before_anything_else(live, wire):
+def test_a_page_first_gets_hello(live, wire):
     wire.deliver(FIX, fix())
-    greeting = taken(live, live.join())
-    assert greeting[0]["type"] == "hello"
-    assert greeting[0].keys() == {"type", "version", "site", "zones", "events", "mqtt"}
-    assert (greeting[0]["site"], greeting[0]["zones"], greeting[0]["mqtt"]) == (None, [], False)
-    assert of("mqtt", greeting) == [{"type": "mqtt", "connected": False, "broker": "mqtt://broker:1"}]
-    assert of("state", greeting)[0]["tags"][0][0] == "t1"
+    messages = drained(live, live.open_page())
+    assert messages[0]["type"] == "hello"
+    assert messages[0].keys() == {"type", "version", "site", "zones", "events", "mqtt"}
+    assert (messages[0]["site"], messages[0]["zones"], messages[0]["mqtt"]) == (None, [], False)
+    assert of("mqtt", messages) == [{"type": "mqtt", "connected": False, "broker": "mqtt://broker:1"}]
+    assert of("state", messages)[0]["tags"][0][0] == "t1"
 
 
-def test_pages_hear_of_the_site_and_of_the_broker(live, wire):
-    page = live.join()
-    taken(live, page)
+def test_pages_are_sent_the_site_and_the_state_of_the_broker(live, wire):
+    page = live.open_page()
+    drained(live, page)
     wire.deliver(topics.site_topic(SITE_ID), SITE)
-    live.connection(connected=True)
-    messages = taken(live, page)
+    live.on_connection(connected=True)
+    messages = drained(live, page)
     assert of("site", messages)[0]["site"]["site"]["name"] == SITE.site.name
     assert of("site", messages)[0]["site"]["simulated"] is True
     assert of("mqtt", messages)[0]["connected"] is True
-    assert taken(live, live.join())[0]["site"]["site"]["id"] == SITE_ID
+    assert drained(live, live.open_page())[0]["site"]["site"]["id"] == SITE_ID
 
 
 def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):
-    page = live.join()
-    taken(live, page)
+    page = live.open_page()
+    drained(live, page)
     for k in range(500):
         times.move(0.05)
         wire.deliver(FIX, fix(serial=k, position_m=(k * 0.01, 0.0, 1.0)))
         wire.deliver(topics.fix_topic(SITE_ID, f"other{k % 7}"), fix(f"other{k % 7}"))
         live.tick()
-    messages = taken(live, page)
+    messages = drained(live, page)
     (state,) = of("state", messages)
     assert len(state["tags"]) == 8
     assert next(row for row in state["tags"] if row[0] == "t1")[1] == 4.99
@@ -87,23 +86,15 @@ def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):
 
 
 def test_without_anything_new_there_is_no_state(live, wire, times):
-    page = live.join()
+    page = live.open_page()
     wire.deliver(FIX, fix())
     live.tick()
-    assert of("state", taken(live, page))
+    assert of("state", drained(live, page))
     times.move(2.0)
     live.tick()
-    messages = taken(live, page)
+    messages = drained(live, page)
     assert of("health", messages)
     assert not of("state", messages)
-
-
-def test_pages_that_left_are_told_nothing(live, wire):
-    page = live.join()
-    live.leave(page)
-    live.leave(page)
-    assert not live.pages
-    live.connection(connected=True)
 
 
 @pytest.mark.parametrize(
@@ -125,52 +116,52 @@ def test_pages_that_left_are_told_nothing(live, wire):
 )
 def test_wrong_messages_are_counted_and_change_nothing(live, wire, topic, payload):
     wire.deliver(topic, payload)
-    assert live.wrong.total() == 1
-    assert live.board.serial == 0
+    assert live.dropped.total() == 1
+    assert live.state.serial == 0
     assert live.site is None
-    assert live.watch.zones == ()
-    counted = of("health", taken(live, live.join()))[0]["dropped"]
+    assert live.monitor.zones == ()
+    counted = of("health", drained(live, live.open_page()))[0]["dropped"]
     assert counted == {topic.rsplit("/", 1)[-1]: 1}
 
 
 def test_health_of_unknown_kinds_and_cleared_statuses_are_no_fault(live, wire):
     wire.deliver(topics.health_topic(SITE_ID, "toaster", "1"), b"{}")
     wire.deliver(topics.status_topic(SITE_ID, "tag", "t1"), b"")
-    assert not live.wrong
+    assert not live.dropped
 
 
-def test_zones_are_retained_and_events_fly_with_quality_of_service_1(live, wire):
-    page = live.join()
+def test_zones_are_retained_and_events_have_quality_of_service_1(live, wire):
+    page = live.open_page()
     enter_the_desk(live, wire)
     assert [(topic, qos, retain) for topic, _, qos, retain in wire.published] == [(ZONES, 1, True), (EVENT, 1, False)]
     event = json.loads(wire.published[1][1])
     assert (event["kind"], event["zone"], event["tag"], event["unix_s"]) == ("enter", "desk", "t1", 1000.0)
-    messages = taken(live, page)
+    messages = drained(live, page)
     assert of("zones", messages)[0]["zones"][0]["id"] == "desk"
     assert of("zone_event", messages) == [{"type": "zone_event", **event}]
-    assert taken(live, live.join())[0]["events"] == [event]
+    assert drained(live, live.open_page())[0]["events"] == [event]
 
 
-def test_the_echo_of_an_own_event_is_not_told_again(live, wire):
+def test_the_echo_of_an_own_event_is_not_sent_again(live, wire):
     enter_the_desk(live, wire)
-    page = live.join()
-    taken(live, page)
+    page = live.open_page()
+    drained(live, page)
     wire.deliver(EVENT, wire.published[-1][1])
     wire.deliver(EVENT, ZoneEvent("desk", "Desk", "t9", "enter", 1.0, (0.0, 0.0, 0.0)))
-    assert [event["tag"] for event in of("zone_event", taken(live, page))] == ["t9"]
+    assert [event["tag"] for event in of("zone_event", drained(live, page))] == ["t9"]
 
 
 def test_events_of_a_slow_page_are_bounded(live, wire):
-    page = live.join()
-    for k in range(3 * MOST_EVENTS):
+    page = live.open_page()
+    for k in range(3 * MAX_EVENTS):
         wire.deliver(EVENT, ZoneEvent("desk", "Desk", f"t{k}", "enter", 1.0, (0.0, 0.0, 0.0)))
-    events = of("zone_event", taken(live, page))
-    assert [event["tag"] for event in events] == [f"t{k}" for k in range(2 * MOST_EVENTS, 3 * MOST_EVENTS)]
+    events = of("zone_event", drained(live, page))
+    assert [event["tag"] for event in events] == [f"t{k}" for k in range(2 * MAX_EVENTS, 3 * MAX_EVENTS)]
 
 
-def test_a_second_dashboard_leaves_the_speaking_to_the_first(live, wire, times):
+def test_a_second_dashboard_leaves_publishing_to_the_first(live, wire, times):
     wire.deliver(topics.status_topic(SITE_ID, "dashboard", "here"), status("dashboard", "here", unix_s=5.0))
-    wire.deliver(topics.status_topic(SITE_ID, "dashboard", "elder"), status("dashboard", "elder", unix_s=1.0))
+    wire.deliver(topics.status_topic(SITE_ID, "dashboard", "older"), status("dashboard", "older", unix_s=1.0))
     enter_the_desk(live, wire)
     assert EVENT not in wire.topics()
     times.move(1.1)
@@ -178,9 +169,9 @@ def test_a_second_dashboard_leaves_the_speaking_to_the_first(live, wire, times):
     assert EVENT in wire.topics()
 
 
-def test_a_tag_that_falls_silent_or_dies_leaves(live, wire, times):
+def test_a_tag_without_fixes_or_offline_leaves(live, wire, times):
     enter_the_desk(live, wire)
-    times.move(SILENCE_S)
+    times.move(TAG_TIMEOUT_S)
     live.tick()
     assert json.loads(wire.published[-1][1])["kind"] == "leave"
     wire.deliver(FIX, fix(unix_s=times.unix_s))
@@ -193,20 +184,20 @@ def test_a_tag_that_falls_silent_or_dies_leaves(live, wire, times):
     ]
 
 
-def test_older_zones_of_the_broker_do_not_undo_a_drawing_on_its_way(live, wire):
-    live.draw_zones((SQUARE,))
+def test_older_zones_of_the_broker_do_not_undo_zones_on_their_way(live, wire):
+    live.store_zones((SQUARE,))
     wire.deliver(ZONES, ZonesMessage(()))
-    assert live.watch.zones == (SQUARE,)
+    assert live.monitor.zones == (SQUARE,)
     wire.deliver(ZONES, ZonesMessage((SQUARE,)))
     other = replace(SQUARE, name="Sofa")
     wire.deliver(ZONES, ZonesMessage((other,)))
-    assert live.watch.zones == (other,)
+    assert live.monitor.zones == (other,)
     assert wire.forgotten == [ZONES], "another dashboard's zones are newer; ours must not come back after a reconnect"
 
 
 def test_zones_drawn_before_the_site_is_known_are_stored_later(times, wire):
-    live = Live("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
-    live.draw_zones((SQUARE,))
+    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
+    live.store_zones((SQUARE,))
     live.attach(wire, SITE_ID)
     assert wire.topics() == [ZONES]
 
@@ -214,4 +205,4 @@ def test_zones_drawn_before_the_site_is_known_are_stored_later(times, wire):
 def test_the_truth_reaches_the_rows(live, wire):
     wire.deliver(topics.truth_topic(SITE_ID), truth(position_m=(2.0, 2.03, 1.0)))
     wire.deliver(FIX, fix(position_m=(2.0, 2.0, 1.0)))
-    assert live.board.rows_since(0)[0][10] == pytest.approx(0.03)
+    assert live.state.rows_since(0)[0][10] == pytest.approx(0.03)

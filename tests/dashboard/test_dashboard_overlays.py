@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.dashboard.overlay_process import overlay_grids
-from skyless.dashboard.overlays import MOST_CELLS, NoOverlayError, Overlays, levels, overlay_task
+from skyless.dashboard.overlays import MAX_CELLS, NoOverlayError, Overlays, levels, overlay_task
 from skyless.method_names import DEFAULT_METHOD, METHODS
 from skyless.planning.columns import HDOP, PDOP, SIGMA
 from skyless.planning.predict import PlanSettings, Predictor
@@ -34,7 +34,7 @@ def test_the_grid_covers_the_floor_plan_too():
 def test_a_large_hall_gets_a_coarser_grid_and_every_grid_is_bounded():
     anchors = tuple(replace(anchor, x_m=anchor.x_m * 100.0, y_m=anchor.y_m * 100.0) for anchor in LAB.anchors)
     task = overlay_task(replace(LAB, anchors=anchors), None, "joint", 0.25)
-    assert task.columns * task.rows <= MOST_CELLS
+    assert task.columns * task.rows <= MAX_CELLS
     assert task.step_m == 5.0
 
 
@@ -51,7 +51,7 @@ def test_values_are_the_planners_row_by_row_from_the_lowest_y():
 
 
 def test_where_there_is_no_fix_there_is_no_value():
-    """One anchor a kilometre away: beyond the middle nobody hears three."""
+    """One anchor a kilometre away: beyond the middle no tag hears three."""
     far = AnchorSite(id=99, x_m=1000.0, y_m=4.0)
     task = overlay_task(replace(LAB, anchors=(*LAB.anchors, far)), None, "weighted", 10.0)
     grids = overlay_grids(task)
@@ -95,7 +95,7 @@ def test_one_process_answers_all_three_kinds():
     assert sigma["values"] == overlay_grids(overlay_task(LAB, None, "weighted", 1.0)).sigma
 
 
-def test_a_site_with_too_few_anchors_says_so():
+def test_too_few_anchors_are_an_error():
     site = replace(LAB, anchors=LAB.anchors[:3], tags=TagsSite())
     with pytest.raises(NoOverlayError, match="4 anchors or more"):
         get(Overlays(), site, None, [], "pdop", 1.0)

@@ -7,9 +7,9 @@ import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, fix, truth
 from starlette.testclient import TestClient
 
-from skyless.dashboard.app import Parts, make_app
-from skyless.dashboard.guard import Rules
-from skyless.dashboard.live import Live
+from skyless.dashboard.app import Services, make_app
+from skyless.dashboard.guard import AccessRules
+from skyless.dashboard.live import LiveSite
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.mqtt import topics
@@ -22,7 +22,7 @@ DURATION_S = 10.0
 
 
 def record(path, *, begin_s=START_S, seconds=DURATION_S, close=True):
-    """Ten fixes a second of a tag that walks along x at 1 m/s and whose fixes lie 3 cm beside it."""
+    """Ten fixes a second of a tag that walks along x at 1 m/s and whose fixes lie 3 cm off it."""
     recorder = McapRecorder(McapFile(path))
 
     def take(topic, message, at_s):
@@ -80,7 +80,7 @@ def test_a_recording_that_grows_is_read_to_its_end(folder):
     assert rows(playback.states("growing.mcap", 1.5, 3.0, 20.0))[0][0] == "t9"
 
 
-def test_the_summary_says_what_a_page_needs_before_it_plays(folder):
+def test_the_summary_has_what_a_page_needs_before_it_plays(folder):
     found = Playback(folder).summary("first.mcap")
     assert found.site == SITE
     assert found.zones == (SQUARE,)
@@ -126,7 +126,7 @@ def test_reading_ends_when_the_server_does(folder):
     assert playback.states("first.mcap", 0.0, 10.0, 20.0) == []
 
 
-def test_a_recording_replaced_by_another_is_read_anew(folder):
+def test_a_recording_replaced_by_another_is_read_again(folder):
     playback = Playback(folder)
     playback.summary("first.mcap")
     record(folder / "new", begin_s=START_S + 50.0, seconds=1.0)
@@ -135,15 +135,15 @@ def test_a_recording_replaced_by_another_is_read_anew(folder):
 
 
 def test_the_server_gives_recordings(folder):
-    live = Live("here", "mqtt://broker:1")
+    live = LiveSite("here", "mqtt://broker:1")
     live.attach(Wire(), SITE_ID)
-    app = make_app(Parts(live, Overlays(), Playback(folder)), Rules())
+    app = make_app(Services(live, Overlays(), Playback(folder)), AccessRules())
     browser = TestClient(app, base_url="http://localhost")
     (listed,) = browser.get("/api/recordings").json()
     assert listed.keys() == {"name", "bytes", "start_unix_s", "duration_s", "complete"}
-    told = browser.get("/api/recordings/first.mcap").json()
-    assert told.keys() == {"name", "site", "start_unix_s", "end_unix_s", "tags", "zones"}
-    assert told["site"]["site"]["id"] == SITE_ID
+    summary = browser.get("/api/recordings/first.mcap").json()
+    assert summary.keys() == {"name", "site", "start_unix_s", "end_unix_s", "tags", "zones"}
+    assert summary["site"]["site"]["id"] == SITE_ID
     states = browser.get("/api/recordings/first.mcap/states?from_s=1&to_s=2&rate_hz=20").json()["states"]
     assert [state["type"] for state in states] == ["state"] * 10
     assert browser.get("/api/recordings/first.mcap/floor_plan").content == PLAN

@@ -1,11 +1,11 @@
-"""What the page is told, in the contract's shape."""
+"""Messages to the page have the fields that it expects."""
 
 import json
 
 import pytest
 from dashboard_builders import fix, status, truth
 
-from skyless.dashboard.state import FORGET_S, MOST_NAMES, Board
+from skyless.dashboard.state import EXPIRY_S, MAX_NAMES, SiteState
 from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
@@ -13,77 +13,77 @@ ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y")
 FIELDS = (*POSITION, *ERRORS, "anchors_used", "chi2", "fix_unix_s", "hpl_m", "alert")
 
 
-def rows(board, since=0):
-    return [dict(zip(FIELDS, row, strict=True)) for row in json.loads(board.state_since(since))["tags"]]
+def rows(state, since=0):
+    return [dict(zip(FIELDS, row, strict=True)) for row in json.loads(state.state_since(since))["tags"]]
 
 
-def test_a_row_is_what_the_contract_says():
-    board = Board()
-    board.unix_s = 1000.0625
+def test_a_row_has_the_fields_in_order():
+    state = SiteState()
+    state.unix_s = 1000.0625
     covariance = (4e-4, 1e-4, 9.0, 1e-4, 2e-4, 9.0, 9.0, 9.0, 9.0)
-    board.fix(fix(position_m=(1.25, 2.5, 0.75), velocity_mps=(0.5, -0.25, 0.1), covariance_m2=covariance), 0.0)
-    message = json.loads(board.state_since(0))
+    state.add_fix(fix(position_m=(1.25, 2.5, 0.75), velocity_mps=(0.5, -0.25, 0.1), covariance_m2=covariance), 0.0)
+    message = json.loads(state.state_since(0))
     assert message["type"] == "state"
     assert message["unix_s"] == pytest.approx(1000.0625, abs=1e-3)
     expected = ("t1", 1.25, 2.5, 0.75, 0.5, -0.25, 4e-4, 1e-4, 2e-4, 0.01, None, None, None, 4, 2.5, 1000.0, None, None)
     assert message["tags"] == [list(expected)]
-    board.fix(fix(velocity_mps=None), 0.0)
-    assert rows(board)[0]["vx"] is None
+    state.add_fix(fix(velocity_mps=None), 0.0)
+    assert rows(state)[0]["vx"] is None
 
 
-def test_levels_and_alerts_are_told():
-    board = Board()
-    for alert, number in (("none", 0), ("detected-excluded", 1), ("unavailable", 3), (None, None), ("new", None)):
-        board.fix(fix(hpl_m=0.123456, alert=alert), 0.0)
-        assert (rows(board)[0]["hpl_m"], rows(board)[0]["alert"]) == (0.1235, number)
+def test_rows_hold_levels_and_alerts():
+    state = SiteState()
+    for alert in ("none", "detected-excluded", None):
+        state.add_fix(fix(hpl_m=0.123456, alert=alert), 0.0)
+        assert (rows(state)[0]["hpl_m"], rows(state)[0]["alert"]) == (0.1235, alert)
 
 
-def test_only_tags_with_a_newer_fix_are_told_and_only_their_last():
-    board = Board()
-    board.fix(fix("a"), 0.0)
-    board.fix(fix("b"), 0.0)
-    seen = board.serial
-    board.fix(fix("b", position_m=(5.0, 5.0, 1.0)), 0.1)
-    board.fix(fix("b", position_m=(6.0, 5.0, 1.0)), 0.2)
-    assert [(row["name"], row["x_m"]) for row in rows(board, seen)] == [("b", 6.0)]
-    assert {row["name"] for row in rows(board)} == {"a", "b"}
-    assert rows(board, board.serial) == []
+def test_only_tags_with_a_newer_fix_are_sent_and_only_their_last():
+    state = SiteState()
+    state.add_fix(fix("a"), 0.0)
+    state.add_fix(fix("b"), 0.0)
+    seen = state.serial
+    state.add_fix(fix("b", position_m=(5.0, 5.0, 1.0)), 0.1)
+    state.add_fix(fix("b", position_m=(6.0, 5.0, 1.0)), 0.2)
+    assert [(row["name"], row["x_m"]) for row in rows(state, seen)] == [("b", 6.0)]
+    assert {row["name"] for row in rows(state)} == {"a", "b"}
+    assert rows(state, state.serial) == []
 
 
-def test_all_who_ask_the_same_get_the_same_bytes():
-    board = Board()
-    board.fix(fix(), 0.0)
-    assert board.state_since(0) is board.state_since(0)
+def test_readers_at_the_same_serial_share_the_bytes():
+    state = SiteState()
+    state.add_fix(fix(), 0.0)
+    assert state.state_since(0) is state.state_since(0)
 
 
 def test_the_error_is_against_the_truth_moved_to_the_moment_of_the_fix():
-    board = Board()
-    board.truth(truth(unix_s=999.9, position_m=(0.0, 0.0, 1.0), velocity_mps=(2.0, 1.0, 0.0)))
-    board.truth(truth(unix_s=1000.05, position_m=(9.0, 9.0, 1.0), velocity_mps=(1.0, 0.0, 0.0)))
-    board.truth(truth(unix_s=1000.2, position_m=(50.0, 50.0, 1.0)))
-    board.fix(fix(unix_s=1000.0, position_m=(8.95, 9.04, 7.0)), 0.0)
-    row = rows(board)[0]
+    state = SiteState()
+    state.add_truth(truth(unix_s=999.9, position_m=(0.0, 0.0, 1.0), velocity_mps=(2.0, 1.0, 0.0)))
+    state.add_truth(truth(unix_s=1000.05, position_m=(9.0, 9.0, 1.0), velocity_mps=(1.0, 0.0, 0.0)))
+    state.add_truth(truth(unix_s=1000.2, position_m=(50.0, 50.0, 1.0)))
+    state.add_fix(fix(unix_s=1000.0, position_m=(8.95, 9.04, 7.0)), 0.0)
+    row = rows(state)[0]
     assert (row["true_x"], row["true_y"]) == (8.95, 9.0)
     assert row["error_m"] == pytest.approx(0.04)  # horizontal: the height was given
-    board.fix(fix(unix_s=1000.0, position_m=(8.95, 9.04, 1.03), height_known=False), 0.0)
-    assert rows(board)[0]["error_m"] == pytest.approx(0.05)
+    state.add_fix(fix(unix_s=1000.0, position_m=(8.95, 9.04, 1.03), height_known=False), 0.0)
+    assert rows(state)[0]["error_m"] == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("late_s", [0.3, -0.3, 100.0])
-def test_a_truth_of_another_time_judges_nothing(late_s):
-    board = Board()
-    board.truth(truth(unix_s=1000.0 + late_s))
-    board.fix(fix(unix_s=1000.0), 0.0)
-    assert rows(board)[0]["error_m"] is None
-    assert rows(board)[0]["true_x"] is None
+def test_a_truth_of_another_time_gives_no_error(late_s):
+    state = SiteState()
+    state.add_truth(truth(unix_s=1000.0 + late_s))
+    state.add_fix(fix(unix_s=1000.0), 0.0)
+    assert rows(state)[0]["error_m"] is None
+    assert rows(state)[0]["true_x"] is None
 
 
-def test_an_ether_that_was_started_anew_is_believed():
-    board = Board()
-    board.truth(truth(unix_s=5000.0))
-    board.truth(truth(unix_s=1000.0, position_m=(2.0, 2.0, 1.0)))
-    board.fix(fix(unix_s=1000.0), 0.0)
-    assert rows(board)[0]["error_m"] == 0.0
+def test_a_restarted_ether_is_accepted():
+    state = SiteState()
+    state.add_truth(truth(unix_s=5000.0))
+    state.add_truth(truth(unix_s=1000.0, position_m=(2.0, 2.0, 1.0)))
+    state.add_fix(fix(unix_s=1000.0), 0.0)
+    assert rows(state)[0]["error_m"] == 0.0
 
 
 def anchor_health(anchor):
@@ -93,8 +93,8 @@ def anchor_health(anchor):
 
 
 def test_health_holds_the_newest_of_every_node():
-    board = Board()
-    assert json.loads(board.health_message({})) == {
+    state = SiteState()
+    assert json.loads(state.health_message({})) == {
         "type": "health",
         "anchors": [],
         "tags": [],
@@ -102,27 +102,27 @@ def test_health_holds_the_newest_of_every_node():
         "nodes": [],
         "dropped": {},
     }
-    board.health("2", anchor_health(1), 0.0)
-    board.health("2", anchor_health(2), 1.0)
-    board.health("air", EtherHealth(0.0, 1.0, 5, 0, {}, {}, 0, 0), 1.0)
-    board.status(status())
-    board.status(status(online=False))
-    message = json.loads(board.health_message({"fix": 3}))
+    state.add_health("2", anchor_health(1), 0.0)
+    state.add_health("2", anchor_health(2), 1.0)
+    state.add_health("air", EtherHealth(0.0, 1.0, 5, 0, {}, {}, 0, 0), 1.0)
+    state.add_status(status())
+    state.add_status(status(online=False))
+    message = json.loads(state.health_message({"fix": 3}))
     assert [anchor["anchor"] for anchor in message["anchors"]] == [2]
     assert message["ether"]["transmissions"] == 5
     assert [(node["name"], node["online"]) for node in message["nodes"]] == [("t1", False)]
     assert message["dropped"] == {"fix": 3}
 
 
-def test_the_silent_are_forgotten_and_made_up_names_fill_no_memory():
-    board = Board()
-    board.fix(fix("old"), 0.0)
-    board.health("1", anchor_health(1), 0.0)
-    for k in range(MOST_NAMES + 50):
-        board.fix(fix(f"t{k}"), 1.0)
-        board.status(status(name=f"t{k}"))
-    assert len(rows(board)) == MOST_NAMES
-    assert len(board.statuses) == MOST_NAMES
-    board.forget(FORGET_S + 0.5)
-    assert "old" not in {row["name"] for row in rows(board)}
-    assert json.loads(board.health_message({}))["anchors"] == []
+def test_old_messages_expire_and_invented_names_do_not_fill_the_memory():
+    state = SiteState()
+    state.add_fix(fix("old"), 0.0)
+    state.add_health("1", anchor_health(1), 0.0)
+    for k in range(MAX_NAMES + 50):
+        state.add_fix(fix(f"t{k}"), 1.0)
+        state.add_status(status(name=f"t{k}"))
+    assert len(rows(state)) == MAX_NAMES
+    assert len(state.statuses) == MAX_NAMES
+    state.expire(EXPIRY_S + 0.5)
+    assert "old" not in {row["name"] for row in rows(state)}
+    assert json.loads(state.health_message({}))["anchors"] == []

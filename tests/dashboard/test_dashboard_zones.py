@@ -1,137 +1,147 @@
-"""Zones: what is refused, and who enters and leaves when."""
+"""Zones: which are refused, when tags enter and leave, and which dashboard publishes that."""
 
 import json
 
 import numpy as np
 import pytest
-from dashboard_builders import SQUARE, fix
+from dashboard_builders import SQUARE, fix, status
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.path import Path
 from msgspec.structs import replace
 
-from skyless.dashboard.zones import LEAST_MARGIN_M, SILENCE_S, STAY_S, BadZonesError, ZoneWatch, read_zones
-from skyless.mqtt.messages import Zone
+from skyless.dashboard.zones import (
+    CROSSING_S,
+    MIN_MARGIN_M,
+    TAG_TIMEOUT_S,
+    TAKEOVER_S,
+    BadZonesError,
+    EventQueue,
+    ZoneMonitor,
+    publisher_rank,
+    read_zones,
+)
+from skyless.mqtt.messages import Zone, ZoneEvent
 
 INSIDE, OUTSIDE = (2.0, 2.0, 1.0), (8.0, 2.0, 1.0)
 
 
-def watching(*zones):
-    watch = ZoneWatch()
-    watch.set_zones(zones or (SQUARE,), 0.0)
-    return watch
+def monitor_of(*zones):
+    monitor = ZoneMonitor()
+    monitor.set_zones(zones or (SQUARE,), 0.0)
+    return monitor
 
 
-def walk(watch, xs, begin_s=0.0, step_s=0.1, std_m=0.01):
+def walk(monitor, xs, begin_s=0.0, step_s=0.1, std_m=0.01):
     """Events of a tag that goes along y = 2."""
     events = []
     for k, x in enumerate(xs):
         at_s = begin_s + k * step_s
-        events += watch.observe(fix(unix_s=at_s, position_m=(float(x), 2.0, 1.0), std_m=std_m), at_s)
+        events += monitor.update(fix(unix_s=at_s, position_m=(float(x), 2.0, 1.0), std_m=std_m), at_s)
     return events
 
 
 def test_a_tag_that_walks_through_enters_once_and_leaves_once():
-    events = walk(watching(), np.arange(0.0, 5.0, 0.05))
+    events = walk(monitor_of(), np.arange(0.0, 5.0, 0.05))
     assert [(e.kind, e.zone, e.name, e.tag) for e in events] == [
         ("enter", "desk", "Desk", "t1"),
         ("leave", "desk", "Desk", "t1"),
     ]
     entered, left = events
-    assert 1.0 < entered.position_m[0] <= 1.0 + LEAST_MARGIN_M + 0.05
-    assert 3.0 < left.position_m[0] <= 3.0 + LEAST_MARGIN_M + 0.05
+    assert 1.0 < entered.position_m[0] <= 1.0 + MIN_MARGIN_M + 0.05
+    assert 3.0 < left.position_m[0] <= 3.0 + MIN_MARGIN_M + 0.05
 
 
 @given(st.lists(st.tuples(st.floats(-1.0, 5.0), st.floats(-1.0, 5.0)), max_size=40), st.floats(0.001, 2.0))
 def test_events_alternate_and_agree_with_where_the_tag_was(places, std_m):
-    """Against Matplotlib: who enters is inside, who leaves is outside, and never two of a kind in a row."""
-    watch = watching()
+    """Against Matplotlib: a tag that enters is inside, one that leaves is outside, and never two of a kind in a row."""
+    monitor = monitor_of()
     square = Path([*SQUARE.polygon_m, SQUARE.polygon_m[0]], closed=True)
     last = "leave"
     for k, (x, y) in enumerate(places):
-        for event in watch.observe(fix(unix_s=k * 0.1, position_m=(x, y, 1.0), std_m=std_m), k * 0.1):
+        for event in monitor.update(fix(unix_s=k * 0.1, position_m=(x, y, 1.0), std_m=std_m), k * 0.1):
             assert event.kind != last
             assert square.contains_point((x, y)) == (event.kind == "enter")
             last = event.kind
-    assert watch.inside("t1") == ({"desk"} if last == "enter" else set())
+    assert [event.kind for event in monitor.remove_tag("t1", 9.0)] == (["leave"] if last == "enter" else [])
 
 
 @given(st.lists(st.floats(-0.024, 0.024), min_size=2, max_size=60))
 def test_noise_smaller_than_half_of_the_margin_makes_no_event(noise):
     """On the edge, outside or inside before."""
-    assert walk(watching(), [1.0 + value for value in noise], std_m=0.01) == []
-    watch = watching()
-    walk(watch, [2.0])
-    assert walk(watch, [1.0 + value for value in noise], begin_s=1.0) == []
+    assert walk(monitor_of(), [1.0 + value for value in noise], std_m=0.01) == []
+    monitor = monitor_of()
+    walk(monitor, [2.0])
+    assert walk(monitor, [1.0 + value for value in noise], begin_s=1.0) == []
 
 
-def test_a_tag_at_rest_on_an_edge_hardly_flutters():
+def test_a_stationary_tag_on_an_edge_causes_few_events():
     """White noise of its own sigma, 10 fixes a second for 1000 s: a bare edge would be crossed 5000 times.
 
     An event needs three sigma at once (0.00135), or four fixes in a row beyond one and a half (0.0668 ** 4).
     """
     draws = np.random.default_rng(7).normal(0.0, 0.05, 10_000)
-    events = walk(watching(), 1.0 + draws, std_m=0.05 * 2**0.5)
+    events = walk(monitor_of(), 1.0 + draws, std_m=0.05 * 2**0.5)
     assert len(events) <= 25  # 10 000 · 0.00137 / 2 is 7 on the average
 
 
 def test_little_beyond_the_edge_counts_after_a_while():
-    watch = watching()
-    events = walk(watch, [0.5, *[1.0 + 0.6 * LEAST_MARGIN_M] * 10])
+    monitor = monitor_of()
+    events = walk(monitor, [0.5, *[1.0 + 0.6 * MIN_MARGIN_M] * 10])
     assert [event.kind for event in events] == ["enter"]
-    assert events[0].unix_s == pytest.approx(0.1 + STAY_S)
-    beyond = 3.0 + 0.6 * LEAST_MARGIN_M
-    assert walk(watch, [beyond, beyond, 2.9, beyond, beyond, beyond], begin_s=10.0) == []
-    assert [event.kind for event in walk(watch, [beyond] * 2, begin_s=10.6)] == ["leave"]
+    assert events[0].unix_s == pytest.approx(0.1 + CROSSING_S)
+    beyond = 3.0 + 0.6 * MIN_MARGIN_M
+    assert walk(monitor, [beyond, beyond, 2.9, beyond, beyond, beyond], begin_s=10.0) == []
+    assert [event.kind for event in walk(monitor, [beyond] * 2, begin_s=10.6)] == ["leave"]
 
 
 def test_a_zone_smaller_than_the_error_can_be_entered_and_left():
     tiny = Zone("tiny", "Tiny", ((1.98, 1.98), (2.02, 1.98), (2.02, 2.02), (1.98, 2.02)))
-    watch = watching(tiny)
-    assert [event.kind for event in walk(watch, [2.0], std_m=3.0)] == ["enter"]
-    assert [event.kind for event in walk(watch, [2.1], begin_s=1.0, std_m=3.0)] == ["leave"]
+    monitor = monitor_of(tiny)
+    assert [event.kind for event in walk(monitor, [2.0], std_m=3.0)] == ["enter"]
+    assert [event.kind for event in walk(monitor, [2.1], begin_s=1.0, std_m=3.0)] == ["leave"]
 
 
 def test_the_margin_is_of_the_worst_direction():
-    """The ellipse lies across the edge; its covariance says so only off the diagonal."""
-    watch = watching()
+    """The ellipse lies across the edge; its covariance shows that only off the diagonal."""
+    monitor = monitor_of()
     turned = (0.01, 0.0099, 0.0, 0.0099, 0.01, 0.0, 0.0, 0.0, 0.0)  # sigma of 0.14 m along the diagonal
     at = fix(position_m=(1.2, 2.0, 1.0), covariance_m2=turned)
-    assert watch.observe(at, 0.0) == []
-    assert len(watch.observe(replace(at, position_m=(1.5, 2.0, 1.0)), 0.1)) == 1
+    assert monitor.update(at, 0.0) == []
+    assert len(monitor.update(replace(at, position_m=(1.5, 2.0, 1.0)), 0.1)) == 1
 
 
-def test_a_silent_tag_leaves():
-    watch = watching()
-    walk(watch, [2.0])
-    assert watch.silent(SILENCE_S - 0.01, 50.0) == []
-    (event,) = watch.silent(SILENCE_S, 50.0)
+def test_a_tag_without_fixes_leaves():
+    monitor = monitor_of()
+    walk(monitor, [2.0])
+    assert monitor.expire_tags(TAG_TIMEOUT_S - 0.01, 50.0) == []
+    (event,) = monitor.expire_tags(TAG_TIMEOUT_S, 50.0)
     assert (event.kind, event.unix_s, event.position_m) == ("leave", 50.0, INSIDE)
-    assert watch.silent(SILENCE_S + 1.0, 51.0) == []
+    assert monitor.expire_tags(TAG_TIMEOUT_S + 1.0, 51.0) == []
 
 
 def test_a_tag_that_goes_offline_leaves_at_once():
-    watch = watching()
-    walk(watch, [2.0])
-    assert [event.kind for event in watch.gone("t1", 7.0)] == ["leave"]
-    assert watch.gone("t1", 8.0) == []
-    assert watch.gone("nobody", 8.0) == []
+    monitor = monitor_of()
+    walk(monitor, [2.0])
+    assert [event.kind for event in monitor.remove_tag("t1", 7.0)] == ["leave"]
+    assert monitor.remove_tag("t1", 8.0) == []
+    assert monitor.remove_tag("nobody", 8.0) == []
 
 
-def test_whoever_is_in_a_zone_that_is_deleted_leaves_it():
-    watch = watching()
-    walk(watch, [2.0])
+def test_tags_in_a_deleted_zone_leave_it():
+    monitor = monitor_of()
+    walk(monitor, [2.0])
     other = replace(SQUARE, id="other")
-    events = watch.set_zones((other,), 9.0)
+    events = monitor.set_zones((other,), 9.0)
     assert [(event.zone, event.kind) for event in events] == [("desk", "leave")]
-    assert [(event.zone, event.kind) for event in walk(watch, [2.0], begin_s=1.0)] == [("other", "enter")]
+    assert [(event.zone, event.kind) for event in walk(monitor, [2.0], begin_s=1.0)] == [("other", "enter")]
 
 
 def test_a_host_that_sets_its_clock_back_does_not_hold_a_tag_out():
-    watch = watching()
+    monitor = monitor_of()
     at = fix(position_m=(1.03, 2.0, 1.0), unix_s=1000.0)
-    watch.observe(at, 0.0)
-    events = [event for k in range(5) for event in watch.observe(replace(at, unix_s=10.0 + k * 0.1), k * 0.1)]
+    monitor.update(at, 0.0)
+    events = [event for k in range(5) for event in monitor.update(replace(at, unix_s=10.0 + k * 0.1), k * 0.1)]
     assert [event.kind for event in events] == ["enter"]
 
 
@@ -139,7 +149,7 @@ GOOD = {"id": "a", "name": "A", "polygon_m": [[0, 0], [1, 0], [1, 1]]}
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "expected"),
     [
         ({"polygon_m": [[0, 0], [1, 0]]}, "2 corners"),
         ({"polygon_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}, "crosses or touches itself"),
@@ -153,8 +163,8 @@ GOOD = {"id": "a", "name": "A", "polygon_m": [[0, 0], [1, 0], [1, 1]]}
         ({"polygon_m": [[0, 0], [1, "x"], [1, 1]]}, "no list of zones"),
     ],
 )
-def test_zones_that_cannot_be_are_refused_with_a_reason(change, said):
-    with pytest.raises(BadZonesError, match=said):
+def test_invalid_zones_are_refused_with_a_reason(change, expected):
+    with pytest.raises(BadZonesError, match=expected):
         read_zones(json.dumps({"zones": [GOOD | change]}).encode())
 
 
@@ -171,7 +181,7 @@ def test_zones_that_cannot_be_are_refused_with_a_reason(change, said):
         b"[" * 100_000,
     ],
 )
-def test_what_is_no_list_of_zones_is_refused(payload):
+def test_anything_but_a_list_of_zones_is_refused(payload):
     with pytest.raises(BadZonesError):
         read_zones(payload)
 
@@ -182,3 +192,50 @@ def test_ids_are_unique_and_zones_not_too_many():
     with pytest.raises(BadZonesError, match="101 zones"):
         read_zones(json.dumps({"zones": [GOOD | {"id": str(k)} for k in range(101)]}).encode())
     assert read_zones(json.dumps({"zones": [GOOD, GOOD | {"id": "b"}]}).encode())[1].id == "b"
+
+
+EVENT = ZoneEvent("desk", "Desk", "t1", "enter", 1000.0, (1.0, 2.0, 3.0))
+
+
+def test_the_dashboard_that_is_online_longest_publishes_first():
+    dashboards = [
+        status("dashboard", "dead", online=False, unix_s=1.0),
+        status("dashboard", "young", unix_s=9.0),
+        status("dashboard", "old", unix_s=5.0),
+    ]
+    assert publisher_rank("old", dashboards) == 0
+    assert publisher_rank("young", dashboards) == 1
+    assert publisher_rank("unknown", dashboards) == 0
+    assert publisher_rank("alone", []) == 0
+
+
+def test_the_first_publishes_at_once_and_ignores_its_echo():
+    queue = EventQueue()
+    queue.schedule([EVENT], 0, 10.0)
+    assert queue.pop_due(10.0) == [EVENT]
+    assert queue.pop_due(11.0) == []
+    assert not queue.add_published(EVENT)
+    assert list(queue.recent) == [EVENT]
+
+
+def test_the_second_publishes_nothing_when_the_first_has():
+    queue = EventQueue()
+    queue.schedule([EVENT], 1, 10.0)
+    assert queue.pop_due(10.0 + 0.9 * TAKEOVER_S) == []
+    others = replace(EVENT, unix_s=1000.1)
+    assert queue.add_published(others)
+    assert queue.pop_due(100.0) == []
+    assert list(queue.recent) == [others]
+
+
+def test_the_second_publishes_when_the_first_does_not():
+    queue = EventQueue()
+    queue.schedule([EVENT, replace(EVENT, tag="t2")], 1, 10.0)
+    assert queue.add_published(replace(EVENT, kind="leave"))
+    assert queue.pop_due(10.0 + TAKEOVER_S) == [EVENT, replace(EVENT, tag="t2")]
+
+
+def test_the_same_event_twice_counts_once():
+    queue = EventQueue()
+    assert queue.add_published(EVENT)
+    assert not queue.add_published(EVENT)

@@ -27,7 +27,7 @@ def test_positions_between_fixes_lie_on_straight_lines(page):
     )
     expected = np.interp(asked, times, times**2)
     silent = (np.array(asked) > times[4]) & (np.array(asked) < times[5])
-    expected[silent] = times[4] ** 2  # nothing is made up over a silence
+    expected[silent] = times[4] ** 2  # nothing is interpolated over a gap
     np.testing.assert_allclose([x for x, _ in got], expected, atol=1e-12)
 
 
@@ -58,15 +58,15 @@ def test_ellipses_have_the_axes_of_the_covariance(page):
         np.testing.assert_allclose(turn @ np.diag([major**2, minor**2]) @ turn.T, covariance, atol=1e-9)
 
 
-def test_offsets_are_followed_over_the_wrap_of_the_counter(page):
+def test_offsets_continue_over_the_wrap_of_the_counter(page):
     wrap_s = 2**40 / 63.8976e9
     given = [(n + 1.0, ((8.602 + 3e-6 * n + wrap_s / 2) % wrap_s) - wrap_s / 2) for n in range(1500)]
     got = page.evaluate(
         """async (given) => {
-          const { remember, anchors } = await import("/page/history.js");
+          const { addHealth, anchorHistory } = await import("/page/history.js");
           const more = { rate_ppm: 3, offset_std_m: 0.01 };
-          for (const [unix_s, offset_s] of given) remember([{ anchor: 99, unix_s, offset_s, ...more }], []);
-          return anchors.get(99).offset_us;
+          for (const [unix_s, offset_s] of given) addHealth([{ anchor: 99, unix_s, offset_s, ...more }], []);
+          return anchorHistory.get(99).offset_us;
         }""",
         given,
     )

@@ -91,8 +91,8 @@ def test_less_motion_means_no_interpolation_and_no_transitions(server, visit):
     page = visit(server, reduced_motion="reduce").page
     until(page, "skyless.live.all.get('robot')?.count > 3")
     same = page.evaluate("""async () => {
-      const { drawn, look } = await import("/page/map/tags.js");
-      return look().seen.every(({ track, row }) => row[0] === track.value(track.find(row[14]), 0));
+      const { visibleTags } = await import("/page/map/tags.js");
+      return visibleTags().seen.every(({ track, row }) => row[0] === track.value(track.find(row[14]), 0));
     }""")
     assert same
     assert page.evaluate("getComputedStyle(document.getElementById('draw')).transitionDuration") == "0s"

@@ -1,4 +1,4 @@
-"""A recording is replayed: what the slider says is what the map shows."""
+"""A recording is replayed: the map shows the time of the slider."""
 
 import page_fake_site as made_up
 import pytest

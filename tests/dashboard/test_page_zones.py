@@ -1,4 +1,4 @@
-"""Zones are drawn with mouse, finger and keyboard, named, moved, deleted; events are told."""
+"""Zones are drawn with mouse, finger and keyboard, named, moved, deleted; events are listed."""
 
 import time
 
@@ -68,7 +68,7 @@ def test_a_zone_is_drawn_with_a_finger(serve, visit):
     near(wait_for_put(server)[1]["polygon_m"], corners)
 
 
-def test_escape_gives_a_drawing_up(hall):
+def test_escape_cancels_a_drawing(hall):
     server, visit = hall
     visit.page.click("#draw")
     visit.page.mouse.click(*visit.at(3, 3))
@@ -124,6 +124,6 @@ def test_events_are_listed_the_newest_first(hall):
     server.send({**event, "kind": "enter", "unix_s": 1_780_000_000.0})
     server.send({**event, "kind": "leave", "unix_s": 1_780_000_009.0})
     until(visit.page, "document.querySelectorAll('#events li').length === 2")
-    told = visit.page.locator("#events li").all_inner_texts()
-    assert "left Dock" in told[0]
-    assert "entered Dock" in told[1]
+    lines = visit.page.locator("#events li").all_inner_texts()
+    assert "left Dock" in lines[0]
+    assert "entered Dock" in lines[1]

@@ -13,8 +13,8 @@ from skyless.cli.nodes.options import DEFAULT_MQTT, Mqtt, MqttCa, listen_address
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.dashboard.guard import Rules
-    from skyless.dashboard.serve import Listen
+    from skyless.dashboard.guard import AccessRules
+    from skyless.dashboard.serve import ListenAddress
     from skyless.mqtt.messages import SiteMessage
 
 _SHORTEST_TOKEN = 12
@@ -60,8 +60,8 @@ def dashboard(
     """
     import asyncio
 
-    from skyless.dashboard.app import Parts
-    from skyless.dashboard.live import Live
+    from skyless.dashboard.app import Services
+    from skyless.dashboard.live import LiveSite
     from skyless.dashboard.overlays import Overlays
     from skyless.dashboard.playback import Playback
     from skyless.dashboard.serve import bind, serve
@@ -78,7 +78,7 @@ def dashboard(
     sock = bind(place)
     port = sock.getsockname()[1]
     rules = _rules(sock.getsockname()[0], place.host, port, token)
-    live = Live(_name(port), str(broker), known)
+    live = LiveSite(_name(port), str(broker), known)
     live.floor_plan = image
     page = _address(place.host, port, rules)
     if json:
@@ -86,9 +86,9 @@ def dashboard(
         sys.stdout.flush()
     else:
         print(f"page    {page}\nbroker  {broker}", flush=True)
-    parts = Parts(live, Overlays(), Playback(recordings))
+    services = Services(live, Overlays(), Playback(recordings))
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(serve(parts, rules, sock, broker, known.site.id if known is not None else site_id))
+        asyncio.run(serve(services, rules, sock, broker, known.site.id if known is not None else site_id))
 
 
 def _name(port: int) -> str:
@@ -110,34 +110,34 @@ def _load(name: str) -> "tuple[SiteMessage, bytes | None]":
     return SiteMessage(site, simulated=False, unix_s=time.time()), image
 
 
-def _place(listen: str | None) -> "Listen":
+def _place(listen: str | None) -> "ListenAddress":
     """Where to listen. Raises SkylessError."""
-    from skyless.dashboard.serve import PORT, Listen
+    from skyless.dashboard.serve import PORT, ListenAddress
 
     if listen is None:
-        return Listen("127.0.0.1", None)
-    return Listen(*listen_address(listen, PORT))
+        return ListenAddress("127.0.0.1", None)
+    return ListenAddress(*listen_address(listen, PORT))
 
 
-def _rules(bound: str, host: str, port: int, token: str | None) -> "Rules":
+def _rules(bound: str, host: str, port: int, token: str | None) -> "AccessRules":
     """Who may come, by the address that the socket is bound to. Raises SkylessError."""
     import ipaddress
     import secrets
     import socket
 
-    from skyless.dashboard.guard import Rules
+    from skyless.dashboard.guard import AccessRules
 
     if token is not None and len(token) < _SHORTEST_TOKEN:
         raise SkylessError(f"--token has {len(token)} characters; it should have {_SHORTEST_TOKEN} or more")
     cookie = f"skyless-{port}"
     if ipaddress.ip_address(bound.partition("%")[0]).is_loopback:
-        return Rules(token, cookie=cookie)
+        return AccessRules(token, cookie=cookie)
     own = socket.gethostname().lower()
     names = {host.lower(), own, own.partition(".")[0], f"{own.partition('.')[0]}.local", socket.getfqdn().lower()}
-    return Rules(token or secrets.token_urlsafe(18), frozenset(names), elsewhere=True, cookie=cookie)
+    return AccessRules(token or secrets.token_urlsafe(18), frozenset(names), remote=True, cookie=cookie)
 
 
-def _address(host: str, port: int, rules: "Rules") -> str:
+def _address(host: str, port: int, rules: "AccessRules") -> str:
     """The page's address, as others reach it, with its token."""
     from urllib.parse import quote
 

@@ -2,7 +2,7 @@
 
 import asyncio
 import mimetypes
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -17,36 +17,45 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from skyless.dashboard.guard import Guard, Rules
-from skyless.dashboard.live import Live
+from skyless.dashboard.guard import AccessRules, Guard
+from skyless.dashboard.live import LiveSite
 from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.dashboard.zones import BadZonesError, read_zones
 
-PAGE: Final = Path(__file__).parent / "page"
-MOST_PAGES: Final = 50
-DEAD_S: Final = 10.0
-"""A page that takes nothing for so long is given up."""
+_PAGE: Final = Path(__file__).parent / "page"
+MAX_PAGES: Final = 50
+PAGE_TIMEOUT_S: Final = 10.0
+"""A page that accepts no message for this long is disconnected."""
 
-MOST_STATES_S: Final = 60.01
-_LARGEST_BODY: Final = 1_000_000
+_MAX_STATES_S: Final = 60.01
+_MAX_BODY_BYTES: Final = 1_000_000
 _TRY_LATER: Final = 1013
+_GOING_AWAY: Final = 1001
+_STATUSES: Final[dict[type[Exception], int]] = {BadZonesError: 400, NoRecordingError: 404, NoOverlayError: 422}
 
 
-class Parts(Struct, frozen=True):
+class Services(Struct, frozen=True):
     """What the server serves."""
 
-    live: Live
+    live: LiveSite
     overlays: Overlays
     playback: Playback
 
 
-def make_app(parts: Parts, rules: Rules, page: Path = PAGE) -> Starlette:
+def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Starlette:
     """The server's application."""
-    mimetypes.add_type("text/javascript", ".js")  # systems may know better, and then no module loads
+    mimetypes.add_type("text/javascript", ".js")  # some systems map it otherwise, and browsers refuse the modules
     mimetypes.add_type("text/javascript", ".mjs")
+
+    async def index(_request: Request) -> Response:
+        path = page / "index.html"
+        if not path.is_file():
+            raise HTTPException(404, "this installation has no page")
+        return FileResponse(path, headers={"Cache-Control": "no-cache"})
+
     routes = [
-        Route("/", _file(page / "index.html")),
+        Route("/", index),
         Route("/api/floor_plan", _floor_plan),
         Route("/api/overlay", _overlay),
         Route("/api/zones", _put_zones, methods=["PUT"]),
@@ -60,14 +69,14 @@ def make_app(parts: Parts, rules: Rules, page: Path = PAGE) -> Starlette:
     app = Starlette(
         routes=routes,
         middleware=[Middleware(Guard, rules=rules)],
-        exception_handlers={HTTPException: _http_error},
+        exception_handlers={HTTPException: _http_error} | dict.fromkeys(_STATUSES, _service_error),
     )
-    app.state.parts = parts
+    app.state.services = services
     return app
 
 
 class _Files(StaticFiles):
-    """Browsers ask each time whether a file has changed."""
+    """Files that browsers check for changes each time."""
 
     def file_response(self, *args: object, **kwargs: object) -> Response:
         response = super().file_response(*args, **kwargs)  # type: ignore[arg-type]
@@ -75,63 +84,52 @@ class _Files(StaticFiles):
         return response
 
 
-def _file(path: Path) -> Callable[[Request], Awaitable[Response]]:
-    async def answer(_request: Request) -> Response:
-        if not path.is_file():
-            return _error(404, "this installation has no page")
-        return FileResponse(path, headers={"Cache-Control": "no-cache"})
-
-    return answer
-
-
-def _error(status: int, text: str) -> Response:
-    return JSONResponse({"error": text}, status_code=status)
-
-
 async def _http_error(_request: Request, error: Exception) -> Response:
     status = error.status_code if isinstance(error, HTTPException) else 500
-    return _error(status, error.detail if isinstance(error, HTTPException) else "something went wrong")
+    detail = error.detail if isinstance(error, HTTPException) else "internal error"
+    return JSONResponse({"error": detail}, status_code=status)
+
+
+async def _service_error(_request: Request, error: Exception) -> Response:
+    return JSONResponse({"error": str(error)}, status_code=_STATUSES[type(error)])
 
 
 def _json(value: object) -> Response:
     return Response(msgspec.json.encode(value), media_type="application/json")
 
 
-def _parts(request: Request | WebSocket) -> Parts:
-    parts: Parts = request.app.state.parts
-    return parts
+def _services(request: Request | WebSocket) -> Services:
+    services: Services = request.app.state.services
+    return services
 
 
 async def _floor_plan(request: Request) -> Response:
-    return _image(_parts(request).live.floor_plan)
+    return _image(_services(request).live.floor_plan)
 
 
 def _image(image: bytes | None) -> Response:
-    kind = image_type(image) if image is not None else None
+    kind = _image_type(image) if image is not None else None
     if image is None or kind is None:
-        return _error(404, "no floor plan is known")
+        raise HTTPException(404, "no floor plan is known")
     return Response(image, media_type=kind)
 
 
-def image_type(image: bytes) -> str | None:
-    """Media type of a PNG or JPEG; None for anything else, which browsers shall not see."""
+def _image_type(image: bytes) -> str | None:
+    """Media type of a PNG or JPEG; None for anything else, which is not served."""
     if image.startswith(b"\x89PNG\r\n\x1a\n"):
         return "image/png"
     return "image/jpeg" if image.startswith(b"\xff\xd8\xff") else None
 
 
 async def _overlay(request: Request) -> Response:
-    overlays, live = _parts(request).overlays, _parts(request).live
+    overlays, live = _services(request).overlays, _services(request).live
     kind = request.query_params.get("kind", "pdop")
     if kind not in KINDS:
-        return _error(400, f"kind is {kind!r}; it should be one of {', '.join(KINDS)}")
+        raise HTTPException(400, f"kind is {kind!r}; it should be one of {', '.join(KINDS)}")
     step_m = _number(request, "step_m", 0.25, 0.01, 100.0)
     if live.site is None:
-        return _error(404, "no site is known yet")
-    try:
-        return _json(await overlays.get(live.site.site, live.floor_plan, live.board.methods(), kind, step_m))
-    except NoOverlayError as error:
-        return _error(422, str(error))
+        raise HTTPException(404, "no site is known yet")
+    return _json(await overlays.get(live.site.site, live.floor_plan, live.state.methods(), kind, step_m))
 
 
 def _number(request: Request, name: str, default: float, least: float, most: float) -> float:
@@ -149,75 +147,63 @@ async def _put_zones(request: Request) -> Response:
     body = b""
     async for chunk in request.stream():
         body += chunk
-        if len(body) > _LARGEST_BODY:
-            return _error(413, "these are too many zones")
-    live = _parts(request).live
-    try:
-        live.draw_zones(read_zones(body))
-    except BadZonesError as error:
-        return _error(400, str(error))
-    return _json({"zones": live.watch.zones})
+        if len(body) > _MAX_BODY_BYTES:
+            raise HTTPException(413, "too many zones")
+    live = _services(request).live
+    live.store_zones(read_zones(body))
+    return _json({"zones": live.monitor.zones})
 
 
 async def _recordings(request: Request) -> Response:
-    return _json(await asyncio.to_thread(_parts(request).playback.recordings))
+    return _json(await asyncio.to_thread(_services(request).playback.recordings))
 
 
 async def _recording(request: Request) -> Response:
-    try:
-        return _json(await asyncio.to_thread(_parts(request).playback.summary, request.path_params["name"]))
-    except NoRecordingError as error:
-        return _error(404, str(error))
+    return _json(await asyncio.to_thread(_services(request).playback.summary, request.path_params["name"]))
 
 
 async def _recorded_floor_plan(request: Request) -> Response:
-    try:
-        return _image(await asyncio.to_thread(_parts(request).playback.floor_plan, request.path_params["name"]))
-    except NoRecordingError as error:
-        return _error(404, str(error))
+    return _image(await asyncio.to_thread(_services(request).playback.floor_plan, request.path_params["name"]))
 
 
 async def _recorded_states(request: Request) -> Response:
     begin_s = _number(request, "from_s", 0.0, 0.0, 1e9)
     end_s = _number(request, "to_s", begin_s + 10.0, 0.0, 1e9)
     rate_hz = _number(request, "rate_hz", 20.0, 0.1, 100.0)
-    if not begin_s <= end_s <= begin_s + MOST_STATES_S:
-        return _error(400, f"to_s is {end_s:g}; it should be at most 60 s after from_s, which is {begin_s:g}")
-    playback, name = _parts(request).playback, request.path_params["name"]
-    try:
-        states = await asyncio.to_thread(playback.states, name, begin_s, end_s, rate_hz)
-    except NoRecordingError as error:
-        return _error(404, str(error))
+    if not begin_s <= end_s <= begin_s + _MAX_STATES_S:
+        raise HTTPException(400, f"to_s is {end_s:g}; it should be at most 60 s after from_s, which is {begin_s:g}")
+    playback, name = _services(request).playback, request.path_params["name"]
+    states = await asyncio.to_thread(playback.states, name, begin_s, end_s, rate_hz)
     return Response(b'{"states":[' + b",".join(states) + b"]}", media_type="application/json")
 
 
 async def _live(socket: WebSocket) -> None:
-    live = _parts(socket).live
-    if len(live.pages) >= MOST_PAGES:
+    live = _services(socket).live
+    if len(live.pages) >= MAX_PAGES:
         await socket.close(_TRY_LATER, "too many pages are open")
         return
     await socket.accept()
-    page = live.join()
-    reading = asyncio.create_task(_read(socket, page.close, lambda: page.put("pong", b'{"type":"pong"}')))
+    page = live.open_page()
+    reading = asyncio.create_task(_read(socket, page.close, lambda: page.replace("pong", b'{"type":"pong"}')))
     try:
         while not page.closed:
-            messages = await page.take(live.board)
-            async with asyncio.timeout(DEAD_S):
+            messages = await page.drain(live.state)
+            async with asyncio.timeout(PAGE_TIMEOUT_S):
                 for message in messages:
                     await socket.send_text(message)
-        await socket.close(1001)
+        await socket.close(_GOING_AWAY)
     except (WebSocketDisconnect, RuntimeError, TimeoutError):
-        pass  # the page went away meanwhile, or is dead
+        pass  # the page was closed meanwhile, or does not respond
     finally:
-        live.leave(page)
+        live.pages.discard(page)
         reading.cancel()
 
 
-async def _read(socket: WebSocket, closed: Callable[[], None], pong: Callable[[], None]) -> None:
-    """Answer pings until the page goes."""
+async def _read(socket: WebSocket, close: Callable[[], None], pong: Callable[[], None]) -> None:
+    """Answer pings until the page closes."""
     try:
         while True:
             if await socket.receive_text() == "ping":
                 pong()
     except (WebSocketDisconnect, KeyError, RuntimeError):
-        closed()
+        close()

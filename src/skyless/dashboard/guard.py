@@ -1,4 +1,4 @@
-"""Who may talk to the dashboard: no other site's pages, and from elsewhere nobody without the token."""
+"""Access control: requests of other sites' pages are refused, and those of other machines need the token."""
 
 import hmac
 import ipaddress
@@ -28,15 +28,15 @@ _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::\d{1,5})?")
 _POLICY_VIOLATION: Final = 1008
 
 
-class Rules(Struct, frozen=True):
-    """What the guard asks for."""
+class AccessRules(Struct, frozen=True):
+    """What the guard checks."""
 
     token: str | None = None
-    """Whoever knows it may in; None where only this machine's own programs can come at all."""
+    """What requests must carry; None where only programs of this machine can reach the server."""
     names: frozenset[str] = frozenset()
-    """Host names, in lower case, under which the page may be called besides ``localhost``."""
-    elsewhere: bool = False
-    """Whether it listens to other machines: then any address of its own may be called, too."""
+    """Valid host names, in lower case, besides ``localhost``."""
+    remote: bool = False
+    """Whether other machines can reach the server: then any IP address is a valid host."""
     cookie: str = "skyless"
     """Name of the cookie: browsers keep one for all ports of a machine."""
 
@@ -44,15 +44,15 @@ class Rules(Struct, frozen=True):
 class Guard:
     """ASGI middleware: checks Host, Origin and token of every request and WebSocket, and adds security headers.
 
-    A page of another site that has rebound its own name to this address sends that name as Host, and is turned away.
+    DNS rebinding: a page of another site that points its own name to this address sends that name as Host: refused.
     """
 
-    def __init__(self, app: ASGIApp, rules: Rules) -> None:
+    def __init__(self, app: ASGIApp, rules: AccessRules) -> None:
         self._app, self._rules = app, rules
         self._secret = sha256(rules.token.encode()).hexdigest() if rules.token is not None else None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer for the application, or turn the request away."""
+        """Pass the request to the application, or refuse it."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -69,16 +69,16 @@ class Guard:
     def _fault(self, scope: MutableMapping[str, Any], headers: Headers) -> tuple[int, str] | None:
         hosts = headers.getlist("host")
         host = hosts[0].lower() if len(hosts) == 1 else ""
-        if not self._is_own(host):
-            return 421, "this server goes by another name: use the address that it has printed"
+        if not self._is_own_host(host):
+            return 421, "unknown host name: open the address that the dashboard has printed"
         origin = headers.get("origin")
         if origin is not None and not _same_origin(origin, host):
-            return 403, "pages of other sites may not come here"
-        if self._secret is not None and not self._knows_token(scope, headers, self._secret):
+            return 403, "requests of other sites are refused"
+        if self._secret is not None and not self._has_token(scope, headers, self._secret):
             return 401, "the token is missing or wrong: open the address that the dashboard has printed"
         return None
 
-    def _is_own(self, host: str) -> bool:
+    def _is_own_host(self, host: str) -> bool:
         match = _HOST.fullmatch(host)
         if match is None:
             return False
@@ -89,9 +89,9 @@ class Guard:
             address = ipaddress.ip_address(name)
         except ValueError:
             return False
-        return self._rules.elsewhere or address.is_loopback
+        return self._rules.remote or address.is_loopback
 
-    def _knows_token(self, scope: MutableMapping[str, Any], headers: Headers, secret: str) -> bool:
+    def _has_token(self, scope: MutableMapping[str, Any], headers: Headers, secret: str) -> bool:
         digests = [sha256(token.encode()).hexdigest() for token in _tokens(scope, headers)]
         digests += _cookies(headers, self._rules.cookie)
         return any(hmac.compare_digest(digest.encode(), secret.encode()) for digest in digests)
@@ -120,7 +120,7 @@ def _same_origin(origin: str, host: str) -> bool:
 
 
 def _tokens(scope: MutableMapping[str, Any], headers: Headers) -> list[str]:
-    """Tokens in the address or as a bearer's."""
+    """Tokens in the query or as a bearer token."""
     query = scope["query_string"].decode("latin-1")
     kind, _, bearer = headers.get("authorization", "").partition(" ")
     try:

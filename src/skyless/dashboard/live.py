@@ -1,22 +1,30 @@
-"""From MQTT to the pages: every message finds its place, and every page hears what is new, twenty times a second."""
+"""The live site: messages from MQTT update its state and its zones; open pages are sent what is new, 20 times a second.
+
+Everything here belongs to one event loop.
+"""
 
 import asyncio
 import logging
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol, TypeVar
 
 import msgspec
 from msgspec import Struct
 
 import skyless
-from skyless.dashboard.incoming import Bus, WrongMessageError, expect_name, read_message
-from skyless.dashboard.mailbox import Mailbox
-from skyless.dashboard.state import Board, encode
-from skyless.dashboard.zone_events import EventDesk, place_in_line
-from skyless.dashboard.zones import BadZonesError, ZoneWatch, check_zones, read_zones
+from skyless.dashboard.state import SiteState, encode
+from skyless.dashboard.zones import (
+    MAX_EVENTS,
+    BadZonesError,
+    EventQueue,
+    ZoneMonitor,
+    check_zones,
+    publisher_rank,
+    read_zones,
+)
 from skyless.errors import ConfigurationError
 from skyless.mqtt import topics
 from skyless.mqtt.messages import (
@@ -33,15 +41,79 @@ from skyless.mqtt.messages import (
 )
 from skyless.site.check import check_site
 
-TICK_S: Final = 0.05
-HEALTH_S: Final = 1.0
+_STATE_PERIOD_S: Final = 0.05
+_HEALTH_PERIOD_S: Final = 1.0
 
 _HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
+_T = TypeVar("_T")
 _log = logging.getLogger("skyless.dashboard")
 
 
-class Live:
-    """The live site: what is known of it, its zones, and the pages that watch. All of it belongs to one event loop."""
+class MqttLink(Protocol):
+    """The part of ``skyless.mqtt.link.Link`` that is used."""
+
+    def publish(self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False) -> None:
+        """Queue a message; returns at once."""
+
+    def subscribe(self, topic_filter: str, handler: Callable[[str, bytes], None], qos: int = 0) -> None:
+        """Call ``handler`` with topic and payload of every message."""
+
+    def forget(self, topic: str) -> None:
+        """Stop repeating a retained message."""
+
+
+class WrongMessageError(ValueError):
+    """A message that does not fit its topic."""
+
+
+class PageQueue:
+    """Messages that wait for one page: the newest of each kind, so that a slow page's queue stays short."""
+
+    def __init__(self, hello: bytes) -> None:
+        self.closed = False
+        self._latest: dict[str, bytes] = {"hello": hello}
+        self._events: deque[bytes] = deque(maxlen=MAX_EVENTS)
+        self._sent_serial = 0
+        self._state_due = True
+        self._wake = asyncio.Event()
+        self._wake.set()
+
+    def replace(self, kind: str, message: bytes) -> None:
+        """Add a message; it replaces one of its kind that still waits."""
+        self._latest[kind] = message
+        self._wake.set()
+
+    def add_event(self, message: bytes) -> None:
+        """Add a message that replaces no other; the oldest is dropped beyond ``MAX_EVENTS``."""
+        self._events.append(message)
+        self._wake.set()
+
+    def request_state(self) -> None:
+        """Send the state with the next messages if there is anything new."""
+        self._state_due = True
+        self._wake.set()
+
+    def close(self) -> None:
+        """End the page's connection."""
+        self.closed = True
+        self._wake.set()
+
+    async def drain(self, state: SiteState) -> list[str]:
+        """Wait for messages and return them all, in the order in which the page needs them."""
+        await self._wake.wait()
+        self._wake.clear()
+        messages = [*self._latest.values(), *self._events]
+        self._latest.clear()
+        self._events.clear()
+        if self._state_due and state.serial > self._sent_serial:
+            messages.append(state.state_since(self._sent_serial))
+            self._sent_serial = state.serial
+        self._state_due = False
+        return [message.decode() for message in messages]
+
+
+class LiveSite:
+    """The live site: its state, its zones, and the pages that are open."""
 
     def __init__(
         self,
@@ -56,195 +128,202 @@ class Live:
         self.site = site
         self.floor_plan: bytes | None = None
         self.connected = False
-        self.board = Board()
-        self.watch = ZoneWatch()
-        self.desk = EventDesk()
-        self.pages: set[Mailbox] = set()
-        self.wrong: Counter[str] = Counter()
-        """Messages that were dropped, by kind."""
+        self.state = SiteState()
+        self.monitor = ZoneMonitor()
+        self.events = EventQueue()
+        self.pages: set[PageQueue] = set()
+        self.dropped: Counter[str] = Counter()
+        """Wrong messages by kind."""
         self._clock, self._wall_clock = clock, wall_clock
-        self._bus: Bus | None = None
+        self._link: MqttLink | None = None
         self._site_id: int | None = None
         self._drawn: ZonesMessage | None = None
-        """Zones drawn here that have not come back from the broker."""
-        self._told_serial = 0
+        """Zones stored here that have not come back from the broker."""
+        self._sent_serial = 0
         self._health_due_s = 0.0
 
     # MQTT
 
-    def attach(self, bus: Bus, site_id: int) -> None:
-        """Listen to a site from now on."""
-        self._bus, self._site_id = bus, site_id
+    def attach(self, link: MqttLink, site_id: int) -> None:
+        """Subscribe to a site's topics."""
+        self._link, self._site_id = link, site_id
         handlers: dict[str, Callable[[str, bytes], None]] = {
-            topics.site_topic(site_id): self._take_site,
-            topics.floor_plan_topic(site_id): self._take_floor_plan,
-            topics.fix_topic(site_id, "+"): self._take_fix,
-            topics.status_topic(site_id, "+", "+"): self._take_status,
-            topics.health_topic(site_id, "+", "+"): self._take_health,
-            topics.truth_topic(site_id): self._take_truth,
-            topics.zones_topic(site_id): self._take_zones,
-            topics.zone_event_topic(site_id, "+"): self._take_zone_event,
+            topics.site_topic(site_id): self._on_site,
+            topics.floor_plan_topic(site_id): self._on_floor_plan,
+            topics.fix_topic(site_id, "+"): self._on_fix,
+            topics.status_topic(site_id, "+", "+"): self._on_status,
+            topics.health_topic(site_id, "+", "+"): self._on_health,
+            topics.truth_topic(site_id): self._on_truth,
+            topics.zones_topic(site_id): self._on_zones,
+            topics.zone_event_topic(site_id, "+"): self._on_zone_event,
         }
         for topic, handler in handlers.items():
-            bus.subscribe(topic, self._counting(topic.rsplit("/", 1)[-1], handler), 1 if "zone" in topic else 0)
+            link.subscribe(topic, self._counting(topic.rsplit("/", 1)[-1], handler), 1 if "zone" in topic else 0)
         if self._drawn is not None:
-            bus.publish(topics.zones_topic(site_id), self._drawn, qos=1, retain=True)
+            link.publish(topics.zones_topic(site_id), self._drawn, qos=1, retain=True)
 
-    def connection(self, connected: bool) -> None:
-        """Take whether the broker is there."""
+    def on_connection(self, connected: bool) -> None:
+        """Update whether the broker is connected."""
         if connected != self.connected:
             self.connected = connected
-            self._tell("mqtt", self._connection())
+            self._broadcast("mqtt", self._connection())
 
     def _counting(self, kind: str, handler: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
         def handle(topic: str, payload: bytes) -> None:
             try:
                 handler(topic, payload)
             except (WrongMessageError, BadZonesError, ConfigurationError) as error:
-                self.wrong[kind] += 1
-                if self.wrong[kind] == 1:
+                self.dropped[kind] += 1
+                if self.dropped[kind] == 1:
                     _log.warning("dropped a wrong message of %s: %s; there may be more", topic, error)
 
         return handle
 
-    def _take_site(self, _topic: str, payload: bytes) -> None:
-        message = read_message(payload, SiteMessage)
+    def _on_site(self, _topic: str, payload: bytes) -> None:
+        message = _decode(payload, SiteMessage)
         check_site(message.site, Path("the site on MQTT"))
         if message.site.id != self._site_id:
             raise WrongMessageError(f"it is of site {message.site.id}")
         self.site = message
-        self._tell("site", encode("site", {"site": message}))
+        self._broadcast("site", encode("site", {"site": message}))
 
-    def _take_floor_plan(self, _topic: str, payload: bytes) -> None:
+    def _on_floor_plan(self, _topic: str, payload: bytes) -> None:
         self.floor_plan = payload or None
 
-    def _take_fix(self, topic: str, payload: bytes) -> None:
-        fix = read_message(payload, FixMessage)
-        expect_name(fix.tag, topic)
+    def _on_fix(self, topic: str, payload: bytes) -> None:
+        fix = _decode(payload, FixMessage)
+        _check_name(fix.tag, topic)
         now_s = self._clock()
-        self.board.fix(fix, now_s)
-        self._hold(self.watch.observe(fix, now_s))
+        self.state.add_fix(fix, now_s)
+        self._schedule(self.monitor.update(fix, now_s))
 
-    def _take_status(self, topic: str, payload: bytes) -> None:
+    def _on_status(self, topic: str, payload: bytes) -> None:
         if not payload:
-            return  # somebody has cleared a retained status
-        status = read_message(payload, StatusMessage)
-        expect_name(status.name, topic)
-        self.board.status(status)
+            return  # a retained status was cleared
+        status = _decode(payload, StatusMessage)
+        _check_name(status.name, topic)
+        self.state.add_status(status)
         if status.kind == "tag" and not status.online:
-            self._hold(self.watch.gone(status.name, self._wall_clock()))
+            self._schedule(self.monitor.remove_tag(status.name, self._wall_clock()))
 
-    def _take_health(self, topic: str, payload: bytes) -> None:
+    def _on_health(self, topic: str, payload: bytes) -> None:
         _, kind, name, _ = topic.rsplit("/", 3)
         if kind in _HEALTHS:
-            self.board.health(name, read_message(payload, _HEALTHS[kind]), self._clock())  # type: ignore[arg-type]
+            self.state.add_health(name, _decode(payload, _HEALTHS[kind]), self._clock())  # type: ignore[arg-type]
 
-    def _take_truth(self, _topic: str, payload: bytes) -> None:
-        self.board.truth(read_message(payload, TruthMessage))
+    def _on_truth(self, _topic: str, payload: bytes) -> None:
+        self.state.add_truth(_decode(payload, TruthMessage))
 
-    def _take_zones(self, topic: str, payload: bytes) -> None:
+    def _on_zones(self, topic: str, payload: bytes) -> None:
         zones = read_zones(payload) if payload else ()
         if self._drawn is not None:
             if zones != self._drawn.zones:
-                return  # older than what was drawn here, which is on its way
+                return  # older than the zones stored here, which are on their way
             self._drawn = None
-        elif zones != self.watch.zones and self._bus is not None:
-            self._bus.forget(topic)
+        elif zones != self.monitor.zones and self._link is not None:
+            self._link.forget(topic)
         self._set_zones(zones)
 
-    def _take_zone_event(self, topic: str, payload: bytes) -> None:
-        event = read_message(payload, ZoneEvent)
-        expect_name(event.zone, topic)
-        if self.desk.heard(event):
-            self._tell_event(event)
+    def _on_zone_event(self, topic: str, payload: bytes) -> None:
+        event = _decode(payload, ZoneEvent)
+        _check_name(event.zone, topic)
+        if self.events.add_published(event):
+            self._broadcast_event(event)
 
     # Zones
 
-    def draw_zones(self, zones: tuple[Zone, ...]) -> None:
-        """Take the zones that a page has drawn. Raises BadZonesError."""
+    def store_zones(self, zones: tuple[Zone, ...]) -> None:
+        """Store the zones that a page has drawn. Raises BadZonesError."""
         check_zones(zones)
         self._drawn = ZonesMessage(zones)
         self._set_zones(zones)
-        if self._bus is not None and self._site_id is not None:
-            self._bus.publish(topics.zones_topic(self._site_id), self._drawn, qos=1, retain=True)
+        if self._link is not None and self._site_id is not None:
+            self._link.publish(topics.zones_topic(self._site_id), self._drawn, qos=1, retain=True)
 
     def _set_zones(self, zones: tuple[Zone, ...]) -> None:
-        if zones != self.watch.zones:
-            self._hold(self.watch.set_zones(zones, self._wall_clock()))
-            self._tell("zones", encode("zones", {"zones": zones}))
+        if zones != self.monitor.zones:
+            self._schedule(self.monitor.set_zones(zones, self._wall_clock()))
+            self._broadcast("zones", encode("zones", {"zones": zones}))
 
-    def _hold(self, events: list[ZoneEvent]) -> None:
+    def _schedule(self, events: list[ZoneEvent]) -> None:
         if events:
-            dashboards = [status for (kind, _), status in self.board.statuses.items() if kind == "dashboard"]
-            self.desk.hold(events, place_in_line(self.name, dashboards), self._clock())
+            dashboards = [status for (kind, _), status in self.state.statuses.items() if kind == "dashboard"]
+            self.events.schedule(events, publisher_rank(self.name, dashboards), self._clock())
 
     def _publish_events(self, now_s: float) -> None:
-        for event in self.desk.due(now_s):
-            self._tell_event(event)
-            if self._bus is not None and self._site_id is not None:
-                self._bus.publish(topics.zone_event_topic(self._site_id, event.zone), event, qos=1)
+        for event in self.events.pop_due(now_s):
+            self._broadcast_event(event)
+            if self._link is not None and self._site_id is not None:
+                self._link.publish(topics.zone_event_topic(self._site_id, event.zone), event, qos=1)
 
     # Pages
 
-    def join(self) -> Mailbox:
-        """A new page's mailbox, with what it must know first."""
+    def open_page(self) -> PageQueue:
+        """A new page's queue, with what it needs first."""
         hello = {
             "version": skyless.__version__,
             "site": self.site,
-            "zones": self.watch.zones,
-            "events": list(self.desk.recent),
+            "zones": self.monitor.zones,
+            "events": list(self.events.recent),
             "mqtt": self.connected,
         }
-        page = Mailbox(encode("hello", hello))
-        page.put("mqtt", self._connection())
-        page.put("health", self._health())
+        page = PageQueue(encode("hello", hello))
+        page.replace("mqtt", self._connection())
+        page.replace("health", self.state.health_message(self.dropped))
         self.pages.add(page)
         return page
 
-    def leave(self, page: Mailbox) -> None:
-        """Forget a page."""
-        self.pages.discard(page)
-
     def close(self) -> None:
-        """Let all pages go."""
+        """Close all pages."""
         for page in self.pages:
             page.close()
 
     def tick(self) -> None:
-        """Do what is due; to be called every ``TICK_S``."""
+        """Do what is due; to be called 20 times a second."""
         now_s, unix_s = self._clock(), self._wall_clock()
-        self.board.unix_s = unix_s
-        self._hold(self.watch.silent(now_s, unix_s))
+        self.state.unix_s = unix_s
+        self._schedule(self.monitor.expire_tags(now_s, unix_s))
         self._publish_events(now_s)
-        if self.board.serial != self._told_serial:
-            self._told_serial = self.board.serial
+        if self.state.serial != self._sent_serial:
+            self._sent_serial = self.state.serial
             for page in self.pages:
-                page.state_due()
+                page.request_state()
         if now_s >= self._health_due_s:
-            self._health_due_s = now_s + HEALTH_S
-            self.board.forget(now_s)
+            self._health_due_s = now_s + _HEALTH_PERIOD_S
+            self.state.expire(now_s)
             if self.pages:
-                self._tell("health", self._health())
+                self._broadcast("health", self.state.health_message(self.dropped))
 
     async def run(self) -> None:
         """Tick until cancelled."""
         due_s = self._clock()
         while True:
             self.tick()
-            due_s = max(due_s + TICK_S, self._clock())
+            due_s = max(due_s + _STATE_PERIOD_S, self._clock())
             await asyncio.sleep(due_s - self._clock())
 
     def _connection(self) -> bytes:
         return encode("mqtt", {"connected": self.connected, "broker": self.broker})
 
-    def _health(self) -> bytes:
-        return self.board.health_message(self.wrong)
-
-    def _tell(self, kind: str, message: bytes) -> None:
+    def _broadcast(self, kind: str, message: bytes) -> None:
         for page in self.pages:
-            page.put(kind, message)
+            page.replace(kind, message)
 
-    def _tell_event(self, event: ZoneEvent) -> None:
+    def _broadcast_event(self, event: ZoneEvent) -> None:
         message = encode("zone_event", msgspec.structs.asdict(event))
         for page in self.pages:
-            page.event(message)
+            page.add_event(message)
+
+
+def _decode(payload: bytes, kind: type[_T]) -> _T:
+    """A message from JSON. Raises WrongMessageError."""
+    try:
+        return msgspec.json.decode(payload, type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise WrongMessageError(str(error)) from None
+
+
+def _check_name(name: str, topic: str) -> None:
+    """Raise WrongMessageError unless a message names the same node or zone as its topic."""
+    if name != topic.rsplit("/", 2)[-2]:
+        raise WrongMessageError(f"it is of {name[:40]!r}")

@@ -1,4 +1,4 @@
-"""The process that computes overlays: a task on standard input, its grids on standard output."""
+"""The process that computes overlays: a task from standard input, its grids to standard output."""
 
 import os
 import sys
@@ -16,13 +16,13 @@ from skyless.planning.maps import Grid, plan_map
 from skyless.planning.predict import PlanSettings, Predictor
 
 _NICE: Final = 19
-"""Positioning on this machine goes first."""
+"""Positioning on this machine has priority."""
 
-_LEAST_SHARE: Final = 0.5
+_MIN_FIX_SHARE: Final = 0.5
 
 
 def main() -> None:
-    """Do one task."""
+    """Compute one task."""
     os.nice(_NICE)
     task = msgspec.json.decode(sys.stdin.buffer.read(), type=OverlayTask)
     sys.stdout.buffer.write(msgspec.json.encode(overlay_grids(task)))
@@ -38,7 +38,7 @@ def overlay_grids(task: OverlayTask) -> OverlayGrids:
         table = plan_map(Predictor(task.site, settings), _grid(task)).table[0]
     except (SkylessError, ValueError) as error:
         return OverlayGrids(error=str(error))
-    covered = table[..., FIX_SHARE] >= _LEAST_SHARE
+    covered = table[..., FIX_SHARE] >= _MIN_FIX_SHARE
     return OverlayGrids(
         pdop=_values(table[..., PDOP], 3),
         hdop=_values(table[..., HDOP], 3),

@@ -1,4 +1,4 @@
-"""Overlays of the map, computed in a process of their own, so that their work never holds up the pages."""
+"""Overlays of the map, computed in a separate process so that they never delay the pages."""
 
 import asyncio
 import sys
@@ -15,26 +15,26 @@ from skyless.site.model import Site
 
 Kind = Literal["pdop", "hdop", "sigma"]
 KINDS: Final[tuple[Kind, ...]] = ("pdop", "hdop", "sigma")
-MOST_CELLS: Final = 40_000
-STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+MAX_CELLS: Final = 40_000
+_STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
-_KEPT: Final = 8
-_LONGEST_S: Final = 120.0
-_BAD_SHARE: Final = 0.95
-"""Worse values than that of so many cells look all the same: single ones beside an anchor would take all colours."""
+_MAX_CACHED: Final = 8
+_TIMEOUT_S: Final = 120.0
+_BAD_QUANTILE: Final = 0.95
+"""The bad end of the scale; otherwise single extreme cells next to an anchor would use up the colours."""
 
-_LEAST_SPAN: Final = 2.0
-"""A scale reaches to twice its best value at least, so that small differences look small."""
+_MIN_SPAN: Final = 2.0
+"""A scale reaches to at least this multiple of its best value, so that small differences look small."""
 
 Box = tuple[float, float, float, float]
 
 
 class NoOverlayError(Exception):
-    """Why there is no overlay, for the person who asked."""
+    """Why there is no overlay."""
 
 
 class OverlayTask(Struct, frozen=True):
-    """What the process is given, as JSON on standard input."""
+    """Input of the process, as JSON on standard input."""
 
     site: Site
     box_m: Box
@@ -46,7 +46,7 @@ class OverlayTask(Struct, frozen=True):
 
 
 class OverlayGrids(Struct, frozen=True):
-    """What the process gives: values row by row from the lowest y, None where there is no fix; or what is wrong."""
+    """Output of the process: values row by row from the lowest y, None where there is no fix; or an error."""
 
     pdop: list[float | None] = []
     hdop: list[float | None] = []
@@ -55,16 +55,16 @@ class OverlayGrids(Struct, frozen=True):
 
 
 class Overlays:
-    """Answers requests for overlays; the last ones are kept, and one is computed at a time."""
+    """Answers requests for overlays; the last ones are cached, and one is computed at a time."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[bytes, OverlayGrids] = OrderedDict()
-        self._one = asyncio.Lock()
+        self._cached: OrderedDict[bytes, OverlayGrids] = OrderedDict()
+        self._lock = asyncio.Lock()
         self._process: asyncio.subprocess.Process | None = None
         self._stopped = False
 
     def stop(self) -> None:
-        """End what is being computed, for good."""
+        """Stop the computation; no other starts."""
         self._stopped = True
         if self._process is not None and self._process.returncode is None:
             self._process.kill()
@@ -73,16 +73,16 @@ class Overlays:
         self, site: Site, floor_plan: bytes | None, methods: list[str], kind: Kind, step_m: float
     ) -> dict[str, Any]:
         """The answer to ``/api/overlay``. Raises NoOverlayError."""
-        task = overlay_task(site, floor_plan, _commonest(methods), step_m)
+        task = overlay_task(site, floor_plan, _most_common(methods), step_m)
         key = msgspec.json.encode(task)
-        async with self._one:
-            grids = self._kept.get(key)
+        async with self._lock:
+            grids = self._cached.get(key)
             if grids is None:
                 grids = await self._compute(key)
-                self._kept[key] = grids
-                while len(self._kept) > _KEPT:
-                    self._kept.popitem(last=False)
-            self._kept.move_to_end(key)
+                self._cached[key] = grids
+                while len(self._cached) > _MAX_CACHED:
+                    self._cached.popitem(last=False)
+            self._cached.move_to_end(key)
         if grids.error is not None:
             raise NoOverlayError(grids.error)
         return _answer(task, kind, grids)
@@ -94,27 +94,27 @@ class Overlays:
             *(sys.executable, "-m", "skyless.dashboard.overlay_process"),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is for the dashboard, which kills this one itself
+            start_new_session=True,  # Ctrl-C stops the dashboard, which kills this process itself
         )
         try:
-            async with asyncio.timeout(_LONGEST_S):
+            async with asyncio.timeout(_TIMEOUT_S):
                 output, _ = await process.communicate(task)
             return msgspec.json.decode(output, type=OverlayGrids)
         except TimeoutError:
             raise NoOverlayError("this overlay takes too long to compute") from None
         except msgspec.MsgspecError:
-            raise NoOverlayError("this overlay could not be computed; the dashboard's terminal says why") from None
+            raise NoOverlayError("this overlay could not be computed; the dashboard's terminal shows why") from None
         finally:
             if process.returncode is None:
                 process.kill()
 
 
 def overlay_task(site: Site, floor_plan: bytes | None, method: str, step_m: float) -> OverlayTask:
-    """The grid over the floor plan and all anchors, coarser than asked for where it would have too many cells."""
+    """The grid over the floor plan and all anchors, with a larger step where it would have too many cells."""
     x1, y1, x2, y2 = _box(site, floor_plan)
-    for step in (step_m, *(step for step in STEPS_M if step > step_m)):
+    for step in (step_m, *(step for step in _STEPS_M if step > step_m)):
         columns, rows = (max(1, -int(-length // step)) for length in (x2 - x1, y2 - y1))
-        if columns * rows <= MOST_CELLS:
+        if columns * rows <= MAX_CELLS:
             break
     site = replace(site, floor_plan=None)  # its image is not here, and its box is known
     return OverlayTask(site, (x1, y1, x1 + columns * step, y1 + rows * step), columns, rows, step, method)
@@ -130,7 +130,7 @@ def _box(site: Site, floor_plan: bytes | None) -> Box:
     return min(xs), min(ys), max(xs), max(ys)
 
 
-def _commonest(methods: list[str]) -> str:
+def _most_common(methods: list[str]) -> str:
     return Counter(methods).most_common(1)[0][0] if methods else DEFAULT_METHOD
 
 
@@ -156,5 +156,5 @@ def levels(values: list[float | None]) -> dict[str, float]:
     known = sorted(value for value in values if value is not None)
     if not known:
         return {"good": 0.0, "bad": 1.0}
-    bad = known[round(_BAD_SHARE * (len(known) - 1))]
-    return {"good": known[0], "bad": max(bad, _LEAST_SPAN * known[0])}
+    bad = known[round(_BAD_QUANTILE * (len(known) - 1))]
+    return {"good": known[0], "bad": max(bad, _MIN_SPAN * known[0])}

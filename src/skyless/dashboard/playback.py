@@ -1,4 +1,4 @@
-"""Recordings for the page: which there are, and what a page would have been told while they were made."""
+"""Recordings for the page: the list of a folder, and the states that a live page would have been sent."""
 
 import logging
 import math
@@ -10,22 +10,25 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.dashboard.state import Board
+from skyless.dashboard.state import SiteState
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import FixMessage, SiteMessage, TruthMessage, Zone
 from skyless.mqtt.truth_buffer import REACH_S
 from skyless.recordings.mcap.recording import McapRecording
 
-SUFFIX: Final = ".mcap"
-_KEPT_OPEN: Final = 8
+_SUFFIX: Final = ".mcap"
+_MAX_OPEN: Final = 8
+_Version = tuple[int, int, int]
+"""A file's inode, size and time of change."""
+
 _log = logging.getLogger("skyless.dashboard")
 
 
 class NoRecordingError(Exception):
-    """There is no such recording, or it cannot be read; for the person who asked."""
+    """There is no such recording, or it cannot be read."""
 
 
-class Listed(Struct, frozen=True):
+class ListedRecording(Struct, frozen=True):
     """A recording in the list."""
 
     name: str
@@ -36,8 +39,8 @@ class Listed(Struct, frozen=True):
     """False while it is being written, and after it was cut off."""
 
 
-class Summary(Struct, frozen=True):
-    """What a page must know before it plays a recording."""
+class PlaybackSummary(Struct, frozen=True):
+    """What a page needs before it plays a recording."""
 
     name: str
     site: SiteMessage | None
@@ -51,45 +54,45 @@ class Playback:
     """The recordings of one folder. Its methods read files; threads may call them."""
 
     def __init__(self, folder: Path | None) -> None:
-        """None: there are none."""
+        """``folder`` is None where there are no recordings."""
         self._folder = folder
         self._lock = threading.Lock()
         self._stopped = threading.Event()
         self._open: OrderedDict[tuple[str, int], McapRecording] = OrderedDict()
-        self._listed: dict[str, tuple[tuple[int, int, int], Listed]] = {}
+        self._listed: dict[str, tuple[_Version, ListedRecording]] = {}
 
     def stop(self) -> None:
-        """Let threads that read end soon; what they return then is worth nothing."""
+        """End running reads soon; their results are incomplete."""
         self._stopped.set()
 
-    def recordings(self) -> list[Listed]:
-        """All that can be read, the newest first."""
+    def recordings(self) -> list[ListedRecording]:
+        """All that can be read, newest first."""
         if self._folder is None:
             return []
         with self._lock:
             known, self._listed = self._listed, {}
-            for file in self._folder.glob(f"*{SUFFIX}"):
+            for file in self._folder.glob(f"*{_SUFFIX}"):
                 if self._stopped.is_set():
                     break
                 try:
                     self._list(file, known)
                 except (NoRecordingError, OSError) as error:
-                    _log.debug("%s is left out: %s", file, error)
+                    _log.debug("%s is not listed: %s", file, error)
             found = [listed for _, listed in self._listed.values()]
         return sorted(found, key=lambda listed: listed.start_unix_s or 0.0, reverse=True)
 
-    def summary(self, name: str) -> Summary:
-        """What a recording holds. Raises NoRecordingError."""
+    def summary(self, name: str) -> PlaybackSummary:
+        """Site, times, tags and zones of a recording. Raises NoRecordingError."""
         with self._lock:
             recording = self._recording(name)
             found = recording.summary()
             if found.start_s is None or found.end_s is None:
-                raise NoRecordingError(f"nothing has been recorded in {name!r} yet")
+                raise NoRecordingError(f"{name!r} holds no messages yet")
             zones = recording.zones.zones if recording.zones is not None else ()
-            return Summary(name, recording.site, found.start_s, found.end_s, found.tags, zones)
+            return PlaybackSummary(name, recording.site, found.start_s, found.end_s, found.tags, zones)
 
     def floor_plan(self, name: str) -> bytes | None:
-        """The image of its floor. Raises NoRecordingError."""
+        """The floor plan's image. Raises NoRecordingError."""
         with self._lock:
             return self._recording(name).floor_plan
 
@@ -103,15 +106,15 @@ class Playback:
             recording = self._recording(name)
             return _states(recording, start_s + begin_s, start_s + end_s, 1.0 / rate_hz, self._stopped)
 
-    def _list(self, file: Path, known: dict[str, tuple[tuple[int, int, int], Listed]]) -> None:
-        """Take a file into the list; it is read only if it has changed since."""
+    def _list(self, file: Path, known: dict[str, tuple[_Version, ListedRecording]]) -> None:
+        """Add a file to the list; it is read only if it has changed since the last list."""
         stat = file.stat()
         version = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
         old = known.get(file.name)
         if old is None or old[0] != version:
             found = self._recording(file.name).summary()
             duration_s = 0.0 if found.start_s is None or found.end_s is None else found.end_s - found.start_s
-            old = version, Listed(file.name, stat.st_size, found.start_s, duration_s, found.finished)
+            old = version, ListedRecording(file.name, stat.st_size, found.start_s, duration_s, found.finished)
         self._listed[file.name] = old
 
     def _recording(self, name: str) -> McapRecording:
@@ -127,13 +130,13 @@ class Playback:
         except (SkylessError, OSError) as error:
             raise NoRecordingError(f"{name!r} cannot be read: {error}") from None
         self._open[key] = recording
-        while len(self._open) > _KEPT_OPEN:
+        while len(self._open) > _MAX_OPEN:
             self._open.popitem(last=False)[1].close()
         return recording
 
     def _path(self, name: str) -> Path:
-        """A file of the folder itself, by a name that a list could hold. Raises NoRecordingError."""
-        plain = name.endswith(SUFFIX) and not name.startswith(".") and not {"/", "\\", "\0", os.sep} & set(name)
+        """A file that lies in the folder itself. Raises NoRecordingError."""
+        plain = name.endswith(_SUFFIX) and not name.startswith(".") and not {"/", "\\", "\0", os.sep} & set(name)
         if self._folder is not None and plain:
             path = self._folder / name
             if path.is_file() and path.resolve().parent == self._folder.resolve():
@@ -144,27 +147,27 @@ class Playback:
 def _states(
     recording: McapRecording, begin_s: float, end_s: float, step_s: float, stopped: threading.Event
 ) -> list[bytes]:
-    """What a board would have told every ``step_s``. Unix times."""
-    board = Board()
+    """A ``state`` message every ``step_s``, if there is anything new. Unix times."""
+    site = SiteState()
     states: list[bytes] = []
-    seen, due_s = 0, begin_s + step_s
+    sent, due_s = 0, begin_s + step_s
     for found in recording.messages({"fix", "truth"}, begin_s - REACH_S, end_s):
         if stopped.is_set():
             break
         if found.time_s >= due_s:
-            seen = _tell(board, seen, due_s, states)
+            sent = _append_state(site, sent, due_s, states)
             due_s += step_s * (1 + math.floor((found.time_s - due_s) / step_s))
         if isinstance(found.message, TruthMessage):
-            board.truth(found.message)
+            site.add_truth(found.message)
         elif isinstance(found.message, FixMessage) and found.time_s >= begin_s:
-            board.fix(found.message, found.time_s)
-    _tell(board, seen, min(due_s, end_s), states)
+            site.add_fix(found.message, found.time_s)
+    _append_state(site, sent, min(due_s, end_s), states)
     return states
 
 
-def _tell(board: Board, seen: int, unix_s: float, states: list[bytes]) -> int:
+def _append_state(site: SiteState, sent: int, unix_s: float, states: list[bytes]) -> int:
     """Add a state if there is anything new."""
-    if board.serial > seen:
-        board.unix_s = unix_s
-        states.append(board.state_since(seen))
-    return board.serial
+    if site.serial > sent:
+        site.unix_s = unix_s
+        states.append(site.state_since(sent))
+    return site.serial

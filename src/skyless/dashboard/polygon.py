@@ -8,7 +8,7 @@ Polygon = tuple[Point, ...]
 
 
 def area_m2(polygon: Polygon) -> float:
-    """Area, never negative; of a polygon that crosses itself it means nothing."""
+    """Area, never negative; the polygon must not cross itself."""
     return abs(0.5 * sum(x1 * y2 - x2 * y1 for (x1, y1), (x2, y2) in sides(polygon)))
 
 
@@ -39,7 +39,7 @@ def depth_m(point: Point, polygon: Polygon) -> float:
 
 
 def is_simple(polygon: Polygon) -> bool:
-    """Whether no two sides touch or cross, but neighbours in their common corner."""
+    """Whether no two sides touch or cross, except neighbours in their common corner."""
     segments = sides(polygon)
     last = len(segments) - 1
     for i, (a, b) in enumerate(segments):

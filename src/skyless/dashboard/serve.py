@@ -1,4 +1,4 @@
-"""Running the dashboard: its socket, its link to the broker, and its end."""
+"""Running the dashboard: its socket, its link to the broker, and its shutdown."""
 
 import asyncio
 import contextlib
@@ -11,8 +11,8 @@ from typing import Final
 import uvicorn
 from msgspec import Struct
 
-from skyless.dashboard.app import DEAD_S, Parts, make_app
-from skyless.dashboard.guard import Rules
+from skyless.dashboard.app import PAGE_TIMEOUT_S, Services, make_app
+from skyless.dashboard.guard import AccessRules
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
@@ -22,13 +22,13 @@ from skyless.nodes.process.loop import ending_signals
 PORT: Final = 8080
 _MORE_PORTS: Final = 50
 _PING_S: Final = 5.0
-_LARGEST_PING: Final = 1024
+_MAX_PING_BYTES: Final = 1024
 _GRACE_S: Final = 0.4
-_SEND_BUFFER: Final = 262_144
-"""Bytes that wait in the kernel for a slow page, which it gets before anything newer."""
+_SEND_BUFFER_BYTES: Final = 262_144
+"""Data for a slow page that waits in the kernel and is sent before anything newer."""
 
 
-class Listen(Struct, frozen=True):
+class ListenAddress(Struct, frozen=True):
     """Where the server listens."""
 
     host: str
@@ -36,38 +36,37 @@ class Listen(Struct, frozen=True):
     """None: 8080, or the next one that is free."""
 
 
-def bind(listen: Listen) -> socket.socket:
-    """A socket at the address, or at the next free port where none was asked for.
+def bind(listen: ListenAddress) -> socket.socket:
+    """A socket at the address, or at the next free port where none is given.
 
     Raises:
-        SkylessError: naming the address and why it cannot be had.
+        SkylessError: the socket cannot listen there.
     """
     if listen.port is not None:
         return _bind(listen.host, listen.port)
     for port in range(PORT, PORT + _MORE_PORTS):
         try:
             return _bind(listen.host, port)
-        except _TakenError:
+        except _PortInUseError:
             continue
     return _bind(listen.host, 0)
 
 
-class _TakenError(SkylessError):
-    """Another program has the port."""
+class _PortInUseError(SkylessError):
+    """Another program uses the port."""
 
 
 def _bind(host: str, port: int) -> socket.socket:
-    place = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    text = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
     try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
-            0
-        ]
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, kind, _, _, address = addresses[0]
         sock = socket.socket(family, kind)
         try:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)  # every page's socket inherits it
-            if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; elsewhere the system's own patience counts
-                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * DEAD_S))
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)  # every page's socket inherits it
+            if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; elsewhere the system's own time-out applies
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * PAGE_TIMEOUT_S))
             sock.bind(address)
             sock.listen(socket.SOMAXCONN)  # two sockets may be bound to one port, but not both listen
         except BaseException:
@@ -75,16 +74,18 @@ def _bind(host: str, port: int) -> socket.socket:
             raise
     except (OSError, UnicodeError) as error:
         if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
-            raise _TakenError(f"--listen is {place!r}; another program has this port") from None
+            raise _PortInUseError(f"--listen is {text!r}; another program uses this port") from None
         reason = error.strerror if isinstance(error, OSError) else error
-        raise SkylessError(f"--listen is {place!r}, where this machine cannot listen: {reason}") from None
+        raise SkylessError(f"--listen is {text!r}, where this machine cannot listen: {reason}") from None
     return sock
 
 
-async def serve(parts: Parts, rules: Rules, sock: socket.socket, address: MqttAddress, site_id: int | None) -> None:
+async def serve(
+    services: Services, rules: AccessRules, sock: socket.socket, address: MqttAddress, site_id: int | None
+) -> None:
     """Serve pages until Ctrl-C, SIGTERM or SIGHUP."""
     config = uvicorn.Config(
-        make_app(parts, rules),
+        make_app(services, rules),
         lifespan="off",
         log_config=None,
         log_level="error",
@@ -92,22 +93,22 @@ async def serve(parts: Parts, rules: Rules, sock: socket.socket, address: MqttAd
         proxy_headers=False,
         server_header=False,
         ws="websockets-sansio",
-        ws_per_message_deflate=False,  # on the own machine it would only cost time
+        ws_per_message_deflate=False,  # on the same machine it would only cost time
         ws_ping_interval=_PING_S,
-        ws_ping_timeout=DEAD_S,
-        ws_max_size=_LARGEST_PING,
+        ws_ping_timeout=PAGE_TIMEOUT_S,
+        ws_max_size=_MAX_PING_BYTES,
         timeout_graceful_shutdown=1,
     )
     server = _Server(config)
-    work = [asyncio.create_task(_follow(parts, address, site_id)), asyncio.create_task(parts.live.run())]
+    work = [asyncio.create_task(_run_link(services, address, site_id)), asyncio.create_task(services.live.run())]
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, *ending_signals()):
-        loop.add_signal_handler(number, _stop, server, parts)
+        loop.add_signal_handler(number, _stop, server, services)
     serving = asyncio.create_task(server.serve(sockets=[sock]))
     try:
         await asyncio.wait([serving, *work], return_when=asyncio.FIRST_COMPLETED)
     finally:
-        _stop(server, parts)
+        _stop(server, services)
         for task in work:
             task.cancel()
         ended = await asyncio.gather(serving, *work, return_exceptions=True)
@@ -116,25 +117,25 @@ async def serve(parts: Parts, rules: Rules, sock: socket.socket, address: MqttAd
             raise result
 
 
-def _stop(server: "_Server", parts: Parts) -> None:
-    """End soon, whatever pages do."""
+def _stop(server: "_Server", services: Services) -> None:
+    """Shut down soon, whatever pages do."""
     if not server.should_exit:
         server.should_exit = True
-        parts.live.close()
-        parts.playback.stop()
-        parts.overlays.stop()
+        services.live.close()
+        services.playback.stop()
+        services.overlays.stop()
         asyncio.get_running_loop().call_later(_GRACE_S, server.drop_connections)
 
 
 class _Server(uvicorn.Server):
-    """A server that leaves signals to its owner."""
+    """A server that does not handle signals; its owner does."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
 
     def drop_connections(self) -> None:
-        """Wait no longer for those who do not read."""
+        """Close connections that have not ended."""
         self.force_exit = True
         for connection in list(self.server_state.connections):
             transport = getattr(connection, "transport", None)
@@ -142,12 +143,12 @@ class _Server(uvicorn.Server):
                 transport.abort()
 
 
-async def _follow(parts: Parts, address: MqttAddress, site_id: int | None) -> None:
-    """Keep the link to the broker."""
-    live = parts.live
+async def _run_link(services: Services, address: MqttAddress, site_id: int | None) -> None:
+    """Connect to the broker and stay connected."""
+    live = services.live
     if site_id is None:
-        site_id = await find_site(address, live.connection)
+        site_id = await find_site(address, live.on_connection)
     link = Link(address, live.name, site=site_id, kind="dashboard")
-    link.on_state.append(live.connection)
+    link.on_state.append(live.on_connection)
     live.attach(link, site_id)
     await link.run()

@@ -1,4 +1,4 @@
-"""What the page is told of the site, gathered from messages. No I/O; the time is passed in."""
+"""The state of the site as pages show it, gathered from messages. No I/O; the time is passed in."""
 
 import math
 from collections.abc import Mapping
@@ -16,71 +16,70 @@ from skyless.mqtt.messages import (
     Vector,
 )
 from skyless.mqtt.truth_buffer import TruthBuffer
-from skyless.positioning.integrity import Alert
 
-MOST_NAMES: Final = 2000
-"""Tags, and nodes, that are remembered; a broker that makes up names fills no memory."""
+MAX_NAMES: Final = 2000
+"""Tags, and nodes, that are kept; a broker that invents names cannot fill the memory."""
 
-FORGET_S: Final = 600.0
-"""A tag or health message is forgotten after so long."""
+EXPIRY_S: Final = 600.0
+"""Fixes and health messages older than this are dropped."""
 
-_ENCODED: Final = 16
+_MAX_ENCODED: Final = 16
 
 
 class _Tag:
-    """The last fix of a tag, and the row of it once somebody has asked."""
+    """The last fix of a tag, and its row once one was requested."""
 
-    __slots__ = ("fix", "heard_s", "row", "serial")
+    __slots__ = ("fix", "received_s", "row", "serial")
 
-    def __init__(self, fix: FixMessage, serial: int, heard_s: float) -> None:
-        self.fix, self.serial, self.heard_s = fix, serial, heard_s
+    def __init__(self, fix: FixMessage, serial: int, received_s: float) -> None:
+        self.fix, self.serial, self.received_s = fix, serial, received_s
         self.row: list[Any] | None = None
 
 
-class Board:
-    """The newest of everything, by name."""
+class SiteState:
+    """The newest fix, health and status by name."""
 
     def __init__(self) -> None:
         self.serial = 0
-        """Counts fixes; a reader who saw the state at one serial asks for what came since."""
+        """Counts fixes; a reader that has the state at one serial requests what came since."""
         self.statuses: dict[tuple[str, str], StatusMessage] = {}
         """By kind and name."""
         self.unix_s = 0.0
-        """What a ``state`` says of its time; whoever keeps the board sets it."""
+        """Time of the next ``state`` message; set by the owner."""
         self._tags: dict[str, _Tag] = {}
         self._truths = TruthBuffer()
         self._healths: dict[tuple[str, str], tuple[float, TagHealth | AnchorHealth | EtherHealth]] = {}
         self._encoded: dict[tuple[int, int], bytes] = {}
 
-    def fix(self, fix: FixMessage, now_s: float) -> None:
-        """Take a fix; ``now_s`` is when it came, by the clock that ``forget`` is given."""
-        if fix.tag not in self._tags and len(self._tags) >= MOST_NAMES:
+    def add_fix(self, fix: FixMessage, now_s: float) -> None:
+        """Add a fix; ``now_s`` is its time of arrival, by the clock of ``expire``."""
+        if fix.tag not in self._tags and len(self._tags) >= MAX_NAMES:
             return
         self.serial += 1
         self._tags[fix.tag] = _Tag(fix, self.serial, now_s)
 
-    def truth(self, truth: TruthMessage) -> None:
-        """Take where simulated tags truly are."""
+    def add_truth(self, truth: TruthMessage) -> None:
+        """Add true positions of simulated tags."""
         self._truths.add(truth)
 
-    def status(self, status: StatusMessage) -> None:
-        """Take whether a node lives."""
+    def add_status(self, status: StatusMessage) -> None:
+        """Update whether a node is online."""
         key = status.kind, status.name
-        if key in self.statuses or len(self.statuses) < MOST_NAMES:
+        if key in self.statuses or len(self.statuses) < MAX_NAMES:
             self.statuses[key] = status
 
-    def health(self, name: str, health: TagHealth | AnchorHealth | EtherHealth, now_s: float) -> None:
-        """Take how a node does."""
+    def add_health(self, name: str, health: TagHealth | AnchorHealth | EtherHealth, now_s: float) -> None:
+        """Update a node's health."""
         key = type(health).__name__, name
-        if key in self._healths or len(self._healths) < MOST_NAMES:
+        if key in self._healths or len(self._healths) < MAX_NAMES:
             self._healths[key] = now_s, health
 
-    def forget(self, now_s: float) -> None:
-        """Drop what is older than ``FORGET_S``."""
+    def expire(self, now_s: float) -> None:
+        """Drop what is older than ``EXPIRY_S``."""
         self._encoded.clear()
-        for name in [name for name, tag in self._tags.items() if now_s - tag.heard_s > FORGET_S]:
+        for name in [name for name, tag in self._tags.items() if now_s - tag.received_s > EXPIRY_S]:
             del self._tags[name]
-        for key in [key for key, (heard_s, _) in self._healths.items() if now_s - heard_s > FORGET_S]:
+        for key in [key for key, (received_s, _) in self._healths.items() if now_s - received_s > EXPIRY_S]:
             del self._healths[key]
 
     def methods(self) -> list[str]:
@@ -88,16 +87,16 @@ class Board:
         return [health.method for _, health in self._healths.values() if isinstance(health, TagHealth)]
 
     def state_since(self, serial: int) -> bytes:
-        """The ``state`` message with all tags that have a fix since; its bytes are shared by all who ask the same."""
+        """The ``state`` message with all tags that have a fix since; readers at the same serial share its bytes."""
         key = serial, self.serial
         if key not in self._encoded:
-            if len(self._encoded) >= _ENCODED:
+            if len(self._encoded) >= _MAX_ENCODED:
                 self._encoded.clear()
             self._encoded[key] = encode("state", {"unix_s": round(self.unix_s, 3), "tags": self.rows_since(serial)})
         return self._encoded[key]
 
     def rows_since(self, serial: int) -> list[list[Any]]:
-        """Rows of the ``state`` message, the fields of each in the order of the contract."""
+        """Rows of the ``state`` message, the fields of each in the order of ``page/tracks.js``."""
         rows = []
         for tag in self._tags.values():
             if tag.serial > serial:
@@ -106,8 +105,8 @@ class Board:
                 rows.append(tag.row)
         return rows
 
-    def health_message(self, wrong: Mapping[str, int]) -> bytes:
-        """The ``health`` message; ``wrong`` counts messages that were dropped, by kind."""
+    def health_message(self, dropped: Mapping[str, int]) -> bytes:
+        """The ``health`` message; ``dropped`` counts wrong messages by kind."""
         healths = [health for _, health in self._healths.values()]
         return encode(
             "health",
@@ -116,7 +115,7 @@ class Board:
                 "tags": [health for health in healths if isinstance(health, TagHealth)],
                 "ether": next((health for health in healths if isinstance(health, EtherHealth)), None),
                 "nodes": list(self.statuses.values()),
-                "dropped": dict(wrong),
+                "dropped": dict(dropped),
             },
         )
 
@@ -127,17 +126,13 @@ def encode(kind: str, fields: dict[str, Any]) -> bytes:
 
 
 def error_m(fix: FixMessage, true_m: Vector) -> float:
-    """Distance from the truth in the axes that the fix estimates: a height that is given is no merit."""
+    """Distance from the true position in the axes that the fix estimates, so without a given height."""
     axes = 2 if fix.height_known else 3
     return math.dist(fix.position_m[:axes], true_m[:axes])
 
 
-_ALERTS: Final = [alert.value for alert in Alert]
-"""Rows tell an alert by its number."""
-
-
 def _row(fix: FixMessage, true_m: Vector | None) -> list[Any]:
-    """One tag in a ``state``, rounded to what a page can show, which halves its bytes."""
+    """One tag in a ``state``, rounded to what a page can show, which halves the bytes."""
     x, y, z = fix.position_m
     xx, xy, _, _, yy = fix.covariance_m2[:5]
     vx, vy, _ = fix.velocity_mps or (None, None, None)
@@ -159,5 +154,5 @@ def _row(fix: FixMessage, true_m: Vector | None) -> list[Any]:
         round(fix.chi2, 3),
         round(fix.unix_s, 4),
         None if fix.hpl_m is None else round(fix.hpl_m, 4),
-        _ALERTS.index(fix.alert) if fix.alert in _ALERTS else None,
+        fix.alert,
     ]

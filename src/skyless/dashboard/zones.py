@@ -1,36 +1,47 @@
-"""Zones: which are valid, and who enters and leaves them. No I/O; the time is passed in.
+"""Zones: which are valid, when tags enter and leave them, and which dashboard publishes these events.
 
-Noise at an edge makes no flutter: a tag has crossed it when its fix lies beyond it by the margin, or by half of the
-margin in every fix for a while. Between, it stays where it was.
+No I/O; the time is passed in. Noise at an edge causes no series of events: a tag has crossed the edge when its fix
+lies beyond it by the margin, or by half of the margin in every fix for a while. In between, it stays on its side.
 """
 
 import math
 import re
+from collections import deque
 from typing import Final
 
 import msgspec
 
 from skyless.dashboard.polygon import Polygon, area_m2, depth_m, is_simple, perimeter_m
-from skyless.mqtt.messages import FixMessage, Vector, Zone, ZoneEvent, ZonesMessage
+from skyless.mqtt.messages import FixMessage, StatusMessage, Vector, Zone, ZoneEvent, ZonesMessage
 
-LEAST_MARGIN_M: Final = 0.05
-SIGMAS: Final = 3.0
-"""The margin is so many standard deviations of the fix in its worst direction, but at least ``LEAST_MARGIN_M``."""
+MIN_MARGIN_M: Final = 0.05
+_MARGIN_SIGMAS: Final = 3.0
+"""The margin in standard deviations of the fix in its worst direction; it is at least ``MIN_MARGIN_M``."""
 
-STAY_S: Final = 0.3
-SILENCE_S: Final = 3.0
-"""A tag that gives no fix for so long has left."""
+CROSSING_S: Final = 0.3
+"""Fixes beyond the edge by half of the margin must last this long."""
 
-MOST_ZONES: Final = 100
-MOST_CORNERS: Final = 100
-FARTHEST_M: Final = 1e5
+TAG_TIMEOUT_S: Final = 3.0
+"""A tag without a fix for this long has left."""
+
+_MAX_ZONES: Final = 100
+_MAX_CORNERS: Final = 100
+_MAX_CORNER_M: Final = 1e5
+
+MAX_EVENTS: Final = 50
+"""Events that are kept for pages."""
+
+TAKEOVER_S: Final = 1.0
+"""A dashboard waits this long for each one of a lower rank to publish an event that both have detected."""
+
+_SAME_EVENT_S: Final = 2.0
 
 _ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _COLOUR = re.compile(r"#[0-9A-Fa-f]{3,8}|[A-Za-z]{1,32}")
 
 
 class BadZonesError(ValueError):
-    """What is wrong with a list of zones, for the person who drew them."""
+    """What is wrong with a list of zones."""
 
 
 def read_zones(payload: bytes) -> tuple[Zone, ...]:
@@ -44,12 +55,12 @@ def read_zones(payload: bytes) -> tuple[Zone, ...]:
 
 
 def check_zones(zones: tuple[Zone, ...]) -> None:
-    """See that zones can be watched and named in topics. Raises BadZonesError."""
-    if len(zones) > MOST_ZONES:
-        raise BadZonesError(f"there are {len(zones)} zones; {MOST_ZONES} are the most")
+    """Check that zones can be monitored and named in topics. Raises BadZonesError."""
+    if len(zones) > _MAX_ZONES:
+        raise BadZonesError(f"there are {len(zones)} zones; at most {_MAX_ZONES} are allowed")
     known: set[str] = set()
     for zone in zones:
-        fault = _fault_in_words(zone) or _fault_in_shape(zone.polygon_m)
+        fault = _text_fault(zone) or _shape_fault(zone.polygon_m)
         if fault:
             raise BadZonesError(f"zone {(zone.name or zone.id)[:40]!r} {fault}")
         if zone.id in known:
@@ -57,7 +68,7 @@ def check_zones(zones: tuple[Zone, ...]) -> None:
         known.add(zone.id)
 
 
-def _fault_in_words(zone: Zone) -> str | None:
+def _text_fault(zone: Zone) -> str | None:
     if not _ID.fullmatch(zone.id):
         return "has an id that is not 1 to 64 letters, digits, dots, dashes and underscores"
     if len(zone.name) > 100:
@@ -67,113 +78,108 @@ def _fault_in_words(zone: Zone) -> str | None:
     return None
 
 
-def _fault_in_shape(corners: Polygon) -> str | None:
-    if not 3 <= len(corners) <= MOST_CORNERS:
-        return f"has {len(corners)} corners; it should have 3 to {MOST_CORNERS}"
-    if not all(math.isfinite(value) and abs(value) <= FARTHEST_M for corner in corners for value in corner):
-        return f"has a corner that is not finite or farther than {FARTHEST_M:g} m"
+def _shape_fault(corners: Polygon) -> str | None:
+    if not 3 <= len(corners) <= _MAX_CORNERS:
+        return f"has {len(corners)} corners; it should have 3 to {_MAX_CORNERS}"
+    if not all(math.isfinite(value) and abs(value) <= _MAX_CORNER_M for corner in corners for value in corner):
+        return f"has a corner that is not finite or farther than {_MAX_CORNER_M:g} m"
     if not is_simple(corners):
         return "crosses or touches itself"
     return None
 
 
-class _Watched:
-    """A zone with what is computed from it once."""
+class _MonitoredZone:
+    """A zone with figures that are computed once."""
 
     def __init__(self, zone: Zone) -> None:
         self.zone = zone
-        self.polygon: Polygon = zone.polygon_m
         xs, ys = zip(*zone.polygon_m, strict=True)
         self.box: tuple[float, float, float, float] = (min(xs), min(ys), max(xs), max(ys))
-        # A zone smaller than the error could never be entered by three sigma; half of a disc's radius always can.
-        self.most_margin_m = area_m2(self.polygon) / perimeter_m(self.polygon)
+        # So that a zone smaller than the error can be entered; for a disc it is half of the radius.
+        self.max_margin_m = area_m2(zone.polygon_m) / perimeter_m(zone.polygon_m)
 
     def may_hold(self, position_m: Vector) -> bool:
-        """Whether a position lies in the box around the zone; quick, as most do not."""
+        """Whether a position lies in the box around the zone, a quick first test."""
         x1, y1, x2, y2 = self.box
         x, y, _ = position_m
         return x1 < x < x2 and y1 < y < y2
 
 
-class _Seen:
-    """What is known of a tag."""
+class _TagState:
+    """The last fix of a tag and the zones that it is in."""
 
     def __init__(self) -> None:
-        self.heard_s = 0.0
+        self.updated_s = 0.0
         self.position_m: Vector = (0.0, 0.0, 0.0)
         self.inside: set[str] = set()
         self.beyond_since_s: dict[str, float] = {}
-        """By zone: since when every fix has been beyond its edge by half of the margin."""
+        """By zone: start of the time in which every fix was beyond its edge by half of the margin."""
 
 
-class ZoneWatch:
-    """Turns fixes into events."""
+class ZoneMonitor:
+    """Detects from fixes when tags enter and leave zones."""
 
     def __init__(self) -> None:
         self.zones: tuple[Zone, ...] = ()
-        self._watched: dict[str, _Watched] = {}
-        self._tags: dict[str, _Seen] = {}
+        self._monitored: dict[str, _MonitoredZone] = {}
+        self._tags: dict[str, _TagState] = {}
 
     def set_zones(self, zones: tuple[Zone, ...], unix_s: float) -> list[ZoneEvent]:
-        """Watch other zones; whoever is in one that is gone leaves it."""
-        old = self._watched
+        """Monitor other zones; tags in a removed zone leave it."""
+        old = self._monitored
         self.zones = zones
-        self._watched = {zone.id: _Watched(zone) for zone in zones}
+        self._monitored = {zone.id: _MonitoredZone(zone) for zone in zones}
         events = []
-        for tag, seen in self._tags.items():
-            seen.beyond_since_s.clear()
-            for zone_id in sorted(seen.inside - self._watched.keys()):
-                seen.inside.discard(zone_id)
-                events.append(_event(old[zone_id].zone, tag, seen, unix_s, entered=False))
+        for name, tag in self._tags.items():
+            tag.beyond_since_s.clear()
+            for zone_id in sorted(tag.inside - self._monitored.keys()):
+                tag.inside.discard(zone_id)
+                events.append(_event(old[zone_id].zone, name, tag, unix_s, entered=False))
         return events
 
-    def observe(self, fix: FixMessage, now_s: float) -> list[ZoneEvent]:
-        """Take a fix; ``now_s`` is when it came, by any clock that ``silent`` shares."""
-        seen = self._tags.setdefault(fix.tag, _Seen())
-        seen.heard_s, seen.position_m = now_s, fix.position_m
-        margin_m = max(LEAST_MARGIN_M, SIGMAS * _worst_std_m(fix))
+    def update(self, fix: FixMessage, now_s: float) -> list[ZoneEvent]:
+        """Process a fix; ``now_s`` is its time of arrival, by the clock of ``expire_tags``."""
+        tag = self._tags.setdefault(fix.tag, _TagState())
+        tag.updated_s, tag.position_m = now_s, fix.position_m
+        margin_m = max(MIN_MARGIN_M, _MARGIN_SIGMAS * _worst_std_m(fix))
         events = []
-        for zone_id, watched in self._watched.items():
-            if zone_id not in seen.inside and not watched.may_hold(fix.position_m):
-                seen.beyond_since_s.pop(zone_id, None)
-            elif _crossed(seen, zone_id, watched, fix, margin_m):
-                events.append(_event(watched.zone, fix.tag, seen, fix.unix_s, entered=zone_id in seen.inside))
+        for zone_id, zone in self._monitored.items():
+            if zone_id not in tag.inside and not zone.may_hold(fix.position_m):
+                tag.beyond_since_s.pop(zone_id, None)
+            elif _crossed(tag, zone, fix, margin_m):
+                events.append(_event(zone.zone, fix.tag, tag, fix.unix_s, entered=zone_id in tag.inside))
         return events
 
-    def silent(self, now_s: float, unix_s: float) -> list[ZoneEvent]:
-        """Let tags leave that have given no fix for ``SILENCE_S``."""
-        gone = [tag for tag, seen in self._tags.items() if now_s - seen.heard_s >= SILENCE_S]
-        return [event for tag in gone for event in self.gone(tag, unix_s)]
+    def expire_tags(self, now_s: float, unix_s: float) -> list[ZoneEvent]:
+        """Remove tags that had no fix for ``TAG_TIMEOUT_S`` from their zones."""
+        expired = [name for name, tag in self._tags.items() if now_s - tag.updated_s >= TAG_TIMEOUT_S]
+        return [event for name in expired for event in self.remove_tag(name, unix_s)]
 
-    def gone(self, tag: str, unix_s: float) -> list[ZoneEvent]:
-        """Let a tag leave all zones."""
-        seen = self._tags.pop(tag, None)
-        if seen is None:
+    def remove_tag(self, name: str, unix_s: float) -> list[ZoneEvent]:
+        """Remove a tag from all zones."""
+        tag = self._tags.pop(name, None)
+        if tag is None:
             return []
-        return [_event(self._watched[z].zone, tag, seen, unix_s, entered=False) for z in sorted(seen.inside)]
-
-    def inside(self, tag: str) -> frozenset[str]:
-        """Ids of the zones that a tag is in."""
-        seen = self._tags.get(tag)
-        return frozenset(seen.inside) if seen else frozenset()
+        return [_event(self._monitored[z].zone, name, tag, unix_s, entered=False) for z in sorted(tag.inside)]
 
 
-def _crossed(seen: _Seen, zone_id: str, watched: _Watched, fix: FixMessage, margin_m: float) -> bool:
-    """Whether the tag has changed sides; if so, ``seen.inside`` says the new one."""
-    margin_m = min(margin_m, watched.most_margin_m)
-    was_inside = zone_id in seen.inside
-    depth = depth_m(fix.position_m[:2], watched.polygon)
+def _crossed(tag: _TagState, zone: _MonitoredZone, fix: FixMessage, margin_m: float) -> bool:
+    """Whether the tag has changed sides; if so, ``tag.inside`` is updated."""
+    zone_id = zone.zone.id
+    margin_m = min(margin_m, zone.max_margin_m)
+    was_inside = zone_id in tag.inside
+    depth = depth_m(fix.position_m[:2], zone.zone.polygon_m)
     beyond_m = -depth if was_inside else depth
     if beyond_m < 0.5 * margin_m:
-        seen.beyond_since_s.pop(zone_id, None)
+        tag.beyond_since_s.pop(zone_id, None)
         return False
-    since_s = seen.beyond_since_s.setdefault(zone_id, fix.unix_s)
+    since_s = tag.beyond_since_s.setdefault(zone_id, fix.unix_s)
     if fix.unix_s < since_s:  # the tag's host has set its clock back
-        since_s = seen.beyond_since_s[zone_id] = fix.unix_s
-    if beyond_m < margin_m and fix.unix_s - since_s < STAY_S:
+        since_s = tag.beyond_since_s[zone_id] = fix.unix_s
+    if beyond_m < margin_m and fix.unix_s - since_s < CROSSING_S:
         return False
-    del seen.beyond_since_s[zone_id]
-    (seen.inside.discard if was_inside else seen.inside.add)(zone_id)
+    del tag.beyond_since_s[zone_id]
+    (tag.inside.discard if was_inside else tag.inside.add)(zone_id)
     return True
 
 
@@ -183,5 +189,47 @@ def _worst_std_m(fix: FixMessage) -> float:
     return math.sqrt(max(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy), 0.0))
 
 
-def _event(zone: Zone, tag: str, seen: _Seen, unix_s: float, *, entered: bool) -> ZoneEvent:
-    return ZoneEvent(zone.id, zone.name, tag, "enter" if entered else "leave", unix_s, seen.position_m)
+def _event(zone: Zone, name: str, tag: _TagState, unix_s: float, *, entered: bool) -> ZoneEvent:
+    return ZoneEvent(zone.id, zone.name, name, "enter" if entered else "leave", unix_s, tag.position_m)
+
+
+def publisher_rank(name: str, dashboards: list[StatusMessage]) -> int:
+    """How many of the dashboards that are online came online before this one; the first publishes the events."""
+    online = sorted((status.unix_s, status.name) for status in dashboards if status.online)
+    names = [other for _, other in online]
+    return names.index(name) if name in names else 0
+
+
+class EventQueue:
+    """Events that wait to be published, and the last that were."""
+
+    def __init__(self) -> None:
+        self.recent: deque[ZoneEvent] = deque(maxlen=MAX_EVENTS)
+        self._waiting: list[tuple[float, ZoneEvent]] = []
+
+    def schedule(self, events: list[ZoneEvent], rank: int, now_s: float) -> None:
+        """Add events detected here, by a dashboard with this rank."""
+        self._waiting += [(now_s + rank * TAKEOVER_S, event) for event in events]
+
+    def pop_due(self, now_s: float) -> list[ZoneEvent]:
+        """Events that no other dashboard has published in time; they count as published."""
+        due = [event for at_s, event in self._waiting if at_s <= now_s]
+        if due:
+            self._waiting = [(at_s, event) for at_s, event in self._waiting if at_s > now_s]
+            self.recent.extend(due)
+        return due
+
+    def add_published(self, event: ZoneEvent) -> bool:
+        """Add an event from MQTT; whether it is new, neither an own one nor a repetition."""
+        if event in self.recent:
+            return False
+        for index, (_, waiting) in enumerate(self._waiting):
+            if _same(event, waiting):
+                del self._waiting[index]
+                break
+        self.recent.append(event)
+        return True
+
+
+def _same(a: ZoneEvent, b: ZoneEvent) -> bool:
+    return (a.zone, a.tag, a.kind) == (b.zone, b.tag, b.kind) and abs(a.unix_s - b.unix_s) < _SAME_EVENT_S

@@ -1,29 +1,29 @@
-/** What the page asks the server, relative to where the page stands. */
+/** Requests to the server, relative to the page's own address. */
 
-/** Fetch JSON; throws an Error with the server's words. */
-export async function fetchJson(path, options = {}) {
+/** Fetch JSON; throws an Error with the server's message. */
+async function fetchJson(path, options = {}) {
   let answer;
   try {
     answer = await fetch(new URL(path, document.baseURI), { cache: "no-store", ...options });
   } catch {
-    throw new Error("The server does not answer.");
+    throw new Error("The server does not respond.");
   }
   let body = null;
   try {
     body = await answer.json();
   } catch {
-    // an error page of somebody in between
+    // an error page of a proxy
   }
-  if (!answer.ok) throw new Error(body?.error ?? `The server answers ${answer.status} ${answer.statusText}.`);
-  if (body === null) throw new Error("The server's answer is no JSON.");
+  if (!answer.ok) throw new Error(body?.error ?? `The server responds with ${answer.status} ${answer.statusText}.`);
+  if (body === null) throw new Error("The server's response is not JSON.");
   return body;
 }
 
-/** Store all zones; returns them as the server has them now. */
+/** Store all zones; returns them as the server has stored them. */
 export async function putZones(zones) {
   const body = JSON.stringify({ zones });
-  const answer = await fetchJson("api/zones", { method: "PUT", headers: { "content-type": "application/json" }, body });
-  return Array.isArray(answer) ? answer : answer.zones;
+  const headers = { "content-type": "application/json" };
+  return (await fetchJson("api/zones", { method: "PUT", headers, body })).zones;
 }
 
 /** The values of an overlay on a grid. */
@@ -31,12 +31,12 @@ export function overlay(kind, step_m) {
   return fetchJson(`api/overlay?kind=${encodeURIComponent(kind)}&step_m=${step_m}`);
 }
 
-/** All recordings, the newest first. */
+/** All recordings, newest first. */
 export function recordings() {
   return fetchJson("api/recordings");
 }
 
-/** What a recording holds. */
+/** Site, times, tags and zones of a recording. */
 export function recording(name) {
   return fetchJson(`api/recordings/${encodeURIComponent(name)}`);
 }

@@ -1,4 +1,4 @@
-/** Live, replay or lost: said in words, by a shape, and by a colour; and what can be done. */
+/** Live, replay or lost: shown by words, a shape and a colour; and a button to reconnect. */
 
 import { on, state } from "./store.js";
 import { byId, text } from "./dom.js";
@@ -14,7 +14,7 @@ const WORDS = {
   broker: "No broker",
 };
 
-/** Begin to tell. */
+/** Fill the banner and keep it up to date. */
 export function start() {
   on(["connection", "mode", "player"], show);
   setInterval(() => state.connection.phase === "lost" || text(byId("time"), timeOfDay(now_s())), 500);
@@ -41,11 +41,11 @@ function show() {
 
 function lostWords() {
   const { reason } = state.connection;
-  const old = state.mode === "live" ? " The map shows what was last known." : "";
-  return `Connection lost: ${reason}.${old} Trying again.`;
+  const old = state.mode === "live" ? " The map shows the last known state." : "";
+  return `Connection lost: ${reason}.${old} Reconnecting.`;
 }
 
-/** How long ago; apart from the words, so that screen readers are told once only. */
+/** How long ago; not part of the message, so that screen readers read it only once. */
 function age(since) {
   const past = Math.floor((performance.now() - since) / 1e3);
   return past < 120 ? `${past} s` : `${Math.floor(past / 60)} min`;
@@ -53,5 +53,5 @@ function age(since) {
 
 function brokerWords() {
   const broker = state.mqtt.broker ? ` ${state.mqtt.broker}` : "";
-  return `The server does not reach its broker${broker}: no news of tags and anchors until it is back.`;
+  return `The server has lost its broker${broker}: tags and anchors are not updated until it is connected again.`;
 }

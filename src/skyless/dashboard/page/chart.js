@@ -14,15 +14,16 @@ const HEIGHT = 96;
 
 export class Chart {
   /**
-   * @param {string} title what is shown, with its unit
+   * @param {string} title the quantity, with its unit
    * @param {Array<{name: string, colour: string, steps?: boolean}>} series colours are names of the palette
-   * @param {(value: number) => string} write how values are written
-   * @param {{whole?: boolean, least?: number, zero?: boolean}} options whole numbers only; least span of y; from zero
+   * @param {(value: number) => string} write formats values
+   * @param {number} span minimum of y's range
+   * @param {{zero?: boolean, whole?: boolean}} options whether y starts at zero, and whether its marks are whole numbers
    */
-  constructor(title, series, write, options = {}) {
+  constructor(title, series, write, span, { zero = true, whole = false } = {}) {
     this.series = series;
     this.write = write;
-    this.options = options;
+    this.axis = { span, zero, whole };
     this.plot = null;
     this.data = [[], ...series.map(() => [])];
     this.value = h("output", {});
@@ -63,7 +64,7 @@ export class Chart {
     this.plot = new uPlot(this.settings(), this.data, this.box);
   }
 
-  /** How a mark of the axis is written: without zeros that say nothing. */
+  /** Label of a mark on the axis, without trailing zeros. */
   tick(value) {
     return this.write(value).replace(/[.]0+(?=\D|$)/, "");
   }
@@ -75,11 +76,11 @@ export class Chart {
       ticks: { show: false },
       font: "10px system-ui, sans-serif",
     };
-    const { whole, least = 0, zero } = this.options;
+    const { span, zero, whole } = this.axis;
     const range = (_plot, low, high) => {
-      if (low === null || high === null || low === undefined) return [0, least || 1];
+      if (low === null || high === null || low === undefined) return [0, span];
       const bottom = zero ? 0 : low;
-      const spare = Math.max(least - (high - bottom), 0.12 * (high - bottom), 1e-9);
+      const spare = Math.max(span - (high - bottom), 0.12 * (high - bottom), 1e-9);
       return [zero ? 0 : bottom - spare / 2, high + spare / (zero ? 1 : 2)];
     };
     return {
@@ -93,8 +94,8 @@ export class Chart {
       axes: [
         {
           ...axis,
-          size: 18,
-          gap: 2,
+          size: 20,
+          gap: 6,
           values: (_plot, marks) => marks.map((mark) => `${mark || "now"}`.replace("-", "−")),
         },
         {

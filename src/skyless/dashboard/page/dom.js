@@ -26,7 +26,14 @@ export function s(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** Set a node's text where it differs, so that nothing is laid out anew for nothing. */
+/** A list of options, pairs of value and words; calls `choose` with the value of the one that is chosen. */
+export function options(properties, pairs, choose) {
+  const list = h("select", properties, ...pairs.map(([value, words]) => h("option", { value }, words)));
+  list.addEventListener("change", () => choose(list.value));
+  return list;
+}
+
+/** Set a node's text where it differs, which avoids needless layout. */
 export function text(element, value) {
   if (element.textContent !== value) element.textContent = value;
 }
@@ -36,7 +43,7 @@ export function byId(id) {
   return document.getElementById(id);
 }
 
-/** Keep one row per item: rows are made once, updated, put in order and taken away. */
+/** Keeps one row per item: rows are made once, updated, ordered and removed. */
 export class Rows {
   constructor(parent, make) {
     this.parent = parent;
@@ -52,18 +59,18 @@ export class Rows {
       row.element.remove();
       this.rows.delete(key);
     }
-    let place = this.parent.firstElementChild;
+    let next = this.parent.firstElementChild;
     for (const [key, value] of items) {
       let row = this.rows.get(key);
       if (!row) this.rows.set(key, (row = this.make(key, value)));
       row.update?.(value);
-      if (row.element === place) place = place.nextElementSibling;
-      else this.parent.insertBefore(row.element, place);
+      if (row.element === next) next = next.nextElementSibling;
+      else this.parent.insertBefore(row.element, next);
     }
   }
 }
 
-/** Say something for a few seconds; with an action, one can be taken back. */
+/** Show a message for a few seconds, with a button for an action such as undo. */
 export function toast(message, kind = "note", action = null) {
   const box = h("div", { class: `toast ${kind}`, role: kind === "bad" ? "alert" : "status" }, message);
   if (action) {
@@ -73,8 +80,8 @@ export function toast(message, kind = "note", action = null) {
   setTimeout(() => box.remove(), action || kind === "bad" ? 8000 : 4000);
 }
 
-/** At most so often, the last call always. */
-export function slowly(interval_ms, call) {
+/** Limit how often a function is called; the last call is always made. */
+export function throttle(interval_ms, call) {
   let last = -Infinity;
   let timer = 0;
   return () => {

@@ -1,4 +1,4 @@
-/** Numbers as people read them; a dash where nothing is known. */
+/** Numbers as text; a dash where nothing is known. */
 
 export const DASH = "–";
 
@@ -11,7 +11,7 @@ export function metres(value, digits = 2) {
   return known(value) ? value.toFixed(digits).replace("-", "−") : DASH;
 }
 
-/** A small length in the unit that suits it. */
+/** A length in m or cm. */
 export function length(value_m) {
   if (!known(value_m)) return DASH;
   const size = Math.abs(value_m);
@@ -42,6 +42,12 @@ export function clock(value_s) {
   const tenths = Math.floor(value_s * 10 + 1e-6);
   const minutes = Math.floor(tenths / 600);
   return `${minutes}:${((tenths % 600) / 10).toFixed(1).padStart(4, "0")}`;
+}
+
+/** The largest of 1, 2 and 5 times a power of ten that is at most `limit`. */
+export function roundStep(limit) {
+  const power = 10 ** Math.floor(Math.log10(limit));
+  return power * ([1, 2, 5, 10].findLast((factor) => factor * power <= limit) ?? 1);
 }
 
 /** Time of day. */

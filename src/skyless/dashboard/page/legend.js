@@ -1,20 +1,19 @@
-/** What the map's marks mean, and switches for its layers. */
+/** The meaning of the map's marks, and switches for its layers. */
 
-import { changed, on, state } from "./store.js";
-import { remember, remembered } from "./browser.js";
-import { byId, h, s, text } from "./dom.js";
+import { changed, on, saveSetting, savedSetting, state } from "./store.js";
+import { byId, h, options, text } from "./dom.js";
 import { DELAY_S, GONE_S, GREY_S, stillMotion } from "./clock.js";
 import { length, number } from "./format.js";
-import { CONDITIONS } from "./map/anchors.js";
+import { CONDITIONS, anchorMark } from "./map/anchors.js";
 import { KINDS, choose, colourAt } from "./map/overlay.js";
 import { NAMED } from "./map/tags.js";
 
 const KEY = "skyless-legend";
 const SWITCHES = {
-  names: `Names (in a crowd of more than ${NAMED}, the selected one)`,
-  ellipses: "Ellipse that holds 95 % of the errors, as the tag states them",
-  levels: "Protection level, a dashed circle: the tag is outside with the stated risk at most",
-  truth: "True position, a faint ring (simulated)",
+  names: `Names (with more than ${NAMED} tags, only the selected one)`,
+  ellipses: "Ellipse of 95 % of the errors, by the tag's reported σ",
+  levels: "Protection level, a dashed circle: the tag is outside with at most the configured probability",
+  truth: "True position, a faint ring (simulated sites)",
 };
 
 /** Fill the legend. */
@@ -23,27 +22,14 @@ export function start() {
   body.append(marks(), ...Object.entries(SWITCHES).map(switchFor), trails(), overlays(), note());
   on(["overlay", "options"], scale);
   on(["site"], () => (byId("switch-truth").hidden = !state.simulated));
-  byId("legend").open = remembered(KEY) === "open";
-  byId("legend").addEventListener("toggle", () => remember(KEY, byId("legend").open ? "open" : "shut"));
+  byId("legend").open = savedSetting(KEY) === "open";
+  byId("legend").addEventListener("toggle", () => saveSetting(KEY, byId("legend").open ? "open" : "shut"));
 }
 
 function marks() {
   const rows = Object.entries(CONDITIONS).map(([kind, { words }]) => h("li", {}, anchorMark(kind), `anchor ${words}`));
-  const master = h("li", {}, anchorMark("good", true), "the master: its clock is the site's time");
+  const master = h("li", {}, anchorMark("good", true), "master: its clock is the site's time");
   return h("ul", { class: "marks" }, ...rows, master);
-}
-
-/** A condition's shape as a small picture. */
-export function anchorMark(kind, master = false) {
-  const shapes = {
-    good: () => s("rect", { x: 5, y: 5, width: 8, height: 8 }),
-    warn: () => s("path", { d: "M9 3.5 14.5 13.5H3.5z" }),
-    bad: () => s("path", { class: "line", d: "M4.5 4.5 13.5 13.5M13.5 4.5 4.5 13.5" }),
-    unknown: () => s("rect", { class: "line", x: 5, y: 5, width: 8, height: 8 }),
-  };
-  const picture = s("svg", { viewBox: "0 0 18 18", class: `mark ${kind}`, "aria-hidden": "true" }, shapes[kind]());
-  if (master) picture.append(s("rect", { class: "line", x: 1.5, y: 1.5, width: 15, height: 15 }));
-  return picture;
 }
 
 function switchFor([key, words]) {
@@ -56,25 +42,17 @@ function switchFor([key, words]) {
 }
 
 function trails() {
-  const lengths = [0, 5, 15, 60];
-  const list = h(
-    "select",
-    { id: "trail-length" },
-    ...lengths.map((value) => h("option", { value }, value ? `${value} s` : "off")),
-  );
-  list.value = String(state.options.trails);
-  list.addEventListener("change", () => {
-    state.options.trails = Number(list.value);
+  const lengths = [0, 5, 15, 60].map((value) => [value, value ? `${value} s` : "off"]);
+  const list = options({ id: "trail-length" }, lengths, (value) => {
+    state.options.trails = Number(value);
     changed("options");
   });
+  list.value = String(state.options.trails);
   return h("label", { class: "choice" }, "Trails", list);
 }
 
 function overlays() {
-  const list = h("select", { id: "overlay" });
-  for (const [value, words] of Object.entries(KINDS)) list.append(h("option", { value }, words));
-  list.addEventListener("change", () => choose(list.value));
-  return h("label", { class: "choice" }, "Overlay", list);
+  return h("label", { class: "choice" }, "Overlay", options({ id: "overlay" }, Object.entries(KINDS), choose));
 }
 
 function scale() {
@@ -97,8 +75,8 @@ function note() {
   const words = () =>
     (stillMotion.matches
       ? "Positions are the last fixes, not interpolated. "
-      : `Live motion is drawn ${DELAY_S} s late and interpolated in straight lines between fixes, never beyond the last one. `) +
-    `A tag is hollow and grey after ${GREY_S} s without a fix, and only in the list after ${GONE_S} s.`;
+      : `Live positions are shown ${DELAY_S} s late, interpolated linearly between fixes, never extrapolated. `) +
+    `Without a fix, a tag is hollow and grey after ${GREY_S} s and only in the list after ${GONE_S} s.`;
   const box = h("p", { class: "fine" }, words());
   stillMotion.addEventListener("change", () => text(box, words()));
   return box;

@@ -1,17 +1,17 @@
-/** The live connection: takes the server's messages into the state, notices when it is lost, comes back by itself. */
+/** The live connection: reads the server's messages into the state, notices a loss, and reconnects. */
 
 import { changed, state } from "./store.js";
-import { heard, live, newServer } from "./clock.js";
+import { live, resetOffset, updateOffset } from "./clock.js";
 import { toast } from "./dom.js";
-import { remember } from "./history.js";
+import { addHealth } from "./history.js";
 
 const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 3000;
 const PING_MS = 5000;
-/** Silence after which a connection is given up: while tags moved, and at all (every ping is answered). */
-const SILENT_MS = 3000;
-const DEAF_MS = 9000;
-const EVENTS = 50;
+/** The connection is lost after this time without a message: while tags move, and otherwise (every ping is answered). */
+const MOVING_TIMEOUT_MS = 3000;
+const IDLE_TIMEOUT_MS = 9000;
+const MAX_EVENTS = 50;
 
 /** @type {WebSocket|null} */
 let socket = null;
@@ -20,16 +20,19 @@ let retryTimer = 0;
 let lastMessage = 0;
 let lastMotion = 0;
 let lastPing = 0;
+/** The live site's message and zones, also while a recording is replayed. */
+let site = null;
+let zones = [];
 
 /** Connect, and stay connected. */
 export function start() {
   connect();
-  setInterval(watch, 250);
+  setInterval(checkConnection, 250);
   addEventListener("online", retryNow);
   document.addEventListener("visibilitychange", () => document.visibilityState === "visible" && retryNow());
 }
 
-/** Try again at once. */
+/** Reconnect at once. */
 export function retryNow() {
   if (state.connection.phase !== "lost") return;
   clearTimeout(retryTimer);
@@ -41,8 +44,8 @@ function connect() {
   address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
   const mine = (socket = new WebSocket(address));
   lastMessage = lastPing = performance.now();
-  mine.onmessage = (event) => mine === socket && take(event.data);
-  mine.onclose = () => mine === socket && lost("the server does not answer");
+  mine.onmessage = (event) => mine === socket && process(event.data);
+  mine.onclose = () => mine === socket && lost("the server does not respond");
 }
 
 function lost(reason) {
@@ -56,33 +59,35 @@ function lost(reason) {
   explain(state.connection);
 }
 
-/** A browser does not tell why a socket is refused; an ordinary request does. */
+/** A browser does not report why a socket is refused; an ordinary request does. */
 async function explain(connection) {
   try {
     const answer = await fetch(new URL("api/recordings", document.baseURI), { cache: "no-store" });
     if (answer.status !== 401 && answer.status !== 403) return;
-    connection.reason = "the server wants its token: open the address that it has printed";
+    connection.reason = "the token is missing or wrong: open the address that the dashboard has printed";
     changed("connection");
   } catch {
-    // nobody there: the first reason holds
+    // no server: the first reason holds
   }
 }
 
-function watch() {
+function checkConnection() {
   if (state.connection.phase === "lost") changed("connection");
   if (!socket) return;
   const now = performance.now();
-  const silent = now - lastMessage;
+  const silence = now - lastMessage;
   const moved = lastMessage - lastMotion < 2000;
   const open = state.connection.phase === "open";
-  if (silent > (moved || !open ? SILENT_MS : DEAF_MS)) return lost(`silent for ${(silent / 1e3).toFixed(0)} s`);
+  if (silence > (moved || !open ? MOVING_TIMEOUT_MS : IDLE_TIMEOUT_MS)) {
+    return lost(`no message for ${(silence / 1e3).toFixed(0)} s`);
+  }
   if (now - lastPing > PING_MS && socket.readyState === WebSocket.OPEN) {
     socket.send("ping");
     lastPing = now;
   }
 }
 
-function take(text) {
+function process(text) {
   lastMessage = performance.now();
   let message;
   try {
@@ -90,37 +95,33 @@ function take(text) {
   } catch {
     return;
   }
-  takers[message?.type]?.(message);
+  handlers[message?.type]?.(message);
 }
 
-const takers = {
+const handlers = {
   hello(message) {
-    newServer();
+    resetOffset();
     retry_ms = FIRST_RETRY_MS;
     lastMotion = 0;
     state.connection = { phase: "open", since: performance.now(), reason: "" };
-    noticeVersion(message.version ?? "");
+    checkVersion(message.version ?? "");
     state.mqtt = { connected: message.mqtt !== false, broker: state.mqtt?.broker ?? "" };
     state.events = [...(message.events ?? [])].sort((a, b) => b.unix_s - a.unix_s);
     changed("connection", "events");
-    takers.zones(message);
-    if (message.site) takers.site(message);
+    handlers.zones(message);
+    if (message.site) handlers.site(message);
   },
   site(message) {
     site = message.site;
-    if (state.mode !== "live") return;
-    state.site = message.site.site;
-    state.simulated = message.site.simulated;
-    changed("site");
+    if (state.mode === "live") showSite();
   },
   state(message) {
-    heard(message.unix_s);
+    updateOffset(message.unix_s);
     lastMotion = lastMessage;
     live.add(message.tags, message.unix_s);
     if (message.tags.length) changed("tags");
   },
-  health(message) {
-    const { anchors = [], tags = [], ether = null, nodes = [] } = message;
+  health({ anchors = [], tags = [], ether = null, nodes = [] }) {
     state.health = {
       anchors: new Map(anchors.map((health) => [health.anchor, health])),
       tags: new Map(tags.map((health) => [health.tag, health])),
@@ -128,18 +129,18 @@ const takers = {
       nodes,
       atMs: performance.now(),
     };
-    live.name(state.health.tags.keys());
-    remember(anchors, tags);
+    live.addNames([...state.health.tags.keys()]);
+    addHealth(anchors, tags);
     changed("health");
   },
   zones(message) {
-    liveZones = message.zones ?? [];
+    zones = message.zones ?? [];
     if (state.mode !== "live") return;
-    state.zones = liveZones;
+    state.zones = zones;
     changed("zones");
   },
   zone_event(message) {
-    state.events = [message, ...state.events].slice(0, EVENTS);
+    state.events = [message, ...state.events].slice(0, MAX_EVENTS);
     changed("events");
   },
   mqtt(message) {
@@ -148,15 +149,19 @@ const takers = {
   },
 };
 
-function noticeVersion(version) {
+function checkVersion(version) {
   if (state.version && version !== state.version) {
-    toast(`The server is version ${version} now.`, "note", { name: "Reload the page", run: () => location.reload() });
+    const action = { name: "Reload the page", run: () => location.reload() };
+    toast(`The server now runs version ${version}.`, "note", action);
   }
   state.version = version;
 }
 
-let site = null;
-let liveZones = [];
+function showSite() {
+  state.site = site?.site ?? null;
+  state.simulated = site?.simulated ?? false;
+  changed("site");
+}
 
 /** The live site, also while a recording is replayed. */
 export function liveSite() {
@@ -166,13 +171,12 @@ export function liveSite() {
 /** Show the live site again after a replay. */
 export function backToLive() {
   state.mode = "live";
-  state.site = site?.site ?? null;
-  state.simulated = site?.simulated ?? false;
-  state.zones = liveZones;
-  changed("mode", "site", "zones", "tags", "selection");
+  state.zones = zones;
+  showSite();
+  changed("mode", "zones", "tags", "selection");
 }
 
-/** Take zones that this page has stored, without waiting for the server's message. */
-export function stored(zones) {
-  takers.zones({ zones });
+/** Show zones that this page has stored, without waiting for the server's message. */
+export function showStored(zones) {
+  handlers.zones({ zones });
 }

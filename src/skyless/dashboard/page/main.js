@@ -12,7 +12,7 @@ import * as tools from "./map/tools.js";
 import { live as liveTracks, replayed, shown_s } from "./clock.js";
 import { byId, text } from "./dom.js";
 
-// The token has become a cookie; it need not stand in the address, nor in the history.
+// The token is now in a cookie; remove it from the address and the history.
 const address = new URL(location.href);
 if (address.searchParams.has("token")) {
   address.searchParams.delete("token");
@@ -33,5 +33,5 @@ on(["site"], () => {
 });
 live.start();
 
-/** For tests and for the curious in the console; nothing in the page uses it. */
+/** For tests and the console; the page itself does not use it. */
 window.skyless = { state, live: liveTracks, replayed, shown_s, frames: map.drawnFrames };

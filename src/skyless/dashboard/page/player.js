@@ -5,10 +5,10 @@ import { recordedStates, recording } from "./api.js";
 import { replayed } from "./clock.js";
 import { backToLive } from "./live.js";
 
-/** What is fetched before a moment (for trails and charts) and after it, at speed 1; together at most 60 s. */
+/** Time that is fetched before a moment (for trails and charts) and after it, at speed 1; together at most 60 s. */
 const BEFORE_S = 25;
 const AFTER_S = 20;
-/** More than this is not kept: the tracks' rings hold 2048 states. */
+/** Time that is kept: a track's ring buffer holds 2048 states. */
 const KEPT_S = 90;
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 
@@ -31,7 +31,7 @@ export async function open(name) {
   state.simulated = found.site?.simulated ?? false;
   state.zones = found.zones ?? [];
   replayed.all.clear();
-  replayed.name(found.tags ?? []);
+  replayed.addNames(found.tags ?? []);
   replayed.sort();
   select(null);
   changed("mode", "site", "zones", "player", "tags", "selection");
@@ -46,7 +46,7 @@ export function close() {
   changed("player");
 }
 
-/** Go to a moment, in s since the start. */
+/** Seek to a time in s since the start. */
 export async function seek(at_s) {
   const player = state.player;
   if (!player) return;
@@ -58,19 +58,19 @@ export async function seek(at_s) {
   seekTimer = setTimeout(() => load(true), 60);
 }
 
-async function load(afresh) {
+async function load(restart) {
   const player = state.player;
-  const mine = afresh ? ++generation : generation;
+  const mine = restart ? ++generation : generation;
   const ahead_s = Math.min(AFTER_S * Math.max(1, player.speed / 2), 60 - BEFORE_S);
-  const from = afresh ? Math.max(0, player.at_s - BEFORE_S) : loaded.to;
-  const to = Math.min((afresh ? player.at_s : loaded.to) + ahead_s, player.duration_s + 0.001);
+  const from = restart ? Math.max(0, player.at_s - BEFORE_S) : loaded.to;
+  const to = Math.min((restart ? player.at_s : loaded.to) + ahead_s, player.duration_s + 0.001);
   fetching = true;
   try {
     const states = await recordedStates(player.name, from, to, player.speed > 2 ? 10 : 20);
     if (mine !== generation || player !== state.player) return;
-    if (afresh) replayed.forget();
+    if (restart) replayed.clearStates();
     for (const one of states) replayed.add(one.tags);
-    loaded = { name: player.name, from: afresh ? from : Math.max(loaded.from, to - KEPT_S), to };
+    loaded = { name: player.name, from: restart ? from : Math.max(loaded.from, to - KEPT_S), to };
     player.waiting = false;
     player.error = "";
   } catch (error) {
@@ -94,7 +94,7 @@ export function toggle() {
   changed("player");
 }
 
-/** Play so many times as fast as it was. */
+/** Set the speed, a multiple of real time. */
 export function setSpeed(speed) {
   if (!state.player) return;
   state.player.speed = speed;

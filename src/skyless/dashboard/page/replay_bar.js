@@ -1,7 +1,7 @@
-/** The bar under the map while a recording is replayed. */
+/** The bar below the map while a recording is replayed. */
 
 import { on, state } from "./store.js";
-import { byId, h, s, text } from "./dom.js";
+import { byId, h, options, s, text } from "./dom.js";
 import { clock, dateTime } from "./format.js";
 import { SPEEDS, close, seek, setSpeed, toggle } from "./player.js";
 
@@ -24,9 +24,11 @@ export function start() {
   });
   slider.addEventListener("input", () => seek(Number(slider.value)));
   const time = h("output", { id: "play-time" });
-  const speeds = h("select", { id: "speed", "aria-label": "Speed" });
-  for (const speed of SPEEDS) speeds.append(h("option", { value: speed }, `${speed} ×`));
-  speeds.addEventListener("change", () => setSpeed(Number(speeds.value)));
+  const speeds = options(
+    { id: "speed", "aria-label": "Speed" },
+    SPEEDS.map((speed) => [speed, `${speed} ×`]),
+    (value) => setSpeed(Number(value)),
+  );
   const name = h("span", { class: "recording-name" });
   const problem = h("span", { class: "problem", role: "alert" });
   const back = h("button", { type: "button", id: "back", onclick: close }, "Back to live");

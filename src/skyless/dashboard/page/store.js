@@ -1,5 +1,5 @@
 /**
- * The one state of the page. Modules change it, say which topic has changed, and are called back at most once a frame.
+ * The one state of the page. Modules change it and notify the topics; callbacks run at most once a frame.
  *
  * Topics: connection, site, zones, events, health, tags, mode, player, recordings, selection, options, overlay, editor,
  * theme.
@@ -29,7 +29,7 @@ export const state = {
   health: { anchors: new Map(), tags: new Map(), ether: null, nodes: [], atMs: 0 },
   /** @type {any[]|null} */
   recordings: null,
-  /** @type {any} what `player.js` plays */
+  /** @type {any} the recording that `player.js` plays */
   player: null,
   selection: { tag: null, anchor: null, zone: null },
   options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none" },
@@ -45,7 +45,7 @@ export function on(topics, callback) {
   }
 }
 
-/** Say what has changed. */
+/** Notify the callbacks of topics that have changed. */
 export function changed(...topics) {
   for (const topic of topics) dirty.add(topic);
   if (scheduled) return;
@@ -61,12 +61,34 @@ function flush() {
   for (const callback of callbacks) callback();
 }
 
-/** Select one tag, anchor or zone; the other two are let go. */
+/** Select one tag, anchor or zone, or with null none. */
 export function select(kind, id) {
   const next = { tag: null, anchor: null, zone: null };
   if (kind) next[kind] = id;
-  const now = state.selection;
-  if (now.tag === next.tag && now.anchor === next.anchor && now.zone === next.zone) return;
+  if (Object.entries(next).every(([key, value]) => state.selection[key] === value)) return;
   state.selection = next;
   changed("selection");
+}
+
+/** Select one item, or deselect it. */
+export function toggleSelection(kind, id) {
+  select(state.selection[kind] === id ? null : kind, id);
+}
+
+/** A setting that this browser has stored; null without one, as in private windows. @returns {string|null} */
+export function savedSetting(key) {
+  try {
+    return localStorage.getItem(key);
+  } catch {
+    return null;
+  }
+}
+
+/** Store a setting in this browser; where it cannot, the setting lasts as long as the page. */
+export function saveSetting(key, value) {
+  try {
+    localStorage.setItem(key, value);
+  } catch {
+    // a private window
+  }
 }

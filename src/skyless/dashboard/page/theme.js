@@ -1,7 +1,6 @@
-/** Dark or light: as the system says, until somebody chooses; and the colours that canvases need. */
+/** Dark or light: the system's choice until the user's; and the colours for canvases. */
 
-import { remember, remembered } from "./browser.js";
-import { changed } from "./store.js";
+import { changed, saveSetting, savedSetting } from "./store.js";
 import { byId } from "./dom.js";
 
 const KEY = "skyless-theme";
@@ -22,24 +21,24 @@ const NAMES = [
 ];
 const TAGS = 8;
 
-/** Colours by their names in tokens.css, and `tags`, a few hues that can be told apart. @type {any} */
+/** Colours by their names in tokens.css, and `tags`, a few distinct hues. @type {any} */
 export const palette = { tags: [] };
 
-/** Whether the page is dark now. */
-export function isDark() {
+/** Whether the page is dark. */
+function isDark() {
   const chosen = document.documentElement.dataset.theme;
   return chosen ? chosen === "dark" : system.matches;
 }
 
-/** Read the colours, and follow the system and the button. */
+/** Read the colours, again when the system or the button changes them. */
 export function start() {
-  const chosen = remembered(KEY);
+  const chosen = savedSetting(KEY);
   if (chosen === "dark" || chosen === "light") document.documentElement.dataset.theme = chosen;
   system.addEventListener("change", refresh);
   byId("theme").addEventListener("click", () => {
     const next = isDark() ? "light" : "dark";
     document.documentElement.dataset.theme = next;
-    remember(KEY, next);
+    saveSetting(KEY, next);
     refresh();
   });
   refresh();
@@ -57,12 +56,12 @@ function refresh() {
   changed("theme");
 }
 
-/** A site with few tags gives each its hue; in a crowd hues say nothing, and all have the same. */
+/** Colour of a tag: its own hue where there are few tags, else one for all. */
 export function tagColour(index, count) {
   return count <= TAGS ? palette.tags[index] : palette.accent;
 }
 
-/** The same colour, fainter. */
+/** The same colour, more transparent. */
 export function faint(colour, alpha) {
   const parts = colour.match(/[\d.]+/g);
   return parts ? `rgba(${parts[0]}, ${parts[1]}, ${parts[2]}, ${alpha})` : colour;

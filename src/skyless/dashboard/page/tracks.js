@@ -1,65 +1,53 @@
-/** What is known of each tag over time: a ring of states, and the position between two of them. */
+/** The states of each tag over time, in a ring buffer, and the position between two of them. */
 
-const STRIDE = 17;
-const FIRST = 64;
-const MOST = 2048;
-/** Between states further apart than this nothing is known, and nothing is interpolated. */
+const FIRST_CAPACITY = 64;
+const MAX_CAPACITY = 2048;
+/** Between states further apart than this nothing is interpolated. */
 const GAP_S = 1.0;
 /** A tag whose host's clock differs more than this from the server's has a wrong clock, not an old fix. */
-const CLOCK_S = 0.5;
+const MAX_CLOCK_ERROR_S = 0.5;
 
-/** Columns of a track: the fields of a state after the tag's name, in the order of the wire. */
-export const X = 0,
-  Y = 1,
-  Z = 2,
-  VX = 3,
-  VY = 4,
-  CXX = 5,
-  CXY = 6,
-  CYY = 7,
-  STD = 8,
-  ERROR = 9;
-export const TRUE_X = 10,
-  TRUE_Y = 11,
-  ANCHORS = 12,
-  CHI2 = 13,
-  TIME = 14,
-  HPL = 15,
-  ALERT = 16;
-/** What the numbers of alerts mean, in the order of the wire. */
-export const ALERTS = [
-  "none",
-  "a faulty anchor is left out",
-  "a fault that cannot be left out: no level",
-  "too early to say",
-  "the level exceeds its limit",
-];
+export const COLUMNS = 17;
+/** Columns of a track: the fields of a `state` message's row after the tag's name, in the order of the wire. */
+export const [X, Y, Z, VX, VY, CXX, CXY, CYY, STD, ERROR, TRUE_X, TRUE_Y, ANCHORS, CHI2, TIME, HPL, ALERT] =
+  Array(COLUMNS).keys();
+
+/** Integrity alerts by their names on the wire; a track holds their index. */
+export const ALERTS = {
+  none: { words: "none", grade: "" },
+  "detected-excluded": { words: "faulty anchor excluded", grade: "warn" },
+  "detected-not-excluded": { words: "fault not excluded: no protection level", grade: "bad" },
+  unavailable: { words: "no protection level available", grade: "" },
+  "alert-limit-exceeded": { words: "protection level above the alert limit", grade: "bad" },
+};
+const ALERT_NAMES = Object.keys(ALERTS);
 
 export class Track {
   /** @param {string} name */
   constructor(name) {
     this.name = name;
-    this.rows = new Float64Array(FIRST * STRIDE);
-    this.capacity = FIRST;
+    this.rows = new Float64Array(FIRST_CAPACITY * COLUMNS);
+    this.capacity = FIRST_CAPACITY;
     this.start = 0;
     this.count = 0;
   }
 
-  /** Take a state off the wire: `[name, x, y, …]`, null for unknown; older ones than the last are ignored. */
+  /** Add a row of a state: `[name, x, y, …]`, null for unknown; rows older than the last are ignored. */
   push(row) {
     const time = row[TIME + 1];
     if (!Number.isFinite(time) || (this.count && time <= this.value(this.count - 1, TIME))) return false;
-    if (this.count === this.capacity && this.capacity < MOST) this.grow();
+    if (this.count === this.capacity && this.capacity < MAX_CAPACITY) this.grow();
     if (this.count === this.capacity) this.start = (this.start + 1) % this.capacity;
     else this.count += 1;
-    const at = ((this.start + this.count - 1) % this.capacity) * STRIDE;
-    for (let column = 0; column < STRIDE; column++) this.rows[at + column] = row[column + 1] ?? NaN;
+    const at = ((this.start + this.count - 1) % this.capacity) * COLUMNS;
+    for (let column = 0; column < COLUMNS; column++) this.rows[at + column] = row[column + 1] ?? NaN;
+    this.rows[at + ALERT] = ALERT_NAMES.indexOf(row[ALERT + 1]);
     return true;
   }
 
   grow() {
-    const rows = new Float64Array(this.capacity * 2 * STRIDE);
-    const split = this.start * STRIDE;
+    const rows = new Float64Array(this.capacity * 2 * COLUMNS);
+    const split = this.start * COLUMNS;
     rows.set(this.rows.subarray(split));
     rows.set(this.rows.subarray(0, split), this.rows.length - split);
     this.rows = rows;
@@ -69,7 +57,7 @@ export class Track {
 
   /** Column of the n-th state, counted from the oldest. */
   value(index, column) {
-    return this.rows[((this.start + index) % this.capacity) * STRIDE + column];
+    return this.rows[((this.start + index) % this.capacity) * COLUMNS + column];
   }
 
   /** Number of the last state at or before a time, −1 where there is none. */
@@ -90,22 +78,22 @@ export class Track {
   }
 
   /**
-   * Write the columns as they are at a time into `out`: between two states in a straight line, after the last one as it
-   * was. Returns false before the first one.
+   * Write the columns at a time into `out`: interpolated linearly between two states, constant after the last one.
+   * Returns false before the first one.
    * @param {number} time
-   * @param {Float64Array} out at least 17 long
+   * @param {Float64Array} out at least COLUMNS long
    * @param {boolean} between whether to interpolate
    */
   at(time, out, between = true) {
     const index = this.find(time);
     if (index < 0) return false;
-    const at = ((this.start + index) % this.capacity) * STRIDE;
-    for (let column = 0; column < STRIDE; column++) out[column] = this.rows[at + column];
+    const at = ((this.start + index) % this.capacity) * COLUMNS;
+    for (let column = 0; column < COLUMNS; column++) out[column] = this.rows[at + column];
     if (!between || index + 1 >= this.count) return true;
     const gap = this.value(index + 1, TIME) - out[TIME];
     if (gap > GAP_S) return true;
     const share = (time - out[TIME]) / gap;
-    const next = ((this.start + index + 1) % this.capacity) * STRIDE;
+    const next = ((this.start + index + 1) % this.capacity) * COLUMNS;
     for (let column = 0; column < ANCHORS; column++) out[column] += share * (this.rows[next + column] - out[column]);
     return true;
   }
@@ -121,34 +109,26 @@ export class Tracks {
   }
 
   /**
-   * Take a state message's rows; returns whether a tag appeared that was not there before. With `unix_s`, the message's
-   * own time, fixes of hosts whose clocks are wrong are taken as made then.
+   * Add a state message's rows. With `unix_s`, the message's own time, it replaces the time of fixes from hosts whose
+   * clocks are wrong.
    */
   add(rows, unix_s = NaN) {
-    let more = false;
+    this.addNames(rows.map(([name]) => name));
     for (const row of rows) {
-      if (Math.abs(row[TIME + 1] - unix_s) > CLOCK_S) row[TIME + 1] = unix_s;
-      let track = this.all.get(row[0]);
-      if (!track) {
-        this.all.set(row[0], (track = new Track(row[0])));
-        more = true;
-      }
-      track.push(row);
+      if (Math.abs(row[TIME + 1] - unix_s) > MAX_CLOCK_ERROR_S) row[TIME + 1] = unix_s;
+      this.all.get(row[0]).push(row);
     }
-    if (more) this.sort();
-    return more;
   }
 
-  /** Make sure that these names are in the list, with or without a state. */
-  name(names) {
+  /** Add tags by name, without a state. */
+  addNames(names) {
     const before = this.all.size;
     for (const name of names) if (!this.all.has(name)) this.all.set(name, new Track(name));
     if (this.all.size !== before) this.sort();
-    return this.all.size !== before;
   }
 
-  /** Forget the states, keep the names. */
-  forget() {
+  /** Remove the states, keep the names. */
+  clearStates() {
     for (const name of this.all.keys()) this.all.set(name, new Track(name));
     this.sort();
   }

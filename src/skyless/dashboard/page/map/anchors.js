@@ -1,22 +1,23 @@
 /** Anchors: their health as a colour and a shape, and their marks on the map. */
 
+import { s } from "../dom.js";
 import { state } from "../store.js";
 import { palette } from "../theme.js";
 import { px, py } from "./view.js";
 
-/** Older health than this tells nothing. */
-const OLD_S = 3.5;
+/** An anchor whose health is older than this is offline. */
+const MAX_AGE_S = 3.5;
 const MARK = 7;
 
-/** What the words mean, for legend and lists. */
+/** The conditions of anchors: their words, their colours and their shapes, outlines in a square from -1 to 1. */
 export const CONDITIONS = {
-  good: { colour: "good", words: "in step" },
-  warn: { colour: "warn", words: "not in step" },
-  bad: { colour: "bad", words: "not heard of" },
-  unknown: { colour: "muted", words: "of unknown health" },
+  good: { colour: "good", words: "synchronised", shape: "M-.86-.86H.86V.86H-.86Z" },
+  warn: { colour: "warn", words: "not synchronised", shape: "M0-1 1 .8H-1Z" },
+  bad: { colour: "bad", words: "offline", shape: "M-1-1 1 1M1-1-1 1" },
+  unknown: { colour: "muted", words: "health unknown", shape: "M-.86-.86H.86V.86H-.86Z" },
 };
 
-/** How an anchor is: good, warn, bad or unknown. A recording tells nothing of it. */
+/** Condition of an anchor: good, warn, bad or unknown, as always in a recording. */
 export function condition(id) {
   if (state.mode === "replay") return "unknown";
   const health = state.health.anchors.get(id);
@@ -25,11 +26,11 @@ export function condition(id) {
   if (!health) return status ? "warn" : "unknown";
   const newest = Math.max(...[...state.health.anchors.values()].map((one) => one.unix_s));
   const age_s = (performance.now() - state.health.atMs) / 1e3 + newest - health.unix_s;
-  if (age_s > OLD_S) return "bad";
+  if (age_s > MAX_AGE_S) return "bad";
   return health.synchronised || health.role === "master" ? "good" : "warn";
 }
 
-/** Who the master is now: the anchors' word before the site file's. */
+/** The current master: as the anchors report it, or else as in the site file. */
 export function masterNow() {
   const master = [...state.health.anchors.values()].filter((health) => health.role === "master");
   master.sort((a, b) => b.term - a.term);
@@ -37,22 +38,12 @@ export function masterNow() {
   return state.site?.master ?? null;
 }
 
-/** Trace a condition's shape: square, triangle, cross or hollow square. */
-export function shape(context, kind, x, y, size) {
-  context.beginPath();
-  if (kind === "warn") {
-    context.moveTo(x, y - size);
-    context.lineTo(x + size, y + size * 0.8);
-    context.lineTo(x - size, y + size * 0.8);
-    context.closePath();
-  } else if (kind === "bad") {
-    context.moveTo(x - size, y - size);
-    context.lineTo(x + size, y + size);
-    context.moveTo(x + size, y - size);
-    context.lineTo(x - size, y + size);
-  } else {
-    context.rect(x - size + 1, y - size + 1, 2 * size - 2, 2 * size - 2);
-  }
+/** A condition's mark as a small picture; the master's has a frame. */
+export function anchorMark(kind, master = false) {
+  const path = s("path", { d: CONDITIONS[kind].shape, transform: "translate(9 9) scale(5)" });
+  const mark = s("svg", { viewBox: "0 0 18 18", class: `mark ${kind}`, "aria-hidden": "true" }, path);
+  if (master) mark.append(s("path", { class: "frame", d: "M1.5 1.5h15v15h-15z" }));
+  return mark;
 }
 
 /** Draw all anchors; the master has a frame around it, the selected one a ring. */
@@ -83,18 +74,18 @@ export function drawAnchors(context) {
 }
 
 function mark(context, kind, x, y, colour) {
-  shape(context, kind, x, y, MARK);
+  const shape = new Path2D();
+  shape.addPath(new Path2D(CONDITIONS[kind].shape), new DOMMatrix([MARK, 0, 0, MARK, x, y]));
+  const outlined = kind === "bad" || kind === "unknown";
   context.lineJoin = "round";
-  if (kind !== "bad") {
-    context.fillStyle = kind === "unknown" ? palette.surface : colour;
-    context.fill();
-  }
-  context.strokeStyle = kind === "bad" || kind === "unknown" ? colour : palette.surface;
+  context.fillStyle = kind === "unknown" ? palette.surface : colour;
+  if (kind !== "bad") context.fill(shape);
+  context.strokeStyle = outlined ? colour : palette.surface;
   context.lineWidth = kind === "bad" ? 3 : 1.5;
-  context.stroke();
+  context.stroke(shape);
 }
 
-/** Draw the ring of what is selected. */
+/** Draw the ring around a selected item. */
 export function ring(context, x, y, radius) {
   context.strokeStyle = palette.text;
   context.lineWidth = 1.5;
@@ -103,7 +94,7 @@ export function ring(context, x, y, radius) {
   context.stroke();
 }
 
-/** Write a label that can be read on anything. */
+/** Write a label that is legible on any background. */
 export function label(context, words, x, y, colour = palette.text) {
   context.lineWidth = 3;
   context.lineJoin = "round";

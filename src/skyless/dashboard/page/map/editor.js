@@ -1,8 +1,8 @@
-/** Drawing and changing zones; every change is stored at the server, which has the last word. */
+/** Drawing and changing zones; every change is stored at the server, which may refuse it. */
 
 import { changed, select, state } from "../store.js";
 import { putZones } from "../api.js";
-import { stored } from "../live.js";
+import { showStored } from "../live.js";
 import { toast } from "../dom.js";
 
 const SNAP_M = 0.05;
@@ -15,21 +15,21 @@ function snap([x, y]) {
   return [x, y].map((value) => Number((Math.round(value / SNAP_M) * SNAP_M).toFixed(3)));
 }
 
-/** Begin a new zone; with `at`, the keyboard's cursor stands there. */
+/** Begin a new zone; with `at`, the keyboard's cursor starts there. */
 export function begin(at = null) {
-  if (state.mode !== "live") return toast("Zones are drawn on the live site, not on a recording.");
+  if (state.mode !== "live") return toast("Zones can be drawn on the live site only.");
   select(null);
   Object.assign(editor, { drawing: true, points: [], cursor: at ? snap(at) : null, moving: null });
   changed("editor");
 }
 
-/** Give the new zone up. */
+/** Cancel the new zone. */
 export function cancel() {
   Object.assign(editor, { drawing: false, points: [], cursor: null });
   changed("editor");
 }
 
-/** Add a corner; the same one twice counts once. */
+/** Add a corner, unless it is the same as the last. */
 export function addPoint(at) {
   const point = snap(at);
   const last = editor.points.at(-1);
@@ -37,7 +37,7 @@ export function addPoint(at) {
   changed("editor");
 }
 
-/** Take the last corner away. */
+/** Remove the last corner. */
 export function undoPoint() {
   editor.points.pop();
   changed("editor");
@@ -51,7 +51,7 @@ export function setCursor(at) {
 
 /** Close the polygon and store it. */
 export async function finish() {
-  if (editor.points.length < 3) return toast("A zone needs three corners or more.");
+  if (editor.points.length < 3) return toast("A zone needs at least three corners.");
   const zone = {
     id: freshId(),
     name: freshName(),
@@ -59,7 +59,7 @@ export async function finish() {
     colour: COLOURS.find((colour) => !state.zones.some((one) => one.colour === colour)) ?? COLOURS[0],
   };
   cancel();
-  if (await store([...state.zones, zone], `${zone.name} is stored.`)) select("zone", zone.id);
+  if (await store([...state.zones, zone], `${zone.name} stored.`)) select("zone", zone.id);
 }
 
 /** Change one zone. */
@@ -67,15 +67,15 @@ export function change(id, values) {
   return store(state.zones.map((zone) => (zone.id === id ? { ...zone, ...values } : zone)));
 }
 
-/** Delete a zone; it can be taken back for a while. */
+/** Delete a zone; the message offers to undo it. */
 export async function remove(id) {
   const zone = state.zones.find((one) => one.id === id);
   if (!zone || !(await store(state.zones.filter((one) => one.id !== id)))) return;
   const bringBack = () => store([...state.zones, zone]);
-  toast(`${zone.name} is deleted.`, "note", { name: "Undo", run: bringBack });
+  toast(`${zone.name} deleted.`, "note", { name: "Undo", run: bringBack });
 }
 
-/** Show a corner at another place while it is dragged; stored when it is let go. */
+/** Move a corner while it is dragged; it is stored when it is released. */
 export function moveCorner(id, index, at) {
   state.zones = state.zones.map((zone) => {
     if (zone.id !== id) return zone;
@@ -93,7 +93,7 @@ async function store(zones, words = "", before = state.zones) {
   state.zones = zones;
   changed("zones");
   try {
-    stored((await putZones(zones)) ?? zones);
+    showStored((await putZones(zones)) ?? zones);
     if (words) toast(words);
     return true;
   } catch (error) {

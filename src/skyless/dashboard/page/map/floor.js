@@ -1,14 +1,15 @@
-/** What stands still: floor plan, overlay, grid, walls, scale bar. */
+/** The layers below the tags: floor plan, overlay, grid, walls, scale bar. */
 
 import { faint, palette } from "../theme.js";
 import { state } from "../store.js";
+import { metres } from "../format.js";
 import { px, py, roundLength, toSite, view } from "./view.js";
 
 /** @type {{image: HTMLImageElement, x_m: number, y_m: number, width_m: number, height_m: number}|null} */
 export let floor = null;
 let floorOf = null;
 
-/** Load the site's floor plan, if it has one; calls back when it is there. */
+/** Load the site's floor plan, if it has one, and call `done` when it is loaded. */
 export function loadFloor(done) {
   const plan = state.site?.floor_plan ?? null;
   if (JSON.stringify(plan) === floorOf) return;
@@ -35,7 +36,7 @@ export function drawFloor(context) {
   context.globalAlpha = 1;
 }
 
-/** Draw an overlay's picture where it belongs. */
+/** Draw the overlay's picture. */
 export function drawOverlay(context) {
   const { data, picture } = state.overlay;
   if (!data || !picture) return;
@@ -57,7 +58,7 @@ export function drawGrid(context) {
   context.lineWidth = 1;
   context.font = "10px system-ui, sans-serif";
   const lines = (from, to, draw) => {
-    for (let n = Math.ceil(from / step); n * step <= to; n++) draw(n * step, n % 5 === 0);
+    for (let n = Math.ceil(from / step); n * step <= to; n++) draw(n * step || 0, n % 5 === 0);
   };
   lines(left, right, (x_m, strong) => {
     const x = Math.round(px(x_m)) + 0.5;
@@ -72,18 +73,14 @@ export function drawGrid(context) {
   context.textBaseline = "bottom";
   lines(left, right, (x_m) => {
     const x = px(x_m);
-    if (x > 40 && x < view.width - 20) context.fillText(write(x_m, digits), x, view.height - 4);
+    if (x > 40 && x < view.width - 20) context.fillText(metres(x_m, digits), x, view.height - 4);
   });
   context.textAlign = "left";
   context.textBaseline = "middle";
   lines(bottom, top, (y_m) => {
     const y = py(y_m);
-    if (y > 16 && y < view.height - 24) context.fillText(write(y_m, digits), 5, y);
+    if (y > 16 && y < view.height - 24) context.fillText(metres(y_m, digits), 5, y);
   });
-}
-
-function write(value_m, digits) {
-  return (Math.abs(value_m) < 1e-9 ? 0 : value_m).toFixed(digits).replace("-", "−");
 }
 
 function line(context, x1, y1, x2, y2, colour) {

@@ -9,8 +9,9 @@ import { drawn } from "./tags.js";
 import { pan, px, py, toSite, view, zoom } from "./view.js";
 import { inside } from "./zones.js";
 
-const NEAR = 14;
-const STILL = 6;
+/** Distances in pixels: a pointer hits an item, and a press is no drag. */
+const HIT = 14;
+const MAX_TAP_TRAVEL = 6;
 /** @type {Map<number, {x: number, y: number}>} */
 const pointers = new Map();
 let travelled = 0;
@@ -18,14 +19,14 @@ let dragged = null;
 
 /** @param {HTMLElement} target the focusable element over the canvases */
 export function listen(target, redraw, fitAll) {
-  const place = (event) => {
+  const pixel = (event) => {
     const box = target.getBoundingClientRect();
     return { x: event.clientX - box.left, y: event.clientY - box.top };
   };
   target.addEventListener("pointerdown", (event) => {
     if (event.button > 0) return;
     target.setPointerCapture(event.pointerId);
-    const at = place(event);
+    const at = pixel(event);
     pointers.set(event.pointerId, at);
     if (pointers.size > 1) return;
     travelled = 0;
@@ -33,21 +34,22 @@ export function listen(target, redraw, fitAll) {
     if (dragged) dragged.before = state.zones;
   });
   target.addEventListener("pointermove", (event) => {
-    const at = place(event);
+    const at = pixel(event);
     hover(at, event.pointerType);
     const before = pointers.get(event.pointerId);
     if (!before) return;
     if (pointers.size === 2) pinch(event.pointerId, before, at);
     else if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
-    else if (travelled + Math.hypot(at.x - before.x, at.y - before.y) >= STILL) pan(at.x - before.x, at.y - before.y);
+    else if (travelled + Math.hypot(at.x - before.x, at.y - before.y) >= MAX_TAP_TRAVEL)
+      pan(at.x - before.x, at.y - before.y);
     travelled += Math.hypot(at.x - before.x, at.y - before.y);
     pointers.set(event.pointerId, at);
     redraw(true);
   });
   const release = (event) => {
     if (!pointers.delete(event.pointerId) || pointers.size) return;
-    if (dragged && travelled >= STILL) storeShown(dragged.before);
-    else if (event.type === "pointerup" && travelled < STILL) tap(place(event));
+    if (dragged && travelled >= MAX_TAP_TRAVEL) storeShown(dragged.before);
+    else if (event.type === "pointerup" && travelled < MAX_TAP_TRAVEL) tap(pixel(event));
     dragged = null;
   };
   target.addEventListener("pointerup", release);
@@ -58,7 +60,7 @@ export function listen(target, redraw, fitAll) {
     "wheel",
     (event) => {
       event.preventDefault();
-      const at = place(event);
+      const at = pixel(event);
       zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), at.x, at.y);
       redraw(true);
     },
@@ -78,7 +80,7 @@ function pinch(moved, before, at) {
   const middle = { x: (at.x + other.x) / 2, y: (at.y + other.y) / 2 };
   pan((at.x - before.x) / 2, (at.y - before.y) / 2);
   if (apart > 1) zoom(Math.hypot(at.x - other.x, at.y - other.y) / apart, middle.x, middle.y);
-  travelled += STILL;
+  travelled += MAX_TAP_TRAVEL;
 }
 
 function tap({ x, y }) {
@@ -98,7 +100,7 @@ function tap({ x, y }) {
 }
 
 function near(x1, y1, x2, y2) {
-  return Math.hypot(x1 - x2, y1 - y2) <= NEAR;
+  return Math.hypot(x1 - x2, y1 - y2) <= HIT;
 }
 
 function cornerAt({ x, y }) {
@@ -143,7 +145,7 @@ function drawingKey(event) {
   else return false;
   const [x_m, y_m] = editor.cursor ?? at;
   const corners = `${editor.points.length} corner${editor.points.length === 1 ? "" : "s"}`;
-  text(byId("said"), editor.drawing ? `x ${metres(x_m)}, y ${metres(y_m)}, ${corners}` : "Drawing ended");
+  text(byId("announcement"), editor.drawing ? `x ${metres(x_m)}, y ${metres(y_m)}, ${corners}` : "Drawing finished");
   changed("editor");
   return true;
 }

@@ -1,11 +1,11 @@
-/** The map: three canvases, drawn anew only where something has changed. */
+/** The map: three canvases, each drawn only when something in it has changed. */
 
 import { on, state } from "../store.js";
 import { byId } from "../dom.js";
 import { drawAnchors } from "./anchors.js";
 import { drawFloor, drawGrid, drawOverlay, drawScale, drawWalls, floor, loadFloor } from "./floor.js";
 import { listen } from "./input.js";
-import { drawTags, look } from "./tags.js";
+import { drawTags, visibleTags } from "./tags.js";
 import { drawTrails, due } from "./trails.js";
 import { fit, prepare, view } from "./view.js";
 import { drawDraft, drawZones, flash } from "./zones.js";
@@ -20,7 +20,7 @@ let trailsDrawn = 0;
 let later = 0;
 let lastEvent = null;
 
-/** Draw again: what stands still too, or only what moves. */
+/** Draw in the next frame: everything, or only what moves. */
 export function redraw(still = true) {
   stillDirty ||= still;
   movingDirty = true;
@@ -40,7 +40,7 @@ function frame() {
   if (movingDirty) {
     movingDirty = false;
     drawnFrames.moving++;
-    const now = look();
+    const now = visibleTags();
     if (still || due(performance.now() - trailsDrawn, now.seen.length)) {
       trailsDrawn = performance.now();
       const context = prepare(byId("trails"));
@@ -74,7 +74,7 @@ export function fitAll() {
   redraw();
 }
 
-/** Begin to draw. */
+/** Start drawing. */
 export function start() {
   const box = byId("map");
   new ResizeObserver(() => {

@@ -1,4 +1,4 @@
-/** Overlays of dilution of precision and predicted sigma: fetched, painted once, explained in the legend. */
+/** Overlays of dilution of precision and predicted σ: fetched and painted once. */
 
 import { changed, on, state } from "../store.js";
 import { overlay } from "../api.js";
@@ -12,7 +12,7 @@ export const KINDS = {
   sigma: "Predicted σ",
 };
 
-/** Viridis at eight places (matplotlib's, CC0): equal steps look equal, also to the colour-blind and in grey. */
+/** Eight colours of viridis (matplotlib's, CC0), perceptually uniform, also for colour-blind readers and in grey. */
 const VIRIDIS = [
   [68, 1, 84],
   [70, 50, 127],
@@ -23,14 +23,14 @@ const VIRIDIS = [
   [159, 218, 58],
   [253, 231, 37],
 ];
-const POINTS = 40_000;
+const MAX_POINTS = 10_000;
 let serial = 0;
 
-/** Colour at a share of the scale from 0 (good) to 1 (bad). */
-export function colourAt(share) {
-  const place = Math.min(Math.max(share, 0), 1) * (VIRIDIS.length - 1);
-  const low = Math.min(Math.floor(place), VIRIDIS.length - 2);
-  return VIRIDIS[low].map((value, part) => value + (place - low) * (VIRIDIS[low + 1][part] - value));
+/** Colour at a fraction of the scale from 0 (good) to 1 (bad). */
+export function colourAt(fraction) {
+  const at = Math.min(Math.max(fraction, 0), 1) * (VIRIDIS.length - 1);
+  const low = Math.min(Math.floor(at), VIRIDIS.length - 2);
+  return VIRIDIS[low].map((value, part) => value + (at - low) * (VIRIDIS[low + 1][part] - value));
 }
 
 /** Show another overlay, or none. */
@@ -41,7 +41,7 @@ export async function choose(kind) {
   changed("overlay", "options");
   if (kind === "none") return;
   if (state.mode === "replay" && JSON.stringify(liveSite()?.anchors) !== JSON.stringify(state.site?.anchors)) {
-    toast("Overlays are computed for the live site; this recording has other anchors.");
+    toast("Overlays are computed for the live site; this recording has different anchors.");
     return choose("none");
   }
   try {
@@ -56,12 +56,12 @@ export async function choose(kind) {
   changed("overlay");
 }
 
-/** A step that gives a fine picture of a small site and a quick one of a large site. */
+/** A fine step for a small site, a coarse one for a large site. */
 function step() {
   const anchors = state.site?.anchors ?? [];
-  const spread = (key) => Math.max(...anchors.map((a) => a[key])) - Math.min(...anchors.map((a) => a[key]));
-  const area = anchors.length ? (spread("x_m") + 2) * (spread("y_m") + 2) : 100;
-  return [0.1, 0.25, 0.5, 1, 2, 5].find((step_m) => area / step_m ** 2 < POINTS / 4) ?? 10;
+  const extent = (key) => Math.max(...anchors.map((a) => a[key])) - Math.min(...anchors.map((a) => a[key]));
+  const area = anchors.length ? (extent("x_m") + 2) * (extent("y_m") + 2) : 100;
+  return [0.1, 0.25, 0.5, 1, 2, 5].find((step_m) => area / step_m ** 2 < MAX_POINTS) ?? 10;
 }
 
 function paint(data) {
@@ -83,7 +83,7 @@ function paint(data) {
   return picture;
 }
 
-/** The overlay's value at a place, null where there is none. */
+/** The overlay's value at a position, null where there is none. */
 export function valueAt(x_m, y_m) {
   const data = state.overlay.data;
   if (!data) return null;

@@ -3,23 +3,23 @@
 import { GONE_S, freshness, now_s, shown_s, stillMotion, tracks } from "../clock.js";
 import { faint, palette, tagColour } from "../theme.js";
 import { state } from "../store.js";
-import { CXX, CXY, CYY, HPL, TRUE_X, TRUE_Y, X, Y } from "../tracks.js";
+import { COLUMNS, CXX, CXY, CYY, HPL, TRUE_X, TRUE_Y, X, Y } from "../tracks.js";
 import { label, ring } from "./anchors.js";
 import { drawStub } from "./trails.js";
 import { px, py, view } from "./view.js";
 
-/** √5.991: so many sigmas hold 95 % in two dimensions. */
-const NINETY_FIVE = 2.4477;
-/** Above so many tags only the selected one is named. */
+/** √5.991: half axes of the ellipse of 95 % in standard deviations, in two dimensions. */
+const SIGMAS_95 = 2.4477;
+/** With more tags than this only the selected one is named. */
 export const NAMED = 40;
 const MARK = 5;
-const row = new Float64Array(17);
+const row = new Float64Array(COLUMNS);
 
-/** What was drawn last, for the pointer: name, pixels. @type {Array<{name: string, x: number, y: number}>} */
+/** The tags as drawn last, for the pointer: name, pixels. @type {Array<{name: string, x: number, y: number}>} */
 export const drawn = [];
 
-/** What the map shows of the tags now, whether the next frame differs without any news, and whether some later one will. */
-export function look() {
+/** The tags on the map, whether the next frame differs without a message (moving), and whether a later one will (ageing). */
+export function visibleTags() {
   const now = now_s();
   const shown = shown_s();
   const list = tracks().sorted;
@@ -53,10 +53,10 @@ export function drawTags(context, { seen, shown }) {
 
 function ellipse(context, { row: at, colour, selected }) {
   const [major, minor, angle] = axes(at[CXX], at[CXY], at[CYY]);
-  const long = NINETY_FIVE * major * view.scale;
+  const long = SIGMAS_95 * major * view.scale;
   if (!(long > MARK)) return;
   context.beginPath();
-  context.ellipse(px(at[X]), py(at[Y]), long, NINETY_FIVE * minor * view.scale, -angle, 0, 2 * Math.PI);
+  context.ellipse(px(at[X]), py(at[Y]), long, SIGMAS_95 * minor * view.scale, -angle, 0, 2 * Math.PI);
   context.fillStyle = faint(colour, 0.14);
   context.fill();
   context.strokeStyle = faint(colour, selected ? 0.95 : 0.6);
@@ -64,7 +64,7 @@ function ellipse(context, { row: at, colour, selected }) {
   context.stroke();
 }
 
-/** The circle beyond which a tag is hardly ever. */
+/** The circle of the protection level. */
 function level(context, { row: at, colour, selected }) {
   const radius = at[HPL] * view.scale;
   if (!(radius > MARK)) return;
@@ -77,11 +77,11 @@ function level(context, { row: at, colour, selected }) {
   context.setLineDash([]);
 }
 
-/** Half axes of one sigma in m, and the long one's angle from x, of a 2 × 2 covariance. */
+/** Half axes of one sigma in m, and the angle of the long one from x, of a 2 × 2 covariance. */
 export function axes(xx, xy, yy) {
   const middle = (xx + yy) / 2;
-  const spread = Math.hypot((xx - yy) / 2, xy);
-  return [Math.sqrt(middle + spread), Math.sqrt(Math.max(middle - spread, 0)), Math.atan2(2 * xy, xx - yy) / 2];
+  const difference = Math.hypot((xx - yy) / 2, xy);
+  return [Math.sqrt(middle + difference), Math.sqrt(Math.max(middle - difference, 0)), Math.atan2(2 * xy, xx - yy) / 2];
 }
 
 function truth(context, { row: at, colour }) {

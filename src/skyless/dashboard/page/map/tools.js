@@ -1,4 +1,4 @@
-/** The map's buttons, and the bar that helps while a zone is drawn. */
+/** The map's buttons, and the bar with help while a zone is drawn. */
 
 import { changed, on } from "../store.js";
 import { byId, text } from "../dom.js";
@@ -6,7 +6,7 @@ import { begin, cancel, editor, finish, undoPoint } from "./editor.js";
 import { fitAll, redraw } from "./map.js";
 import { view, zoom } from "./view.js";
 
-/** Make the buttons work. */
+/** Connect the buttons. */
 export function start() {
   const click = (id, call) => byId(id).addEventListener("click", call);
   click("zoom-in", () => (zoom(1.25), redraw()));
@@ -23,7 +23,7 @@ export function start() {
   });
 }
 
-/** Begin a zone; from the keyboard with a cursor in the middle of the map. */
+/** Begin a zone; from the keyboard, with a cursor in the middle of the map. */
 export function startDrawing(keyboard) {
   begin(keyboard ? [view.x_m, view.y_m] : null);
   byId("canvas").focus({ preventScroll: true });

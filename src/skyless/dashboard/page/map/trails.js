@@ -1,37 +1,37 @@
 /**
- * Trails on a canvas of their own, which is drawn a few times a second: their strokes are what costs most without a
- * graphics card. What has come since is a short stub that is drawn with the tag.
+ * Trails on a separate canvas, which is drawn a few times a second: without a graphics card their strokes cost most.
+ * The part since then is a short stub that is drawn with the tag.
  */
 
 import { faint } from "../theme.js";
 import { TIME, X, Y } from "../tracks.js";
 import { px, py } from "./view.js";
 
-/** Time between two drawings: for a few tags, and for more than `CROWD`. */
+/** Time between two drawings: for few tags, and for more than `MANY`. */
 const FEW_MS = 100;
 const MANY_MS = 330;
-const CROWD = 40;
+const MANY = 40;
 /** Points nearer than this to the last one are left out, in pixels. */
-const NEAR = 2.5;
-/** Over a longer silence no line is drawn. */
+const MIN_STEP = 2.5;
+/** Over a longer gap no line is drawn. */
 const GAP_S = 1;
 
 let drawn_s = NaN;
 let strength = 0.4;
 
-/** Whether the trails are due for so many tags. */
+/** Whether the trails are due, for a number of tags. */
 export function due(since_ms, count) {
-  return since_ms > (count > CROWD ? MANY_MS : FEW_MS);
+  return since_ms > (count > MANY ? MANY_MS : FEW_MS);
 }
 
 /** Draw all trails up to a moment. */
 export function drawTrails(context, seen, shown, length_s) {
   drawn_s = shown;
-  strength = seen.length > CROWD ? 0.22 : 0.4;
+  strength = seen.length > MANY ? 0.22 : 0.4;
   for (const one of seen) path(context, one, px(one.row[X]), py(one.row[Y]), shown, shown - length_s);
 }
 
-/** Draw what a trail has grown since `drawTrails`, up to the tag. */
+/** Draw a trail from the last `drawTrails` to the tag. */
 export function drawStub(context, one, shown) {
   path(context, one, px(one.row[X]), py(one.row[Y]), shown, Math.min(drawn_s, shown) - 0.15);
 }
@@ -49,7 +49,7 @@ function path(context, { track, colour, selected }, x0, y0, shown, from) {
     const x = px(track.value(index, X));
     const y = py(track.value(index, Y));
     const gap = time0 - time > GAP_S;
-    if (!gap && index > 0 && Math.abs(x - x0) + Math.abs(y - y0) < NEAR) continue;
+    if (!gap && index > 0 && Math.abs(x - x0) + Math.abs(y - y0) < MIN_STEP) continue;
     if (gap) context.moveTo(x, y);
     else context.lineTo(x, y);
     [x0, y0, time0] = [x, y, time];

@@ -1,7 +1,10 @@
-/** How metres of the site lie on the canvas: y points up, the scale is the same in both directions. */
+/** The transformation from metres of the site to the canvas: y points up, with one scale for both axes. */
 
-const LEAST = 2;
-const MOST = 2000;
+import { roundStep } from "../format.js";
+
+/** Limits of the scale, pixels in a metre. */
+const MIN_SCALE = 2;
+const MAX_SCALE = 2000;
 
 export const view = { width: 1, height: 1, ratio: 1, x_m: 0, y_m: 0, scale: 50, touched: false };
 
@@ -20,17 +23,17 @@ export function toSite(x, y) {
   return [view.x_m + (x - view.width / 2) / view.scale, view.y_m - (y - view.height / 2) / view.scale];
 }
 
-/** Move the picture by so many pixels. */
+/** Move the map by pixels. */
 export function pan(dx, dy) {
   view.x_m -= dx / view.scale;
   view.y_m += dy / view.scale;
   view.touched = true;
 }
 
-/** Zoom so that the site stays where it is under a pixel. */
+/** Zoom about a pixel. */
 export function zoom(factor, x = view.width / 2, y = view.height / 2) {
   const [x_m, y_m] = toSite(x, y);
-  view.scale = Math.min(Math.max(view.scale * factor, LEAST), MOST);
+  view.scale = Math.min(Math.max(view.scale * factor, MIN_SCALE), MAX_SCALE);
   view.x_m = x_m - (x - view.width / 2) / view.scale;
   view.y_m = y_m + (y - view.height / 2) / view.scale;
   view.touched = true;
@@ -52,17 +55,14 @@ export function fit(site, zones, floor) {
     view.width < 600 ? { left: 34, right: 22, top: 62, bottom: 82 } : { left: 48, right: 64, top: 32, bottom: 104 };
   const across = (view.width - edge.left - edge.right) / Math.max(right - left, 1);
   const up = (view.height - edge.top - edge.bottom) / Math.max(top - bottom, 1);
-  view.scale = Math.min(Math.max(Math.min(across, up), LEAST), MOST);
+  view.scale = Math.min(Math.max(Math.min(across, up), MIN_SCALE), MAX_SCALE);
   view.x_m = (left + right) / 2 + (edge.right - edge.left) / 2 / view.scale;
   view.y_m = (bottom + top) / 2 + (edge.top - edge.bottom) / 2 / view.scale;
 }
 
-/** A round length of about so many pixels: 1, 2 or 5 times a power of ten. */
+/** A round length of at most as many pixels. */
 export function roundLength(pixels) {
-  const wanted = pixels / view.scale;
-  const power = 10 ** Math.floor(Math.log10(wanted));
-  const step = [1, 2, 5, 10].findLast((factor) => factor * power <= wanted) ?? 1;
-  return step * power;
+  return roundStep(pixels / view.scale);
 }
 
 /** Fit a canvas to its element and clear it; the context counts in pixels of CSS. */

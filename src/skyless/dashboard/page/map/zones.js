@@ -1,4 +1,4 @@
-/** Zones on the map, and the one that is being drawn. */
+/** Zones on the map, and the zone that is being drawn. */
 
 import { state } from "../store.js";
 import { faint, palette } from "../theme.js";
@@ -6,7 +6,7 @@ import { label } from "./anchors.js";
 import { editor } from "./editor.js";
 import { px, py } from "./view.js";
 
-/** A zone's colour; one that says nothing, or nothing that a browser knows, gets the page's. */
+/** A zone's colour; the page's where it has none or one that the browser does not know. */
 export function zoneColour(zone) {
   return zone.colour && CSS.supports("color", zone.colour) ? zone.colour : palette.accent;
 }
@@ -14,7 +14,7 @@ export function zoneColour(zone) {
 /** Zones that had an event within the last second and a half. */
 const flashing = new Map();
 
-/** Show for a moment that something happened in a zone. */
+/** Highlight a zone for a moment. */
 export function flash(id) {
   flashing.set(id, performance.now() + 1500);
 }
@@ -44,7 +44,7 @@ export function drawZones(context) {
   return flashing.size > 0;
 }
 
-/** Draw what is being drawn: corners so far, the line to the cursor, and the cursor of the keyboard. */
+/** Draw the zone that is being drawn: its corners, the line to the cursor, and the cursor. */
 export function drawDraft(context) {
   if (!editor.drawing) return;
   const points = editor.cursor ? [...editor.points, editor.cursor] : editor.points;

@@ -1,41 +1,40 @@
 /** The recordings that can be replayed. */
 
-import { changed, on, state } from "../store.js";
+import { changed, state } from "../store.js";
 import { recordings } from "../api.js";
 import { Rows, h, text, toast } from "../dom.js";
 import { bytes, dateTime, duration } from "../format.js";
 import { open as play, close } from "../player.js";
 
 export const title = "Replay";
+export const topics = ["recordings", "player", "mode"];
+export const interval_ms = 60;
+
 let parts = null;
-let isOpen = () => false;
 let error = "";
 
 /** Build the tab. */
-export function start(panel, open) {
-  isOpen = open;
-  const again = h("button", { type: "button", onclick: load }, "Look again");
+export function start(panel) {
+  const refresh = h("button", { type: "button", onclick: load }, "Refresh");
   const back = h("button", { type: "button", class: "primary", onclick: close }, "Back to live");
   const list = h("ul", { class: "recordings" });
   const empty = h("p", { class: "empty" });
   parts = { back, empty, rows: new Rows(list, makeRow) };
   panel.append(
-    h("div", { class: "above" }, h("p", { class: "count" }, "Recordings, the newest first"), back, again),
+    h("div", { class: "above" }, h("p", { class: "count" }, "Recordings, newest first"), back, refresh),
     empty,
     list,
   );
-  on(["recordings", "player", "mode"], show);
 }
 
 /** Show the list; fetched when first seen. */
 export function show() {
-  if (!parts || !isOpen()) return;
   if (state.recordings === null) {
     state.recordings = [];
     load();
   }
   parts.back.hidden = state.mode === "live";
-  text(parts.empty, error || "No recordings yet. `skyless record` makes them.");
+  text(parts.empty, error || "No recordings yet. `skyless record` makes one.");
   parts.empty.hidden = state.recordings.length > 0;
   parts.rows.show(state.recordings.map((one) => [one.name, one]));
 }

@@ -1,90 +1,187 @@
-/** All tags as a list, and the selected one in detail. */
+/** All tags as a list; the selected one in detail, with its last minute as charts. */
 
-import { on, select, state } from "../store.js";
-import { freshness, shown_s, tracks } from "../clock.js";
-import { Rows, h, slowly, text } from "../dom.js";
-import { DASH, length, metres, number } from "../format.js";
+import { state } from "../store.js";
+import { GONE_S, GREY_S, freshness, shown_s, tracks } from "../clock.js";
+import { Chart } from "../chart.js";
+import { h, text } from "../dom.js";
+import { DASH, bytes, duration, length, metres, number } from "../format.js";
+import { tagHistory } from "../history.js";
 import { tagColour } from "../theme.js";
-import { ERROR, STD, X, Y } from "../tracks.js";
-import { split } from "../tabs.js";
-import { TagDetail } from "./tag_detail.js";
+import { ALERT, ALERTS, ANCHORS, CHI2, COLUMNS, ERROR, HPL, STD, TIME, VX, VY, X, Y, Z } from "../tracks.js";
+import { facts, selectionTable, split } from "./parts.js";
 
 export const title = "Tags";
+export const topics = ["tags", "health", "selection", "mode", "player", "theme", "site"];
+export const interval_ms = 300;
+export const changesWithTime = true;
+
 const MARKS = { fresh: "●", stale: "○", gone: "✕", never: "–" };
-const WORDS = { fresh: "has a fix", stale: "no fix for a second", gone: "lost", never: "no fix yet" };
+const WORDS = {
+  fresh: "has a fix",
+  stale: `no fix for ${GREY_S} s`,
+  gone: `no fix for ${GONE_S} s`,
+  never: "no fix yet",
+};
+/** With more tags than this there is a search field. */
 const SEARCHED = 12;
-const row = new Float64Array(17);
+const WINDOW_S = 60;
+const row = new Float64Array(COLUMNS);
 let parts = null;
-let isOpen = () => false;
 
 /** Build the tab. */
-export function start(panel, open) {
-  isOpen = open;
+export function start(panel) {
   const search = h("input", { type: "search", placeholder: "Find a tag", "aria-label": "Find a tag", oninput: show });
-  const head = h(
-    "tr",
-    {},
-    ...["", "Tag", "x", "y", "σ", "Error", "Rate"].map((words) => h("th", { scope: "col" }, words)),
-  );
-  head.cells[0].append(h("span", { class: "unseen" }, "State"));
-  head.cells[5].title = "Distance to the true position, where it is known";
-  head.cells[6].title = "Fixes in the last second";
-  const body = h("tbody", {});
-  const table = h("table", { class: "list tags" }, h("thead", {}, head), body);
-  const empty = h("p", { class: "empty" }, "No tag has been heard of yet.");
-  const detail = new TagDetail();
+  const table = selectionTable("tag", ["Tag", "x", "y", "σ", "Error", "Rate"], describe);
+  table.head.cells[4].title = "Reported standard deviation of the position";
+  table.head.cells[5].title = "Distance to the true position, where it is known";
+  table.head.cells[6].title = "Fixes in the last second";
+  const empty = h("p", { class: "empty" }, "No tags yet.");
   const count = h("p", { class: "count" });
-  const box = h("div", { class: "scroll-x" }, table);
+  const box = h("div", { class: "scroll-x" }, table.element);
+  const detail = makeDetail();
   panel.append(h("div", { class: "above" }, count, search), empty, box, detail.element);
-  parts = { panel, box, search, table, head, empty, detail, count, rows: new Rows(body, makeRow) };
-  on(["tags", "health", "selection", "mode", "player"], slowly(300, show));
-  on(["theme", "site"], show);
-  setInterval(show, 1000);
+  parts = { panel, box, search, table, empty, count, detail };
 }
 
-/** Bring the tab up to date, if anybody sees it. */
+/** Bring the tab up to date. */
 export function show() {
-  if (!parts || !isOpen()) return;
   const list = tracks().sorted;
   const wanted = parts.search.value.trim().toLowerCase();
   parts.search.hidden = list.length <= SEARCHED;
   parts.empty.hidden = list.length > 0;
-  parts.table.hidden = list.length === 0;
-  parts.table.classList.toggle("untrue", !state.simulated);
+  parts.table.element.hidden = list.length === 0;
+  parts.table.element.classList.toggle("no-truth", !state.simulated);
   const shown = list.map((track, index) => [track.name, { track, colour: tagColour(index, list.length) }]);
-  parts.rows.show(shown.filter(([name]) => name.toLowerCase().includes(wanted)));
+  parts.table.rows.show(shown.filter(([name]) => name.toLowerCase().includes(wanted)));
   const fresh = list.filter((track) => freshness(track) === "fresh").length;
   text(parts.count, list.length ? `${fresh} of ${list.length} with a fix` : "");
   parts.detail.show(tracks().all.get(state.selection.tag) ?? null);
   split(parts.panel, parts.box, !parts.detail.element.hidden);
 }
 
-function makeRow(name) {
-  const cells = Array.from({ length: 7 }, () => h("td", {}));
-  const button = h("button", { type: "button", class: "name", onclick: () => toggle(name) }, name);
-  cells[1].append(button);
-  const words = h("span", { class: "unseen" });
-  const mark = h("span", { "aria-hidden": "true" });
-  cells[0].append(mark, words);
-  const element = h("tr", { onclick: (event) => event.target === button || toggle(name) }, ...cells);
-  const update = ({ track, colour }) => {
-    const kind = freshness(track);
-    const known = kind !== "never" && track.at(shown_s(), row, false);
-    text(mark, MARKS[kind]);
-    text(words, WORDS[kind]);
-    mark.style.color = kind === "fresh" ? colour : "";
-    element.className = `${kind} ${state.selection.tag === name ? "selected" : ""}`;
-    button.setAttribute("aria-pressed", String(state.selection.tag === name));
-    const rate = state.mode === "live" ? state.health.tags.get(name)?.updates_per_s : null;
-    const values = known
-      ? [metres(row[X]), metres(row[Y]), length(row[STD]), length(row[ERROR]), number(rate)]
-      : [DASH, DASH, DASH, DASH, number(rate)];
-    values.forEach((value, index) => text(cells[index + 2], value));
+function describe(name, { track, colour }) {
+  const condition = freshness(track);
+  const known = condition !== "never" && track.at(shown_s(), row, false);
+  const style = condition === "fresh" ? `color: ${colour}` : "";
+  const rate = state.mode === "live" ? state.health.tags.get(name)?.updates_per_s : null;
+  const position = known ? [metres(row[X]), metres(row[Y]), length(row[STD]), length(row[ERROR])] : Array(4).fill(DASH);
+  return {
+    condition,
+    words: WORDS[condition],
+    key: condition + style,
+    mark: () => h("span", { "aria-hidden": "true", style }, MARKS[condition]),
+    name,
+    figures: [...position, number(rate)],
   };
-  return { element, update };
 }
 
-function toggle(name) {
-  if (state.selection.tag === name) select(null);
-  else select("tag", name);
+function makeDetail() {
+  const heading = h("h2", {});
+  const reason = h("p", { class: "reason", hidden: true });
+  const list = facts([
+    "Position",
+    "Speed",
+    "Protection level",
+    "Integrity alert",
+    "Anchors used",
+    "Time to first fix",
+    "Latency",
+    "Method",
+    "Dropped",
+    "CPU",
+    "Memory",
+  ]);
+  const sigma = { name: "σ", colour: "accent" };
+  const errors = new Chart("Error and reported σ", [{ name: "error", colour: "bad" }, sigma], length, 0.02);
+  const sigmas = new Chart("Reported σ", [sigma], length, 0.02);
+  const rates = new Chart("Fixes per second", [{ name: "rate", colour: "good", steps: true }], number, 4);
+  const anchors = { name: "anchors", colour: "accent", steps: true };
+  const used = new Chart("Anchors used", [anchors], number, 4, { whole: true });
+  const chi2 = new Chart("Residuals (χ² of each fix)", [{ name: "χ²", colour: "warn" }], (v) => number(v, 1), 1);
+  const element = h(
+    "section",
+    { class: "detail", "aria-label": "Selected tag", hidden: true },
+    heading,
+    reason,
+    list.element,
+    ...[errors, sigmas, rates, used, chi2].map((chart) => chart.element),
+    h("p", { class: "fine" }, `Charts: the last ${WINDOW_S} s.`),
+  );
+
+  const showCharts = (track) => {
+    const now = shown_s();
+    const columns = lastMinute(track, now);
+    const truth = columns[ERROR].some((value) => value !== null);
+    errors.element.hidden = !truth;
+    sigmas.element.hidden = truth;
+    if (truth) errors.show([columns[TIME], columns[ERROR], columns[STD]], WINDOW_S);
+    else sigmas.show([columns[TIME], columns[STD]], WINDOW_S);
+    used.show([columns[TIME], columns[ANCHORS]], WINDOW_S);
+    chi2.show([columns[TIME], columns[CHI2]], WINDOW_S);
+    const past = state.mode === "live" ? tagHistory.get(track.name) : null;
+    rates.element.hidden = !past;
+    if (past) rates.show([past.time.map((time) => time - now), past.rate], WINDOW_S);
+  };
+
+  /** @param {import("../tracks.js").Track|null} track */
+  const showDetail = (track) => {
+    element.hidden = !track;
+    if (!track) return;
+    const health = state.mode === "live" ? state.health.tags.get(track.name) : null;
+    text(heading, track.name);
+    reason.hidden = !health?.reason;
+    text(reason, health?.reason ? `No fix: ${health.reason.replaceAll("-", " ")}` : "");
+    const known = track.at(shown_s(), row, false);
+    list.show({ ...(known ? fixFacts() : {}), ...(health ? healthFacts(health) : {}) });
+    list.grade("Integrity alert", (known && Object.values(ALERTS)[row[ALERT]]?.grade) || "");
+    showCharts(track);
+  };
+  return { element, show: showDetail };
+}
+
+/** What `row` holds. */
+function fixFacts() {
+  const speed = Math.hypot(row[VX], row[VY]);
+  return {
+    Position: `${metres(row[X], 3)}, ${metres(row[Y], 3)}, ${metres(row[Z], 3)} m`,
+    Speed: speed >= 0 ? `${speed.toFixed(2)} m/s` : null,
+    "Protection level": row[HPL] >= 0 ? length(row[HPL]) : null,
+    "Integrity alert": Object.values(ALERTS)[row[ALERT]]?.words,
+    "Anchors used": number(row[ANCHORS]),
+  };
+}
+
+function healthFacts({ first_fix_s, latency_p50_s, latency_p99_s, method, counters, cpu, memory_bytes }) {
+  const dropped = Object.entries(counters).filter(([, count]) => count);
+  return {
+    "Time to first fix": first_fix_s == null ? null : duration(first_fix_s),
+    Latency: latency_p50_s == null ? null : `${duration(latency_p50_s)}, p99 ${duration(latency_p99_s)}`,
+    Method: method,
+    Dropped: dropped.map(([name, count]) => `${count} ${name}`).join(", ") || "none",
+    CPU: `${(100 * cpu).toFixed(1)} %`,
+    Memory: bytes(memory_bytes),
+  };
+}
+
+/** The charts' columns of the last minute; a gap of more than a second is shown as one. */
+function lastMinute(track, now) {
+  const columns = { [TIME]: [], [ERROR]: [], [STD]: [], [ANCHORS]: [], [CHI2]: [] };
+  const wanted = [ERROR, STD, ANCHORS, CHI2];
+  const first = Math.max(track.find(now - WINDOW_S), 0);
+  const last = track.find(now);
+  let before = NaN;
+  for (let index = first; index <= last; index++) {
+    const time = track.value(index, TIME) - now;
+    if (time - before > 1) {
+      columns[TIME].push(before + 0.01);
+      for (const column of wanted) columns[column].push(null);
+    }
+    columns[TIME].push(time);
+    for (const column of wanted) {
+      const value = track.value(index, column);
+      columns[column].push(Number.isNaN(value) ? null : value);
+    }
+    before = time;
+  }
+  return columns;
 }

@@ -1,50 +1,52 @@
-/** The superframe, and when each tag was positioning within it: the paper's oscilloscope picture, from the tags' reports. */
+/** The superframe, and when each tag processed its messages: the paper's oscilloscope picture, from the tags' health. */
 
-import { on, state } from "../store.js";
-import { byId, h, s, slowly, text } from "../dom.js";
-import { duration, number } from "../format.js";
-import { facts } from "./tag_detail.js";
+import { state } from "../store.js";
+import { byId, h, s, text } from "../dom.js";
+import { duration, number, roundStep } from "../format.js";
+import { facts } from "./parts.js";
 
 export const title = "Timing";
-/** Rows of the picture; more could not be told apart. */
-const MOST = 24;
-const ROW = 30;
+export const topics = ["health", "selection", "theme", "mode"];
+export const interval_ms = 200;
+
+/** Limit of the rows in the picture. */
+const MAX_ROWS = 24;
+const ROW_HEIGHT = 30;
 const TOP = 38;
 const LEFT = 62;
 let parts = null;
-let isOpen = () => false;
 
 /** Build the tab. */
-export function start(panel, open) {
-  isOpen = open;
+export function start(panel) {
   const about = h(
     "p",
     { class: "fine" },
-    "Each tag's last whole superframe. The line is high while the tag works on a message; ",
-    "a dot is a fix. Above, the slots and the anchors that were heard in them.",
+    "Each tag's last complete superframe. The line is high while the tag processes a message; ",
+    "a dot marks a fix. Top: the slots, and the anchors heard in them.",
   );
   const picture = h("div", { id: "phases" });
-  const empty = h("p", { class: "empty" }, "No tag has reported its phases yet.");
+  const empty = h("p", { class: "empty" });
   const caption = h("p", { class: "count" });
-  const ether = facts(["Transmissions", "Too late", "Stalls", "Overruns", "Simulated time"]);
-  const etherBox = h("section", { hidden: true }, h("h2", {}, "The emulated air"), ether.element);
+  const ether = facts(["Transmissions", "Late", "Stalls", "Overruns", "Simulated time"]);
+  const etherBox = h("section", { hidden: true }, h("h2", {}, "Emulated radio channel"), ether.element);
   parts = { picture, empty, caption, ether, etherBox };
   panel.append(h("h2", {}, "Superframe and positioning phases"), caption, picture, empty, about, etherBox);
-  on(["health", "selection", "theme", "mode"], slowly(200, show));
-  new ResizeObserver(() => show()).observe(panel);
+  new ResizeObserver(() => panel.clientWidth && show()).observe(panel);
 }
 
-/** Bring the tab up to date, if anybody sees it. */
+/** Bring the tab up to date. */
 export function show() {
-  if (!parts || !isOpen()) return;
   const all =
     state.mode === "live" ? [...state.health.tags.values()].filter(({ phases }) => phases?.length).map(read) : [];
   all.sort((a, b) => a.tag.localeCompare(b.tag, "en", { numeric: true }));
   const chosen = all.filter((health) => health.tag === state.selection.tag);
-  const shown = [...chosen, ...all.filter((health) => health.tag !== state.selection.tag)].slice(0, MOST);
+  const shown = [...chosen, ...all.filter((health) => health.tag !== state.selection.tag)].slice(0, MAX_ROWS);
   parts.empty.hidden = shown.length > 0;
   parts.picture.replaceChildren(...(shown.length ? [draw(shown)] : []));
-  text(parts.empty, state.mode === "live" ? "No tag has reported its phases yet." : "Phases are shown live only.");
+  text(
+    parts.empty,
+    state.mode === "live" ? "No positioning phases reported yet." : "Phases are shown on the live site only.",
+  );
   const { slot_s = 0 } = state.site?.schedule ?? {};
   const slots = slotCount();
   const more = all.length > shown.length ? ` ${shown.length} of ${all.length} tags.` : "";
@@ -57,7 +59,7 @@ export function show() {
   showEther();
 }
 
-/** A tag's health with its phases by name; on the wire they are arrays. */
+/** A tag's phases with named fields; on the wire they are arrays. */
 function read(health) {
   const phases = health.phases.map(([superframe, slot, anchor, heard_s, done_s, fix]) => {
     return { superframe, slot, anchor, heard_s, done_s, fix };
@@ -72,7 +74,7 @@ function slotCount() {
 
 function draw(tags) {
   const width = Math.max(byId("phases").clientWidth || 340, 260);
-  const height = TOP + tags.length * ROW + 8;
+  const height = TOP + tags.length * ROW_HEIGHT + 8;
   const slot_s = state.site?.schedule.slot_s ?? 2e-3;
   const latest = Math.max(...tags.flatMap((health) => health.phases.map((phase) => phase.done_s)));
   const end_s = Math.max(slotCount() * slot_s, latest);
@@ -80,29 +82,27 @@ function draw(tags) {
   const label = `Positioning phases of ${tags.map((health) => health.tag).join(", ")} over ${duration(end_s)}`;
   const picture = s("svg", { width, height, viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": label });
   picture.append(...slotMarks(tags, slot_s, at, height), ...timeMarks(end_s, at));
-  tags.forEach((health, index) => picture.append(trace(health, TOP + index * ROW, at, end_s)));
+  tags.forEach((health, index) => picture.append(trace(health, TOP + index * ROW_HEIGHT, at, end_s)));
   return picture;
 }
 
-/** Boxes of the slots from the first that was heard, with who spoke; a dot where nobody was heard. */
+/** Boxes of the slots from the first that was heard, with the anchor; a dot where none was heard. */
 function slotMarks(tags, slot_s, at, height) {
-  const speakers = new Map(tags.flatMap(({ phases }) => phases.map(({ slot, anchor }) => [slot, anchor])));
+  const heard = new Map(tags.flatMap(({ phases }) => phases.map(({ slot, anchor }) => [slot, anchor])));
   const first = tags[0].phases[0].slot;
   const marks = [];
   for (let slot = first; slot < Math.max(slotCount(), first + 1); slot++) {
     const x = at((slot - first) * slot_s);
     const next = at((slot - first + 1) * slot_s);
     marks.push(s("rect", { class: "slot", x, y: 18, width: Math.max(next - x - 1, 1), height: height - 24 }));
-    const name = String(speakers.get(slot) ?? "·");
+    const name = String(heard.get(slot) ?? "·");
     if (next - x > 11) marks.push(s("text", { x: (x + next) / 2, y: 31, class: "slot-name" }, name));
   }
   return marks;
 }
 
 function timeMarks(end_s, at) {
-  const wanted = end_s / 4;
-  const power = 10 ** Math.floor(Math.log10(wanted));
-  const step = power * [1, 2, 5].findLast((factor) => factor * power <= wanted);
+  const step = roundStep(end_s / 4);
   const marks = [s("text", { x: 0, y: 31, class: "row-name" }, "anchor")];
   for (let n = 0; n * step <= end_s + 1e-9; n++) {
     marks.push(
@@ -113,7 +113,7 @@ function timeMarks(end_s, at) {
 }
 
 function trace(health, top, at, end_s) {
-  const low = top + ROW - 8;
+  const low = top + ROW_HEIGHT - 8;
   const high = top + 8;
   let line = `M${LEFT} ${low}`;
   const row = s("g", { class: health.tag === state.selection.tag ? "trace selected" : "trace" });
@@ -139,7 +139,7 @@ function showEther() {
   if (!ether) return;
   parts.ether.show({
     Transmissions: number(ether.transmissions),
-    "Too late": number(ether.late),
+    Late: number(ether.late),
     Stalls: number(ether.stalls),
     Overruns: number(ether.overruns),
     "Simulated time": duration(ether.simulated_s),

@@ -1,47 +1,39 @@
-/** Zones: named, recoloured, moved by numbers, deleted; and who entered and left. */
+/** Zones: their names, colours and corners; and the tags that entered and left. */
 
-import { on, select, state } from "../store.js";
-import { Rows, h, slowly, text } from "../dom.js";
+import { select, state, toggleSelection } from "../store.js";
+import { Rows, h, text } from "../dom.js";
 import { timeOfDay } from "../format.js";
 import { change, editor, remove } from "../map/editor.js";
 import { startDrawing } from "../map/tools.js";
 import { zoneColour } from "../map/zones.js";
 
 export const title = "Zones";
+export const topics = ["zones", "events", "selection", "mode", "editor"];
+export const interval_ms = 60;
+
 let parts = null;
-let isOpen = () => false;
 
 /** Build the tab. */
-export function start(panel, open) {
-  isOpen = open;
+export function start(panel) {
   const add = h("button", { type: "button", class: "primary", id: "add-zone" }, "Draw a zone");
   add.addEventListener("click", (event) => startDrawing(event.detail === 0));
   const zones = h("ul", { class: "zones" });
   const events = h("ol", { class: "events", id: "events", role: "log", "aria-label": "Events" });
   const none = h("p", { class: "empty" }, "No zones yet. Draw one on the map with mouse, finger or keyboard.");
-  const silent = h("p", { class: "empty" }, "Nobody has entered or left a zone yet.");
-  parts = {
-    add,
-    none,
-    silent,
-    zones: new Rows(zones, makeZone),
-    events: new Rows(events, makeEvent),
-    eventBox: events,
-  };
+  const silent = h("p", { class: "empty" });
+  parts = { add, none, silent, zones: new Rows(zones, makeZone), events: new Rows(events, makeEvent) };
   panel.append(h("div", { class: "above" }, h("p", { class: "count" }), add), none, zones);
-  panel.append(h("section", {}, h("h2", {}, "Entered and left"), silent, events));
-  on(["zones", "events", "selection", "mode", "editor"], slowly(60, show));
+  panel.append(h("section", {}, h("h2", {}, "Events"), silent, events));
 }
 
-/** Bring the tab up to date, if anybody sees it. */
+/** Bring the tab up to date. */
 export function show() {
-  if (!parts || !isOpen()) return;
   const live = state.mode === "live";
   parts.add.disabled = !live || editor.drawing;
   parts.none.hidden = state.zones.length > 0;
   parts.zones.show(state.zones.map((zone) => [zone.id, zone]));
   const events = live ? state.events : [];
-  text(parts.silent, live ? "Nobody has entered or left a zone yet." : "Events are shown live only.");
+  text(parts.silent, live ? "No tag has entered or left a zone yet." : "Events are shown on the live site only.");
   parts.silent.hidden = events.length > 0;
   parts.events.show(events.map((event) => [`${event.unix_s} ${event.tag} ${event.zone} ${event.kind}`, event]));
 }
@@ -52,10 +44,14 @@ function makeZone(id, zone) {
   const name = h("input", { type: "text", maxLength: 60, "aria-label": "Name of the zone" });
   name.addEventListener("change", () => name.value.trim() && change(id, { name: name.value.trim() }));
   name.addEventListener("keydown", (event) => event.key === "Enter" && name.blur());
-  const corners = h("button", { type: "button", class: "quiet", onclick: () => toggle(id) }, "Corners");
-  const away = h("button", { type: "button", class: "quiet", onclick: () => remove(id) }, "Delete");
+  const corners = h(
+    "button",
+    { type: "button", class: "quiet", onclick: () => toggleSelection("zone", id) },
+    "Corners",
+  );
+  const del = h("button", { type: "button", class: "quiet", onclick: () => remove(id) }, "Delete");
   const table = h("div", { class: "corners", hidden: true });
-  const element = h("li", {}, h("div", { class: "zone" }, swatch, name, corners, away), table);
+  const element = h("li", {}, h("div", { class: "zone" }, swatch, name, corners, del), table);
   let shown = "";
   const update = (now) => {
     const chosen = state.selection.zone === id;
@@ -64,8 +60,8 @@ function makeZone(id, zone) {
     const colour = zoneColour(now);
     if (document.activeElement !== swatch && colour.startsWith("#")) swatch.value = colour;
     if (document.activeElement !== name) name.value = now.name;
-    away.setAttribute("aria-label", `Delete ${now.name}`);
-    for (const input of [swatch, name, away]) input.disabled = state.mode !== "live";
+    del.setAttribute("aria-label", `Delete ${now.name}`);
+    for (const input of [swatch, name, del]) input.disabled = state.mode !== "live";
     table.hidden = !chosen;
     const key = JSON.stringify(now.polygon_m);
     if (chosen && key !== shown && !table.contains(document.activeElement)) table.replaceChildren(...cornerRows(now));
@@ -84,14 +80,14 @@ function cornerRows(zone) {
         "aria-label": `Corner ${index + 1}, ${axis} in metres`,
         disabled: state.mode !== "live",
       });
-      input.addEventListener("change", () => moveBy(zone.id, index, part, Number(input.value)));
+      input.addEventListener("change", () => setCoordinate(zone.id, index, part, Number(input.value)));
       return h("label", {}, `${axis} `, input);
     });
     return h("div", {}, h("span", {}, String(index + 1)), ...inputs, "m");
   });
 }
 
-function moveBy(id, index, part, value) {
+function setCoordinate(id, index, part, value) {
   const zone = state.zones.find((one) => one.id === id);
   if (!zone || !Number.isFinite(value)) return;
   const polygon_m = zone.polygon_m.map((corner, n) =>
@@ -111,9 +107,4 @@ function makeEvent(_key, event) {
     h("span", {}, ` ${entered ? "entered" : "left"} ${event.name}`),
   );
   return { element };
-}
-
-function toggle(id) {
-  if (state.selection.zone === id) select(null);
-  else select("zone", id);
 }
