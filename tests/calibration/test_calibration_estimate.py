@@ -81,7 +81,12 @@ def test_a_slope_is_found_and_the_constants_with_it():
 
 @pytest.mark.parametrize(
     ("slope_m", "still", "why"),
-    [(0.0, False, "told from zero"), (-0.08, False, "told from zero"), (0.4, False, "no radio"), (0.08, True, "alike")],
+    [
+        (0.0, False, "differ from zero"),
+        (-0.08, False, "differ from zero"),
+        (0.4, False, "no radio"),
+        (0.08, True, "alike"),
+    ],
 )
 def test_a_slope_that_cannot_be_told_or_cannot_be_is_left_out(slope_m, still, why):
     found = estimate(measured(np.random.default_rng(2), slope_m=slope_m, still=still))

@@ -37,7 +37,7 @@ def _of_tag(tag, seconds, method, join_s, publish_every, integrity):
         host_s = one.host_s
         if host_s >= join_s:
             log.request(RequestMessage("test", ("*",), 10.0), host_s)
-        log.hear(receiver, one.reception, serial)
+        log.add(receiver, one.reception, serial)
         fix = receiver.hear(one.reception)
         if fix is not None:
             serial += 1
@@ -56,7 +56,7 @@ def record(path, said, flush_s=1.0, close=True, **options):
     recorder = McapRecorder(McapFile(path, **options))
     flushed_s = said[0][0]
     for unix_s, topic, payload in said:
-        recorder.take(topic, payload, unix_s)
+        recorder.add(topic, payload, unix_s)
         if unix_s - flushed_s >= flush_s:
             recorder.file.flush()
             flushed_s = unix_s

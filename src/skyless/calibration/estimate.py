@@ -1,4 +1,4 @@
-"""One constant for each anchor from time differences at known places, robustly, with honest standard errors.
+"""One constant for each anchor from time differences at known positions, robustly, with honest standard errors.
 
 A difference measures |p − b| − |p − a| + bias_b − bias_a (+ slope·ln(|p − b| / |p − a|)) + noise. With p known the
 biases follow by linear regression: Huber's weights, and nothing beyond four standard deviations. Only differences of
@@ -15,10 +15,10 @@ from msgspec import Struct
 from skyless.kernels.arrays import Array, Integers, Mask, Vector
 from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
 
-# The robust regression behind a calibration: constants of anchors, and a slope, from differences at known places.
+# The robust regression behind a calibration: constants of anchors, and a slope, from differences at known positions.
 
 _HUBER: Final = 1.345
-"""Standard deviations up to which a residual weighs in full: 95 % of the efficiency on Gaussian noise."""
+"""Standard deviations up to which a residual has full weight: 95 % of the efficiency on Gaussian noise."""
 
 _REJECT: Final = 4.0
 
@@ -33,14 +33,14 @@ _LEAST_MOTION: Final = 0.05
 
 @dataclass(frozen=True)
 class Differences:
-    """Time differences at known places, n of them."""
+    """Time differences at known positions, n of them."""
 
     t_s: Vector
     """Shape (n,), not decreasing."""
     anchor_a: Integers
     anchor_b: Integers
     excess_m: Vector
-    """Measured less what the geometry says."""
+    """Measured less what follows from the geometry."""
     log_ratio: Vector
     """ln(range to b / range to a)."""
 
@@ -91,7 +91,7 @@ def fit(data: Differences, anchors: Integers, *, slope: bool) -> Fit:
 
 
 def moves(data: Differences, found: Fit) -> bool:
-    """Whether the ranges change enough; at one place a slope looks like constants."""
+    """Whether the ranges change enough; at one position a slope looks like constants."""
     a, b, count, still = found.a, found.b, len(found.anchors), np.zeros(len(found.a))
     alike = _solve(_normal(a, b, still, still + 1.0, count), _right(a, b, still, data.log_ratio, count))
     change = data.log_ratio - _model(alike, a, b, still)
@@ -126,7 +126,7 @@ def _right(a: Integers, b: Integers, x: Vector, values: Vector, count: int) -> V
 
 
 def _normal(a: Integers, b: Integers, x: Vector, weights: Vector, count: int) -> Array:
-    """Hᵀ W H; the sum of the constants is held at zero, and the slope where nothing tells it."""
+    """Hᵀ W H; the sum of the constants is held at zero, and the slope where nothing determines it."""
     normal = np.zeros((count + 1, count + 1))
     flat = normal.reshape(-1)
     for row, column, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
@@ -159,14 +159,10 @@ def _covariance(
     return result
 
 
-# One constant for each anchor from time differences at known places, robustly, with honest standard errors.
-#
-# A difference measures |p − b| − |p − a| + bias_b − bias_a (+ slope·ln(|p − b| / |p − a|)) + noise. With p known the
-# biases follow by linear regression: Huber's weights, and nothing beyond four standard deviations. Only differences of
-# constants can be seen; the zero is their mean, or one anchor.
+# The estimate: which constants are determined, their zero and their standard errors.
 
 _FEWEST: Final = 3
-"""Accepted differences below which nothing is said of an anchor."""
+"""Accepted differences below which an anchor's constant is not determined."""
 
 _MAX_STD_M: Final = 0.1
 """A constant that is known worse does more harm than good."""
@@ -175,12 +171,12 @@ _STEEPEST_M: Final = 0.12
 """Decawave's table (APS011) is nowhere steeper than 12 mm/dB, 0.105 m while the range grows by the factor e."""
 
 _SURE: Final = 3.0
-"""The slope is believed from so many of its standard errors on."""
+"""The slope is used if it is at least this number of its standard errors."""
 
 _MAD_ERROR: Final = 1.17
 """Relative standard error of a 1.4826 MAD of n Gaussian values, times √n."""
 
-_ALIKE: Final = "not used: the places are too much alike to tell it"
+_ALIKE: Final = "not used: the positions are too much alike to determine it"
 
 
 class AnchorEstimate(Struct, frozen=True):
@@ -230,14 +226,14 @@ class CalibrationEstimate(Struct, frozen=True):
 
 
 def _at_most(anchor: AnchorEstimate) -> float | None:
-    """The noise that it has at most, as far as so many differences can tell (twice the error of a 1.4826 MAD)."""
+    """The noise that it has at most, as far as its differences can show (twice the error of a 1.4826 MAD)."""
     return None if anchor.noise_m is None else anchor.noise_m * (1.0 + 2.0 * _MAD_ERROR / anchor.count**0.5)
 
 
 def estimate(differences: Differences, *, zero: int | None = None, slope: bool = True) -> CalibrationEstimate:
     """Estimate the anchors' constants; ``zero``: the anchor whose constant is 0, by default their mean is.
 
-    With ``slope`` the growth with the range is estimated too, and used if it can be told from zero and is one that
+    With ``slope`` the growth with the range is estimated too, and used if it differs from zero and is one that
     the radio can have.
     """
     found = np.unique(np.concatenate([differences.anchor_a, differences.anchor_b]))
@@ -287,7 +283,7 @@ def _slope_note(found: Fit) -> str:
     if std_m > _STEEPEST_M / _SURE:
         return _ALIKE
     if slope_m < _SURE * std_m:
-        return "not used: it cannot be told from zero"
+        return "not used: it does not differ from zero"
     if slope_m > _STEEPEST_M:
         return "not used: no radio has such a slope, so something else is behind it"
     return ""
@@ -310,14 +306,14 @@ def _estimate(
     anchors = []
     differences_used = int(found.used.sum())
     for anchor in np.unique(np.concatenate([differences.anchor_a, differences.anchor_b])).tolist():
-        place = rows.get(anchor)
-        used = 0 if place is None else int(found.counts[place])
-        if place is None or anchor in reasons:
+        own_row = rows.get(anchor)
+        used = 0 if own_row is None else int(found.counts[own_row])
+        if own_row is None or anchor in reasons:
             anchors.append(AnchorEstimate(anchor, used, None, None, None, reasons[anchor]))
             continue
-        of_anchor = np.abs(found.residual_m[found.used & ((found.a == place) | (found.b == place))])
+        of_anchor = np.abs(found.residual_m[found.used & ((found.a == own_row) | (found.b == own_row))])
         noise_m = 1.4826 * float(np.median(of_anchor)) * _spent(differences_used, len(found.anchors))
-        anchors.append(AnchorEstimate(anchor, used, float(bias_m[place]), float(std_m[place]), noise_m, None))
+        anchors.append(AnchorEstimate(anchor, used, float(bias_m[own_row]), float(std_m[own_row]), noise_m, None))
     pair = found.a * count + found.b
     medians = [float(np.median(found.residual_m[here])) for here in map(pair.__eq__, np.unique(pair[found.used]))]
     return CalibrationEstimate(
@@ -342,11 +338,11 @@ def _spent(differences: int, anchors: int) -> float:
 def _in_gauge(found: Fit, good: Mask, zero: int | None) -> tuple[Vector, Vector]:
     """Constants and their standard errors with the zero where it should be, each of shape (m,)."""
     count = len(found.anchors)
-    place = np.zeros(count)
+    zero_weights = np.zeros(count)
     if zero is not None:
-        place[found.anchors == zero] = 1.0
+        zero_weights[found.anchors == zero] = 1.0
     else:
-        place[good] = 1.0 / max(int(good.sum()), 1)
-    shift = np.eye(count) - place
+        zero_weights[good] = 1.0 / max(int(good.sum()), 1)
+    shift = np.eye(count) - zero_weights
     covariance = shift @ found.covariance_m2[:count, :count] @ shift.T
     return shift @ found.bias_m, np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -1,4 +1,4 @@
-"""What a recording gives a calibration: time differences while the tag's place is known, in bounded memory."""
+"""What a recording gives a calibration: time differences while the tag's position is known, in bounded memory."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -26,7 +26,7 @@ from skyless.recordings.source import Drops
 from skyless.replay.site import HostClock, reception_of
 from skyless.ticks import difference, from_seconds
 
-# Time differences out of a tag's recorded receptions: every anchor against the master, both as the site tells time.
+# Time differences out of a tag's recorded receptions: every anchor against the master, both in the site's time.
 #
 # Between two beacons of the master the tag's clock runs evenly, so the master's range less the clock is interpolated
 # to the moment of the anchor's beacon.
@@ -35,7 +35,7 @@ _LONGEST_TICKS: Final = from_seconds(0.2)
 """Over a longer time between two beacons of the master the tag's clock does not run evenly enough."""
 
 _WORST_CLOCK_TICKS: Final = 40.0
-"""An anchor whose clock is known worse, 0.19 m, is not used."""
+"""An anchor whose clock is known less well, 0.19 m, is not used."""
 
 
 class _TimedBeacon(Struct, frozen=True):
@@ -58,8 +58,8 @@ class SiteListener:
         self._before: _TimedBeacon | None = None
         self._between: list[_TimedBeacon] = []
 
-    def hear(self, message: ReceptionsMessage) -> Iterator[PairTdoa]:
-        """Take a run of receptions, some of which may have come before; times are Unix seconds."""
+    def process(self, message: ReceptionsMessage) -> Iterator[PairTdoa]:
+        """Process a run of receptions, some of which may have come before; times are Unix seconds."""
         if message.segment != self._segment:
             self._segment, self._next = message.segment, message.first
             self._clock, self._before, self._between = HostClock(), None, []
@@ -102,12 +102,12 @@ class SiteListener:
 
 def site_tdoas(recording: McapRecording, tags: Sequence[str], site: int, drops: Counter[str]) -> Iterator[PairTdoa]:
     """All time differences of some tags under the first master that was heard; those under others are counted."""
-    ears = {tag: SiteListener(site) for tag in tags}
+    listeners = {tag: SiteListener(site) for tag in tags}
     master: int | None = None
     for found in recording.messages({"receptions"}):
-        if found.place.name not in ears:
+        if found.channel.name not in listeners:
             continue
-        for pair in ears[found.place.name].hear(cast("ReceptionsMessage", found.message)):
+        for pair in listeners[found.channel.name].process(cast("ReceptionsMessage", found.message)):
             master = pair.anchor_a if master is None else master
             if pair.anchor_a == master:
                 yield pair
@@ -125,19 +125,19 @@ def _late_ticks(heard: _TimedBeacon, before: _TimedBeacon) -> float:
     return difference(heard.rx_ticks, before.rx_ticks) - difference(whole, 0) - fraction / 256.0
 
 
-# What a recording gives a calibration: time differences while the tag's place is known, in bounded memory.
+# Differences of a recording at known positions.
 
 _MOST_ROWS: Final = 300_000
 """Of a longer recording an even sample is used."""
 
 _NEAREST_M: Final = 0.01
 
-PlaceAt = Callable[[float], Point | None]
+PositionAt = Callable[[float], Point | None]
 """Where the tag's antenna was at a time of the recording; None where that is not known."""
 
 
 class Stay(Struct, frozen=True):
-    """A tag at rest at a known place."""
+    """A tag at rest at a known position."""
 
     x_m: float
     y_m: float
@@ -149,7 +149,7 @@ class Stay(Struct, frozen=True):
 
 
 class First(Struct, frozen=True):
-    """Only the beginning of a recording: so many differences, so many seconds, or such a part of its time."""
+    """Only the beginning of a recording: a number of differences, of seconds, or a part of its time."""
 
     count: int | None = None
     seconds: float | None = None
@@ -167,34 +167,34 @@ class Samples(Struct, frozen=True):
     """Differences that could not be used, by reason."""
 
 
-def place_of_truth(judge: Judge, above_m: float | None) -> PlaceAt:
+def position_of_truth(judge: Judge, above_m: float | None) -> PositionAt:
     """Truth by time, where it is high enough."""
 
-    def place(time_s: float) -> Point | None:
+    def position_at(time_s: float) -> Point | None:
         at_m = judge.at(time_s)
         return None if at_m is None or (above_m is not None and at_m[2] <= above_m) else at_m
 
-    return place
+    return position_at
 
 
-def place_of_stays(stays: Sequence[Stay], height_m: float | None, begin_s: float) -> PlaceAt:
-    """Known places by time; of stays that overlap the first counts.
+def position_of_stays(stays: Sequence[Stay], height_m: float | None, begin_s: float) -> PositionAt:
+    """Known positions by time; of stays that overlap the first counts.
 
     Raises:
         SkylessError: a stay has no height, and the site does not know it either.
     """
-    places: list[tuple[Stay, Point]] = []
+    stays_m: list[tuple[Stay, Point]] = []
     for stay in stays:
         z_m = height_m if stay.z_m is None else stay.z_m
         if z_m is None:
             raise SkylessError(f"--at {stay.x_m:g},{stay.y_m:g} lacks its height: it should be x,y,z")
-        places.append((stay, (stay.x_m, stay.y_m, z_m)))
+        stays_m.append((stay, (stay.x_m, stay.y_m, z_m)))
 
-    def place(time_s: float) -> Point | None:
+    def position_at(time_s: float) -> Point | None:
         since_s = time_s - begin_s
-        return next((place_m for stay, place_m in places if stay.from_s <= since_s <= stay.to_s), None)
+        return next((position_m for stay, position_m in stays_m if stay.from_s <= since_s <= stay.to_s), None)
 
-    return place
+    return position_at
 
 
 def tdoas_of(recording: Recording, anchors_m: Mapping[int, Point]) -> Iterator[PairTdoa]:
@@ -210,21 +210,24 @@ def tdoas_of(recording: Recording, anchors_m: Mapping[int, Point]) -> Iterator[P
 
 
 def gather(
-    pairs: Iterable[PairTdoa], anchors_m: Mapping[int, Point], place_from: Callable[[float], PlaceAt], first: First
+    pairs: Iterable[PairTdoa],
+    anchors_m: Mapping[int, Point],
+    position_from: Callable[[float], PositionAt],
+    first: First,
 ) -> Samples:
-    """Gather the differences at known places; ``place_from`` is told the time of the first difference."""
+    """Gather the differences at known positions; ``position_from`` gets the time of the first difference."""
     drops: Drops = Counter()
-    places_m = dict(anchors_m)
+    anchor_positions_m = dict(anchors_m)
     sample = EvenSample(5, _MOST_ROWS)
-    place: PlaceAt | None = None
+    position_at: PositionAt | None = None
     begin_s = last_s = 0.0
     for pair in pairs:
-        if place is None:
-            place, begin_s = place_from(pair.time_s), pair.time_s
+        if position_at is None:
+            position_at, begin_s = position_from(pair.time_s), pair.time_s
         if first.seconds is not None and pair.time_s - begin_s > first.seconds:
             break
         last_s = max(last_s, pair.time_s)
-        row = _row(pair, places_m, place)
+        row = _row(pair, anchor_positions_m, position_at)
         if isinstance(row, str):
             drops[row] += 1
             continue
@@ -237,19 +240,19 @@ def gather(
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     ids = rows[:, 1:3].astype(np.int64)
     differences = Differences(rows[:, 0], ids[:, 0], ids[:, 1], rows[:, 3], rows[:, 4])
-    return Samples(differences, places_m, sample.seen, dict(sorted(drops.items())))
+    return Samples(differences, anchor_positions_m, sample.seen, dict(sorted(drops.items())))
 
 
-def _row(pair: PairTdoa, places_m: dict[int, Point], place: PlaceAt) -> tuple[float, ...] | str:
+def _row(pair: PairTdoa, anchor_positions_m: dict[int, Point], position_at: PositionAt) -> tuple[float, ...] | str:
     """Time, anchors, excess over the geometry, logarithm of the ranges' ratio; or why there is none."""
     if pair.a_m is not None:
-        places_m[pair.anchor_a] = pair.a_m
+        anchor_positions_m[pair.anchor_a] = pair.a_m
     if pair.b_m is not None:
-        places_m[pair.anchor_b] = pair.b_m
-    a_m, b_m = places_m.get(pair.anchor_a), places_m.get(pair.anchor_b)
+        anchor_positions_m[pair.anchor_b] = pair.b_m
+    a_m, b_m = anchor_positions_m.get(pair.anchor_a), anchor_positions_m.get(pair.anchor_b)
     if a_m is None or b_m is None:
         return "unknown-anchor"
-    at_m = place(pair.time_s)
+    at_m = position_at(pair.time_s)
     if at_m is None:
         return "place-unknown"
     range_a, range_b = max(dist(at_m, a_m), _NEAREST_M), max(dist(at_m, b_m), _NEAREST_M)

@@ -119,7 +119,7 @@ class RecorderNode:
             self._ask()
 
     def _take(self, topic: str, payload: bytes) -> None:
-        message = self.recorder.take(topic, payload, time.time())
+        message = self.recorder.add(topic, payload, time.time())
         if isinstance(message, ReceptionsMessage):
             self._follow(message)
         elif isinstance(message, StatusMessage) and message.kind == "tag" and message.online:

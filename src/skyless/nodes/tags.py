@@ -33,7 +33,7 @@ class Tag:
         self._fix_topic = self._health_topic = self._receptions_topic = ""
         asked = receiver_settings(settings.method, settings.site, settings.qa, settings.z_bounds_m, settings.integrity)
         self.log = ReceptionLog(radio.name, asked, secrets.token_hex(4))
-        self.node = TagNode(settings, radio, self._publish, say, self.log.hear)
+        self.node = TagNode(settings, radio, self._publish, say, self.log.add)
 
     async def run(self) -> None:
         """Serve until cancelled."""

@@ -24,7 +24,7 @@ Drops = Counter[str]
 
 
 def open_source(path: str | PathLike[str]) -> BufferedIOBase:
-    """Open a file for reading, through gzip if its first bytes say so.
+    """Open a file for reading, through gzip if its first bytes are gzip's.
 
     Raises:
         ConfigurationError: the file cannot be opened.
@@ -139,9 +139,9 @@ def rows(stream: BufferedIOBase, drops: Drops, columns: Sequence[str]) -> Iterat
     if not set(columns) <= set(names):
         drops["header-without-the-columns"] += 1
         return
-    places = [names.index(column) for column in columns]
+    positions = [names.index(column) for column in columns]
     width = len(names)
-    as_it_stands = places == list(range(width))
+    in_order = positions == list(range(width))
     first = names[0].encode()
     for line in source:
         fields = line.split(b",")
@@ -150,7 +150,7 @@ def rows(stream: BufferedIOBase, drops: Drops, columns: Sequence[str]) -> Iterat
         elif fields[0] == first:
             drops["repeated-header"] += 1
         else:
-            yield fields if as_it_stands else [fields[place] for place in places]
+            yield fields if in_order else [fields[position] for position in positions]
 
 
 def finite(field: str, file: str | PathLike[str], line: int, column: str) -> float:

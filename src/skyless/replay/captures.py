@@ -29,7 +29,7 @@ from skyless.recordings.foreign.formats import Recording, format_of, open_record
 MOST_PAIRS: Final = 256
 ROWS_PER_PAIR: Final = 4096
 MIN_PAIR_DIFFERENCES: Final = 20
-"""Differences of a pair from which its noise can be told."""
+"""Differences of a pair from which its noise can be estimated."""
 
 
 class PairNoise(Struct, frozen=True):
@@ -54,7 +54,7 @@ class NoiseByPair:
         self._samples: dict[tuple[int, int, bool], EvenSample] = {}
 
     def add(self, pair: PairTdoa) -> None:
-        """Take one difference."""
+        """Add one difference."""
         predicted_m = self._predicted_m(pair) if self._judge.has_truth else None
         key = (pair.anchor_a, pair.anchor_b, predicted_m is not None)
         sample = self._samples.get(key)
@@ -102,8 +102,8 @@ class ByPairs:
         self._noise = noise
         self._made = False
 
-    def hear(self, record: Record) -> float | None:
-        """Take one record; the time of its differences."""
+    def process(self, record: Record) -> float | None:
+        """Process one record; the time of its differences."""
         pairs: Sequence[PairTdoa]
         if isinstance(record, Packet):
             assert self._engine is not None
@@ -142,7 +142,7 @@ class ByPairs:
 
     @property
     def contradictions_m(self) -> Mapping[tuple[int, int], float]:
-        """Pairs of anchors whose own ranging contradicts the table: differences do not tell."""
+        """Pairs of anchors whose own ranging contradicts the table: none, as differences hold no ranges."""
         return {}
 
 
@@ -156,8 +156,8 @@ class ByPackets:
         self._heard = 0
         self._fix: Fix | None = None
 
-    def hear(self, record: Record) -> float | None:
-        """Take one packet; its time."""
+    def process(self, record: Record) -> float | None:
+        """Process one packet; its time."""
         assert isinstance(record, Packet)
         if self._heard % _SAMPLED_OF < _SAMPLED:
             for pair in self._engine.hear(record):
@@ -197,17 +197,17 @@ class ByPackets:
 PROFILES: Final[Mapping[str, EstimatorSettings]] = {
     "miluv": structs.replace(DIFFERENCES, qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),
 }
-"""Settings for formats whose nature asks for others: MILUV's exchanges come once or twice a second, among obstacles."""
+"""Settings for formats that need others: MILUV's exchanges come once or twice a second, among obstacles."""
 
 BATCH: Final = 512
-"""Records that are read at a time: reading and filtering by turns take each other's place in the processor's caches."""
+"""Records that are read at a time: reading and filtering by turns evict each other from the processor's caches."""
 
 PACKETS, DIFFERENCES_MADE = "packets", "differences"
 MEASUREMENTS: Final = (PACKETS, DIFFERENCES_MADE)
 """What the filter is given: anchors' packets as they are, or time differences made of them."""
 
 FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
-"""Formats of which packets are taken by default, which real captures showed to be better. Of Avalue's they were not."""
+"""Formats of which packets are used by default, as real captures showed that to be better; of Avalue's it was not."""
 
 
 class ReplayRequest(Struct, frozen=True):
@@ -230,7 +230,7 @@ class ReplayRequest(Struct, frozen=True):
 
 
 class ReplayReport(Struct, frozen=True):
-    """What a replay came to; metres and seconds, None where it cannot be told."""
+    """What a replay came to; metres and seconds, None where it is not known."""
 
     format: str
     receptions: int
@@ -263,7 +263,7 @@ class ReplayReport(Struct, frozen=True):
     """What the filter was given, one of ``MEASUREMENTS``; None for the receptions of a site."""
     contradictions_m: dict[str, float]
     """Pairs of anchors whose own ranging contradicts the table: by how much they are farther (if negative, nearer)
-    than it says."""
+    than there."""
 
 
 class Replay:
@@ -326,14 +326,14 @@ class Replay:
             while batch := list(islice(records, BATCH)):
                 for record in batch:
                     self.receptions += 1
-                    time_s = self._pipeline.hear(record)
+                    time_s = self._pipeline.process(record)
                     if time_s is not None:
-                        self._take(time_s, on_fix)
+                        self._add_result(time_s, on_fix)
                 on_progress(self.recording.bytes_read)
         return self._report(time.perf_counter() - started_s)
 
-    def _take(self, time_s: float, on_fix: Callable[[Fix], None] | None) -> None:
-        """Take what one reception gave: one fix at most."""
+    def _add_result(self, time_s: float, on_fix: Callable[[Fix], None] | None) -> None:
+        """Add what one reception gave: one fix at most."""
         if self._first_s is None:
             self._first_s = time_s
         self._last_s = time_s

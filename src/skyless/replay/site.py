@@ -29,7 +29,7 @@ from skyless.replay.captures import ReplayReport
 from skyless.site.model import Site
 from skyless.ticks import WRAP_TICKS, Unwrapper
 
-# Recorded fixes beside those of a replay: whether they are the same, bit by bit.
+# Recorded fixes against those of a replay: whether they are the same, bit by bit.
 
 _T = TypeVar("_T")
 
@@ -37,7 +37,7 @@ _MOST_WAITING: Final = 20_000
 """Fixes that wait for their counterpart; those that the recording lacks never get one."""
 
 SAME_FIX_S: Final = 2.0
-"""Serial numbers begin anew with the tag; fixes of one number that are farther apart are different ones."""
+"""Serial numbers begin again with the tag; fixes of one number that are farther apart are different ones."""
 
 
 class Identical(Struct, frozen=True):
@@ -61,7 +61,7 @@ class Comparison:
         return Identical(self._compared, self._different)
 
     def recorded(self, message: FixMessage) -> None:
-        """Take a recorded fix."""
+        """Add a recorded fix."""
         found = self._replayed.pop(message.serial, None)
         if found is None or abs(found[1] - message.unix_s) > SAME_FIX_S:
             _keep(self._recorded, message.serial, message)
@@ -69,7 +69,7 @@ class Comparison:
             self._judge(found[0], message)
 
     def replayed(self, serial: int, fix: Fix, unix_s: float) -> None:
-        """Take one of the replay."""
+        """Add one of the replay."""
         found = self._recorded.pop(serial, None)
         if found is None or abs(found.unix_s - unix_s) > SAME_FIX_S:
             _keep(self._replayed, serial, (fix, unix_s))
@@ -121,7 +121,7 @@ class HostClock:
 
 
 class TagReplay:
-    """Takes the receptions of one tag in the order of the recording."""
+    """Processes the receptions of one tag in the order of the recording."""
 
     def __init__(
         self,
@@ -142,7 +142,7 @@ class TagReplay:
         """Unix time of the first reception."""
         self.drops: Drops = Counter()
         self.reason = "no-beacons"
-        """Why there is no fix, as last told."""
+        """Why there is no fix, as given last."""
         self._asked = method
         self._receiver: Receiver | None = None
         self._serial: int | None = None
@@ -153,8 +153,8 @@ class TagReplay:
         self._clock = HostClock()
         self._comparison = Comparison(tag)
 
-    def hear(self, message: ReceptionsMessage) -> Iterator[Replayed]:
-        """Take a run of receptions; the fixes that they make."""
+    def process(self, message: ReceptionsMessage) -> Iterator[Replayed]:
+        """Process a run of receptions; the fixes that they make."""
         for raw in self._unheard(message):
             reception = reception_of(raw)
             if reception is None:
@@ -175,7 +175,7 @@ class TagReplay:
             yield Replayed(fix, unix_s)
 
     def compare(self, recorded: FixMessage) -> None:
-        """Take a recorded fix."""
+        """Add a recorded fix."""
         self._comparison.recorded(recorded)
 
     @property
@@ -257,15 +257,15 @@ def reception_of(raw: RawReception) -> Reception | None:
     """A recorded reception; None for one that no radio gives."""
     if not 0 <= raw.rx_ticks < WRAP_TICKS or (raw.host_s is not None and not abs(raw.host_s) < 1e12):
         return None
-    told = (raw.rx_power_dbm, raw.first_path_power_dbm, raw.carrier_offset_ppm)
-    return Reception(raw.frame, raw.rx_ticks, raw.host_s, None if told == (None, None, None) else Diagnostics(*told))
+    diagnostics = Diagnostics(raw.rx_power_dbm, raw.first_path_power_dbm, raw.carrier_offset_ppm)
+    return Reception(raw.frame, raw.rx_ticks, raw.host_s, None if diagnostics == Diagnostics() else diagnostics)
 
 
 def _receiver_of(start: SegmentStart, method: str | None, integrity: IntegrityRequirement | None) -> Receiver | None:
     """A receiver that knows nothing, made as the tag's was; None where that makes no sense."""
-    told = start.settings
-    name, site, qa = method or told.get("method"), told.get("site"), told.get("qa", 0.3)
-    low_m, high_m = told.get("z_low_m"), told.get("z_high_m")
+    settings = start.settings
+    name, site, qa = method or settings.get("method"), settings.get("site"), settings.get("qa", 0.3)
+    low_m, high_m = settings.get("z_low_m"), settings.get("z_high_m")
     if not isinstance(name, str) or name not in METHODS or not isinstance(site, int | None):
         return None
     if not isinstance(qa, int | float) or not 0.0 < qa < 1e6:
@@ -280,7 +280,7 @@ def _receiver_of(start: SegmentStart, method: str | None, integrity: IntegrityRe
 
 
 def _integrity_of(start: SegmentStart) -> IntegrityRequirement:
-    """What was asked of the tag's levels; recordings from before it could be asked do not say.
+    """What was asked of the tag's levels; the defaults where a recording does not hold it.
 
     Raises:
         ValueError, TypeError: it makes no sense.
@@ -357,23 +357,23 @@ class SiteReplay:
     def run(
         self, on_fix: Callable[[str, Replayed], None] | None, on_progress: Callable[[float], None]
     ) -> list[TagReport]:
-        """Replay all; ``on_progress`` is told now and then the recording's seconds done so far."""
+        """Replay all; ``on_progress`` gets now and then the recording's seconds done so far."""
         begun_s = time.perf_counter()
         for number, found in enumerate(self._recording.messages({"receptions", "fix"})):
-            if found.place.name in self.tags:
-                self._take(found, on_fix)
+            if found.channel.name in self.tags:
+                self._process(found, on_fix)
             if number % 256 == 0:
                 on_progress(found.time_s - self._begin_s)
         wall_s = time.perf_counter() - begun_s
         return [self._report(tag, wall_s) for tag in self.tags]
 
-    def _take(self, found: Recorded, on_fix: Callable[[str, Replayed], None] | None) -> None:
-        tag = found.place.name
+    def _process(self, found: Recorded, on_fix: Callable[[str, Replayed], None] | None) -> None:
+        tag = found.channel.name
         replay, judge = self.tags[tag], self.judges[tag]
-        if found.place.kind == "fix":
+        if found.channel.kind == "fix":
             replay.compare(cast("FixMessage", found.message))
             return
-        for made in replay.hear(cast("ReceptionsMessage", found.message)):
+        for made in replay.process(cast("ReceptionsMessage", found.message)):
             first_s, _ = self._spans.get(tag, (made.unix_s, 0.0))
             self._spans[tag] = (first_s, made.unix_s)
             x, y, z = made.fix.position_m.tolist()
@@ -420,14 +420,16 @@ def recorded_site(recording: McapRecording, identifier: int | None = None) -> Si
     """The site of a recording.
 
     Raises:
-        ConfigurationError: it does not tell its site, or another one than ``identifier`` is wanted.
+        ConfigurationError: it does not hold its site, or another one than ``identifier`` is wanted.
     """
-    told = recording.site
-    if told is None:
-        raise ConfigurationError(recording.summary().path, "the site", None, "told by the recording")
-    if identifier is not None and told.site.id != identifier:
-        raise ConfigurationError(recording.summary().path, "the site's id", told.site.id, f"{identifier}, as in --site")
-    return told.site
+    found = recording.site
+    if found is None:
+        raise ConfigurationError(recording.summary().path, "the site", None, "in the recording")
+    if identifier is not None and found.site.id != identifier:
+        raise ConfigurationError(
+            recording.summary().path, "the site's id", found.site.id, f"{identifier}, as in --site"
+        )
+    return found.site
 
 
 def recorded_truth(recording: McapRecording) -> dict[str, Truth]:

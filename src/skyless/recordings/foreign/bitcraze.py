@@ -18,13 +18,13 @@ from skyless.recordings.source import Drops, chunks, lines
 # Payloads of Bitcraze's loco positioning anchors, TDoA2 and TDoA3, to packets.
 #
 # Both are little-endian and hold the low 32 bits of all stamps. Distances are times of flight in ticks that include
-# the antenna delays. After either a short LPP packet may follow that tells the anchor's position.
+# the antenna delays. A short LPP packet with the anchor's position may come after either.
 #
 # TDoA2, type 0x22: sequence u8 × 8 | stamp u32 × 8 | distance u16 × 8, indexed by anchor. The sender's own stamp is the
 # TX time, the others are when it last heard that anchor, 0 for never.
 #
 # TDoA3, type 0x30: sequence (7 bits) | TX time u32 | count, then count times: anchor | sequence (7 bits) with the high
-# bit telling that a distance follows | RX time u32 | distance u16, if any.
+# bit set if a distance comes after it | RX time u32 | distance u16, if any.
 
 TDOA2: Final = 0x22
 TDOA3: Final = 0x30
@@ -93,7 +93,7 @@ def _tdoa2(payload: bytes, host_s: float | None, sender: int, rx_ticks: int) -> 
 
 
 def _position(payload: bytes, at: int) -> Point | None:
-    """Position of the LPP packet at that place, None where there is none or where it makes no sense."""
+    """Position of the LPP packet at that offset, None where there is none or where it makes no sense."""
     if at + _POSITION.size > len(payload):
         return None
     short, kind, x_m, y_m, z_m = _POSITION.unpack_from(payload, at)
@@ -109,7 +109,7 @@ _LINE: Final = re.compile(rb"From ([0-9a-f]{2}) to [0-9a-f]{2} @([0-9a-f]{10}): 
 
 
 def recognise_text(head: bytes) -> bool:
-    """Tell whether a line of the sniffer's text stands near the beginning."""
+    """Whether a line of the sniffer's text stands near the beginning."""
     return _LINE.search(head) is not None
 
 
@@ -151,7 +151,7 @@ _TRAILER_BYTES: Final = 2
 
 
 def recognise_binary(head: bytes) -> bool:
-    """Tell whether a whole record of a known payload stands near the beginning."""
+    """Whether a whole record of a known payload stands near the beginning."""
     at = head.find(_MARK)
     while at >= 0:
         if _record_size(head, at) and head[at + _HEADER_BYTES] in (TDOA2, TDOA3):
@@ -205,14 +205,14 @@ class BinaryCutter:
             if not self._lost:
                 self._drops["bytes-of-no-record"] += 1
                 self._lost = True
-            following = buffer.find(_MARK, at + 1)
-            at = following if following >= 0 else len(buffer)
+            next_mark = buffer.find(_MARK, at + 1)
+            at = next_mark if next_mark >= 0 else len(buffer)
         self._buffer = buffer[at:]
         return records
 
 
 def _may_grow(buffer: bytes, at: int) -> bool:
-    """Whether what stands there may be a record of which more is to come."""
+    """Whether the bytes there may be a record of which more is to come."""
     if buffer[at] != _MARK:
         return False
     left = len(buffer) - at
@@ -223,7 +223,7 @@ def _may_grow(buffer: bytes, at: int) -> bool:
 
 
 def _record_size(buffer: bytes, at: int) -> int:
-    """Size of the whole record at that place, 0 where none stands."""
+    """Size of the whole record at that offset, 0 where there is none."""
     left = len(buffer) - at
     if left <= _HEADER_BYTES + _TRAILER_BYTES or buffer[at] != _MARK:
         return 0
@@ -237,7 +237,7 @@ def _record_size(buffer: bytes, at: int) -> int:
 # YAML captures of Bitcraze anchors, one document a packet, as the ``uwb_tdoa`` capture tool writes them.
 #
 # Used keys: ``data`` (payload, base64), ``from`` (anchor), ``ts`` (RX stamp of the tag, 40 bits), ``rxSys`` (host's
-# Unix time). The rest repeats what the payload says. Documents of exactly the tool's shape are cut out by searching;
+# Unix time). The rest repeats the payload. Documents of exactly the tool's shape are cut out by searching;
 # any other goes through libyaml's events. (Its loader takes 110 µs a document and crashes on deep nesting.)
 
 MAX_DOCUMENT_BYTES: Final = 1 << 13
@@ -251,7 +251,7 @@ _Loader: Final = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 
 def recognise_yaml(head: bytes) -> bool:
-    """Tell whether a recording begins like a YAML capture."""
+    """Whether a recording begins like a YAML capture."""
     return all(key.search(head) for key in _KEYS)
 
 

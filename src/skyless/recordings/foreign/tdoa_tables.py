@@ -16,7 +16,7 @@ TDOA_COLUMNS: Final = ("t_s", "idA", "idB", "tdoa_m")
 
 
 def recognise_tdoas(head: bytes) -> bool:
-    """Tell whether the first line names the four columns."""
+    """Whether the first line names the four columns."""
     return set(TDOA_COLUMNS) <= set(header_of(head))
 
 
@@ -60,7 +60,7 @@ _MAX_RATE: Final = 100e-6
 
 
 def recognise_miluv(head: bytes) -> bool:
-    """Tell whether the first line names the nodes, the nine stamps and the positions."""
+    """Whether the first line names the nodes, the nine stamps and the positions."""
     return set(MILUV_COLUMNS) <= set(header_of(head))
 
 

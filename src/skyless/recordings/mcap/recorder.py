@@ -3,6 +3,7 @@
 import contextlib
 import os
 from collections import Counter
+from io import IOBase
 from os import PathLike
 from pathlib import Path
 from typing import IO, Final, cast
@@ -19,10 +20,10 @@ from skyless.recordings.mcap.channels import (
     FLOOR_PLAN,
     JSON,
     JSON_SCHEMA,
-    LASTING,
     PROFILE,
+    RETAINED_KINDS,
+    channel_of,
     decoder_of,
-    place_of,
     schema_of,
 )
 from skyless.recordings.mcap.recording import NS
@@ -32,37 +33,34 @@ from skyless.site.model import GeoreferenceSite
 # An MCAP file that is being written: whole after every flush, whatever happens then.
 #
 # Chunks are compressed (zstd) and handed to the system at once; a program that is killed loses what came after the last
-# flush. A full disk ends the recording and is told once; the file is cut back to its last whole chunk.
+# flush. A full disk ends the recording and is reported once; the file is cut back to its last whole chunk.
 
 _CHUNK_BYTES: Final = 1 << 22
 """Chunks are closed by time; no second is expected to be longer."""
 
 
-class _UnwrittenTail:
+class _Unwritten(IOBase):
     """Gathers what the MCAP writer writes since the last flush; as much of a file as that writer uses."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
         self._length = 0
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: bytes, /) -> int:
         """Keep a piece."""
         self._parts.append(bytes(data))
         self._length += len(data)
         return len(data)
 
-    def tell(self) -> int:
-        """Length of the file so far."""
+    def seek(self, _offset: int, _whence: int = 0, /) -> int:
+        """Length of the file so far, as the writer asks for nothing else."""
         return self._length
 
-    def flush(self) -> None:
-        """Nothing to do: what was written waits to be taken."""
-
-    def take(self) -> bytes:
+    def drain(self) -> bytes:
         """What was written since the last call."""
-        taken = b"".join(self._parts)
+        written = b"".join(self._parts)
         self._parts.clear()
-        return taken
+        return written
 
 
 class McapFile:
@@ -94,7 +92,7 @@ class McapFile:
             raise ConfigurationError(path, "", None, "a new file; this one exists and is not overwritten") from None
         except OSError as error:
             raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
-        self._tail = _UnwrittenTail()
+        self._tail = _Unwritten()
         self._writer = Writer(cast("IO[bytes]", self._tail), _CHUNK_BYTES, CompressionType.ZSTD)
         self._writer.start(PROFILE, f"skyless {skyless.__version__}")
         self.flush()
@@ -122,14 +120,14 @@ class McapFile:
         if self.ended is not None:
             return
         self._writer.flush()  # type: ignore[no-untyped-call]
-        if self._write(self._tail.take()):
+        if self._write(self._tail.drain()):
             self._unflushed = 0
             if self.limit_bytes is not None and self.written_bytes >= self.limit_bytes:
                 self._finish()
                 self.ended = f"its limit of {self.limit_bytes / 1e6:g} MB is reached"
 
     def sync(self) -> None:
-        """See that what was flushed stands on the disk; takes as long as the disk does."""
+        """Wait until what was flushed is on the disk."""
         handle = self._handle
         try:
             if handle >= 0:
@@ -151,7 +149,7 @@ class McapFile:
 
     def _finish(self) -> None:
         self._writer.finish()  # type: ignore[no-untyped-call]
-        self._write(self._tail.take())
+        self._write(self._tail.drain())
 
     def _new_channel(self, topic: str, schema: tuple[str, bytes]) -> int:
         name, data = schema
@@ -203,10 +201,10 @@ class McapRecorder:
         self._shown_s: dict[str, float] = {}
         self._georeference: GeoreferenceSite | None = None
 
-    def take(self, topic: str, payload: bytes, unix_s: float) -> Struct | None:
-        """Keep a message that came at a time, and return it; what is not of this version is counted and dropped."""
-        place = place_of(topic)
-        if place is None:
+    def add(self, topic: str, payload: bytes, unix_s: float) -> Struct | None:
+        """Add a message that came at a time, and return it; what is not of this version is counted and dropped."""
+        channel = channel_of(topic)
+        if channel is None:
             self.drops["unknown-topic"] += 1
             return None
         if not payload or self._last.get(topic) == payload:
@@ -215,20 +213,20 @@ class McapRecorder:
             self.drops["too-many-topics"] += 1
             return None
         self._topics.add(topic)
-        if place.kind in LASTING:
+        if channel.kind in RETAINED_KINDS:
             self._last[topic] = payload
         log_ns = round(unix_s * NS)
-        if place.payload is None:
+        if channel.payload is None:
             media_type = "image/png" if payload.startswith(b"\x89PNG") else "image/jpeg"
             self.file.attach(FLOOR_PLAN, media_type, payload, log_ns)
             return None
         try:
-            message = decoder_of(place.payload).decode(payload)
+            message = decoder_of(channel.payload).decode(payload)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             self.drops["malformed-message"] += 1
             return None
-        self.kinds[place.kind] += 1
-        self.file.add(topic, schema_of(place.payload), payload, log_ns)
+        self.kinds[channel.kind] += 1
+        self.file.add(topic, schema_of(channel.payload), payload, log_ns)
         self._add_views(message, unix_s, log_ns)
         return message
 
@@ -236,7 +234,7 @@ class McapRecorder:
         if isinstance(message, FixMessage):
             try:
                 self._show(message, log_ns)
-            except (ValueError, ArithmeticError):  # figures that no tag tells
+            except (ValueError, ArithmeticError):  # figures that no tag publishes
                 self.drops["impossible-fix"] += 1
         elif isinstance(message, SiteMessage):
             self._georeference = message.site.georeference

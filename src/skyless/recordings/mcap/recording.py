@@ -24,7 +24,7 @@ from skyless.mqtt.messages import (
     ZoneEvent,
     ZonesMessage,
 )
-from skyless.recordings.mcap.channels import FLOOR_PLAN, Place, decoder_of, place_of
+from skyless.recordings.mcap.channels import FLOOR_PLAN, Channel, channel_of, decoder_of
 from skyless.recordings.source import Drops
 
 # The chunks of an MCAP file, found by walking over its records: it need not have an index, nor an end.
@@ -34,7 +34,7 @@ from skyless.recordings.source import Drops
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_CHUNK_BYTES: Final = 1 << 28
-"""Decompressed; more is not believed."""
+"""Decompressed; more is taken for damage."""
 
 MAX_ATTACHMENT_BYTES: Final = 1 << 26
 
@@ -48,7 +48,7 @@ _INDEX_ENTRY_BYTES: Final = 16
 
 
 class ChunkIndex(Struct):
-    """Where a chunk lies and what its index says of it."""
+    """Where a chunk is in the file, and its index."""
 
     offset: int
     """Of its content in the file."""
@@ -92,7 +92,7 @@ class McapScan:
         self.walk()
 
     def walk(self) -> None:
-        """Take what has been written since."""
+        """Read what has been written since."""
         size = self._file.seek(0, 2)
         while not self.finished and self._next + _RECORD.size <= size:
             self._file.seek(self._next)
@@ -100,7 +100,7 @@ class McapScan:
             content = self._next + _RECORD.size
             if content + length > size:
                 return
-            self._enter(kind, content, length)
+            self._index_record(kind, content, length)
             self._next = content + length
 
     @property
@@ -112,9 +112,9 @@ class McapScan:
         """Close the file."""
         self._file.close()
 
-    def _enter(self, kind: int, content: int, length: int) -> None:
+    def _index_record(self, kind: int, content: int, length: int) -> None:
         if kind != _MESSAGE_INDEX and self.chunks:
-            self._settle(self.chunks[-1])
+            self._complete_index(self.chunks[-1])
             self._file.seek(content)
         if kind == _CHUNK and length >= _CHUNK_HEAD.size:
             start_ns, end_ns, _, _ = _CHUNK_HEAD.unpack(self._file.read(_CHUNK_HEAD.size))
@@ -123,21 +123,21 @@ class McapScan:
             channel, entries = _INDEX_HEAD.unpack(self._file.read(_INDEX_HEAD.size))
             self.chunks[-1].counts[channel] = entries // _INDEX_ENTRY_BYTES
         elif kind == _ATTACHMENT:
-            self._enter_attachment(content, length)
+            self._index_attachment(content, length)
         elif kind == _MESSAGE:
             self.drops["message-outside-chunks"] += 1
         elif kind == _DATA_END:
             self.finished = True
 
-    def _settle(self, chunk: ChunkIndex) -> None:
-        """Its index is complete; look into it if that names a channel that is not known yet."""
+    def _complete_index(self, chunk: ChunkIndex) -> None:
+        """The chunk's index is complete; read the chunk if that names a channel that is not known yet."""
         if not chunk.indexed and chunk.counts:
             chunk.indexed = True
             if not chunk.counts.keys() <= self.topics.keys():
                 for _ in self.messages(chunk):
                     pass
 
-    def _enter_attachment(self, content: int, length: int) -> None:
+    def _index_attachment(self, content: int, length: int) -> None:
         head = self._file.read(min(length, 1 << 12))
         (name_bytes,) = struct.unpack_from("<I", head.ljust(20, b"\0"), 16)
         self.attachments[head[20 : 20 + name_bytes].decode("utf-8", "replace")] = (content, length)
@@ -179,10 +179,10 @@ class McapScan:
                 channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(data, at)
                 yield channel, log_ns, data[at + _MESSAGE_HEAD.size : at + length]
             elif kind == _CHANNEL:
-                self._enter_channel(data[at : at + length])
+                self._index_channel(data[at : at + length])
             at += length
 
-    def _enter_channel(self, record: bytes) -> None:
+    def _index_channel(self, record: bytes) -> None:
         if len(record) >= 8:
             channel, _, size = struct.unpack_from("<HHI", record)
             self.topics[channel] = record[8 : 8 + size].decode("utf-8", "replace")
@@ -240,16 +240,16 @@ class RecordingSummary(Struct, frozen=True):
 
 
 class Recorded(Struct, frozen=True):
-    """One message: when it was recorded, on which topic, and what it says."""
+    """One message: when it was recorded, on which topic, and its contents."""
 
     time_s: float
-    place: Place
+    channel: Channel
     topic: str
     message: Struct
 
 
 class McapRecording:
-    """A recording; ``refresh`` takes what has been written since it was opened."""
+    """A recording; ``refresh`` reads what has been written since it was opened."""
 
     def __init__(self, path: str | PathLike[str]) -> None:
         """Open it and read where its chunks are.
@@ -273,17 +273,17 @@ class McapRecording:
         self._scan.close()
 
     def refresh(self) -> None:
-        """Take what has been written since."""
+        """Read what has been written since."""
         self._scan.walk()
 
     @property
     def site(self) -> SiteMessage | None:
-        """The site, as last told."""
+        """The site, as recorded last."""
         return cast("SiteMessage | None", self._last("site"))
 
     @property
     def zones(self) -> ZonesMessage | None:
-        """The site's zones, as last told."""
+        """The site's zones, as recorded last."""
         return cast("ZonesMessage | None", self._last("zones"))
 
     @property
@@ -298,14 +298,14 @@ class McapRecording:
         raw_tags: set[str] = set()
         site = self.site
         for topic, count in self._counts().items():
-            place = place_of(topic)
-            if place is None:
+            channel = channel_of(topic)
+            if channel is None:
                 continue
-            counts[place.kind] += count
-            if place.kind in ("fix", "receptions"):
-                tags.add(place.name)
-            if place.kind == "receptions":
-                raw_tags.add(place.name)
+            counts[channel.kind] += count
+            if channel.kind in ("fix", "receptions"):
+                tags.add(channel.name)
+            if channel.kind == "receptions":
+                raw_tags.add(channel.name)
         chunks = self._scan.chunks
         return RecordingSummary(
             path=str(self._scan.path),
@@ -328,7 +328,7 @@ class McapRecording:
         """Fixes recorded from ``from_s`` on and before ``to_s`` (Unix time), in the order of recording."""
         wanted = None if tags is None else frozenset(tags)
         for found in self.messages({"fix"}, from_s, to_s):
-            if wanted is None or found.place.name in wanted:
+            if wanted is None or found.channel.name in wanted:
                 yield cast("FixMessage", found.message)
 
     def truth(self, from_s: float = -math.inf, to_s: float = math.inf) -> Iterator[TruthMessage]:
@@ -352,7 +352,7 @@ class McapRecording:
     def receptions(self, tag: str | None = None) -> Iterator[ReceptionsMessage]:
         """Raw receptions of one tag, or of all."""
         for found in self.messages({"receptions"}):
-            if tag is None or found.place.name == tag:
+            if tag is None or found.channel.name == tag:
                 yield cast("ReceptionsMessage", found.message)
 
     def messages(self, kinds: set[str], from_s: float = -math.inf, to_s: float = math.inf) -> Iterator[Recorded]:
@@ -362,25 +362,25 @@ class McapRecording:
                 yield from self._of(chunk, kinds, from_s, to_s)
 
     def _of(self, chunk: ChunkIndex, kinds: set[str], from_s: float, to_s: float) -> Iterator[Recorded]:
-        for channel, log_ns, payload in self._scan.messages(chunk):
-            topic = self._scan.topics.get(channel, "")
-            place = place_of(topic)
+        for channel_id, log_ns, payload in self._scan.messages(chunk):
+            topic = self._scan.topics.get(channel_id, "")
+            channel = channel_of(topic)
             time_s = log_ns / NS
-            if place is None or place.payload is None or place.kind not in kinds or not from_s <= time_s < to_s:
+            if channel is None or channel.payload is None or channel.kind not in kinds or not from_s <= time_s < to_s:
                 continue
             try:
-                message = decoder_of(place.payload).decode(payload)
+                message = decoder_of(channel.payload).decode(payload)
             except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
                 self.drops["malformed-message"] += 1
                 continue
-            yield Recorded(time_s, place, topic, message)
+            yield Recorded(time_s, channel, topic, message)
 
     def _may_hold(self, chunk: ChunkIndex, kinds: set[str]) -> bool:
         """Whether the index does not rule it out."""
         if not chunk.indexed:
             return True
-        places = (place_of(self._scan.topics.get(channel, "")) for channel in chunk.counts)
-        return any(place is not None and place.kind in kinds for place in places)
+        channels = (channel_of(self._scan.topics.get(number, "")) for number in chunk.counts)
+        return any(channel is not None and channel.kind in kinds for channel in channels)
 
     def _last(self, kind: str) -> Struct | None:
         """The newest message of a kind that lasts."""
@@ -389,7 +389,7 @@ class McapRecording:
         for chunk in chunks[self._lasting_chunks :]:
             if self._may_hold(chunk, kinds):
                 for found in self._of(chunk, kinds, -math.inf, math.inf):
-                    self._lasting[found.place.kind] = found.message
+                    self._lasting[found.channel.kind] = found.message
         self._lasting_chunks = len(chunks)
         return self._lasting.get(kind)
 
