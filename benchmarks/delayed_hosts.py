@@ -5,6 +5,7 @@ from collections import Counter
 from typing import Any, Final
 
 import numpy as np
+from host_programs import HostLatency, NodeAir, Process
 from numpy.typing import NDArray
 
 from skyless.air.reception import Diagnostics, Reception
@@ -15,11 +16,8 @@ from skyless.nodes.anchor import ASK_AGAIN_S, LEAD_GAIN, LEAD_LOSS, LEAD_S, MAX_
 from skyless.radios.dw1000.chip_session import ChipSession
 from skyless.radios.interface import AntennaDelays, Late, RadioEvent, Sent
 from skyless.receiver import Receiver
-from skyless.simulation.dw1000.bus import HostLatency, ModelBus
-from skyless.simulation.dw1000.chip import Chip
-from skyless.simulation.dw1000.node_air import NodeAir
+from skyless.simulation.dw1000.chip import Chip, ModelBus
 from skyless.simulation.medium import Medium
-from skyless.simulation.processes import Process
 from skyless.site.model import Site
 from skyless.ticks import difference
 
@@ -59,7 +57,7 @@ class Host:
         self._coming[reception.frame] = (slot, place_m)
         if len(self._coming) > _COMING:
             del self._coming[next(iter(self._coming))]
-        self.chip.hear(reception.frame, reception.rx_ticks, reception.diagnostics or Diagnostics())
+        self.chip.receive(reception.frame, reception.rx_ticks, reception.diagnostics or Diagnostics())
         if self.chip.irq:
             self.process.notify()
 

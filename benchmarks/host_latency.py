@@ -7,8 +7,7 @@ import sys
 
 import numpy as np
 from host_latency_model import LatencyResult, run_hosts
-
-from skyless.simulation.dw1000.bus import HostLatency
+from host_programs import HostLatency
 
 SLOTS_MS = (1.05, 2.1, 2.5, 5.0, 10.0)
 

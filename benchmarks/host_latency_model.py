@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 from delayed_hosts import AnchorHost, Host, TagHost
+from host_programs import HostLatency
 from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -17,10 +18,9 @@ from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.reception import Reception
 from skyless.evaluation.scenarios import Request, impairments_of, trajectories_of
-from skyless.simulation.broadcast import diagnostics_of
-from skyless.simulation.dw1000.bus import HostLatency
 from skyless.simulation.medium import Delivery, Medium
 from skyless.simulation.stations import TagSpec
+from skyless.simulation.world import diagnostics_of
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import ScheduleSite, Site
 from skyless.ticks import wrap

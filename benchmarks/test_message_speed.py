@@ -8,7 +8,7 @@ from skyless.air.codec import decode, encode
 from skyless.anchor import Anchor
 from skyless.method_names import METHODS
 from skyless.receiver import Receiver
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World

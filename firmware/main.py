@@ -1,7 +1,7 @@
 """What a DWM1001 does when it starts: an anchor's radio, or a tag's, which only listens.
 
-A tag it is where the file ``role.txt`` begins with ``tag``, or without such a file where pin ROLE is tied to ground.
-Whatever goes wrong ends in a reset, for there is nobody to read an error message: the serial port speaks the link.
+It is a tag's where the file ``role.txt`` begins with ``tag``, or without such a file where pin ROLE is tied to ground.
+Whatever goes wrong ends in a reset, as there is no place for an error message: the serial port carries the link.
 """
 
 import gc
@@ -28,7 +28,7 @@ def can_transmit() -> bool:
 
 
 def main() -> None:
-    """Set up pins and buses, and turn until the power goes."""
+    """Set up pins and buses, and serve until the power goes."""
     Pin("UART_TX", Pin.OUT, value=1)
     Pin("UART_RX", Pin.IN, Pin.PULL_UP)
     select = Pin("DW_CS", Pin.OUT, value=1)
@@ -36,7 +36,7 @@ def main() -> None:
     bus = nrf52.SpiBus(SPI(1, baudrate=nrf52.SLOW_HZ), select, Pin("DW_RST", Pin.IN), time.sleep_us)
     uart = nrf52.Uarte(time.sleep_us)
     identity = bytearray(8)
-    link.copy(DEVICE_ID, 0, 8, identity, 0)  # machine code takes a number for an address
+    link.copy(DEVICE_ID, 0, 8, identity, 0)  # machine code treats a number as an address
     made = board.Board(dw1000.DW1000(bus), uart, time, gc, can_transmit(), identity, interrupt)
     gc.collect()
     made.begin()

@@ -1,9 +1,9 @@
-"""UART and SPI of an nRF52832 as a board wants them, for MicroPython alone. It has never run on a chip.
+"""UART and SPI of an nRF52832 as a board needs them, for MicroPython alone. It has never run on a chip.
 
 The port's own ``machine.UART`` waits until a record is out, 1.2 ms for a long one, and holds 64 bytes that came in
 meanwhile: too slow for slots of 2.1 ms. Here both directions go through EasyDMA: the receiver fills a ring of 255
-bytes over and over (short ENDRX to STARTRX), and a timer counts the bytes (PPI from RXDRDY to COUNT). Offsets of
-registers are those of the nRF52832 Product Specification, held against the tables that NuttX has.
+bytes repeatedly (short ENDRX to STARTRX), and a timer counts the bytes (PPI from RXDRDY to COUNT). Offsets of
+registers are those of the nRF52832 Product Specification, compared with the tables of NuttX.
 """
 
 import dw1000
@@ -19,13 +19,13 @@ TX_PIN = 5
 RX_PIN = 11
 
 RING_BYTES = 255
-"""The most that RXD.MAXCNT takes on this chip: 8 bits."""
+"""The greatest RXD.MAXCNT of this chip: 8 bits."""
 OUT_BYTES = 1024
 COUNT_MASK = 0x3FFF_FFFF
 """Counts stay small integers."""
 FAST_HZ = 8_000_000
 SLOW_HZ = 2_000_000
-MOST_WRITTEN = 131
+MAX_WRITE_BYTES = 131
 """Header and data of the longest write."""
 
 # Offsets in words of 32 bits. CLOCK:
@@ -66,7 +66,7 @@ _CH7_TEP = const((0x514 + 7 * 8) // 4)
 
 @micropython.viper
 def stop(uarte: ptr32, timer: ptr32, ppi: ptr32):  # noqa: ANN201, F821 - viper's types
-    """Take the UART from whoever had it: no interrupts, nothing under way."""
+    """Stop the UART, whatever used it: no interrupts, no transfer."""
     uarte[_INTENCLR] = -1
     uarte[_SHORTS] = 0
     uarte[_STOPRX] = 1
@@ -102,14 +102,14 @@ def start(uarte: ptr32, timer: ptr32, ppi: ptr32, ring: ptr8, clock: ptr32):  # 
 
 @micropython.viper
 def received(timer: ptr32) -> int:  # noqa: F821
-    """How many bytes have come, modulo 2**30."""
+    """How many bytes were received, modulo 2**30."""
     timer[_CAPTURE0] = 1
     return int(timer[_CC0]) & 0x3FFFFFFF
 
 
 @micropython.viper
-def take(ring: ptr8, at: int, size: int, out: ptr8) -> int:  # noqa: F821
-    """Copy ``size`` bytes from the ring; return where the next one stands."""
+def copy_from_ring(ring: ptr8, at: int, size: int, out: ptr8) -> int:  # noqa: F821
+    """Copy ``size`` bytes from the ring; return the index of the next one."""
     fill = 0
     while fill < size:
         out[fill] = ring[at]
@@ -122,7 +122,7 @@ def take(ring: ptr8, at: int, size: int, out: ptr8) -> int:  # noqa: F821
 
 @micropython.viper
 def join(header: ptr8, begin: int, data: ptr8, end: int, out: ptr8):  # noqa: ANN201, F821
-    """Header of so many bytes, and behind it data up to ``end``."""
+    """Header of ``begin`` bytes, and data after it up to ``end``."""
     at = 0
     while at < begin:
         out[at] = header[at]
@@ -134,7 +134,7 @@ def join(header: ptr8, begin: int, data: ptr8, end: int, out: ptr8):  # noqa: AN
 
 @micropython.viper
 def send(uarte: ptr32, data: ptr8, at: int, size: int):  # noqa: ANN201, F821
-    """Begin to send ``data[at:at + size]``, which must stay as it is until ``is_sent``."""
+    """Begin to send ``data[at:at + size]``, which must not change until ``is_sent``."""
     uarte[_ENDTX] = 0
     uarte[_TXD_PTR] = int(data) + at
     uarte[_TXD_MAXCNT] = size
@@ -143,7 +143,7 @@ def send(uarte: ptr32, data: ptr8, at: int, size: int):  # noqa: ANN201, F821
 
 @micropython.viper
 def is_sent(uarte: ptr32) -> bool:  # noqa: F821
-    """Whether what was begun last is out."""
+    """Whether the last piece is sent."""
     return uarte[_ENDTX] != 0
 
 
@@ -158,32 +158,32 @@ class Uarte:
         self.restart()
 
     def restart(self):  # noqa: ANN201
-        """Start anew; what was being sent is cut off, and what waits is sent behind it."""
+        """Restart; what was being sent is cut off, and what waits is sent after it."""
         stop(self._uarte, self._timer, self._ppi)
         self._pause_us(200)
         start(self._uarte, self._timer, self._ppi, self._ring, self._clock)
-        self._taken, self._at = received(self._timer), 0
+        self._read_count, self._at = received(self._timer), 0
         self._drop(self._sending)
 
     def read(self, into):  # noqa: ANN001, ANN201
-        """Take what has come, and keep sending. What was overwritten is left out, which the records' check shows."""
+        """Read what was received, and keep sending. Overwritten bytes are missing, which the records' check shows."""
         if self._held > 0:
             self._pump()
-        fresh = (received(self._timer) - self._taken) & COUNT_MASK
+        fresh = (received(self._timer) - self._read_count) & COUNT_MASK
         if fresh == 0:
             return 0
         if fresh > RING_BYTES:
             self.overruns += 1
             self._at = (self._at + fresh) % RING_BYTES
-            self._taken = (self._taken + fresh) & COUNT_MASK
+            self._read_count = (self._read_count + fresh) & COUNT_MASK
             return 0
         size = min(len(into), fresh)
-        self._at = take(self._ring, self._at, size, into)
-        self._taken = (self._taken + size) & COUNT_MASK
+        self._at = copy_from_ring(self._ring, self._at, size, into)
+        self._read_count = (self._read_count + size) & COUNT_MASK
         return size
 
     def write(self, line, end):  # noqa: ANN001, ANN201
-        """Queue ``line[:end]``; False where there is no room."""
+        """Queue ``line[:end]``; False where it does not fit."""
         if end > OUT_BYTES - self._held:
             return False
         fill = (self._begin + self._held) % OUT_BYTES
@@ -196,7 +196,7 @@ class Uarte:
         return True
 
     def _pump(self):  # noqa: ANN202
-        """Let the next piece follow when one is out."""
+        """Send the next piece when one is sent."""
         if self._sending > 0:
             if not is_sent(self._uarte):
                 return
@@ -220,11 +220,11 @@ class SpiBus(dw1000.Bus):
     """
 
     def __init__(self, spi, select, reset_pin, pause_us):  # noqa: ANN001, ANN204
-        """Pins are ``machine.Pin``; the reset's must not drive the line yet."""
+        """Pins are ``machine.Pin``; the reset pin must not drive the line yet."""
         self._spi, self._select, self._reset, self.pause_us = spi, select, reset_pin, pause_us
         self._exchange = spi.write_readinto
-        self._out, self._into = bytearray(MOST_WRITTEN), bytearray(MOST_WRITTEN)
-        self._outs, self._intos = [None] * (MOST_WRITTEN + 1), [None] * (MOST_WRITTEN + 1)
+        self._out, self._into = bytearray(MAX_WRITE_BYTES), bytearray(MAX_WRITE_BYTES)
+        self._outs, self._intos = [None] * (MAX_WRITE_BYTES + 1), [None] * (MAX_WRITE_BYTES + 1)
 
     def transfer(self, out, into):  # noqa: ANN001, ANN201
         """Both directions at once."""
@@ -233,7 +233,7 @@ class SpiBus(dw1000.Bus):
         self._select(1)
 
     def write(self, header, data):  # noqa: ANN001, ANN201
-        """What comes back goes where nobody looks. Slices are made when a length is first used, and kept."""
+        """What comes back is ignored. Slices are made when a length is first used, and kept."""
         begin = len(header)
         end = begin + len(data)
         join(header, begin, data, end, self._out)
@@ -250,7 +250,7 @@ class SpiBus(dw1000.Bus):
         self._spi.init(baudrate=SLOW_HZ, polarity=0, phase=0)
 
     def fast(self):  # noqa: ANN201
-        """What this processor can do; the chip could 20 MHz."""
+        """The maximum of this processor; that of the chip is 20 MHz."""
         self._spi.init(baudrate=FAST_HZ, polarity=0, phase=0)
 
     def reset(self):  # noqa: ANN201

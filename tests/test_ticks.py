@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless import ticks
-from skyless.constants import SPEED_OF_LIGHT_MPS
+from skyless.constants import TICK_M
 
 RATE_HZ = 128 * 499_200_000
 WRAP_S = Fraction(2**40, RATE_HZ)
@@ -22,7 +22,7 @@ steps = st.integers(-HALF, HALF - 1)
 def test_published_figures():
     assert float(WRAP_S) == pytest.approx(17.2074, abs=5e-5)  # DW1000 User Manual 7.2.8
     assert ticks.to_seconds(1) == pytest.approx(15.650040064e-12, rel=1e-10)
-    assert ticks.to_metres(1) == pytest.approx(4.6917639786e-3, rel=1e-9)
+    assert pytest.approx(4.6917639786e-3, rel=1e-9) == TICK_M
     assert ticks.from_seconds(2.1005128205128206e-3) == 2**27  # the slot of 2.1005 ms
 
 
@@ -51,10 +51,8 @@ def test_nearest_finds_the_time_near_the_expected_one(time, error, bits):
 
 
 @given(st.integers(-(2**53), 2**53))
-def test_seconds_and_metres_against_fractions(count):
-    seconds = Fraction(count, RATE_HZ)
-    assert ticks.to_seconds(count) == pytest.approx(float(seconds), rel=4e-16, abs=0)
-    assert ticks.to_metres(count) == pytest.approx(float(seconds * int(SPEED_OF_LIGHT_MPS)), rel=8e-16, abs=0)
+def test_seconds_against_fractions(count):
+    assert ticks.to_seconds(count) == pytest.approx(float(Fraction(count, RATE_HZ)), rel=4e-16, abs=0)
 
 
 @given(st.integers(-(2**50), 2**50))
@@ -74,17 +72,6 @@ def test_unwrapping_gives_back_a_time_that_never_wrapped(start, gaps):
     times = start + np.cumsum([0, *gaps], dtype=np.int64)
     unwrapper = ticks.Unwrapper()
     assert [unwrapper.unwrap(ticks.wrap(int(time))) for time in times] == times.tolist()
-
-
-@given(st.integers(0, 2**40 - 1), st.lists(steps, max_size=30))
-def test_array_and_stream_agree(start, gaps):
-    counters = np.array([ticks.wrap(time) for time in np.cumsum([start, *gaps]).tolist()], dtype=np.int64)
-    unwrapper = ticks.Unwrapper()
-    assert ticks.unwrap_array(counters).tolist() == [unwrapper.unwrap(counter) for counter in counters.tolist()]
-
-
-def test_no_stamps_unwrap_to_none():
-    assert ticks.unwrap_array(np.array([], dtype=np.int64)).tolist() == []
 
 
 @given(

@@ -1,7 +1,7 @@
 """GPS without a sky: listen-only ultra-wideband positioning indoors.
 
-The names below are the front door for programs and notebooks; they are imported when first used, so that
-``import skyless`` stays light. Everything else is found in the rooms that ``docs/architecture.md`` describes.
+The names below are the interface for programs and notebooks; they are imported when first used, so that
+``import skyless`` stays light. ``docs/architecture.md`` describes the packages that hold everything else.
 """
 
 from importlib import import_module
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_PLACES: Final = {
+_MODULES: Final = {
     "METHODS": "skyless.method_names",
     "Anchor": "skyless.anchor",
     "Fix": "skyless.positioning.fix",
@@ -63,10 +63,10 @@ __all__ = [
 def __getattr__(name: str) -> object:
     if name == "__version__":
         return import_module("importlib.metadata").version(__name__)
-    place = _PLACES.get(name)
-    if place is None:
+    module = _MODULES.get(name)
+    if module is None:
         raise AttributeError(f"module 'skyless' has no attribute {name!r}")
-    return getattr(import_module(place), name)
+    return getattr(import_module(module), name)
 
 
 def __dir__() -> list[str]:

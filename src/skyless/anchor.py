@@ -11,9 +11,8 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.air.almanac import Page
-from skyless.air.beacon import Beacon, Heard, MasterTime
+from skyless.air.beacon import Beacon, Heard, Malformed, MasterTime
 from skyless.air.codec import decode_cached, encode, heard_capacity
-from skyless.air.malformed import Malformed
 from skyless.air.master_term import MasterTerm
 from skyless.air.reception import Reception, Transmission
 from skyless.clocks.filter import ClockFilter, clock_noise
@@ -21,34 +20,34 @@ from skyless.clocks.site_clock import SiteClock
 from skyless.clocks.site_time import SUBTICKS
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.master_election import MasterElection, Role, Verdict
-from skyless.site.almanac_sending import almanac_issue, page_for, pages_of
+from skyless.site.almanac_pages import almanac_issue, page_for, pages_of
 from skyless.site.model import AnchorSite, Site
 from skyless.site.slots import first_slots, schedule_of
 from skyless.ticks import Unwrapper, difference, wrap
 from skyless.uncertainty.tdoa import stamp_variance_m2
 
 MAX_OFFSET_STD_M: Final = 0.3
-"""An anchor speaks only while its offset is known better than this (``docs/maths.md`` section 6)."""
+"""An anchor sends only while its offset is known better than this (``docs/maths.md`` section 6)."""
 
 MAX_TAKEOVER_STD_M: Final = 3.0
-"""And takes over the master's role while it is known better than this: so much may the site's time jump on sites whose
-superframes last a second."""
+"""An anchor takes over the master's role only while its offset is known better than this, by which the site's time may
+then jump, on sites whose superframes last a second."""
 
 MAX_RELAY_AGE_S: Final = 1.0
 """Older stamps are not relayed: sequence numbers come around after 256 frames, and then name another frame."""
 
 
 class Synchronisation(Struct, frozen=True):
-    """How well an anchor knows the site's time, and by whom."""
+    """How well an anchor knows the site's time, and whose."""
 
     beacons: int
-    """Master beacons taken since the clock filter's last start."""
+    """Master beacons used since the clock filter's last start."""
     rate_ppm: float
     offset_std_m: float
     """After the last beacon, in metres of light."""
     role: Role = Role.LISTENING
     master: int | None = None
-    """The master that it follows, itself if it is the master; None before it has heard one."""
+    """The present master, which may be the anchor itself; None before it has received one."""
     term: int | None = None
     """Counts the takeovers of the master's role, modulo 256."""
 
@@ -69,7 +68,7 @@ class Anchor:
         self._pages: tuple[Page, ...] = pages_of(site)
         self._issue = almanac_issue(self._pages)
         self._own_ticks = Unwrapper()
-        self._succession = MasterElection(site, anchor_id, self._schedule)
+        self._election = MasterElection(site, anchor_id, self._schedule)
         self._clock = SiteClock(_filter_of(site), self._schedule, self.counters)
         self._master_heard: Heard | None = None
         self._heard: dict[int, tuple[Heard, int]] = {}
@@ -79,13 +78,13 @@ class Anchor:
     @property
     def is_master(self) -> bool:
         """Whether this anchor keeps the site's time at present."""
-        return self._succession.role is Role.MASTER
+        return self._election.role is Role.MASTER
 
     @property
     def synchronisation(self) -> Synchronisation:
         """State of the own clock against the site's time; exact for the master itself."""
-        claim, clock, role = self._succession.claim, self._clock, self._succession.role
-        master, term = (None, None) if claim is None else (claim.master, claim.term)
+        master_term, clock, role = self._election.master_term, self._clock, self._election.role
+        master, term = (None, None) if master_term is None else (master_term.master, master_term.term)
         if role is Role.MASTER:
             return Synchronisation(0, clock.rate * 1e6, 0.0, role, master, term)
         return Synchronisation(clock.updates, clock.rate * 1e6, clock.offset_std_m, role, master, term)
@@ -104,7 +103,7 @@ class Anchor:
         return offset_s, (site_ticks - clock.epoch_ticks) // self._schedule.superframe_ticks
 
     def hear(self, reception: Reception) -> None:
-        """Take a frame off the air; what does not belong here is counted and dropped."""
+        """Process a frame from the air; one that does not belong here is counted and dropped."""
         beacon = decode_cached(reception.frame)
         if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
@@ -118,12 +117,12 @@ class Anchor:
             heard = Heard(beacon.anchor, beacon.sequence, reception.rx_ticks)
             self._heard.pop(beacon.anchor, None)
             self._heard[beacon.anchor] = (heard, rx_ticks)
-            self._hear_of_master(beacon, heard, rx_ticks)
+            self._update_master(beacon, heard, rx_ticks)
 
-    def _hear_of_master(self, beacon: Beacon, heard: Heard, rx_ticks: int) -> None:
-        """Follow the master that is the newest, and set the clock by its own beacons."""
-        verdict = self._succession.hear(beacon, rx_ticks)
-        if verdict in {Verdict.STALE, Verdict.STRANGE}:
+    def _update_master(self, beacon: Beacon, heard: Heard, rx_ticks: int) -> None:
+        """Track which anchor is the master, and set the clock by the master's own beacons."""
+        verdict = self._election.on_beacon(beacon, rx_ticks)
+        if verdict in {Verdict.STALE, Verdict.UNKNOWN}:
             self.counters[verdict] += 1
         if verdict in {Verdict.FROM_NEW_MASTER, Verdict.FROM_FIRST_MASTER}:
             self._master_heard = None
@@ -137,11 +136,11 @@ class Anchor:
     def next_transmission_ticks(self, now_ticks: int) -> int | None:
         """TX stamp (40-bit, own counter) of the next frame that can still be made; None while the clock is unknown."""
         now = self._own_ticks.unwrap(now_ticks)
-        self._succession.resign_if_silent(now)
-        self._lead_if_due(now)
+        self._election.resign_if_silent(now)
+        self._take_over_if_due(now)
         earliest = now + self._lead_ticks
         epoch = self._clock.epoch_ticks
-        if epoch is None or not self._may_speak(earliest):
+        if epoch is None or not self._may_send(earliest):
             return None
         since_epoch = self._clock.subticks(earliest) // SUBTICKS - epoch
         superframe, slot = self._schedule.next_slot(since_epoch + DELAYED_TX_GRANULARITY_TICKS, self._slots)
@@ -157,27 +156,27 @@ class Anchor:
         """
         superframe, slot = self._pending.pop(tx_ticks)
         unwrapped = self._own_ticks.expect(tx_ticks)
-        self._lead_if_due(unwrapped - self._lead_ticks)
+        self._take_over_if_due(unwrapped - self._lead_ticks)
         beacon = self._beacon(tx_ticks, superframe, slot)
-        self._succession.sent(unwrapped)
+        self._election.on_sent(unwrapped)
         self._sequence = (self._sequence + 1) & 0xFF
         self.counters["sent"] += 1
         return Transmission(encode(beacon), tx_ticks)
 
-    def _lead_if_due(self, now: int) -> None:
-        """Take over the master's role if nobody has it: the site's time goes on by the own clock as it is."""
+    def _take_over_if_due(self, now: int) -> None:
+        """Take the master's role if no anchor has it: the site's time goes on by the own clock."""
         good = self._clock.updates > 1 and self._clock.variance_m2(now) < MAX_TAKEOVER_STD_M**2
-        if self._succession.must_lead(now, good):
-            self.counters["takeover"] += self._succession.claim is not None
-            self._succession.lead(now)
+        if self._election.must_become_master(now, good):
+            self.counters["takeover"] += self._election.master_term is not None
+            self._election.become_master(now)
             self._clock.lead(now)
             self._master_heard = None
 
     def _beacon(self, tx_ticks: int, superframe: int, slot: int) -> Beacon:
-        superframe &= 0xFFFFFFFF  # as the frame shows it: whoever reads it can tell the page
+        superframe &= 0xFFFFFFFF  # as the frame shows it: its reader can compute the page
         page = page_for(self._pages, superframe, slot)
-        claim = self._succession.claim or MasterTerm(0, self.id)
-        room = heard_capacity(master_heard=self._master_heard is not None, master_time=True, page=True)
+        master_term = self._election.master_term or MasterTerm(0, self.id)
+        capacity = heard_capacity(master_heard=self._master_heard is not None, master_time=True, page=True)
         return Beacon(
             site=self._site.id,
             anchor=self.id,
@@ -186,16 +185,16 @@ class Anchor:
             slot=slot,
             tx_ticks=tx_ticks,
             almanac_issue=self._issue,
-            master=claim.master,
-            term=claim.term,
+            master=master_term.master,
+            term=master_term.term,
             master_heard=self._master_heard,
             master_time=self._master_time(self._own_ticks.expect(tx_ticks)),
-            heard=self._relayed(self._own_ticks.expect(tx_ticks), claim.master)[:room],
+            heard=self._relayed(self._own_ticks.expect(tx_ticks), master_term.master)[:capacity],
             page=page,
         )
 
     def _relayed(self, ticks_own: int, master: int) -> tuple[Heard, ...]:
-        """What was heard of late of the anchors beside the master, the most recent first."""
+        """Recent receptions of the anchors other than the master, the most recent first."""
         oldest = ticks_own - round(MAX_RELAY_AGE_S * TICK_RATE_HZ)
         return tuple(
             heard for heard, rx_ticks in reversed(self._heard.values()) if rx_ticks > oldest and heard.anchor != master
@@ -203,17 +202,17 @@ class Anchor:
 
     def _master_time(self, ticks_own: int) -> MasterTime | None:
         """Site time of a frame; None for one that was due when its sender lost its master."""
-        role = self._succession.role
+        role = self._election.role
         if role is Role.LISTENING or (role is Role.FOLLOWER and self._clock.updates < 2):
             return None
         std_ticks = math.sqrt(self._clock.variance_m2(ticks_own)) / TICK_M
         return MasterTime(wrap(self._clock.subticks(ticks_own), 48), std_ticks)
 
-    def _may_speak(self, ticks_own: int) -> bool:
+    def _may_send(self, ticks_own: int) -> bool:
         """Whether the own clock is known well enough."""
         if self.is_master:
             return True
-        following = self._succession.role is Role.FOLLOWER and self._clock.updates > 1
+        following = self._election.role is Role.FOLLOWER and self._clock.updates > 1
         return following and self._clock.variance_m2(ticks_own) < MAX_OFFSET_STD_M**2
 
     def _on_radio_grid(self, ticks_own: int) -> int:

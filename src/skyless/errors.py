@@ -1,4 +1,4 @@
-"""What is raised at the user: a fault that he can mend, told so that he can."""
+"""Errors for the user: faults that the user can correct, with messages that name what to correct."""
 
 import json
 from os import PathLike, fspath
@@ -11,10 +11,10 @@ class SkylessError(Exception):
 
 
 class ConfigurationError(SkylessError):
-    """A configuration that cannot be used: which file, which key, what stands there, what would be right."""
+    """A configuration that cannot be used: which file, which key, its value, what would be right."""
 
     def __init__(self, file: str | PathLike[str], key: str, value: object, expected: str) -> None:
-        """``key`` is empty when the file as a whole is meant; ``value`` is None when nothing stands there."""
+        """``key`` is empty when the file as a whole is meant; ``value`` is None when the key is missing."""
         self.file = fspath(file)
         self.key = key
         self.value = value

@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
-from skyless.air.followed_master import FollowedMaster
+from skyless.air.master_term import FollowedMaster
 from skyless.air.reception import Diagnostics, Reception
 from skyless.clocks.stamps import AnchorStamps, StampTracks
 from skyless.kernels.arrays import Array
@@ -25,22 +25,22 @@ from skyless.positioning.methods.joint import Estimation, EstimationState
 from skyless.positioning.methods.nlos_weighting import variance_factor
 from skyless.positioning.methods.observations import Observer
 from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
-from skyless.site.almanac_gathering import AlmanacAssembly, AlmanacState
+from skyless.site.almanac_pages import AlmanacAssembly, AlmanacState
 from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)
-"""A tag that may choose its site leaves one that is silent for so long when it hears another."""
+"""A tag that may choose its site leaves one that has been silent for this time when it hears another."""
 
 NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
 """Counters of a receiver that do not count dropped frames."""
 
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
-"""Stamps that go back farther than radios and hosts reorder mean that the tag's own counter has started anew."""
+"""Stamps that go back farther than radios and hosts reorder them mean that the tag's own counter has restarted."""
 
 
 class ReceiverState(Struct, frozen=True):
-    """All that a ``Receiver`` remembers; to be used or encoded before it hears more, as they share some parts."""
+    """All that a ``Receiver`` keeps; to be used or encoded before its next frame, as they share some parts."""
 
     options: MethodOptions
     site: int | None
@@ -56,8 +56,8 @@ class ReceiverState(Struct, frozen=True):
     master: int | None
     master_scale: tuple[int, int] | None
     superframe_ticks: int
-    has_key: bool
-    """Whether the almanac has been looked at for a method."""
+    has_method_key: bool
+    """Whether a method has been looked for since stamps were forgotten."""
     method: EstimationState | SnapshotsState | None
 
 
@@ -76,8 +76,8 @@ class Receiver:
         """Make a tag that knows nothing yet.
 
         ``method`` is one of ``METHODS``; ``site`` the only site to listen to, by default the first that is heard;
-        ``qa`` the tag's agility in m²/s³ (filters); ``z_bounds_m`` decides between mirror solutions; ``integrity``
-        is asked of the protection levels (``joint``).
+        ``qa`` the tag's process noise in m²/s³ (filters); ``z_bounds_m`` decides between mirror solutions;
+        ``integrity`` is the requirement for the protection levels (``joint``).
 
         Raises:
             ValueError: there is no such method.
@@ -87,7 +87,7 @@ class Receiver:
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self.almanac = AlmanacAssembly()
-        self._wanted = MethodOptions(method, qa, z_bounds_m, integrity or IntegrityRequirement())
+        self._options = MethodOptions(method, qa, z_bounds_m, integrity or IntegrityRequirement())
         self._site = site
         self._may_change_site = site is None
         self._site_heard_ticks = 0
@@ -96,16 +96,16 @@ class Receiver:
         self._stamps = AnchorStamps(self.counters)
         self._observer = Observer()
         self._method: Estimation | Snapshots | None = None
-        self._made_of: object = None
+        self._method_key: object = None
         self._superframe_ticks = 0
         self._followed = FollowedMaster()
         self._master: int | None = None
         self._positions: dict[int, Array] = {}
 
     def state(self) -> ReceiverState:
-        """All that it remembers, as it is now."""
+        """All that it keeps, as it is now."""
         return ReceiverState(
-            options=self._wanted,
+            options=self._options,
             site=self._site,
             may_change_site=self._may_change_site,
             site_heard_ticks=self._site_heard_ticks,
@@ -119,19 +119,19 @@ class Receiver:
             master=self._master,
             master_scale=self._observer.scale,
             superframe_ticks=self._superframe_ticks,
-            has_key=self._made_of is not None,
+            has_method_key=self._method_key is not None,
             method=None if self._method is None else self._method.state(),
         )
 
     @classmethod
     def from_state(cls, state: ReceiverState) -> "Receiver":
-        """A receiver that goes on with the same bits as the one whose state it is.
+        """A receiver that continues with the same bits as the one with this state.
 
         Raises:
             ValueError: no receiver has such a state.
         """
-        asked = state.options
-        made = cls(asked.method, qa=asked.qa, z_bounds_m=asked.z_bounds_m, integrity=asked.integrity)
+        options = state.options
+        made = cls(options.method, qa=options.qa, z_bounds_m=options.z_bounds_m, integrity=options.integrity)
         made._site, made._may_change_site = state.site, state.may_change_site
         made._site_heard_ticks, made._superframe_ticks = state.site_heard_ticks, state.superframe_ticks
         made.counters.update(state.counters)
@@ -142,7 +142,7 @@ class Receiver:
         made._read_positions()
         made._master, made._observer.scale = state.master, state.master_scale
         made._observer.follow(state.master, made.almanac.slot_of(state.master) or 0)
-        if state.has_key:
+        if state.has_method_key:
             made._choose_method()
         match made._method, state.method:
             case Estimation() as method, EstimationState() as saved:
@@ -157,20 +157,20 @@ class Receiver:
 
     @property
     def site(self) -> int | None:
-        """Identifier of the site that it listens to, None before the first beacon."""
+        """Identifier of the site that it receives, None before the first beacon."""
         return self._site
 
     @property
     def method(self) -> Estimation | Snapshots | None:
-        """The positioning method at work, None before the almanac is known."""
+        """The positioning method in use, None before the almanac is known."""
         return self._method
 
     def hear(self, reception: Reception) -> Fix | None:
-        """Take a frame off the air; a fix if it made one, else ``reason`` says why not.
+        """Process a frame from the air; a fix if it made one, else ``reason`` is set.
 
         What does not belong here is counted in ``counters`` and dropped; nothing on the air raises.
         """
-        frame, told = reception.frame, reception.diagnostics
+        frame, diagnostics = reception.frame, reception.diagnostics
         beacon = decode_cached(frame)
         if not isinstance(beacon, Beacon):
             self.counters[beacon] += 1
@@ -185,8 +185,8 @@ class Receiver:
         if method is None or anchor_m is None:
             self.reason = NoFixReason.NO_ALMANAC
             return None
-        factor, claim = 1.0 if told is None else _trust(told), self._followed.claim
-        result = method.hear(self._observer.observe(frame, beacon, anchor_m, rx_ticks, tx_ticks, factor, claim))
+        scale, master_term = 1.0 if diagnostics is None else _variance_scale(diagnostics), self._followed.master_term
+        result = method.hear(self._observer.observe(frame, beacon, anchor_m, rx_ticks, tx_ticks, scale, master_term))
         if isinstance(result, Fix):
             self.counters["fixes"] += 1
             return result
@@ -196,7 +196,7 @@ class Receiver:
         return None
 
     def hear_height(self, height_m: float, std_m: float) -> bool:
-        """Take a reading of the tag's height sensor, above the site's origin, at the present; True if it was used.
+        """Process a reading of the tag's height sensor, above the site's origin, at the present; True if it was used.
 
         Only ``joint`` uses it. Before the first fix it limits the heights at which a position is sought. Recordings do
         not hold these readings, so a replay lacks them.
@@ -215,7 +215,7 @@ class Receiver:
         """TX stamp, unwrapped, of a beacon of the site, by the present master, and of an anchor that may be there."""
         newest = self._stamps.tracks.newest_rx_ticks
         jumped = newest is not None and rx_ticks < newest - COUNTER_JUMP_TICKS
-        if (jumped or not -LAST_TICKS <= rx_ticks <= LAST_TICKS) and not self._begin_anew(rx_ticks):
+        if (jumped or not -LAST_TICKS <= rx_ticks <= LAST_TICKS) and not self._restart(rx_ticks):
             return None
         if beacon.site != self._site and not self._change_site(beacon.site, rx_ticks):
             self.counters["foreign-site"] += 1
@@ -227,13 +227,13 @@ class Receiver:
         if tx_ticks is None:
             return None
         self._site_heard_ticks = rx_ticks
-        if self._followed.hear(beacon, rx_ticks, self._superframe_ticks):
+        if self._followed.on_beacon(beacon, rx_ticks, self._superframe_ticks):
             return tx_ticks
         self.counters["stale-master"] += 1
         return None
 
-    def _begin_anew(self, rx_ticks: int) -> bool:
-        """Forget all stamps, as the tag's counter started anew; False where the host's clock was set by ages."""
+    def _restart(self, rx_ticks: int) -> bool:
+        """Forget all stamps, as the tag's counter restarted; False where the host's clock jumped by over a year."""
         self._forget_stamps()
         if abs(rx_ticks) <= LAST_TICKS:
             self.counters["counter-jump"] += 1
@@ -244,7 +244,7 @@ class Receiver:
         return False
 
     def _change_site(self, site: int, rx_ticks: int) -> bool:
-        """Whether to listen to this site from now on: the first one, or another when the present one is silent."""
+        """Whether to use this site from now on: the first one, or another when the present one is silent."""
         if not self._may_change_site:
             return False
         if self._site is not None:
@@ -258,44 +258,44 @@ class Receiver:
         return True
 
     def _forget_stamps(self) -> None:
-        """Start anew in all but the almanac."""
+        """Restart everything but the almanac."""
         self._stamps.forget()
         self._observer.forget()
         self._followed = FollowedMaster()
-        self._method = self._made_of = None
+        self._method = self._method_key = None
 
     def _read_almanac(self, beacon: Beacon) -> None:
-        """Keep the page; another issue, schedule, noise or accuracy makes the method anew.
+        """Add the page; another issue, schedule, noise or accuracy replaces the method.
 
-        So does another master where the method rests on the master's own stamps; the filters ride on.
+        So does another master where the method uses the master's own stamps; filters continue.
         """
-        book, claim = self.almanac, self._followed.claim
-        master = None if claim is None else claim.master
-        if book.hear(beacon.almanac_issue, beacon.page):
+        almanac, master = self.almanac, self._followed.master
+        if almanac.add_page(beacon.almanac_issue, beacon.page):
             self._read_positions()
         elif self._method is not None and master == self._master:
             return
         self._master = master
-        self._observer.follow(master, book.slot_of(master) or 0)
+        self._observer.follow(master, almanac.slot_of(master) or 0)
         self._choose_method()
 
     def _read_positions(self) -> None:
-        self._positions = {anchor: np.array(position_m) for anchor, position_m in self.almanac.anchors_m.items()}
+        self._positions = {anchor: np.array(point) for anchor, point in self.almanac.anchors_m.items()}
 
     def _choose_method(self) -> None:
-        """Make the method that almanac and master ask for, unless it is at work already."""
-        book, master = self.almanac, self._master
-        method_master = None if self._wanted.method in FILTERS else master
-        method_key = (book.issue, book.schedule, book.noise, book.accuracy, method_master)
-        if method_key != self._made_of:
-            self._made_of, self._method = method_key, None
-            if master is not None and book.schedule is not None and book.noise is not None:
-                schedule = schedule_from_page(book.schedule)
+        """Make the method that almanac and master require, unless it is in use already."""
+        almanac, options, master = self.almanac, self._options, self._master
+        method_master = None if options.method in FILTERS else master
+        schedule_page, noise, accuracy = almanac.schedule, almanac.noise, almanac.accuracy
+        method_key = (almanac.issue, schedule_page, noise, accuracy, method_master)
+        if method_key != self._method_key:
+            self._method_key, self._method = method_key, None
+            if master is not None and schedule_page is not None and noise is not None:
+                schedule = schedule_from_page(schedule_page)
                 self._superframe_ticks = schedule.superframe_ticks
-                self._method = new_method(self._wanted, master, book.schedule, book.noise, book.accuracy, self._time)
+                self._method = new_method(options, master, schedule_page, noise, accuracy, self._time)
                 self._observer.serve(self._method, schedule)
 
 
-def _trust(told: Diagnostics) -> float:
-    """Factor on the variance of a reception by what the radio told of it."""
-    return variance_factor(told.rx_power_dbm, told.first_path_power_dbm)
+def _variance_scale(diagnostics: Diagnostics) -> float:
+    """Factor on the variance of a reception, from what the radio measured of it."""
+    return variance_factor(diagnostics.rx_power_dbm, diagnostics.first_path_power_dbm)

@@ -6,18 +6,16 @@ float64 seconds lose 0.6 mm after an hour, integers lose nothing.
 
 from typing import Annotated, Final
 
-import numpy as np
 from msgspec import Meta, Struct
 
-from skyless.constants import TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.kernels.arrays import Integers
+from skyless.constants import TICK_BITS, TICK_RATE_HZ, TICK_S
 
 WRAP_TICKS: Final = 1 << TICK_BITS
 HALF_WRAP_TICKS: Final = WRAP_TICKS // 2
 TICK_MASK: Final = WRAP_TICKS - 1
 
 LAST_TICKS: Final = 1 << 61
-"""A year of ticks, of which 64 bits hold the differences; a host's clock that jumps by more was set."""
+"""A year of ticks, whose differences fit 64 bits; a host's clock that jumps by more was set."""
 
 
 def wrap(ticks: int, bits: int = TICK_BITS) -> int:
@@ -45,11 +43,6 @@ def to_seconds(ticks: int) -> float:
     return ticks * TICK_S
 
 
-def to_metres(ticks: float) -> float:
-    """Metres that light travels in that many ticks."""
-    return ticks * TICK_M
-
-
 def from_seconds(seconds: float) -> int:
     """Nearest whole number of ticks."""
     return round(seconds * TICK_RATE_HZ)
@@ -58,8 +51,8 @@ def from_seconds(seconds: float) -> int:
 class Unwrapper(Struct):
     """Turns one counter's wrapped stamps into int64 ticks that never wrap.
 
-    Without a host time a stamp is taken to lie within half a wrap (8.6 s for 40 bits) of the stamp before it,
-    before or after. With one, the host's clock says which wrap it is, however long the gap, as long as the
+    Without a host time a stamp is assumed to lie within half a wrap (8.6 s for 40 bits) of the stamp before it,
+    before or after. With one, the host's clock decides which wrap it is, however long the gap, as long as the
     host's clock errs by less than half a wrap over that gap. Stamps with and without a host time may alternate.
     """
 
@@ -86,16 +79,5 @@ class Unwrapper(Struct):
         return ticks
 
     def expect(self, counter: int) -> int:
-        """Unwrapped ticks of a counter value near the last stamp, without taking it as a stamp."""
+        """Unwrapped ticks of a counter value near the last stamp; it does not count as a stamp."""
         return counter if self.last_ticks is None else nearest(counter, self.last_ticks, self.bits)
-
-
-def unwrap_array(counters: Integers, bits: int = TICK_BITS) -> Integers:
-    """Unwrapped ticks, shape (n,), of successive counter values, each within half a wrap of the one before."""
-    half = np.int64(1) << (bits - 1)
-    steps = ((np.diff(counters) + half) & ((half << 1) - 1)) - half
-    ticks = np.empty_like(counters)
-    ticks[:1] = counters[:1]
-    np.cumsum(steps, out=ticks[1:])
-    ticks[1:] += counters[:1]
-    return ticks

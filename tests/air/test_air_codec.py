@@ -7,10 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.air.almanac import AnchorPage, NoisePage
-from skyless.air.beacon import Beacon, Heard, MasterTime
+from skyless.air.beacon import Beacon, Heard, Malformed, MasterTime
 from skyless.air.codec import decode, decode_cached, encode, heard_capacity
-from skyless.air.fcs import fcs
-from skyless.air.malformed import Malformed
+from skyless.air.ieee802154 import fcs
 
 BARE = msgspec.structs.replace(FULL, master_heard=None, master_time=None, heard=(), page=None)
 PAYLOAD_AT, VERSION_AT, FLAGS_AT, COUNT_AT = 9, 10, 11, 40

@@ -47,11 +47,6 @@ def test_schedule_from_the_almanac():
     assert schedule_from_page(SchedulePage(2**27, 14, 2, 1, 7, None)) == Schedule(2**27, 14, 2)
 
 
-def test_air_is_quiet_between_frames():
-    # A slot of 2.1005 ms less 314.8 µs of the longest frame.
-    assert Schedule(2**27, 7).quiet_s(127) == pytest.approx(1785.7e-6, abs=0.5e-6)
-
-
 schedules = st.integers(1, 40).flatmap(
     lambda slots: st.builds(Schedule, st.integers(1, 10_000), st.just(slots), st.integers(1, slots))
 )

@@ -5,9 +5,9 @@ import struct
 import pytest
 from beacon_strategies import FULL
 
+from skyless.air.beacon import Malformed
 from skyless.air.codec import decode, encode
-from skyless.air.fcs import fcs
-from skyless.air.malformed import Malformed
+from skyless.air.ieee802154 import fcs
 
 LONG_ADDRESSES = 0xDC41
 SHORT_ADDRESSES = 0x8841

@@ -8,10 +8,9 @@ import msgspec
 from beacon_strategies import FULL
 
 from skyless.air.almanac import AccuracyPage, GeoreferencePage, NoisePage, SchedulePage
-from skyless.air.beacon import Beacon
+from skyless.air.beacon import Beacon, Malformed
 from skyless.air.codec import decode, encode, heard_capacity
-from skyless.air.fcs import fcs
-from skyless.air.malformed import Malformed
+from skyless.air.ieee802154 import fcs
 
 FRAMES = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
 PAGES = (

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
-from skyless.air.malformed import Malformed
+from skyless.air.beacon import Malformed
 from skyless.air.page_codec import decode_page, encode_page
 
 metres = st.floats(-1e6, 1e6)

@@ -8,10 +8,9 @@ import msgspec
 import pytest
 
 from skyless.air.almanac import AnchorPage
-from skyless.air.beacon import Beacon
+from skyless.air.beacon import Beacon, Malformed
 from skyless.air.codec import decode, encode
-from skyless.air.malformed import Malformed
-from skyless.site.almanac_sending import page_for, pages_of
+from skyless.site.almanac_pages import page_for, pages_of
 from skyless.site.model import AnchorSite, Site
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")

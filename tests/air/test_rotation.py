@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.air.page_codec import decode_page, encode_page
-from skyless.site.almanac_sending import almanac_issue, page_for, pages_of
-from skyless.site.limits import LIMITS
+from skyless.site.almanac_pages import almanac_issue, page_for, pages_of
+from skyless.site.check import SITE_LIMITS
 from skyless.site.model import (
     EXACT,
     AccuracySite,
@@ -100,7 +100,7 @@ def test_a_few_anchors_heard_at_random_fill_it_in_due_time(anchors):
 @pytest.mark.parametrize("end", ["low", "high"])
 def test_whatever_a_site_file_may_say_fits_the_pages(end):
     def at_end(*keys):
-        return [getattr(LIMITS[key], end) for key in keys]
+        return [getattr(SITE_LIMITS[key], end) for key in keys]
 
     places = at_end("anchors.id", "anchors.x_m", "anchors.y_m", "anchors.z_m")
     noise = at_end("noise.tx_stamp_ps", "noise.rx_stamp_ps", "noise.white_fm", "noise.random_walk_fm")

@@ -2,8 +2,7 @@
 
 import pytest
 from host_latency_model import run_hosts
-
-from skyless.simulation.dw1000.bus import HostLatency
+from host_programs import HostLatency
 
 MOST_RATIO = 2.0
 """Error over bound. Four runs of 11 s give 1.27 with latency and 1.32 without it at 5 ms, 1.37 and 1.32 at 2.1 ms: the

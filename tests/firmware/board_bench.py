@@ -54,7 +54,7 @@ class Nrf52Line:
     def received(self, timer):
         return self.taken + self.wire.in_end - self.wire.in_at
 
-    def take(self, ring, at, size, out):
+    def copy_from_ring(self, ring, at, size, out):
         into = bytearray(size)
         self.taken += self.wire.read(into)
         out[:size] = into

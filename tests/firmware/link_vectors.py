@@ -22,8 +22,8 @@ def exercise(writer, reader, ticks, frame, counts):
             end = writer.status(ticks, 3, counts)
         else:
             end = writer.tx_at(ticks, frame, 100)
-        reader.take(writer.line, 0, end)
-        total += reader.length + link.unsigned(reader.record, 2, 2) + link.signed16(reader.record, 7)
+        reader.read(writer.line, 0, end)
+        total += reader.length + link.unsigned(reader.record, 2, 2) + link.unsigned(reader.record, 7, 2)
     return total
 
 
@@ -33,7 +33,7 @@ def main():
     counts = [0, 1, 255, 65536, 0x3FFFFFFF, 0x40000001]
     print("crc", link.crc16(b"123456789", 9))
     for end in (0, 1, 2, 126, 127):
-        show("rx", writer.line, writer.rx(ticks, -7953, link.NOT_TOLD, 32767, frame, end))
+        show("rx", writer.line, writer.rx(ticks, -7953, link.NOT_MEASURED, 32767, frame, end))
         show("tx_at", writer.line, writer.tx_at(ticks, frame, end))
     show("hello", writer.line, writer.hello((1, 2, 3), bytearray(b"\x00identit"), 1))
     show("done", writer.line, writer.tx_done(ticks, ticks))
@@ -53,7 +53,7 @@ def main():
         place += 1500
     at, found = 0, []
     while at < len(mess):
-        at = reader.take(mess, at, min(at + 97, len(mess)))
+        at = reader.read(mess, at, min(at + 97, len(mess)))
         if reader.length:
             found.append(reader.record[0])
     print("found", found, reader.garbled, reader.overlong)

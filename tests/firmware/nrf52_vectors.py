@@ -68,7 +68,7 @@ print("overrun", fetch(), uart.overruns)
 arrive(7)
 print("after", len(fetch()), uart._at == Line.place)
 Line.count = nrf52.COUNT_MASK - 20 + (1 << 30)  # the timer runs on where the count wraps
-uart._taken = Line.count & nrf52.COUNT_MASK
+uart._read_count = Line.count & nrf52.COUNT_MASK
 arrive(60)
 print("wrapped", len(fetch()), uart.overruns)
 

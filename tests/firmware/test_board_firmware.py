@@ -73,7 +73,7 @@ def test_a_board_greets_and_is_configured_by_its_host():
 def command(kind, body):
     writer = link.Writer()
     writer.begin(kind)
-    writer.put_bytes(bytearray(body), 0, len(body))
+    writer.append_bytes(bytearray(body), 0, len(body))
     return bytes(writer.line[: writer.end()])
 
 
@@ -148,7 +148,7 @@ def test_frames_leave_at_their_tick_and_the_receiver_is_off_no_longer_than_neede
     stamp = (dx & ~0x1FF) + vectors.TX_DELAY
     assert told == [Done(dx % 2**40, stamp % 2**40)]
     assert made.bus.sent[:38] == FRAME[:38]
-    assert deaf_us <= board.LEAD_US + board.SOON_US + 3 * step_us
+    assert deaf_us <= board.LEAD_US + board.CLOSE_US + 3 * step_us
     assert made.bus.listening
 
 
@@ -216,7 +216,7 @@ def test_a_chip_that_was_reset_is_told_of_and_can_be_configured_again():
     made.tx_at(made.clock.us + 900_000, FRAME, 40)
     made.turn(4)
     made.bus.reset()
-    made.clock.us += board.LOOK_US
+    made.clock.us += board.POLL_US
     told = said(made, 2)
     assert [type(one) for one in told] == [TooLate, Hello]
     made.say(made.host.ask(link.ASK_STATUS))
@@ -304,7 +304,7 @@ def test_nothing_long_is_begun_shortly_before_a_frame_is_due(ahead_us, step_us):
     while made.clock.us < at_us + 20_000:
         made.turn(1, step_us)
     (collected_us,) = made.collector.at_us
-    assert collected_us >= at_us - 1 or collected_us <= at_us - board.APART_US
+    assert collected_us >= at_us - 1 or collected_us <= at_us - board.CLEARANCE_US
     if ahead_us > 500:
         assert made.chip.sent == 1
 
@@ -377,7 +377,7 @@ def test_a_host_that_does_not_read_costs_records_and_they_are_counted():
 
 # What a frame costs
 
-COMPILED_ON_BOARDS = {"copy", "keep", "log10", "crc16", "stuff", "unstuff", "copy_to_zero", "place"}
+COMPILED_ON_BOARDS = {"copy", "copy_masked", "log10", "crc16", "stuff", "unstuff", "copy_to_zero", "write_number"}
 FILES = {module.__file__ for module in (board, dw1000, link)}
 
 

@@ -16,10 +16,10 @@ from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import EXACT, Site
-from skyless.site.room import room_site
+from skyless.site.template import rectangular_site
 
 LAB = ideal_lab_site()
-ROOM = replace(room_site(8.0, 6.0, 8, 3.0, None), accuracy=EXACT)
+ROOM = replace(rectangular_site(8.0, 6.0, 8, 3.0, None), accuracy=EXACT)
 """Eight anchors at alternating heights: the height is to be estimated."""
 LOFT = replace(ROOM, anchors=tuple(replace(anchor, z_m=5.0) for anchor in ROOM.anchors))
 """All anchors in one plane, so that every position has a mirror image above it."""

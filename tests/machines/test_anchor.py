@@ -14,7 +14,7 @@ from skyless.air.reception import Reception
 from skyless.anchor import MAX_OFFSET_STD_M, Anchor
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.simulation.impairments import AnchorOutage, Outage
-from skyless.site.almanac_sending import page_for, pages_of
+from skyless.site.almanac_pages import page_for, pages_of
 from skyless.site.slots import first_slots, schedule_of
 from skyless.ticks import difference, wrap
 

@@ -12,7 +12,7 @@ from skyless.positioning.estimator.monitor import INCONSISTENT_NIS
 from skyless.simulation.trajectory import Waypoints
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import EXACT
-from skyless.site.room import room_site
+from skyless.site.template import rectangular_site
 
 
 @pytest.mark.parametrize("tag_height_m", [1.2, None])
@@ -21,7 +21,7 @@ def test_a_vehicle_at_20_metres_a_second(tag_height_m, seed):
     """It crosses the hall in 1.4 s; half a second after the site's power-on it must be followed, and rightly."""
     if seed == 1:
         pytest.xfail("up to 17 standard deviations off: a tag faster than a start assumes looks like jumping ranges")
-    site = replace(room_site(30.0, 20.0, 8, 4.0, tag_height_m), accuracy=EXACT)
+    site = replace(rectangular_site(30.0, 20.0, 8, 4.0, tag_height_m), accuracy=EXACT)
     path = Waypoints([(1.0, 10.0, 1.2), (29.0, 10.0, 1.2)], 20.0)
     fleet = Fleet(site, [path], impairments_of(Request(site), site), seed, FleetSettings())
     judged = [one for one in fleet.run(1.35) if one.time_s > 0.5]

@@ -8,12 +8,12 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from bench import EVERY_METHOD, LAB, ROOM, assert_honest, tape
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench import EVERY_METHOD, LAB, ROOM, assert_honest, tape
 from skyless.air.codec import MAX_FRAME_BYTES
-from skyless.air.fcs import fcs
+from skyless.air.ieee802154 import fcs
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
 from skyless.constants import TICK_RATE_HZ

@@ -12,13 +12,13 @@ from skyless.positioning.estimator.kalman import predict
 from skyless.positioning.estimator.settings import EstimatorSettings
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import EXACT
-from skyless.site.room import room_site
+from skyless.site.template import rectangular_site
 from skyless.ticks import from_seconds
 
 LISTENING_S = 3.0
 
 
-HALL = replace(room_site(30.0, 20.0, 8, 4.0, None), accuracy=EXACT)
+HALL = replace(rectangular_site(30.0, 20.0, 8, 4.0, None), accuracy=EXACT)
 
 
 @pytest.mark.parametrize("site", [ideal_lab_site(), HALL], ids=lambda site: site.name)

@@ -437,7 +437,7 @@ def test_a_takeover_past_term_255():
     for _ in stage.world.run(0.05):
         pass
     machine = stage.machines[1]
-    machine._succession.claim = replace(machine._succession.claim, term=255)
+    machine._election.master_term = replace(machine._election.master_term, term=255)
     story = Story(stage, 4.0, tags)
     assert [reign[:2] for reign in story.reigns()] == [(255, 1), (0, 2)]
     assert {m.synchronisation.term for m in stage.machines.values()} == {0}

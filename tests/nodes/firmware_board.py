@@ -10,8 +10,7 @@ from skyless.nodes.open_radio import open_radios
 from skyless.nodes.process.pty import Pty
 from skyless.radios.dw1000.chip_ports import ETHER_LEAD_TICKS
 from skyless.radios.interface import AntennaDelays, Gone, Restarted, Sent
-from skyless.simulation.dw1000.bus import ModelBus
-from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.dw1000.chip import Chip, ModelBus
 from skyless.ticks import difference
 
 TURN_S = 0.3e-3
@@ -49,7 +48,7 @@ class FirmwareBoard:
         if isinstance(event, Restarted | Gone):
             self.chip.pull_reset()
         elif isinstance(event, Reception):
-            self.chip.hear(event.frame, event.rx_ticks, event.diagnostics or Diagnostics())
+            self.chip.receive(event.frame, event.rx_ticks, event.diagnostics or Diagnostics())
             self.board.turn()
         elif isinstance(event, Sent):
             self.chip.transceiver.finish()

@@ -16,7 +16,7 @@ from skyless.nodes.emulation.board_protocol import LinkProtocol, SnifferProtocol
 from skyless.radios.interface import Late, Restarted, Sent
 from skyless.radios.serial.link_records import Done, Hello, NotDone, Status, TooLate, decode
 from skyless.radios.serial.sniffer_radio import SnifferStream
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World
@@ -49,7 +49,7 @@ class Host:
     def _take(self, data):
         at = 0
         while at < len(data) and not self.full:
-            at = self._reader.take(bytearray(data), at, len(data))
+            at = self._reader.read(bytearray(data), at, len(data))
             if self._reader.length:
                 self.said.append(decode(bytes(self._reader.record[: self._reader.length])))
         return not self.full
@@ -96,10 +96,10 @@ def test_another_channel_or_preamble_is_refused(at):
     wanted = bytearray([5, 64, 2, 9, 128, 0, 1, 0, 1, 0, 0])
     wanted[at] += 1
     host.writer.begin(link.CONFIG)
-    host.writer.put_bytes(wanted, 0, 11)
+    host.writer.append_bytes(wanted, 0, 11)
     assert host.say(host.writer.end()) == [NotDone(link.CONFIG, link.REFUSED_SETTING)]
     host.writer.begin(link.CONFIG)
-    host.writer.put_bytes(wanted, 0, 10)
+    host.writer.append_bytes(wanted, 0, 10)
     assert host.say(host.writer.end()) == [NotDone(link.CONFIG, link.REFUSED_MALFORMED)]
 
 
@@ -121,7 +121,7 @@ def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later()
     assert (status.sent, status.late) == (1, 2)
     for length in (0, 128):
         host.writer.begin(link.TX_AT)
-        host.writer.put_bytes(bytearray(133), 0, 5 + length)
+        host.writer.append_bytes(bytearray(133), 0, 5 + length)
         assert host.say(host.writer.end()) == [NotDone(link.TX_AT, link.REFUSED_MALFORMED)]
     silent = Host(can_transmit=False).ready()
     assert silent.say(silent.writer.tx_at(dx(512), frame, 7)) == [TooLate(512, link.LATE_NOT_READY)]

@@ -19,7 +19,7 @@ from skyless.planning.verify import random_points, verify
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import ideal_lab_site, lab_site
 from skyless.site.model import EXACT, AnchorSite, Site, TagsSite, WallSite
-from skyless.site.room import room_site
+from skyless.site.template import rectangular_site
 
 FILE = Path("site.toml")
 BRACKETED = PlanSettings("bracketed")
@@ -34,15 +34,15 @@ def searched(site, outline, anchors, heights, tag_heights, settings=BRACKETED, s
 @pytest.mark.parametrize(
     ("site", "outline", "anchors", "heights", "tag_heights"),
     [
-        (room_site(20.0, 5.0, 6, 3.0, 1.2), None, 6, (2.5,), (1.2,)),
+        (rectangular_site(20.0, 5.0, 6, 3.0, 1.2), None, 6, (2.5,), (1.2,)),
         (
-            room_site(12.0, 9.0, 4, 3.0, 1.2),
+            rectangular_site(12.0, 9.0, 4, 3.0, 1.2),
             np.array([(0, 0), (12, 0), (12, 4), (5, 4), (5, 9), (0, 9)], float),
             5,
             (2.5,),
             (1.2,),
         ),
-        (room_site(8.0, 6.0, 6, 3.0, None), None, 6, (0.3, 2.7), (1.0, 1.8)),
+        (rectangular_site(8.0, 6.0, 6, 3.0, None), None, 6, (0.3, 2.7), (1.0, 1.8)),
     ],
     ids=("corridor", "L", "3-D"),
 )
@@ -60,7 +60,7 @@ def test_the_optimiser_beats_the_even_layout(site, outline, anchors, heights, ta
 
 
 def test_same_seed_same_places():
-    site = room_site(10.0, 6.0, 4, 3.0, 1.2)
+    site = rectangular_site(10.0, 6.0, 4, 3.0, 1.2)
     places = [searched(site, None, 4, (2.5,), (1.2,))[1].best.site.anchors for _ in range(2)]
     assert places[0] == places[1]
 

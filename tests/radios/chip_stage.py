@@ -6,8 +6,7 @@ from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_S
 from skyless.radios.dw1000.chip_session import ChipSession
 from skyless.radios.interface import AntennaDelays, Sent
-from skyless.simulation.dw1000.bus import ModelBus
-from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.dw1000.chip import Chip, ModelBus
 from skyless.ticks import wrap
 
 DELAYS = AntennaDelays()
@@ -53,7 +52,7 @@ class ChipNode:
 
     def hear(self, frame, rx_ticks, diagnostics=None, host_s=None, fault=None):
         """A frame comes in, and the host serves its interrupt; the reception, if it became one."""
-        self.chip.hear(frame, rx_ticks, diagnostics or Diagnostics(), fault)
+        self.chip.receive(frame, rx_ticks, diagnostics or Diagnostics(), fault)
         told = len(self.told)
         while self.chip.irq:
             self.session.serve(host_s)

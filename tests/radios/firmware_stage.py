@@ -6,8 +6,7 @@ from skyless.air.reception import Diagnostics
 from skyless.firmware import board, dw1000
 from skyless.radios.interface import AntennaDelays, Reception
 from skyless.radios.serial.link_session import LinkSession
-from skyless.simulation.dw1000.bus import ModelBus
-from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.dw1000.chip import Chip, ModelBus
 
 DELAYS = AntennaDelays()
 
@@ -77,7 +76,7 @@ class FirmwareNode:
         """The reception as it arrives at the host."""
         self.line.host_s = reception.host_s
         told = len(self.line.told)
-        self.chip.hear(reception.frame, reception.rx_ticks, reception.diagnostics or Diagnostics())
+        self.chip.receive(reception.frame, reception.rx_ticks, reception.diagnostics or Diagnostics())
         self.serve()
         (heard,) = [event for event in self.line.told[told:] if isinstance(event, Reception)]
         return heard

@@ -5,8 +5,7 @@ from hypothesis import event, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from skyless.air.airtime import after_rmarker_s
-from skyless.air.fcs import fcs
+from skyless.air.ieee802154 import after_rmarker_s, fcs
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.firmware import dw1000
 from skyless.radios.interface import AntennaDelays, Late, Sent
@@ -57,14 +56,14 @@ class Fire(RuleBasedStateMachine):
         frame = body + (fcs(body) if fault != "fcs" else bytes(x ^ 1 for x in fcs(body)))
         stamp = wrap(self.air.ticks - from_seconds(after_rmarker_s(len(frame))))
         told = Diagnostics(float(power), power - 3.0, float(offset))
-        outcome = self.node.chip.hear(frame, stamp, told, None if fault == "fcs" else fault)
+        outcome = self.node.chip.receive(frame, stamp, told, None if fault == "fcs" else fault)
         if outcome in ("heard", "spoilt", "suspect"):
             assert self.waits is None, "a frame came over one that had not been fetched"
             self.waits = outcome
             self.heard += outcome != "spoilt"
             self.spoilt += outcome == "spoilt"
             self.flown[frame] = (stamp, told)
-        assert outcome not in ("suspect", "deaf", "without-microcode")
+        assert outcome not in ("suspect", "other-settings", "without-microcode")
         if served:
             self.serve()
 

@@ -12,7 +12,7 @@ from air_stage import LAB, make_ether
 from chip_stage import HandClock, TimedNode
 from radio_ears import ears
 
-from skyless.air.fcs import fcs
+from skyless.air.ieee802154 import fcs
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_RATE_HZ
 from skyless.errors import SkylessError
@@ -22,7 +22,7 @@ from skyless.radios.dw1000 import chip_ports, spi_bus
 from skyless.radios.dw1000.chip_ports import SpiPort
 from skyless.radios.dw1000.radio import Dw1000Radio
 from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
-from skyless.simulation.dw1000.bus import ModelBus
+from skyless.simulation.dw1000.chip import ModelBus
 from skyless.ticks import difference, wrap
 
 
@@ -102,7 +102,7 @@ def test_a_chip_on_spi_is_asked_where_it_has_no_interrupt_line_and_found_again(m
             await host.until(Restarted)
             assert abs(difference(radio.now_ticks(), node.air.now_ticks())) < 512
             node.air.pass_s(1e-3)
-            node.chip.hear(b"\x01\x02\x03\x2a\x14", node.air.now_ticks(), Diagnostics(-80.0))
+            node.chip.receive(b"\x01\x02\x03\x2a\x14", node.air.now_ticks(), Diagnostics(-80.0))
             buses[0].broken = True
             assert "Input/output error" in (await host.until(Gone)).reason
             assert radio.now_ticks() is None
@@ -204,7 +204,7 @@ class LinedSpi(PlayedSpi):
 def hear(node, data):
     """A good frame comes in."""
     node.air.pass_s(1e-3)
-    node.chip.hear(data + fcs(data), node.air.now_ticks(), Diagnostics(-80.0))
+    node.chip.receive(data + fcs(data), node.air.now_ticks(), Diagnostics(-80.0))
 
 
 def test_an_interrupt_line_that_is_stuck_is_told_once_and_the_chip_is_asked_at_intervals(monkeypatch):

@@ -3,7 +3,7 @@
 import pytest
 from air_stage import LAB, Stage, in_loop
 
-from skyless.air.airtime import after_rmarker_s
+from skyless.air.ieee802154 import after_rmarker_s
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.radios.emulated.ether_wire import Arrival, Clocks, Done, Joined
 from skyless.ticks import difference

@@ -34,7 +34,7 @@ class Talk:
     def _take(self, data):
         at = 0
         while at < len(data):
-            at = self._reader.take(bytearray(data), at, len(data))
+            at = self._reader.read(bytearray(data), at, len(data))
             if self._reader.length:
                 self.commands.append(bytes(self._reader.record[: self._reader.length]))
 
@@ -100,7 +100,7 @@ def test_receptions_come_through_with_their_measurements_in_the_line_s_units():
     talk = Talk().ready()
     frame = bytes(range(40))
     talk.say(talk.board.rx(stamp(2**40 - 1), -7953, -8312, -12_345, bytearray(frame), 40))
-    talk.say(talk.board.rx(stamp(0), link.NOT_TOLD, link.NOT_TOLD, link.NOT_TOLD, bytearray(frame), 1))
+    talk.say(talk.board.rx(stamp(0), link.NOT_MEASURED, link.NOT_MEASURED, link.NOT_MEASURED, bytearray(frame), 1))
     assert talk.told[1:] == [
         Reception(frame, 2**40 - 1, talk.now_s, Diagnostics(-79.53, -83.12, -12.345)),
         Reception(frame[:1], 0, talk.now_s, Diagnostics()),
@@ -172,12 +172,12 @@ def test_records_of_a_later_minor_version_are_read():
     talk = Talk()
     board = talk.board
     board.begin(link.HELLO)
-    board.put_bytes(bytearray([link.MAJOR, 9, 1, 2, 3, *range(8)]), 0, 13)
-    board.put(link.RATE_KHZ, 4)
-    board.put_bytes(bytearray([40, 0xFF, 1, 2, 3]), 0, 5)
+    board.append_bytes(bytearray([link.MAJOR, 9, 1, 2, 3, *range(8)]), 0, 13)
+    board.append(link.RATE_KHZ, 4)
+    board.append_bytes(bytearray([40, 0xFF, 1, 2, 3]), 0, 5)
     talk.say(board.end())
     board.begin(link.STATUS)
-    board.put_bytes(bytearray([*stamp(T0), ON, *bytes(24), 0, 0x80, 0xFF, 0xFF, 9, 9]), 0, 36)
+    board.append_bytes(bytearray([*stamp(T0), ON, *bytes(24), 0, 0x80, 0xFF, 0xFF, 9, 9]), 0, 36)
     talk.say(board.end())
     assert talk.told == [Restarted()]
     assert (talk.session.status.temperature_c, talk.session.status.supply_v) == (None, None)
@@ -188,8 +188,8 @@ def test_a_board_of_another_major_version_is_refused_once_and_taken_when_it_has_
     talk.kinds()
     for _ in range(3):
         talk.board.begin(link.HELLO)
-        talk.board.put(2, 1)
-        talk.board.put(0, 1)
+        talk.board.append(2, 1)
+        talk.board.append(0, 1)
         talk.say(talk.board.end())
         talk.poll(POLL_S)
     (gone,) = talk.told
@@ -215,9 +215,9 @@ def test_a_board_that_refuses_its_configuration_or_counts_otherwise_cannot_be_us
     assert talk.counters == {"refused-command": 1}
     talk = Talk()
     talk.board.begin(link.HELLO)
-    talk.board.put_bytes(bytearray([link.MAJOR, 0, 1, 2, 3, *range(8)]), 0, 13)
-    talk.board.put(1000, 4)
-    talk.board.put_bytes(bytearray([32, 1]), 0, 2)
+    talk.board.append_bytes(bytearray([link.MAJOR, 0, 1, 2, 3, *range(8)]), 0, 13)
+    talk.board.append(1000, 4)
+    talk.board.append_bytes(bytearray([32, 1]), 0, 2)
     talk.say(talk.board.end())
     assert "counts 1000 kHz in 32 bits" in talk.told[0].reason
 

@@ -202,8 +202,8 @@ def test_a_board_of_another_version_is_refused_in_words():
 
         def answer(data):
             writer.begin(link.HELLO)
-            writer.put(7, 1)
-            writer.put(3, 1)
+            writer.append(7, 1)
+            writer.append(3, 1)
             board.pty.send(bytes(writer.line[: writer.end()]))
 
         board.speech.hear_host = answer

@@ -4,15 +4,15 @@ import math
 
 import pytest
 
-from skyless.air.airtime import after_rmarker_s, preamble_s
-from skyless.air.fcs import fcs
+from skyless.air.ieee802154 import after_rmarker_s, fcs, preamble_s
 from skyless.air.reception import Diagnostics
 from skyless.constants import TICK_RATE_HZ
-from skyless.simulation.dw1000 import bits
 from skyless.simulation.dw1000 import registers as r
 from skyless.simulation.dw1000.chip import Chip
-from skyless.simulation.dw1000.measures import HZ_PER_STEP, Senses
+from skyless.simulation.dw1000.clocking import Sensors
 from skyless.simulation.dw1000.memory import Access, decode_header
+from skyless.simulation.dw1000.settings import TUNED_TO_RECEIVE, TUNED_TO_SEND
+from skyless.simulation.dw1000.transceiver import HZ_PER_STEP
 from skyless.ticks import wrap
 
 TX_DELAY, RX_DELAY = 16_000, 17_000
@@ -60,16 +60,16 @@ class Bench:
         """As section 2.5.5 tells, for the emulated air."""
         self.now_s += 1e-3
         if microcode:
-            self.write(r.PMSC_CTRL0, bits.PMSC_FOR_LDE, length=2)
-            self.write(r.OTP_CTRL, bits.LDELOAD)
+            self.write(r.PMSC_CTRL0, r.PMSC_FOR_LDE, length=2)
+            self.write(r.OTP_CTRL, r.LDELOAD)
             self.now_s += 200e-6
             self.write(r.PMSC_CTRL0, 0x0200, length=2)
-        for register, value in (*bits.TUNED.values(), *bits.TUNED_TO_SEND.values()):
-            self.write(register, value)
+        for name, value in (*TUNED_TO_RECEIVE.items(), *TUNED_TO_SEND.items()):
+            self.write(r.ALL_REGISTERS[name], value)
         self.write(r.CHAN_CTRL, 5 | 5 << 4 | 2 << 18 | 9 << 22 | 9 << 27)
         self.write(r.TX_ANTD, TX_DELAY)
         self.write(r.LDE_RXANTD, RX_DELAY)
-        self.write(r.SYS_MASK, bits.RXFCG | bits.TXFRS)
+        self.write(r.SYS_MASK, r.RXFCG | r.TXFRS)
 
     def send(self, ahead_s, frame=FRAME):
         """Start a delayed transmission so far ahead; the DX_TIME."""
@@ -77,17 +77,17 @@ class Bench:
         self.write(r.TX_BUFFER, int.from_bytes(frame, "little"), length=len(frame))
         self.write(r.TX_FCTRL, len(frame) | 2 << 13 | 2 << 16 | 1 << 18 | 1 << 20)
         self.write(r.DX_TIME, dx)
-        self.write(r.SYS_CTRL, bits.TXSTRT | bits.TXDLYS)
+        self.write(r.SYS_CTRL, r.TXSTRT | r.TXDLYS)
         return dx
 
     def listen(self):
-        self.write(r.SYS_CTRL, bits.RXENAB)
+        self.write(r.SYS_CTRL, r.RXENAB)
         self.now_s += 1e-3
 
     def hear(self, frame=FRAME, told=None, fault=None):
         """A frame ends now; its stamp and what became of it."""
         stamp = wrap(self.now_ticks() - round(after_rmarker_s(len(frame)) * TICK_RATE_HZ))
-        return stamp, self.chip.hear(frame, stamp, told or Diagnostics(-80.0, -84.0, 2.0), fault)
+        return stamp, self.chip.receive(frame, stamp, told or Diagnostics(-80.0, -84.0, 2.0), fault)
 
 
 @pytest.fixture
@@ -120,12 +120,12 @@ def test_spi_is_limited_to_3_mhz_until_the_pll_has_locked():
     bench.write(r.PANADR, 0x12345678, hz=FAST)
     assert bench.read(r.PANADR) == 0xFFFFFFFF
     assert bench.chip.misuse["spi-too-fast"] == 2
-    assert not bench.read(r.SYS_STATUS) & bits.CPLOCK
+    assert not bench.read(r.SYS_STATUS) & r.CPLOCK
     bench.now_s += 1e-4
     assert bench.read(r.DEV_ID, hz=FAST) == 0xDECA0130
-    assert bench.read(r.SYS_STATUS) & bits.CPLOCK
+    assert bench.read(r.SYS_STATUS) & r.CPLOCK
     assert bench.read(r.DEV_ID, hz=FAST + 1) != 0xDECA0130
-    bench.write(r.PMSC_CTRL0, bits.SYSCLKS_XTI, length=1)
+    bench.write(r.PMSC_CTRL0, r.SYSCLKS_XTI, length=1)
     assert bench.read(r.DEV_ID, hz=FAST) != 0xDECA0130
 
 
@@ -133,12 +133,12 @@ def test_status_is_cleared_by_ones_but_for_what_is_read_only(bench):
     bench.listen()
     bench.hear()
     status = bench.read(r.SYS_STATUS)
-    assert status & (bits.RXFCG | bits.RXDFR | bits.LDEDONE) == bits.RXFCG | bits.RXDFR | bits.LDEDONE
-    bench.write(r.SYS_STATUS, bits.RXFCG)
-    assert bench.read(r.SYS_STATUS) == status & ~(bits.RXFCG | bits.IRQS)
+    assert status & (r.RXFCG | r.RXDFR | r.LDEDONE) == r.RXFCG | r.RXDFR | r.LDEDONE
+    bench.write(r.SYS_STATUS, r.RXFCG)
+    assert bench.read(r.SYS_STATUS) == status & ~(r.RXFCG | r.IRQS)
     bench.send(100e-6)
     bench.write(r.SYS_STATUS, (1 << 40) - 1)
-    assert bench.read(r.SYS_STATUS) == bits.HPDWARN
+    assert bench.read(r.SYS_STATUS) == r.HPDWARN
 
 
 def test_the_interrupt_line_follows_status_and_mask_with_the_polarity_that_is_set(bench):
@@ -146,8 +146,8 @@ def test_the_interrupt_line_follows_status_and_mask_with_the_polarity_that_is_se
     bench.listen()
     bench.hear()
     assert bench.chip.irq
-    assert bench.read(r.SYS_STATUS) & bits.IRQS
-    bench.write(r.SYS_MASK, bits.TXFRS)
+    assert bench.read(r.SYS_STATUS) & r.IRQS
+    bench.write(r.SYS_MASK, r.TXFRS)
     assert not bench.chip.irq
     bench.write(r.SYS_CFG, 0x1000)
     assert bench.chip.irq
@@ -167,23 +167,23 @@ def test_a_delayed_frame_leaves_at_dx_time_without_its_low_bits_and_is_stamped_s
     ((frame, leaves),) = bench.sent
     assert frame == FRAME
     assert leaves == wrap((dx & ~0x1FF) + TX_DELAY)
-    assert not bench.read(r.SYS_STATUS) & bits.OF_SENDING
+    assert not bench.read(r.SYS_STATUS) & r.OF_SENDING
     bench.now_s += 2e-3 - preamble_s() + 1e-6
-    assert bench.read(r.SYS_STATUS) & bits.OF_SENDING == bits.TXFRB
+    assert bench.read(r.SYS_STATUS) & r.OF_SENDING == r.TXFRB
     bench.now_s += preamble_s()
-    assert bench.read(r.SYS_STATUS) & bits.OF_SENDING == bits.TXFRB | bits.TXPRS
+    assert bench.read(r.SYS_STATUS) & r.OF_SENDING == r.TXFRB | r.TXPRS
     bench.now_s += after_rmarker_s(len(FRAME))
     assert bench.chip.irq
     assert bench.read(r.TX_STAMP) == leaves
     assert bench.read(r.TX_RAWST) == dx & ~0x1FF
-    assert bench.read(r.SYS_STATUS) & bits.TXFRS
+    assert bench.read(r.SYS_STATUS) & r.TXFRS
 
 
 def test_the_chip_makes_the_fcs_unless_it_is_told_not_to(bench):
     bench.send(2e-3, BODY + b"??")
     assert bench.sent[-1][0] == FRAME
-    bench.write(r.SYS_CTRL, bits.TRXOFF)
-    bench.write(r.SYS_CTRL, bits.TXSTRT | bits.TXDLYS | bits.SFCST)
+    bench.write(r.SYS_CTRL, r.TRXOFF)
+    bench.write(r.SYS_CTRL, r.TXSTRT | r.TXDLYS | r.SFCST)
     assert bench.sent[-1][0] == BODY + b"??"
 
 
@@ -192,26 +192,26 @@ def test_the_warning_of_half_a_period_is_judged_on_the_preamble_s_start(bench):
     for ahead_s, late in ((edge_s + 20e-6, False), (edge_s - 20e-6, True), (-1e-3, True), (8.5, False), (8.7, True)):
         begun = len(bench.sent)
         bench.send(ahead_s)
-        assert bool(bench.read(r.SYS_STATUS) & bits.HPDWARN) is late, ahead_s
+        assert bool(bench.read(r.SYS_STATUS) & r.HPDWARN) is late, ahead_s
         assert len(bench.sent) == begun + (not late)
-        bench.write(r.SYS_CTRL, bits.TRXOFF)
-        assert not bench.read(r.SYS_STATUS) & bits.HPDWARN
+        bench.write(r.SYS_CTRL, r.TRXOFF)
+        assert not bench.read(r.SYS_STATUS) & r.HPDWARN
     bench.send(edge_s + 3e-6)
-    assert bench.read(r.SYS_STATUS) & bits.TXPUTE
+    assert bench.read(r.SYS_STATUS) & r.TXPUTE
     assert not +bench.chip.misuse
 
 
 def test_what_the_air_refuses_is_late_too_and_what_is_turned_off_is_withdrawn(bench):
     bench.in_time = False
     bench.send(2e-3)
-    assert bench.read(r.SYS_STATUS) & bits.HPDWARN
-    bench.write(r.SYS_CTRL, bits.TRXOFF)
+    assert bench.read(r.SYS_STATUS) & r.HPDWARN
+    bench.write(r.SYS_CTRL, r.TRXOFF)
     bench.in_time = True
     bench.send(2e-3)
-    bench.write(r.SYS_CTRL, bits.TRXOFF)
+    bench.write(r.SYS_CTRL, r.TRXOFF)
     assert bench.withdrawn == 1
     bench.now_s += 5e-3
-    assert not bench.read(r.SYS_STATUS) & bits.TXFRS
+    assert not bench.read(r.SYS_STATUS) & r.TXFRS
 
 
 def test_a_received_frame_its_stamp_and_what_was_measured(bench):
@@ -245,7 +245,7 @@ def test_the_stamp_is_less_the_antenna_delay_that_is_set(bench):
 
 def test_one_buffer_one_frame_until_the_receiver_is_turned_on_again(bench):
     assert bench.hear()[1] == "receiver-off"
-    bench.write(r.SYS_CTRL, bits.RXENAB)
+    bench.write(r.SYS_CTRL, r.RXENAB)
     assert bench.hear()[1] == "preamble-missed"
     bench.now_s += 1e-3
     first, _ = bench.hear()
@@ -253,7 +253,7 @@ def test_one_buffer_one_frame_until_the_receiver_is_turned_on_again(bench):
     assert bench.hear()[1] == "receiver-off"
     assert bench.read(r.RX_STAMP) == first
     bench.listen()
-    assert not bench.read(r.SYS_STATUS) & bits.OF_RECEIVING
+    assert not bench.read(r.SYS_STATUS) & r.OF_RECEIVING
     assert bench.hear()[1] == "heard"
 
 
@@ -262,13 +262,13 @@ def test_without_the_microcode_there_is_no_stamp_and_without_its_run_bit_none_is
     bench.configure(microcode=False)
     bench.listen()
     assert bench.hear()[1] == "without-microcode"
-    assert not bench.read(r.SYS_STATUS) & (bits.RXFCG | bits.LDEDONE)
-    bench.write(r.PMSC_CTRL1, r.PMSC_CTRL1.reset & ~bits.LDERUNE)
+    assert not bench.read(r.SYS_STATUS) & (r.RXFCG | r.LDEDONE)
+    bench.write(r.PMSC_CTRL1, r.PMSC_CTRL1.reset & ~r.LDERUNE)
     bench.listen()
     assert bench.hear()[1] == "heard"
-    assert bench.read(r.SYS_STATUS) & (bits.RXFCG | bits.LDEDONE) == bits.RXFCG
+    assert bench.read(r.SYS_STATUS) & (r.RXFCG | r.LDEDONE) == r.RXFCG
     assert bench.read(r.RX_STAMP) == 0
-    bench.write(r.OTP_CTRL, bits.LDELOAD)
+    bench.write(r.OTP_CTRL, r.LDELOAD)
     assert bench.chip.misuse == {"microcode-without-its-clock": 1}
 
 
@@ -278,7 +278,7 @@ def test_without_the_microcode_there_is_no_stamp_and_without_its_run_bit_none_is
         (r.CHAN_CTRL, 2 | 2 << 4 | 2 << 18 | 9 << 22 | 9 << 27, "channel"),
         (r.CHAN_CTRL, 5 | 5 << 4 | 1 << 18 | 9 << 22 | 9 << 27, "prf"),
         (r.CHAN_CTRL, 5 | 5 << 4 | 2 << 18 | 10 << 22 | 10 << 27, "code"),
-        (r.SYS_CFG, 0x1200 | bits.RXM110K, "rate"),
+        (r.SYS_CFG, 0x1200 | r.RXM110K, "rate"),
         (r.DRX_TUNE2, 0x311A002D, "tuning"),
         (r.FS_PLLTUNE, 0x46, "tuning"),
     ],
@@ -286,22 +286,22 @@ def test_without_the_microcode_there_is_no_stamp_and_without_its_run_bit_none_is
 def test_with_another_setting_it_hears_nothing_and_is_not_heard(bench, register, value, why):
     bench.write(register, value)
     bench.listen()
-    assert bench.hear()[1] == "deaf"
+    assert bench.hear()[1] == "other-settings"
     assert not bench.chip.irq
-    bench.write(r.SYS_CTRL, bits.TRXOFF)
+    bench.write(r.SYS_CTRL, r.TRXOFF)
     bench.send(2e-3)
     assert len(bench.sent) == (why in ("rate", "prf") or register is r.DRX_TUNE2)  # these concern the receiver alone
 
 
 @pytest.mark.parametrize(
     ("fault", "event"),
-    [("header", bits.RXPHE), ("parity", bits.RXRFSL), ("delimiter", bits.RXSFDTO), ("first-path", bits.LDEERR)],
+    [("header", r.RXPHE), ("parity", r.RXRFSL), ("delimiter", r.RXSFDTO), ("first-path", r.LDEERR)],
 )
 def test_errors_show_and_want_a_reset_of_the_receiver(bench, fault, event):
     bench.listen()
     bench.hear(fault=fault)
     assert bench.read(r.SYS_STATUS) & event
-    assert not (bench.read(r.SYS_STATUS) & bits.LDEDONE)
+    assert not (bench.read(r.SYS_STATUS) & r.LDEDONE)
     if fault == "first-path":
         return
     bench.listen()
@@ -316,10 +316,10 @@ def test_errors_show_and_want_a_reset_of_the_receiver(bench, fault, event):
 
 
 def test_a_wrong_fcs_is_told_and_with_auto_re_enable_the_receiver_stays_on(bench):
-    bench.write(r.SYS_CFG, 0x1200 | bits.RXAUTR)
+    bench.write(r.SYS_CFG, 0x1200 | r.RXAUTR)
     bench.listen()
     bench.hear(BODY + b"??")
-    assert bench.read(r.SYS_STATUS) & (bits.RXFCE | bits.RXFCG) == bits.RXFCE
+    assert bench.read(r.SYS_STATUS) & (r.RXFCE | r.RXFCG) == r.RXFCE
     bench.now_s += 1e-3
     assert bench.hear()[1] == "suspect"
 
@@ -327,7 +327,7 @@ def test_a_wrong_fcs_is_told_and_with_auto_re_enable_the_receiver_stays_on(bench
 def test_a_soft_reset_forgets_everything_but_the_counter(bench):
     bench.listen()
     before = bench.read(r.SYS_TIME)
-    bench.write(r.PMSC_CTRL0, bits.SYSCLKS_XTI, length=1)
+    bench.write(r.PMSC_CTRL0, r.SYSCLKS_XTI, length=1)
     bench.chip.transfer(bytes((0xF6, 0x03, 0x00)), SLOW)
     bench.write(r.PANADR, 1)
     assert bench.chip.misuse["write-in-reset"] == 1
@@ -336,35 +336,35 @@ def test_a_soft_reset_forgets_everything_but_the_counter(bench):
     assert not bench.chip.clocking.microcode_loaded
     assert bench.read(r.SYS_TIME) == before
     bench.now_s += 1e-3
-    assert bench.read(r.SYS_STATUS) == bits.CPLOCK | bits.SLP2INIT
+    assert bench.read(r.SYS_STATUS) == r.CPLOCK | r.SLP2INIT
     assert bench.hear()[1] == "receiver-off"
 
 
 def test_waiting_for_a_response_turns_the_receiver_on_after_the_frame(bench):
     bench.write(r.ACK_RESP_T, 500)
     dx = bench.send(2e-3)
-    bench.write(r.SYS_CTRL, bits.TRXOFF)
+    bench.write(r.SYS_CTRL, r.TRXOFF)
     bench.write(r.DX_TIME, dx)
-    bench.write(r.SYS_CTRL, bits.TXSTRT | bits.TXDLYS | bits.WAIT4RESP)
+    bench.write(r.SYS_CTRL, r.TXSTRT | r.TXDLYS | r.WAIT4RESP)
     bench.now_s += 2e-3 + after_rmarker_s(len(FRAME)) + 1e-6
-    assert bench.read(r.SYS_STATUS) & bits.TXFRS
+    assert bench.read(r.SYS_STATUS) & r.TXFRS
     assert bench.hear()[1] == "preamble-missed"
     bench.now_s += 1e-3
     assert bench.hear()[1] == "heard"
 
 
 def test_the_receiver_s_timeout(bench):
-    bench.write(r.SYS_CFG, 0x1200 | bits.RXWTOE)
+    bench.write(r.SYS_CFG, 0x1200 | r.RXWTOE)
     bench.write(r.RX_FWTO, 2000)
     bench.listen()
-    assert not bench.read(r.SYS_STATUS) & bits.RXRFTO
+    assert not bench.read(r.SYS_STATUS) & r.RXRFTO
     bench.now_s += 1.1e-3
-    assert bench.read(r.SYS_STATUS) & bits.RXRFTO
+    assert bench.read(r.SYS_STATUS) & r.RXRFTO
     assert bench.hear()[1] == "receiver-off"
 
 
 def test_temperature_and_supply_need_their_switches_and_refer_to_what_is_in_the_otp():
-    bench = Bench(senses=Senses(temperature_c=45.8, supply_v=3.0))
+    bench = Bench(senses=Sensors(temperature_c=45.8, supply_v=3.0))
     bench.write(r.TC_SARC, 1)
     assert bench.read(r.TC_SARL) == 0
     bench.write(r.TC_SARC, 0)
@@ -376,7 +376,7 @@ def test_temperature_and_supply_need_their_switches_and_refer_to_what_is_in_the_
     references = []
     for address in (0x08, 0x09):
         bench.write(r.OTP_ADDR, address)
-        bench.write(r.OTP_CTRL, bits.OTPREAD | bits.OTPRDEN)
+        bench.write(r.OTP_CTRL, r.OTPREAD | r.OTPRDEN)
         references.append(bench.read(r.OTP_RDAT) & 0xFF)
     assert ((reading >> 8 & 0xFF) - references[1]) * 1.14 + 23.0 == pytest.approx(45.8, abs=0.6)
     assert ((reading & 0xFF) - references[0]) / 173 + 3.3 == pytest.approx(3.0, abs=0.003)
@@ -389,8 +389,8 @@ def test_what_the_manual_forbids_is_counted(bench):
     bench.send(5e-3)
     bench.send(5e-3)
     bench.listen()
-    bench.write(r.PMSC_CTRL0, bits.SYSCLKS_XTI, length=1)
-    bench.write(r.SYS_CTRL, bits.RXENAB)
+    bench.write(r.PMSC_CTRL0, r.SYSCLKS_XTI, length=1)
+    bench.write(r.SYS_CTRL, r.RXENAB)
     assert bench.chip.misuse == {
         "transaction-without-header": 1,
         "write-beyond-register": 1,

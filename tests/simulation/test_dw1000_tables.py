@@ -3,12 +3,13 @@
 import dw1000_published as published
 import pytest
 
-from skyless.air.fcs import fcs
+from skyless.air.ieee802154 import fcs
+from skyless.air.reception import Diagnostics
 from skyless.firmware import dw1000
-from skyless.simulation.dw1000 import bits, measures
 from skyless.simulation.dw1000 import registers as r
-from skyless.simulation.dw1000.bus import ModelBus
-from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.dw1000 import settings, transceiver
+from skyless.simulation.dw1000.chip import Chip, ModelBus
+from skyless.simulation.dw1000.clocking import Sensors
 from skyless.simulation.dw1000.memory import decode_header
 from skyless.ticks import wrap
 
@@ -20,16 +21,16 @@ NOT_PUBLISHED = {
 """Names of the model that have no line of their own there."""
 
 
-@pytest.mark.parametrize("name", sorted(r.ALL.keys() - NOT_PUBLISHED))
+@pytest.mark.parametrize("name", sorted(r.ALL_REGISTERS.keys() - NOT_PUBLISHED))
 def test_the_model_s_registers_are_where_they_are_published(name):
-    one = r.ALL[name]
+    one = r.ALL_REGISTERS[name]
     assert (one.file, one.sub, one.length) == published.REGISTERS[name]
 
 
 def test_the_parts_of_the_frame_quality_lie_as_their_masks_say():
     shifts = {"STD_NOISE": 0, "FP_AMPL2": 16, "FP_AMPL3": 32, "CIR_PWR": 48}
-    assert {name: 8 * r.ALL[name].sub for name in shifts} == shifts
-    assert {r.ALL[name].length for name in shifts} == {2}
+    assert {name: 8 * r.ALL_REGISTERS[name].sub for name in shifts} == shifts
+    assert {r.ALL_REGISTERS[name].length for name in shifts} == {2}
 
 
 @pytest.mark.parametrize(
@@ -37,19 +38,19 @@ def test_the_parts_of_the_frame_quality_lie_as_their_masks_say():
     [*published.STATUS.items(), *published.CONTROL.items(), *published.CONFIG.items(), *published.OTHER_BITS.items()],
 )
 def test_the_model_s_bits_are_the_published_ones(name, mask):
-    assert getattr(bits, name) == mask
+    assert getattr(r, name) == mask
 
 
 def test_the_model_wants_the_published_tuning():
-    for name, (register, value) in {**bits.TUNED, **bits.TUNED_TO_SEND}.items():
-        assert register is r.ALL[name]
+    for name, value in {**settings.TUNED_TO_RECEIVE, **settings.TUNED_TO_SEND}.items():
+        assert name in r.ALL_REGISTERS
         assert value == published.VALUES[name], name
     assert r.DEV_ID.reset == published.DEVICE_ID
-    assert measures.PRF_64_DB == published.POWER_A_DB
+    assert transceiver.PRF_64_DB == published.POWER_A_DB
     assert {value >> 4 for value in published.RESETS.values()} == {
-        bits.SOFTRESET_ALL, bits.SOFTRESET_RX, bits.SOFTRESET_NONE
+        r.SOFTRESET_ALL, r.SOFTRESET_RX, r.SOFTRESET_NONE
     }  # fmt: skip
-    assert measures.Senses().otp().keys() <= set(published.OTP.values())
+    assert Sensors().otp().keys() <= set(published.OTP.values())
 
 
 # The driver: by what it does on the bus, so that constants without a name count as well
@@ -93,13 +94,13 @@ def life():
     bus = Tapped(chip, air.spend)
     driver = dw1000.DW1000(bus)
     driver.start(0x1234, 0x4321)
-    started = {name: chip.memory.get(register) for name, register in r.ALL.items()}
+    started = {name: chip.memory.get(register) for name, register in r.ALL_REGISTERS.items()}
     driver.receive()
     frame = b"some frame"
     frame += fcs(frame)
     for fault in (None, "header", "delimiter", None, "first-path"):
         air.spend(1e-3)
-        chip.hear(frame, air.now_ticks(), measures.Diagnostics(-80.0, -82.0, 1.0), fault)
+        chip.receive(frame, air.now_ticks(), Diagnostics(-80.0, -82.0, 1.0), fault)
         driver.poll()
         driver.track()
     for ahead_s in (2e-3, 0.1e-3):
@@ -116,7 +117,7 @@ def life():
 
 def test_all_that_the_driver_touches_is_a_published_register_or_the_manual_s(life):
     seen, _, _ = life
-    places = [*published.REGISTERS.values(), *((one.file, one.sub, one.length) for one in r.ALL.values())]
+    places = [*published.REGISTERS.values(), *((one.file, one.sub, one.length) for one in r.ALL_REGISTERS.values())]
     touched = set()
     for access, data in seen:
         fits = [
@@ -134,10 +135,15 @@ def test_the_driver_sets_the_published_values(life):
         assert started[name] == value, name
     assert started["TX_FCTRL"] & 0xFFFFFC00 == published.TX_FCTRL
     assert (started["TX_ANTD"], started["LDE_RXANTD"]) == (0x1234, 0x4321)
-    assert started["FS_XTALT"] == 0x60 | measures.Senses().crystal_trim  # bits 7 to 5: 011 (UM 7.2.44.5)
+    assert started["FS_XTALT"] == 0x60 | Sensors().crystal_trim  # bits 7 to 5: 011 (UM 7.2.44.5)
     assert started["DRX_SFDTOC"] == 128 + 1 + 8 - 8  # UM 7.2.40.7
     configured = {(file, sub, size) for file, sub, size, _ in dw1000.CONFIGURATION}
-    known = {published.REGISTERS.get(name, (r.ALL[name].file, r.ALL[name].sub, r.ALL[name].length)) for name in r.ALL}
+    known = {
+        published.REGISTERS.get(
+            name, (r.ALL_REGISTERS[name].file, r.ALL_REGISTERS[name].sub, r.ALL_REGISTERS[name].length)
+        )
+        for name in r.ALL_REGISTERS
+    }
     assert configured - known == {(0x08, 0x00, 4)}  # TX_FCTRL without its fifth octet
 
 

@@ -16,18 +16,23 @@ from scipy.stats import binom, chi2, expon, kstest
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.simulation.channel import ChannelModel, power_bias_m, received_power_dbm
-from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage, lab_impairments
 from skyless.simulation.oscillator import OscillatorModel
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import RandomWalk, Static, Waypoints
 from skyless.simulation.world import World
 from skyless.site.lab import lab_site
 from skyless.site.model import WallSite
-from skyless.ticks import difference, unwrap_array
+from skyless.ticks import Unwrapper, difference
 
 LAB = lab_site()
 AT_P1 = TagSpec(Static(3.0, 4.0))
+
+
+def unwrapped(counters):
+    """Ticks of successive counter values, shape (n,)."""
+    unwrapper = Unwrapper()
+    return np.array([unwrapper.unwrap(int(counter)) for counter in counters])
 
 
 def _with(**changes):
@@ -98,7 +103,7 @@ def test_crystals_run_at_their_own_rates():
     world = World(LAB, staggered(), [AT_P1], _with(oscillator=crystals, rx_stamp_ps=100.0), 3)
     slopes = []
     for rows in _receptions(world, 20.0).values():
-        tx, rx = (unwrap_array(np.array([row[k] for row in rows])) for k in (0, 1))
+        tx, rx = (unwrapped([row[k] for row in rows]) for k in (0, 1))
         beyond = ((rx - rx[0]) - (tx - tx[0])).astype(np.float64)
         line = np.polyfit((tx - tx[0]).astype(np.float64), beyond, 1)
         left = beyond - np.polyval(line, (tx - tx[0]).astype(np.float64))
@@ -127,8 +132,8 @@ def test_counters_wrap_for_hours_without_a_jump():
     site = site_of((0, 0))
     world = World(site, lambda a: Metronome(a, period_s=8.0), [AT_P1], _with(oscillator=crystals), 4)
     rows = _receptions(world, 36_000.0)[1]
-    rx = unwrap_array(np.array([row[1] for row in rows]))
-    tx = unwrap_array(np.array([row[0] for row in rows]))
+    rx = unwrapped([row[1] for row in rows])
+    tx = unwrapped([row[0] for row in rows])
     true = np.array([row[2] for row in rows])
     assert rx[-1] - rx[0] > 2000 * 2**40
     for counter in (rx, tx):
@@ -311,9 +316,9 @@ def test_diagnostics_tell_power_offset_and_doppler():
             offsets[tag].append(reception.diagnostics.carrier_offset_ppm)
         seen.append(broadcast.diagnostics[0].rx_power_dbm)
     assert seen == pytest.approx([received_power_dbm(-14.3, 5.0, 0.0)] * len(seen))
-    tx_ticks = unwrap_array(np.array(tx))
+    tx_ticks = unwrapped(tx)
     for tag in (0, 1):  # sender's rate against the listener's, as the stamps themselves tell it, Doppler included
-        rx_ticks = unwrap_array(np.array(rx[tag]))
+        rx_ticks = unwrapped(rx[tag])
         from_stamps = ((tx_ticks[-1] - tx_ticks[0]) / (rx_ticks[-1] - rx_ticks[0]) - 1.0) * 1e6
         assert np.mean(offsets[tag]) == pytest.approx(from_stamps, abs=2e-3)
     assert 30.0 / SPEED_OF_LIGHT_MPS * 1e6 > 0.1  # the Doppler that the second tag must have seen

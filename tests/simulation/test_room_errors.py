@@ -13,8 +13,7 @@ from scipy.stats import chi2, kstest, uniform
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.simulation.channel import ChannelModel
-from skyless.simulation.impairments import AnchorBias, AnchorDisplacement, Body, Impairments, WarmUp
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import AnchorBias, AnchorDisplacement, Body, Impairments, WarmUp, lab_impairments
 from skyless.simulation.oscillator import OscillatorModel, clock_rate, drift_phase_s, make_clocks, warm_up
 from skyless.simulation.range_errors import RangeErrorModel, RangeErrors, slope_error_m
 from skyless.simulation.stations import TagSpec
@@ -151,7 +150,7 @@ def test_changing_errors_forget_with_their_correlation_length(along):
     history = []
     for step in range(301):
         world.medium._move_tags(0.5 * step)
-        errors.pass_to(0.5 * step, world.medium.stations)
+        errors.advance_to(0.5 * step, world.medium.stations)
         history.append(errors.present_m[2:].copy())
     walking, resting = np.array(history)[:, :-1], np.array(history)[:, -1]
     assert (np.ptp(resting, axis=0) == 0.0).all() == (along == "way")

@@ -5,7 +5,7 @@ import pytest
 from metronome import IDEAL, Metronome, site_of
 from scipy.stats import binom
 
-from skyless.air.airtime import air_time_s
+from skyless.air.ieee802154 import air_time_s
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World

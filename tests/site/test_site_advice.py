@@ -83,6 +83,6 @@ def test_short_guard():
 
 def test_survey_and_ranges_without_error():
     (warning,) = warnings_of(replace(site_of(CUBE), accuracy=EXACT))
-    assert "says that survey and ranges are exact; no real site is" in warning
+    assert "states that survey and ranges are exact; no real site is" in warning
     for accuracy in (AccuracySite(survey_std_m=0.0), AccuracySite(range_std_m=0.0)):
         assert warnings_of(replace(site_of(CUBE), accuracy=accuracy)) == []

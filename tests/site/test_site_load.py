@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.errors import ConfigurationError
+from skyless.site.check import SITE_LIMITS
 from skyless.site.lab import lab_site
-from skyless.site.limits import LIMITS
 from skyless.site.load import load_site
 from skyless.site.model import AccuracySite
 from skyless.site.template import site_template
@@ -202,7 +202,9 @@ def test_files_that_are_not_there(tmp_path):
             load_site(path)
 
 
-@pytest.mark.parametrize("key", [key for key in LIMITS if not key.startswith(("walls", "floor_plan", "georeference"))])
+@pytest.mark.parametrize(
+    "key", [key for key in SITE_LIMITS if not key.startswith(("walls", "floor_plan", "georeference"))]
+)
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf", "true", '"1"', "1979-05-27"])
 def test_no_number_takes_what_is_none(refused, key, number):
     """Every numeric key of the template, given a value that is no finite number."""

@@ -12,8 +12,7 @@ from skyless.site.advice import warnings_of
 from skyless.site.lab import lab_site
 from skyless.site.load import load_site
 from skyless.site.model import EXACT, AccuracySite, Site
-from skyless.site.room import room_site
-from skyless.site.template import site_template
+from skyless.site.template import rectangular_site, site_template
 
 
 def reload(tmp_path, site):
@@ -82,7 +81,7 @@ def test_every_key_stands_in_the_template(tmp_path):
     st.none() | st.floats(-5, 30),
 )
 def test_rooms_load_and_their_anchors_hang_on_the_walls(tmp_path_factory, width, depth, anchors, height, tag_height):
-    site = room_site(width, depth, anchors, height, tag_height)
+    site = rectangular_site(width, depth, anchors, height, tag_height)
     assert reload(tmp_path_factory.getbasetemp(), site) == site
     assert len(site.anchors) == anchors
     for a in site.anchors:
@@ -93,15 +92,15 @@ def test_rooms_load_and_their_anchors_hang_on_the_walls(tmp_path_factory, width,
 
 
 def test_room_of_the_handbook():
-    site = room_site(6, 8, 4, 3, None)
+    site = rectangular_site(6, 8, 4, 3, None)
     assert [(a.x_m, a.y_m, a.z_m) for a in site.anchors] == [(0, 0, 2.5), (6, 1, 0.5), (6, 8, 2.5), (0, 7, 0.5)]
-    assert [a.z_m for a in room_site(6, 8, 4, 3, 1.0).anchors] == [2.5] * 4
+    assert [a.z_m for a in rectangular_site(6, 8, 4, 3, 1.0).anchors] == [2.5] * 4
 
 
 @pytest.mark.parametrize("anchors", range(5, 13))
 def test_rooms_have_a_good_geometry(anchors):
-    assert warnings_of(room_site(12, 8, anchors, 3, None)) == []
-    assert warnings_of(room_site(12, 8, anchors, 3, 1.2)) == []
+    assert warnings_of(rectangular_site(12, 8, anchors, 3, None)) == []
+    assert warnings_of(rectangular_site(12, 8, anchors, 3, 1.2)) == []
 
 
 def test_names_are_quoted(tmp_path):

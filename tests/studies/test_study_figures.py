@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from skyless.air.codec import decode_cached
 from skyless.anchor import Anchor
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.world import World
 from skyless.site.check import check_site
 from skyless.site.lab import lab_site

@@ -1,1 +1,1 @@
-"""What flies: beacon frames and their bytes, the almanac, the schedule, and what a radio reports of a frame."""
+"""What is on the air: beacons and their bytes, the almanac's pages, and what a radio reports of a frame."""

@@ -1,10 +1,10 @@
-"""The almanac: all that a tag must know of a site, sent as rotating pages of 17 bytes."""
+"""The almanac: all that a tag must know about a site, sent as rotating pages of 17 bytes."""
 
 from msgspec import Struct
 
 
 class AnchorPage(Struct, frozen=True, gc=False, tag="anchor"):
-    """Where one anchor stands (antenna phase centre), to the millimetre."""
+    """Position of one anchor (antenna phase centre), to the millimetre."""
 
     anchor: int
     x_m: float
@@ -15,7 +15,7 @@ class AnchorPage(Struct, frozen=True, gc=False, tag="anchor"):
 
 
 class SchedulePage(Struct, frozen=True, gc=False, tag="schedule"):
-    """The superframe, and where tags may be."""
+    """The superframe, and the height of the tags."""
 
     slot_ticks: int
     slots: int
@@ -39,7 +39,7 @@ class NoisePage(Struct, frozen=True, gc=False, tag="noise"):
 
 
 class AccuracyPage(Struct, frozen=True, gc=False, tag="accuracy"):
-    """How good the site's survey and a tag's ranges are, for its filters (``skyless.site.model.AccuracySite``)."""
+    """Accuracy of the site's survey and of a tag's ranges, for its filters (``skyless.site.model.AccuracySite``)."""
 
     survey_std_m: float
     range_std_m: float
@@ -50,7 +50,7 @@ class AccuracyPage(Struct, frozen=True, gc=False, tag="accuracy"):
 
 
 class GeoreferencePage(Struct, frozen=True, gc=False, tag="georeference"):
-    """Where the site's origin lies on the Earth (WGS 84) and how its x axis points."""
+    """Position of the site's origin on the Earth (WGS 84), and azimuth of its axes."""
 
     latitude_deg: float
     longitude_deg: float

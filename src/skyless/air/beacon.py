@@ -1,7 +1,8 @@
-"""The beacon: what every anchor broadcasts in its slots (``docs/protocol.md``)."""
+"""The beacon: what every anchor broadcasts in its slots, and why bytes are none (``docs/protocol.md``)."""
 
 import struct
 from collections.abc import Iterator
+from enum import StrEnum
 from typing import Final
 
 from msgspec import Struct
@@ -24,7 +25,7 @@ class Heard(Struct, frozen=True, gc=False):
 
 
 class PackedHeard(Struct, frozen=True, gc=False, eq=False):
-    """``heard`` entries as they stand in a frame, taken apart when looked at; equal to a tuple of them."""
+    """``heard`` entries as the bytes of a frame, decoded when they are read; equal to a tuple of them."""
 
     packed: bytes
 
@@ -66,15 +67,15 @@ class Beacon(Struct, frozen=True, gc=False):
     superframe: int
     """Number of the superframe, 32 bits, counted by the master."""
     slot: int
-    """Slot within the superframe in which this frame flies, 8 bits."""
+    """Slot within the superframe in which this frame is sent, 8 bits."""
     tx_ticks: int
     """TX stamp in the sender's own clock, 40 bits."""
     almanac_issue: int
-    """Changes when the almanac changes, 8 bits; a tag then forgets the old one."""
+    """Changes when the almanac changes, 8 bits; a tag then discards the old one."""
     master: int
-    """Identifier of the master that this anchor follows; its own for the master."""
+    """Identifier of the master whose time this anchor uses; its own for the master."""
     term: int
-    """Which reign the sender lives in, 8 bits: counts the takeovers of the master's role, modulo 256."""
+    """Counts the takeovers of the master's role, modulo 256 (8 bits)."""
     master_heard: Heard | None
     """The last master beacon that this anchor heard (raw stamp), None for the master or when none was heard."""
     master_time: MasterTime | None
@@ -83,3 +84,26 @@ class Beacon(Struct, frozen=True, gc=False):
     """The other anchors, the master excluded, in the order of the most recent first; as many as fit."""
     page: Page | None
     """One page of the almanac."""
+
+
+class Malformed(StrEnum):
+    """Reason why bytes are not a beacon of this version (``docs/protocol.md``, "What is dropped")."""
+
+    TOO_SHORT = "too-short"
+    """Shorter than any frame of IEEE 802.15.4, or a beacon that ends before its fixed part does."""
+    TOO_LONG = "too-long"
+    """Longer than the 127 bytes of a PSDU."""
+    BAD_FCS = "bad-fcs"
+    """The frame check sequence does not fit the bytes."""
+    NOT_A_BEACON = "not-a-beacon"
+    """An intact frame of another system."""
+    UNKNOWN_VERSION = "unknown-version"
+    """A beacon of another version of the protocol."""
+    BAD_FLAGS = "bad-flags"
+    """A reserved flag is set."""
+    BAD_LENGTH = "bad-length"
+    """The length does not fit the flags and the number of relayed stamps."""
+    BAD_HEARD = "bad-heard"
+    """Impossible stamps: of the sender by itself, of the master in the wrong field, twice of one anchor."""
+    BAD_PAGE = "bad-page"
+    """A page of the almanac with an impossible value."""

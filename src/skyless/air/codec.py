@@ -11,15 +11,14 @@ from functools import lru_cache
 from operator import index
 from typing import Final, SupportsIndex
 
-from skyless.air.beacon import HEARD, Beacon, Heard, MasterTime, PackedHeard
-from skyless.air.fcs import fcs, is_intact
-from skyless.air.malformed import Malformed
+from skyless.air.beacon import HEARD, Beacon, Heard, Malformed, MasterTime, PackedHeard
+from skyless.air.ieee802154 import fcs, is_intact
 from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
 
 MAX_FRAME_BYTES: Final = 127
 """Longest PSDU (IEEE 802.15.4-2015, aMaxPhyPacketSize)."""
 AUTHENTICATION_BYTES: Final = 16
-"""Room that every frame keeps for an authentication trailer."""
+"""Bytes that every frame reserves for an authentication trailer."""
 STD_STEPS_PER_TICK: Final = 64
 SATURATED_STD: Final = 0xFFFF
 
@@ -65,20 +64,20 @@ _CAPACITY: Final = tuple(
     (MAX_FRAME_BYTES - _bare_bytes(flags | _HAS_AUTHENTICATION)) // HEARD.size for flags in range(16)
 )
 _HEARD_ANCHORS: Final = tuple(struct.Struct("<" + count * "H6x") for count in range(MAX_FRAME_BYTES // HEARD.size))
-"""The anchors alone of so many ``heard`` entries."""
+"""The anchors alone of ``heard`` entries, by the number of entries."""
 _MASTER: Final = slice(_FIXED.size - 3, _FIXED.size - 1)
 _MASTERS_STAMP: Final = slice(_FIXED.size, _FIXED.size + _STAMP.size)
 
 
 def heard_capacity(master_heard: bool, master_time: bool, page: bool) -> int:
-    """How many ``heard`` entries a frame with these parts may carry, room for authentication kept: 6 to 10."""
+    """How many ``heard`` entries a frame with these parts may carry, with space for authentication: 6 to 10."""
     return _CAPACITY[master_heard * _HAS_MASTER_HEARD | master_time * _HAS_MASTER_TIME | page * _HAS_PAGE]
 
 
 def encode(beacon: Beacon) -> bytes:
     """Return the whole frame, FCS included.
 
-    The standard deviation of the master time is rounded up to 1/64 tick, so that it never claims too much.
+    The standard deviation of the master time is rounded up to 1/64 tick, so that it is never too optimistic.
 
     Raises:
         ValueError: a field is out of its range, or there are more ``heard`` than fit; the message names it.
@@ -107,7 +106,7 @@ def decode(frame: bytes) -> Beacon | Malformed:
 
 
 decode_cached = lru_cache(maxsize=256)(decode)
-"""``decode`` that remembers the last 256 frames: for a program that runs many tags which hear the same bytes."""
+"""``decode`` that remembers the last 256 frames: for a program that runs many tags which receive the same bytes."""
 
 
 def _foreign(frame: bytes) -> Malformed:
@@ -135,8 +134,8 @@ def _decode_version_1(frame: bytes) -> Beacon | Malformed:
     if control != _FRAME_CONTROL or destination != _BROADCAST or magic != _VERSION_1:
         return _foreign(frame)
     relays_master, is_master = flags & _HAS_MASTER_HEARD, anchor == master
-    told = {anchor, master, *_HEARD_ANCHORS[count].unpack_from(frame, count_at + 1)}
-    if len(told) + is_master != count + 2 or (relays_master and is_master):
+    named = {anchor, master, *_HEARD_ANCHORS[count].unpack_from(frame, count_at + 1)}
+    if len(named) + is_master != count + 2 or (relays_master and is_master):
         return Malformed.BAD_HEARD
     master_heard = master_time = None
     if relays_master:
@@ -156,13 +155,13 @@ def _decode_version_1(frame: bytes) -> Beacon | Malformed:
 
 
 def _foreign_or(fault: Malformed, frame: bytes) -> Malformed:
-    """What is wrong with a frame of this fault, which means nothing in one of another kind."""
+    """Fault of a frame, or that it is no beacon of this version: then the fault means nothing."""
     foreign = _foreign(frame)
     return fault if foreign is Malformed.TOO_SHORT else foreign
 
 
 def packed_relays(frame: bytes, beacon: Beacon) -> bytes:
-    """All receptions that a beacon tells, ``HEARD`` after ``HEARD``, the master's first; ``frame`` is its bytes."""
+    """All receptions that a beacon relays, ``HEARD`` after ``HEARD``, the master's first; ``frame`` is its bytes."""
     packed: bytes = beacon.heard.packed  # type: ignore[union-attr]  # it is of a frame
     return packed if beacon.master_heard is None else frame[_MASTER] + frame[_MASTERS_STAMP] + packed
 
@@ -178,8 +177,8 @@ def _heard_fault(anchor: int, master: int, master_heard: Heard | None, heard: Co
     seen.update([entry.anchor for entry in heard])
     if len(seen) == expected:
         return None
-    told = [anchor, master, *(entry.anchor for entry in heard)]
-    twice = next(one for place, one in enumerate(told) if place > 1 and one in told[:place])
+    named = [anchor, master, *(entry.anchor for entry in heard)]
+    twice = next(one for index, one in enumerate(named) if index > 1 and one in named[:index])
     return f"heard repeats anchor {twice}, or it is the sender or the master"
 
 

@@ -1,6 +1,6 @@
-"""What a tag hears in a system without a master, and the time differences that follow from it.
+"""What a tag receives in a system without a master, and the time differences that result from it.
 
-Anchors of such a system tell when they sent and when they heard each other, each in its own clock. How many bits
+Anchors of such a system report when they sent and when they heard each other, each in its own clock. How many bits
 their counters have is a property of the whole stream, so it is kept with the stream and not in each value.
 """
 
@@ -24,7 +24,7 @@ class Relay(Struct, frozen=True, gc=False):
 
 
 class Packet(Struct, frozen=True, gc=False):
-    """One packet of an anchor as a tag heard it."""
+    """One packet of an anchor as a tag received it."""
 
     host_s: float | None
     """The host's clock, needed only to bridge gaps over 8.6 s."""
@@ -34,10 +34,10 @@ class Packet(Struct, frozen=True, gc=False):
     tx_ticks: int
     """When it was sent, in the sender's clock."""
     rx_ticks: int
-    """When the tag heard it, in the tag's own clock."""
+    """When the tag received it, in the tag's own clock."""
     relays: tuple[Relay, ...]
     position_m: Point | None = None
-    """Where the sender says that it stands."""
+    """The sender's position, as it reports it."""
 
 
 class PairTdoa(Struct, frozen=True, gc=False):
@@ -50,5 +50,5 @@ class PairTdoa(Struct, frozen=True, gc=False):
     tdoa_m: float
     """Range to b less range to a."""
     a_m: Point | None = None
-    """Where a was, if it moves and the recording says so; otherwise the site's coordinates hold."""
+    """Position of a, if it moves and the recording has it; otherwise the site's coordinates hold."""
     b_m: Point | None = None

@@ -5,12 +5,12 @@ from functools import lru_cache
 from typing import Final, Literal
 
 from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
-from skyless.air.malformed import Malformed
+from skyless.air.beacon import Malformed
 
 PAGE_BYTES: Final = 17
 
 MAX_COORDINATE_M: Final = 1e6
-"""Coordinates and heights beyond 1000 km from the origin are taken for errors."""
+"""Coordinates and heights beyond 1000 km from the origin are errors; a page has 32-bit millimetres, ±2147 km."""
 MAX_NOISE: Final = 2.0**-19
 """Stamp noise beyond 1.9 µs (572 m) and oscillator noise beyond 1.9 ppm are errors; float32 keeps the bound."""
 MAX_SUPERFRAME_TICKS: Final = (1 << 39) - 1
@@ -63,7 +63,7 @@ def encode_page(page: Page) -> bytes:
 
 @lru_cache(maxsize=1024)
 def decode_page(data: bytes) -> Page | Literal[Malformed.BAD_PAGE] | None:
-    """Return the page in 17 bytes, ``BAD_PAGE`` where a value is absurd, None for a type not known here."""
+    """Return the page in 17 bytes, ``BAD_PAGE`` where a value is impossible, None for a type not known here."""
     decode = _DECODERS.get(data[0])
     if decode is None:
         return None

@@ -4,10 +4,9 @@ from msgspec import Struct
 
 
 class Diagnostics(Struct, frozen=True, gc=False):
-    """What a radio measured of one frame beside its time; a value is None where the radio does not tell.
+    """What a radio measured of one frame besides its time; a value is None where the radio does not report it.
 
-    Powers are those of the chip's formulas as they stand; ``positioning/methods/nlos_weighting.py`` says what drivers
-    make of them.
+    Powers are those of the chip's formulas without corrections (``positioning/methods/nlos_weighting.py``).
     """
 
     rx_power_dbm: float | None = None
@@ -16,10 +15,10 @@ class Diagnostics(Struct, frozen=True, gc=False):
 
 
 class Reception(Struct, frozen=True, gc=False):
-    """One frame as a radio heard it.
+    """One frame as a radio received it.
 
-    ``frame`` is the whole PSDU, FCS included. ``rx_ticks`` is the listener's own 40-bit counter at the frame's
-    RMARKER, antenna delay already taken off. ``host_s`` is the host's clock, needed only to bridge gaps over 8.6 s.
+    ``frame`` is the whole PSDU, FCS included. ``rx_ticks`` is the receiver's own 40-bit counter at the frame's
+    RMARKER, antenna delay already subtracted. ``host_s`` is the host's clock, needed only to bridge gaps over 8.6 s.
     """
 
     frame: bytes

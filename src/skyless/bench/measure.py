@@ -21,7 +21,7 @@ from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
 from skyless.positioning.solver.locate import PseudorangeSolution, locate_pseudoranges
 from skyless.receiver import Receiver
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World

@@ -28,11 +28,11 @@ from skyless.recordings.foreign.formats import open_recording
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.recordings.truth import Truth
 from skyless.replay.site import SITE_FORMAT, recorded_site, recorded_truth
-from skyless.site.limits import LIMITS
+from skyless.site.check import SITE_LIMITS
 from skyless.site.model import Site
-from skyless.site.rewrite import KEY
+from skyless.site.rewrite import DELAY_KEY
 
-_DELAY: Final = LIMITS[f"anchors.{KEY}"]
+_DELAY: Final = SITE_LIMITS[f"anchors.{DELAY_KEY}"]
 
 
 class CalibrationRequest(Struct, frozen=True):
@@ -77,7 +77,7 @@ class Calibrated(Struct, frozen=True):
             if found_m is None:
                 continue
             ticks = anchor.tx_antenna_delay_ticks + round(found_m / TICK_M)
-            if not _DELAY.hold(ticks):
+            if not _DELAY.contains(ticks):
                 raise SkylessError(f"anchor {anchor.id} would need an antenna delay of {ticks}; it should be {_DELAY}")
             changes[anchor.id] = (anchor.tx_antenna_delay_ticks, ticks)
         return changes

@@ -8,9 +8,8 @@ from typing import Final, cast
 import numpy as np
 from msgspec import Struct
 
-from skyless.air.beacon import Beacon, MasterTime
+from skyless.air.beacon import Beacon, Malformed, MasterTime
 from skyless.air.codec import decode_cached
-from skyless.air.malformed import Malformed
 from skyless.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.air.reception import Reception
 from skyless.calibration.estimate import Differences

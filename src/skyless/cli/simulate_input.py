@@ -44,15 +44,15 @@ def site_of(scenario: str | None, file: Path | None) -> "Site":
 
 def path_of(text: str) -> tuple[tuple[float, ...], ...]:
     """Points of a path, x,y or x,y,z each, separated by semicolons or spaces. Raises SkylessError."""
-    from skyless.site.limits import FARTHEST_M
+    from skyless.air.page_codec import MAX_COORDINATE_M
 
     points = tuple(finite_numbers("waypoints", part, (2, 3)) for part in text.replace(";", " ").split())
     if len(points) < 2:
         raise SkylessError(f"--waypoints is {text!r}; it should be two or more points in quotes, 'x,y;x,y;x,y'")
     if len({len(point) for point in points}) > 1:
         raise SkylessError(f"--waypoints is {text!r}; all of its points should have a height, or none")
-    if any(abs(value) > FARTHEST_M for point in points for value in point):
-        raise SkylessError(f"--waypoints is {text!r}; its points should lie within {FARTHEST_M:g} m")
+    if any(abs(value) > MAX_COORDINATE_M for point in points for value in point):
+        raise SkylessError(f"--waypoints is {text!r}; its points should lie within {MAX_COORDINATE_M:g} m")
     if any(dist(a, b) < _SHORTEST_M for a, b in pairwise(points)):
         raise SkylessError(f"--waypoints is {text!r}; from point to point it should be {_SHORTEST_M:g} m or more")
     return points

@@ -55,11 +55,10 @@ def new(
     """
     from skyless.site.check import check_site
     from skyless.site.lab import lab_site
-    from skyless.site.room import room_site
-    from skyless.site.template import site_template
+    from skyless.site.template import rectangular_site, site_template
 
     if width is not None and depth is not None:
-        site = room_site(width, depth, anchors or 6, height or 3.0, tag_height)
+        site = rectangular_site(width, depth, anchors or 6, height or 3.0, tag_height)
     elif (width, depth, anchors, height, tag_height) == (None,) * 5:
         site = lab_site()
     else:
@@ -100,8 +99,8 @@ def check(file: Path, /, *, json: bool = False) -> None:
 
 def _report(site: "Site") -> dict[str, Any]:
     """What there is to say of a valid site, SI units."""
-    from skyless.air.airtime import air_time_s
     from skyless.air.codec import MAX_FRAME_BYTES
+    from skyless.air.ieee802154 import air_time_s
     from skyless.constants import TICK_S
     from skyless.site.advice import warnings_of
     from skyless.site.slots import first_slots, schedule_of

@@ -10,7 +10,7 @@ from skyless.evaluation.fleet import Fleet, FleetSettings
 from skyless.method_names import DEFAULT_METHOD
 from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import lab_site
 from skyless.ticks import from_seconds, wrap

@@ -16,11 +16,11 @@ from skyless.method_names import DEFAULT_METHOD
 from skyless.positioning.fix import Fix
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.receiver import NOT_DROPS, Receiver
-from skyless.simulation.broadcast import Broadcast, Tally
 from skyless.simulation.impairments import Impairments
+from skyless.simulation.medium import Tally
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Trajectory
-from skyless.simulation.world import World
+from skyless.simulation.world import Broadcast, World
 from skyless.site.model import Site
 from skyless.site.slots import schedule_of
 

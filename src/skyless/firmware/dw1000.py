@@ -1,40 +1,31 @@
 """Driver of the DW1000, for MicroPython and CPython alike: integers only, and nothing is allocated per frame.
 
-Written from the DW1000 User Manual v2.12 ("UM", pages of that version); ``docs/dw1000.md`` says which table was held
-against which other source. It has never run on a chip. What it needs of the hardware is a ``Bus``.
+Written from the DW1000 User Manual v2.12 ("UM", pages of that version); ``docs/dw1000.md`` lists which table was
+compared with which other source. It has never run on a chip. What it needs of the hardware is a ``Bus``.
 
 States, in ``DW1000.state``:
 
     OFF         nothing is known of the chip. ``start`` resets and configures it, and leaves it IDLE.
-    IDLE        the radio does nothing. ``receive`` turns the receiver on.
+    IDLE        the radio is off. ``receive`` turns the receiver on.
     LISTENING   the receiver is on, and stays on: after each frame, after each error, after each transmission.
-    SENDING     a frame waits for its time or is on its way. The receiver is off all that while (one DX_TIME, one
+    SENDING     a frame waits for its time or is on its way. The receiver is off during that time (one DX_TIME, one
                 transceiver), so ``transmit_at`` is to be called as late as it safely can. Ends with SENT from
                 ``poll``, or with ``cancel``.
 
-``poll`` is to be called when the interrupt line is high, or now and then; it tells what happened as a sum of RECEIVED,
-SENT, FAILED, CLOCK_SLIPPED and LOST, and has already turned the receiver on again. Until the next ``poll``, what was
-received stands in ``rx_ticks``, ``frame[:frame_bytes]``, ``rx_power_cdbm``, ``first_path_cdbm`` and ``offset_ppb``, the
-stamp of what was SENT in ``tx_ticks``. Where SENT does not come 1 ms after its time, ``cancel``. After LOST the chip is
-OFF and counts anew: ``start`` again. Before ``transmit_at`` poll once, or a frame that has just come is lost.
+``poll`` is to be called when the interrupt line is high, or periodically; it returns what happened as a sum of
+RECEIVED, SENT, FAILED, CLOCK_SLIPPED and LOST, and has already turned the receiver on again. Until the next ``poll``,
+what was received is in ``rx_ticks``, ``frame[:frame_bytes]``, ``rx_power_cdbm``, ``first_path_cdbm`` and
+``offset_ppb``, the stamp of what was SENT in ``tx_ticks``. If SENT does not come within 1 ms after its time, call
+``cancel``. After LOST the chip is OFF and its counter has restarted: ``start`` again. Before ``transmit_at`` poll once,
+or a frame that has just come is lost.
 
 Stamps are raw 40-bit ticks in 5 bytes, the lowest first, as the chip has them; they are never numbers here.
 """
 
 try:
-    import micropython
-except ImportError:
-
-    class _Plain:
-        """Stands in for MicroPython's module where there is none."""
-
-        @staticmethod
-        def viper(function):  # noqa: ANN001, ANN205 - of any kind
-            """Leave the function as it is."""
-            return function
-
-    micropython = _Plain
-    ptr8 = bytearray
+    from skyless.firmware import micropython, ptr8
+except ImportError:  # a board, where MicroPython brings both
+    import micropython  # type: ignore[no-redef]
 
 OFF = 0
 IDLE = 1
@@ -47,18 +38,18 @@ SENT = 2
 FAILED = 4
 CLOCK_SLIPPED = 8
 LOST = 16
-"""What ``poll`` tells: a frame has come, ours has left; a reception came to nothing; the clock's PLL was losing lock
-(the stamps around are doubtful); the chip does not answer or was reset."""
+"""Results of ``poll``: a frame was received, ours was sent; a reception failed; the clock's PLL was losing lock (stamps
+around that time are unreliable); the chip does not answer or was reset."""
 
 QUEUED = 0
 LATE = 1
 BUSY = 2
 NOT_READY = 3
-"""What ``transmit_at`` tells: the frame will leave at its time; or nothing is sent, because it came too late, another
+"""Results of ``transmit_at``: the frame will be sent at its time; or nothing is sent, because it was too late, another
 frame waits, or the chip is OFF."""
 
-NOT_TOLD = -32768
-"""A measured value that there is not."""
+NOT_MEASURED = -32768
+"""A measured value that is missing."""
 MIN_PSDU_BYTES = 3
 MAX_PSDU_BYTES = 127
 """FCS included, which the chip makes and checks (UM p. 80)."""
@@ -66,7 +57,7 @@ MAX_PSDU_BYTES = 127
 DEVICE_ID = b"\x30\x01\xca\xde"
 """DEV_ID 0xDECA0130, low byte first (UM 7.2.2)."""
 
-# SYS_STATUS (UM 7.2.17, pp. 86-92), bits 0 to 23 as one number; octets 3 and 4 apart, for numbers stay below 2**30.
+# SYS_STATUS (UM 7.2.17, pp. 86-92), bits 0 to 23 as one number; octets 3 and 4 apart, as numbers stay below 2**30.
 CPLOCK = 1 << 1
 TXFRS = 1 << 7
 LDEDONE = 1 << 10
@@ -90,7 +81,7 @@ UNUSED_4 = 0xF8
 """Bits of SYS_STATUS; _3 and _4 are within octet 3 and 4."""
 
 CLEARED = b"\xf8\xff\xff\x37\x07"
-"""What is written back to SYS_STATUS at most: not CPLOCK, which says that the chip still runs as it was started, nor
+"""What is written back to SYS_STATUS at most: not CPLOCK, which shows that the chip still runs as it was started, nor
 bits that cannot be written."""
 
 # SYS_CTRL (UM 7.2.15, pp. 80-84)
@@ -107,7 +98,7 @@ TX_FCTRL = 0x0016_C000
 
 TX_POWER = 0x2545_6585
 """Smart power, channel 5, PRF 64 MHz: the manual's reference values (UM 7.2.31, Tables 19 and 20). A beacon of up to
-67 bytes takes the third octet; the rule behind it is one frame per millisecond."""
+67 bytes uses the third octet; the rule behind it is one frame per millisecond."""
 
 CONFIGURATION = (
     # file, sub-address, octets, value; channel 5, PRF 64 MHz, 6.8 Mbit/s, preamble of 128 symbols with code 9
@@ -171,11 +162,11 @@ _BIAS_MM = (-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71
 
 
 class ChipError(Exception):
-    """There is no DW1000 on the bus, or it does not start; the message says what was found."""
+    """There is no DW1000 on the bus, or it does not start; the message states what was found."""
 
 
 class Bus:
-    """What the driver asks of the hardware. Buffers belong to the driver; nothing may be kept of them."""
+    """The hardware that the driver needs. Buffers belong to the driver; no reference to them may be kept."""
 
     def transfer(self, out: memoryview, into: memoryview) -> None:
         """One SPI transaction (mode 0) in both directions; both have the same length."""
@@ -198,7 +189,7 @@ class Bus:
         return False
 
     def pause_us(self, microseconds: int) -> None:
-        """Wait at least so long."""
+        """Wait at least that long."""
         raise NotImplementedError
 
 
@@ -213,7 +204,7 @@ def header(is_write: bool, file: int, sub: int) -> bytes:
 
 
 class _Reading:
-    """A register that is read again and again; ``data`` is what was read."""
+    """A register that is read repeatedly; ``data`` is what was read."""
 
     def __init__(self, file: int, sub: int, size: int) -> None:
         head = header(False, file, sub)
@@ -223,7 +214,7 @@ class _Reading:
 
 
 class _Writing:
-    """A register that is written again and again; ``data`` is what will be."""
+    """A register that is written repeatedly; ``data`` is what will be written."""
 
     def __init__(self, file: int, sub: int, content: bytes) -> None:
         self.header = memoryview(header(True, file, sub))
@@ -242,7 +233,7 @@ def copy(source: ptr8, at: int, end: int, out: ptr8) -> int:
 
 
 @micropython.viper
-def keep(source: ptr8, mask: ptr8, end: int, out: ptr8) -> int:
+def copy_masked(source: ptr8, mask: ptr8, end: int, out: ptr8) -> int:
     """Copy ``source[:end]`` to ``out``, only the bits that ``mask`` has."""
     at = 0
     while at < end:
@@ -268,22 +259,22 @@ def log10(value: int, table: ptr8) -> int:
 
 
 def accumulated(symbols: int) -> int:
-    """What the formulas of power take off for RXPACC symbols in 1e-4 dB: A, and 20 log10; 0 where there are none."""
+    """What the formulas of power subtract for RXPACC symbols in 1e-4 dB: A, and 20 log10; 0 where there are none."""
     return POWER_A + 2 * log10(symbols, LOG10_TABLE) if symbols > 0 else 0
 
 
 def power_cdbm(cir_power: int, level: int) -> int:
-    """Received power in 0.01 dBm from CIR_PWR and what ``accumulated`` gave (UM 4.7.2), or NOT_TOLD."""
+    """Received power in 0.01 dBm from CIR_PWR and what ``accumulated`` gave (UM 4.7.2), or NOT_MEASURED."""
     if cir_power == 0 or level == 0:
-        return NOT_TOLD
+        return NOT_MEASURED
     power: int = log10(cir_power, LOG10_TABLE) + 17 * LOG10_2 - level
     return (power + 50) // 100
 
 
 def first_path_cdbm(f1: int, f2: int, f3: int, level: int) -> int:
-    """First path's power in 0.01 dBm from three amplitudes of 16 bits and ``accumulated`` (UM 4.7.1), or NOT_TOLD."""
+    """First path's power in 0.01 dBm from its amplitudes and ``accumulated`` (UM 4.7.1), or NOT_MEASURED."""
     if level == 0:
-        return NOT_TOLD
+        return NOT_MEASURED
     while f1 >= 0x4000 or f2 >= 0x4000 or f3 >= 0x4000:
         f1 >>= 1
         f2 >>= 1
@@ -291,7 +282,7 @@ def first_path_cdbm(f1: int, f2: int, f3: int, level: int) -> int:
         level -= 2 * LOG10_2
     squares = f1 * f1 + f2 * f2 + f3 * f3
     if squares == 0:
-        return NOT_TOLD
+        return NOT_MEASURED
     power: int = log10(squares, LOG10_TABLE) - level
     return (power + 50) // 100
 
@@ -299,27 +290,27 @@ def first_path_cdbm(f1: int, f2: int, f3: int, level: int) -> int:
 def carrier_offset_ppb(integrator: int) -> int:
     """The sender's carrier against ours in 1e-9 from DRX_CAR_INT; positive: the sender is fast (UM p. 151, Table 35).
 
-    One step is -1e9 / (6.5 · 2**28) = -0.57311 of them on channel 5. NOT_TOLD beyond 32 767.
+    One step is -1e9 / (6.5 · 2**28) = -0.57311 of them on channel 5. NOT_MEASURED beyond 32 767.
     """
     if integrator > 57_170 or integrator < -57_170:
-        return NOT_TOLD
+        return NOT_MEASURED
     return (8192 - integrator * 9390) >> 14
 
 
 def clock_offset_ppb(offset: int) -> int:
     """The sender's clock against ours in 1e-9 from RXTOFS, over RXTTCKI = 0x01FC0000; positive: fast (UM p. 99)."""
     if offset > 1090 or offset < -1090:
-        return NOT_TOLD
+        return NOT_MEASURED
     return (offset * 30_037 + 500) // 1000
 
 
 def bias_ticks(rx_power_cdbm: int) -> int:
     """How many ticks late a stamp is at that power: straight lines between the values of APS011, held beyond them."""
-    place = -6100 - rx_power_cdbm
-    place = 0 if place < 0 else 3399 if place > 3399 else place
-    at = place // 200
+    below = -6100 - rx_power_cdbm  # 0.01 dB
+    below = 0 if below < 0 else 3399 if below > 3399 else below
+    at = below // 200
     low = _BIAS_MM[at]
-    parts = low * 200 + (_BIAS_MM[at + 1] - low) * (place - at * 200)
+    parts = low * 200 + (_BIAS_MM[at + 1] - low) * (below - at * 200)
     return (parts * 1000 + 469_176) // 938_353  # a tick is 4.691764 mm
 
 
@@ -339,12 +330,12 @@ def micros_until(now: bytearray | memoryview, then: bytearray | memoryview) -> i
 
 
 class DW1000:
-    """One chip. Counts wrap at 30 bits. ``errors`` are those receptions that came to nothing, of any kind."""
+    """One chip. Counts wrap at 30 bits. ``errors`` are failed receptions of any kind."""
 
     def __init__(self, bus: Bus) -> None:
         self.state = OFF
         self.measuring = True
-        """Whether powers and carrier offset are read with each frame, in two transactions more; else NOT_TOLD."""
+        """Whether powers and carrier offset are read with each frame, in two transactions more; else NOT_MEASURED."""
         self.correct_bias = False
         """Whether ``rx_ticks`` are corrected for received power (APS011); needs ``measuring``."""
         self.received = 0
@@ -354,11 +345,11 @@ class DW1000:
         self.error_status = 0
         """SYS_STATUS, octets 0 to 2, of the last error; 0 for a frame that was too short."""
         self.frame_bytes = 0
-        self.rx_power_cdbm = NOT_TOLD
-        self.first_path_cdbm = NOT_TOLD
-        self.offset_ppb = NOT_TOLD
+        self.rx_power_cdbm = NOT_MEASURED
+        self.first_path_cdbm = NOT_MEASURED
+        self.offset_ppb = NOT_MEASURED
         self.carrier_integrator = 0
-        self.temperature_cc = NOT_TOLD
+        self.temperature_cc = NOT_MEASURED
         self.millivolts = 0
         """Of the last ``measure``."""
         self.identity = bytes(8)
@@ -423,78 +414,78 @@ class DW1000:
         self._bus.fast()
         self._identify(" at full speed")
         for file, sub, size, value in CONFIGURATION:
-            self._put(file, sub, size, value)
-        self._put(0x1E, 0, 4, tx_power)
+            self._write(file, sub, size, value)
+        self._write(0x1E, 0, 4, tx_power)
         self.set_antenna_delays(tx_antenna_delay, rx_antenna_delay)
-        self._put(0x0E, 0, 4, SYS_MASK_EVENTS[0] | SYS_MASK_EVENTS[1] << 24)
+        self._write(0x0E, 0, 4, SYS_MASK_EVENTS[0] | SYS_MASK_EVENTS[1] << 24)
         self._off_and_clear()
         self.state = IDLE
 
     def set_antenna_delays(self, tx_ticks: int, rx_ticks: int) -> None:
-        """TX_ANTD (UM 7.2.26, p. 103) and LDE_RXANTD (7.2.47.5), which the chip takes into all its stamps."""
-        self._put(0x18, 0, 2, tx_ticks)
-        self._put(0x2E, 0x1804, 2, rx_ticks)
+        """TX_ANTD (UM 7.2.26, p. 103) and LDE_RXANTD (7.2.47.5), which the chip includes in all its stamps."""
+        self._write(0x18, 0, 2, tx_ticks)
+        self._write(0x2E, 0x1804, 2, rx_ticks)
 
-    def _put(self, file: int, sub: int, size: int, value: int) -> None:
-        content = bytes([value >> 8 * place & 0xFF for place in range(size)])
+    def _write(self, file: int, sub: int, size: int, value: int) -> None:
+        content = bytes([value >> 8 * octet & 0xFF for octet in range(size)])
         self._bus.write(memoryview(header(True, file, sub)), memoryview(content))
 
-    def _get(self, file: int, sub: int, size: int) -> bytes:
+    def _read(self, file: int, sub: int, size: int) -> bytes:
         reading = _Reading(file, sub, size)
         self._bus.transfer(reading.out, reading.into)
         return bytes(reading.data)
 
     def _identify(self, when: str) -> None:
-        found = self._get(0x00, 0, 4)
+        found = self._read(0x00, 0, 4)
         if found != DEVICE_ID:
-            number = "".join(["%02X" % found[place] for place in (3, 2, 1, 0)])  # noqa: UP031 - MicroPython too
+            number = "".join(["%02X" % found[octet] for octet in (3, 2, 1, 0)])  # noqa: UP031 - MicroPython too
             raise ChipError("no DW1000" + when + ": its identifier is DECA0130, read was " + number)
 
     def _soft_reset(self) -> None:
         """Crystal clock; nothing to be restored by the always-on block; SOFTRESET (UM 7.2.50.1, 7.2.45)."""
-        self._put(0x36, 0, 2, 0x0201)  # PMSC_CTRL0: SYSCLKS 1
-        self._put(0x2C, 0x00, 2, 0)  # AON_WCFG
-        self._put(0x2C, 0x06, 1, 0)  # AON_CFG0: no sleep
-        self._put(0x2C, 0x02, 1, 0)  # AON_CTRL
-        self._put(0x2C, 0x02, 1, 0x02)  # AON_CTRL: SAVE
-        self._put(0x36, 3, 1, 0x00)
+        self._write(0x36, 0, 2, 0x0201)  # PMSC_CTRL0: SYSCLKS 1
+        self._write(0x2C, 0x00, 2, 0)  # AON_WCFG
+        self._write(0x2C, 0x06, 1, 0)  # AON_CFG0: no sleep
+        self._write(0x2C, 0x02, 1, 0)  # AON_CTRL
+        self._write(0x2C, 0x02, 1, 0x02)  # AON_CTRL: SAVE
+        self._write(0x36, 3, 1, 0x00)
         self._bus.pause_us(1000)
-        self._put(0x36, 3, 1, 0xF0)
+        self._write(0x36, 3, 1, 0xF0)
         self._bus.pause_us(1000)
-        self._put(0x36, 0, 2, 0x0201)
+        self._write(0x36, 0, 2, 0x0201)
 
     def _read_otp(self, address: int) -> bytes:
         """One word of the one-time programmable memory (UM 6.3.2, 7.2.46)."""
-        self._put(0x2D, 0x04, 2, address)
-        self._put(0x2D, 0x06, 1, 0x03)  # OTP_CTRL: OTPRDEN, OTPREAD
-        self._put(0x2D, 0x06, 1, 0x00)
-        return self._get(0x2D, 0x0A, 4)
+        self._write(0x2D, 0x04, 2, address)
+        self._write(0x2D, 0x06, 1, 0x03)  # OTP_CTRL: OTPRDEN, OTPREAD
+        self._write(0x2D, 0x06, 1, 0x00)
+        return self._read(0x2D, 0x0A, 4)
 
     def _calibrate(self, crystal_trim: int) -> None:
         """What was measured when the chip or module was made: supply, crystal, temperature (UM 2.5.5.11, 8.1, 6.4)."""
-        self._put(0x24, 0x00, 4, 0x04)  # EC_CTRL: PLLLDT, without which CPLOCK means nothing (UM 7.2.37.1)
+        self._write(0x24, 0x00, 4, 0x04)  # EC_CTRL: PLLLDT, without which CPLOCK means nothing (UM 7.2.37.1)
         if self._read_otp(OTP_LDOTUNE)[0] != 0:
-            self._put(0x2D, 0x12, 1, 0x02)  # OTP_SF: LDO_KICK
+            self._write(0x2D, 0x12, 1, 0x02)  # OTP_SF: LDO_KICK
         self._voltage_33 = self._read_otp(OTP_VOLTAGE)[0]
         self._temperature_23 = self._read_otp(OTP_TEMPERATURE)[0]
         self.identity = self._read_otp(OTP_PART_ID) + self._read_otp(OTP_LOT_ID)
         trim = self._read_otp(OTP_CRYSTAL_TRIM)[0] & 0x1F if crystal_trim < 0 else crystal_trim & 0x1F
         if trim == 0 and crystal_trim < 0:
             trim = 0x10  # not trimmed: mid-range
-        self._put(0x2B, 0x0E, 1, 0x60 | trim)  # FS_XTALT: the upper three bits are 011 (UM 7.2.44.5)
+        self._write(0x2B, 0x0E, 1, 0x60 | trim)  # FS_XTALT: the upper three bits are 011 (UM 7.2.44.5)
 
     def _load_microcode(self) -> None:
         """The leading-edge search, without which there are no RX stamps (UM 2.5.5.10, Table 4)."""
-        self._put(0x36, 0, 2, 0x0301)
-        self._put(0x2D, 0x06, 2, 0x8000)  # OTP_CTRL: LDELOAD
+        self._write(0x36, 0, 2, 0x0301)
+        self._write(0x2D, 0x06, 2, 0x8000)  # OTP_CTRL: LDELOAD
         self._bus.pause_us(LDE_LOAD_US)
 
     def _wait_for_lock(self) -> None:
         """Let the PLL lock, without a transaction while the clock changes, which would garble it (UM 2.3.2)."""
-        self._put(0x36, 0, 2, 0x0200)  # PMSC_CTRL0: clocks by themselves
+        self._write(0x36, 0, 2, 0x0200)  # PMSC_CTRL0: clocks by themselves
         for _ in range(LOCK_TRIES):
             self._bus.pause_us(100)
-            if self._get(0x0F, 0, 5)[0] & CPLOCK:
+            if self._read(0x0F, 0, 5)[0] & CPLOCK:
                 return
         raise ChipError("the DW1000's clock does not lock: is its crystal or supply sound?")
 
@@ -518,7 +509,7 @@ class DW1000:
     def transmit_at(self, dx: bytearray | memoryview, frame: bytearray | memoryview, at: int, end: int) -> int:
         """Send the PSDU ``frame[at:end]`` when the counter is at ``dx``; QUEUED, or why not.
 
-        ``dx`` has 5 bytes; its low nine bits count for nothing (UM p. 26). The stamp will be that + the TX antenna
+        ``dx`` has 5 bytes; its low nine bits are ignored (UM p. 26). The stamp will be that + the TX antenna
         delay. The last two bytes are replaced by the FCS, which the chip makes.
 
         Raises:
@@ -546,7 +537,7 @@ class DW1000:
         return self._was_in_time()
 
     def _was_in_time(self) -> int:
-        """Look whether the frame will leave when it should, and take it back if not (UM pp. 27, 91, 92).
+        """Check whether the frame will be sent at its time, and cancel it if not (UM pp. 27, 91, 92).
 
         HPDWARN: its time has passed, and it would leave after 17 s. TXPUTE: the transmitter had no time to power up;
         the stamp would be right, but the preamble is damaged. What is already out when TRXOFF comes counts as sent.
@@ -560,7 +551,7 @@ class DW1000:
         return LATE
 
     def cancel(self) -> bool:
-        """Take back a frame that has not been sent; False where it has, which the next ``poll`` will tell."""
+        """Cancel a frame that has not been sent; False where it has, which the next ``poll`` will return."""
         if self.state != SENDING:
             return True
         self._bus.write(self._off.header, self._off.data)
@@ -589,18 +580,18 @@ class DW1000:
             if seen & RX_ERRORS or status[3] & RX_ERRORS_3:
                 return events | self._recover(seen)
             if seen & RXFCG:
-                return events | self._take_frame()
+                return events | self._read_frame()
         return events
 
     def check(self) -> bool:
         """Whether the chip still has its configuration; if not it is OFF.
 
-        ``poll`` asks when SYS_STATUS looks strange. A chip whose supply failed may lock again unseen and say nothing
-        for ever, so this is to be asked now and then where nothing has come for long.
+        ``poll`` calls this when SYS_STATUS looks implausible. A chip whose supply failed may lock again unnoticed and
+        report nothing for ever, so this is to be called periodically where nothing is received for long.
         """
         if self.state == OFF:
             return False
-        if self._get(0x1F, 0, 4) == CONFIGURATION[1][3].to_bytes(4, "little"):
+        if self._read(0x1F, 0, 4) == CONFIGURATION[1][3].to_bytes(4, "little"):
             return True
         self.state = OFF
         self._listening = False
@@ -623,14 +614,14 @@ class DW1000:
         if self.state in (OFF, SENDING):
             return False
         self._off_and_clear()
-        self._put(0x28, 0x11, 1, 0x80)  # bias of the temperature sensor
-        self._put(0x28, 0x12, 1, 0x0A)  # bias of the converter
-        self._put(0x28, 0x12, 1, 0x0F)  # outputs
-        self._put(0x2A, 0x00, 1, 0x00)  # TC_SARC
-        self._put(0x2A, 0x00, 1, 0x01)
+        self._write(0x28, 0x11, 1, 0x80)  # bias of the temperature sensor
+        self._write(0x28, 0x12, 1, 0x0A)  # bias of the converter
+        self._write(0x28, 0x12, 1, 0x0F)  # outputs
+        self._write(0x2A, 0x00, 1, 0x00)  # TC_SARC
+        self._write(0x2A, 0x00, 1, 0x01)
         self._bus.pause_us(1000)
-        self._convert(self._get(0x2A, 0x03, 1)[0], self._get(0x2A, 0x04, 1)[0])
-        self._put(0x2A, 0x00, 1, 0x00)
+        self._convert(self._read(0x2A, 0x03, 1)[0], self._read(0x2A, 0x04, 1)[0])
+        self._write(0x2A, 0x00, 1, 0x00)
         if self._listening:
             self._resume()
         return True
@@ -652,7 +643,7 @@ class DW1000:
 
     def _clear(self) -> None:
         """Clear what the last reading of SYS_STATUS has shown; what came since stays."""
-        keep(self._status.data, CLEARED, 5, self._clear_status.data)
+        copy_masked(self._status.data, CLEARED, 5, self._clear_status.data)
         self._bus.write(self._clear_status.header, self._clear_status.data)
 
     def _clear_slip(self) -> None:
@@ -667,9 +658,9 @@ class DW1000:
     def _resume(self) -> None:
         """LISTENING or IDLE again, with all events forgotten."""
         self._off_and_clear()
-        self._listen_anew()
+        self._listen_again()
 
-    def _listen_anew(self) -> None:
+    def _listen_again(self) -> None:
         """Listen, or be IDLE, after an error or after the receiver was turned off, perhaps in the middle of a frame.
 
         It must be reset then, or the next stamp may be wrong (UM 4.1.6, pp. 34-35).
@@ -686,7 +677,7 @@ class DW1000:
         self._bus.transfer(self._tx_time.out, self._tx_time.into)
         self.sent = (self.sent + 1) & COUNT_MASK
         self._clear()
-        self._listen_anew()
+        self._listen_again()
         return SENT
 
     def _recover(self, status: int) -> int:
@@ -696,7 +687,7 @@ class DW1000:
         self._resume()
         return FAILED
 
-    def _take_frame(self) -> int:
+    def _read_frame(self) -> int:
         """Read a frame and all that was measured of it, and listen on."""
         bus = self._bus
         tries = LDE_TRIES
@@ -719,7 +710,7 @@ class DW1000:
         if self.measuring:
             self._read_diagnostics(info.data[2] >> 4 | info.data[3] << 4)
         else:
-            self.rx_power_cdbm = self.first_path_cdbm = self.offset_ppb = NOT_TOLD
+            self.rx_power_cdbm = self.first_path_cdbm = self.offset_ppb = NOT_MEASURED
         self.received = (self.received + 1) & COUNT_MASK
         self._clear()
         self._bus.write(self._enable.header, self._enable.data)
@@ -743,5 +734,5 @@ class DW1000:
         integrator = carrier[0] | carrier[1] << 8 | (carrier[2] & 0x1F) << 16
         self.carrier_integrator = integrator - 0x20_0000 if integrator & 0x10_0000 else integrator
         self.offset_ppb = carrier_offset_ppb(self.carrier_integrator)
-        if self.correct_bias and self.rx_power_cdbm != NOT_TOLD:
+        if self.correct_bias and self.rx_power_cdbm != NOT_MEASURED:
             add_ticks(self.rx_ticks, -bias_ticks(self.rx_power_cdbm))

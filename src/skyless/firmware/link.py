@@ -2,26 +2,16 @@
 
 A record is ``kind | number | body | CRC-16``, stuffed (COBS) and ended by a 0 byte, which occurs nowhere else. This
 file runs unchanged in MicroPython, which compiles the loops over bytes to machine code, and in CPython. Whatever is
-sent and received lives in buffers that are made once; 40-bit stamps are 5 bytes and never numbers.
+sent and received is held in buffers that are made once; 40-bit stamps are 5 bytes and never numbers.
 """
 
 try:
-    import micropython
-except ImportError:
-
-    class _Plain:
-        """Stands in for MicroPython's module where there is none."""
-
-        @staticmethod
-        def viper(function):  # noqa: ANN001, ANN205 - of any kind
-            """Leave the function as it is."""
-            return function
-
-    micropython = _Plain
-    ptr8 = bytearray
+    from skyless.firmware import micropython, ptr8
+except ImportError:  # a board, where MicroPython brings both
+    import micropython  # type: ignore[no-redef]
 
 MAJOR = 1
-"""Ends with different ones do not understand each other."""
+"""Ends with different major versions cannot work together."""
 MINOR = 0
 """Grows with fields that are appended and kinds that are added, which an older end ignores."""
 
@@ -51,8 +41,8 @@ STATUS_BYTES = 36
 CONFIG_BYTES = 13
 """Lengths of whole records, kind and number included."""
 
-NOT_TOLD = -32768
-"""A measured value that the board has not."""
+NOT_MEASURED = -32768
+"""A measured value that the board does not have."""
 NO_VOLTAGE = 0xFFFF
 
 CAN_TRANSMIT = 0x01
@@ -65,12 +55,12 @@ HAS_FRAME_WAITING = 0x04
 LATE_FOR_RADIO = 1
 LATE_BUSY = 2
 LATE_NOT_READY = 3
-"""Why a frame was not sent: its time had passed, another one waits, or the radio is not configured."""
+"""Why a frame was not sent: it was too late, another one waits, or the radio is not configured."""
 
 REFUSED_SETTING = 1
 REFUSED_MALFORMED = 2
 REFUSED_RADIO = 3
-"""Why a command was not followed."""
+"""Why a command was refused."""
 
 RATE_KHZ = 63_897_600
 COUNTER_BITS = 40
@@ -78,7 +68,7 @@ COUNT_MASK = 0x3FFF_FFFF
 """Counters wrap at 30 bits, so that they stay small integers in MicroPython."""
 
 MAX_RECORD_BYTES = 250
-"""With its check: one block of COBS, and room for later versions."""
+"""With its check: one block of COBS, with space for later versions."""
 
 
 @micropython.viper
@@ -120,7 +110,7 @@ def stuff(data: ptr8, end: int, out: ptr8) -> int:
 
 @micropython.viper
 def unstuff(data: ptr8, end: int, out: ptr8) -> int:
-    """Undo ``stuff`` for ``data[:end]``, which holds no zero; return the length, -1 where a block lacks its end."""
+    """Inverse of ``stuff`` for ``data[:end]`` without zeros; return the length, -1 where a block lacks its end."""
     at = 0
     fill = 0
     while at < end:
@@ -160,7 +150,7 @@ def copy_to_zero(source: ptr8, at: int, end: int, out: ptr8, fill: int) -> int:
 
 
 @micropython.viper
-def place(value: int, size: int, out: ptr8, fill: int) -> int:
+def write_number(value: int, size: int, out: ptr8, fill: int) -> int:
     """Write a number of up to 32 bits to ``out[fill:]``, little-endian; return where it ends there."""
     while size > 0:
         out[fill] = value & 0xFF
@@ -171,7 +161,7 @@ def place(value: int, size: int, out: ptr8, fill: int) -> int:
 
 
 def unsigned(record: bytearray, at: int, size: int) -> int:
-    """Little-endian number of so many bytes."""
+    """Little-endian number of ``size`` bytes."""
     value = 0
     while size > 0:
         size -= 1
@@ -179,14 +169,8 @@ def unsigned(record: bytearray, at: int, size: int) -> int:
     return value
 
 
-def signed16(record: bytearray, at: int) -> int:
-    """Little-endian number of two bytes with a sign."""
-    value = record[at] | record[at + 1] << 8
-    return value - 0x10000 if value & 0x8000 else value
-
-
 class Writer:
-    """Makes records; each method returns the length of what then stands in ``line``, ready to be sent."""
+    """Writes records; each method returns the length of what is then in ``line``, ready to be sent."""
 
     def __init__(self) -> None:
         self.line = bytearray(MAX_RECORD_BYTES + 3)
@@ -201,11 +185,11 @@ class Writer:
         self._number = (self._number + 1) & 0xFF
         self._fill = BODY_AT
 
-    def put(self, value: int, size: int) -> None:
+    def append(self, value: int, size: int) -> None:
         """Append a number, negative ones as their complement."""
-        self._fill = place(value, size, self._record, self._fill)
+        self._fill = write_number(value, size, self._record, self._fill)
 
-    def put_bytes(self, source: bytearray | memoryview, at: int, end: int) -> None:
+    def append_bytes(self, source: bytearray | memoryview, at: int, end: int) -> None:
         """Append ``source[at:end]``."""
         self._fill = copy(source, at, end, self._record, self._fill)
 
@@ -218,16 +202,16 @@ class Writer:
         return length
 
     def hello(self, firmware: tuple[int, int, int], device_id: bytearray, capabilities: int) -> int:
-        """Who the board is; ``device_id`` has 8 bytes."""
+        """Identity of the board; ``device_id`` has 8 bytes."""
         self.begin(HELLO)
-        self.put(MAJOR, 1)
-        self.put(MINOR, 1)
+        self.append(MAJOR, 1)
+        self.append(MINOR, 1)
         for part in firmware:
-            self.put(part, 1)
-        self.put_bytes(device_id, 0, 8)
-        self.put(RATE_KHZ, 4)
-        self.put(COUNTER_BITS, 1)
-        self.put(capabilities, 1)
+            self.append(part, 1)
+        self.append_bytes(device_id, 0, 8)
+        self.append(RATE_KHZ, 4)
+        self.append(COUNTER_BITS, 1)
+        self.append(capabilities, 1)
         return self.end()
 
     def rx(
@@ -241,25 +225,25 @@ class Writer:
     ) -> int:
         """A frame ``frame[:frame_end]``, its stamp, powers in 0.01 dBm, the sender's carrier offset in 1e-9."""
         self.begin(RX)
-        self.put_bytes(ticks, 0, 5)
-        self.put(rx_power_cdbm, 2)
-        self.put(first_path_cdbm, 2)
-        self.put(offset_ppb, 2)
-        self.put_bytes(frame, 0, frame_end)
+        self.append_bytes(ticks, 0, 5)
+        self.append(rx_power_cdbm, 2)
+        self.append(first_path_cdbm, 2)
+        self.append(offset_ppb, 2)
+        self.append_bytes(frame, 0, frame_end)
         return self.end()
 
     def tx_done(self, dx: bytearray, ticks: bytearray | memoryview) -> int:
         """The frame of ``dx`` has left with this 5-byte TX stamp."""
         self.begin(TX_DONE)
-        self.put_bytes(dx, 0, 5)
-        self.put_bytes(ticks, 0, 5)
+        self.append_bytes(dx, 0, 5)
+        self.append_bytes(ticks, 0, 5)
         return self.end()
 
     def tx_late(self, dx: bytearray, reason: int) -> int:
         """The frame of ``dx`` was not sent."""
         self.begin(TX_LATE)
-        self.put_bytes(dx, 0, 5)
-        self.put(reason, 1)
+        self.append_bytes(dx, 0, 5)
+        self.append(reason, 1)
         return self.end()
 
     def status(
@@ -267,59 +251,59 @@ class Writer:
         ticks: bytearray | memoryview,
         state: int,
         counts: list[int],
-        temperature_cc: int = NOT_TOLD,
+        temperature_cc: int = NOT_MEASURED,
         millivolts: int = NO_VOLTAGE,
     ) -> int:
         """Counter now, state, and ``counts``: received, errors, sent, late, garbled commands, records not sent."""
         self.begin(STATUS)
-        self.put_bytes(ticks, 0, 5)
-        self.put(state, 1)
+        self.append_bytes(ticks, 0, 5)
+        self.append(state, 1)
         for count in counts:
-            self.put(count & COUNT_MASK, 4)
-        self.put(temperature_cc, 2)
-        self.put(millivolts, 2)
+            self.append(count & COUNT_MASK, 4)
+        self.append(temperature_cc, 2)
+        self.append(millivolts, 2)
         return self.end()
 
     def refused(self, kind: int, reason: int) -> int:
-        """The board does not follow a command of that kind."""
+        """A command of that kind was refused."""
         self.begin(REFUSED)
-        self.put(kind, 1)
-        self.put(reason, 1)
+        self.append(kind, 1)
+        self.append(reason, 1)
         return self.end()
 
     def ask(self, kind: int) -> int:
-        """A command without parameters: ``ASK_STATUS`` or ``RX_ON``; and ``ASK_HELLO``, which tells our version."""
+        """A command without parameters: ``ASK_STATUS`` or ``RX_ON``; and ``ASK_HELLO``, which states our version."""
         self.begin(kind)
         if kind == ASK_HELLO:
-            self.put(MAJOR, 1)
-            self.put(MINOR, 1)
+            self.append(MAJOR, 1)
+            self.append(MINOR, 1)
         return self.end()
 
     def config(self, tx_antenna_delay: int, rx_antenna_delay: int) -> int:
         """Channel 5, 64 MHz PRF, 6.8 Mbit/s, preamble of 128 symbols with code 9; antenna delays in ticks."""
         self.begin(CONFIG)
-        self.put(5, 1)
-        self.put(64, 1)
-        self.put(2, 1)
-        self.put(9, 1)
-        self.put(128, 2)
-        self.put(tx_antenna_delay, 2)
-        self.put(rx_antenna_delay, 2)
-        self.put(0, 1)
+        self.append(5, 1)
+        self.append(64, 1)
+        self.append(2, 1)
+        self.append(9, 1)
+        self.append(128, 2)
+        self.append(tx_antenna_delay, 2)
+        self.append(rx_antenna_delay, 2)
+        self.append(0, 1)
         return self.end()
 
     def tx_at(self, dx: bytearray, frame: bytearray, frame_end: int) -> int:
         """Send ``frame[:frame_end]`` so that its RMARKER leaves the radio at the 5-byte ``dx``."""
         self.begin(TX_AT)
-        self.put_bytes(dx, 0, 5)
-        self.put_bytes(frame, 0, frame_end)
+        self.append_bytes(dx, 0, 5)
+        self.append_bytes(frame, 0, frame_end)
         return self.end()
 
 
 class Reader:
     """Finds the records in a stream of bytes that may hold anything.
 
-    ``record[:length]`` is the one that ``take`` came upon, without its check; ``length`` is 0 where it found none.
+    ``record[:length]`` is the one that ``read`` found, without its check; ``length`` is 0 where it found none.
     ``garbled`` counts stretches between two zeros that are no record, ``overlong`` those that no record can be.
     """
 
@@ -332,12 +316,12 @@ class Reader:
         self._fill = 0
         self._skipping = False
 
-    def take(self, data: bytearray, at: int, end: int) -> int:
-        """Take ``data[at:end]`` up to the end of the next record; return up to where that was."""
+    def read(self, data: bytearray, at: int, end: int) -> int:
+        """Process ``data[at:end]`` up to the end of the next record; return where that is."""
         self.length = 0
         while at < end:
-            room = len(self._line) - self._fill
-            limit = end if end - at <= room else at + room
+            free = len(self._line) - self._fill
+            limit = end if end - at <= free else at + free
             stop = copy_to_zero(data, at, limit, self._line, self._fill)
             self._fill += stop - at
             at = stop
@@ -354,7 +338,7 @@ class Reader:
         return at
 
     def _finish(self) -> None:
-        """See whether what stands before a zero is a record."""
+        """Check whether the bytes before a zero are a record."""
         fill = self._fill
         self._fill = 0
         if self._skipping:

@@ -3,8 +3,8 @@
 from collections import deque
 from typing import Final
 
+from skyless.air.beacon import Malformed
 from skyless.air.codec import decode_cached
-from skyless.air.malformed import Malformed
 from skyless.mqtt.messages import Phase
 
 _MOST: Final = 4096

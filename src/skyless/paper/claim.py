@@ -10,7 +10,7 @@ from skyless.kernels.arrays import Array
 from skyless.paper.listening import listen
 from skyless.paper.plan import CLAIM_M, DW1000_PS, P1, PAPER_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict, grouped
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 

@@ -11,7 +11,7 @@ from skyless.evaluation.plot_style import INK, METHOD_COLOURS, panel
 from skyless.paper.plan import RADIO_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict
 from skyless.receiver import Receiver
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World

@@ -15,7 +15,7 @@ from skyless.kernels.arrays import Array, Integers
 from skyless.paper.plan import P1, RADIO_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict, grouped
 from skyless.receiver import Receiver
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
 from skyless.simulation.world import World

@@ -9,8 +9,7 @@ from skyless.constants import TICK_M
 from skyless.kernels.arrays import Array
 from skyless.paper.plan import RADIO_PS, Place
 from skyless.simulation.channel import ChannelModel, power_bias_m, received_power_dbm
-from skyless.simulation.impairments import DelayError, Impairments
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import DelayError, Impairments, lab_impairments
 from skyless.site.lab import ideal_lab_site
 
 DELAY_STD_M: Final = 0.05

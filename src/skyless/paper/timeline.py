@@ -13,12 +13,10 @@ from skyless.evaluation.plot_style import GREEN, GRID, INK, METHOD_COLOURS, MUTE
 from skyless.paper.plan import RADIO_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict
 from skyless.receiver import Receiver
-from skyless.simulation.broadcast import Broadcast
-from skyless.simulation.impairments import Outage
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import Outage, lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
+from skyless.simulation.world import Broadcast, World
 from skyless.site.lab import ideal_lab_site
 from skyless.site.slots import schedule_of
 

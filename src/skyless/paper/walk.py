@@ -11,7 +11,7 @@ from skyless.paper.dop_map import ANCHORS_M, literal_covariance_m2
 from skyless.paper.listening import Track, listen
 from skyless.paper.plan import RADIO_PS, Plan, Progress, Results, Task
 from skyless.paper.section import Panel, Section, Verdict, grouped
-from skyless.simulation.lab_scenario import lab_impairments
+from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Waypoints
 from skyless.site.lab import ideal_lab_site
 from skyless.uncertainty.dop import dops_at

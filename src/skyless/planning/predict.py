@@ -28,7 +28,7 @@ from skyless.planning.snapshot_sigma import fill_snapshot_sigma, rounds_of
 from skyless.positioning.methods.factory import estimator_settings
 from skyless.positioning.methods.snapshots import SnapshotMethod
 from skyless.simulation.channel import ChannelModel, pack_walls
-from skyless.site.almanac_sending import filter_pages_of
+from skyless.site.almanac_pages import filter_pages_of
 from skyless.site.model import Site
 from skyless.site.slots import schedule_of
 

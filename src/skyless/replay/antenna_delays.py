@@ -6,9 +6,8 @@ clock rests on its RX stamps of the master and on the master's TX stamps, so its
 
 from msgspec import Struct, structs
 
-from skyless.air.beacon import Beacon
+from skyless.air.beacon import Beacon, Malformed
 from skyless.air.codec import decode_cached, encode
-from skyless.air.malformed import Malformed
 from skyless.air.reception import Reception
 from skyless.site.model import Site
 from skyless.ticks import wrap

@@ -1,1 +1,1 @@
-"""The emulated radio world: oscillators, channel, ether and moving tags, deterministic by seed."""
+"""The emulated radio world: oscillators, channel, medium and moving tags, deterministic by seed."""

@@ -22,10 +22,10 @@ LINE_OF_SIGHT_FIRST_PATH_DB: Final = 2.0
 """How far the first path's power lies below the total with a clear line of sight (assumed)."""
 
 BLOCKED_FIRST_PATH_DB: Final = 8.0
-"""And how much further where the message came late or through a wall: as far as metal lowers it."""
+"""How much further it lies below where the message is late or crossed a wall: as far as metal lowers it."""
 
 FIRST_PATH_SCALE_M: Final = 0.1
-"""Messages that are later by little lower it by less, 1/e short of that at this: 5 cm show nothing."""
+"""Delay at which the first path has lost all but 1/e of that; shorter delays lower it by less."""
 
 _POWER_BIAS_CM: Final = (
     -11.0, -10.5, -10.0, -9.3, -8.2, -6.9, -5.1, -2.7, 0.0, 2.1, 3.5, 4.2, 4.9, 6.2, 7.1, 7.6, 8.1, 8.6,
@@ -36,7 +36,7 @@ _POWER_BIAS_STEP_DB: Final = 2.0
 
 
 class ChannelModel(Struct, frozen=True, forbid_unknown_fields=True):
-    """The air of a site, and how its receivers fail."""
+    """Propagation at a site, and how its receivers fail."""
 
     tx_power_dbm: float = -14.3
     """Power sent, antenna gains included (EIRP)."""
@@ -49,13 +49,13 @@ class ChannelModel(Struct, frozen=True, forbid_unknown_fields=True):
     loss_probability: float = 0.0
     """Chance of losing any message at any listener."""
     nlos_probability: float = 0.0
-    """Chance that a message comes late, at any tag."""
+    """Chance that a message is late, at any tag."""
     nlos_mean_m: float = 1.0
     """Mean of the exponential delay of such a message."""
     nlos_between_anchors: bool = False
-    """Whether anchors, too, hear each other late."""
+    """Whether messages between anchors are late, too."""
     walls_between_anchors: bool = True
-    """Whether walls make anchors, too, hear each other late; they weaken all messages either way."""
+    """Whether walls delay messages between anchors, too; they weaken all messages either way."""
     power_bias: bool = False
     """Whether RX stamps carry the power-dependent bias (APS011, 500 MHz, PRF 64 MHz)."""
     power_noise_db: float = 0.5
@@ -64,13 +64,13 @@ class ChannelModel(Struct, frozen=True, forbid_unknown_fields=True):
     """Of the reported carrier offset (assumed: the resolution of RX_TTCKO)."""
 
 
-CHANNEL: Final = np.dtype([(field.name, np.float64) for field in structs.fields(ChannelModel)])
+CHANNEL_RECORD: Final = np.dtype([(field.name, np.float64) for field in structs.fields(ChannelModel)])
 """A ``ChannelModel`` for the kernels; switches are 0 or 1."""
 
 
 def pack_channel(model: ChannelModel) -> Records:
     """Return the model for the kernels, shape (1,)."""
-    return np.array([structs.astuple(model)], dtype=CHANNEL)
+    return np.array([structs.astuple(model)], dtype=CHANNEL_RECORD)
 
 
 def pack_walls(walls: tuple[WallSite, ...]) -> Array:
@@ -104,16 +104,16 @@ def received_power_dbm(tx_power_dbm: float, distance_m: float, loss_db: float) -
 @part
 def power_bias_m(rx_power_dbm: float) -> float:
     """Range bias of an RX stamp by received power (APS011 in docs/radio.md): straight lines, held beyond the ends."""
-    place = (_POWER_BIAS_FIRST_DBM - rx_power_dbm) / _POWER_BIAS_STEP_DB
-    place = min(max(place, 0.0), _POWER_BIAS_M.shape[0] - 1.0)
-    low = min(int(place), _POWER_BIAS_M.shape[0] - 2)
-    bias_m: float = _POWER_BIAS_M[low] + (place - low) * (_POWER_BIAS_M[low + 1] - _POWER_BIAS_M[low])
+    position = (_POWER_BIAS_FIRST_DBM - rx_power_dbm) / _POWER_BIAS_STEP_DB
+    position = min(max(position, 0.0), _POWER_BIAS_M.shape[0] - 1.0)
+    low = min(int(position), _POWER_BIAS_M.shape[0] - 2)
+    bias_m: float = _POWER_BIAS_M[low] + (position - low) * (_POWER_BIAS_M[low + 1] - _POWER_BIAS_M[low])
     return bias_m
 
 
 @part
 def first_path_loss_db(extra_m: float) -> float:
-    """How far the first path's power lies below the total for a message that comes so much late, or early."""
+    """How far the first path's power lies below the total for a message that is ``extra_m`` late."""
     late = 1.0 - math.exp(-max(extra_m, 0.0) / FIRST_PATH_SCALE_M)
     return LINE_OF_SIGHT_FIRST_PATH_DB + BLOCKED_FIRST_PATH_DB * late
 

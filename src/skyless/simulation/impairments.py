@@ -1,4 +1,4 @@
-"""All that is not ideal in a world, as one value."""
+"""Everything that is not ideal in a world, as one value."""
 
 import math
 
@@ -10,7 +10,7 @@ from skyless.simulation.range_errors import RangeErrorModel
 
 
 class AnchorBias(Struct, frozen=True, forbid_unknown_fields=True):
-    """An obstacle near an anchor: the tags hear it late, always or in bursts."""
+    """An obstacle near an anchor: tags receive it late, always or in bursts."""
 
     anchor: int
     bias_m: float
@@ -20,7 +20,7 @@ class AnchorBias(Struct, frozen=True, forbid_unknown_fields=True):
     """Time between bursts; the first burst begins after one pause."""
     from_s: float = 0.0
     to_s: float = math.inf
-    """With ``from_s``: the true time in which there is a bias, or bursts of it, at all."""
+    """With ``from_s``: the interval of true time that has a bias, or bursts of it."""
 
     def active_m(self, t_s: float) -> float:
         """Bias at a true time, 0 between bursts."""
@@ -40,7 +40,7 @@ class DelayError(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AnchorDisplacement(Struct, frozen=True, forbid_unknown_fields=True):
-    """True minus told position of an anchor: frames fly from and to the true one, machines know the told one."""
+    """True minus configured position of an anchor: frames travel from and to the true one, machines know the other."""
 
     anchor: int
     x_m: float = 0.0
@@ -49,7 +49,7 @@ class AnchorDisplacement(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WarmUp(Struct, frozen=True, forbid_unknown_fields=True):
-    """A crystal whose frequency changes, beside all else, by ppm·(1 − exp(−(t − start_s)/tau_s)) from a time on.
+    """A crystal whose frequency changes, besides all else, by ppm·(1 − exp(−(t − start_s)/tau_s)) from a time on.
 
     Raises:
         ValueError: the time constant is not more than 0.
@@ -59,7 +59,7 @@ class WarmUp(Struct, frozen=True, forbid_unknown_fields=True):
     tau_s: float
     start_s: float = 0.0
     anchor: int | None = None
-    """Whose crystal; None for those of all tags. A second one of the same crystal takes the place of the first."""
+    """Whose crystal; None for those of all tags. A second one of the same crystal replaces the first."""
 
     def __post_init__(self) -> None:
         if not self.tau_s > 0.0:
@@ -67,7 +67,7 @@ class WarmUp(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Body(Struct, frozen=True, forbid_unknown_fields=True):
-    """Whoever carries a tag: late at every tag are the anchors in a sector that turns with the tag's motion."""
+    """A person who carries each tag: anchors in a sector that turns with the tag's motion are received late."""
 
     delay_m: float = 0.2
     sector_rad: float = math.radians(100.0)
@@ -108,3 +108,12 @@ class Impairments(Struct, frozen=True, forbid_unknown_fields=True):
     warm_ups: tuple[WarmUp, ...] = ()
     diagnostics: bool = False
     """Whether receptions carry power and carrier offset."""
+
+
+def lab_impairments(noise_ps: float) -> Impairments:
+    """Return the world of the scenario ``lab`` (``docs/maths.md`` section 5), for the site of ``skyless.site.lab``.
+
+    Crystals of ±10 ppm with white FM 2·10⁻¹¹ and random-walk FM 10⁻⁹/√s, Gaussian noise of ``noise_ps`` on every TX
+    and every RX stamp, stamps rounded to ticks, no loss and no obstacle.
+    """
+    return Impairments(tx_stamp_ps=noise_ps, rx_stamp_ps=noise_ps)

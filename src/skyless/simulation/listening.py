@@ -1,11 +1,12 @@
-"""Who hears a frame, when by its own clock, and why not: one compiled step over all nodes.
+"""Which nodes receive a frame, with which stamp, and why others do not: one compiled step over all nodes.
 
-A node that sends hears nothing meanwhile (half duplex). Frames that overlap at a listener destroy each other,
+A node that sends receives nothing meanwhile (half duplex). Frames that overlap at a listener destroy each other,
 unless one is stronger than every other by the capture margin; real receivers that locked on the weaker one first
-would lose both, and that is not modelled.
+would lose both, which is not modelled.
 """
 
 import math
+from enum import StrEnum
 from typing import Final
 
 import numpy as np
@@ -20,20 +21,31 @@ from skyless.simulation.channel import (
     power_bias_m,
     received_power_dbm,
 )
-from skyless.simulation.ether import OUTCOMES, Outcome
 from skyless.simulation.oscillator import advance, clock_rate
 from skyless.simulation.range_errors import slope_error_m
 from skyless.simulation.stations import body_m, coordinate_m, velocity_mps
 from skyless.simulation.streams import draw_normal, draw_uniform
 from skyless.ticks import TICK_MASK
 
+
+class Outcome(StrEnum):
+    """What became of a frame at a listener; the values are shown in reports."""
+
+    HEARD = "heard"
+    WEAK = "below-sensitivity"
+    HALF_DUPLEX = "half-duplex"
+    COLLISION = "collision"
+    LOST = "message-loss"
+
+
+OUTCOMES: Final = tuple(Outcome)
 _HEARD: Final = OUTCOMES.index(Outcome.HEARD)
 _WEAK: Final = OUTCOMES.index(Outcome.WEAK)
 _HALF_DUPLEX: Final = OUTCOMES.index(Outcome.HALF_DUPLEX)
 _COLLISION: Final = OUTCOMES.index(Outcome.COLLISION)
 _LOST: Final = OUTCOMES.index(Outcome.LOST)
 
-RECEIVED: Final = np.dtype(
+RECEPTION_RECORD: Final = np.dtype(
     [
         ("node", np.int64),
         ("rx_ticks", np.int64),  # the listener's 40-bit counter
@@ -45,7 +57,7 @@ RECEIVED: Final = np.dtype(
     ],
     align=True,
 )
-"""One frame at one node that heard it; position and velocity are the truth at the frame's emission."""
+"""One frame at one node that received it; position and velocity are the true ones at the frame's emission."""
 
 
 @kernel
@@ -80,7 +92,7 @@ def link(
 
 
 @part
-def overlapped(
+def overlap_outcome(
     stations: Records,
     channel: Records,
     walls: Array,
@@ -110,7 +122,7 @@ def overlapped(
 
 
 @part
-def received(channel: Records, normals: Array, cursors: Integers, node: int, power_dbm: float) -> int:
+def reception_outcome(channel: Records, normals: Array, cursors: Integers, node: int, power_dbm: float) -> int:
     """Outcome at a listener of power and chance: heard, weak or lost. Draws only where chance decides."""
     sensitivity_dbm, width_db = channel[0]["sensitivity_dbm"], channel[0]["sensitivity_width_db"]
     margin = (power_dbm - sensitivity_dbm) / width_db
@@ -127,7 +139,7 @@ def received(channel: Records, normals: Array, cursors: Integers, node: int, pow
 
 
 @part
-def late_m(
+def extra_path_m(
     stations: Records,
     channel: Records,
     normals: Array,
@@ -166,8 +178,8 @@ def stamp(
 
 
 @part
-def place(stations: Records, node: int, t_s: float, row: np.void) -> None:
-    """Fill in where a listener truly was and how it moved."""
+def fill_truth(stations: Records, node: int, t_s: float, row: np.void) -> None:
+    """Fill in the true position and velocity of a listener."""
     row["node"] = node
     for axis in range(3):
         row["position_m"][axis] = coordinate_m(stations, node, axis, t_s)
@@ -195,7 +207,7 @@ def measure(
 
 
 @kernel
-def hear(
+def receive_frame(
     clocks: Records,
     normals: Array,
     cursors: Integers,
@@ -214,12 +226,12 @@ def hear(
     heard: Records,
     tally: Integers,
 ) -> tuple[int, int, int]:
-    """Let every node that is on listen to one frame.
+    """Let every node that is on receive one frame, or lose it.
 
     ``span_s`` is the frame's begin and end from its RMARKER, ``others`` as from ``OnAir.others``, ``range_errors_m``
     has shape (nodes, anchors), and ``slope_m`` is that of ``RangeErrorModel``. Fills ``heard``
-    (``RECEIVED``, one row a node that heard it) and counts into ``tally``, shape (2, outcomes), anchors and tags.
-    Returns how many anchors and how many nodes heard it, and the highest cursor.
+    (``RECEPTION_RECORD``, one row a node that received it) and counts into ``tally``, shape (2, outcomes), for anchors
+    and tags. Returns how many anchors and how many nodes received it, and the highest cursor.
     """
     t_s = (emission_ticks + emission_fraction) * TICK_S
     anchors, count, highest = 0, 0, 0
@@ -230,14 +242,16 @@ def hear(
         distance_m, extra_m, power_dbm, range_rate_mps = link(stations, channel, walls, sender, node, t_s)
         flight_s = (distance_m + extra_m) / SPEED_OF_LIGHT_MPS
         arrival_s = (span_s[0] + flight_s, span_s[1] + flight_s)
-        outcome = overlapped(stations, channel, walls, others, node, t_s, arrival_s, power_dbm)
+        outcome = overlap_outcome(stations, channel, walls, others, node, t_s, arrival_s, power_dbm)
         if outcome == _HEARD:
-            outcome = received(channel, normals, cursors, node, power_dbm)
+            outcome = reception_outcome(channel, normals, cursors, node, power_dbm)
         tally[station["is_tag"], outcome] += 1
         if outcome == _HEARD:
             row = heard[count]
-            place(stations, node, t_s, row)
-            extra_m += late_m(stations, channel, normals, cursors, node, bias_m) + body_m(stations, sender, node, t_s)
+            fill_truth(stations, node, t_s, row)
+            extra_m += extra_path_m(stations, channel, normals, cursors, node, bias_m) + body_m(
+                stations, sender, node, t_s
+            )
             error_m = range_errors_m[node, sender]
             if station["is_tag"] != 0:
                 error_m += slope_error_m(slope_m, distance_m)

@@ -1,62 +1,171 @@
-"""The medium: true time, the nodes' clocks and radios, and the frames that fly between them.
+"""The medium: true time, the nodes' clocks and radios, and the frames between them.
 
-A frame has two events: its RMARKER leaves, and it ends, when the listeners get it. The emulated radio takes the low
-nine bits off DX = TX stamp - configured antenna delay, as the DW1000 does, so a node that ignores the granularity
-sends with a wrong stamp. Who sends what and when is the affair of the medium's owner.
+A frame has two events: its RMARKER leaves, and it ends, when the listeners get it. The emulated radio clears the low
+nine bits of DX = TX stamp - configured antenna delay, as the DW1000 does, so a node that ignores the granularity
+sends with a wrong stamp. Who sends what and when is decided by the medium's owner.
 """
 
+import heapq
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, Generic, TypeVar
 
 import numpy as np
+from msgspec import Struct
 
-from skyless.air.airtime import after_rmarker_s, preamble_s
+from skyless.air.ieee802154 import after_rmarker_s, preamble_s
 from skyless.air.reception import Transmission
-from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_S
-from skyless.kernels.arrays import Records
-from skyless.simulation.broadcast import Tally, make_tally
+from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
+from skyless.kernels.arrays import Array, Integers, Records
 from skyless.simulation.channel import pack_channel, pack_walls
-from skyless.simulation.ether import OUTCOMES, Flight, OnAir
 from skyless.simulation.impairments import Impairments
-from skyless.simulation.listening import RECEIVED, hear
+from skyless.simulation.listening import OUTCOMES, RECEPTION_RECORD, receive_frame
 from skyless.simulation.oscillator import advance, emit, foresee, make_clocks, restart_counter, warm_up
 from skyless.simulation.range_errors import RangeErrors
 from skyless.simulation.stations import TagSpec, make_stations, set_piece
 from skyless.simulation.streams import ANCHOR_KEY, TAG_KEY, Streams, stream
-from skyless.simulation.timeline import Timeline
 from skyless.site.model import Site
 from skyless.ticks import difference, from_seconds, wrap
 
 TURNAROUND_S: Final = 0.2e-3
 """What a host needs to hand a frame to its radio; a preamble that should begin earlier is too late (HPDWARN).
 
-Longer than any frame after its RMARKER (177 µs), so that all that overlap it are known when the RMARKER leaves.
+Longer than any frame after its RMARKER (177 µs), so that all frames that overlap it are known when the RMARKER leaves.
 """
 
 _TURNAROUND_TICKS: Final = from_seconds(TURNAROUND_S)
 _PREAMBLE_TICKS: Final = from_seconds(preamble_s())
 _DX_MASK: Final = ~(DELAYED_TX_GRANULARITY_TICKS - 1)
 
-Told = TypeVar("Told")
+_NO_OTHERS: Final = np.empty((0, 3))
+_KEPT_TICKS: Final = round(2e-3 * TICK_RATE_HZ)
+_FARTHEST_TICKS: Final = round(10e-6 * TICK_RATE_HZ)
+"""Flight times up to 10 µs (3 km) may turn neighbours on the air into an overlap."""
+
+Result = TypeVar("Result")
+
+
+class Timeline(Generic[Result]):
+    """Events in the order of true time (whole ideal ticks); those of one tick in the order of their planning."""
+
+    def __init__(self) -> None:
+        self.now_ticks = 0
+        self._serial = self._until_ticks = 0
+        self._events: list[tuple[int, int, Callable[[], Result | None]]] = []
+
+    @property
+    def next_ticks(self) -> int | None:
+        """When the next event happens; None while nothing is planned."""
+        return self._events[0][0] if self._events else None
+
+    def at(self, ticks: int, happen: Callable[[], Result | None]) -> None:
+        """Plan an event; one in the past happens now."""
+        self._serial += 1
+        heapq.heappush(self._events, (max(ticks, self.now_ticks), self._serial, happen))
+
+    def pass_to(self, ticks: int) -> bool:
+        """Let time pass up to ``ticks`` at once if no event and no end of ``run`` lies before; whether it did."""
+        if ticks > self._until_ticks or (self._events and self._events[0][0] <= ticks):
+            return False
+        self.now_ticks = max(self.now_ticks, ticks)
+        return True
+
+    def run(self, until_ticks: int) -> Iterator[Result]:
+        """Run all events up to a time, and yield their results."""
+        self._until_ticks = until_ticks
+        while self._events and self._events[0][0] <= until_ticks:
+            self.now_ticks, _, happen = heapq.heappop(self._events)
+            result = happen()
+            if result is not None:
+                yield result
+        self.now_ticks = max(self.now_ticks, until_ticks)
+
+
+@dataclass(slots=True, eq=False)
+class Flight:
+    """One frame on its way; times are true time in whole ticks."""
+
+    sender: int
+    """Node that sends."""
+    boot: int
+    """How often the sender had been switched on, so that a frame from before a restart is not sent."""
+    frame: bytes
+    marker_local_ticks: int
+    """Sender's unwrapped counter when the RMARKER leaves, noise and delay error apart."""
+    begin_ticks: int
+    """Start of the preamble."""
+    marker_ticks: int
+    end_ticks: int
+    emission_ticks: int = 0
+    emission_fraction: float = 0.0
+    """With ``emission_ticks``: when the RMARKER really left."""
+
+
+class OnAir:
+    """The frames that are, were lately, or will soon be on the air."""
+
+    def __init__(self) -> None:
+        self._flights: deque[Flight] = deque()
+
+    def add(self, flight: Flight, now_ticks: int) -> None:
+        """Add a frame; those that ended long ago are removed."""
+        while self._flights and self._flights[0].end_ticks < now_ticks - _KEPT_TICKS:
+            self._flights.popleft()
+        self._flights.append(flight)
+
+    def withdraw(self, flight: Flight) -> None:
+        """Remove a frame that will not be sent."""
+        self._flights.remove(flight)
+
+    def others(self, flight: Flight) -> Array:
+        """Frames that may overlap this one, shape (n, 3): sending node, begin and end in s from this RMARKER."""
+        first, last = flight.begin_ticks - _FARTHEST_TICKS, flight.end_ticks + _FARTHEST_TICKS
+        rows = [
+            (
+                other.sender,
+                (other.begin_ticks - flight.marker_ticks) * TICK_S,
+                (other.end_ticks - flight.marker_ticks) * TICK_S,
+            )
+            for other in self._flights
+            if other is not flight and other.begin_ticks <= last and other.end_ticks >= first
+        ]
+        return np.array(rows) if rows else _NO_OTHERS
+
+
+class Tally(Struct, frozen=True):
+    """Counts of a world so far."""
+
+    transmissions: int
+    late_transmissions: int
+    """Frames that were too late and not sent."""
+    at_anchors: dict[str, int]
+    """Outcomes (``Outcome``) of frames at anchors that were on."""
+    at_tags: dict[str, int]
+
+
+def make_tally(transmissions: int, late: int, counts: Integers) -> Tally:
+    """Tally from the kernels' counts, shape (2, outcomes)."""
+    at_anchors, at_tags = (dict(zip((str(o) for o in OUTCOMES), row.tolist(), strict=True)) for row in counts)
+    return Tally(transmissions, late, at_anchors, at_tags)
 
 
 @dataclass(slots=True, eq=False)
 class Delivery:
-    """A frame that has just ended, and the rows (``RECEIVED``) of the nodes that heard it."""
+    """A frame that has just ended, and the rows (``RECEPTION_RECORD``) of the nodes that received it."""
 
     flight: Flight
     by_anchors: Records
     by_tags: Records
 
 
-class Medium(Generic[Told]):
+class Medium(Generic[Result]):
     """A site's air, deterministic by its seed; memory stays flat however long it runs.
 
     Nodes are numbered: the site's anchors in the order of its file, then the tags; all are off at first. A node's noise
-    depends on the seed and on its own key alone: more tags do not change what the others hear.
+    depends on the seed and on its own key alone: more tags do not change what the others receive.
     """
 
     def __init__(
@@ -65,9 +174,9 @@ class Medium(Generic[Told]):
         tags: Sequence[TagSpec],
         impairments: Impairments,
         seed: int,
-        deliver: Callable[[Delivery], Told | None],
+        deliver: Callable[[Delivery], Result | None],
     ) -> None:
-        """``deliver`` is given every frame when it ends; what it returns comes out of ``run``.
+        """``deliver`` is called with every frame when it ends; ``run`` yields what it returns.
 
         Raises ValueError when an impairment names an anchor that the site has not.
         """
@@ -89,11 +198,11 @@ class Medium(Generic[Told]):
         self.boots = [0] * len(keys)
         """How often each node was switched off."""
         self._air = OnAir()
-        self._heard = np.zeros(len(keys), dtype=RECEIVED)
+        self._received = np.zeros(len(keys), dtype=RECEPTION_RECORD)
         self._counts = np.zeros((2, len(OUTCOMES)), dtype=np.int64)
         self._transmissions = self._late = 0
         self._deliver = deliver
-        self.timeline: Timeline[Told] = Timeline()
+        self.timeline: Timeline[Result] = Timeline()
 
     @property
     def tally(self) -> Tally:
@@ -105,19 +214,19 @@ class Medium(Generic[Told]):
         """True time that has passed."""
         return self.timeline.now_ticks * TICK_S
 
-    def run(self, until_s: float) -> Iterator[Told]:
+    def run(self, until_s: float) -> Iterator[Result]:
         """Let true time pass up to ``until_s``. Can be called again."""
         return self.timeline.run(from_seconds(until_s))
 
     # Power
 
     def switch_off(self, node: int) -> None:
-        """Take a node off the air; a frame of its whose RMARKER has not left is not sent."""
+        """Switch a node off; its frame is not sent if the RMARKER has not left."""
         self.stations[node]["on"] = 0
         self.boots[node] += 1
 
     def switch_on(self, node: int) -> None:
-        """Put a node on the air, with a new counter unless time has only begun."""
+        """Switch a node on, with a new counter except at time 0."""
         self.stations[node]["on"] = 1
         if self.timeline.now_ticks > 0:
             restart_counter(self.clocks, node, self._setups[node])
@@ -145,7 +254,7 @@ class Medium(Generic[Told]):
     # Tags
 
     def _move_tags(self, t_s: float) -> None:
-        """Take the next piece of every trajectory whose present one has ended."""
+        """Set the next piece of every trajectory whose present one has ended."""
         for tag in np.flatnonzero(self._piece_ends_s <= t_s).tolist():
             piece = self._tags[tag].trajectory.piece(t_s)
             set_piece(self.stations, len(self._anchors) + tag, piece)
@@ -171,7 +280,7 @@ class Medium(Generic[Told]):
         return True
 
     def _radiate(self, flight: Flight) -> None:
-        """Let the RMARKER leave, and every node that can hear the frame stamp it."""
+        """Let the RMARKER leave, and every node that can receive the frame stamp it."""
         node, streams = flight.sender, self._streams
         if flight.boot != self.boots[node]:
             self._air.withdraw(flight)
@@ -184,8 +293,8 @@ class Medium(Generic[Told]):
         flight.emission_ticks, flight.emission_fraction = ticks, fraction
         t_s = ticks * TICK_S
         self._move_tags(t_s)
-        self.range_errors.pass_to(t_s, self.stations)
-        anchors, count, highest = hear(
+        self.range_errors.advance_to(t_s, self.stations)
+        anchors, count, highest = receive_frame(
             self.clocks,
             normals,
             cursors,
@@ -201,12 +310,12 @@ class Medium(Generic[Told]):
             self.range_errors.present_m,
             self._impairments.range_errors.slope_m,
             self._impairments.diagnostics,
-            self._heard,
+            self._received,
             self._counts,
         )
         streams.refill(highest)
         self._transmissions += 1
-        delivery = Delivery(flight, self._heard[:anchors].copy(), self._heard[anchors:count].copy())
+        delivery = Delivery(flight, self._received[:anchors].copy(), self._received[anchors:count].copy())
         self.timeline.at(flight.end_ticks, partial(self._deliver, delivery))
 
     def _bias_m(self, node: int, t_s: float) -> float:

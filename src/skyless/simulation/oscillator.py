@@ -1,8 +1,8 @@
 """Crystal oscillators and the 40-bit counters that they drive.
 
-A node's state is where its counter stands at one instant of true time. Both are a whole number of ticks and a
+A node's state is its counter's value at one instant of true time. Both are a whole number of ticks and a
 fraction: true time counts ideal ticks from the start of the world, the counter is kept unwrapped, so that
-nothing is lost over months (``docs/maths.md`` section 3).
+no precision is lost over months (``docs/maths.md`` section 3).
 
 The noise is the two-state model, sampled exactly between any two instants dt apart: phase and fractional
 frequency gain a normal pair of covariance [[q_w dt + q_rw dt³/3, q_rw dt²/2], [q_rw dt²/2, q_rw dt]], with

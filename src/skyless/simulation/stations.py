@@ -1,4 +1,4 @@
-"""Where the nodes of a world are and how good their radios are, as the kernels see it."""
+"""Positions, motion and radio noise of a world's nodes, as records for the kernels."""
 
 import math
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ from skyless.site.model import AnchorSite
 
 
 class TagSpec(Struct, frozen=True):
-    """A tag of a world; what it computes is its owner's affair."""
+    """A tag of a world, without what it computes."""
 
     trajectory: Trajectory
     rx_delay_error_ticks: float = 0.0
     """True minus configured antenna delay."""
     outages: tuple[Outage, ...] = ()
     range_errors_m: tuple[float, ...] = ()
-    """By how much it hears each anchor late at all times, in the order of the site file; () for not at all."""
+    """Constant range error to each anchor (positive: late), in the order of the site file; () for none."""
 
 
 STATION: Final = np.dtype(
@@ -38,7 +38,7 @@ STATION: Final = np.dtype(
         ("rx_noise_ticks", np.float64),
         ("tx_error_ticks", np.float64),  # true minus configured antenna delay
         ("rx_error_ticks", np.float64),
-        ("body_m", np.float64),  # delay through whoever carries the tag, 0 for nobody
+        ("body_m", np.float64),  # delay through the person who carries the tag, 0 for none
         ("body_direction_rad", np.float64),
         ("body_cosine", np.float64),  # of half the sector's width
     ],
@@ -48,7 +48,7 @@ STATION: Final = np.dtype(
 
 
 def make_stations(anchors: Sequence[AnchorSite], tags: Sequence[TagSpec], impairments: Impairments) -> Records:
-    """Stations of a world, shape (anchors + tags,), all off; the tags' positions are to be set yet."""
+    """Stations of a world, shape (anchors + tags,), all off; the tags' positions are not yet set."""
     stations = np.zeros(len(anchors) + len(tags), dtype=STATION)
     stations["tx_noise_ticks"] = impairments.tx_stamp_ps * 1e-12 / TICK_S
     stations["rx_noise_ticks"] = impairments.rx_stamp_ps * 1e-12 / TICK_S
@@ -97,7 +97,7 @@ def velocity_mps(stations: Records, node: int, axis: int, t_s: float) -> float:
 
 @kernel
 def body_m(stations: Records, sender: int, node: int, t_s: float) -> float:
-    """Delay of a sender's messages through the body that carries a listener, 0 where that does not stand between."""
+    """Delay of a sender's messages through the body that carries a listener, 0 where it is not in between."""
     s = stations[node]
     delay_m: float = s["body_m"]
     if delay_m == 0.0:

@@ -1,7 +1,7 @@
-"""Random numbers for many nodes: every node draws from a stream of its own.
+"""Random numbers for many nodes: every node draws from its own stream.
 
 The stream of a node depends on the seed and on the node's own key alone, so that another tag, or another
-anchor, changes nothing of what the others draw.
+anchor, does not change what the others draw.
 """
 
 import math
@@ -16,7 +16,7 @@ BLOCK: Final = 1024
 """Normals drawn ahead for each node."""
 
 MAX_DRAWS: Final = 16
-"""Most numbers that one step of a node may take; what is left of a block below that is thrown away."""
+"""Most numbers that one step of a node may draw; a rest of a block below that is discarded."""
 
 ANCHOR_KEY: Final = 0
 TAG_KEY: Final = 1

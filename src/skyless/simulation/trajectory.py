@@ -1,7 +1,7 @@
 """How tags move: paths made of pieces of constant acceleration, as functions of true time.
 
-Every path answers with the piece in which an instant lies, so that the compiled channel evaluates positions
-and asks Python only when a piece ends.
+A path returns the piece that holds at an instant, so that the compiled channel evaluates positions and calls
+Python only when a piece ends.
 """
 
 import bisect
@@ -54,7 +54,7 @@ def _rest(position_m: Array, start_s: float = -math.inf, end_s: float = math.inf
 
 
 class Static(Trajectory):
-    """A tag that lies still."""
+    """A tag that does not move."""
 
     def __init__(self, x_m: float, y_m: float, z_m: float = 0.0) -> None:
         self._piece = _rest(np.array([x_m, y_m, z_m], dtype=np.float64))
@@ -158,7 +158,7 @@ def _as_points(points_m: ArrayLike) -> Array:
 
 
 class RandomWalk(Trajectory):
-    """Wandering in a box: a random acceleration every ``step_s``, and walls that reflect.
+    """A random walk in a box: a random acceleration every ``step_s``, and walls that reflect.
 
     The velocity gains variance qa per second and axis (the process noise that a constant-velocity filter
     assumes); with ``damping_s`` it also decays with that time constant (Ornstein–Uhlenbeck), towards a standard
@@ -192,7 +192,7 @@ class RandomWalk(Trajectory):
         self._begin()
 
     def piece(self, t_s: float) -> Piece:
-        """See ``Trajectory``; going back in time walks again from the start."""
+        """See ``Trajectory``; going back in time starts again."""
         if t_s < self._start_s:
             return _rest(self._start_m, end_s=self._start_s)
         if t_s < self._piece.start_s:
@@ -239,33 +239,33 @@ class RandomWalk(Trajectory):
 
 
 class Roaming(Trajectory):
-    """Wandering about a place: random accelerations as of ``RandomWalk``, with nothing that turns a tag at once.
+    """A random walk about a point: random accelerations as of ``RandomWalk``, without abrupt turns.
 
-    Damping and a spring hold it: each coordinate is normal about the middle, with ``spread_m``, and its velocity with a
-    standard deviation of √(qa·damping_s/2), from the start on. An axis whose spread is 0 does not move.
+    Damping and a spring hold it: each coordinate is normal about the middle, with ``std_m``, and its velocity with a
+    standard deviation of √(qa·damping_s/2), from the start on. An axis whose ``std_m`` is 0 does not move.
     """
 
     def __init__(
         self,
         middle_m: ArrayLike,
-        spread_m: ArrayLike,
+        std_m: ArrayLike,
         *,
         qa_m2ps3: float = 0.3,
         damping_s: float = 3.0,
         step_s: float = 0.05,
         seed: int = 0,
     ) -> None:
-        """``middle_m`` and ``spread_m`` have shape (3,); accelerations change every ``step_s``."""
-        self._middle_m, self._spread_m = np.array(middle_m, dtype=np.float64), np.array(spread_m, dtype=np.float64)
-        self._free = self._spread_m > 0.0
+        """``middle_m`` and ``std_m`` have shape (3,); accelerations change every ``step_s``."""
+        self._middle_m, self._std_m = np.array(middle_m, dtype=np.float64), np.array(std_m, dtype=np.float64)
+        self._free = self._std_m > 0.0
         self._speed_mps = math.sqrt(0.5 * qa_m2ps3 * damping_s)
         self._kick_mps2 = math.sqrt(qa_m2ps3 / step_s)
-        self._pull_per_s2 = np.square(self._speed_mps / np.where(self._free, self._spread_m, 1.0))
+        self._pull_per_s2 = np.square(self._speed_mps / np.where(self._free, self._std_m, 1.0))
         self._damping_s, self._step_s, self._seed = damping_s, step_s, seed
         self._begin()
 
     def piece(self, t_s: float) -> Piece:
-        """See ``Trajectory``; going back in time wanders again from the start."""
+        """See ``Trajectory``; going back in time starts again."""
         if t_s < self._piece.start_s:
             self._begin()
         while t_s >= self._piece.end_s:
@@ -273,15 +273,15 @@ class Roaming(Trajectory):
             dt_s = last.end_s - last.origin_s
             velocity = last.velocity_mps + dt_s * last.acceleration_mps2
             position = last.position_m + dt_s * (last.velocity_mps + 0.5 * dt_s * last.acceleration_mps2)
-            self._push(position, velocity)
+            self._append(position, velocity)
         return self._piece
 
     def _begin(self) -> None:
         self._generator, self._steps = stream(self._seed, _ROAM_KEY, 0), 0
-        place, motion = self._generator.standard_normal((2, 3))
-        self._push(self._middle_m + self._spread_m * place, np.where(self._free, self._speed_mps * motion, 0.0))
+        offset, motion = self._generator.standard_normal((2, 3))
+        self._append(self._middle_m + self._std_m * offset, np.where(self._free, self._speed_mps * motion, 0.0))
 
-    def _push(self, position_m: Array, velocity_mps: Array) -> None:
+    def _append(self, position_m: Array, velocity_mps: Array) -> None:
         """Append a piece with an acceleration of its own."""
         away_m = position_m + 0.5 * self._step_s * velocity_mps - self._middle_m  # halfway through the piece
         held = -self._pull_per_s2 * away_m - velocity_mps / self._damping_s

@@ -1,4 +1,4 @@
-"""The world: anchors' machines on the emulated air, tags that listen, and true time that passes.
+"""The world: anchors' machines on the simulated medium, tags that listen, and true time.
 
 Three events make a transmission: its frame is fetched (the lead time before its RMARKER), the RMARKER leaves, and
 the frame ends, when the listeners get it.
@@ -6,19 +6,85 @@ the frame ends, when the listeners get it.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Final, Protocol
 
-from skyless.air.reception import Reception
-from skyless.simulation.broadcast import Broadcast, Tally, diagnostics_of
+import numpy as np
+
+from skyless.air.reception import Diagnostics, Reception, Transmission
+from skyless.constants import TICK_S
+from skyless.kernels.arrays import Array, Integers
 from skyless.simulation.impairments import Impairments
-from skyless.simulation.machine_interface import AnchorFactory, AnchorMachine
-from skyless.simulation.medium import Delivery, Medium
+from skyless.simulation.medium import Delivery, Medium, Tally
 from skyless.simulation.stations import TagSpec
 from skyless.site.model import Site
 from skyless.ticks import difference, from_seconds, wrap
 
 _RETRY_TICKS: Final = from_seconds(5e-3)
+
+
+class AnchorMachine(Protocol):
+    """An anchor as its radio uses it (``skyless.anchor.Anchor`` is one)."""
+
+    @property
+    def id(self) -> int:
+        """Identifier of the anchor, 16 bits."""
+
+    def hear(self, reception: Reception) -> None:
+        """Process one frame from the air; never raises."""
+
+    def next_transmission_ticks(self, now_ticks: int) -> int | None:
+        """TX stamp (own 40-bit counter) of the next frame, at least a lead time after now; None: ask later."""
+
+    def transmission(self, tx_ticks: int) -> Transmission:
+        """The frame for that slot, made as late as possible so that it carries the latest receptions."""
+
+
+AnchorFactory = Callable[[int], AnchorMachine]
+"""Makes a machine for an anchor's identifier; called again when that anchor restarts."""
+
+
+@dataclass(slots=True, eq=False)
+class Broadcast:
+    """One frame, at the moment that its end arrived, with the tags that received it and their true motion."""
+
+    anchor: int
+    """Identifier of the sender."""
+    frame: bytes
+    emission_ticks: int
+    """True time at which the RMARKER left the antenna, in ideal ticks since the start; and its fraction."""
+    emission_fraction: float
+    end_s: float
+    """True time of the frame's end, which the receptions carry as the host's time."""
+    tags: Integers
+    """Indices of the tags that received it, shape (n,)."""
+    rx_ticks: Integers
+    """Their RX stamps, 40 bits, shape (n,)."""
+    positions_m: Array
+    """Their true positions at the emission, shape (n, 3)."""
+    velocities_mps: Array
+    """Their true velocities, shape (n, 3)."""
+    diagnostics: tuple[Diagnostics, ...] | None
+    """What their radios measured, where the impairments ask for it."""
+
+    @property
+    def emission_s(self) -> float:
+        """True time of the RMARKER's emission in seconds since the start."""
+        return (self.emission_ticks + self.emission_fraction) * TICK_S
+
+    def receptions(self) -> Iterator[tuple[int, Reception, Array]]:
+        """Tag index, reception and true position, shape (3,), of every tag that received the frame."""
+        frame, host_s = self.frame, self.end_s
+        measured = self.diagnostics or (None,) * len(self.tags)
+        rows = zip(self.tags.tolist(), self.rx_ticks.tolist(), self.positions_m, measured, strict=True)
+        for tag, rx_ticks, position_m, diagnostics in rows:
+            yield tag, Reception(frame, rx_ticks, host_s, diagnostics), position_m
+
+
+def diagnostics_of(row: np.void) -> Diagnostics:
+    """Diagnostics in a row (``RECEPTION_RECORD``) of a node."""
+    return Diagnostics(float(row["rx_power_dbm"]), float(row["first_path_power_dbm"]), float(row["carrier_offset_ppm"]))
 
 
 class World:
@@ -60,7 +126,7 @@ class World:
         return self.medium.now_s
 
     def run(self, until_s: float) -> Iterator[Broadcast]:
-        """Let true time pass up to ``until_s``; every frame is told when it ended, in order. Can be called again."""
+        """Let true time pass up to ``until_s``; yields every frame when it ended, in order. Can be called again."""
         return self.medium.run(until_s)
 
     # Power
@@ -98,7 +164,7 @@ class World:
     # Transmissions
 
     def _ask(self, node: int, boot: int) -> None:
-        """Ask an anchor's machine when it wants to send next."""
+        """Ask an anchor's machine for the time of its next frame."""
         machine, medium = self._machines[node], self.medium
         if machine is None or boot != medium.boots[node]:
             return
@@ -120,7 +186,7 @@ class World:
             self._timeline.at(self._timeline.now_ticks + _RETRY_TICKS, partial(self._ask, node, boot))
 
     def _deliver(self, delivery: Delivery) -> Broadcast:
-        """Hand the frame to the anchors that heard it, and tell of the tags that did."""
+        """Pass the frame to the anchors that received it; returns the receptions of the tags."""
         flight, by_anchors, by_tags = delivery.flight, delivery.by_anchors, delivery.by_tags
         end_s, diagnostics = self.now_s, self._impairments.diagnostics
         rows = zip(by_anchors, by_anchors["node"].tolist(), by_anchors["rx_ticks"].tolist(), strict=True)

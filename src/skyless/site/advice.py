@@ -1,4 +1,4 @@
-"""What a valid site may still suffer from: geometry and distances that cost accuracy or the fix itself."""
+"""Soft problems of a valid site: geometry and distances that reduce accuracy or prevent a fix."""
 
 from math import dist
 from typing import Final
@@ -9,9 +9,9 @@ from skyless.kernels.arrays import Array
 from skyless.site.model import Site
 
 _FLATTEST: Final = 0.05
-"""Spread across the best plane (or line) over the whole spread, below which anchors count as lying in it."""
+"""Extent across the best plane (or line) over the whole extent, below which anchors count as in it."""
 _REACH_M: Final = 100.0
-"""What a DW1000 reaches in the open at 6.8 Mbit/s, at best; walls shorten it."""
+"""Range of a DW1000 in the open at 6.8 Mbit/s, at best; walls shorten it."""
 _SHORTEST_GUARD_S: Final = 0.35e-3
 """Shortest turn-around of a host that reads one frame and prepares the next (firmware in C)."""
 
@@ -29,7 +29,7 @@ def _count(site: Site) -> list[str]:
     if count < needed:
         return [f"{count} anchors give no position: one {what} needs {needed}"]
     if count == needed:
-        return [f"{count} anchors are the fewest for a position {what}: none may fail, and no outlier can be noticed"]
+        return [f"{count} anchors are the fewest for a position {what}: none may fail, and no outlier can be detected"]
     return []
 
 
@@ -40,22 +40,22 @@ def _geometry(site: Site) -> list[str]:
     points = _points(site)[:, :dimensions]
     if len(points) < dimensions + 1:
         return []
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if spread[-1] >= _FLATTEST * spread[0]:
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if extents[-1] >= _FLATTEST * extents[0]:
         return []
     if flat:
-        return ["all anchors lie nearly in one line: a tag cannot be told from its mirror image on the other side"]
+        return ["all anchors lie nearly in one line: the mirror image of a tag's position fits its beacons as well"]
     return [
-        "all anchors lie nearly in one plane: a tag cannot be told from its mirror image on the other side, and "
-        "the direction across is poor; alternate the anchors' heights, or set tags.height_m if it is known"
+        "all anchors lie nearly in one plane: the mirror image of a tag's position fits its beacons as well, "
+        "and the direction across is poor; alternate the anchors' heights, or set tags.height_m if it is known"
     ]
 
 
 def _reach(site: Site) -> list[str]:
-    places = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
-    distances = {number: dist(place, places[site.master]) for number, place in places.items()}
+    points = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
+    distances = {number: dist(point, points[site.master]) for number, point in points.items()}
     return [
-        f"anchor {number} is {distance:.0f} m from the master, which it must hear: over {_REACH_M:.0f} m is doubtful"
+        f"anchor {number} is {distance:.0f} m from the master, which it must hear: over {_REACH_M:.0f} m may be too far"
         for number, distance in distances.items()
         if distance > _REACH_M
     ]
@@ -75,8 +75,8 @@ def _accuracy(site: Site) -> list[str]:
     if site.accuracy.survey_std_m > 0.0 or site.accuracy.range_std_m > 0.0:
         return []
     return [
-        "[accuracy] says that survey and ranges are exact; no real site is: tags will claim to know their positions "
-        "better than they do; set survey_std_m and range_std_m"
+        "[accuracy] states that survey and ranges are exact; no real site is: the standard deviations that tags report "
+        "will be too small; set survey_std_m and range_std_m"
     ]
 
 

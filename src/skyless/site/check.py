@@ -1,5 +1,9 @@
-"""What a site must fulfil beyond the types of its values; every breach is a configuration error."""
+"""The rules of a site beyond the types of its values: limits of each number, then rules between them.
 
+Every violation is a configuration error.
+"""
+
+import math
 import re
 from collections.abc import Iterable, Iterator
 from itertools import combinations
@@ -9,14 +13,103 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.air.airtime import air_time_s
 from skyless.air.codec import MAX_FRAME_BYTES
+from skyless.air.ieee802154 import air_time_s
+from skyless.air.page_codec import MAX_COORDINATE_M
 from skyless.constants import TICK_BITS, TICK_S
 from skyless.errors import ConfigurationError
 from skyless.site.image import image_size
-from skyless.site.limits import LIMITS, expected
 from skyless.site.model import AnchorSite, Site
 from skyless.site.slots import Schedule, first_slots, schedule_of
+
+ANY_ADDRESS: Final = 65_533
+"""Highest identifier on the air; 65534 means "no short address" and 65535 is broadcast in IEEE 802.15.4."""
+
+
+class Limits(Struct, frozen=True):
+    """A closed interval, without its lower end where ``above`` is set."""
+
+    low: float
+    high: float
+    unit: str = ""
+    whole: bool = False
+    above: bool = False
+
+    def contains(self, value: float) -> bool:
+        """Whether the value is finite and lies within."""
+        enough = value > self.low if self.above else value >= self.low
+        return math.isfinite(value) and enough and value <= self.high
+
+    def __str__(self) -> str:
+        """Return their text for error messages."""
+        noun = "a whole number" if self.whole else "a number"
+        unit = f" of {self.unit}" if self.unit else ""
+        if self.above:
+            return f"{noun}{unit} above {self.low:.12g} and up to {self.high:.12g}"
+        return f"{noun}{unit} from {self.low:.12g} to {self.high:.12g}"
+
+
+_ADDRESS = Limits(0, ANY_ADDRESS, whole=True)
+_COORDINATE = Limits(-MAX_COORDINATE_M, MAX_COORDINATE_M, "metres")
+_STD = Limits(0, 6.5, "metres")
+"""Sent as a 16-bit number of 0.1 mm (``docs/protocol.md``, "Pages")."""
+_DELAY = Limits(0, 65_535, "ticks (15.65 ps)", whole=True)
+
+SITE_LIMITS: Final = {
+    "id": _ADDRESS,
+    "master": _ADDRESS,
+    "anchors.id": _ADDRESS,
+    "anchors.x_m": _COORDINATE,
+    "anchors.y_m": _COORDINATE,
+    "anchors.z_m": _COORDINATE,
+    "anchors.slot": Limits(0, 254, whole=True),
+    "anchors.tx_antenna_delay_ticks": _DELAY,
+    "anchors.rx_antenna_delay_ticks": _DELAY,
+    "schedule.slot_s": Limits(0, 0.067, "seconds", above=True),
+    "schedule.slots": Limits(1, 255, whole=True),
+    "schedule.frames_per_node": Limits(1, 255, whole=True),
+    "schedule.guard_s": Limits(0, 1, "seconds"),
+    "noise.tx_stamp_ps": Limits(0, 1e6, "picoseconds", above=True),
+    "noise.rx_stamp_ps": Limits(0, 1e6, "picoseconds", above=True),
+    "noise.white_fm": Limits(0, 1e-6, above=True),
+    "noise.random_walk_fm": Limits(0, 1e-6, "1/√s", above=True),
+    "accuracy.survey_std_m": _STD,
+    "accuracy.range_std_m": _STD,
+    "accuracy.slope_std_m": _STD,
+    "accuracy.place_std_m": _STD,
+    "accuracy.place_distance_m": Limits(0, 650, "metres", above=True),
+    "accuracy.place_time_s": Limits(0, 6000, "seconds", above=True),
+    "tags.height_m": _COORDINATE,
+    "walls.x1_m": _COORDINATE,
+    "walls.y1_m": _COORDINATE,
+    "walls.x2_m": _COORDINATE,
+    "walls.y2_m": _COORDINATE,
+    "walls.loss_db": Limits(0, 200, "decibels"),
+    "walls.delay_m": Limits(0, 100, "metres"),
+    "floor_plan.width_m": Limits(0, MAX_COORDINATE_M, "metres", above=True),
+    "floor_plan.x_m": _COORDINATE,
+    "floor_plan.y_m": _COORDINATE,
+    "georeference.latitude_deg": Limits(-90, 90, "degrees"),
+    "georeference.longitude_deg": Limits(-180, 180, "degrees"),
+    "georeference.height_m": Limits(-1e4, 1e5, "metres"),
+    "georeference.heading_deg": Limits(-360, 360, "degrees"),
+}
+"""By key, without the indices in lists."""
+
+_OTHERS: Final = {
+    "name": "a text",
+    "anchors": "a list of [[anchors]] tables, one for each anchor",
+    "walls": "a list of [[walls]] tables",
+    "floor_plan.image": "the path of a PNG or JPEG file, relative to the site file",
+}
+
+
+def expected(key: str) -> str:
+    """What the value of a key (without indices in lists) should be."""
+    if key in SITE_LIMITS:
+        return str(SITE_LIMITS[key])
+    return _OTHERS.get(key, f"a [{key}] table")
+
 
 HALF_WRAP_S: Final = (1 << (TICK_BITS - 1)) * TICK_S
 """Longest gap over which a stamp can be unwrapped without a host time."""
@@ -25,17 +118,17 @@ _CLOSEST_M: Final = 1e-3
 
 
 def check_site(site: Site, file: Path) -> None:
-    """Check everything that the site says of itself.
+    """Check the values of a site.
 
     Raises:
         ConfigurationError: naming ``file``, the key, its value and what would be right.
     """
     if not site.name.strip():
         raise ConfigurationError(file, "name", site.name, "a text of at least one character")
-    for place, value in _numbers(site):
-        key = re.sub(r"\[\d+\]", "", place)
-        if not LIMITS[key].hold(value):
-            raise ConfigurationError(file, with_anchor(place, site.anchors), value, expected(key))
+    for path, value in _numbers(site):
+        key = re.sub(r"\[\d+\]", "", path)
+        if not SITE_LIMITS[key].contains(value):
+            raise ConfigurationError(file, with_anchor(path, site.anchors), value, expected(key))
     _check_anchors(site, file)
     _check_slots(site, file)
     _check_times(site, file)
@@ -62,26 +155,26 @@ def check_floor_plan(site: Site, file: Path) -> None:
         raise ConfigurationError(file, "floor_plan.image", image, "a PNG or JPEG image")
 
 
-def with_anchor(place: str, anchors: Iterable[object]) -> str:
-    """Add to a place in the list of anchors the identifier of that anchor, which its owner knows it by."""
-    match = re.match(r"anchors\[(\d+)\]", place)
+def with_anchor(path: str, anchors: Iterable[object]) -> str:
+    """Add the anchor's identifier, which its owner knows, to the path of a value in the list of anchors."""
+    match = re.match(r"anchors\[(\d+)\]", path)
     if match is None:
-        return place
+        return path
     anchor = list(anchors)[int(match[1])]
     identifier = anchor.get("id") if isinstance(anchor, dict) else getattr(anchor, "id", None)
-    return place if identifier is None else f"{place} (anchor {identifier})"
+    return path if identifier is None else f"{path} (anchor {identifier})"
 
 
-def _numbers(value: object, place: str = "") -> Iterator[tuple[str, float]]:
-    """Every number in a tree of structs, with its key."""
+def _numbers(value: object, path: str = "") -> Iterator[tuple[str, float]]:
+    """Every number in a tree of structs, with its path."""
     if isinstance(value, Struct):
         for field in value.__struct_fields__:
-            yield from _numbers(getattr(value, field), f"{place}.{field}".lstrip("."))
+            yield from _numbers(getattr(value, field), f"{path}.{field}".lstrip("."))
     elif isinstance(value, tuple):
         for index, entry in enumerate(value):
-            yield from _numbers(entry, f"{place}[{index}]")
+            yield from _numbers(entry, f"{path}[{index}]")
     elif isinstance(value, int | float):
-        yield place, value
+        yield path, value
 
 
 def _check_anchors(site: Site, file: Path) -> None:
@@ -111,7 +204,7 @@ def _check_slots(site: Site, file: Path) -> None:
     share = f"{len(site.anchors)} anchors × {frames} frames"
     if schedule.slots < needed:
         raise ConfigurationError(file, "schedule.slots", schedule.slots, f"at least {needed} ({share})")
-    if schedule.slots > LIMITS["schedule.slots"].high:
+    if schedule.slots > SITE_LIMITS["schedule.slots"].high:
         right = f"less: {share} need more than 255 slots"
         raise ConfigurationError(file, "schedule.frames_per_node", frames, right)
     _check_own_slots(site, schedule, file)
@@ -123,7 +216,7 @@ def _check_slots(site: Site, file: Path) -> None:
 
 
 def _check_own_slots(site: Site, schedule: Schedule, file: Path) -> None:
-    """Check the slots that the file gives to anchors; the others find theirs."""
+    """Check the slots that the file sets; other anchors get free ones."""
     taken: dict[int, int] = {}
     for index, anchor in enumerate(site.anchors):
         if anchor.slot is None:

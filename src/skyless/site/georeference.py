@@ -1,4 +1,4 @@
-"""From a site's metres to the Earth."""
+"""From a site's coordinates to longitude, latitude and height."""
 
 import math
 from typing import Final

@@ -1,24 +1,24 @@
-"""The lab: the named scenario that the figures of ``docs/maths.md`` section 5 belong to."""
+"""The site ``lab``, the reference of the simulated world (``docs/maths.md`` section 5)."""
 
 from typing import Final
 
 from skyless.site.model import EXACT, AccuracySite, AnchorSite, NoiseSite, ScheduleSite, Site, TagsSite
 
-_ROOM: Final = AccuracySite()
-_PLACES = ((0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (6.0, 8.0), (0.0, 8.0), (0.0, 4.0))
+_TYPICAL: Final = AccuracySite()
+_POSITIONS_M: Final = ((0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (6.0, 8.0), (0.0, 8.0), (0.0, 4.0))
 
 
-def lab_site(noise_ps: float = 100.0, accuracy: AccuracySite = _ROOM) -> Site:
+def lab_site(noise_ps: float = 100.0, accuracy: AccuracySite = _TYPICAL) -> Site:
     """Six anchors on the walls of 6 m × 8 m, the first one the master; tags at the anchors' height (2-D).
 
     ``noise_ps``: noise of every TX and RX stamp that the filters assume. ``accuracy``: errors of survey and ranges
-    that they assume; by default those of a real room.
+    that they assume; by default the typical ones of a real site.
     """
     return Site(
         name="lab",
         id=1,
         master=1,
-        anchors=tuple(AnchorSite(id=number, x_m=x, y_m=y) for number, (x, y) in enumerate(_PLACES, start=1)),
+        anchors=tuple(AnchorSite(id=number, x_m=x, y_m=y) for number, (x, y) in enumerate(_POSITIONS_M, start=1)),
         noise=NoiseSite(tx_stamp_ps=noise_ps, rx_stamp_ps=noise_ps),
         schedule=ScheduleSite(slot_s=2.5e-3),
         tags=TagsSite(height_m=0.0),
@@ -27,5 +27,5 @@ def lab_site(noise_ps: float = 100.0, accuracy: AccuracySite = _ROOM) -> Site:
 
 
 def ideal_lab_site(noise_ps: float = 100.0) -> Site:
-    """The lab with exact survey and ranges, as the simulated world has them where nothing else is asked for."""
+    """The same site with exact survey and ranges, as the simulated world has them by default."""
     return lab_site(noise_ps, EXACT)

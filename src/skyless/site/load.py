@@ -10,8 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.errors import ConfigurationError
-from skyless.site.check import check_floor_plan, check_site, with_anchor
-from skyless.site.limits import expected
+from skyless.site.check import check_floor_plan, check_site, expected, with_anchor
 from skyless.site.model import (
     AccuracySite,
     AnchorSite,
@@ -34,7 +33,7 @@ _TABLES: Final[dict[str, type[Struct]]] = {
 }
 _LISTS: Final[dict[str, type[Struct]]] = {"anchors": AnchorSite, "walls": WallSite}
 
-_PLACE = re.compile(r"(?P<finding>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTALL)
+_FINDING = re.compile(r"(?P<finding>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTALL)
 _MISSING = re.compile(r"Object missing required field `(?P<name>\w+)`")
 
 
@@ -91,24 +90,24 @@ def _refuse_unknown(path: Path, document: dict[str, Any], prefix: str, table: ob
 
 
 def _wrong_type(path: Path, document: dict[str, Any], message: str) -> ConfigurationError:
-    """Say of msgspec's message where it stands in the file, what stands there and what should."""
-    match = _PLACE.fullmatch(message)
-    place = match["path"] or "" if match else ""
+    """The error that msgspec's message means: which key of the file, its value, and what would be right."""
+    match = _FINDING.fullmatch(message)
+    key_path = match["path"] or "" if match else ""
     missing = _MISSING.match(message)
     if missing:
-        place = f"{place}.{missing['name']}".lstrip(".")
-    key = re.sub(r"\[\d+\]", "", place)
-    value = None if missing else _value_at(document, place)
-    return ConfigurationError(path, _named(document, place), value, expected(key))
+        key_path = f"{key_path}.{missing['name']}".lstrip(".")
+    key = re.sub(r"\[\d+\]", "", key_path)
+    value = None if missing else _value_at(document, key_path)
+    return ConfigurationError(path, _named(document, key_path), value, expected(key))
 
 
-def _named(document: dict[str, Any], place: str) -> str:
+def _named(document: dict[str, Any], key_path: str) -> str:
     anchors = document.get("anchors")
-    return with_anchor(place, anchors) if isinstance(anchors, list) else place
+    return with_anchor(key_path, anchors) if isinstance(anchors, list) else key_path
 
 
-def _value_at(document: object, place: str) -> object:
-    for step in re.findall(r"\w+", place):
+def _value_at(document: object, key_path: str) -> object:
+    for step in re.findall(r"\w+", key_path):
         if isinstance(document, list):
             document = document[int(step)]
         elif isinstance(document, dict):

@@ -8,14 +8,14 @@ from skyless.constants import DEFAULT_ANTENNA_DELAY_TICKS
 
 
 class AnchorSite(Struct, frozen=True, forbid_unknown_fields=True):
-    """One anchor: where its antenna stands and when it speaks."""
+    """One anchor: the position of its antenna and its slot."""
 
     id: int
     x_m: float
     y_m: float
     z_m: float = 0.0
     slot: int | None = None
-    """Its first slot; by default the anchors speak in the order of the file, the master first."""
+    """Its first slot; by default the anchors send in the order of the file, the master first."""
     tx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
     rx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
 
@@ -30,7 +30,7 @@ class ScheduleSite(Struct, frozen=True, forbid_unknown_fields=True):
     frames_per_node: int = 1
     """1: one frame per node and superframe; 2: the paper's pair in every superframe."""
     guard_s: float = 0.5e-3
-    """Time at the end of each slot in which nobody may be on the air."""
+    """Time at the end of each slot in which no frame may be on the air."""
 
 
 class NoiseSite(Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,12 +43,12 @@ class NoiseSite(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AccuracySite(Struct, frozen=True, forbid_unknown_fields=True):
-    """How good the survey and a tag's ranges are, beyond the noise of single stamps; each std is one sigma."""
+    """Accuracy of the survey and of a tag's ranges, beyond the noise of single stamps; each std is one sigma."""
 
     survey_std_m: float = 0.02
     """How well each anchor's position was measured, per axis."""
     range_std_m: float = 0.03
-    """Constant error of a tag's ranges, another one for each anchor."""
+    """Constant error of a tag's ranges, a different one for each anchor."""
     slope_std_m: float = 0.05
     """Range error that depends on the received power: it is a constant times clip((d - 4 m) / 4 m, -1, 1) at a
     distance d, and this is the constant's standard deviation."""
@@ -61,35 +61,35 @@ class AccuracySite(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def is_exact(self) -> bool:
-        """Whether survey and ranges are taken for exact."""
+        """Whether survey and ranges are assumed exact."""
         return self.survey_std_m == self.range_std_m == self.slope_std_m == self.place_std_m == 0.0
 
 
 EXACT: Final = AccuracySite(survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0)
-"""Survey and ranges without error, as in simulated ideal air."""
+"""Survey and ranges without error, as in the simulated world without errors."""
 
 
 class TagsSite(Struct, frozen=True, forbid_unknown_fields=True):
-    """What is known of the tags."""
+    """What is known about the tags."""
 
     height_m: float | None = None
     """All tags move at this height (2-D positioning); leave out to estimate the height."""
 
 
 class FloorPlanSite(Struct, frozen=True, forbid_unknown_fields=True):
-    """An image of the floor, and where it lies."""
+    """An image of the floor, and its position."""
 
     image: str
     """Path of a PNG or JPEG, relative to the site file."""
     width_m: float
-    """What the image's width measures on the floor."""
+    """Width on the floor that the image covers."""
     x_m: float = 0.0
     y_m: float = 0.0
     """Site coordinates of the image's lower left corner."""
 
 
 class GeoreferenceSite(Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the site's origin lies on the Earth (WGS 84)."""
+    """Position of the site's origin on the Earth (WGS 84)."""
 
     latitude_deg: float
     longitude_deg: float
@@ -116,7 +116,7 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     id: int
     """Identifier on the air, 16 bits."""
     master: int
-    """The anchor that starts the site's time; when it dies the others succeed in the order of the file."""
+    """The anchor that starts the site's time; when it fails the others take over in the order of the file."""
     anchors: tuple[AnchorSite, ...]
     schedule: ScheduleSite = ScheduleSite()
     noise: NoiseSite = NoiseSite()

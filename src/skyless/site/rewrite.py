@@ -1,4 +1,4 @@
-"""Antenna delays into the text of a site file, everything else left as it stands, comments included."""
+"""Writes antenna delays into the text of a site file; everything else stays unchanged, comments included."""
 
 import re
 import tomllib
@@ -9,20 +9,20 @@ from typing import Any, Final
 
 from skyless.errors import ConfigurationError
 
-KEY: Final = "tx_antenna_delay_ticks"
+DELAY_KEY: Final = "tx_antenna_delay_ticks"
 
 _HEADER = re.compile(r"\s*\[")
 _ANCHOR = re.compile(r"\s*\[\[\s*anchors\s*\]\]")
 _ID = re.compile(r"\s*id\s*=\s*(\d+)\s*(#.*)?$")
-_DELAY = re.compile(rf"(\s*{KEY}\s*=\s*)([\d_]+)(.*)", re.DOTALL)
+_DELAY = re.compile(rf"(\s*{DELAY_KEY}\s*=\s*)([\d_]+)(.*)", re.DOTALL)
 _ASSIGNMENT = re.compile(r"(\s*)[\w-]+\s*=.*?(\r?\n)?$", re.DOTALL)
 
 
 def with_tx_delays(text: str, delays_ticks: Mapping[int, int], path: str | PathLike[str]) -> str:
-    """The text with the TX antenna delays of some anchors changed, or added where they stood at their default.
+    """The text with the TX antenna delays of some anchors changed, or added where the key is missing.
 
     Raises:
-        ConfigurationError: the anchors are written in a way that this cannot follow, such as inline tables.
+        ConfigurationError: the anchors are written in a form that this cannot edit, such as inline tables.
     """
     lines = text.splitlines(keepends=True)
     starts = [number for number, line in enumerate(lines) if _HEADER.match(line)]
@@ -30,7 +30,7 @@ def with_tx_delays(text: str, delays_ticks: Mapping[int, int], path: str | PathL
         if _ANCHOR.match(lines[start]):
             lines[start + 1 : end] = _with_delay(lines[start + 1 : end], delays_ticks)
     changed = "".join(lines)
-    if not _says(changed, _wanted(text, delays_ticks)):
+    if not _parses_to(changed, _expected(text, delays_ticks)):
         expected = "in [[anchors]] tables, one line for each key, so that the delays can be written into them"
         raise ConfigurationError(path, "anchors", "written otherwise", expected)
     return changed
@@ -52,18 +52,18 @@ def _with_delay(lines: list[str], delays_ticks: Mapping[int, int]) -> list[str]:
         return lines
     end = match[2] or "\n"
     before = lines[last] if match[2] else lines[last] + end
-    return [*lines[:last], before, f"{match[1]}{KEY} = {ticks}{end}", *lines[last + 1 :]]
+    return [*lines[:last], before, f"{match[1]}{DELAY_KEY} = {ticks}{end}", *lines[last + 1 :]]
 
 
-def _wanted(text: str, delays_ticks: Mapping[int, int]) -> dict[str, Any]:
+def _expected(text: str, delays_ticks: Mapping[int, int]) -> dict[str, Any]:
     document = tomllib.loads(text)
     for anchor in document["anchors"]:
         if anchor["id"] in delays_ticks:
-            anchor[KEY] = delays_ticks[anchor["id"]]
+            anchor[DELAY_KEY] = delays_ticks[anchor["id"]]
     return document
 
 
-def _says(text: str, document: dict[str, Any]) -> bool:
+def _parses_to(text: str, document: dict[str, Any]) -> bool:
     try:
         return tomllib.loads(text) == document
     except tomllib.TOMLDecodeError:

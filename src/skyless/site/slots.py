@@ -1,14 +1,13 @@
-"""Who speaks when: the superframe and its slots.
+"""The schedule: the superframe and its slots.
 
 The RMARKER of a frame lies at the start of its slot on the master's scale, which counts from the start of superframe 0.
-So a frame's preamble flies in the last 138 µs of the slot before.
+So a frame's preamble is sent in the last 138 µs of the slot before.
 """
 
 from msgspec import Struct
 
-from skyless.air.airtime import air_time_s
 from skyless.air.almanac import SchedulePage
-from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
+from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ
 from skyless.site.model import Site
 
 
@@ -30,12 +29,8 @@ class Schedule(Struct, frozen=True, gc=False):
         return TICK_RATE_HZ / self.superframe_ticks
 
     def messages_per_s(self, nodes: int) -> float:
-        """Frames per second of so many nodes, each of them one update for a tag that tracks by message."""
+        """Frames per second of that many nodes, each of them one update for a tag that is updated by each message."""
         return nodes * self.frames_per_node * self.superframe_rate_hz
-
-    def quiet_s(self, psdu_bytes: int) -> float:
-        """Time that the air is free between the end of a frame of so many bytes and the next one's preamble."""
-        return self.slot_ticks * TICK_S - air_time_s(psdu_bytes)
 
     def slots_of(self, first_slot: int) -> tuple[int, ...]:
         """Slots of a node, ascending: its first and every ``slots // frames_per_node`` after it, modulo slots."""
@@ -47,7 +42,7 @@ class Schedule(Struct, frozen=True, gc=False):
         return superframe * self.superframe_ticks + slot * self.slot_ticks
 
     def round_of(self, superframe: int, slot: int) -> int:
-        """Round of a frame; in each every node speaks once: the superframe, or its share with several frames.
+        """Round of a frame; in each round every node sends once: the superframe, or its share with several frames.
 
         Slots beyond the last whole share (``slots`` no multiple of the frames per node) count to the last one.
         """
@@ -67,7 +62,7 @@ class Schedule(Struct, frozen=True, gc=False):
 
 
 def schedule_from_page(page: SchedulePage) -> Schedule:
-    """Return the schedule that the almanac tells of."""
+    """Return the schedule that a page of the almanac describes."""
     return Schedule(page.slot_ticks, page.slots, page.frames_per_node)
 
 

@@ -1,20 +1,21 @@
 """Site files to start from: every key with a comment."""
 
 import json
+from typing import Final
 
 from msgspec import structs
 
-from skyless.site.model import AnchorSite, FloorPlanSite, GeoreferenceSite, Site
+from skyless.site.model import AnchorSite, FloorPlanSite, GeoreferenceSite, ScheduleSite, Site, TagsSite
 
 _HEAD = """\
 # A Skyless site. Lengths are metres in the site's own frame: x and y on the floor, z up.
-# `skyless site check FILE` says whether all is well.
+# `skyless site check FILE` checks it.
 
 name = {name}
 id = {id}                          # of the site on the air, 0 to 65533; neighbouring sites need different ones
-master = {master}                      # the anchor whose clock is the site's time; best in the middle, heard by all
+master = {master}                      # the anchor whose clock is the site's time; best in the middle, in range of all
 
-[schedule]                      # the anchors speak in turn, one in each slot; all slots make a superframe
+[schedule]                      # the anchors send in turn, one in each slot; all slots make a superframe
 slot_s = {slot_s}                 # length of a slot in seconds
 guard_s = {guard_s}                # silence at the end of each slot, for the hosts to prepare the next frame
 frames_per_node = {frames}             # frames of each anchor in a superframe
@@ -26,11 +27,11 @@ rx_stamp_ps = {rx_ps}             # of a receive stamp; a DW1000 has 100 to 150
 white_fm = {white}                # crystals' white frequency noise: Allan deviation at 1 s
 random_walk_fm = {walk}          # crystals' random-walk frequency noise in 1/√s
 
-# Errors that do not average out, as standard deviations; 0 means exact. Too small costs honesty: tags then claim to
-# know their positions better than they do. Too large costs accuracy.
+# Errors that do not average out, as standard deviations; 0 means exact. Too small: tags report
+# standard deviations that are too small. Too large: the fixes are less accurate.
 [accuracy]
 survey_std_m = {survey_std_m}             # how well each anchor's position was measured, in each of x, y and z
-range_std_m = {range_std_m}              # constant error of the distances to an anchor, another one for each anchor
+range_std_m = {range_std_m}              # constant error of the distances to an anchor, a different one for each anchor
 slope_std_m = {slope_std_m}              # error that grows with the distance: none at 4 m, this much from 8 m on
 place_std_m = {place_std_m}              # error of the distances that changes as a tag moves (reflections)
 place_distance_m = {place_distance_m}          # how far a tag moves until that error is a different one
@@ -48,8 +49,8 @@ _ESTIMATED_HEIGHT = """
 """
 
 _ANCHORS = """
-# The anchors: where the antennas stand. Optional keys, with their defaults:
-#   slot = 0                         its first slot; otherwise the master speaks first, the others as listed
+# The anchors: positions of the antennas. Optional keys, with their defaults:
+#   slot = 0                         its first slot; otherwise the master sends first, the others as listed
 #   tx_antenna_delay_ticks = 16436   antenna delays in ticks of 15.65 ps
 #   rx_antenna_delay_ticks = 16436
 """
@@ -92,12 +93,12 @@ _FLOOR_PLAN = """
 {off}[floor_plan]
 {off}image = {image}           # PNG or JPEG, relative to this file
 {off}width_m = {width_m}                 # what the image's width measures on the floor
-{off}x_m = {x_m}                     # where its lower left corner lies
+{off}x_m = {x_m}                     # position of its lower left corner
 {off}y_m = {y_m}
 """
 
 _GEOREFERENCE = """
-# Where the site's origin lies on the Earth (WGS 84).
+# Position of the site's origin on the Earth (WGS 84).
 {off}[georeference]
 {off}latitude_deg = {latitude_deg}
 {off}longitude_deg = {longitude_deg}
@@ -106,13 +107,16 @@ _GEOREFERENCE = """
 """
 
 _EXAMPLE_PLAN = FloorPlanSite(image="floor.png", width_m=6.0)
-_EXAMPLE_PLACE = GeoreferenceSite(latitude_deg=47.3769, longitude_deg=8.5417, height_m=408.0)
+_EXAMPLE_GEOREFERENCE = GeoreferenceSite(latitude_deg=47.3769, longitude_deg=8.5417, height_m=408.0)
+
+
+_FROM_FLOOR_AND_CEILING_M: Final = 0.5
 
 
 def site_template(site: Site) -> str:
     """Site file, with a comment on every key, of a site without slots and antenna delays of its own.
 
-    Walls, floor plan and georeference that the site has not stand in it as commented examples.
+    Walls, floor plan and georeference that the site has not are commented examples.
     """
     schedule, noise = site.schedule, site.noise
     head = _HEAD.format(
@@ -141,10 +145,46 @@ def _anchor(anchor: AnchorSite) -> str:
 def _tail(site: Site) -> str:
     """Walls, floor plan and georeference, or an example of each."""
     walls = "".join(_WALL.format(**structs.asdict(wall)) for wall in site.walls)
-    plan, place = site.floor_plan or _EXAMPLE_PLAN, site.georeference or _EXAMPLE_PLACE
+    plan, earth = site.floor_plan or _EXAMPLE_PLAN, site.georeference or _EXAMPLE_GEOREFERENCE
     image = json.dumps(plan.image, ensure_ascii=False)
     return (
         (_WALLS + walls if walls else _NO_WALLS)
         + _FLOOR_PLAN.format(**{**structs.asdict(plan), "image": image}, off="" if site.floor_plan else "# ")
-        + _GEOREFERENCE.format(**structs.asdict(place), off="" if site.georeference else "# ")
+        + _GEOREFERENCE.format(**structs.asdict(earth), off="" if site.georeference else "# ")
     )
+
+
+def rectangular_site(width_m: float, depth_m: float, anchors: int, height_m: float, tag_height_m: float | None) -> Site:
+    """A rectangular room with anchors evenly along its walls, from the corner (0, 0) on.
+
+    They alternate between half a metre above the floor and half a metre below the ceiling, so that heights can
+    be estimated; with a known ``tag_height_m`` all are below the ceiling.
+    """
+    high = round(max(height_m - _FROM_FLOOR_AND_CEILING_M, 0.0), 3)
+    low = high if tag_height_m is not None else min(_FROM_FLOOR_AND_CEILING_M, high)
+    points = [_along_walls(index / anchors, width_m, depth_m) for index in range(anchors)]
+    return Site(
+        name="room",
+        id=1,
+        master=1,
+        anchors=tuple(
+            AnchorSite(id=number, x_m=x, y_m=y, z_m=high if number % 2 else low)
+            for number, (x, y) in enumerate(points, start=1)
+        ),
+        schedule=ScheduleSite(slot_s=2.5e-3),
+        tags=TagsSite(height_m=tag_height_m),
+    )
+
+
+def _along_walls(share: float, width_m: float, depth_m: float) -> tuple[float, float]:
+    """The point at a share of the way around the walls, to the millimetre."""
+    way_m = share * 2 * (width_m + depth_m)
+    if way_m <= width_m:
+        x, y = way_m, 0.0
+    elif way_m <= width_m + depth_m:
+        x, y = width_m, way_m - width_m
+    elif way_m <= 2 * width_m + depth_m:
+        x, y = 2 * width_m + depth_m - way_m, depth_m
+    else:
+        x, y = 0.0, 2 * (width_m + depth_m) - way_m
+    return round(x, 3), round(y, 3)

@@ -11,8 +11,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 from scipy.stats import chi2
 
+from skyless.air.beacon import Malformed
 from skyless.air.codec import decode_cached, encode
-from skyless.air.malformed import Malformed
 from skyless.anchor import Anchor
 from skyless.evaluation.statistics import EvenSample
 from skyless.kernels.arrays import Array

@@ -15,7 +15,7 @@ from skyless.firmware import link
 from skyless.radios.interface import Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radios.serial.link_records import OFFSET_STEPS_PER_PPM, POWER_STEPS_PER_DB, to_steps
 from skyless.recordings.foreign.bitcraze import TDOA3
-from skyless.site.almanac_gathering import AlmanacAssembly
+from skyless.site.almanac_pages import AlmanacAssembly
 from skyless.ticks import wrap
 
 Send = Callable[[bytes], bool]
@@ -74,7 +74,7 @@ class LinkProtocol:
         """Follow commands; a board whose radio is dead does nothing."""
         reader, buffer, at = self._reader, bytearray(data), 0
         while at < len(buffer):
-            at = reader.take(buffer, at, len(buffer))
+            at = reader.read(buffer, at, len(buffer))
             if reader.length and self._radio.now_ticks() is not None:
                 self._follow(reader.record, reader.length)
 
@@ -144,7 +144,7 @@ def _stamp(ticks: int) -> bytearray:
 def _usual_config() -> bytes:
     """The record of a CONFIG, without delays."""
     writer, reader = link.Writer(), link.Reader()
-    reader.take(writer.line, 0, writer.config(0, 0))
+    reader.read(writer.line, 0, writer.config(0, 0))
     return bytes(reader.record[: reader.length])
 
 
@@ -193,7 +193,7 @@ class SnifferProtocol:
         if not isinstance(beacon, Beacon) or beacon.anchor > _LAST_ID:
             self.drops["not-translated"] += 1
             return
-        self._almanac.hear(beacon.almanac_issue, beacon.page)
+        self._almanac.add_page(beacon.almanac_issue, beacon.page)
         payload = self._payload(beacon)
         if self._binary:
             length = struct.pack("<H", len(payload))

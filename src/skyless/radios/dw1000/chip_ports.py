@@ -12,8 +12,7 @@ from skyless.firmware.dw1000 import Bus, ChipError
 from skyless.radios.dw1000.spi_bus import SpiBus
 from skyless.radios.emulated.radio import EmulatedRadio
 from skyless.radios.interface import AntennaDelays, Gone, Late, RadioEvent, Restarted, Sent
-from skyless.simulation.dw1000.bus import ModelBus
-from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.dw1000.chip import Chip, ModelBus
 from skyless.simulation.dw1000.transceiver import PREAMBLE_TICKS
 from skyless.ticks import difference, from_seconds
 
@@ -150,7 +149,7 @@ class ModelPort:
         elif isinstance(event, Gone):
             served.end(event.reason)
         elif isinstance(event, Reception):
-            chip.hear(event.frame, event.rx_ticks, event.diagnostics or Diagnostics())
+            chip.receive(event.frame, event.rx_ticks, event.diagnostics or Diagnostics())
         elif isinstance(event, Sent):
             chip.transceiver.finish()
         elif isinstance(event, Late):

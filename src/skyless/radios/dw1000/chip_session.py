@@ -111,4 +111,4 @@ def _ticks(stamp: memoryview) -> int:
 
 
 def _value(told: int, steps: int) -> float | None:
-    return None if told == dw1000.NOT_TOLD else told / steps
+    return None if told == dw1000.NOT_MEASURED else told / steps

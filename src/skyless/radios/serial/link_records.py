@@ -90,13 +90,13 @@ def quantised(diagnostics: Diagnostics) -> Diagnostics:
 
 
 def to_steps(value: float | None, steps: int) -> int:
-    """A measured value in the line's units; ``NOT_TOLD`` for none and for what does not fit."""
+    """A measured value in the line's units; ``NOT_MEASURED`` for none and for what does not fit."""
     whole = None if value is None else round(value * steps)
-    return link.NOT_TOLD if whole is None or abs(whole) > _GREATEST else whole
+    return link.NOT_MEASURED if whole is None or abs(whole) > _GREATEST else whole
 
 
 def _value(steps: int, per_unit: int) -> float | None:
-    return None if steps == link.NOT_TOLD else steps / per_unit
+    return None if steps == link.NOT_MEASURED else steps / per_unit
 
 
 def _signed(record: bytes, at: int) -> int:

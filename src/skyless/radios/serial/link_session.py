@@ -117,7 +117,7 @@ class LinkSession:
         reader, buffer, at = self._reader, bytearray(data), 0
         before = reader.garbled + reader.overlong
         while at < len(buffer):
-            at = reader.take(buffer, at, len(buffer))
+            at = reader.read(buffer, at, len(buffer))
             if reader.length:
                 self._hear_record(bytes(reader.record[: reader.length]), host_s)
         self._count("garbled-record", reader.garbled + reader.overlong - before)

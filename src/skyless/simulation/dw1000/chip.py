@@ -1,20 +1,23 @@
-"""The chip as its host sees it: SPI transactions, an interrupt line and a reset pin."""
+"""The chip as its host sees it: SPI transactions, an interrupt line and a reset pin; and a driver's bus to it."""
 
 from collections import Counter
 from collections.abc import Callable
+from typing import Final
 
 from skyless.air.reception import Diagnostics
-from skyless.simulation.dw1000 import bits
+from skyless.firmware.dw1000 import Bus
 from skyless.simulation.dw1000 import registers as r
-from skyless.simulation.dw1000.clocking import Clocking
-from skyless.simulation.dw1000.measures import Senses
+from skyless.simulation.dw1000.clocking import Clocking, Sensors
 from skyless.simulation.dw1000.memory import Access, Memory, decode_header
-from skyless.simulation.dw1000.reception import Fault, arrive
-from skyless.simulation.dw1000.transceiver import Air, Transceiver
+from skyless.simulation.dw1000.transceiver import Air, Fault, Transceiver
 from skyless.ticks import wrap
 
-_STEP_MASK = ~0x1FF
+_STEP_MASK: Final = ~0x1FF
 """SYS_TIME steps by 512 ticks (UM 7.2.8)."""
+
+_SLOW_HZ: Final = 2_000_000
+_FAST_HZ: Final = 16_000_000
+"""Rates at which the bus clocks the SPI."""
 
 
 class Chip:
@@ -26,56 +29,53 @@ class Chip:
         tx_delay_ticks: int,
         rx_delay_ticks: int,
         seconds: Callable[[], float],
-        senses: Senses | None = None,
+        sensors: Sensors | None = None,
     ) -> None:
-        """The delays are what truly lies between chip and antenna, whatever the host sets."""
+        """The delays are the true ones between chip and antenna, whatever the host sets."""
         self.misuse: Counter[str] = Counter()
-        """What the manual forbids and the host did."""
+        """Violations of the manual by the host."""
         self.arrivals: Counter[str] = Counter()
-        """What became of the frames that were there to be heard."""
+        """What became of the frames that reached the antenna."""
         self._air, self._rx_delay_ticks = air, rx_delay_ticks
         self.memory = Memory(self.misuse)
-        self.clocking = Clocking(self.memory, self.misuse, seconds, senses or Senses())
+        self.clocking = Clocking(self.memory, self.misuse, seconds, sensors or Sensors())
         self.transceiver = Transceiver(self.memory, air, tx_delay_ticks, self.misuse)
         self.transfers = 0
-        self._powered_on()
-
-    def _powered_on(self) -> None:
-        self.transceiver.reset()
-        self.memory.reset()
-        self.clocking.in_reset = False
-        self.clocking.restart()
-        self._lock_told = False
-        self.memory.put(r.SYS_STATUS, bits.SLP2INIT)
+        self.pull_reset()
 
     # Pins
 
     def pull_reset(self) -> None:
-        """RSTn was low for a moment."""
-        self._powered_on()
+        """RSTn was low for a moment; as after power-on."""
+        self.transceiver.reset()
+        self.memory.reset()
+        self.clocking.in_reset = False
+        self.clocking.restart()
+        self._lock_shown = False
+        self.memory.set(r.SYS_STATUS, r.SLP2INIT)
 
     @property
     def irq(self) -> bool:
         """The interrupt line: an event that SYS_MASK lets through, with the polarity of SYS_CFG."""
-        self._settle()
-        return self._is_pending() == bool(self.memory.get(r.SYS_CFG) & bits.HIRQ_POL)
+        self._update()
+        return self._is_pending() == bool(self.memory.get(r.SYS_CFG) & r.HIRQ_POL)
 
     def _is_pending(self) -> bool:
-        return bool(self.memory.get(r.SYS_STATUS) & self.memory.get(r.SYS_MASK) & ~bits.IRQS)
+        return bool(self.memory.get(r.SYS_STATUS) & self.memory.get(r.SYS_MASK) & ~r.IRQS)
 
     # SPI
 
     def transfer(self, out: bytes, hz: int) -> bytes:
-        """One transaction: what the chip says while it is told ``out``, as many octets."""
+        """One transaction: the octets that the chip sends while it receives ``out``, as many."""
         self.transfers += 1
         access = decode_header(out)
         if access is None:
             self.misuse["transaction-without-header"] += 1
             return bytes(len(out))
-        if not self.clocking.takes(hz):
+        if not self.clocking.accepts(hz):
             self.misuse["spi-too-fast"] += 1
             return self._garbled(access, len(out))
-        self._settle()
+        self._update()
         body = out[access.octets :]
         if access.is_write:
             self._write(access, body)
@@ -83,28 +83,27 @@ class Chip:
         return bytes(access.octets) + self._read(access, len(body))
 
     def _garbled(self, access: Access, length: int) -> bytes:
-        """Bits are lost on the way: what is read is shifted by one, what is written does not arrive."""
+        """Bits are lost: what is read is shifted by one, what is written does not arrive."""
         if access.is_write:
             return bytes(length)
         right = int.from_bytes(self.memory.read(access.file, access.sub, length - access.octets), "big")
         return (right << 1 | 1).to_bytes(length + 1, "big")[1:]
 
-    def _settle(self) -> None:
+    def _update(self) -> None:
+        """Show in the registers what has happened up to now."""
         if self.clocking.in_reset:
             return
-        self.transceiver.settle()
-        if self.clocking.pll_has_locked and not self._lock_told:
-            self._lock_told = True
-            self.transceiver.raise_bits(bits.CPLOCK)
-
-    _lock_told = False
+        self.transceiver.update()
+        if self.clocking.pll_has_locked and not self._lock_shown:
+            self._lock_shown = True
+            self.transceiver.raise_bits(r.CPLOCK)
 
     def _read(self, access: Access, length: int) -> bytes:
         if access.file == r.SYS_TIME.file:
-            self.memory.put(r.SYS_TIME, self._air.now_ticks() & _STEP_MASK)
+            self.memory.set(r.SYS_TIME, self._air.now_ticks() & _STEP_MASK)
         elif access.file == r.SYS_STATUS.file:
-            status = self.memory.get(r.SYS_STATUS) & ~bits.IRQS
-            self.memory.put(r.SYS_STATUS, status | (bits.IRQS if self._is_pending() else 0))
+            status = self.memory.get(r.SYS_STATUS) & ~r.IRQS
+            self.memory.set(r.SYS_STATUS, status | (r.IRQS if self._is_pending() else 0))
         elif access.file == r.TX_BUFFER.file:
             self.misuse["tx-buffer-read"] += 1  # UM p. 77
             return bytes(length)
@@ -117,47 +116,92 @@ class Chip:
             self.misuse["write-in-reset"] += 1
         elif access.file == r.SYS_STATUS.file:
             value = int.from_bytes(data, "little") << 8 * access.sub
-            self.transceiver.drop_bits(value & ~bits.READ_ONLY)
+            self.transceiver.drop_bits(value & ~r.READ_ONLY)
         elif access.file == r.SYS_CTRL.file:
             self._command(int.from_bytes(data, "little") << 8 * access.sub)
         else:
             self.memory.write(access.file, access.sub, data)
-            self._follow(access, len(data))
+            self._apply_written(access, len(data))
 
     def _command(self, control: int) -> None:
-        if control & (bits.TXSTRT | bits.RXENAB) and not self.clocking.locked:
+        if control & (r.TXSTRT | r.RXENAB) and not self.clocking.locked:
             self.misuse["radio-without-pll"] += 1
         else:
             self.transceiver.command(control)
 
-    def _follow(self, access: Access, length: int) -> None:
-        """Do what writing these registers does."""
+    def _apply_written(self, access: Access, length: int) -> None:
+        """Perform what writing these registers starts."""
         if access.file == r.PMSC.file and access.sub < 4:
-            kind = self.clocking.write_pmsc()
-            if kind == bits.SOFTRESET_ALL:
+            kind = self.clocking.on_pmsc_written()
+            if kind == r.SOFTRESET_ALL:
                 self._soft_reset()
-            elif kind == bits.SOFTRESET_RX:
+            elif kind == r.SOFTRESET_RX:
                 self.transceiver.listening_since = None
                 self.transceiver.suspect = False
         elif access.file == r.OTP_IF.file and access.sub < r.OTP_CTRL.sub + 2 and access.sub + length > r.OTP_CTRL.sub:
-            self.clocking.write_otp()
+            self.clocking.on_otp_written()
         elif access.file == r.TX_CAL.file and access.sub == 0:
-            self.clocking.write_sensor()
+            self.clocking.on_sensor_written()
 
     def _soft_reset(self) -> None:
         """All registers but the bits that hold the chip in reset (UM 7.2.50.1)."""
         self.transceiver.reset()
         self.memory.reset()
-        self.memory.put(r.PMSC_CTRL0, r.PMSC_CTRL0.reset & ~(0xF << bits.SOFTRESET_SHIFT))
-        self.memory.put(r.SYS_STATUS, bits.SLP2INIT)
-        self._lock_told = False
+        self.memory.set(r.PMSC_CTRL0, r.PMSC_CTRL0.reset & ~(0xF << r.SOFTRESET_SHIFT))
+        self.memory.set(r.SYS_STATUS, r.SLP2INIT)
+        self._lock_shown = False
 
     # The air
 
-    def hear(self, frame: bytes, rx_ticks: int, told: Diagnostics, fault: Fault | None = None) -> str:
+    def receive(self, frame: bytes, rx_ticks: int, diagnostics: Diagnostics, fault: Fault | None = None) -> str:
         """A frame has ended whose RMARKER reached the antenna at ``rx_ticks`` of the counter; what became of it."""
-        self._settle()
+        self._update()
         ticks, microcode = wrap(rx_ticks + self._rx_delay_ticks), self.clocking.microcode_loaded
-        outcome = arrive(self.memory, self.transceiver, frame, ticks, told, microcode=microcode, fault=fault)
+        outcome = self.transceiver.receive(frame, ticks, diagnostics, microcode=microcode, fault=fault)
         self.arrivals[outcome] += 1
         return outcome
+
+
+class ModelBus(Bus):
+    """A driver's bus to a model of the chip.
+
+    ``spend`` lets the host's time pass; a transfer reaches the chip when its time is over.
+    """
+
+    def __init__(
+        self, chip: Chip, spend: Callable[[float], None] | None = None, latency_s: Callable[[], float] | None = None
+    ) -> None:
+        self.chip = chip
+        self._spend, self._latency_s = spend, latency_s
+        self._hz = _SLOW_HZ
+
+    def _exchange(self, out: bytes) -> bytes:
+        if self._spend is not None:
+            self._spend((0.0 if self._latency_s is None else self._latency_s()) + 8 * len(out) / self._hz)
+        return self.chip.transfer(out, self._hz)
+
+    def transfer(self, out: memoryview, into: memoryview) -> None:
+        """One transaction in both directions."""
+        into[:] = self._exchange(bytes(out))
+
+    def write(self, header: memoryview, data: memoryview) -> None:
+        """One transaction that only sends."""
+        self._exchange(bytes(header) + bytes(data))
+
+    def slow(self) -> None:
+        """Clock slowly from now on."""
+        self._hz = _SLOW_HZ
+
+    def fast(self) -> None:
+        """Clock fast from now on."""
+        self._hz = _FAST_HZ
+
+    def reset(self) -> bool:
+        """Pull RSTn low for a moment."""
+        self.chip.pull_reset()
+        return True
+
+    def pause_us(self, microseconds: int) -> None:
+        """Wait."""
+        if self._spend is not None:
+            self._spend(1e-6 * microseconds)

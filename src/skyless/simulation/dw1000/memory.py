@@ -4,7 +4,7 @@ from collections import Counter
 
 from msgspec import Struct
 
-from skyless.simulation.dw1000.registers import ALL, FILE_LENGTHS, Register
+from skyless.simulation.dw1000.registers import ALL_REGISTERS, FILE_LENGTHS, Register
 
 
 class Access(Struct, frozen=True):
@@ -43,7 +43,7 @@ class Memory:
         self._misuse = misuse
         self._files = {file: bytearray(length) for file, length in FILE_LENGTHS.items()}
         self._fixed = {file: bytearray(length) for file, length in FILE_LENGTHS.items()}
-        for one in ALL.values():
+        for one in ALL_REGISTERS.values():
             if one.access == "RO":
                 self._fixed[one.file][one.sub : one.sub + one.length] = b"\1" * one.length
         self.reset()
@@ -52,16 +52,16 @@ class Memory:
         """All registers as after power-on."""
         for octets in self._files.values():
             octets[:] = bytes(len(octets))
-        for one in ALL.values():
+        for one in ALL_REGISTERS.values():
             if one.reset:
-                self.put(one, one.reset)
+                self.set(one, one.reset)
 
     def get(self, register: Register) -> int:
         """A register's value."""
         octets = self._files[register.file]
         return int.from_bytes(octets[register.sub : register.sub + register.length], "little")
 
-    def put(self, register: Register, value: int) -> None:
+    def set(self, register: Register, value: int) -> None:
         """Set a register from within the chip."""
         value &= (1 << 8 * register.length) - 1
         octets = value.to_bytes(register.length, "little")

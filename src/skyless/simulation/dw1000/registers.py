@@ -1,6 +1,6 @@
-"""Registers of the DW1000 as the model has them, from the User Manual v2.12 ("UM"): section 7.2 and the tables of 2.5.
+"""Registers of the DW1000 and their bits, from sections 7.2 and 2.5 of the User Manual v2.12 ("UM").
 
-The driver has a table of its own; ``tests/simulation/test_dw1000_tables.py`` holds both against a third.
+The driver has a table of its own; ``tests/simulation/test_dw1000_tables.py`` compares both with a third.
 """
 
 from typing import Final
@@ -16,7 +16,7 @@ class Register(Struct, frozen=True):
     length: int
     """Octets."""
     reset: int = 0
-    """Value after a reset; of tuning registers only those that section 2.5 tells to change are known exactly."""
+    """Value after a reset; of tuning registers only those that section 2.5 names for a change are known exactly."""
     access: str = "RW"
     """RW; RO, which writing does not change; WO, which reads as zeros."""
 
@@ -121,8 +121,90 @@ PMSC_CTRL0: Final = Register(0x36, 0x00, 4, 0xF0300200)  # 7.2.50.1
 PMSC_CTRL1: Final = Register(0x36, 0x04, 4, 0x81020738)  # 7.2.50.2
 PMSC_LEDC: Final = Register(0x36, 0x28, 4)
 
-ALL: Final = {name: value for name, value in globals().items() if isinstance(value, Register)}
+ALL_REGISTERS: Final = {name: value for name, value in globals().items() if isinstance(value, Register)}
 FILE_LENGTHS: Final = {
-    file: max(one.sub + one.length for one in ALL.values() if one.file == file)
-    for file in {one.file for one in ALL.values()}
+    file: max(one.sub + one.length for one in ALL_REGISTERS.values() if one.file == file)
+    for file in {one.file for one in ALL_REGISTERS.values()}
 }
+
+# SYS_CTRL (UM 7.2.15, pp. 80-84)
+SFCST: Final = 1 << 0
+TXSTRT: Final = 1 << 1
+TXDLYS: Final = 1 << 2
+CANSFCS: Final = 1 << 3
+TRXOFF: Final = 1 << 6
+WAIT4RESP: Final = 1 << 7
+RXENAB: Final = 1 << 8
+RXDLYE: Final = 1 << 9
+HRBPT: Final = 1 << 24
+
+# SYS_STATUS (UM 7.2.17, pp. 86-93); SYS_MASK has the same bits
+IRQS: Final = 1 << 0
+CPLOCK: Final = 1 << 1
+ESYNCR: Final = 1 << 2
+AAT: Final = 1 << 3
+TXFRB: Final = 1 << 4
+TXPRS: Final = 1 << 5
+TXPHS: Final = 1 << 6
+TXFRS: Final = 1 << 7
+RXPRD: Final = 1 << 8
+RXSFDD: Final = 1 << 9
+LDEDONE: Final = 1 << 10
+RXPHD: Final = 1 << 11
+RXPHE: Final = 1 << 12
+RXDFR: Final = 1 << 13
+RXFCG: Final = 1 << 14
+RXFCE: Final = 1 << 15
+RXRFSL: Final = 1 << 16
+RXRFTO: Final = 1 << 17
+LDEERR: Final = 1 << 18
+RXOVRR: Final = 1 << 20
+RXPTO: Final = 1 << 21
+GPIOIRQ: Final = 1 << 22
+SLP2INIT: Final = 1 << 23
+RFPLL_LL: Final = 1 << 24
+CLKPLL_LL: Final = 1 << 25
+RXSFDTO: Final = 1 << 26
+HPDWARN: Final = 1 << 27
+TXBERR: Final = 1 << 28
+AFFREJ: Final = 1 << 29
+HSRBP: Final = 1 << 30
+ICRBP: Final = 1 << 31
+RXRSCS: Final = 1 << 32
+RXPREJ: Final = 1 << 33
+TXPUTE: Final = 1 << 34
+
+READ_ONLY: Final = IRQS | HPDWARN | HSRBP | ICRBP
+"""What writing a 1 does not clear (pp. 86, 91, 92)."""
+OF_SENDING: Final = AAT | TXFRB | TXPRS | TXPHS | TXFRS | TXPUTE
+"""Forgotten when the transmitter is enabled again."""
+OF_RECEIVING: Final = (
+    RXPRD | RXSFDD | LDEDONE | RXPHD | RXPHE | RXDFR | RXFCG | RXFCE | RXRFSL | RXRFTO | LDEERR | RXOVRR | RXPTO
+    | RXSFDTO | AFFREJ | RXRSCS | RXPREJ
+)  # fmt: skip
+"""Forgotten when the receiver is enabled again."""
+
+# SYS_CFG (UM 7.2.6)
+HIRQ_POL: Final = 1 << 9
+DIS_DRXB: Final = 1 << 12
+PHR_MODE: Final = 0b11 << 16
+RXM110K: Final = 1 << 22
+RXWTOE: Final = 1 << 28
+RXAUTR: Final = 1 << 29
+
+# PMSC (UM 7.2.50)
+SYSCLKS: Final = 0b11
+SYSCLKS_AUTO: Final = 0
+SYSCLKS_XTI: Final = 1
+SOFTRESET_SHIFT: Final = 28
+SOFTRESET_ALL: Final = 0x0
+SOFTRESET_RX: Final = 0xE
+SOFTRESET_NONE: Final = 0xF
+LDERUNE: Final = 1 << 17  # of PMSC_CTRL1
+PMSC_FOR_LDE: Final = 0x0301
+"""Low half of PMSC_CTRL0 while the microcode is loaded (UM 2.5.5.10)."""
+
+# OTP_CTRL (UM 7.2.46.3)
+OTPRDEN: Final = 1 << 0
+OTPREAD: Final = 1 << 1
+LDELOAD: Final = 1 << 15

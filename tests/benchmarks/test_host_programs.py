@@ -1,9 +1,9 @@
 """Programs that take simulated time."""
 
 import pytest
+from host_programs import Process
 
-from skyless.simulation.processes import Process
-from skyless.simulation.timeline import Timeline
+from skyless.simulation.medium import Timeline
 from skyless.ticks import from_seconds, to_seconds
 
 
