@@ -120,7 +120,7 @@ def test_one_anchor_as_the_zero():
 def test_anchors_that_no_chain_ties_to_the_others_are_not_determined():
     data = measured(np.random.default_rng(7))
     keep = (data.anchor_a < 5) == (data.anchor_b < 5)
-    part = Differences(*(values[keep] for values in vars(data).values()))
+    part = data.select(keep)
     found = estimate(part)
     assert [one.bias_m is None for one in found.anchors] == [False] * 5 + [True] * 3
     assert all("no chain" in one.reason for one in found.anchors[5:])
@@ -132,7 +132,7 @@ def test_an_anchor_with_two_differences_is_not_determined_and_does_not_move_the_
     with_7 = np.flatnonzero((data.anchor_a == 7) | (data.anchor_b == 7))
     keep = np.ones(len(data.t_s), dtype=bool)
     keep[with_7[2:]] = False
-    found = estimate(Differences(*(values[keep] for values in vars(data).values())))
+    found = estimate(data.select(keep))
     assert found.anchors[7].bias_m is None
     assert "2 differences" in found.anchors[7].reason
     bias = np.array([one.bias_m for one in found.anchors[:7]])

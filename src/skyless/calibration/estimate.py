@@ -6,7 +6,6 @@ constants can be seen; the zero is their mean, or one anchor.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -31,8 +30,7 @@ _LEAST_MOTION: Final = 0.05
 """How much the logarithms of the ratios must change beyond what constants explain for a slope to be looked for."""
 
 
-@dataclass(frozen=True)
-class Differences:
+class Differences(Struct, frozen=True):
     """Time differences at known positions, n of them."""
 
     t_s: Vector
@@ -44,9 +42,13 @@ class Differences:
     log_ratio: Vector
     """ln(range to b / range to a)."""
 
+    def select(self, rows: Mask | Integers) -> "Differences":
+        """These rows."""
+        a, b = self.anchor_a[rows], self.anchor_b[rows]
+        return Differences(self.t_s[rows], a, b, self.excess_m[rows], self.log_ratio[rows])
 
-@dataclass(frozen=True)
-class Fit:
+
+class Fit(Struct, frozen=True):
     """A regression: m anchors, n differences."""
 
     anchors: Integers
@@ -238,7 +240,7 @@ def estimate(differences: Differences, *, zero: int | None = None, slope: bool =
     """
     found = np.unique(np.concatenate([differences.anchor_a, differences.anchor_b]))
     kept, reasons = _connected(differences, found.tolist(), zero)
-    data = _only(differences, kept)
+    data = differences.select(np.isin(differences.anchor_a, kept))
     plain = fit(data, np.array(kept, dtype=np.int64), slope=False)
     steep = fit(data, plain.anchors, slope=True) if slope and moves(data, plain) else None
     note = _ALIKE if slope else "not asked for"
@@ -264,17 +266,6 @@ def _connected(differences: Differences, anchors: Sequence[int], zero: int | Non
     kept = sorted(chosen)
     lost = [anchor for anchor in anchors if anchor not in chosen]
     return kept, dict.fromkeys(lost, "no chain of differences ties it to the others")
-
-
-def _only(differences: Differences, anchors: Sequence[int]) -> Differences:
-    keep = np.isin(differences.anchor_a, anchors)
-    return Differences(
-        differences.t_s[keep],
-        differences.anchor_a[keep],
-        differences.anchor_b[keep],
-        differences.excess_m[keep],
-        differences.log_ratio[keep],
-    )
 
 
 def _slope_note(found: Fit) -> str:

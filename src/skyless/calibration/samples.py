@@ -7,6 +7,7 @@ from typing import Final, cast
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import astuple
 
 from skyless.air.beacon import Beacon, Malformed, MasterTime
 from skyless.air.codec import decode_cached
@@ -262,15 +263,8 @@ def _row(pair: PairTdoa, anchor_positions_m: dict[int, Point], position_at: Posi
 def joined(samples: Sequence[Samples]) -> Samples:
     """Samples of several tags as one, in the order of time."""
     parts = [one.differences for one in samples]
-    t_s = np.concatenate([part.t_s for part in parts])
-    order = np.argsort(t_s, kind="stable")
-    differences = Differences(
-        t_s[order],
-        np.concatenate([part.anchor_a for part in parts])[order],
-        np.concatenate([part.anchor_b for part in parts])[order],
-        np.concatenate([part.excess_m for part in parts])[order],
-        np.concatenate([part.log_ratio for part in parts])[order],
-    )
+    differences = Differences(*map(np.concatenate, zip(*map(astuple, parts), strict=True)))
+    differences = differences.select(np.argsort(differences.t_s, kind="stable"))
     drops: Drops = Counter()
     for one in samples:
         drops.update(one.drops)

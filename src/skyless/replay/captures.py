@@ -7,7 +7,7 @@ from contextlib import closing
 from itertools import islice
 from math import dist
 from os import PathLike
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct, structs
@@ -229,7 +229,7 @@ class ReplayRequest(Struct, frozen=True):
     """One of ``MEASUREMENTS``; None: what suits the format."""
 
 
-class ReplayReport(Struct, frozen=True):
+class ReplayReport(Struct, frozen=True, kw_only=True):
     """What a replay came to; metres and seconds, None where it is not known."""
 
     format: str
@@ -247,7 +247,7 @@ class ReplayReport(Struct, frozen=True):
     max_m: float | None
     rate_hz: float | None
     """Fixes per second of recorded time, None without fixes."""
-    tdoa_noise_m: float | None
+    tdoa_noise_m: float | None = None
     """Median over the pairs of anchors of their differences' noise (1.4826 MAD), about the truth or the median."""
     bias_m: tuple[float, float, float] | None
     first_fix_s: float | None
@@ -255,15 +255,33 @@ class ReplayReport(Struct, frozen=True):
     reason: str | None
     """Why there is no fix at all."""
     drops: dict[str, int]
-    pairs: tuple[PairNoise, ...]
+    pairs: tuple[PairNoise, ...] = ()
     wall_s: float
     receptions_per_s: float
     method: str | None
-    measurements: str | None
+    measurements: str | None = None
     """What the filter was given, one of ``MEASUREMENTS``; None for the receptions of a site."""
-    contradictions_m: dict[str, float]
+    contradictions_m: dict[str, float] = {}
     """Pairs of anchors whose own ranging contradicts the table: by how much they are farther (if negative, nearer)
     than there."""
+
+
+def common_figures(
+    judgement: Judgement, receptions: int, fixes: int, drops: dict[str, int], wall_s: float
+) -> dict[str, Any]:
+    """What every ``ReplayReport`` holds of a judgement and of counts."""
+    errors = judgement.errors
+    return {
+        "receptions": receptions,
+        "fixes": fixes,
+        "drops": drops,
+        "dropped": sum(drops.values()),
+        "median_m": judgement.median_m,
+        "std_m": judgement.std_m,
+        **{name: getattr(errors, name) for name in errors.__struct_fields__ if name != "count"},
+        "wall_s": wall_s,
+        "receptions_per_s": receptions / wall_s if wall_s > 0.0 else 0.0,
+    }
 
 
 class Replay:
@@ -352,32 +370,18 @@ class Replay:
         return {name: count for name, count in sorted(total.items()) if count}
 
     def _report(self, wall_s: float) -> ReplayReport:
-        judgement: Judgement = self._judge.judgement()
-        drops = self._drops()
         pairs = self._noise.pairs()
         span_s = self._last_s - (self._first_s or 0.0)
         reason = self._pipeline.reason if self._request.anchors_m or self.fixes else NoFixReason.NO_ALMANAC
         return ReplayReport(
             format=self.recording.format.name,
-            receptions=self.receptions,
-            fixes=self.fixes,
-            dropped=sum(drops.values()),
-            median_m=judgement.median_m,
-            std_m=judgement.std_m,
-            rmse_2d_m=judgement.errors.rmse_2d_m,
-            rmse_3d_m=judgement.errors.rmse_3d_m,
-            p95_m=judgement.errors.p95_m,
-            max_m=judgement.errors.max_m,
+            **common_figures(self._judge.judgement(), self.receptions, self.fixes, self._drops(), wall_s),
             rate_hz=self.fixes / span_s if self.fixes and span_s > 0.0 else None,
             tdoa_noise_m=float(np.median([pair.noise_m for pair in pairs])) if pairs else None,
-            bias_m=judgement.errors.bias_m,
             first_fix_s=self._first_fix_s,
             height_m=self._request.height_m,
             reason=None if self.fixes else str(reason),
-            drops=drops,
             pairs=pairs,
-            wall_s=wall_s,
-            receptions_per_s=self.receptions / wall_s if wall_s > 0.0 else 0.0,
             method="joint",
             measurements=self.measurements,
             contradictions_m={f"{a}-{b}": by_m for (a, b), by_m in sorted(self._pipeline.contradictions_m.items())},

@@ -25,7 +25,7 @@ from skyless.recordings.mcap.recording import McapRecording, Recorded
 from skyless.recordings.source import Drops
 from skyless.recordings.truth import Truth
 from skyless.replay.antenna_delays import DelayChange, delay_changes, with_delays
-from skyless.replay.captures import ReplayReport
+from skyless.replay.captures import ReplayReport, common_figures
 from skyless.site.model import Site
 from skyless.ticks import WRAP_TICKS, Unwrapper
 
@@ -382,34 +382,17 @@ class SiteReplay:
                 on_fix(tag, made)
 
     def _report(self, tag: str, wall_s: float) -> TagReport:
-        replay, judgement = self.tags[tag], self.judges[tag].judgement()
+        replay = self.tags[tag]
         first_s, last_s = self._spans.get(tag, (0.0, 0.0))
-        drops = replay.all_drops()
         return TagReport(
             format=SITE_FORMAT,
-            receptions=replay.receptions,
-            fixes=replay.fixes,
-            dropped=sum(drops.values()),
-            median_m=judgement.median_m,
-            std_m=judgement.std_m,
-            rmse_2d_m=judgement.errors.rmse_2d_m,
-            rmse_3d_m=judgement.errors.rmse_3d_m,
-            p95_m=judgement.errors.p95_m,
-            max_m=judgement.errors.max_m,
+            **common_figures(self.judges[tag].judgement(), replay.receptions, replay.fixes, replay.all_drops(), wall_s),
             rate_hz=replay.fixes / (last_s - first_s) if last_s > first_s else None,
-            tdoa_noise_m=None,
-            bias_m=judgement.errors.bias_m,
             first_fix_s=first_s - replay.begun_s if replay.fixes and replay.begun_s is not None else None,
             height_m=self.height_m,
             reason=None if replay.fixes else replay.reason,
-            drops=drops,
-            pairs=(),
-            wall_s=wall_s,
-            receptions_per_s=replay.receptions / wall_s if wall_s > 0.0 else 0.0,
             tag=tag,
             method=replay.method,
-            measurements=None,
-            contradictions_m={},
             identical=replay.identical,
             segments=replay.segments,
             cold_starts=replay.cold_starts,
