@@ -1,4 +1,4 @@
-"""Hosts of ``host_latency``: what programs on a Raspberry Pi do with a DW1000, in the simulated world's time."""
+"""Slow hosts of ``host_latency``: programs on a Raspberry Pi with a DW1000, in the simulated world's time."""
 
 import random
 from collections import Counter
@@ -13,7 +13,7 @@ from skyless.anchor import Anchor
 from skyless.constants import TICK_S
 from skyless.method_names import DEFAULT_METHOD
 from skyless.nodes.anchor import ASK_AGAIN_S, LEAD_GAIN, LEAD_LOSS, LEAD_S, MAX_LEAD_S
-from skyless.radios.dw1000.chip_session import ChipSession
+from skyless.radios.dw1000.radio import ChipSession
 from skyless.radios.interface import AntennaDelays, Late, RadioEvent, Sent
 from skyless.receiver import Receiver
 from skyless.simulation.dw1000.chip import Chip, ModelBus
@@ -21,7 +21,7 @@ from skyless.simulation.medium import Medium
 from skyless.site.model import Site
 from skyless.ticks import difference
 
-LOOK_S: Final = 20e-3
+_POLL_S: Final = 20e-3
 _COMING: Final = 64
 """Frames that a host may still be about to fetch."""
 
@@ -44,7 +44,7 @@ class Host:
 
     @property
     def misused(self) -> int:
-        """What should never happen."""
+        """Events that should never happen."""
         return self.chip.misuse.total() + self.air.counts.total() + self.counters["sent-at-another-time"]
 
     def _spend(self, seconds: float) -> None:
@@ -52,9 +52,9 @@ class Host:
 
     # The air
 
-    def arrive(self, reception: Reception, slot: int, place_m: NDArray[np.float64]) -> None:
+    def arrive(self, reception: Reception, slot: int, position_m: NDArray[np.float64]) -> None:
         """A frame has ended at the antenna."""
-        self._coming[reception.frame] = (slot, place_m)
+        self._coming[reception.frame] = (slot, position_m)
         if len(self._coming) > _COMING:
             del self._coming[next(iter(self._coming))]
         self.chip.receive(reception.frame, reception.rx_ticks, reception.diagnostics or Diagnostics())
@@ -70,25 +70,25 @@ class Host:
     # The program
 
     def program(self) -> None:
-        """What the host does; never returns."""
+        """The host's program; never returns."""
         raise NotImplementedError
 
     def serve(self, seconds: float) -> None:
-        """Wait for the interrupt line or for so long, and serve it."""
+        """Wait for the interrupt line for some seconds, and serve it."""
         self.process.wait(seconds)
         while self.chip.irq:
             self.process.sleep(self.latency.draw(self.generator))  # until the program runs
             self.session.serve(self.medium.now_s)
 
     def work(self, reception: Reception) -> tuple[int, NDArray[np.float64]]:
-        """Spend what a frame costs to be understood; its slot, and where the tag was."""
+        """Spend the time that a frame costs to be processed; its slot, and the tag's position."""
         self.process.sleep(self.latency.work_s)
-        slot, place_m = self._coming[reception.frame]
+        slot, position_m = self._coming[reception.frame]
         self.heard.add(slot)
-        return slot, place_m
+        return slot, position_m
 
     def hear(self, event: RadioEvent) -> None:
-        """What the session tells."""
+        """An event of the session."""
         raise NotImplementedError
 
 
@@ -106,7 +106,7 @@ class AnchorHost(Host):
         super().__init__(medium, node, latency, generator)
 
     def program(self) -> None:
-        """Hear others, and speak in its slots."""
+        """Receive others, and send in its slots."""
         self.session.start()
         while True:
             now_ticks = self.session.read_ticks()
@@ -124,20 +124,20 @@ class AnchorHost(Host):
                 self._wait_s = 0.0
 
     def _serve_until(self, tx_ticks: int) -> None:
-        """Hear others until the frame is to be handed over."""
+        """Receive others until the frame is to be handed over."""
         while (ahead_s := difference(tx_ticks, self.air.now_ticks()) * TICK_S - self.lead_s) > 0.0:
             self.serve(ahead_s + 1e-6)
 
     def _await_answer(self) -> None:
         while not self._answered:
             overdue = self.session.overdue_ticks
-            ahead_s = LOOK_S if overdue is None else difference(overdue, self.air.now_ticks()) * TICK_S
+            ahead_s = _POLL_S if overdue is None else difference(overdue, self.air.now_ticks()) * TICK_S
             if ahead_s <= 0.0:
-                self.session.give_up()
+                self.session.cancel_overdue()
             self.serve(max(ahead_s, 0.0) + 1e-6)
 
     def hear(self, event: RadioEvent) -> None:
-        """A frame of another, or what became of its own."""
+        """A frame of another anchor, or the result of its own."""
         if isinstance(event, Reception):
             self.work(event)
             self.machine.hear(event)
@@ -166,12 +166,12 @@ class TagHost(Host):
         """Listen."""
         self.session.start()
         while True:
-            self.serve(LOOK_S)
+            self.serve(_POLL_S)
 
     def hear(self, event: RadioEvent) -> None:
         """A frame."""
         if isinstance(event, Reception):
-            slot, place_m = self.work(event)
+            slot, position_m = self.work(event)
             fix = self.receiver.hear(event)
             if fix is not None:
-                self.errors_m2.append((slot, float(np.sum((fix.position_m - place_m)[:2] ** 2))))
+                self.errors_m2.append((slot, float(np.sum((fix.position_m - position_m)[:2] ** 2))))

@@ -1,21 +1,178 @@
 """Which slot length suits a Raspberry Pi: the table of docs/hardware.md. Simulated; some minutes.
 
 python benchmarks/host_latency.py [SECONDS [SEEDS [SLOT_MS ...]]]
+
+A site whose anchors and tag are DW1000s on the SPI of slow hosts. Hosts run the driver (``skyless.firmware.dw1000``) on
+the register model; every transfer costs time, in which the air and the other hosts go on. Frames that come too late are
+skipped, and cost their slots.
 """
 
+import random
 import sys
+from typing import Final
 
 import numpy as np
-from host_latency_model import LatencyResult, run_hosts
+from delayed_hosts import AnchorHost, Host, TagHost
 from host_programs import HostLatency
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
 
-SLOTS_MS = (1.05, 2.1, 2.5, 5.0, 10.0)
+from skyless.air.beacon import Beacon
+from skyless.air.codec import decode_cached
+from skyless.air.reception import Reception
+from skyless.evaluation.scenarios import Request, impairments_of, trajectories_of
+from skyless.simulation.medium import Delivery, Medium
+from skyless.simulation.stations import TagSpec
+from skyless.simulation.world import diagnostics_of
+from skyless.site.lab import ideal_lab_site
+from skyless.site.model import ScheduleSite, Site
+from skyless.ticks import wrap
+from skyless.uncertainty.bounds import bound_settings, received_bound
+
+_SLOTS_MS: Final = (1.05, 2.1, 2.5, 5.0, 10.0)
+_QA: Final = 0.3
+_SPEED_STD_MPS: Final = 1.0
+_WARMUP_S: Final = 3.0
+
+
+class LatencyResult(Struct, frozen=True):
+    """One run."""
+
+    slot_s: float
+    slots: int
+    """Slots after the warm-up."""
+    sent: int
+    """Frames in them."""
+    late: int
+    """Frames that came too late for their radios, in the whole run; none of them was sent."""
+    wrong_stamps: int
+    """Frames that left at another time than the one that they state."""
+    misused: int
+    """Uses of chips that the manual forbids, and frames that were sent although they were cancelled."""
+    heard: float
+    """Share of the frames sent that the tag received."""
+    relayed: float
+    """Share of the frames sent that anchors received, on average over those that could."""
+    fixes: int
+    rms_m: float
+    """Error of the position (2-D), root mean square over all fixes."""
+    bound_m: float
+    """The posterior Cramér-Rao bound for the messages that were received, at the same instants."""
+
+    @property
+    def skipped(self) -> float:
+        """Share of the slots without a frame."""
+        return 1.0 - self.sent / self.slots
+
+
+class LatencyWorld:
+    """The lab with another slot length on such hosts, deterministic by its seed."""
+
+    def __init__(self, slot_s: float, latency: HostLatency, seed: int = 1) -> None:
+        lab = ideal_lab_site()
+        self.site = replace(lab, schedule=ScheduleSite(slot_s=slot_s))
+        request = Request(self.site, seed=seed)
+        self.trajectory = trajectories_of(request)[0]
+        faults = replace(impairments_of(request, self.site), diagnostics=True)
+        self.medium: Medium[None] = Medium(self.site, [TagSpec(self.trajectory)], faults, seed, self._deliver)
+        generators = [random.Random(f"{seed} {node}") for node in range(len(self.site.anchors) + 1)]
+        for node in range(len(generators)):
+            self.medium.switch_on(node)
+        self.anchors = [
+            AnchorHost(self.medium, self.site, node, latency, generators[node])
+            for node in range(len(self.site.anchors))
+        ]
+        self.tag = TagHost(self.medium, len(self.anchors), latency, generators[-1], _QA)
+        self.hosts: list[Host] = [*self.anchors, self.tag]
+        self.sent_frames: list[tuple[int, float, NDArray[np.float64]]] = []
+        """Slot (counted from the first superframe), time and the tag's position of every frame that was sent."""
+        self.wrong_stamps = 0
+
+    def run(self, seconds: float) -> None:
+        """Run for some seconds, and end all programs."""
+        try:
+            for _ in self.medium.run(seconds):
+                pass
+        finally:
+            for host in self.hosts:
+                host.process.close()
+
+    def _deliver(self, delivery: Delivery) -> None:
+        """A frame has ended: notify its sender, and pass it to the chips that can receive it."""
+        flight = delivery.flight
+        beacon = decode_cached(flight.frame)
+        assert isinstance(beacon, Beacon)
+        self.wrong_stamps += beacon.tx_ticks != wrap(flight.marker_local_ticks)
+        slot = beacon.superframe * len(self.anchors) + flight.sender
+        position_m = self.trajectory.position(self.medium.now_s)
+        self.sent_frames.append((slot, self.medium.now_s, position_m))
+        self.hosts[flight.sender].finish()
+        for rows in (delivery.by_anchors, delivery.by_tags):
+            for row in rows:
+                reception = Reception(flight.frame, int(row["rx_ticks"]), self.medium.now_s, diagnostics_of(row))
+                self.hosts[int(row["node"])].arrive(reception, slot, row["position_m"].copy())
+
+
+def run_hosts(slot_s: float, latency: HostLatency, seconds: float, seed: int = 1) -> LatencyResult:
+    """Run the lab on such hosts for some seconds, ``_WARMUP_S`` included."""
+    world = LatencyWorld(slot_s, latency, seed)
+    world.run(seconds)
+    sent = {slot: position_m for slot, time_s, position_m in world.sent_frames if time_s >= _WARMUP_S}
+    first, last = min(sent), max(sent)
+    n = len(world.anchors)
+    first += -first % n
+    slots = last - last % n - first
+    inside = {slot for slot in sent if first <= slot < first + slots}
+    heard = np.zeros((slots, n + 1), bool)
+    for column, host in enumerate(world.hosts):
+        for slot in host.heard & inside:
+            heard[slot - first, column] = True
+    errors_m2 = {slot: error_m2 for slot, error_m2 in world.tag.errors_m2 if slot in inside}
+    traces = _bound(world.site, world, heard, first)
+    at = np.array(sorted(errors_m2), dtype=int) - first
+    judged = at[at * world.site.schedule.slot_s > 1.0]
+    return LatencyResult(
+        slot_s=slot_s,
+        slots=slots,
+        sent=len(inside),
+        late=sum(host.late for host in world.anchors),
+        wrong_stamps=world.wrong_stamps,
+        misused=sum(host.misused for host in world.hosts),
+        heard=float(heard[:, -1].sum() / len(inside)),
+        relayed=float(heard[:, :-1].sum() / (len(inside) * (n - 1))),
+        fixes=len(judged),
+        rms_m=float(np.sqrt(np.mean([errors_m2[int(slot) + first] for slot in judged]))),
+        bound_m=float(np.sqrt(traces[judged].mean())),
+    )
+
+
+def _bound(site: Site, world: LatencyWorld, heard: NDArray[np.bool_], first: int) -> NDArray[np.float64]:
+    """Trace of the bound at each slot, of what hosts received; it begins without any knowledge."""
+    n, slot_s, noise = len(site.anchors), site.schedule.slot_s, site.noise
+    known = heard.copy()
+    of_others = np.arange(len(heard)) % n != 0
+    known[:, :-1] &= ~of_others[:, None] | heard[:, -1:]
+    begun_s = min(time_s - (slot - first) * slot_s for slot, time_s, _ in world.sent_frames if slot >= first)
+    path_m = np.array([world.trajectory.position(begun_s + slot * slot_s) for slot in range(len(heard))])
+    settings = bound_settings(
+        noise.rx_stamp_ps * 1e-12,
+        white_fm=noise.white_fm,
+        random_walk_fm=noise.random_walk_fm,
+        qa=_QA,
+        slot_s=slot_s,
+        speed_std_mps=_SPEED_STD_MPS,
+        mesh=True,
+    )
+    anchors_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    traces: NDArray[np.float64] = np.trace(received_bound(anchors_m, path_m, settings, known), axis1=1, axis2=2)
+    return traces
 
 
 def main() -> None:
     """Print the table."""
     seconds, seeds = (float(word) for word in (*sys.argv[1:3], *("10", "4")[len(sys.argv[1:3]) :]))
-    slots_ms = [float(word) for word in sys.argv[3:]] or SLOTS_MS
+    slots_ms = [float(word) for word in sys.argv[3:]] or _SLOTS_MS
     heads = (
         "slot",
         "messages/s",

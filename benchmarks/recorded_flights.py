@@ -29,7 +29,7 @@ from plain_flight_filter import plain_positions
 from scipy.stats import chi2
 
 from skyless.calibration.run import CalibrationRequest, calibrate_capture
-from skyless.cli.replay_input import flight_height, height_to_hold, known_anchors, known_truth
+from skyless.cli.common.recording_inputs import flight_height, height_to_hold, known_anchors, known_truth
 from skyless.evaluation.judge import Judge
 from skyless.recordings.foreign.avalue import anchor_distances_m
 from skyless.recordings.foreign.formats import format_of, open_recording

@@ -21,10 +21,9 @@ import msgspec
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import AnchorHealth, EtherHealth, TagHealth
 from skyless.mqtt.topics import health_topic
-from skyless.nodes.broker.broker import start_broker
-from skyless.nodes.broker.settings import BrokerSettings
-from skyless.nodes.process.children import Child, Program
-from skyless.nodes.process.ports import any_port
+from skyless.nodes.broker import BrokerSettings, start_broker
+from skyless.nodes.children import Child, Program
+from skyless.nodes.ports import hold_any
 from skyless.site.lab import lab_site
 
 START_S = 120.0
@@ -80,7 +79,8 @@ def programs(tags, processes, port, mqtt, publish_hz):
 async def measure(tags, processes, seconds, publish_hz):
     """Run a site of so many tags, and what it took."""
     with tempfile.TemporaryDirectory() as folder:
-        port = any_port("127.0.0.1")
+        port, held = hold_any("127.0.0.1")
+        held.close()
         broker = await start_broker(BrokerSettings(data=Path(folder)))
         link = Link(broker.address, "benchmark", site=SITE.id, kind="watch")
         healths = Healths(link)

@@ -30,6 +30,16 @@ def test_importing_it_is_light():
     assert subprocess.check_output([sys.executable, "-c", script], text=True).strip() == "set()"
 
 
+def test_a_value_loads_no_estimator():
+    """Value types and the interface of methods need neither the compiler nor what computes them."""
+    modules = "fix, integrity, observation"
+    script = f"import sys; from skyless import Fix; from skyless.positioning import {modules}; print(*sys.modules)"
+    loaded = subprocess.check_output([sys.executable, "-c", script], text=True).split()
+    assert "numba" not in loaded
+    below = ("skyless.positioning.estimator", "skyless.positioning.methods", "skyless.positioning.masterless")
+    assert [name for name in loaded if name.startswith(below)] == []
+
+
 def test_a_position_from_a_notebook():
     """Five anchors, ideal differences: the position comes back without a guess."""
     import numpy as np

@@ -60,7 +60,7 @@ VERBS = {
 }
 """Names of functions that do not say what is done."""
 
-HEARING = {"anchor.py", "receiver.py", "simulation/world.py", "evaluation/receiver_with_outages.py"}
+HEARING = {"anchor.py", "receiver.py", "simulation/world.py", "evaluation/fleet.py"}
 """Only what stands where a radio's receptions arrive has methods named ``hear``."""
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from skyless.evaluation.scenarios import Request, fleet_of
     from skyless.method_names import METHODS
     from skyless.positioning.fix import Fix, NoFixReason
-    from skyless.positioning.solver.locate import locate
+    from skyless.positioning.methods.locate import locate
     from skyless.receiver import Receiver
     from skyless.recordings.foreign.formats import open_recording
     from skyless.site.lab import lab_site
@@ -37,7 +37,7 @@ _MODULES: Final = {
     "fleet_of": "skyless.evaluation.scenarios",
     "lab_site": "skyless.site.lab",
     "load_site": "skyless.site.load",
-    "locate": "skyless.positioning.solver.locate",
+    "locate": "skyless.positioning.methods.locate",
     "open_recording": "skyless.recordings.foreign.formats",
 }
 

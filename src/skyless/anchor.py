@@ -15,16 +15,14 @@ from skyless.air.beacon import Beacon, Heard, Malformed, MasterTime
 from skyless.air.codec import decode_cached, encode, heard_capacity
 from skyless.air.master_term import MasterTerm
 from skyless.air.reception import Reception, Transmission
-from skyless.clocks.filter import ClockFilter, clock_noise
+from skyless.clocks.filter import ClockFilter, clock_noise, stamp_variance_m2
 from skyless.clocks.site_clock import SiteClock
-from skyless.clocks.site_time import SUBTICKS
-from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, SUBTICKS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.master_election import MasterElection, Role, Verdict
 from skyless.site.almanac_pages import almanac_issue, page_for, pages_of
 from skyless.site.model import AnchorSite, Site
 from skyless.site.slots import first_slots, schedule_of
 from skyless.ticks import Unwrapper, difference, wrap
-from skyless.uncertainty.tdoa import stamp_variance_m2
 
 MAX_OFFSET_STD_M: Final = 0.3
 """An anchor sends only while its offset is known better than this (``docs/maths.md`` section 6)."""
@@ -127,10 +125,10 @@ class Anchor:
         if verdict in {Verdict.FROM_NEW_MASTER, Verdict.FROM_FIRST_MASTER}:
             self._master_heard = None
             range_m = _distance_m(self._own, self._anchors[beacon.anchor])
-            self._clock.follow(range_m, afresh=verdict is Verdict.FROM_FIRST_MASTER)
+            self._clock.track_master(range_m, restart=verdict is Verdict.FROM_FIRST_MASTER)
         elif verdict is not Verdict.FROM_MASTER:
             return
-        if self._clock.hear(beacon, rx_ticks):
+        if self._clock.on_master_beacon(beacon, rx_ticks):
             self._master_heard = heard
 
     def next_transmission_ticks(self, now_ticks: int) -> int | None:
@@ -169,7 +167,7 @@ class Anchor:
         if self._election.must_become_master(now, good):
             self.counters["takeover"] += self._election.master_term is not None
             self._election.become_master(now)
-            self._clock.lead(now)
+            self._clock.become_master(now)
             self._master_heard = None
 
     def _beacon(self, tx_ticks: int, superframe: int, slot: int) -> Beacon:

@@ -20,6 +20,9 @@ TICK_M: Final = SPEED_OF_LIGHT_MPS * TICK_S
 TICK_BITS: Final = 40
 """Width of the timestamp counter (DW1000 User Manual v2.12, 7.2.8); it wraps every 17.2074 s."""
 
+SUBTICKS: Final = 256
+"""Parts of a tick; the air's unit of the site's time, of which beacons carry 48 bits."""
+
 DELAYED_TX_GRANULARITY_TICKS: Final = 512
 """DX_TIME ignores its low nine bits: transmissions start on 8.013 ns boundaries (DW1000 User Manual, p. 26)."""
 

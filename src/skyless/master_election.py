@@ -84,9 +84,9 @@ class MasterElection:
             return self._accept(master_term, rx_ticks, Verdict.FROM_FIRST_MASTER) if by_master else Verdict.OTHER
         if master_term == self.master_term:
             if by_master:
-                self._watch.hear(beacon.anchor, beacon.sequence, rx_ticks)
+                self._watch.update(beacon.anchor, beacon.sequence, rx_ticks)
             elif beacon.master_heard is not None:
-                self._watch.hear(beacon.anchor, beacon.master_heard.sequence, rx_ticks)
+                self._watch.update(beacon.anchor, beacon.master_heard.sequence, rx_ticks)
             return Verdict.FROM_MASTER if by_master else Verdict.OTHER
         if not self._is_newer(master_term):
             return self._on_older(master_term, rx_ticks) if by_master else Verdict.STALE

@@ -14,16 +14,13 @@ from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.master_term import FollowedMaster
 from skyless.air.reception import Diagnostics, Reception
-from skyless.clocks.stamps import AnchorStamps, StampTracks
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.fix_time import FixTime
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.positioning.methods.factory import MethodOptions, new_method
 from skyless.positioning.methods.joint import Estimation, EstimationState
-from skyless.positioning.methods.nlos_weighting import variance_factor
-from skyless.positioning.methods.observations import Observer
+from skyless.positioning.methods.observations import AnchorStamps, FixTime, Observer, StampTracks, variance_factor
 from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
 from skyless.site.almanac_pages import AlmanacAssembly, AlmanacState
 from skyless.site.slots import schedule_from_page
@@ -141,7 +138,7 @@ class Receiver:
         made.almanac.restore(state.almanac)
         made._read_positions()
         made._master, made._observer.scale = state.master, state.master_scale
-        made._observer.follow(state.master, made.almanac.slot_of(state.master) or 0)
+        made._observer.set_master(state.master, made.almanac.slot_of(state.master) or 0)
         if state.has_method_key:
             made._choose_method()
         match made._method, state.method:
@@ -186,7 +183,7 @@ class Receiver:
             self.reason = NoFixReason.NO_ALMANAC
             return None
         scale, master_term = 1.0 if diagnostics is None else _variance_scale(diagnostics), self._followed.master_term
-        result = method.hear(self._observer.observe(frame, beacon, anchor_m, rx_ticks, tx_ticks, scale, master_term))
+        result = method.update(self._observer.observe(frame, beacon, anchor_m, rx_ticks, tx_ticks, scale, master_term))
         if isinstance(result, Fix):
             self.counters["fixes"] += 1
             return result
@@ -209,7 +206,7 @@ class Receiver:
                 f"height_m is {height_m!r} and std_m is {std_m!r}; both should be finite numbers, std_m above 0"
             )
         method = self._method
-        return isinstance(method, Estimation) and method.hear_height(height_m, std_m)
+        return isinstance(method, Estimation) and method.update_height(height_m, std_m)
 
     def _admit(self, beacon: Beacon, rx_ticks: int) -> int | None:
         """TX stamp, unwrapped, of a beacon of the site, by the present master, and of an anchor that may be there."""
@@ -275,7 +272,7 @@ class Receiver:
         elif self._method is not None and master == self._master:
             return
         self._master = master
-        self._observer.follow(master, almanac.slot_of(master) or 0)
+        self._observer.set_master(master, almanac.slot_of(master) or 0)
         self._choose_method()
 
     def _read_positions(self) -> None:
@@ -293,7 +290,7 @@ class Receiver:
                 schedule = schedule_from_page(schedule_page)
                 self._superframe_ticks = schedule.superframe_ticks
                 self._method = new_method(options, master, schedule_page, noise, accuracy, self._time)
-                self._observer.serve(self._method, schedule)
+                self._observer.set_method(self._method, schedule)
 
 
 def _variance_scale(diagnostics: Diagnostics) -> float:

@@ -1,7 +1,7 @@
-"""A site on hosts that take their time: slots are skipped and counted, and never a frame leaves with a wrong stamp."""
+"""A site on slow hosts: slots are skipped and counted, and never a frame leaves with a wrong stamp."""
 
 import pytest
-from host_latency_model import run_hosts
+from host_latency import run_hosts
 from host_programs import HostLatency
 
 MOST_RATIO = 2.0

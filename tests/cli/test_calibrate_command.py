@@ -79,7 +79,7 @@ def test_the_delays_of_a_site_are_found_and_written_back(site_recording, capsys,
     ]
 
 
-def test_a_replay_with_the_mended_file_is_as_good_as_without_errors(site_recording, capsys, tmp_path):
+def test_a_replay_with_the_corrected_file_is_as_good_as_without_errors(site_recording, capsys, tmp_path):
     folder, _ = site_recording
     out = tmp_path / "new.toml"
     run(capsys, folder / "stay.mcap", "--site", folder / "site.toml", "--out", out)
@@ -200,8 +200,8 @@ def test_a_table_may_be_calibrated_in_its_place_when_asked(stay, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--out", "new.csv"), "the site file is mended"),
-        (("--out", "new.toml"), "the site file is mended"),
+        (("--out", "new.csv"), "the site file is corrected"),
+        (("--out", "new.toml"), "the site file is corrected"),
         (("--anchors", "a.csv"), "brings its own"),
         (("--tag", "nobody"), "tag is"),
         (("--site", "{folder}/other.toml"), "site's id"),

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from skyless.cli.nodes.demo_screen import MOST_ALERTS, SHOWN_S, Screen
+from skyless.cli.nodes.demo import ALERT_SHOWN_S, MOST_ALERTS, Screen
 from skyless.mqtt.messages import AnchorHealth, Counters, FixMessage
 from skyless.nodes.watch import Watch
 from skyless.positioning.integrity import Alert
@@ -26,7 +26,7 @@ def stage():
     watch = Watch(NoLink(), 7, planar=True)
     for number in range(1, 7):
         unix_s = time.time() - (60.0 if number == 6 else 0.0)
-        watch._take_anchor(
+        watch._on_anchor(
             AnchorHealth(
                 number, unix_s, 1.0, "anchor", 1, 0, True, 0.0, 0.0, 0.0, 1, 0, 1, 1, {}, {}, Counters(0, 0, 0)
             )
@@ -53,7 +53,7 @@ def drawn(screen):
 
 def test_methods_without_alerts_have_no_line(stage):
     screen, watch = stage
-    watch._take_fix(fix("t1", None))
+    watch._on_fix(fix("t1", None))
     assert screen.alerts() == []
     assert screen.summary()["alerts"] == {}
     assert "alerts" not in screen.closing()
@@ -61,29 +61,29 @@ def test_methods_without_alerts_have_no_line(stage):
 
 def test_words_that_are_no_alerts_are_not_shown(stage):
     screen, watch = stage
-    watch._take_fix(fix("t1", "none"))
-    watch._take_fix(fix("t1", "\x1b[2Jboo"))
+    watch._on_fix(fix("t1", "none"))
+    watch._on_fix(fix("t1", "\x1b[2Jboo"))
     assert drawn(screen) == "alerts: none now; none so far"
 
 
 def test_the_line_is_there_before_there_is_an_alert_so_that_tables_do_not_jump(stage):
     screen, watch = stage
-    watch._take_fix(fix("t1", "none"))
+    watch._on_fix(fix("t1", "none"))
     assert drawn(screen) == "alerts: none now; none so far"
 
 
 def test_alerts_of_the_newest_fixes_are_named_with_the_anchors_left_out_and_all_are_counted(stage):
     screen, watch = stage
     for _ in range(3):
-        watch._take_fix(fix("t1", "unavailable"))
-    watch.tags["t1"].alerted_s -= SHOWN_S
-    watch._take_fix(fix("t1", "none"))
-    watch._take_fix(fix("t2", "detected-excluded", (1, 2, 3, 5)))
-    watch._take_fix(fix("t2", "none"))  # it comes and goes with each message of the anchor
+        watch._on_fix(fix("t1", "unavailable"))
+    watch.tags["t1"].alerted_s -= ALERT_SHOWN_S
+    watch._on_fix(fix("t1", "none"))
+    watch._on_fix(fix("t2", "detected-excluded", (1, 2, 3, 5)))
+    watch._on_fix(fix("t2", "none"))  # it comes and goes with each message of the anchor
     assert drawn(screen) == (
         "alerts: t2 detected-excluded (without 4), 1 of 2 tags now; so far detected-excluded 1, unavailable 3"
     )
-    watch.tags["t2"].alerted_s -= SHOWN_S
+    watch.tags["t2"].alerted_s -= ALERT_SHOWN_S
     assert drawn(screen) == "alerts: none now; so far detected-excluded 1, unavailable 3"
     assert screen.summary()["alerts"] == {"detected-excluded": 1, "none": 2, "unavailable": 3}
 
@@ -92,7 +92,7 @@ def test_alerts_of_the_newest_fixes_are_named_with_the_anchors_left_out_and_all_
 def test_many_alerts_take_no_more_than_four_lines(stage, alert):
     screen, watch = stage
     for number in range(200):
-        watch._take_fix(fix(f"t{number}", alert, (1, 2)))
+        watch._on_fix(fix(f"t{number}", alert, (1, 2)))
     console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
     console.print(*screen.alerts())
     text = console.export_text()

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from skyless.cli.main import main
-from skyless.cli.nodes.demo_screen import _subscriber
+from skyless.cli.nodes.demo import _subscriber
 from skyless.mqtt.address import MqttAddress
-from skyless.nodes.process.ports import any_port
+from skyless.nodes.ports import hold_any
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ from skyless.nodes.process.ports import any_port
         ("anchor 1 2 --radio serial:/dev/ttyACM0", "it should name 2 ports, one for each node, with commas"),
         ("anchor 1 --radio listener:/dev/ttyACM0", "it should be one that can transmit: a listener only listens"),
         ("board tag1 --radio serial:/dev/ttyACM0", "it should be the emulated air, ether:HOST[:PORT]"),
-        ("board tag1 --link /", "--link is '/'; it should be a name that is free, and something stands there"),
+        ("board tag1 --link /", "--link is '/'; it should be a free name, and this path exists"),
         ("tag t --integrity-risk 0", "--integrity-risk"),
         ("tag t --integrity-risk 0.2", "--integrity-risk"),
         ("tag t --method weighted --alert-limit-m 0.5", "weighted gives no protection levels"),
@@ -78,7 +78,9 @@ def test_the_demo_tells_how_to_watch_its_broker(address, words):
 
 
 def test_a_recorder_that_found_no_site_says_so_with_its_exit_code(tmp_path, capsys):
-    broker = f"mqtt://127.0.0.1:{any_port('127.0.0.1')}"
+    port, held = hold_any("127.0.0.1")
+    held.close()
+    broker = f"mqtt://127.0.0.1:{port}"
     assert main(["record", str(tmp_path / "a.mcap"), "--mqtt", broker, "--duration", "0.2"]) == 1
     assert "nothing was recorded" in capsys.readouterr().out
 

@@ -8,7 +8,7 @@ import threading
 
 WORK = """
 from skyless.cli.common import progress
-progress._PATIENCE_S = {patience}
+progress._HIDDEN_S = {patience}
 with progress.progress_bar("replaying", 3) as bar:
     for done in range(4):
         bar.reach(done)

@@ -16,7 +16,7 @@ from matplotlib.image import imread
 
 import synthetic_recordings as synthetic
 from skyless.cli.main import main
-from skyless.cli.replay_output import COLUMNS
+from skyless.cli.replay import FIXES_COLUMNS
 from skyless.site.lab import lab_site
 from skyless.site.template import site_template
 
@@ -74,9 +74,9 @@ def test_fixes_file_and_report_agree(run, room, tmp_path):
     told = report(run("tdoa-table", "--anchors", "anchors.csv", "--fixes", path, "--settle", "0", "--json"))
     with path.open(newline="") as file:
         table = list(csv.DictReader(file))
-    assert tuple(table[0]) == COLUMNS
+    assert tuple(table[0]) == FIXES_COLUMNS
     assert len(table) == told["fixes"]
-    values = {name: np.array([float(row[name]) for row in table]) for name in COLUMNS if name not in TEXTS}
+    values = {name: np.array([float(row[name]) for row in table]) for name in FIXES_COLUMNS if name not in TEXTS}
     assert (np.diff(values["t_s"]) > 0.0).all()
     places = np.stack([values["x_m"], values["y_m"], values["z_m"]], axis=1)
     assert np.median(places, axis=0) == pytest.approx(told["median_m"], abs=1e-5)
@@ -120,7 +120,7 @@ def test_pictures(run, tmp_path):
 
 
 def test_a_table_for_people_in_a_pipe_has_no_control_characters(room):
-    environment = {**os.environ, "FORCE_COLOR": "", "COLUMNS": "80"}
+    environment = {**os.environ, "FORCE_COLOR": "", "FIXES_COLUMNS": "80"}
     done = subprocess.run(
         [*COMMAND, "bitcraze-yaml", "--anchors", "anchors.csv"],
         cwd=room,
@@ -274,8 +274,8 @@ def test_interrupted_replay_keeps_what_it_has_written(room, tmp_path):
     assert (process.returncode, out, err) == (130, b"", b"")
     with path.open(newline="") as file:
         table = list(csv.reader(file))
-    assert tuple(table[0]) == COLUMNS
+    assert tuple(table[0]) == FIXES_COLUMNS
     assert 10 < len(table) < 100_000
-    assert all(len(row) == len(COLUMNS) for row in table)
+    assert all(len(row) == len(FIXES_COLUMNS) for row in table)
     assert float(table[-1][0]) > 0.0
     assert path.read_bytes().endswith(b"\n")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from skyless.cli.main import main
-from skyless.cli.simulate_output import COLUMNS
+from skyless.cli.simulate import FIXES_CSV_COLUMNS
 from skyless.site.lab import lab_site
 
 C = 299_792_458.0
@@ -99,7 +99,7 @@ def test_fixes_file_and_report_agree(run, tmp_path):
     told = report(run("--position", "3,4", "--duration", "3", "--warmup", "0", "--fixes-csv", "fixes.csv", "--json"))
     with (tmp_path / "fixes.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
-    assert tuple(table[0]) == COLUMNS
+    assert tuple(table[0]) == FIXES_CSV_COLUMNS
     assert len(table) == pytest.approx(told["updates_per_s"] * (3.0 - told["first_fix_s"]), abs=1)
     errors = [
         math.dist((float(r["x_m"]), float(r["y_m"])), (float(r["truth_x_m"]), float(r["truth_y_m"]))) for r in table
@@ -144,7 +144,7 @@ def test_the_room_is_the_lab_with_the_errors_of_rooms(run):
 def test_deaf_tags_make_no_fix_and_find_themselves_again(run, tmp_path, method):
     base = ["--method", method, "--duration", "8", "--fixes-csv", "fixes.csv", "--json"]
     told = report(run(*base, "--deaf", "3:4.5", "--deaf", "5:5.5"))
-    assert told["drops"]["deaf"] == pytest.approx(2.0 * 400, abs=2)
+    assert told["drops"]["radio-off"] == pytest.approx(2.0 * 400, abs=2)
     with (tmp_path / "fixes.csv").open(newline="") as file:
         times_s = [float(row["t_s"]) for row in csv.DictReader(file)]
     assert not any(3.0 <= time_s < 4.5 or 5.0 <= time_s < 5.5 for time_s in times_s)
@@ -282,5 +282,5 @@ def test_an_interrupted_run_keeps_what_it_has_written(tmp_path):
     with path.open(newline="") as file:
         table = list(csv.reader(file))
     assert len(table) > 10
-    assert all(len(row) == len(COLUMNS) for row in table)
+    assert all(len(row) == len(FIXES_CSV_COLUMNS) for row in table)
     assert path.read_bytes().endswith(b"\n")

@@ -6,7 +6,7 @@ from scipy.linalg import solve_discrete_are
 
 from skyless.clocks.broadcast import (
     ACCELERATION_M2PS3,
-    RANDOM_WALK_FM,
+    BROADCAST_WALK_FM,
     RESTART_AFTER,
     STAMP_TICKS,
     WHITE_FM,
@@ -28,7 +28,7 @@ def test_32_bit_counters_are_followed_across_gaps_of_seconds(rate, offset, first
     times = [0, 1, 2, 3, 4, 4 + first_gap, 5 + first_gap, 5 + first_gap + second_gap]
     heard = stamps([time * PERIOD for time in times], rate, offset)
     clock = BroadcastClock(32, *heard[0])
-    assert all(clock.hear(*packet) for packet in heard[1:])
+    assert all(clock.update(*packet) for packet in heard[1:])
     assert clock.tx_ticks - heard[0][0] == pytest.approx(times[-1] * PERIOD * (1 - rate), abs=2)
     assert clock.rate == pytest.approx(rate / (1 - rate), abs=1e-9)
     assert abs(clock.phase) < 2
@@ -36,7 +36,7 @@ def test_32_bit_counters_are_followed_across_gaps_of_seconds(rate, offset, first
 
 def test_the_phase_is_as_good_as_an_optimal_filter_of_that_noise():
     rng = np.random.default_rng(4)
-    walk = (2 * RANDOM_WALK_FM**2 + ACCELERATION_M2PS3 / SPEED_OF_LIGHT_MPS**2) * TICK_S
+    walk = (2 * BROADCAST_WALK_FM**2 + ACCELERATION_M2PS3 / SPEED_OF_LIGHT_MPS**2) * TICK_S
     white = 2 * WHITE_FM**2 / TICK_S
     step = np.array([[1.0, PERIOD], [0.0, 1.0]])
     noise = np.array(
@@ -52,7 +52,7 @@ def test_the_phase_is_as_good_as_an_optimal_filter_of_that_noise():
         state = step @ state + rng.multivariate_normal([0.0, 0.0], noise)
         sent = number * PERIOD
         rx_ticks = sent + round(state[0] + rng.normal(0.0, STAMP_TICKS))
-        clock.hear(sent % 2**32, rx_ticks)
+        clock.update(sent % 2**32, rx_ticks)
         errors.append(rx_ticks + clock.phase - sent - state[0])
     # 20 000 errors that are alike over some 6 packets: standard error of the deviation 1.2 %, of the mean 1.7 %.
     assert np.std(errors[100:]) == pytest.approx(np.sqrt(posterior), rel=0.05)
@@ -65,10 +65,10 @@ def test_single_wild_stamps_are_left_out_and_change_nothing():
     wild = BroadcastClock(32, 0, 0)
     for number, (tx, rx) in enumerate(stamps(times, 5e-6, 0)[1:]):
         if number % 10 == 9:
-            assert not wild.hear(tx, rx + 20_000)
+            assert not wild.update(tx, rx + 20_000)
         else:
-            assert clean.hear(tx, rx)
-            assert wild.hear(tx, rx)
+            assert clean.update(tx, rx)
+            assert wild.update(tx, rx)
     assert (wild.rate, wild.phase) == (clean.rate, clean.phase)
 
 
@@ -76,8 +76,8 @@ def test_a_restarted_anchor_is_followed_after_three_packets():
     before = stamps([number * PERIOD for number in range(50)], 5e-6, 123)
     after = stamps([number * PERIOD for number in range(50, 100)], 5e-6, 3_000_000_000)
     clock = BroadcastClock(32, *before[0])
-    assert all(clock.hear(*packet) for packet in before[1:])
-    taken = [clock.hear(*packet) for packet in after]
+    assert all(clock.update(*packet) for packet in before[1:])
+    taken = [clock.update(*packet) for packet in after]
     assert taken == [False] * RESTART_AFTER + [True] * (50 - RESTART_AFTER)
     assert clock.restarts == 1
     assert clock.rate == pytest.approx(5e-6, abs=2e-9)
@@ -87,6 +87,6 @@ def test_packets_out_of_order_are_refused():
     heard = stamps([number * PERIOD for number in range(20)], 0.0, 0)
     clock = BroadcastClock(32, *heard[0])
     for packet in heard[1:]:
-        assert clock.hear(*packet)
-    assert not clock.hear(*heard[10])
+        assert clock.update(*packet)
+    assert not clock.update(*heard[10])
     assert clock.tx_ticks == 19 * PERIOD

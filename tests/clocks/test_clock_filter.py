@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
-from skyless.clocks.filter import COVARIANCE, VAR_OFFSET, VAR_RATE, ClockFilter, ClockNoise, clock_noise
+from skyless.clocks.filter import ClockFilter, ClockNoise, clock_noise
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
 
 NOISE = clock_noise(2e-11, 1e-9)
@@ -24,12 +24,12 @@ def transition(dt):
 def test_steady_covariance_solves_the_riccati_equation():
     clock = ClockFilter(NOISE, VARIANCE_M2)
     for k in range(5000):
-        clock.hear(k * PERIOD_TICKS, 10**12 + k * PERIOD_TICKS, 0.0)
+        clock.update(k * PERIOD_TICKS, 10**12 + k * PERIOD_TICKS, 0.0)
     F, Q = transition(PERIOD_TICKS / TICK_RATE_HZ)
     H = np.array([[1.0, 0.0]])
     predicted = solve_discrete_are(F.T, H.T, Q, np.array([[VARIANCE_M2]]))
     updated = predicted - predicted @ H.T @ H @ predicted / (predicted[0, 0] + VARIANCE_M2)
-    filtered = clock.state[[VAR_OFFSET, COVARIANCE, VAR_RATE]]
+    filtered = np.array(clock.covariance)
     np.testing.assert_allclose(filtered, [updated[0, 0], updated[0, 1], updated[1, 1]], rtol=1e-6)
 
 
@@ -47,7 +47,7 @@ def run_pair(seed, beacons, gate=6.0):
         tx = k * PERIOD_TICKS
         noise = np.sqrt(VARIANCE_M2) * generator.standard_normal()
         whole = round((truth[0] + range_m + noise) / TICK_M)
-        innovations.append(clock.hear(tx, base + tx + whole, range_m))
+        innovations.append(clock.update(tx, base + tx + whole, range_m))
         if k > 50:
             own = base + tx + round(truth[0] / TICK_M)
             ticks, fraction, variance = clock.to_master(own)
@@ -68,7 +68,7 @@ def test_times_convert_there_and_back(epoch, offset, rate):
     clock = ClockFilter(NOISE, VARIANCE_M2)
     for k in range(20):
         elapsed = k * PERIOD_TICKS
-        clock.hear(epoch + elapsed, epoch + offset + elapsed + round(rate * elapsed), 0.0)
+        clock.update(epoch + elapsed, epoch + offset + elapsed + round(rate * elapsed), 0.0)
     for later in (-PERIOD_TICKS, 0, PERIOD_TICKS // 3, 5 * PERIOD_TICKS):
         master = epoch + 19 * PERIOD_TICKS + later
         ticks, fraction, _ = clock.to_master(clock.from_master(master))
@@ -81,7 +81,7 @@ def test_hours_of_drift_lose_nothing():
     step = 60 * round(TICK_RATE_HZ)
     for k in range(24 * 60):
         drift = k * step // 50_000
-        clock.hear(k * step, k * step + drift, 0.0)
+        clock.update(k * step, k * step + drift, 0.0)
     own = (24 * 60 - 1) * step + (24 * 60 - 1) * step // 50_000
     ticks, fraction, _ = clock.to_master(own)
     assert abs(ticks - (24 * 60 - 1) * step + fraction) < 1.0
@@ -90,11 +90,11 @@ def test_hours_of_drift_lose_nothing():
 def test_an_outlier_is_refused_and_counted():
     clock = ClockFilter(NOISE, VARIANCE_M2)
     for k in range(100):
-        clock.hear(k * PERIOD_TICKS, k * PERIOD_TICKS, 0.0)
+        clock.update(k * PERIOD_TICKS, k * PERIOD_TICKS, 0.0)
     before = clock.to_master(100 * PERIOD_TICKS)
-    assert clock.hear(100 * PERIOD_TICKS, 100 * PERIOD_TICKS + 5000, 0.0) > 36.0
+    assert clock.update(100 * PERIOD_TICKS, 100 * PERIOD_TICKS + 5000, 0.0) > 36.0
     assert clock.rejected == 1
     after = clock.to_master(100 * PERIOD_TICKS)
     assert after[0] + after[1] == pytest.approx(before[0] + before[1], abs=1e-6)
-    clock.hear(101 * PERIOD_TICKS, 101 * PERIOD_TICKS, 0.0)
+    clock.update(101 * PERIOD_TICKS, 101 * PERIOD_TICKS, 0.0)
     assert clock.rejected == 0

@@ -1,12 +1,28 @@
 """The paper's two-message synchronisation on ideal and noisy linear clocks."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.clocks.paper import LinearClock, relative_offset, relative_rate, synchronise, to_master
 from skyless.constants import TICK_M, TICK_RATE_HZ
+from skyless.positioning.methods.snapshots import relative_offset, relative_rate, synchronise, to_master
+
+
+@dataclass(frozen=True, slots=True)
+class LinearClock:
+    """A clock with constant offset and rate (``eq:TauMaster``, ``eq:TauAnchor``, ``eq:TauTag``)."""
+
+    offset_ticks: float
+    rate: float
+    """Normalised rate ν, 1 for a perfect oscillator."""
+
+    def read(self, true_ticks: float) -> float:
+        """Reading, in ticks, at a true time counted in ticks."""
+        return self.offset_ticks + self.rate * true_ticks
+
 
 ppm = st.floats(-20e-6, 20e-6)
 interval_s = st.floats(1e-3, 20.0)

@@ -51,7 +51,7 @@ def test_the_median_of_a_pair_survives_wild_stamps_and_a_restart():
             ((1, 2), (2, 1), (1, 2)), legs(900, 7e-6, start, start + shift, 40), strict=True
         ):
             glitch = 5000 if number % 7 == 3 else 0
-            ranging.hear(sender, receiver, leg.tx_ticks, (leg.rx_ticks + glitch) % 2**40)
+            ranging.add(sender, receiver, leg.tx_ticks, (leg.rx_ticks + glitch) % 2**40)
     assert ranging.flight_ticks(2, 1) == pytest.approx(900, abs=2)
     assert ranging.flights_ticks().keys() == {(1, 2)}
     assert ranging.flight_ticks(1, 3) is None

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from skyless.cli.dashboard import _address, _place, _rules
+from skyless.cli.dashboard import _address, _listening, _rules
 from skyless.cli.main import main
 from skyless.dashboard.serve import PORT, ListenAddress, bind
 from skyless.errors import SkylessError
@@ -26,13 +26,13 @@ from skyless.errors import SkylessError
     ],
 )
 def test_where_to_listen(text, host, port):
-    assert _place(text) == ListenAddress(host, port)
+    assert _listening(text) == ListenAddress(host, port)
 
 
 @pytest.mark.parametrize("text", ["", ":8080", "127.0.0.1:x", "127.0.0.1:70000", "127.0.0.1:-1", "localhost:8080x"])
-def test_a_wrong_place_is_refused_with_what_would_be_right(text):
+def test_a_wrong_listening_is_refused_with_what_would_be_right(text):
     with pytest.raises(SkylessError, match="HOST:PORT"):
-        _place(text)
+        _listening(text)
 
 
 def test_a_taken_port_is_an_error_when_it_was_asked_for():

@@ -17,8 +17,7 @@ from dashboard_builders import SITE, SITE_ID, SQUARE, fix, truth
 from skyless.mqtt import topics
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import ZonesMessage
-from skyless.nodes.broker.broker import start_broker
-from skyless.nodes.broker.settings import BrokerSettings
+from skyless.nodes.broker import BrokerSettings, start_broker
 
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "dashboard", "--json"]
 PATIENCE_S = 20.0

@@ -8,8 +8,7 @@ from msgspec.structs import replace
 from scipy.stats import chi2
 
 from skyless.evaluation.fleet import report
-from skyless.evaluation.room_world import Room, displacements
-from skyless.evaluation.scenarios import Request, fleet_of, impairments_of, trajectories_of
+from skyless.evaluation.scenarios import Request, Room, displacements, fleet_of, impairments_of, trajectories_of
 from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Roaming, Static
 from skyless.site.lab import lab_site

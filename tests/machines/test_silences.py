@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from skyless.evaluation.scenarios import Request, fleet_of
 from skyless.positioning.estimator.estimator import Estimator
 from skyless.positioning.estimator.kalman import predict
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import EXACT
 from skyless.site.template import rectangular_site

@@ -11,7 +11,7 @@ from bench import EVERY_METHOD, LAB, ROOM, SNAPSHOTS, Stage, assert_honest
 from skyless.air.codec import decode
 from skyless.air.master_term import is_newer
 from skyless.anchor import Anchor
-from skyless.clocks.site_time import continued
+from skyless.clocks.site_clock import continued
 from skyless.clocks.watch import MOST_CHANCE, MasterWatch
 from skyless.constants import TICK_S
 from skyless.evaluation.scenarios import Request, impairments_of
@@ -234,12 +234,12 @@ def watched(loss, others, turns, seed=1):
     watch.begin(0)
     for turn in range(turns):
         if generator.random() > loss:
-            watch.hear(1, turn % 256, turn)
+            watch.update(1, turn % 256, turn)
         for other in range(others):
             if generator.random() > loss:
                 last[other] = turn
             if generator.random() > loss and last[other] is not None:
-                watch.hear(2 + other, last[other] % 256, turn)
+                watch.update(2 + other, last[other] % 256, turn)
         yield watch
 
 

@@ -13,8 +13,7 @@ import weakref
 from pathlib import Path
 
 from skyless.mqtt.address import MqttAddress
-from skyless.nodes.broker.broker import start_broker
-from skyless.nodes.broker.settings import BrokerSettings
+from skyless.nodes.broker import BrokerSettings, start_broker
 
 MOSQUITTO = shutil.which("mosquitto", path=os.environ.get("PATH", "") + ":/usr/sbin")
 

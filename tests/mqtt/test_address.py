@@ -56,7 +56,7 @@ def test_the_password_may_stand_in_the_environment(monkeypatch):
         ("mqtt://:word@h", "a user's name"),
     ],
 )
-def test_a_wrong_url_is_told_with_what_would_be_right(url, right):
+def test_a_wrong_url_is_reported_with_what_would_be_right(url, right):
     with pytest.raises(SkylessError, match=right):
         mqtt_address(url)
 

@@ -7,8 +7,7 @@ import pytest
 
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.connect import check_broker, open_connection
-from skyless.mqtt.paho_client import Introduction
+from skyless.mqtt.connection import Introduction, check_broker, open_connection
 
 
 @contextlib.asynccontextmanager
@@ -28,15 +27,15 @@ async def player(answer):
 @pytest.mark.parametrize(
     ("code", "reason"),
     [
-        (1, "does not speak MQTT"),
+        (1, "answer is not MQTT"),
         (2, "refuses: Client identifier not valid"),
         (3, "refuses: Server unavailable"),
-        (4, "refuses: wrong user name or password; the password stands in SKYLESS_MQTT_PASSWORD"),
-        (5, "refuses: wrong user name or password, or no permission; the password stands in"),
+        (4, "refuses: wrong user name or password; the password goes in SKYLESS_MQTT_PASSWORD"),
+        (5, "refuses: wrong user name or password, or no permission; the password goes in"),
         (99, "refuses: "),
     ],
 )
-def test_each_refusal_of_the_standard_is_told(code, reason):
+def test_each_refusal_of_the_standard_is_reported(code, reason):
     """MQTT 3.1.1, table 3.1."""
 
     async def check():

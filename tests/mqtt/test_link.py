@@ -14,7 +14,7 @@ from mqtt_brokers import free_port, running, stopped, until
 from skyless.errors import SkylessError
 from skyless.mqtt import connection
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.connect import check_broker
+from skyless.mqtt.connection import check_broker
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import StatusMessage, Zone, ZonesMessage
 from skyless.mqtt.topics import fix_topic, receptions_topic, status_topic, zones_topic
@@ -92,7 +92,7 @@ async def start_node(broker):
     return await asyncio.create_subprocess_exec(sys.executable, "-c", NODE, str(broker.address.port))
 
 
-def test_a_killed_process_is_told_offline_by_its_last_will(make_broker):
+def test_a_killed_process_is_reported_offline_by_its_last_will(make_broker):
     async def check():
         broker = make_broker()
         inbox = Inbox(broker.address, status_topic(7, "tag", "+"))
@@ -127,7 +127,7 @@ def test_a_process_frozen_for_longer_than_the_broker_waits_comes_back(make_broke
     asyncio.run(check())
 
 
-def test_a_stopped_link_says_so_and_sends_what_waits(make_broker):
+def test_a_stopped_link_logs_it_and_sends_what_waits(make_broker):
     async def check():
         broker = make_broker()
         inbox = Inbox(broker.address, "skyless/v1/7/#", qos=1)
@@ -144,7 +144,7 @@ def test_a_stopped_link_says_so_and_sends_what_waits(make_broker):
     asyncio.run(check())
 
 
-def test_a_link_stopped_without_a_broker_ends_at_once_and_says_what_is_lost(caplog):
+def test_a_link_stopped_without_a_broker_ends_at_once_and_logs_what_is_lost(caplog):
     async def check():
         link = tag_link(MqttAddress("127.0.0.1", free_port()))
         task = asyncio.ensure_future(link.run())
@@ -153,8 +153,8 @@ def test_a_link_stopped_without_a_broker_ends_at_once_and_says_what_is_lost(capl
         await until(lambda: "cannot be reached" in caplog.text)
         await stopped(task)
         assert task.cancelled()
-        assert "has not taken 1 messages" in caplog.text
-        assert "'not a topic' is not one that every broker takes" in caplog.text
+        assert "has not accepted 1 messages" in caplog.text
+        assert "'not a topic' is not one that every broker accepts" in caplog.text
         assert link.counters.dropped == 1
 
     asyncio.run(check())
@@ -175,7 +175,7 @@ def test_a_link_can_run_again(make_broker):
     asyncio.run(check())
 
 
-def test_a_will_that_comes_late_does_not_tell_a_living_node_offline(make_broker):
+def test_a_will_that_comes_late_does_not_show_a_running_node_as_offline(make_broker):
     async def check():
         broker = make_broker()
         inbox = Inbox(broker.address, status_topic(7, "tag", "+"))
@@ -191,7 +191,7 @@ def test_a_will_that_comes_late_does_not_tell_a_living_node_offline(make_broker)
     asyncio.run(check())
 
 
-def test_after_a_broker_s_death_it_reconnects_and_says_what_was_dropped(make_broker, caplog):
+def test_after_a_broker_s_death_it_reconnects_and_logs_what_was_dropped(make_broker, caplog):
     caplog.set_level(logging.WARNING, "skyless.mqtt")
 
     async def check():
@@ -339,7 +339,7 @@ def test_tls_trusts_only_the_given_certificate(make_broker, certificate):
     asyncio.run(check())
 
 
-def test_a_wrong_password_is_told_without_showing_it(make_broker, caplog):
+def test_a_wrong_password_is_reported_without_showing_it(make_broker, caplog):
     async def check():
         broker = make_broker(user="ann", password="right-word")
         wrong = msgspec.structs.replace(broker.address, password="wrong-word")
@@ -377,15 +377,15 @@ def certificate(tmp_path):
     ("answer", "trouble"),
     [
         (b"", "no answer within 0.2 s"),
-        (b"\x00\x00", "does not speak MQTT"),
-        (b"HTTP/1.1 400 Bad Request\r\n\r\n" * 9, "does not speak MQTT"),
-        (b"\x20\x02\x00\x00\x30\x01\xff", "does not speak MQTT"),
+        (b"\x00\x00", "answer is not MQTT"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n" * 9, "answer is not MQTT"),
+        (b"\x20\x02\x00\x00\x30\x01\xff", "answer is not MQTT"),
         (b"\x20\x02\x00\x00\x30\x05\x00", "closed the connection"),
     ],
 )
-def test_what_is_no_broker_is_told_and_tried_again(answer, trouble, monkeypatch):
+def test_what_is_no_broker_is_reported_and_tried_again(answer, trouble, monkeypatch):
     """Silence, garbage, another protocol, a wrong packet, half a packet."""
-    monkeypatch.setattr(connection, "ANSWER_S", 0.2)
+    monkeypatch.setattr(connection, "BROKER_ANSWER_S", 0.2)
     visits = []
 
     async def serve(_, writer):

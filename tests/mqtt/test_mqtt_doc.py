@@ -30,7 +30,7 @@ STRUCTS = {
 
 
 @pytest.mark.parametrize("topic", STRUCTS)
-def test_an_example_is_what_the_struct_says(topic):
+def test_an_example_is_what_the_struct_holds(topic):
     """The struct reads it, and holds all of it: no key is misspelt."""
     example = EXAMPLES[topic]
     value = msgspec.json.decode(example, type=STRUCTS[topic])

@@ -24,11 +24,11 @@ class Broker:
         self.number = 0
 
     def take(self):
-        message = self.box.take()
+        message = self.box.next_message()
         if message is None:
             return None
         self.number += 1
-        self.box.gave(message, self.number)
+        self.box.mark_sent(message, self.number)
         self.got.append((message.topic, message.payload, message.qos > 0, message.retain))
         if message.qos:
             self.flying.append(self.number)
@@ -43,6 +43,11 @@ class Broker:
         self.flying = []
 
 
+def waiting_bytes(box):
+    """Payload of all messages that wait or are kept."""
+    return box._newest_bytes + box._queue_bytes + box._retained_bytes
+
+
 @given(STEPS)
 def test_its_bounds_hold_and_all_losses_are_counted(steps):
     box = Outbox(LIMITS)
@@ -53,17 +58,17 @@ def test_its_bounds_hold_and_all_losses_are_counted(steps):
             getattr(broker, step)()
         else:
             topic, size, qos, retain = step
-            box.put(topic, b"%04d" % number + b"." * size, qos, retain=retain)
+            box.add(topic, b"%04d" % number + b"." * size, qos, retain=retain)
             put[qos, retain] += 1
         assert len(box._newest) <= LIMITS.topics
-        assert len(box._kept) <= LIMITS.topics
+        assert len(box._retained) <= LIMITS.topics
         assert len(box._flying) <= LIMITS.window
         assert len(box._queue) <= LIMITS.messages
-        assert box.waiting_bytes <= 2 * LIMITS.topic_bytes + LIMITS.bytes + LIMITS.window * LIMITS.payload
+        assert waiting_bytes(box) <= 2 * LIMITS.topic_bytes + LIMITS.bytes + LIMITS.window * LIMITS.payload
     broker.restart()
     while broker.take() is not None or broker.flying:
         broker.acknowledge()
-    assert box.waiting_bytes == sum(len(message.payload) for message in box._kept.values())
+    assert waiting_bytes(box) == sum(len(message.payload) for message in box._retained.values())
     assert box.unacknowledged == 0
     unretained = {message for message in broker.got if not message[3]}
     lost = put[0, False] + put[1, False] - len(unretained)
@@ -81,7 +86,7 @@ def test_qos_1_comes_in_order_and_completely(steps):
             getattr(broker, step)()
         else:
             payload = b"%d" % number
-            box.put(step[0], payload, 1, retain=False)
+            box.add(step[0], payload, 1, retain=False)
             put.append(payload)
     broker.restart()
     while broker.take() is not None or broker.flying:
@@ -94,8 +99,8 @@ def test_qos_1_comes_in_order_and_completely(steps):
 def test_of_qos_0_the_newest_of_a_topic_wins():
     box = Outbox(Limits())
     for number in range(5):
-        box.put("a", b"%d" % number, 0, retain=False)
-    box.put("b", b"x", 0, retain=False)
+        box.add("a", b"%d" % number, 0, retain=False)
+    box.add("b", b"x", 0, retain=False)
     broker = Broker(box)
     while broker.take():
         pass
@@ -107,11 +112,11 @@ def test_of_qos_1_the_oldest_that_is_not_on_its_way_goes():
     box = Outbox(LIMITS)
     broker = Broker(box)
     for number in range(4):
-        box.put("a", b"%d" % number, 1, retain=False)
+        box.add("a", b"%d" % number, 1, retain=False)
     while broker.take():
         pass
     for number in range(4, 20):
-        box.put("a", b"%d" % number, 1, retain=False)
+        box.add("a", b"%d" % number, 1, retain=False)
     while broker.take() is not None or broker.flying:
         broker.acknowledge()
     assert [int(payload) for _, payload, _, _ in broker.got] == [0, 1, 2, 3, 16, 17, 18, 19]
@@ -122,7 +127,7 @@ def test_the_newest_retained_message_is_sent_again_to_every_broker():
     box = Outbox(Limits())
     broker = Broker(box)
     for payload in (b"old", b"new"):
-        box.put("a", payload, 1, retain=True)
+        box.add("a", payload, 1, retain=True)
     for _ in range(2):
         while broker.take() is not None or broker.flying:
             broker.acknowledge()
@@ -136,6 +141,6 @@ def test_the_newest_retained_message_is_sent_again_to_every_broker():
 @pytest.mark.parametrize("topic", ["", "a/+/b", "a/#", "a b", "a\tb", "a\x00b", "a" * 251])
 def test_a_topic_that_a_broker_would_not_take_is_dropped(topic):
     box = Outbox(Limits())
-    box.put(topic, b"", 1, retain=False)
+    box.add(topic, b"", 1, retain=False)
     assert box.dropped == 1
-    assert box.take() is None
+    assert box.next_message() is None

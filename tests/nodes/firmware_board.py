@@ -6,9 +6,9 @@ import time
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.firmware import board, dw1000
+from skyless.nodes.board import Pty
 from skyless.nodes.open_radio import open_radios
-from skyless.nodes.process.pty import Pty
-from skyless.radios.dw1000.chip_ports import ETHER_LEAD_TICKS
+from skyless.radios.dw1000.model import ETHER_LEAD_TICKS
 from skyless.radios.interface import AntennaDelays, Gone, Restarted, Sent
 from skyless.simulation.dw1000.chip import Chip, ModelBus
 from skyless.ticks import difference

@@ -7,8 +7,8 @@ import numpy as np
 
 from skyless.evaluation.scenarios import Request, impairments_of
 from skyless.nodes.anchor import AnchorNode
-from skyless.nodes.emulation.board import Board
-from skyless.nodes.emulation.ether import Ether
+from skyless.nodes.board import Board
+from skyless.nodes.ether import Ether
 from skyless.nodes.open_radio import open_radios, open_sniffers
 from skyless.nodes.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.nodes.tag import TagNode, TagSettings
@@ -33,7 +33,7 @@ class LiveSite:
     async def __aenter__(self):
         server = await self.ether.serve("127.0.0.1", 0)
         self.air = f"ether:127.0.0.1:{server.sockets[0].getsockname()[1]}"
-        self.start("ether", self.ether.tell_clocks())
+        self.start("ether", self.ether.send_clocks())
         return self
 
     async def __aexit__(self, *_):

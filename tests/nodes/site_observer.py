@@ -1,4 +1,4 @@
-"""Who watches a running site over MQTT and judges every fix that it publishes."""
+"""Watches a running site over MQTT and judges every fix that it publishes."""
 
 import asyncio
 import bisect

@@ -9,7 +9,7 @@ import time
 from mqtt_brokers import Mosquitto, free_port
 
 from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.nodes.process.loop import end_with_parent
+from skyless.nodes.process import end_with_parent
 
 START_S = 120.0
 """A first start compiles the kernels."""

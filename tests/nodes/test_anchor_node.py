@@ -24,7 +24,7 @@ async def running(anchor=1):
     node = AnchorNode(LAB, anchor, radio, said.append)
     task = asyncio.ensure_future(node.run())
     await asyncio.sleep(0)
-    node.hear(Restarted())
+    node.on_event(Restarted())
     try:
         if anchor == 1:
             await first_words(radio)
@@ -44,11 +44,11 @@ async def first_words(radio):
     raise AssertionError("the master never speaks")
 
 
-def test_a_master_speaks_once_in_a_superframe_and_hands_over_each_frame_as_late_as_it_may():
+def test_a_master_transmits_once_in_a_superframe_and_hands_over_each_frame_as_late_as_it_may():
     async def main():
         async with running() as (node, radio, said):
             radio.sends = True
-            node.hear(Sent(radio.transmissions[0][1].tx_ticks))
+            node.on_event(Sent(radio.transmissions[0][1].tx_ticks))
             await asyncio.sleep(20.5 * SUPERFRAME_S)
             stamps = [transmission.tx_ticks for _, transmission in radio.transmissions]
             steps_s = [difference(b, a) / TICK_RATE_HZ for a, b in itertools.pairwise(stamps)]
@@ -69,7 +69,7 @@ def test_a_late_frame_is_skipped_and_counted_and_the_next_slot_is_taken():
     async def main():
         async with running() as (node, radio, _):
             _, first = radio.transmissions[-1]
-            node.hear(Late(first.tx_ticks))
+            node.on_event(Late(first.tx_ticks))
             assert node.late == 1
             await asyncio.sleep(ASK_AGAIN_S + SUPERFRAME_S)
             _, second = radio.transmissions[-1]
@@ -103,13 +103,13 @@ def test_a_radio_that_starts_again_gets_a_new_machine_and_no_frame_of_the_old_on
     async def main():
         async with running() as (node, radio, said):
             old = node.machine
-            node.hear(Gone("pulled out"))
+            node.on_event(Gone("pulled out"))
             radio.ready = False
             sent = len(radio.transmissions)
             await asyncio.sleep(3.0)
             assert len(radio.transmissions) == sent
             radio.ready, radio.begin_ticks = True, 5
-            node.hear(Restarted())
+            node.on_event(Restarted())
             assert node.machine is not old
             await first_words(radio)
             _, transmission = radio.transmissions[-1]
@@ -124,7 +124,7 @@ def test_a_radio_that_starts_again_gets_a_new_machine_and_no_frame_of_the_old_on
     play(main())
 
 
-def test_an_anchor_that_knows_no_time_does_not_speak():
+def test_an_anchor_that_knows_no_time_does_not_transmit():
     async def main():
         async with running(anchor=4) as (node, radio, _):
             await asyncio.sleep(0.02)
@@ -141,7 +141,7 @@ def test_who_was_heard_is_noted_but_no_other_site():
     async def main():
         async with running(anchor=4) as (node, _, __):
             for reception in receptions(1.0)[:100]:
-                node.hear(reception)
+                node.on_event(reception)
             assert node.heard_s.keys() <= {1, 2, 3, 4, 5, 6}
             assert {1, 2} <= node.heard_s.keys()
 

@@ -26,25 +26,25 @@ def test_anchors_and_tags_on_boards_make_the_fixes_of_those_on_the_air_and_survi
             node = site.tag("tag1", f"serial:{tmp_path / 'tag1'}")
             assert are_right(await site.fixes("tag1", 300))
             assert {4, 5, 6} & set(site.published["tag1"][-1].anchors)
-            await site.until(lambda: all(one.speech.counts["sent"] > 20 for one in boards.values()))
+            await site.until(lambda: all(one.protocol.counts["sent"] > 20 for one in boards.values()))
             await site.until(lambda: node.radio._session.status and node.radio._session.status.received > 0)
-            assert board.speech.counts["received"] >= node.receptions
+            assert board.protocol.counts["received"] >= node.receptions
             assert not node.radio.counters.keys() & {"malformed-record", "unknown-record", "copied-record"}
 
             await site.stop("board tag1")
-            await site.until(lambda: any("pulled out" in line for line in site.said))
+            await site.until(lambda: any("unplugged" in line for line in site.said))
             told = len(site.published["tag1"])
             await asyncio.sleep(0.3)
             assert len(site.published["tag1"]) == told
             site.plug_in("tag1")
             assert are_right(await site.fixes("tag1", 300))
-            assert node.restarts == 2
+            assert node.monitor.restarts == 2
 
             await site.stop("board 4")
-            await site.until(lambda: any("anchor 4" in line and "pulled out" in line for line in site.said))
+            await site.until(lambda: any("anchor 4" in line and "unplugged" in line for line in site.said))
             again = site.plug_in("4")
-            await site.until(lambda: again.speech.counts["sent"] > 20)
-            assert anchors[4].restarts == 2
+            await site.until(lambda: again.protocol.counts["sent"] > 20)
+            assert anchors[4].monitor.restarts == 2
             assert are_right(await site.fixes("tag1", 300))
 
     asyncio.run(play())
@@ -55,8 +55,8 @@ def test_a_frame_that_reaches_the_board_too_late_is_skipped_and_the_anchor_makes
         async with LiveSite(tmp_path) as site:
             board = site.plug_in("1")
             master = site.anchor(1, f"serial:{tmp_path / '1'}")
-            await site.until(lambda: board.speech.counts["sent"] > 10)
-            late, said = master.late, board.speech.hear_host
+            await site.until(lambda: board.protocol.counts["sent"] > 10)
+            late, said = master.late, board.protocol.on_host_data
 
             def slowly(data):
                 time.sleep(0.004)  # the host's bytes lie in a driver
@@ -64,16 +64,16 @@ def test_a_frame_that_reaches_the_board_too_late_is_skipped_and_the_anchor_makes
 
             board.pty.start(slowly)
             await site.until(lambda: master.late > late)
-            sent = board.speech.counts["sent"]
-            await site.until(lambda: board.speech.counts["sent"] > sent + 10)
-            assert board.speech.counts["late"] == master.late
+            sent = board.protocol.counts["sent"]
+            await site.until(lambda: board.protocol.counts["sent"] > sent + 10)
+            assert board.protocol.counts["late"] == master.late
             assert master.lead_s > 1.8e-3
 
     asyncio.run(play())
 
 
 @pytest.mark.parametrize("speaks", ["sniffer", "sniffer-text", "listener"])
-def test_boards_that_speak_other_people_s_formats_give_right_fixes(speaks, tmp_path):
+def test_boards_of_other_formats_give_right_fixes(speaks, tmp_path):
     async def play():
         async with LiveSite(tmp_path) as site:
             for number in PLACES:
@@ -87,9 +87,9 @@ def test_boards_that_speak_other_people_s_formats_give_right_fixes(speaks, tmp_p
             if driver == "sniffer":
                 assert node.radio._stream._is_text is (speaks == "sniffer-text")
             await site.stop("board tag2")
-            await site.until(lambda: any("pulled out" in line for line in site.said))
+            await site.until(lambda: any("unplugged" in line for line in site.said))
             site.plug_in("tag2", speaks)
             assert are_right(await site.fixes("tag2", 400))
-            assert node.restarts == 2
+            assert node.monitor.restarts == 2
 
     asyncio.run(play())

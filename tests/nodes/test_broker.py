@@ -16,11 +16,10 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.errors import SkylessError
-from skyless.mqtt.connect import check_broker
+from skyless.mqtt.connection import check_broker
 from skyless.mqtt.link import Link
-from skyless.nodes.broker.broker import folder as broker_place
-from skyless.nodes.broker.broker import start_broker
-from skyless.nodes.broker.settings import BrokerSettings
+from skyless.nodes import broker as broker_module
+from skyless.nodes.broker import BrokerSettings, start_broker
 
 BROKER = (sys.executable, "-m", "skyless.cli.main", "broker")
 
@@ -127,7 +126,7 @@ def test_a_taken_port_is_an_error_when_it_was_asked_for(taken, tmp_path, capsys)
 
 
 def test_without_a_port_the_next_free_one_is_taken(taken, tmp_path, monkeypatch):
-    monkeypatch.setattr(broker_place, "FIRST_PORT", taken)
+    monkeypatch.setattr(broker_module, "FIRST_PORT", taken)
 
     async def check():
         async with await start_broker(BrokerSettings(data=tmp_path / "store")) as broker:
@@ -172,14 +171,14 @@ def test_a_home_that_cannot_be_written_costs_nothing(tmp_path, monkeypatch):
         (["--data", "/proc/nothing"], "--data is '/proc/nothing', which cannot be used"),
     ],
 )
-def test_wrong_options_are_told_with_what_would_be_right(options, right, tmp_path, monkeypatch, capsys):
+def test_wrong_options_are_reported_with_what_would_be_right(options, right, tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("SKYLESS_MQTT_PASSWORD", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     assert main(["broker", *options]) == 2
     assert re.search(right, capsys.readouterr().err)
 
 
-def test_an_address_of_another_machine_is_told(tmp_path, monkeypatch, capsys):
+def test_an_address_of_another_machine_is_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("SKYLESS_MQTT_PASSWORD", "word")
     for listen in ("192.0.2.1", "nowhere.invalid"):
         assert main(["broker", "--listen", listen, "--user", "ann", "--data", str(tmp_path)]) == 2

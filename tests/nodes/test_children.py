@@ -8,8 +8,8 @@ import sys
 
 from mqtt_brokers import free_port, until
 
-from skyless.nodes.process import children
-from skyless.nodes.process.children import Child, Program, end
+from skyless.nodes import children
+from skyless.nodes.children import Child, Program, end
 
 
 def alive(pid):
@@ -25,7 +25,7 @@ async def stop(task):
     await asyncio.wait([task])
 
 
-def test_a_program_that_is_killed_is_started_again_and_said_so():
+def test_a_program_that_is_killed_is_started_again_and_logged():
     async def main():
         said = []
         child = Child(Program("air", ("ether", "--mqtt", "none", "--listen", f"127.0.0.1:{free_port()}")), said.append)
@@ -36,7 +36,7 @@ def test_a_program_that_is_killed_is_started_again_and_said_so():
         await until(lambda: child.pid is not None and child.pid != first)
         second = child.pid
         assert child.starts == 2
-        assert said == ["air ended (signal 9): it said nothing; started again"]
+        assert said == ["air ended (signal 9): no message; started again"]
         assert not alive(first)
         assert alive(second)
         await stop(task)
@@ -46,7 +46,7 @@ def test_a_program_that_is_killed_is_started_again_and_said_so():
     asyncio.run(main())
 
 
-def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last_words_are_told(monkeypatch):
+def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last_lines_are_reported(monkeypatch):
     waits = []
 
     async def main():
@@ -74,7 +74,7 @@ def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last_words
     assert waits[0] >= 0.2
 
 
-def test_a_program_whose_own_child_holds_its_words_is_still_seen_to_die(monkeypatch):
+def test_a_program_whose_own_child_holds_its_pipe_is_still_seen_to_die(monkeypatch):
     """A grandchild keeps the pipe of standard error open; the program's death must not go unnoticed."""
 
     async def main():
@@ -120,7 +120,7 @@ def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypatch):
     asyncio.run(main())
 
 
-def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_when_it_says_so(monkeypatch, tmp_path):
+def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_when_it_logs_it(monkeypatch, tmp_path):
     program = Program("recorder", ("record", str(tmp_path / "a.mcap"), "--x"), 1)
     assert program.start(1) == program.arguments
     assert program.start(3) == ("record", str(tmp_path / "a-3.mcap"), "--x")

@@ -8,7 +8,7 @@ from firmware_board import FirmwareBoard
 from live_nodes import LiveSite, are_right
 
 from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.firmware.board import NONE
+from skyless.firmware.board import NO_FRAME
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -46,20 +46,20 @@ def test_anchor_and_tag_on_the_firmware_make_right_fixes_and_survive_noise_and_p
             assert are_right(await site.fixes("tag1", 200))
 
             await site.stop("board tag1")
-            await site.until(lambda: any("pulled out" in line for line in site.said))
+            await site.until(lambda: any("unplugged" in line for line in site.said))
             plug_in(site, "tag1")
             assert are_right(await site.fixes("tag1", 200))
-            assert node.restarts == 2
+            assert node.monitor.restarts == 2
 
             await site.stop("anchor 4")  # the host vanishes, and comes back
             await asyncio.sleep(0.5)
-            await site.until(lambda: anchor_board.board._stage == NONE)
+            await site.until(lambda: anchor_board.board._stage == NO_FRAME)
             sent = anchor_board.board._chip.sent
             await asyncio.sleep(0.3)
             assert anchor_board.board._chip.sent == sent
             site.anchor(4, f"serial:{tmp_path / '4'}")
             await site.until(lambda: anchor_board.board._chip.sent > sent + 20)
-            assert anchor.restarts == 1
+            assert anchor.monitor.restarts == 1
             assert not +anchor_board.chip.misuse
 
     asyncio.run(play())

@@ -15,21 +15,19 @@ from node_stage import receptions
 
 from skyless.air.codec import decode
 from skyless.errors import SkylessError
-from skyless.nodes.latency import Latencies, PhaseLog
-from skyless.nodes.process.folders import data_folder, new_recording, recordings_folder
-from skyless.nodes.process.running import every, together
-from skyless.nodes.process.usage import Usage, resident_bytes
+from skyless.nodes.fix_log import Latencies, PhaseLog
+from skyless.nodes.process import Usage, data_folder, every, new_recording, recordings_folder, resident_bytes, together
 from skyless.nodes.record import _own_name
 
 # Latencies and phases
 
 
 @given(st.lists(st.floats(0.0, 10.0), max_size=300))
-def test_latencies_are_told_once_by_their_order(values):
+def test_latencies_are_reported_once_by_their_order(values):
     latencies = Latencies()
     for value in values:
         latencies.add(value)
-    median_s, late_s, number = latencies.take()
+    median_s, late_s, number = latencies.drain()
     assert number == len(values)
     if values:
         assert (
@@ -39,45 +37,45 @@ def test_latencies_are_told_once_by_their_order(values):
         assert late_s in values
     else:
         assert (median_s, late_s) == (None, None)
-    assert latencies.take() == (None, None, 0)
+    assert latencies.drain() == (None, None, 0)
 
 
 def test_latencies_keep_the_newest_of_many():
     latencies = Latencies()
     for value in range(10_000):
         latencies.add(float(value))
-    median_s, late_s, number = latencies.take()
+    median_s, late_s, number = latencies.drain()
     assert number == 4096
     assert median_s == pytest.approx(10_000 - 2048, abs=2)
     assert late_s == pytest.approx(10_000 - 41, abs=2)
 
 
 def test_the_book_of_phases_shows_the_last_whole_superframe():
-    book = PhaseLog()
+    phases = PhaseLog()
     heard = receptions(0.2)
     for number, reception in enumerate(heard):
-        book.hear(reception.frame, reception.host_s, reception.host_s + 1e-4, made_fix=number % 2 == 0)
-        book.hear(b"rubbish", reception.host_s, reception.host_s, made_fix=False)
+        phases.add(reception.frame, reception.host_s, reception.host_s + 1e-4, made_fix=number % 2 == 0)
+        phases.add(b"rubbish", reception.host_s, reception.host_s, made_fix=False)
     superframes = [decode(reception.frame).superframe for reception in heard]
     last = sorted(set(superframes))[-2]
     inside = [reception for reception, superframe in zip(heard, superframes, strict=True) if superframe == last]
-    assert [(phase.superframe, phase.slot) for phase in book.last] == [
+    assert [(phase.superframe, phase.slot) for phase in phases.last] == [
         (last, decode(reception.frame).slot) for reception in inside
     ]
-    for phase, reception in zip(book.last, inside, strict=True):
+    for phase, reception in zip(phases.last, inside, strict=True):
         assert phase.heard_s == pytest.approx(reception.host_s - inside[0].host_s)
         assert phase.done_s == pytest.approx(phase.heard_s + 1e-4)
-    assert {phase.fix for phase in book.last} == {True, False}
+    assert {phase.fix for phase in phases.last} == {True, False}
 
 
-def test_the_book_does_not_grow_while_one_superframe_goes_on_for_ever():
-    book = PhaseLog()
+def test_the_phase_log_does_not_grow_while_one_superframe_goes_on_for_ever():
+    phases = PhaseLog()
     first, *_ = receptions(0.1)
     for _ in range(1000):
-        book.hear(first.frame, 0.0, 0.0, made_fix=False)
+        phases.add(first.frame, 0.0, 0.0, made_fix=False)
     other = next(r for r in receptions(0.2) if decode(r.frame).superframe != decode(first.frame).superframe)
-    book.hear(other.frame, 1.0, 1.0, made_fix=False)
-    assert len(book.last) == 64
+    phases.add(other.frame, 1.0, 1.0, made_fix=False)
+    assert len(phases.last) == 64
 
 
 # Usage
@@ -92,12 +90,12 @@ def test_a_busy_process_uses_a_core_and_a_sleeping_one_none():
     usage = Usage()
     time.sleep(0.3)
     before = clocks()
-    asleep, _ = usage.take()
+    asleep, _ = usage.sample()
     begin = clocks()
     while clocks()[1] < begin[1] + 0.3:
         pass
     end = clocks()
-    busy, memory_bytes = usage.take()
+    busy, memory_bytes = usage.sample()
     (longest_s, most_s), (shortest_s, least_s) = clocks() - before, end - begin
     assert asleep < 0.2
     assert least_s / longest_s <= busy <= most_s / shortest_s
@@ -213,7 +211,7 @@ def test_something_is_done_again_and_again():
 
 PROGRAM = """
 import asyncio, sys
-from skyless.nodes.process.loop import run
+from skyless.nodes.process import run
 async def main():
     try:
         print("running", flush=True)
@@ -243,7 +241,7 @@ def test_a_program_ends_cleanly_when_it_is_asked_to(number, code):
 def test_a_program_ends_with_the_one_that_started_it_however_that_ends():
     parent = f"""
 import subprocess, sys, time
-from skyless.nodes.process.loop import end_with_parent
+from skyless.nodes.process import end_with_parent
 child = subprocess.Popen([sys.executable, "-c", {PROGRAM!r}], preexec_fn=end_with_parent())
 time.sleep(60)
 """

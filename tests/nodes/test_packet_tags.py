@@ -23,15 +23,15 @@ def packets():
     return [decode_payload(payload, 100.0 + t_s, sender, rx_ticks) for t_s, sender, rx_ticks, payload in told]
 
 
-def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_anew(packets):
+def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_again(packets):
     published, said = [], []
     (radio,) = open_sniffers("sniffer:/dev/nothing", ("drone",))
     node = PacketTagNode(SETTINGS, radio, published.append, said.append)
-    node.book.unix_less_host_s = 0.0
-    node.hear(Restarted())
+    node.fix_log.unix_less_host_s = 0.0
+    node.on_event(Restarted())
     first = node.tracking
     for packet in packets:
-        node.hear(packet)
+        node.on_event(packet)
     late = [fix for fix in published if fix.unix_s > 102.0]
     assert len(late) > 400
     errors_m = np.linalg.norm([np.subtract(fix.position_m, hall.path_m(0.0, 0.0)) for fix in late], axis=1)
@@ -39,14 +39,14 @@ def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_anew(packets)
     assert {fix.unix_s for fix in late} <= {packet.host_s for packet in packets}
     assert [fix.serial for fix in published] == list(range(1, len(published) + 1))
     assert late[-1].method == "joint"
-    fixes, drops = node.book.serial, node.counters
-    node.hear(Gone("pulled out"))
-    node.hear(Restarted())
+    fixes, drops = node.fix_log.serial, node.drops
+    node.on_event(Gone("pulled out"))
+    node.on_event(Restarted())
     assert node.tracking is not first
-    assert node.counters == drops
+    assert node.drops == drops
     for packet in packets:
-        node.hear(msgspec.structs.replace(packet, rx_ticks=(packet.rx_ticks + 2**39) % 2**40))
-    assert node.book.serial > fixes + 400
+        node.on_event(msgspec.structs.replace(packet, rx_ticks=(packet.rx_ticks + 2**39) % 2**40))
+    assert node.fix_log.serial > fixes + 400
     assert said == ["tag drone: listening", "tag drone: pulled out; still looking for it", "tag drone: listening again"]
 
 
@@ -76,17 +76,21 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     )
     one, _ = tags.nodes
     one.radio.counters["malformed-line"] += 3
-    one.hear(Packet(1.0, 77, 0, 0, 0, ()))
+    one.on_event(Packet(1.0, 77, 0, 0, 0, ()))
     for packet in packets:
-        one.hear(packet)
-    tags._tell()
+        one.on_event(packet)
+    tags._publish_health()
     (fix_topic, fix), *_, (site_topic, told), (health_topic, health) = links[0].told
     assert (site_topic, told.site.id, told.simulated) == ("skyless/v1/7/site", 7, False)
     assert {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in told.site.anchors} == hall.ANCHORS_M
     assert (fix_topic, health_topic) == ("skyless/v1/7/tag/one/fix", "skyless/v1/7/tag/one/health")
     assert isinstance(fix, FixMessage)
     again = msgspec.json.decode(msgspec.json.encode(health), type=TagHealth)
-    assert (again.receptions, again.fixes, again.updates_per_s) == (len(packets) + 1, one.book.serial, one.book.serial)
+    assert (again.receptions, again.fixes, again.updates_per_s) == (
+        len(packets) + 1,
+        one.fix_log.serial,
+        one.fix_log.serial,
+    )
     assert again.reason is None
     assert again.counters["malformed-line"] == 3
     assert again.counters["unknown-anchor"] == 1
@@ -94,24 +98,24 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     assert (topic, silent.reason, silent.fixes) == ("skyless/v1/7/tag/two/health", "no-beacons", 0)
 
 
-def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_told_as_such(monkeypatch, tmp_path):
+def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_reported_as_such(monkeypatch, tmp_path):
     links, path = [], tmp_path / "sniffer"
     monkeypatch.setattr(packet_tags, "link_of", lambda *_, **__: links.append(Link()) or links[-1])
     spec = f"sniffer:{path}"
     tags = PacketTags(SETTINGS, open_sniffers(spec, ("one",)), None, print, simulated=lambda: is_simulated(spec))
-    tags._tell()  # nothing is plugged in yet
+    tags._publish_health()  # nothing is plugged in yet
     path.symlink_to("/dev/pts/7")
-    tags.nodes[0].hear(Restarted())
+    tags.nodes[0].on_event(Restarted())
     for _ in range(3):
-        tags._tell()
+        tags._publish_health()
     path.unlink()
     path.symlink_to("/dev/ttyACM0")
-    tags.nodes[0].hear(Gone("pulled out"))
-    tags.nodes[0].hear(Restarted())
-    tags._tell()
+    tags.nodes[0].on_event(Gone("pulled out"))
+    tags.nodes[0].on_event(Restarted())
+    tags._publish_health()
     sites = [message for _, message in links[0].told if isinstance(message, SiteMessage)]
     assert [site.simulated for site in sites] == [False, True, False]
 
 
-def test_a_table_that_no_site_can_have_is_not_told():
+def test_a_table_that_no_site_can_have_is_not_reported():
     assert packet_tags.site_of(PacketTagSettings({1: (0.0, 0.0, 0.0), 99_999: (1.0, 2.0, 0.0)})) is None

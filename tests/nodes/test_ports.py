@@ -4,9 +4,16 @@ import socket
 
 import pytest
 
-from skyless.nodes.process.ports import any_port, claim, claim_next, hold_any, is_free
+from skyless.nodes.ports import claim, claim_next, hold_any, is_free
 
 HOST = "127.0.0.1"
+
+
+def any_port(host):
+    """A port that is free at this moment."""
+    port, held = hold_any(host)
+    held.close()
+    return port
 
 
 def test_a_port_that_is_taken_is_passed_over():

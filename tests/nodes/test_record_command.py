@@ -20,9 +20,8 @@ from skyless.evaluation.compile_ahead import compile_kernels
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import SiteMessage
 from skyless.mqtt.topics import site_topic
-from skyless.nodes.process.loop import end_with_parent
-from skyless.nodes.tag import TagSettings
-from skyless.nodes.tags import Tags
+from skyless.nodes.process import end_with_parent
+from skyless.nodes.tag import Tags, TagSettings
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.replay.site import SiteReplay
 
@@ -216,7 +215,7 @@ def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_o
     assert json.loads(out)["receptions"] > 400
 
 
-def test_a_disk_that_takes_no_more_is_told_once_and_leaves_a_whole_file(broker, tmp_path):
+def test_a_disk_that_takes_no_more_is_reported_once_and_leaves_a_whole_file(broker, tmp_path):
     recorder = Recorder(broker.address, tmp_path / "full.mcap", limit_bytes=250_000)
 
     async def scenario():
@@ -232,7 +231,7 @@ def test_a_disk_that_takes_no_more_is_told_once_and_leaves_a_whole_file(broker, 
     assert 100_000 < recorder.size() <= 250_000
 
 
-def test_mistakes_are_told_in_one_line(tmp_path, capsys):
+def test_mistakes_are_reported_in_one_line(tmp_path, capsys):
     path = tmp_path / "there.mcap"
     path.write_text("precious")
     for arguments, words in (

@@ -27,7 +27,7 @@ def node(tmp_path, monkeypatch):
 
 def hear(node, segment, first, count, start=None, tag="a"):
     message = ReceptionsMessage(tag, segment, first, 0.0, (ONE,) * count, start)
-    node._take(receptions_topic(LAB.id, tag), msgspec.json.encode(message))
+    node._on_message(receptions_topic(LAB.id, tag), msgspec.json.encode(message))
 
 
 def test_whole_runs_and_repetitions_ask_for_nothing(node):
@@ -60,9 +60,11 @@ def test_a_run_without_its_beginning_is_asked_about(node):
 
 def test_a_tag_that_comes_is_asked_at_once(node):
     status = StatusMessage(True, "tag", "a", unix_s=1.0)
-    node._take(status_topic(LAB.id, "tag", "a"), msgspec.json.encode(status))
-    node._take(status_topic(LAB.id, "tag", "a"), msgspec.json.encode(msgspec.structs.replace(status, online=False)))
-    node._take(status_topic(LAB.id, "anchor", 1), msgspec.json.encode(StatusMessage(True, "anchor", "1")))
+    node._on_message(status_topic(LAB.id, "tag", "a"), msgspec.json.encode(status))
+    node._on_message(
+        status_topic(LAB.id, "tag", "a"), msgspec.json.encode(msgspec.structs.replace(status, online=False))
+    )
+    node._on_message(status_topic(LAB.id, "anchor", 1), msgspec.json.encode(StatusMessage(True, "anchor", "1")))
     assert len(node.asked) == 1
 
 

@@ -20,11 +20,11 @@ class Bench:
     def __init__(self, **settings):
         self.published, self.said = [], []
         self.node = TagNode(TagSettings(**settings), FakeRadio("t1"), self.published.append, self.said.append)
-        self.node.book.unix_less_host_s = 1e9
+        self.node.fix_log.unix_less_host_s = 1e9
 
     def hear(self, heard):
         for reception in heard:
-            self.node.hear(reception)
+            self.node.on_event(reception)
 
 
 def test_fixes_are_right_and_say_when_they_held():
@@ -40,7 +40,7 @@ def test_fixes_are_right_and_say_when_they_held():
     assert bench.node.receptions == len(HEARD)
     serials = [fix.serial for fix in bench.published]
     assert serials == list(range(1, len(serials) + 1))
-    assert bench.node.book.serial == serials[-1]
+    assert bench.node.fix_log.serial == serials[-1]
     again = msgspec.json.decode(msgspec.json.encode(late[-1]), type=FixMessage)
     assert again == late[-1]
 
@@ -55,7 +55,7 @@ def test_no_more_fixes_are_published_than_asked_for_on_average_nor_in_any_second
     made_s = times[-1] - times[0]
     assert len(times) - 1 <= publish_hz * made_s + 1.0
     assert len(times) >= min(publish_hz, 395.0) * made_s * 0.95  # and not many fewer
-    assert bench.node.book.serial > 1500  # all of them are made
+    assert bench.node.fix_log.serial > 1500  # all of them are made
 
 
 def test_pauses_are_not_made_up_for_by_a_burst():
@@ -69,19 +69,19 @@ def test_pauses_are_not_made_up_for_by_a_burst():
 
 def test_a_radio_that_starts_again_gets_a_new_receiver_and_the_numbers_go_on():
     bench = Bench(publish_hz=1000.0)
-    bench.node.hear(Restarted())
+    bench.node.on_event(Restarted())
     first = bench.node.receiver
     bench.hear(HEARD[:1000])
-    fixes = bench.node.book.serial
+    fixes = bench.node.fix_log.serial
     assert fixes > 0
-    bench.node.hear(Gone("pulled out"))
-    bench.node.hear(Restarted())
+    bench.node.on_event(Gone("pulled out"))
+    bench.node.on_event(Restarted())
     assert bench.node.receiver is not first
     jump = 2**39  # another counter
     shifted = [Reception(r.frame, (r.rx_ticks + jump) % 2**40, r.host_s, r.diagnostics) for r in HEARD[1000:]]
     bench.hear(shifted)
-    assert bench.node.book.serial > fixes + 500
-    assert bench.published[-1].serial == bench.node.book.serial
+    assert bench.node.fix_log.serial > fixes + 500
+    assert bench.published[-1].serial == bench.node.fix_log.serial
     assert bench.said == ["tag t1: listening", "tag t1: pulled out; still looking for it", "tag t1: listening again"]
     assert bench.node.receiver.counters["counter-jump"] == 0
 
@@ -89,7 +89,7 @@ def test_a_radio_that_starts_again_gets_a_new_receiver_and_the_numbers_go_on():
 def test_a_first_start_keeps_the_receiver():
     bench = Bench()
     receiver = bench.node.receiver
-    bench.node.hear(Restarted())
+    bench.node.on_event(Restarted())
     assert bench.node.receiver is receiver
 
 
@@ -101,17 +101,17 @@ def test_what_is_done_before_a_reception_sees_the_receiver_before_it():
 
     node = TagNode(TagSettings(), FakeRadio("t1"), lambda fix: None, lambda line: None, before)
     for reception in HEARD[:300]:
-        node.hear(reception)
+        node.on_event(reception)
     assert [reception for _, reception, _ in seen] == HEARD[:300]
     assert [heard for heard, _, _ in seen] == list(range(300))
-    assert seen[-1][2] in {node.book.serial, node.book.serial - 1}
+    assert seen[-1][2] in {node.fix_log.serial, node.fix_log.serial - 1}
 
 
 def test_latencies_and_phases_are_kept():
     bench = Bench()
     bench.hear(HEARD[:600])
-    median_s, late_s, number = bench.node.book.latencies.take()
-    assert number == bench.node.book.serial
+    median_s, late_s, number = bench.node.fix_log.latencies.drain()
+    assert number == bench.node.fix_log.serial
     assert median_s <= late_s
     assert 1 <= len(bench.node.phases.last) <= 6
     assert [phase.slot for phase in bench.node.phases.last] == sorted(phase.slot for phase in bench.node.phases.last)

@@ -7,10 +7,9 @@ from node_stage import LAB, FakeRadio, receptions_of
 
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import Counters, FixMessage, SiteMessage, TagHealth
-from skyless.nodes import anchors, tags
-from skyless.nodes.process import running
-from skyless.nodes.tag import TagSettings
-from skyless.nodes.tags import Tag
+from skyless.nodes import anchor, process
+from skyless.nodes import tag as tag_module
+from skyless.nodes.tag import Tag, TagSettings
 from skyless.radios.interface import Restarted
 
 
@@ -37,7 +36,7 @@ class FakeLink:
             self.state = "left"
 
 
-def test_anchors_behind_a_port_that_leads_elsewhere_tell_again_whether_they_are_simulated(monkeypatch):
+def test_anchors_behind_a_port_that_leads_elsewhere_publish_again_whether_they_are_simulated(monkeypatch):
     told, answers = [], [False, True]
 
     class SiteLink(FakeLink):
@@ -46,33 +45,33 @@ def test_anchors_behind_a_port_that_leads_elsewhere_tell_again_whether_they_are_
                 told.append(message.simulated)
 
     FakeLink.made = []
-    monkeypatch.setattr(anchors, "link_of", SiteLink)
+    monkeypatch.setattr(anchor, "link_of", SiteLink)
     radio = FakeRadio(str(LAB.master))
     radio.ready = False
-    both = anchors.Anchors(LAB, [radio], None, print, simulated=lambda: answers.pop(0))
-    (node,) = both.nodes
+    anchors = anchor.Anchors(LAB, [radio], None, print, simulated=lambda: answers.pop(0))
+    (node,) = anchors.nodes
     node._wait = lambda seconds, then: None  # it has no loop
 
     class Leading:
         is_master = True
 
-    monkeypatch.setattr(anchors, "health_of", lambda *_: None)
+    monkeypatch.setattr(anchor, "health_of", lambda *_: None)
     node._new_machine = Leading
-    node._plan = lambda: None
-    node.look = lambda now_s: None
+    node._schedule = lambda: None
+    node.check_reception = lambda now_s: None
     node.machine = Leading()
-    both._tell()
-    both._tell()
-    node.hear(Restarted())
-    both._tell()
-    both._tell()
+    anchors._publish_health()
+    anchors._publish_health()
+    node.on_event(Restarted())
+    anchors._publish_health()
+    anchors._publish_health()
     assert told == [False, True]
     assert answers == []  # asked once for each start
 
 
 @pytest.fixture
 def links(monkeypatch):
-    monkeypatch.setattr(tags, "Link", FakeLink)
+    monkeypatch.setattr(tag_module, "Link", FakeLink)
     FakeLink.made = []
     return FakeLink.made
 
@@ -88,23 +87,23 @@ def test_the_link_comes_with_the_site_and_goes_with_it(links):
         tag = Tag(TagSettings(), FakeRadio("t1"), MqttAddress("127.0.0.1", 1883), said.append)
         running = asyncio.ensure_future(tag.run())
         await settled()
-        tag.tell_health(0.1, 1)
+        tag.publish_health(0.1, 1)
         assert links == []  # nobody to tell it to
         for reception in receptions_of(LAB.id, 2.0):
-            tag.node.hear(reception)
+            tag.node.on_event(reception)
         await settled()
         (first,) = links
         assert (first.name, first.site, first.kind, first.state) == ("t1", 1, "tag", "running")
         assert {topic for topic, _ in first.published} == {"skyless/v1/1/tag/t1/fix"}
         assert all(isinstance(message, FixMessage) for _, message in first.published)
         for reception in receptions_of(9, 2.0, later_s=10.0):
-            tag.node.hear(reception)
+            tag.node.on_event(reception)
         await settled()
         first, second = links
         assert (first.state, second.state, second.site) == ("left", "running", 9)
         assert {topic for topic, _ in second.published} == {"skyless/v1/9/tag/t1/fix"}
-        tag.node.hear(Restarted())  # a new receiver knows no site yet, but the link stays
-        tag.tell_health(0.1, 1)
+        tag.node.on_event(Restarted())  # a new receiver knows no site yet, but the link stays
+        tag.publish_health(0.1, 1)
         await settled()
         assert len(links) == 2
         topic, health = second.published[-1]
@@ -117,21 +116,21 @@ def test_the_link_comes_with_the_site_and_goes_with_it(links):
     asyncio.run(main())
 
 
-def test_without_a_broker_it_works_and_tells_nobody(links):
+def test_without_a_broker_it_works_and_publishes_nothing(links):
     async def main():
         tag = Tag(TagSettings(), FakeRadio("t1"), None, lambda line: None)
         for reception in receptions_of(LAB.id, 2.0):
-            tag.node.hear(reception)
-        tag.tell_health(0.1, 1)
-        tag.tell_receptions()
-        assert tag.node.book.serial > 100
+            tag.node.on_event(reception)
+        tag.publish_health(0.1, 1)
+        tag.publish_receptions()
+        assert tag.node.fix_log.serial > 100
         assert links == []
 
     asyncio.run(main())
 
 
-def test_a_link_that_fails_is_told_of_and_started_again(monkeypatch):
-    monkeypatch.setattr(running, "HEALTH_S", 0.01)
+def test_a_link_that_fails_is_reported_of_and_started_again(monkeypatch):
+    monkeypatch.setattr(process, "HEALTH_S", 0.01)
     said = []
 
     class Faulty:
@@ -144,7 +143,7 @@ def test_a_link_that_fails_is_told_of_and_started_again(monkeypatch):
 
     async def main():
         link = Faulty()
-        task = asyncio.ensure_future(running.keep(link, said.append))
+        task = asyncio.ensure_future(process.keep(link, said.append))
         while link.runs < 3:
             await asyncio.sleep(0.005)
         task.cancel()

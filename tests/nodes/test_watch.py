@@ -1,4 +1,4 @@
-"""Who watches a site: fixes beside the truth, rates, latencies, and messages that make no sense."""
+"""Watches a site: fixes beside the truth, rates, latencies, and messages that make no sense."""
 
 import time
 
@@ -93,7 +93,7 @@ def test_errors_count_from_a_second_after_a_tag_s_first_fix(site):
     assert (watch.variance_sum_m2 / watch.judged) ** 0.5 == pytest.approx(0.1)
 
 
-def test_the_rate_counts_between_health_messages_and_anew_after_a_tag_s_restart(site):
+def test_the_rate_counts_between_health_messages_and_again_after_a_tag_s_restart(site):
     link, watch = site
     link.send("tag/+/health", health(NOW_S, 100))  # before its first fix was heard it is unknown
     assert watch.tags == {}
@@ -112,8 +112,8 @@ def test_latencies_are_those_of_the_tag_and_those_to_here(site):
     link, watch = site
     for latency_s in (1e-3, 2e-3, 3e-3):
         link.send("/fix", fix(unix_s=time.time() - 0.5, latency_s=latency_s))
-    assert watch.latencies.take()[0] == pytest.approx(2e-3)
-    median_s, _, number = watch.arrivals.take()
+    assert watch.latencies.drain()[0] == pytest.approx(2e-3)
+    median_s, _, number = watch.arrivals.drain()
     assert number == 3
     assert 0.5 <= median_s < 5.0
 

@@ -1,19 +1,20 @@
 """Monte Carlo of the paper's chain: covariances against the theory, sums against other ways to make them."""
 
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 from skyless.bench.monte_carlo_speed import bench_chain, numpy_draw, numpy_loop
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.paper.chain_draws import Quantity, Readings
-from skyless.paper.monte_carlo import CHUNK, draw_lambdas, draw_moments
-from skyless.uncertainty import corrected
-from skyless.uncertainty.chain import Chain
-from skyless.uncertainty.tdoa import Reference, chain_covariance
+from skyless.paper.monte_carlo import (
+    CHUNK_DRAWS,
+    Quantity,
+    draw_lambdas,
+    draw_moments,
+    ideal_values,
+    noise_batches,
+    readings_of,
+)
+from skyless.uncertainty.chain import CORRECTED, Chain, Reference, chain_covariance
 
 SHARING = list(Reference)
 
@@ -60,18 +61,18 @@ def test_the_theorys_covariance_is_a_diagonal_and_a_common_number(reference):
     own = covariance.diagonal() - common
     np.testing.assert_allclose(np.diag(own) + common, covariance, rtol=1e-4)
     if reference is Reference.APART:
-        np.testing.assert_allclose(np.diag(covariance), corrected.lambda_m2(chain), rtol=1e-12)
+        np.testing.assert_allclose(np.diag(covariance), CORRECTED.lambda_m2(chain), rtol=1e-12)
 
 
 def test_the_autocovariance_of_epsilon_is_the_theorys():
     chain = chain_for(Reference.APART)
     moments = draw_moments(chain, 5, 500_000)
-    excess = moments.epsilon_covariance_s2 - corrected.epsilon_covariance(chain)
+    excess = moments.epsilon_covariance_s2 - CORRECTED.epsilon_covariance(chain)
     assert (np.abs(excess) < 5.0 * moments.epsilon_covariance_error_s2).all()
 
 
 def test_sums_have_the_same_bits_for_any_number_of_threads():
-    draws = 5 * CHUNK + 77
+    draws = 5 * CHUNK_DRAWS + 77
     one, three = (draw_moments(chain_for(Reference.APART), 8, draws, threads=threads) for threads in (1, 3))
     assert one.draws == three.draws == draws
     for name in ("mean", "variance", "fourth", "epsilon_covariance_s2", "lambda_covariance_m2"):
@@ -80,8 +81,8 @@ def test_sums_have_the_same_bits_for_any_number_of_threads():
 
 def test_moments_are_those_of_the_draws_one_by_one():
     """Chunks merged against all draws at once, and standard errors against their own scatter over batches."""
-    chain, draws = chain_for(Reference.APART), 2 * CHUNK + 5
-    lambdas = draw_lambdas(chain, 8, 0, draws)
+    chain, draws = chain_for(Reference.APART), 2 * CHUNK_DRAWS + 5
+    lambdas = np.concatenate(list(draw_lambdas(chain, 8, draws)))
     moments = draw_moments(chain, 8, draws)
     np.testing.assert_allclose(moments.mean[Quantity.LAMBDA], lambdas.mean(axis=0), rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(moments.variance[Quantity.LAMBDA], lambdas.var(axis=0, ddof=1), rtol=1e-9)
@@ -93,40 +94,36 @@ def test_moments_are_those_of_the_draws_one_by_one():
 
 def test_progress_counts_every_draw():
     seen = []
-    draw_moments(chain_for(Reference.APART), 1, 2 * CHUNK + 3, progress=seen.append)
-    assert seen == [CHUNK, 2 * CHUNK, 2 * CHUNK + 3]
+    draw_moments(chain_for(Reference.APART), 1, 2 * CHUNK_DRAWS + 3, progress=seen.append)
+    assert seen == [CHUNK_DRAWS, 2 * CHUNK_DRAWS, 2 * CHUNK_DRAWS + 3]
 
 
-def test_the_numpy_loop_of_the_yardstick_computes_the_same_chain():
+def test_the_numpy_loop_of_the_bench_computes_the_same_chain():
     chain = chain_for(Reference.APART)
-    readings = Readings(chain, Reference.APART, uniform=False)
+    ideal_ticks = ideal_values(readings_of(chain, Reference.APART))
     units = np.array([1.0, *[TICK_S] * 5, 1.0, TICK_S, TICK_S])[:, None]
     ideal = numpy_draw(chain, np.zeros(64))
-    np.testing.assert_allclose(readings.ideal * units, ideal, rtol=1e-12, atol=2e-15)
+    np.testing.assert_allclose(ideal_ticks * units, ideal, rtol=1e-12, atol=2e-15)
     _, variance = numpy_loop(chain, 4000, np.random.default_rng(2))
     moments = draw_moments(chain, 2, 100_000)
     scale = np.array([1.0] * 8 + [SPEED_OF_LIGHT_MPS])[:, None]
     np.testing.assert_allclose(np.sqrt(variance) * scale, moments.std, rtol=5.0 / np.sqrt(2 * 4000))
 
 
-SIMULATED = """
-import numpy as np
-from skyless.paper.chain_draws import Readings
-from skyless.paper.gpu_draws import gpu_sums
-from skyless.paper.monte_carlo import draw_moments, gpu_available, sums_of
-from skyless.bench.monte_carlo_speed import bench_chain
-from skyless.uncertainty.tdoa import Reference
-assert gpu_available()
-for uniform in (False, True):
-    readings = Readings(bench_chain(2), Reference.SECOND_SYNC, uniform=uniform)
-    device, processor = gpu_sums(readings, 5, 3, 150, blocks=1), sums_of(readings, 5, 3, 150)
-    np.testing.assert_allclose(device, processor, rtol=1e-9)
-"""
+@pytest.mark.parametrize(("uniform", "kurtosis", "largest"), [(False, 3.0, 6.0), (True, 1.8, np.sqrt(3.0))])
+def test_moments_and_independence_of_the_numbers_of_a_draw(uniform, kurtosis, largest):
+    """Of mean 0 and variance 1, draws and the numbers of a draw independent of each other."""
+    draws = CHUNK_DRAWS
+    noise = np.concatenate(list(noise_batches(7, 3, draws, 8, uniform=uniform)))
+    assert noise.shape == (draws, 8)
+    assert np.abs(noise).max() <= largest
+    tolerance = 5.0 / np.sqrt(draws)
+    np.testing.assert_allclose(noise.T @ noise / draws, np.eye(8), atol=tolerance * np.sqrt(2.0))
+    np.testing.assert_allclose((noise**4).mean(axis=0), kurtosis, atol=tolerance * np.sqrt(96.0))
+    np.testing.assert_allclose((noise[1:] * noise[:-1]).mean(axis=0), 0.0, atol=tolerance)
 
 
-def test_the_device_makes_the_same_draws_in_the_simulator():
-    """Numba's simulator runs the device's function as Python, thread by thread; a real device is not needed."""
-    environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1"}
-    command = [sys.executable, "-c", SIMULATED]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+def test_seeds_and_chunks_have_noise_of_their_own():
+    keys = [(1, 1), (1, 2), (2, 1), (1, 1 + 2**32), (1 + 2**32, 1)]
+    rows = [next(noise_batches(seed, chunk, 1, 4, uniform=False)) for seed, chunk in keys]
+    assert len(np.unique(rows)) == 4 * len(keys)

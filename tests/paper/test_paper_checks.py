@@ -5,14 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from skyless.paper.chain_checks import (
-    ANCHORS,
-    NOISES,
-    QUANTITIES,
-    lambda_distributions,
-    paper_chain,
-    paper_checks,
-)
+from skyless.paper.checks import CHECKED_ANCHORS, NOISES, QUANTITY_NAMES, paper_chain, paper_checks
+from skyless.paper.distributions import lambda_distributions
 
 DRAWS = 2_000_000
 PRINTED_PCT = {
@@ -35,7 +29,10 @@ def checks():
 
 def test_every_quantity_of_ten_anchors_is_checked_for_both_noises(checks):
     assert {(c.noise, c.quantity, c.anchor) for c in checks} == {
-        (noise, quantity, anchor) for noise in NOISES for quantity in QUANTITIES for anchor in range(1, ANCHORS + 1)
+        (noise, quantity, anchor)
+        for noise in NOISES
+        for quantity in QUANTITY_NAMES
+        for anchor in range(1, CHECKED_ANCHORS + 1)
     }
     assert {c.draws for c in checks} == {DRAWS}
 
@@ -54,7 +51,7 @@ def test_the_standard_error_is_that_of_so_many_draws(checks):
     assert all(0.7 * gaussian < c.standard_error_pct < gaussian for c in checks if c.noise == "uniform")
 
 
-@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("quantity", QUANTITY_NAMES)
 def test_printed_standard_deviations_are_off(checks, quantity):
     low, high = PRINTED_PCT[quantity]
     errors = [c.printed_error_pct for c in checks if c.quantity == quantity]

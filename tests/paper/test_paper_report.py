@@ -10,7 +10,7 @@ import pytest
 from skyless.cli.main import main
 from skyless.paper import plan as plans
 from skyless.paper import run
-from skyless.paper.chain_checks import QUANTITIES
+from skyless.paper.checks import QUANTITY_NAMES
 from skyless.paper.plan import Plan
 
 TINY = Plan(
@@ -100,7 +100,7 @@ def test_the_numbers_are_told_twice_alike(made):
     assert len(told["sections"]) == 10
     assert told["sections"][0]["key"] == "scenario"
     names = {check["name"] for check in told["checks"]}
-    assert len(names) == 2 * 10 * len(QUANTITIES)
+    assert len(names) == 2 * 10 * len(QUANTITY_NAMES)
     for check in told["checks"]:
         assert check["draws"] == TINY.draws
         assert check["corrected_error_pct"] < 5.0 * check["standard_error_pct"]

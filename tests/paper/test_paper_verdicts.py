@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from skyless.evaluation.report_page import inline_svg
 from skyless.evaluation.scenarios import Request, fleet_of
 from skyless.paper import (
     checks,
@@ -15,15 +16,13 @@ from skyless.paper import (
     rate,
     scale,
     scenario,
-    stamp_bias,
     static,
     timeline,
     walk,
 )
-from skyless.paper.chain_checks import LambdaDistribution, PaperCheck
-from skyless.paper.html import inline_svg
-from skyless.paper.plan import P1, P2, plan_of
-from skyless.paper.section import Verdict
+from skyless.paper.checks import PaperCheck
+from skyless.paper.distributions import LambdaDistribution
+from skyless.paper.plan import P1, P2, Verdict, plan_of
 from skyless.site.lab import lab_site
 
 HOLDS, CORRECTED, FAILS = Verdict.HOLDS, Verdict.CORRECTED, Verdict.FAILS
@@ -71,7 +70,7 @@ def moments(mean_sigmas, skewness=0.0, excess=0.0):
 
 
 @pytest.mark.parametrize(
-    ("clean", "biased", "verdict"),
+    ("noise_only", "biased", "verdict"),
     [
         (moments(1.0), moments(100.0), CORRECTED),
         (moments(9.0), moments(100.0), HOLDS),
@@ -80,8 +79,8 @@ def moments(mean_sigmas, skewness=0.0, excess=0.0):
         (moments(1.0, excess=0.9), moments(100.0), FAILS),
     ],
 )
-def test_means_are_asked_of_noise_and_of_biases(clean, biased, verdict):
-    assert static.judge([clean], [biased])[0] is verdict
+def test_means_are_asked_of_noise_and_of_biases(noise_only, biased, verdict):
+    assert static.judge([noise_only], [biased])[0] is verdict
 
 
 def test_other_verdicts_follow_their_numbers():
@@ -138,7 +137,7 @@ def test_the_paper_keeps_20_cm_up_to_the_published_noise():
 
 
 def test_predicted_deviations_are_the_published_ones():
-    """5.36 cm at P1 and 5.46 cm at P2 (docs/maths.md: said by the fixes), rounding included."""
+    """5.36 cm at P1 and 5.46 cm at P2 (docs/maths.md: predicted σ), rounding included."""
     for place, published_cm in ((P1, 5.36), (P2, 5.46)):
         predicted_cm = 100.0 * math.sqrt(np.trace(dop_map.literal_covariance_m2(np.array(place))))
         assert predicted_cm == pytest.approx(published_cm, abs=0.02)
@@ -146,18 +145,18 @@ def test_predicted_deviations_are_the_published_ones():
 
 def test_antenna_delays_move_the_least_squares_by_the_normal_equations():
     """A DTDoA is late by the TX and RX delay of its anchor; the master's own cancel."""
-    assert stamp_bias.expected_bias_m("clean", P2, 1) == pytest.approx([0.0, 0.0], abs=1e-12)
-    late_m = np.array([error.tx_ticks + error.rx_ticks for error in stamp_bias.delay_errors(7)])[1:] * 4.691764e-3
+    assert static.expected_bias_m("noise", P2, 1) == pytest.approx([0.0, 0.0], abs=1e-12)
+    late_m = np.array([error.tx_ticks + error.rx_ticks for error in static.delay_errors(7)])[1:] * 4.691764e-3
     anchors = np.array([(anchor.x_m, anchor.y_m) for anchor in lab_site().anchors])
     units = (np.array(P2) - anchors) / np.linalg.norm(np.array(P2) - anchors, axis=1)[:, None]
     rows = units[1:] - units[0]
     expected = np.linalg.inv(rows.T @ rows) @ rows.T @ late_m
-    assert stamp_bias.expected_bias_m("delay", P2, 7) == pytest.approx(expected, rel=1e-5)
+    assert static.expected_bias_m("delay", P2, 7) == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_command_beside_a_figure_makes_its_number_again():
     """Several methods and tags in one world hear what ``skyless simulate`` lets one tag hear."""
-    tracks = static.run_world(lambda share: None, "clean", 9, 60)
+    tracks = static.run_world(lambda share: None, "noise", 9, 60)
     fleet = fleet_of(Request(lab_site(), "literal", seed=9, noise_ps=100.0, positions_m=(P1,), most_fixes=60))
     for _ in fleet.run(3.2):
         pass
@@ -169,7 +168,7 @@ def test_the_command_beside_a_figure_makes_its_number_again():
 
 def test_phases_end_with_the_fix():
     def heard(tag, when, fixed):
-        return timeline.Heard(tag, 1, when, when + 1e-4, fixed, 1e-5)
+        return timeline.TimedReception(tag, 1, when, when + 1e-4, fixed, 1e-5)
 
     found = timeline.phases_of([heard(0, 1.0, False), heard(1, 1.0, False), heard(0, 2.0, True), heard(0, 3.0, False)])
     assert [(phase.tag, phase.begin_s, phase.last_s) for phase in found] == [(0, 1.0, 2.0)]

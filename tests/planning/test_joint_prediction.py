@@ -6,7 +6,7 @@ from msgspec.structs import replace
 from scipy.stats import binom
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.planning.anchor_clocks import AGE_S, LATE_M, TOLD, anchor_clocks, relays_of, stamp_variances
+from skyless.planning.anchor_clocks import anchor_clocks, relays_of, stamp_variances
 from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
 from skyless.planning.links import anchor_links, anchor_positions, link_budget
 from skyless.planning.predict import PlanSettings, Predictor
@@ -22,7 +22,7 @@ ROOM = Site("room", 2, 1, tuple(AnchorSite(k + 1, *place) for k, place in enumer
 QA = 0.3
 
 
-def relays(site, channel=None):
+def relays_and_clocks(site, channel=None):
     channel = channel or ChannelModel()
     anchors, budget, walls = anchor_positions(site), link_budget(channel), pack_walls(site.walls)
     master = [anchor.id for anchor in site.anchors].index(site.master)
@@ -69,7 +69,7 @@ def dense(site, point, superframes, shift_m=0.0):
     """
     anchors, accuracy = anchor_positions(site), site.accuracy
     n, dim = len(anchors), 2 if site.tags.height_m is not None else 3
-    clocks, told = relays(site)
+    clocks, relays = relays_and_clocks(site)
     tx_var, rx_var = stamp_variances(site)
     white, walk = (SPEED_OF_LIGHT_MPS * site.noise.white_fm) ** 2, (SPEED_OF_LIGHT_MPS * site.noise.random_walk_fm) ** 2
     half = dim + n
@@ -104,8 +104,8 @@ def dense(site, point, superframes, shift_m=0.0):
             h[constant + i], h[change + i], h[slope] = 1.0, 1.0, np.clip((range_m - 4.0) / 4.0, -1.0, 1.0)
             h[survey + dim * i : survey + dim * (i + 1)] = -towards
             measured = [(h, rx_var, len(P), shift_m * (site.anchors[i].id == 3))]
-            for r in range(told.ends[k - 1] if k else 0, told.ends[k]):
-                j, age = told.heard[r], told.values[r, AGE_S]
+            for r in range(relays.ends[k - 1] if k else 0, relays.ends[k]):
+                j, age = relays.sender[r], relays.age_s[r]
                 h = np.zeros(len(P))
                 h[dim + j], h[dim + i], h[2 * half + j] = 1.0, -1.0, 1.0
                 h[half + dim + j], h[half + dim + i] = -age, age
@@ -156,8 +156,8 @@ def test_a_late_anchor_shifts_positions_as_in_a_dense_recursion():
     point = (2.0, 5.5, 0.0)
     wall = WallSite(4.5, 4.4, 4.5, 4.7, loss_db=0.0, delay_m=0.05)
     site = replace(LAB, walls=(wall,))
-    _, told = relays(site)
-    assert (told.values[:, LATE_M] == 0.0).all()
+    _, relays = relays_and_clocks(site)
+    assert (relays.delay_m == 0.0).all()
     row = Predictor(site, PlanSettings("joint", qa=QA)).at(np.array([point]))[0]
     expected = dense(LAB, np.array(point), 150, 0.05)[2]
     assert row[BIAS] == pytest.approx(expected, rel=0.01)
@@ -165,25 +165,25 @@ def test_a_late_anchor_shifts_positions_as_in_a_dense_recursion():
 
 
 def test_small_sites_relay_everything_once():
-    clocks, told = relays(LAB)
+    clocks, relays = relays_and_clocks(LAB)
     assert clocks.sender.tolist() == [0, 1, 2, 3, 4, 5]
-    assert told.ends.tolist() == [5, 10, 15, 20, 25, 30]
+    assert relays.ends.tolist() == [5, 10, 15, 20, 25, 30]
     slot_s = schedule_of(LAB).slot_ticks * TICK_S
-    assert told.heard[5:10].tolist() == [0, 5, 4, 3, 2]
-    assert told.values[5:10, AGE_S] == pytest.approx(slot_s * np.arange(1, 6))
-    assert told.values[:, TOLD] == pytest.approx(1.0, abs=1e-6)
+    assert relays.sender[5:10].tolist() == [0, 5, 4, 3, 2]
+    assert relays.age_s[5:10] == pytest.approx(slot_s * np.arange(1, 6))
+    assert relays.share == pytest.approx(1.0, abs=1e-6)
 
 
 def test_large_sites_relay_the_master_and_the_last_receptions_that_fit():
     """Six beside the master's; with every other frame lost, those that came after fill the room by chance."""
     anchors = tuple(AnchorSite(k + 1, float(k % 5), float(k // 5)) for k in range(20))
     site = Site("many", 1, 1, anchors, tags=TagsSite(0.0))
-    _, told = relays(site)
-    last = slice(told.ends[18], told.ends[19])
-    assert told.heard[last].tolist() == [18, 17, 16, 15, 14, 13, 0]
-    assert told.heard[: told.ends[0]].tolist() == [19, 18, 17, 16, 15, 14, 13]  # the master has none to tell first
-    _, told = relays(site, ChannelModel(loss_probability=0.5))
-    heard, share = told.heard[told.ends[18] :], told.values[told.ends[18] :, TOLD]
+    _, relays = relays_and_clocks(site)
+    last = slice(relays.ends[18], relays.ends[19])
+    assert relays.sender[last].tolist() == [18, 17, 16, 15, 14, 13, 0]
+    assert relays.sender[: relays.ends[0]].tolist() == [19, 18, 17, 16, 15, 14, 13]  # the master has none to tell first
+    _, relays = relays_and_clocks(site, ChannelModel(loss_probability=0.5))
+    heard, share = relays.sender[relays.ends[18] :], relays.share[relays.ends[18] :]
     expected = 0.5 * binom.cdf(5, np.arange(18), 0.5)
     expected = expected[expected >= 0.01]
     assert heard.tolist() == [*range(18, 18 - len(expected), -1), 0]
@@ -194,10 +194,10 @@ def test_silent_anchors_relay_nothing_and_are_not_relayed():
     site = replace(
         LAB, walls=(WallSite(5.0, 7.0, 7.0, 7.0, loss_db=300.0), WallSite(5.0, 9.0, 5.0, 7.0, loss_db=300.0))
     )
-    clocks, told = relays(site)
-    assert clocks.speaks.tolist() == [True, True, True, False, True, True]
-    assert 3 not in told.heard
-    assert len(told.ends) == 5
+    clocks, relays = relays_and_clocks(site)
+    assert clocks.sends.tolist() == [True, True, True, False, True, True]
+    assert 3 not in relays.sender
+    assert len(relays.ends) == 5
 
 
 def test_lost_packets_cost_and_fixes_come_with_those_that_arrive():
@@ -208,5 +208,5 @@ def test_lost_packets_cost_and_fixes_come_with_those_that_arrive():
     ]
     assert [row[FIX_SHARE] for row in rows] == pytest.approx([1.0, 0.8, 0.5], abs=1e-5)
     assert rows[0][SIGMA] < rows[1][SIGMA] < rows[2][SIGMA]
-    # anchors lose half as well here: more than the 1.39 of tags alone (docs/maths.md section 6)
+    # anchors lose half as well here: more than the 1.39 of tags alone (docs/maths.md section 7)
     assert 1.39 < rows[2][CLAIMED] / rows[0][CLAIMED] < 1.6

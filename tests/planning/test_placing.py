@@ -8,12 +8,19 @@ from msgspec.structs import replace
 
 from skyless.planning.advice import plan_warnings
 from skyless.planning.columns import FIX_SHARE
-from skyless.planning.floor import floor_of, sides
-from skyless.planning.lattice import exchange, lattice_of, mean_and_worst
+from skyless.planning.floor import Mounts, floor_of, sample_points, sides
 from skyless.planning.links import anchor_links, link_budget, with_range
 from skyless.planning.maps import grid_of, plan_map, summary_of
-from skyless.planning.mounts import Mounts, even_layout, sample_points, site_with, site_with_one_more
-from skyless.planning.optimise import Search, one_more
+from skyless.planning.optimise import (
+    Search,
+    even_layout,
+    exchange,
+    lattice_of,
+    mean_and_worst,
+    one_more,
+    site_with,
+    site_with_one_more,
+)
 from skyless.planning.predict import PlanSettings, Predictor
 from skyless.planning.verify import random_points, verify
 from skyless.simulation.channel import ChannelModel, pack_walls
@@ -93,7 +100,7 @@ def test_exchange_finds_what_trying_all_finds():
 def test_the_even_layout_goes_around_with_heights_in_turn():
     mounts = Mounts(sides(np.array([(0, 0), (4, 0), (4, 2), (0, 2)], float)), (0.5, 2.5))
     layout = even_layout(mounts, 4)
-    assert mounts.at(layout.ways_m, layout.levels).tolist() == [[0, 0, 0.5], [3, 0, 2.5], [4, 2, 0.5], [1, 2, 2.5]]
+    assert mounts.at(layout.along_m, layout.levels).tolist() == [[0, 0, 0.5], [3, 0, 2.5], [4, 2, 0.5], [1, 2, 2.5]]
 
 
 def test_one_more_anchor_helps_where_one_is_missing():
@@ -102,11 +109,11 @@ def test_one_more_anchor_helps_where_one_is_missing():
     site = replace(lab_site(), anchors=anchors)
     floor = floor_of(site, FILE, np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float), None)
     more = one_more(site, BRACKETED, floor, Mounts(sides(floor.outline_m), (0.0,)), (0.0,))
-    assert more.place_m[0] == pytest.approx(6.0, abs=0.5)
-    assert more.place_m[1] > 6.0
+    assert more.position_m[0] == pytest.approx(6.0, abs=0.5)
+    assert more.position_m[1] > 6.0
     assert more.mean_after_m < 0.9 * more.mean_before_m
     assert more.worst_after_m < 0.7 * more.worst_before_m
-    grown = site_with_one_more(site, np.array(more.place_m))
+    grown = site_with_one_more(site, np.array(more.position_m))
     assert [a.id for a in grown.anchors] == [1, 2, 5, 6, 7]
 
 
@@ -168,7 +175,7 @@ def test_prediction_and_simulation_agree(monkeypatch, name, method, rounds):
 
     Three points at once; their mean is held to a tighter bound.
     """
-    monkeypatch.setattr("skyless.planning.verify.WORLDS", 8)
+    monkeypatch.setattr("skyless.planning.verify._WORLDS", 8)
     site = lab_site() if name == "range errors" else SITES[name]
     floor = floor_of(site, FILE, None, None)
     predictor = Predictor(site, PlanSettings(method))

@@ -14,11 +14,11 @@ from msgspec.structs import replace
 
 from skyless.errors import ConfigurationError
 from skyless.planning import maps
-from skyless.planning.columns import ANCHORS, COLUMNS, PDOP, SIGMA
-from skyless.planning.floor import along, area, distance_outside, floor_of, inside, sides, total_length
-from skyless.planning.maps import grid_of, plan_map, summary_of
+from skyless.planning.columns import ANCHORS_IN_VIEW, PDOP, PLAN_COLUMNS, SIGMA
+from skyless.planning.floor import Mounts, area, distance_outside, floor_of, inside, points_along, sides
+from skyless.planning.maps import csv_lines, geojson_lines, grid_of, plan_map, summary_of
 from skyless.planning.predict import PlanSettings, Predictor
-from skyless.planning.tables import csv_lines, geojson_lines, to_wgs84
+from skyless.site.georeference import to_wgs84
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, GeoreferenceSite, WallSite
 
@@ -40,9 +40,9 @@ def test_inside_agrees_with_matplotlib(x, y):
 def test_areas_and_ways_around():
     assert area(L_SHAPE) == pytest.approx(12 * 4 + 5 * 5)
     assert area(L_SHAPE[::-1]) == pytest.approx(-73)
-    walls = sides(L_SHAPE)
-    assert total_length(walls) == pytest.approx(42)
-    around = along(walls, np.array([0.0, 12.0, 14.0, 23.0, 42.0, 43.0]))
+    mounts = Mounts(sides(L_SHAPE), (0.0,))
+    assert mounts.length_m == pytest.approx(42)
+    around = points_along(mounts.segments_m, np.array([0.0, 12.0, 14.0, 23.0, 42.0, 43.0]))
     assert around.tolist() == [[0, 0], [12, 0], [12, 2], [5, 4], [0, 0], [1, 0]]
     assert distance_outside(np.array([8.0, 6.0]), L_SHAPE) == pytest.approx(2.0)
     assert distance_outside(np.array([2.0, 6.0]), L_SHAPE) == 0.0
@@ -86,11 +86,11 @@ def test_interpolation_of_the_filter_is_close_and_keeps_walls_sharp(monkeypatch)
     """A wall that hides two anchors altogether: what was computed in full every 0.2 m against every 0.8 m."""
     site = replace(LAB, walls=(WallSite(2.0, 3.0, 4.0, 3.0, loss_db=60.0, delay_m=0.0),))
     full = lab_map(0.2, "joint", site)
-    monkeypatch.setattr(maps, "JOINT_BUDGET", 1.4e4)
+    monkeypatch.setattr(maps, "_JOINT_BUDGET", 1.4e4)
     rough = lab_map(0.2, "joint", site)
     assert full.computed_every_m == 0.2
     assert rough.computed_every_m == pytest.approx(0.8)
-    assert (rough.column(ANCHORS) == full.column(ANCHORS)).all()
+    assert (rough.column(ANCHORS_IN_VIEW) == full.column(ANCHORS_IN_VIEW)).all()
     assert (rough.column(PDOP) == full.column(PDOP)).all()
     errors = rough.column(SIGMA) / full.column(SIGMA) - 1.0
     assert np.quantile(abs(errors), 0.95) < 0.1
@@ -101,7 +101,7 @@ def test_csv_holds_the_map():
     plan = lab_map(1.0)
     rows = list(csv.DictReader("".join(csv_lines(plan)).splitlines()))
     assert len(rows) == 48
-    assert list(rows[0]) == ["x_m", "y_m", "z_m", *COLUMNS]
+    assert list(rows[0]) == ["x_m", "y_m", "z_m", *PLAN_COLUMNS]
     assert [float(row["sigma_m"]) for row in rows] == pytest.approx(plan.column(SIGMA).ravel(), rel=1e-3)
     assert (float(rows[1]["x_m"]), float(rows[1]["y_m"])) == (1.5, 0.5)
 

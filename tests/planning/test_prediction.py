@@ -9,16 +9,31 @@ from dense_covariance import position_covariance
 from skyless.clocks.filter import ClockNoise, clock_noise
 from skyless.method_names import FILTERS
 from skyless.planning.anchor_clocks import offset_variances, stamp_variances
-from skyless.planning.columns import CLAIMED, COLUMNS, FIX_SHARE, GDOP, RMSE, SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, TDOP
-from skyless.planning.links import anchor_positions, hears, link_budget, range_of, with_range
+from skyless.planning.columns import (
+    CLAIMED,
+    FIX_SHARE,
+    GDOP,
+    PLAN_COLUMNS,
+    RMSE,
+    SIGMA,
+    SIGMA_X,
+    SIGMA_Y,
+    SIGMA_Z,
+    TDOP,
+)
+from skyless.planning.links import anchor_positions, link, link_budget, range_of, with_range
 from skyless.planning.predict import PlanSettings, Predictor, with_noise
 from skyless.planning.snapshot_sigma import delays, phase_covariance
-from skyless.positioning.methods.snapshots import SnapshotMethod
+from skyless.positioning.methods.snapshots import (
+    SnapshotMethod,
+    bracketed_covariance,
+    literal_covariance,
+    literal_delayed_covariance,
+)
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, NoiseSite, Site, TagsSite, WallSite
 from skyless.uncertainty.dop import dops_at
-from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance, literal_delayed_covariance
 
 LAB = ideal_lab_site(100.0)
 QUIET = replace(LAB, noise=NoiseSite(100.0, 100.0, 1e-15, 1e-15))
@@ -136,9 +151,9 @@ def test_links_are_the_simulations():
     assert range_of(channel) == pytest.approx(20.0)
     budget, walls = link_budget(channel), pack_walls((WallSite(5.0, -1.0, 5.0, 1.0, loss_db=6.0206, delay_m=0.3),))
     origin = np.zeros(3)
-    assert hears(budget, walls, origin, np.array([0.0, 20.0, 0.0])) == pytest.approx((0.5, 0.0))
-    assert hears(budget, walls, origin, np.array([10.0, 0.0, 0.0])) == pytest.approx((0.5, 0.3), abs=1e-4)
-    assert hears(budget, walls, origin, np.array([4.0, 0.0, 0.0]))[0] > 0.999
+    assert link(budget, walls, origin, np.array([0.0, 20.0, 0.0])) == pytest.approx((0.5, 0.0))
+    assert link(budget, walls, origin, np.array([10.0, 0.0, 0.0])) == pytest.approx((0.5, 0.3), abs=1e-4)
+    assert link(budget, walls, origin, np.array([4.0, 0.0, 0.0]))[0] > 0.999
 
 
 def test_without_enough_anchors_there_is_no_fix():
@@ -148,8 +163,8 @@ def test_without_enough_anchors_there_is_no_fix():
     assert (table[:, FIX_SHARE] == 0.0).all()
 
 
-def test_an_anchor_that_speaks_before_the_master_is_of_no_use_to_snapshots():
-    late = replace(LAB, anchors=tuple(replace(a, slot=a.id % 6) for a in LAB.anchors))  # anchor 6 speaks first
+def test_an_anchor_that_sends_before_the_master_is_of_no_use_to_snapshots():
+    late = replace(LAB, anchors=tuple(replace(a, slot=a.id % 6) for a in LAB.anchors))  # anchor 6 sends first
     others = replace(LAB, anchors=LAB.anchors[:5], schedule=replace(LAB.schedule, slots=6))
     with_six, with_five = (Predictor(site, PlanSettings("bracketed")).at(points())[:, SIGMA] for site in (late, others))
     assert with_six == pytest.approx(with_five, rel=1e-3)
@@ -167,7 +182,7 @@ def test_a_walls_delay_shifts_positions_as_the_tdoas_shift():
     H = (unit[1:] - unit[0])[:, :2]
     expected = np.linalg.norm(np.linalg.lstsq(H, shift[1:], rcond=None)[0])
     row = Predictor(site, PlanSettings("literal")).at(point)[0]
-    assert row[COLUMNS.index("bias_m")] == pytest.approx(expected, rel=1e-6)
+    assert row[PLAN_COLUMNS.index("bias_m")] == pytest.approx(expected, rel=1e-6)
     assert row[RMSE] ** 2 == pytest.approx(row[SIGMA] ** 2 + expected**2, rel=1e-6)
 
 
@@ -193,5 +208,5 @@ def test_a_site_out_of_its_masters_reach_is_silent():
     anchors = (AnchorSite(1, 0.0, 0.0), AnchorSite(2, 5.0, 0.0), AnchorSite(3, 0.0, 5.0), AnchorSite(4, 90.0, 5.0))
     site = Site("far", 1, 1, anchors, tags=TagsSite(0.0))
     predictor = Predictor(site, PlanSettings())
-    assert predictor.clocks.speaks.tolist() == [True, True, True, False]
+    assert predictor.clocks.sends.tolist() == [True, True, True, False]
     assert 3 not in predictor.clocks.sender

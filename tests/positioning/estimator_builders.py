@@ -10,12 +10,11 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.evaluation.lab_bound import SPEED_STD_MPS, WHITE_FM, random_path
 from skyless.positioning.estimator.estimator import LEVELS, Estimator, Packets
-from skyless.positioning.estimator.settings import EstimatorSettings
-from skyless.positioning.estimator.state import layout
+from skyless.positioning.estimator.state import EstimatorSettings, layout
 from skyless.positioning.observation import Observation
 from skyless.site.lab import ideal_lab_site
+from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
 
 SLOT_S = ideal_lab_site().schedule.slot_s
 LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in ideal_lab_site().anchors])
@@ -115,7 +114,7 @@ def begun(episode, settings, anchors_m=LAB_M, std_m=0.3, seed=2, off=1.0):
     """An estimator that begins ``off·std_m`` off, and takes it for ``std_m``."""
     estimator, dim = Estimator(settings, anchors_m), settings.dim
     start_m = episode.path_m[0, :dim] + np.random.default_rng(seed).normal(0.0, off * std_m, dim)
-    estimator.start(int(episode.packets.rx_ticks[0]), start_m, std_m**2 * np.eye(dim), SPEED_STD_MPS**2)
+    estimator.start(int(episode.packets.rx_ticks[0]), start_m, std_m**2 * np.eye(dim), EPISODE_SPEED_STD_MPS**2)
     return estimator
 
 

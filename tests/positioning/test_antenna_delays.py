@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.positioning.masterless.antenna_delays import BLOCKED_M, DELAY_STD_M, EXCESS_STD_M, antenna_delays_m
+from skyless.positioning.masterless.anchor_errors import ANTENNA_DELAY_STD_M, BLOCKED_M, EXCESS_STD_M, antenna_delays_m
 
 delays = st.lists(st.floats(-0.2, 0.2), min_size=2, max_size=9)
 
@@ -32,7 +32,7 @@ def test_it_is_the_conditional_mean_of_a_gaussian(delays_m, seed):
     told = {pair: value + error for (pair, value), error in zip(told.items(), noise, strict=True)}
     n = len(delays_m)
     H = np.array([[float(i in pair) for i in range(n)] for pair in told])
-    prior = DELAY_STD_M**2 * np.eye(n)
+    prior = ANTENNA_DELAY_STD_M**2 * np.eye(n)
     spread = H @ prior @ H.T + EXCESS_STD_M**2 * np.eye(len(told)) + 1e6
     values = np.array(list(told.values()))
     expected = prior @ H.T @ np.linalg.solve(spread, values - values.mean())
@@ -40,7 +40,7 @@ def test_it_is_the_conditional_mean_of_a_gaussian(delays_m, seed):
 
 
 def test_many_exact_flights_are_believed_a_pair_alone_says_nothing():
-    true_m = np.random.default_rng(1).normal(0.0, DELAY_STD_M, 30)
+    true_m = np.random.default_rng(1).normal(0.0, ANTENNA_DELAY_STD_M, 30)
     found = antenna_delays_m(excesses(true_m))
     assert list(found.values()) == pytest.approx(true_m - true_m.mean(), abs=0.02)
     assert antenna_delays_m({(1, 2): 154.0}) == pytest.approx({1: 0.0, 2: 0.0})

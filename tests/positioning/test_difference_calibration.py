@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skyless.air.masterless_packets import PairTdoa
-from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 
 PLACES = {k: (6.0 * (k % 2), 8.0 * (k // 2 % 2), 0.2 + 2.5 * ((k + k // 4) % 2)) for k in range(8)}
@@ -26,7 +26,7 @@ def heard(calibration, tag_m, count=3000, seed=1, noise_m=0.05, late_m=0.0):
         off_m = KNOWN.constant_m(clean) + 0.08 * log(dist(tag_m, PLACES[b]) / dist(tag_m, PLACES[a]))
         off_m += rng.normal(0.0, noise_m)
         off_m += late_m * ((b == 2) - (a == 2)) * (k > count // 2)
-        if tracking.hear((PairTdoa(clean.time_s, a, b, clean.tdoa_m + off_m),)) and k > count // 2:
+        if tracking.update((PairTdoa(clean.time_s, a, b, clean.tdoa_m + off_m),)) and k > count // 2:
             places.append(tracking.position_m)
     return np.array(places), tracking
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skyless.air.masterless_packets import PairTdoa
-from skyless.positioning.estimator.kalman import is_at_rest
+from skyless.positioning.estimator.kalman import is_stationary
 from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 
 ANCHORS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * ((n ^ n >> 1 ^ n >> 2) & 1)) for n in range(4)}
@@ -34,7 +34,7 @@ def run(until_s, late_m=lambda _time_s, _anchor: 0.0, *, seed=0, still=False, an
         a, b = (int(n) for n in generator.choice(count, 2, replace=False))
         off_m = [late_m(time_s, n) + 0.05 * np.log(dist(tag_m, anchors_m[n])) for n in (a, b)]
         true_m = dist(tag_m, anchors_m[b]) - dist(tag_m, anchors_m[a]) + off_m[1] - off_m[0]
-        if tracking.hear([PairTdoa(time_s, a, b, true_m + generator.normal(0.0, STD_M))]):
+        if tracking.update([PairTdoa(time_s, a, b, true_m + generator.normal(0.0, STD_M))]):
             fix = tracking.fix()
             rows.append((time_s, fix.position_m - tag_m, fix.covariance_m2))
     return rows, tracking
@@ -88,7 +88,7 @@ def test_covariances_hold_where_anchors_are_off_as_assumed(seed):
 def test_a_tag_at_rest_is_known_better_than_one_that_may_move_and_wakes_at_once():
     moving, _ = run(30.0)
     rows, tracking = run(30.0, still=True)
-    assert is_at_rest(tracking.estimator.state)
+    assert is_stationary(tracking.estimator.state)
     jitter = [np.std([error for time_s, error, _ in of if time_s >= 15.0], axis=0).max() for of in (rows, moving)]
     assert jitter[0] < 0.35 * jitter[1]
     for k in range(800):  # it goes on, at 1 m/s at once
@@ -96,7 +96,7 @@ def test_a_tag_at_rest_is_known_better_than_one_that_may_move_and_wakes_at_once(
         tag_m = place_m(k * STEP_S)
         a, b = k % 8, (k + 1 + k // 8 % 7) % 8
         off_m = 0.05 * np.log(dist(tag_m, ANCHORS_M[b]) / dist(tag_m, ANCHORS_M[a]))
-        tracking.hear([PairTdoa(time_s, a, b, dist(tag_m, ANCHORS_M[b]) - dist(tag_m, ANCHORS_M[a]) + off_m)])
+        tracking.update([PairTdoa(time_s, a, b, dist(tag_m, ANCHORS_M[b]) - dist(tag_m, ANCHORS_M[a]) + off_m)])
         assert dist(tracking.position_m, tag_m) < 0.3
     assert dist(tracking.position_m, tag_m) < 0.1
 

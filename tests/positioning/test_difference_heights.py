@@ -23,7 +23,7 @@ def test_no_level_where_the_anchors_do_not_tell_the_height(height_m):
     for k in range(12_000):
         a, b = k % 6, (k + 1 + k // 6 % 5) % 6
         true_m = np.linalg.norm(place - anchors_m[b]) - np.linalg.norm(place - anchors_m[a])
-        if tracking.hear([PairTdoa(k / 400.0, a, b, float(true_m + generator.normal(0.0, 0.1)))]):
+        if tracking.update([PairTdoa(k / 400.0, a, b, float(true_m + generator.normal(0.0, 0.1)))]):
             fix = tracking.fix()
             std_m.append(fix.covariance_m2[2, 2] ** 0.5)
             assert np.linalg.norm(fix.position_m - place) < 5.0 * fix.std_m

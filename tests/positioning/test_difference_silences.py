@@ -21,7 +21,7 @@ def test_a_tag_that_moved_on_in_silence_is_found_again():
         place = np.array([4.0 + 2.5 * np.cos(time_s / 2.5), 3.0 + 2.5 * np.sin(time_s / 2.5), 1.2])
         a, b = k % 8, (k + 1 + k // 8 % 7) % 8
         true_m = np.linalg.norm(place - ANCHORS_M[b]) - np.linalg.norm(place - ANCHORS_M[a])
-        if tracking.hear([PairTdoa(time_s, a, b, float(true_m + generator.normal(0.0, STD_M)))]):
+        if tracking.update([PairTdoa(time_s, a, b, float(true_m + generator.normal(0.0, STD_M)))]):
             fix = tracking.fix()
             errors_m.append(float(np.linalg.norm(fix.position_m - place)))
             sigmas_m.append(fix.std_m)

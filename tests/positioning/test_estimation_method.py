@@ -20,12 +20,10 @@ from estimator_builders import (
 from msgspec.structs import replace
 
 from skyless.air.master_term import MasterTerm
-from skyless.constants import TICK_M, TICK_RATE_HZ
-from skyless.positioning.estimator.kinds import SUBTICKS
+from skyless.constants import SUBTICKS, TICK_M, TICK_RATE_HZ
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.integrity import Alert
-from skyless.positioning.methods.joint import Estimation
-from skyless.positioning.methods.master_scale import MasterScale
+from skyless.positioning.methods.joint import Estimation, MasterScale
 from skyless.positioning.observation import Observation
 from skyless.ticks import TICK_MASK
 
@@ -36,7 +34,7 @@ MODULO = SUBTICKS * (TICK_MASK + 1)
 def fixes_of(method, observations, path_m):
     """Number of each packet that made a fix, the fix, and its error."""
     for k, observation in enumerate(observations):
-        result = method.hear(observation)
+        result = method.update(observation)
         if isinstance(result, Fix):
             yield k, result, result.position_m - path_m[k]
 
@@ -132,7 +130,7 @@ def test_clocks_lead_from_anchor_to_anchor():
 def test_without_any_link_between_clocks_there_is_no_start():
     method = Estimation(settings_of(MESH))
     bare = [replace(o, relays=()) for o in observations_of(episode_of(MESH, 30).packets)]
-    assert {method.hear(o) for o in bare} <= {NoFixReason.TOO_FEW_ANCHORS, NoFixReason.ACQUIRING}
+    assert {method.update(o) for o in bare} <= {NoFixReason.TOO_FEW_ANCHORS, NoFixReason.ACQUIRING}
 
 
 def test_an_anchor_that_was_never_received_joins_later():
@@ -140,7 +138,7 @@ def test_an_anchor_that_was_never_received_joins_later():
     method = Estimation(settings_of(CALM))
     some = [o for k, o in enumerate(observations_of(episode.packets)) if o.anchor != 5 or k > 180]
     assert method.clock(5) is None
-    results = [method.hear(o) for o in some]
+    results = [method.update(o) for o in some]
     assert method.clock(5) is not None
     assert isinstance(results[-1], Fix)
     assert set(results[-1].anchors) == set(range(6))
@@ -151,8 +149,8 @@ def test_relays_of_unknown_anchors_are_passed_over():
     episode = episode_of(CALM, 40)
     plain, told = Estimation(settings_of(CALM)), Estimation(settings_of(CALM))
     for observation in observations_of(episode.packets):
-        one = plain.hear(observation)
-        other = told.hear(replace(observation, relays=(*observation.relays, (77, 3, 12345), (78, 4, 99))))
+        one = plain.update(observation)
+        other = told.update(replace(observation, relays=(*observation.relays, (77, 3, 12345), (78, 4, 99))))
         assert isinstance(one, Fix) == isinstance(other, Fix)
     assert np.array_equal(one.position_m, other.position_m)
 
@@ -190,7 +188,7 @@ def test_a_place_that_is_wrong_is_left():
     for k, observation in enumerate(observations_of(episode.packets)):
         if k == 200:
             method.estimator.state.x[:2] += 5.0
-        result = method.hear(observation)
+        result = method.update(observation)
         if isinstance(result, Fix):
             errors[k] = np.linalg.norm(result.position_m - episode.path_m[k])
     assert max(error for k, error in errors.items() if k < 200 or k > 260) < 0.15
@@ -210,7 +208,7 @@ def test_a_wrong_place_that_the_anchors_contradict_is_left():
                 away = x[:2] - LAB_M[anchor, :2]
                 x[2 + anchor] -= np.linalg.norm(away) - np.linalg.norm(away - 2.0)
         if keep[k]:
-            result = method.hear(observation)
+            result = method.update(observation)
             if isinstance(result, Fix) and k > 1200:
                 errors.append(np.linalg.norm(result.position_m - episode.path_m[k]))
     assert len(errors) > 300
@@ -243,7 +241,7 @@ def test_packets_out_of_order_stop_no_fixes():
     for k in range(100, len(observations) - 1, 20):
         observations[k], observations[k + 1] = observations[k + 1], observations[k]
     method = Estimation(settings_of(CALM))
-    fixes = [isinstance(method.hear(observation), Fix) for observation in observations]
+    fixes = [isinstance(method.update(observation), Fix) for observation in observations]
     assert np.mean(fixes[50:]) > 0.93
 
 
@@ -254,7 +252,7 @@ def test_bursts_of_loss_are_bridged():
     for k, observation in enumerate(observations_of(episode.packets)):
         if time_s[k] % 1.0 < 0.4 and k > 200:
             continue
-        result = method.hear(observation)
+        result = method.update(observation)
         if isinstance(result, Fix) and k > 200:
             error, P = (result.position_m - episode.path_m[k])[:2], result.covariance_m2[:2, :2]
             errors.append(error @ np.linalg.solve(P, error) / 2.0)
@@ -267,7 +265,7 @@ def test_coasting_gives_the_fix_that_stands():
     method, observations = Estimation(settings_of(CALM)), list(observations_of(episode.packets))
     assert method.coast(observations[0]) is NoFixReason.RESIDUALS
     for observation in observations:
-        fix = method.hear(observation)
+        fix = method.update(observation)
     again = method.coast(observations[-1])
     assert np.array_equal(again.position_m, fix.position_m)
     assert again.time_s == pytest.approx(fix.time_s, abs=1e-6)
@@ -299,7 +297,7 @@ def test_an_anchor_whose_path_is_blocked_is_told_while_it_is():
     episode = episode_of(CALM, 200)
     method, told = Estimation(settings_of(CALM)), []
     for observation in observations_of(late_from(episode.packets, 3, 1.0, 500, 800)):
-        fix = method.hear(observation)
+        fix = method.update(observation)
         told.append((method.excluded, fix.alert if isinstance(fix, Fix) else None))
     assert told[490] == ((), Alert.NONE)
     assert {excluded for excluded, _ in told[530:799]} == {(3,)}
@@ -311,7 +309,7 @@ def test_fixes_carry_levels_and_alert_limit():
     episode = episode_of(CALM, 60)
     for limit_m, alert in ((None, Alert.NONE), (0.01, Alert.LIMIT), (10.0, Alert.NONE)):
         method = Estimation(settings_of(CALM, alert_limit_m=limit_m))
-        fixes = [fix for fix in map(method.hear, observations_of(episode.packets)) if isinstance(fix, Fix)]
+        fixes = [fix for fix in map(method.update, observations_of(episode.packets)) if isinstance(fix, Fix)]
         assert fixes[0].alert is Alert.UNAVAILABLE
         assert fixes[-1].alert is alert
         assert 0.02 < fixes[-1].hpl_m < 0.4
@@ -322,32 +320,45 @@ def test_fixes_carry_levels_and_alert_limit():
 # Reports of the anchors' clocks
 
 
-def packet(anchor, own_ticks, site_subticks, claim):
+def packet(anchor, own_ticks, site_subticks, master_term):
     whole, fraction = divmod(site_subticks, SUBTICKS)
     return Observation(
-        anchor, np.zeros(3), 0, 0, own_ticks, own_ticks, None, None, whole, fraction / SUBTICKS, 0.0, (), claim, 1e-4
+        anchor,
+        np.zeros(3),
+        0,
+        0,
+        own_ticks,
+        own_ticks,
+        None,
+        None,
+        whole,
+        fraction / SUBTICKS,
+        0.0,
+        (),
+        master_term,
+        1e-4,
     )
 
 
 def test_a_master_may_lead_the_sites_time_at_another_rate_than_its_own():
     """As one does that took over; the first packets of its term say at which."""
-    scale, claim = MasterScale(), MasterTerm(3, 7)
+    scale, master_term = MasterScale(), MasterTerm(3, 7)
     step, lead = 958_482_000, 1.0 + 17e-6
     own = [5_000 + k * step for k in range(4)]
     site = [123_456_789_012 + round(t * lead * SUBTICKS) for t in own]
     at = own[-1] + step // 2
-    other = packet(1, 77, 123_456_789_012 + round(at * lead * SUBTICKS), claim)
-    scale.hear(packet(7, own[0], site[0], claim))
+    other = packet(1, 77, 123_456_789_012 + round(at * lead * SUBTICKS), master_term)
+    scale.update(packet(7, own[0], site[0], master_term))
     assert scale.difference(other) is None
     for ticks, subticks in zip(own[1:], site[1:], strict=True):
-        scale.hear(packet(7, ticks, subticks, claim))
+        scale.update(packet(7, ticks, subticks, master_term))
     assert abs(scale.difference(other) - (77 - at) * SUBTICKS % MODULO) <= 3
-    assert scale.difference(replace(other, claim=MasterTerm(4, 7))) is None
-    scale.hear(packet(7, own[3] + step, site[3] + 3 * step, claim))
+    assert scale.difference(replace(other, master_term=MasterTerm(4, 7))) is None
+    scale.update(packet(7, own[3] + step, site[3] + 3 * step, master_term))
     assert scale.difference(replace(other, tx_ticks_master=other.tx_ticks_master + step)) is None
 
 
-def with_site_time(packets, claim):
+def with_site_time(packets, master_term):
     """Observations that tell the site's time as each anchor knows it: the first anchor's clock, to 5 mm."""
     relayed, ends = packets.relays, packets.ends
     master = {int(packets.sequences[k]): int(packets.tx_ticks[k]) for k in np.flatnonzero(packets.anchors == 0)}
@@ -378,7 +389,7 @@ def with_site_time(packets, claim):
             tx_ticks_master=int(ticks),
             tx_fraction_ticks=float(fraction),
             tx_variance_m2=variance,
-            claim=claim,
+            master_term=master_term,
         )
 
 
@@ -389,11 +400,11 @@ def test_reports_help_where_most_packets_are_lost():
         keep = np.random.default_rng(seed + 50).random(len(episode.path_m)) >= 0.85
         keep[:30] = True
         told = list(with_site_time(episode.packets, MasterTerm(1, 0)))
-        silent = [replace(o, claim=None, tx_variance_m2=0.0, tx_ticks_master=None) for o in told]
+        silent = [replace(o, master_term=None, tx_variance_m2=0.0, tx_ticks_master=None) for o in told]
         for k, observations in enumerate((silent, told)):
             method = Estimation(settings_of(replace(PLAIN, qa=0.3)))
             for n, observation in enumerate(observations):
-                fix = method.hear(observation) if keep[n] else None
+                fix = method.update(observation) if keep[n] else None
                 if isinstance(fix, Fix) and n > 200:
                     squares[k] += np.square(fix.position_m - episode.path_m[n]).sum()
         used += int(method.estimator.state.status["reports_used"][0])

@@ -26,9 +26,9 @@ from scipy.stats import binom, chi2
 from skyless.constants import TICK_M
 from skyless.positioning.estimator import faults
 from skyless.positioning.estimator.faults import OPENED_STD_M, explained_chi2, open_faults, whiten
-from skyless.positioning.estimator.levels import HPL, LASTING_CHI2, LEVELS, RECENT_STD_M, protect
-from skyless.positioning.estimator.state import LASTING, LASTING_STD_M, with_anchor
-from skyless.positioning.integrity import CONTRADICTED, Alert, IntegrityRequirement, integrity_of, limits_of
+from skyless.positioning.estimator.levels import LASTING_CHI2, LEVELS, RECENT_STD_M, protect
+from skyless.positioning.estimator.state import ALL_RANGE_ERRORS, LASTING_STD_M, with_anchor
+from skyless.positioning.integrity import CONTRADICTED, HPL, Alert, IntegrityRequirement, integrity_of, limits_of
 
 RISK = 1e-4
 LATE_M = 4 * TICK_M
@@ -165,7 +165,7 @@ def test_opening_a_fault_is_a_filter_that_had_it_open_from_the_beginning(late_m,
             estimator._state = with_anchor(estimator.state, anchor, LAB_M[anchor])
             constant = where(estimator).constant + int(estimator.state.index_of[anchor])
             estimator.state.P[constant, constant] += OPENED_STD_M**2
-            estimator.state.status["range_errors"] = LASTING
+            estimator.state.status["range_errors"] = ALL_RANGE_ERRORS
 
     follow(opened, packets, wide, packets, widen)
     faults._open_fault(opened.state, 0, anchor)

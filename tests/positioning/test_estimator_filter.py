@@ -36,12 +36,11 @@ from textbook_filter import TextbookFilter
 
 from skyless.air.beacon import HEARD
 from skyless.constants import TICK_RATE_HZ, TICK_S
-from skyless.evaluation.lab_bound import SPEED_STD_MPS, WHITE_FM
 from skyless.positioning.estimator.estimator import JOINED, REJECTED, STALE, Estimator, Packets
 from skyless.positioning.estimator.kalman import predict
 from skyless.positioning.estimator.levels import LASTING_CHI2
-from skyless.positioning.estimator.settings import EstimatorSettings
-from skyless.positioning.estimator.state import layout, new_state, with_anchor, without_anchor
+from skyless.positioning.estimator.state import EstimatorSettings, layout, new_state, with_anchor, without_anchor
+from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
 BIASED = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
@@ -65,13 +64,13 @@ def test_a_textbook_filter_says_the_same(case, anchors_m, height_m, height_std_m
     assumed = settings_of(case, height_m, gate=1e3, height_std_m=height_std_m, **errors)
     estimator = begun(episode, assumed, anchors_m)
     s, dim = estimator.state, estimator.dim
-    start = (s.x[:dim].copy(), s.P[:dim, :dim].copy(), SPEED_STD_MPS**2)
+    start = (s.x[:dim].copy(), s.P[:dim, :dim].copy(), EPISODE_SPEED_STD_MPS**2)
     textbook = TextbookFilter(estimator.settings, anchors_m, int(episode.packets.rx_ticks[0]), *start)
     for packet in one_by_one(episode.packets):
         status, anchors = estimator.state.status[0].copy(), estimator.state.anchors
         scales = dict(zip(anchors["table_index"].tolist(), anchors["walk_scale"].tolist(), strict=True))
         estimator.process(*packet)
-        textbook.hear(packet, status["q_scale"], status["walk_scale"], scales)
+        textbook.update(packet, status["q_scale"], status["walk_scale"], scales)
         s, n = estimator.state, len(estimator.state.anchors)
         np.testing.assert_allclose(s.x[:dim], textbook.x[textbook.p], rtol=0.0, atol=1e-6)
         if n == len(anchors_m):
@@ -104,7 +103,12 @@ def test_the_covariance_is_the_bound_of_what_has_come_in(case):
     run = tracked(begun(episode, settings_of(case)), episode.packets)
     noise = {"white_fm": WHITE_FM, "random_walk_fm": case.random_walk_fm, "qa": case.qa}
     stage = bound_settings(
-        case.noise_ps * 1e-12, **noise, slot_s=SLOT_S, speed_std_mps=SPEED_STD_MPS, mesh=case.mesh, at_once=False
+        case.noise_ps * 1e-12,
+        **noise,
+        slot_s=SLOT_S,
+        speed_std_mps=EPISODE_SPEED_STD_MPS,
+        mesh=case.mesh,
+        at_once=False,
     )
     bound = tracking_bound(LAB_M, episode.path_m, stage)
     ratio = np.trace(run.covariances[5::6][-20:], axis1=1, axis2=2) / np.trace(bound[-20:], axis1=1, axis2=2)
@@ -194,7 +198,7 @@ def test_packed_relays_are_those_listed():
     listed = begun(episode, settings_of(MESH))
     packed = begun(episode, settings_of(MESH), np.empty((0, 3)))
     for name, anchor_m in zip(names.tolist(), LAB_M, strict=True):
-        packed.place_anchor(name, anchor_m)
+        packed.anchor_index(name, anchor_m)
     for anchor, sequence, rx_ticks, tx_ticks, relays in one_by_one(episode.packets):
         told = b"".join(
             HEARD.pack(name, number & 0xFF, stamp & 0xFFFFFFFF, stamp >> 32 & 0xFF)
@@ -421,7 +425,7 @@ def test_an_anchor_whose_counter_starts_anew_is_taken_up_again():
 def test_a_new_anchor_is_told_of_first():
     estimator = Estimator(settings_of(PLAIN))
     estimator.start(0, np.array([3.0, 4.0]), np.eye(2), 1.0)
-    assert [estimator.place_anchor(7 + n, anchor_m) for n, anchor_m in enumerate(LAB_M)] == list(range(6))
+    assert [estimator.anchor_index(7 + n, anchor_m) for n, anchor_m in enumerate(LAB_M)] == list(range(6))
     assert estimator.process(0, 0, 100, 50) == JOINED
     assert estimator.clock(0) is not None
     assert estimator.clock(1) is None

@@ -24,11 +24,11 @@ from estimator_builders import (
 from msgspec.structs import replace
 
 from skyless.clocks.filter import ClockFilter, clock_noise
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.evaluation.lab_bound import WHITE_FM
+from skyless.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
 from skyless.positioning.estimator.estimator import ACCEPTED, REJECTED, Report
-from skyless.positioning.estimator.kinds import REPORT_GAIN, SUBTICKS
+from skyless.positioning.estimator.measurements import REPORT_GAIN
 from skyless.positioning.estimator.monitor import gate_of
+from skyless.studies.episodes import WHITE_FM
 from skyless.ticks import TICK_MASK
 
 ROOM_ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
@@ -196,7 +196,7 @@ def reports_of(packets, case, anchors_m=LAB_M):
         for listener, sender, number, rx_ticks in relays.tolist():
             if sender == 0:
                 way_m = float(np.linalg.norm(anchors_m[listener] - anchors_m[0]))
-                filters[listener].hear(sent[number], rx_ticks, way_m)
+                filters[listener].update(sent[number], rx_ticks, way_m)
         said = Report(-1, 0, 0.0)
         if filters[anchor].updates > 1:
             ticks, fraction, variance_m2 = filters[anchor].to_master(tx_ticks)
@@ -306,8 +306,8 @@ def test_where_the_offset_is_for_now_agrees_with_the_stamps():
     now = int(episode.packets.rx_ticks[-1])
     for k in range(len(episode.path_m) - 6, len(episode.path_m)):
         anchor = int(episode.packets.anchors[k])
-        whole, rest_m, rate_mps = estimator.clock(anchor)
+        whole, stationary_m, rate_mps = estimator.clock(anchor)
         measured = int(episode.packets.rx_ticks[k] - episode.packets.tx_ticks[k]) - whole
         flight_m = np.linalg.norm(episode.path_m[k] - LAB_M[anchor])
         later_s = (now - int(episode.packets.rx_ticks[k])) * TICK_S
-        assert measured * TICK_M - flight_m + later_s * rate_mps == pytest.approx(rest_m, abs=0.2)
+        assert measured * TICK_M - flight_m + later_s * rate_mps == pytest.approx(stationary_m, abs=0.2)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from skyless.air.reception import Diagnostics
 from skyless.anchor import Anchor
 from skyless.positioning.fix import Fix
-from skyless.positioning.methods.nlos_weighting import MOST, variance_factor
+from skyless.positioning.methods.observations import MAX_VARIANCE_FACTOR, variance_factor
 from skyless.receiver import Receiver
 from skyless.simulation.channel import ChannelModel, first_path_loss_db
 from skyless.simulation.impairments import AnchorBias, Impairments
@@ -22,7 +22,10 @@ from skyless.site.lab import ideal_lab_site
 POWERS = st.floats(-150.0, 0.0)
 
 
-@pytest.mark.parametrize(("difference_db", "least", "most"), [(0, 1, 1), (6, 1, 1), (10, 10, MOST), (20, MOST, MOST)])
+@pytest.mark.parametrize(
+    ("difference_db", "least", "most"),
+    [(0, 1, 1), (6, 1, 1), (10, 10, MAX_VARIANCE_FACTOR), (20, MAX_VARIANCE_FACTOR, MAX_VARIANCE_FACTOR)],
+)
 def test_the_makers_rule_of_thumb(difference_db, least, most):
     """DW1000 User Manual: below 6 dB likely a line of sight, above 10 dB likely none."""
     assert least <= variance_factor(-80.0, -80.0 - difference_db) <= most
@@ -31,14 +34,14 @@ def test_the_makers_rule_of_thumb(difference_db, least, most):
 @given(POWERS, POWERS, st.floats(0.0, 100.0))
 def test_it_is_bounded_and_never_falls_with_the_difference(rx_dbm, first_dbm, less_db):
     factor, weaker = variance_factor(rx_dbm, first_dbm), variance_factor(rx_dbm, first_dbm - less_db)
-    assert 1.0 <= factor <= weaker <= MOST
+    assert 1.0 <= factor <= weaker <= MAX_VARIANCE_FACTOR
     assert math.isfinite(factor)
 
 
 @given(st.floats(0.0, 39.0))
 def test_it_has_no_steps(difference_db):
     here, beyond = (variance_factor(0.0, -difference_db - more) for more in (0.0, 0.01))
-    assert beyond - here < 0.01 * 2.0 * MOST * math.log(MOST) * 1.5 / 4.0
+    assert beyond - here < 0.01 * 2.0 * MAX_VARIANCE_FACTOR * math.log(MAX_VARIANCE_FACTOR) * 1.5 / 4.0
 
 
 @pytest.mark.parametrize("nonsense", [None, math.nan, math.inf, -math.inf])

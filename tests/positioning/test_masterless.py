@@ -69,7 +69,7 @@ class World:
 
 
 def hear(engine, packets):
-    return [tdoa for packet in packets for tdoa in engine.hear(packet)]
+    return [tdoa for packet in packets for tdoa in engine.on_packet(packet)]
 
 
 def worst_m(world, tdoas):
@@ -95,7 +95,7 @@ def test_time_runs_in_seconds_of_the_tag_since_its_first_packet():
     world = World(1)
     times_s = world.times_s(4000)  # 20 s: the tag's counter wraps
     engine = PairEngine()
-    found = [(engine.hear(world.packet(1 + i % 4, time_s)), time_s) for i, time_s in enumerate(times_s)]
+    found = [(engine.on_packet(world.packet(1 + i % 4, time_s)), time_s) for i, time_s in enumerate(times_s)]
     stamps = [(tdoas[0].time_s, time_s - times_s[0]) for tdoas, time_s in found if tdoas]
     assert stamps[-1][1] > 18
     assert max(abs(told / true - 1) for told, true in stamps) < 20e-6
@@ -144,7 +144,7 @@ def test_a_wild_relay_is_caught_by_the_distance_of_the_anchors():
     hear(engine, world.packets(200))
     packet = world.packet(1, 1.1)
     spoilt, *sound = packet.relays
-    tdoas = engine.hear(structs.replace(packet, relays=(late_by(4000, spoilt), *sound)))
+    tdoas = engine.on_packet(structs.replace(packet, relays=(late_by(4000, spoilt), *sound)))
     assert [tdoa.anchor_a for tdoa in tdoas] == [relay.anchor for relay in sound]
     assert engine.drops["beyond-anchors"] == 1
 
@@ -153,12 +153,12 @@ def test_positions_that_packets_carry_arm_the_gate():
     world = World(6)
     silent, telling = PairEngine(), PairEngine()
     for packet in world.packets(200):
-        silent.hear(packet)
-        telling.hear(structs.replace(packet, position_m=ANCHORS_M[packet.anchor]))
+        silent.on_packet(packet)
+        telling.on_packet(structs.replace(packet, position_m=ANCHORS_M[packet.anchor]))
     packet = world.packet(1, 1.1)
     late = structs.replace(packet, relays=tuple(late_by(4000, relay) for relay in packet.relays))
-    assert len(silent.hear(late)) == len(packet.relays) == 3
-    assert telling.hear(late) == []
+    assert len(silent.on_packet(late)) == len(packet.relays) == 3
+    assert telling.on_packet(late) == []
     assert telling.drops["beyond-anchors"] == 3
 
 
@@ -187,17 +187,17 @@ def test_duplicates_and_stale_relays_are_counted():
     assert len(tdoas) == len(hear(PairEngine(), packets))
     before = engine.drops["relay-of-unheard-packet"]
     strange = (Relay(9, 1, 5, None), Relay(2, 99, 5, None))
-    assert engine.hear(structs.replace(world.packet(1, 0.8), relays=strange)) == []
+    assert engine.on_packet(structs.replace(world.packet(1, 0.8), relays=strange)) == []
     assert engine.drops["relay-of-unheard-packet"] == before + len(strange)
     old = structs.replace(world.packet(1, 1.3), relays=world.packet(1, 1.3).relays)
-    assert engine.hear(old) == []
+    assert engine.on_packet(old) == []
     assert engine.drops["relay-too-old"] == len(old.relays)
 
 
 def test_the_engine_holds_a_bounded_number_of_anchors():
     engine = PairEngine()
     for anchor in range(MOST_ANCHORS + 50):
-        engine.hear(Packet(None, anchor, 1, 1, anchor * 1000, ()))
+        engine.on_packet(Packet(None, anchor, 1, 1, anchor * 1000, ()))
     assert engine.drops == {"too-many-anchors": 50}
 
 

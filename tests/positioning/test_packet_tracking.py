@@ -9,15 +9,15 @@ from msgspec import structs
 
 import masterless_world as hall
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.recordings.foreign.bitcraze import decode_payload
 
 SECONDS = 6.0
 SPEED_MPS = 1.0
 EXACT = structs.replace(
-    MASTERLESS, survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0, place_memory_s=0.0, rest_s=0.0,
-    rx_variance_m2=9e-4,
+    MASTERLESS, survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0, change_memory_s=0.0,
+    stationary_s=0.0, rx_variance_m2=9e-4,
 )  # fmt: skip
 """As the hall is where nothing else is asked for."""
 
@@ -45,7 +45,7 @@ def follow(
     tracking = PacketTracking(structs.replace(settings, height_m=height_m), anchors_m, **options)
     rows, squared = [], []
     for t_s, packet in timed:
-        fix = tracking.hear(packet)
+        fix = tracking.on_packet(packet)
         if fix is not None and t_s >= settle_s:
             error_m = fix.position_m - np.array(hall.path_m(t_s, speed_mps))
             rows.append((t_s, *error_m, fix.time_s))
@@ -126,7 +126,7 @@ def test_a_blocked_anchor_does_not_pull_the_tag_away(system):
     assert tracking.drops["outlier"] >= 1
     excluded = {}
     for t_s, packet in timed:
-        again.hear(packet)
+        again.on_packet(packet)
         excluded[t_s] = again._tracking.excluded
     assert {told for t_s, told in excluded.items() if 3.3 < t_s < 4.9} == {(3,)}
     assert {told for t_s, told in excluded.items() if t_s > 5.3} == {()}

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.positioning.masterless.start import against_reference
-from skyless.positioning.solver.locate import NoSolution, Solution, locate
+from skyless.positioning.masterless.difference_tracking import against_reference
+from skyless.positioning.methods.locate import NoSolution, Solution, locate
 
 
 def _tdoas(anchors, p, pairs):

@@ -6,8 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.constants import TICK_M, TICK_RATE_HZ
-from skyless.positioning.solver.paper import bracketed_tdoa, literal_tdoa
-from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance, literal_delayed_covariance
+from skyless.positioning.methods.snapshots import (
+    bracketed_covariance,
+    bracketed_tdoa,
+    literal_covariance,
+    literal_delayed_covariance,
+    literal_tdoa,
+)
 
 SUPERFRAME = round(15e-3 * TICK_RATE_HZ)
 

@@ -12,8 +12,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.solver.locate import NoSolution, PseudorangeSolution, Solution, locate, locate_pseudoranges
-from skyless.positioning.solver.minima import GAIN_TOLERANCE, mean_if_positive
+from skyless.positioning.methods.locate import (
+    GAIN_TOLERANCE,
+    NoSolution,
+    PseudorangeSolution,
+    Solution,
+    locate,
+    locate_pseudoranges,
+    mean_if_positive,
+)
 from skyless.uncertainty.dop import dilution_of_precision
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
@@ -319,7 +326,7 @@ def test_a_singular_covariance_is_refused():
 
 
 def test_iterations_that_do_not_settle_are_told(monkeypatch):
-    from skyless.positioning.solver import minima
+    from skyless.positioning.methods import locate as minima
 
     monkeypatch.setattr(minima, "descend", lambda *_: (minima.EXHAUSTED, 100))
     refused(locate(LAB, np.zeros(5), sigma(5), height_m=0), NoFixReason.NOT_CONVERGED)
@@ -372,7 +379,7 @@ WITHOUT_COMPILER = """
 import sys, warnings
 warnings.simplefilter("error")
 import numpy as np
-from skyless.positioning.solver.locate import locate, NoSolution
+from skyless.positioning.methods.locate import locate, NoSolution
 from skyless.uncertainty.dop import dops_at
 draw = np.random.default_rng(9)
 anchors = draw.uniform(0, 8, (7, 3))

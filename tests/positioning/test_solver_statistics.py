@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.solver.locate import NoSolution, Solution, locate, locate_pseudoranges
+from skyless.positioning.methods.locate import NoSolution, Solution, locate, locate_pseudoranges
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 LAB_3D = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])

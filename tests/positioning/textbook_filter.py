@@ -41,7 +41,7 @@ class TextbookFilter:
         pair_variance = PAIR_STD_M**2 if settings.range_std_m or settings.survey_std_m else 0.0
         self.pairs = {frozenset((i, j)): [0.0, pair_variance] for i in range(n) for j in range(i)}
 
-    def hear(self, packet, q_scale, own_walk_scale, walk_scales):
+    def update(self, packet, q_scale, own_walk_scale, walk_scales):
         """``packet`` as ``Estimator.process`` takes it; what the process noise is multiplied by is told."""
         anchor, sequence, rx, tx, relays = packet
         walks = np.ones(self.n)
@@ -96,20 +96,20 @@ class TextbookFilter:
         expected = range_m + h @ self.x
         h[self.p], h[survey], h[self.height] = direction, -direction, away[self.dim :] / range_m
         place = self.P[: self.dim, : self.dim]
-        widest, bend_m = np.trace(place) / range_m, (np.trace(place) - direction @ place @ direction) / range_m / 2
-        if min(widest**2 / 2, 2 * bend_m**2) < 0.01 * variance:
-            bend_m = 0.0
-        return h, range_m, bend_m, expected + bend_m
+        widest, curvature_m = np.trace(place) / range_m, (np.trace(place) - direction @ place @ direction) / range_m / 2
+        if min(widest**2 / 2, 2 * curvature_m**2) < 0.01 * variance:
+            curvature_m = 0.0
+        return h, range_m, curvature_m, expected + curvature_m
 
     def _join(self, anchor, rx, tx):
         s, offset = self.settings, self.b[anchor]
         self._reset(self.w[anchor], s.tx_variance_m2)
         self._reset(self.f[anchor], (50e-6 * SPEED_OF_LIGHT_MPS) ** 2)
         self.whole[anchor] = rx - tx
-        h, range_m, bend_m, expected_m = self._range(anchor, s.rx_variance_m2)
+        h, range_m, curvature_m, expected_m = self._range(anchor, s.rx_variance_m2)
         J, R = np.eye(self.size), np.zeros((self.size, self.size))
         J[offset] = -h
-        R[offset, offset] = s.rx_variance_m2 + 2 * bend_m**2
+        R[offset, offset] = s.rx_variance_m2 + 2 * curvature_m**2
         self._go(J, R)
         self.x[offset] = -expected_m
         self.newest[anchor] = Newest(tx, rx, self.walked_m, range_m, True)
@@ -123,12 +123,12 @@ class TextbookFilter:
         self._go(F, Q)
         self._reset(self.w[anchor], s.tx_variance_m2)
         has_tx_noise = anchor in self.relayed
-        h, range_m, bend_m, expected_m = self._range(
+        h, range_m, curvature_m, expected_m = self._range(
             anchor, s.rx_variance_m2 + (0.0 if has_tx_noise else s.tx_variance_m2)
         )
         h[self.b[anchor]] = 1.0
         z = (rx - tx - self.whole[anchor]) * TICK_M
-        self._update(h, z - expected_m - self.x[self.b[anchor]], s.rx_variance_m2 + 2 * bend_m**2, self.size)
+        self._update(h, z - expected_m - self.x[self.b[anchor]], s.rx_variance_m2 + 2 * curvature_m**2, self.size)
         self.newest[anchor] = Newest(tx, rx, self.walked_m, range_m, has_tx_noise)
 
     def _relay(self, listener, sender, tx, rx, stamp, walk_scale):

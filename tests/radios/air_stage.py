@@ -1,11 +1,11 @@
-"""An ether whose time a test moves by hand, and guests without a network."""
+"""An ether whose time a test moves by hand, and clients without a network."""
 
 import asyncio
 
 from skyless.constants import TICK_RATE_HZ
 from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.nodes.emulation.ether import Ether
-from skyless.radios.emulated.ether_wire import Join, Joined, Send
+from skyless.nodes.ether import Ether
+from skyless.radios.ether_wire import Join, Joined, Send
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import lab_site
 from skyless.ticks import wrap
@@ -19,19 +19,19 @@ def make_ether(clock, seed=1, **faults):
 
 
 class Listener:
-    """A guest that writes down what it is told; ``deaf`` refuses it, as a full connection does."""
+    """A client that writes down what it is told; ``deaf`` refuses it, as a full connection does."""
 
     def __init__(self):
-        self.told = []
+        self.events = []
         self.deaf = False
 
-    def tell(self, message):
+    def send(self, message):
         if not self.deaf:
-            self.told.append(message)
+            self.events.append(message)
         return not self.deaf
 
     def of(self, kind):
-        return [message for message in self.told if isinstance(message, kind)]
+        return [message for message in self.events if isinstance(message, kind)]
 
 
 class Stage:
@@ -47,20 +47,20 @@ class Stage:
             self.ether.advance()
 
     def join(self, kind, *names):
-        """A guest, its seat (or why it has none), and its counters when it joined."""
-        guest = Listener()
-        seat = self.ether.join(guest, Join(kind, names))
-        return guest, seat
+        """A client, its session (or why it has none), and its counters when it joined."""
+        client = Listener()
+        session = self.ether.join(client, Join(kind, names))
+        return client, session
 
-    def ticks(self, guest, node, ahead_s):
-        """Counter of a guest's node so far ahead, from what it was told when it joined."""
-        joined = guest.of(Joined)[-1]
+    def ticks(self, client, node, ahead_s):
+        """Counter of a client's node so far ahead, from what it was told when it joined."""
+        joined = client.of(Joined)[-1]
         elapsed_s = self.now_s - joined.host_s + ahead_s
         return wrap(joined.ticks[node] + round(elapsed_s * TICK_RATE_HZ))
 
-    def send(self, guest, seat, node=0, ahead_s=2e-3, frame=b"a frame" * 10):
-        tx_ticks = self.ticks(guest, node, ahead_s)
-        self.ether.send(seat, Send(node, tx_ticks, frame))
+    def send(self, client, session, node=0, ahead_s=2e-3, frame=b"a frame" * 10):
+        tx_ticks = self.ticks(client, node, ahead_s)
+        self.ether.transmit(session, Send(node, tx_ticks, frame))
         return tx_ticks
 
 

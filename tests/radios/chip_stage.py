@@ -4,7 +4,7 @@ from collections import Counter
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_S
-from skyless.radios.dw1000.chip_session import ChipSession
+from skyless.radios.dw1000.radio import ChipSession
 from skyless.radios.interface import AntennaDelays, Sent
 from skyless.simulation.dw1000.chip import Chip, ModelBus
 from skyless.ticks import wrap
@@ -40,9 +40,9 @@ class ChipNode:
     """A chip, its driver, and what both tell."""
 
     def __init__(self, air, delays=DELAYS, true_delays=DELAYS):
-        self.air, self.told, self.counters = air, [], Counter()
+        self.air, self.events, self.counters = air, [], Counter()
         self.chip = Chip(air, true_delays.tx_ticks, true_delays.rx_ticks, air.now_s)
-        self.session = ChipSession(ModelBus(self.chip, self.pause), delays, self.told.append, self.counters)
+        self.session = ChipSession(ModelBus(self.chip, self.pause), delays, self.events.append, self.counters)
 
     def pause(self, seconds):
         """Only what the driver waits for takes time, and only on the chip's own clock."""
@@ -53,10 +53,10 @@ class ChipNode:
     def hear(self, frame, rx_ticks, diagnostics=None, host_s=None, fault=None):
         """A frame comes in, and the host serves its interrupt; the reception, if it became one."""
         self.chip.receive(frame, rx_ticks, diagnostics or Diagnostics(), fault)
-        told = len(self.told)
+        told = len(self.events)
         while self.chip.irq:
             self.session.serve(host_s)
-        return next((event for event in self.told[told:] if isinstance(event, Reception)), None)
+        return next((event for event in self.events[told:] if isinstance(event, Reception)), None)
 
 
 class TimedNode(ChipNode):
@@ -103,7 +103,7 @@ class ChipAnchor:
 
     def hear(self, reception):
         heard = self.node.hear(reception.frame, reception.rx_ticks, reception.diagnostics, reception.host_s)
-        assert heard is not None, (self.node.chip.arrivals, self.node.told[-3:])
+        assert heard is not None, (self.node.chip.arrivals, self.node.events[-3:])
         self._machine.hear(heard)
 
     def next_transmission_ticks(self, now_ticks):
@@ -116,4 +116,4 @@ class ChipAnchor:
 
     @property
     def sent(self):
-        return sum(isinstance(event, Sent) for event in self.node.told)
+        return sum(isinstance(event, Sent) for event in self.node.events)

@@ -5,7 +5,7 @@ from collections import Counter
 from skyless.air.reception import Diagnostics
 from skyless.firmware import board, dw1000
 from skyless.radios.interface import AntennaDelays, Reception
-from skyless.radios.serial.link_session import LinkSession
+from skyless.radios.serial.serial_radio import LinkSession
 from skyless.simulation.dw1000.chip import Chip, ModelBus
 
 DELAYS = AntennaDelays()
@@ -15,9 +15,9 @@ class Line:
     """A wire without a delay between the board's UART and the host's conversation; clock and collector besides."""
 
     def __init__(self, air):
-        self.air, self.told, self.counters = air, [], Counter()
+        self.air, self.events, self.counters = air, [], Counter()
         self.to_board = bytearray()
-        self.session = LinkSession("the wire", DELAYS, self.to_board.extend, self.told.append, self.counters)
+        self.session = LinkSession("the wire", DELAYS, self.to_board.extend, self.events.append, self.counters)
         self.host_s = None
         self.collections = 0
 
@@ -28,7 +28,7 @@ class Line:
         return size
 
     def write(self, line, end):
-        self.session.hear(bytes(line[:end]), self.air.now_s() if self.host_s is None else self.host_s)
+        self.session.on_data(bytes(line[:end]), self.air.now_s() if self.host_s is None else self.host_s)
         return True
 
     def restart(self):
@@ -75,10 +75,10 @@ class FirmwareNode:
     def hear(self, reception):
         """The reception as it arrives at the host."""
         self.line.host_s = reception.host_s
-        told = len(self.line.told)
+        told = len(self.line.events)
         self.chip.receive(reception.frame, reception.rx_ticks, reception.diagnostics or Diagnostics())
         self.serve()
-        (heard,) = [event for event in self.line.told[told:] if isinstance(event, Reception)]
+        (heard,) = [event for event in self.line.events[told:] if isinstance(event, Reception)]
         return heard
 
 

@@ -3,12 +3,17 @@
 import contextlib
 from collections import Counter
 
-from radio_ears import ears
+from radio_events import radio_events
 
-from skyless.nodes.emulation.board_protocol import LinkProtocol
-from skyless.nodes.process.pty import Pty
+from skyless.nodes.board import LinkProtocol, Pty
 from skyless.radios.interface import Restarted
+from skyless.radios.serial.link_records import from_steps, to_steps
 from skyless.radios.serial.serial_radio import SerialRadio
+
+
+def quantised(diagnostics):
+    """Measured values as the serial link rounds them."""
+    return from_steps(*to_steps(diagnostics))
 
 
 class PlayedRadio:
@@ -31,22 +36,22 @@ class PlayedBoard:
     def __init__(self, link=None, can_transmit=True):
         self.radio = PlayedRadio()
         self.pty = Pty(link)
-        self.speech = LinkProtocol(self.radio, self.pty.send, can_transmit=can_transmit)
+        self.protocol = LinkProtocol(self.radio, self.pty.send, can_transmit=can_transmit)
 
     async def __aenter__(self):
-        self.pty.start(self.speech.hear_host)
+        self.pty.start(self.protocol.on_host_data)
         return self
 
     async def __aexit__(self, *_):
         self.pty.close()
 
     def hear(self, reception):
-        self.speech.hear_radio(reception)
+        self.protocol.on_radio_event(reception)
 
 
 @contextlib.asynccontextmanager
 async def linked(link=None, **kind):
     """A board and a host that are in touch."""
-    async with PlayedBoard(link, **kind) as board, ears(SerialRadio(board.pty.place, 1_000_000, "tag1")) as host:
+    async with PlayedBoard(link, **kind) as board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
         await host.until(Restarted)
         yield board, host

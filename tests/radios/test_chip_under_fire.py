@@ -110,7 +110,7 @@ class Fire(RuleBasedStateMachine):
     @rule()
     def give_up(self):
         waits = self.node.session.overdue_ticks is not None
-        self.node.session.give_up()
+        self.node.session.cancel_overdue()
         if waits:
             self.fetched()
 
@@ -136,7 +136,7 @@ class Fire(RuleBasedStateMachine):
     # What must hold
 
     def of(self, kind):
-        return [one for one in self.node.told if isinstance(one, kind)]
+        return [one for one in self.node.events if isinstance(one, kind)]
 
     def fetched(self):
         self.waits = None

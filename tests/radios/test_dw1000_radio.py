@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 from air_stage import LAB, make_ether
 from chip_stage import HandClock, TimedNode
-from radio_ears import ears
+from radio_events import radio_events
 
 from skyless.air.ieee802154 import fcs
 from skyless.air.reception import Diagnostics, Reception, Transmission
@@ -18,9 +18,9 @@ from skyless.constants import TICK_RATE_HZ
 from skyless.errors import SkylessError
 from skyless.evaluation.compile_ahead import compile_kernels
 from skyless.nodes.open_radio import is_simulated, open_radios
-from skyless.radios.dw1000 import chip_ports, spi_bus
-from skyless.radios.dw1000.chip_ports import SpiPort
+from skyless.radios.dw1000 import spi
 from skyless.radios.dw1000.radio import Dw1000Radio
+from skyless.radios.dw1000.spi import SpiPort
 from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
 from skyless.simulation.dw1000.chip import ModelBus
 from skyless.ticks import difference, wrap
@@ -39,7 +39,7 @@ def test_frames_fly_between_models_on_the_emulated_air_and_late_ones_do_not():
         place = f"model:127.0.0.1:{server.sockets[0].getsockname()[1]}"
         (anchor,) = open_radios(place, "anchor", (str(LAB.anchors[0].id),), [AntennaDelays()])
         (tag,) = open_radios(place, "tag", ("tag1",))
-        async with ears(anchor) as sender, ears(tag) as listener:
+        async with radio_events(anchor) as sender, radio_events(tag) as listener:
             await sender.until(Restarted)
             await listener.until(Restarted)
             for number in range(20):
@@ -84,7 +84,7 @@ class PlayedSpi(ModelBus):
 
 
 def spi_radio(monkeypatch, bus=PlayedSpi):
-    monkeypatch.setattr(chip_ports, "RETRY_S", 0.01)
+    monkeypatch.setattr(spi, "REOPEN_S", 0.01)
     node, buses = TimedNode(HandClock()), []
 
     def open_bus():
@@ -98,7 +98,7 @@ def test_a_chip_on_spi_is_asked_where_it_has_no_interrupt_line_and_found_again(m
     radio, node, buses = spi_radio(monkeypatch)
 
     async def play():
-        async with ears(radio) as host:
+        async with radio_events(radio) as host:
             await host.until(Restarted)
             assert abs(difference(radio.now_ticks(), node.air.now_ticks())) < 512
             node.air.pass_s(1e-3)
@@ -107,7 +107,7 @@ def test_a_chip_on_spi_is_asked_where_it_has_no_interrupt_line_and_found_again(m
             assert "Input/output error" in (await host.until(Gone)).reason
             assert radio.now_ticks() is None
             radio.transmit(Transmission(b"frame", 1))
-            assert host.told[-1] == Late(1)
+            assert host.events[-1] == Late(1)
             await host.until(Restarted, 2)
             assert buses[0].closed
         assert buses[-1].closed
@@ -115,12 +115,12 @@ def test_a_chip_on_spi_is_asked_where_it_has_no_interrupt_line_and_found_again(m
     asyncio.run(play())
 
 
-def test_a_chip_whose_supply_failed_is_started_again_even_where_it_says_nothing(monkeypatch):
+def test_a_chip_whose_supply_failed_is_started_again_even_where_it_logs_nothing(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
-    monkeypatch.setattr("skyless.radios.dw1000.radio.CARE_S", 0.01)
+    monkeypatch.setattr("skyless.radios.dw1000.radio.CHECK_S", 0.01)
 
     async def play():
-        async with ears(radio) as host:
+        async with radio_events(radio) as host:
             for time_s in (1, 2):
                 await host.until(Restarted, time_s)
                 if time_s == 1:
@@ -134,11 +134,11 @@ def test_a_chip_whose_supply_failed_is_started_again_even_where_it_says_nothing(
 
 def test_a_chip_that_is_missed_by_the_looks_after_it_is_found_again(monkeypatch):
     radio, _, buses = spi_radio(monkeypatch)
-    monkeypatch.setattr("skyless.radios.dw1000.radio.CARE_S", 0.01)
-    monkeypatch.setattr(chip_ports, "ASK_S", 0.2)  # so that the look after it comes first
+    monkeypatch.setattr("skyless.radios.dw1000.radio.CHECK_S", 0.01)
+    monkeypatch.setattr(spi, "CHIP_POLL_S", 0.2)  # so that the look after it comes first
 
     async def play():
-        async with ears(radio) as host:
+        async with radio_events(radio) as host:
             await host.until(Restarted)
             buses[0].broken = True
             await host.until(Restarted, 2)
@@ -148,19 +148,21 @@ def test_a_chip_that_is_missed_by_the_looks_after_it_is_found_again(monkeypatch)
     asyncio.run(play())
 
 
-def test_a_bus_that_fails_while_a_frame_is_overdue_is_opened_anew(monkeypatch):
+def test_a_bus_that_fails_while_a_frame_is_overdue_is_opened_again(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
     faults = []
 
     async def play():
         asyncio.get_running_loop().set_exception_handler(lambda _loop, context: faults.append(context))
-        async with ears(radio) as host:
+        async with radio_events(radio) as host:
             await host.until(Restarted)
             session = radio._session
             radio.transmit(Transmission(b"frame", wrap((node.air.now_ticks() + (1 << 26) & ~0x1FF) + 16_436)))
-            monkeypatch.setattr(session, "give_up", lambda: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+            monkeypatch.setattr(
+                session, "cancel_overdue", lambda: (_ for _ in ()).throw(OSError(5, "Input/output error"))
+            )
             node.air.pass_s(5e-3)
-            radio._give_up(session)
+            radio._on_overdue(session)
             await host.until(Restarted, 2)
             assert len(host.of(Gone)) == 1
         assert not faults
@@ -207,17 +209,17 @@ def hear(node, data):
     node.chip.receive(data + fcs(data), node.air.now_ticks(), Diagnostics(-80.0))
 
 
-def test_an_interrupt_line_that_is_stuck_is_told_once_and_the_chip_is_asked_at_intervals(monkeypatch):
+def test_an_interrupt_line_that_is_stuck_is_reported_once_and_the_chip_is_asked_at_intervals(monkeypatch):
     """Without a bound every turn of the loop asks the chip: thousands of times in these 0.2 s."""
     radio, node, buses = spi_radio(monkeypatch, LinedSpi)
-    monkeypatch.setattr(chip_ports, "ASK_S", 0.02)
+    monkeypatch.setattr(spi, "CHIP_POLL_S", 0.02)
 
     async def play():
-        async with ears(radio) as host:
+        async with radio_events(radio) as host:
             await host.until(Restarted)
             buses[0].stuck = True
             hint = await host.until(Hint)
-            assert "the interrupt line of /dev/spidev0.0 calls though" in hint.text
+            assert "the interrupt line of /dev/spidev0.0 rises though" in hint.text
             looks, begun_s = buses[0].looks, time.monotonic()
             await asyncio.sleep(0.2)
             assert buses[0].looks - looks <= (time.monotonic() - begun_s) / 0.02 + 1
@@ -238,12 +240,12 @@ def test_an_interrupt_line_that_is_stuck_is_told_once_and_the_chip_is_asked_at_i
     asyncio.run(play())
 
 
-def test_an_interrupt_line_that_picks_up_noise_is_told_and_does_not_make_the_program_spin(monkeypatch):
+def test_an_interrupt_line_that_picks_up_noise_is_reported_and_does_not_make_the_program_spin(monkeypatch):
     radio, _, buses = spi_radio(monkeypatch, LinedSpi)
-    monkeypatch.setattr(chip_ports, "ASK_S", 0.02)
+    monkeypatch.setattr(spi, "CHIP_POLL_S", 0.02)
 
     async def play():
-        async with ears(radio) as host:
+        async with radio_events(radio) as host:
             await host.until(Restarted)
             buses[0].noisy = True
             buses[0].rise()
@@ -260,9 +262,9 @@ def test_an_interrupt_line_that_is_high_for_good_reason_is_not_called_stuck(monk
     radio, node, buses = spi_radio(monkeypatch, LinedSpi)
 
     async def play():
-        async with ears(radio) as host:
+        async with radio_events(radio) as host:
             await host.until(Restarted)
-            for number in range(3 * chip_ports.VAIN_WAKES):
+            for number in range(3 * spi.MOST_VAIN_INTERRUPTS):
                 hear(node, b"frame %d" % number)
                 buses[0].rise()
                 await host.until(Reception, number + 1)
@@ -272,15 +274,15 @@ def test_an_interrupt_line_that_is_high_for_good_reason_is_not_called_stuck(monk
     asyncio.run(play())
 
 
-def test_what_answers_but_is_no_dw1000_is_told_in_words(monkeypatch):
+def test_what_answers_but_is_no_dw1000_is_reported_in_words(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
     monkeypatch.setattr(node.chip, "transfer", lambda out, _hz: b"\xff" * len(out))
 
     async def play():
-        async with ears(radio) as host:
+        async with radio_events(radio) as host:
             assert "/dev/spidev0.0" in (await host.until(Gone)).reason
             await asyncio.sleep(0.05)
-            assert len(host.told) == 1
+            assert len(host.events) == 1
 
     asyncio.run(play())
 
@@ -321,8 +323,8 @@ def test_an_address_is_no_host_of_an_ether(driver):
 def pi(monkeypatch):
     """A computer with both packages and all device files, which tests take away."""
     files = {"/dev/spidev0.0", "/dev/spidev0.1", "/dev/gpiochip0", "/dev/gpiochip4"}
-    monkeypatch.setattr(spi_bus.os.path, "exists", files.__contains__)
-    monkeypatch.setattr(spi_bus.os, "access", lambda path, mode: True)
+    monkeypatch.setattr(spi.os.path, "exists", files.__contains__)
+    monkeypatch.setattr(spi.os, "access", lambda path, mode: True)
     for name in ("spidev", "gpiod", "gpiod.line"):
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
     return files
@@ -338,7 +340,7 @@ def pi(monkeypatch):
     ],
 )
 @pytest.mark.usefixtures("pi")
-def test_a_package_that_is_missing_is_told_at_the_start(monkeypatch, package, spec, refused):
+def test_a_package_that_is_missing_is_reported_at_the_start(monkeypatch, package, spec, refused):
     monkeypatch.setitem(sys.modules, package, None)
     if not refused:
         assert open_radios(spec, "tag", ("tag1",))
@@ -356,15 +358,15 @@ def test_a_package_that_is_missing_is_told_at_the_start(monkeypatch, package, sp
     ],
 )
 @pytest.mark.usefixtures("pi")
-def test_a_device_file_that_is_missing_is_told_at_the_start(spec, words):
+def test_a_device_file_that_is_missing_is_reported_at_the_start(spec, words):
     with pytest.raises(SkylessError, match=f"--radio is '{spec}'; {words}"):
         open_radios(spec, "tag", ("tag1",))
 
 
 @pytest.mark.parametrize(("path", "group"), [("/dev/spidev0.0", "spi"), ("/dev/gpiochip0", "gpio")])
 @pytest.mark.usefixtures("pi")
-def test_a_device_file_that_may_not_be_opened_is_told_at_the_start(monkeypatch, path, group):
-    monkeypatch.setattr(spi_bus.os, "access", lambda asked, mode: asked != path)
+def test_a_device_file_that_may_not_be_opened_is_reported_at_the_start(monkeypatch, path, group):
+    monkeypatch.setattr(spi.os, "access", lambda asked, mode: asked != path)
     with pytest.raises(SkylessError, match=f"{path} may not be opened: its group, usually {group}"):
         open_radios("spi:0.0,irq=25", "tag", ("tag1",))
 
@@ -382,7 +384,7 @@ def test_what_fails_once_it_has_started_is_tried_again(monkeypatch):
     radio._port._open_bus = open_bus
 
     async def play():
-        async with ears(radio) as host:
+        async with radio_events(radio) as host:
             await host.until(Restarted)
             assert (len(host.of(Gone)), len(failures), len(buses)) == (1, 3, 1)
 
@@ -394,7 +396,7 @@ def test_names_of_chips():
     (one,) = open_radios(
         "spi:0.1,irq=25,reset=24,hz=4000000,chip=/dev/gpiochip4", "anchor", ("3",), [AntennaDelays(1, 2)]
     )
-    assert (one.name, one._delays, one._port._place) == ("3", AntennaDelays(1, 2), "/dev/spidev0.1")
+    assert (one.name, one._delays, one._port._name) == ("3", AntennaDelays(1, 2), "/dev/spidev0.1")
     with pytest.raises(SkylessError, match="carries one node, not 2"):
         open_radios("spi:0.0", "anchor", ("1", "2"))
     assert is_simulated("model:127.0.0.1")

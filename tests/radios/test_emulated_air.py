@@ -5,20 +5,20 @@ from air_stage import LAB, Stage, in_loop
 
 from skyless.air.ieee802154 import after_rmarker_s
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.radios.emulated.ether_wire import Arrival, Clocks, Done, Joined
+from skyless.radios.ether_wire import Arrival, Clocks, Done, Joined
 from skyless.ticks import difference
 
 FRAME = b"a frame" * 10
 
 
-def test_a_frame_reaches_all_that_are_on_the_air_and_its_sender_is_told():
+def test_a_frame_reaches_all_that_are_on_the_air_and_its_sender_is_reported():
     def play():
         stage = Stage()
-        sender, seat = stage.join("anchor", "1")
+        sender, session = stage.join("anchor", "1")
         others, _ = stage.join("anchor", "2", "4")
         tags, _ = stage.join("tag", "tag2", "tag1")
         sent_s = stage.now_s
-        tx_ticks = stage.send(sender, seat, ahead_s=2e-3)
+        tx_ticks = stage.send(sender, session, ahead_s=2e-3)
         stage.pass_time(1.9e-3)
         assert sender.of(Done) == others.of(Arrival) == tags.of(Arrival) == []
         stage.pass_time(1e-3)
@@ -39,17 +39,17 @@ def test_stamps_are_the_flight_time_apart():
 
     def play():
         stage = Stage(noise_ps=1e-3)
-        one, one_seat = stage.join("anchor", "1")
-        two, two_seat = stage.join("anchor", "4")
+        one, one_session = stage.join("anchor", "1")
+        two, two_session = stage.join("anchor", "4")
         stamps = []
-        for sender, seat, listener in ((one, one_seat, two), (two, two_seat, one)):
-            stage.send(sender, seat, ahead_s=1e-3)
+        for sender, session, listener in ((one, one_session, two), (two, two_session, one)):
+            stage.send(sender, session, ahead_s=1e-3)
             stage.pass_time(1.5e-3)
             stamps.append((sender.of(Done)[-1].tx_ticks, listener.of(Arrival)[-1].rows[0].rx_ticks))
         (tx_one, rx_two), (tx_two, rx_one) = stamps
         # asymmetric single-sided ranging; the turn-round of 1.5 ms costs ppm × 1.5 ms, which a second round measures
-        for sender, seat, listener in ((one, one_seat, two),):
-            stage.send(sender, seat, ahead_s=1e-3)
+        for sender, session, listener in ((one, one_session, two),):
+            stage.send(sender, session, ahead_s=1e-3)
             stage.pass_time(1.5e-3)
             tx_again, rx_again = sender.of(Done)[-1].tx_ticks, listener.of(Arrival)[-1].rows[0].rx_ticks
         round_one, reply_two = difference(rx_one, tx_one), difference(tx_two, rx_two)
@@ -61,13 +61,13 @@ def test_stamps_are_the_flight_time_apart():
     in_loop(play)
 
 
-def test_a_frame_that_comes_too_late_is_not_sent_and_said_to_be_late():
+def test_a_frame_that_comes_too_late_is_not_sent_and_reported_late():
     def play():
         stage = Stage()
-        sender, seat = stage.join("anchor", "1")
+        sender, session = stage.join("anchor", "1")
         tag, _ = stage.join("tag", "tag1")
         for ahead_s in (0.3e-3, 0.0, -1.0):
-            tx_ticks = stage.send(sender, seat, ahead_s=ahead_s)
+            tx_ticks = stage.send(sender, session, ahead_s=ahead_s)
             assert sender.of(Done)[-1] == Done(0, tx_ticks, late=True)
         stage.pass_time(0.1)
         assert tag.of(Arrival) == []
@@ -80,13 +80,13 @@ def test_a_frame_that_comes_too_late_is_not_sent_and_said_to_be_late():
 def test_a_radio_has_room_for_one_frame():
     def play():
         stage = Stage()
-        sender, seat = stage.join("anchor", "1")
-        first = stage.send(sender, seat, ahead_s=2e-3)
-        second = stage.send(sender, seat, ahead_s=5e-3)
+        sender, session = stage.join("anchor", "1")
+        first = stage.send(sender, session, ahead_s=2e-3)
+        second = stage.send(sender, session, ahead_s=5e-3)
         assert sender.of(Done) == [Done(0, second, late=True)]
         stage.pass_time(10e-3)
         assert sender.of(Done)[1:] == [Done(0, first, late=False)]
-        stage.send(sender, seat, ahead_s=2e-3)
+        stage.send(sender, session, ahead_s=2e-3)
         stage.pass_time(5e-3)
         assert stage.ether.health(0.0).transmissions == 2
 
@@ -96,10 +96,10 @@ def test_a_radio_has_room_for_one_frame():
 def test_two_anchors_in_one_slot_collide_and_alone_they_do_not():
     def play(apart_s):
         stage = Stage()
-        anchors, seat = stage.join("anchor", "1", "4")
+        anchors, session = stage.join("anchor", "1", "4")
         tag, _ = stage.join("tag", "tag1")
-        stage.send(anchors, seat, 0, 2e-3)
-        stage.send(anchors, seat, 1, 2e-3 + apart_s)
+        stage.send(anchors, session, 0, 2e-3)
+        stage.send(anchors, session, 1, 2e-3 + apart_s)
         stage.pass_time(20e-3)
         assert len(anchors.of(Done)) == 2  # a sender does not know
         return len(tag.of(Arrival)), stage.ether.health(0.0).at_tags
@@ -113,12 +113,12 @@ def test_two_anchors_in_one_slot_collide_and_alone_they_do_not():
 def test_the_same_seed_and_the_same_doings_give_the_same_bits():
     def play(seed):
         stage = Stage(seed, loss=0.2, nlos=0.2)
-        anchors, seat = stage.join("anchor", "1", "2")
+        anchors, session = stage.join("anchor", "1", "2")
         tags, _ = stage.join("tag", "tag1", "tag2")
         for number in range(100):
-            stage.send(anchors, seat, number % 2, 2e-3)
+            stage.send(anchors, session, number % 2, 2e-3)
             stage.pass_time(5e-3, steps=1 + number % 7)
-        return anchors.told, tags.told
+        return anchors.events, tags.events
 
     one, same, other = in_loop(lambda: play(1)), in_loop(lambda: play(1)), in_loop(lambda: play(2))
     assert one == same
@@ -135,15 +135,15 @@ def test_the_same_seed_and_the_same_doings_give_the_same_bits():
         ("tag", ("tag1", "tag1"), "tag tag1 is on the air already"),
     ],
 )
-def test_who_may_not_join_is_told_why(kind, names, said):
+def test_who_may_not_join_is_reported_why(kind, names, said):
     def play():
         stage = Stage()
         stage.join("anchor", "2")
-        guest, answer = stage.join(kind, *names)
+        client, answer = stage.join(kind, *names)
         assert said in answer
-        assert guest.told == []
-        good, seat = stage.join("anchor", "1")  # nobody is left half joined
-        assert not isinstance(seat, str)
+        assert client.events == []
+        good, session = stage.join("anchor", "1")  # nobody is left half joined
+        assert not isinstance(session, str)
         assert good.of(Joined)
 
     in_loop(play)
@@ -152,14 +152,14 @@ def test_who_may_not_join_is_told_why(kind, names, said):
 def test_who_leaves_is_off_the_air_and_comes_back_with_a_new_counter():
     def play():
         stage = Stage()
-        sender, seat = stage.join("anchor", "1")
-        tag, tag_seat = stage.join("tag", "tag1")
+        sender, session = stage.join("anchor", "1")
+        tag, tag_session = stage.join("tag", "tag1")
         assert set(stage.ether.truth(0.0).tags) == {"tag1"}
         stage.pass_time(0.5)
         expected = stage.ticks(tag, 0, 0.0)
-        stage.ether.leave(tag_seat)
+        stage.ether.leave(tag_session)
         assert stage.ether.truth(0.0).tags == {}
-        stage.send(sender, seat)
+        stage.send(sender, session)
         stage.pass_time(5e-3)
         assert tag.of(Arrival) == []
         again, _ = stage.join("tag", "tag1")
@@ -172,12 +172,12 @@ def test_who_leaves_is_off_the_air_and_comes_back_with_a_new_counter():
 def test_a_frame_of_a_process_that_dies_before_it_leaves_is_not_sent():
     def play():
         stage = Stage()
-        sender, seat = stage.join("anchor", "1")
+        sender, session = stage.join("anchor", "1")
         tag, _ = stage.join("tag", "tag1")
-        stage.send(sender, seat, ahead_s=3e-3)
-        stage.ether.leave(seat)
-        again, seat = stage.join("anchor", "1")
-        tx_ticks = stage.send(again, seat, ahead_s=20e-3)  # the old frame does not keep the new one from its place
+        stage.send(sender, session, ahead_s=3e-3)
+        stage.ether.leave(session)
+        again, session = stage.join("anchor", "1")
+        tx_ticks = stage.send(again, session, ahead_s=20e-3)  # the old frame does not keep the new one from its place
         stage.pass_time(10e-3)
         assert (tag.of(Arrival), again.of(Done)) == ([], [])
         stage.pass_time(20e-3)
@@ -187,15 +187,15 @@ def test_a_frame_of_a_process_that_dies_before_it_leaves_is_not_sent():
     in_loop(play)
 
 
-def test_the_end_of_a_dead_process_s_frame_is_not_told_to_the_next_one():
+def test_the_end_of_a_dead_process_s_frame_is_not_sent_to_the_next_one():
     def play():
         stage = Stage()
-        sender, seat = stage.join("anchor", "1")
-        stage.send(sender, seat, ahead_s=2e-3)
+        sender, session = stage.join("anchor", "1")
+        stage.send(sender, session, ahead_s=2e-3)
         stage.pass_time(2.02e-3)  # the RMARKER has left, the frame has not ended
-        stage.ether.leave(seat)
-        again, seat = stage.join("anchor", "1")
-        tx_ticks = stage.send(again, seat, ahead_s=5e-3)
+        stage.ether.leave(session)
+        again, session = stage.join("anchor", "1")
+        tx_ticks = stage.send(again, session, ahead_s=5e-3)
         stage.pass_time(2e-3)
         assert again.of(Done) == []
         stage.pass_time(5e-3)
@@ -207,12 +207,12 @@ def test_the_end_of_a_dead_process_s_frame_is_not_told_to_the_next_one():
 def test_what_a_process_does_not_read_is_counted_and_costs_the_others_nothing():
     def play():
         stage = Stage()
-        sender, seat = stage.join("anchor", "1")
+        sender, session = stage.join("anchor", "1")
         deaf, _ = stage.join("tag", "tag1")
         tag, _ = stage.join("tag", "tag2")
         deaf.deaf = True
         for _ in range(5):
-            stage.send(sender, seat)
+            stage.send(sender, session)
             stage.pass_time(5e-3)
         assert (len(deaf.of(Arrival)), len(tag.of(Arrival))) == (0, 5)
         assert stage.ether.health(0.0).overruns == 5
@@ -223,10 +223,10 @@ def test_what_a_process_does_not_read_is_counted_and_costs_the_others_nothing():
 def test_an_ether_that_was_stopped_lets_true_time_stand_still_meanwhile():
     def play():
         stage = Stage()
-        sender, seat = stage.join("anchor", "1")
+        sender, session = stage.join("anchor", "1")
         tag, _ = stage.join("tag", "tag1")
         stage.pass_time(1.0)
-        stage.send(sender, seat, ahead_s=5e-3)
+        stage.send(sender, session, ahead_s=5e-3)
         stage.now_s += 2.0
         stage.ether.advance()
         health = stage.ether.health(0.0)
@@ -240,14 +240,14 @@ def test_an_ether_that_was_stopped_lets_true_time_stand_still_meanwhile():
     in_loop(play)
 
 
-def test_the_counters_that_it_tells_are_those_of_its_radios(monkeypatch):
+def test_the_counters_that_it_sends_are_those_of_its_radios(monkeypatch):
     """20 ppm of crystal either way, and the counter that a frame's stamp shows."""
 
     def play():
         stage = Stage()
-        sender, seat = stage.join("anchor", "1", "2")
+        sender, session = stage.join("anchor", "1", "2")
         stage.pass_time(1.0)
-        clocks = Clocks(stage.ether.now_host_s, stage.ether._counters(seat))
+        clocks = Clocks(stage.ether.now_host_s, stage.ether._counters(session))
         joined = sender.of(Joined)[0]
         for node in (0, 1):
             passed_s = difference(clocks.ticks[node], joined.ticks[node]) * TICK_S

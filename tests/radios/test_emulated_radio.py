@@ -7,14 +7,14 @@ import time
 
 import pytest
 from air_stage import make_ether
-from radio_ears import ears
+from radio_events import radio_events
 
 from skyless.air.reception import Reception, Transmission
 from skyless.constants import TICK_RATE_HZ
 from skyless.errors import SkylessError
-from skyless.nodes.emulation.ether_clients import Client
+from skyless.nodes.ether import Client
 from skyless.nodes.open_radio import host_and_port, is_simulated, open_radios
-from skyless.radios.emulated.ether_wire import Join, Joined, Refused, Send, Unpacker, from_ether, pack
+from skyless.radios.ether_wire import Join, Joined, Refused, Send, Unpacker, from_ether, pack
 from skyless.radios.interface import Gone, Late, Restarted, Sent
 from skyless.ticks import difference, wrap
 
@@ -26,24 +26,24 @@ class OpenAir:
     """A listening ether whose connections the test can cut."""
 
     def __init__(self, port=0):
-        self.ether, self.guests = make_ether(time.monotonic), []
+        self.ether, self.clients = make_ether(time.monotonic), []
         self.port, self._server, self._clocks = port, None, None
 
     async def __aenter__(self):
-        def guest():
-            self.guests.append(Client(self.ether))
-            return self.guests[-1]
+        def client():
+            self.clients.append(Client(self.ether))
+            return self.clients[-1]
 
-        self._server = await asyncio.get_running_loop().create_server(guest, HOST, self.port)
+        self._server = await asyncio.get_running_loop().create_server(client, HOST, self.port)
         self.port = self._server.sockets[0].getsockname()[1]
-        self._clocks = asyncio.ensure_future(self.ether.tell_clocks())
+        self._clocks = asyncio.ensure_future(self.ether.send_clocks())
         self.ether.advance()
         return self
 
     async def __aexit__(self, *_):
         self._server.close()
-        for guest in self.guests:
-            guest._transport.abort()
+        for client in self.clients:
+            client._transport.abort()
         self._clocks.cancel()
         await asyncio.wait([self._clocks])
         self.ether._timer.cancel()
@@ -53,7 +53,7 @@ class OpenAir:
 async def nodes(port, kind, *names):
     async with contextlib.AsyncExitStack() as stack:
         radios = open_radios(f"ether:{HOST}:{port}", kind, names)
-        yield [await stack.enter_async_context(ears(radio)) for radio in radios]
+        yield [await stack.enter_async_context(radio_events(radio)) for radio in radios]
 
 
 @contextlib.asynccontextmanager
@@ -82,7 +82,7 @@ async def speak(node, listener):
         async with asyncio.timeout(20):
             while len(node.of(Sent)) + len(node.of(Late)) == done:
                 await asyncio.sleep(0.001)
-        if Sent(tx_ticks) in node.told:
+        if Sent(tx_ticks) in node.events:
             await listener.until(Reception, heard + 1)
             return tx_ticks
     raise AssertionError("no frame was in time")
@@ -129,7 +129,7 @@ def test_a_counter_goes_with_its_crystal():
     asyncio.run(play())
 
 
-def test_a_late_frame_is_said_to_be_late_and_the_radio_goes_on():
+def test_a_late_frame_is_reported_late_and_the_radio_goes_on():
     async def play():
         async with anchor_and_tag("1") as (air, anchor, tag):
             tx_ticks = ahead(anchor.radio, -1e-3)
@@ -146,7 +146,7 @@ def test_radios_of_one_process_share_a_connection():
         async with OpenAir() as air, nodes(air.port, "anchor", "3", "1") as (three, one):
             await three.until(Restarted)
             await one.until(Restarted)
-            assert len(air.guests) == 1
+            assert len(air.clients) == 1
             assert three.radio.now_ticks() != one.radio.now_ticks()
             await speak(three, one)
             assert one.of(Sent) == three.of(Reception) == []
@@ -162,7 +162,7 @@ def test_a_radio_finds_an_ether_that_starts_late_and_one_that_starts_again():
             gone = await anchor.until(Gone)
             assert str(port) in gone.reason
             anchor.radio.transmit(Transmission(WORD, 5))
-            assert anchor.told[-1] == Late(5)  # without an ether everything is late
+            assert anchor.events[-1] == Late(5)  # without an ether everything is late
             async with OpenAir(port):
                 await anchor.until(Restarted)
                 await tag.until(Restarted)
@@ -194,7 +194,7 @@ def test_a_cancelled_radio_leaves_the_air():
     asyncio.run(play())
 
 
-def test_a_name_that_the_ether_has_not_or_that_is_taken_is_told_and_asked_for_again():
+def test_a_name_that_the_ether_has_not_or_that_is_taken_is_reported_and_asked_for_again():
     async def play():
         async with OpenAir() as air, nodes(air.port, "tag", "tag1") as (first,):
             await first.until(Restarted)
@@ -269,7 +269,7 @@ def test_a_process_that_does_not_read_loses_frames_which_are_counted_and_the_oth
             writer.write(pack(Join("tag", ("tag2",))))
             await asyncio.sleep(0.05)
             reader._transport.pause_reading()
-            deaf = air.guests[-1]
+            deaf = air.clients[-1]
             filled_s = loop.time() + 20.0
             while deaf._transport.get_write_buffer_size() <= 1 << 16 and loop.time() < filled_s:
                 deaf._transport.write(pack(Refused("x" * 60_000)))  # as many frames would, in a minute
@@ -286,7 +286,7 @@ def test_a_process_that_does_not_read_loses_frames_which_are_counted_and_the_oth
 @pytest.mark.parametrize(
     "answer", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\xff\xff\xff\xff", b"\x01\x00\x00\x00\xc1", b""]
 )
-def test_a_radio_says_that_what_answers_is_no_ether(answer):
+def test_a_radio_reports_that_what_answers_is_no_ether(answer):
     async def play():
         async def serve(reader, writer):
             await reader.read(4)
@@ -307,7 +307,7 @@ def test_a_radio_says_that_what_answers_is_no_ether(answer):
 def test_of_another_machine_s_ether_the_clock_is_shifted_to_this_one(monkeypatch):
     async def play():
         async with OpenAir() as air:
-            monkeypatch.setattr("skyless.nodes.emulation.ether.this_machine", lambda: "another")
+            air.ether.machine = "another"
             air.ether._origin_s -= 1000.0
             air.ether._clock = lambda: time.monotonic() - 1000.0
             async with nodes(air.port, "anchor", "1") as (anchor,), nodes(air.port, "tag", "tag1") as (tag,):
@@ -329,12 +329,12 @@ def test_of_another_machine_s_ether_the_clock_is_shifted_to_this_one(monkeypatch
         ("ether:[::1]:99", "::1", 99),
     ],
 )
-def test_a_radio_s_name_tells_where_its_ether_is(spec, host, port):
+def test_a_radio_s_name_holds_the_address_of_its_ether(spec, host, port):
     assert host_and_port(spec, spec.partition(":")[2], 7784) == (host, port)
     assert is_simulated(spec)
 
 
 @pytest.mark.parametrize("spec", ["", "dw1000:/dev/spidev0.0", "ether:box:0", "ether:box:65536", "ether:box:x"])
-def test_a_radio_that_there_is_not_is_told_with_what_would_be_right(spec):
+def test_a_radio_that_there_is_not_is_reported_with_what_would_be_right(spec):
     with pytest.raises(SkylessError, match="ether:HOST"):
         open_radios(spec, "tag", ("tag1",))

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.radios.emulated.ether_wire import (
+from skyless.radios import ether_wire
+from skyless.radios.ether_wire import (
     MAX_MESSAGE_BYTES,
     Arrival,
     Clocks,
@@ -23,7 +24,6 @@ from skyless.radios.emulated.ether_wire import (
     pack,
     to_ether,
 )
-from skyless.radios.emulated.radio import ether_wire
 
 TICKS = st.integers(0, 2**40 - 1)
 NODES = st.integers(0, 300)
@@ -56,7 +56,7 @@ def test_what_processes_say_arrives_however_the_stream_is_cut(messages, cuts):
 
 
 @given(st.lists(FROM_ETHER, max_size=8), st.lists(st.integers(0, 10_000), max_size=30))
-def test_what_the_ether_says_arrives_however_the_stream_is_cut(messages, cuts):
+def test_what_the_ether_sends_arrives_however_the_stream_is_cut(messages, cuts):
     unpacker = Unpacker()
     stream = b"".join(pack(message) for message in messages)
     bodies = [body for piece in pieces_of(stream, cuts) for body in unpacker.feed(piece)]

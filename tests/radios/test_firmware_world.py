@@ -54,7 +54,7 @@ def test_the_same_frames_at_the_same_ticks_from_a_whole_site_of_boards(ways):
         assert not +node.line.counters
         assert set(node.chip.arrivals) == {"heard"}
     for machine in machines.values():
-        told = machine.node.line.told
+        told = machine.node.line.events
         assert sum(isinstance(event, Sent) for event in told) > 150
         assert not [event for event in told if isinstance(event, Late)]
 

@@ -16,9 +16,8 @@ import pytest
 from recordings.capture_makers import binary_record, tdoa3, text_line
 from skyless.firmware import link
 from skyless.radios.interface import AntennaDelays
-from skyless.radios.serial.link_session import LinkSession
-from skyless.radios.serial.listener_radio import ListenerRadio
-from skyless.radios.serial.sniffer_radio import SnifferStream
+from skyless.radios.serial.foreign_radios import ListenerRadio, SnifferStream
+from skyless.radios.serial.serial_radio import LinkSession
 
 BYTES = int(os.environ.get("SKYLESS_FUZZ_BYTES", "300000"))
 ALPHABETS = (
@@ -51,7 +50,7 @@ class LinkLine:
         self.found.append(getattr(event, "rx_ticks", None))
 
     def feed(self, data):
-        self.session.hear(data, 0.0)
+        self.session.on_data(data, 0.0)
 
     def record(self, number, rng):
         frame = bytearray(rng.randbytes(rng.randrange(1, 128)))
@@ -64,12 +63,12 @@ class ListenerLine:
         self.found = []
         self.radio = ListenerRadio("listener", 115_200, "tag")
         self.radio._listener = lambda event: self.found.append(getattr(event, "rx_ticks", None))
-        self.radio.begin(lambda data: None)
+        self.radio.on_open(lambda data: None)
         self.counters = self.radio.counters
         self.found.clear()
 
     def feed(self, data):
-        self.radio.hear(data)
+        self.radio.on_data(data)
 
     def record(self, number, rng):
         frame = rng.randbytes(rng.randrange(1, 128))

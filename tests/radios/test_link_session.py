@@ -3,12 +3,12 @@
 from collections import Counter
 
 import pytest
+from serial_stage import quantised
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.firmware import link
 from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
-from skyless.radios.serial.link_records import quantised
-from skyless.radios.serial.link_session import PENDING, POLL_S, SILENCE_S, LinkSession
+from skyless.radios.serial.serial_radio import BOARD_SILENCE_S, MOST_PENDING_FRAMES, STATUS_S, LinkSession
 
 DELAYS = AntennaDelays(16_450, 16_500)
 COUNTS = [7, 1, 3, 2, 0, 5]
@@ -24,11 +24,11 @@ class Talk:
     """A session whose port is the test."""
 
     def __init__(self, **needs):
-        self.told, self.counters, self.now_s = [], Counter(), 50.0
+        self.events, self.counters, self.now_s = [], Counter(), 50.0
         self.commands = []
         self._reader = link.Reader()
         self.board = link.Writer()
-        self.session = LinkSession("/dev/board", DELAYS, self._take, self.told.append, self.counters, **needs)
+        self.session = LinkSession("/dev/board", DELAYS, self._take, self.events.append, self.counters, **needs)
         self.session.begin(self.now_s)
 
     def _take(self, data):
@@ -48,7 +48,7 @@ class Talk:
         self.hear(bytes(self.board.line[:end]))
 
     def hear(self, data):
-        self.session.hear(data, self.now_s)
+        self.session.on_data(data, self.now_s)
 
     def hello(self):
         self.say(self.board.hello((1, 2, 3), bytearray(b"board-01"), link.CAN_TRANSMIT))
@@ -66,8 +66,8 @@ class Talk:
     def poll(self, seconds):
         """Let time pass; what the session says to it in the end."""
         said = None
-        for _ in range(round(seconds / POLL_S)):
-            self.now_s += POLL_S
+        for _ in range(round(seconds / STATUS_S)):
+            self.now_s += STATUS_S
             said = said or self.session.poll(self.now_s)
         return said
 
@@ -81,10 +81,10 @@ def test_a_board_is_greeted_configured_and_ready():
     assert [link.unsigned(config, at, 2) for at in (8, 10)] == [16_450, 16_500]
     assert talk.kinds() == [link.CONFIG, link.RX_ON]
     talk.status(link.IS_CONFIGURED)
-    assert talk.told == []
+    assert talk.events == []
     assert talk.session.clock.read(talk.now_s) is None
     talk.status()
-    assert talk.told == [Restarted()]
+    assert talk.events == [Restarted()]
     assert talk.session.clock.read(talk.now_s) == T0
     hello, status = talk.session.hello, talk.session.status
     assert (hello.firmware, hello.device_id, hello.can_transmit) == ((1, 2, 3), b"board-01", True)
@@ -92,7 +92,7 @@ def test_a_board_is_greeted_configured_and_ready():
         *COUNTS,
     )
     assert (status.temperature_c, status.supply_v) == (21.5, 3.3)
-    talk.poll(POLL_S)
+    talk.poll(STATUS_S)
     assert talk.kinds() == [link.ASK_STATUS]
 
 
@@ -101,7 +101,7 @@ def test_receptions_come_through_with_their_measurements_in_the_line_s_units():
     frame = bytes(range(40))
     talk.say(talk.board.rx(stamp(2**40 - 1), -7953, -8312, -12_345, bytearray(frame), 40))
     talk.say(talk.board.rx(stamp(0), link.NOT_MEASURED, link.NOT_MEASURED, link.NOT_MEASURED, bytearray(frame), 1))
-    assert talk.told[1:] == [
+    assert talk.events[1:] == [
         Reception(frame, 2**40 - 1, talk.now_s, Diagnostics(-79.53, -83.12, -12.345)),
         Reception(frame[:1], 0, talk.now_s, Diagnostics()),
     ]
@@ -110,7 +110,7 @@ def test_receptions_come_through_with_their_measurements_in_the_line_s_units():
     assert quantised(quantised(told)) == quantised(told)
 
 
-def test_transmissions_are_asked_for_by_dx_and_their_end_is_told_by_tx_ticks():
+def test_transmissions_are_asked_for_by_dx_and_their_end_is_reported_by_tx_ticks():
     talk = Talk().ready()
     tx_ticks = (T0 & ~0x1FF) + DELAYS.tx_ticks
     for number, frame in enumerate((b"one", b"two")):
@@ -122,7 +122,7 @@ def test_transmissions_are_asked_for_by_dx_and_their_end_is_told_by_tx_ticks():
     talk.say(talk.board.tx_done(dx, stamp(tx_ticks)))
     talk.say(talk.board.tx_done(dx, stamp(tx_ticks)))  # nobody asked for that one any more
     talk.say(talk.board.tx_late(stamp((T0 & ~0x1FF) + 512), link.LATE_FOR_RADIO))
-    assert talk.told[1:] == [Sent(tx_ticks), Late(tx_ticks + 512)]
+    assert talk.events[1:] == [Sent(tx_ticks), Late(tx_ticks + 512)]
     assert not +talk.counters
     talk.session.transmit(Transmission(b"three", tx_ticks))
     talk.say(talk.board.tx_done(dx, stamp(tx_ticks + 1)))
@@ -135,7 +135,7 @@ def test_before_the_board_is_ready_everything_is_late_and_nothing_is_heard():
     talk.session.transmit(Transmission(b"one", 77))
     talk.hello()
     talk.say(talk.board.rx(stamp(5), 0, 0, 0, bytearray(b"frame"), 5))
-    assert talk.told == [Late(77)]
+    assert talk.events == [Late(77)]
 
 
 def test_dx_wraps_with_the_counter():
@@ -158,7 +158,7 @@ def test_lost_copied_unknown_malformed_and_garbled_records_are_counted():
     for kind in (link.TX_DONE, link.TX_LATE, link.STATUS, link.REFUSED, link.HELLO):
         talk.say(talk.board.ask(kind))
     talk.hear(b"\x05garbage\0" + line[:10] + b"\0")
-    assert [event.rx_ticks for event in talk.told[1:]] == [1, 2, 3]
+    assert [event.rx_ticks for event in talk.events[1:]] == [1, 2, 3]
     assert talk.counters == {
         "copied-record": 1,
         "lost-record": 2,
@@ -179,7 +179,7 @@ def test_records_of_a_later_minor_version_are_read():
     board.begin(link.STATUS)
     board.append_bytes(bytearray([*stamp(T0), ON, *bytes(24), 0, 0x80, 0xFF, 0xFF, 9, 9]), 0, 36)
     talk.say(board.end())
-    assert talk.told == [Restarted()]
+    assert talk.events == [Restarted()]
     assert (talk.session.status.temperature_c, talk.session.status.supply_v) == (None, None)
 
 
@@ -191,18 +191,18 @@ def test_a_board_of_another_major_version_is_refused_once_and_taken_when_it_has_
         talk.board.append(2, 1)
         talk.board.append(0, 1)
         talk.say(talk.board.end())
-        talk.poll(POLL_S)
-    (gone,) = talk.told
+        talk.poll(STATUS_S)
+    (gone,) = talk.events
     assert gone == Gone(
-        "the board at /dev/board speaks version 2.0 of the serial link, this program 1.0; bring the board's firmware "
+        "the board at /dev/board has version 2.0 of the serial link, this program 1.0; bring the board's firmware "
         "and Skyless to the same release"
     )
     assert set(talk.kinds()) == {link.ASK_HELLO}
     talk.status()
-    assert talk.told == [gone]
+    assert talk.events == [gone]
     talk.hello()
     talk.status()
-    assert talk.told == [gone, Restarted()]
+    assert talk.events == [gone, Restarted()]
 
 
 def test_a_board_that_refuses_its_configuration_or_counts_otherwise_cannot_be_used():
@@ -210,8 +210,8 @@ def test_a_board_that_refuses_its_configuration_or_counts_otherwise_cannot_be_us
     talk.hello()
     talk.say(talk.board.refused(link.CONFIG, link.REFUSED_SETTING))
     talk.say(talk.board.refused(link.TX_AT, link.REFUSED_MALFORMED))
-    assert [type(event) for event in talk.told] == [Gone]
-    assert "refuses its configuration" in talk.told[0].reason
+    assert [type(event) for event in talk.events] == [Gone]
+    assert "refuses its configuration" in talk.events[0].reason
     assert talk.counters == {"refused-command": 1}
     talk = Talk()
     talk.board.begin(link.HELLO)
@@ -219,46 +219,46 @@ def test_a_board_that_refuses_its_configuration_or_counts_otherwise_cannot_be_us
     talk.board.append(1000, 4)
     talk.board.append_bytes(bytearray([32, 1]), 0, 2)
     talk.say(talk.board.end())
-    assert "counts 1000 kHz in 32 bits" in talk.told[0].reason
+    assert "counts 1000 kHz in 32 bits" in talk.events[0].reason
 
 
-def test_a_board_whose_radio_does_not_start_is_told_of_once_and_taken_when_it_does():
+def test_a_board_whose_radio_does_not_start_is_reported_of_once_and_taken_when_it_does():
     talk = Talk()
     for _ in range(4):
         talk.hello()
         talk.say(talk.board.refused(link.CONFIG, link.REFUSED_RADIO))
-        talk.poll(POLL_S)
+        talk.poll(STATUS_S)
     gone = Gone("the board at /dev/board refuses its configuration: its radio does not answer or start")
-    assert talk.told == [gone]
+    assert talk.events == [gone]
     talk.hello()
     talk.status()
-    assert talk.told == [gone, Restarted()]
+    assert talk.events == [gone, Restarted()]
     talk.say(talk.board.refused(link.CONFIG, link.REFUSED_RADIO))
-    assert talk.told == [gone, Restarted(), gone]
+    assert talk.events == [gone, Restarted(), gone]
 
 
 def test_frames_whose_answer_was_lost_on_the_line_are_not_kept_for_ever():
     talk = Talk().ready()
     for number in range(1000):
         talk.session.transmit(Transmission(b"frame", (number << 9) + DELAYS.tx_ticks))
-    assert len(talk.session._pending) == PENDING
-    told = len(talk.told)
+    assert len(talk.session._pending) == MOST_PENDING_FRAMES
+    told = len(talk.events)
     talk.say(talk.board.tx_done(stamp(999 << 9), stamp((999 << 9) + DELAYS.tx_ticks)))
-    assert talk.told[told:] == [Sent((999 << 9) + DELAYS.tx_ticks)]
+    assert talk.events[told:] == [Sent((999 << 9) + DELAYS.tx_ticks)]
 
 
 def test_an_anchor_needs_a_board_that_can_transmit():
     talk = Talk(transmits=True)
     talk.say(talk.board.hello((1, 2, 3), bytearray(8), 0))
     talk.status()
-    assert talk.told == [Gone("the board at /dev/board only listens; an anchor needs one that can transmit")]
+    assert talk.events == [Gone("the board at /dev/board only listens; an anchor needs one that can transmit")]
     talk = Talk(transmits=True)
     talk.hello()
     talk.status()
-    assert talk.told == [Restarted()]
+    assert talk.events == [Restarted()]
 
 
-def test_a_board_that_starts_anew_is_configured_again_and_its_numbers_begin_anew():
+def test_a_board_that_starts_again_is_configured_again_and_its_numbers_begin_again():
     talk = Talk().ready()
     tx_ticks = (T0 & ~0x1FF) + DELAYS.tx_ticks
     talk.session.transmit(Transmission(b"one", tx_ticks))
@@ -268,14 +268,14 @@ def test_a_board_that_starts_anew_is_configured_again_and_its_numbers_begin_anew
     assert not talk.session.ready
     assert talk.kinds() == [link.TX_AT, link.ASK_STATUS, link.CONFIG, link.RX_ON]
     talk.status(ON, 1000)
-    assert talk.told == [Restarted(), Restarted()]
+    assert talk.events == [Restarted(), Restarted()]
     assert talk.session.clock.read(talk.now_s) == 1000
     talk.say(talk.board.tx_done(stamp(T0 & ~0x1FF), stamp(tx_ticks)))  # of its former life
-    assert talk.told == [Restarted(), Restarted()]
+    assert talk.events == [Restarted(), Restarted()]
     assert talk.counters == {"board-restart": 1}
 
 
-def test_a_board_that_starts_again_and_again_is_counted_and_told_once():
+def test_a_board_that_starts_again_and_again_is_counted_and_reported_once():
     """It falls over its configuration each time, is never ready, and is never silent."""
     talk = Talk()
     talk.hello()
@@ -284,25 +284,25 @@ def test_a_board_that_starts_again_and_again_is_counted_and_told_once():
         talk.board = link.Writer()
         talk.hello()
         talk.status(0)
-    (hint,) = talk.told
+    (hint,) = talk.events
     assert isinstance(hint, Hint)
     assert "the board at /dev/board starts again and again (3 times within 4 s)" in hint.text
     assert talk.counters == {"board-restart": 6}
 
 
-def test_a_board_that_answers_and_never_listens_is_told_once():
+def test_a_board_that_answers_and_never_listens_is_reported_once():
     talk = Talk()
     talk.hello()
     for _ in range(30):
         talk.poll(1.0)
         talk.status(link.IS_CONFIGURED)
-    assert talk.told == [Hint("the board at /dev/board answers, but does not start to receive: does its radio work?")]
+    assert talk.events == [Hint("the board at /dev/board answers, but does not start to receive: does its radio work?")]
     assert talk.session.hello is not None
     talk.status()
-    assert talk.told[1:] == [Restarted()]
+    assert talk.events[1:] == [Restarted()]
 
 
-def test_a_board_that_works_and_starts_again_now_and_then_is_counted_and_said_nothing_of():
+def test_a_board_that_works_and_starts_again_now_and_then_is_counted_and_not_reported():
     talk = Talk().ready()
     for _ in range(5):
         for _ in range(31):
@@ -312,11 +312,11 @@ def test_a_board_that_works_and_starts_again_now_and_then_is_counted_and_said_no
         talk.hello()
         talk.status(0)
         talk.status()
-    assert talk.told == [Restarted()] * 6
+    assert talk.events == [Restarted()] * 6
     assert talk.counters == {"board-restart": 5}
 
 
-def test_a_loop_that_comes_back_after_a_calm_time_is_told_again():
+def test_a_loop_that_comes_back_after_a_calm_time_is_reported_again():
     talk = Talk().ready()
     for calm_s in (0, 90):
         for _ in range(calm_s):
@@ -328,10 +328,10 @@ def test_a_loop_that_comes_back_after_a_calm_time_is_told_again():
             talk.hello()
             talk.status(0)
             talk.status()
-    assert sum(isinstance(event, Hint) for event in talk.told) == 2
+    assert sum(isinstance(event, Hint) for event in talk.events) == 2
 
 
-def test_receptions_with_errors_that_the_board_tells_of_are_counted_since_the_first_status():
+def test_receptions_with_errors_that_the_board_reports_are_counted_since_the_first_status():
     talk = Talk().ready()
     for errors in (1, 5, 9, 2):  # the last one after a start
         talk.say(talk.board.status(stamp(T0), ON, [7, errors, 0, 0, 0, 0], 2150, 3300))
@@ -342,14 +342,14 @@ def test_a_second_answer_to_hello_changes_nothing():
     talk = Talk().ready()
     talk.hello()
     talk.status()
-    assert talk.told == [Restarted()]
+    assert talk.events == [Restarted()]
 
 
 def test_a_lost_configuration_is_sent_again():
     talk = Talk()
     talk.hello()
     talk.kinds()
-    talk.poll(POLL_S)
+    talk.poll(STATUS_S)
     assert talk.kinds() == [link.CONFIG, link.RX_ON]
 
 
@@ -358,11 +358,11 @@ def test_a_lost_configuration_is_sent_again():
     [
         (lambda talk: None, "no board answers at /dev/board"),
         (lambda talk: talk.hear(b"Hello from PANS\r\n" * 9), "no serial link of Skyless (153 bytes); wrong baud rate?"),
-        (Talk.ready, "says nothing any more"),
+        (Talk.ready, "has stopped answering"),
     ],
 )
 def test_a_board_that_is_silent_is_given_up(first, said):
     talk = Talk()
     first(talk)
-    assert talk.poll(SILENCE_S) is None
+    assert talk.poll(BOARD_SILENCE_S) is None
     assert said in talk.poll(1.0)

@@ -1,4 +1,4 @@
-"""Serial radios over pseudo-terminals: the same fixes bit for bit, boards that are pulled out, noise on the line."""
+"""Serial radios over pseudo-terminals: the same fixes bit for bit, boards that are unplugged, noise on the line."""
 
 import asyncio
 import os
@@ -9,20 +9,18 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from radio_ears import ears
-from serial_stage import PlayedBoard, linked
+from radio_events import radio_events
+from serial_stage import PlayedBoard, linked, quantised
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.anchor import Anchor
 from skyless.errors import SkylessError
 from skyless.evaluation.scenarios import Request, impairments_of
 from skyless.firmware import link
-from skyless.nodes.emulation.board_protocol import ListenerProtocol
+from skyless.nodes.board import ListenerProtocol, Pty
 from skyless.nodes.open_radio import is_simulated, open_radios, open_sniffers
-from skyless.nodes.process.pty import Pty
 from skyless.radios.interface import AntennaDelays, Gone, Late, Restarted, Sent
-from skyless.radios.serial.link_records import quantised
-from skyless.radios.serial.listener_radio import ListenerRadio
+from skyless.radios.serial.foreign_radios import ListenerRadio
 from skyless.radios.serial.serial_radio import SerialRadio
 from skyless.receiver import Receiver
 from skyless.simulation.stations import TagSpec
@@ -60,7 +58,7 @@ def fix_bits(fix):
 async def over_the_line(heard, make):
     """The same receptions behind a board and a serial port."""
     board, radio = make()
-    async with board, ears(radio) as host:
+    async with board, radio_events(radio) as host:
         await host.until(Restarted)
         for at in range(0, len(heard), 20):
             for reception in heard[at : at + 20]:
@@ -71,18 +69,18 @@ async def over_the_line(heard, make):
 
 def link_pair():
     board = PlayedBoard()
-    return board, SerialRadio(board.pty.place, 1_000_000, "tag1")
+    return board, SerialRadio(board.pty.name, 1_000_000, "tag1")
 
 
 class ListenerBoard(PlayedBoard):
     def __init__(self):
         super().__init__()
-        self.speech = ListenerProtocol(self.pty.send)
+        self.protocol = ListenerProtocol(self.pty.send)
 
 
 def listener_pair():
     board = ListenerBoard()
-    return board, ListenerRadio(board.pty.place, 115_200, "tag1")
+    return board, ListenerRadio(board.pty.name, 115_200, "tag1")
 
 
 @pytest.mark.parametrize("method", ["joint", "bracketed"])
@@ -98,7 +96,7 @@ def test_fixes_over_a_serial_port_are_those_of_the_radio_itself_bit_for_bit(pair
     assert sum(fix != "None" for fix in here[0]) > 100
 
 
-def test_frames_are_sent_at_their_tick_and_their_end_is_told():
+def test_frames_are_sent_at_their_tick_and_their_end_is_reported():
     async def play():
         async with linked() as (board, host):
             ticks = 512 * 10**6 + AntennaDelays().tx_ticks
@@ -107,7 +105,7 @@ def test_frames_are_sent_at_their_tick_and_their_end_is_told():
                 while not board.radio.transmissions:
                     await asyncio.sleep(0.001)
                 assert board.radio.transmissions.pop() == Transmission(b"a frame", ticks)
-                board.speech.hear_radio(event(ticks))
+                board.protocol.on_radio_event(event(ticks))
                 assert await host.until(event) == event(ticks)
             host.radio.transmit(Transmission(b"one", ticks))
             host.radio.transmit(Transmission(b"two", ticks + 512))  # there is room for one
@@ -146,7 +144,7 @@ def test_a_board_that_is_pulled_out_and_plugged_in_is_found_again(tmp_path):
     place = tmp_path / "board"
 
     async def play():
-        async with ears(SerialRadio(str(place), 1_000_000, "tag1")) as host:
+        async with radio_events(SerialRadio(str(place), 1_000_000, "tag1")) as host:
             assert f"there is no {place}" in (await host.until(Gone)).reason
             for time_s in (1, 2, 3):
                 async with PlayedBoard(place) as board:
@@ -154,19 +152,19 @@ def test_a_board_that_is_pulled_out_and_plugged_in_is_found_again(tmp_path):
                     board.hear(Reception(b"%d" % time_s, time_s))
                     assert (await host.until(Reception, time_s)).frame == b"%d" % time_s
                 await host.until(Gone, 2 * time_s)
-                assert f"{place} was pulled out" in [event.reason for event in host.of(Gone)]
+                assert f"{place} was unplugged" in [event.reason for event in host.of(Gone)]
                 assert host.radio.now_ticks() is None
                 host.radio.transmit(Transmission(b"x", 9))
-                assert host.told[-1] == Late(9)
+                assert host.events[-1] == Late(9)
             assert len(host.of(Gone)) <= 8  # each reason once, however often it is tried
 
     asyncio.run(play())
 
 
-def test_a_board_that_starts_anew_behind_an_open_port_is_set_up_again():
+def test_a_board_that_starts_again_behind_an_open_port_is_set_up_again():
     async def play():
         async with linked() as (board, host):
-            board.speech.hear_radio(Restarted())
+            board.protocol.on_radio_event(Restarted())
             await host.until(Restarted, 2)
             board.hear(Reception(b"again", 7))
             assert (await host.until(Reception)).frame == b"again"
@@ -206,46 +204,46 @@ def test_a_board_of_another_version_is_refused_in_words():
             writer.append(3, 1)
             board.pty.send(bytes(writer.line[: writer.end()]))
 
-        board.speech.hear_host = answer
-        async with board, ears(SerialRadio(board.pty.place, 1_000_000, "tag1")) as host:
-            assert "speaks version 7.3 of the serial link, this program 1.0" in (await host.until(Gone)).reason
+        board.protocol.on_host_data = answer
+        async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
+            assert "has version 7.3 of the serial link, this program 1.0" in (await host.until(Gone)).reason
             await asyncio.sleep(1.2)
-            assert len(host.told) == 1
+            assert len(host.events) == 1
             assert host.radio.now_ticks() is None
 
     asyncio.run(play())
 
 
-def test_a_port_that_is_taken_or_no_port_is_told_in_words():
+def test_a_port_that_is_taken_or_no_port_is_reported_in_words():
     async def play():
-        async with linked() as (board, _), ears(SerialRadio(board.pty.place, 1_000_000, "tag2")) as second:
+        async with linked() as (board, _), radio_events(SerialRadio(board.pty.name, 1_000_000, "tag2")) as second:
             assert "is used by another program" in (await second.until(Gone)).reason
-        async with ears(SerialRadio("/dev/null", 1_000_000, "tag2")) as null:
+        async with radio_events(SerialRadio("/dev/null", 1_000_000, "tag2")) as null:
             assert "/dev/null is no serial port" in (await null.until(Gone)).reason
 
     asyncio.run(play())
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
-def test_a_port_that_may_not_be_opened_is_told_in_words():
+def test_a_port_that_may_not_be_opened_is_reported_in_words():
     async def play():
         async with PlayedBoard() as board:
             Path(board.pty.path).chmod(0)
-            async with ears(SerialRadio(board.pty.path, 1_000_000, "tag1")) as host:
+            async with radio_events(SerialRadio(board.pty.path, 1_000_000, "tag1")) as host:
                 assert "dialout" in (await host.until(Gone)).reason
 
     asyncio.run(play())
 
 
-def test_what_nobody_fetches_is_dropped_and_who_comes_later_hears_the_present():
+def test_what_nobody_fetches_is_dropped_and_who_comes_later_receives_the_present():
     async def play():
         async with PlayedBoard() as board:
-            board.speech._configured = board.speech._receiving = True
+            board.protocol._configured = board.protocol._receiving = True
             for number in range(2000):
                 board.hear(Reception(bytes(100), number))
             assert board.pty.overruns >= 1
-            assert board.speech.counts["unsent"] == board.pty.overruns
-            async with ears(SerialRadio(board.pty.place, 1_000_000, "tag1")) as host:
+            assert board.protocol.counts["unsent"] == board.pty.overruns
+            async with radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
                 await host.until(Restarted)
                 board.hear(Reception(b"now", 5000))
                 assert [one.frame for one in [await host.until(Reception)]] == [b"now"]
@@ -264,7 +262,7 @@ def test_a_link_keeps_its_name_and_goes_with_the_board(tmp_path):
         second.close()
         assert not place.is_symlink()
         place.write_text("a file")
-        with pytest.raises(SkylessError, match="something stands there"):
+        with pytest.raises(SkylessError, match="this path exists"):
             Pty(place)
         with pytest.raises(SkylessError, match="cannot be made"):
             Pty(tmp_path / "nowhere" / "board")
@@ -291,7 +289,7 @@ def test_a_link_keeps_its_name_and_goes_with_the_board(tmp_path):
         ("usb:/dev/a", "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN]"),
     ],
 )
-def test_ports_that_cannot_be_are_told_at_once(spec, right):
+def test_ports_that_cannot_be_are_reported_at_once(spec, right):
     with pytest.raises(SkylessError) as told:
         open_radios(spec, "tag", ("tag1",))
     assert right in str(told.value)
@@ -303,7 +301,7 @@ def test_a_sniffer_s_port_is_one_of_this_computer_too():
         open_sniffers("sniffer:socket://10.0.0.1:4000", ("drone",))
 
 
-def test_ports_that_nobody_can_look_at_are_opened_to_be_told_why(tmp_path, monkeypatch):
+def test_ports_that_nobody_can_look_at_are_opened_to_be_reported_why(tmp_path, monkeypatch):
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
 
     def forbidden(_path):
@@ -337,10 +335,10 @@ def test_names_of_ports():
     assert is_simulated("serial:/dev/pts/7@1000000")
 
 
-def test_a_listener_hears_whole_lines_only_and_transmits_nothing():
+def test_a_listener_receives_whole_lines_only_and_transmits_nothing():
     async def play():
         board, radio = listener_pair()
-        async with board, ears(radio) as host:
+        async with board, radio_events(radio) as host:
             await host.until(Restarted)
             assert radio.now_ticks() is None
             board.pty.send(b'"dlen":2,"d":"abcd"}\r\n')  # what was on its way when the port was opened
@@ -353,7 +351,7 @@ def test_a_listener_hears_whole_lines_only_and_transmits_nothing():
             assert abs(first.host_s - time.monotonic()) < 30.0
             assert radio.counters == Counter({"wrong-length": 1, "malformed-line": 1, "impossible-stamp": 1})
             radio.transmit(Transmission(b"x", 3))
-            assert host.told[-1] == Late(3)
+            assert host.events[-1] == Late(3)
             assert radio.now_ticks() is not None
 
     asyncio.run(play())

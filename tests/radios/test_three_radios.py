@@ -9,7 +9,7 @@ import asyncio
 import msgspec
 import pytest
 from chip_stage import ChipAnchor, TimedNode, WorldAir
-from radio_ears import ears
+from radio_events import radio_events
 from serial_stage import PlayedBoard
 
 from skyless.anchor import Anchor
@@ -61,7 +61,7 @@ def through_the_chip():
 async def over_the_line(heard):
     """The same receptions behind a board and a serial port."""
     board = PlayedBoard()
-    async with board, ears(SerialRadio(board.pty.place, 1_000_000, "tag1")) as host:
+    async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
         await host.until(Restarted)
         for at in range(0, len(heard), 20):
             for reception in heard[at : at + 20]:
@@ -106,7 +106,7 @@ def test_the_same_frames_at_the_same_ticks_from_a_whole_site_on_driver_and_model
     assert sum(machine.sent for machine in machines.values()) == pytest.approx(len(emulated), abs=7)
 
 
-def test_what_the_chip_measures_is_what_the_air_tells_but_for_rounding(ways):
+def test_what_the_chip_measures_is_what_the_air_gives_but_for_rounding(ways):
     emulated, _, _, chip, _, _ = ways
     for one, other in zip(emulated, chip, strict=True):
         assert other.diagnostics.rx_power_dbm == pytest.approx(one.diagnostics.rx_power_dbm, abs=0.03)

@@ -3,7 +3,7 @@
 import pytest
 
 from skyless.errors import ConfigurationError
-from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.recordings.anchor_table import calibrated_table, new_table, read_anchors, read_calibration
 
 KNOWN = DifferenceCalibration({1: AnchorCalibration(0.1234, 0.08, 0.061), 16: AnchorCalibration(-0.1)})

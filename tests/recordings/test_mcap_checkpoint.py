@@ -17,7 +17,7 @@ from skyless.air.codec import decode, encode
 from skyless.air.page_codec import encode_page
 from skyless.air.reception import Reception
 from skyless.method_names import METHODS
-from skyless.positioning.estimator.state import ANCHOR, KEPT, STATUS
+from skyless.positioning.estimator.state import ANCHOR_DTYPE, KEPT_ARRAYS, STATUS_DTYPE
 from skyless.receiver import Receiver
 from skyless.recordings.mcap.checkpoint import RefusedError, load, save
 
@@ -183,7 +183,7 @@ def test_damaged_bytes_are_refused_or_harmless(data):
 ARRAYS = ("method", "estimator", "arrays")
 
 
-@pytest.mark.parametrize("name", KEPT)
+@pytest.mark.parametrize("name", KEPT_ARRAYS)
 @pytest.mark.parametrize(
     "change", [lambda data: data[:-8], lambda data: data + bytes(8), lambda _: b"", lambda data: data * 2, lambda _: 0]
 )
@@ -215,15 +215,15 @@ def filled(dtype, name, place, value):
 @pytest.mark.parametrize(
     ("array", "change"),
     [
-        ("anchors", filled(ANCHOR, "table_index", 2, -5)),
-        ("anchors", filled(ANCHOR, "table_index", 2, 6)),
-        ("anchors", filled(ANCHOR, "table_index", 2, 1 << 40)),
+        ("anchors", filled(ANCHOR_DTYPE, "table_index", 2, -5)),
+        ("anchors", filled(ANCHOR_DTYPE, "table_index", 2, 6)),
+        ("anchors", filled(ANCHOR_DTYPE, "table_index", 2, 1 << 40)),
         (
             "anchors",
-            filled(ANCHOR, "table_index", 2, 1),
+            filled(ANCHOR_DTYPE, "table_index", 2, 1),
         ),
-        ("status", filled(STATUS, "range_errors", 0, -1)),
-        ("status", filled(STATUS, "range_errors", 0, 3)),
+        ("status", filled(STATUS_DTYPE, "range_errors", 0, -1)),
+        ("status", filled(STATUS_DTYPE, "range_errors", 0, 3)),
     ],
 )
 def test_states_that_would_lead_their_kernels_astray_are_refused(array, change):

@@ -22,7 +22,7 @@ LEVER_ARM_M = np.array([-0.01245, 0.00127, 0.0908])
 def tdoas_of(path, anchors_m=None, listener=None):
     with open_recording(path, listener=listener) as recording:
         engine = PairEngine(recording.format.tx_bits, anchors_m=anchors_m)
-        return [tdoa for packet in recording for tdoa in engine.hear(packet)], engine.drops
+        return [tdoa for packet in recording for tdoa in engine.on_packet(packet)], engine.drops
 
 
 def by_pair(tdoas):

@@ -9,11 +9,22 @@ from skyless.errors import SkylessError
 from skyless.evaluation.figures import picture
 from skyless.site.lab import ideal_lab_site
 from skyless.studies.catalogue import STUDIES
-from skyless.studies.clustered_intervals import CLUSTER, rare_interval
 from skyless.studies.episodes import Case, draw_episode
-from skyless.studies.integrity import ALL, MOST_RATIO, Chunk, anchors_of, cells, rows, run_chunk
-from skyless.studies.integrity_faults import BURST_S, FAULTS, Fault, faulty
+from skyless.studies.integrity import (
+    ALL_FAULTS,
+    FAULT_BURST_S,
+    FAULTS,
+    MAX_LEVEL_RATIO,
+    Chunk,
+    Fault,
+    anchors_of,
+    cells,
+    faulty,
+    rows,
+    run_chunk,
+)
 from skyless.studies.plan import plan_of
+from skyless.studies.summary import CLUSTER_FIXES, clustered_interval
 
 SLOT_S = ideal_lab_site().schedule.slot_s
 PLAN = plan_of("joint", 1, episodes=100)
@@ -49,21 +60,21 @@ def test_ramps_grow_for_a_second_and_bursts_come_and_go():
         )[own]
 
     assert late_m("ramp") == pytest.approx(2.0 * np.clip(since_s, 0.0, 1.0), abs=TICK_M)
-    on = (since_s >= 0.0) & (since_s % (2.0 * BURST_S) < BURST_S)
+    on = (since_s >= 0.0) & (since_s % (2.0 * FAULT_BURST_S) < FAULT_BURST_S)
     assert late_m("bursts") == pytest.approx(np.where(on, 2.0, 0.0), abs=TICK_M)
 
 
 @pytest.mark.parametrize("n", [1, 7])
-@pytest.mark.parametrize("size", [1.0, CLUSTER, 2.0 * CLUSTER])
+@pytest.mark.parametrize("size", [1.0, CLUSTER_FIXES, 2.0 * CLUSTER_FIXES])
 def test_intervals_of_equal_clusters_are_garwoods(n, size):
-    low, high = rare_interval(np.full(n, size), 1e4)
+    low, high = clustered_interval(np.full(n, size), 1e4)
     exact = size * chi2.ppf(0.995, 2 * n + 2) / 2e4
     assert low == pytest.approx(size * chi2.ppf(0.005, 2 * n) / 2e4)
-    assert high == pytest.approx(exact) if size >= CLUSTER else high > exact
+    assert high == pytest.approx(exact) if size >= CLUSTER_FIXES else high > exact
 
 
 def test_nothing_seen_proves_a_share_small_but_not_zero():
-    assert rare_interval(np.zeros(9), 1e4) == (0.0, pytest.approx(CLUSTER * chi2.ppf(0.995, 2) / 2e4))
+    assert clustered_interval(np.zeros(9), 1e4) == (0.0, pytest.approx(CLUSTER_FIXES * chi2.ppf(0.995, 2) / 2e4))
 
 
 def test_intervals_of_clusters_hold_the_true_share():
@@ -72,7 +83,7 @@ def test_intervals_of_clusters_hold_the_true_share():
     missed = 0
     for _ in range(runs):
         events = np.array([draw.integers(1, 21) for _ in range(draw.poisson(3.0))], float)
-        low, high = rare_interval(events, 1.0)
+        low, high = clustered_interval(events, 1.0)
         missed += not low <= mean <= high
     assert missed <= 23  # at most 10 are expected; more than 23 with a probability of 10⁻⁴
 
@@ -90,15 +101,21 @@ def test_rows_are_what_chunks_tell():
     told = {row.case: row for row in rows(PLAN, results)}
     assert len(told) == len(FAULTS) + 1
     clean, step = told["lab, clean"], told["lab, step 0.05 m"]
-    assert (clean.runs, clean.fixes, clean.available, clean.hmi, clean.limit) == (100, 10_000, 0.9, 0.0, MOST_RATIO)
+    assert (clean.runs, clean.fixes, clean.available, clean.hmi, clean.limit) == (
+        100,
+        10_000,
+        0.9,
+        0.0,
+        MAX_LEVEL_RATIO,
+    )
     assert clean.ratio == pytest.approx(1.0 / 0.8, rel=0.01)
     assert clean.passed
     assert step.hmi == 0.01
     assert step.hmi_interval[0] < 1e-4 < 0.01 < step.hmi_interval[1]  # one cluster proves little
     assert step.passed
     assert (step.hpl_m, step.vpl_m, told["room, clean"].vpl_m) == (pytest.approx(0.1), None, pytest.approx(0.2))
-    assert told[ALL].hmi == pytest.approx(100 / told[ALL].fixes)
-    assert told[ALL].fixes == 10_000 * (len(FAULTS) - 2)
+    assert told[ALL_FAULTS].hmi == pytest.approx(100 / told[ALL_FAULTS].fixes)
+    assert told[ALL_FAULTS].fixes == 10_000 * (len(FAULTS) - 2)
 
 
 def test_levels_that_mislead_often_fail():

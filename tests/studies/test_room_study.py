@@ -6,22 +6,20 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.cli.study_output import print_rows
+from skyless.cli.study import print_rows
 from skyless.evaluation.figures import picture
-from skyless.positioning.integrity import Alert
+from skyless.evaluation.statistics import LevelCounts, LevelTally
+from skyless.positioning.integrity import Alert, Integrity
 from skyless.simulation.channel import cross_walls, pack_walls
 from skyless.simulation.impairments import Body
 from skyless.site.lab import lab_site
 from skyless.studies import room
 from skyless.studies.catalogue import STUDIES
-from skyless.studies.clustered_intervals import rare_interval
-from skyless.studies.lab_setup import box
-from skyless.studies.level_counts import LevelCounter, LevelCounts
-from skyless.studies.limits import judged
-from skyless.studies.plan import Limit, Row, plan_of
-from skyless.studies.room_bound import biases_of, bound_cells
-from skyless.studies.worlds import RunResult, run_world
-from skyless.uncertainty.biased_bound import Biases
+from skyless.studies.plan import Limit, Row, plan_of, with_limits
+from skyless.studies.room import biases_of, bound_cells
+from skyless.studies.summary import clustered_interval
+from skyless.studies.worlds import RunResult, box, run_world
+from skyless.uncertainty.bounds import Biases
 
 PLAN = plan_of("joint", 1, study="room")
 CASES = {case.name: case for case in room.cases(PLAN)}
@@ -155,33 +153,41 @@ def test_the_limits_are_those_of_the_acceptance():
 
 def test_limits_hold_at_their_ends_and_what_does_not_exist_exceeds_nothing():
     most, least, both = Limit("rmse_m", most=0.03), Limit("level", 0.99), Limit("nees", 0.7, 1.3)
-    assert judged(EMPTY, ()) is EMPTY
-    row = judged(replace(EMPTY, nees=1.31, level=0.99), (most, least, both))
+    assert with_limits(EMPTY, ()) is EMPTY
+    row = with_limits(replace(EMPTY, nees=1.31, level=0.99), (most, least, both))
     assert (row.missed, row.passed, row.limits) == (("nees",), False, (most, least, both))
-    assert judged(replace(EMPTY, nees=0.7, level=1.0), (most, least, both)).passed is True
-    assert judged(EMPTY, (most, least, Limit("exceeded", most=1e-4))).missed == ("level",)
-    assert judged(replace(EMPTY, fixes=0, rmse_m=None), (most,)).passed is False
-    assert judged(replace(EMPTY, limit=1.3, ratio=1.4, passed=False), ()).missed == ("ratio",)
-    assert judged(replace(EMPTY, limit=1.3, ratio=1.2, passed=True), (most,)).passed is True
+    assert with_limits(replace(EMPTY, nees=0.7, level=1.0), (most, least, both)).passed is True
+    assert with_limits(EMPTY, (most, least, Limit("exceeded", most=1e-4))).missed == ("level",)
+    assert with_limits(replace(EMPTY, fixes=0, rmse_m=None), (most,)).passed is False
+    assert with_limits(replace(EMPTY, limit=1.3, ratio=1.4, passed=False), ()).missed == ("ratio",)
+    assert with_limits(replace(EMPTY, limit=1.3, ratio=1.2, passed=True), (most,)).passed is True
 
 
-class Told:
-    """A fix that promises a level."""
+class FixWithLevel:
+    """A fix that gives a level, or none."""
 
-    def __init__(self, hpl_m, alert=Alert.NONE):
-        self.hpl_m, self.alert, self.asked = hpl_m, alert, object()
+    integrity_risk = 1e-4
+
+    def __init__(self, hpl_m, alert, vpl_m=None):
+        self.integrity = Integrity(hpl_m, vpl_m, self.integrity_risk, alert)
+
+
+class FixWithoutLevels:
+    integrity = integrity_risk = None
 
 
 def test_levels_are_counted_for_each_tag():
-    counter = LevelCounter(2)
+    counter = LevelTally(2, 100)
+    counter.add(0, FixWithoutLevels(), np.ones(3))
     assert counter.counts() is None
+    assert counter.report() is None
     for tag, hpl_m, across_m, alert in (
         (0, 0.1, 0.05, Alert.NONE),
         (0, 0.1, 0.2, Alert.NONE),
         (1, 0.3, 0.4, Alert.EXCLUDED),
         (1, None, 9.0, Alert.UNAVAILABLE),
     ):
-        counter.add(tag, Told(hpl_m, alert), across_m)
+        counter.add(tag, FixWithLevel(hpl_m, alert), np.array((0.6 * across_m, 0.8 * across_m, 9.0)))
     counts = counter.counts()
     assert [list(part) for part in (counts.fixes, counts.levels, counts.exceeded, counts.unwarned)] == [
         [2, 2],
@@ -190,6 +196,11 @@ def test_levels_are_counted_for_each_tag():
         [1, 0],
     ]
     assert sorted(counts.hpl_m) == [0.1, 0.1, 0.3]
+    report = counter.report()
+    assert (report.available, report.misleading, report.hpl_m) == (0.75, 2, 0.1)
+    assert report.alerts == {"detected-excluded": 1, "none": 2, "unavailable": 1}
+    counter.add(0, FixWithLevel(1.0, Alert.NONE, vpl_m=0.5), np.array((0.1, 0.1, -0.6)))
+    assert counter.report().misleading == 3
 
 
 def _results(plan, levels):
@@ -205,7 +216,7 @@ def test_rows_have_shares_of_the_fixes_with_a_level_and_intervals_over_tags():
     row = rows[0]
     assert row.level == pytest.approx(12.0 / 18.0)
     assert row.exceeded == pytest.approx(6.0 / 12.0)
-    assert row.exceeded_interval == (rare_interval(np.array([3.0, 0.0, 3.0, 0.0]), 12.0)[0], 1.0)
+    assert row.exceeded_interval == (clustered_interval(np.array([3.0, 0.0, 3.0, 0.0]), 12.0)[0], 1.0)
     assert row.exceeded_unwarned == pytest.approx(2.0 / 12.0)
     assert row.hpl_m == pytest.approx(0.25)
     assert (row.bound_m, row.ratio) == (pytest.approx(0.02), pytest.approx(5.0 / 3.0))

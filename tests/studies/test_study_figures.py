@@ -10,12 +10,10 @@ from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.world import World
 from skyless.site.check import check_site
 from skyless.site.lab import lab_site
-from skyless.studies import efficiency_rows, loss, motion, motions, nlos, room, scale, sync
-from skyless.studies.efficiency import efficiency
-from skyless.studies.lab_setup import box, hall_site, walking
+from skyless.studies import efficiency, loss, motion, nlos, room, scale, sync
 from skyless.studies.plan import Plan, plan_of, seed_of
 from skyless.studies.summary import Case, interval, jackknife, world_cells, world_rows
-from skyless.studies.worlds import RunResult, run_world, without_mesh
+from skyless.studies.worlds import RunResult, box, large_lab_site, run_world, walking, without_mesh
 
 SMALL = Plan(method="joint", worlds=2, seconds=1.0, tags=1)
 RANDOM = np.random.default_rng(5)
@@ -161,14 +159,14 @@ def test_the_limits_that_were_asked_for_are_there(quick):
 @pytest.mark.parametrize(
     ("kind", "speed_mps"),
     [
-        *((motions.rounds, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
-        *((motions.zigzag, speed_mps) for speed_mps in (1.0, 3.0)),
-        *((motions.stop_and_go, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
+        *((motion.rounds, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
+        *((motion.zigzag, speed_mps) for speed_mps in (1.0, 3.0)),
+        *((motion.stop_and_go, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
     ],
 )
 def test_paths_keep_to_speed_acceleration_and_room(kind, speed_mps):
     """By central differences, over a minute; and they do reach the speed and the acceleration."""
-    low_m, high_m = box(hall_site(100.0))
+    low_m, high_m = box(large_lab_site(100.0))
     for seed in range(5):
         path = kind(np.random.default_rng(seed), low_m, high_m, speed_mps, 3.0)
         step_s = 0.01
@@ -195,15 +193,15 @@ def test_a_long_superframe_has_its_anchors_evenly_spread():
 
 def test_rows_of_efficiency_are_those_of_the_episodes():
     plan = Plan(seed=4, episodes=60)
-    cells = efficiency_rows.cells(plan)
-    case = efficiency_rows.CASES[0]
+    cells = efficiency.cells(plan)
+    case = efficiency.EFFICIENCY_CASES[0]
     wanted = [number for number, cell in enumerate(cells) if cell.name == cells[0].name]
     assert wanted == [0, 1]  # chunks of 50
     results = [cells[number].function(cells[number].argument) for number in wanted]
-    told = efficiency(case, 60, 4)
-    row = efficiency_rows.rows(plan, results * len(efficiency_rows.CASES))[0]
+    told = efficiency.summary(case, efficiency.run_chunk(case, np.random.SeedSequence(4).spawn(60)))
+    row = efficiency.rows(plan, results * len(efficiency.EFFICIENCY_CASES))[0]
     assert (row.rmse_m, row.bound_m, row.ratio) == (told.rmse_m, told.arrived_bound_m, told.ratio)
     assert row.nees == told.nees / 2
     assert (row.mesh, row.noise_ps, row.limit, row.runs) == (False, 100.0, 1.02, 60)
-    kinds = {(case.mesh, case.noise_ps, case.random_walk_fm, case.qa) for case in efficiency_rows.CASES}
+    kinds = {(case.mesh, case.noise_ps, case.random_walk_fm, case.qa) for case in efficiency.EFFICIENCY_CASES}
     assert len(kinds) == 16

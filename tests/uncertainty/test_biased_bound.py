@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.evaluation.lab_bound import random_path
-from skyless.uncertainty.biased_bound import Biases, biased_bound
-from skyless.uncertainty.bounds import OFFSET_STD_M, POSITION_STD_M, RATE_STD_MPS, bound_settings, tracking_bound
-from skyless.uncertainty.loss_bound import received_bound
+from skyless.studies.episodes import random_path
+from skyless.uncertainty.bounds import (
+    OFFSET_STD_M,
+    POSITION_STD_M,
+    RATE_STD_MPS,
+    Biases,
+    biased_bound,
+    bound_settings,
+    received_bound,
+    tracking_bound,
+)
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 RAISED = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
@@ -194,7 +201,7 @@ def test_larger_biases_never_make_the_bound_smaller(name):
 
 
 def test_shapes_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match="7 places, no multiple of 6 anchors"):
+    with pytest.raises(ValueError, match="7 positions, no multiple of 6 anchors"):
         biased_bound(LAB, np.zeros((7, 3)), settings_of(), Biases())
     with pytest.raises(ValueError, match="survey_std_m has 2 values; it should be one number, or one for each of 6"):
         biased_bound(LAB, np.zeros((6, 3)), settings_of(), Biases(survey_std_m=(0.1, 0.2)))

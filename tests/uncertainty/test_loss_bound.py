@@ -6,8 +6,7 @@ import pytest
 from skyless.site.lab import lab_site
 from skyless.studies import loss
 from skyless.studies.plan import Plan
-from skyless.uncertainty.bounds import bound_settings, tracking_bound
-from skyless.uncertainty.loss_bound import known_receptions, received_bound
+from skyless.uncertainty.bounds import bound_settings, known_receptions, received_bound, tracking_bound
 
 LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors])
 PATH_M = np.tile([2.0, 3.0, 0.0], (600, 1))

@@ -1,16 +1,22 @@
 """The paper's variances derived again: its algorithm run on symbols, linearised, and compared term by term.
 
-The functions that are linearised are the program's own (``clocks/paper.py``, ``positioning/solver/paper.py``), fed with
-clock readings plus noise. Nothing of ``corrected`` or of the errata enters before the comparison.
+The functions that are linearised are the program's own (``positioning/methods/snapshots.py``), fed with clock readings
+plus noise. Nothing of ``CORRECTED`` or of the errata enters before the comparison.
 """
 
 import pytest
 import sympy as sp
 
-from skyless.clocks.paper import averaged_offset, relative_offset, relative_rate, to_master
-from skyless.positioning.solver.paper import protocol_interval, tag_rate
-from skyless.uncertainty import corrected, printed
-from skyless.uncertainty.chain import Chain
+from skyless.positioning.methods.snapshots import (
+    averaged_offset,
+    protocol_interval,
+    relative_offset,
+    relative_rate,
+    tag_rate,
+    to_master,
+)
+from skyless.uncertainty import chain
+from skyless.uncertainty.chain import CORRECTED, PRINTED, Chain
 
 POSITIVE = [
     "master_rate",
@@ -51,8 +57,7 @@ QUANTITIES = (
 @pytest.fixture(autouse=True)
 def light_is_a_symbol(monkeypatch):
     """The speed of light as a float is not exact when squared."""
-    for module in (corrected, printed):
-        monkeypatch.setattr(module, "SPEED_OF_LIGHT_MPS", LIGHT)
+    monkeypatch.setattr(chain, "SPEED_OF_LIGHT_MPS", LIGHT)
 
 
 def plain(function):
@@ -124,16 +129,21 @@ def equal(a, b):
 
 @pytest.mark.parametrize("name", QUANTITIES)
 def test_the_corrected_variances_are_those_of_the_algorithm(gradients, name):
-    assert equal(covariance(gradients[name], gradients[name]), getattr(corrected, name)(CHAIN))
+    assert equal(covariance(gradients[name], gradients[name]), getattr(CORRECTED, name)(CHAIN))
 
 
 def test_the_corrected_autocovariance_of_epsilon_is_that_of_the_algorithm(gradients):
     derived = covariance(gradients["epsilon_first"], gradients["epsilon_delayed"])
-    assert equal(derived, corrected.epsilon_covariance(CHAIN))
+    assert equal(derived, CORRECTED.epsilon_covariance(CHAIN))
 
 
 def test_the_compact_form_is_the_same_variance():
-    assert equal(corrected.lambda_compact_m2(CHAIN), corrected.lambda_m2(CHAIN))
+    """σ_λ² free of the origin of time: what of which stamp remains (``docs/maths.md`` section 2)."""
+    c = CHAIN
+    tag = (c.Q + 1) * TAG**2 + c.V**2 * MASTER**2
+    anchor = (c.Q + sp.Rational(1, 2)) * ANCHOR**2 + c.N**2 * MASTER**2 / 2
+    compact = LIGHT**2 * (tag + (c.V / c.N) ** 2 * (anchor + c.u**2 * CORRECTED.beta(c)))
+    assert equal(compact, CORRECTED.lambda_m2(c))
 
 
 def test_both_offsets_are_one_for_any_noise():
@@ -157,10 +167,10 @@ def test_without_noise_the_chain_gives_what_the_paper_says():
 def test_what_is_wrong_in_the_printed_variances():
     """The difference printed − derived of every quantity that owes nothing to another one."""
     c = CHAIN
-    s_i, s_m, beta = ANCHOR**2, MASTER**2, corrected.beta(CHAIN)
+    s_i, s_m, beta = ANCHOR**2, MASTER**2, CORRECTED.beta(CHAIN)
 
     def excess(name):
-        return getattr(printed, name)(c) - getattr(corrected, name)(c)
+        return getattr(PRINTED, name)(c) - getattr(CORRECTED, name)(c)
 
     assert equal(excess("beta"), 0)
     assert equal(excess("gamma_first"), -4 * c.T / c.L * s_i)  # E1

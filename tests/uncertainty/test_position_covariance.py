@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from dense_covariance import position_covariance
-from skyless.positioning.solver.locate import Solution, locate
-from skyless.uncertainty.tdoa import (
-    bracketed_covariance,
-    literal_covariance,
-    literal_delayed_covariance,
-    stamp_variance_m2,
-)
+from skyless.clocks.filter import stamp_variance_m2
+from skyless.positioning.methods.locate import Solution, locate
+from skyless.positioning.methods.snapshots import bracketed_covariance, literal_covariance, literal_delayed_covariance
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 LAB_3D = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
@@ -69,7 +65,7 @@ def test_it_is_the_scatter_of_the_solvers_estimates(anchors, height, weighted):
     ids=["literal", "literal-delayed", "weighted", "bracketed"],
 )
 def test_it_predicts_the_simulated_lab(covariance, weighted, at_p1_cm, at_p2_cm):
-    """The column "said by the fixes" of docs/maths.md section 5: 100 ps, one fix per superframe."""
+    """The column "predicted σ" of docs/maths.md section 5: 100 ps, one fix per superframe."""
     tx, rx = (stamp_variance_m2(100e-12, rounded=rounded) for rounded in (False, True))
     predicted = position_covariance(LAB, [P1, P2], covariance(KAPPA, tx, rx), height_known=True, weighted=weighted)
     sigma_cm = 100.0 * np.sqrt(np.trace(predicted, axis1=1, axis2=2))

@@ -2,12 +2,7 @@
 
 import numpy as np
 import pytest
-
-from skyless.bench.monte_carlo_speed import bench_chain
-from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.paper.chain_draws import Quantity, Readings
-from skyless.positioning.solver.paper import bracketed_tdoa, literal_tdoa
-from skyless.uncertainty.systematic import (
+from systematic import (
     bracketed_motion_error_m,
     literal_motion_error_m,
     motion_seen,
@@ -15,7 +10,12 @@ from skyless.uncertainty.systematic import (
     smoothed_rate_motion_error_m,
     synchronisation_error_m,
 )
-from skyless.uncertainty.tdoa import Reference
+
+from skyless.bench.monte_carlo_speed import bench_chain
+from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.paper.monte_carlo import Quantity, ideal_values, readings_of
+from skyless.positioning.methods.snapshots import bracketed_tdoa, literal_tdoa
+from skyless.uncertainty.chain import Reference
 
 MASTER, ANCHORS = np.array([0.0, 0.0, 0.5]), np.array([(6, 0, 2.5), (6, 8, 0.5), (0, 8, 2.5)], float)
 SPACING_S = 15e-3
@@ -82,7 +82,7 @@ def test_a_smoothed_rate_keeps_the_velocity():
 def test_what_the_ideal_chain_leaves_is_e_and_the_tags_scale():
     """``eq:GPSTDoA`` without noise, through the program's kernels, to a ten-thousandth of a tick."""
     chain = bench_chain(10, seed=6)
-    left_m = Readings(chain, Reference.APART, uniform=False).ideal[Quantity.LAMBDA] * TICK_M
+    left_m = ideal_values(readings_of(chain, Reference.APART))[Quantity.LAMBDA] * TICK_M
     left_m -= (chain.tag_tof_s - chain.tag_master_tof_s) / TICK_S * TICK_M  # the true difference
     np.testing.assert_allclose(left_m, synchronisation_error_m(chain) + scale_error_m(chain), atol=1e-4 * TICK_M)
 

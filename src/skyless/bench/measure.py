@@ -1,9 +1,11 @@
-"""How fast the receiver's kernels are here, beside what others would write (``docs/speed.md``)."""
+"""How fast the receiver's kernels are here, compared with plain implementations (``docs/speed.md``)."""
 
 import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
 from typing import Final
@@ -14,22 +16,26 @@ from scipy.optimize import least_squares
 
 from skyless.air.codec import decode_cached
 from skyless.air.reception import Reception
-from skyless.anchor import Anchor
-from skyless.bench.many_tags import TagsSpeed, many_joints, one_core
-from skyless.bench.runs import ANCHORS_M, NODES, JointRuns, Run
+from skyless.bench.runs import BENCH_ANCHORS_M, BENCH_NODES, JointRuns, Run
+from skyless.evaluation.fleet import world_of
 from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
-from skyless.positioning.solver.locate import PseudorangeSolution, locate_pseudoranges
+from skyless.positioning.methods.locate import PseudorangeSolution, locate_pseudoranges
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import lab_impairments
-from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
 from skyless.site.lab import ideal_lab_site
 
-NO_FILTERPY: Final = "filterpy is not installed; pip install 'skyless[bench]' adds it"
-WARM_S: Final = 2.0
+_NO_FILTERPY: Final = "filterpy is not installed; pip install 'skyless[bench]' adds it"
+_WARM_S: Final = 2.0
 """A receiver has its almanac and its first fix by then."""
+_TAGS: Final = (1, 100, 10_000)
+_CHUNK_SUPERFRAMES: Final = 10
+"""Of each tag in a call."""
+_CHUNKS: Final = 64
+
+Tag = Callable[[int], None]
+"""Processes the chunk of that number."""
 
 
 class Effort(Struct, frozen=True):
@@ -41,8 +47,8 @@ class Effort(Struct, frozen=True):
     streaming_s: float = 8.0
 
 
-FULL: Final = Effort()
-QUICK: Final = Effort(3, 120, 42, 3.0)
+FULL_EFFORT: Final = Effort()
+QUICK_EFFORT: Final = Effort(3, 120, 42, 3.0)
 
 
 class KernelSpeed(Struct, frozen=True):
@@ -70,7 +76,7 @@ class Kernels(Struct, frozen=True):
     """The filters."""
 
     joint: KernelSpeed
-    """As ``joint_mesh`` at a site that calls survey and ranges exact, as plain NumPy and the loop take them for; ..."""
+    """As ``joint_mesh`` at a site whose survey and ranges are exact, as plain NumPy and the loop assume; ..."""
     joint_mesh: KernelSpeed
     joint_room: KernelSpeed
     """... this and the next estimate their errors as well: 54 states."""
@@ -79,11 +85,20 @@ class Kernels(Struct, frozen=True):
 
 
 class SnapshotSpeed(Struct, frozen=True):
-    """Positions per second from seven pseudoranges each, without a guess, beside scipy's ``least_squares`` with one."""
+    """Positions per second from seven pseudoranges, without a guess; of scipy's ``least_squares`` with one."""
 
     fixes_per_s: float
     scipy_fixes_per_s: float
     ratio: float
+
+
+class TagsSpeed(Struct, frozen=True):
+    """Many tags in one process, ``_CHUNK_SUPERFRAMES`` superframes of each in a call."""
+
+    ns_per_message: dict[int, float]
+    """By the number of tags, on one core."""
+    all_cores_messages_per_s: float
+    """With the most tags."""
 
 
 class Speed(Struct, frozen=True):
@@ -100,7 +115,7 @@ class Speed(Struct, frozen=True):
     """Why filterpy was not measured, None if it was."""
 
 
-def measure_all(effort: Effort = FULL) -> Speed:
+def measure_all(effort: Effort = FULL_EFFORT) -> Speed:
     """Measure everything: medians of several short runs, by the time of a thread that stays on one core."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     with one_core():
@@ -112,8 +127,8 @@ def measure_all(effort: Effort = FULL) -> Speed:
             _streaming(effort),
         )
         snapshots = _snapshots(effort)
-    tags = {"joint": many_joints()}
-    return Speed(kernels, snapshots, tags, load, cores(), None if find_spec("filterpy") else NO_FILTERPY)
+    tags = {"joint": _many_joints()}
+    return Speed(kernels, snapshots, tags, load, cores(), None if find_spec("filterpy") else _NO_FILTERPY)
 
 
 def seconds(prepare: Callable[[], Run], runs: int) -> float:
@@ -139,13 +154,15 @@ def _joint(effort: Effort, *, mesh: bool, exact: bool = True, filterpy: bool = F
 
 def _streaming(effort: Effort) -> StreamingSpeed:
     site = ideal_lab_site()
-    world = World(site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(3.0, 4.0))], lab_impairments(100.0), 1)
-    heard = [reception for sent in world.run(WARM_S + effort.streaming_s) for _, reception, _ in sent.receptions()]
-    warm = round(len(heard) * WARM_S / (WARM_S + effort.streaming_s))
-    return StreamingSpeed(seconds(partial(_hearing, heard, warm), max(3, effort.runs // 2)) / (len(heard) - warm))
+    world = world_of(site, [Static(3.0, 4.0)], lab_impairments(100.0), 1)
+    heard = [reception for sent in world.run(_WARM_S + effort.streaming_s) for _, reception, _ in sent.receptions()]
+    warm = round(len(heard) * _WARM_S / (_WARM_S + effort.streaming_s))
+    return StreamingSpeed(
+        seconds(partial(_prepared_receiver, heard, warm), max(3, effort.runs // 2)) / (len(heard) - warm)
+    )
 
 
-def _hearing(heard: list[Reception], warm: int) -> Run:
+def _prepared_receiver(heard: list[Reception], warm: int) -> Run:
     receiver = Receiver()
     for reception in heard[:warm]:
         receiver.hear(reception)
@@ -160,28 +177,82 @@ def _hearing(heard: list[Reception], warm: int) -> Run:
 
 
 def _snapshots(effort: Effort) -> SnapshotSpeed:
-    runs = JointRuns(effort.plain_messages // NODES + 1, mesh=False)
-    rows = runs.pseudoranges_m[: effort.plain_messages // NODES * NODES].reshape(-1, NODES)
-    variances, middle = np.full(NODES, 2e-3), np.array([*ANCHORS_M[:, :2].mean(axis=0), 0.0])
+    runs = JointRuns(effort.plain_messages // BENCH_NODES + 1, mesh=False)
+    rows = runs.pseudoranges_m[: effort.plain_messages // BENCH_NODES * BENCH_NODES].reshape(-1, BENCH_NODES)
+    variances, middle = np.full(BENCH_NODES, 2e-3), np.array([*BENCH_ANCHORS_M[:, :2].mean(axis=0), 0.0])
 
     def residuals(unknown: Array, pseudoranges_m: Array) -> Array:
-        away = ANCHORS_M[:, :2] - unknown[:2]
+        away = BENCH_ANCHORS_M[:, :2] - unknown[:2]
         left: Array = np.hypot(away[:, 0], away[:, 1]) + unknown[2] - pseudoranges_m
         return left
 
     def own() -> None:
         for row in rows:
-            solution = locate_pseudoranges(ANCHORS_M, row, variances, height_m=0.0)
+            solution = locate_pseudoranges(BENCH_ANCHORS_M, row, variances, height_m=0.0)
             assert isinstance(solution, PseudorangeSolution)
 
     def other() -> None:
         for row in rows:
             least_squares(residuals, middle, method="lm", args=(row,))
 
-    ours, scipys = (len(rows) / seconds(partial(_as_it_is, run), 3) for run in (own, other))
+    ours, scipys = (len(rows) / seconds(partial(_unprepared, run), 3) for run in (own, other))
     return SnapshotSpeed(ours, scipys, ours / scipys)
 
 
-def _as_it_is(run: Run) -> Run:
+def _unprepared(run: Run) -> Run:
     """A run that needs no preparation."""
     return run
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Keep this thread on one core, where the system can."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(before)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def _many_joints() -> TagsSpeed:
+    """Measure ``joint``."""
+    runs = JointRuns(_CHUNK_SUPERFRAMES * _CHUNKS, mesh=False)
+    parts = [
+        runs.part(k * _CHUNK_SUPERFRAMES * BENCH_NODES, (k + 1) * _CHUNK_SUPERFRAMES * BENCH_NODES)
+        for k in range(_CHUNKS)
+    ]
+
+    def tag() -> Tag:
+        estimator = runs.new_estimator()
+        return lambda chunk: estimator.track(parts[chunk])
+
+    return _many(tag)
+
+
+def _many(new_tag: Callable[[], Tag]) -> TagsSpeed:
+    by_tags, size = {}, _CHUNK_SUPERFRAMES * BENCH_NODES
+    for count in _TAGS:
+        tags = [new_tag() for _ in range(count)]
+        _process_chunk(tags, 0)
+        rounds = range(1, min(_CHUNKS - 1, max(4, 2000 // count)))
+        with one_core():
+            times = []
+            for chunk in rounds:
+                started_s = time.thread_time()
+                _process_chunk(tags, chunk)
+                times.append(time.thread_time() - started_s)
+        by_tags[count] = 1e9 * statistics.median(times) / (count * size)
+    shares = [tags[k :: cores()] for k in range(cores())]
+    started_s = time.perf_counter()
+    with ThreadPoolExecutor(cores()) as pool:
+        list(pool.map(lambda share: _process_chunk(share, len(rounds) + 1), shares))
+    return TagsSpeed(by_tags, len(tags) * size / (time.perf_counter() - started_s))
+
+
+def _process_chunk(tags: list[Tag], chunk: int) -> None:
+    for tag in tags:
+        tag(chunk)

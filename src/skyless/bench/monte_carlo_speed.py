@@ -1,4 +1,4 @@
-"""How fast the Monte Carlo of ``monte_carlo`` is, beside a plain NumPy loop over draws of the same chain."""
+"""How fast ``paper/monte_carlo.py`` is, compared with a plain NumPy loop over draws of the same chain."""
 
 import time
 from collections.abc import Callable
@@ -11,13 +11,11 @@ from numpy.random import Generator
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Array
 from skyless.kernels.compiled import cores
-from skyless.paper.chain_draws import QUANTITIES
-from skyless.paper.monte_carlo import draw_moments, gpu_available
+from skyless.paper.monte_carlo import Quantity, draw_moments
 from skyless.uncertainty.chain import Chain
 
-GPU_DRAWS_PER_CPU_DRAW: Final = 100
-ROUNDS: Final = 3
-"""Each is measured so often in turn, and its best counts: other work on the machine only ever takes away."""
+_ROUNDS: Final = 3
+"""Measurements of each in turn; the best counts, as other work on the machine only slows down."""
 
 
 class MonteCarloSpeed(Struct, frozen=True):
@@ -28,8 +26,6 @@ class MonteCarloSpeed(Struct, frozen=True):
     one_core_draws_per_s: float
     all_cores_draws_per_s: float
     cores: int
-    gpu_draws_per_s: float | None
-    """None where there is no CUDA device."""
     ratio: float
 
 
@@ -65,7 +61,7 @@ def numpy_loop(chain: Chain, draws: int, generator: Generator) -> tuple[Array, A
     """
     n = len(chain.anchor_rate)
     ideal = numpy_draw(chain, np.zeros((4 + 6 * n,)))
-    total, squares = np.zeros((QUANTITIES, n)), np.zeros((QUANTITIES, n))
+    total, squares = np.zeros((len(Quantity), n)), np.zeros((len(Quantity), n))
     for _ in range(draws):
         error = numpy_draw(chain, generator.standard_normal(4 + 6 * n)) - ideal
         total += error
@@ -101,20 +97,16 @@ def numpy_draw(chain: Chain, noise: Array) -> Array:
 
 
 def measure(draws: int, anchors: int = 10) -> MonteCarloSpeed:
-    """Measure side by side; the NumPy loop takes a hundredth of ``draws``, and all is compiled before."""
+    """Measure both; the NumPy loop makes a hundredth of ``draws``, and all is compiled before."""
     chain = bench_chain(anchors)
     draw_moments(chain, 1, 2)
     loops, ones, boths = [], [], []
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         loops.append(_rate(max(draws // 100, 100), lambda n: numpy_loop(chain, n, np.random.default_rng(1))))
         ones.append(_rate(draws, lambda n: draw_moments(chain, 1, n, threads=1)))
         boths.append(_rate(draws, lambda n: draw_moments(chain, 1, n)))
-    on_gpu = None
-    if gpu_available():
-        draw_moments(chain, 1, 2, gpu=True)
-        on_gpu = _rate(draws * GPU_DRAWS_PER_CPU_DRAW, lambda n: draw_moments(chain, 1, n, gpu=True))
     loop, one = max(loops), max(ones)
-    return MonteCarloSpeed(anchors, loop, one, max(boths), cores(), on_gpu, one / loop)
+    return MonteCarloSpeed(anchors, loop, one, max(boths), cores(), one / loop)
 
 
 def _rate(draws: int, run: Callable[[int], object]) -> float:

@@ -1,4 +1,4 @@
-"""What ``skyless bench`` lets the filters hear: seven nodes in the lab's room and a tag that stands still."""
+"""The messages of ``skyless bench``: seven nodes in the lab's room and a tag at rest."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, Final
@@ -6,48 +6,52 @@ from typing import Any, Final
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.bench.reference_filters import FilterpyJoint, PlainJoint
-from skyless.bench.reference_loop import joint_filter
+from skyless.bench.baselines import FilterpyJoint, PlainJoint, joint_filter
 from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.kernels.arrays import Array, Integers
 from skyless.positioning.estimator.estimator import Estimator, Packets
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.studies.episodes import Case, draw_episode, settings_of
 
 Run = Callable[[], object]
 """Prepared before a clock starts, called once while it runs."""
 
-NODES: Final = 7
-SLOT_S: Final = 2.1e-3
-NOISE_M: Final = 100e-12 * SPEED_OF_LIGHT_MPS
-_ANGLES: Final = 2.0 * np.pi * np.arange(NODES) / NODES
-ANCHORS_M: Final = np.column_stack([3.0 + 4.0 * np.cos(_ANGLES), 4.0 + 5.0 * np.sin(_ANGLES), np.zeros(NODES)])
-RANGE_ERRORS: Final = ("survey_std_m", "range_std_m", "slope_std_m", "place_std_m")
+BENCH_NODES: Final = 7
+BENCH_SLOT_S: Final = 2.1e-3
+_NOISE_M: Final = 100e-12 * SPEED_OF_LIGHT_MPS
+_ANGLES: Final = 2.0 * np.pi * np.arange(BENCH_NODES) / BENCH_NODES
+BENCH_ANCHORS_M: Final = np.column_stack(
+    [3.0 + 4.0 * np.cos(_ANGLES), 4.0 + 5.0 * np.sin(_ANGLES), np.zeros(BENCH_NODES)]
+)
+_RANGE_ERRORS: Final = ("survey_std_m", "range_std_m", "slope_std_m", "place_std_m")
 START_VARIANCES: Final = (0.09, 0.16)
 """Of a position and of a speed."""
 
 
 class JointRuns:
-    """The same messages for ``joint``, plain NumPy and filterpy; a loop of 18 states beside them."""
+    """The same messages for ``joint``, plain NumPy and filterpy; a loop of 18 states as well."""
 
     def __init__(self, superframes: int, *, mesh: bool, exact: bool = True) -> None:
-        """``exact``: whether the filter takes survey and ranges for exact, else it estimates their errors as well."""
+        """``exact``: whether the filter assumes exact survey and ranges; else it estimates their errors as well."""
         case = Case(mesh=mesh, qa=0.0)
-        episode = draw_episode(np.random.default_rng(1), ANCHORS_M, SLOT_S, case, superframes)
+        episode = draw_episode(np.random.default_rng(1), BENCH_ANCHORS_M, BENCH_SLOT_S, case, superframes)
         self.packets, self.tag_m = episode.packets, episode.path_m[0]
         self.count = len(self.packets.anchors)
-        ranges_m, draw = np.linalg.norm(ANCHORS_M[self.packets.anchors] - self.tag_m, axis=1), np.random.default_rng(2)
-        self.pseudoranges_m: Array = ranges_m + draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
+        ranges_m, draw = (
+            np.linalg.norm(BENCH_ANCHORS_M[self.packets.anchors] - self.tag_m, axis=1),
+            np.random.default_rng(2),
+        )
+        self.pseudoranges_m: Array = ranges_m + draw.normal(0.0, 2.0**0.5 * _NOISE_M, self.count)
         """What a tag with a perfect clock would measure."""
-        self._sync_m = draw.normal(0.0, 2.0**0.5 * NOISE_M, self.count)
+        self._sync_m = draw.normal(0.0, 2.0**0.5 * _NOISE_M, self.count)
         self.settings = settings_of(Case(mesh=mesh), height_m=0.0)
         if not exact:
             usual = EstimatorSettings()
-            self.settings = replace(self.settings, **{name: getattr(usual, name) for name in RANGE_ERRORS})
+            self.settings = replace(self.settings, **{name: getattr(usual, name) for name in _RANGE_ERRORS})
 
-    def begun(self) -> Estimator:
+    def new_estimator(self) -> Estimator:
         """A filter that begins where the tag stands, without any anchor in view."""
-        estimator = Estimator(self.settings, ANCHORS_M)
+        estimator = Estimator(self.settings, BENCH_ANCHORS_M)
         position, speed = START_VARIANCES
         estimator.start(int(self.packets.rx_ticks[0]), self.tag_m[:2], position * np.eye(2), speed)
         return estimator
@@ -61,15 +65,15 @@ class JointRuns:
 
     def kernel(self) -> Run:
         """All messages through the kernel."""
-        estimator = self.begun()
+        estimator = self.new_estimator()
         return lambda: estimator.track(self.packets)
 
     def plain(self, count: int, kind: type[PlainJoint] = PlainJoint) -> Run:
         """The first messages through plain NumPy or filterpy."""
         p = self.packets
-        joint = kind(self.settings, ANCHORS_M, int(p.rx_ticks[0]), self.tag_m[:2], START_VARIANCES)
+        joint = kind(self.settings, BENCH_ANCHORS_M, int(p.rx_ticks[0]), self.tag_m[:2], START_VARIANCES)
         rows = list(packets_of(p, count))
-        return lambda: _each(lambda row: joint.hear(*row), rows)
+        return lambda: _each(lambda row: joint.process(*row), rows)
 
     def filterpy(self, count: int) -> Run:
         """The first messages through filterpy."""
@@ -80,12 +84,12 @@ class JointRuns:
         measured = (self.pseudoranges_m, self._sync_m)
         x, P = np.zeros(18), np.eye(18)
         x[:2] = self.tag_m[:2]
-        steps, noise = np.full(self.count, SLOT_S), np.array([self.settings.qa, 3.6e-5, 0.09])
-        return lambda: joint_filter(x, P, ANCHORS_M, self.packets.anchors, steps, *measured, 2e-3, noise)
+        steps, noise = np.full(self.count, BENCH_SLOT_S), np.array([self.settings.qa, 3.6e-5, 0.09])
+        return lambda: joint_filter(x, P, BENCH_ANCHORS_M, self.packets.anchors, steps, *measured, 2e-3, noise)
 
 
 def packets_of(packets: Packets, count: int) -> Iterable[tuple[int, int, int, int, Integers]]:
-    """The first packets as ``Estimator.process`` takes them."""
+    """The first packets as arguments of ``Estimator.process``."""
     begin = 0
     for k, end in enumerate(packets.ends[:count].tolist()):
         yield (
@@ -98,6 +102,6 @@ def packets_of(packets: Packets, count: int) -> Iterable[tuple[int, int, int, in
         begin = end
 
 
-def _each(take: Callable[[Any], object], rows: Iterable[Any]) -> None:
+def _each(process: Callable[[Any], object], rows: Iterable[Any]) -> None:
     for row in rows:
-        take(row)
+        process(row)

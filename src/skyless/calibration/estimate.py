@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.kernels.arrays import Array, Integers, Mask, Vector
-from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
 
 # The robust regression behind a calibration: constants of anchors, and a slope, from differences at known positions.
 

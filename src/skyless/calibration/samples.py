@@ -204,7 +204,7 @@ def tdoas_of(recording: Recording, anchors_m: Mapping[int, Point]) -> Iterator[P
     for record in recording:
         if isinstance(record, Packet):
             assert engine is not None
-            yield from engine.hear(record)
+            yield from engine.on_packet(record)
         else:
             yield record
 

@@ -1,4 +1,4 @@
-"""``skyless bench``: how fast the heavy parts run here."""
+"""``skyless bench``: how fast filters and Monte Carlo draws run on this machine."""
 
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from skyless.bench.measure import Speed
     from skyless.bench.monte_carlo_speed import MonteCarloSpeed
 
-QUICK_DRAWS: Final = 100_000
+_QUICK_DRAWS: Final = 100_000
 
 app = App(name="bench", help_epilogue="Example: skyless bench --json")
 
@@ -22,9 +22,9 @@ def bench(
     quick: bool = False,
     json: bool = False,
 ) -> None:
-    """Measure filters and Monte Carlo draws beside plain NumPy, filterpy, scipy and plain compiled loops.
+    """Measure filters and Monte Carlo draws next to plain NumPy, filterpy, scipy and plain compiled loops.
 
-    The filters' figures are medians of several short runs on one core, by the time that the core gave them.
+    The filters' figures are medians of several short runs on one core, in CPU time.
 
     Parameters
     ----------
@@ -33,18 +33,18 @@ def bench(
     anchors
         Anchors in each draw.
     quick
-        A look in a few seconds, with fewer and shorter runs and at most a tenth of a million draws.
+        A few seconds only, with fewer and shorter runs and at most a tenth of a million draws.
     json
         Write one JSON object instead of a table.
     """
-    from skyless.bench.measure import FULL, QUICK, measure_all
+    from skyless.bench.measure import FULL_EFFORT, QUICK_EFFORT, measure_all
     from skyless.bench.monte_carlo_speed import measure
     from skyless.cli.common.output import print_json
     from skyless.cli.common.progress import status
 
-    draws = min(draws, QUICK_DRAWS) if quick else draws
+    draws = min(draws, _QUICK_DRAWS) if quick else draws
     with status("filters"):
-        speed = measure_all(QUICK if quick else FULL)
+        speed = measure_all(QUICK_EFFORT if quick else FULL_EFFORT)
     with status(f"{draws:,} draws of {anchors} anchors"):
         chain = measure(draws, anchors)
     if json:
@@ -52,10 +52,10 @@ def bench(
 
         print_json({**asdict(speed), "monte_carlo": chain})
         return
-    _tell(speed, chain)
+    _print_table(speed, chain)
 
 
-def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
+def _print_table(speed: "Speed", chain: "MonteCarloSpeed") -> None:
     from skyless.cli.common.output import console
 
     out = console()
@@ -87,8 +87,7 @@ def _tell(speed: "Speed", chain: "MonteCarloSpeed") -> None:
         ("NumPy loop, one core", chain.numpy_loop_draws_per_s),
         ("compiled, one core", chain.one_core_draws_per_s),
         (f"compiled, {chain.cores} cores", chain.all_cores_draws_per_s),
-        ("GPU", chain.gpu_draws_per_s),
     ]
     for name, rate in rows:
-        out.print(f"{name:<24}" + (f"{rate:>14,.0f} draws/s" if rate is not None else f"{'none here':>14}"))
+        out.print(f"{name:<24}{rate:>14,.0f} draws/s")
     out.print(f"compiled over NumPy loop, one core: {chain.ratio:.1f} times")

@@ -1,20 +1,23 @@
 """``skyless calibrate``: the anchors' antenna delays from a recording during which it was known where the tag was."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 from cyclopts import App
 
-from skyless.cli.calibrate_output import report_of, see_that_it_can_be_written, show, write
-from skyless.cli.common.options import Finite, finite_numbers, spare_inputs
-from skyless.cli.common.output import print_json
+from skyless.cli.common.options import Finite, check_left_out, check_output, finite_numbers, options
+from skyless.cli.common.output import console, number, print_json, write_file
 from skyless.cli.common.progress import status
-from skyless.cli.replay_input import flight_height, known_anchors, known_truth
-from skyless.cli.replay_site import is_mcap, see_that_they_are_left_out
+from skyless.cli.common.recording_inputs import flight_height, is_mcap, known_anchors, known_truth
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
+    from skyless.calibration.estimate import CalibrationEstimate
+    from skyless.calibration.run import Calibrated
     from skyless.calibration.samples import First, Stay
+
+_MANY_OUTLIERS: Final = 0.05
+_UNEXPLAINED_SHARE: Final = 0.5
 
 app = App(
     name="calibrate",
@@ -22,95 +25,106 @@ app = App(
 )
 
 
-@app.default
-def calibrate(
-    file: Path,
-    /,
-    *,
-    anchors: Path | None = None,
-    site: Path | None = None,
-    truth: Path | None = None,
-    lever_arm: str | None = None,
-    at: list[str] | None = None,
-    first: str | None = None,
-    above: Finite | None = None,
-    format: str | None = None,  # noqa: A002 - the option's natural name
-    listener: str | None = None,
-    tag: str | None = None,
-    out: Path | None = None,
-    force: bool = False,
-    json: bool = False,
-) -> None:
-    """Estimate what each anchor's signals seem late by, from a tag whose place was known, and write it back.
+@options
+class CalibrateOptions:
+    """Options of ``skyless calibrate``."""
 
-    Takes what skyless replay takes. Of a recording of skyless record the antenna delays of the site file are mended;
+    anchors: Path | None = None
+    """Table of anchors: id,x_m,y_m,z_m."""
+    site: Path | None = None
+    """A site file instead. Of a recording of skyless record: the file whose antenna delays are to be corrected."""
+    truth: Path | None = None
+    """Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns; t_s in the recording's time, in
+    Unix time for a recording of skyless record. MILUV ticks and simulated sites bring their own."""
+    lever_arm: str | None = None
+    """The antenna in the body's frame, x,y,z in metres, added to the truth."""
+    at: list[str] | None = None
+    """Where the tag stood still instead: x,y,z in metres, or x,y where the site knows its tags' height; with
+    @FROM:TO in seconds since the beginning. Several times for several positions."""
+    first: str | None = None
+    """Use the beginning only: a number of differences (30), seconds (60s) or a part of the time (50%)."""
+    above: Finite | None = None
+    """Use the truth only while its height exceeds this; by default 0.3 m for a truth that starts below it and later
+    flies."""
+    format: str | None = None
+    """Name of the format, if the content should not decide."""
+    listener: str | None = None
+    """Which receiver, in recordings with several."""
+    tag: str | None = None
+    """Name of the tag, in recordings of skyless record; by default all whose truth is known."""
+    out: Path | None = None
+    """Write the calibrated table of anchors (.csv) or site file (.toml) here."""
+    force: bool = False
+    """Overwrite --out if it exists."""
+    json: bool = False
+    """Write one JSON object instead of the table."""
+
+
+@app.default
+def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) -> None:
+    """Estimate what each anchor's signals seem late by, from a tag whose position was known, and write it back.
+
+    Takes what skyless replay takes. Of a recording of skyless record the antenna delays of the site file are corrected;
     of any other the table of anchors gets a column bias_m, which skyless replay then takes off.
 
     Parameters
     ----------
     file
         The recording, plain or gzip.
-    anchors
-        Table of anchors: id,x_m,y_m,z_m.
-    site
-        A site file instead. Of a recording of skyless record: the file whose antenna delays are to be mended.
-    truth
-        Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns; t_s in the recording's time, in
-        Unix time for a recording of skyless record. MILUV ticks and simulated sites bring their own.
-    lever_arm
-        The antenna in the body's frame, x,y,z in metres, added to the truth.
-    at
-        Where the tag stood still instead: x,y,z in metres, or x,y where the site knows its tags' height; with
-        @FROM:TO in seconds since the beginning. Several times for several places.
-    first
-        Use the beginning only: a number of differences (30), seconds (60s) or a part of the time (50%).
-    above
-        Use the truth only while its height exceeds this; by default 0.3 m for a truth that starts below it and later
-        flies.
-    format
-        Name of the format, if the content should not decide.
-    listener
-        Whose ears, in recordings with several listeners.
-    tag
-        Name of the tag, in recordings of skyless record; by default all whose truth is known.
-    out
-        Write the calibrated table of anchors (.csv) or site file (.toml) here.
-    force
-        Overwrite --out if it exists.
-    json
-        Write one JSON object instead of the table.
     """
     from skyless.calibration.run import CalibrationRequest, calibrate_capture, calibrate_site
 
-    spare_inputs("out", out, file, truth)
+    check_output("out", asked.out, file, asked.truth)
     own = is_mcap(file)
-    see_that_it_can_be_written(out, own=own, site=site, force=force)
-    if at and (truth is not None or lever_arm is not None):
+    _check_out(asked, own=own)
+    if asked.at and (asked.truth is not None or asked.lever_arm is not None):
         raise SkylessError("--at says where the antenna was; it should be given without --truth and --lever-arm")
-    stays, beginning = tuple(map(_stay, at or ())), _first(first)
+    stays, beginning = tuple(map(_stay, asked.at or ())), _first(asked.first)
     if own:
-        useless = {"--anchors": anchors, "--format": format, "--listener": listener}
-        see_that_they_are_left_out(useless, "a recording of skyless record brings its own")
+        useless = {"anchors": asked.anchors, "format": asked.format, "listener": asked.listener}
+        check_left_out(useless, "a recording of skyless record brings its own")
     else:
-        see_that_they_are_left_out({"--tag": tag}, "it is for recordings of skyless record")
-    known = None if at or (own and truth is None) else known_truth(file, truth, lever_arm, format, listener)
+        check_left_out({"tag": asked.tag}, "it is for recordings of skyless record")
+    known = None
+    if not asked.at and not (own and asked.truth is None):
+        known = known_truth(file, asked.truth, asked.lever_arm, asked.format, asked.listener)
     with status("calibrating"):
         if own:
-            done = calibrate_site(
-                CalibrationRequest(file, stays, known, above, beginning, tag=tag), _identifier_of(site)
-            )
+            request = CalibrationRequest(file, stays, known, asked.above, beginning, tag=asked.tag)
+            done = calibrate_site(request, _identifier_of(asked.site))
         else:
-            places, height_m = known_anchors(anchors, site)
-            above_m = flight_height(above, known)
+            anchors_m, height_m = known_anchors(asked.anchors, asked.site)
+            above_m = flight_height(asked.above, known)
             done = calibrate_capture(
-                CalibrationRequest(file, stays, known, above_m, beginning, places, height_m, format, listener)
+                CalibrationRequest(
+                    file, stays, known, above_m, beginning, anchors_m, height_m, asked.format, asked.listener
+                )
             )
-    if out is not None:
-        write(done, anchors, site, out)
-    if json:
-        print_json(report_of(done, out))
+    if asked.out is not None:
+        _write(done, asked.anchors, asked.site, asked.out)
+    if asked.json:
+        print_json(_report(done, asked.out))
     else:
-        show(done, out)
+        _show(done, asked.out)
+
+
+def _check_out(asked: CalibrateOptions, *, own: bool) -> None:
+    """See that --out can be written, before the long work instead of after it. Raises SkylessError."""
+    out = asked.out
+    if out is None:
+        return
+    if own and (out.suffix.lower() != ".toml" or asked.site is None):
+        raise SkylessError(
+            f"--out is {str(out)!r}; of a recording of skyless record the site file is corrected: --out should be a "
+            ".toml, and --site the file to start from"
+        )
+    if not own and out.suffix.lower() == ".toml":
+        raise SkylessError(
+            f"--out is {str(out)!r}; it should be a table, .csv: a site file holds antenna delays, which only a "
+            "recording of skyless record can correct"
+        )
+    if out.exists() and not asked.force:
+        raise SkylessError(f"{out} exists; --force overwrites it")
 
 
 def _identifier_of(site: Path | None) -> int | None:
@@ -120,11 +134,11 @@ def _identifier_of(site: Path | None) -> int | None:
 
 
 def _stay(text: str) -> "Stay":
-    """Place of a tag at rest: x,y[,z][@FROM:TO]. Raises SkylessError."""
+    """Position of a tag at rest: x,y[,z][@FROM:TO]. Raises SkylessError."""
     from skyless.calibration.samples import Stay
 
-    place, mark, span = text.partition("@")
-    x_m, y_m, *z_m = finite_numbers("at", place, (2, 3))
+    position, mark, span = text.partition("@")
+    x_m, y_m, *z_m = finite_numbers("at", position, (2, 3))
     if not mark:
         return Stay(x_m, y_m, *z_m)
     from_s, to_s = finite_numbers("at", span, (2,), ":")
@@ -139,10 +153,10 @@ def _first(text: str | None) -> "First":
 
     if text is None:
         return First()
-    number = text.rstrip("s%")
-    unit = text[len(number) :]
+    digits = text.rstrip("s%")
+    unit = text[len(digits) :]
     try:
-        value = float(number)
+        value = float(digits)
     except ValueError:
         value = 0.0
     if 0.0 < value < 1e12:
@@ -153,3 +167,83 @@ def _first(text: str | None) -> "First":
         if unit == "" and value == int(value):
             return First(count=int(value))
     raise SkylessError(f"--first is {text!r}; it should be a number of differences, seconds (60s) or a part (50%)")
+
+
+def _write(done: "Calibrated", anchors: Path | None, site: Path | None, out: Path) -> None:
+    """Write the table or site file with the calibration in it. Raises SkylessError."""
+    if site is not None and done.site is not None:
+        from skyless.site.rewrite import with_tx_delays
+
+        delays_ticks = {anchor: new for anchor, (_, new) in done.tx_delays_ticks().items()}
+        text = with_tx_delays(site.read_bytes().decode(), delays_ticks, site)
+    else:
+        from skyless.recordings.anchor_table import calibrated_table, new_table
+
+        known = done.estimate.calibration()
+        text = new_table(done.samples.anchors_m, known) if anchors is None else calibrated_table(anchors, known)
+    write_file(out, text.encode())
+
+
+def _report(done: "Calibrated", out: Path | None) -> dict[str, Any]:
+    """The report as one object."""
+    import msgspec
+
+    return {
+        "format": done.format,
+        **msgspec.to_builtins(done.estimate),
+        "tx_antenna_delay_ticks": {str(anchor): new for anchor, (_, new) in done.tx_delays_ticks().items()},
+        "drops": done.samples.drops,
+        "notes": _notes(done.estimate),
+        "written": out,
+    }
+
+
+def _show(done: "Calibrated", out: Path | None) -> None:
+    """Show the report as a table."""
+    from rich.table import Table
+
+    found, delays = done.estimate, done.tx_delays_ticks()
+    names = [
+        "anchor",
+        "bias / m",
+        "std error / m",
+        "noise / m",
+        "differences",
+        *(["TX delay / ticks"] if delays else []),
+    ]
+    table = Table(title=f"{done.format}: {found.used} differences used, {found.rejected} outliers")
+    for name in names:
+        table.add_column(name, justify="right")
+    for anchor in found.anchors:
+        old, new = delays.get(anchor.anchor, (0, 0))
+        fields = [number(value) for value in (anchor.bias_m, anchor.std_m, anchor.noise_m)]
+        change = [f"{old} → {new}" if anchor.anchor in delays else "–"] if delays else []
+        table.add_row(str(anchor.anchor), *fields, str(anchor.count), *change)
+    screen = console()
+    screen.print(table)
+    zero = "the mean of the constants" if found.zero == "mean" else f"{found.zero}, the master"
+    screen.print(f"only differences can be seen; the zero is {zero}")
+    screen.print(f"noise of a difference: {number(found.noise_before_m)} m before, {number(found.noise_m)} m after")
+    if found.slope_m is not None:
+        slope = f"{found.slope_m:.3f} ± {number(found.slope_std_m)} m while the range grows by the factor e"
+        screen.print(f"range bias (received power): {slope}")
+    for note in _notes(found):
+        screen.print(f"note: {note}", markup=False)
+    for reason, count in done.samples.drops.items():
+        screen.print(f"left out: {count} × {reason}")
+    if out is not None:
+        screen.print(f"wrote {out}", markup=False)
+
+
+def _notes(found: "CalibrationEstimate") -> list[str]:
+    """What the user should know."""
+    notes = [f"anchor {one.anchor} is not determined: {one.reason}" for one in found.anchors if one.reason]
+    if found.rejected > _MANY_OUTLIERS * (found.used + found.rejected):
+        part = found.rejected / (found.used + found.rejected)
+        notes.append(f"{part:.0%} of the differences are outliers: calibrate where every anchor is in sight")
+    if (found.loop_m or 0.0) > _UNEXPLAINED_SHARE * (found.noise_m or 0.0):
+        notes.append(
+            f"pairs of anchors remain {found.loop_m:.3f} m off, which no constants explain: something may stand "
+            "between anchors or in the tag's way"
+        )
+    return notes

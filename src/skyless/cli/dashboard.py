@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
-from cyclopts.validators import Number
 
 from skyless.cli.common.output import print_json
-from skyless.cli.nodes.options import DEFAULT_MQTT, Mqtt, MqttCa, listen_address, site_named
+from skyless.cli.nodes.options import MqttOptions, SiteId, listen_address, site_named
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -25,10 +24,9 @@ app = App(name="dashboard", help_epilogue="Example: skyless dashboard --mqtt mqt
 @app.default
 def dashboard(
     *,
-    mqtt: Mqtt = DEFAULT_MQTT,
-    mqtt_ca: MqttCa = None,
+    broker: MqttOptions = MqttOptions(),
     site: str | None = None,
-    site_id: Annotated[int, Parameter(validator=Number(gte=0, lt=0xFFFE))] | None = None,
+    site_id: SiteId | None = None,
     listen: str | None = None,
     recordings: Path | None = None,
     token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_TOKEN")] = None,
@@ -36,25 +34,25 @@ def dashboard(
 ) -> None:
     """Show a site live in the browser; Ctrl-C stops.
 
-    Whoever opens the page may draw zones. On this machine only, it asks for no token; to other machines it speaks plain
-    HTTP, so use it in networks that you trust or behind a proxy with TLS.
+    Anyone who opens the page may draw zones. On this machine only, it asks for no token; to other machines it serves
+    plain HTTP, so use it in networks that you trust or behind a proxy with TLS.
 
     Parameters
     ----------
-    mqtt
-        The broker, mqtt://HOST[:PORT] or mqtts://[USER@]HOST[:PORT]; the password stands in SKYLESS_MQTT_PASSWORD.
-    mqtt_ca
+    broker.mqtt
+        The broker, mqtt://HOST[:PORT] or mqtts://[USER@]HOST[:PORT]; the password is taken from SKYLESS_MQTT_PASSWORD.
+    broker.mqtt_ca
         Certificates to trust instead of the system's, a PEM file.
     site
-        The site file, or lab; by default what the broker has retained, which counts more than this.
+        The site file, or lab; by default the one that the broker has retained, which comes before this.
     site_id
-        Number of the site; by default the first that the broker knows.
+        Number of the site; by default the first that the broker has.
     listen
-        Where the page stands, HOST:PORT; by default 127.0.0.1:8080, or the next free port.
+        Address of the page, HOST:PORT; by default 127.0.0.1:8080, or the next free port.
     recordings
         Folder of recordings to replay.
     token
-        What pages must know; made and printed where other machines can reach the page and none is given.
+        Token that browsers must give; made and printed where other machines can reach the page and none is given.
     json
         Write the page's address as one JSON object instead of a table.
     """
@@ -67,32 +65,32 @@ def dashboard(
     from skyless.dashboard.serve import bind, serve
     from skyless.mqtt.address import mqtt_address
 
-    broker = mqtt_address(mqtt, mqtt_ca)
-    broker.tls_context()
+    address = mqtt_address(broker.mqtt, broker.mqtt_ca)
+    address.tls_context()
     known, image = (None, None) if site is None else _load(site)
     if known is not None and site_id is not None and known.site.id != site_id:
         raise SkylessError(f"--site-id is {site_id}, but {site} is of site {known.site.id}; give one of them")
     if recordings is not None and not recordings.is_dir():
         raise SkylessError(f"--recordings is {str(recordings)!r}; it should be a folder")
-    place = _place(listen)
-    sock = bind(place)
+    listening = _listening(listen)
+    sock = bind(listening)
     port = sock.getsockname()[1]
-    rules = _rules(sock.getsockname()[0], place.host, port, token)
-    live = LiveSite(_name(port), str(broker), known)
+    rules = _rules(sock.getsockname()[0], listening.host, port, token)
+    live = LiveSite(_client_name(port), str(address), known)
     live.floor_plan = image
-    page = _address(place.host, port, rules)
+    page = _address(listening.host, port, rules)
     if json:
-        print_json({"page": page, "mqtt": str(broker), "token": rules.token})
+        print_json({"page": page, "mqtt": str(address), "token": rules.token})
         sys.stdout.flush()
     else:
-        print(f"page    {page}\nbroker  {broker}", flush=True)
+        print(f"page    {page}\nbroker  {address}", flush=True)
     services = Services(live, Overlays(), Playback(recordings))
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(serve(services, rules, sock, broker, known.site.id if known is not None else site_id))
+        asyncio.run(serve(services, rules, sock, address, known.site.id if known is not None else site_id))
 
 
-def _name(port: int) -> str:
-    """The dashboard's on MQTT: the same after a restart, so that no old ones pile up there."""
+def _client_name(port: int) -> str:
+    """The dashboard's client name on MQTT: the same after a restart, so that no old sessions accumulate."""
     import re
     import socket
 
@@ -110,7 +108,7 @@ def _load(name: str) -> "tuple[SiteMessage, bytes | None]":
     return SiteMessage(site, simulated=False, unix_s=time.time()), image
 
 
-def _place(listen: str | None) -> "ListenAddress":
+def _listening(listen: str | None) -> "ListenAddress":
     """Where to listen. Raises SkylessError."""
     from skyless.dashboard.serve import PORT, ListenAddress
 
@@ -120,7 +118,7 @@ def _place(listen: str | None) -> "ListenAddress":
 
 
 def _rules(bound: str, host: str, port: int, token: str | None) -> "AccessRules":
-    """Who may come, by the address that the socket is bound to. Raises SkylessError."""
+    """Who may connect, by the address that the socket is bound to. Raises SkylessError."""
     import ipaddress
     import secrets
     import socket

@@ -4,17 +4,23 @@ import os
 import sys
 from collections.abc import Sequence
 from io import TextIOWrapper
+from typing import TYPE_CHECKING
 
 from cyclopts import App, CycloptsError, Parameter
+from cyclopts.help import DefaultFormatter
 
 from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from cyclopts.help import HelpPanel
+    from rich.console import Console, ConsoleOptions
 
 _COMMANDS = (
     # name, module below skyless.cli (imported only when it is called), what it does
     ("demo", "nodes.demo", "Show a site and walking tags in real time."),
     ("simulate", "simulate", "Run a site in the simulated world and judge it against the truth."),
     ("replay", "replay", "Turn a recording into fixes and judge them against the truth."),
-    ("calibrate", "calibrate", "Find wrong antenna delays from a tag whose place is known."),
+    ("calibrate", "calibrate", "Find wrong antenna delays from a tag whose position is known."),
     ("paper", "paper", "Reproduce the paper's figures and claims in one report."),
     ("study", "study", "Measure the receiver's errors over many simulated runs."),
     ("plan", "plan", "Predict a site's errors before it is mounted, and place its anchors."),
@@ -42,6 +48,19 @@ _BROKEN_PIPE = 1
 _USER_ERROR = 2
 
 
+class _Help(DefaultFormatter):
+    """Cyclopts's own format; line breaks of the source within a help text become spaces."""
+
+    def __call__(self, console: "Console", options: "ConsoleOptions", panel: "HelpPanel") -> None:
+        from rich.text import Text
+
+        for entry in panel.entries:
+            text = getattr(entry.description, "primary_renderable", None)
+            if isinstance(text, Text):
+                text.plain = " ".join(text.plain.split())
+        super().__call__(console, options, panel)
+
+
 def program() -> App:
     """The program with all its commands, none of them imported yet."""
     app = App(
@@ -49,6 +68,7 @@ def program() -> App:
         help="GPS without a sky: fixed UWB anchors broadcast, tags only listen and compute their own position.",
         help_epilogue="Example: skyless site new site.toml && skyless site check site.toml",
         help_format="plaintext",
+        help_formatter=_Help(),
         version=_version,
         print_error=False,
         exit_on_error=False,
@@ -61,7 +81,7 @@ def program() -> App:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit code: 0, 2 for a fault of the user's, 130 after Ctrl-C.
+    """Run one command and return the exit code: 0, 2 for a user's error, 130 after Ctrl-C.
 
     A command's own exit code is what it returns, None meaning 0.
     """

@@ -3,13 +3,13 @@
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import App, Parameter
-from cyclopts.validators import Number
+from cyclopts import App
 
-from skyless.cli.common.output import console, print_json
-from skyless.cli.common.progress import progress_bar, status
+from skyless.cli.common.options import Seed
+from skyless.cli.common.output import console, json_form, print_json
+from skyless.cli.common.progress import loading_kernels, progress_bar
 
 if TYPE_CHECKING:
     from skyless.paper.run import Report
@@ -21,11 +21,11 @@ app = App(name="paper", help_epilogue="Example: skyless paper --out report --see
 def paper(
     *,
     out: Path,
-    seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
+    seed: Seed = 1,
     quick: bool = False,
     json: bool = False,
 ) -> None:
-    """Reproduce every figure and claim of the paper, and say which hold.
+    """Reproduce every figure and claim of the paper, and judge which hold.
 
     Writes report.html, which needs no other file, every picture as PNG and SVG, and numbers.json. The full report takes
     some minutes on two cores.
@@ -46,7 +46,7 @@ def paper(
     from skyless.paper.run import write_report
 
     started_s = time.perf_counter()
-    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
+    with loading_kernels():
         compile_kernels()
     try:
         with progress_bar("simulating the paper", 1.0) as bar:
@@ -57,17 +57,12 @@ def paper(
     if json:
         import msgspec
 
-        print_json({**msgspec.to_builtins(report, enc_hook=_array), "wall_s": time.perf_counter() - started_s})
+        print_json({**msgspec.to_builtins(report, enc_hook=json_form), "wall_s": time.perf_counter() - started_s})
     else:
-        show(report)
+        _show(report)
 
 
-def _array(value: object) -> object:
-    """NumPy's scalars and arrays; the JSON writer knows what to do with the rest."""
-    return value.tolist() if hasattr(value, "tolist") else value
-
-
-def show(report: "Report") -> None:
+def _show(report: "Report") -> None:
     """Show the verdicts as a table."""
     from rich.table import Table
 
@@ -75,4 +70,4 @@ def show(report: "Report") -> None:
     for number, section in enumerate(report.sections, start=1):
         table.add_row(str(number), str(section["title"]), str(section["verdict"]))
     console().print(table)
-    console().print(f"{report.report}: {len(report.figures)} pictures and numbers.json beside it")
+    console().print(f"{report.report}: {len(report.figures)} pictures and numbers.json next to it")

@@ -7,147 +7,234 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.common.options import Positive
+from skyless.cli.common.options import Positive, Seed, check_method, check_output, finite_numbers, options
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import progress_bar
-from skyless.cli.plan_files import write_files, write_site
-from skyless.cli.plan_input import (
-    check_count,
-    load_inputs,
-    mounts_of,
-    outline_of,
-    region_of,
-    settings_of,
-    tag_heights_of,
-)
-from skyless.cli.plan_output import report, show
-from skyless.errors import SkylessError
+from skyless.cli.plan_output import report, show, write_files, write_site
+from skyless.errors import ConfigurationError, SkylessError
 from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
-    from skyless.planning.floor import Floor
+    from skyless.kernels.arrays import Matrix
+    from skyless.planning.floor import Box, Floor, Mounts
     from skyless.planning.maps import PlanMap
-    from skyless.planning.mounts import Mounts
     from skyless.planning.optimise import Optimised
     from skyless.planning.predict import PlanSettings, Predictor
     from skyless.planning.verify import Verification
     from skyless.site.model import Site
 
-_Count = Annotated[int, Parameter(validator=Number(gte=1, lte=200))]
-
 app = App(name="plan", help_epilogue="Example: skyless plan hall.toml --method joint --plot hall.png --target 5")
 
 
+@options
+class PlanOptions:
+    """Options of ``skyless plan``."""
+
+    method: str = DEFAULT_METHOD
+    """literal, literal-delayed, weighted, bracketed or joint."""
+    noise_ps: Positive | None = None
+    """Noise of every TX and RX stamp in picoseconds; by default the site's own figures."""
+    qa: Positive = 0.3
+    """Process noise that joint assumes: spectral density of the acceleration, m²/s³."""
+    range_m: Annotated[Positive | None, Parameter(name="--range")] = None
+    """How far a frame carries in the open, metres: half arrive there; by default what the link budget gives (31 m)."""
+    step: Positive | None = None
+    """Spacing of the map's points in metres; by default some ten thousand points."""
+    slices: str | None = None
+    """Heights of the tags, h1,h2,... in metres, for sites that estimate the height (3-D); by default three."""
+    region: str | None = None
+    """Region of interest, x1,y1,x2,y2 in metres; by default the whole floor."""
+    outline: str | None = None
+    """Corners of the floor, "x1,y1 x2,y2 x3,y3 ..." in metres; by default the floor plan, or the box of the anchors."""
+    target: Positive | None = None
+    """Standard deviation to be met, in centimetres."""
+    plot: Path | None = None
+    """Write the map of the predicted error into this PNG, PDF or SVG."""
+    grid: Path | None = None
+    """Write every point's predictions into this .csv or .geojson file."""
+    html: Path | None = None
+    """Write a page with all maps, numbers and warnings into this file; it needs no other file."""
+    optimise: Annotated[int, Parameter(validator=Number(gte=3, lte=60))] | None = None
+    """Replace the site's anchors by this many, placed on the walls where they serve best."""
+    out: Path | None = None
+    """Write the optimised site into this file, which must not exist."""
+    heights: str | None = None
+    """Heights at which anchors may hang, h1,h2,... in metres; by default the lowest and highest of the site's."""
+    mounts: list[str] | None = None
+    """A wall on which anchors may hang, x1,y1,x2,y2 in metres; may be given several times; by default the outline."""
+    seconds: Positive = 60.0
+    """Time after which the search for positions ends in any case."""
+    verify: Annotated[int, Parameter(validator=Number(gte=1, lte=200))] | None = None
+    """Let tags rest at this many random points of the region in the simulated world, and compare."""
+    rounds: Annotated[int, Parameter(validator=Number(gte=100))] = 3000
+    """Superframes that the comparison lasts."""
+    seed: Seed = 1
+    """Same seed, same random points and search."""
+    json: bool = False
+    """Write one JSON object instead of the tables."""
+
+    @property
+    def target_m(self) -> float | None:
+        """The standard deviation to be met in metres."""
+        return None if self.target is None else self.target / 100.0
+
+
 @app.default
-def plan(
-    file: Path,
-    /,
-    *,
-    method: str = DEFAULT_METHOD,
-    noise_ps: Positive | None = None,
-    qa: Positive = 0.3,
-    range_m: Annotated[Positive | None, Parameter(name="--range")] = None,
-    step: Positive | None = None,
-    slices: str | None = None,
-    region: str | None = None,
-    outline: str | None = None,
-    target: Positive | None = None,
-    plot: Path | None = None,
-    grid: Path | None = None,
-    html: Path | None = None,
-    optimise: Annotated[int, Parameter(validator=Number(gte=3, lte=60))] | None = None,
-    out: Path | None = None,
-    heights: str | None = None,
-    mounts: list[str] | None = None,
-    seconds: Positive = 60.0,
-    verify: _Count | None = None,
-    rounds: Annotated[int, Parameter(validator=Number(gte=100))] = 3000,
-    seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
-    json: bool = False,
-) -> None:
+def plan(file: Path, /, *, asked: PlanOptions = PlanOptions()) -> None:
     """Predict the errors that tags at rest will have at a site, and where one more anchor would help.
 
-    With --optimise the anchors are placed anew, and the plan is of that site.
+    With --optimise the anchors are placed from the start, and the plan is of that site.
 
     Parameters
     ----------
     file
         The site file.
-    method
-        literal, literal-delayed, weighted, bracketed or joint.
-    noise_ps
-        Noise of every TX and RX stamp in picoseconds; by default the site's own figures.
-    qa
-        Agility that joint assumes, m²/s³.
-    range_m
-        How far a frame carries in the open, metres: half arrive there; by default what the link budget gives (31 m).
-    step
-        Spacing of the map's points in metres; by default some ten thousand points.
-    slices
-        Heights of the tags, h1,h2,... in metres, for sites that estimate the height (3-D); by default three.
-    region
-        Region of interest, x1,y1,x2,y2 in metres; by default the whole floor.
-    outline
-        Corners of the floor, "x1,y1 x2,y2 x3,y3 ..." in metres; by default the floor plan, or the box of the anchors.
-    target
-        Standard deviation to be met, in centimetres.
-    plot
-        Write the map of the predicted error into this PNG, PDF or SVG.
-    grid
-        Write every point's predictions into this .csv or .geojson file.
-    html
-        Write a page with all maps, numbers and warnings into this file; it needs no other file.
-    optimise
-        Place so many anchors anew, on the walls.
-    out
-        Write the optimised site into this file, which must not exist.
-    heights
-        Heights at which anchors may hang, h1,h2,... in metres; by default the lowest and highest of the site's.
-    mounts
-        A wall on which anchors may hang, x1,y1,x2,y2 in metres; may be given several times; by default the outline.
-    seconds
-        Time after which the search for places ends in any case.
-    verify
-        Let tags rest at so many random points of the region in the simulated world, and compare.
-    rounds
-        Superframes that the comparison lasts.
-    seed
-        Same seed, same random points and search.
-    json
-        Write one JSON object instead of the tables.
     """
     from skyless.planning.floor import floor_of
     from skyless.planning.maps import summary_of
     from skyless.planning.predict import Predictor
 
     started_s = time.perf_counter()
-    outputs = {"plot": plot, "grid": grid, "html": html, "out": out}
-    site = load_inputs(file, outputs)
-    settings = settings_of(method, noise_ps, qa, range_m)
-    if optimise is None:
-        check_count(site, file)
-    if out is not None and optimise is None:
-        raise SkylessError("--out writes an optimised site; --optimise N asks for one")
-    ground = floor_of(site, file, outline_of(outline), region_of(region))
-    tag_heights = tag_heights_of(slices, site)
-    hangers = mounts_of(site, ground, heights, mounts or [])
+    site = _load(file, asked)
+    settings = _settings(asked)
+    if asked.optimise is None:
+        _check_count(site, file)
+        if asked.out is not None:
+            raise SkylessError("--out writes an optimised site; --optimise N asks for one")
+    floor = floor_of(site, file, _outline(asked.outline), _region(asked.region))
+    tag_heights_m = _tag_heights(asked.slices, site)
+    mounts = _mounts(site, floor, asked)
     optimised = None
-    if optimise is not None:
-        optimised = _optimise(site, settings, ground, hangers, tag_heights, (optimise, seed, seconds), target)
+    if asked.optimise is not None:
+        optimised = _optimise(site, settings, floor, mounts, tag_heights_m, asked.optimise, asked)
         site = optimised.best.site
-        if out is not None:
-            write_site(out, site, file)
+        if asked.out is not None:
+            write_site(asked.out, site, file)
     predictor = Predictor(site, settings)
-    mapped = _map(predictor, ground, tag_heights, step)
-    checked = None if verify is None else _verify(predictor, mapped, verify, rounds, seed)
-    summary = summary_of(mapped, None if target is None else target / 100.0)
-    result = report(predictor, ground, hangers, mapped, summary, optimised, checked)
-    write_files(file, predictor, ground, mapped, result, plot, grid, html)
+    mapped = _map(predictor, floor, tag_heights_m, asked.step)
+    checked = None if asked.verify is None else _verify(predictor, mapped, asked.verify, asked)
+    result = report(predictor, floor, mounts, mapped, summary_of(mapped, asked.target_m), optimised, checked)
+    write_files(file, predictor.site, floor, mapped, result, asked.plot, asked.grid, asked.html)
     result["wall_s"] = time.perf_counter() - started_s
-    if json:
+    if asked.json:
         print_json(result)
     else:
         show(file, result)
+
+
+# From files and texts to values
+
+
+def _load(file: Path, asked: PlanOptions) -> "Site":
+    """Read the site and its image, and see that no output is an input or another output. Raises SkylessError."""
+    from skyless.site.load import load_site
+
+    site = load_site(file)
+    image = None if site.floor_plan is None else file.parent / site.floor_plan.image
+    outputs = {"plot": asked.plot, "grid": asked.grid, "html": asked.html, "out": asked.out}
+    for name, path in outputs.items():
+        check_output(name, path, file, image, *(other for key, other in outputs.items() if key != name))
+    if asked.grid is not None and asked.grid.suffix.lower() not in {".csv", ".geojson", ".json"}:
+        raise SkylessError(f"--grid is {str(asked.grid)!r}; it should end with .csv or .geojson")
+    if asked.out is not None and asked.out.exists():
+        raise SkylessError(f"--out is {str(asked.out)!r}, which exists; it should be a new file")
+    if image is not None:
+        _check_image(file, site, image)
+    return site
+
+
+def _check_image(file: Path, site: "Site", image: Path) -> None:
+    """See that the whole image can be read, not only its size."""
+    from matplotlib.image import imread
+
+    try:
+        imread(image)
+    except (OSError, SyntaxError, ValueError) as error:
+        shown = site.floor_plan.image if site.floor_plan else ""
+        right = f"an image that can be read to its end ({' '.join(str(error).split())})"
+        raise ConfigurationError(file, "floor_plan.image", shown, right) from None
+
+
+def _settings(asked: PlanOptions) -> "PlanSettings":
+    """How tags compute, and how far a frame carries. Raises SkylessError."""
+    from skyless.planning.links import with_range
+    from skyless.planning.predict import PlanSettings
+    from skyless.simulation.channel import ChannelModel
+
+    check_method(asked.method)
+    channel = ChannelModel() if asked.range_m is None else with_range(ChannelModel(), asked.range_m)
+    return PlanSettings(asked.method, asked.noise_ps, asked.qa, channel)
+
+
+def _check_count(site: "Site", file: Path) -> None:
+    """See that the site has anchors enough for a position. Raises ConfigurationError."""
+    needed, what = (4, "with its height") if site.tags.height_m is None else (3, "at a known height")
+    if len(site.anchors) < needed:
+        right = f"at least {needed}, which a position {what} needs"
+        raise ConfigurationError(file, "anchors", f"a list of {len(site.anchors)}", right)
+
+
+def _outline(text: str | None) -> "Matrix | None":
+    """Corners of the floor, shape (n, 2) in metres, None if not asked for. Raises SkylessError."""
+    import numpy as np
+
+    if text is None:
+        return None
+    corners = [finite_numbers("outline", part, (2,)) for part in text.replace(";", " ").split()]
+    if len(corners) < 3:
+        raise SkylessError(f"--outline is {text!r}; it should be three or more corners, 'x1,y1 x2,y2 x3,y3'")
+    return np.array(corners)
+
+
+def _region(text: str | None) -> "Box | None":
+    """The region of interest in metres, None if not asked for. Raises SkylessError."""
+    if text is None:
+        return None
+    x1, y1, x2, y2 = finite_numbers("region", text, (4,))
+    if not (x2 > x1 and y2 > y1):
+        raise SkylessError(f"--region is {text!r}; it should be x1,y1,x2,y2 with x1 < x2 and y1 < y2")
+    return x1, y1, x2, y2
+
+
+def _tag_heights(text: str | None, site: "Site") -> tuple[float, ...]:
+    """Heights of the maps: the known one, or those asked for, or three between the lowest and the highest anchor.
+
+    Raises SkylessError when heights are asked for at a site that knows its tags' height.
+    """
+    if site.tags.height_m is not None:
+        if text is not None:
+            raise SkylessError(f"--slices is {text!r}; this site's tags are all at {site.tags.height_m:g} m")
+        return (site.tags.height_m,)
+    if text is not None:
+        return _numbers("slices", text)
+    low, high = _lowest_and_highest(site)
+    return tuple(round(low + share * (high - low), 2) for share in (1 / 6, 1 / 2, 5 / 6))[: 3 if high > low else 1]
+
+
+def _mounts(site: "Site", floor: "Floor", asked: PlanOptions) -> "Mounts":
+    """Where anchors may hang: on the walls given, or on the floor's sides. Raises SkylessError."""
+    import numpy as np
+
+    from skyless.planning.floor import Mounts, sides
+
+    walls = [finite_numbers("mounts", text, (4,)) for text in asked.mounts or ()]
+    levels = _lowest_and_highest(site) if asked.heights is None else _numbers("heights", asked.heights)
+    mounts = Mounts(np.array(walls) if walls else sides(floor.outline_m), tuple(dict.fromkeys(levels)))
+    if not mounts.length_m > 0.0:
+        raise SkylessError("--mounts has no length; it should be x1,y1,x2,y2 with two different ends")
+    return mounts
+
+
+def _numbers(option: str, text: str) -> tuple[float, ...]:
+    return finite_numbers(option, text, (text.count(",") + 1,))
+
+
+def _lowest_and_highest(site: "Site") -> tuple[float, ...]:
+    levels = [anchor.z_m for anchor in site.anchors]
+    return min(levels), max(levels)
+
+
+# The long work, with progress
 
 
 def _optimise(
@@ -156,18 +243,17 @@ def _optimise(
     floor: "Floor",
     mounts: "Mounts",
     heights_m: tuple[float, ...],
-    search: tuple[int, int, float],
-    target: float | None,
+    anchors: int,
+    asked: PlanOptions,
 ) -> "Optimised":
     from skyless.planning.optimise import Search
 
-    anchors, seed, seconds = search
     needed = 4 if site.tags.height_m is None else 3
     if anchors < needed:
         raise SkylessError(f"--optimise is {anchors}; this site's positions need {needed} anchors or more")
     with progress_bar("placing anchors", 1.0) as bar:
-        found = Search(site, settings, floor, mounts, heights_m, anchors, seed, seconds)
-        return found.run(None if target is None else target / 100.0, bar.reach)
+        found = Search(site, settings, floor, mounts, heights_m, anchors, asked.seed, asked.seconds)
+        return found.run(asked.target_m, bar.reach)
 
 
 def _map(predictor: "Predictor", floor: "Floor", heights_m: tuple[float, ...], step: float | None) -> "PlanMap":
@@ -181,9 +267,9 @@ def _map(predictor: "Predictor", floor: "Floor", heights_m: tuple[float, ...], s
         return plan_map(predictor, grid, bar.reach)
 
 
-def _verify(predictor: "Predictor", mapped: "PlanMap", count: int, rounds: int, seed: int) -> "Verification":
+def _verify(predictor: "Predictor", mapped: "PlanMap", count: int, asked: PlanOptions) -> "Verification":
     """Simulate at random points of the map's region."""
     from skyless.planning.verify import random_points, verify
 
     with progress_bar("simulating", 1.0) as bar:
-        return verify(predictor, random_points(mapped, count, seed), rounds, seed, bar.reach)
+        return verify(predictor, random_points(mapped, count, asked.seed), asked.rounds, asked.seed, bar.reach)

@@ -1,32 +1,32 @@
-"""What ``skyless plan`` tells: one report for JSON, the terminal and the page."""
+"""What ``skyless plan`` writes: one report for JSON, the terminal and the page; tables, pictures and a site."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from skyless.cli.common.output import console
+from skyless.cli.common.output import cm, open_for_writing, print_facts, print_warnings, write_file
+from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from skyless.planning.floor import Floor
+    from skyless.planning.floor import Floor, Mounts
     from skyless.planning.maps import MapSummary, PlanMap
-    from skyless.planning.mounts import Mounts
     from skyless.planning.optimise import OneMore, Optimised, Scored
     from skyless.planning.picture import Background
     from skyless.planning.predict import Predictor
     from skyless.planning.verify import Verification
+    from skyless.site.model import Site
 
-NOTES: Final = (
-    "Tags are at rest. A moving tag's filter (joint) is less exact; the paper's methods hardly notice motion "
+_NOTES: Final = (
+    "Tags are at rest. A moving tag's filter (joint) is less accurate; motion hardly affects the paper's methods "
     "up to 1 m/s.",
     "Stamps' noise and crystals are those of the site file, and the filters know them.",
     "Links are free space on channel 5 with the walls' losses of the site file; people, furniture, reflections and "
     "antennas' patterns are not known to the plan.",
-    "Walls delay what crosses them as the site file says; nothing else comes late.",
+    "Walls delay what crosses them as the site file states; nothing else is delayed.",
     "joint's figures hold the errors of survey and ranges that the site file states (accuracy); for the other methods "
-    "positions of the anchors, antenna delays and ranges are taken to be right.",
+    "positions of the anchors, antenna delays and ranges are assumed to be right.",
 )
 
 
@@ -39,7 +39,7 @@ def report(
     optimised: "Optimised | None",
     checked: "Verification | None",
 ) -> dict[str, Any]:
-    """All there is to say, SI units."""
+    """The whole report, SI units."""
     import numpy as np
 
     from skyless.planning.advice import plan_warnings
@@ -75,7 +75,7 @@ def report(
                 "y_m": anchor.y_m,
                 "z_m": anchor.z_m,
                 "hears_master": float(predictor.links.share[row]),
-                "speaks": bool(predictor.clocks.speaks[row]),
+                "sends": bool(predictor.clocks.sends[row]),
             }
             for row, anchor in enumerate(site.anchors)
         ],
@@ -108,39 +108,39 @@ def _scored(scored: "Scored") -> dict[str, Any]:
     }
 
 
-def described(result: dict[str, Any]) -> str:
+def _described(result: dict[str, Any]) -> str:
     """Method, noise and schedule in one line."""
     tx_ps, rx_ps = result["tx_stamp_ps"], result["rx_stamp_ps"]
     noise = f"{tx_ps:g} ps" if tx_ps == rx_ps else f"{tx_ps:g} ps (TX) and {rx_ps:g} ps (RX)"
-    agility = f" with qa {result['qa']:g} m²/s³" if result["method"] == "joint" else ""
+    process_noise = f" with qa {result['qa']:g} m²/s³" if result["method"] == "joint" else ""
     return (
-        f"predicted for {result['method']}{agility}, stamps of {noise}, "
+        f"predicted for {result['method']}{process_noise}, stamps of {noise}, "
         f"superframes of {1e3 * result['superframe_s']:.1f} ms, tags at rest"
     )
 
 
-def _lines(result: dict[str, Any]) -> dict[str, str]:
+def _facts(result: dict[str, Any]) -> dict[str, str]:
     """The numbers for people."""
     worst_at = result["worst_at_m"]
-    place = "" if worst_at is None else " at ({:.2f}, {:.2f}, {:.2f}) m".format(*worst_at)
-    lines = {
+    where = "" if worst_at is None else " at ({:.2f}, {:.2f}, {:.2f}) m".format(*worst_at)
+    facts = {
         "anchors": f"{len(result['anchors'])}, master {result['master']}, range {result['range_m']:.0f} m in the open",
         "map": _map_line(result),
         "covered": f"{result['covered_share']:.1%} of the region; fewest anchors in view: {result['fewest_anchors']}",
-        "standard deviation": f"mean {_cm(result['mean_sigma_m'])}, median {_cm(result['median_sigma_m'])}, "
-        f"95 % {_cm(result['p95_sigma_m'])}, worst {_cm(result['worst_sigma_m'])}{place}",
+        "standard deviation": f"mean {cm(result['mean_sigma_m'])}, median {cm(result['median_sigma_m'])}, "
+        f"95 % {cm(result['p95_sigma_m'])}, worst {cm(result['worst_sigma_m'])}{where}",
     }
     if result["walls_bias"]:
-        lines["with the walls' delays"] = f"RMSE mean {_cm(result['mean_rmse_m'])}, worst {_cm(result['worst_rmse_m'])}"
+        facts["with the walls' delays"] = f"RMSE mean {cm(result['mean_rmse_m'])}, worst {cm(result['worst_rmse_m'])}"
     if result["target_share"] is not None:
-        lines["target met"] = f"in {result['target_share']:.1%} of the region"
+        facts["target met"] = f"in {result['target_share']:.1%} of the region"
     if result["one_more"] is not None:
-        lines["one more anchor"] = _one_more(result["one_more"])
+        facts["one more anchor"] = _one_more(result["one_more"])
     if result["optimised"] is not None:
-        lines["optimised"] = _against_even(result["optimised"])
+        facts["optimised"] = _against_even(result["optimised"])
     if result["verification"] is not None:
-        lines["simulated"] = _verified(result["verification"])
-    return lines
+        facts["simulated"] = _verified(result["verification"])
+    return facts
 
 
 def _map_line(result: dict[str, Any]) -> str:
@@ -151,20 +151,20 @@ def _map_line(result: dict[str, Any]) -> str:
 
 
 def _one_more(more: "OneMore") -> str:
-    x, y, z = more.place_m
+    x, y, z = more.position_m
     if more.mean_after_m >= more.mean_before_m and more.worst_after_m >= more.worst_before_m:
         return "would not help: the superframe grows, and the geometry is good"
     return (
-        f"helps most at ({x:.2f}, {y:.2f}, {z:.2f}) m: mean {_cm(more.mean_before_m)} → {_cm(more.mean_after_m)}, "
-        f"worst {_cm(more.worst_before_m)} → {_cm(more.worst_after_m)}"
+        f"helps most at ({x:.2f}, {y:.2f}, {z:.2f}) m: mean {cm(more.mean_before_m)} → {cm(more.mean_after_m)}, "
+        f"worst {cm(more.worst_before_m)} → {cm(more.worst_after_m)}"
     )
 
 
 def _against_even(found: dict[str, Any]) -> str:
     best, even = found["best"], found["even"]
     text = (
-        f"mean {_cm(best['mean_sigma_m'])}, worst {_cm(best['worst_sigma_m'])}; evenly along the walls "
-        f"{_cm(even['mean_sigma_m'])} and {_cm(even['worst_sigma_m'])}"
+        f"mean {cm(best['mean_sigma_m'])}, worst {cm(best['worst_sigma_m'])}; evenly along the walls "
+        f"{cm(even['mean_sigma_m'])} and {cm(even['worst_sigma_m'])}"
     )
     if found["target_met"] is not None:
         text += "; the target is met everywhere" if found["target_met"] else "; the target is not met everywhere"
@@ -180,37 +180,75 @@ def _verified(checked: "Verification") -> str:
     )
 
 
-def _cm(value_m: float | None) -> str:
-    return "–" if value_m is None else f"{100 * value_m:.2f} cm"
-
-
 def show(file: Path, result: dict[str, Any]) -> None:
     """Show a plan in the terminal."""
-    from rich.table import Table
-    from rich.text import Text
-
-    out = console()
-    table = Table("", "", title=Text(f"{result['site']} ({file}): {described(result)}"), show_header=False)
-    for name, value in _lines(result).items():
-        table.add_row(name, Text(value))
-    out.print(table)
-    for warning in result["warnings"]:
-        out.print(Text.assemble(("warning: ", "bold yellow"), warning))
+    print_facts(f"{result['site']} ({file}): {_described(result)}", _facts(result).items())
+    print_warnings(result["warnings"])
 
 
-def html_page(result: dict[str, Any], mapped: "PlanMap", background: "Background") -> str:
+def _page(result: dict[str, Any], mapped: "PlanMap", background: "Background") -> str:
     """The plan as a page."""
     from skyless.planning.page import page
     from skyless.planning.picture import draw_layer, layers_for
 
-    sections: list[tuple[str, Figure]] = [
+    sections = [
         (layer.title.capitalize() if layer.title.islower() else layer.title, draw_layer(mapped, layer, background))
         for layer in layers_for(mapped)
     ]
-    lines = _lines(result)
+    facts = _facts(result)
     for anchor in result["anchors"]:
-        speaks = "" if anchor["speaks"] else ", silent"
-        place = f"({anchor['x_m']:g}, {anchor['y_m']:g}, {anchor['z_m']:g}) m"
-        lines[f"anchor {anchor['id']}"] = f"{place}, hears {anchor['hears_master']:.0%} of the master's frames{speaks}"
+        position = f"({anchor['x_m']:g}, {anchor['y_m']:g}, {anchor['z_m']:g}) m"
+        silent = "" if anchor["sends"] else ", silent"
+        facts[f"anchor {anchor['id']}"] = (
+            f"{position}, hears {anchor['hears_master']:.0%} of the master's frames{silent}"
+        )
     title = f"Plan of {result['site']}"
-    return page(title, described(result), lines, result["warnings"], sections, NOTES)
+    return page(title, _described(result), facts, result["warnings"], sections, _NOTES)
+
+
+def write_site(out: Path, site: "Site", source: Path) -> None:
+    """Write an optimised site, made from ``source``, with the path of its image relative to the new file.
+
+    Raises SkylessError when it cannot be written.
+    """
+    from skyless.site.check import check_site
+    from skyless.site.template import site_template
+
+    if site.floor_plan is not None:
+        image = os.path.relpath(source.parent / site.floor_plan.image, out.parent)
+        site = msgspec.structs.replace(site, floor_plan=msgspec.structs.replace(site.floor_plan, image=image))
+    check_site(site, out)
+    write_file(out, site_template(site).encode())
+
+
+def write_files(
+    file: Path,
+    site: "Site",
+    floor: "Floor",
+    mapped: "PlanMap",
+    result: dict[str, Any],
+    plot: Path | None,
+    grid: Path | None,
+    html: Path | None,
+) -> None:
+    """Write the files that were asked for. Raises SkylessError when one cannot be written."""
+    if grid is not None:
+        from skyless.planning.maps import csv_lines, geojson_lines
+
+        with open_for_writing(grid) as table:
+            is_csv = grid.suffix.lower() == ".csv"
+            table.writelines(csv_lines(mapped) if is_csv else geojson_lines(mapped, site.georeference))
+    if plot is None and html is None:
+        return
+    from skyless.evaluation.figures import save_figure
+    from skyless.planning.picture import RMSE_LAYER, SIGMA_LAYER, Background, draw_layer
+
+    background = Background(site, floor, file, _described(result))
+    if plot is not None:
+        layer = RMSE_LAYER if result["walls_bias"] else SIGMA_LAYER
+        try:
+            save_figure(draw_layer(mapped, layer, background), plot)
+        except (OSError, ValueError) as error:
+            raise SkylessError(f"{plot} cannot be written: {error}") from None
+    if html is not None:
+        write_file(html, _page(result, mapped, background).encode())

@@ -1,8 +1,10 @@
 """``skyless replay``: a recording becomes fixes, and is judged against the truth where there is one."""
 
-from contextlib import ExitStack
+import csv
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from cyclopts import App
 
@@ -11,21 +13,34 @@ from skyless.cli.common.options import (
     IntegrityRisk,
     NotNegative,
     Positive,
-    integrity_of,
-    see_that_a_height_is_given,
-    spare_inputs,
+    ProtectionOptions,
+    check_height_std,
+    check_left_out,
+    check_method,
+    check_output,
+    check_picture,
+    options,
 )
-from skyless.cli.common.output import print_json
-from skyless.cli.common.progress import progress_bar, status
-from skyless.cli.replay_input import flight_height, height_to_hold, known_anchors, known_truth
-from skyless.cli.replay_output import check_plot_path, draw_track, fix_writer, show
-from skyless.cli.replay_site import Options, is_mcap, replay_site, see_that_they_are_left_out
+from skyless.cli.common.output import number, open_for_writing, print_facts, print_json
+from skyless.cli.common.progress import loading_kernels, progress_bar
+from skyless.cli.common.recording_inputs import flight_height, height_to_hold, is_mcap, known_anchors, known_truth
 from skyless.errors import ConfigurationError, SkylessError
+from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.evaluation.judge import Judge
+    from skyless.positioning.fix import Fix
     from skyless.recordings.truth import Truth
     from skyless.replay.captures import Replay, ReplayReport
+    from skyless.replay.site import SiteReplay, TagReport
+
+FIXES_COLUMNS: Final = (
+    *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
+    *("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2"),
+    *("anchors", "anchor_ids", "chi2", "residual_rms_m"),
+    *("hpl_m", "vpl_m", "integrity_risk", "alert"),
+)
+"""Columns of the file that --fixes writes."""
 
 app = App(
     name="replay",
@@ -33,34 +48,71 @@ app = App(
 )
 
 
+@options
+class _OtherProtection(ProtectionOptions):
+    """What is required of protection levels, instead of what the tag did."""
+
+    integrity_risk: IntegrityRisk | None = None
+    """Another probability than the tag's own that an error exceeds its protection level, in recordings of skyless
+    record (joint)."""
+    alert_limit_m: Positive | None = None
+    """Another alert limit than the tag's own, in metres."""
+    max_acceleration: NotNegative | None = None
+    """Another largest acceleration than the tag's own, in m/s². With any of these, or --height-std, tags start from
+    the beginning, as with another method, and those that are not given are as of a tag of which nothing was asked."""
+
+
+@options
+class ReplayOptions:
+    """Options of ``skyless replay``."""
+
+    anchors: Path | None = None
+    """Table of anchors: id,x_m,y_m,z_m, with bias_m where skyless calibrate has been; that is then taken off."""
+    site: Path | None = None
+    """A site file instead, for its anchors and its tags' height. With a recording of skyless record: replay as if
+    its anchors had had the antenna delays of this file, as skyless calibrate writes them."""
+    truth: Path | None = None
+    """Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns. MILUV ticks bring their own."""
+    lever_arm: str | None = None
+    """The antenna in the body's frame, x,y,z in metres, added to the truth."""
+    height: str = "auto"
+    """The tag's height: metres, truth (its median), free (estimated), or auto: free where the anchors determine it."""
+    height_std: NotNegative | None = None
+    """Standard deviation of the tag's height from the one that is given, in metres, which fixes and levels then
+    count; by default 0.5 where the height is only taken for the anchors', else 0."""
+    format: str | None = None
+    """Name of the format, if the content should not decide."""
+    listener: str | None = None
+    """Which receiver, in recordings with several."""
+    settle: NotNegative | None = None
+    """Seconds from the start that are not judged; by default 3 with a truth table, 2 without."""
+    above: Finite | None = None
+    """Judge only while the true height exceeds this; by default 0.3 m for a table of differences that starts below
+    it and later flies, as tags on the floor hear reflections only."""
+    qa: Positive | None = None
+    """Process noise that the filter assumes: spectral density of the acceleration, m²/s³."""
+    tdoa_std: Positive | None = None
+    """Noise of what is new in a time difference, metres."""
+    uncalibrated: bool = False
+    """Leave out the calibration that the table of anchors holds."""
+    tag: str | None = None
+    """Name of the tag, in recordings of skyless record; by default all."""
+    method: str | None = None
+    """Another method than the tag's own, in recordings of skyless record."""
+    measurements: str | None = None
+    """What the filter is given of other recordings: packets, as anchors sent them, which is the default for
+    Bitcraze's; or differences, which are made of them."""
+    protection: _OtherProtection = _OtherProtection()
+    fixes: Path | None = None
+    """Write every fix into this table."""
+    plot: Path | None = None
+    """Draw track, errors and histograms into this PNG, SVG or PDF."""
+    json: bool = False
+    """Write one JSON object instead of the table."""
+
+
 @app.default
-def replay(
-    file: Path,
-    /,
-    *,
-    anchors: Path | None = None,
-    site: Path | None = None,
-    truth: Path | None = None,
-    lever_arm: str | None = None,
-    height: str = "auto",
-    height_std: NotNegative | None = None,
-    format: str | None = None,  # noqa: A002 - the option's natural name
-    listener: str | None = None,
-    settle: NotNegative | None = None,
-    above: Finite | None = None,
-    qa: Positive | None = None,
-    tdoa_std: Positive | None = None,
-    uncalibrated: bool = False,
-    tag: str | None = None,
-    method: str | None = None,
-    measurements: str | None = None,
-    integrity_risk: IntegrityRisk | None = None,
-    alert_limit_m: Positive | None = None,
-    max_acceleration: NotNegative | None = None,
-    fixes: Path | None = None,
-    plot: Path | None = None,
-    json: bool = False,
-) -> None:
+def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> None:
     """Turn a recording into fixes; judge them where the truth is known.
 
     Reads recordings of skyless record (MCAP), Bitcraze sniffer captures (YAML, binary, text; TDoA2 and TDoA3), tables
@@ -74,125 +126,83 @@ def replay(
     ----------
     file
         The recording, plain or gzip.
-    anchors
-        Table of anchors: id,x_m,y_m,z_m, with bias_m where skyless calibrate has been; that is then taken off.
-    site
-        A site file instead, for its anchors and its tags' height. With a recording of skyless record: replay as if
-        its anchors had had the antenna delays of this file, as skyless calibrate writes them.
-    truth
-        Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns. MILUV ticks bring their own.
-    lever_arm
-        The antenna in the body's frame, x,y,z in metres, added to the truth.
-    height
-        The tag's height: metres, truth (its median), free (estimated), or auto: free where the anchors can tell it.
-    height_std
-        Standard deviation of the tag's height from the one that is given, in metres, which fixes and levels then
-        count; by default 0.5 where the height is only taken for the anchors', else 0.
-    format
-        Name of the format, if the content should not decide.
-    listener
-        Whose ears, in recordings with several listeners.
-    settle
-        Seconds from the start that are not judged; by default 3 with a truth table, 2 without.
-    above
-        Judge only while the true height exceeds this; by default 0.3 m for a table of differences that starts below
-        it and later flies, as tags on the floor hear reflections only.
-    qa
-        Agility that the filter assumes, m²/s³.
-    tdoa_std
-        Noise of what is new in a time difference, metres.
-    uncalibrated
-        Leave out the calibration that the table of anchors holds.
-    tag
-        Name of the tag, in recordings of skyless record; by default all.
-    method
-        Another method than the tag's own, in recordings of skyless record.
-    measurements
-        What the filter is given of other recordings: packets, as anchors sent them, which is the default for
-        Bitcraze's; or differences, which are made of them.
-    integrity_risk
-        Another probability than the tag's own that an error exceeds its protection level, in recordings of skyless
-        record (joint).
-    alert_limit_m
-        Another alert limit than the tag's own, in metres.
-    max_acceleration
-        Another largest acceleration than the tag's own, in m/s². With any of these, or --height-std, tags begin anew,
-        as with another method, and those that are not given are as of a tag of which nothing was asked.
-    fixes
-        Write every fix into this table.
-    plot
-        Draw track, errors and histograms into this PNG, SVG or PDF.
-    json
-        Write one JSON object instead of the table.
     """
+    check_output("fixes", asked.fixes, file, asked.anchors, asked.site, asked.truth)
+    check_output("plot", asked.plot, file, asked.anchors, asked.site, asked.truth, asked.fixes)
+    check_picture(asked.plot)
+    if is_mcap(file):
+        _replay_site(file, asked)
+    else:
+        _replay_foreign(file, asked)
+
+
+# Recordings of other systems
+
+
+def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
+    """Replay a recording that another program made. Raises SkylessError."""
     from skyless.evaluation.judge import Judge
     from skyless.recordings.anchor_table import read_calibration
     from skyless.recordings.foreign.formats import format_of
     from skyless.replay.captures import MEASUREMENTS, Replay, ReplayRequest
 
-    spare_inputs("fixes", fixes, file, anchors, site, truth)
-    spare_inputs("plot", plot, file, anchors, site, truth, fixes)
-    check_plot_path(plot)
-    if is_mcap(file):
-        useless = {
-            "--anchors": anchors, "--truth": truth, "--lever-arm": lever_arm, "--format": format,
-            "--listener": listener, "--qa": qa, "--tdoa-std": tdoa_std,
-            "--measurements": measurements,
-            "--height": None if height == "auto" else height, "--uncalibrated": uncalibrated or None,
-        }  # fmt: skip
-        see_that_they_are_left_out(useless, "a recording of skyless record brings its own")
-        asked = None
-        if (integrity_risk, alert_limit_m, max_acceleration, height_std) != (None,) * 4:
-            asked = integrity_of(integrity_risk, alert_limit_m, max_acceleration, method, height_std)
-        replay_site(file, Options(tag, method, asked, settle, above, site, fixes, plot, json))
-        return
+    protection = asked.protection
     of_sites = {
-        "--tag": tag, "--method": method, "--integrity-risk": integrity_risk, "--alert-limit-m": alert_limit_m,
-        "--max-acceleration": max_acceleration,
+        "tag": asked.tag, "method": asked.method, "integrity-risk": protection.integrity_risk,
+        "alert-limit-m": protection.alert_limit_m, "max-acceleration": protection.max_acceleration,
     }  # fmt: skip
-    see_that_they_are_left_out(of_sites, "it is for recordings of skyless record")
-    if measurements not in {None, *MEASUREMENTS}:
-        raise SkylessError(f"--measurements is {measurements!r}; it should be one of {', '.join(MEASUREMENTS)}")
-    places, site_height_m = known_anchors(anchors, site)
-    known = known_truth(file, truth, lever_arm, format, listener)
-    height_m, std_m, note = height_to_hold(height, places, site_height_m, known, format_of(file, format).name)
-    settle_s = settle if settle is not None else (2.0 if known is None else 3.0)
-    see_that_a_height_is_given(height_std, height_m)
-    judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=flight_height(above, known))
+    check_left_out(of_sites, "it is for recordings of skyless record")
+    if asked.measurements not in {None, *MEASUREMENTS}:
+        raise SkylessError(f"--measurements is {asked.measurements!r}; it should be one of {', '.join(MEASUREMENTS)}")
+    anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)
+    known = known_truth(file, asked.truth, asked.lever_arm, asked.format, asked.listener)
+    format_name = format_of(file, asked.format).name
+    height_m, std_m, note = height_to_hold(asked.height, anchors_m, site_height_m, known, format_name)
+    settle_s = asked.settle if asked.settle is not None else (2.0 if known is None else 3.0)
+    check_height_std(asked.height_std, height_m)
+    judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=flight_height(asked.above, known))
     request = ReplayRequest(
         path=file,
-        anchors_m=places,
-        format=format,
-        listener=listener,
+        anchors_m=anchors_m,
+        format=asked.format,
+        listener=asked.listener,
         height_m=height_m,
-        height_std_m=std_m if height_std is None else height_std,
-        qa=qa,
-        tdoa_std_m=tdoa_std,
-        calibration=None if anchors is None or uncalibrated else read_calibration(anchors),
-        measurements=measurements,
+        height_std_m=std_m if asked.height_std is None else asked.height_std,
+        qa=asked.qa,
+        tdoa_std_m=asked.tdoa_std,
+        calibration=None if asked.anchors is None or asked.uncalibrated else read_calibration(asked.anchors),
+        measurements=asked.measurements,
     )
-    report = _run(Replay(request, judge), file, fixes)
-    _see_that_it_was_heard(file, listener, report)
-    if truth is not None and known is not None:
-        _see_that_truth_matches(truth, known, judge)
+    report = _run_foreign(Replay(request, judge), file, asked.fixes)
+    if asked.listener is not None and report.receptions == 0:
+        raise ConfigurationError(file, "listener", asked.listener, "one that the recording names")
+    if asked.truth is not None and known is not None:
+        _check_times(asked.truth, known, judge)
     distances = _distances(file, report.format)
-    if plot is not None:
-        draw_track(plot, judge, report)
-    if json:
+    if asked.plot is not None:
+        _draw_track(asked.plot, judge, report)
+    if asked.json:
         import msgspec
 
         print_json({**msgspec.to_builtins(report), "height_note": note, "anchor_distances_m": distances})
     else:
-        show(report, note, distances)
+        _show(report, note, distances)
 
 
-def _see_that_it_was_heard(file: Path, listener: str | None, report: "ReplayReport") -> None:
-    if listener is not None and report.receptions == 0:
-        raise ConfigurationError(file, "listener", listener, "one that the recording names")
+def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
+    from skyless.evaluation.compile_ahead import compile_packet_kernels, compile_pair_kernels
+
+    with loading_kernels():
+        if run.measurements == "packets":
+            compile_packet_kernels()
+        else:
+            compile_pair_kernels()
+    with progress_bar("replaying", file.stat().st_size) as bar, _table_of_fixes(fixes, FIXES_COLUMNS) as write:
+        return run.run(None if write is None else lambda fix: write(_row(fix)), bar.reach)
 
 
-def _see_that_truth_matches(table: Path, truth: "Truth", judge: "Judge") -> None:
-    """Fixes without any truth beside them mean that the table belongs to another recording, or to another clock."""
+def _check_times(table: Path, truth: "Truth", judge: "Judge") -> None:
+    """Fixes without any truth mean that the table belongs to another recording, or to another clock."""
     import numpy as np
 
     times_s, true_x_m = judge.track.rows[:, 0], judge.track.rows[:, 4]
@@ -200,20 +210,6 @@ def _see_that_truth_matches(table: Path, truth: "Truth", judge: "Judge") -> None
         span = f"{truth.t_s[0]:.3f} to {truth.t_s[-1]:.3f}"
         expected = f"in the time of the recording, whose fixes are from {times_s.min():.3f} to {times_s.max():.3f}"
         raise ConfigurationError(table, "column t_s", span, expected)
-
-
-def _run(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
-    from skyless.evaluation.compile_ahead import compile_packet_kernels, compile_pair_kernels
-
-    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
-        if run.measurements == "packets":
-            compile_packet_kernels()
-        else:
-            compile_pair_kernels()
-    with ExitStack() as stack:
-        bar = stack.enter_context(progress_bar("replaying", file.stat().st_size))
-        on_fix = None if fixes is None else fix_writer(stack, fixes)
-        return run.run(on_fix, bar.reach)
 
 
 def _distances(file: Path, name: str) -> dict[str, float]:
@@ -225,3 +221,176 @@ def _distances(file: Path, name: str) -> dict[str, float]:
     from skyless.recordings.foreign.avalue import anchor_distances_m
 
     return {f"{a:X}-{b:X}": metres for (a, b), metres in sorted(anchor_distances_m(file, Counter()).items())}
+
+
+# Recordings of skyless record
+
+
+def _replay_site(file: Path, asked: ReplayOptions) -> None:
+    """Replay all tags of a recording of skyless record, or one. Raises SkylessError."""
+    from skyless.recordings.mcap.recording import McapRecording
+    from skyless.replay.site import SiteReplay
+    from skyless.site.load import load_site
+
+    useless = {
+        "anchors": asked.anchors, "truth": asked.truth, "lever-arm": asked.lever_arm, "format": asked.format,
+        "listener": asked.listener, "qa": asked.qa, "tdoa-std": asked.tdoa_std, "measurements": asked.measurements,
+        "height": None if asked.height == "auto" else asked.height, "uncalibrated": asked.uncalibrated or None,
+    }  # fmt: skip
+    check_left_out(useless, "a recording of skyless record brings its own")
+    required = None
+    if asked.protection.given or asked.height_std is not None:
+        required = asked.protection.requirement(asked.method, asked.height_std)
+    if asked.method is not None:
+        check_method(asked.method)
+    with McapRecording(file) as recording:
+        tags = None if asked.tag is None else (asked.tag,)
+        settle_s = 2.0 if asked.settle is None else asked.settle
+        wanted = None if asked.site is None else load_site(asked.site)
+        run = SiteReplay(recording, tags, asked.method, settle_s, asked.above, wanted, required)
+        if asked.plot is not None and len(run.tags) > 1:
+            raise SkylessError(f"--plot draws one tag; choose it with --tag, one of {', '.join(run.tags)}")
+        summary = recording.summary()
+        span_s = (summary.end_s or 0.0) - (summary.start_s or 0.0)
+        reports = _run_site(run, span_s, asked)
+    if asked.plot is not None:
+        _draw_track(asked.plot, run.judges[reports[0].tag], reports[0])
+    if asked.json:
+        print_json(_site_json(reports))
+    else:
+        for report in reports:
+            _show(report, "from the site", {}, _site_facts(report))
+
+
+def _run_site(run: "SiteReplay", span_s: float, asked: ReplayOptions) -> "list[TagReport]":
+    """The table of fixes has the tag's name at the end of each row; its ``t_s`` is Unix time."""
+    from skyless.evaluation.compile_ahead import compile_kernels
+
+    with loading_kernels():
+        compile_kernels(asked.method or DEFAULT_METHOD)
+    with progress_bar("replaying", span_s) as bar, _table_of_fixes(asked.fixes, (*FIXES_COLUMNS, "tag")) as write:
+        if write is None:
+            return run.run(None, bar.reach)
+        return run.run(lambda tag, made: write((f"{made.unix_s:.6f}", *_row(made.fix)[1:], tag)), bar.reach)
+
+
+def _site_json(reports: "Sequence[TagReport]") -> dict[str, object]:
+    """One tag's report as that of any other recording; of several, their sums and the reports by tag."""
+    import msgspec
+
+    if len(reports) == 1:
+        return {**msgspec.to_builtins(reports[0]), "height_note": "from the site"}
+    compared = [report.identical for report in reports if report.identical is not None]
+    identical = {
+        "compared": sum(one.compared for one in compared),
+        "different": sum(one.different for one in compared),
+    }
+    return {
+        "format": reports[0].format,
+        "receptions": sum(report.receptions for report in reports),
+        "fixes": sum(report.fixes for report in reports),
+        "dropped": sum(report.dropped for report in reports),
+        "identical": identical if compared else None,
+        "wall_s": reports[0].wall_s,
+        "tags": {report.tag: msgspec.to_builtins(report) for report in reports},
+    }
+
+
+def _site_facts(report: "TagReport") -> list[tuple[str, str]]:
+    """What only the replay of a site reports."""
+    found = report.identical
+    if found is None:
+        same = "–"
+    elif found.compared == 0:
+        same = "nothing to compare"
+    elif found.different == 0:
+        same = f"identical, all {found.compared} of them"
+    else:
+        same = f"{found.different} of {found.compared} differ"
+    started = "as the tag was" if report.cold_starts == 0 else f"{report.cold_starts} of {report.segments} cold"
+    return [("tag", report.tag), ("recorded fixes", same), ("starts", started)]
+
+
+# Tables and pictures
+
+
+@contextmanager
+def _table_of_fixes(path: Path | None, columns: tuple[str, ...]) -> Iterator[Callable[[Sequence[str]], None] | None]:
+    """A function that writes a row of the table; None where none is asked for. Raises SkylessError."""
+    if path is None:
+        yield None
+        return
+    with open_for_writing(path) as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+
+        def write(row: Sequence[str]) -> None:
+            writer.writerow(row)
+
+        yield write
+
+
+def _row(fix: "Fix") -> list[str]:
+    """A fix as a row of ``FIXES_COLUMNS``."""
+    velocity = ("", "", "") if fix.velocity_mps is None else (f"{value:.5g}" for value in fix.velocity_mps)
+    covariance = fix.covariance_m2[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return [
+        f"{fix.time_s:.6f}",
+        *(f"{value:.5f}" for value in fix.position_m),
+        *velocity,
+        *(f"{value:.5g}" for value in covariance),
+        str(len(fix.anchors)),
+        " ".join(map(str, fix.anchors)),
+        f"{fix.chi2:.4g}",
+        f"{fix.residual_rms_m:.4g}",
+        *("" if level is None else f"{level:.4g}" for level in (fix.hpl_m, fix.vpl_m, fix.integrity_risk)),
+        fix.alert or "",
+    ]
+
+
+def _draw_track(path: Path, judge: "Judge", report: "ReplayReport") -> None:
+    """Draw what --plot asks for. Raises SkylessError."""
+    from skyless.replay.plot import draw
+
+    try:
+        draw(path, judge.track.rows, f"{report.format}, {report.fixes} fixes")
+    except (OSError, ValueError) as error:
+        raise SkylessError(f"{path} cannot be drawn: {error}") from None
+
+
+def _show(report: "ReplayReport", note: str, distances: dict[str, float], more: Sequence[tuple[str, str]] = ()) -> None:
+    """Show a replay as a table; ``note`` says where the height is from, ``more`` comes first."""
+    fixes = str(report.fixes) if report.reason is None else f"none: {report.reason}"
+    if report.reason == "no-almanac":
+        fixes += " (give a table of the anchors' positions with --anchors, or --site)"
+    truth_known = any(pair.against_truth for pair in report.pairs)
+    facts = [
+        *more,
+        ("fixes", fixes),
+        ("method", f"{report.method}" + ("" if report.measurements is None else f", given {report.measurements}")),
+        ("rate", number(report.rate_hz, "{:.1f} Hz")),
+        ("height", note if report.height_m is None else f"{report.height_m:.3f} m, {note}"),
+        ("median position", _triple(report.median_m)),
+        ("standard deviation", _triple(report.std_m)),
+        # without truth, the tag's own motion is in it
+        ("noise of a difference" if truth_known else "scatter of a difference", _metres(report.tdoa_noise_m)),
+        ("RMSE 2-D", _metres(report.rmse_2d_m)),
+        ("RMSE 3-D", _metres(report.rmse_3d_m)),
+        ("95 %", _metres(report.p95_m)),
+        ("largest error", _metres(report.max_m)),
+        ("speed", f"{report.receptions_per_s:,.0f} receptions/s"),
+    ]
+    facts += [(f"dropped: {reason}", str(count)) for reason, count in report.drops.items()]
+    for pair, by_m in report.contradictions_m.items():
+        nearer = "nearer" if by_m < 0.0 else "farther"
+        facts.append((f"anchors {pair}", f"range each other {abs(by_m):.2f} m {nearer} than the table has them"))
+    facts += [(f"distance {pair}", _metres(metres)) for pair, metres in distances.items()]
+    print_facts(f"{report.format}: {report.receptions} receptions", facts)
+
+
+def _metres(value: float | None) -> str:
+    return number(value, "{:.3f} m")
+
+
+def _triple(values: tuple[float, float, float] | None) -> str:
+    return "–" if values is None else ", ".join(f"{value:.3f}" for value in values) + " m"

@@ -3,6 +3,9 @@
 import csv
 import math
 import time
+from collections.abc import Sequence
+from itertools import pairwise
+from math import dist
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TextIO
 
@@ -10,33 +13,51 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.common.options import (
-    IntegrityRisk,
     NotNegative,
     Picoseconds,
     Positive,
+    ProtectionOptions,
+    Seed,
+    check_output,
     finite_numbers,
-    integrity_of,
-    open_for_writing,
-    spare_inputs,
+    options,
 )
-from skyless.cli.common.output import print_json
-from skyless.cli.common.progress import progress_bar, status
-from skyless.cli.simulate_input import ROOM, bias_of, delay_errors_of, outage_of, path_of, silence_of, site_of
-from skyless.cli.simulate_output import COLUMNS, row_of, show
+from skyless.cli.common.output import cm, open_for_writing, print_facts, print_json
+from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
-    from skyless.evaluation.fleet import Fleet, FleetReport
+    from skyless.evaluation.fleet import Fleet, FleetReport, JudgedFix
     from skyless.evaluation.scenarios import Request
+    from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Outage
+    from skyless.site.model import Site
 
 _Share = Annotated[float, Parameter(validator=Number(gte=0, lt=1))]
 
-_USUAL_S: Final = 60.0
-"""A run without goal lasts so long."""
+_ROOM: Final = "room"
 
-_PATIENCE_S: Final = 60.0
-"""Simulated time that a run whose goal is fixes waits for one."""
+_USUAL_S: Final = 60.0
+"""Duration of a run without a goal."""
+
+_LONGEST_WAIT_S: Final = 60.0
+"""Simulated time for which a run whose goal is fixes waits for one."""
+
+_LATEST_S: Final = 1e8
+"""Three years: the 64 bits of unwrapped ticks last four and a half."""
+
+_SHORTEST_M: Final = 0.01
+"""Of the legs of a path, whose corners are rounded on them."""
+
+_LONGEST_DELAY_NS: Final = 1000.0
+"""Of an antenna: the range of a site file."""
+
+FIXES_CSV_COLUMNS: Final = (
+    *("t_s", "tag"),
+    *("x_m", "y_m", "z_m", "var_x_m2", "var_y_m2", "var_z_m2", "truth_x_m", "truth_y_m", "truth_z_m", "anchors"),
+    *("hpl_m", "vpl_m", "integrity_risk", "alert"),
+)
+"""Columns of the file that --fixes-csv writes."""
 
 app = App(
     name="simulate",
@@ -46,151 +67,236 @@ app = App(
 )
 
 
+@options
+class SimulateOptions:
+    """Options of ``skyless simulate``."""
+
+    scenario: str | None = None
+    """A named site: lab (six anchors on the walls of 6 m × 8 m, 2-D), the default; room (the lab as real rooms are:
+    anchors 2 cm off per axis, ranges 5 cm off, and more with the distance, tags with random acceleration)."""
+    site: Path | None = None
+    """A site file instead of a named one."""
+    method: str = DEFAULT_METHOD
+    """literal, literal-delayed, weighted, bracketed or joint.
+    Fixes of all but joint hold at the master's message that they refer to, but are judged when made."""
+    position: list[str] | None = None
+    """Where a tag lies still, x,y or x,y,z in metres; may be given several times."""
+    waypoints: list[str] | None = None
+    """A tag's path, "x,y;x,y;..." with or without z, walked once, or for ever if it ends where it begins;
+    repeatable."""
+    tags: Annotated[int, Parameter(validator=Number(gte=1, lte=10_000))] | None = None
+    """How many tags walk about where neither --position nor --waypoints is given; 1 by default."""
+    speed: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] | None = None
+    """How fast tags walk, in m/s; 1 by default. In the room only for --waypoints."""
+    qa: Positive = 0.3
+    """Process noise that joint assumes: spectral density of the acceleration, m²/s³."""
+    protection: ProtectionOptions = ProtectionOptions()
+    noise_ps: Picoseconds | None = None
+    """Noise of every TX and RX stamp in picoseconds, known to the filters; by default the site's own figures."""
+    fixes: Annotated[int, Parameter(validator=Number(gte=1))] | None = None
+    """Stop when every tag has this many judged fixes (one per superframe), or has had none for 60 s."""
+    duration: Positive | None = None
+    """Stop after this many simulated seconds; by default 60 unless --fixes is given."""
+    warmup: NotNegative = 2.0
+    """Simulated seconds before which fixes are not judged; less than the run lasts."""
+    seed: Seed = 1
+    """Same seed, same bytes and ticks."""
+    loss: _Share = 0.0
+    """Probability that a message is lost."""
+    nlos: _Share = 0.0
+    """Probability that a message reaches a tag late."""
+    nlos_mean: Positive = 1.0
+    """Mean delay of such a message in metres."""
+    bias: list[str] | None = None
+    """ANCHOR:METRES, or ANCHOR:METRES:BURST_S for bursts: tags hear this anchor late."""
+    outage: list[str] | None = None
+    """ANCHOR:OFF_S or ANCHOR:OFF_S:ON_S: an anchor that stops, and restarts."""
+    delay_error: list[str] | None = None
+    """ANCHOR:TX_NS:RX_NS: by how much this anchor's antenna delays are longer than in its site file."""
+    deaf: list[str] | None = None
+    """FROM_S or FROM_S:TO_S: the tags' radios hear nothing from then on, or for that time."""
+    power_bias: bool = False
+    """Give RX stamps the DW1000's bias by received power."""
+    temperature: bool = False
+    """Let the crystals warm up and swing."""
+    fixes_csv: Path | None = None
+    """Write every fix with its truth into this file."""
+    json: bool = False
+    """Write one JSON object instead of the table."""
+
+    def __post_init__(self) -> None:
+        """Raises SkylessError when options contradict each other."""
+        check_output("fixes-csv", self.fixes_csv, self.site)
+        if self.position and not self.waypoints and (self.tags is not None or self.speed is not None):
+            raise SkylessError(
+                "--position is for tags that lie still, --tags and --speed for tags that walk; give either"
+            )
+        if self.waypoints and self.tags is not None:
+            raise SkylessError(
+                "--waypoints is the path of one tag, --tags a number of tags that walk about; give either"
+            )
+        if self.scenario == _ROOM and self.speed is not None and not self.waypoints:
+            raise SkylessError(
+                "--speed is for tags that walk from point to point; those of --scenario room accelerate at "
+                "random, or give --waypoints"
+            )
+
+    @property
+    def until_s(self) -> float:
+        """When the run ends, unless it reaches its goal before."""
+        return self.duration or (_USUAL_S if self.fixes is None else math.inf)
+
+
 @app.default
-def simulate(
-    *,
-    scenario: str | None = None,
-    site: Path | None = None,
-    method: str = DEFAULT_METHOD,
-    position: list[str] | None = None,
-    waypoints: list[str] | None = None,
-    tags: Annotated[int, Parameter(validator=Number(gte=1, lte=10_000))] | None = None,
-    speed: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] | None = None,
-    qa: Positive = 0.3,
-    integrity_risk: IntegrityRisk | None = None,
-    alert_limit_m: Positive | None = None,
-    max_acceleration: NotNegative | None = None,
-    noise_ps: Picoseconds | None = None,
-    fixes: Annotated[int, Parameter(validator=Number(gte=1))] | None = None,
-    duration: Positive | None = None,
-    warmup: NotNegative = 2.0,
-    seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
-    loss: _Share = 0.0,
-    nlos: _Share = 0.0,
-    nlos_mean: Positive = 1.0,
-    bias: list[str] | None = None,
-    outage: list[str] | None = None,
-    delay_error: list[str] | None = None,
-    deaf: list[str] | None = None,
-    power_bias: bool = False,
-    temperature: bool = False,
-    fixes_csv: Path | None = None,
-    json: bool = False,
-) -> None:
+def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
     """Run a site faster than real time and report the errors of its tags.
 
     Anchors and tags are the machines that would run on radios; clocks, noise, air and motion are simulated.
-
-    Parameters
-    ----------
-    scenario
-        A named site: lab (six anchors on the walls of 6 m × 8 m, 2-D), the default; room (the lab as real rooms are:
-        anchors 2 cm off per axis, ranges 5 cm off, and more with the distance, tags with random acceleration).
-    site
-        A site file instead of a named one.
-    method
-        literal, literal-delayed, weighted, bracketed or joint.
-        Fixes of all but joint hold at the master's message that they refer to, but are judged when made.
-    position
-        Where a tag lies still, x,y or x,y,z in metres; may be given several times.
-    waypoints
-        A tag's path, "x,y;x,y;..." with or without z, walked once, or for ever if it ends where it begins; repeatable.
-    tags
-        How many tags walk about where neither --position nor --waypoints is given; 1 by default.
-    speed
-        How fast tags walk, in m/s; 1 by default. In the room only for --waypoints.
-    qa
-        Agility that joint assumes, m²/s³.
-    integrity_risk
-        Probability, for each fix, that the error exceeds its protection level (joint); 1e-4 by default.
-    alert_limit_m
-        Fixes with a higher protection level than so many metres carry an alert (joint).
-    max_acceleration
-        The largest acceleration of the tags in m/s², for protection levels that cover their hardest turns (joint).
-    noise_ps
-        Noise of every TX and RX stamp in picoseconds, known to the filters; by default the site's own figures.
-    fixes
-        Stop when every tag has so many judged fixes (one per superframe), or waits for one for 60 s in vain.
-    duration
-        Stop after so many simulated seconds; by default 60 unless --fixes is given.
-    warmup
-        Simulated seconds before which fixes are not judged; less than the run lasts.
-    seed
-        Same seed, same bytes and ticks.
-    loss
-        Probability that a message is lost.
-    nlos
-        Probability that a message reaches a tag late.
-    nlos_mean
-        Mean delay of such a message in metres.
-    bias
-        ANCHOR:METRES, or ANCHOR:METRES:BURST_S for bursts: tags hear this anchor late.
-    outage
-        ANCHOR:OFF_S or ANCHOR:OFF_S:ON_S: an anchor that stops, and restarts.
-    delay_error
-        ANCHOR:TX_NS:RX_NS: by how much this anchor's antenna delays are longer than its site file says.
-    deaf
-        FROM_S or FROM_S:TO_S: the tags' radios hear nothing from then on, or for that time.
-    power_bias
-        Give RX stamps the DW1000's bias by received power.
-    temperature
-        Let the crystals warm up and swing.
-    fixes_csv
-        Write every fix with its truth into this file.
-    json
-        Write one JSON object instead of the table.
     """
-    from skyless.evaluation.room_world import Room
-    from skyless.evaluation.scenarios import Request
-
-    spare_inputs("fixes-csv", fixes_csv, site)
-    if position and not waypoints and (tags is not None or speed is not None):
-        raise SkylessError("--position is for tags that lie still, --tags and --speed for tags that walk; give either")
-    if waypoints and tags is not None:
-        raise SkylessError("--waypoints is the path of one tag, --tags a number of tags that walk about; give either")
-    if scenario == ROOM and speed is not None and not waypoints:
+    request = _request(asked)
+    if asked.warmup >= asked.until_s:
         raise SkylessError(
-            "--speed is for tags that walk from point to point; those of --scenario room accelerate at "
-            "random, or give --waypoints"
+            f"--warmup is {asked.warmup:g}; a run of {asked.until_s:g} s (--duration) ends before any fix is judged"
         )
-    request = Request(
-        site=site_of(scenario, site),
-        method=method,
-        seed=seed,
-        noise_ps=noise_ps,
-        positions_m=tuple(finite_numbers("position", text, (2, 3)) for text in position or ()),
-        paths_m=tuple(path_of(text) for text in waypoints or ()),
-        tags=1 if tags is None else tags,
-        speed_mps=1.0 if speed is None else speed,
-        qa=qa,
-        integrity=integrity_of(integrity_risk, alert_limit_m, max_acceleration, method),
-        warmup_s=warmup,
-        most_fixes=fixes,
-        loss=loss,
-        nlos=nlos,
-        nlos_mean_m=nlos_mean,
-        power_bias=power_bias,
-        temperature=temperature,
-        biases=tuple(bias_of(text) for text in bias or ()),
-        outages=tuple(outage_of(text) for text in outage or ()),
-        delay_errors=delay_errors_of(delay_error or []),
-        silences=tuple(silence_of(text) for text in deaf or ()),
-        room=Room() if scenario == ROOM else None,
-    )
-    until_s = duration if duration is not None else (math.inf if fixes is not None else _USUAL_S)
-    if warmup >= until_s:
-        raise SkylessError(f"--warmup is {warmup:g}; a run of {until_s:g} s (--duration) ends before any fix is judged")
-    result = _run(request, until_s, fixes_csv)
-    if json:
+    result = _run(request, asked)
+    if asked.json:
         import msgspec
 
-        settings = {"seed": seed, "noise_ps": noise_ps, "warmup_s": warmup, "site": request.site.name}
+        settings = {
+            "seed": asked.seed, "noise_ps": asked.noise_ps, "warmup_s": asked.warmup, "site": request.site.name
+        }  # fmt: skip
         print_json({**msgspec.to_builtins(result), **settings})
     else:
-        show(result)
+        _show(result)
 
 
-def _run(request: "Request", until_s: float, fixes_csv: Path | None) -> "FleetReport":
+# What is simulated
+
+
+def _request(asked: SimulateOptions) -> "Request":
+    from skyless.evaluation.scenarios import Request, Room
+
+    return Request(
+        site=_site(asked),
+        method=asked.method,
+        seed=asked.seed,
+        noise_ps=asked.noise_ps,
+        positions_m=tuple(finite_numbers("position", text, (2, 3)) for text in asked.position or ()),
+        paths_m=tuple(map(_path, asked.waypoints or ())),
+        tags=asked.tags or 1,
+        speed_mps=asked.speed or 1.0,
+        qa=asked.qa,
+        integrity=asked.protection.requirement(asked.method),
+        warmup_s=asked.warmup,
+        most_fixes=asked.fixes,
+        loss=asked.loss,
+        nlos=asked.nlos,
+        nlos_mean_m=asked.nlos_mean,
+        power_bias=asked.power_bias,
+        temperature=asked.temperature,
+        biases=tuple(map(_bias, asked.bias or ())),
+        outages=tuple(map(_outage, asked.outage or ())),
+        delay_errors=_delay_errors(asked.delay_error or []),
+        silences=tuple(map(_silence, asked.deaf or ())),
+        room=Room() if asked.scenario == _ROOM else None,
+    )
+
+
+def _site(asked: SimulateOptions) -> "Site":
+    """The site of that name, or in that file; the lab by default. Raises SkylessError."""
+    from msgspec.structs import replace
+
+    from skyless.site.lab import ideal_lab_site, lab_site
+    from skyless.site.load import load_site
+
+    if asked.site is not None:
+        if asked.scenario is not None:
+            raise SkylessError("give either --scenario or --site, not both")
+        return load_site(asked.site)
+    if asked.scenario not in {None, "lab", _ROOM}:
+        raise SkylessError(
+            f"--scenario is {asked.scenario!r}; it should be lab or room (or give a site file with --site)"
+        )
+    return replace(lab_site(), name=_ROOM) if asked.scenario == _ROOM else ideal_lab_site()
+
+
+def _path(text: str) -> tuple[tuple[float, ...], ...]:
+    """Points of a path, x,y or x,y,z each, separated by semicolons or spaces. Raises SkylessError."""
+    from skyless.air.page_codec import MAX_COORDINATE_M
+
+    points = tuple(finite_numbers("waypoints", part, (2, 3)) for part in text.replace(";", " ").split())
+    if len(points) < 2:
+        raise SkylessError(f"--waypoints is {text!r}; it should be two or more points in quotes, 'x,y;x,y;x,y'")
+    if len({len(point) for point in points}) > 1:
+        raise SkylessError(f"--waypoints is {text!r}; all of its points should have a height, or none")
+    if any(abs(value) > MAX_COORDINATE_M for point in points for value in point):
+        raise SkylessError(f"--waypoints is {text!r}; its points should lie within {MAX_COORDINATE_M:g} m")
+    if any(dist(a, b) < _SHORTEST_M for a, b in pairwise(points)):
+        raise SkylessError(f"--waypoints is {text!r}; from point to point it should be {_SHORTEST_M:g} m or more")
+    return points
+
+
+def _bias(text: str) -> "AnchorBias":
+    """ANCHOR:METRES or ANCHOR:METRES:BURST_S. Raises SkylessError."""
+    from skyless.simulation.impairments import AnchorBias
+
+    anchor, metres, *burst = finite_numbers("bias", text, (2, 3), ":")
+    if burst and burst[0] <= 0.0:
+        raise SkylessError(f"--bias is {text!r}; a burst should last longer than 0 s")
+    return AnchorBias(_whole("bias", text, anchor), metres, *burst)
+
+
+def _outage(text: str) -> "AnchorOutage":
+    """ANCHOR:OFF_S or ANCHOR:OFF_S:ON_S. Raises SkylessError."""
+    from skyless.simulation.impairments import AnchorOutage
+
+    anchor, *times_s = finite_numbers("outage", text, (2, 3), ":")
+    outage = _off_and_on("outage", text, times_s, "the anchor should come back after it has stopped")
+    return AnchorOutage(_whole("outage", text, anchor), outage)
+
+
+def _silence(text: str) -> "Outage":
+    """FROM_S or FROM_S:TO_S. Raises SkylessError."""
+    return _off_and_on("deaf", text, finite_numbers("deaf", text, (1, 2), ":"), "it should end after it has begun")
+
+
+def _off_and_on(option: str, text: str, times_s: Sequence[float], order: str) -> "Outage":
+    from skyless.simulation.impairments import Outage
+
+    if len(times_s) == 2 and times_s[1] <= times_s[0]:
+        raise SkylessError(f"--{option} is {text!r}; {order}")
+    if not 0.0 <= times_s[0] <= times_s[-1] <= _LATEST_S:
+        raise SkylessError(f"--{option} is {text!r}; times should be 0 s or later, and at most {_LATEST_S:g} s")
+    return Outage(*times_s)
+
+
+def _delay_errors(texts: list[str]) -> "tuple[DelayError, ...]":
+    """ANCHOR:TX_NS:RX_NS, each of another anchor. Raises SkylessError."""
+    from skyless.constants import TICK_S
+    from skyless.simulation.impairments import DelayError
+
+    errors: dict[int, DelayError] = {}
+    for text in texts:
+        number, *delays_ns = finite_numbers("delay-error", text, (3,), ":")
+        anchor = _whole("delay-error", text, number)
+        if anchor in errors:
+            raise SkylessError(f"--delay-error is {text!r}; anchor {anchor} already has one")
+        if any(abs(delay_ns) > _LONGEST_DELAY_NS for delay_ns in delays_ns):
+            raise SkylessError(f"--delay-error is {text!r}; delays should be within {_LONGEST_DELAY_NS:g} ns")
+        errors[anchor] = DelayError(anchor, *(delay_ns * 1e-9 / TICK_S for delay_ns in delays_ns))
+    return tuple(errors.values())
+
+
+def _whole(option: str, text: str, anchor: float) -> int:
+    if not anchor.is_integer():
+        raise SkylessError(f"--{option} is {text!r}; the anchor should be a whole number")
+    return int(anchor)
+
+
+# The run
+
+
+def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.evaluation.fleet import report
     from skyless.evaluation.scenarios import fleet_of
@@ -199,22 +305,22 @@ def _run(request: "Request", until_s: float, fixes_csv: Path | None) -> "FleetRe
         fleet = fleet_of(request)
     except ValueError as error:
         raise SkylessError(str(error)) from None
-    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
+    with loading_kernels():
         compile_kernels(request.method)
     started_s = time.perf_counter()
-    if fixes_csv is None:
-        _pass_time(fleet, request, until_s, None)
+    if asked.fixes_csv is None:
+        _advance(fleet, request, asked.until_s, None)
     else:
-        with open_for_writing(fixes_csv) as file:
-            _pass_time(fleet, request, until_s, file)
+        with open_for_writing(asked.fixes_csv) as file:
+            _advance(fleet, request, asked.until_s, file)
     return report(fleet, request.method, started_s)
 
 
-def _pass_time(fleet: "Fleet", request: "Request", until_s: float, file: TextIO | None) -> None:
-    """Let the world run in steps, so that the bar moves and the goal is seen."""
+def _advance(fleet: "Fleet", request: "Request", until_s: float, file: TextIO | None) -> None:
+    """Run the world in steps, so that the bar moves and the goal is noticed."""
     writer = None if file is None else csv.writer(file)
     if writer is not None:
-        writer.writerow(COLUMNS)
+        writer.writerow(FIXES_CSV_COLUMNS)
     fixes = request.most_fixes
     with progress_bar("simulating", fixes if fixes is not None else until_s) as bar:
         now_s = 0.0
@@ -222,16 +328,54 @@ def _pass_time(fleet: "Fleet", request: "Request", until_s: float, file: TextIO 
             now_s = min(now_s + 0.25, until_s)
             for judged in fleet.run(now_s):
                 if writer is not None:
-                    writer.writerow(row_of(judged))
+                    writer.writerow(_row(judged))
             bar.reach(fleet.errors.count / len(fleet.records) if fixes is not None else now_s)
 
 
 def _enough(fleet: "Fleet", request: "Request", now_s: float) -> bool:
-    """Whether all tags have their fixes, or those that have not wait in vain, with nothing planned to come back."""
+    """Whether all tags have their fixes, or those that have not wait too long, with nothing planned to come back."""
     fixes = request.most_fixes
     if fixes is None:
         return False
     returns_s = [planned.outage.on_s for planned in request.outages] + [silence.on_s for silence in request.silences]
     planned_s = max(filter(math.isfinite, returns_s), default=0.0)
     last_s = (0.0 if tag.last is None else tag.last.time_s for tag in fleet.records if tag.judged < fixes)
-    return all(now_s - max(tag_s, planned_s) > _PATIENCE_S for tag_s in last_s)
+    return all(now_s - max(tag_s, planned_s) > _LONGEST_WAIT_S for tag_s in last_s)
+
+
+def _row(judged: "JudgedFix") -> tuple[object, ...]:
+    """One fix as a row of ``FIXES_CSV_COLUMNS``."""
+    fix = judged.fix
+    numbers = [*fix.position_m, *fix.covariance_m2.diagonal(), *judged.truth_m]
+    levels = ("" if one is None else f"{one:.4g}" for one in (fix.hpl_m, fix.vpl_m, fix.integrity_risk))
+    return (
+        *(f"{judged.time_s:.6f}", judged.tag, *(f"{value:.6g}" for value in numbers)),
+        *(" ".join(map(str, fix.anchors)), *levels, fix.alert or ""),
+    )
+
+
+# The report
+
+
+def _show(result: "FleetReport") -> None:
+    facts = [
+        ("simulated time", f"{result.simulated_s:.1f} s in {result.wall_s:.1f} s ({result.speed:.1f} × real time)"),
+        ("messages at tags", f"{result.messages} ({result.dropped} dropped)"),
+        ("fixes judged", f"{result.fixes}"),
+        ("updates", f"{result.updates_per_s:.1f} per second and tag"),
+        ("first fix", "none" if result.first_fix_s is None else f"{result.first_fix_s:.3f} s after power-on"),
+        ("RMSE", cm(result.rmse_m)),
+        ("predicted σ", cm(result.sigma_m)),
+        ("95 %", cm(result.p95_m)),
+        ("largest", cm(result.max_m)),
+    ]
+    if (levels := result.levels) is not None:
+        alerts = ", ".join(f"{alert} {count}" for alert, count in levels.alerts.items() if alert != "none")
+        available = f"{100 * levels.available:.1f} % of the fixes"
+        facts += [
+            ("protection level", f"median {cm(levels.hpl_m)}, for {available}"),
+            ("errors beyond it", f"{levels.misleading} (stated risk {levels.integrity_risk:g})"),
+            ("alerts", alerts or "none"),
+        ]
+    drops = [(f"dropped: {reason}", str(count)) for reason, count in result.drops.items()]
+    print_facts(f"{result.method}, {result.tags} tag(s)", [*facts, *drops])

@@ -7,7 +7,7 @@ import msgspec
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.common.output import console, print_json, write_atomically
+from skyless.cli.common.output import console, print_json, print_warnings, write_file
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -67,10 +67,7 @@ def new(
     check_site(site, file)
     if file.exists() and not force:
         raise SkylessError(f"{file} exists; --force overwrites it")
-    try:
-        write_atomically(file, site_template(site).encode())
-    except OSError as error:
-        raise SkylessError(f"{file} cannot be written: {error.strerror}") from None
+    write_file(file, site_template(site).encode())
     console().print(f"wrote {file}; next: skyless site check {file}", markup=False)
 
 
@@ -78,7 +75,7 @@ def new(
 def check(file: Path, /, *, json: bool = False) -> None:
     """Check a site file, and show what it makes: anchors, slots, rates, and what may cost accuracy.
 
-    A mistake ends with exit code 2 and says which key should be what; warnings do not.
+    A mistake ends with exit code 2 and a message that names the key and what it should be; warnings do not.
 
     Parameters
     ----------
@@ -98,7 +95,7 @@ def check(file: Path, /, *, json: bool = False) -> None:
 
 
 def _report(site: "Site") -> dict[str, Any]:
-    """What there is to say of a valid site, SI units."""
+    """The report on a valid site, SI units."""
     from skyless.air.codec import MAX_FRAME_BYTES
     from skyless.air.ieee802154 import air_time_s
     from skyless.constants import TICK_S
@@ -143,8 +140,8 @@ def _show(file: Path, report: dict[str, Any]) -> None:
         column.justify = "right"
     for anchor in report["anchors"]:
         role = " (master)" if anchor["id"] == report["master"] else ""
-        places = [f"{anchor[axis]:.3f}" for axis in ("x_m", "y_m", "z_m")]
-        table.add_row(f"{anchor['id']}{role}", *places, " ".join(map(str, anchor["slots"])))
+        position = [f"{anchor[axis]:.3f}" for axis in ("x_m", "y_m", "z_m")]
+        table.add_row(f"{anchor['id']}{role}", *position, " ".join(map(str, anchor["slots"])))
     out = console()
     out.print(table)
     height = report["tag_height_m"]
@@ -153,9 +150,8 @@ def _show(file: Path, report: dict[str, Any]) -> None:
         f"{report['slots']} slots of {report['slot_s'] * 1e3:.3f} ms: "
         f"{report['superframes_per_s']:.1f} superframes/s, {report['messages_per_s']:.0f} messages/s\n"
         f"the longest frame takes {report['longest_frame_s'] * 1e6:.0f} µs; "
-        f"the air is taken {report['occupancy']:.0%} of the time at most\n"
+        f"the air is occupied {report['occupancy']:.0%} of the time at most\n"
         f"tags {tags}"
     )
-    for warning in report["warnings"]:
-        out.print(Text.assemble(("warning: ", "bold yellow"), warning))
+    print_warnings(report["warnings"])
     out.print("the site file is valid" if not report["warnings"] else "the site file is valid, with warnings")

@@ -1,53 +1,114 @@
-"""``skyless study``: how the receiver does under what, over many runs in the simulated world."""
+"""``skyless study``: how accurate the receiver is under which conditions, over many runs in the simulated world."""
 
+import csv
+import io
+import os
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
+import msgspec
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.common.options import IntegrityRisk, Picoseconds, Positive, integrity_of, known_method
-from skyless.cli.common.progress import progress_bar, status
+from skyless.cli.common.options import (
+    IntegrityRisk,
+    Picoseconds,
+    Positive,
+    Seed,
+    check_method,
+    check_picture,
+    options,
+)
+from skyless.cli.common.output import console, print_json, to_json, write_atomically
+from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.errors import SkylessError
+from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from skyless.studies.plan import Plan, Row, Study
 
 _Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "scale"]
-_Count = Annotated[int, Parameter(validator=Number(gte=1, lte=10**6))]
 
-_USUAL_METHOD = "joint"
-
-_OF_EPISODES = ("efficiency", "integrity")
+_OF_EPISODES: Final = ("efficiency", "integrity")
 """Studies of the filter ``joint`` itself."""
+
+_WIDEST: Final = 220
+"""Columns of a table that is not shown on a terminal."""
+
+_OF_ERRORS: Final = (
+    "Simulated. ± standard errors. NEES: per dimension, with the interval where 99 % of honest ones lie.",
+    "Fixes: superframes with one. CPU: of a tag for a message, measured.",
+)
+_OF_LEVELS: Final = (
+    "Simulated. Level: share of fixes with a protection level. HPL, VPL: its median. Misleading, vertical: share of",
+    "fixes whose error exceeds it, in 10⁻⁴, with the interval where it truly lies with 99 %; held unless the risk lies",
+    "below that. Ratio: how many times smaller levels could be on clean data.",
+)
+_OF_THE_ROOM: Final = (
+    "Simulated. ± standard errors. NEES: per dimension. Fixes: superframes with one.",
+    "Level: share of fixes with a protection level. HPL: its median. Exceeded: share of those whose error is larger,",
+    "in 10⁻⁴, with the interval where it truly lies with 99 % (tags as units); unwarned: those without an alert.",
+)
+_LEGENDS: Final = {"integrity": _OF_LEVELS, "room": _OF_THE_ROOM}
+
+_FIGURES: Final = {
+    "rmse_m": "RMSE",
+    "nees": "NEES",
+    "level": "level",
+    "exceeded": "exceeded",
+    "hpl_m": "HPL",
+    "ratio": "ratio",
+}
+"""How the table names what may have limits."""
 
 app = App(name="study", help_epilogue="Example: skyless study loss --seed 7 --plot loss.png")
 
 
+@options
+class StudyOptions:
+    """Options of ``skyless study``."""
+
+    method: str | None = None
+    """A positioning method, by default the best one."""
+    seed: Seed = 1
+    """Same seed, same rows, whatever computes them; CPU times apart."""
+    episodes: Annotated[int, Parameter(validator=Number(gte=1, lte=10**6))] | None = None
+    """Episodes of two seconds for each case (efficiency, integrity)."""
+    worlds: Annotated[int, Parameter(validator=Number(gte=2, lte=10**5))] | None = None
+    """Independent worlds for each case (all others, but for the tags of scale; room: a quarter but for its first)."""
+    seconds: Annotated[float, Parameter(validator=Number(gte=1, lte=1e6))] | None = None
+    """Simulated seconds for which each world is judged."""
+    noise_ps: Picoseconds | None = None
+    """Noise of every TX and RX stamp in picoseconds, known to the filters; by default 100."""
+    qa: Positive | None = None
+    """Process noise that the filters assume at rest: spectral density of the acceleration, m²/s³; by default 0.3."""
+    integrity_risk: IntegrityRisk | None = None
+    """Probability, for each fix, that the error exceeds its protection level (integrity); 1e-4 by default."""
+    alert_limit_m: Positive | None = None
+    """Fixes whose protection level exceeds this, in metres, count as not available (integrity)."""
+    without_mesh: bool = False
+    """Anchors relay only when they heard the master."""
+    quick: bool = False
+    """Simulate a fraction, with more scatter."""
+    json: bool = False
+    """Write one JSON object instead of the table."""
+    plot: Path | None = None
+    """Draw the picture into this file."""
+    out: Path | None = None
+    """Write the rows as JSON and CSV and the picture as PNG and SVG into this folder."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler whose workers do the work, for example tcp://127.0.0.1:8786."""
+    processes: Annotated[int, Parameter(validator=Number(gte=1, lte=1024))] | None = None
+    """Processes on this machine; by default one for each core."""
+
+
 @app.default
-def study(
-    name: _Name,
-    /,
-    *,
-    method: str | None = None,
-    seed: Annotated[int, Parameter(validator=Number(gte=0))] = 1,
-    episodes: _Count | None = None,
-    worlds: Annotated[int, Parameter(validator=Number(gte=2, lte=10**5))] | None = None,
-    seconds: Annotated[float, Parameter(validator=Number(gte=1, lte=1e6))] | None = None,
-    noise_ps: Picoseconds | None = None,
-    qa: Positive | None = None,
-    integrity_risk: IntegrityRisk | None = None,
-    alert_limit_m: Positive | None = None,
-    without_mesh: bool = False,
-    quick: bool = False,
-    json: bool = False,
-    plot: Path | None = None,
-    out: Path | None = None,
-    scheduler: str | None = None,
-    processes: Annotated[int, Parameter(validator=Number(gte=1, lte=1024))] | None = None,
-) -> None:
+def study(name: _Name, /, *, asked: StudyOptions = StudyOptions()) -> None:
     """Measure errors over many simulated runs: a table with standard errors, a picture, JSON.
 
     Parameters
@@ -56,99 +117,198 @@ def study(
         efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
         sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
         room: the errors of real rooms, and what goes wrong in them. scale: numbers of tags and anchors.
-    method
-        A positioning method, by default the best one.
-    seed
-        Same seed, same rows, whatever computes them; CPU times apart.
-    episodes
-        Episodes of two seconds for each case (efficiency, integrity).
-    worlds
-        Independent worlds for each case (all others, but for the tags of scale; room: a quarter but for its first).
-    seconds
-        Simulated seconds for which each world is judged.
-    noise_ps
-        Noise of every TX and RX stamp in picoseconds, known to the filters; by default 100.
-    qa
-        Agility that the filters assume at rest, m²/s³; by default 0.3.
-    integrity_risk
-        Probability, for each fix, that the error exceeds its protection level (integrity); 1e-4 by default.
-    alert_limit_m
-        Fixes with a higher protection level than so many metres count as not available (integrity).
-    without_mesh
-        Anchors relay only when they heard the master.
-    quick
-        Simulate a fraction, with more scatter.
-    json
-        Write one JSON object instead of the table.
-    plot
-        Draw the picture into this file.
-    out
-        Write the rows as JSON and CSV and the picture as PNG and SVG into this folder.
-    scheduler
-        Address of a Dask scheduler whose workers do the work, for example tcp://127.0.0.1:8786.
-    processes
-        Processes on this machine; by default one for each core.
     """
-    from skyless.cli.study_output import print_rows, see_that_it_can_be_written, write
     from skyless.studies.catalogue import STUDIES
-    from skyless.studies.plan import plan_of
 
-    asked = integrity_of(integrity_risk, alert_limit_m, None)
-    if name != "integrity" and (integrity_risk is not None or alert_limit_m is not None):
-        raise SkylessError("--integrity-risk and --alert-limit-m are for the study integrity")
-    _see_that_it_applies(name, episodes, {"worlds": worlds, "seconds": seconds, "noise-ps": noise_ps, "qa": qa})
-    if scheduler is not None and processes is not None:
-        raise SkylessError("--processes are on this machine, --scheduler is for others; give either")
-    see_that_it_can_be_written(plot, out)
-    plan = plan_of(
-        method or _USUAL_METHOD,
-        seed,
-        study=name,
-        quick=quick,
-        noise_ps=noise_ps or 100.0,
-        qa=qa or 0.3,
-        mesh=not without_mesh,
-        worlds=worlds,
-        seconds=seconds,
-        episodes=episodes,
-        integrity_risk=asked.risk,
-        alert_limit_m=asked.alert_limit_m,
-    )
+    _check(name, asked)
+    plan = _plan(name, asked)
     started_s = time.perf_counter()
     chosen = STUDIES[name]
-    rows = _run(chosen, plan, scheduler, processes)
-    write(chosen, rows, plot, out)
-    print_rows(chosen, plan, rows, time.perf_counter() - started_s, json=json)
+    rows = _run(chosen, plan, asked)
+    _write(chosen, rows, asked.plot, asked.out)
+    print_rows(chosen, plan, rows, time.perf_counter() - started_s, json=asked.json)
 
 
-def _see_that_it_applies(name: str, episodes: int | None, others: dict[str, float | None]) -> None:
-    if name not in _OF_EPISODES and episodes is not None:
+def _check(name: str, asked: StudyOptions) -> None:
+    """See that the options fit the study and that its files can be written. Raises SkylessError."""
+    if name != "integrity" and (asked.integrity_risk is not None or asked.alert_limit_m is not None):
+        raise SkylessError("--integrity-risk and --alert-limit-m are for the study integrity")
+    if name not in _OF_EPISODES and asked.episodes is not None:
         takes = f"{name} takes --worlds and --seconds"
         raise SkylessError(f"--episodes is for the studies efficiency and integrity; {takes}")
+    others = {"worlds": asked.worlds, "seconds": asked.seconds, "noise-ps": asked.noise_ps, "qa": asked.qa}
     given = [option for option, value in others.items() if value is not None]
-    if name == "integrity":
-        unfit = [option for option in given if option in {"worlds", "seconds"}]
-        if unfit:
-            raise SkylessError(f"--{unfit[0]} is not for the study integrity; give --episodes")
+    unfit = [option for option in given if option in {"worlds", "seconds"}]
+    if name == "integrity" and unfit:
+        raise SkylessError(f"--{unfit[0]} is not for the study integrity; give --episodes")
     if name == "efficiency" and given:
         raise SkylessError(f"--{given[0]} is not for the study efficiency, which has cases of its own; give --episodes")
+    if asked.scheduler is not None and asked.processes is not None:
+        raise SkylessError("--processes are on this machine, --scheduler is for others; give either")
+    check_picture(asked.plot)
+    if (out := asked.out) is None:
+        return
+    if out.exists() and not out.is_dir():
+        raise SkylessError(f"--out is {str(out)!r}, which is a file; it should be a folder, or not exist yet")
+    parent = next(folder for folder in (out, *out.absolute().parents) if folder.is_dir())
+    if not os.access(parent, os.W_OK):
+        raise SkylessError(f"--out is {str(out)!r}, where no folder can be written")
 
 
-def _run(chosen: "Study", plan: "Plan", scheduler: str | None, processes: int | None) -> "list[Row]":
+def _plan(name: str, asked: StudyOptions) -> "Plan":
+    from skyless.positioning.integrity import RISK
+    from skyless.studies.plan import plan_of
+
+    return plan_of(
+        asked.method or DEFAULT_METHOD,
+        asked.seed,
+        study=name,
+        quick=asked.quick,
+        noise_ps=asked.noise_ps or 100.0,
+        qa=asked.qa or 0.3,
+        mesh=not asked.without_mesh,
+        worlds=asked.worlds,
+        seconds=asked.seconds,
+        episodes=asked.episodes,
+        integrity_risk=asked.integrity_risk or RISK,
+        alert_limit_m=asked.alert_limit_m,
+    )
+
+
+def _run(chosen: "Study", plan: "Plan", asked: StudyOptions) -> "list[Row]":
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.studies.runner import run_cells, run_cells_on_dask
 
-    known_method(plan.method)
+    check_method(plan.method)
     cells = chosen.cells(plan)
-    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
+    with loading_kernels():
         compile_kernels(plan.method)
     try:
         with progress_bar(f"studying {chosen.title}", 1.0) as bar:
-            if scheduler is None:
-                results = run_cells(cells, bar.reach, processes)
+            if asked.scheduler is None:
+                results = run_cells(cells, bar.reach, asked.processes)
             else:
-                results = run_cells_on_dask(cells, bar.reach, scheduler)
+                results = run_cells_on_dask(cells, bar.reach, asked.scheduler)
     except KeyboardInterrupt:
         print("stopped; nothing was written", file=sys.stderr)
         raise
     return chosen.rows(plan, results)
+
+
+def _write(study: "Study", rows: "Sequence[Row]", plot: Path | None, out: Path | None) -> None:
+    """Write the files that were asked for, each whole or not at all. Raises SkylessError."""
+    if plot is None and out is None:
+        return
+    from skyless.evaluation.figures import picture
+
+    figure = study.draw(rows)
+    files = {} if plot is None else {plot: plot.suffix.removeprefix(".")}
+    try:
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            files |= {out / f"{study.name}.{kind}": kind for kind in ("png", "svg")}
+            write_atomically(out / f"{study.name}.json", to_json(rows).encode())
+            write_atomically(out / f"{study.name}.csv", _csv(rows).encode())
+        for path, kind in files.items():
+            write_atomically(path, picture(figure, kind))
+    except OSError as error:
+        raise SkylessError(f"{error.filename or plot or out} cannot be written: {error.strerror}") from None
+
+
+def _csv(rows: "Sequence[Row]") -> str:
+    text = io.StringIO()
+    table = csv.writer(text)
+    table.writerow(rows[0].__struct_fields__)
+    for row in rows:
+        values = ["" if value is None else value for value in msgspec.structs.astuple(row)]
+        table.writerow([" ".join(map(str, value)) if isinstance(value, tuple) else value for value in values])
+    return text.getvalue()
+
+
+def print_rows(study: "Study", plan: "Plan", rows: "Sequence[Row]", wall_s: float, *, json: bool) -> None:
+    """Print the result."""
+    if json:
+        built = msgspec.to_builtins(plan)
+        print_json({"study": study.name, "simulated": True, **built, "wall_s": wall_s, "rows": rows})
+        return
+    out = console()
+    if not out.is_terminal:
+        out.width = _WIDEST
+    out.print(_table(study, plan, rows))
+    for line in _LEGENDS.get(study.name, _OF_ERRORS):
+        out.print(line)
+
+
+def _table(study: "Study", plan: "Plan", rows: "Sequence[Row]") -> "Table":
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, title=f"{study.title}: {plan.method}, seed {plan.seed}")
+    heads = (
+        *("case", "RMSE in cm", "95 %", "max", "σ", "NEES", "", "fixes", "bound"),
+        *("level", "HPL in cm", "VPL", "misleading", "", "vertical", "", "exceeded", "", "unwarned"),
+        *("ratio", "limit", "CPU in µs"),
+    )
+    cells = [_cells(row) for row in rows]
+    used = [column for column in range(len(heads)) if any(line[column] for line in cells)]
+    for column in used:
+        table.add_column(heads[column], justify="left" if column == 0 else "right")
+    for line in cells:
+        table.add_row(*(line[column] for column in used))
+    return table
+
+
+def _cells(row: "Row") -> tuple[str, ...]:
+    in_a_room = row.study == "room"  # its table is wide enough without the columns that have no limits
+    return (
+        row.case,
+        _figure(row.rmse_m, 100.0, row.rmse_error_m),
+        _figure(row.p95_m, 100.0),
+        _figure(row.max_m, 100.0),
+        _figure(row.said_m, 100.0),
+        _figure(row.nees),
+        "" if row.nees_interval is None or in_a_room else "{:.2f}–{:.2f}".format(*row.nees_interval),
+        "" if row.risk is not None else _percent(row.available),
+        _figure(row.bound_m, 100.0),
+        _percent(row.level if row.risk is None else row.available),
+        _figure(row.hpl_m, 100.0, digits=1),
+        _figure(row.vpl_m, 100.0, digits=1),
+        _figure(row.hmi, 1e4),
+        _interval(row.hmi_interval),
+        _figure(row.hmi_vertical, 1e4),
+        _interval(row.hmi_vertical_interval),
+        _rare(row.exceeded),
+        "" if row.exceeded_interval is None else "–".join(map(_rare, row.exceeded_interval)),
+        _rare(row.exceeded_unwarned),
+        _figure(row.ratio, 1.0, row.ratio_error, 3),
+        _limit(row),
+        "" if in_a_room else _figure(row.cpu_us_per_message, digits=0),
+    )
+
+
+def _limit(row: "Row") -> str:
+    """Which limits were missed; or the largest ratio that is accepted, else the risk of levels, and whether it held."""
+    if row.limits:
+        return "missed: " + ", ".join(map(_FIGURES.__getitem__, row.missed)) if row.missed else "held"
+    limit = row.risk if row.limit is None else row.limit
+    return "" if limit is None else f"{limit:g} {'held' if row.passed else 'missed'}"
+
+
+def _rare(share: float | None) -> str:
+    """In 10⁻⁴."""
+    return "" if share is None else f"{1e4 * share:.{0 if share >= 1e-2 else 2}f}"
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{100.0 * share:.1f} %"
+
+
+def _interval(shares: tuple[float, float] | None) -> str:
+    return "" if shares is None else "{:.2f}–{:.2f}".format(*(1e4 * share for share in shares))
+
+
+def _figure(value: float | None, factor: float = 1.0, error: float | None = None, digits: int = 2) -> str:
+    if value is None:
+        return ""
+    after = "" if error is None else f" ± {factor * error:.{digits}f}"
+    return f"{factor * value:.{digits}f}{after}"

@@ -1,30 +1,23 @@
 """The two-state clock filter: an anchor's offset and rate against the master (``docs/maths.md`` section 6).
 
 The offset is kept in two parts, whole ticks in an integer and a remainder below one tick in metres of light, so that
-nothing is lost however long the filter runs. One update takes one master beacon.
+nothing is lost however long the filter runs. One update processes one master beacon.
 
-This is plain Python: so little arithmetic a beacon takes no longer than a kernel takes to be called.
+Plain Python: so little arithmetic takes no longer than the call of a kernel.
 """
 
 import math
 from typing import Final
 
-import numpy as np
 from msgspec import Struct
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.kernels.two_state import TwoState, predict, predicted_value_variance, update
 
-MAX_RATE: Final = 40e-6
+MAX_RELATIVE_RATE: Final = 40e-6
 """Two crystals of ±20 ppm each, the widest that IEEE 802.15.4 allows."""
 
-OFFSET, RATE, VAR_OFFSET, COVARIANCE, VAR_RATE = range(5)
-"""Places in the filter's float state: metres, m/s, and their covariance."""
-
-WHOLE_OFFSET, EPOCH_MASTER, UPDATES, REJECTED = range(4)
-"""Places in the filter's integer state: ticks, ticks, counts."""
-
-_MAX_RATE_MPS: Final = MAX_RATE * SPEED_OF_LIGHT_MPS
-_State = tuple[float, float, float, float, float]
+_MAX_RATE_VARIANCE: Final = (MAX_RELATIVE_RATE * SPEED_OF_LIGHT_MPS) * (MAX_RELATIVE_RATE * SPEED_OF_LIGHT_MPS)
 
 
 class ClockNoise(Struct, frozen=True, gc=False):
@@ -42,6 +35,12 @@ def clock_noise(white_fm: float, random_walk_fm: float, clocks: int = 2) -> Cloc
     return ClockNoise(scale * white_fm**2, scale * random_walk_fm**2)
 
 
+def stamp_variance_m2(stamp_s: float, *, rounded: bool) -> float:
+    """Variance of a stamp in m²; rounding to whole ticks adds a twelfth of a tick squared."""
+    rounding = TICK_S**2 / 12.0 if rounded else 0.0
+    return SPEED_OF_LIGHT_MPS**2 * (stamp_s**2 + rounding)
+
+
 class ClockFilter:
     """One anchor's clock against the master, beacon by beacon."""
 
@@ -49,104 +48,75 @@ class ClockFilter:
         self._noise = noise
         self._variance_m2 = variance_m2
         self._gate = gate
-        self.state = np.zeros(5)
-        self.whole = np.zeros(4, dtype=np.int64)
-
-    @property
-    def updates(self) -> int:
-        """Beacons taken since the last start."""
-        return int(self.whole[UPDATES])
-
-    @property
-    def rejected(self) -> int:
-        """Beacons refused in a row."""
-        return int(self.whole[REJECTED])
+        self._whole_offset = self._epoch_master = 0
+        """Offset in whole ticks, and the master's time of the last beacon."""
+        self._offset_m = self._rate_mps = 0.0
+        """The rest of the offset, and the rate, in metres of light."""
+        self.covariance: TwoState = (0.0, 0.0, 0.0)
+        """Of offset and rate."""
+        self.updates = 0
+        """Beacons processed since the last start."""
+        self.rejected = 0
+        """Beacons rejected in a row."""
 
     @property
     def rate(self) -> float:
         """Fractional rate of the own clock against the master's."""
-        return float(self.state[RATE]) / SPEED_OF_LIGHT_MPS
+        return self._rate_mps / SPEED_OF_LIGHT_MPS
 
     @property
     def offset_std_m(self) -> float:
         """Standard deviation of the offset at the last beacon, in metres of light."""
-        return float(np.sqrt(self.state[VAR_OFFSET]))
+        return math.sqrt(self.covariance[0])
 
-    def hear(self, tx_ticks_master: int, rx_ticks_own: int, range_m: float) -> float:
-        """Take a master beacon, both stamps unwrapped; return the normalised innovation squared (0 at the start).
+    def update(self, tx_ticks_master: int, rx_ticks_own: int, range_m: float) -> float:
+        """Process a master beacon, both stamps unwrapped; return the normalised innovation squared (0 at the start).
 
         The state is at the time at which the beacon arrives, so the rate acts on the flight time as it should
         (``docs/maths.md`` section 4). An innovation beyond the gate changes nothing but the time.
         """
-        whole_offset, epoch_master, updates, rejected = self.whole.tolist()
-        if updates == 0:
+        if self.updates == 0:
             self.restart(tx_ticks_master, rx_ticks_own, range_m)
             return 0.0
-        state = self._predicted((tx_ticks_master - epoch_master) * TICK_S)
-        measured_m = (rx_ticks_own - tx_ticks_master - whole_offset) * TICK_M - range_m
-        innovation = measured_m - state[OFFSET]
-        spread = state[VAR_OFFSET] + self._variance_m2
-        normalised = innovation * innovation / spread
-        if normalised > self._gate * self._gate:
-            rejected += 1
+        dt_s = (tx_ticks_master - self._epoch_master) * TICK_S
+        offset_m = self._offset_m + self._rate_mps * dt_s
+        self.covariance = predict(self.covariance, dt_s, self._noise.white, self._noise.walk)
+        innovation = (rx_ticks_own - tx_ticks_master - self._whole_offset) * TICK_M - range_m - offset_m
+        nis = innovation * innovation / (self.covariance[0] + self._variance_m2)
+        if nis > self._gate * self._gate:
+            self.rejected += 1
         else:
-            updates, rejected = updates + 1, 0
-            state = self._corrected(state, innovation, spread)
-        steps = math.floor(state[OFFSET] / TICK_M)
-        self.state[:] = (state[OFFSET] - steps * TICK_M, *state[RATE:])
-        self.whole[:] = (whole_offset + steps, tx_ticks_master, updates, rejected)
-        return normalised
-
-    def _predicted(self, dt_s: float) -> _State:
-        """The float state ``dt_s`` of master time later."""
-        offset, rate, var_offset, covariance, var_rate = self.state.tolist()
-        white, walk = self._noise.white, self._noise.walk
-        var_offset += dt_s * (2.0 * covariance + dt_s * var_rate)
-        var_offset += dt_s * (white + walk * dt_s * dt_s / 3.0)
-        covariance += dt_s * (var_rate + walk * dt_s / 2.0)
-        return offset + rate * dt_s, rate, var_offset, covariance, var_rate + walk * dt_s
-
-    def _corrected(self, state: _State, innovation: float, spread: float) -> _State:
-        """Kalman update in Joseph form, which keeps the covariance positive whatever the rounding."""
-        offset, rate, var_offset, covariance, var_rate = state
-        noise = self._variance_m2
-        gain_offset = var_offset / spread
-        gain_rate = covariance / spread
-        keep = 1.0 - gain_offset
-        return (
-            offset + gain_offset * innovation,
-            rate + gain_rate * innovation,
-            keep * keep * var_offset + gain_offset * gain_offset * noise,
-            keep * (covariance - gain_rate * var_offset) + gain_offset * gain_rate * noise,
-            var_rate + gain_rate * (gain_rate * (var_offset + noise) - 2.0 * covariance),
-        )
+            gain, rate_gain, self.covariance = update(self.covariance, self._variance_m2)
+            offset_m += gain * innovation
+            self._rate_mps += rate_gain * innovation
+            self.updates, self.rejected = self.updates + 1, 0
+        steps = math.floor(offset_m / TICK_M)
+        self._offset_m = offset_m - steps * TICK_M
+        self._whole_offset += steps
+        self._epoch_master = tx_ticks_master
+        return nis
 
     def restart(self, tx_ticks_master: int, rx_ticks_own: int, range_m: float) -> None:
         """Forget all and begin with this beacon: offset known to the stamps' noise, rate to the crystals' tolerance."""
-        self.whole[:] = (rx_ticks_own - tx_ticks_master, tx_ticks_master, 1, 0)
-        self.state[:] = (-range_m, 0.0, self._variance_m2, 0.0, _MAX_RATE_MPS * _MAX_RATE_MPS)
+        self._whole_offset, self._epoch_master = rx_ticks_own - tx_ticks_master, tx_ticks_master
+        self._offset_m, self._rate_mps = -range_m, 0.0
+        self.covariance = (self._variance_m2, 0.0, _MAX_RATE_VARIANCE)
+        self.updates, self.rejected = 1, 0
 
-    def doubt(self, factor: float) -> None:
-        """Multiply the covariance: what is followed from now on may differ from what was followed before."""
-        self.state[VAR_OFFSET:] *= factor
+    def inflate_covariance(self, factor: float) -> None:
+        """Multiply the covariance: the clock that is tracked from now on may differ from the one before."""
+        variance, covariance, rate_variance = self.covariance
+        self.covariance = (variance * factor, covariance * factor, rate_variance * factor)
 
     def to_master(self, ticks_own: int) -> tuple[int, float, float]:
         """Own time on the master's scale: whole ticks, the fraction of a tick in [0, 1), and the variance in m²."""
-        whole_offset, epoch_master = self.whole[: EPOCH_MASTER + 1].tolist()
-        offset, rate, var_offset, covariance, var_rate = self.state.tolist()
-        elapsed_own = (ticks_own - whole_offset - epoch_master) - offset / TICK_M
-        elapsed = elapsed_own / (1.0 + rate / SPEED_OF_LIGHT_MPS)
-        floor = math.floor(elapsed)
-        dt_s = elapsed * TICK_S
-        span_s = abs(dt_s)
-        variance = var_offset + dt_s * (2.0 * covariance + dt_s * var_rate)
-        variance += span_s * (self._noise.white + self._noise.walk * span_s * span_s / 3.0)
-        return epoch_master + floor, elapsed - floor, variance
+        elapsed_own = (ticks_own - self._whole_offset - self._epoch_master) - self._offset_m / TICK_M
+        elapsed = elapsed_own / (1.0 + self._rate_mps / SPEED_OF_LIGHT_MPS)
+        whole = math.floor(elapsed)
+        variance = predicted_value_variance(self.covariance, elapsed * TICK_S, self._noise.white, self._noise.walk)
+        return self._epoch_master + whole, elapsed - whole, variance
 
     def from_master(self, ticks_master: int) -> int:
         """Nearest own tick of a time on the master's scale."""
-        whole_offset, epoch_master = self.whole[: EPOCH_MASTER + 1].tolist()
-        offset, rate = self.state[: RATE + 1].tolist()
-        offset_m = offset + rate * ((ticks_master - epoch_master) * TICK_S)
-        own_ticks: int = ticks_master + whole_offset + round(offset_m / TICK_M)
-        return own_ticks
+        offset_m = self._offset_m + self._rate_mps * ((ticks_master - self._epoch_master) * TICK_S)
+        return ticks_master + self._whole_offset + round(offset_m / TICK_M)

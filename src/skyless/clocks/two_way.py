@@ -1,19 +1,47 @@
-"""Time of flight between two nodes that both broadcast and hear each other, by bracketing.
+"""Time of flight between two nodes that both broadcast and receive each other, by bracketing.
 
-Node x sends twice, at ``t1`` and ``t2`` of its clock, and y hears it at ``r1`` and ``r2`` of its own. In between x
-hears y at ``r`` (clock of x), sent at ``t`` (clock of y). The line through (t1, r1) and (t2, r2) maps a time of x to
+Node x sends twice, at ``t1`` and ``t2`` of its clock, and y receives it at ``r1`` and ``r2`` of its own. In between x
+receives y at ``r`` (clock of x), sent at ``t`` (clock of y). The line through (t1, r1) and (t2, r2) maps a time of x to
 the time of y one flight later, so ``line(r) - t`` is twice the time of flight. The rate of the two clocks comes from
 the bracket itself, and a rate that drifts acts only in the second order.
 """
 
+from bisect import bisect_left, insort
+from collections import deque
 from typing import Final
 
 from msgspec import Struct
 
-from skyless.clocks.running_median import RunningMedian
 from skyless.ticks import difference
 
-MAX_RATE: Final = 80e-6
+
+class RunningMedian:
+    """Median of the last ``window`` values; fewer than half of them may be arbitrarily wrong."""
+
+    def __init__(self, window: int = 31) -> None:
+        self._window = window
+        self._arrived: deque[float] = deque()
+        self._sorted: list[float] = []
+
+    def __len__(self) -> int:
+        return len(self._sorted)
+
+    def add(self, value: float) -> float:
+        """Add one finite value and return the median, the upper one of an even number of values."""
+        ordered = self._sorted
+        if len(ordered) == self._window:
+            del ordered[bisect_left(ordered, self._arrived.popleft())]
+        self._arrived.append(value)
+        insort(ordered, value)
+        return ordered[len(ordered) >> 1]
+
+    @property
+    def value(self) -> float | None:
+        """The median, None before the first value."""
+        return self._sorted[len(self._sorted) >> 1] if self._sorted else None
+
+
+MAX_BRACKET_RATE: Final = 80e-6
 """Twice what two crystals of ±20 ppm can differ: a bracket beyond it mixes stamps of different clocks."""
 
 MAX_FLIGHT_TICKS: Final = 1 << 18
@@ -41,7 +69,7 @@ def bracketed_flight_ticks(before: Leg, back: Leg, after: Leg, bits: int) -> flo
         return None
     gained = difference(after.rx_ticks, before.rx_ticks, bits) - span_x
     rate = gained / span_x
-    if abs(rate) > MAX_RATE:
+    if abs(rate) > MAX_BRACKET_RATE:
         return None
     reply = until_back_x - difference(back.tx_ticks, before.rx_ticks, bits)
     flight = (reply + rate * until_back_x) / 2
@@ -57,8 +85,8 @@ class TwoWayRanging:
         self._last: dict[tuple[int, int], Leg] = {}
         self._flights: dict[tuple[int, int], RunningMedian] = {}
 
-    def hear(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int) -> float | None:
-        """Take one reception; return the time of flight in ticks that it completes, if it does."""
+    def add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int) -> float | None:
+        """Add one reception; return the time of flight in ticks that it completes, if it does."""
         leg = Leg(tx_ticks, rx_ticks)
         before = self._last.get((sender, receiver))
         self._last[sender, receiver] = leg

@@ -1,7 +1,7 @@
 """Whether the master still lives, from its own beacons and from what others relay of them.
 
-Every listener learns how often each link brings news of the master. Silence is believed to be its death once so long a
-silence would be next to impossible on those links; lost frames alone do not depose a master.
+Every listener estimates how often each link brings news of the master. A silent master is declared dead once its
+silence is next to impossible on those links; lost frames alone do not replace a master.
 """
 
 import math
@@ -10,29 +10,29 @@ from typing import Final
 from msgspec import Struct
 
 MOST_CHANCE: Final = 1e-10
-"""Chance of a silence, were the master alive, below which it is taken for dead."""
+"""Chance of a silence, were the master alive, below which it is declared dead."""
 
 MEMORY: Final = 64
 """Turns of the master over which a link's share is averaged."""
 
 RECENT_TURNS: Final = 8
-"""A link that has brought nothing for so long counts for nothing."""
+"""A link that has brought nothing for this number of turns does not count."""
 
 SEQUENCES: Final = 256
 
 
 class _Link(Struct):
-    """One way by which news of the master comes."""
+    """A source of news of the master: itself, or an anchor that receives it."""
 
     sequence: int
-    """Of the master's last beacon that it told of."""
+    """Of the master's last beacon that it reported."""
     turns: int = 0
     share: float = 0.5
-    """Part of the master's turns of which it tells before the next one."""
+    """Part of the master's turns that it reports before the next one."""
 
 
 class MasterWatch:
-    """Follows the sequence numbers of one master's beacons; a turn is one beacon that it should send."""
+    """Tracks the sequence numbers of one master's beacons; a turn is one beacon that it should send."""
 
     def __init__(self) -> None:
         self.news_ticks = 0
@@ -45,13 +45,13 @@ class MasterWatch:
         self.news_ticks, self._sequence = now_ticks, None
         self._links.clear()
 
-    def hear(self, teller: int, sequence: int, now_ticks: int) -> None:
-        """Take the sequence number of the master's last beacon by the master itself, or by an anchor that heard it."""
+    def update(self, source: int, sequence: int, now_ticks: int) -> None:
+        """Process the sequence number of the master's last beacon, from itself or an anchor that received it."""
         if self._sequence is None or 0 < (sequence - self._sequence) % SEQUENCES < SEQUENCES // 2:
             self._sequence, self.news_ticks = sequence, now_ticks
-        link = self._links.get(teller)
+        link = self._links.get(source)
         if link is None:
-            self._links[teller] = _Link(sequence)
+            self._links[source] = _Link(sequence)
             return
         turns = (sequence - link.sequence) % SEQUENCES
         if not 0 < turns < SEQUENCES // 2:
@@ -62,7 +62,7 @@ class MasterWatch:
         link.sequence = sequence
 
     def is_dead(self, missed_turns: int) -> bool:
-        """Whether so many turns without news tell of the master's death."""
+        """Whether this number of turns without news shows that the master is dead."""
         return missed_turns * self._surprise() > -math.log(MOST_CHANCE)
 
     def _surprise(self) -> float:

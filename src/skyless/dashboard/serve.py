@@ -17,7 +17,7 @@ from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
 from skyless.nodes.find_site import find_site
-from skyless.nodes.process.loop import ending_signals
+from skyless.nodes.process import ending_signals
 
 PORT: Final = 8080
 _MORE_PORTS: Final = 50

@@ -3,30 +3,32 @@
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from typing import Final
 
 import numpy as np
 from msgspec import Struct
 
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
-from skyless.evaluation.level_tally import LevelReport, LevelTally
-from skyless.evaluation.statistics import ErrorStatistics, ErrorSummary
+from skyless.evaluation.statistics import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD
 from skyless.positioning.fix import Fix
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.receiver import NOT_DROPS, Receiver
-from skyless.simulation.impairments import Impairments
+from skyless.simulation.impairments import Impairments, Outage
 from skyless.simulation.medium import Tally
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Trajectory
 from skyless.simulation.world import Broadcast, World
 from skyless.site.model import Site
-from skyless.site.slots import schedule_of
+
+_LEVEL_ROWS: Final = 1 << 16
+"""Protection levels kept, of which the median is reported."""
 
 
 class JudgedFix(Struct, frozen=True, gc=False):
-    """A fix beside the truth at the moment it was made."""
+    """A fix and the truth at the moment it was made."""
 
     tag: int
     time_s: float
@@ -47,10 +49,35 @@ class FleetSettings(Struct, frozen=True):
     method: str = DEFAULT_METHOD
     qa: float = 0.3
     warmup_s: float = 2.0
-    """True time before which no fix counts for the errors; cold starts are told by ``first_fix_s``."""
+    """True time before which no fix counts for the errors; ``first_fix_s`` reports cold starts."""
     most_fixes: int | None = None
     """Judged fixes per tag after which no more are judged."""
     integrity: IntegrityRequirement = IntegrityRequirement()
+    silences: tuple[Outage, ...] = ()
+    """True times in which no tag's radio receives."""
+
+
+class ReceiverWithOutages(Receiver):
+    """Counts as dropped what arrives while its radio is off; unlike after a loss of power, its counter has gone on."""
+
+    def __init__(
+        self, method: str, *, qa: float, integrity: IntegrityRequirement, silences: tuple[Outage, ...]
+    ) -> None:
+        """``silences`` are in the time of the host, which in the simulated world is the true one.
+
+        Raises:
+            ValueError: there is no such method.
+        """
+        super().__init__(method, qa=qa, integrity=integrity)
+        self._silences = silences
+
+    def hear(self, reception: Reception) -> Fix | None:
+        """See ``Receiver``."""
+        host_s = reception.host_s
+        if host_s is not None and any(silence.off_s <= host_s < silence.on_s for silence in self._silences):
+            self.counters["radio-off"] += 1
+            return None
+        return super().hear(reception)
 
 
 class TagRecord(Struct):
@@ -63,8 +90,14 @@ class TagRecord(Struct):
     last: JudgedFix | None = None
 
 
+def world_of(site: Site, trajectories: Sequence[Trajectory], impairments: Impairments, seed: int) -> World:
+    """A world of the site's anchors, as they run on their hosts, and of tags on the trajectories."""
+    tags = [TagSpec(trajectory) for trajectory in trajectories]
+    return World(site, lambda anchor: Anchor(site, anchor), tags, impairments, seed)
+
+
 class Fleet:
-    """Tags listening in a world; each frame that flies becomes fixes."""
+    """Tags listening in a world; each frame on the air becomes fixes."""
 
     def __init__(
         self,
@@ -81,28 +114,30 @@ class Fleet:
         self.world = World(site, self._new_anchor, specs, impairments, seed)
         self.receivers = [self._new_receiver() for _ in specs]
         self.records = [TagRecord() for _ in specs]
-        self._judged_round: list[int] = [-1] * len(specs)
-        self._superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
+        self._first_fixes = FirstFixes(site, len(specs))
         self.errors = ErrorStatistics(planar=site.tags.height_m is not None)
         self.sigma_squared_sum = 0.0
-        self.levels = LevelTally()
+        self.levels = LevelTally(len(specs), _LEVEL_ROWS)
 
     def _new_anchor(self, anchor: int) -> Anchor:
         self.anchors[anchor] = Anchor(self.site, anchor)
         return self.anchors[anchor]
 
     def _new_receiver(self) -> Receiver:
-        return Receiver(self._settings.method, qa=self._settings.qa, integrity=self._settings.integrity)
+        asked = self._settings
+        if asked.silences:
+            return ReceiverWithOutages(asked.method, qa=asked.qa, integrity=asked.integrity, silences=asked.silences)
+        return Receiver(asked.method, qa=asked.qa, integrity=asked.integrity)
 
     def run(self, until_s: float) -> Iterator[JudgedFix]:
-        """Let true time pass; every fix of every tag, beside the truth."""
+        """Let true time pass; every fix of every tag, with the truth."""
         for broadcast in self.world.run(until_s):
             for tag, reception, truth_m in broadcast.receptions():
-                judged = self._hear(tag, reception, truth_m, broadcast)
+                judged = self._add(tag, reception, truth_m, broadcast)
                 if judged is not None:
                     yield judged
 
-    def _hear(self, tag: int, reception: Reception, truth_m: Array, broadcast: Broadcast) -> JudgedFix | None:
+    def _add(self, tag: int, reception: Reception, truth_m: Array, broadcast: Broadcast) -> JudgedFix | None:
         record = self.records[tag]
         record.messages += 1
         fix = self.receivers[tag].hear(reception)
@@ -118,15 +153,12 @@ class Fleet:
         return judged
 
     def _judge(self, judged: JudgedFix) -> None:
-        """Count one fix per tag and superframe, so that all methods are judged at the same times."""
-        superframe = int(judged.time_s / self._superframe_s)
         record = self.records[judged.tag]
-        if superframe == self._judged_round[judged.tag] or record.judged == self._settings.most_fixes:
+        if record.judged == self._settings.most_fixes or not self._first_fixes.is_first(judged.tag, judged.time_s):
             return
-        self._judged_round[judged.tag] = superframe
         record.judged += 1
         error = judged.error_m
-        self.levels.add(judged.fix, error)
+        self.levels.add(judged.tag, judged.fix, error)
         self.errors.add(float(error[0]), float(error[1]), float(error[2]))
         self.sigma_squared_sum += float(np.trace(judged.fix.covariance_m2))
 
@@ -140,7 +172,7 @@ class Fleet:
 
 
 class FleetReport(Struct, frozen=True):
-    """What a run came to; errors in metres, over one fix per tag and superframe after the warm-up."""
+    """Results of a run; errors in metres, over one fix per tag and superframe after the warm-up."""
 
     method: str
     tags: int
@@ -156,13 +188,13 @@ class FleetReport(Struct, frozen=True):
     std_m: float | None
     """Root mean square error about the mean error."""
     sigma_m: float | None
-    """What the fixes themselves said: the root of the mean trace of their covariances."""
+    """Predicted by the fixes: the root of the mean trace of their covariances."""
     bias_m: tuple[float, float, float] | None
     first_fix_s: float | None
     """Median over the tags of the true time of the first fix, from a cold start of the whole site."""
     tags_without_fix: int
     levels: LevelReport | None
-    """How the protection levels did; None for methods that give none."""
+    """None for methods that give no protection levels."""
     drops: dict[str, int]
     air: Tally
     simulated_s: float

@@ -1,4 +1,4 @@
-"""What a recording can tell at all: whether the anchors resolve the height, and whether the tag flies."""
+"""What a recording can resolve: whether its anchors resolve the height, and whether the tag flies."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -17,16 +17,16 @@ FLIGHT_M: Final = 0.3
 
 
 GUESSED_STD_M: Final = 0.5
-"""Standard deviation of a tag's height from the anchors', where that is taken for it."""
+"""Standard deviation of a tag's height from the anchors', where that is used instead."""
 
 
 def plane_height_m(anchors_m: Mapping[int, Point]) -> float | None:
-    """Mean height of anchors that lie too flat to tell the height; None where they can tell it, or are too few."""
-    places = np.array(list(anchors_m.values()), dtype=np.float64).reshape(-1, 3)
-    if len(places) < 3:
+    """Mean height of anchors that lie too flat to resolve the height; None where they resolve it, or are too few."""
+    positions_m = np.array(list(anchors_m.values()), dtype=np.float64).reshape(-1, 3)
+    if len(positions_m) < 3:
         return None
-    middle = places.mean(axis=0)
-    dops = dilution_of_precision(places, middle, height_known=False)
+    middle = positions_m.mean(axis=0)
+    dops = dilution_of_precision(positions_m, middle, height_known=False)
     return float(middle[2]) if dops.vdop > MAX_VDOP else None
 
 

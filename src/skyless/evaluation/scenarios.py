@@ -1,5 +1,6 @@
 """Simulations by name and number: from what a person asks for to a fleet in a world."""
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -9,28 +10,61 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from skyless.evaluation.fleet import Fleet, FleetSettings
-from skyless.evaluation.receiver_with_outages import ReceiverWithOutages
-from skyless.evaluation.room_world import Room, displacements, wanderer
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.simulation.channel import ChannelModel
-from skyless.simulation.impairments import AnchorBias, AnchorOutage, Body, DelayError, Impairments, Outage, WarmUp
+from skyless.simulation.impairments import (
+    AnchorBias,
+    AnchorDisplacement,
+    AnchorOutage,
+    Body,
+    DelayError,
+    Impairments,
+    Outage,
+    WarmUp,
+)
 from skyless.simulation.oscillator import OscillatorModel, Temperature
 from skyless.simulation.range_errors import RangeErrorModel
-from skyless.simulation.trajectory import Static, Trajectory, Waypoints
+from skyless.simulation.streams import stream
+from skyless.simulation.trajectory import Roaming, Static, Trajectory, Waypoints
 from skyless.site.model import Site
 
 WALL_MARGIN_M: Final = 0.5
 """Walking tags keep this distance from the box around the anchors."""
 
 LEAST_WALK_M: Final = 1.0
-"""And have at least this much room along x and y, were there one anchor only."""
+"""And have at least this much space along x and y, even around a single anchor."""
 
 WAYPOINTS: Final = 8
 
 COMFORT_MPS2: Final = 2.0
 """Acceleration with which people and robots turn."""
+
+ROOM_QA_M2PS3: Final = 0.3
+"""Density of the random accelerations of tags in a room."""
+
+_BOX_SIGMAS: Final = 3.0
+"""Standard deviations from the middle of the box in which tags wander to its walls."""
+
+_ROOM_KEY: Final = 4
+_ROAM_KEY: Final = 6
+"""Of streams of random numbers, next to those of the simulated world."""
+
+
+class Room(Struct, frozen=True):
+    """What is wrong in a real room besides the noise: errors of survey and ranges, drawn from a world's seed.
+
+    The sizes are those that recordings of DW1000s show after a survey and a calibration by hand (``docs/studies.md``).
+    """
+
+    axis_std_m: float = 0.02
+    """Of the stated positions of the anchors: each coordinate has a normal error; the height where it is used."""
+    off_anchors: int = 0
+    """Number of anchors, drawn by chance, that are off by ``off_m`` more, each in a random horizontal direction."""
+    off_m: float = 0.0
+    ranges: RangeErrorModel = RangeErrorModel(constant_m=0.05, slope_m=0.05)
+    """Errors of the ranges at tags."""
 
 
 class Request(Struct, frozen=True):
@@ -44,7 +78,7 @@ class Request(Struct, frozen=True):
     positions_m: tuple[tuple[float, ...], ...] = ()
     """Tags that lie still, (x, y) or (x, y, z) each."""
     paths_m: tuple[tuple[tuple[float, ...], ...], ...] = ()
-    """Tags that walk from point to point, each along its path: once, or round and round if it ends where it began."""
+    """Tags that walk from point to point, each along its path: once, or again and again if it ends where it began."""
     tags: int = 1
     """How many tags walk about where neither positions nor paths are given."""
     speed_mps: float = 1.0
@@ -66,9 +100,9 @@ class Request(Struct, frozen=True):
     delay_errors: tuple[DelayError, ...] = ()
     """Antenna delays that the site file has wrong, one entry an anchor at most."""
     silences: tuple[Outage, ...] = ()
-    """When all tags' radios are deaf; their counters go on."""
+    """When no tag's radio receives; their counters go on."""
     room: Room | None = None
-    """Errors of survey and ranges; None for anchors that stand where the site file says and ranges without errors."""
+    """Errors of survey and ranges; None for anchors at the site file's positions and ranges without errors."""
     body: Body | None = None
     warm_ups: tuple[WarmUp, ...] = ()
     walls_between_anchors: bool = True
@@ -78,24 +112,20 @@ def fleet_of(request: Request) -> Fleet:
     """Make the world and its tags.
 
     Raises:
-        ValueError: the method, or an anchor that is to fail, does not exist; a path has points in one place.
+        ValueError: the method, or an anchor that is to fail, does not exist; a path has equal neighbouring points.
     """
     site = request.site
     if request.noise_ps is not None:
         noise = replace(site.noise, tx_stamp_ps=request.noise_ps, rx_stamp_ps=request.noise_ps)
         site = replace(site, noise=noise)
-    settings = FleetSettings(request.method, request.qa, request.warmup_s, request.most_fixes, request.integrity)
-    fleet = Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, settings)
-    if request.silences:
-        fleet.receivers = [
-            ReceiverWithOutages(request.method, qa=request.qa, integrity=request.integrity, silences=request.silences)
-            for _ in fleet.receivers
-        ]
-    return fleet
+    settings = FleetSettings(
+        request.method, request.qa, request.warmup_s, request.most_fixes, request.integrity, request.silences
+    )
+    return Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, settings)
 
 
 def impairments_of(request: Request, site: Site) -> Impairments:
-    """Noise and faults: the site's noise figures are taken for true."""
+    """Noise and faults: the site's noise figures are the true ones."""
     noise, room = site.noise, request.room
     return Impairments(
         tx_stamp_ps=noise.tx_stamp_ps,
@@ -142,6 +172,27 @@ def wanderers(site: Site, tags: int, seed: int) -> list[Trajectory]:
     return [wanderer(low, high, seed, tag) for tag in range(tags)]
 
 
+def displacements(room: Room, site: Site, seed: int) -> tuple[AnchorDisplacement, ...]:
+    """True positions of the anchors less the stated ones; the first draws are the same for all rooms of a seed."""
+    draw = stream(seed, _ROOM_KEY, 0)
+    count = len(site.anchors)
+    shifts_m = room.axis_std_m * draw.standard_normal((count, 3))
+    if site.tags.height_m is not None:
+        shifts_m[:, 2] = 0.0
+    off, directions = draw.permutation(count)[: room.off_anchors], draw.uniform(0.0, 2.0 * math.pi, count)
+    shifts_m[off, 0] += room.off_m * np.cos(directions[off])
+    shifts_m[off, 1] += room.off_m * np.sin(directions[off])
+    return tuple(
+        AnchorDisplacement(anchor.id, *shift) for anchor, shift in zip(site.anchors, shifts_m.tolist(), strict=True)
+    )
+
+
+def wanderer(low_m: Array, high_m: Array, seed: int, tag: int) -> Roaming:
+    """A tag with random acceleration that is in the box for 99.7 % of the time along each axis."""
+    own = int(stream(seed, _ROAM_KEY, tag).integers(2**62))
+    return Roaming((low_m + high_m) / 2.0, (high_m - low_m) / (2.0 * _BOX_SIGMAS), qa_m2ps3=ROOM_QA_M2PS3, seed=own)
+
+
 def _with_height(point: tuple[float, ...], height_m: float) -> tuple[float, float, float]:
     return point[0], point[1], point[2] if len(point) > 2 else height_m
 
@@ -165,16 +216,16 @@ def _walk(request: Request, index: int) -> Trajectory:
 
 def _smooth_path(points: Sequence[ArrayLike], speed_mps: float, *, loop: bool = True) -> Waypoints:
     """Path whose corners are as gentle as the legs allow, at most ``COMFORT_MPS2``; ``loop``: round and round."""
-    places = np.array(points, dtype=np.float64)
-    steps_m = np.roll(places, -1, axis=0) - places
+    points_m = np.array(points, dtype=np.float64)
+    steps_m = np.roll(points_m, -1, axis=0) - points_m
     legs_m = np.linalg.norm(steps_m if loop else steps_m[:-1], axis=1)
     corner_s = min(2.0 * speed_mps / COMFORT_MPS2, 0.9 * float(legs_m.min()) / speed_mps)
-    return Waypoints(places, speed_mps, loop=loop, corner_s=corner_s)
+    return Waypoints(points_m, speed_mps, loop=loop, corner_s=corner_s)
 
 
 def _walkable_box(site: Site) -> tuple[Array, Array]:
-    places = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
-    low, high = places.min(axis=0), places.max(axis=0)
+    points_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
     margin = np.minimum(WALL_MARGIN_M, (high - low) / 4.0)
     lacking = np.maximum((LEAST_WALK_M, LEAST_WALK_M, 0.0) - (high - low - 2.0 * margin), 0.0) / 2.0
     low, high = low + margin - lacking, high - margin + lacking

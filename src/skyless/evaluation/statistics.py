@@ -1,21 +1,46 @@
-"""Error statistics in bounded memory: sums are exact, percentiles and plots come from an even sample of the run."""
+"""Which fixes are judged, and tallies of errors and protection levels, in bounded memory.
 
+Sums are exact; percentiles, medians and plots come from an even sample of the run.
+"""
+
+import math
 from array import array
+from collections import Counter
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
 
 from skyless.kernels.arrays import Array
+from skyless.positioning.fix import Fix
+from skyless.positioning.integrity import Alert
+from skyless.site.model import Site
+from skyless.site.slots import schedule_of
 
-SAMPLE_ROWS: Final = 1 << 17
+_SAMPLE_ROWS: Final = 1 << 17
 """Rows kept at most; with fewer, percentiles are exact."""
+
+
+class FirstFixes:
+    """Picks the first fix of each tag and superframe, so that all methods are judged at the same times."""
+
+    def __init__(self, site: Site, tags: int) -> None:
+        self.superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
+        self._last = [-1] * tags
+
+    def is_first(self, tag: int, time_s: float) -> bool:
+        """Whether a fix at that true time is the tag's first one in its superframe."""
+        superframe = int(time_s / self.superframe_s)
+        if superframe == self._last[tag]:
+            return False
+        self._last[tag] = superframe
+        return True
 
 
 class EvenSample:
     """Every k-th row of a stream, k doubling whenever the store is full: an even sample, reproducible."""
 
-    def __init__(self, columns: int, rows: int = SAMPLE_ROWS) -> None:
+    def __init__(self, columns: int, rows: int = _SAMPLE_ROWS) -> None:
         self._columns = columns
         self._most = rows * columns
         self._store = array("d")
@@ -71,7 +96,7 @@ class ErrorStatistics:
         self._sample = EvenSample(1)
 
     def add(self, x_m: float, y_m: float, z_m: float) -> None:
-        """Take one error vector."""
+        """Add one error vector."""
         if self._count == 0:
             self._origin = (x_m, y_m, z_m)
         self._count += 1
@@ -101,7 +126,7 @@ class ErrorStatistics:
         ]
 
     def summary(self) -> ErrorSummary:
-        """What the errors come to."""
+        """Figures of all errors."""
         if self._count == 0:
             return ErrorSummary(0, None, None, None, None, None)
         x_m, y_m, z_m = (start + total / self._count for start, total in zip(self._origin, self._sum, strict=True))
@@ -115,3 +140,76 @@ class ErrorStatistics:
             max_m=self._max,
             bias_m=means_m,
         )
+
+
+class LevelCounts(Struct, frozen=True):
+    """Protection levels of each tag's judged fixes; counts have shape (tags,)."""
+
+    fixes: Array
+    levels: Array
+    """Fixes with a horizontal protection level."""
+    exceeded: Array
+    """Those whose horizontal error is larger than it."""
+    unwarned: Array
+    """Those of them that carry no alert."""
+    hpl_m: Array
+    """Levels, an even sample of them."""
+
+
+class LevelReport(Struct, frozen=True):
+    """Protection levels of all judged fixes, of a method that gives levels."""
+
+    integrity_risk: float
+    available: float
+    """Share of fixes that give a level."""
+    misleading: int
+    """Fixes whose horizontal or vertical error exceeds their level."""
+    hpl_m: float | None
+    """Median of the horizontal levels, None where there is none."""
+    alerts: dict[str, int]
+    """How many fixes carry which alert."""
+
+
+class LevelTally:
+    """Counts fixes by their protection levels and whether these held."""
+
+    def __init__(self, tags: int, sample_rows: int) -> None:
+        self._risk: float | None = None
+        self._counts = np.zeros((4, tags))
+        self._misleading = 0
+        self._alerts: Counter[str] = Counter()
+        self._sample = EvenSample(1, sample_rows)
+
+    def add(self, tag: int, fix: Fix, error_m: Array) -> None:
+        """Add a fix and its error, shape (3,)."""
+        integrity = fix.integrity
+        if integrity is None:
+            return
+        self._risk = fix.integrity_risk
+        self._alerts[integrity.alert.value] += 1
+        self._counts[0, tag] += 1
+        hpl_m, vpl_m = integrity.hpl_m, integrity.vpl_m
+        if hpl_m is None:
+            return
+        self._sample.add((hpl_m,))
+        self._counts[1, tag] += 1
+        exceeded = math.hypot(error_m[0], error_m[1]) > hpl_m
+        self._misleading += exceeded or (vpl_m is not None and bool(abs(error_m[2]) > vpl_m))
+        if exceeded:
+            self._counts[2, tag] += 1
+            self._counts[3, tag] += integrity.alert is Alert.NONE
+
+    def counts(self) -> LevelCounts | None:
+        """By tag; None where no fix was judged, or the method gives no levels."""
+        if self._risk is None:
+            return None
+        fixes, levels, exceeded, unwarned = self._counts
+        return LevelCounts(fixes, levels, exceeded, unwarned, self._sample.rows[:, 0])
+
+    def report(self) -> LevelReport | None:
+        """Of all tags together; None where no fix was judged, or the method gives no levels."""
+        if self._risk is None:
+            return None
+        fixes, levels = self._counts[:2].sum(axis=1).tolist()
+        median_m = float(np.median(self._sample.rows)) if levels else None
+        return LevelReport(self._risk, levels / fixes, self._misleading, median_m, dict(sorted(self._alerts.items())))

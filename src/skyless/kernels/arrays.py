@@ -1,4 +1,4 @@
-"""Types of arrays. Docstrings say the shape; a name that says it, too, is used where it helps."""
+"""Types of arrays. Docstrings state the shape; a name that states it as well is used where it helps."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ Matrix = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 Indices = NDArray[np.uint32]
-"""Indices that cannot count from an array's end, for which kernels would have to look at each."""
+"""Indices that cannot count from an array's end, which kernels would have to check for each."""
 
 Mask = NDArray[np.bool_]
 

@@ -34,12 +34,13 @@ def _cache_folder() -> str:
     digest = hashlib.sha1(usedforsecurity=False)
     for source in sorted(_PACKAGE.rglob("*.py")):
         text = source.read_bytes()
-        if b"skyless.kernels.compiled" in text or source.name in {"constants.py", "compiled.py"}:
+        is_kernel = b"skyless.kernels.compiled" in text or source.parent.name == "kernels"
+        if is_kernel or source.name == "constants.py":
             digest.update(text)
     folder = _cache_home() / f"kernels-{digest.hexdigest()[:16]}"
     if not folder.exists():
         for old in folder.parent.glob("kernels-*"):
-            with suppress(FileNotFoundError):  # another program may be tidying up as well
+            with suppress(FileNotFoundError):  # another program may be cleaning up as well
                 if time.time() - old.stat().st_mtime > _KEPT_S:
                     shutil.rmtree(old, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
@@ -83,8 +84,8 @@ def step(function: Function) -> Function:
     """A step of kernels: compiled as part of each that calls it, and plain Python where Python calls it.
 
     A step that takes arrays returns at its end only. Then the compiler sees that all references to arrays that it
-    counts up it counts down again, and leaves both out; with a dozen arrays they take as long as the arithmetic. A
-    kernel is rid of them where all that it calls are steps.
+    counts up it counts down again, and omits both; with a dozen arrays they take as long as the arithmetic. A kernel
+    has none of them where all that it calls are steps.
     """
     return register_jitable(forceinline=True, error_model="numpy")(function)
 

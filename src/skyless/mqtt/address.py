@@ -1,4 +1,4 @@
-"""Where an MQTT broker is, and how one gets in."""
+"""Address of an MQTT broker, with user, password and certificates."""
 
 import os
 import re
@@ -17,7 +17,7 @@ _LOOPBACK: Final = re.compile(r"localhost|127(\.\d{1,3}){3}|::1")
 
 
 class MqttAddress(Struct, frozen=True):
-    """A broker; ``str()`` of it never tells the password."""
+    """A broker; its ``str()`` never shows the password."""
 
     host: str
     port: int
@@ -41,7 +41,7 @@ class MqttAddress(Struct, frozen=True):
         return bool(_LOOPBACK.fullmatch(self.host))
 
     def tls_context(self) -> ssl.SSLContext | None:
-        """What to check the broker's certificate with; None without TLS.
+        """The checks of the broker's certificate; None without TLS.
 
         Raises:
             SkylessError: the file of certificates cannot be used.
@@ -56,10 +56,10 @@ class MqttAddress(Struct, frozen=True):
 
 
 def mqtt_address(url: str, ca: Path | None = None) -> MqttAddress:
-    """The broker that a URL tells; its password may also stand in ``SKYLESS_MQTT_PASSWORD``.
+    """The broker of a URL; its password may also be in ``SKYLESS_MQTT_PASSWORD``.
 
     Raises:
-        SkylessError: saying what would be right; it never shows the password.
+        SkylessError: with what would be right; it never shows the password.
     """
     try:
         parts = urlsplit(url)
@@ -103,5 +103,5 @@ def _wrong(url: str, expected: str) -> SkylessError:
 
 
 def hide_password(url: str) -> str:
-    """The URL with asterisks where its password stands, be the rest as wrong as it may."""
+    """The URL with asterisks in place of its password, however wrong the rest is."""
     return re.sub(r"^((?:[^:/?#]*://)?[^:/?#@]*):.*@", r"\1:***@", url)

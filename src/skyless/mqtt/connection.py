@@ -3,32 +3,34 @@
 import asyncio
 import contextlib
 import logging
+import secrets
 import socket
 import ssl
 from collections.abc import Callable, Iterable, Mapping
+from threading import Thread
 from typing import Final, cast
 
 from msgspec import Struct
 from paho.mqtt import client as paho
-from paho.mqtt.enums import MQTTErrorCode
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 from paho.mqtt.reasoncodes import ReasonCode
 
+from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.paho_client import Introduction, connect, make_client
 
-ANSWER_S: Final = 5.0
+BROKER_ANSWER_S: Final = 5.0
 """How long a broker may take to accept a connection."""
 
-_GOODBYE_S: Final = 1.0
+_LEAVE_S: Final = 1.0
 
 _SEND_BUFFER: Final = 262_144
 """Bytes that wait in the kernel, and as many in the process: what is older than the newest fix should not be many."""
 
 _MOST_PACKETS: Final = 100
-"""Read at once, before others of the event loop have their turn."""
+"""Read at once, before the event loop continues with other work."""
 
 _QUICK_ACK: Final = getattr(socket, "TCP_QUICKACK", None)
-"""Linux forgets it and must be told again. mosquitto holds a message back until the one before is acknowledged, which
+"""Linux resets it after each use. mosquitto holds a message back until the one before is acknowledged, which
 TCP otherwise delays by 40 ms."""
 
 _REFUSALS: Final = {
@@ -39,8 +41,23 @@ _REFUSALS: Final = {
 _log = logging.getLogger("skyless.mqtt")
 
 
-class RefusedError(Exception):
-    """The broker does not want this client; the text says why."""
+class Will(Struct, frozen=True):
+    """What the broker publishes, retained and at QoS 1, when the client goes without disconnecting."""
+
+    topic: str
+    payload: bytes
+
+
+class Introduction(Struct, frozen=True):
+    """What a client sends the broker about itself."""
+
+    client: str
+    """Its name; a new one where it is empty."""
+    keepalive_s: int
+    """The connection is given up when the broker has been silent for this time."""
+    persistent: bool = False
+    """The broker keeps subscriptions, and messages of QoS 1, for this name."""
+    will: Will | None = None
 
 
 class Reactions(Struct, frozen=True):
@@ -50,20 +67,24 @@ class Reactions(Struct, frozen=True):
     acknowledged: Callable[[int], None] = lambda _number: None
     """The broker has the message of QoS 1 that ``publish`` gave this number."""
     writable: Callable[[], None] = lambda: None
-    """The connection takes more again."""
+    """The connection accepts more again."""
+
+
+class RefusedError(Exception):
+    """The broker refuses this client; the text says why."""
 
 
 class Connection:
-    """A client of paho for one connection: what breaks is thrown away, and nothing waits here for the next one.
+    """A client of paho for one connection: a broken one is discarded, and nothing waits here for the next one.
 
     paho writes at once (it would wait for a turn of the event loop if it had ``on_socket_register_write``). What the
-    socket does not take waits in paho until the event loop finds the socket writable, and what is published while paho
-    reads, until it has read.
+    socket does not accept waits in paho until the socket is writable, and what is published while paho reads, until it
+    has read.
     """
 
     def __init__(self, address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions) -> None:
         self.writable = False
-        """Whether the connection takes more; false while a slow broker has its buffers full, and once it is lost."""
+        """Whether the connection accepts more; false while a slow broker has its buffers full, and once it is lost."""
         self.lost = asyncio.Event()
         self.reason = "the broker has closed the connection"
         """Why it was lost."""
@@ -71,11 +92,11 @@ class Connection:
         self._keepalive_s = who.keepalive_s
         self._react = react
         self._loop = asyncio.get_running_loop()
-        self._client = make_client(address, tls, who, ANSWER_S)
+        self._client = _make_client(address, tls, who, BROKER_ANSWER_S)
         self._accepted: asyncio.Future[None] = self._loop.create_future()
         self._socket: socket.socket | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._heard = False
+        self._has_answered = False
         self._messages = 0
         self._reading = self._awaits_socket = False
         self._waiting_bytes = 0
@@ -90,8 +111,8 @@ class Connection:
             OSError: it cannot be reached, or does not answer (TimeoutError).
         """
         try:
-            async with asyncio.timeout(ANSWER_S):
-                await connect(self._client, self._address, max(1, self._keepalive_s // 2))
+            async with asyncio.timeout(BROKER_ANSWER_S):
+                await _connect(self._client, self._address, max(1, self._keepalive_s // 2))
                 self._begin()
                 await self._accepted
         except BaseException as error:
@@ -100,12 +121,12 @@ class Connection:
                 raise TimeoutError(self._no_answer()) from None
             raise
         self.writable = not self.lost.is_set()
-        self._look()
+        self._keep_alive()
 
     def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> int:
         """Send a message, or let it wait for the socket; never blocks. Its number until it is acknowledged."""
         info = self._client.publish(topic, payload, qos, retain)
-        while info.rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:  # its number still flies, 65 535 messages later
+        while info.rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:  # its number is still in use, 65 535 messages later
             info = self._client.publish(topic, payload, qos, retain)
         if qos and not info.rc:
             self._flying[info.mid] = info
@@ -116,14 +137,14 @@ class Connection:
         return info.mid
 
     def subscribe(self, filters: Mapping[str, int]) -> None:
-        """Ask for the messages of topic filters, each with its QoS."""
+        """Subscribe to topic filters, each with its QoS."""
         _, number = self._client.subscribe(list(filters.items()))
         if number is not None:
             self._asked[number] = tuple(filters)
         self._await_socket()
 
     def unsubscribe(self, filters: Iterable[str]) -> None:
-        """Ask for them no more."""
+        """End subscriptions."""
         self._client.unsubscribe(list(filters))
         self._await_socket()
 
@@ -138,13 +159,13 @@ class Connection:
             sock.close()
 
     async def leave(self) -> None:
-        """Say goodbye, and close when all is sent, or without it after a second."""
+        """Disconnect and close when all is sent, or after a second."""
         self.writable = False
         if not self.lost.is_set():
             self._client.disconnect()
             self._await_socket()
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_GOODBYE_S):
+            async with asyncio.timeout(_LEAVE_S):
                 await self.lost.wait()
         self.abort("left")
 
@@ -166,14 +187,14 @@ class Connection:
         self._await_socket()
 
     def _read(self) -> None:
-        """Read all that has come, one packet after the other."""
-        self._heard = self._reading = True
+        """Read all that has come, packet by packet."""
+        self._has_answered = self._reading = True
         left = _MOST_PACKETS
         while self._socket is not None:
             seen = self._messages
             self._client.loop_read()
             left -= 1
-            # What TLS has decrypted already, the socket does not announce any more.
+            # The socket does not announce what TLS has decrypted already.
             if not _decrypted(self._socket) and (left <= 0 or self._messages == seen):
                 break
         self._reading = False
@@ -186,7 +207,7 @@ class Connection:
         self._write()
 
     def _write(self) -> None:
-        """Write what waits, and let more come when nothing waits any more."""
+        """Write what waits, and accept more when nothing waits."""
         if self._client.want_write():
             self._client.loop_write()
         if not self._client.want_write():
@@ -197,7 +218,7 @@ class Connection:
         self._await_socket()
 
     def _await_socket(self) -> None:
-        """Be called when the socket takes more, as long as paho has more for it."""
+        """Watch whether the socket accepts more while paho has more for it."""
         wanted = self._client.want_write() and self._socket is not None
         if self._reading or self._socket is None or wanted == self._awaits_socket:
             return
@@ -207,12 +228,12 @@ class Connection:
         else:
             self._loop.remove_writer(self._socket)
 
-    def _look(self) -> None:
-        """Let paho ask for a sign of life after half the keepalive time, and give up after the other half."""
+    def _keep_alive(self) -> None:
+        """Let paho ping the broker after half the keepalive time, and give up after the other half."""
         self._client.loop_misc()
         self._await_socket()
         if self._socket is not None:
-            self._timer = self._loop.call_later(self._keepalive_s / 20, self._look)
+            self._timer = self._loop.call_later(self._keepalive_s / 20, self._keep_alive)
 
     def _leave_loop(self) -> None:
         if self._socket is not None:
@@ -227,11 +248,11 @@ class Connection:
         self.writable = False
         if not self._accepted.done():
             self._accepted.set_exception(ConnectionError(reason))
-            self._accepted.exception()  # retrieved, should nobody wait for it any more
+            self._accepted.exception()  # retrieved, in case nothing awaits it
         self.lost.set()
 
     def _no_answer(self) -> str:
-        return "the broker does not speak MQTT" if self._heard else f"no answer within {ANSWER_S:g} s"
+        return "its answer is not MQTT" if self._has_answered else f"no answer within {BROKER_ANSWER_S:g} s"
 
     # What paho calls
 
@@ -249,7 +270,7 @@ class Connection:
         if code == "Keep alive timeout":
             self._lose(f"the broker has been silent for {self._keepalive_s} s")
         elif code == "Protocol error":
-            self._lose("the broker does not speak MQTT")
+            self._lose("its answer is not MQTT")
         else:
             self._lose(self.reason)
 
@@ -261,7 +282,7 @@ class Connection:
         try:
             topic = message.topic
         except UnicodeDecodeError:
-            self.abort("the broker does not speak MQTT: a topic that is not UTF-8")
+            self.abort("its answer is not MQTT: a topic that is not UTF-8")
             return
         self._react.message(topic, bytes(message.payload))
 
@@ -276,3 +297,106 @@ class Connection:
 def _decrypted(sock: socket.socket) -> int:
     """Bytes that wait in TLS."""
     return sock.pending() if isinstance(sock, ssl.SSLSocket) else 0
+
+
+async def open_connection(
+    address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions | None = None
+) -> Connection:
+    """A connection that the broker has accepted.
+
+    Raises:
+        RefusedError: it refuses this client.
+        OSError: it cannot be reached, or does not answer (TimeoutError).
+    """
+    connection = Connection(address, tls, who, react or Reactions())
+    await connection.open()
+    return connection
+
+
+async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) -> None:
+    """Check that a broker accepts this client; ``tls`` replaces the address's own checks of its certificate.
+
+    Raises:
+        SkylessError: it does not; the message says why.
+    """
+    try:
+        connection = await open_connection(address, tls or address.tls_context(), Introduction("", 60))
+    except (OSError, RefusedError) as error:
+        raise SkylessError(trouble_with(address, error)) from None
+    await connection.leave()
+
+
+def trouble_with(address: MqttAddress, error: OSError | RefusedError) -> str:
+    """One line for a person about a connection that cannot be made."""
+    if isinstance(error, RefusedError):
+        hint = "; the password goes in SKYLESS_MQTT_PASSWORD or after the user's name" if "user" in str(error) else ""
+        return f"the broker {address} refuses: {error}{hint}"
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return (
+            f"the certificate of the broker {address} is not trusted: {error.verify_message}; --mqtt-ca names another"
+        )
+    if isinstance(error, ssl.SSLError):
+        return f"the broker {address} does not use TLS as expected: {error.reason or error}"
+    return f"the broker {address} cannot be reached: {error.strerror or error}"
+
+
+def _make_client(address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, timeout_s: float) -> paho.Client:
+    """A client that neither bounds the messages in flight nor connects again; a link does both."""
+    client = paho.Client(
+        CallbackAPIVersion.VERSION2,
+        who.client or f"skyless-{secrets.token_hex(4)}",
+        clean_session=not who.persistent,
+        reconnect_on_failure=False,
+    )
+    client.connect_timeout = timeout_s
+    client.max_inflight_messages_set(0)
+    client.username_pw_set(address.user, address.password)
+    if who.will is not None:
+        client.will_set(who.will.topic, who.will.payload, qos=1, retain=True)
+    if tls is not None:
+        client.tls_set_context(tls)
+        client.tls_insecure_set(not tls.check_hostname)  # else paho compares the names itself
+    return client
+
+
+async def _connect(client: paho.Client, address: MqttAddress, keepalive_s: int) -> None:
+    """Let paho connect, which blocks, in a thread that nothing waits for, not even the end of the program.
+
+    Raises:
+        OSError: it cannot be reached.
+    """
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[None] = loop.create_future()
+
+    def finish(error: BaseException | None) -> None:
+        if done.cancelled():
+            _close(client)
+        elif error is None:
+            done.set_result(None)
+        else:
+            done.set_exception(error)
+
+    def work() -> None:
+        error: BaseException | None = None
+        try:
+            client.connect(address.host, address.port, keepalive_s)
+        except Exception as caught:  # noqa: BLE001 - raised where it is awaited
+            error = caught
+        try:
+            loop.call_soon_threadsafe(finish, error)
+        except RuntimeError:  # the event loop has ended meanwhile
+            _close(client)
+
+    Thread(target=work, name="MQTT connect", daemon=True).start()
+    try:
+        await done
+    except asyncio.CancelledError:
+        if not done.cancelled():  # it connected at the same moment
+            _close(client)
+        raise
+
+
+def _close(client: paho.Client) -> None:
+    sock = client.socket()
+    if sock is not None:
+        sock.close()

@@ -12,35 +12,45 @@ from typing import Final
 
 import msgspec
 from msgspec import Struct
+from paho.mqtt.client import topic_matches_sub
 
 import skyless
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.connect import open_connection, trouble_with
-from skyless.mqtt.connection import Connection, Reactions, RefusedError
+from skyless.mqtt.connection import (
+    Connection,
+    Introduction,
+    Reactions,
+    RefusedError,
+    Will,
+    open_connection,
+    trouble_with,
+)
 from skyless.mqtt.messages import Counters, StatusMessage
 from skyless.mqtt.outbox import Limits, Outbox
-from skyless.mqtt.paho_client import Introduction, Will
-from skyless.mqtt.subscriptions import Handler, Subscriptions
 from skyless.mqtt.topics import status_topic
 
 _log = logging.getLogger("skyless.mqtt")
 _encode: Final = msgspec.json.Encoder().encode
 
+Handler = Callable[[str, bytes], None]
+"""Called from the event loop with topic and payload; must return quickly."""
+
+_MOST_TOPICS: Final = 10_000
 _FIRST_WAIT_S: Final = 0.1
 _LONGEST_WAIT_S: Final = 5.0
 _LONGEST_WAIT_LOOPBACK_S: Final = 0.5
-_FAREWELL_S: Final = 1.0
+_LEAVE_S: Final = 1.0
 _SAME_TROUBLE_S: Final = 30.0
-_SOON_S: Final = 0.5
-"""A first connection that takes no longer is nothing to speak of."""
+_QUICK_START_S: Final = 0.5
+"""A first connection that takes no longer is not logged."""
 
 
 class Link:
     """One MQTT connection of a node, made again for as long as ``run`` runs.
 
-    It tells the node's status: retained, with a last will. Messages wait in an ``Outbox`` while the broker is slow or
-    away. All of it belongs to one event loop. Subscribers may get a message of QoS 1 twice, when a connection broke at
-    the wrong moment.
+    It publishes the node's status, retained and with a last will. Messages wait in an ``Outbox`` while the broker is
+    slow or away. All of it belongs to one event loop. Subscribers may get a message of QoS 1 twice, when a connection
+    broke at the wrong moment.
     """
 
     def __init__(
@@ -56,7 +66,7 @@ class Link:
     ) -> None:
         """``persistent`` lets the broker keep messages of QoS 1 for this name while it is away, until it is stopped.
 
-        Two persistent links of one name would push each other out.
+        Two persistent links of one name would end each other's connection.
 
         Raises:
             SkylessError: the address names a file of certificates that cannot be used.
@@ -74,20 +84,20 @@ class Link:
         self._status_topic = status_topic(site, kind, name)
         self._offline = StatusMessage(online=False, kind=kind, name=str(name))
         self._outbox = Outbox(limits or Limits())
-        self._routes = Subscriptions()
-        self._reactions = Reactions(self._routes.receive, self._acknowledged, self._pump)
+        self._subscriptions = _Subscriptions()
+        self._reactions = Reactions(self._subscriptions.receive, self._acknowledged, self._pump)
         self._connection: Connection | None = None
         self._reconnects = -1
-        self._told_dropped = 0
+        self._reported_dropped = 0
         self._away_since_s = time.monotonic()
-        self._told: tuple[str, float] = ("", 0.0)
-        self._told_fault = False
+        self._logged: tuple[str, float] = ("", 0.0)
+        self._logged_fault = False
         self._stopping = False
         self.subscribe(self._status_topic, self._correct_status)
 
     @property
     def counters(self) -> Counters:
-        """What it has done."""
+        """Messages sent and dropped, reconnects."""
         return Counters(self._outbox.sent, self._outbox.dropped, max(0, self._reconnects))
 
     @property
@@ -98,9 +108,9 @@ class Link:
     def publish(self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False) -> None:
         """Hand over a message; returns at once, whatever the broker does. A struct becomes JSON."""
         payload = message if isinstance(message, bytes) else _encode(message)
-        fault = self._outbox.put(topic, payload, qos, retain=retain)
+        fault = self._outbox.add(topic, payload, qos, retain=retain)
         if fault is not None:
-            self._tell_once(fault)
+            self._log_fault(fault)
         self._pump()
 
     def forget(self, topic: str) -> None:
@@ -108,17 +118,17 @@ class Link:
         self._outbox.forget(topic)
 
     def subscribe(self, topic_filter: str, handler: Handler, qos: int = 0) -> None:
-        """Call ``handler`` with every message of a filter, now and after every reconnect.
+        """Call ``handler`` with every message of a filter, also after every reconnect.
 
-        A second handler of the same filter takes the place of the first. Where filters of one link overlap, some
-        brokers send a message once for each, and all its handlers see it as often.
+        A second handler of the same filter replaces the first. Where filters of one link overlap, some brokers send a
+        message once for each, and all its handlers get it as often.
         """
-        self._routes.add(topic_filter, handler, qos)
+        self._subscriptions.add(topic_filter, handler, qos)
         if self._connection is not None:
             self._connection.subscribe({topic_filter: qos})
 
     async def run(self) -> None:
-        """Stay connected until cancelled; then send what waits, for a second at most, and say goodbye."""
+        """Stay connected until cancelled; then send what waits, for a second at most, and disconnect."""
         failures = 0
         try:
             while True:
@@ -130,20 +140,20 @@ class Link:
         finally:
             self._down("stopped")
             if self.unacknowledged:
-                _log.warning("stopped; the broker %s has not taken %d messages", self.address, self.unacknowledged)
+                _log.warning("stopped; the broker %s has not accepted %d messages", self.address, self.unacknowledged)
 
     async def _one_connection(self) -> bool:
         """Whether it came about; returns when it is lost."""
         try:
             connection = await open_connection(self.address, self._tls, self._introduction(), self._reactions)
         except (OSError, RefusedError) as error:
-            self._tell_trouble(trouble_with(self.address, error))
+            self._log_trouble(trouble_with(self.address, error))
             return False
         self._up(connection)
         try:
             await connection.lost.wait()
         except asyncio.CancelledError:
-            await self._farewell(connection)
+            await self._leave(connection)
             raise
         self._down(connection.reason)
         _log.warning("lost the broker %s: %s", self.address, connection.reason)
@@ -157,10 +167,10 @@ class Link:
         self._connection = connection
         self._stopping = False
         self._reconnects += 1
-        self._tell_return()
+        self._log_return()
         self._outbox.restart()
-        self._say_online()
-        connection.subscribe(self._routes.filters)
+        self._publish_online()
+        connection.subscribe(self._subscriptions.filters)
         self._set_state(connected=True, trouble=None)
         self._pump()
 
@@ -175,7 +185,7 @@ class Link:
         for callback in self.on_state:
             callback(connected)
 
-    def _say_online(self) -> None:
+    def _publish_online(self) -> None:
         status = StatusMessage(
             online=True,
             kind=self._offline.kind,
@@ -188,19 +198,19 @@ class Link:
         self.publish(self._status_topic, status, qos=1, retain=True)
 
     def _correct_status(self, _topic: str, payload: bytes) -> None:
-        """A last will of an earlier run comes late, from a connection that the broker took for alive: we are online."""
+        """Publish the status again after a late last will, of a connection that the broker held open."""
         if not self._stopping and b'"online":false' in payload:
-            self._say_online()
+            self._publish_online()
 
-    async def _farewell(self, connection: Connection) -> None:
+    async def _leave(self, connection: Connection) -> None:
         self._stopping = True
         try:
-            async with asyncio.timeout(_FAREWELL_S):
+            async with asyncio.timeout(_LEAVE_S):
                 self.publish(self._status_topic, self._offline, qos=1, retain=True)
                 while self._outbox.unacknowledged and not connection.lost.is_set():
                     await asyncio.sleep(0.005)
                 if self._persistent:
-                    connection.unsubscribe(self._routes.filters)
+                    connection.unsubscribe(self._subscriptions.filters)
                 await connection.leave()
         except TimeoutError:
             pass
@@ -210,11 +220,11 @@ class Link:
     def _pump(self) -> None:
         connection = self._connection
         while connection is not None and connection.writable:
-            message = self._outbox.take()
+            message = self._outbox.next_message()
             if message is None:
                 return
             number = connection.publish(message.topic, message.payload, message.qos, retain=message.retain)
-            self._outbox.gave(message, number)
+            self._outbox.mark_sent(message, number)
 
     def _acknowledged(self, number: int) -> None:
         self._outbox.acknowledge(number)
@@ -224,23 +234,56 @@ class Link:
         longest_s = _LONGEST_WAIT_LOOPBACK_S if self.address.loopback else _LONGEST_WAIT_S
         return min(longest_s, _FIRST_WAIT_S * 2.0 ** min(failures, 10)) * random.uniform(0.6, 1.0)
 
-    def _tell_trouble(self, trouble: str) -> None:
-        """Once, and again every half minute while it lasts."""
+    def _log_trouble(self, trouble: str) -> None:
+        """Log it once, and again every half minute while it lasts."""
         self.trouble = trouble
         now_s = time.monotonic()
-        if trouble != self._told[0] or now_s > self._told[1] + _SAME_TROUBLE_S:
-            self._told = (trouble, now_s)
+        if trouble != self._logged[0] or now_s > self._logged[1] + _SAME_TROUBLE_S:
+            self._logged = (trouble, now_s)
             _log.warning("%s", trouble)
 
-    def _tell_once(self, fault: str) -> None:
-        if not self._told_fault:
-            self._told_fault = True
+    def _log_fault(self, fault: str) -> None:
+        if not self._logged_fault:
+            self._logged_fault = True
             _log.warning("not published: %s", fault)
 
-    def _tell_return(self) -> None:
-        dropped = self._outbox.dropped - self._told_dropped
+    def _log_return(self) -> None:
+        dropped = self._outbox.dropped - self._reported_dropped
         away_s = time.monotonic() - self._away_since_s
-        if self._reconnects or (dropped and away_s > _SOON_S):
+        if self._reconnects or (dropped and away_s > _QUICK_START_S):
             _log.warning("connected to %s after %.1f s; %d messages were dropped", self.address, away_s, dropped)
-        self._told_dropped += dropped
-        self._told = ("", 0.0)
+        self._reported_dropped += dropped
+        self._logged = ("", 0.0)
+
+
+class _Subscriptions:
+    """The handlers of one link; those of each topic are searched once."""
+
+    def __init__(self) -> None:
+        self.filters: dict[str, int] = {}
+        """Topic filters, each with its QoS."""
+        self._handlers: dict[str, Handler] = {}
+        self._found: dict[str, tuple[Handler, ...]] = {}
+
+    def add(self, topic_filter: str, handler: Handler, qos: int) -> None:
+        """Set the handler of a filter; it replaces the one before."""
+        self.filters[topic_filter], self._handlers[topic_filter] = qos, handler
+        self._found.clear()
+
+    def receive(self, topic: str, payload: bytes) -> None:
+        """Call all handlers whose filter matches."""
+        handlers = self._found.get(topic)
+        if handlers is None:
+            handlers = self._find(topic)
+        for handler in handlers:
+            try:
+                handler(topic, payload)
+            except Exception:  # noqa: BLE001 - one bad handler must not cost the others the connection
+                _log.exception("a message of %s could not be handled", topic)
+
+    def _find(self, topic: str) -> tuple[Handler, ...]:
+        if len(self._found) >= _MOST_TOPICS:
+            self._found.clear()
+        found = tuple(handler for name, handler in self._handlers.items() if topic_matches_sub(name, topic))
+        self._found[topic] = found
+        return found

@@ -1,4 +1,4 @@
-"""What flies over MQTT, version 1: JSON objects, one struct for each topic of ``mqtt/topics.py`` (``docs/mqtt.md``).
+"""The messages on MQTT, version 1: JSON objects, one struct for each topic of ``mqtt/topics.py`` (``docs/mqtt.md``).
 
 SI units. ``unix_s`` is seconds since 1970 by the sender's clock. Fields may be added within a version; readers ignore
 those that they do not know.
@@ -16,7 +16,7 @@ Matrix = tuple[float, float, float, float, float, float, float, float, float]
 
 
 class SiteMessage(Struct, frozen=True):
-    """The site as its file says it, retained, so that a new tag or page knows it at once."""
+    """The site as in its file, retained, so that a new tag or page has it at once."""
 
     site: Site
     simulated: bool
@@ -25,7 +25,7 @@ class SiteMessage(Struct, frozen=True):
 
 
 class StatusMessage(Struct, frozen=True):
-    """Whether a node lives; retained, and the broker itself publishes ``online: false`` as its last will."""
+    """Whether a node is online; retained, and the broker itself publishes ``online: false`` as its last will."""
 
     online: bool
     kind: str
@@ -38,7 +38,7 @@ class StatusMessage(Struct, frozen=True):
 
 
 class FixMessage(Struct, frozen=True):
-    """One fix of one tag. A tag publishes as many a second as it is told; ``serial`` counts all that it made."""
+    """One fix of one tag. A tag publishes at its configured rate; ``serial`` counts all fixes that it made."""
 
     tag: str
     serial: int
@@ -66,20 +66,20 @@ class FixMessage(Struct, frozen=True):
     latency_s: float
     """From the end of the last frame to the computed fix."""
     hpl_m: float | None = None
-    """Horizontal protection level; None where nothing can be promised, or the method has none."""
+    """Horizontal protection level; None where there is no guarantee, or the method has none."""
     vpl_m: float | None = None
     integrity_risk: float | None = None
     """Probability, for each fix, that the error exceeds its level."""
     alert: str | None = None
-    """As ``skyless.positioning.integrity.Alert`` has it."""
+    """A value of ``skyless.positioning.integrity.Alert``."""
 
 
 class Counters(Struct, frozen=True):
-    """What a node's MQTT link has done."""
+    """Counts of a node's MQTT link."""
 
     published: int
     dropped: int
-    """Messages given up because the broker was away or slow."""
+    """Messages dropped because the broker was away or slow."""
     reconnects: int
 
 
@@ -97,7 +97,7 @@ class Phase(Struct, frozen=True, array_like=True):
 
 
 class TagHealth(Struct, frozen=True):
-    """How a tag does, once a second."""
+    """A tag's state, once a second."""
 
     tag: str
     unix_s: float
@@ -126,14 +126,14 @@ class TagHealth(Struct, frozen=True):
 
 
 class AnchorHealth(Struct, frozen=True):
-    """How an anchor does, once a second."""
+    """An anchor's state, once a second."""
 
     anchor: int
     unix_s: float
     uptime_s: float
     role: Literal["master", "anchor", "listening"]
     master: int | None
-    """Whom it follows."""
+    """The anchor whose time it uses."""
     term: int
     synchronised: bool
     offset_s: float | None
@@ -168,21 +168,21 @@ class EtherHealth(Struct, frozen=True):
 
 
 class TrueMotion(Struct, frozen=True, array_like=True):
-    """Where a simulated tag truly is."""
+    """True position and velocity of a simulated tag."""
 
     position_m: Vector
     velocity_mps: Vector
 
 
 class TruthMessage(Struct, frozen=True):
-    """Where all simulated tags truly are at one moment."""
+    """True motion of all simulated tags at one moment."""
 
     unix_s: float
     tags: dict[str, TrueMotion]
 
 
 class RequestMessage(Struct, frozen=True):
-    """Somebody wants raw receptions; to be repeated before the lease ends."""
+    """A request for raw receptions; to be repeated before the lease ends."""
 
     by: str
     receptions: tuple[str, ...]
@@ -208,7 +208,7 @@ class ReceptionsMessage(Struct, frozen=True):
     segment: str
     """Another one begins when a run is interrupted; each begins with ``start``."""
     first: int
-    """Number of the first reception within the segment; the next message goes on where this one ends."""
+    """Number of the first reception within the segment; the next message continues where this one ends."""
     unix_less_host_s: float
     """What to add to ``host_s`` to get ``unix_s``."""
     receptions: tuple[RawReception, ...]
@@ -217,12 +217,12 @@ class ReceptionsMessage(Struct, frozen=True):
 
 
 class SegmentStart(Struct, frozen=True):
-    """What the receiver was when a segment began."""
+    """The receiver's state when a segment began."""
 
     serial: int
     """Number of fixes made before."""
     settings: dict[str, str | float | int | None]
-    """How the receiver was made."""
+    """Arguments of the receiver."""
     state: bytes | None
     """Its state (``skyless.recordings.mcap.checkpoint``); None for a receiver that had heard nothing yet."""
 

@@ -7,7 +7,7 @@ from typing import Final
 from msgspec import Struct
 
 _TOPIC: Final = re.compile(r"[^\s+#\x00-\x1f\x7f]{1,250}")
-"""What every broker takes; nats-server takes no blanks."""
+"""What every broker accepts; nats-server accepts no blanks."""
 
 
 class Limits(Struct, frozen=True):
@@ -39,7 +39,7 @@ class Outbox:
 
     Of QoS 0 the newest message of a topic stays, and the oldest topics go when there are too many. Of QoS 1 all stay in
     their order, and the oldest that is not on its way goes when there are too many. Retained messages are a topic's
-    state: the newest one stays for ever, to be sent again after a reconnect.
+    state: the newest one stays, to be sent again after each reconnect.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -50,22 +50,22 @@ class Outbox:
         self._queue_bytes = 0
         self._again: deque[Waiting] = deque()
         self._flying: dict[int, Waiting] = {}
-        self._kept: dict[str, Waiting] = {}
-        self._kept_bytes = 0
-        self._to_keep: dict[str, Waiting] = {}
+        self._retained: dict[str, Waiting] = {}
+        self._retained_bytes = 0
+        self._to_retain: dict[str, Waiting] = {}
         self.dropped = 0
         self.sent = 0
         """Messages of QoS 0 given to the connection, and messages of QoS 1 acknowledged."""
 
-    def put(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> str | None:
-        """Add a message; why not, where no broker would take it."""
+    def add(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> str | None:
+        """Add a message; returns the fault of one that no broker would accept."""
         fault = self._fault(topic, payload)
         if fault is not None:
             self.dropped += 1
             return fault
         message = Waiting(topic, payload, qos, retain)
         if retain:
-            self._keep(message)
+            self._retain(message)
         elif qos:
             self._queue.append(message)
             self._queue_bytes += len(payload)
@@ -74,13 +74,13 @@ class Outbox:
             self._replace(message)
         return None
 
-    def take(self) -> Waiting | None:
+    def next_message(self) -> Waiting | None:
         """The next message to send; None when nothing is left, or the window is full."""
         open_window = len(self._flying) < self._limits.window
         if self._again:
             return self._again.popleft()
-        if self._to_keep and (open_window or not next(iter(self._to_keep.values())).qos):
-            return self._to_keep.pop(next(iter(self._to_keep)))
+        if self._to_retain and (open_window or not next(iter(self._to_retain.values())).qos):
+            return self._to_retain.pop(next(iter(self._to_retain)))
         if self._queue and open_window:
             return self._queue.popleft()
         if self._newest:
@@ -89,8 +89,8 @@ class Outbox:
             return message
         return None
 
-    def gave(self, message: Waiting, number: int) -> None:
-        """The connection has what was taken, and knows it by this number."""
+    def mark_sent(self, message: Waiting, number: int) -> None:
+        """The connection has the message, under this number."""
         if message.qos:
             self._flying[number] = message
         else:
@@ -109,27 +109,22 @@ class Outbox:
         """A new connection: send again what was not acknowledged, and what the broker should have retained."""
         self._again.extendleft(message for message in reversed(self._flying.values()) if not message.retain)
         self._flying.clear()
-        self._to_keep = dict(self._kept)
+        self._to_retain = dict(self._retained)
 
     def forget(self, topic: str) -> None:
-        """Send the retained message of a topic no more: somebody else has written a newer one."""
-        self._to_keep.pop(topic, None)
-        old = self._kept.pop(topic, None)
-        self._kept_bytes -= len(old.payload) if old else 0
+        """Stop sending the retained message of a topic: another node has published a newer one."""
+        self._to_retain.pop(topic, None)
+        old = self._retained.pop(topic, None)
+        self._retained_bytes -= len(old.payload) if old else 0
 
     @property
     def unacknowledged(self) -> int:
         """Messages of QoS 1, and retained ones, that the broker does not have for certain."""
-        return len(self._flying) + len(self._again) + len(self._queue) + len(self._to_keep)
-
-    @property
-    def waiting_bytes(self) -> int:
-        """Payload of everything in here."""
-        return self._newest_bytes + self._queue_bytes + self._kept_bytes
+        return len(self._flying) + len(self._again) + len(self._queue) + len(self._to_retain)
 
     def _fault(self, topic: str, payload: bytes) -> str | None:
         if not _TOPIC.fullmatch(topic):
-            return f"the topic {topic!r} is not one that every broker takes"
+            return f"the topic {topic!r} is not one that every broker accepts"
         if len(payload) > self._limits.payload:
             return f"the message for {topic} has {len(payload)} bytes; {self._limits.payload} are the most"
         return None
@@ -153,13 +148,13 @@ class Outbox:
             self._queue_bytes -= len(self._queue.popleft().payload)
             self.dropped += 1
 
-    def _keep(self, message: Waiting) -> None:
-        """Newer state of a topic in the place of the old."""
+    def _retain(self, message: Waiting) -> None:
+        """Replace the state of a topic."""
         self.forget(message.topic)
-        more = len(self._kept) >= self._limits.topics
-        if more or self._kept_bytes + len(message.payload) > self._limits.topic_bytes:
+        more = len(self._retained) >= self._limits.topics
+        if more or self._retained_bytes + len(message.payload) > self._limits.topic_bytes:
             self.dropped += 1
             return
-        self._kept[message.topic] = message
-        self._kept_bytes += len(message.payload)
-        self._to_keep[message.topic] = message
+        self._retained[message.topic] = message
+        self._retained_bytes += len(message.payload)
+        self._to_retain[message.topic] = message

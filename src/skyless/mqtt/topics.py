@@ -1,4 +1,4 @@
-"""MQTT topics, version 1 (``docs/mqtt.md``); everything of a site stands under ``skyless/v1/<site>/``."""
+"""MQTT topics, version 1 (``docs/mqtt.md``); all topics of a site begin with ``skyless/v1/<site>/``."""
 
 from typing import Final
 
@@ -38,7 +38,7 @@ def receptions_topic(site: int | str, tag: str) -> str:
 
 
 def request_topic(site: int | str) -> str:
-    """``RequestMessage``: who wants raw receptions of which tags."""
+    """``RequestMessage``: which raw receptions are wanted, and by whom."""
     return f"{ROOT}/{site}/request"
 
 

@@ -1,4 +1,4 @@
-"""Where simulated tags truly were, at any moment of the last seconds."""
+"""True positions of simulated tags at any moment of the last seconds."""
 
 from collections import deque
 from typing import Final
@@ -6,19 +6,19 @@ from typing import Final
 from skyless.mqtt.messages import TruthMessage, Vector
 
 REACH_S: Final = 0.25
-"""A truth tells where a tag was for so long before and after; a turning tag strays from the line by then."""
+"""A message holds for this time before and after it, along a straight line; a turning tag leaves the line by then."""
 
-_KEPT: Final = 64
+_MOST_MESSAGES: Final = 64
 
 
 class TruthBuffer:
     """The newest messages of an ether."""
 
     def __init__(self) -> None:
-        self._truths: deque[TruthMessage] = deque(maxlen=_KEPT)
+        self._truths: deque[TruthMessage] = deque(maxlen=_MOST_MESSAGES)
 
     def add(self, truth: TruthMessage) -> None:
-        """Take a message; an older one than the last begins anew (a restarted ether)."""
+        """Add a message; one older than the last (a restarted ether) replaces all before it."""
         if self._truths and truth.unix_s < self._truths[-1].unix_s:
             self._truths.clear()
         self._truths.append(truth)

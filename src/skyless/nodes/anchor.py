@@ -1,53 +1,63 @@
-"""One anchor as a program: its protocol machine on a radio, its health on MQTT."""
+"""``skyless anchor``: one process with one or several anchors, each with its own radio and its own MQTT connection."""
 
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final, Literal
 
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
 from skyless.constants import TICK_RATE_HZ
-from skyless.nodes.hearing import Hearing
-from skyless.radios.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
+from skyless.master_election import Role
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.messages import AnchorHealth, Counters
+from skyless.mqtt.topics import health_topic
+from skyless.nodes.process import HEALTH_S, Log, SitePublisher, every, keep, link_of, together
+from skyless.nodes.radio_monitor import RadioMonitor
+from skyless.radios.interface import Gone, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.site.model import Site
 from skyless.ticks import difference
 
 LEAD_S: Final = 1.8e-3
-"""How long before its RMARKER a frame is handed to the radio: its preamble, the way there, and a host's timers."""
+"""How long before its RMARKER a frame is handed to the radio: its preamble, the transfer, and a host's timers."""
 
 MAX_LEAD_S: Final = 8e-3
 LEAD_GAIN: Final = 1.25
 LEAD_LOSS: Final = 0.998
 """A host that is late hands its frames over earlier: by the gain with each late one, up to the maximum, and back by the
-loss with each one sent. What an earlier frame costs is relayed stamps that are older by as much."""
+loss with each one sent. The cost of an earlier frame is relayed stamps that are older by as much."""
 
 ASK_AGAIN_S: Final = 5e-3
 LOST_ANSWER_S: Final = 0.25
-"""A radio that has not said for so long what became of a frame will not say it any more."""
+"""A radio that has not reported the end of a frame within this time will not report it."""
 
 _NOT_DROPS: Final = frozenset({"heard", "sent", "takeover"})
 
+_ROLES: Final[dict[Role, Literal["master", "anchor", "listening"]]] = {
+    Role.MASTER: "master",
+    Role.FOLLOWER: "anchor",
+    Role.LISTENING: "listening",
+}
+
 
 class AnchorNode:
-    """Runs ``Anchor`` on a radio. ``said`` is told in words what a person should know."""
+    """Runs ``Anchor`` on a radio."""
 
-    def __init__(self, site: Site, anchor_id: int, radio: Radio, said: Callable[[str], None]) -> None:
+    def __init__(self, site: Site, anchor_id: int, radio: Radio, log: Log) -> None:
         self.site, self.id, self.radio = site, anchor_id, radio
         self.machine = self._new_machine()
+        self.monitor = RadioMonitor(f"anchor {anchor_id}", "on the air", log, radio.advice)
         self.started_s = time.monotonic()
         self.late = 0
         self.lead_s = LEAD_S
         """How long before its RMARKER the next frame is made."""
-        self.restarts = 0
         self.heard_s: dict[int, float] = {}
         """When each other anchor was last heard, by the host's monotonic clock."""
-        self._said = said
-        self._came = 0
-        self._hearing = Hearing(f"anchor {self.id}", said, radio.advice)
+        self._received = 0
         self._timer: asyncio.TimerHandle | None = None
 
     def _new_machine(self) -> Anchor:
@@ -56,42 +66,37 @@ class AnchorNode:
     async def run(self) -> None:
         """Serve until cancelled."""
         try:
-            await self.radio.run(self.hear)
+            await self.radio.run(self.on_event)
         finally:
             if self._timer is not None:
                 self._timer.cancel()
 
-    def hear(self, event: RadioEvent) -> None:
-        """Take what the radio tells."""
+    def on_event(self, event: RadioEvent) -> None:
+        """Process an event of the radio."""
         if isinstance(event, Reception):
-            self._came += 1
+            self._received += 1
             self.machine.hear(event)
             self._note(event)
         elif isinstance(event, Sent):
             self.lead_s = max(self.lead_s * LEAD_LOSS, LEAD_S)
-            self._plan()
+            self._schedule()
         elif isinstance(event, Late):
             self.late += 1
             self.lead_s = min(self.lead_s * LEAD_GAIN, MAX_LEAD_S)
-            self._wait(ASK_AGAIN_S, self._plan)
-        elif isinstance(event, Restarted):
-            self.restarts += 1
-            self._hearing.begin()
-            self._said(f"anchor {self.id}: on the air" + (" again" if self.restarts > 1 else ""))
-            self.machine = self._new_machine()
-            self._plan()
-        elif isinstance(event, Gone):
-            self._hearing.end()
-            self._said(f"anchor {self.id}: {event.reason}; still looking for it")
-            self._wait(None, self._plan)
-        elif isinstance(event, Hint):
-            self._said(f"anchor {self.id}: {event.text}")
+            self._wait(ASK_AGAIN_S, self._schedule)
+        else:
+            self.monitor.on_event(event)
+            if isinstance(event, Restarted):
+                self.machine = self._new_machine()
+                self._schedule()
+            elif isinstance(event, Gone):
+                self._wait(None, self._schedule)
 
-    def look(self, now_s: float) -> None:
-        """Log where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
+    def check_reception(self, now_s: float) -> None:
+        """Log where to look if it receives nothing usable; ``now_s`` is the host's monotonic clock."""
         counters = self.machine.counters
         drops = Counter({reason: count for reason, count in counters.items() if reason not in _NOT_DROPS})
-        self._hearing.look(now_s, self._came, counters["heard"], drops + self.radio.counters)
+        self.monitor.check(now_s, self._received, counters["heard"], drops + self.radio.counters)
 
     def _note(self, reception: Reception) -> None:
         beacon = decode_cached(reception.frame)
@@ -99,22 +104,88 @@ class AnchorNode:
             self.heard_s[beacon.anchor] = time.monotonic()
 
     def _wait(self, seconds: float | None, then: Callable[[], None]) -> None:
-        """Do one thing later, and nothing else that was planned; None plans nothing."""
+        """Call a function later, instead of the one planned before; None plans nothing."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None if seconds is None else asyncio.get_running_loop().call_later(seconds, then)
 
-    def _plan(self) -> None:
-        """Ask the machine when to speak next."""
+    def _schedule(self) -> None:
+        """Ask the machine for its next transmission."""
         now_ticks = self.radio.now_ticks()
         tx_ticks = None if now_ticks is None else self.machine.next_transmission_ticks(now_ticks)
         if now_ticks is None or tx_ticks is None:
-            self._wait(ASK_AGAIN_S, self._plan)
+            self._wait(ASK_AGAIN_S, self._schedule)
             return
         ahead_s = difference(tx_ticks, now_ticks) / TICK_RATE_HZ - self.lead_s
-        self._wait(max(ahead_s, 0.0), lambda: self._speak(tx_ticks))
+        self._wait(max(ahead_s, 0.0), lambda: self._transmit(tx_ticks))
 
-    def _speak(self, tx_ticks: int) -> None:
-        """Hand the frame to the radio, and ask again should it never answer."""
-        self._wait(LOST_ANSWER_S, self._plan)
+    def _transmit(self, tx_ticks: int) -> None:
+        """Hand the frame to the radio, and ask again if it never reports the frame's end."""
+        self._wait(LOST_ANSWER_S, self._schedule)
         self.radio.transmit(self.machine.transmission(tx_ticks))
+
+
+class Anchors:
+    """The anchors of one process."""
+
+    def __init__(
+        self,
+        site: Site,
+        radios: Sequence[Radio],
+        address: MqttAddress | None,
+        log: Log,
+        *,
+        simulated: Callable[[], bool],
+        floor_plan: Path | None = None,
+    ) -> None:
+        """``simulated`` is asked again when a radio has restarted: its port may lead to another device."""
+        self._site, self._log = site, log
+        self._site_publisher = SitePublisher(site, simulated, floor_plan)
+        self.nodes = tuple(AnchorNode(site, int(radio.name), radio, log) for radio in radios)
+        self._links = tuple(link_of(address, node.id, site=site.id, kind="anchor") for node in self.nodes)
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        parts = [node.run() for node in self.nodes]
+        parts += [keep(link, self._log) for link in self._links if link is not None]
+        await together(*parts, every(HEALTH_S, self._publish_health))
+
+    def _publish_health(self) -> None:
+        """Health of all anchors, and the site by its master."""
+        unix_s, now_s = time.time(), time.monotonic()
+        self._site_publisher.update(sum(node.monitor.restarts for node in self.nodes))
+        for node, link in zip(self.nodes, self._links, strict=True):
+            node.check_reception(now_s)
+            if link is not None:
+                if node.machine.is_master:
+                    self._site_publisher.publish(link)
+                health = health_of(node, link.counters, unix_s, now_s)
+                link.publish(health_topic(self._site.id, "anchor", node.id), health)
+
+
+def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> AnchorHealth:
+    """State of an anchor; ``now_s`` is the host's monotonic clock."""
+    machine = node.machine
+    state = machine.synchronisation
+    now_ticks = node.radio.now_ticks()
+    reading = None if now_ticks is None else machine.site_time(now_ticks)
+    known = machine.is_master or (state.role is Role.FOLLOWER and state.beacons > 1)
+    return AnchorHealth(
+        anchor=node.id,
+        unix_s=unix_s,
+        uptime_s=now_s - node.started_s,
+        role=_ROLES[state.role],
+        master=state.master,
+        term=state.term or 0,
+        synchronised=known,
+        offset_s=None if reading is None else reading[0],
+        rate_ppm=state.rate_ppm if known else None,
+        offset_std_m=state.offset_std_m if known else None,
+        sent=machine.counters["sent"],
+        late=node.late,
+        heard=machine.counters["heard"],
+        superframe=None if reading is None else reading[1],
+        heard_age_s={str(anchor): now_s - heard_s for anchor, heard_s in sorted(node.heard_s.items())},
+        counters=machine.counters | node.radio.counters,
+        mqtt=mqtt,
+    )

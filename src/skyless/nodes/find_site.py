@@ -1,4 +1,4 @@
-"""Which site a broker carries, for a dashboard that was not told one."""
+"""Which site a broker carries, for a dashboard or recorder without a configured one."""
 
 import asyncio
 import logging
@@ -6,9 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.connect import open_connection, trouble_with
-from skyless.mqtt.connection import Reactions, RefusedError
-from skyless.mqtt.paho_client import Introduction
+from skyless.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
 from skyless.mqtt.topics import EVERY_SITE, site_topic
 
 _KEEPALIVE_S: Final = 10
@@ -25,15 +23,15 @@ async def find_site(address: MqttAddress, on_state: Callable[[bool], None]) -> i
     ``on_state`` is called with whether the broker is there. A link needs its site from the start, for its last will;
     so this has a connection of its own.
     """
-    told = ""
+    logged = ""
     while True:
         try:
             sites = await _sites(address, on_state)
         except (OSError, RefusedError) as error:
             sites = set()
             trouble = trouble_with(address, error)
-            if trouble != told:
-                told = trouble
+            if trouble != logged:
+                logged = trouble
                 _log.warning("%s", trouble)
         on_state(False)
         if sites:
@@ -49,13 +47,13 @@ async def _sites(address: MqttAddress, on_state: Callable[[bool], None]) -> set[
     sites: set[int] = set()
     found = asyncio.Event()
 
-    def take(topic: str, payload: bytes) -> None:
+    def on_message(topic: str, payload: bytes) -> None:
         number = topic.split("/")[-2]
         if payload and number.isdecimal():
             sites.add(int(number))
             found.set()
 
-    who, react = Introduction("", _KEEPALIVE_S), Reactions(message=take)
+    who, react = Introduction("", _KEEPALIVE_S), Reactions(message=on_message)
     connection = await open_connection(address, address.tls_context(), who, react)
     on_state(True)
     connection.subscribe({site_topic(EVERY_SITE): 0})

@@ -1,49 +1,56 @@
-"""What a tag's program keeps of its fixes: their numbers, latencies and Unix times; what of them goes onto MQTT."""
+"""What a tag's program keeps of its fixes: numbers, latencies and Unix times; which of them are published."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
+from typing import Final
 
+from skyless.air.beacon import Malformed
+from skyless.air.codec import decode_cached
 from skyless.mqtt.fix_message import fix_message
 from skyless.mqtt.messages import Counters, FixMessage, Phase, TagHealth
-from skyless.nodes.latency import Latencies
-from skyless.nodes.process.running import HEALTH_S
-from skyless.nodes.publish_rate import Pace
+from skyless.nodes.process import HEALTH_S
 from skyless.positioning.fix import Fix
 
 FixListener = Callable[[FixMessage], None]
+
+_MOST_LATENCIES: Final = 4096
+_MOST_PHASES: Final = 64
+_LATE_SHARE: Final = 0.5
+"""A fix that is published late by up to this share of the interval does not lower the average rate."""
 
 
 class FixLog:
     """Numbers, times and publishes the fixes of one tag, from the first one on, whatever its radio does."""
 
     def __init__(self, tag: str, publish: FixListener, publish_hz: float) -> None:
-        """``publish`` is given so many of the fixes a second at most; all of them count."""
+        """``publish`` is called at most ``publish_hz`` times a second; all fixes count."""
         self.tag = tag
         self.started_s = time.monotonic()
         self.unix_less_host_s = 0.0
-        self.tie_clocks()
+        self.update_clock_offset()
         self.serial = 0
-        """Number of the newest fix: how many there were."""
+        """Number of the newest fix, which is the number of fixes so far."""
         self.first_fix_s: float | None = None
         """Since the start."""
         self.last_fix_s: float | None = None
         """When the last fix was made, by the host's monotonic clock."""
         self.latencies = Latencies()
-        self._told = 0
-        self._publish, self._pace = publish, Pace(publish_hz)
+        self._reported_serial = 0
+        self._publish, self._rate = publish, _RateLimit(publish_hz)
 
-    def tie_clocks(self) -> None:
-        """Ask again how far Unix time is from the host's monotonic clock: it is set now and then."""
+    def update_clock_offset(self) -> None:
+        """Measure again how far Unix time is from the host's monotonic clock: it is set now and then."""
         self.unix_less_host_s = time.time() - time.monotonic()
 
-    def take(self, fix: Fix, ended_s: float, done_s: float) -> None:
-        """Take a fix: when its last frame ended, and when it was made, by the host's monotonic clock."""
+    def add(self, fix: Fix, ended_s: float, done_s: float) -> None:
+        """Add a fix: when its last frame ended, and when it was made, by the host's monotonic clock."""
         self.serial += 1
         self.last_fix_s = done_s
         self.latencies.add(done_s - ended_s)
         if self.first_fix_s is None:
             self.first_fix_s = done_s - self.started_s
-        if self._pace.is_due(ended_s):
+        if self._rate.is_due(ended_s):
             unix_s = ended_s + self.unix_less_host_s
             self._publish(fix_message(self.tag, self.serial, fix, unix_s, done_s - ended_s))
 
@@ -59,11 +66,11 @@ class FixLog:
         memory_bytes: int,
         phases: tuple[Phase, ...] = (),
     ) -> TagHealth:
-        """How the tag has done since this was last asked; ``reason``: why there is no fix, where there is none."""
+        """The tag's state since the last call; ``reason``: why there is no fix, where there is none."""
         now_s = time.monotonic()
-        median_s, late_s, _ = self.latencies.take()
-        fixes, self._told = self.serial - self._told, self.serial
-        silent = self.last_fix_s is None or now_s - self.last_fix_s > HEALTH_S
+        median_s, late_s, _ = self.latencies.drain()
+        fixes, self._reported_serial = self.serial - self._reported_serial, self.serial
+        is_silent = self.last_fix_s is None or now_s - self.last_fix_s > HEALTH_S
         return TagHealth(
             tag=self.tag,
             unix_s=time.time(),
@@ -72,7 +79,7 @@ class FixLog:
             receptions=receptions,
             fixes=self.serial,
             updates_per_s=fixes / HEALTH_S,
-            reason=reason if silent else None,
+            reason=reason if is_silent else None,
             first_fix_s=self.first_fix_s,
             latency_p50_s=median_s,
             latency_p99_s=late_s,
@@ -81,4 +88,64 @@ class FixLog:
             cpu=cpu,
             memory_bytes=memory_bytes,
             phases=phases,
+        )
+
+
+class _RateLimit:
+    """Passes at most so many events a second."""
+
+    def __init__(self, most_hz: float) -> None:
+        self._interval_s = 1.0 / most_hz
+        self._due_s = 0.0
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether an event at this time passes."""
+        if now_s < self._due_s:
+            return False
+        self._due_s = max(self._due_s, now_s - _LATE_SHARE * self._interval_s) + self._interval_s
+        return True
+
+
+class Latencies:
+    """Latencies since they were last read, in s."""
+
+    def __init__(self) -> None:
+        self._values: deque[float] = deque(maxlen=_MOST_LATENCIES)
+
+    def add(self, latency_s: float) -> None:
+        """Count one fix."""
+        self._values.append(latency_s)
+
+    def drain(self) -> tuple[float | None, float | None, int]:
+        """Median, 99th percentile and number; the latencies are forgotten."""
+        ordered = sorted(self._values)
+        self._values.clear()
+        if not ordered:
+            return None, None, 0
+        return ordered[len(ordered) // 2], ordered[min(len(ordered) - 1, (99 * len(ordered)) // 100)], len(ordered)
+
+
+class PhaseLog:
+    """When the frames of the present superframe and of the last whole one ended and were processed."""
+
+    def __init__(self) -> None:
+        self._superframe: int | None = None
+        self._begin_s = 0.0
+        self._present: list[Phase] = []
+        self.last: tuple[Phase, ...] = ()
+
+    def add(self, frame: bytes, ended_s: float, done_s: float, *, made_fix: bool) -> None:
+        """Add one frame: when it ended, and when its processing did, by the host's monotonic clock."""
+        beacon = decode_cached(frame)
+        if isinstance(beacon, Malformed):
+            return
+        if beacon.superframe != self._superframe:
+            self.last = tuple(self._present)
+            self._present.clear()
+            self._superframe, self._begin_s = beacon.superframe, ended_s
+        if len(self._present) >= _MOST_PHASES:
+            return
+        begin_s = self._begin_s
+        self._present.append(
+            Phase(beacon.superframe, beacon.slot, beacon.anchor, ended_s - begin_s, done_s - begin_s, made_fix)
         )

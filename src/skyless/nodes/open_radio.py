@@ -1,37 +1,35 @@
-"""Radios by name, as ``--radio`` gives them."""
+"""Radios by their names in ``--radio``."""
 
 import os
 from collections.abc import Sequence
 from typing import Final, Literal
 
 from skyless.errors import SkylessError
-from skyless.radios.dw1000.chip_ports import ModelPort, SpiPort
+from skyless.radios.dw1000.model import ModelPort
 from skyless.radios.dw1000.radio import Dw1000Radio
-from skyless.radios.dw1000.spi_bus import DEFAULT_CHIP, DEFAULT_FAST_HZ, MAX_FAST_HZ, SLOW_HZ, SpiBus, check_place
-from skyless.radios.emulated.ether_wire import DEFAULT_PORT, Join
-from skyless.radios.emulated.radio import EtherConnection
+from skyless.radios.dw1000.spi import DEFAULT_CHIP, DEFAULT_FAST_HZ, MAX_FAST_HZ, START_HZ, SpiBus, SpiPort, check_spi
+from skyless.radios.emulated import EtherConnection
+from skyless.radios.ether_wire import DEFAULT_PORT, Join
 from skyless.radios.interface import AntennaDelays, Radio
-from skyless.radios.serial.listener_radio import ListenerRadio
+from skyless.radios.serial.foreign_radios import ListenerRadio, SnifferRadio
 from skyless.radios.serial.serial_port import check_path
 from skyless.radios.serial.serial_radio import SerialRadio
-from skyless.radios.serial.sniffer_radio import SnifferRadio
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
-SERIAL_BAUD: Final = 1_000_000
-SNIFFER_BAUD: Final = 115_200
-"""Of a real sniffer's USB port no rate matters."""
-
-LISTENER_BAUD: Final = 115_200
-EXPECTED: Final = (
+_SERIAL_BAUD: Final = 1_000_000
+_SNIFFER_BAUD: Final = 115_200
+"""Any rate serves on a real sniffer's USB port."""
+_LISTENER_BAUD: Final = 115_200
+_EXPECTED: Final = (
     "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN], model:HOST[:PORT], "
     "listener:PATH[@BAUD] or sniffer:PATH[@BAUD]"
 )
 
 
 def is_simulated(spec: str) -> bool:
-    """Whether nothing real flies over a radio of that name; what sits behind a pseudo-terminal is no radio.
+    """Whether a radio of that name is simulated: emulated, a model, or behind a pseudo-terminal.
 
-    To be asked again when a radio has come back: a path may lead elsewhere by then.
+    To be asked again when a radio has restarted: the path may lead to another device.
     """
     port = spec.partition(":")[2].partition(",")[0].partition("@")[0]
     return spec.split(":", 1)[0] in ("ether", "model") or os.path.realpath(port).startswith("/dev/pts/")
@@ -43,7 +41,7 @@ def is_ether(spec: str) -> bool:
 
 
 def is_sniffer(spec: str) -> bool:
-    """Whether a radio of that name hears packets of another system, and not beacons."""
+    """Whether a radio of that name receives packets of another system, and not beacons."""
     return spec.split(":", 1)[0] == "sniffer"
 
 
@@ -55,18 +53,18 @@ def open_radios(
 ) -> tuple[Radio, ...]:
     """Radios for the nodes of one process, in the order of their names; nothing is connected yet.
 
-    ``delays`` are the nodes' antenna delays, for radios that are of hardware.
+    ``delays`` are the nodes' antenna delays, for hardware radios.
 
     Raises:
         SkylessError: there is no such radio; the message says what would be right.
     """
-    driver, _, place = spec.partition(":")
+    driver, _, where = spec.partition(":")
     if driver == "ether":
-        host, port = host_and_port(spec, place, DEFAULT_PORT)
+        host, port = host_and_port(spec, where, DEFAULT_PORT)
         return EtherConnection(host, port, Join(kind, names)).radios
     settings = delays or [AntennaDelays()] * len(names)
     if driver == "model":
-        host, port = host_and_port(spec, place, DEFAULT_PORT)
+        host, port = host_and_port(spec, where, DEFAULT_PORT)
         nodes = EtherConnection(host, port, Join(kind, names)).radios
         return tuple(
             Dw1000Radio(ModelPort(node, own), node.name, own) for node, own in zip(nodes, settings, strict=True)
@@ -74,28 +72,28 @@ def open_radios(
     if driver == "spi":
         if len(names) != 1:
             raise SkylessError(f"--radio is {spec!r}; a chip on SPI carries one node, not {len(names)}")
-        return (Dw1000Radio(spi_port(spec, place), names[0], settings[0]),)
+        return (Dw1000Radio(spi_port(spec, where), names[0], settings[0]),)
     if driver == "serial":
-        ports = _ports(spec, place, SERIAL_BAUD, names)
+        ports = _ports(spec, where, _SERIAL_BAUD, names)
         transmits = kind == "anchor"
         return tuple(SerialRadio(*ports[i], name, settings[i], transmits=transmits) for i, name in enumerate(names))
     if driver in ("listener", "sniffer") and kind == "anchor":
         raise SkylessError(f"--radio is {spec!r}; it should be one that can transmit: a {driver} only listens")
     if driver == "listener":
-        ports = _ports(spec, place, LISTENER_BAUD, names)
+        ports = _ports(spec, where, _LISTENER_BAUD, names)
         return tuple(ListenerRadio(*port, name) for port, name in zip(ports, names, strict=True))
-    raise SkylessError(f"--radio is {spec!r}; it should be {EXPECTED}")
+    raise SkylessError(f"--radio is {spec!r}; it should be {_EXPECTED}")
 
 
 def open_sniffers(spec: str, names: tuple[str, ...]) -> tuple[SnifferRadio, ...]:
     """Sniffers for the tags of one process, in the order of their names. Raises SkylessError."""
-    ports = _ports(spec, spec.partition(":")[2], SNIFFER_BAUD, names)
+    ports = _ports(spec, spec.partition(":")[2], _SNIFFER_BAUD, names)
     return tuple(SnifferRadio(*port, name) for port, name in zip(ports, names, strict=True))
 
 
-def _ports(spec: str, place: str, usual_baud: int, names: tuple[str, ...]) -> list[tuple[str, int]]:
+def _ports(spec: str, where: str, usual_baud: int, names: tuple[str, ...]) -> list[tuple[str, int]]:
     """Path and baud rate of each node's port, from PATH[@BAUD],PATH[@BAUD] and so on. Raises SkylessError."""
-    parts = place.split(",")
+    parts = where.split(",")
     if len(parts) != len(names) or not all(parts):
         wanted = "one port" if len(names) == 1 else f"{len(names)} ports, one for each node, with commas"
         raise SkylessError(f"--radio is {spec!r}; it should name {wanted}, as {spec.partition(':')[0]}:/dev/ttyACM0")
@@ -107,9 +105,9 @@ def _ports(spec: str, place: str, usual_baud: int, names: tuple[str, ...]) -> li
     return ports
 
 
-def spi_port(spec: str, place: str) -> SpiPort:
+def spi_port(spec: str, where: str) -> SpiPort:
     """The chip of BUS.DEVICE[,irq=PIN][,reset=PIN][,hz=RATE][,chip=PATH], if it could be there. Raises SkylessError."""
-    wires, _, rest = place.partition(",")
+    wires, _, rest = where.partition(",")
     bus, dot, device = wires.partition(".")
     options = [part.partition("=")[::2] for part in rest.split(",") if part]
     given = dict(options)
@@ -121,10 +119,10 @@ def spi_port(spec: str, place: str) -> SpiPort:
     right = dot and bus.isdecimal() and device.isdecimal() and chip.startswith("/")
     if not right or not numbers.keys() <= {"irq", "reset", "hz"} or min(numbers.values(), default=0) < 0:
         raise SkylessError(f"--radio is {spec!r}; it should be spi:BUS.DEVICE, as spi:0.0,irq=25,reset=24,hz=8000000")
-    if not SLOW_HZ <= numbers.get("hz", DEFAULT_FAST_HZ) <= MAX_FAST_HZ:
-        raise SkylessError(f"--radio is {spec!r}; it should have hz from {SLOW_HZ} to {MAX_FAST_HZ}")
+    if not START_HZ <= numbers.get("hz", DEFAULT_FAST_HZ) <= MAX_FAST_HZ:
+        raise SkylessError(f"--radio is {spec!r}; it should have hz from {START_HZ} to {MAX_FAST_HZ}")
     has_lines = not numbers.keys().isdisjoint({"irq", "reset"})
-    check_place(spec, int(bus), int(device), chip if has_lines else None)
+    check_spi(spec, int(bus), int(device), chip if has_lines else None)
     return SpiPort(
         f"/dev/spidev{bus}.{device}",
         lambda: SpiBus(
@@ -147,9 +145,9 @@ def _port(spec: str, part: str, usual_baud: int) -> tuple[str, int]:
     return path, int(digits)
 
 
-def host_and_port(spec: str, place: str, default_port: int) -> tuple[str, int]:
+def host_and_port(spec: str, where: str, default_port: int) -> tuple[str, int]:
     """HOST[:PORT] of a radio's name, the host 127.0.0.1 where none is given. Raises SkylessError."""
-    host, colon, digits = place.rpartition(":") if place.count(":") != 0 else (place, "", "")
+    host, colon, digits = where.rpartition(":") if where.count(":") != 0 else (where, "", "")
     port = int(digits) if digits.isdecimal() and len(digits) < 6 else 0
     if colon and not 0 < port < 65_536:
         driver = spec.partition(":")[0]

@@ -1,36 +1,36 @@
-"""Tags on sniffers: they hear the packets of a system without a master, and are told where its anchors stand."""
+"""Tags on sniffers: they receive the packets of a system without a master, whose anchors' positions are configured."""
 
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 from msgspec import Struct, structs
 
 from skyless.air.masterless_packets import Packet, Point
 from skyless.errors import ConfigurationError
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.link import Link
-from skyless.mqtt.messages import Counters, FixMessage, SiteMessage
-from skyless.mqtt.topics import fix_topic, health_topic, site_topic
+from skyless.mqtt.messages import Counters, FixMessage
+from skyless.mqtt.topics import fix_topic, health_topic
 from skyless.nodes.fix_log import FixListener, FixLog
-from skyless.nodes.hearing import Hearing
-from skyless.nodes.process.running import HEALTH_S, AskedAgain, Log, every, keep, link_of, together
-from skyless.nodes.process.usage import Usage
-from skyless.positioning.masterless.calibration import DifferenceCalibration
+from skyless.nodes.process import HEALTH_S, Log, SitePublisher, Usage, every, keep, link_of, together
+from skyless.nodes.radio_monitor import RadioMonitor
+from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.radios.interface import Gone, Restarted
-from skyless.radios.serial.sniffer_radio import SnifferRadio
+from skyless.radios.serial.foreign_radios import SnifferRadio
 from skyless.site.check import check_site
 from skyless.site.model import AnchorSite, Site, TagsSite
 
-METHOD = "joint"
-TDOA_SITE = 0
-"""What topics call a system that has no site identifier."""
+TDOA_SITE: Final = 0
+"""The site in the topics of a system that has no site identifier."""
+
+_METHOD: Final = "joint"
 
 
 class PacketTagSettings(Struct, frozen=True):
-    """What tags of such a system are told."""
+    """Configuration of the tags of such a system."""
 
     anchors_m: Mapping[int, Point]
     site: int = TDOA_SITE
@@ -45,7 +45,7 @@ class PacketTagSettings(Struct, frozen=True):
 
 def site_of(settings: PacketTagSettings) -> Site | None:
     """The system as a site that a page can draw; None for a table of anchors that no site can have."""
-    anchors = tuple(AnchorSite(anchor, *place_m) for anchor, place_m in settings.anchors_m.items())
+    anchors = tuple(AnchorSite(anchor, *position_m) for anchor, position_m in settings.anchors_m.items())
     tags = TagsSite(height_m=settings.height_m)
     site = Site("TDoA system", settings.site, anchors[0].id, anchors, tags=tags)
     try:
@@ -56,18 +56,17 @@ def site_of(settings: PacketTagSettings) -> Site | None:
 
 
 class PacketTagNode:
-    """Runs ``PacketTracking`` on a sniffer. ``publish`` is given the fixes that are to be published."""
+    """Runs ``PacketTracking`` on a sniffer. ``publish`` is called with the fixes that are to be published."""
 
-    def __init__(self, settings: PacketTagSettings, radio: SnifferRadio, publish: FixListener, said: Log) -> None:
+    def __init__(self, settings: PacketTagSettings, radio: SnifferRadio, publish: FixListener, log: Log) -> None:
         self.settings, self.radio = settings, radio
         self.tracking = self._new_tracking()
-        self.packets = self.restarts = 0
-        self.book = FixLog(radio.name, publish, settings.publish_hz)
+        self.packets = 0
+        self.fix_log = FixLog(radio.name, publish, settings.publish_hz)
+        self.monitor = RadioMonitor(f"tag {radio.name}", "listening", log, radio.advice)
         self._drops: Counter[str] = Counter()
-        self._said = said
         self._known = 0
-        """Packets of anchors that stand in the table."""
-        self._hearing = Hearing(f"tag {radio.name}", said, radio.advice)
+        """Packets of anchors that are in the table."""
 
     def _new_tracking(self) -> PacketTracking:
         asked = self.settings
@@ -76,40 +75,35 @@ class PacketTagNode:
         return PacketTracking(filter_settings, asked.anchors_m, calibration=asked.calibration)
 
     @property
-    def counters(self) -> Counter[str]:
+    def drops(self) -> Counter[str]:
         """What could not be used, by reason."""
         return self._drops + self.tracking.drops + self.radio.counters
 
-    def look(self, now_s: float) -> None:
-        """Log where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
-        self._hearing.look(now_s, self.packets, self._known, self.counters)
+    def check_reception(self, now_s: float) -> None:
+        """Log where to look if it receives nothing usable; ``now_s`` is the host's monotonic clock."""
+        self.monitor.check(now_s, self.packets, self._known, self.drops)
 
     async def run(self) -> None:
         """Listen until cancelled."""
-        await self.radio.run(self.hear)
+        await self.radio.run(self.on_event)
 
-    def hear(self, event: Packet | Restarted | Gone) -> None:
-        """Take what the sniffer tells."""
+    def on_event(self, event: Packet | Restarted | Gone) -> None:
+        """Process an event of the sniffer."""
         if isinstance(event, Packet):
             self._receive(event)
-        elif isinstance(event, Restarted):
-            self.restarts += 1
-            self._hearing.begin()
-            self._said(f"tag {self.radio.name}: listening" + (" again" if self.restarts > 1 else ""))
-            if self.packets:
-                self._drops += self.tracking.drops
-                self.tracking = self._new_tracking()
-        else:
-            self._hearing.end()
-            self._said(f"tag {self.radio.name}: {event.reason}; still looking for it")
+            return
+        self.monitor.on_event(event)
+        if isinstance(event, Restarted) and self.packets:
+            self._drops += self.tracking.drops
+            self.tracking = self._new_tracking()
 
     def _receive(self, packet: Packet) -> None:
         self.packets += 1
         self._known += packet.anchor in self.settings.anchors_m
-        fix = self.tracking.hear(packet)
+        fix = self.tracking.on_packet(packet)
         if fix is not None:
             done_s = time.monotonic()
-            self.book.take(fix, done_s if packet.host_s is None else packet.host_s, done_s)
+            self.fix_log.add(fix, done_s if packet.host_s is None else packet.host_s, done_s)
 
 
 class PacketTags:
@@ -120,26 +114,25 @@ class PacketTags:
         settings: PacketTagSettings,
         radios: Sequence[SnifferRadio],
         address: MqttAddress | None,
-        say: Log,
+        log: Log,
         *,
         simulated: Callable[[], bool],
     ) -> None:
-        """``simulated`` is asked again when a sniffer has come back: something else may stand behind its port."""
-        self._settings, self._say = settings, say
-        self._simulated = AskedAgain(simulated)
-        self._told_simulated: bool | None = None
+        """``simulated`` is asked again when a sniffer has restarted: its port may lead to another device."""
+        self._settings, self._log = settings, log
         self._links = tuple(link_of(address, radio.name, site=settings.site, kind="tag") for radio in radios)
         self.nodes = tuple(
-            PacketTagNode(settings, radio, self._publisher(index), say) for index, radio in enumerate(radios)
+            PacketTagNode(settings, radio, self._publisher(index), log) for index, radio in enumerate(radios)
         )
         self._usage = Usage()
-        self._site: Site | None = site_of(settings)
+        site = site_of(settings)
+        self._site_publisher = None if site is None else SitePublisher(site, simulated)
 
     async def run(self) -> None:
         """Serve until cancelled."""
         parts = [node.run() for node in self.nodes]
-        parts += [keep(link, self._say) for link in self._links if link is not None]
-        await together(*parts, every(HEALTH_S, self._tell))
+        parts += [keep(link, self._log) for link in self._links if link is not None]
+        await together(*parts, every(HEALTH_S, self._publish_health))
 
     def _publisher(self, index: int) -> FixListener:
         def publish(message: FixMessage) -> None:
@@ -149,28 +142,23 @@ class PacketTags:
 
         return publish
 
-    def _tell(self) -> None:
-        share, memory_bytes = self._usage.take()
+    def _publish_health(self) -> None:
+        """Health of all tags, and the site with the anchors' positions."""
+        share, memory_bytes = self._usage.sample()
         for node, link in zip(self.nodes, self._links, strict=True):
-            node.book.tie_clocks()
-            node.look(time.monotonic())
-            health = node.book.health(
-                method=METHOD,
+            node.fix_log.update_clock_offset()
+            node.check_reception(time.monotonic())
+            health = node.fix_log.health(
+                method=_METHOD,
                 receptions=node.packets,
                 reason=str(node.tracking.reason),
-                counters=node.counters,
+                counters=node.drops,
                 mqtt=Counters(0, 0, 0) if link is None else link.counters,
                 cpu=share / len(self.nodes),
                 memory_bytes=memory_bytes,
             )
             if link is not None:
-                self._tell_site(link)
+                if self._site_publisher is not None:
+                    self._site_publisher.update(sum(each.monitor.restarts for each in self.nodes))
+                    self._site_publisher.publish(link)
                 link.publish(health_topic(self._settings.site, "tag", node.radio.name), health)
-
-    def _tell_site(self, link: Link) -> None:
-        """Where the anchors stand; retained, so that a page that comes later knows it at once."""
-        simulated = self._simulated.at(sum(node.restarts for node in self.nodes))
-        if self._site is not None and simulated is not self._told_simulated:
-            self._told_simulated = simulated
-            message = SiteMessage(self._site, simulated, time.time())
-            link.publish(site_topic(self._site.id), message, qos=1, retain=True)

@@ -1,8 +1,7 @@
-"""The recorder: asks a site's tags for their receptions and writes all that is said there into a file."""
+"""``skyless record``: requests the receptions of a site's tags and writes all its messages into a file."""
 
 import asyncio
 import contextlib
-import fcntl
 import re
 import socket
 import tempfile
@@ -17,23 +16,25 @@ from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage
 from skyless.mqtt.topics import request_topic, site_topic
-from skyless.nodes.process.running import Log, every
+from skyless.nodes.process import Log, every, locked
 from skyless.recordings.mcap.reception_log import EVERY_TAG
 from skyless.recordings.mcap.recorder import McapFile, McapRecorder
 
-LEASE_S: Final = 15.0
-ASK_S: Final = 5.0
-FLUSH_S: Final = 0.8
-"""A recorder that is killed loses what came since; the rest of a second is the way of a message."""
+_LEASE_S: Final = 15.0
+_REQUEST_S: Final = 5.0
+"""Each request for receptions is repeated at this interval, before its lease ends."""
+
+_FLUSH_S: Final = 0.8
+"""A recorder that is killed loses what came since: less than a second with the delay of a message."""
 
 _MOST_RECORDERS: Final = 1000
 
-ASK_ANEW_S: Final = 1.0
-"""After a loss; not more often than this, as each request begins a run with a checkpoint in it."""
+_NEW_RUN_S: Final = 1.0
+"""After a loss; not more often than this, as each new run begins with a checkpoint."""
 
 
 class RecorderState(Struct, frozen=True):
-    """How a recording goes."""
+    """Progress of a recording."""
 
     seconds: float
     messages: dict[str, int]
@@ -45,12 +46,13 @@ class RecorderState(Struct, frozen=True):
     trouble: str | None
     """Why there is no broker; None while there is one."""
     ended: str | None
+    """Why the file is not written any more; None while it is."""
 
 
 class RecorderNode:
     """Records one site until cancelled, or until the file cannot be written any more."""
 
-    def __init__(self, file: McapFile, address: MqttAddress, site: int, say: Log) -> None:
+    def __init__(self, file: McapFile, address: MqttAddress, site: int, log: Log) -> None:
         self.file = file
         self.recorder = McapRecorder(file)
         self._name, self._lock = _own_name(site)
@@ -58,20 +60,19 @@ class RecorderNode:
         self.link = Link(address, self._name, site=site, kind="recorder", persistent=True)
         self.receptions = 0
         self._site = site
-        self._say = say
+        self._log = log
         self._started_s = time.monotonic()
         self._runs = 0
-        self._asked_anew_s = 0.0
+        self._new_run_s = 0.0
         self._next: dict[str, tuple[str, int]] = {}
-        """Of each tag: the segment, and the number of its next reception."""
-        self._flushing: asyncio.Future[None] | None = None
-        self.link.subscribe(f"{site_topic(site).removesuffix('site')}#", self._take, qos=1)
-        self.link.on_state.append(self._ask_when_connected)
+        """For each tag: the segment, and the number of its next reception."""
+        self.link.subscribe(f"{site_topic(site).removesuffix('site')}#", self._on_message, qos=1)
+        self.link.on_state.append(self._on_state)
 
     async def run(self, duration_s: float | None = None) -> None:
-        """Record; in the end the tags are told, and the file is closed."""
+        """Record; at the end the request is withdrawn and the file closed."""
         link = asyncio.ensure_future(self.link.run())
-        work = [asyncio.ensure_future(every(ASK_S, self._ask)), asyncio.ensure_future(self._write())]
+        work = [asyncio.ensure_future(every(_REQUEST_S, self._request)), asyncio.ensure_future(self._write())]
         try:
             await asyncio.wait([link, *work], timeout=duration_s, return_when=asyncio.FIRST_COMPLETED)
             for task in (link, *work):
@@ -86,7 +87,7 @@ class RecorderNode:
             self._lock.close()
 
     def state(self) -> RecorderState:
-        """How it goes."""
+        """Progress so far."""
         return RecorderState(
             seconds=time.monotonic() - self._started_s,
             messages=dict(self.recorder.kinds),
@@ -103,30 +104,30 @@ class RecorderNode:
     def _by(self) -> str:
         return f"{self._name}-{self._started_s:.3f}-{self._runs}"
 
-    def _ask(self) -> None:
-        self.link.publish(request_topic(self._site), RequestMessage(self._by, (EVERY_TAG,), LEASE_S), qos=1)
+    def _request(self) -> None:
+        self.link.publish(request_topic(self._site), RequestMessage(self._by, (EVERY_TAG,), _LEASE_S), qos=1)
 
-    def _ask_when_connected(self, connected: bool) -> None:
+    def _on_state(self, connected: bool) -> None:
         if connected:
-            self._ask()
+            self._request()
 
-    def _ask_anew(self) -> None:
-        """Something was lost: under another name the tags begin another run, with its checkpoint."""
+    def _begin_new_run(self) -> None:
+        """After a loss: request under another name, so that the tags begin another run with its checkpoint."""
         now_s = time.monotonic()
-        if now_s - self._asked_anew_s >= ASK_ANEW_S:
-            self._asked_anew_s = now_s
+        if now_s - self._new_run_s >= _NEW_RUN_S:
+            self._new_run_s = now_s
             self._runs += 1
-            self._ask()
+            self._request()
 
-    def _take(self, topic: str, payload: bytes) -> None:
+    def _on_message(self, topic: str, payload: bytes) -> None:
         message = self.recorder.add(topic, payload, time.time())
         if isinstance(message, ReceptionsMessage):
-            self._follow(message)
+            self._check_sequence(message)
         elif isinstance(message, StatusMessage) and message.kind == "tag" and message.online:
-            self._ask()
+            self._request()
 
-    def _follow(self, message: ReceptionsMessage) -> None:
-        """See that no reception is missing; a message that comes twice, after a broken connection, does no harm."""
+    def _check_sequence(self, message: ReceptionsMessage) -> None:
+        """Check that no reception is missing; a message may come twice after a broken connection."""
         self.receptions += len(message.receptions)
         segment, following = self._next.get(message.tag, ("", 0))
         end = message.first + len(message.receptions)
@@ -138,25 +139,25 @@ class RecorderNode:
         self._next[message.tag] = (message.segment, end)
         if lost:
             self.recorder.drops["gap-in-receptions"] += 1
-            self._ask_anew()
+            self._begin_new_run()
 
     async def _write(self) -> None:
-        """Close a chunk now and then, and see that it stands on the disk; until nothing can be written any more."""
+        """Close a chunk at intervals and sync it to the disk; until nothing can be written any more."""
         while True:
-            await asyncio.sleep(FLUSH_S)
+            await asyncio.sleep(_FLUSH_S)
             self.file.flush()
             if self.file.ended is None:
                 await asyncio.to_thread(self.file.sync)
             if self.file.ended is not None:
-                self._say(f"the recording has ended: {self.file.ended}")
+                self._log(f"the recording has ended: {self.file.ended}")
                 return
 
 
 def _own_name(site: int) -> tuple[str, IO[str]]:
-    """A name on MQTT that no other recorder of this machine has now, and one before it may have had.
+    """A name on MQTT that no other running recorder of this machine has; an earlier one may have had it.
 
     A recorder that was killed has left a session that the broker fills; the next one takes it over and ends it. A lock
-    that another user has made cannot be opened, and its name is passed over.
+    that another user has made cannot be opened, and its name is skipped.
 
     Raises:
         SkylessError: there is no folder for temporary files, or too many recorders run.
@@ -165,7 +166,7 @@ def _own_name(site: int) -> tuple[str, IO[str]]:
     folder = _temporary_folder()
     for number in range(1, _MOST_RECORDERS + 1):
         with contextlib.suppress(OSError):
-            return f"{host}-{number}", _locked(folder / f"skyless-record-{site}-{number}.lock")
+            return f"{host}-{number}", locked(folder / f"skyless-record-{site}-{number}.lock")
     raise SkylessError(f"no name is left for a recorder: {folder}/skyless-record-{site}-*.lock cannot be locked")
 
 
@@ -174,14 +175,3 @@ def _temporary_folder() -> Path:
         return Path(tempfile.gettempdir())
     except OSError as error:
         raise SkylessError(f"a recorder needs a folder for temporary files: {error.strerror}") from None
-
-
-def _locked(file: Path) -> IO[str]:
-    """The file, locked until it is closed. Raises OSError."""
-    lock = file.open("a", encoding="utf-8")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.close()
-        raise
-    return lock

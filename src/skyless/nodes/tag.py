@@ -1,99 +1,204 @@
-"""One tag as a program: its receiver on a radio, its fixes and health on MQTT."""
+"""``skyless tag``: one process with one or several tags, each with its own radio and its own MQTT connection."""
 
+import asyncio
+import secrets
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Final
 
+import msgspec
 from msgspec import Struct
 
 from skyless.air.reception import Reception
 from skyless.method_names import DEFAULT_METHOD
-from skyless.nodes.fix_log import FixListener, FixLog
-from skyless.nodes.hearing import Hearing
-from skyless.nodes.latency import PhaseLog
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import Counters, FixMessage, RequestMessage
+from skyless.mqtt.topics import fix_topic, health_topic, receptions_topic, request_topic
+from skyless.nodes.fix_log import FixListener, FixLog, PhaseLog
+from skyless.nodes.process import HEALTH_S, Log, Usage, every, keep, together
+from skyless.nodes.radio_monitor import RadioMonitor
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.radios.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.receiver import NOT_DROPS, Receiver
+from skyless.recordings.mcap.reception_log import ReceptionLog, receiver_settings
+
+RECEPTIONS_S: Final = 0.05
+"""Interval of the messages with raw receptions."""
+_decode_request: Final = msgspec.json.Decoder(RequestMessage).decode
 
 
 class TagSettings(Struct, frozen=True):
-    """How a tag computes and what it tells."""
+    """How a tag computes and what it publishes."""
 
     method: str = DEFAULT_METHOD
     qa: float = 0.3
     site: int | None = None
     """The only site to listen to; None for the first that is heard."""
-    z_bounds_m: tuple[float, float] | None = None
     integrity: IntegrityRequirement = IntegrityRequirement()
     publish_hz: float = 50.0
-    """Fixes a second on MQTT at most; all of them count."""
+    """Largest rate of fixes on MQTT; all of them count."""
 
 
 class TagNode:
-    """Runs ``Receiver`` on a radio. ``publish`` is given the fixes that are to be published."""
+    """Runs ``Receiver`` on a radio. ``publish`` is called with the fixes that are to be published."""
 
     def __init__(
         self,
         settings: TagSettings,
         radio: Radio,
         publish: FixListener,
-        said: Callable[[str], None],
+        log: Log,
         before: Callable[[Receiver, Reception, int], None] | None = None,
     ) -> None:
         """``before`` is called with receiver, reception and the number of fixes so far before each reception."""
         self.settings, self.radio = settings, radio
         self.name = radio.name
         self.receiver = self.new_receiver()
-        self.receptions = self.restarts = 0
-        self.book = FixLog(self.name, publish, settings.publish_hz)
+        self.receptions = 0
+        self.fix_log = FixLog(self.name, publish, settings.publish_hz)
         self.phases = PhaseLog()
-        self._said, self._before = said, before
-        self._hearing = Hearing(f"tag {self.name}", said, radio.advice)
+        self.monitor = RadioMonitor(f"tag {self.name}", "listening", log, radio.advice)
+        self._before = before
 
     def new_receiver(self) -> Receiver:
-        """A receiver that knows nothing yet."""
+        """A receiver that has heard nothing yet."""
         asked = self.settings
-        return Receiver(
-            asked.method, site=asked.site, qa=asked.qa, z_bounds_m=asked.z_bounds_m, integrity=asked.integrity
-        )
+        return Receiver(asked.method, site=asked.site, qa=asked.qa, integrity=asked.integrity)
 
     @property
     def drops(self) -> Counter[str]:
         """What could not be used, by reason."""
-        heard = self.receiver.counters.items()
-        return Counter({reason: count for reason, count in heard if reason not in NOT_DROPS}) + self.radio.counters
+        counters = self.receiver.counters.items()
+        return Counter({reason: count for reason, count in counters if reason not in NOT_DROPS}) + self.radio.counters
 
-    def look(self, now_s: float) -> None:
-        """Log where to look if it hears nothing of use; ``now_s`` is the host's monotonic clock."""
-        self._hearing.look(now_s, self.receptions, self.receiver.counters["heard"], self.drops)
+    def check_reception(self, now_s: float) -> None:
+        """Log where to look if it receives nothing usable; ``now_s`` is the host's monotonic clock."""
+        self.monitor.check(now_s, self.receptions, self.receiver.counters["heard"], self.drops)
 
     async def run(self) -> None:
         """Listen until cancelled."""
-        await self.radio.run(self.hear)
+        await self.radio.run(self.on_event)
 
-    def hear(self, event: RadioEvent) -> None:
-        """Take what the radio tells."""
+    def on_event(self, event: RadioEvent) -> None:
+        """Process an event of the radio."""
         if isinstance(event, Reception):
             self._receive(event)
-        elif isinstance(event, Restarted):
-            self.restarts += 1
-            self._hearing.begin()
-            self._said(f"tag {self.name}: listening" + (" again" if self.restarts > 1 else ""))
-            if self.receptions:
+        elif isinstance(event, Restarted | Gone | Hint):
+            self.monitor.on_event(event)
+            if isinstance(event, Restarted) and self.receptions:
                 self.receiver = self.new_receiver()
-        elif isinstance(event, Gone):
-            self._hearing.end()
-            self._said(f"tag {self.name}: {event.reason}; still looking for it")
-        elif isinstance(event, Hint):
-            self._said(f"tag {self.name}: {event.text}")
 
     def _receive(self, reception: Reception) -> None:
         if self._before is not None:
-            self._before(self.receiver, reception, self.book.serial)
+            self._before(self.receiver, reception, self.fix_log.serial)
         self.receptions += 1
         fix = self.receiver.hear(reception)
         done_s = time.monotonic()
         ended_s = done_s if reception.host_s is None else reception.host_s
-        self.phases.hear(reception.frame, ended_s, done_s, made_fix=fix is not None)
+        self.phases.add(reception.frame, ended_s, done_s, made_fix=fix is not None)
         if fix is not None:
-            self.book.take(fix, ended_s, done_s)
+            self.fix_log.add(fix, ended_s, done_s)
+
+
+class Tag:
+    """A tag and its link, which is made once the tag's site is known, and again in another site."""
+
+    def __init__(self, settings: TagSettings, radio: Radio, address: MqttAddress | None, log: Log) -> None:
+        self._address, self._log = address, log
+        self.link: Link | None = None
+        self._site: int | None = None
+        self._link_tasks: list[asyncio.Task[None]] = []
+        self._fix_topic = self._health_topic = self._receptions_topic = ""
+        asked = receiver_settings(settings.method, settings.site, settings.qa, integrity=settings.integrity)
+        self.reception_log = ReceptionLog(radio.name, asked, secrets.token_hex(4))
+        self.node = TagNode(settings, radio, self._publish, log, self.reception_log.add)
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        try:
+            await self.node.run()
+        finally:
+            for task in self._link_tasks:
+                task.cancel()
+            await asyncio.gather(*self._link_tasks, return_exceptions=True)
+
+    def _publish(self, message: FixMessage) -> None:
+        self._connect()
+        if self.link is not None:
+            self.link.publish(self._fix_topic, message)
+
+    def _connect(self) -> None:
+        """Make the link to the site to which the tag listens."""
+        site = self.node.receiver.site
+        if self._address is None or site is None or site == self._site:
+            return
+        for task in self._link_tasks:
+            task.cancel()  # it publishes its end to the site that was left
+        self._link_tasks = [task for task in self._link_tasks if not task.done()]
+        self._site = site
+        self.link = Link(self._address, self.node.name, site=site, kind="tag")
+        self._fix_topic = fix_topic(site, self.node.name)
+        self._health_topic = health_topic(site, "tag", self.node.name)
+        self._receptions_topic = receptions_topic(site, self.node.name)
+        self.link.subscribe(request_topic(site), self._on_request, qos=1)
+        self._link_tasks.append(asyncio.ensure_future(keep(self.link, self._log)))
+
+    def _on_request(self, _topic: str, payload: bytes) -> None:
+        """A subscriber requests raw receptions; a request that cannot be read is counted."""
+        try:
+            request = _decode_request(payload)
+        except msgspec.MsgspecError:
+            self.reception_log.counters["bad-request"] += 1
+        else:
+            self.reception_log.request(request, time.monotonic())
+
+    def publish_receptions(self) -> None:
+        """Publish the raw receptions that were requested and are due."""
+        if self.link is None:
+            return
+        unix_less_host_s = self.node.fix_log.unix_less_host_s
+        while (message := self.reception_log.collect(time.monotonic(), unix_less_host_s)) is not None:
+            self.link.publish(self._receptions_topic, message, qos=1)
+
+    def publish_health(self, cpu: float, memory_bytes: int) -> None:
+        """Publish the tag's state."""
+        node = self.node
+        node.fix_log.update_clock_offset()
+        self._connect()
+        node.check_reception(time.monotonic())
+        health = node.fix_log.health(
+            method=node.settings.method,
+            receptions=node.receptions,
+            reason=str(node.receiver.reason),
+            counters=node.drops | self.reception_log.counters,
+            mqtt=Counters(0, 0, 0) if self.link is None else self.link.counters,
+            cpu=cpu,
+            memory_bytes=memory_bytes,
+            phases=node.phases.last,
+        )
+        if self.link is not None:
+            self.link.publish(self._health_topic, health)
+
+
+class Tags:
+    """The tags of one process."""
+
+    def __init__(self, settings: TagSettings, radios: Sequence[Radio], address: MqttAddress | None, log: Log) -> None:
+        self.tags = tuple(Tag(settings, radio, address, log) for radio in radios)
+        self._usage = Usage()
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        parts = [tag.run() for tag in self.tags]
+        await together(*parts, every(HEALTH_S, self._publish_health), every(RECEPTIONS_S, self._publish_receptions))
+
+    def _publish_health(self) -> None:
+        share, memory_bytes = self._usage.sample()
+        for tag in self.tags:
+            tag.publish_health(share / len(self.tags), memory_bytes)
+
+    def _publish_receptions(self) -> None:
+        for tag in self.tags:
+            tag.publish_receptions()

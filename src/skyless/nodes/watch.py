@@ -1,4 +1,4 @@
-"""Watching a running site over MQTT: fixes beside the truth, health, and how late everything comes."""
+"""Watching a running site over MQTT: errors of fixes against the truth, health, latencies."""
 
 import time
 from collections import Counter
@@ -9,20 +9,20 @@ import msgspec
 from msgspec import Struct
 
 from skyless.evaluation.statistics import ErrorStatistics
-from skyless.mqtt.link import Link
+from skyless.mqtt.link import Handler, Link
 from skyless.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, TagHealth, TruthMessage, Vector
 from skyless.mqtt.topics import EVERY_NODE, fix_topic, health_topic, truth_topic
 from skyless.mqtt.truth_buffer import TruthBuffer
-from skyless.nodes.latency import Latencies
+from skyless.nodes.fix_log import Latencies
 from skyless.positioning.integrity import Alert
 
-WARMUP_S: Final = 1.0
-"""Fixes of a tag count for the errors from so long after its first."""
+_WARMUP_S: Final = 1.0
+"""Fixes of a tag count for the errors from this time after its first."""
 
-ALERTS: Final = frozenset(alert.value for alert in Alert)
+_ALERTS: Final = frozenset(alert.value for alert in Alert)
 
 
-class Watched(Struct):
+class WatchedTag(Struct):
     """What is known of one tag."""
 
     first_unix_s: float
@@ -45,79 +45,79 @@ class Watched(Struct):
 
 
 class Watch:
-    """Gathers what the nodes of a site tell."""
+    """Collects what the nodes of a site publish, and the errors of its fixes."""
 
     def __init__(self, link: Link, site: int, *, planar: bool) -> None:
-        self.tags: dict[str, Watched] = {}
+        self.tags: dict[str, WatchedTag] = {}
         self.anchors: dict[int, AnchorHealth] = {}
         self.ether: EtherHealth | None = None
         self.errors = ErrorStatistics(planar=planar)
         self.variance_sum_m2 = 0.0
         self.judged = 0
         self.alerts: Counter[str] = Counter()
-        """What the fixes said of their integrity, of methods that say something."""
+        """How often fixes reported each state of their integrity, for methods that report one."""
         self.arrivals = Latencies()
-        """From the end of a fix's last frame to its arrival here."""
+        """From the end of a fix's last frame to its arrival in this process."""
         self.latencies = Latencies()
-        """From there to the computed fix, as the tags say."""
+        """From there to the computed fix, as the tags report them."""
         self.wrong = 0
         """Messages that could not be read."""
         self._truths = TruthBuffer()
-        for topic, kind, take in (
-            (fix_topic(site, EVERY_NODE), FixMessage, self._take_fix),
+        for topic, kind, handle in (
+            (fix_topic(site, EVERY_NODE), FixMessage, self._on_fix),
             (truth_topic(site), TruthMessage, self._truths.add),
-            (health_topic(site, "tag", EVERY_NODE), TagHealth, self._take_tag),
-            (health_topic(site, "anchor", EVERY_NODE), AnchorHealth, self._take_anchor),
-            (health_topic(site, "ether", EVERY_NODE), EtherHealth, self._take_ether),
+            (health_topic(site, "tag", EVERY_NODE), TagHealth, self._on_tag),
+            (health_topic(site, "anchor", EVERY_NODE), AnchorHealth, self._on_anchor),
+            (health_topic(site, "ether", EVERY_NODE), EtherHealth, self._on_ether),
         ):
-            link.subscribe(topic, self._reader(msgspec.json.Decoder(kind), take))
+            link.subscribe(topic, self._reader(msgspec.json.Decoder(kind), handle))
 
-    def _reader(self, decoder: msgspec.json.Decoder[Struct], take: Callable[..., None]) -> Callable[[str, bytes], None]:
+    def _reader(self, decoder: msgspec.json.Decoder[Struct], handle: Callable[..., None]) -> Handler:
         def read(_topic: str, payload: bytes) -> None:
             try:
                 message = decoder.decode(payload)
             except msgspec.MsgspecError:
                 self.wrong += 1
             else:
-                take(message)
+                handle(message)
 
         return read
 
-    def _take_fix(self, fix: FixMessage) -> None:
+    def _on_fix(self, fix: FixMessage) -> None:
         self.arrivals.add(time.time() - fix.unix_s)
         self.latencies.add(fix.latency_s)
         tag = self.tags.get(fix.tag)
         if tag is None:
-            tag = self.tags[fix.tag] = Watched(fix.unix_s, fix)
+            tag = self.tags[fix.tag] = WatchedTag(fix.unix_s, fix)
         tag.fix = fix
-        if fix.alert in ALERTS:
+        if fix.alert in _ALERTS:
             self.alerts[fix.alert] += 1
             if fix.alert != Alert.NONE:
                 tag.alerted, tag.alerted_s = fix, time.monotonic()
         true_m = self._truths.at(fix.tag, fix.unix_s)
         tag.error_m = None
         if true_m is not None:
-            self._judge(tag, true_m)
+            self._add_error(tag, true_m)
 
-    def _judge(self, tag: Watched, true_m: Vector) -> None:
+    def _add_error(self, tag: WatchedTag, true_m: Vector) -> None:
         fix = tag.fix
         dx, dy, dz = (have - true for have, true in zip(fix.position_m, true_m, strict=True))
         dz = 0.0 if fix.height_known else dz
         tag.error_m = (dx * dx + dy * dy + dz * dz) ** 0.5
-        if fix.unix_s - tag.first_unix_s >= WARMUP_S:
+        if fix.unix_s - tag.first_unix_s >= _WARMUP_S:
             self.errors.add(dx, dy, dz)
             self.judged += 1
             self.variance_sum_m2 += fix.std_m**2
 
-    def _take_tag(self, health: TagHealth) -> None:
+    def _on_tag(self, health: TagHealth) -> None:
         tag = self.tags.get(health.tag)
         if tag is not None:
             tag.health = health
             if tag.began is None or health.fixes < tag.began[1]:
                 tag.began = health.unix_s, health.fixes
 
-    def _take_anchor(self, health: AnchorHealth) -> None:
+    def _on_anchor(self, health: AnchorHealth) -> None:
         self.anchors[health.anchor] = health
 
-    def _take_ether(self, health: EtherHealth) -> None:
+    def _on_ether(self, health: EtherHealth) -> None:
         self.ether = health

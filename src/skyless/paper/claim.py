@@ -5,27 +5,39 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.evaluation.plot_style import GREEN, INK, METHOD_COLOURS, MUTED, panel
+from skyless.evaluation.figures import GREEN, INK, METHOD_COLOURS, MUTED, panel
 from skyless.kernels.arrays import Array
 from skyless.paper.listening import listen
-from skyless.paper.plan import CLAIM_M, DW1000_PS, P1, PAPER_PS, Plan, Progress, Results, Task
-from skyless.paper.section import Panel, Section, Verdict, grouped
+from skyless.paper.plan import (
+    CLAIM_M,
+    DW1000_PS,
+    P1,
+    PAPER_PS,
+    Panel,
+    Plan,
+    Progress,
+    Results,
+    Section,
+    Task,
+    Verdict,
+    grouped,
+)
 from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 
-METHODS: Final = ("literal", "weighted", "bracketed", "joint")
-CLAIM_FIXES: Final = 30_000
+_METHODS: Final = ("literal", "weighted", "bracketed", "joint")
+_CLAIM_FIXES: Final = 30_000
 """As many as the paper made at each position."""
 
-FIT_FROM_PS: Final = 50.0
+_FIT_FROM_PS: Final = 50.0
 """Below, rounding to ticks and the crystals' own noise flatten the curve."""
 
 
-CARRIED_ON: Final = " Where the limit is reached by {}, beyond {:g} ps, the power law is carried on."
+_EXTRAPOLATED: Final = " Where the limit is reached by {}, beyond {:g} ps, the power law is extrapolated."
 
-SCALED: Final = (
-    " The largest of {} errors is carried on to {} as Gaussian errors grow; the table has what was simulated."
+_SCALED: Final = (
+    " The largest of {} errors is extrapolated to {} as Gaussian errors grow; the table has what was simulated."
 )
 
 
@@ -39,9 +51,9 @@ class Worst(Struct, frozen=True):
     max_m: float
     rmse_m: float
     growth: float
-    """How much larger the largest of ``CLAIM_FIXES`` Gaussian errors of this covariance is than that of ``fixes``."""
+    """How much larger the largest of ``_CLAIM_FIXES`` Gaussian errors of this covariance is than that of ``fixes``."""
     scatter: tuple[float, float]
-    """5 % and 95 % of the largest of ``CLAIM_FIXES`` independent Gaussian errors of this covariance over its median."""
+    """5 % and 95 % of the largest of ``_CLAIM_FIXES`` independent errors of this covariance over its median."""
 
 
 def tasks(plan: Plan) -> list[Task]:
@@ -65,15 +77,15 @@ def seed_of(plan: Plan, noise_ps: float) -> int:
 def run_world(progress: Progress, noise_ps: float, seed: int, fixes: int) -> list[Worst]:
     """One tag at P1, heard by all methods."""
     site, impairments = ideal_lab_site(noise_ps), lab_impairments(noise_ps)
-    (tracks,) = listen(site, [Static(*P1)], METHODS, impairments, seed, progress, fixes=fixes)
-    return [worst_of(method, noise_ps, seed, tracks[method].error_m) for method in METHODS]
+    (tracks,) = listen(site, [Static(*P1)], _METHODS, impairments, seed, progress, fixes=fixes)
+    return [worst_of(method, noise_ps, seed, tracks[method].error_m) for method in _METHODS]
 
 
 def worst_of(method: str, noise_ps: float, seed: int, error_m: Array) -> Worst:
     """Sum the errors of a run up, shape (n, 2)."""
     squared = (error_m**2).sum(axis=1)
     covariance_m2 = np.cov(error_m.T)
-    low, middle, high = (largest_of_m(covariance_m2, CLAIM_FIXES, q) for q in (0.05, 0.5, 0.95))
+    low, middle, high = (largest_of_m(covariance_m2, _CLAIM_FIXES, q) for q in (0.05, 0.5, 0.95))
     growth = middle / largest_of_m(covariance_m2, len(error_m), 0.5)
     largest_m, rmse_m = float(squared.max() ** 0.5), float(squared.mean() ** 0.5)
     return Worst(method, noise_ps, seed, len(error_m), largest_m, rmse_m, growth, (low / middle, high / middle))
@@ -87,13 +99,13 @@ def largest_of_m(covariance_m2: Array, count: float, quantile: float) -> float:
     """
     angles = np.linspace(0.0, np.pi, 721)[:-1]
     along = np.stack([np.cos(angles), np.sin(angles)])
-    spread = 1.0 / np.einsum("ia,ij,ja->a", along, np.linalg.inv(covariance_m2), along)
-    weight = spread / np.sqrt(np.linalg.det(covariance_m2))
+    variances_m2 = 1.0 / np.einsum("ia,ij,ja->a", along, np.linalg.inv(covariance_m2), along)
+    weight = variances_m2 / np.sqrt(np.linalg.det(covariance_m2))
     exceed = -np.expm1(np.log(quantile) / count)
     low, high = 0.0, 12.0 * float(np.sqrt(np.trace(covariance_m2)))
     for _ in range(60):
         middle = 0.5 * (low + high)
-        tail = float(np.mean(np.exp(-0.5 * middle**2 / spread) * weight))
+        tail = float(np.mean(np.exp(-0.5 * middle**2 / variances_m2) * weight))
         low, high = (middle, high) if tail > exceed else (low, middle)
     return 0.5 * (low + high)
 
@@ -121,8 +133,8 @@ class Trend(Struct, frozen=True):
 
 
 def trend_of(rows: list[Worst]) -> Trend:
-    """Fit one method's largest errors from ``FIT_FROM_PS`` on."""
-    fitted = [row for row in rows if row.noise_ps >= FIT_FROM_PS]
+    """Fit one method's largest errors from ``_FIT_FROM_PS`` on."""
+    fitted = [row for row in rows if row.noise_ps >= _FIT_FROM_PS]
     noise, largest = np.array([(row.noise_ps, row.growth * row.max_m) for row in fitted]).T
     exponent, offset = np.polyfit(np.log(noise), np.log(largest), 1)
     low, high = np.mean([row.scatter for row in fitted], axis=0).tolist()
@@ -147,21 +159,21 @@ def judge(crossings_ps: dict[str, float]) -> tuple[Verdict, str]:
 def section(plan: Plan, results: Results) -> Section:
     """The figure with its verdict."""
     rows: list[Worst] = [row for noise_ps in plan.noises_ps for row in results[f"claim/{noise_ps:g}"]]
-    by_method = {method: [row for row in rows if row.method == method] for method in METHODS}
+    by_method = {method: [row for row in rows if row.method == method] for method in _METHODS}
     trends = {method: trend_of(found) for method, found in by_method.items()}
     crossings = {method: trend.crossings_ps for method, trend in trends.items()}
     verdict, reason = judge({method: crossing[1] for method, crossing in crossings.items()})
-    heads = ("stamp noise in ps", "seed", *(f"{method}: largest (RMSE), cm" for method in METHODS))
+    heads = ("stamp noise in ps", "seed", *(f"{method}: largest (RMSE), cm" for method in _METHODS))
     table = [heads]
     for noise_ps in plan.noises_ps:
         cells = [row for row in rows if row.noise_ps == noise_ps]
         table.append(
             (f"{noise_ps:g}", str(cells[0].seed), *(f"{100 * c.max_m:.1f} ({100 * c.rmse_m:.2f})" for c in cells))
         )
-    table.append(("reaches 20 cm at", "", *(_range(crossings[method]) for method in METHODS)))
-    beyond = [method for method in METHODS if crossings[method][1] > max(plan.noises_ps)]
-    carried_on = CARRIED_ON.format(" and ".join(beyond), max(plan.noises_ps)) if beyond else ""
-    scaled = "" if plan.fixes == CLAIM_FIXES else SCALED.format(grouped(plan.fixes), grouped(CLAIM_FIXES))
+    table.append(("reaches 20 cm at", "", *(_range(crossings[method]) for method in _METHODS)))
+    beyond = [method for method in _METHODS if crossings[method][1] > max(plan.noises_ps)]
+    extrapolated = _EXTRAPOLATED.format(" and ".join(beyond), max(plan.noises_ps)) if beyond else ""
+    scaled = "" if plan.fixes == _CLAIM_FIXES else _SCALED.format(grouped(plan.fixes), grouped(_CLAIM_FIXES))
     return Section(
         key="largest-error",
         title="The largest of 30 000 errors, and 20 cm",
@@ -170,8 +182,8 @@ def section(plan: Plan, results: Results) -> Section:
         simulated=(
             f"{grouped(plan.fixes)} fixes at P1 for each of {len(plan.noises_ps)} stamp noises, each in a world of its "
             "own; four methods on the same receptions. A largest error scatters from run to run, so a power law is "
-            f"fitted from {FIT_FROM_PS:g} ps on; the bands hold 90 % of the largest of so many independent Gaussian "
-            f"errors. No obstacles and no biased stamps.{carried_on}{scaled}"
+            f"fitted from {_FIT_FROM_PS:g} ps on; the bands hold 90 % of the largest of as many independent Gaussian "
+            f"errors. No obstacles and no biased stamps.{extrapolated}{scaled}"
         ),
         verdict=verdict,
         reason=reason,
@@ -201,7 +213,7 @@ def _all(by_method: dict[str, list[Worst]], trends: dict[str, Trend]) -> Panel:
     for method, rows in by_method.items():
         noise = [row.noise_ps for row in rows]
         colour = METHOD_COLOURS[method]
-        curve = np.linspace(FIT_FROM_PS, max(noise), 60)
+        curve = np.linspace(_FIT_FROM_PS, max(noise), 60)
         low, high = (100 * trends[method].largest_m(curve, factor) for factor in trends[method].scatter)
         axes.fill_between(curve, low, high, color=colour, alpha=0.2, linewidth=0)
         axes.plot(curve, 100 * trends[method].largest_m(curve), color=colour, linewidth=1.0)
@@ -211,7 +223,7 @@ def _all(by_method: dict[str, list[Worst]], trends: dict[str, Trend]) -> Panel:
     top = 100 * max(row.growth * row.max_m for row in by_method["literal"])
     axes.annotate("DW1000", (sum(DW1000_PS) / 2, top), ha="center", va="top", fontsize=8.0)
     axes.annotate("20 cm", (0, 100 * CLAIM_M), (3, 3), textcoords="offset points", ha="left", fontsize=8.0)
-    axes.set(xlabel="noise of every stamp in ps", ylabel=f"largest of {grouped(CLAIM_FIXES)} errors in cm")
+    axes.set(xlabel="noise of every stamp in ps", ylabel=f"largest of {grouped(_CLAIM_FIXES)} errors in cm")
     axes.set(xlim=(0, None), ylim=(0, None))
     axes.legend(loc="upper left", bbox_to_anchor=(0.34, 1.0))
     caption = "Dots: simulated; lines: power laws fitted; bands: where 90 % of runs lie."
@@ -221,11 +233,11 @@ def _all(by_method: dict[str, list[Worst]], trends: dict[str, Trend]) -> Panel:
 def _limits(crossings: dict[str, tuple[float, float, float]]) -> Panel:
     figure, axes = panel("Stamp noise that keeps the claim", 2.6)
     names = list(crossings)
-    for place, method in enumerate(reversed(names)):
+    for row, method in enumerate(reversed(names)):
         low, typical, high = crossings[method]
-        axes.barh(place, typical, color=METHOD_COLOURS[method], height=0.62)
-        axes.plot([low, high], [place, place], color=INK, linewidth=1.4)
-        axes.annotate(f"{typical:.0f} ps", (high, place), (5, 0), textcoords="offset points", va="center", fontsize=8.5)
+        axes.barh(row, typical, color=METHOD_COLOURS[method], height=0.62)
+        axes.plot([low, high], [row, row], color=INK, linewidth=1.4)
+        axes.annotate(f"{typical:.0f} ps", (high, row), (5, 0), textcoords="offset points", va="center", fontsize=8.5)
     axes.axvspan(*DW1000_PS, color=MUTED, alpha=0.16, linewidth=0)
     axes.axvline(PAPER_PS, color=GREEN, linestyle=":", linewidth=1.4)
     axes.set_yticks(range(len(names)), list(reversed(names)))
@@ -234,7 +246,7 @@ def _limits(crossings: dict[str, tuple[float, float, float]]) -> Panel:
     )
     axes.grid(visible=False, axis="y")
     caption = (
-        f"Largest stamp noise that keeps {grouped(CLAIM_FIXES)} errors below 20 cm; black: where 90 % of runs lie. "
+        f"Largest stamp noise that keeps {grouped(_CLAIM_FIXES)} errors below 20 cm; black: where 90 % of runs lie. "
         "Grey: what is reported for a DW1000; dotted: the paper's ±15.65 ps."
     )
     return Panel("09-limits", caption, figure)

@@ -1,28 +1,28 @@
-"""Tags in the lab's world that compute by several methods from the very same receptions."""
+"""Tags in the lab's world that compute with several methods from the same receptions."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from msgspec import Struct
 
-from skyless.anchor import Anchor
+from skyless.evaluation.fleet import world_of
+from skyless.evaluation.statistics import FirstFixes
 from skyless.kernels.arrays import Array
 from skyless.paper.plan import Progress
 from skyless.positioning.fix import Fix
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import Impairments
-from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Trajectory
-from skyless.simulation.world import World
 from skyless.site.model import Site
 from skyless.site.slots import schedule_of
 
-WARMUP_S = 2.0
+_WARMUP_S: Final = 2.0
 """Fixes before this true time are not judged: the filters settle."""
 
 
 class Track(Struct, frozen=True):
-    """Fixes of one tag by one method, one per superframe, beside the truth."""
+    """Fixes of one tag by one method, one per superframe, and the truth."""
 
     time_s: Array
     """Shape (n,): true time at which the fix was made."""
@@ -31,7 +31,7 @@ class Track(Struct, frozen=True):
     truth_m: Array
     """Shape (n, 2): where the tag was at the emission of the last message."""
     sigma_m: Array
-    """Shape (n,): what the fixes themselves say, root of the covariance's trace."""
+    """Shape (n,): predicted by the fixes, root of the covariance's trace."""
 
     @property
     def error_m(self) -> Array:
@@ -42,17 +42,13 @@ class Track(Struct, frozen=True):
 class _Log:
     """Keeps the first fix of every superframe."""
 
-    def __init__(self, superframe_s: float) -> None:
-        self._superframe_s = superframe_s
-        self._last = -1
+    def __init__(self, site: Site) -> None:
+        self._first_fixes = FirstFixes(site, 1)
         self.rows: list[tuple[float, ...]] = []
 
     def add(self, time_s: float, fix: Fix, truth_m: Array) -> None:
-        superframe = int(time_s / self._superframe_s)
-        if superframe == self._last:
-            return
-        self._last = superframe
-        self.rows.append((time_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist(), fix.std_m))
+        if self._first_fixes.is_first(0, time_s):
+            self.rows.append((time_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist(), fix.std_m))
 
     def track(self, most: int | None) -> Track:
         rows = np.array(self.rows[:most]).reshape(-1, 6)
@@ -70,17 +66,15 @@ def listen(
     fixes: int | None = None,
     until_s: float | None = None,
 ) -> list[dict[str, Track]]:
-    """Let time pass until every method of every tag has ``fixes`` fixes, or until ``until_s``.
+    """Run a world until every method of every tag has ``fixes`` fixes, or until ``until_s``.
 
     Returns for each tag its track by each method. A world gives its first tag the same stamps with and without
-    other tags, so ``skyless simulate`` with the same seed makes the first tag's figures again.
+    other tags, so ``skyless simulate`` with the same seed reproduces the first tag's figures.
     """
-    world = World(
-        site, lambda anchor: Anchor(site, anchor), [TagSpec(path) for path in trajectories], impairments, seed
-    )
+    world = world_of(site, trajectories, impairments, seed)
     superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
-    listeners = [[(Receiver(method), _Log(superframe_s)) for method in methods] for _ in trajectories]
-    end_s = until_s if until_s is not None else WARMUP_S + 1.02 * (fixes or 0) * superframe_s + 1.0
+    listeners = [[(Receiver(method), _Log(site)) for method in methods] for _ in trajectories]
+    end_s = until_s if until_s is not None else _WARMUP_S + 1.02 * (fixes or 0) * superframe_s + 1.0
     now_s = 0.0
     while now_s < end_s and not _enough(listeners, fixes):
         now_s = min(now_s + 0.5, end_s)
@@ -88,7 +82,7 @@ def listen(
             for tag, reception, truth_m in broadcast.receptions():
                 for receiver, log in listeners[tag]:
                     fix = receiver.hear(reception)
-                    if fix is not None and broadcast.end_s >= WARMUP_S:
+                    if fix is not None and broadcast.end_s >= _WARMUP_S:
                         log.add(broadcast.end_s, fix, truth_m)
         progress(min(now_s / end_s, 1.0))
     return [{method: log.track(fixes) for method, (_, log) in zip(methods, pairs, strict=True)} for pairs in listeners]

@@ -1,14 +1,16 @@
-"""How much of everything the report simulates, and the places and noises that its figures share."""
+"""What the figures of the report share: amounts, positions, noises, and the pieces that a figure consists of."""
 
 from collections.abc import Callable, Mapping
+from enum import StrEnum
 from typing import Any, Final
 
+from matplotlib.figure import Figure
 from msgspec import Struct
 
-Place = tuple[float, float]
+Point = tuple[float, float]
 
-P1: Final[Place] = (3.0, 4.0)
-P2: Final[Place] = (1.2, 1.6)
+P1: Final[Point] = (3.0, 4.0)
+P2: Final[Point] = (1.2, 1.6)
 """Stand-ins for the paper's two static test positions, whose coordinates it does not give."""
 
 RADIO_PS: Final = 100.0
@@ -24,7 +26,7 @@ CLAIM_M: Final = 0.20
 """The paper's bound on the position error."""
 
 Progress = Callable[[float], None]
-"""Told the share done, 0 to 1; raises when the work should end."""
+"""Called with the share done, 0 to 1; raises when the work should end."""
 
 Results = Mapping[str, Any]
 """What the tasks returned, by their names."""
@@ -72,3 +74,46 @@ class Task(Struct, frozen=True):
     arguments: dict[str, Any]
     weight_s: float
     """About how long it takes: the longest are begun first."""
+
+
+class Verdict(StrEnum):
+    """Whether a statement of the paper holds."""
+
+    HOLDS = "holds"
+    CORRECTED = "holds with a correction"
+    FAILS = "does not hold"
+
+
+class Panel(Struct, frozen=True):
+    """One picture."""
+
+    name: str
+    """Of its files, without ending."""
+    caption: str
+    figure: Figure
+
+
+class Section(Struct, frozen=True):
+    """A figure and the statement that it tests."""
+
+    key: str
+    title: str
+    label: str
+    """The paper's label of the figure or section."""
+    claim: str
+    """The paper's statement in other words."""
+    simulated: str
+    verdict: Verdict
+    reason: str
+    panels: tuple[Panel, ...]
+    table: tuple[tuple[str, ...], ...]
+    """Rows of cells, the first one the heads."""
+    numbers: dict[str, object]
+    """The same and more for programs, SI units in the names."""
+    command: str
+    """A command that reproduces the central number."""
+
+
+def grouped(count: int) -> str:
+    """A whole number with thousands separated."""
+    return f"{count:,}".replace(",", "\u00a0")

@@ -6,22 +6,19 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.anchor import Anchor
-from skyless.evaluation.plot_style import INK, METHOD_COLOURS, panel
-from skyless.paper.plan import RADIO_PS, Plan, Progress, Results, Task
-from skyless.paper.section import Panel, Section, Verdict
+from skyless.evaluation.figures import INK, METHOD_COLOURS, panel
+from skyless.evaluation.fleet import world_of
+from skyless.paper.plan import RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import lab_impairments
-from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, ScheduleSite, Site
 from skyless.site.slots import schedule_of
 
-METHODS: Final = ("literal", "joint")
-PAPER_HZ: Final = 67.0
-FROM_S: Final = 1.0
+_METHODS: Final = ("literal", "joint")
+_PAPER_HZ: Final = 67.0
+_COUNTED_FROM_S: Final = 1.0
 """Updates count from this true time on."""
 
 
@@ -61,16 +58,14 @@ def tasks(plan: Plan) -> list[Task]:
 def run_world(progress: Progress, name: str, seed: int, seconds: float) -> list[Count]:
     """Count the updates of one tag."""
     site = sites()[name]
-    world = World(
-        site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(3.0, 4.0))], lab_impairments(RADIO_PS), seed
-    )
-    receivers = {method: Receiver(method) for method in METHODS}
-    times_s: dict[str, list[float]] = {method: [] for method in METHODS}
-    until_s = FROM_S + seconds
+    world = world_of(site, [Static(3.0, 4.0)], lab_impairments(RADIO_PS), seed)
+    receivers = {method: Receiver(method) for method in _METHODS}
+    times_s: dict[str, list[float]] = {method: [] for method in _METHODS}
+    until_s = _COUNTED_FROM_S + seconds
     for broadcast in world.run(until_s):
         for _, reception, _ in broadcast.receptions():
             for method, receiver in receivers.items():
-                if receiver.hear(reception) is not None and broadcast.end_s >= FROM_S:
+                if receiver.hear(reception) is not None and broadcast.end_s >= _COUNTED_FROM_S:
                     times_s[method].append(broadcast.end_s)
         progress(broadcast.end_s / until_s)
     schedule, nodes = schedule_of(site), len(site.anchors)
@@ -83,7 +78,7 @@ def run_world(progress: Progress, name: str, seed: int, seconds: float) -> list[
 
 def judge(superframe_hz: float, message_hz: float) -> tuple[Verdict, str]:
     """Whether a fix per superframe comes at the paper's rate."""
-    if superframe_hz >= PAPER_HZ - 0.5:
+    if superframe_hz >= _PAPER_HZ - 0.5:
         return Verdict.HOLDS, (
             f"One fix per superframe comes {superframe_hz:.1f} times a second. A filter that takes every message "
             f"has {message_hz:.0f}: the number of anchors, which the paper names as the limit, sets the superframe "
@@ -142,10 +137,10 @@ def section(plan: Plan, results: Results) -> Section:
 
 def _bars(counts: list[Count]) -> Panel:
     figure, axes = panel("Updates per second of one tag", 2.6)
-    for place, count in enumerate(reversed(counts)):
-        axes.barh(place, count.rate_hz, color=METHOD_COLOURS[count.method], height=0.62)
-        axes.annotate(f"{count.rate_hz:.1f}", (count.rate_hz, place), (5, 0), textcoords="offset points", va="center")
-    axes.axvline(PAPER_HZ, color=INK, linestyle="--", linewidth=1.0)
+    for row, count in enumerate(reversed(counts)):
+        axes.barh(row, count.rate_hz, color=METHOD_COLOURS[count.method], height=0.62)
+        axes.annotate(f"{count.rate_hz:.1f}", (count.rate_hz, row), (5, 0), textcoords="offset points", va="center")
+    axes.axvline(_PAPER_HZ, color=INK, linestyle="--", linewidth=1.0)
     labels = [f"{count.site.split(',')[0]},\n{count.method}" for count in reversed(counts)]
     axes.set_yticks(range(len(counts)), labels)
     axes.set(

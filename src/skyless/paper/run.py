@@ -17,8 +17,8 @@ import msgspec
 from msgspec import Struct
 
 from skyless.errors import SkylessError
-from skyless.evaluation.figures import picture
-from skyless.evaluation.plot_style import house_style
+from skyless.evaluation.figures import picture, report_style
+from skyless.kernels.compiled import cores
 from skyless.paper import (
     checks,
     claim,
@@ -31,15 +31,14 @@ from skyless.paper import (
     timeline,
     walk,
 )
-from skyless.paper.html import Heading, page
-from skyless.paper.plan import Plan, Task
-from skyless.paper.section import Section
+from skyless.paper.html import Heading, report_page
+from skyless.paper.plan import Plan, Section, Task
 
-FIGURES: Final = (scenario, checks, distributions, static, walk, dop_map, timeline, rate, claim, scale)
+_FIGURES: Final = (scenario, checks, distributions, static, walk, dop_map, timeline, rate, claim, scale)
 """In the order of the report."""
 
-REPORT: Final = "report.html"
-NUMBERS: Final = "numbers.json"
+_REPORT: Final = "report.html"
+_NUMBERS: Final = "numbers.json"
 
 _POLL_S: Final = 0.2
 
@@ -68,7 +67,7 @@ _shared: dict[str, Any] = {}
 
 
 def write_report(plan: Plan, out: Path, reached: Callable[[float], None], processes: int | None = None) -> Report:
-    """Simulate, draw, write; ``reached`` is told the share of the work that is done.
+    """Simulate, draw, write; ``reached`` is called with the share of the work that is done.
 
     The files appear in ``out`` when all are ready; other files there stay.
 
@@ -76,9 +75,9 @@ def write_report(plan: Plan, out: Path, reached: Callable[[float], None], proces
         SkylessError: ``out`` cannot be a folder with the report.
     """
     with _scratch(out) as folder:
-        results = run_tasks([task for figure in FIGURES for task in figure.tasks(plan)], reached, processes)
-        with house_style():
-            sections = [figure.section(plan, results) for figure in FIGURES]
+        results = run_tasks([task for figure in _FIGURES for task in figure.tasks(plan)], reached, processes)
+        with report_style():
+            sections = [figure.section(plan, results) for figure in _FIGURES]
             report = _write(plan, sections, results, folder, out)
         _move(folder, out)
     return report
@@ -89,7 +88,7 @@ def run_tasks(tasks: list[Task], reached: Callable[[float], None], processes: in
     context = multiprocessing.get_context("spawn")
     total_s = sum(task.weight_s for task in tasks)
     done_s, stop = context.Value("d", 0.0), context.Event()
-    workers = min(processes or _cores(), len(tasks))
+    workers = min(processes or cores(), len(tasks))
     with ProcessPoolExecutor(workers, context, _start_worker, (done_s, stop)) as pool:
         try:
             futures = {pool.submit(_run, task): task.name for task in sorted(tasks, key=lambda task: -task.weight_s)}
@@ -106,12 +105,8 @@ def run_tasks(tasks: list[Task], reached: Callable[[float], None], processes: in
     return {name: future.result() for future, name in futures.items()}
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _start_worker(done_s: "Synchronized[float]", stop: Event) -> None:
-    """An interrupt reaches all processes of a terminal; the parent alone acts on it and tells the others."""
+    """An interrupt reaches all processes of a terminal; the parent alone acts on it and stops the others."""
     import signal  # noqa: PLC0415 - only workers need it
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -121,16 +116,16 @@ def _start_worker(done_s: "Synchronized[float]", stop: Event) -> None:
 def _run(task: Task) -> Any:  # noqa: ANN401 - each task has a result of its own
     """Run one task in a worker."""
     done_s, stop = _shared["done_s"], _shared["stop"]
-    told = 0.0
+    reported = 0.0
 
     def progress(share: float) -> None:
-        nonlocal told
+        nonlocal reported
         if stop.is_set():
             raise StoppedError
-        if share - told >= 0.01 or share >= 1.0 > told:
+        if share - reported >= 0.01 or share >= 1.0 > reported:
             with done_s.get_lock():
-                done_s.value += (share - told) * task.weight_s
-            told = share
+                done_s.value += (share - reported) * task.weight_s
+            reported = share
 
     result = task.function(progress, **task.arguments)
     progress(1.0)
@@ -139,15 +134,15 @@ def _run(task: Task) -> Any:  # noqa: ANN401 - each task has a result of its own
 
 @contextmanager
 def _scratch(out: Path) -> Iterator[Path]:
-    """A folder beside ``out`` for what is not ready yet, gone at the end whatever happens."""
+    """A folder next to ``out`` for unfinished files, removed at the end in any case."""
     if out.exists() and not out.is_dir():
         raise SkylessError(f"--out is {str(out)!r}, which is a file; it should be a folder, or not exist yet")
-    place = out.absolute().parent
+    parent = out.absolute().parent
     try:
-        place.mkdir(parents=True, exist_ok=True)
+        parent.mkdir(parents=True, exist_ok=True)
         if out.is_dir():
             tempfile.TemporaryFile(dir=out).close()
-        folder = Path(tempfile.mkdtemp(prefix=f".{out.absolute().name}.", dir=place))
+        folder = Path(tempfile.mkdtemp(prefix=f".{out.absolute().name}.", dir=parent))
     except OSError as error:
         raise SkylessError(f"--out is {str(out)!r}, where no folder can be written: {error.strerror}") from None
     try:
@@ -167,21 +162,22 @@ def _write(plan: Plan, sections: list[Section], results: dict[str, Any], folder:
             files += [str(out / f"{panel.name}.{kind}") for kind in ("png", "svg")]
     command = f"skyless paper --out {out} --seed {plan.seed}{' --quick' if plan.quick else ''}"
     heading = Heading(plan.seed, plan.quick, version("skyless"), command)
-    (folder / REPORT).write_text(page(heading, sections, pictures), encoding="utf-8")
+    (folder / _REPORT).write_text(report_page(heading, sections, pictures), encoding="utf-8")
     report = Report(
         seed=plan.seed,
         quick=plan.quick,
         command=command,
-        report=str(out / REPORT),
+        report=str(out / _REPORT),
         figures=tuple(files),
         checks=tuple(msgspec.to_builtins(check) for check in results["checks"]),
-        sections=tuple(_told(section) for section in sections),
+        sections=tuple(_as_fields(section) for section in sections),
     )
-    (folder / NUMBERS).write_bytes(msgspec.json.format(msgspec.json.encode(report, enc_hook=_plain), indent=1))
+    (folder / _NUMBERS).write_bytes(msgspec.json.format(msgspec.json.encode(report, enc_hook=_json_value), indent=1))
     return report
 
 
-def _told(section: Section) -> dict[str, object]:
+def _as_fields(section: Section) -> dict[str, object]:
+    """A section without its figures."""
     return {
         "key": section.key,
         "title": section.title,
@@ -194,7 +190,7 @@ def _told(section: Section) -> dict[str, object]:
     }
 
 
-def _plain(value: object) -> object:
+def _json_value(value: object) -> object:
     """NumPy's scalars and arrays as plain numbers and lists."""
     if hasattr(value, "tolist"):
         return value.tolist()
@@ -202,12 +198,12 @@ def _plain(value: object) -> object:
 
 
 def _move(folder: Path, out: Path) -> None:
-    """Give the files their place, the page last: who finds it finds all of it."""
+    """Move the files to where they belong, the page last, so that a page never lacks its pictures."""
     if not out.exists():
         folder.chmod(0o777 & ~_umask())
         folder.rename(out)
         return
-    for file in sorted(folder.iterdir(), key=lambda file: file.name == REPORT):
+    for file in sorted(folder.iterdir(), key=lambda file: file.name == _REPORT):
         file.replace(out / file.name)
 
 

@@ -9,28 +9,25 @@ from matplotlib.ticker import FuncFormatter
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from skyless.anchor import Anchor
-from skyless.evaluation.plot_style import BLUE, GREEN, INK, MUTED, ORANGE, panel
+from skyless.evaluation.figures import BLUE, GREEN, INK, MUTED, ORANGE, panel
+from skyless.evaluation.fleet import world_of
 from skyless.kernels.arrays import Array, Integers
-from skyless.paper.plan import P1, RADIO_PS, Plan, Progress, Results, Task
-from skyless.paper.section import Panel, Section, Verdict, grouped
+from skyless.paper.plan import P1, RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import lab_impairments
-from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
 from skyless.site.lab import ideal_lab_site
 
-FROM_S: Final = 0.6
-UNTIL_S: Final = 1.2
+_JUDGED_FROM_S: Final = 0.6
+_JUDGED_UNTIL_S: Final = 1.2
 """The stretch of true time in which all fleets are judged: the anchors' noise in it is the same for all of them."""
 
-RANGINGS_OF_TWR: Final = 6
-MESSAGES_PER_RANGING: Final = 4
+_RANGINGS_OF_TWR: Final = 6
+_MESSAGES_PER_RANGING: Final = 4
 """Double-sided two-way ranging with each of six anchors, as the paper counts its messages."""
 
 
-FRAMES_PER_MS: Final = 100.0
+_FRAMES_PER_MS: Final = 100.0
 """Frames per second on the right axis for each millisecond on the left."""
 
 
@@ -65,16 +62,14 @@ def tasks(plan: Plan) -> list[Task]:
 
 
 def run_world(progress: Progress, tags: int, seed: int) -> FleetResult:
-    """Tags at P1 with radios and clocks of their own; places would only mix geometry into the comparison."""
+    """Tags at P1 with radios and clocks of their own; other positions would only mix geometry into the comparison."""
     site = ideal_lab_site(RADIO_PS)
-    world = World(
-        site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(*P1))] * tags, lab_impairments(RADIO_PS), seed
-    )
+    world = world_of(site, [Static(*P1)] * tags, lab_impairments(RADIO_PS), seed)
     receivers = [Receiver("joint") for _ in range(tags)]
     squares_m2, fixes = np.zeros(tags), np.zeros(tags, dtype=np.int64)
     digest, frames, cpu_s = hashlib.sha256(), 0, 0.0
-    for broadcast in world.run(UNTIL_S):
-        judged = broadcast.end_s >= FROM_S
+    for broadcast in world.run(_JUDGED_UNTIL_S):
+        judged = broadcast.end_s >= _JUDGED_FROM_S
         frames += judged
         begun_s = time.process_time()
         for tag, reception, truth_m in broadcast.receptions():
@@ -89,13 +84,13 @@ def run_world(progress: Progress, tags: int, seed: int) -> FleetResult:
                 fixes[tag] += 1
         if judged:
             cpu_s += time.process_time() - begun_s
-        progress(broadcast.end_s / UNTIL_S)
+        progress(broadcast.end_s / _JUDGED_UNTIL_S)
     return summarise(seed, squares_m2, fixes, frames, digest.hexdigest()[:16], cpu_s)
 
 
 def summarise(seed: int, squares_m2: Array, fixes: Integers, frames: int, digest: str, cpu_s: float) -> FleetResult:
     """Sum a fleet up: squared errors and fixes of each tag, shape (tags,)."""
-    tags, span_s = len(fixes), UNTIL_S - FROM_S
+    tags, span_s = len(fixes), _JUDGED_UNTIL_S - _JUDGED_FROM_S
     own = np.sqrt(squares_m2 / np.maximum(fixes, 1))
     rmse = float(np.sqrt(squares_m2.sum() / max(int(fixes.sum()), 1)))
     mean_square_error = float((own**2).std(ddof=1)) / tags**0.5 if tags > 1 else None
@@ -166,9 +161,9 @@ def section(plan: Plan, results: Results) -> Section:
         claim="Any number of tags can be tracked without a lower update rate; the paper shows it with three.",
         simulated=(
             f"Fleets of {', '.join(grouped(tags) for tags in plan.fleet_sizes)} tags, all at P1 with radios and "
-            f"clocks of their own, {RADIO_PS:g} ps, joint, from a cold start; judged from {FROM_S:g} to "
-            f"{UNTIL_S:g} s, so that the anchors' noise is the same for all sizes (a single short stretch: the RMSE "
-            "belongs to it, figure 4 has the long run). Every tag is the real receiver, every message is decoded "
+            f"clocks of their own, {RADIO_PS:g} ps, joint, from a cold start; judged from {_JUDGED_FROM_S:g} to "
+            f"{_JUDGED_UNTIL_S:g} s, so that the anchors' noise is the same for all sizes (a single short stretch: the "
+            "RMSE belongs to it, figure 4 has the long run). Every tag is the real receiver, every message is decoded "
             "by every tag. The lines for uplink are arithmetic, not simulated."
         ),
         verdict=verdict,
@@ -210,7 +205,7 @@ def _rates(fleets: list[FleetResult]) -> Panel:
     axes.set_yscale("log")
     axes.plot(tags, [fleet.fixes_per_s for fleet in fleets], "o-", color=BLUE, label="downlink: simulated")
     axes.plot(tags, slots_hz / tags, "--", color=ORANGE, label="uplink, one slot per blink")
-    ranging = slots_hz / (RANGINGS_OF_TWR * MESSAGES_PER_RANGING)
+    ranging = slots_hz / (_RANGINGS_OF_TWR * _MESSAGES_PER_RANGING)
     axes.plot(tags, ranging / tags, ":", color=MUTED, label="two-way ranging, 24 messages")
     axes.set(ylabel="updates per second and tag", ylim=(None, 3 * slots_hz))
     axes.legend(loc="lower left")
@@ -223,7 +218,7 @@ def _cpu(fleets: list[FleetResult]) -> Panel:
     (axes,) = figure.axes
     tags = [fleet.tags for fleet in fleets]
     cpu_ms = [1e3 * fleet.cpu_s_per_tag_s for fleet in fleets]
-    frames = [fleet.frames_per_s / FRAMES_PER_MS for fleet in fleets]
+    frames = [fleet.frames_per_s / _FRAMES_PER_MS for fleet in fleets]
     axes.plot(tags, cpu_ms, "s-", color=GREEN, label="CPU time of a tag (left), measured here")
     axes.plot(tags, frames, "o--", color=INK, label="frames on the air (right)")
     axes.set(ylabel="CPU time in ms per s", ylim=(0, 1.7 * max(*cpu_ms, *frames)))
@@ -234,8 +229,8 @@ def _cpu(fleets: list[FleetResult]) -> Panel:
 
 
 def _frames_of_ms(cpu_ms: ArrayLike) -> Array:
-    return FRAMES_PER_MS * np.asarray(cpu_ms, np.float64)
+    return _FRAMES_PER_MS * np.asarray(cpu_ms, np.float64)
 
 
 def _ms_of_frames(frames: ArrayLike) -> Array:
-    return np.asarray(frames, np.float64) / FRAMES_PER_MS
+    return np.asarray(frames, np.float64) / _FRAMES_PER_MS

@@ -5,34 +5,30 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.evaluation.plot_style import INK, METHOD_COLOURS, RED, floor, panel
+from skyless.evaluation.figures import INK, METHOD_COLOURS, RED, draw_floor_plan, panel
 from skyless.kernels.arrays import Array
-from skyless.paper.dop_map import ANCHORS_M, literal_covariance_m2
+from skyless.paper.dop_map import EXPLAINING_CORRELATION, LAB_ANCHORS_M, literal_covariance_m2, pdop_at
 from skyless.paper.listening import Track, listen
-from skyless.paper.plan import RADIO_PS, Plan, Progress, Results, Task
-from skyless.paper.section import Panel, Section, Verdict, grouped
+from skyless.paper.plan import RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
 from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Waypoints
 from skyless.site.lab import ideal_lab_site
-from skyless.uncertainty.dop import dops_at
 
-METHODS: Final = ("literal", "joint")
-CORNERS_M: Final = ((1.0, 1.0), (5.0, 1.0), (5.0, 7.0), (1.0, 7.0))
-SPEED_MPS: Final = 1.0
-CORNER_S: Final = 1.0
+_METHODS: Final = ("literal", "joint")
+_CORNERS_M: Final = ((1.0, 1.0), (5.0, 1.0), (5.0, 7.0), (1.0, 7.0))
+_SPEED_MPS: Final = 1.0
+_CORNER_S: Final = 1.0
 """Time over which the tag turns at a corner."""
-LAP_S: Final = 20.0
-BINS: Final = 40
+_LAP_S: Final = 20.0
+_BINS: Final = 40
 """Pieces of the path, half a metre each."""
-EXPLAINS: Final = 0.8
-"""Correlation above which one thing explains another."""
 
 
 class AlongPath(Struct, frozen=True):
-    """Errors of ``literal`` piece by piece of the path, and what could explain them; arrays of shape (BINS,)."""
+    """Errors of ``literal`` piece by piece of the path, and what could explain them; arrays of shape (_BINS,)."""
 
-    place_m: Array
-    """True mean position, shape (BINS, 2)."""
+    position_m: Array
+    """True mean position, shape (_BINS, 2)."""
     rms_m: Array
     """About the piece's mean error, which holds the delay of a fix behind a moving tag."""
     pdop: Array
@@ -50,26 +46,26 @@ def tasks(plan: Plan) -> list[Task]:
 
 
 def run_world(progress: Progress, seed: int, laps: int) -> dict[str, Track]:
-    """The tag walks round its rectangle, clockwise of the sun's way, heard by ``METHODS``."""
-    path = Waypoints(CORNERS_M, SPEED_MPS, loop=True, corner_s=CORNER_S)
-    until_s = (laps + 0.5) * LAP_S
+    """The tag walks round its rectangle; its receptions go to ``_METHODS``."""
+    path = Waypoints(_CORNERS_M, _SPEED_MPS, loop=True, corner_s=_CORNER_S)
+    until_s = (laps + 0.5) * _LAP_S
     (tracks,) = listen(
-        ideal_lab_site(RADIO_PS), [path], METHODS, lab_impairments(RADIO_PS), seed, progress, until_s=until_s
+        ideal_lab_site(RADIO_PS), [path], _METHODS, lab_impairments(RADIO_PS), seed, progress, until_s=until_s
     )
     return tracks
 
 
 def along_path(track: Track) -> AlongPath:
     """Cut the rounds into pieces of the path."""
-    phase = (track.time_s % LAP_S) / LAP_S * BINS
-    piece = phase.astype(int) % BINS
-    rows = [piece == k for k in range(BINS)]
-    places = np.array([track.truth_m[row].mean(axis=0) for row in rows])
+    phase = (track.time_s % _LAP_S) / _LAP_S * _BINS
+    piece = phase.astype(int) % _BINS
+    rows = [piece == k for k in range(_BINS)]
+    positions_m = np.array([track.truth_m[row].mean(axis=0) for row in rows])
     scatter = np.array([float((track.error_m[row].var(axis=0)).sum() ** 0.5) for row in rows])
-    pdop = dops_at(np.pad(ANCHORS_M, ((0, 0), (0, 1))), np.pad(places, ((0, 0), (0, 1))), height_known=True)[:, 1]
-    predicted = np.array([float(np.trace(literal_covariance_m2(place)) ** 0.5) for place in places])
+    pdop = pdop_at(positions_m)
+    predicted = np.array([float(np.trace(literal_covariance_m2(at)) ** 0.5) for at in positions_m])
     return AlongPath(
-        places,
+        positions_m,
         scatter,
         pdop,
         predicted,
@@ -80,20 +76,20 @@ def along_path(track: Track) -> AlongPath:
 
 
 def judge(pdop_correlation: float, predicted_correlation: float) -> tuple[Verdict, str]:
-    """Whether the PDoP, or only the full covariance, tells where the estimates scatter."""
-    told = (
+    """Whether the PDoP, or only the full covariance, shows where the estimates scatter."""
+    correlations = (
         f"correlation with the scatter along the path: PDoP {pdop_correlation:.2f}, "
         f"full covariance {predicted_correlation:.2f}"
     )
-    if pdop_correlation >= EXPLAINS:
-        return Verdict.HOLDS, f"The PDoP tells where the estimates scatter ({told})."
-    if predicted_correlation >= EXPLAINS:
+    if pdop_correlation >= EXPLAINING_CORRELATION:
+        return Verdict.HOLDS, f"The PDoP shows where the estimates scatter ({correlations})."
+    if predicted_correlation >= EXPLAINING_CORRELATION:
         return Verdict.CORRECTED, (
             "The geometry matters, but the PDoP alone does not explain the asymmetry: it is the same on either "
-            "side of the room, the scatter is not. Anchors that speak late after the master are noisier (Q = (1 + "
-            f"κ)² + κ²), so the TDoAs' covariance belongs to the picture ({told})."
+            "side of the room, the scatter is not. Anchors that send late after the master are noisier (Q = (1 + "
+            f"κ)² + κ²), so the TDoAs' covariance belongs to the picture ({correlations})."
         )
-    return Verdict.FAILS, f"Neither the PDoP nor the covariance explains the scatter ({told})."
+    return Verdict.FAILS, f"Neither the PDoP nor the covariance explains the scatter ({correlations})."
 
 
 def section(plan: Plan, results: Results) -> Section:
@@ -117,13 +113,13 @@ def section(plan: Plan, results: Results) -> Section:
             "estimated positions is explained by the PDoP."
         ),
         simulated=(
-            f"A tag walks {plan.laps} times round a rectangle of 4 m × 6 m at {SPEED_MPS:g} m/s, turning within "
-            f"{CORNER_S:g} s at each corner; stamp noise {RADIO_PS:g} ps. Drawn is the first round, judged are all. "
+            f"A tag walks {plan.laps} times round a rectangle of 4 m × 6 m at {_SPEED_MPS:g} m/s, turning within "
+            f"{_CORNER_S:g} s at each corner; stamp noise {RADIO_PS:g} ps. Drawn is the first round, judged are all. "
             "Errors count against where the tag is when the fix comes, so delay counts."
         ),
         verdict=verdict,
         reason=reason,
-        panels=(*(_path(method, tracks[method]) for method in METHODS), _explained(pieces)),
+        panels=(*(_path(method, tracks[method]) for method in _METHODS), _explained(pieces)),
         table=tuple(rows),
         numbers={
             "methods": numbers,
@@ -137,12 +133,12 @@ def section(plan: Plan, results: Results) -> Section:
 
 def _path(method: str, track: Track) -> Panel:
     figure, axes = panel(f"First round by {method}", 4.6)
-    first = track.time_s < track.time_s[0] + LAP_S
+    first = track.time_s < track.time_s[0] + _LAP_S
     x, y = track.position_m[first].T
     axes.plot(x, y, ".", color=METHOD_COLOURS[method], markersize=3, label=f"{method}, {first.sum()} fixes", zorder=2)
-    corners = np.array([*CORNERS_M, CORNERS_M[0]])
+    corners = np.array([*_CORNERS_M, _CORNERS_M[0]])
     axes.plot(*corners.T, "--", color=INK, linewidth=1.1, label="planned path", zorder=3)
-    floor(axes, [(x, y) for x, y in ANCHORS_M.tolist()])
+    draw_floor_plan(axes, [(x, y) for x, y in LAB_ANCHORS_M.tolist()])
     axes.set(xlim=(-0.4, 6.4), ylim=(-0.4, 8.4))
     figure.legend(loc="outside lower center", ncols=2)
     return Panel(
@@ -152,7 +148,7 @@ def _path(method: str, track: Track) -> Panel:
 
 def _explained(pieces: AlongPath) -> Panel:
     figure, axes = panel("Scatter of literal along the path", 3.6)
-    along = (np.arange(BINS) + 0.5) * LAP_S / BINS * SPEED_MPS
+    along = (np.arange(_BINS) + 0.5) * _LAP_S / _BINS * _SPEED_MPS
     scale = float(pieces.rms_m.mean() / pieces.pdop.mean())
     axes.plot(along, 100 * pieces.rms_m, "o", color=METHOD_COLOURS["literal"], markersize=4, label="simulated")
     axes.plot(

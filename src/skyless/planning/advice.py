@@ -1,4 +1,4 @@
-"""What a plan warns of: links, geometry, mirrors, weak corners and holes, each in a sentence."""
+"""Warnings of a plan: links, geometry, mirrors, weak corners and holes, each in a sentence."""
 
 from typing import Final
 
@@ -8,27 +8,26 @@ from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.method_names import FILTERS
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA
-from skyless.planning.floor import Floor
-from skyless.planning.links import IN_VIEW, anchor_links
+from skyless.planning.floor import Floor, sample_points
+from skyless.planning.links import IN_VIEW, anchor_links, masters_by_links
 from skyless.planning.maps import PlanMap
-from skyless.planning.mounts import masters_by_links, sample_points
 from skyless.planning.predict import Predictor
 from skyless.planning.snapshot_sigma import delays
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.solver.locate import NoSolution, locate
+from skyless.positioning.methods.locate import NoSolution, locate
+from skyless.positioning.methods.snapshots import literal_covariance
 from skyless.site.advice import warnings_of
-from skyless.uncertainty.tdoa import literal_covariance
 
-RELIABLE: Final = 0.95
+_RELIABLE: Final = 0.95
 """An anchor should hear at least this share of the master's frames."""
 
-MOST_NAMED: Final = 8
+_MOST_NAMED: Final = 8
 """Anchors named in one warning."""
 
-WEAK: Final = 2.0
-"""A place is weak where the error is so many times the median."""
+_WEAK_RATIO: Final = 2.0
+"""A position is weak where the error exceeds this multiple of the median."""
 
-MIRROR_POINTS: Final = 150
+_MIRROR_POINTS: Final = 150
 
 
 def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
@@ -45,28 +44,28 @@ def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str
 
 
 def _master(predictor: Predictor) -> list[str]:
-    """Anchors that hear the master badly have a poor clock, or none and stay silent; a better master, if there is."""
-    share, speaks = predictor.links.share, predictor.clocks.speaks
+    """Anchors that hear the master badly have a poor clock, or none and stay silent; a better master, if any."""
+    share, sends = predictor.links.share, predictor.clocks.sends
     found = [
-        _hears_badly(predictor, np.flatnonzero(~speaks), "stay silent"),
-        _hears_badly(predictor, np.flatnonzero(speaks & (share < RELIABLE)), "follow its clock badly"),
+        _poor_reception(predictor, np.flatnonzero(~sends), "stay silent"),
+        _poor_reception(predictor, np.flatnonzero(sends & (share < _RELIABLE)), "follow its clock badly"),
     ]
-    told = [text for text in found if text]
+    warnings = [text for text in found if text]
     best = int(masters_by_links(predictor.anchors_m, predictor.budget, predictor.walls)[0])
-    hear_best = anchor_links(predictor.anchors_m, best, predictor.budget, predictor.walls).share
-    if told and (hear_best >= RELIABLE).sum() > (share >= RELIABLE).sum():
+    best_share = anchor_links(predictor.anchors_m, best, predictor.budget, predictor.walls).share
+    if warnings and (best_share >= _RELIABLE).sum() > (share >= _RELIABLE).sum():
         number = predictor.site.anchors[best].id
-        told[0] += f"; with anchor {number} as the master {(hear_best < RELIABLE).sum()} would hear it so badly"
-    return told
+        warnings[0] += f"; with anchor {number} as the master {(best_share < _RELIABLE).sum()} would hear it that badly"
+    return warnings
 
 
-def _hears_badly(predictor: Predictor, rows: Integers, what: str) -> str:
+def _poor_reception(predictor: Predictor, rows: Integers, what: str) -> str:
     """One sentence for all anchors that do the same."""
     if len(rows) == 0:
         return ""
     numbers = [str(predictor.site.anchors[row].id) for row in rows]
-    more = f" and {len(numbers) - MOST_NAMED} more" if len(numbers) > MOST_NAMED else ""
-    listed = ", ".join(numbers[:MOST_NAMED]) + more
+    more = f" and {len(numbers) - _MOST_NAMED} more" if len(numbers) > _MOST_NAMED else ""
+    listed = ", ".join(numbers[:_MOST_NAMED]) + more
     distances = np.linalg.norm(predictor.anchors_m[rows] - predictor.anchors_m[predictor.master], axis=1)
     nearest, share = float(distances.min()), float(predictor.links.share[rows].max())
     heard = f"hear {share:.0%} of its frames at most"
@@ -85,8 +84,8 @@ def _order(predictor: Predictor) -> list[str]:
 
 
 def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
-    """Ask the solver itself, with TDoAs that are exact, whether a place has a mirror image that fits as well."""
-    points, _ = sample_points(floor, tuple(plan.grid.heights_m.tolist()), MIRROR_POINTS)
+    """Ask the solver itself, with TDoAs that are exact, whether a position has a mirror image that fits as well."""
+    points, _ = sample_points(floor, tuple(plan.grid.heights_m.tolist()), _MIRROR_POINTS)
     tx_var, rx_var = stamp_variances(predictor.site)
     height = predictor.site.tags.height_m
     share, _ = predictor.scene.heard_at(points)
@@ -105,7 +104,7 @@ def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
 
 
 def _has_mirror(anchors: Array, point: Array, height_m: float | None, tx_var: float, rx_var: float) -> bool:
-    """Whether the anchors in view, shape (n, 3), leave two places."""
+    """Whether the anchors in view, shape (n, 3), leave two positions."""
     if len(anchors) < (4 if height_m is None else 3):
         return False
     ranges = np.linalg.norm(anchors - point, axis=1)
@@ -120,23 +119,23 @@ def _holes(plan: PlanMap) -> list[str]:
     if not missing.any():
         return []
     part = missing.sum() / (plan.grid.points)
-    x, y, z = _place(plan, missing)
+    x, y, z = _central(plan, missing)
     return [f"{part:.1%} of the region has no fix most of the time, as around ({x:.1f}, {y:.1f}, {z:.1f})"]
 
 
 def _weak(plan: PlanMap) -> list[str]:
-    """The worst place of those whose error is a multiple of the median."""
+    """The worst position of those whose error is a multiple of the median."""
     sigma = np.where(plan.column(FIX_SHARE) >= 0.5, plan.column(SIGMA), np.nan)
     if not np.isfinite(sigma).any():
         return []
     median, worst = float(np.nanmedian(sigma)), float(np.nanmax(sigma))
-    if worst < WEAK * median:
+    if worst < _WEAK_RATIO * median:
         return []
-    part = float(np.nansum(sigma > WEAK * median)) / plan.grid.points
-    x, y, z = _place(plan, sigma == worst)
+    part = float(np.nansum(sigma > _WEAK_RATIO * median)) / plan.grid.points
+    x, y, z = _central(plan, sigma == worst)
     return [
         f"weak corner at ({x:.1f}, {y:.1f}, {z:.1f}): {100 * worst:.1f} cm, {worst / median:.1f} times the median; "
-        f"{part:.1%} of the region is worse than {WEAK:g} times the median"
+        f"{part:.1%} of the region is worse than {_WEAK_RATIO:g} times the median"
     ]
 
 
@@ -155,9 +154,9 @@ def _walls(predictor: Predictor, plan: PlanMap) -> list[str]:
     ]
 
 
-def _place(plan: PlanMap, where: Mask) -> tuple[float, float, float]:
+def _central(plan: PlanMap, where: Mask) -> tuple[float, float, float]:
     """The marked point that is nearest to the middle of all marked ones."""
     k, y, x = np.nonzero(where)
-    places = np.column_stack([plan.grid.x_m[x], plan.grid.y_m[y], plan.grid.heights_m[k]])
-    nearest = places[np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1))]
+    points = np.column_stack([plan.grid.x_m[x], plan.grid.y_m[y], plan.grid.heights_m[k]])
+    nearest = points[np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1))]
     return float(nearest[0]), float(nearest[1]), float(nearest[2])

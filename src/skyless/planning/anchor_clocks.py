@@ -1,4 +1,4 @@
-"""The anchors of a site as tags hear them: who sends when, whose clock is good enough to send, and what is relayed."""
+"""The anchors of a site as tags receive them: who sends when, whose clock is good enough, and what is relayed."""
 
 from collections.abc import Iterator
 from typing import Final, NamedTuple
@@ -7,31 +7,31 @@ import numpy as np
 
 from skyless.air.codec import heard_capacity
 from skyless.anchor import MAX_OFFSET_STD_M
-from skyless.clocks.filter import clock_noise
+from skyless.clocks.filter import clock_noise, stamp_variance_m2
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Integers, Mask, Matrix, Vector
-from skyless.kernels.compiled import kernel
+from skyless.kernels.compiled import jitted, kernel
+from skyless.kernels.two_state import predict, update
 from skyless.planning.links import LEAST_SYNC, links
 from skyless.site.model import Site
 from skyless.site.slots import first_slots, schedule_of
-from skyless.uncertainty.tdoa import stamp_variance_m2
 
-_SETTLED: Final = 1e-7
-_LONGEST: Final = 20_000
-"""Superframes after which a filter counts as settled in any case."""
+_STEADY_CHANGE: Final = 1e-7
+_MOST_SUPERFRAMES: Final = 20_000
+"""Superframes after which a filter counts as steady in any case."""
 
 
-LEAST_TOLD: Final = 0.01
+LEAST_SHARE: Final = 0.01
 """A reception that is relayed more rarely does not count."""
 
-AGE_S, TOLD, LATE_M = range(3)
-"""Places in a row of ``values``."""
+jitted(predict)
+jitted(update)
 
 
 class AnchorClocks(NamedTuple):
     """One superframe of a site, message by message: who sends, and when."""
 
-    speaks: Mask
+    sends: Mask
     """Anchors whose clock is known well enough to send; shape (anchors,)."""
     sender: Integers
     """Row of the sending anchor; shape (messages,)."""
@@ -40,27 +40,29 @@ class AnchorClocks(NamedTuple):
 
 
 def anchor_clocks(site: Site, share: Vector) -> AnchorClocks:
-    """For anchors, in the order of the file, that hear these shares of the master's messages."""
+    """For anchors, in the order of the file, that receive these shares of the master's messages."""
     sender, time_s, superframe_s = _messages(site)
     variances = offset_variances(site, share)
-    speaks = share >= LEAST_SYNC
-    speaks[sender[variances > MAX_OFFSET_STD_M**2]] = False
-    spoken = speaks[sender]
-    sender, time_s = sender[spoken], time_s[spoken]
+    sends = share >= LEAST_SYNC
+    sends[sender[variances > MAX_OFFSET_STD_M**2]] = False
+    sent = sends[sender]
+    sender, time_s = sender[sent], time_s[sent]
     gap_s = np.diff(time_s, prepend=time_s[-1] - superframe_s) if len(time_s) else time_s
-    return AnchorClocks(speaks, sender, gap_s)
+    return AnchorClocks(sends, sender, gap_s)
 
 
 def offset_variances(site: Site, share: Vector) -> Vector:
-    """What each message of a superframe tells of its sender's clock in the steady state, m²; 0 of the master's."""
+    """Variance of its sender's clock that each message states in the steady state, m²; 0 of the master's."""
     noise = clock_noise(site.noise.white_fm, site.noise.random_walk_fm)
     master = [anchor.id for anchor in site.anchors].index(site.master)
     sender, time_s, superframe_s = _messages(site)
-    variance, told = sum(stamp_variances(site)), {}
+    variance, reported = sum(stamp_variances(site)), {}
     for part in set(share[share >= LEAST_SYNC].tolist()):
-        told[part] = np.zeros(len(sender))
-        _settle(sender, time_s, superframe_s, master, part, variance, noise.white, noise.walk, told[part])
-    own = [0.0 if row == master or share[row] not in told else told[share[row]][k] for k, row in enumerate(sender)]
+        reported[part] = np.zeros(len(sender))
+        _run_filter(sender, time_s, superframe_s, master, part, variance, noise.white, noise.walk, reported[part])
+    own = [
+        0.0 if row == master or share[row] not in reported else reported[share[row]][k] for k, row in enumerate(sender)
+    ]
     return np.array(own)
 
 
@@ -81,7 +83,7 @@ def _messages(site: Site) -> tuple[Integers, Vector, float]:
 
 
 @kernel
-def _settle(
+def _run_filter(
     sender: Integers,
     time_s: Vector,
     superframe_s: float,
@@ -90,26 +92,26 @@ def _settle(
     variance: float,
     white: float,
     walk: float,
-    told: Vector,
+    reported: Vector,
 ) -> None:
     """Run one anchor's filter into its steady state: its offset's variance at every message."""
-    p00, p01, p11 = variance, 0.0, 144.0
+    covariance = (variance, 0.0, 144.0)
     last_s = 0.0
-    for _ in range(_LONGEST):
-        before = p00
+    for _ in range(_MOST_SUPERFRAMES):
+        before = covariance[0]
         for k in range(len(sender)):
             dt = time_s[k] - last_s if time_s[k] >= last_s else time_s[k] - last_s + superframe_s
             last_s = time_s[k]
-            p00 += dt * (2.0 * p01 + dt * p11) + dt * (white + walk * dt * dt / 3.0)
-            p01 += dt * (p11 + walk * dt / 2.0)
-            p11 += walk * dt
-            told[k] = p00
+            covariance = predict(covariance, dt, white, walk)
+            reported[k] = covariance[0]
             if sender[k] == master:
-                spread = p00 + variance
-                p11 -= share * p01 * p01 / spread
-                p01 -= share * p01 * p00 / spread
-                p00 -= share * p00 * p00 / spread
-        if abs(p00 - before) <= _SETTLED * share * p00:
+                _, _, updated = update(covariance, variance)
+                covariance = (
+                    covariance[0] + share * (updated[0] - covariance[0]),
+                    covariance[1] + share * (updated[1] - covariance[1]),
+                    covariance[2] + share * (updated[2] - covariance[2]),
+                )
+        if abs(covariance[0] - before) <= _STEADY_CHANGE * share * covariance[0]:
             break
 
 
@@ -118,40 +120,45 @@ class Relays(NamedTuple):
 
     ends: Integers
     """Where those of each message end; shape (messages,)."""
-    heard: Integers
-    """Row of the anchor whose packet was heard; shape (relays,)."""
-    values: Matrix
-    """How long ago it was sent, of the sender's messages those that tell of it, its delay by walls; (relays, 3)."""
+    sender: Integers
+    """Row of the anchor whose packet was received; this and the following have shape (relays,)."""
+    age_s: Vector
+    """How long ago it was sent."""
+    share: Vector
+    """Of the listener's messages, those that relay it."""
+    delay_m: Vector
+    """By walls."""
 
 
 def relays_of(anchors_m: Matrix, master: int, clocks: AnchorClocks, budget: Vector, walls: Matrix) -> Relays:
-    """The relays of a site's superframe, whose frames tell of the last receptions while there is room.
+    """The relays of a site's superframe, whose frames carry the last receptions that fit.
 
-    ``anchors_m``: shape (anchors, 3); ``master``: row of the master, whose packets have a place of their own.
+    ``anchors_m``: shape (anchors, 3); ``master``: row of the master, whose packets have a field of their own.
     """
     share, delay_m = links(anchors_m, anchors_m, budget, walls)
-    share *= clocks.speaks & clocks.speaks[:, None]
-    room = heard_capacity(master_heard=True, master_time=True, page=True)
-    masters_room = heard_capacity(master_heard=False, master_time=True, page=True)
-    ends, heard, values = [], [], []
+    share *= clocks.sends & clocks.sends[:, None]
+    capacity = heard_capacity(master_heard=True, master_time=True, page=True)
+    master_capacity = heard_capacity(master_heard=False, master_time=True, page=True)
+    ends, rows = [], []
     for k, listener in enumerate(clocks.sender.tolist()):
-        for sender, age_s, part in _told(
-            clocks, k, share[listener], master, masters_room if listener == master else room
-        ):
-            heard.append(sender)
-            values.append((age_s, part, delay_m[listener, sender]))
-        ends.append(len(heard))
-    return Relays(np.array(ends, np.int64), np.array(heard, np.int64), np.array(values).reshape(-1, 3))
+        fits = master_capacity if listener == master else capacity
+        for sender, age_s, part in _relayed(clocks, k, share[listener], master, fits):
+            rows.append((sender, age_s, part, delay_m[listener, sender]))
+        ends.append(len(rows))
+    columns = np.array(rows).reshape(-1, 4).T
+    return Relays(np.array(ends, np.int64), columns[0].astype(np.int64), *(column.copy() for column in columns[1:]))
 
 
-def _told(clocks: AnchorClocks, k: int, share: Vector, master: int, room: int) -> Iterator[tuple[int, float, float]]:
-    """What message k relays: senders, how long ago they sent, and how often it tells.
+def _relayed(
+    clocks: AnchorClocks, k: int, share: Vector, master: int, capacity: int
+) -> Iterator[tuple[int, float, float]]:
+    """What message k relays: senders, how long ago they sent, and how often it relays them.
 
-    From an anchor's message back to its one before: a packet is told of if it was heard and there is room, as fewer
-    that came later were heard than fit. Of an anchor that sent several only the last counts.
+    From an anchor's message back to its one before: a packet is relayed if it was received and fits, as fewer that
+    came later were received than fit. Of an anchor that sent several only the last counts.
     """
-    more = np.zeros(room + 1)  # probability that one less than so many later packets were heard
-    more[1] = 1.0
+    fewer = np.zeros(capacity + 1)  # element i: probability that i − 1 later packets were received
+    fewer[1] = 1.0
     seen, age_s = {int(clocks.sender[k])}, 0.0
     for back in range(1, len(clocks.sender)):
         age_s += float(clocks.gap_s[k - back + 1])
@@ -163,7 +170,7 @@ def _told(clocks: AnchorClocks, k: int, share: Vector, master: int, room: int) -
         seen.add(sender)
         part = float(share[sender])
         if sender != master:
-            part *= float(more.sum())
-            more[1:] += share[sender] * (more[:-1] - more[1:])
-        if part >= LEAST_TOLD:
+            part *= float(fewer.sum())
+            fewer[1:] += share[sender] * (fewer[:-1] - fewer[1:])
+        if part >= LEAST_SHARE:
             yield sender, age_s, part

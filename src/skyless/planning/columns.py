@@ -6,8 +6,8 @@ import numpy as np
 
 from skyless.kernels.arrays import Array, Integers
 
-COLUMNS: Final = (
-    "anchors",  # how many are in view
+PLAN_COLUMNS: Final = (
+    "anchors",  # number in view
     "gdop",
     "pdop",
     "hdop",
@@ -20,11 +20,13 @@ COLUMNS: Final = (
     "bias_m",  # length of the mean error that walls leave
     "rmse_m",  # both together
     "fix_share",  # of the rounds that give a fix
-    "claimed_m",  # what the fixes themselves will say of their standard deviation
+    "claimed_m",  # the standard deviation that the fixes themselves will report
 )
 """Names of a prediction's columns, metres; infinite where there is no fix."""
 
-ANCHORS, GDOP, PDOP, HDOP, VDOP, TDOP, SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, BIAS, RMSE, FIX_SHARE, CLAIMED = range(14)
+ANCHORS_IN_VIEW, GDOP, PDOP, HDOP, VDOP, TDOP, SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, BIAS, RMSE, FIX_SHARE, CLAIMED = range(
+    14
+)
 
 
 def fill_errors(

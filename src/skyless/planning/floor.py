@@ -1,4 +1,4 @@
-"""The floor of a site: its outline, what lies inside, and the walls on which anchors may hang."""
+"""The floor of a site: its outline, points inside it, and the walls on which anchors may hang."""
 
 from pathlib import Path
 from typing import Final
@@ -7,15 +7,15 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.errors import ConfigurationError
-from skyless.kernels.arrays import Mask, Matrix, Vector
+from skyless.kernels.arrays import Integers, Mask, Matrix, Vector
 from skyless.planning.links import anchor_positions
 from skyless.site.image import image_size
 from skyless.site.model import Site
 
 Box = tuple[float, float, float, float]
 
-OUTSIDE_M: Final = 0.5
-"""Anchors hang on walls, whose thickness a plan may leave out: so far outside of it they pass."""
+_OUTSIDE_M: Final = 0.5
+"""Anchors hang on walls, whose thickness a plan may leave out: this far outside the outline they are accepted."""
 
 
 class Floor(Struct, frozen=True):
@@ -53,8 +53,8 @@ def floor_of(site: Site, file: Path, outline_m: Matrix | None, region_m: Box | N
     if abs(area(outline_m)) < 1e-6:
         right = "anchors that are not all in one line, or a floor plan; --outline gives the room else"
         raise ConfigurationError(file, "anchors", f"{len(anchors)} in one line", right)
-    for index, place in enumerate(anchors):
-        if distance_outside(place, outline_m) > OUTSIDE_M:
+    for index, position in enumerate(anchors):
+        if distance_outside(position, outline_m) > _OUTSIDE_M:
             raise _outside(site, file, index, outline_m)
     low, high = outline_m.min(axis=0), outline_m.max(axis=0)
     return Floor(outline_m, region_m or (*low.tolist(), *high.tolist()))
@@ -100,17 +100,57 @@ def sides(outline_m: Matrix) -> Matrix:
     return np.hstack([outline_m, np.roll(outline_m, -1, axis=0)])
 
 
-def total_length(segments_m: Matrix) -> float:
-    """Length of all segments, shape (k, 4), together."""
-    return float(np.linalg.norm(segments_m[:, 2:] - segments_m[:, :2], axis=1).sum())
+class Mounts(Struct, frozen=True):
+    """Walls and heights at which anchors may hang."""
+
+    segments_m: Matrix
+    """Shape (k, 4): x1, y1, x2, y2."""
+    heights_m: tuple[float, ...]
+
+    @property
+    def length_m(self) -> float:
+        """Length of all walls together."""
+        return float(np.linalg.norm(self.segments_m[:, 2:] - self.segments_m[:, :2], axis=1).sum())
+
+    def at(self, along_m: Vector, levels: Integers) -> Matrix:
+        """Points at distances along the walls and at heights by their index, to the millimetre; shape (m, 3)."""
+        points = np.column_stack([points_along(self.segments_m, along_m), np.array(self.heights_m)[levels]])
+        rounded: Matrix = np.round(points, 3)
+        return rounded
 
 
-def along(segments_m: Matrix, ways_m: Vector) -> Matrix:
-    """Points, shape (m, 2), so far along the segments one after the other, round and round."""
+def points_along(segments_m: Matrix, along_m: Vector) -> Matrix:
+    """Points, shape (m, 2), at distances along segments, shape (k, 4), one after the other and round again."""
     lengths = np.linalg.norm(segments_m[:, 2:] - segments_m[:, :2], axis=1)
     ends = np.cumsum(lengths)
-    ways = np.mod(ways_m, ends[-1])
-    place = np.minimum(np.searchsorted(ends, ways, side="right"), len(lengths) - 1)
-    share = (ways - (ends[place] - lengths[place])) / np.maximum(lengths[place], 1e-12)
-    points: Matrix = segments_m[place, :2] + share[:, None] * (segments_m[place, 2:] - segments_m[place, :2])
+    distances = np.mod(along_m, ends[-1])
+    index = np.minimum(np.searchsorted(ends, distances, side="right"), len(lengths) - 1)
+    share = (distances - (ends[index] - lengths[index])) / np.maximum(lengths[index], 1e-12)
+    points: Matrix = segments_m[index, :2] + share[:, None] * (segments_m[index, 2:] - segments_m[index, :2])
     return points
+
+
+def sample_points(floor: Floor, heights_m: tuple[float, ...], most: int) -> tuple[Matrix, Vector]:
+    """About ``most`` points all over the region, up to 10 cm from its edges; shape (m, 3).
+
+    With them their weights in a mean over the area, shape (m,), of sum 1: half on edges, a quarter in corners.
+    """
+    x1, y1, x2, y2 = floor.region_m
+    width, depth = x2 - x1, y2 - y1
+    per_slice = max(most / len(heights_m), 4.0)
+    nx = max(2, round(np.sqrt(per_slice * width / depth)))
+    ny = max(2, round(per_slice / nx))
+    inset = min(0.1, 0.02 * min(width, depth))
+    xs, ys = np.linspace(x1 + inset, x2 - inset, nx), np.linspace(y1 + inset, y2 - inset, ny)
+    flat = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    weights = np.outer(_trapezoid(ny), _trapezoid(nx)).ravel()
+    within = inside(flat, floor.outline_m)
+    flat, weights = flat[within], np.tile(weights[within], len(heights_m))
+    points = np.concatenate([np.column_stack([flat, np.full(len(flat), height)]) for height in heights_m])
+    return points, weights / weights.sum()
+
+
+def _trapezoid(count: int) -> Vector:
+    weights = np.ones(count)
+    weights[[0, -1]] = 0.5
+    return weights

@@ -1,10 +1,10 @@
-"""Predicted errors of ``joint`` for a tag at rest: the estimator's own kernels on a superframe, covariance only.
+"""Predicted errors of ``joint`` for a stationary tag: the estimator's own kernels on a superframe, covariance only.
 
-The filter's P, with constant errors of ranges and survey as the site tells them, is run through superframes until it
-repeats. It holds what the filter allows for accelerations, which a tag at rest does not have. That part follows from
-the estimator's sensitivities V: rows of V begin, at moments of a superframe, as a velocity that the filter does not
-know of, and the squares of what they do to the position, integrated over the time after that, are what accelerations
-add to P. Another row holds the walls' delays.
+The filter's P, with constant errors of ranges and survey as the site configures them, is run through superframes until
+it repeats. It holds what the filter allows for accelerations, which a stationary tag does not have. That part follows
+from the estimator's sensitivities V: rows of V begin, at moments of a superframe, as a velocity that the filter does
+not know of, and the squares of what they do to the position, integrated over the time after that, are what
+accelerations add to P. Another row holds the walls' delays.
 
 Where only a share of an anchor's packets arrives, the stamps of all count for as much less: their variances are divided
 by the share, and those of relayed receptions by the share of all three that they take.
@@ -18,7 +18,7 @@ import numpy as np
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Integers, Matrix, Vector
 from skyless.kernels.compiled import kernel, threaded_kernel
-from skyless.planning.anchor_clocks import AGE_S, LATE_M, TOLD, AnchorClocks, Relays
+from skyless.planning.anchor_clocks import AnchorClocks, Relays
 from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA, SIGMA_X, SIGMA_Z, fill_errors
 from skyless.planning.links import Scene, fill_dops
 from skyless.positioning.estimator.faults import compute_fault_input
@@ -30,30 +30,29 @@ from skyless.positioning.estimator.kalman import (
     reset_state,
     update,
 )
-from skyless.positioning.estimator.kinds import first_reception, reception_terms, relay_terms, relay_variance
-from skyless.positioning.estimator.settings import EstimatorSettings
-from skyless.positioning.estimator.state import EstimatorState, layout, new_state, with_anchor
+from skyless.positioning.estimator.measurements import first_reception, reception_terms, relay_terms, relay_variance
+from skyless.positioning.estimator.state import EstimatorSettings, EstimatorState, layout, new_state, with_anchor
 
 RARELY: Final = 0.1
 """An anchor of whose frames fewer arrive does not help the tag."""
 
-SETTLED: Final = 1e-3
+COMPLETE_CHANGE: Final = 1e-3
 """Relative change of the position's variance, or of a sum, in a tenth of a second or in a superframe, if that is
 longer, below which it counts as complete, ..."""
 
-SETTLING_S: Final = 0.1
+COMPLETE_OVER_S: Final = 0.1
 
-LONGEST_S: Final = 4.0
-"""... or after so long, and ..."""
+MOST_S: Final = 4.0
+"""... or after this time and ..."""
 
-LONGEST: Final = 20
-"""... so many superframes."""
+MOST_SUPERFRAMES: Final = 20
+"""... this number of superframes."""
 
-KICKS: Final = 4
+IMPULSES: Final = 4
 """Moments of a superframe at which an acceleration is tried."""
 
-NEVER: Final = 1 << 62
-"""After all others."""
+AFTER_ALL_TICKS: Final = 1 << 62
+"""A time after all others."""
 
 START_VARIANCE: Final = 1.0
 """Of each component of position and velocity, m² and m²/s²; the steady state does not depend on it."""
@@ -67,7 +66,7 @@ def site_state(settings: EstimatorSettings, anchors_m: Matrix, in_view: Integers
         s.P[axis, axis] = START_VARIANCE
     for row in in_view.tolist():
         s = with_anchor(s, row, anchors_m[row])
-    rows = len(s.V) + 1 + KICKS * settings.dim
+    rows = len(s.V) + 1 + IMPULSES * settings.dim
     return s._replace(V=np.zeros((rows, len(s.x))), fault_input=np.zeros(rows))
 
 
@@ -79,15 +78,15 @@ def _superframe(
     share: Vector,
     delay_m: Vector,
     begin_ticks: int,
-    kicks_ticks: int,
+    impulses_ticks: int,
     motion: Vector,
     row: Vector,
 ) -> int:
     """Process a superframe's packets; when it ends.
 
     Leaves sums over packets, each by how often it arrives, of the position's variances and squared mean error in
-    ``row``. The tag is kicked at moments of the superframe that begins at ``kicks_ticks``; the squares of what that
-    does to the position are added to ``motion``.
+    ``row``. Impulses act on the tag at moments of the superframe that begins at ``impulses_ticks``; the squares of what
+    they do to the position are added to ``motion``.
     """
     dim, count, now = s.settings[0]["dim"], len(s.anchors), begin_ticks
     walls = 2 * count + dim
@@ -97,14 +96,14 @@ def _superframe(
         own = s.index_of[clocks.sender[k]]
         if own < 0:
             continue
-        _let_time_pass(s, now, kicks_ticks, clocks.gap_s.sum())
+        _time_update(s, now, impulses_ticks, clocks.gap_s.sum())
         arrives = share[clocks.sender[k]]
         _own_reception(s, own, now, arrives, delay_m[clocks.sender[k]])
         for r in range(relays.ends[k - 1] if k > 0 else 0, relays.ends[k]):
-            sender = s.index_of[relays.heard[r]]
+            sender = s.index_of[relays.sender[r]]
             if sender >= 0 and s.anchors[sender]["packets"] > 0:
-                told = arrives * share[relays.heard[r]] * relays.values[r, TOLD]
-                _relay(s, own, sender, relays.values[r, AGE_S], told, relays.values[r, LATE_M])
+                used = arrives * share[relays.sender[r]] * relays.share[r]
+                _relay(s, own, sender, relays.age_s[r], used, relays.delay_m[r])
         row[FIX_SHARE] += arrives
         for axis in range(dim):
             row[SIGMA_X + axis] += arrives * s.P[axis, axis]
@@ -115,22 +114,22 @@ def _superframe(
 
 
 @kernel
-def _let_time_pass(s: EstimatorState, now: int, kicks_ticks: int, superframe_s: float) -> None:
-    """Time update, with a velocity of 1 m/s that the filter does not know of from each moment of a kick on."""
+def _time_update(s: EstimatorState, now: int, impulses_ticks: int, superframe_s: float) -> None:
+    """Time update, with a velocity of 1 m/s that the filter does not know of from each impulse on."""
     dim, count, before = s.settings[0]["dim"], len(s.anchors), s.status[0]["epoch_ticks"]
     velocity = layout(dim, count).velocity
     predict(s, now)
-    for kick in range(KICKS):
-        moment = kicks_ticks + round((kick + 0.5) / KICKS * superframe_s / TICK_S)
+    for impulse in range(IMPULSES):
+        moment = impulses_ticks + round((impulse + 0.5) / IMPULSES * superframe_s / TICK_S)
         if before < moment <= now:
             for axis in range(dim):
-                row = 2 * count + dim + 1 + dim * kick + axis
+                row = 2 * count + dim + 1 + dim * impulse + axis
                 s.V[row, axis], s.V[row, velocity + axis] = (now - moment) * TICK_S, 1.0
 
 
 @kernel
 def _own_reception(s: EstimatorState, anchor: int, rx_ticks: int, share: float, late_m: float) -> None:
-    """The tag's reception of an anchor, of which so large a share arrives, so late."""
+    """The tag's reception of an anchor, of which this share arrives, late by ``late_m``."""
     settings, a, n = s.settings[0], s.anchors[anchor], len(s.x)
     where = layout(settings["dim"], len(s.anchors))
     walls = 2 * len(s.anchors) + settings["dim"]
@@ -151,7 +150,7 @@ def _own_reception(s: EstimatorState, anchor: int, rx_ticks: int, share: float, 
 
 @kernel
 def _relay(s: EstimatorState, listener: int, sender: int, age_s: float, share: float, late_m: float) -> None:
-    """A relayed reception, of which the tag can use so large a share, so late."""
+    """A relayed reception, of which the tag can use this share, late by ``late_m``."""
     terms = relay_terms(s, listener, sender, age_s, True)
     variance = relay_variance(s, listener, sender, age_s) / share
     variance += compute_ph(s, terms)
@@ -162,7 +161,7 @@ def _relay(s: EstimatorState, listener: int, sender: int, age_s: float, share: f
 
 
 @threaded_kernel
-def settle(
+def predict_steady_state(
     s: EstimatorState,
     clocks: AnchorClocks,
     relays: Relays,
@@ -176,24 +175,24 @@ def settle(
     ``motion``, which is zero before, becomes what accelerations have of each axis' variance.
     """
     superframe_s = clocks.gap_s.sum()
-    most = max(LONGEST, math.ceil(LONGEST_S / superframe_s))
-    step = max(1, math.ceil(SETTLING_S / superframe_s))
+    most = max(MOST_SUPERFRAMES, math.ceil(MOST_S / superframe_s))
+    step = max(1, math.ceil(COMPLETE_OVER_S / superframe_s))
     now, before = 0, 0.0
     for superframe in range(most):
-        now = _superframe(s, clocks, relays, share, delay_m, now, NEVER, motion, row)
+        now = _superframe(s, clocks, relays, share, delay_m, now, AFTER_ALL_TICKS, motion, row)
         if superframe % step == step - 1:
             variance = row[SIGMA_X : SIGMA_Z + 1].sum()
-            if abs(variance - before) <= SETTLED * variance:
+            if abs(variance - before) <= COMPLETE_CHANGE * variance:
                 break
             before = variance
-    kicks_ticks, before = now, 0.0
+    impulses_ticks, before = now, 0.0
     for superframe in range(most):
-        now = _superframe(s, clocks, relays, share, delay_m, now, kicks_ticks, motion, row)
+        now = _superframe(s, clocks, relays, share, delay_m, now, impulses_ticks, motion, row)
         if superframe % step == step - 1:
-            if superframe >= 1 and motion.sum() - before <= SETTLED * motion.sum():
+            if superframe >= 1 and motion.sum() - before <= COMPLETE_CHANGE * motion.sum():
                 break
             before = motion.sum()
-    motion *= s.settings[0]["qa"] * superframe_s / (KICKS * row[FIX_SHARE])
+    motion *= s.settings[0]["qa"] * superframe_s / (IMPULSES * row[FIX_SHARE])
 
 
 def fill_joint_sigma(
@@ -223,12 +222,12 @@ def fill_joint_sigma(
         s.x[:dim] = point[:dim]
         if dim == 2:
             s.settings["height_m"] = point[2]
-        settle(s, clocks, relays, share, delay_m, motion, row)
+        predict_steady_state(s, clocks, relays, share, delay_m, motion, row)
     known = np.flatnonzero(table[:, FIX_SHARE] > 0.0)
     heard = table[known, FIX_SHARE]
-    said = table[known, SIGMA_X : SIGMA_Z + 1] / heard[:, None]
-    variance = np.maximum(said - motions[known], 0.0)
-    fill_errors(table, known, variance, table[known, BIAS] / heard, said.sum(axis=1))
+    claimed = table[known, SIGMA_X : SIGMA_Z + 1] / heard[:, None]
+    variance = np.maximum(claimed - motions[known], 0.0)
+    fill_errors(table, known, variance, table[known, BIAS] / heard, claimed.sum(axis=1))
     table[known, FIX_SHARE] = heard / len(clocks.sender)
     lost = ~(table[:, SIGMA] < farthest)
     table[lost, SIGMA:], table[lost, FIX_SHARE] = math.inf, 0.0

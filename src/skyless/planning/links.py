@@ -1,4 +1,4 @@
-"""Who hears whom at a site, by the simulated channel's own formulas without its chance; and with which geometry."""
+"""Which anchors are received where at a site, by the simulated channel's own formulas without its chance."""
 
 import math
 from typing import Final, NamedTuple
@@ -6,9 +6,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from msgspec import Struct
 
-from skyless.kernels.arrays import Mask, Matrix, Vector
+from skyless.kernels.arrays import Integers, Mask, Matrix, Vector
 from skyless.kernels.compiled import kernel, threaded_kernel
-from skyless.planning.columns import ANCHORS, GDOP, PDOP, TDOP
+from skyless.planning.columns import ANCHORS_IN_VIEW, GDOP, PDOP, TDOP
 from skyless.simulation.channel import (
     FREE_SPACE_LOSS_1_M_DB,
     ChannelModel,
@@ -22,10 +22,10 @@ from skyless.uncertainty.dop import dops_at
 IN_VIEW: Final = 0.5
 """An anchor is in view where at least this share of its frames arrives."""
 
-HOPELESS: Final = 1e-4
+_NEGLIGIBLE_SHARE: Final = 1e-4
 """A share below this, in free space already, counts as none."""
 
-UNSURE: Final = 1e-7
+_NEGLIGIBLE_LOSS: Final = 1e-7
 """A share of losses below this, in free space, counts as none."""
 
 LEAST_SYNC: Final = 0.01
@@ -33,7 +33,7 @@ LEAST_SYNC: Final = 0.01
 
 
 class AnchorLinks(Struct, frozen=True):
-    """How the anchors of a site, in the order of its file, hear their master; shape (anchors,) each."""
+    """How the anchors of a site, in the order of its file, receive their master; shape (anchors,) each."""
 
     share: Vector
     """Share of the master's frames that arrive; 1 for the master itself."""
@@ -48,7 +48,7 @@ def range_of(channel: ChannelModel) -> float:
 
 
 def with_range(channel: ChannelModel, range_m: float) -> ChannelModel:
-    """A channel like this one that carries so far: its sensitivity follows."""
+    """A channel like this one with another range, by another sensitivity."""
     sensitivity_dbm = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 20.0 * math.log10(range_m)
     values = {name: getattr(channel, name) for name in channel.__struct_fields__}
     return ChannelModel(**{**values, "sensitivity_dbm": sensitivity_dbm})
@@ -60,14 +60,14 @@ def anchor_positions(site: Site) -> Matrix:
 
 
 def link_budget(channel: ChannelModel) -> Vector:
-    """What ``hears`` wants of a channel.
+    """What ``link`` needs of a channel.
 
     Power sent, sensitivity, its width, share lost by chance, and the squared
     distances, m², beyond which nothing arrives and within which all does.
     """
-    hopeless_db = math.log(1.0 / HOPELESS) * channel.sensitivity_width_db
-    farthest_m = range_of(channel) * 10.0 ** (hopeless_db / 20.0)
-    certain_m = range_of(channel) * 10.0 ** (math.log(UNSURE) * channel.sensitivity_width_db / 20.0)
+    farthest_db = math.log(1.0 / _NEGLIGIBLE_SHARE) * channel.sensitivity_width_db
+    farthest_m = range_of(channel) * 10.0 ** (farthest_db / 20.0)
+    certain_m = range_of(channel) * 10.0 ** (math.log(_NEGLIGIBLE_LOSS) * channel.sensitivity_width_db / 20.0)
     return np.array(
         [
             channel.tx_power_dbm,
@@ -81,7 +81,7 @@ def link_budget(channel: ChannelModel) -> Vector:
 
 
 @kernel
-def hears(budget: Vector, walls: Matrix, a_m: Vector, b_m: Vector) -> tuple[float, float]:
+def link(budget: Vector, walls: Matrix, a_m: Vector, b_m: Vector) -> tuple[float, float]:
     """Share of the frames that arrive over the straight line from a to b, and the walls' delay in metres."""
     loss_db, delay_m = 0.0, 0.0
     x, y, z = b_m[0] - a_m[0], b_m[1] - a_m[1], b_m[2] - a_m[2]
@@ -102,7 +102,7 @@ def _fill_links(
 ) -> None:
     for i in range(len(listeners_m)):
         for j in range(len(senders_m)):
-            share[i, j], delay_m[i, j] = hears(budget, walls, senders_m[j], listeners_m[i])
+            share[i, j], delay_m[i, j] = link(budget, walls, senders_m[j], listeners_m[i])
 
 
 def links(senders_m: Matrix, listeners_m: Matrix, budget: Vector, walls: Matrix) -> tuple[Matrix, Matrix]:
@@ -113,18 +113,26 @@ def links(senders_m: Matrix, listeners_m: Matrix, budget: Vector, walls: Matrix)
 
 
 def anchor_links(anchors_m: Matrix, master: int, budget: Vector, walls: Matrix) -> AnchorLinks:
-    """How anchors, shape (anchors, 3), hear the one in row ``master``."""
+    """How anchors, shape (anchors, 3), receive the one in row ``master``."""
     share, delay_m = links(anchors_m[master : master + 1], anchors_m, budget, walls)
     share[master] = 1.0
     return AnchorLinks(share[:, 0], delay_m[:, 0])
 
 
+def masters_by_links(anchors_m: Matrix, budget: Vector, walls: Matrix) -> Integers:
+    """Rows of anchors, best master first: that which all others hear best; equals by distance from the middle."""
+    heard, _ = links(anchors_m, anchors_m, budget, walls)
+    total = np.round(np.minimum(heard, 0.99).sum(axis=0), 3)
+    middle = np.linalg.norm(anchors_m[:, :2] - anchors_m[:, :2].mean(axis=0), axis=1)
+    return np.lexsort((middle, -total))
+
+
 class Scene(NamedTuple):
-    """Anchors, and what stands between them and points."""
+    """Anchors, and the walls between them and points."""
 
     anchors: Matrix
     """Positions, shape (anchors, 3)."""
-    speaks: Mask
+    sends: Mask
     """Those that send at all, shape (anchors,)."""
     budget: Vector
     """``link_budget``."""
@@ -134,16 +142,16 @@ class Scene(NamedTuple):
     def heard_at(self, points: Matrix) -> tuple[Matrix, Matrix]:
         """Share of each anchor's frames that arrives at points, and the walls' delay, metres; shape (m, anchors)."""
         share, delay_m = links(self.anchors, points, self.budget, self.walls)
-        return share * self.speaks, delay_m
+        return share * self.sends, delay_m
 
 
 def fill_dops(scene: Scene, points: Matrix, share: Matrix, dim: int, table: Matrix) -> None:
     """Fill the number of anchors in view and the columns of their DOPs."""
     in_view = share >= IN_VIEW
-    table[:, ANCHORS] = in_view.sum(axis=1)
+    table[:, ANCHORS_IN_VIEW] = in_view.sum(axis=1)
     table[:, GDOP : TDOP + 1] = dops_at(scene.anchors, points, height_known=dim == 2, weights=in_view)
 
 
 def weighted_pdop(scene: Scene, points: Matrix, share: Matrix, dim: int) -> Vector:
-    """PDOP with every anchor weighted by its share of frames, so that none comes or goes at once; may be infinite."""
+    """PDOP of anchors weighted by their shares of frames, without steps where one comes into view; may be infinite."""
     return dops_at(scene.anchors, points, height_known=dim == 2, weights=share)[:, PDOP - GDOP]

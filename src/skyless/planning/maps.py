@@ -1,12 +1,12 @@
-"""Maps: predictions over a grid of the floor, one slice for each height.
+"""Maps: predictions over a grid of the floor, one slice for each height; and the map as a table for other programs.
 
-The filter's points are dear. On large grids they are computed on a coarser one (on the largest the other methods,
-too), and their ratio to the PDOP of anchors weighted by their share of frames, which is smooth, is interpolated; that
-PDOP is computed at every point, so that edges behind walls stay sharp.
+The filter's points take long to compute. On large grids they are computed on a coarser one (on the largest the other
+methods, too), and their ratio to the PDOP of anchors weighted by their share of frames, which is smooth, is
+interpolated; that PDOP is computed at every point, so that edges behind walls stay sharp.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import numpy as np
@@ -14,11 +14,11 @@ from msgspec import Struct
 
 from skyless.kernels.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.planning.columns import (
-    ANCHORS,
+    ANCHORS_IN_VIEW,
     BIAS,
     CLAIMED,
-    COLUMNS,
     FIX_SHARE,
+    PLAN_COLUMNS,
     RMSE,
     SIGMA,
     SIGMA_X,
@@ -27,18 +27,23 @@ from skyless.planning.columns import (
 )
 from skyless.planning.floor import Floor, inside
 from skyless.planning.predict import Predictor
+from skyless.site.georeference import to_wgs84
+from skyless.site.model import GeoreferenceSite
 
-MOST_POINTS: Final = 5_000_000
-NICE_POINTS: Final = 12_000
-STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-JOINT_BUDGET: Final = 2.5e5
+_MOST_POINTS: Final = 5_000_000
+_NICE_POINTS: Final = 12_000
+_STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+_JOINT_BUDGET: Final = 2.5e5
 """Points of the joint filter times what one costs, the square of the anchors in view and a constant."""
 
-MOST_ASKED: Final = 500
-"""Points that are asked for their anchors in view."""
+_SAMPLE_POINTS: Final = 500
+"""Points from which the mean number of anchors in view is estimated."""
 
-SNAPSHOT_BUDGET: Final = 20_000_000
+_SNAPSHOT_BUDGET: Final = 20_000_000
 """Points of a snapshot method times what one costs, anchors and a constant; only the largest grids exceed it."""
+
+_TABLE_ROWS: Final = 20_000
+"""Rows of a table that are written at once."""
 
 
 class Grid(Struct, frozen=True):
@@ -66,9 +71,9 @@ class PlanMap(Struct, frozen=True):
     computed_every_m: float
     """Spacing of the points that were computed in full; wider than the grid's where the rest was interpolated."""
 
-    def column(self, place: int) -> Array:
+    def column(self, index: int) -> Array:
         """One column, shape (heights, ny, nx)."""
-        return self.table[..., place]
+        return self.table[..., index]
 
 
 class MapSummary(Struct, frozen=True):
@@ -100,11 +105,11 @@ def grid_of(floor: Floor, heights_m: tuple[float, ...], step_m: float | None) ->
     if not (x2 > x1 and y2 > y1):
         raise ValueError("the region has no area")
     step = step_m or next(
-        (s for s in STEPS_M if (x2 - x1) * (y2 - y1) / s**2 * len(heights_m) <= NICE_POINTS), STEPS_M[-1]
+        (s for s in _STEPS_M if (x2 - x1) * (y2 - y1) / s**2 * len(heights_m) <= _NICE_POINTS), _STEPS_M[-1]
     )
     nx, ny = max(round((x2 - x1) / step), 1), max(round((y2 - y1) / step), 1)
-    if nx * ny * len(heights_m) > MOST_POINTS:
-        raise ValueError(f"a step of {step:g} m makes {nx * ny * len(heights_m)} points; {MOST_POINTS} are the most")
+    if nx * ny * len(heights_m) > _MOST_POINTS:
+        raise ValueError(f"a step of {step:g} m makes {nx * ny * len(heights_m)} points; {_MOST_POINTS} are the most")
     xs = x1 + (np.arange(nx) + 0.5) * (x2 - x1) / nx
     ys = y1 + (np.arange(ny) + 0.5) * (y2 - y1) / ny
     flat = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
@@ -116,13 +121,15 @@ def grid_of(floor: Floor, heights_m: tuple[float, ...], step_m: float | None) ->
 
 def plan_map(predictor: Predictor, grid: Grid, progress: Callable[[float], None] | None = None) -> PlanMap:
     """Predict over a grid; ``progress`` gets the share done."""
-    slices = [_slice(predictor, grid, height, _part(progress, k, grid)) for k, height in enumerate(grid.heights_m)]
+    slices = [
+        _slice(predictor, grid, height, _slice_progress(progress, k, grid)) for k, height in enumerate(grid.heights_m)
+    ]
     return PlanMap(grid, np.stack([table for table, _ in slices]), slices[0][1])
 
 
 def summary_of(plan: PlanMap, target_m: float | None = None) -> MapSummary:
-    """Sum a map up."""
-    table = plan.table[:, plan.grid.within].reshape(-1, len(COLUMNS))
+    """Summarise a map."""
+    table = plan.table[:, plan.grid.within].reshape(-1, len(PLAN_COLUMNS))
     covered = table[:, FIX_SHARE] >= 0.5
     sigma, rmse = table[covered, SIGMA], table[covered, RMSE]
     some = len(sigma) > 0
@@ -140,12 +147,12 @@ def summary_of(plan: PlanMap, target_m: float | None = None) -> MapSummary:
         worst_at_m=worst_at,
         mean_rmse_m=float(rmse.mean()) if some else None,
         worst_rmse_m=float(rmse.max()) if some else None,
-        fewest_anchors=int(table[:, ANCHORS].min()),
+        fewest_anchors=int(table[:, ANCHORS_IN_VIEW].min()),
         target_share=None if target_m is None else float((covered & (table[:, SIGMA] <= target_m)).mean()),
     )
 
 
-def _part(progress: Callable[[float], None] | None, k: int, grid: Grid) -> Callable[[float], None] | None:
+def _slice_progress(progress: Callable[[float], None] | None, k: int, grid: Grid) -> Callable[[float], None] | None:
     if progress is None:
         return None
     per_slice = grid.points / len(grid.heights_m)
@@ -156,7 +163,7 @@ def _slice(
     predictor: Predictor, grid: Grid, height_m: float, progress: Callable[[float], None] | None
 ) -> tuple[Array, float]:
     points = points_of(grid, height_m)
-    table = np.full((*grid.within.shape, len(COLUMNS)), np.nan)
+    table = np.full((*grid.within.shape, len(PLAN_COLUMNS)), np.nan)
     stride = _stride(predictor, grid, points[grid.within])
     if stride == 1:
         table[grid.within] = predictor.at(points[grid.within], progress)
@@ -178,17 +185,17 @@ def points_of(grid: Grid, height_m: float) -> Array:
 
 
 def _stride(predictor: Predictor, grid: Grid, points: Matrix) -> int:
-    """Of how many rows and columns one is computed; ``points``: those of a slice that count, shape (n, 3)."""
+    """One in how many rows and columns is computed; ``points``: those of a slice that count, shape (n, 3)."""
     if predictor.settings.method == "joint":
-        some = points[:: math.ceil(len(points) / MOST_ASKED)]
-        most = JOINT_BUDGET / float(((predictor.geometry_at(some)[:, ANCHORS] + 8.0) ** 2).mean())
+        some = points[:: math.ceil(len(points) / _SAMPLE_POINTS)]
+        most = _JOINT_BUDGET / float(((predictor.geometry_at(some)[:, ANCHORS_IN_VIEW] + 8.0) ** 2).mean())
     else:
-        most = SNAPSHOT_BUDGET / (len(predictor.anchors_m) + 14.0)
+        most = _SNAPSHOT_BUDGET / (len(predictor.anchors_m) + 14.0)
     return max(1, math.ceil(math.sqrt(grid.points / most)))
 
 
 def _every(stride: int, count: int) -> Integers:
-    """Every so many indices, the last one included."""
+    """Every ``stride``-th index, the last one included."""
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
@@ -219,8 +226,8 @@ def _interpolate(
     near_steady = distance_transform_edt(~steady, return_distances=False, return_indices=True)
 
     def bilinear(values: Array) -> Vector:
-        taken: Vector = map_coordinates(values, at, order=1, mode="nearest")
-        return taken
+        interpolated: Vector = map_coordinates(values, at, order=1, mode="nearest")
+        return interpolated
 
     by_geometry = np.isfinite(fine_carrier) & bool(steady.any())
     for column in (SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, CLAIMED):
@@ -234,3 +241,56 @@ def _interpolate(
     without = ~(map_coordinates(known.astype(np.float64), at, order=0, mode="nearest") > 0.5)
     fine[without, SIGMA:] = math.inf
     fine[without, FIX_SHARE] = 0.0
+
+
+# Tables
+
+
+def rows_of(plan: PlanMap) -> Matrix:
+    """x, y, z and the columns of every point inside the outline, shape (points, 3 + columns)."""
+    x, y = np.meshgrid(plan.grid.x_m, plan.grid.y_m)
+    within = plan.grid.within
+    slices = [
+        np.column_stack([x[within], y[within], np.full(int(within.sum()), height), table[within]])
+        for height, table in zip(plan.grid.heights_m, plan.table, strict=True)
+    ]
+    return np.concatenate(slices)
+
+
+def csv_lines(plan: PlanMap) -> Iterator[str]:
+    """The table in pieces; empty fields where there is no fix."""
+    yield ",".join(("x_m", "y_m", "z_m", *PLAN_COLUMNS)) + "\n"
+    pattern = (
+        ",".join(["%.3f"] * 3 + ["%d" if k == ANCHORS_IN_VIEW else "%.4g" for k in range(len(PLAN_COLUMNS))]) + "\n"
+    )
+    for rows in _pieces(plan):
+        text = "".join([pattern % row for row in map(tuple, rows.tolist())])
+        yield text.replace("inf", "").replace("nan", "")
+
+
+def geojson_lines(plan: PlanMap, georeference: GeoreferenceSite | None) -> Iterator[str]:
+    """A FeatureCollection in pieces; null where there is no fix.
+
+    With a georeference of the site the coordinates are longitude and latitude as RFC 7946 requires; without one
+    they are the site's metres; a member ``skyless:frame`` names the frame.
+    """
+    frame = "WGS 84" if georeference else "site, metres"
+    yield f'{{"type":"FeatureCollection","skyless:frame":"{frame}","features":[\n'
+    keys = ",".join(f'"{name}":' + ("%d" if k == ANCHORS_IN_VIEW else "%.4g") for k, name in enumerate(PLAN_COLUMNS))
+    coordinates = "[%.8f,%.8f,%.3f]" if georeference else "[%.3f,%.3f,%.3f]"
+    geometry = f'"geometry":{{"type":"Point","coordinates":{coordinates}}}'
+    pattern = f'{{"type":"Feature",{geometry},"properties":{{{keys}}}}}'
+    first = True
+    for rows in _pieces(plan):
+        if georeference:
+            rows[:, :3] = to_wgs84(rows[:, :3], georeference)
+        text = ",\n".join([pattern % row for row in map(tuple, rows.tolist())])
+        yield ("" if first else ",\n") + text.replace(":inf", ":null").replace(":nan", ":null")
+        first = False
+    yield "\n]}\n"
+
+
+def _pieces(plan: PlanMap) -> Iterator[Matrix]:
+    rows = rows_of(plan)
+    for start in range(0, len(rows), _TABLE_ROWS):
+        yield rows[start : start + _TABLE_ROWS]

@@ -11,12 +11,12 @@ from matplotlib.image import AxesImage
 from msgspec import Struct
 
 from skyless.kernels.arrays import Array
-from skyless.planning.columns import ANCHORS, BIAS, FIX_SHARE, HDOP, PDOP, RMSE, SIGMA, VDOP
+from skyless.planning.columns import ANCHORS_IN_VIEW, BIAS, FIX_SHARE, HDOP, PDOP, RMSE, SIGMA, VDOP
 from skyless.planning.floor import Floor, floor_plan_box
 from skyless.planning.maps import PlanMap
 from skyless.site.model import Site
 
-NO_FIX: Final = "#d9d9d9"
+_NO_FIX: Final = "#d9d9d9"
 _EDGE: Final = "black"
 
 
@@ -31,9 +31,9 @@ class Layer(Struct, frozen=True):
 
 SIGMA_LAYER: Final = Layer(SIGMA, "predicted standard deviation", "cm", 100.0)
 RMSE_LAYER: Final = Layer(RMSE, "predicted RMSE, walls' delays included", "cm", 100.0)
-LAYERS: Final = (
+_LAYERS: Final = (
     SIGMA_LAYER,
-    Layer(ANCHORS, "anchors in view", "anchors"),
+    Layer(ANCHORS_IN_VIEW, "anchors in view", "anchors"),
     Layer(HDOP, "horizontal dilution of precision (HDOP)", ""),
     Layer(FIX_SHARE, "fixes of those possible", "%", 100.0),
 )
@@ -45,7 +45,7 @@ class Background(Struct, frozen=True):
     site: Site
     floor: Floor
     file: Path
-    """The site's file, beside which the image of the floor lies."""
+    """The site's file, next to which the image of the floor lies."""
     described: str
     """Method, noise and schedule, in words."""
 
@@ -53,7 +53,7 @@ class Background(Struct, frozen=True):
 def layers_for(plan: PlanMap) -> tuple[Layer, ...]:
     """The layers worth showing: RMSE only where walls bias positions, VDOP and PDOP only in 3-D."""
     bias = plan.column(BIAS)
-    layers = list(LAYERS)
+    layers = list(_LAYERS)
     if np.nanmax(np.where(np.isfinite(bias), bias, 0.0)) > 1e-4:
         layers.insert(1, RMSE_LAYER)
     if np.nanmax(plan.column(VDOP)) > 0.0:
@@ -63,14 +63,14 @@ def layers_for(plan: PlanMap) -> tuple[Layer, ...]:
 
 
 def draw_layer(plan: PlanMap, layer: Layer, background: Background) -> Figure:
-    """One layer, a slice beside the other for each height."""
+    """One layer, a slice for each height, next to each other."""
     grid = plan.grid
     heights = grid.heights_m
     x1, y1 = background.floor.outline_m.min(axis=0)
     x2, y2 = background.floor.outline_m.max(axis=0)
     width = 5.2 if len(heights) > 1 else 8.0
-    tall = float(np.clip(width * (y2 - y1) / (x2 - x1), 2.5, 1.4 * width)) + 1.5
-    figure = Figure(figsize=(width * len(heights) + 1.2, tall), layout="constrained")
+    height_in = float(np.clip(width * (y2 - y1) / (x2 - x1), 2.5, 1.4 * width)) + 1.5
+    figure = Figure(figsize=(width * len(heights) + 1.2, height_in), layout="constrained")
     figure.suptitle(f"{background.site.name}: {layer.title}\n{background.described}", fontsize=11)
     axes = np.atleast_1d(figure.subplots(1, len(heights), sharey=True))
     values = plan.column(layer.column) * layer.scale
@@ -89,7 +89,7 @@ def draw_layer(plan: PlanMap, layer: Layer, background: Background) -> Figure:
 def _norm(values: Array, layer: Layer) -> tuple[LogNorm | BoundaryNorm | None, Array | None]:
     """Colours: whole numbers for anchors, per cent from 0 to 100, else logarithmic between percentiles."""
     known = values[np.isfinite(values)]
-    if layer.column == ANCHORS:
+    if layer.column == ANCHORS_IN_VIEW:
         most = int(known.max(initial=1))
         every = max(1, (most + 1) // 12)
         bounds = np.arange(-0.5, most + every, every)
@@ -98,10 +98,10 @@ def _norm(values: Array, layer: Layer) -> tuple[LogNorm | BoundaryNorm | None, A
         return None, None
     low = max(float(np.percentile(known, 1)), 1e-6)
     high = max(float(np.percentile(known, 98)), 1.3 * low)
-    return LogNorm(low, high), _nice(low, high)
+    return LogNorm(low, high), _round_numbers(low, high)
 
 
-def _nice(low: float, high: float) -> Array:
+def _round_numbers(low: float, high: float) -> Array:
     """About six round numbers between two."""
     if high / low > 8.0:
         decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
@@ -122,22 +122,22 @@ def _slice(
     _image(axes, background)
     shown = np.where(grid.within, values, np.nan)
     extent = (*_extent(grid.x_m), *_extent(grid.y_m))
-    hopeless = grid.within & ~np.isfinite(values)
-    see_through = 0.75 if background.site.floor_plan else 1.0
+    without_fix = grid.within & ~np.isfinite(values)
+    opacity = 0.75 if background.site.floor_plan else 1.0
     axes.imshow(
-        np.where(hopeless, 1.0, np.nan), extent=extent, origin="lower", cmap="Greys", vmin=0.0, vmax=5.0,
+        np.where(without_fix, 1.0, np.nan), extent=extent, origin="lower", cmap="Greys", vmin=0.0, vmax=5.0,
         interpolation="nearest", zorder=1,
     )  # fmt: skip
     most = 100.0 if norm is None else None
     mesh = axes.imshow(
         np.where(np.isfinite(shown), shown, np.nan), extent=extent, origin="lower", cmap="cividis", norm=norm,
-        interpolation="nearest", alpha=see_through, zorder=2, vmin=None if most is None else 0.0, vmax=most,
+        interpolation="nearest", alpha=opacity, zorder=2, vmin=None if most is None else 0.0, vmax=most,
     )  # fmt: skip
     if isinstance(norm, LogNorm) and np.isfinite(shown).sum() > 3 and min(shown.shape) > 1:
         _contours(axes, plan, shown, norm, layer)
-    _furniture(axes, background)
-    if hopeless.any():
-        axes.plot([], [], "s", color=NO_FIX, label="no fix")
+    _site_plan(axes, background)
+    if without_fix.any():
+        axes.plot([], [], "s", color=_NO_FIX, label="no fix")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, fontsize=8, frameon=False)
     return mesh
 
@@ -148,7 +148,7 @@ def _extent(centres: Array) -> tuple[float, float]:
 
 
 def _contours(axes: Axes, plan: PlanMap, shown: Array, norm: LogNorm, layer: Layer) -> None:
-    levels = _nice(float(norm.vmin or 0.1), float(norm.vmax or 1.0))
+    levels = _round_numbers(float(norm.vmin or 0.1), float(norm.vmax or 1.0))
     clipped = np.where(np.isfinite(shown), np.minimum(shown, 2.0 * float(norm.vmax or 1.0)), np.nan)
     if len(levels) == 0 or not (np.nanmin(clipped) < levels[-1] and np.nanmax(clipped) > levels[0]):
         return
@@ -160,7 +160,7 @@ def _contours(axes: Axes, plan: PlanMap, shown: Array, norm: LogNorm, layer: Lay
 
 
 def _image(axes: Axes, background: Background) -> None:
-    """The image of the floor, under all."""
+    """The image of the floor, below everything else."""
     plan = background.site.floor_plan
     box = floor_plan_box(background.site, background.file)
     if plan is None or box is None:
@@ -171,7 +171,7 @@ def _image(axes: Axes, background: Background) -> None:
     axes.imshow(image, extent=(box[0], box[2], box[1], box[3]), zorder=0, cmap="gray")
 
 
-def _furniture(axes: Axes, background: Background) -> None:
+def _site_plan(axes: Axes, background: Background) -> None:
     """Outline, walls, and anchors with their identifiers; the master is a star."""
     site, outline = background.site, background.floor.outline_m
     closed = np.vstack([outline, outline[:1]])

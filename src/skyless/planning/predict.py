@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from skyless.kernels.arrays import Matrix
 from skyless.method_names import DEFAULT_METHOD, FILTERS
 from skyless.planning.anchor_clocks import anchor_clocks, relays_of
-from skyless.planning.columns import COLUMNS, SIGMA
+from skyless.planning.columns import PLAN_COLUMNS, SIGMA
 from skyless.planning.joint_sigma import fill_joint_sigma
 from skyless.planning.links import (
     AnchorLinks,
@@ -34,11 +34,11 @@ from skyless.site.slots import schedule_of
 
 Fill = Callable[[Matrix, Matrix], None]
 
-CHUNK: Final = 2000
-"""Points that a thread takes at once; ..."""
+_SNAPSHOT_CHUNK: Final = 2000
+"""Points that a thread computes at a time; ..."""
 
-FILTER_CHUNK: Final = 100
-"""... fewer for the filter, whose points are dear."""
+_FILTER_CHUNK: Final = 100
+"""... fewer for the filter, whose points take longer."""
 
 
 class PlanSettings(Struct, frozen=True):
@@ -48,7 +48,7 @@ class PlanSettings(Struct, frozen=True):
     noise_ps: float | None = None
     """Noise of every TX and RX stamp; None for the site's own figures."""
     qa: float = 0.3
-    """Agility that the filter assumes, m²/s³."""
+    """Process noise that the filter assumes: spectral density of the acceleration, m²/s³."""
     channel: ChannelModel = ChannelModel()
 
 
@@ -64,14 +64,14 @@ class Predictor:
         self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls)
         self.links: AnchorLinks = anchor_links(self.anchors_m, self.master, self.budget, self.walls)
         self.clocks = anchor_clocks(self.site, self.links.share)
-        self.scene = Scene(self.anchors_m, self.clocks.speaks, self.budget, self.walls)
+        self.scene = Scene(self.anchors_m, self.clocks.sends, self.budget, self.walls)
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
         if settings.method in FILTERS:
             self._fill = self._joint()
-            self._chunk = FILTER_CHUNK
+            self._chunk = _FILTER_CHUNK
         else:
             self._fill = self._snapshots(SnapshotMethod(settings.method))
-            self._chunk = CHUNK
+            self._chunk = _SNAPSHOT_CHUNK
 
     def _snapshots(self, method: SnapshotMethod) -> Fill:
         rounds = rounds_of(self.site, method)
@@ -91,12 +91,12 @@ class Predictor:
         )
 
     def at(self, points_m: Matrix, progress: Callable[[float], None] | None = None) -> Matrix:
-        """Predictions at points, shape (m, 3): a table (m, len(COLUMNS)); ``progress`` gets the points done."""
+        """Predictions at points, shape (m, 3): a table (m, len(PLAN_COLUMNS)); ``progress`` gets the points done."""
         return in_threads(self._fill, np.ascontiguousarray(points_m, np.float64), self._chunk, progress)
 
     def geometry_at(self, points_m: Matrix) -> Matrix:
-        """The same table with anchors in view and DOPs only; in the place of ``sigma_m`` the weighted PDOP."""
-        return in_threads(self._geometry, np.ascontiguousarray(points_m, np.float64), CHUNK)
+        """The same table with anchors in view and DOPs only; with the weighted PDOP in the column ``sigma_m``."""
+        return in_threads(self._geometry, np.ascontiguousarray(points_m, np.float64), _SNAPSHOT_CHUNK)
 
     def _geometry(self, points: Matrix, table: Matrix) -> None:
         share, _ = self.scene.heard_at(points)
@@ -113,7 +113,7 @@ def with_noise(site: Site, noise_ps: float | None) -> Site:
 
 def in_threads(fill: Fill, points_m: Matrix, chunk: int, progress: Callable[[float], None] | None = None) -> Matrix:
     """Fill a table of predictions for points, in pieces on all cores."""
-    table: Matrix = np.zeros((len(points_m), len(COLUMNS)))
+    table: Matrix = np.zeros((len(points_m), len(PLAN_COLUMNS)))
     starts = range(0, len(points_m), chunk)
     if len(starts) == 1:
         fill(points_m, table)

@@ -1,12 +1,12 @@
 """Predicted errors of the snapshot methods at points: the TDoAs' covariance through the geometry, G·Σ·Gᵀ.
 
-Where frames arrive only at times, fixes come from changing sets of anchors: the sets that the most doubtful anchors
+Where frames arrive only at times, fixes come from changing sets of anchors: the sets that the most uncertain anchors
 make are gone through one by one, each with its probability; other anchors count by whether they mostly take part.
 
-To the stamps' noise of ``uncertainty/tdoa.py`` comes what the crystals do between the stamps, which counts in long
-superframes: a TDoA with its pair at κ and κ + 1 rounds holds (1 + κ)·x(κ) − κ·x(κ + 1) − x(0) of a clock's phase x, and
-the anchor's own clock enters with the same weights. For the delayed messages and the bracketed form, which refer to
-the second message, it is (1 − κ)·x(κ + 1) + κ·x(κ) − x(1).
+The crystals' noise between the stamps, which matters in long superframes, is added to the stamps' noise of
+``uncertainty/tdoa.py``: a TDoA with its pair at κ and κ + 1 rounds holds (1 + κ)·x(κ) − κ·x(κ + 1) − x(0) of a clock's
+phase x, and the anchor's own clock enters with the same weights. For the delayed messages and the bracketed form, which
+refer to the second message, it is (1 − κ)·x(κ + 1) + κ·x(κ) − x(1).
 """
 
 from collections.abc import Iterator
@@ -19,22 +19,21 @@ from msgspec import Struct
 from skyless.clocks.filter import ClockNoise, clock_noise
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Array, Mask, Matrix, Vector
-from skyless.kernels.normal import inverse_of
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import FIX_SHARE, SIGMA, fill_errors
 from skyless.planning.links import AnchorLinks, Scene, fill_dops
-from skyless.positioning.methods.snapshots import SnapshotMethod
+from skyless.positioning.methods.locate import inverse_of
+from skyless.positioning.methods.snapshots import SnapshotMethod, bracketed_covariance, literal_covariance
 from skyless.site.model import Site
 from skyless.site.slots import first_slots, schedule_of
-from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance
 
-MOST_DOUBTFUL: Final = 4
-"""Anchors whose coming and going is followed exactly."""
+_MOST_UNCERTAIN: Final = 4
+"""Anchors whose presence and absence are both gone through."""
 
-DOUBT: Final = 0.01
-"""An anchor is sure to take part, or not to, beyond this."""
+_UNCERTAIN: Final = 0.01
+"""An anchor whose part is within this of 0 or 1 is sure not to take part, or to."""
 
-_KEPT: Final = 1e-3
+_LEAST_EIGENVALUE: Final = 1e-3
 """Part of the largest eigenvalue below which a common error is left out."""
 
 
@@ -53,7 +52,7 @@ class Rounds(Struct, frozen=True):
 
 
 def rounds_of(site: Site, method: SnapshotMethod) -> Rounds:
-    """What the snapshot methods meet at a site whose noise figures hold."""
+    """Errors of the snapshot methods' TDoAs at a site whose noise figures hold."""
     noise = site.noise
     tx_var, rx_var = stamp_variances(site)
     kappa, round_s = delays(site)
@@ -84,7 +83,7 @@ def delays(site: Site) -> tuple[Vector, float]:
 
 
 def phase_covariance(kappa: Vector, round_s: float, noise: ClockNoise, *, first: bool) -> Matrix:
-    """Covariance, m², of what one clock's noise does to TDoAs with these κ; shape (n, n)."""
+    """Covariance, m², of what one clock's noise contributes to TDoAs with these κ; shape (n, n)."""
     reference = 0.0 if first else 1.0
     near, far = (1.0 + kappa, -kappa) if first else (kappa, 1.0 - kappa)
     times = np.array([kappa, kappa + 1.0, np.full_like(kappa, reference)]) * round_s
@@ -105,7 +104,7 @@ def _phase(s: Matrix, t: Matrix, noise: ClockNoise) -> Matrix:
 
 def _factors(covariance: Matrix) -> Matrix:
     values, vectors = np.linalg.eigh(covariance)
-    kept = values > _KEPT * values[-1]
+    kept = values > _LEAST_EIGENVALUE * values[-1]
     factors: Matrix = np.ascontiguousarray(vectors[:, kept] * np.sqrt(values[kept]))
     return factors
 
@@ -139,15 +138,15 @@ def anchor_sets(part: Matrix) -> Iterator[tuple[Vector, Mask]]:
 
     ``part``: each anchor's part in the rounds, shape (m, n).
     """
-    uncertain = (part > DOUBT) & (part < 1.0 - DOUBT)
-    order = np.argsort(np.where(uncertain, np.abs(part - 0.5), np.inf), axis=1, kind="stable")[:, :MOST_DOUBTFUL]
+    uncertain = (part > _UNCERTAIN) & (part < 1.0 - _UNCERTAIN)
+    order = np.argsort(np.where(uncertain, np.abs(part - 0.5), np.inf), axis=1, kind="stable")[:, :_MOST_UNCERTAIN]
     order = order[:, np.take_along_axis(uncertain, order, axis=1).any(axis=0)]
-    doubtful, there = np.take_along_axis(uncertain, order, axis=1), np.take_along_axis(part, order, axis=1)
+    uncertain_here, there = np.take_along_axis(uncertain, order, axis=1), np.take_along_axis(part, order, axis=1)
     usual = part >= 0.5
     usual_here = np.take_along_axis(usual, order, axis=1)
     for present in product((False, True), repeat=order.shape[1]):
-        chances = np.where(doubtful, np.where(present, there, 1.0 - there), np.logical_not(present))
-        np.put_along_axis(usual, order, np.where(doubtful, present, usual_here), axis=1)
+        chances = np.where(uncertain_here, np.where(present, there, 1.0 - there), np.logical_not(present))
+        np.put_along_axis(usual, order, np.where(uncertain_here, present, usual_here), axis=1)
         yield chances.prod(axis=1), usual
 
 
@@ -168,10 +167,10 @@ def fill_snapshot_sigma(
     """
     share, delay_m = scene.heard_at(points)
     fill_dops(scene, points, share, dim, table)
-    part = share * share * np.where(rounds.usable & scene.speaks, links.share**2, 0.0)
+    part = share * share * np.where(rounds.usable & scene.sends, links.share**2, 0.0)
     part[:, master] = 0.0
     # of each point only the anchors that take part, in the order of how much
-    some = np.argsort(-part, axis=1, kind="stable")[:, : int((part > DOUBT).sum(axis=1).max())]
+    some = np.argsort(-part, axis=1, kind="stable")[:, : int((part > _UNCERTAIN).sum(axis=1).max())]
     part = np.take_along_axis(part, some, axis=1)
     towards = (_directions(scene.anchors[some], points) - _directions(scene.anchors[master], points))[..., :dim]
     late_m = np.take_along_axis(delay_m, some, axis=1) - delay_m[:, master, None] + links.delay_m[some]
@@ -184,18 +183,18 @@ def fill_snapshot_sigma(
         rows = np.flatnonzero((probability > 0.0) & (chosen.sum(axis=1) >= dim))
         gain = gains(towards[rows], chosen[rows] * weights[rows], rounds.assumed_common if weighted else 0.0)
         with np.errstate(invalid="ignore"):
-            said = variances(gain, assumed[rows], assumed_common[rows]).sum(axis=1)
-        good = said < farthest_m**2
+            predicted = variances(gain, assumed[rows], assumed_common[rows]).sum(axis=1)
+        good = predicted < farthest_m**2
         rows, gain = rows[good], gain[good]
         chance = probability[rows]
         shift = np.einsum("mna,mn->ma", gain, late_m[rows])
         fixes[rows] += chance
-        claimed[rows] += chance * said[good]
+        claimed[rows] += chance * predicted[good]
         bias[rows, :dim] += chance[:, None] * shift
         total[rows, :dim] += chance[:, None] * (variances(gain, true[rows], common[rows]) + shift * shift)
     table[:, SIGMA:] = np.inf
     table[:, FIX_SHARE] = fixes * share[:, master] ** 2
-    known = np.flatnonzero(table[:, FIX_SHARE] >= DOUBT)
+    known = np.flatnonzero(table[:, FIX_SHARE] >= _UNCERTAIN)
     shift = bias[known] / fixes[known, None]
     variance = np.maximum(total[known] / fixes[known, None] - shift * shift, 0.0)
     fill_errors(table, known, variance, (shift * shift).sum(axis=1), claimed[known] / fixes[known])

@@ -1,7 +1,7 @@
-"""Predictions against the simulated world: tags at rest at given points, each one's errors beside its prediction.
+"""Predictions against the simulated world: tags at rest at given points, each one's errors next to its prediction.
 
-Where the method is ``joint`` and the site's survey and ranges have errors, there are many worlds, each with errors
-drawn anew, and what is compared is the RMSE over all of them.
+Where the method is ``joint`` and the site's survey and ranges have errors, there are many worlds, each with its own
+errors, and what is compared is the RMSE over all of them.
 """
 
 import math
@@ -13,8 +13,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.evaluation.fleet import Fleet, FleetSettings
-from skyless.evaluation.room_world import Room
-from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.evaluation.scenarios import Request, Room, impairments_of
 from skyless.kernels.arrays import Matrix
 from skyless.method_names import FILTERS
 from skyless.planning.columns import CLAIMED, FIX_SHARE, RMSE, SIGMA
@@ -25,12 +24,12 @@ from skyless.simulation.trajectory import Static
 from skyless.site.model import AccuracySite
 from skyless.site.slots import schedule_of
 
-WARM_UP_S: Final = 3.0
-BATCH_ROUNDS: Final = 60
+_WARM_UP_S: Final = 3.0
+_BATCH_ROUNDS: Final = 60
 """Superframes that make a batch: longer than the filters remember, so that batches are independent."""
 
-WORLDS: Final = 20
-"""In which survey and ranges have errors drawn anew."""
+_WORLDS: Final = 20
+"""Each with its own errors of survey and ranges."""
 
 
 class PointCheck(Struct, frozen=True):
@@ -87,23 +86,23 @@ class _Batches:
         total = rows.sum(axis=0)
         mean = total[1:4] / total[0]
         variance, mean_square = total[4] / total[0] - mean @ mean, total[4] / total[0]
-        spread = rows[:, 4] - rows[:, 0] * mean_square
+        excess = rows[:, 4] - rows[:, 0] * mean_square
         if about_mean:
-            spread += 2.0 * (rows[:, 0] * (mean @ mean) - rows[:, 1:4] @ mean)
+            excess += 2.0 * (rows[:, 0] * (mean @ mean) - rows[:, 1:4] @ mean)
         count, judged = len(rows), variance if about_mean else mean_square
-        error = np.sqrt((spread @ spread) * count / max(count - 1, 1)) / (total[0] * judged)
+        error = np.sqrt((excess @ excess) * count / max(count - 1, 1)) / (total[0] * judged)
         return float(np.sqrt(variance)), float(np.sqrt(mean_square)), float(error / 2.0)
 
 
 def random_points(plan: PlanMap, count: int, seed: int) -> Matrix:
-    """So many points, evenly random over a map's region and between its heights, shape (count, 3)."""
+    """Points evenly random over a map's region and between its heights, shape (count, 3)."""
     grid, random = plan.grid, np.random.default_rng(seed)
     half = 0.5 * grid.step_m
     y, x = np.nonzero(grid.within)
     chosen = random.integers(len(x), size=count)
-    places = np.column_stack([grid.x_m[x[chosen]], grid.y_m[y[chosen]]]) + random.uniform(-half, half, (count, 2))
+    flat = np.column_stack([grid.x_m[x[chosen]], grid.y_m[y[chosen]]]) + random.uniform(-half, half, (count, 2))
     levels = random.uniform(grid.heights_m.min(), grid.heights_m.max(), count)
-    points: Matrix = np.column_stack([places, levels])
+    points: Matrix = np.column_stack([flat, levels])
     return points
 
 
@@ -114,13 +113,13 @@ def verify(
     seed: int,
     progress: Callable[[float], None] | None = None,
 ) -> Verification:
-    """Let a tag rest at each point, shape (m, 3), for so many superframes, and compare."""
+    """Let a tag rest at each point, shape (m, 3), for ``rounds`` superframes, and compare."""
     site, settings = predictor.site, predictor.settings
     superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
-    worlds = 1 if settings.method != "joint" or site.accuracy.is_exact else WORLDS
+    worlds = 1 if settings.method != "joint" or site.accuracy.is_exact else _WORLDS
     rounds = max(rounds // worlds, 1)
     still = [Static(*point) for point in points_m.tolist()]
-    warm_up_s = max(WARM_UP_S, 60.0 * superframe_s)
+    warm_up_s = max(_WARM_UP_S, 60.0 * superframe_s)
     batches = [_Batches() for _ in still]
     end_s = warm_up_s + rounds * superframe_s
     for world in range(worlds):
@@ -133,7 +132,7 @@ def verify(
             now_s = min(now_s + 0.25, end_s)
             for judged in fleet.run(now_s):
                 if judged.time_s >= warm_up_s:
-                    batch = int(judged.time_s / (BATCH_ROUNDS * superframe_s)) if worlds == 1 else world
+                    batch = int(judged.time_s / (_BATCH_ROUNDS * superframe_s)) if worlds == 1 else world
                     batches[judged.tag].add(batch, judged.error_m)
             if progress is not None:
                 progress((world + now_s / end_s) / worlds)

@@ -14,7 +14,7 @@ from skyless.positioning.integrity import Alert, Integrity, IntegrityRequirement
 if TYPE_CHECKING:
     from skyless.uncertainty.dop import Dops
 
-# What fixes carry: rows of three numbers in one array, which costs less than an array for each.
+# What fixes carry: rows of three numbers in one array, which costs less than separate arrays.
 
 POSITION: Final = 0
 """The position, then three rows of its covariance."""
@@ -47,13 +47,13 @@ class NoFixReason(StrEnum):
 class Fix(Struct, frozen=True, gc=False):
     """One position with all that is known of its quality. SI units, site frame.
 
-    It keeps what the method wrote as it is, and takes it apart when it is asked: arrays are read-only views.
+    It keeps the rows as the method wrote them; arrays are read-only views, made when they are read.
     """
 
     time_s: float
     """Master time at which the position holds, since the receiver's first fix."""
     rows: bytes
-    """Rows of float64 (``POSITION`` and the following), without those of which the method knows nothing."""
+    """Rows of float64 (``POSITION`` and the following), as far as the method knows them."""
     anchors: tuple[int, ...]
     """Identifiers of the anchors in use, the reference first."""
     anchors_m: Array
@@ -63,7 +63,7 @@ class Fix(Struct, frozen=True, gc=False):
     """True for 2-D positioning at a given height."""
     dof: int = 1
     """Degrees of freedom of ``chi2``; 1 for the running mean of a filter."""
-    asked: IntegrityRequirement | None = None
+    requirement: IntegrityRequirement | None = None
     """What the protection levels answer; None for methods that know none."""
 
     def __repr__(self) -> str:
@@ -105,10 +105,10 @@ class Fix(Struct, frozen=True, gc=False):
     @property
     def integrity(self) -> Integrity | None:
         """Protection levels, and whether they can be relied on; None for methods that know none."""
-        asked = self.asked
-        if asked is None:
+        requirement = self.requirement
+        if requirement is None:
             return None
-        return integrity_of(_row(self.rows, PROTECTION), asked.risk, self.height_known, asked.alert_limit_m)
+        return integrity_of(_row(self.rows, PROTECTION), requirement.risk, self.height_known, requirement.alert_limit_m)
 
     @property
     def hpl_m(self) -> float | None:
@@ -125,7 +125,7 @@ class Fix(Struct, frozen=True, gc=False):
     @property
     def integrity_risk(self) -> float | None:
         """None for methods that know no protection levels."""
-        return None if self.asked is None else self.asked.risk
+        return None if self.requirement is None else self.requirement.risk
 
     @property
     def alert(self) -> Alert | None:
@@ -151,13 +151,13 @@ _ROW: Final = Format("3d")
 ROW_BYTES: Final = _ROW.size
 
 
-def _row(rows: bytes, place: int) -> tuple[float, ...]:
-    return _ROW.unpack_from(rows, place * ROW_BYTES)
+def _row(rows: bytes, row: int) -> tuple[float, ...]:
+    return _ROW.unpack_from(rows, row * ROW_BYTES)
 
 
-def _vector(rows: bytes, place: int) -> Array:
-    return np.frombuffer(rows, count=3, offset=place * ROW_BYTES)
+def _vector(rows: bytes, row: int) -> Array:
+    return np.frombuffer(rows, count=3, offset=row * ROW_BYTES)
 
 
-def _matrix(rows: bytes, place: int) -> Array:
-    return np.frombuffer(rows, count=9, offset=place * ROW_BYTES).reshape(3, 3)
+def _matrix(rows: bytes, row: int) -> Array:
+    return np.frombuffer(rows, count=9, offset=row * ROW_BYTES).reshape(3, 3)

@@ -17,7 +17,7 @@ MARGIN: Final = 1.05
 
 
 class Alert(StrEnum):
-    """What a fix says of its integrity."""
+    """What a fix states of its integrity."""
 
     NONE = "none"
     EXCLUDED = "detected-excluded"
@@ -31,7 +31,7 @@ HPL, VPL, STATE = range(3)
 
 SOUND, OBSTRUCTED, CONTRADICTED, UNAVAILABLE = range(4)
 """... a position without known faults, with anchors whose range error has jumped or was wrong from the start, with a
-fault that the levels may not cover, and one of which nothing can be promised."""
+fault that the levels may not cover, and one without levels."""
 
 _ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
 
@@ -40,7 +40,7 @@ class Integrity(Struct, frozen=True, gc=False):
     """How wrong a fix may be."""
 
     hpl_m: float | None
-    """The horizontal error is larger with a probability of at most ``risk``; None if nothing can be promised."""
+    """The horizontal error is larger with a probability of at most ``risk``; None if there is no level."""
     vpl_m: float | None
     """As well for the vertical error; None also where the height is given."""
     risk: float
@@ -49,7 +49,7 @@ class Integrity(Struct, frozen=True, gc=False):
 
 
 class IntegrityRequirement(Struct, frozen=True):
-    """What an application asks of the levels.
+    """What an application requires of the levels.
 
     Raises:
         ValueError: the risk is not between 0 and 0.1, the limit or the height's is not a length, or the acceleration
@@ -59,9 +59,9 @@ class IntegrityRequirement(Struct, frozen=True):
     risk: float = RISK
     """Probability, for each fix, that an error exceeds its protection level."""
     alert_limit_m: float | None = None
-    """Fixes with a higher horizontal protection level say so."""
+    """Fixes with a higher horizontal protection level have an alert."""
     max_acceleration_mps2: float = 0.0
-    """The tag's largest acceleration, which the levels then cover whatever its agility; 0 where it is not known."""
+    """The tag's largest acceleration, which the levels then cover beyond the process noise; 0 where it is not known."""
     height_std_m: float = 0.0
     """Standard deviation of the tag's height from the one that is given, which fixes then count."""
 
@@ -75,9 +75,9 @@ class IntegrityRequirement(Struct, frozen=True):
 
 
 def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert_limit_m: float | None) -> Integrity:
-    """What ``protect`` has filled in, in words.
+    """The levels that ``protect`` has written, as values.
 
-    While an anchor's fault is in the fix the levels cover it, up to a size beyond which nothing is promised.
+    While an anchor's fault is in the fix the levels cover it, up to a size beyond which there is none.
     """
     state = int(levels[STATE])
     if state >= CONTRADICTED:

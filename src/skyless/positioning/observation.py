@@ -13,7 +13,7 @@ from skyless.ticks import nearest
 
 
 class Observation(Struct, frozen=True, gc=False):
-    """A beacon heard by the tag; integers never wrap."""
+    """A beacon received by the tag; integers never wrap."""
 
     anchor: int
     anchor_m: Array
@@ -25,7 +25,7 @@ class Observation(Struct, frozen=True, gc=False):
     rx_ticks_tag: int
     tx_ticks_anchor: int
     master_sequence: int | None
-    """... the sequence number of the last master beacon that the anchor heard, ..."""
+    """... the sequence number of the last master beacon that the anchor received, ..."""
     master_rx_ticks_anchor: int | None
     """... and the anchor's RX stamp of it."""
     tx_ticks_master: int | None
@@ -34,13 +34,13 @@ class Observation(Struct, frozen=True, gc=False):
     tx_variance_m2: float
     """Variance of the TX time on the master's scale, from the anchor's clock filter."""
     relays: tuple[tuple[int, int, int], ...] = ()
-    """When the anchor heard others: (anchor, sequence number, own RX stamp, unwrapped); for ``joint`` only."""
-    claim: MasterTerm | None = None
+    """When the anchor received others: (anchor, sequence number, own RX stamp, unwrapped); for ``joint`` only."""
+    master_term: MasterTerm | None = None
     """Whose time ``tx_ticks_master`` is; for ``joint`` only."""
     rx_variance_factor: float = 1.0
-    """On the variance of this reception, at least 1: what the radio's diagnostics say (``first_path``)."""
+    """On the variance of this reception, at least 1: from the radio's diagnostics (``variance_factor``)."""
     packed_relays: bytes = b""
-    """Relays beside ``relays``, as frames carry them (``codec.packed_relays``)."""
+    """Relays besides ``relays``, as frames carry them (``codec.packed_relays``)."""
 
     def all_relays(self) -> Iterator[tuple[int, int, int]]:
         """``relays`` and ``packed_relays``."""
@@ -52,6 +52,9 @@ class Observation(Struct, frozen=True, gc=False):
 class Method(Protocol):
     """A positioning method: observations in, fixes out."""
 
-    def hear(self, observation: Observation) -> Fix | NoFixReason:
-        """Take one observation; a fix, or why there is none yet."""
+    needs_relays: bool
+    """Whether observations carry relays and the master's term, instead of rounds and stamps of the master's frames."""
+
+    def update(self, observation: Observation) -> Fix | NoFixReason:
+        """Process one observation; a fix, or why there is none yet."""
         ...

@@ -1,4 +1,4 @@
-"""What a daemon asks of a radio, and no more."""
+"""The narrow interface between a program and its radio."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from skyless.constants import DEFAULT_ANTENNA_DELAY_TICKS
 
 
 class AntennaDelays(Struct, frozen=True):
-    """What a radio of hardware is to take off its stamps, in ticks."""
+    """What a hardware radio subtracts from its stamps, in ticks."""
 
     tx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
     rx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
@@ -34,7 +34,7 @@ class Restarted(Struct, frozen=True, gc=False):
 
 
 class Gone(Struct, frozen=True, gc=False):
-    """The radio does not answer; it is being looked for."""
+    """The radio does not answer; it looks for it by itself."""
 
     reason: str
 
@@ -50,19 +50,23 @@ Listener = Callable[[RadioEvent], None]
 """Called from the event loop as soon as something happens; must return quickly and not raise."""
 
 
+def ignore(_event: object) -> None:
+    """The listener of a radio that does not run yet."""
+
+
 class Radio(Protocol):
     """One radio. It is used from one event loop."""
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
 
     @property
     def counters(self) -> Counter[str]:
         """What was lost or could not be used on the way from the radio, by reason."""
 
     async def run(self, listener: Listener) -> None:
-        """Configure the radio and receive until cancelled; finds a radio that went away again by itself."""
+        """Configure the radio and receive until cancelled; a radio that has gone is looked for by itself."""
 
     def advice(self) -> str:
         """Where to look when nothing has come from it for some seconds; without numbers that change."""
@@ -71,4 +75,4 @@ class Radio(Protocol):
         """The radio's 40-bit counter now, to about 0.1 ms; None while the radio is not ready."""
 
     def transmit(self, transmission: Transmission) -> None:
-        """Send a frame so that its RMARKER leaves at ``tx_ticks``; ``Sent`` or ``Late`` tells what became of it."""
+        """Send a frame so that its RMARKER leaves at ``tx_ticks``; answered by ``Sent`` or ``Late``."""

@@ -8,7 +8,7 @@ from typing import Final
 
 from skyless.air.masterless_packets import Point
 from skyless.errors import ConfigurationError
-from skyless.positioning.masterless.calibration import AnchorCalibration, DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.recordings.source import finite, read_lines
 
 ANCHOR_COLUMNS: Final = ("id", "x_m", "y_m", "z_m")

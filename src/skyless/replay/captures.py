@@ -16,9 +16,9 @@ from skyless.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.errors import SkylessError
 from skyless.evaluation.judge import Judge, Judgement
 from skyless.evaluation.statistics import EvenSample
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.masterless.calibration import DifferenceCalibration
+from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
 from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.positioning.masterless.pair_engine import PairEngine
@@ -107,7 +107,7 @@ class ByPairs:
         pairs: Sequence[PairTdoa]
         if isinstance(record, Packet):
             assert self._engine is not None
-            pairs = self._engine.hear(record)
+            pairs = self._engine.on_packet(record)
         else:
             pairs = (record,)
         self._made = False
@@ -115,7 +115,7 @@ class ByPairs:
             return None
         for pair in pairs:
             self._noise.add(pair)
-        self._made = self._tracking.hear(pairs)
+        self._made = self._tracking.update(pairs)
         return pairs[0].time_s
 
     @property
@@ -160,10 +160,10 @@ class ByPackets:
         """Process one packet; its time."""
         assert isinstance(record, Packet)
         if self._heard % _SAMPLED_OF < _SAMPLED:
-            for pair in self._engine.hear(record):
+            for pair in self._engine.on_packet(record):
                 self._noise.add(pair)
         self._heard += 1
-        self._fix = self._tracking.hear(record)
+        self._fix = self._tracking.on_packet(record)
         return self._tracking.time_s
 
     @property

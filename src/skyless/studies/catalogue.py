@@ -7,9 +7,8 @@ from typing import Any, Final
 from msgspec.structs import replace
 
 from skyless.studies import (
-    efficiency_rows,
+    efficiency,
     integrity,
-    integrity_picture,
     loss,
     motion,
     nlos,
@@ -38,8 +37,8 @@ STUDIES: Final = {
         Study(
             "efficiency",
             "RMSE over the Cramér–Rao bound",
-            efficiency_rows.cells,
-            efficiency_rows.rows,
+            efficiency.cells,
+            efficiency.rows,
             partial(draw, Look("RMSE over the Cramér–Rao bound", ("ratio", "nees"))),
         ),
         replace(
@@ -59,7 +58,7 @@ STUDIES: Final = {
             "protection levels with one faulty anchor",
             integrity.cells,
             integrity.rows,
-            integrity_picture.draw,
+            integrity.draw,
         ),
         replace(
             _of_worlds("room", "the room", room.cases, Look("The room", ("rmse", "nees", "level", "exceeded"))),

@@ -1,42 +1,56 @@
-"""How near ``joint`` comes to the Cramér–Rao bound: matched constant-velocity episodes in the lab.
+"""The study ``efficiency``: how near ``joint`` comes to the Cramér–Rao bound in matched episodes in the lab.
 
 Each episode lasts two seconds; errors count after each of its last 20 superframes, as the bound does. The filter
 assumes the very noise that the episodes have. Two bounds are given with mesh: of all receptions, and of those that had
 come in by then.
 """
 
-from concurrent.futures import Executor, ThreadPoolExecutor
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct
 from scipy.stats import chi2
 
-from skyless.evaluation.lab_bound import LAST, SPEED_STD_MPS, WHITE_FM
+from skyless.errors import SkylessError
 from skyless.kernels.arrays import Array
-from skyless.kernels.compiled import cores
 from skyless.positioning.estimator.estimator import Estimator
 from skyless.site.lab import ideal_lab_site
-from skyless.studies.episodes import Case, Episode, draw_episode, settings_of
+from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, Case, Episode, draw_episode, settings_of
+from skyless.studies.plan import Cell, Plan, Row
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
-START_STD_M: Final = 0.3
-"""The filter starts so far off, per axis; after two seconds nothing of it is left."""
+_JUDGED_SUPERFRAMES: Final = 20
+"""At the end of an episode."""
 
-CHUNK: Final = 50
-"""Episodes that a thread takes at a time."""
+_START_STD_M: Final = 0.3
+"""Error of the filter's start, per axis; after two seconds nothing of it is left."""
 
-NOISE_AND_AGILITY: Final = ((100.0, 1e-9, 0.5), (150.0, 1e-9, 0.5), (100.0, 1e-9, 2.0), (100.0, 1e-8, 0.5))
-CASES: Final = tuple(
+_CHUNK_EPISODES: Final = 50
+"""Of a cell."""
+
+_EPISODE_COST_S: Final = 0.02
+"""About what an episode and its bounds take."""
+
+_MAX_RATIO: Final = 1.02
+
+_NOISES_PS: Final = (100.0, 150.0)
+_WALKS: Final = (1e-9, 1e-8)
+_QAS_M2PS3: Final = (0.5, 2.0)
+_MESHES: Final = ((False, False), (True, False), (True, True))
+"""Without; relayed with an anchor's next frame; known at once."""
+
+EFFICIENCY_CASES: Final = tuple(
     Case(noise_ps, walk, qa, mesh, at_once)
-    for noise_ps, walk, qa in NOISE_AND_AGILITY
-    for mesh, at_once in ((False, False), (True, False), (True, True))
+    for mesh, at_once in _MESHES
+    for noise_ps in _NOISES_PS
+    for walk in _WALKS
+    for qa in _QAS_M2PS3
 )
-"""Stamp noise, random walk and agility, each without mesh, with it, and with receptions that are known at once."""
 
 
 class Efficiency(Struct, frozen=True):
-    """What the episodes of one case came to; lengths are root mean squares over the last superframes."""
+    """Results of the episodes of one case; lengths are root mean squares over the last superframes."""
 
     case: Case
     episodes: int
@@ -44,7 +58,7 @@ class Efficiency(Struct, frozen=True):
     ratio_error: float
     """Standard error of ``ratio``; both errors and bound vary with the path."""
     said_m: float
-    """What the filter's covariance says."""
+    """Predicted by the filter's covariance."""
     bound_m: float
     """Of all receptions that the anchors have made."""
     arrived_bound_m: float
@@ -60,20 +74,8 @@ class Efficiency(Struct, frozen=True):
         return self.rmse_m / self.arrived_bound_m
 
 
-def efficiency(case: Case, episodes: int, seed: int, pool: Executor | None = None) -> Efficiency:
-    """Run the episodes of a case; they depend on the seed and their number alone."""
-    seeds = np.random.SeedSequence(seed).spawn(episodes)
-    chunks = [(case, seeds[first : first + CHUNK]) for first in range(0, episodes, CHUNK)]
-    if pool is None:
-        with ThreadPoolExecutor(cores()) as own:
-            parts = list(own.map(run_chunk, *zip(*chunks, strict=True)))
-    else:
-        parts = list(pool.map(run_chunk, *zip(*chunks, strict=True)))
-    return summary(case, np.concatenate(parts))
-
-
 def summary(case: Case, rows: Array) -> Efficiency:
-    """What episodes come to; a row for each of them, as ``run_chunk`` gives it."""
+    """Results of episodes; ``rows`` has one for each of them, as ``run_chunk`` returns it."""
     episodes = len(rows)
     squared, said, bound, arrived, nees = rows.mean(axis=0)
     excess = rows[:, 0] - squared / arrived * rows[:, 3]
@@ -101,7 +103,7 @@ def _run(case: Case, draw: np.random.Generator) -> list[float]:
     anchors = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     episode = draw_episode(draw, anchors, site.schedule.slot_s, case)
     motions, variances = _filtered(case, anchors, episode, draw)
-    ends = np.arange(len(anchors) - 1, len(motions), len(anchors))[-LAST:]
+    ends = np.arange(len(anchors) - 1, len(motions), len(anchors))[-_JUDGED_SUPERFRAMES:]
     errors = motions[ends, :2] - episode.path_m[ends, :2]
     covariances = variances[ends].reshape(-1, 2, 2)
     bounds = [_bound(case, anchors, episode, site.schedule.slot_s, at_once) for at_once in (True, False)]
@@ -116,8 +118,8 @@ def _run(case: Case, draw: np.random.Generator) -> list[float]:
 
 def _filtered(case: Case, anchors: Array, episode: Episode, draw: np.random.Generator) -> tuple[Array, Array]:
     estimator = Estimator(settings_of(case, height_m=0.0), anchors)
-    start = episode.path_m[0, :2] + draw.normal(0.0, START_STD_M, 2)
-    estimator.start(int(episode.packets.rx_ticks[0]), start, START_STD_M**2 * np.eye(2), SPEED_STD_MPS**2)
+    start = episode.path_m[0, :2] + draw.normal(0.0, _START_STD_M, 2)
+    estimator.start(int(episode.packets.rx_ticks[0]), start, _START_STD_M**2 * np.eye(2), EPISODE_SPEED_STD_MPS**2)
     frames = len(episode.path_m)
     motions, variances = np.empty((frames, 4)), np.empty((frames, 4))
     estimator.track(episode.packets, motions, variances)
@@ -131,9 +133,75 @@ def _bound(case: Case, anchors: Array, episode: Episode, slot_s: float, at_once:
         random_walk_fm=case.random_walk_fm,
         qa=case.qa,
         slot_s=slot_s,
-        speed_std_mps=SPEED_STD_MPS,
+        speed_std_mps=EPISODE_SPEED_STD_MPS,
         mesh=case.mesh,
         at_once=at_once,
     )
-    bound = tracking_bound(anchors, episode.path_m, settings)[-LAST:]
+    bound = tracking_bound(anchors, episode.path_m, settings)[-_JUDGED_SUPERFRAMES:]
     return float(np.trace(bound, axis1=1, axis2=2).mean())
+
+
+def cells(plan: Plan) -> list[Cell]:
+    """Episodes in chunks.
+
+    Raises:
+        SkylessError: the method is not one that can be fed with an episode's stamps.
+    """
+    if plan.method != "joint":
+        raise SkylessError(f"--method is {plan.method!r}; the study efficiency is about joint, whose bound it computes")
+    return [
+        Cell(
+            _name(case),
+            _run_cell,
+            (case, tuple(seeds[first : first + _CHUNK_EPISODES])),
+            _EPISODE_COST_S * _CHUNK_EPISODES,
+        )
+        for case in EFFICIENCY_CASES
+        for seeds in [np.random.SeedSequence(plan.seed).spawn(plan.episodes)]
+        for first in range(0, plan.episodes, _CHUNK_EPISODES)
+    ]
+
+
+def _run_cell(chunk: tuple[Case, tuple[np.random.SeedSequence, ...]]) -> Array:
+    case, seeds = chunk
+    return run_chunk(case, list(seeds))
+
+
+def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
+    """A row for each case; the results stand in the order of ``cells``."""
+    each = -(-plan.episodes // _CHUNK_EPISODES)
+    return [
+        _row(case, np.concatenate(results[each * number : each * (number + 1)]))
+        for number, case in enumerate(EFFICIENCY_CASES)
+    ]
+
+
+def _row(case: Case, episodes: Array) -> Row:
+    found = summary(case, episodes)
+    low, high = found.nees_interval
+    return Row(
+        study="efficiency",
+        method="joint",
+        case=_name(case),
+        series="at once" if case.at_once else "with mesh" if case.mesh else "without mesh",
+        x=None,
+        mesh=case.mesh,
+        noise_ps=case.noise_ps,
+        runs=found.episodes,
+        fixes=found.episodes,
+        rmse_m=found.rmse_m,
+        rmse_error_m=float(episodes[:, 0].std() / np.sqrt(len(episodes)) / (2.0 * found.rmse_m)),
+        said_m=found.said_m,
+        nees=found.nees / 2.0,
+        nees_interval=(low / 2.0, high / 2.0),
+        bound_m=found.arrived_bound_m,
+        ratio=found.ratio,
+        ratio_error=found.ratio_error,
+        limit=_MAX_RATIO,
+        passed=found.ratio <= _MAX_RATIO,
+    )
+
+
+def _name(case: Case) -> str:
+    mesh = "at once" if case.at_once else "mesh" if case.mesh else "no mesh"
+    return f"{case.noise_ps:.0f} ps, {case.random_walk_fm:.0e}, qa {case.qa:g}, {mesh}"

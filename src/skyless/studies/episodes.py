@@ -1,7 +1,7 @@
 """Episodes of one tag in the lab, simulated to the stamps alone: quick to draw, with just the noise of the bounds.
 
-Every oscillator has white and random-walk frequency noise, every TX stamp an error that all who hear the frame
-share, every RX stamp its own. Stamps are whole ticks.
+Every oscillator has white and random-walk frequency noise, every TX stamp an error that all
+receivers of the frame share, every RX stamp its own. Stamps are whole ticks.
 """
 
 from typing import Final
@@ -11,14 +11,19 @@ from msgspec import Struct
 from numpy.random import Generator
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.evaluation.lab_bound import SUPERFRAMES, WHITE_FM, random_path
 from skyless.kernels.arrays import Array, Integers
 from skyless.positioning.estimator.estimator import Packets
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings
 
-CRYSTALS_PPM: Final = 10.0
-SPREAD_M: Final = 1e6
-"""Of what the counters show at the start."""
+EPISODE_SUPERFRAMES: Final = 134
+"""Two seconds, after which nothing of what was known before the first frame is left."""
+EPISODE_SPEED_STD_MPS: Final = 0.4
+"""Of each component of a tag's velocity at the start."""
+WHITE_FM: Final = 2e-11
+
+_CRYSTALS_PPM: Final = 10.0
+_OFFSETS_M: Final = 1e6
+"""Range of the counters at the start."""
 
 
 class Case(Struct, frozen=True):
@@ -29,21 +34,21 @@ class Case(Struct, frozen=True):
     random_walk_fm: float = 1e-9
     qa: float = 0.5
     mesh: bool = False
-    """Whether all anchors relay whom they hear, not only when they heard the master."""
+    """Whether anchors relay their receptions of all anchors, not only of the master."""
     at_once: bool = False
-    """Whether what an anchor heard is known at once, not with its next frame."""
+    """Whether an anchor's reception is known at once, not with its next frame."""
 
 
 class Episode(Struct, frozen=True):
-    """What one tag heard, and where it was."""
+    """Receptions of one tag, and its path."""
 
     packets: Packets
     path_m: Array
-    """Place at each frame, shape (frames, 3)."""
+    """Position at each frame, shape (frames, 3)."""
 
 
 def draw_episode(
-    draw: Generator, anchors_m: Array, slot_s: float, case: Case, superframes: int = SUPERFRAMES
+    draw: Generator, anchors_m: Array, slot_s: float, case: Case, superframes: int = EPISODE_SUPERFRAMES
 ) -> Episode:
     """Draw one episode: the tag starts in the middle half of the room, one frame of each anchor in a superframe."""
     n = len(anchors_m)
@@ -66,8 +71,19 @@ def draw_episode(
     return Episode(packets, path_m)
 
 
+def random_path(draw: Generator, middle: Array, half: Array, step_s: float, steps: int, qa: float) -> Array:
+    """Positions every ``step_s`` of a tag with random acceleration, shape (steps, 3), at height 0."""
+    start, velocity = draw.uniform(middle - half, middle + half), draw.normal(0.0, EPISODE_SPEED_STD_MPS, 2)
+    kicks = draw.normal(size=(2, steps - 1, 2)) * np.sqrt(qa * step_s)
+    velocities = velocity + np.vstack([np.zeros(2), np.cumsum(kicks[0], axis=0)])
+    moves = step_s * (velocities[:-1] + kicks[0] / 2.0 + kicks[1] / np.sqrt(12.0))
+    path = np.zeros((steps, 3))
+    path[:, :2] = start + np.vstack([np.zeros(2), np.cumsum(moves, axis=0)])
+    return path
+
+
 def settings_of(case: Case, height_m: float | None) -> EstimatorSettings:
-    """What a filter has to assume for an episode to be just what it assumes."""
+    """The settings of a filter whose model is exactly that of an episode."""
     light2 = SPEED_OF_LIGHT_MPS**2
     stamp = light2 * (case.noise_ps * 1e-12) ** 2
     return EstimatorSettings(
@@ -95,16 +111,16 @@ def _clocks(draw: Generator, frames: int, clocks: int, step_s: float, random_wal
     walks = kicks[0] * (random_walk_fm * light * np.sqrt(step_s))
     own = kicks[1] * (light * np.sqrt(step_s * (WHITE_FM**2 + random_walk_fm**2 * step_s**2 / 12.0)))
     rates = np.empty((frames, clocks))
-    rates[0] = draw.uniform(-CRYSTALS_PPM, CRYSTALS_PPM, clocks) * (1e-6 * light)
+    rates[0] = draw.uniform(-_CRYSTALS_PPM, _CRYSTALS_PPM, clocks) * (1e-6 * light)
     rates[1:] = rates[0] + np.cumsum(walks, axis=0)
     offsets = np.empty((frames, clocks))
-    offsets[0] = draw.uniform(0.0, SPREAD_M, clocks)
+    offsets[0] = draw.uniform(0.0, _OFFSETS_M, clocks)
     offsets[1:] = offsets[0] + np.cumsum(rates[:-1] * step_s + walks * (step_s / 2.0) + own, axis=0)
     return offsets, rates
 
 
 def _relays(rx_ticks: Integers, senders: Integers, n: int, case: Case) -> tuple[Integers, Integers]:
-    """Who heard whom when, in the order in which the tag gets to know it, and where each frame's share ends."""
+    """Rows of (listener, sender, sequence, RX ticks) in the order in which the tag gets them, and where frames end."""
     frames = np.arange(len(senders))
     rows = []
     for back in range(1, n):

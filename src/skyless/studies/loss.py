@@ -1,4 +1,4 @@
-"""How the error grows with the share of messages that are lost: at the tags alone, or between anchors as well."""
+"""The study ``loss``: how the error grows with the share of lost messages, at the tags or between anchors as well."""
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -6,17 +6,15 @@ from typing import Any, Final
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.studies.lab_setup import walking
 from skyless.studies.plan import Plan, Row, seed_of
 from skyless.studies.summary import RAW_METHODS, Case, world_rows
-from skyless.studies.worlds import Run
-from skyless.uncertainty.bounds import bound_settings
-from skyless.uncertainty.loss_bound import known_receptions, received_bound
+from skyless.studies.worlds import Run, walking
+from skyless.uncertainty.bounds import bound_settings, known_receptions, received_bound
 
-SHARES: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-QUICK: Final = (0.3, 0.5, 0.7, 0.9)
-LIMITS: Final = {0.5: 1.3, 0.9: 2.5}
-CLEAN: Final = "nothing lost"
+_SHARES: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+_QUICK_SHARES: Final = (0.3, 0.5, 0.7, 0.9)
+_MAX_RATIOS: Final = {0.5: 1.3, 0.9: 2.5}
+_NOTHING_LOST: Final = "nothing lost"
 
 AT_TAGS: Final = "lost at tags"
 EVERYWHERE: Final = "lost everywhere"
@@ -24,12 +22,18 @@ EVERYWHERE: Final = "lost everywhere"
 
 def cases(plan: Plan) -> list[Case]:
     """Both kinds of loss, one case for each share."""
-    clean = walking(plan)
-    shares = QUICK if plan.quick else SHARES
+    nothing_lost = walking(plan)
+    shares = _QUICK_SHARES if plan.quick else _SHARES
     return [
-        Case(CLEAN, AT_TAGS, 0.0, clean, CLEAN),
-        *(Case(_name(s, AT_TAGS), AT_TAGS, s, walking(plan, lost_at_tags=s), CLEAN, LIMITS.get(s)) for s in shares),
-        *(Case(_name(s, EVERYWHERE), EVERYWHERE, s, walking(plan, loss=s), CLEAN, LIMITS.get(s)) for s in shares),
+        Case(_NOTHING_LOST, AT_TAGS, 0.0, nothing_lost, _NOTHING_LOST),
+        *(
+            Case(_name(s, AT_TAGS), AT_TAGS, s, walking(plan, lost_at_tags=s), _NOTHING_LOST, _MAX_RATIOS.get(s))
+            for s in shares
+        ),
+        *(
+            Case(_name(s, EVERYWHERE), EVERYWHERE, s, walking(plan, loss=s), _NOTHING_LOST, _MAX_RATIOS.get(s))
+            for s in shares
+        ),
     ]
 
 
@@ -37,16 +41,18 @@ def _name(share: float, kind: str) -> str:
     return f"{100 * share:.0f} % {kind}"
 
 
-BOUND_S: Final = 9.0
-BOUND_FROM_S: Final = 3.0
-BOUND_EPISODES: Final = 24
-"""Of the bound: how long tags are followed, from when on it counts, and how many of them."""
+_BOUND_S: Final = 9.0
+_BOUND_FROM_S: Final = 3.0
+_BOUND_EPISODES: Final = 24
+"""Of the bound: how long tags move, from when on it counts, and the number of tags."""
 
-SPEED_STD_MPS: Final = 1.0
+_SPEED_STD_MPS: Final = 1.0
+_BOUND_KEY: Final = 17
+"""Of the stream of random numbers that decides what is lost."""
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
-    """A row for each case, with the bound of what is on the air in such worlds."""
+    """A row for each case, with the bound of all receptions in such worlds."""
     each = cases(plan)
     bounds = {case.name: bound_m(case.runs, plan) for case in each}
     return [replace(row, bound_m=bounds[row.case]) for row in world_rows("loss", plan, each, results)]
@@ -55,20 +61,20 @@ def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
 def bound_m(runs: Sequence[Run], plan: Plan) -> float | None:
     """Root mean square of the posterior bound when the tags make the fixes that are judged.
 
-    Of tags that accelerate at random with the agility that filters assume, at the places where tags of the worlds
-    walk: these themselves keep their speed, which filters do not know.
+    Of tags that accelerate at random with the process noise that filters assume, at the positions where tags of the
+    worlds walk: these themselves keep their speed, which filters do not know.
     """
-    variances = [_variances(runs[number % len(runs)], plan, number) for number in range(BOUND_EPISODES)]
+    variances = [_variances(runs[number % len(runs)], plan, number) for number in range(_BOUND_EPISODES)]
     judged = np.concatenate(variances)
     return float(np.sqrt(judged.mean())) if len(judged) else None
 
 
 def _variances(run: Run, plan: Plan, number: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Traces of the bound at the first frame that the tag hears of each superframe."""
+    """Traces of the bound at the first frame of each superframe that the tag receives."""
     site, noise = run.site, run.site.noise
     anchors_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     n, slot_s = len(anchors_m), site.schedule.slot_s
-    superframes = int(BOUND_S / (n * slot_s))
+    superframes = int(_BOUND_S / (n * slot_s))
     tag = run.trajectories[number % len(run.trajectories)]
     times = run.warmup_s + slot_s * np.arange(n * superframes)
     path_m = np.array([tag.position(float(t)) for t in times])
@@ -87,17 +93,13 @@ def _variances(run: Run, plan: Plan, number: int) -> np.ndarray[Any, np.dtype[np
         random_walk_fm=noise.random_walk_fm,
         qa=run.qa,
         slot_s=slot_s,
-        speed_std_mps=SPEED_STD_MPS,
+        speed_std_mps=_SPEED_STD_MPS,
         mesh=run.mesh,
         height_known=site.tags.height_m is not None,
     )
     traces = np.trace(received_bound(anchors_m, path_m, settings, known), axis1=1, axis2=2).reshape(superframes, n)
     heard = known[:, -1].reshape(superframes, n)
-    begin = int(BOUND_FROM_S / (n * slot_s))
+    begin = int(_BOUND_FROM_S / (n * slot_s))
     firsts = traces[np.arange(superframes), heard.argmax(axis=1)]
     judged: np.ndarray[Any, np.dtype[np.float64]] = firsts[begin:][heard[begin:].any(axis=1)]
     return judged
-
-
-_BOUND_KEY: Final = 17
-"""Of the stream of random numbers that say what is lost."""

@@ -1,4 +1,4 @@
-"""The picture of a study: a line of panels for each series, curves over numbers and rows beside names."""
+"""The picture of a study: a line of panels for each series, curves over numbers and bars for named cases."""
 
 from collections.abc import Callable, Sequence
 from itertools import groupby
@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from msgspec import Struct
 
-from skyless.evaluation.plot_style import BLUE, GRID, INK, MUTED, ORANGE, RED, house_style
+from skyless.evaluation.figures import BLUE, GRID, INK, MUTED, ORANGE, RED, report_style
 from skyless.kernels.arrays import Array
 from skyless.studies.plan import Row
 
-WIDTH_IN: Final = 4.7
-BAR_IN: Final = 0.24
-CURVE_IN: Final = 2.6
-WIDE: Final = 15.0
+_WIDTH_IN: Final = 4.7
+_BAR_IN: Final = 0.24
+_CURVE_IN: Final = 2.6
+_WIDE_RATIO: Final = 15.0
 """Values that lie farther apart are drawn on a logarithmic axis."""
 
 
@@ -48,23 +48,24 @@ class _Panel(Struct, frozen=True):
     """Whether the axis of bars is logarithmic; None for where values lie far apart."""
 
 
-def _cm(value_m: float | None) -> float | None:
+def centimetres(value_m: float | None) -> float | None:
+    """A length in centimetres."""
     return None if value_m is None else 100.0 * value_m
 
 
-LEAST: Final = 1e-6
-"""Smaller shares of exceeded levels are drawn here, none as well."""
+LEAST_SHARE: Final = 1e-6
+"""Smaller shares of exceeded levels, and none, are drawn here."""
 
 
 def _exceeded(row: Row) -> float | None:
-    return None if row.exceeded is None else 1e4 * max(row.exceeded, LEAST)
+    return None if row.exceeded is None else 1e4 * max(row.exceeded, LEAST_SHARE)
 
 
 _PANELS: Final = {
     "rmse": _Panel(
         "RMSE in cm",
-        lambda row: _cm(row.rmse_m),
-        lambda row: _cm(row.rmse_error_m),
+        lambda row: centimetres(row.rmse_m),
+        lambda row: centimetres(row.rmse_error_m),
         limits=True,
         figure="rmse_m",
         scale=100.0,
@@ -86,12 +87,12 @@ _PANELS: Final = {
 
 def draw(look: Look, rows: Sequence[Row]) -> Figure:
     """Draw the rows of a study; error bars are standard errors."""
-    with house_style():
+    with report_style():
         series = [(name, list(group)) for name, group in groupby(rows, key=lambda row: row.series)]
-        heights = [CURVE_IN if _is_curve(group) else 0.8 + BAR_IN * len(group) for _, group in series]
-        figure = Figure(figsize=(WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
+        heights = [_CURVE_IN if _is_curve(group) else 0.8 + _BAR_IN * len(group) for _, group in series]
+        figure = Figure(figsize=(_WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
         methods = ", ".join(dict.fromkeys(row.method for row in rows))
-        note = "; grey: where 99 % of honest ones lie" if "nees" in look.panels else ""
+        note = "; grey: where 99 % of consistent ones lie" if "nees" in look.panels else ""
         figure.suptitle(f"{look.title}: {methods}, simulated{note}", x=0.01, ha="left", fontsize=11.0)
         grid = figure.subplots(len(series), len(look.panels), squeeze=False, height_ratios=heights)
         for line, (name, group) in zip(grid, series, strict=True):
@@ -142,7 +143,7 @@ def _curve(axes: Axes, x: Array, values: Array, errors: Array, look: Look, serie
         axes.set_xticks(x, [f"{value:g}" for value in x])
         axes.set_xticks([], minor=True)
     highest = float(np.nanmax(values + errors, initial=0.0))
-    if highest > WIDE * float(np.nanmin(values, initial=np.inf)):
+    if highest > _WIDE_RATIO * float(np.nanmin(values, initial=np.inf)):
         axes.set_yscale("log")
         _plain_numbers(axes.yaxis)
     else:
@@ -157,28 +158,28 @@ def _plain_numbers(axis: Axis, *, between: bool = True) -> None:
 
 
 def _named(axes: Axes, panel: _Panel, rows: list[Row], values: Array, errors: Array) -> None:
-    places = np.arange(len(rows))
+    rows_y = np.arange(len(rows))
     colours = [ORANGE if row.passed is False else BLUE for row in rows]
-    for place, value, error, colour in zip(places, values, errors, colours, strict=True):
+    for row_y, value, error, colour in zip(rows_y, values, errors, colours, strict=True):
         if panel.target is not None:
-            axes.errorbar(value, place, xerr=error, fmt="o", color=colour, markersize=5, capsize=2, zorder=3)
+            axes.errorbar(value, row_y, xerr=error, fmt="o", color=colour, markersize=5, capsize=2, zorder=3)
         else:
-            axes.barh(place, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
-    wide = np.nanmax(values, initial=0.0) > WIDE * np.nanmin(values, initial=np.inf)
+            axes.barh(row_y, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
+    wide = np.nanmax(values, initial=0.0) > _WIDE_RATIO * np.nanmin(values, initial=np.inf)
     if (wide if panel.log is None else panel.log) and np.isfinite(values).any():
         axes.set_xscale("log")
         axes.set_xlim(left=0.6 * float(np.nanmin(values)))
         _plain_numbers(axes.xaxis, between=panel.log is None)
-    axes.set_yticks(places, [row.case for row in rows])
+    axes.set_yticks(rows_y, [row.case for row in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
 
 
 def _intervals(axes: Axes, rows: list[Row], *, curve: bool) -> None:
-    for place, row in enumerate(rows):
+    for row_y, row in enumerate(rows):
         if row.nees_interval is None:
             continue
-        at = (row.x or 0.0) if curve else place
+        at = (row.x or 0.0) if curve else row_y
         low, high = row.nees_interval
         ends = ([at, at], [low, high]) if curve else ([low, high], [at, at])
         axes.plot(*ends, color=GRID, linewidth=7.0, solid_capstyle="butt", zorder=1.2, scalex=False, scaley=False)
@@ -186,21 +187,21 @@ def _intervals(axes: Axes, rows: list[Row], *, curve: bool) -> None:
 
 def _limits(axes: Axes, rows: list[Row]) -> None:
     """Mark the largest RMSE that is accepted."""
-    for place, row in enumerate(rows):
+    for row_y, row in enumerate(rows):
         if row.limit is None or row.ratio is None or row.rmse_m is None:
             continue
         limit_cm = 100.0 * row.rmse_m / row.ratio * row.limit
-        x, y, mark = (limit_cm, place, "|") if row.x is None else (row.x, limit_cm, "_")
+        x, y, mark = (limit_cm, row_y, "|") if row.x is None else (row.x, limit_cm, "_")
         (line,) = axes.plot(x, y, mark, color=RED, markersize=14, markeredgewidth=1.6, linestyle="none", label="limit")
         axes.legend(handles=[line])
 
 
 def _own_limits(axes: Axes, panel: _Panel, rows: list[Row]) -> None:
     """Mark what a figure should be at least or at most."""
-    for place, row in enumerate(rows):
+    for row_y, row in enumerate(rows):
         ends = [end for one in row.limits if one.figure == panel.figure for end in (one.least, one.most)]
         values = [panel.scale * end for end in ends if end is not None]
         if values:
-            places = [float(place)] * len(values)
-            (line,) = axes.plot(values, places, "|", color=RED, markersize=14, markeredgewidth=1.6, label="limit")
+            rows_y = [float(row_y)] * len(values)
+            (line,) = axes.plot(values, rows_y, "|", color=RED, markersize=14, markeredgewidth=1.6, label="limit")
             axes.legend(handles=[line])

@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.positioning.integrity import RISK
 
@@ -19,7 +20,7 @@ class Plan(Struct, frozen=True):
     noise_ps: float = 100.0
     """Noise of every TX and RX stamp, which filters know."""
     qa: float = 0.3
-    """Agility that filters assume at rest, m²/s³."""
+    """Process noise that filters assume at rest, m²/s³."""
     mesh: bool = True
     """Whether anchors also relay when they heard anchors that are not the master."""
     worlds: int = 12
@@ -36,9 +37,9 @@ class Plan(Struct, frozen=True):
     """Fixes with a higher level count as not available (``integrity``)."""
 
 
-QUICK: Final = Plan(worlds=6, seconds=10.0, tags=2, episodes=200)
+_QUICK_PLAN: Final = Plan(worlds=6, seconds=10.0, tags=2, episodes=200)
 
-USUAL: Final = {"room": Plan(worlds=20, seconds=15.0, tags=5)}
+_USUAL: Final = {"room": Plan(worlds=20, seconds=15.0, tags=5)}
 """Of studies that do not take the usual amounts; those of ``room`` are the room's own, its other cases have fewer."""
 
 
@@ -58,7 +59,7 @@ def plan_of(
     alert_limit_m: float | None = None,
 ) -> Plan:
     """The usual amounts, or with ``quick`` few, where none are given."""
-    usual = QUICK if quick else USUAL.get(study or "", Plan())
+    usual = _QUICK_PLAN if quick else _USUAL.get(study or "", Plan())
     return Plan(
         method=method,
         seed=seed,
@@ -101,7 +102,7 @@ class Limit(Struct, frozen=True):
 
 
 class Row(Struct, frozen=True):
-    """What a case came to; lengths in metres, None where it does not apply. All is simulated.
+    """Results of a case; lengths in metres, None where it does not apply. All is simulated.
 
     All depends on the plan alone, except for ``cpu_us_per_message``, which is measured where the cells ran.
     """
@@ -126,11 +127,11 @@ class Row(Struct, frozen=True):
     p95_m: float | None = None
     max_m: float | None = None
     said_m: float | None = None
-    """What the fixes themselves say: the root of the mean trace of their covariances."""
+    """Predicted by the fixes: the root of the mean trace of their covariances."""
     nees: float | None = None
-    """Mean normalised error squared over the degrees of freedom: 1 for fixes that tell their errors truly."""
+    """Mean normalised error squared over the degrees of freedom: 1 for fixes whose covariances are right."""
     nees_interval: tuple[float, float] | None = None
-    """Where ``nees`` lies with a probability of 99 % if they do."""
+    """Where ``nees`` lies with a probability of 99 % if they are."""
     outside: float | None = None
     """Share of fixes that lie outside of their own 99.9 % ellipse; 0.001 for true ones with Gaussian errors."""
     available: float | None = None
@@ -172,6 +173,24 @@ class Row(Struct, frozen=True):
     """Share of the fixes with a level whose error is larger, and which carry no alert."""
     smallest_m: float | None = None
     """Horizontal error that the share ``risk`` of fixes exceeds, with or without a level."""
+
+
+def with_limits(row: Row, limits: Sequence[Limit]) -> Row:
+    """The row with its limits and the figures that miss them; one without a fix misses all."""
+    if row.limit is not None:
+        limits = (*limits, Limit("ratio", most=row.limit))
+    if not limits:
+        return row
+    missed = tuple(limit.figure for limit in limits if row.fixes == 0 or not _holds(row, limit))
+    return replace(row, limits=tuple(limits), missed=missed, passed=not missed)
+
+
+def _holds(row: Row, limit: Limit) -> bool:
+    """What does not exist exceeds nothing (levels that no fix gives), and reaches nothing."""
+    value = getattr(row, limit.figure)
+    if value is None:
+        return limit.least is None
+    return (limit.least is None or value >= limit.least) and (limit.most is None or value <= limit.most)
 
 
 class Study(Struct, frozen=True):

@@ -1,80 +1,89 @@
 """The study ``room``: a method judged where the errors of real rooms are, and where one thing more is wrong.
 
-The room is the lab with anchors, ranges and motions as in ``evaluation/room_world.py``. Each other case changes one
+The room is the lab with anchors, ranges and motions as in ``evaluation/scenarios.py``. Each other case changes one
 thing in it. The worlds do not depend on the method.
+
+Cases whose errors of survey and ranges are all that is wrong, and whose tags accelerate at random, have a Cramér–Rao
+bound: that of all receptions on the air, for errors with the variances with which the worlds draw them, whatever a site
+file states. That tags are also held in the room by a spring and damping is left out, as no receiver knows it.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
+from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.evaluation.room_world import Room
-from skyless.evaluation.scenarios import wanderers
+from skyless.evaluation.scenarios import ROOM_QA_M2PS3, Room, wanderers
+from skyless.evaluation.statistics import LevelCounts
+from skyless.kernels.arrays import Array
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.simulation.impairments import AnchorBias, Body, WarmUp
 from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Trajectory, Waypoints
 from skyless.site.lab import lab_site
 from skyless.site.model import AnchorSite, Site, TagsSite, WallSite
-from skyless.studies.clustered_intervals import rare_interval
-from skyless.studies.lab_setup import anchor_of, box, worlds
-from skyless.studies.level_counts import LevelCounts
-from skyless.studies.limits import judged
-from skyless.studies.motions import laps
-from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of
-from skyless.studies.room_bound import biases_of, bound_cells, with_bound
-from skyless.studies.summary import Case, world_cells, world_rows
-from skyless.studies.worlds import RunResult
+from skyless.studies.motion import laps
+from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.studies.summary import Case, clustered_interval, jackknife, world_cells, world_rows
+from skyless.studies.worlds import Run, RunResult, anchor_of, box, worlds
+from skyless.uncertainty.bounds import Biases, biased_bound, bound_settings
 
 BASE: Final = "the room"
 AIR: Final = "unbiased air"
-WARMUP_S: Final = 1.5
+_WARMUP_S: Final = 1.5
 
-BOUND_RATIO: Final = 1.15
+_BOUND_RATIO: Final = 1.15
 """Over the Cramér–Rao bound, at most, in the room itself."""
 
-SHARE: Final = 0.25
+_SHARE: Final = 0.25
 """Worlds of each case but the room itself, of those that the room has."""
 
-CHANGING_M: Final = 0.029
+_CHANGING_M: Final = 0.029
 """As large as constants that are uniform within 5 cm."""
 
-HALL_M: Final = (12.0, 16.0)
-ROOM_3D_M: Final = (8.0, 6.0)
-HEIGHTS_M: Final = (0.2, 3.0)
+_HALL_M: Final = (12.0, 16.0)
+_ROOM_3D_M: Final = (8.0, 6.0)
+_HEIGHTS_M: Final = (0.2, 3.0)
 """Of neighbouring anchors in the 3-D room."""
 
 WALL: Final = WallSite(4.0, 3.0, 4.0, 5.0, delay_m=0.25)
 """Between the tags that walk past and three of the anchors, low enough for these to hear the others over it."""
-PAST_WALL_X_M: Final = (3.4, 3.7)
-PAST_WALL_Y_M: Final = (0.3, 7.7)
+_PAST_WALL_X_M: Final = (3.4, 3.7)
+_PAST_WALL_Y_M: Final = (0.3, 7.7)
 
-SMALL_M: Final = (0.1, 0.4)
-LARGE_M: Final = (0.5, 2.0)
+_SMALL_M: Final = (0.1, 0.4)
+_LARGE_M: Final = (0.5, 2.0)
 """By how much anchors are late, each by its own draw."""
-LATE_S: Final = (WARMUP_S + 3.0, WARMUP_S + 9.0)
+_LATE_S: Final = (_WARMUP_S + 3.0, _WARMUP_S + 9.0)
 
-CRYSTALS: Final = ((1.0, 20.0), (-1.0, 20.0), (2.0, 20.0), (-2.0, 20.0), (5.0, 60.0))
+_CRYSTALS: Final = ((1.0, 20.0), (-1.0, 20.0), (2.0, 20.0), (-2.0, 20.0), (5.0, 60.0))
 """What tags' crystals gain in the end in ppm, and the time constant in s."""
 
 TURNS_MPS2: Final = (3.0, 6.0, 10.0, 30.0)
-TURNING_MPS: Final = 3.0
-STATED_MPS2: Final = 10.0
+_TURNING_MPS: Final = 3.0
+_STATED_MPS2: Final = 10.0
 """Turns that are also driven with the tag's largest acceleration stated."""
 
 _LATE_KEY: Final = 23
 _PATH_KEY: Final = 29
-"""Of streams of random numbers, beside the worlds' own."""
+"""Of streams of random numbers, next to the worlds' own."""
+
+_BOUND_SPEED_STD_MPS: Final = 1.0
+"""Before the first frame; after the second and a half for which nothing is judged nothing of it is left."""
+
+_BOUND_UPDATE_S: Final = 1e-6
+"""About what the bound takes for one measurement."""
 
 Paths = Callable[[int], Sequence[Trajectory]]
 
 
 def cases(plan: Plan) -> list[Case]:
     """The room, and what differs from it in one thing."""
-    return [*_places(plan), *_errors(plan), *_obstacles(plan), *_late(plan), *_crystals(plan), *_turns(plan)]
+    return [*_rooms(plan), *_errors(plan), *_obstacles(plan), *_late(plan), *_crystals(plan), *_turns(plan)]
 
 
 def _case(
@@ -88,11 +97,11 @@ def _case(
     **faults: Any,  # noqa: ANN401 - of ``worlds``
 ) -> Case:
     """``bounded``: nothing is wrong but what the room's errors of survey and ranges are, so that there is a bound."""
-    place = site or lab_site(plan.noise_ps)
-    count = plan.worlds if name == BASE else max(2, round(SHARE * plan.worlds))
-    ways = paths or partial(wanderers, place, plan.tags)
+    in_site = site or lab_site(plan.noise_ps)
+    count = plan.worlds if name == BASE else max(2, round(_SHARE * plan.worlds))
+    trajectories = paths or partial(wanderers, in_site, plan.tags)
     faults = {"room": Room(), **faults}
-    runs = worlds(plan, place, ways, warmup_s=WARMUP_S, count=count, **faults)
+    runs = worlds(plan, in_site, trajectories, warmup_s=_WARMUP_S, count=count, **faults)
     return Case(name, series, None, runs, limits=limits, biases=biases_of(faults["room"]) if bounded else None)
 
 
@@ -100,7 +109,7 @@ def _exceeded(most: float) -> Limit:
     return Limit("exceeded", most=most)
 
 
-def _places(plan: Plan) -> list[Case]:
+def _rooms(plan: Plan) -> list[Case]:
     usual = (
         Limit("rmse_m", most=0.029),
         Limit("nees", 0.7, 1.3),
@@ -109,7 +118,7 @@ def _places(plan: Plan) -> list[Case]:
         Limit("hpl_m", most=0.30),
     )
     return [
-        replace(_case(plan, BASE, "rooms", *usual, bounded=True), limit=BOUND_RATIO),
+        replace(_case(plan, BASE, "rooms", *usual, bounded=True), limit=_BOUND_RATIO),
         _case(plan, AIR, "rooms", Limit("rmse_m", most=0.019), room=None, bounded=True),
         _case(plan, "hall, 8 anchors", "rooms", Limit("level", 0.97), site=hall_site(plan.noise_ps), bounded=True),
         _case(plan, "3-D room, 8 anchors", "rooms", site=room_3d_site(plan.noise_ps), bounded=True),
@@ -119,8 +128,8 @@ def _places(plan: Plan) -> list[Case]:
 def _errors(plan: Plan) -> list[Case]:
     """Constants of the ranges, then anchors that stand elsewhere than their room's survey accounts for."""
     ranges = {
-        "constants change in 10 s": {"constant_m": 0.0, "changing_m": CHANGING_M, "correlation_s": 10.0},
-        "constants change within 1 m": {"constant_m": 0.0, "changing_m": CHANGING_M, "correlation_m": 1.0},
+        "constants change in 10 s": {"constant_m": 0.0, "changing_m": _CHANGING_M, "correlation_s": 10.0},
+        "constants change within 1 m": {"constant_m": 0.0, "changing_m": _CHANGING_M, "correlation_m": 1.0},
         "constants within 10 cm": {"constant_m": 0.10},
     }
     off = [(1, 0.10), (1, 0.15), (1, 0.20), (1, 0.30), (2, 0.20)]
@@ -133,13 +142,13 @@ def _errors(plan: Plan) -> list[Case]:
             _case(
                 plan,
                 f"{'one anchor' if count == 1 else 'two anchors'} {100 * off_m:.0f} cm off",
-                "places of anchors",
+                "positions of anchors",
                 _exceeded(3e-4),
                 room=Room(off_anchors=count, off_m=off_m),
             )
             for count, off_m in off
         ),
-        _case(plan, "each axis N(5 cm)", "places of anchors", room=Room(axis_std_m=0.05), bounded=True),
+        _case(plan, "each axis N(5 cm)", "positions of anchors", room=Room(axis_std_m=0.05), bounded=True),
     ]
 
 
@@ -157,9 +166,9 @@ def _obstacles(plan: Plan) -> list[Case]:
 
 def _late(plan: Plan) -> list[Case]:
     found = []
-    for span_m in (SMALL_M, LARGE_M):
+    for span_m in (_SMALL_M, _LARGE_M):
         for count in (1, 2, 3):
-            for when, (from_s, to_s) in {"": (0.0, np.inf), ", 6 s": LATE_S}.items():
+            for when, (from_s, to_s) in {"": (0.0, np.inf), ", 6 s": _LATE_S}.items():
                 name = f"{count} of 6 late, {span_m[0]:g}–{span_m[1]:g} m{when}"
                 limits = () if count == 1 else (_exceeded(1e-3),)
                 late = partial(late_anchors, plan, count, span_m, from_s, to_s)
@@ -181,11 +190,11 @@ def _crystals(plan: Plan) -> list[Case]:
     lab = lab_site(plan.noise_ps)
 
     def of_an_anchor(number: int) -> tuple[WarmUp, ...]:
-        return (WarmUp(1.0, 20.0, WARMUP_S, anchor_of(lab, number).id),)
+        return (WarmUp(1.0, 20.0, _WARMUP_S, anchor_of(lab, number).id),)
 
     tags = [
-        _case(plan, f"tags' crystals {ppm:+g} ppm", "crystals", warm_ups=(WarmUp(ppm, tau_s, WARMUP_S),))
-        for ppm, tau_s in CRYSTALS
+        _case(plan, f"tags' crystals {ppm:+g} ppm", "crystals", warm_ups=(WarmUp(ppm, tau_s, _WARMUP_S),))
+        for ppm, tau_s in _CRYSTALS
     ]
     return [
         replace(case, of=BASE, limit=1.3)
@@ -194,11 +203,11 @@ def _crystals(plan: Plan) -> list[Case]:
 
 
 def _turns(plan: Plan) -> list[Case]:
-    """Of tags that nobody has told of it, and of some that know how hard they turn."""
+    """Of tags whose largest acceleration is not stated, and of some for which it is."""
     found = []
-    for turn, stated in (*((turn, False) for turn in TURNS_MPS2), (STATED_MPS2, True)):
-        name = f"turns of {turn:g} m/s² at {TURNING_MPS:g} m/s" + (", stated" if stated else "")
-        limits = (_exceeded(1e-3),) if turn == STATED_MPS2 else ()
+    for turn, stated in (*((turn, False) for turn in TURNS_MPS2), (_STATED_MPS2, True)):
+        name = f"turns of {turn:g} m/s² at {_TURNING_MPS:g} m/s" + (", stated" if stated else "")
+        limits = (_exceeded(1e-3),) if turn == _STATED_MPS2 else ()
         asked = IntegrityRequirement(max_acceleration_mps2=turn if stated else 0.0)
         found.append(_case(plan, name, "turns", *limits, paths=partial(turning, plan, turn), integrity=asked))
     return found
@@ -207,25 +216,25 @@ def _turns(plan: Plan) -> list[Case]:
 def turning(plan: Plan, acceleration_mps2: float, seed: int) -> Sequence[Trajectory]:
     """Tags that go round and round the lab; all accelerations have the same rounds."""
     draw, (low_m, high_m) = np.random.default_rng(seed_of(seed, _PATH_KEY)), box(lab_site(plan.noise_ps))
-    return [laps(draw, low_m, high_m, TURNING_MPS, acceleration_mps2) for _ in range(plan.tags)]
+    return [laps(draw, low_m, high_m, _TURNING_MPS, acceleration_mps2) for _ in range(plan.tags)]
 
 
 def past_wall(tags: int, seed: int) -> Sequence[Trajectory]:
     """Tags that walk to and fro along the wall at 1 m/s, from where it hides no anchor."""
-    lines_m = np.random.default_rng(seed_of(seed, _PATH_KEY)).uniform(*PAST_WALL_X_M, tags).tolist()
-    return [Waypoints([(x_m, y_m) for y_m in PAST_WALL_Y_M], 1.0, loop=True, corner_s=1.0) for x_m in lines_m]
+    lines_m = np.random.default_rng(seed_of(seed, _PATH_KEY)).uniform(*_PAST_WALL_X_M, tags).tolist()
+    return [Waypoints([(x_m, y_m) for y_m in _PAST_WALL_Y_M], 1.0, loop=True, corner_s=1.0) for x_m in lines_m]
 
 
 def hall_site(noise_ps: float) -> Site:
     """Eight anchors on the walls of 12 m × 16 m: corners and middles, at the tags' height as in the lab."""
-    anchors = tuple(AnchorSite(id=k, x_m=x, y_m=y) for k, (x, y) in enumerate(_around(*HALL_M), start=1))
+    anchors = tuple(AnchorSite(id=k, x_m=x, y_m=y) for k, (x, y) in enumerate(_around(*_HALL_M), start=1))
     return replace(lab_site(noise_ps), name="hall", anchors=anchors)
 
 
 def room_3d_site(noise_ps: float) -> Site:
     """Eight anchors on the walls of 8 m × 6 m, high and low by turns; the height of tags is not given."""
     anchors = tuple(
-        AnchorSite(id=k, x_m=x, y_m=y, z_m=HEIGHTS_M[k % 2]) for k, (x, y) in enumerate(_around(*ROOM_3D_M), start=1)
+        AnchorSite(id=k, x_m=x, y_m=y, z_m=_HEIGHTS_M[k % 2]) for k, (x, y) in enumerate(_around(*_ROOM_3D_M), start=1)
     )
     return replace(lab_site(noise_ps), name="3-D room", anchors=anchors, tags=TagsSite())
 
@@ -250,12 +259,12 @@ def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
     for case, row in zip(each, world_rows("room", plan, each, results[:count]), strict=True):
         own: list[RunResult] = [next(ran) for _ in case.runs]
         bounded = row if case.biases is None else with_bound(row, own, [next(bounds) for _ in case.runs])
-        found.append(judged(_with_levels(bounded, own), case.limits))
+        found.append(with_limits(_with_levels(bounded, own), case.limits))
     return found
 
 
 def _with_levels(row: Row, own: Sequence[RunResult]) -> Row:
-    """What became of the protection levels, with tags as units; as it is where the method gives none."""
+    """The row with its protection levels, tags as units; unchanged where the method gives none."""
     counts = [world.levels for world in own if world.levels is not None]
     if not counts:
         return row
@@ -263,7 +272,7 @@ def _with_levels(row: Row, own: Sequence[RunResult]) -> Row:
     row = replace(row, level=levels.sum() / row.fixes)
     if not levels.any():
         return row
-    low, high = rare_interval(exceeded, levels.sum())
+    low, high = clustered_interval(exceeded, levels.sum())
     return replace(
         row,
         exceeded=exceeded.sum() / levels.sum(),
@@ -276,3 +285,89 @@ def _with_levels(row: Row, own: Sequence[RunResult]) -> Row:
 def _total(counts: Sequence[LevelCounts], name: str) -> np.ndarray[Any, np.dtype[np.float64]]:
     """A count of every tag of all worlds."""
     return np.concatenate([getattr(one, name) for one in counts])
+
+
+class BoundRun(Struct, frozen=True):
+    """A world, and the errors that are drawn in it."""
+
+    run: Run
+    biases: Biases
+
+
+def biases_of(room: Room | None) -> Biases:
+    """Standard deviations of the errors of a room's survey and ranges; its slope is one such deviation."""
+    if room is None:
+        return Biases()
+    ranges = room.ranges
+    return Biases(
+        survey_std_m=room.axis_std_m,
+        constant_std_m=ranges.constant_m / math.sqrt(3.0),
+        changing_std_m=ranges.changing_m,
+        slope_std_m=ranges.slope_m,
+        correlation_s=ranges.correlation_s or math.inf,
+        correlation_m=ranges.correlation_m or math.inf,
+    )
+
+
+def bound_cells(cases: Sequence[Case]) -> list[Cell]:
+    """One cell for each world of the cases that have a bound."""
+    return [
+        Cell(case.name, bound_variance_m2, BoundRun(run, case.biases), _weight_s(run))
+        for case in cases
+        if case.biases is not None
+        for run in case.runs
+    ]
+
+
+def _weight_s(run: Run) -> float:
+    return (
+        _BOUND_UPDATE_S * 2.0 * len(run.trajectories) * len(run.site.anchors) * run.until_s / run.site.schedule.slot_s
+    )
+
+
+def bound_variance_m2(world: BoundRun) -> float:
+    """Trace of the bound, its mean over all tags of a world and the superframes in which fixes are judged."""
+    run = world.run
+    site, noise = run.site, run.impairments
+    off_m = {one.anchor: (one.x_m, one.y_m, one.z_m) for one in noise.anchor_displacements}
+    anchors_m = np.array(
+        [np.add((one.x_m, one.y_m, one.z_m), off_m.get(one.id, (0.0, 0.0, 0.0))) for one in site.anchors]
+    )
+    superframe_s = len(anchors_m) * site.schedule.slot_s
+    settings = bound_settings(
+        noise.rx_stamp_ps * 1e-12,
+        white_fm=noise.oscillator.white_fm,
+        random_walk_fm=noise.oscillator.random_walk_fm,
+        qa=ROOM_QA_M2PS3,
+        slot_s=site.schedule.slot_s,
+        speed_std_mps=_BOUND_SPEED_STD_MPS,
+        mesh=run.mesh,
+        height_known=site.tags.height_m is not None,
+        at_once=False,
+    )
+    frames = int(run.until_s / superframe_s) * len(anchors_m)
+    first = int(run.warmup_s / superframe_s)
+    means = []
+    for tag in run.trajectories:
+        path_m = np.array([tag.position(frame * site.schedule.slot_s) for frame in range(frames)])
+        bound = biased_bound(anchors_m, path_m, settings, world.biases)[first:]
+        means.append(np.trace(bound, axis1=1, axis2=2).mean())
+    return float(np.mean(means))
+
+
+def with_bound(row: Row, worlds: Sequence[RunResult], variances_m2: Sequence[float]) -> Row:
+    """The row with the bound of its worlds, and the RMSE over it."""
+    sums = np.array(
+        [(a.fixes, a.squared_m2, variance) for a, variance in zip(worlds, variances_m2, strict=True)], np.float64
+    )
+    row = replace(row, bound_m=float(np.sqrt(np.mean(variances_m2))))
+    if row.fixes == 0:
+        return row
+    ratio, ratio_error = jackknife(sums, _ratio)
+    passed = None if row.limit is None else ratio <= row.limit
+    return replace(row, ratio=ratio, ratio_error=ratio_error, passed=passed)
+
+
+def _ratio(sums: Array) -> float:
+    fixes = sums[:, 0].sum()
+    return float(np.sqrt(sums[:, 1].sum() / fixes / sums[:, 2].mean())) if fixes else np.nan

@@ -17,18 +17,18 @@ from skyless.errors import SkylessError
 from skyless.kernels.compiled import cores
 from skyless.studies.plan import Cell
 
-POLL_S: Final = 0.2
-CONNECT_S: Final = 10.0
+_POLL_S: Final = 0.2
+_CONNECT_S: Final = 10.0
 
-ADDRESS: Final = re.compile(r"((tcp|tls|ws|wss)://)?[^\s/]+:\d{1,5}")
+_ADDRESS: Final = re.compile(r"((tcp|tls|ws|wss)://)?[^\s/]+:\d{1,5}")
 
 Reached = Callable[[float], None]
 
 
 def run_cells(cells: Sequence[Cell], reached: Reached, processes: int | None = None) -> list[Any]:
-    """Results in the order of the cells, computed by so many processes, by default one for each core.
+    """Results in the order of the cells, computed by ``processes`` processes, by default one for each core.
 
-    ``reached`` is told the share of the work that is done. An interrupt ends all processes at once.
+    ``reached`` is called with the share of the work that is done. An interrupt ends all processes at once.
 
     Raises:
         SkylessError: a process died.
@@ -54,9 +54,11 @@ def run_cells_on_dask(cells: Sequence[Cell], reached: Reached, scheduler: str) -
         except SkylessError:
             raise
         except (CancelledError, Exception) as error:  # noqa: BLE001 - whatever a worker raised, or the network
-            told = "the scheduler has gone" if isinstance(error, CancelledError) else str(error) or type(error).__name__
+            reason = (
+                "the scheduler has gone" if isinstance(error, CancelledError) else str(error) or type(error).__name__
+            )
             raise SkylessError(
-                f"--scheduler {scheduler}: the cluster failed, nothing was written: {' '.join(told.split())}"
+                f"--scheduler {scheduler}: the cluster failed, nothing was written: {' '.join(reason.split())}"
             ) from None
 
 
@@ -70,7 +72,7 @@ def _map(pool: Executor, cells: Sequence[Cell], reached: Reached) -> list[Any]:
     total_s = sum(cell.weight_s for cell in cells)
     done_s, waiting = 0.0, set(futures)
     while waiting:
-        finished, waiting = wait(waiting, POLL_S, FIRST_COMPLETED)
+        finished, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
         for future in finished:
             future.result()
             done_s += cells[futures[future]].weight_s
@@ -125,13 +127,13 @@ def _start_worker(parent: Connection) -> None:
 
 @contextmanager
 def _cluster(scheduler: str) -> Iterator[Executor]:
-    if not ADDRESS.fullmatch(scheduler):
+    if not _ADDRESS.fullmatch(scheduler):
         raise SkylessError(f"--scheduler is {scheduler!r}; it should be an address such as tcp://127.0.0.1:8786")
     try:
         from distributed import Client  # noqa: PLC0415 - an extra, and slow to import
     except ImportError:
         raise SkylessError("--scheduler needs the package distributed: pip install 'skyless[dask]'") from None
-    logging.disable(logging.ERROR)  # what goes wrong is told once, by an exception
+    logging.disable(logging.ERROR)  # what goes wrong is reported once, by an exception
     try:
         yield from _connected(Client, scheduler)
     finally:
@@ -140,12 +142,12 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
 
 def _connected(connect: Callable[..., Any], scheduler: str) -> Iterator[Executor]:
     try:
-        client = connect(scheduler, timeout=CONNECT_S, set_as_default=False)
+        client = connect(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise SkylessError(f"--scheduler is {scheduler!r}, where no Dask scheduler answers: {error}") from None
     try:
         if not client.scheduler_info(n_workers=-1)["workers"]:
-            raise SkylessError(f"--scheduler is {scheduler!r}, which has no workers; start some: dask worker ADDRESS")
+            raise SkylessError(f"--scheduler is {scheduler!r}, which has no workers; start some: dask worker _ADDRESS")
         executor = client.get_executor(pure=False)
         try:
             yield executor

@@ -1,4 +1,4 @@
-"""What a tag costs and how well it does: from one tag to ten thousand, from four anchors in view to sixty."""
+"""The study ``scale``: what a tag costs and how accurate it is: one to ten thousand tags, four to sixty anchors."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -10,22 +10,22 @@ from msgspec.structs import replace
 from skyless.simulation.trajectory import Trajectory
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, Site
-from skyless.studies.lab_setup import box, worlds
-from skyless.studies.motions import still
+from skyless.studies.motion import still
 from skyless.studies.plan import Plan
 from skyless.studies.summary import Case
+from skyless.studies.worlds import box, worlds
 
-FROM_S: Final = 1.0
-FLEET_S: Final = 0.5
+_FLEET_WARMUP_S: Final = 1.0
+_FLEET_S: Final = 0.5
 """Fleets of all sizes are judged in the same stretch of time, short enough for ten thousand tags."""
 
-FLEETS: Final = ((1, 48), (10, 24), (100, 12), (1_000, 4), (10_000, 2))
-"""Tags, and worlds of so many."""
-QUICK_FLEETS: Final = ((1, 24), (10, 12), (100, 4), (1_000, 2))
+_FLEETS: Final = ((1, 48), (10, 24), (100, 12), (1_000, 4), (10_000, 2))
+"""Numbers of tags, and of worlds with them."""
+_QUICK_FLEETS: Final = ((1, 24), (10, 12), (100, 4), (1_000, 2))
 
-ANCHORS: Final = (4, 6, 8, 12, 20, 30, 45, 60)
-QUICK_ANCHORS: Final = (4, 8, 20, 60)
-ROOM_M: Final = (12.0, 16.0)
+_ANCHORS: Final = (4, 6, 8, 12, 20, 30, 45, 60)
+_QUICK_ANCHORS: Final = (4, 8, 20, 60)
+_RING_ROOM_M: Final = (12.0, 16.0)
 
 
 def cases(plan: Plan) -> list[Case]:
@@ -40,9 +40,9 @@ def _fleets(plan: Plan) -> list[Case]:
             f"{tags} tag{'s' if tags > 1 else ''}",
             "tags",
             float(tags),
-            worlds(plan, lab, partial(_places, lab, tags), warmup_s=FROM_S, seconds=FLEET_S, count=count),
+            worlds(plan, lab, partial(_still_tags, lab, tags), warmup_s=_FLEET_WARMUP_S, seconds=_FLEET_S, count=count),
         )
-        for tags, count in (QUICK_FLEETS if plan.quick else FLEETS)
+        for tags, count in (_QUICK_FLEETS if plan.quick else _FLEETS)
     ]
 
 
@@ -53,13 +53,13 @@ def _rings(plan: Plan) -> list[Case]:
             f"{count} anchors",
             "anchors in view",
             float(count),
-            worlds(plan, ring(plan, count), partial(_places, ring(plan, count), plan.tags), seconds=seconds),
+            worlds(plan, ring(plan, count), partial(_still_tags, ring(plan, count), plan.tags), seconds=seconds),
         )
-        for count in (QUICK_ANCHORS if plan.quick else ANCHORS)
+        for count in (_QUICK_ANCHORS if plan.quick else _ANCHORS)
     ]
 
 
-def _places(site: Site, tags: int, seed: int) -> Sequence[Trajectory]:
+def _still_tags(site: Site, tags: int, seed: int) -> Sequence[Trajectory]:
     draw = np.random.default_rng(seed)
     low_m, high_m = box(site)
     return [still(draw, low_m, high_m) for _ in range(tags)]
@@ -69,6 +69,6 @@ def ring(plan: Plan, count: int) -> Site:
     """A site of ``count`` anchors, all in radio range of each other, evenly spread on an ellipse."""
     lab = ideal_lab_site(plan.noise_ps)
     angles = 2.0 * np.pi * (np.arange(count) + 0.5) / count
-    places = ((1.0 + np.column_stack([np.cos(angles), np.sin(angles)])) * np.array(ROOM_M) / 2.0).tolist()
-    anchors = tuple(AnchorSite(id=number, x_m=x, y_m=y) for number, (x, y) in enumerate(places, start=1))
+    positions = ((1.0 + np.column_stack([np.cos(angles), np.sin(angles)])) * np.array(_RING_ROOM_M) / 2.0).tolist()
+    anchors = tuple(AnchorSite(id=number, x_m=x, y_m=y) for number, (x, y) in enumerate(positions, start=1))
     return replace(lab, name=f"ring of {count}", anchors=anchors)

@@ -1,4 +1,4 @@
-"""From the worlds of a case to a row, with standard errors from what scatters between them."""
+"""From the worlds of a case to a row: standard errors from the scatter between worlds, intervals of rare shares."""
 
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -6,18 +6,24 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
+from scipy.stats import chi2
 from scipy.stats import t as student
 
 from skyless.kernels.arrays import Array
 from skyless.studies.plan import Cell, Limit, Plan, Row
 from skyless.studies.worlds import Run, RunResult, run_world
-from skyless.uncertainty.biased_bound import Biases
+from skyless.uncertainty.bounds import Biases
 
-MESSAGE_S: Final = 40e-6
+_MESSAGE_S: Final = 40e-6
 """About what a tag takes for a message, and an anchor with all that is simulated around it."""
 
 RAW_METHODS: Final = ("joint",)
 """Methods that use what anchors hear of each other."""
+
+
+_ALPHA: Final = 0.01
+CLUSTER_FIXES: Final = 25.0
+"""Fixes that may be misleading together, as neighbours share their errors, even if no such cluster was observed."""
 
 
 class Case(Struct, frozen=True):
@@ -44,7 +50,7 @@ def world_cells(cases: Sequence[Case]) -> list[Cell]:
 
 def _weight_s(run: Run) -> float:
     frames = run.until_s / run.site.schedule.slot_s
-    return frames * MESSAGE_S * (len(run.trajectories) + len(run.site.anchors))
+    return frames * _MESSAGE_S * (len(run.trajectories) + len(run.site.anchors))
 
 
 def world_rows(study: str, plan: Plan, cases: Sequence[Case], results: Sequence[RunResult]) -> list[Row]:
@@ -57,7 +63,7 @@ def world_rows(study: str, plan: Plan, cases: Sequence[Case], results: Sequence[
     ]
 
 
-def _row(study: str, plan: Plan, case: Case, worlds: list[RunResult], clean: list[RunResult] | None) -> Row:
+def _row(study: str, plan: Plan, case: Case, worlds: list[RunResult], reference: list[RunResult] | None) -> Row:
     cpu_s = sum(world.cpu_s for world in worlds)
     fixes = sum(world.fixes for world in worlds)
     row = Row(
@@ -81,7 +87,7 @@ def _row(study: str, plan: Plan, case: Case, worlds: list[RunResult], clean: lis
     if fixes == 0:
         return row
     row = _with_errors(row, worlds)
-    return row if clean is None else _with_ratio(row, worlds, clean)
+    return row if reference is None else _with_ratio(row, worlds, reference)
 
 
 def _with_errors(row: Row, worlds: list[RunResult]) -> Row:
@@ -101,9 +107,9 @@ def _with_errors(row: Row, worlds: list[RunResult]) -> Row:
     )
 
 
-def _with_ratio(row: Row, worlds: list[RunResult], clean: list[RunResult]) -> Row:
-    """Worlds and clean ones of the same number share their seed, so they are left out together."""
-    pairs = zip(worlds, clean, strict=True)
+def _with_ratio(row: Row, worlds: list[RunResult], reference: list[RunResult]) -> Row:
+    """Worlds and reference worlds of the same number share their seed, so they are left out together."""
+    pairs = zip(worlds, reference, strict=True)
     sums = np.array([(a.fixes, a.squared_m2, b.fixes, b.squared_m2) for a, b in pairs])
     if sums[:, 2].sum() == 0:
         return row
@@ -124,7 +130,7 @@ def _nees(sums: Array) -> float:
 
 
 def jackknife(rows: Array, figure: Callable[[Array], float]) -> tuple[float, float | None]:
-    """A figure of independent rows and its standard error, None where that cannot be told (Quenouille, Tukey).
+    """A figure of independent rows and its standard error, None where it cannot be estimated (Quenouille, Tukey).
 
     ``rows`` has shape (n, columns); the figure is a smooth function of their sums.
     """
@@ -142,3 +148,16 @@ def interval(standard_error: float | None, runs: int) -> tuple[float, float] | N
         return None
     reach = float(student.ppf(0.995, runs - 1)) * standard_error
     return max(1.0 - reach, 0.0), 1.0 + reach
+
+
+def clustered_interval(events: Array, count: float) -> tuple[float, float]:
+    """Where the true share of rare events lies, with 99 %, for ``count`` cases with ``events`` in each independent run.
+
+    Runs with events are taken as a Poisson process of clusters: Fay and Feuer (Statistics in Medicine 16, 1997,
+    791-801), whose interval ends where Garwood's exact one does, below, if all clusters have one event.
+    """
+    y, v = float(events.sum()), float(np.square(events).sum())
+    w = max(float(events.max(initial=0.0)), CLUSTER_FIXES)
+    low = v / (2.0 * y) * float(chi2.ppf(_ALPHA / 2.0, 2.0 * y * y / v)) if y > 0.0 else 0.0
+    high = (v + w * w) / (2.0 * (y + w)) * float(chi2.ppf(1.0 - _ALPHA / 2.0, 2.0 * (y + w) ** 2 / (v + w * w)))
+    return low / count, high / count

@@ -1,4 +1,4 @@
-"""What the clocks' alignment withstands: masters that die, long superframes, bad crystals, temperature."""
+"""The study ``sync``: synchronisation when masters die, with long superframes, bad crystals and temperature."""
 
 from functools import partial
 from typing import Final
@@ -9,14 +9,13 @@ from skyless.simulation.impairments import AnchorOutage, Impairments, Outage
 from skyless.simulation.oscillator import Temperature
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import Site
-from skyless.studies.lab_setup import WARMUP_S, walking
 from skyless.studies.plan import Plan
 from skyless.studies.summary import Case
-from skyless.studies.worlds import Run
+from skyless.studies.worlds import LAB_WARMUP_S, Run, walking
 
-STEADY: Final = "steady"
-SUPERFRAMES_MS: Final = (15.0, 30.0, 60.0, 120.0, 300.0, 1000.0)
-LONGEST_SLOT_S: Final = 0.06
+_STEADY: Final = "steady"
+_SUPERFRAMES_MS: Final = (15.0, 30.0, 60.0, 120.0, 300.0, 1000.0)
+_LONGEST_SLOT_S: Final = 0.06
 """A site file may say 67 ms."""
 
 
@@ -29,12 +28,12 @@ def _outages(plan: Plan) -> list[Case]:
     every_s = 5.0
     lab = ideal_lab_site(plan.noise_ps)
     rounds = int(plan.seconds / every_s)
-    masters = tuple(_off(lab, number, WARMUP_S + 1.0 + every_s * number, 2.0) for number in range(rounds or 1))
-    last = tuple(_off(lab, 5, WARMUP_S + 1.0 + every_s * number, 2.0) for number in range(rounds or 1))
+    masters = tuple(_off(lab, number, LAB_WARMUP_S + 1.0 + every_s * number, 2.0) for number in range(rounds or 1))
+    last = tuple(_off(lab, 5, LAB_WARMUP_S + 1.0 + every_s * number, 2.0) for number in range(rounds or 1))
     return [
-        Case(STEADY, "outages", None, walking(plan), STEADY),
-        Case("an anchor gone for 2 s of every 5 s", "outages", None, walking(plan, outages=last), STEADY),
-        Case("the master gone for 2 s of every 5 s", "outages", None, walking(plan, outages=masters), STEADY),
+        Case(_STEADY, "outages", None, walking(plan), _STEADY),
+        Case("an anchor gone for 2 s of every 5 s", "outages", None, walking(plan, outages=last), _STEADY),
+        Case("the master gone for 2 s of every 5 s", "outages", None, walking(plan, outages=masters), _STEADY),
     ]
 
 
@@ -58,7 +57,7 @@ def _crystals(plan: Plan) -> list[Case]:
         "draughts, ±0.1 ppm in 60 s": walking(plan, change=partial(_draughty, 1.0)),
         "draughts, ±0.5 ppm in 60 s": walking(plan, change=partial(_draughty, 5.0)),
     }
-    return [Case(name, "crystals", None, worlds, STEADY) for name, worlds in runs.items()]
+    return [Case(name, "crystals", None, worlds, _STEADY) for name, worlds in runs.items()]
 
 
 def _draughty(swing_k: float, impairments: Impairments) -> Impairments:
@@ -68,9 +67,9 @@ def _draughty(swing_k: float, impairments: Impairments) -> Impairments:
 
 
 def _superframes(plan: Plan) -> list[Case]:
-    lengths_ms = SUPERFRAMES_MS[::2] if plan.quick else SUPERFRAMES_MS[1:]
+    lengths_ms = _SUPERFRAMES_MS[::2] if plan.quick else _SUPERFRAMES_MS[1:]
     return [
-        Case(f"superframe of {ms:.0f} ms", "superframes", ms, walking(plan, _slow(plan, ms * 1e-3)), STEADY)
+        Case(f"superframe of {ms:.0f} ms", "superframes", ms, walking(plan, _slow(plan, ms * 1e-3)), _STEADY)
         for ms in lengths_ms
     ]
 
@@ -79,9 +78,9 @@ def _slow(plan: Plan, superframe_s: float) -> Site:
     """The lab with its anchors evenly spread over a superframe."""
     lab = ideal_lab_site(plan.noise_ps)
     apart = 1
-    while superframe_s / (apart * len(lab.anchors)) > LONGEST_SLOT_S:
+    while superframe_s / (apart * len(lab.anchors)) > _LONGEST_SLOT_S:
         apart += 1
     slots = apart * len(lab.anchors)
-    anchors = tuple(replace(anchor, slot=apart * place) for place, anchor in enumerate(lab.anchors))
+    anchors = tuple(replace(anchor, slot=apart * number) for number, anchor in enumerate(lab.anchors))
     schedule = replace(lab.schedule, slots=slots, slot_s=superframe_s / slots)
     return replace(lab, anchors=anchors, schedule=schedule)

@@ -1,10 +1,14 @@
-"""One cell of most studies: a site in the simulated world, its tags judged against the truth."""
+"""Worlds of the studies: a site on the simulated air, its tags judged against the truth; most are the lab.
+
+``run_world`` is the work of one cell; ``worlds`` makes the worlds of a case.
+"""
 
 import math
 import time
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import compress
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct
@@ -13,28 +17,32 @@ from scipy.stats import chi2
 
 from skyless.air.beacon import Malformed
 from skyless.air.codec import decode_cached, encode
-from skyless.anchor import Anchor
-from skyless.evaluation.statistics import EvenSample
+from skyless.evaluation.fleet import world_of
+from skyless.evaluation.scenarios import WALL_MARGIN_M, Request, impairments_of, trajectories_of
+from skyless.evaluation.statistics import EvenSample, FirstFixes, LevelCounts, LevelTally
 from skyless.kernels.arrays import Array
 from skyless.positioning.fix import Fix
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import Impairments
-from skyless.simulation.stations import TagSpec
 from skyless.simulation.streams import stream
 from skyless.simulation.trajectory import Trajectory
-from skyless.simulation.world import World
-from skyless.site.model import Site
-from skyless.site.slots import schedule_of
-from skyless.studies.level_counts import LevelCounter, LevelCounts
+from skyless.site.lab import ideal_lab_site
+from skyless.site.model import AnchorSite, Site
+from skyless.studies.plan import Plan, seed_of
 
-OUTSIDE: Final = 0.999
+LAB_WARMUP_S: Final = 4.0
+"""No fix is judged before; cold starts of the lab take a tenth of a second, those with 90 % loss some seconds."""
+
+_LARGE_LAB_SCALE: Final = 2.5
+
+_OUTSIDE: Final = 0.999
 """Probability of the ellipse outside of which fixes are counted."""
 
-SAMPLE_ROWS: Final = 1 << 13
+_SAMPLE_ROWS: Final = 1 << 13
 
 _LOSS_KEY: Final = 3
-"""Of the stream of random numbers, beside those of the simulated world."""
+"""Of the stream of random numbers, next to those of the simulated world."""
 
 
 class Run(Struct, frozen=True):
@@ -81,34 +89,32 @@ class RunResult(Struct, frozen=True):
     """None for methods that give no protection levels."""
 
 
-class _Judge:
-    """Counts one fix per tag and superframe, so that all methods are judged at the same times."""
+class _Tally:
+    """Sums over the judged fixes of a world."""
 
     def __init__(self, run: Run) -> None:
-        self._superframe_s = 1.0 / schedule_of(run.site).superframe_rate_hz
+        tags = len(run.trajectories)
+        self._first_fixes = FirstFixes(run.site, tags)
         self._from_s = run.warmup_s
-        self._last = [-1] * len(run.trajectories)
         self._dim = 2 if run.site.tags.height_m is not None else 3
-        self._far = float(chi2.ppf(OUTSIDE, self._dim))
+        self._outside_chi2 = float(chi2.ppf(_OUTSIDE, self._dim))
         self._sums = np.zeros(4)
         self._max_m = 0.0
-        self._sample = EvenSample(1, SAMPLE_ROWS)
-        self._levels = LevelCounter(len(run.trajectories))
-        first, end = int(run.warmup_s / self._superframe_s), math.ceil(run.until_s / self._superframe_s - 1e-3)
-        self._superframes = (end - first) * len(run.trajectories)
+        self._sample = EvenSample(1, _SAMPLE_ROWS)
+        self._levels = LevelTally(tags, _SAMPLE_ROWS)
+        superframe_s = self._first_fixes.superframe_s
+        self._superframes = (math.ceil(run.until_s / superframe_s - 1e-3) - int(run.warmup_s / superframe_s)) * tags
 
     def add(self, tag: int, time_s: float, fix: Fix, truth_m: Array) -> None:
-        superframe = int(time_s / self._superframe_s)
-        if time_s < self._from_s or superframe == self._last[tag]:
+        if time_s < self._from_s or not self._first_fixes.is_first(tag, time_s):
             return
-        self._last[tag] = superframe
-        off_m = fix.position_m - truth_m
-        self._levels.add(tag, fix, math.hypot(off_m[0], off_m[1]))
-        error = off_m[: self._dim]
+        error_m = fix.position_m - truth_m
+        self._levels.add(tag, fix, error_m)
+        error = error_m[: self._dim]
         covariance = fix.covariance_m2[: self._dim, : self._dim]
         squared = float(error @ error)
         nees = float(error @ np.linalg.solve(covariance, error))
-        self._sums += (squared, float(np.trace(covariance)), nees / self._dim, nees > self._far)
+        self._sums += (squared, float(np.trace(covariance)), nees / self._dim, nees > self._outside_chi2)
         self._max_m = max(self._max_m, squared**0.5)
         self._sample.add((squared**0.5,))
 
@@ -131,11 +137,10 @@ class _Judge:
 
 
 def run_world(run: Run) -> RunResult:
-    """Let a world run and judge its tags."""
-    tags = [TagSpec(trajectory) for trajectory in run.trajectories]
-    world = World(run.site, lambda anchor: Anchor(run.site, anchor), tags, run.impairments, run.seed)
-    receivers = [Receiver(run.method, qa=run.qa, integrity=run.integrity) for _ in tags]
-    judge, messages, cpu_s = _Judge(run), 0, 0.0
+    """Run a world and judge its tags."""
+    world = world_of(run.site, run.trajectories, run.impairments, run.seed)
+    receivers = [Receiver(run.method, qa=run.qa, integrity=run.integrity) for _ in run.trajectories]
+    tally, messages, cpu_s = _Tally(run), 0, 0.0
     draw = stream(run.seed, _LOSS_KEY, 0)
     for broadcast in world.run(run.until_s):
         if not run.mesh:
@@ -149,8 +154,8 @@ def run_world(run: Run) -> RunResult:
         messages += len(receptions)
         for (tag, _, truth_m), fix in zip(receptions, fixes, strict=True):
             if fix is not None:
-                judge.add(tag, broadcast.end_s, fix, truth_m)
-    return judge.result(messages, run.until_s * len(tags), cpu_s)
+                tally.add(tag, broadcast.end_s, fix, truth_m)
+    return tally.result(messages, run.until_s * len(receivers), cpu_s)
 
 
 @lru_cache(64)
@@ -158,3 +163,76 @@ def without_mesh(frame: bytes) -> bytes:
     """The same beacon from an anchor that relays nothing but when it heard the master."""
     beacon = decode_cached(frame)
     return frame if isinstance(beacon, Malformed) else encode(replace(beacon, heard=()))
+
+
+def large_lab_site(noise_ps: float) -> Site:
+    """The lab at 15 m × 20 m: space for 5 m/s, and the same dilution of precision at the corresponding positions."""
+    lab = ideal_lab_site(noise_ps)
+    anchors = tuple(replace(one, x_m=_LARGE_LAB_SCALE * one.x_m, y_m=_LARGE_LAB_SCALE * one.y_m) for one in lab.anchors)
+    return replace(lab, name="hall", anchors=anchors)
+
+
+def walking(plan: Plan, site: Site | None = None, **options: Any) -> tuple[Run, ...]:  # noqa: ANN401 - of ``worlds``
+    """Worlds of the lab, or another site, with tags that walk at 1 m/s from point to point."""
+    in_site = site or ideal_lab_site(plan.noise_ps)
+
+    def paths(seed: int) -> Sequence[Trajectory]:
+        return trajectories_of(Request(in_site, seed=seed, tags=plan.tags))
+
+    return worlds(plan, in_site, paths, **options)
+
+
+def worlds(
+    plan: Plan,
+    site: Site,
+    paths: Callable[[int], Sequence[Trajectory]],
+    *,
+    assumed: Site | None = None,
+    change: Callable[[Impairments], Impairments] | None = None,
+    warmup_s: float = LAB_WARMUP_S,
+    seconds: float | None = None,
+    count: int | None = None,
+    lost_at_tags: float = 0.0,
+    integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
+    **faults: Any,  # noqa: ANN401 - of a Request
+) -> tuple[Run, ...]:
+    """Worlds of a case; those of the same number have the same seed in all cases of a study.
+
+    ``paths`` gets a world's seed. Crystals and stamps have the noise of ``site``; the filters assume that of
+    ``assumed``, where it is given. ``faults`` are fields of a ``Request``, or functions of the world's number that
+    return them; ``change`` is for impairments that a request has no field for.
+    """
+    runs = []
+    for number in range(count or plan.worlds):
+        seed = seed_of(plan.seed, number)
+        own = {name: fault(number) if callable(fault) else fault for name, fault in faults.items()}
+        impairments = impairments_of(Request(site, seed=seed, **own), site)
+        runs.append(
+            Run(
+                site=assumed or site,
+                trajectories=tuple(paths(seed)),
+                impairments=impairments if change is None else change(impairments),
+                seed=seed,
+                method=plan.method,
+                qa=plan.qa,
+                mesh=plan.mesh,
+                warmup_s=warmup_s,
+                until_s=warmup_s + (seconds or plan.seconds),
+                lost_at_tags=lost_at_tags,
+                integrity=integrity,
+            )
+        )
+    return tuple(runs)
+
+
+def box(site: Site) -> tuple[Array, Array]:
+    """Lowest and highest corner of the space in which tags move, shape (3,): half a metre within the anchors."""
+    anchors_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    low_m, high_m = anchors_m.min(axis=0) + WALL_MARGIN_M, anchors_m.max(axis=0) - WALL_MARGIN_M
+    low_m[2] = high_m[2] = site.tags.height_m or 0.0
+    return low_m, high_m
+
+
+def anchor_of(site: Site, number: int) -> AnchorSite:
+    """Another anchor for each world in turn, the master among them."""
+    return site.anchors[number % len(site.anchors)]

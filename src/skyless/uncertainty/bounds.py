@@ -1,21 +1,37 @@
 """Cramér–Rao bounds: the least error that any unbiased estimator can have with the stamps of a schedule.
 
 With Gaussian noise the (posterior) bound is the covariance of a filter that is linearised at the truth. Its states, in
-metres and m/s of light, are the tag's position p, velocity v and clock (b, f), and the clock (x_i, f_i) of every anchor
-but the first, all clocks against the first anchor's. Each frame brings a state of its own for the noise of its TX
-stamp, which everyone who hears the frame shares. The first anchor's oscillator is in all clock differences, so their
-process noise is q·(I + 11ᵀ).
+metres and m/s of light, all clocks against the first anchor's:
+
+    values      position p (dims), offset b of the tag's clock, offsets x_i of all anchors but the first
+    rates       velocity v, rates f and f_i, in the same order
+    biases      see ``Biases``; none where the bound has none
+    TX noise    of the newest frame's stamp, which everyone who receives the frame shares
+
+The first anchor's oscillator is in all clock differences, so their process noise is q·(I + 11ᵀ). Three bounds run the
+same recursion: with all receptions (``tracking_bound``), with those that a receiver gets to know where frames are lost
+(``received_bound``), and with biases of survey and ranges (``biased_bound``). Equations: ``docs/maths.md`` section 7.
 """
 
-from typing import Final
+import math
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from msgspec import Struct
+from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.kernels.arrays import Array
-from skyless.kernels.compiled import kernel, threaded_kernel
+from skyless.kernels.arrays import Array, Indices, Mask, Matrix, Vector
+from skyless.kernels.compiled import jitted, kernel, threaded_kernel
+from skyless.kernels.covariance import (
+    add_process_noise,
+    decay_state,
+    integrate_rates,
+    multiply_ph,
+    reset_covariance,
+    subtract_information,
+)
 from skyless.uncertainty.dop import direction
 
 POSITION_STD_M: Final = 30.0
@@ -23,8 +39,8 @@ OFFSET_STD_M: Final = 1e4
 RATE_STD_MPS: Final = 10e-6 * SPEED_OF_LIGHT_MPS
 """What is known before the first frame, next to nothing: 30 m, 33 µs, ±10 ppm."""
 
-QA, WHITE, WALK, TX, RX, DIM = range(6)
-"""Places of the kernels' settings."""
+_MOST_TERMS: Final = 12
+"""Of a reception by the tag with all biases: two directions, two clocks, TX noise, and three errors of the range."""
 
 
 class BoundSettings(Struct, frozen=True):
@@ -42,10 +58,15 @@ class BoundSettings(Struct, frozen=True):
     speed_std_mps: float
     """Of each component of the velocity, before the first frame."""
     mesh: bool
-    """Whether anchors also relay when they heard each other, not only the first anchor."""
+    """Whether anchors also relay when they received each other, not only the first anchor."""
     height_known: bool = True
     at_once: bool = True
     """Whether anchors' receptions are known at once; else each comes with the listener's next frame, as on the air."""
+
+    @property
+    def dims(self) -> int:
+        """Dimensions of the position that are estimated."""
+        return 2 if self.height_known else 3
 
 
 def bound_settings(
@@ -77,6 +98,34 @@ def bound_settings(
     )
 
 
+PerAnchor: TypeAlias = float | tuple[float, ...]
+"""One value for all anchors, or one for each."""
+
+
+class Biases(Struct, frozen=True):
+    """Standard deviations of errors that nobody knows, in metres; each has a normal prior with mean zero.
+
+    They are states behind the clocks, and every measurement updates all of them: what anchors receive of each other
+    informs about their positions as well. For priors that are not normal the bound is the least mean square error
+    of all linear estimators.
+    """
+
+    survey_std_m: PerAnchor = 0.0
+    """Of each coordinate of an anchor that the position has (two where the height is known): true − configured."""
+    constant_std_m: PerAnchor = 0.0
+    """Of what all of the tag's ranges to an anchor are wrong by."""
+    changing_std_m: PerAnchor = 0.0
+    """Of a part of that error that changes: Gauss–Markov along time, the tag's path, or both."""
+    slope_std_m: float = 0.0
+    """Of what ranges gain for each unit of clip((range − 4 m)/4 m, −1, 1)."""
+    pair_std_m: float = 0.0
+    """Of what receptions of one anchor by another are wrong by, for each pair, alike both ways."""
+    correlation_s: float = math.inf
+    """Time in which the correlation of the part that changes falls to 1/e ..."""
+    correlation_m: float = math.inf
+    """... and distance walked by the tag in which it does."""
+
+
 def tracking_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSettings) -> Array:
     """Posterior bound of the position after every superframe, shape (superframes, dims, dims), in m².
 
@@ -86,188 +135,295 @@ def tracking_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSetti
     Raises:
         ValueError: the path has no whole number of superframes.
     """
+    return _superframe_bound(anchors_m, path_m, settings, None)
+
+
+def biased_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSettings, biases: Biases) -> Array:
+    """As ``tracking_bound``, with biases; ``anchors_m`` are the anchors' true positions.
+
+    Raises:
+        ValueError: the path has no whole number of superframes, or there is not one deviation for each anchor.
+    """
+    return _superframe_bound(anchors_m, path_m, settings, biases)
+
+
+def received_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSettings, known: Mask) -> Array:
+    """Posterior bound of the position after every frame, shape (frames, dims, dims), in m², where frames are lost.
+
+    ``anchors_m``: shape (n, 3), in the order of their slots, the reference first. ``path_m``: where the tag is at each
+    frame, shape (frames, 3). ``known``: as of ``known_receptions``, shape (frames, n + 1); it, not the settings, states
+    what of the mesh is known.
+
+    Raises:
+        ValueError: there is not one row of ``known`` for each position.
+    """
     anchors = np.ascontiguousarray(anchors_m, np.float64)
     path = np.ascontiguousarray(path_m, np.float64)
-    if len(path) % len(anchors):
-        raise ValueError(f"the path has {len(path)} places, no multiple of {len(anchors)} anchors")
-    dims = 2 if settings.height_known else 3
-    bound = np.empty((len(path) // len(anchors), dims, dims))
-    size = 2 * dims + 2 * len(anchors) + 1
-    array = kernel_settings(settings)
-    P = diffuse(size, dims, settings.speed_std_mps)
-    scratch = np.empty_like(P), np.empty(size), np.empty(size)
-    _run(anchors, path, settings.slot_s, settings.mesh, settings.at_once, array, P, *scratch, bound)
+    if known.shape != (len(path), len(anchors) + 1):
+        raise ValueError(f"known has shape {known.shape}; it should be {(len(path), len(anchors) + 1)}")
+    return _frame_bound(anchors, path, settings, known, at_once=True, biases=None)
+
+
+def known_receptions(
+    draw: Generator, frames: int, anchors: int, *, lost_at_tags: float, lost_at_anchors: float, mesh: bool
+) -> Mask:
+    """Which receptions of each frame the tag gets to know, shape (frames, anchors + 1); its own are the last column.
+
+    Anchors send in turn, the reference first. The information is what there is on the air at most. What an anchor
+    receives of the reference is known at once, whatever the tag receives of that anchor, as its next beacon states its
+    clock, in which all of it is. Other receptions among anchors are known where the tag has received the packet itself,
+    without whose stamp they give no information, and receives the listener before that has received a newer one; they
+    are known at once as well, so that no receiver can do better.
+    """
+    senders = np.arange(frames) % anchors
+    heard = draw.random((frames, anchors + 1)) >= np.append(np.full(anchors, lost_at_anchors), lost_at_tags)
+    own = heard[:, -1]
+    relay_share = (1.0 - lost_at_tags) / max(1.0 - lost_at_tags * lost_at_anchors, 1e-12)
+    relayed = draw.random((frames, anchors)) < relay_share
+    others = relayed & own[:, None] if mesh else np.zeros_like(relayed)
+    others[senders == 0] = True
+    heard[:, :-1] &= others
+    heard[np.arange(frames), senders] = False
+    return heard
+
+
+def _superframe_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSettings, biases: Biases | None) -> Array:
+    anchors = np.ascontiguousarray(anchors_m, np.float64)
+    path = np.ascontiguousarray(path_m, np.float64)
+    n, frames = len(anchors), len(path)
+    if frames % n:
+        raise ValueError(f"the path has {frames} positions, no multiple of {n} anchors")
+    senders = np.arange(frames) % n
+    known = np.ones((frames, n + 1), np.bool_)
+    known[:, :-1] = settings.mesh | (senders == 0)[:, None]
+    known[np.arange(frames), senders] = False
+    return _frame_bound(anchors, path, settings, known, settings.at_once, biases)[n - 1 :: n]
+
+
+def _frame_bound(
+    anchors: Array, path: Array, settings: BoundSettings, known: Mask, at_once: bool, biases: Biases | None
+) -> Array:
+    """Bound after every frame; where receptions are not known at once it holds at the end of a superframe."""
+    n, dims = len(anchors), settings.dims
+    errors = Biases() if biases is None else biases
+    model = _Model(
+        anchors,
+        path,
+        known,
+        dims,
+        biases is not None,
+        settings.slot_s,
+        settings.qa,
+        settings.white,
+        settings.walk,
+        settings.tx_variance_m2,
+        settings.rx_variance_m2,
+        np.square(_of_each("changing_std_m", errors.changing_std_m, n)),
+        1.0 / errors.correlation_s,
+        1.0 / errors.correlation_m,
+    )
+    P = _prior(n, settings, biases)
+    bound = np.empty((len(path), dims, dims))
+    h, h_index, ph = np.empty(_MOST_TERMS + dims), np.empty(_MOST_TERMS + dims, np.uint32), np.empty(len(P))
+    _run(model, at_once, P, np.empty_like(P), h, h_index, ph, bound)
     return bound
 
 
-def kernel_settings(settings: BoundSettings) -> Array:
-    """The settings as the kernels take them."""
-    noise = (settings.qa, settings.white, settings.walk, settings.tx_variance_m2, settings.rx_variance_m2)
-    return np.array([*noise, 2 if settings.height_known else 3])
+def _of_each(name: str, std_m: PerAnchor, anchors: int) -> Array:
+    given = np.atleast_1d(np.asarray(std_m, np.float64))
+    if len(given) not in {1, anchors}:
+        raise ValueError(
+            f"{name} has {len(given)} values; it should be one number, or one for each of {anchors} anchors"
+        )
+    return np.broadcast_to(given, anchors).copy()
 
 
-def diffuse(size: int, dims: int, speed_std_mps: float) -> Array:
-    """Covariance before the first frame: [p, v, offsets and rates of the tag and all anchors but one, TX noise]."""
-    clocks = (size - 1 - 2 * dims) // 2
-    clock = [OFFSET_STD_M, RATE_STD_MPS] * clocks
-    return np.diag(np.square([*[POSITION_STD_M] * dims, *[speed_std_mps] * dims, *clock, 0.0]))
+def _prior(anchors: int, settings: BoundSettings, biases: Biases | None) -> Matrix:
+    """Covariance before the first frame."""
+    dims = settings.dims
+    stds = [
+        [POSITION_STD_M] * dims,
+        [OFFSET_STD_M] * anchors,
+        [settings.speed_std_mps] * dims,
+        [RATE_STD_MPS] * anchors,
+    ]
+    parts = [np.array(part) for part in stds]
+    if biases is not None:
+        parts += [
+            np.repeat(_of_each("survey_std_m", biases.survey_std_m, anchors), dims),
+            _of_each("constant_std_m", biases.constant_std_m, anchors),
+            _of_each("changing_std_m", biases.changing_std_m, anchors),
+            np.array([biases.slope_std_m]),
+            np.full(anchors * (anchors - 1) // 2, biases.pair_std_m),
+        ]
+    return np.diag(np.square(np.concatenate([*parts, np.zeros(1)])))
+
+
+class _Model(NamedTuple):
+    """What the kernels need to know."""
+
+    anchors: Array
+    path: Array
+    known: Mask
+    """Receptions, shape (frames, anchors + 1), the tag's own in the last column."""
+    dims: int
+    has_biases: bool
+    slot_s: float
+    qa: float
+    white: float
+    walk: float
+    tx_variance_m2: float
+    rx_variance_m2: float
+    changing_m2: Vector
+    """Variance of the part of range errors that changes, shape (anchors,)."""
+    changes_per_s: float
+    changes_per_m: float
+
+
+class _Layout(NamedTuple):
+    """Where the states begin; the TX noise is the last."""
+
+    values: int
+    """Number of states that have rates."""
+    survey: int
+    constant: int
+    change: int
+    slope: int
+    pair: int
+
+
+@jitted
+def _layout(dims: int, anchors: int) -> _Layout:
+    survey = 2 * (dims + anchors)
+    constant = survey + dims * anchors
+    slope = constant + 2 * anchors
+    return _Layout(dims + anchors, survey, constant, constant + anchors, slope, slope + 1)
 
 
 @threaded_kernel
 def _run(
-    anchors: Array,
-    path: Array,
-    slot_s: float,
-    mesh: bool,
-    at_once: bool,
-    settings: Array,
-    P: Array,
-    known: Array,
-    h: Array,
-    ph: Array,
-    bound: Array,
+    m: _Model, at_once: bool, P: Matrix, present: Matrix, h: Vector, h_index: Indices, ph: Vector, bound: Array
 ) -> None:
-    """Take superframe by superframe; what of the newest one has not come in yet is left out of its own bound only.
+    """Process frame by frame.
 
-    A frame's reception by an anchor whose turn is earlier in the superframe comes with the next superframe.
+    Where receptions are not known at once, those by anchors whose turn is earlier in the superframe come with the next
+    superframe: they are left out of ``present``, from which the superframe's own bound is.
     """
-    dims, n = int(settings[DIM]), len(anchors)
-    for superframe in range(len(path) // n):
-        if not at_once:
-            known[:] = P
-            _superframe(anchors, path, slot_s, mesh, False, settings, known, h, ph, superframe)
-        _superframe(anchors, path, slot_s, mesh, True, settings, P, h, ph, superframe)
-        bound[superframe] = P[:dims, :dims] if at_once else known[:dims, :dims]
+    n = len(m.anchors)
+    for frame in range(len(m.path)):
+        if not at_once and frame % n == 0:
+            present[:] = P
+            for own in range(frame, frame + n):
+                _process_frame(m, own, False, present, h, h_index, ph)
+                bound[own] = present[: m.dims, : m.dims]
+        _process_frame(m, frame, True, P, h, h_index, ph)
+        if at_once:
+            bound[frame] = P[: m.dims, : m.dims]
 
 
 @kernel
-def _superframe(
-    anchors: Array,
-    path: Array,
-    slot_s: float,
-    mesh: bool,
-    at_once: bool,
-    settings: Array,
-    P: Array,
-    h: Array,
-    ph: Array,
-    superframe: int,
-) -> None:
-    """Take the frames of a superframe; the tag hears each of them, and so do the anchors whose stamps are relayed."""
-    n, dims = len(anchors), int(settings[DIM])
-    for sender in range(n):
-        frame = superframe * n + sender
-        if frame > 0:
-            predict(P, dims, n, slot_s, settings)
-        new_packet(P, settings[TX])
-        hear_by_tag(P, h, ph, anchors, sender, path[frame], dims, settings[RX])
-        for listener in range(n):
-            if listener != sender and (mesh or sender == 0) and (at_once or listener > sender):
-                hear_by_anchor(P, h, ph, sender, listener, dims, settings[RX])
+def _process_frame(m: _Model, frame: int, at_once: bool, P: Matrix, h: Vector, h_index: Indices, ph: Vector) -> None:
+    """Process the receptions of a frame: the tag's, and those of anchors that are relayed."""
+    n, sender = len(m.anchors), frame % len(m.anchors)
+    if frame > 0:
+        _predict(m, P)
+        if m.has_biases:
+            _decay_changes(m, frame, P)
+    reset_covariance(P, len(P), len(P) - 1, m.tx_variance_m2)
+    if m.known[frame, n]:
+        _update(m, P, h, h_index, _tag_terms(m, frame, len(P), h, h_index), ph)
+    for listener in range(n):
+        if m.known[frame, listener] and (at_once or listener > sender):
+            _update(m, P, h, h_index, _anchor_terms(m, sender, listener, len(P), h, h_index), ph)
 
 
 @kernel
-def predict(P: Array, dims: int, clocks: int, dt_s: float, settings: Array) -> None:
-    """Advance by ``dt_s``: constant velocity, and clocks whose differences all hold the first anchor's oscillator.
-
-    ``clocks``: how many clocks are states. What stands behind them stays as it is.
-    """
-    behind = 2 * (dims + clocks)
-    for axis in range(dims):
-        _advance(P, axis, dims + axis, dt_s)
-        _add_noise(P, axis, dims + axis, axis, dims + axis, dt_s, 0.0, settings[QA])
-    for i in range(2 * dims, behind, 2):
-        _advance(P, i, i + 1, dt_s)
-    for i in range(2 * dims, behind, 2):
-        for j in range(2 * dims, behind, 2):
+def _predict(m: _Model, P: Matrix) -> None:
+    """Time update by a slot: constant velocity, and clocks whose differences all hold the first anchor's oscillator."""
+    values = m.dims + len(m.anchors)
+    integrate_rates(P, len(P), values, m.slot_s)
+    for axis in range(m.dims):
+        add_process_noise(P, axis, values + axis, axis, values + axis, m.slot_s, 0.0, m.qa)
+    for i in range(m.dims, values):
+        for j in range(m.dims, values):
             share = 2.0 if i == j else 1.0
-            _add_noise(P, i, i + 1, j, j + 1, dt_s, share * settings[WHITE], share * settings[WALK])
+            add_process_noise(P, i, values + i, j, values + j, m.slot_s, share * m.white, share * m.walk)
 
 
 @kernel
-def _advance(P: Array, i: int, j: int, dt_s: float) -> None:
-    """State i gains dt·(state j)."""
-    for column in range(len(P)):
-        P[i, column] += dt_s * P[j, column]
-    for row in range(len(P)):
-        P[row, i] += dt_s * P[row, j]
+def _decay_changes(m: _Model, frame: int, P: Matrix) -> None:
+    """Time update of the part of range errors that changes."""
+    n, first = len(m.anchors), _layout(m.dims, len(m.anchors)).change
+    walked_m = _distance_m(m.path[frame - 1], m.path[frame])
+    kept = math.exp(-m.slot_s * m.changes_per_s - walked_m * m.changes_per_m)
+    for anchor in range(n):
+        decay_state(P, len(P), first + anchor, kept, m.changing_m2[anchor])
 
 
 @kernel
-def _add_noise(P: Array, a: int, a_rate: int, b: int, b_rate: int, dt_s: float, white: float, walk: float) -> None:
-    """Add the covariance of the noise that two pairs (value, rate) collect in common."""
-    P[a, b] += white * dt_s + walk * dt_s**3 / 3.0
-    P[a, b_rate] += walk * dt_s**2 / 2.0
-    P[a_rate, b] += walk * dt_s**2 / 2.0
-    P[a_rate, b_rate] += walk * dt_s
-
-
-@kernel
-def new_packet(P: Array, variance: float) -> None:
-    """Forget the last frame's TX noise, the last state, for that of a new one."""
-    last = len(P) - 1
-    P[last, :] = 0.0
-    P[:, last] = 0.0
-    P[last, last] = variance
-
-
-@kernel
-def hear_by_tag(
-    P: Array, h: Array, ph: Array, anchors: Array, sender: int, place: Array, dims: int, variance: float
-) -> None:
-    """The tag's stamp less the frame's: range, its clock, less the sender's clock, less the TX noise."""
-    tag_terms(h, anchors, sender, place, dims)
-    update(P, h, ph, variance)
-
-
-@kernel
-def tag_terms(h: Array, anchors: Array, sender: int, place: Array, dims: int) -> None:
-    """Put that measurement into ``h``."""
-    h[:] = 0.0
-    towards = direction(anchors, sender, place)
-    for axis in range(dims):
-        h[axis] = towards[axis]
-    h[2 * dims] = 1.0
-    _subtract_sender(h, sender, dims)
-
-
-@kernel
-def hear_by_anchor(P: Array, h: Array, ph: Array, sender: int, listener: int, dims: int, variance: float) -> None:
-    """An anchor's stamp less the frame's; the distance is known."""
-    anchor_terms(h, sender, listener, dims)
-    update(P, h, ph, variance)
-
-
-@kernel
-def anchor_terms(h: Array, sender: int, listener: int, dims: int) -> None:
-    """Put that measurement into ``h``."""
-    h[:] = 0.0
-    if listener > 0:
-        h[2 * dims + 2 * listener] = 1.0
-    _subtract_sender(h, sender, dims)
-
-
-@kernel
-def _subtract_sender(h: Array, sender: int, dims: int) -> None:
-    if sender > 0:
-        h[2 * dims + 2 * sender] -= 1.0
-    h[len(h) - 1] = -1.0
-
-
-@kernel
-def update(P: Array, h: Array, ph: Array, variance: float) -> None:
-    """What a scalar measurement h with this variance leaves of the covariance."""
+def _update(m: _Model, P: Matrix, h: Vector, h_index: Indices, terms: int, ph: Vector) -> None:
+    """What the measurement in ``h`` leaves of the covariance."""
     n = len(P)
-    ph[:] = 0.0
-    for column in range(n):
-        if h[column] != 0.0:
-            for row in range(n):
-                ph[row] += P[column, row] * h[column]
-    spread = variance
-    for row in range(n):
-        spread += h[row] * ph[row]
-    for row in range(n):
-        gain = ph[row] / spread
-        for column in range(row, n):
-            P[row, column] -= gain * ph[column]
-            P[column, row] = P[row, column]
+    innovation_variance = multiply_ph(P, n, h, h_index, terms, ph) + m.rx_variance_m2
+    subtract_information(P, n, n, ph, innovation_variance)
+
+
+@kernel
+def _distance_m(a: Array, b: Array) -> float:
+    return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
+@jitted
+def _set_term(h: Vector, h_index: Indices, term: int, state: int, weight: float) -> int:
+    h[term], h_index[term] = weight, state
+    return term + 1
+
+
+@kernel
+def _tag_terms(m: _Model, frame: int, size: int, h: Vector, h_index: Indices) -> int:
+    """The tag's stamp less the frame's: range, its clock, less the sender's, less the TX noise; number of terms.
+
+    With biases the range also holds the anchor's displacement and all errors of ranges.
+    """
+    sender, position = frame % len(m.anchors), m.path[frame]
+    towards = direction(m.anchors, sender, position)
+    term = _set_term(h, h_index, 0, m.dims, 1.0)
+    for axis in range(m.dims):
+        term = _set_term(h, h_index, term, axis, towards[axis])
+    term = _sender_terms(m, sender, size, h, h_index, term)
+    if m.has_biases:
+        where = _layout(m.dims, len(m.anchors))
+        for axis in range(m.dims):
+            term = _set_term(h, h_index, term, where.survey + m.dims * sender + axis, -towards[axis])
+        term = _set_term(h, h_index, term, where.constant + sender, 1.0)
+        term = _set_term(h, h_index, term, where.change + sender, 1.0)
+        far = min(max((_distance_m(m.anchors[sender], position) - 4.0) / 4.0, -1.0), 1.0)
+        term = _set_term(h, h_index, term, where.slope, far)
+    return term
+
+
+@kernel
+def _anchor_terms(m: _Model, sender: int, listener: int, size: int, h: Vector, h_index: Indices) -> int:
+    """An anchor's stamp less the frame's, whose distance is known; number of terms.
+
+    With biases the distance holds the displacements of both anchors, and what their pair is wrong by.
+    """
+    n, term = len(m.anchors), _sender_terms(m, sender, size, h, h_index, 0)
+    if listener > 0:
+        term = _set_term(h, h_index, term, m.dims + listener, 1.0)
+    if m.has_biases:
+        where, towards = _layout(m.dims, n), direction(m.anchors, sender, m.anchors[listener])
+        for axis in range(m.dims):
+            term = _set_term(h, h_index, term, where.survey + m.dims * listener + axis, towards[axis])
+            term = _set_term(h, h_index, term, where.survey + m.dims * sender + axis, -towards[axis])
+        low, high = min(sender, listener), max(sender, listener)
+        term = _set_term(h, h_index, term, where.pair + low * (2 * n - low - 1) // 2 + high - low - 1, 1.0)
+    return term
+
+
+@kernel
+def _sender_terms(m: _Model, sender: int, size: int, h: Vector, h_index: Indices, term: int) -> int:
+    """Less the sender's clock and the noise of its stamp."""
+    if sender > 0:
+        term = _set_term(h, h_index, term, m.dims + sender, -1.0)
+    return _set_term(h, h_index, term, size - 1, -1.0)

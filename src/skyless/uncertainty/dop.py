@@ -7,8 +7,8 @@ from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from skyless.kernels.arrays import Array
-from skyless.kernels.cholesky import factorise, invert
 from skyless.kernels.compiled import kernel, threaded_kernel
+from skyless.kernels.linear_algebra import factorise, invert
 
 
 class Dops(Struct, frozen=True, gc=False):

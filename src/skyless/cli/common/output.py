@@ -3,10 +3,13 @@
 import os
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 import msgspec
+
+from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,7 +22,16 @@ def print_json(value: object) -> None:
 
 def to_json(value: object) -> str:
     """Write a tree of structs, dataclasses, containers, NumPy values and paths as one line of JSON."""
-    return msgspec.json.encode(value, enc_hook=_plain).decode()
+    return msgspec.json.encode(value, enc_hook=json_form).decode()
+
+
+def json_form(value: object) -> object:
+    """What msgspec does not know: NumPy's scalars and arrays (which need not be imported for this), paths."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise TypeError(f"{type(value).__name__} has no form in JSON")
 
 
 def console() -> "Console":
@@ -27,6 +39,56 @@ def console() -> "Console":
     from rich.console import Console
 
     return Console(file=sys.stdout, highlight=False)
+
+
+def print_facts(title: str, facts: Iterable[tuple[str, str]]) -> None:
+    """Show a table of names and values."""
+    from rich.markup import escape
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("", "", title=escape(title), show_header=False)
+    for name, value in facts:
+        table.add_row(Text(name), Text(value))
+    console().print(table)
+
+
+def print_warnings(warnings: Iterable[str]) -> None:
+    """Show warnings, one a line."""
+    from rich.text import Text
+
+    for warning in warnings:
+        console().print(Text.assemble(("warning: ", "bold yellow"), warning))
+
+
+def number(value: float | None, form: str = "{:.3f}", scale: float = 1.0) -> str:
+    """A number for people; a dash where there is none."""
+    return "–" if value is None else form.format(scale * value)
+
+
+def cm(value_m: float | None) -> str:
+    """A length in centimetres for people."""
+    return number(value_m, "{:.2f} cm", 100.0)
+
+
+def open_for_writing(path: Path) -> TextIO:
+    """Open a table to be written row by row.
+
+    Raises:
+        SkylessError: the file cannot be written.
+    """
+    try:
+        return path.open("w", newline="", encoding="utf-8")
+    except OSError as error:
+        raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write a file as ``write_atomically`` does. Raises SkylessError when it cannot be written."""
+    try:
+        write_atomically(path, data)
+    except OSError as error:
+        raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -40,15 +102,6 @@ def write_atomically(path: Path, data: bytes) -> None:
     except BaseException:
         Path(scratch).unlink(missing_ok=True)
         raise
-
-
-def _plain(value: object) -> object:
-    """What msgspec does not know: NumPy's scalars and arrays (which need not be imported for this), paths."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    raise TypeError(f"{type(value).__name__} has no form in JSON")
 
 
 def _umask() -> int:

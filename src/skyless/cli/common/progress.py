@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-_PATIENCE_S: Final = 1.5
+_HIDDEN_S: Final = 1.5
 _REDRAW_S: Final = 0.1
 
 
@@ -20,11 +20,11 @@ class Bar:
         self._description = description
         self._total = total
         self._wanted = sys.stderr is not None and sys.stderr.isatty()
-        self._next_s = time.monotonic() + _PATIENCE_S
+        self._next_s = time.monotonic() + _HIDDEN_S
         self._shown: tuple[Progress, TaskID] | None = None
 
     def reach(self, done: float) -> None:
-        """Say how much of the total is done; cheap enough to be called for every chunk of work."""
+        """Show how much of the total is done; cheap enough to be called for every chunk of work."""
         if not self._wanted or time.monotonic() < self._next_s:
             return
         self._next_s = time.monotonic() + _REDRAW_S
@@ -34,7 +34,7 @@ class Bar:
         progress.update(task, completed=done)
 
     def close(self) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         if self._shown is not None:
             self._shown[0].stop()
 
@@ -67,4 +67,11 @@ def status(description: str) -> Iterator[None]:
     from rich.console import Console
 
     with Console(stderr=True).status(description):
+        yield
+
+
+@contextmanager
+def loading_kernels() -> Iterator[None]:
+    """A spinner while the compiled kernels are loaded, which are compiled where they have not been yet."""
+    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
         yield

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from skyless.cli.nodes.options import DEFAULT_MQTT, Mqtt, MqttCa, broker, say, site_named
+from skyless.cli.nodes.options import MqttOptions, log, site_named
 from skyless.errors import SkylessError
 from skyless.nodes.open_radio import DEFAULT_RADIO
 
@@ -18,12 +18,11 @@ def anchor(
     *ids: Annotated[int, Parameter(name="IDS")],
     site: str = "lab",
     radio: str = DEFAULT_RADIO,
-    mqtt: Mqtt = DEFAULT_MQTT,
-    mqtt_ca: MqttCa = None,
+    broker: MqttOptions = MqttOptions(),
 ) -> None:
     """Run anchors of a site until Ctrl-C.
 
-    An anchor listens first, sets its clock by the master's, and speaks in its slots. It does its work with or without
+    An anchor listens first, synchronises its clock to the master's, and sends in its slots. It works with or without
     a broker.
 
     Parameters
@@ -35,29 +34,26 @@ def anchor(
     radio
         The anchors' radio: ether:HOST:PORT is the emulated air of skyless ether, serial:PATH a board,
         spi:BUS.DEVICE,irq=PIN,reset=PIN a DW1000 on this computer's SPI, model:HOST:PORT a model of one on that air.
-    mqtt
+    broker.mqtt
         Broker for health and site, or none.
-    mqtt_ca
-        Certificates (PEM) to trust for mqtts.
     """
     from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.nodes.anchors import Anchors
+    from skyless.nodes.anchor import Anchors
     from skyless.nodes.open_radio import is_simulated, open_radios
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.process import run
     from skyless.radios.interface import AntennaDelays
 
-    plan, address = site_named(site), broker(mqtt, mqtt_ca)
-    known = [node.id for node in plan.anchors]
-    if not ids or len(set(ids)) < len(ids) or not set(ids) <= set(known):
+    plan, address = site_named(site), broker.address()
+    nodes = {node.id: node for node in plan.anchors}
+    if not ids or len(set(ids)) < len(ids) or not set(ids) <= set(nodes):
         given = " ".join(map(str, ids)) or "missing"
         raise SkylessError(
-            f"IDS is {given}; it should be one or more of the site's, each once: {' '.join(map(str, known))}"
+            f"IDS is {given}; it should be one or more of the site's, each once: {' '.join(map(str, nodes))}"
         )
-    placed = {node.id: node for node in plan.anchors}
-    delays = [AntennaDelays(placed[i].tx_antenna_delay_ticks, placed[i].rx_antenna_delay_ticks) for i in ids]
+    delays = [AntennaDelays(nodes[i].tx_antenna_delay_ticks, nodes[i].rx_antenna_delay_ticks) for i in ids]
     radios = open_radios(radio, "anchor", tuple(map(str, ids)), delays)
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
     compile_kernels()
     with contextlib.suppress(KeyboardInterrupt):
-        nodes = Anchors(plan, radios, address, say, simulated=lambda: is_simulated(radio), floor_plan=image)
-        run(nodes.run(), punctual=True)
+        anchors = Anchors(plan, radios, address, log, simulated=lambda: is_simulated(radio), floor_plan=image)
+        run(anchors.run(), punctual=True)

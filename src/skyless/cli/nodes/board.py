@@ -1,4 +1,4 @@
-"""``skyless board``: an emulated board on a serial port that is none."""
+"""``skyless board``: an emulated board on a pseudo-terminal."""
 
 import contextlib
 import sys
@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import App, Parameter
 
 from skyless.cli.common.output import print_json
-from skyless.cli.nodes.options import say
+from skyless.cli.nodes.options import log
 from skyless.errors import SkylessError
 from skyless.nodes.open_radio import DEFAULT_RADIO
 
@@ -33,20 +33,20 @@ def board(
     Parameters
     ----------
     name
-        Whose radio it is: an anchor's number, or a tag of the air (tag1).
+        Which radio it is: an anchor's number, or a tag of the air (tag1).
     radio
         The air: ether:HOST:PORT of skyless ether.
     format
-        What it speaks: link (Skyless), sniffer or sniffer-text (Bitcraze; beacons become TDoA3 packets), listener
-        (uwb-apps, JSON).
+        Format on the serial port: link (Skyless), sniffer or sniffer-text (Bitcraze; beacons become TDoA3 packets),
+        listener (uwb-apps, JSON).
     link
         A symbolic link to the pseudo-terminal, which keeps its name when the board is started again.
     json
-        Tell path and format as one JSON object before it starts.
+        Print path and format as one JSON object before it starts.
     """
-    from skyless.nodes.emulation.board import RADIO_OF, Board
+    from skyless.nodes.board import RADIO_OF, Board
     from skyless.nodes.open_radio import is_ether, open_radios
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.process import run
 
     if not is_ether(radio):
         raise SkylessError(f"--radio is {radio!r}; it should be the emulated air, ether:HOST[:PORT]")
@@ -55,14 +55,14 @@ def board(
         raise SkylessError(
             f"--format is {format!r}; it should be link for an anchor, as boards of other formats only listen"
         )
-    emulated = Board(open_radios(radio, kind, (name,))[0], kind, format, link, say)
-    place = emulated.pty.place
+    emulated = Board(open_radios(radio, kind, (name,))[0], kind, format, link, log)
+    path = emulated.pty.name
     if json:
-        print_json({"board": name, "path": place, "format": format, "radio": f"{RADIO_OF[format]}:{place}"})
+        print_json({"board": name, "path": path, "format": format, "radio": f"{RADIO_OF[format]}:{path}"})
         sys.stdout.flush()
     else:
-        say(f"board {name}: emulated, at {place}")
+        log(f"board {name}: emulated, at {path}")
         rest = " --anchors anchors.csv" if RADIO_OF[format] == "sniffer" else ""
-        say(f"next: skyless {kind} {name} --radio {RADIO_OF[format]}:{place}{rest}")
+        log(f"next: skyless {kind} {name} --radio {RADIO_OF[format]}:{path}{rest}")
     with contextlib.suppress(KeyboardInterrupt):
         run(emulated.run(), punctual=True)

@@ -14,7 +14,7 @@ from skyless.cli.common.output import print_json
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.nodes.broker.settings import BrokerSettings
+    from skyless.nodes.broker import BrokerSettings
 
 app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
 
@@ -32,27 +32,27 @@ def broker(
 ) -> None:
     """Run an MQTT broker until Ctrl-C, and print its address when it is ready.
 
-    It serves this machine alone unless --listen says otherwise, and then asks for a name and a password.
+    It serves this machine alone unless --listen is given, and then asks for a name and a password.
 
     Parameters
     ----------
     port
-        Where it listens; by default 1883, or the next port that is free.
+        Port to listen on; by default 1883, or the next port that is free.
     listen
         Address of this machine to listen on; 0.0.0.0 means all of them.
     data
         Folder for retained messages and sessions; by default skyless/broker in the user's data folder.
     user
-        Name that clients must give; their password stands in SKYLESS_MQTT_PASSWORD.
+        Name that clients must give; their password is taken from SKYLESS_MQTT_PASSWORD.
     certificate
-        Certificate in PEM form; with it and --key the broker speaks TLS.
+        Certificate in PEM form; with it and --key the broker uses TLS.
     key
         Private key of the certificate in PEM form.
     json
         Print one JSON object instead of the address.
     """
     from skyless.mqtt.address import PASSWORD_VARIABLE
-    from skyless.nodes.broker.settings import BrokerSettings
+    from skyless.nodes.broker import BrokerSettings
 
     password = None if user is None else os.environ.get(PASSWORD_VARIABLE)
     settings = BrokerSettings(port, listen, data, user, password, certificate, key)
@@ -60,8 +60,8 @@ def broker(
 
 
 async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
-    from skyless.nodes.broker.broker import start_broker
-    from skyless.nodes.process.loop import ending_signals
+    from skyless.nodes.broker import start_broker
+    from skyless.nodes.process import ending_signals
 
     stop = asyncio.Event()
     for number in (signal.SIGINT, *ending_signals()):
@@ -77,5 +77,5 @@ async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
         await asyncio.wait((ended, asked), return_when=asyncio.FIRST_COMPLETED)
         asked.cancel()
         if ended.done():
-            raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may say why")
+            raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may show why")
         ended.cancel()

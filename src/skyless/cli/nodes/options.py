@@ -1,32 +1,43 @@
-"""What the commands of a running site share."""
+"""Options that the commands of a running site share."""
 
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import Parameter
+from cyclopts.validators import Number
 
-from skyless.cli.common.options import finite_numbers
+from skyless.cli.common.options import finite_numbers, options
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
     from skyless.mqtt.address import MqttAddress
     from skyless.site.model import Site
 
-DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
-Mqtt = Annotated[str, Parameter(env_var="SKYLESS_MQTT")]
+_DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
+
 MqttCa = Annotated[Path | None, Parameter(env_var="SKYLESS_MQTT_CA")]
+SiteId = Annotated[int, Parameter(validator=Number(gte=0, lt=0xFFFE))]
+WalkingSpeed = Annotated[float, Parameter(validator=Number(gt=0, lte=10))]
 
 
-def broker(mqtt: str, mqtt_ca: Path | None) -> "MqttAddress | None":
-    """The broker of ``--mqtt``; None for ``none``. Raises SkylessError."""
-    from skyless.mqtt.address import mqtt_address
+@options
+class MqttOptions:
+    """The broker of a running site. What a program uses it for stands in the help of its command."""
 
-    if mqtt == "none":
-        if mqtt_ca is not None:
-            raise SkylessError("--mqtt is 'none'; give a broker's address together with --mqtt-ca")
-        return None
-    return mqtt_address(mqtt, mqtt_ca)
+    mqtt: Annotated[str, Parameter(env_var="SKYLESS_MQTT")] = _DEFAULT_MQTT
+    mqtt_ca: MqttCa = None
+    """Certificates (PEM) to trust for mqtts."""
+
+    def address(self) -> "MqttAddress | None":
+        """The broker's address; None for ``none``. Raises SkylessError."""
+        from skyless.mqtt.address import mqtt_address
+
+        if self.mqtt == "none":
+            if self.mqtt_ca is not None:
+                raise SkylessError("--mqtt is 'none'; give a broker's address together with --mqtt-ca")
+            return None
+        return mqtt_address(self.mqtt, self.mqtt_ca)
 
 
 def site_named(site: str) -> "Site":
@@ -44,7 +55,7 @@ def site_named(site: str) -> "Site":
 
 
 def listen_address(text: str, usual_port: int) -> tuple[str, int | None]:
-    """HOST:PORT, or one of both; the port is None where it is not told. Raises SkylessError."""
+    """HOST:PORT, or one of both; the port is None where it is not given. Raises SkylessError."""
     host, colon, digits = text.rpartition(":")
     if text.isdecimal():
         host = "127.0.0.1"
@@ -58,6 +69,6 @@ def listen_address(text: str, usual_port: int) -> tuple[str, int | None]:
     return host, int(digits) if digits else None
 
 
-def say(line: str) -> None:
-    """Tell a person."""
+def log(line: str) -> None:
+    """Show a line to a person, on standard error."""
     print(line, file=sys.stderr, flush=True)

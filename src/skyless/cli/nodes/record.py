@@ -5,14 +5,13 @@ import contextlib
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import App, Parameter
-from cyclopts.validators import Number
+from cyclopts import App
 
 from skyless.cli.common.options import Positive
 from skyless.cli.common.output import print_json
-from skyless.cli.nodes.options import DEFAULT_MQTT, Mqtt, MqttCa, broker, say
+from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -30,9 +29,8 @@ def record(
     file: Path | None = None,
     /,
     *,
-    mqtt: Mqtt = DEFAULT_MQTT,
-    mqtt_ca: MqttCa = None,
-    site_id: Annotated[int | None, Parameter(validator=Number(gte=0, lt=0xFFFE))] = None,
+    broker: MqttOptions = MqttOptions(),
+    site_id: SiteId | None = None,
     duration: Positive | None = None,
     limit_mb: Positive | None = None,
     json: bool = False,
@@ -44,13 +42,11 @@ def record(
     Parameters
     ----------
     file
-        The recording, a new MCAP file; by default named by the time, in this folder.
-    mqtt
+        The recording, a new MCAP file; by default in this folder, named after the time.
+    broker.mqtt
         The site's broker.
-    mqtt_ca
-        Certificates (PEM) to trust for mqtts.
     site_id
-        Number of the site; by default the first that the broker knows.
+        Number of the site; by default the first that the broker has.
     duration
         Seconds after which the recording ends.
     limit_mb
@@ -58,10 +54,10 @@ def record(
     json
         Write one JSON object at the end instead of text.
     """
-    from skyless.nodes.process.loop import run
+    from skyless.nodes.process import run
     from skyless.recordings.mcap.recorder import McapFile
 
-    address = broker(mqtt, mqtt_ca)
+    address = broker.address()
     if address is None:
         raise SkylessError("--mqtt is 'none'; it should be the broker of the site to record")
     address.tls_context()
@@ -91,7 +87,7 @@ async def _record(
     if site_id is None:
         async with asyncio.timeout(duration_s):
             site_id = await find_site(address, lambda _: None)
-    node = RecorderNode(file, address, site_id, say)
+    node = RecorderNode(file, address, site_id, log)
     found.append(node)
     screen = asyncio.ensure_future(_status(node)) if sys.stderr.isatty() else None
     try:
@@ -128,7 +124,7 @@ def _report(path: Path, state: "RecorderState | None", *, json: bool) -> None:
     if json:
         print_json({"file": path, **({} if state is None else msgspec.to_builtins(state))})
     elif state is None:
-        print(f"{path}: nothing was recorded, as the broker told of no site")
+        print(f"{path}: nothing was recorded, as the broker has no site")
     else:
         print(f"{path}: {state.seconds:.1f} s, {state.bytes / 1e6:.2f} MB, {sum(state.messages.values())} messages")
         for kind, number in sorted(state.messages.items()):
@@ -136,4 +132,4 @@ def _report(path: Path, state: "RecorderState | None", *, json: bool) -> None:
         for reason, number in sorted(state.drops.items()):
             print(f"  dropped: {reason} {number}")
         if state.lost:
-            print(f"  not written any more: {state.lost} messages; {state.ended}")
+            print(f"  not written at the end: {state.lost} messages; {state.ended}")

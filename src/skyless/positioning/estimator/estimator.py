@@ -15,15 +15,22 @@ from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.kernels.arrays import Array, Indices, Integers, Matrix, Records, Vector
 from skyless.kernels.compiled import kernel, step, threaded_kernel
 from skyless.positioning.estimator.faults import (
-    SURE_CHI2,
     explained_chi2,
     fade_recent_faults,
     fault_chi2,
     open_faults,
 )
-from skyless.positioning.estimator.flatness import fit_plane, is_height_open
-from skyless.positioning.estimator.kalman import is_at_rest, predict
-from skyless.positioning.estimator.kinds import (
+from skyless.positioning.estimator.kalman import is_stationary, predict
+from skyless.positioning.estimator.levels import (
+    LASTING_CHI2,
+    LEVELS,
+    RECENT_CHI2,
+    RECENT_STD_M,
+    fit_plane,
+    integrity_state,
+    protect,
+)
+from skyless.positioning.estimator.measurements import (
     CLOCK_JUMPED,
     difference,
     first_reception,
@@ -33,21 +40,12 @@ from skyless.positioning.estimator.kinds import (
     report,
     zero_velocity,
 )
-from skyless.positioning.estimator.levels import (
-    HPL,
-    LASTING_CHI2,
-    LEVELS,
-    RECENT_CHI2,
-    RECENT_STD_M,
-    VPL,
-    protect,
-)
-from skyless.positioning.estimator.monitor import OFTEN_LATE, covariance_scale, follow_rest
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.monitor import LATE_OFTEN_SHARE, covariance_scale, update_stationary
 from skyless.positioning.estimator.state import (
     LASTING_STD_M,
     NEVER,
-    REMEMBERED,
+    PACKETS_KEPT,
+    EstimatorSettings,
     EstimatorState,
     layout,
     new_state,
@@ -58,23 +56,20 @@ from skyless.positioning.estimator.state import (
     without_anchor,
 )
 from skyless.positioning.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY
-from skyless.positioning.integrity import CONTRADICTED, OBSTRUCTED, SOUND, UNAVAILABLE
+from skyless.positioning.integrity import HPL, VPL
 from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 
 REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = range(7)
-"""What became of a packet; the last three ask for an anchor to join or leave, and for the packet again."""
+"""What became of a packet; the last three require an anchor to join or leave, and for the packet again."""
 
 RESTART_M: Final = 300.0
 """A path that seems longer than expected by more than this is a counter that has jumped, ..."""
 
 RESTART_IN_ROW: Final = 3
-"""... if this number of packets in a row say so."""
+"""... if this is so for this number of packets in a row."""
 
 MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS
 """Between two clocks that are still crystals."""
-
-UNCOVERED_CHI2: Final = 240.0
-"""A test of faults beyond this shows one that the levels may not cover."""
 
 LOST_IN_ROW: Final = 8
 """This number of packets beyond the gate in a row, of more anchors than can all be blocked, is a wrong state, ..."""
@@ -82,10 +77,10 @@ LOST_IN_ROW: Final = 8
 LOST_SHARE: Final = 0.5
 """... as does a larger share of them."""
 
-DOUBTED_STD_M: Final = 0.3
+MISFIT_RANGE_STD_M: Final = 0.3
 """Of the range error of an anchor that did not fit at the start."""
 
-MOST_REFUSED: Final = 4.0
+MOST_RELAYS_REJECTED: Final = 4.0
 """Relays beyond the gate lately; fewer may be late ones."""
 
 FADING: Final = 0.95
@@ -94,30 +89,12 @@ FADING: Final = 0.95
 MOST_PACKED: Final = 16
 """Relays in a frame; 13 fit."""
 
-MOST_PLACED: Final = 4096
-"""Anchors in the table of an estimator that is restored."""
-
-FIRST_PACKETS: Final = 3
-"""Of each anchor, before which nothing is promised."""
-
-
-WIDE: Final = 0.05
-"""Part of the mean range; ranges are curved within positions of a larger standard deviation, which have no level."""
-
-DOUBTED_S: Final = 5.0
-"""There is no level for this time after a start whose packets contradicted each other: where several anchors are late,
-the others may agree on a wrong position, until the tag has moved enough to show it."""
-
-OPEN_WIDE: Final = 0.02
-"""The same where all range errors are open: then only the tag's way tells its position, by directions that change, and
-a filter that is linearised at a wrong place learns too much from them (errors of 5 standard deviations)."""
-
 
 class Report(Struct, frozen=True, gc=False):
-    """What an anchor says of its clock."""
+    """What an anchor reports of its clock."""
 
     master: int
-    """The master's index in the table; −1 where nothing is said."""
+    """The master's index in the table; −1 where nothing is reported."""
     subticks: int
     """The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸."""
     variance_m2: float
@@ -194,25 +171,25 @@ def _process(
             was_known = result != CLOCK_JUMPED
     if joins or was_known:
         status["packets"] += 1
-        _remember(s, anchor, sequence, rx_ticks, tx_ticks)
+        _keep_packet(s, anchor, sequence, rx_ticks, tx_ticks)
     if was_known:
-        status["relays_taken"] *= FADING
-        status["relays_refused"] *= FADING
+        status["relays_lately_accepted"] *= FADING
+        status["relays_lately_rejected"] *= FADING
     _process_relays(s, relays, first, last if was_known else first)
     if was_known and report_variance_m2 > 0.0 and master >= 0 and s.index_of[master] not in (-1, anchor):
         report(s, anchor, s.index_of[master], subticks, report_variance_m2)
     if joins or was_known:
-        _look_around(s, elapsed_s)
+        _check_motion_and_faults(s, elapsed_s)
     s.status[0]["outcome"] = outcome
     return outcome
 
 
 @step
-def _look_around(s: EstimatorState, elapsed_s: float) -> None:
-    """Look whether the tag stands still, and once in a round of packets for faults."""
-    if s.settings[0]["rest_s"] > 0.0:
-        follow_rest(s, elapsed_s)
-        if is_at_rest(s):
+def _check_motion_and_faults(s: EstimatorState, elapsed_s: float) -> None:
+    """Check whether the tag stands still and, once in a round of packets, for faults."""
+    if s.settings[0]["stationary_s"] > 0.0:
+        update_stationary(s, elapsed_s)
+        if is_stationary(s):
             zero_velocity(s)
     if s.status[0]["packets"] % len(s.anchors) == 0:
         open_faults(s, fault_chi2(s, 0, s.status[0]["fault_std_m"]), fault_chi2(s, 1, RECENT_STD_M))
@@ -244,9 +221,9 @@ def _admit(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> int:
 
 
 @step
-def _remember(s: EstimatorState, anchor: int, sequence: int, rx_ticks: int, tx_ticks: int) -> None:
+def _keep_packet(s: EstimatorState, anchor: int, sequence: int, rx_ticks: int, tx_ticks: int) -> None:
     """Keep what later packets and relays of this one need."""
-    a, packet = s.anchors[anchor], s.packets[anchor, sequence % REMEMBERED]
+    a, packet = s.anchors[anchor], s.packets[anchor, sequence % PACKETS_KEPT]
     a["packets"] += 1
     a["tx_ticks"], a["rx_ticks"], a["walked_m"] = tx_ticks, rx_ticks, s.status[0]["walked_m"]
     packet["sequence"], packet["tx_ticks"], packet["rx_ticks"] = sequence, tx_ticks, rx_ticks
@@ -259,7 +236,7 @@ def _process_relays(s: EstimatorState, relays: Integers, first: int, last: int) 
         listener, sender = s.index_of[relays[row, 0]], s.index_of[relays[row, 1]]
         sequence, rx_ticks = relays[row, 2], relays[row, 3]
         if listener >= 0 and sender >= 0 and listener != sender:
-            packet, link = s.packets[sender, sequence % REMEMBERED], s.links[listener, sender]
+            packet, link = s.packets[sender, sequence % PACKETS_KEPT], s.links[listener, sender]
             young = (s.status[0]["epoch_ticks"] - packet["rx_ticks"]) * TICK_S < s.settings[0]["relay_age_s"]
             if packet["sequence"] == sequence and packet["tx_ticks"] > link["tx_ticks"] and young:
                 link["tx_ticks"] = packet["tx_ticks"]
@@ -280,7 +257,7 @@ def _track(
     covariances: Matrix,
     levels: Matrix,
 ) -> int:
-    """Process packets from ``begin`` on; returns the first that asks for an anchor to join or leave, or their number.
+    """Process packets from ``begin`` on; returns the first that requires an anchor to join or leave, or their number.
 
     Rows of ``motions``, ``covariances`` and ``levels`` are filled in, where there are any.
     """
@@ -302,40 +279,8 @@ def _track(
         if len(levels) > 0:
             protect(s, levels[n])
             levels[n, LEVELS] = outcome
-            levels[n, LEVELS + 1] = _soundness(s, levels[n])
+            levels[n, LEVELS + 1] = integrity_state(s, levels[n])
     return len(anchors)
-
-
-@step
-def _spread(s: EstimatorState) -> float:
-    """The position's horizontal standard deviation as a part of the mean range; levels are of first order in it."""
-    range_m = 0.0
-    for anchor in range(len(s.anchors)):
-        range_m += s.anchors[anchor]["range_m"] / len(s.anchors)
-    return float(np.sqrt(s.P[0, 0] + s.P[1, 1]) / max(range_m, 1e-6))
-
-
-@step
-def _soundness(s: EstimatorState, levels: Vector) -> int:
-    """What can be said of a position with these levels."""
-    count, status = len(s.anchors), s.status[0]
-    soundness = SOUND
-    for anchor in range(count):
-        if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
-            soundness = OBSTRUCTED
-    is_doubted = status["fault_std_m"] > LASTING_STD_M  # then none are singled out
-    limit = SURE_CHI2 if is_doubted else UNCOVERED_CHI2
-    share = _spread(s)
-    if status["withholds_levels"] or max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > limit:
-        soundness = CONTRADICTED
-    if is_doubted and (status["epoch_ticks"] - status["start_ticks"]) * TICK_S < DOUBTED_S:
-        soundness = CONTRADICTED
-    if status["open_range_errors"] and share > OPEN_WIDE:
-        soundness = CONTRADICTED
-    is_new = count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count
-    if is_new or share > WIDE or is_height_open(s):
-        soundness = UNAVAILABLE
-    return soundness
 
 
 @kernel
@@ -421,7 +366,7 @@ def _fill_rows(s: EstimatorState, levels: Vector, rows: Matrix) -> None:
     rows[QUALITY, 0], rows[QUALITY, 1] = s.status[0]["mean_nis"], s.status[0]["mean_square_m2"]
     protect(s, levels)
     rows[QUALITY, 2] = max(levels[LASTING_CHI2], levels[RECENT_CHI2])
-    rows[PROTECTION, 0], rows[PROTECTION, 1], rows[PROTECTION, 2] = levels[HPL], levels[VPL], _soundness(s, levels)
+    rows[PROTECTION, 0], rows[PROTECTION, 1], rows[PROTECTION, 2] = levels[HPL], levels[VPL], integrity_state(s, levels)
 
 
 @kernel
@@ -452,7 +397,7 @@ def _process_difference(
         used = s.anchors[anchor]
         used["packets"] += 1
         used["rx_ticks"], used["walked_m"] = rx_ticks, status["walked_m"]
-    _look_around(s, elapsed_s)
+    _check_motion_and_faults(s, elapsed_s)
     _fill_rows(s, levels, rows)
     return outcome
 
@@ -479,12 +424,16 @@ def fill_motion(s: EstimatorState, rows: Matrix) -> None:
         rows[POSITION, 2] = s.settings[0]["height_m"]
 
 
+MOST_ANCHORS_IN_TABLE: Final = 4096
+"""Of an estimator that is restored."""
+
+
 class SavedEstimator(Struct, frozen=True):
     """An ``Estimator`` in plain values: its table of anchors, and the arrays of its state as bytes."""
 
-    table: Annotated[tuple[tuple[int, float, float, float], ...], Meta(max_length=MOST_PLACED)]
+    table: Annotated[tuple[tuple[int, float, float, float], ...], Meta(max_length=MOST_ANCHORS_IN_TABLE)]
     """Identifier and position of each anchor."""
-    left_out: tuple[int, ...]
+    misfits: tuple[int, ...]
     arrays: dict[str, bytes]
 
 
@@ -492,14 +441,14 @@ class Estimator:
     """The filter of one tag."""
 
     def __init__(self, settings: EstimatorSettings, table_m: Matrix | None = None) -> None:
-        """``table_m``: positions of anchors that are called by their indices, shape (n, 3); others can be placed."""
+        """``table_m``: positions of anchors with identifiers 0, 1, …, shape (n, 3); ``anchor_index`` adds others."""
         self.settings = settings
         self.dim = settings.dim
         self._table_m: list[Vector] = [] if table_m is None else [np.array(row, np.float64) for row in table_m]
         self._identifiers = np.arange(len(self._table_m))
         self.index_of = {index: index for index in range(len(self._table_m))}
-        """Where in the table an anchor stands that relays in frames call so."""
-        self._left_out: frozenset[int] = frozenset()
+        """Index in the table of each anchor identifier, by which frames name it."""
+        self._misfits: frozenset[int] = frozenset()
         self._levels = np.zeros(LEVELS)
         self._rows = np.zeros((PROTECTED_ROWS, 3))
         self._packed = np.zeros(MOST_PACKED * HEARD.size, np.uint8)
@@ -509,19 +458,19 @@ class Estimator:
     def save(self) -> SavedEstimator:
         """All that ``restore`` needs to continue with the same bits."""
         table = tuple((anchor, *self._table_m[index].tolist()) for anchor, index in self.index_of.items())
-        return SavedEstimator(table, tuple(self._left_out), packed_state(self._state))
+        return SavedEstimator(table, tuple(self._misfits), packed_state(self._state))
 
     def restore(self, saved: SavedEstimator) -> None:
         """Continue from what an estimator with the same settings has saved.
 
         Raises:
-            ValueError: it would lead the kernels astray.
+            ValueError: kernels could not run on it.
         """
         for anchor, *position_m in saved.table:
-            self.place_anchor(anchor, np.array(position_m))
+            self.anchor_index(anchor, np.array(position_m))
         if len(self._table_m) != len(saved.table):
-            raise ValueError("an anchor stands in the estimator's table twice")
-        self._left_out = frozenset(saved.left_out)
+            raise ValueError("an anchor is in the estimator's table twice")
+        self._misfits = frozenset(saved.misfits)
         self._state = unpacked_state(self.settings, len(self._table_m), saved.arrays)
 
     @property
@@ -534,10 +483,10 @@ class Estimator:
         """What a fix carries (``POSITION`` and the following), as of the newest packet."""
         return self._rows
 
-    def place_anchor(self, identifier: int, position_m: Vector) -> int:
-        """Index in the table of the anchor that relays in frames call so: a new one, or one that may have moved.
+    def anchor_index(self, identifier: int, position_m: Vector) -> int:
+        """Index in the table of an anchor: a new one, or one that may have moved.
 
-        ``position_m``, shape (3,), is taken for unchanged as long as it is the same array.
+        ``position_m``, shape (3,), counts as unchanged as long as it is the same array.
         """
         index = self.index_of.get(identifier)
         if index is None:
@@ -553,17 +502,17 @@ class Estimator:
                 fit_plane(self._state)
         return index
 
-    def doubt_anchor(self, table_index: int) -> None:
+    def inflate_range_error(self, table_index: int) -> None:
         """Expect that the ranges to an anchor are wrong by metres."""
         if self._state.index_of[table_index] < 0:
             self._resize(NEW_ANCHOR, table_index, 0)
         state = self._state
         anchor = int(state.index_of[table_index])
         constant = layout(self.dim, len(state.anchors)).constant + anchor
-        state.P[constant, constant] = DOUBTED_STD_M**2
+        state.P[constant, constant] = MISFIT_RANGE_STD_M**2
 
     def withhold_levels(self) -> None:
-        """Promise nothing until a new start: the anchors do not stand where the table says."""
+        """State no levels until a new start: the anchors' positions are known to be wrong."""
         self._state.status["withholds_levels"] = 1
 
     def start(
@@ -574,19 +523,19 @@ class Estimator:
         speed_variance: float,
         open_range_errors: bool = False,
         fault_std_m: float = LASTING_STD_M,
-        left_out: Iterable[int] = (),
+        misfitting: Iterable[int] = (),
     ) -> None:
-        """Begin at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept.
+        """Start at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept.
 
         ``open_range_errors``: expect ranges to be wrong by half a metre and anchors to be misplaced, since what
-        the settings say of them has been contradicted. ``left_out``: do so of these anchors of the table alone.
+        the settings assume of them has been contradicted. ``misfitting``: do so of these anchors of the table alone.
         ``fault_std_m``: of range errors of all anchors that the levels are to cover.
         """
         settings, dim = self.settings, self.dim
         state = new_state(settings, len(self._table_m), open_range_errors=open_range_errors)
         state.status["late_share"] = self._state.status["late_share"]
         state.status["fault_std_m"] = fault_std_m
-        self._left_out = frozenset(left_out)
+        self._misfits = frozenset(misfitting)
         state.x[:dim] = position_m
         state.P[:dim, :dim] = covariance_m2
         state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
@@ -608,7 +557,7 @@ class Estimator:
         """Process one packet; returns what became of it (``ACCEPTED`` …) and leaves ``rows``.
 
         ``relays``: rows as in ``Packets``; ``packed``: relays as frames carry them (``codec.packed_relays``), anchors
-        by the identifiers that ``place_anchor`` was given; ``variance_factor``: on the variance of the tag's reception.
+        by the identifiers that ``anchor_index`` was given; ``variance_factor``: on the variance of the tag's reception.
         """
         listed = len(relays)
         if listed:
@@ -644,7 +593,7 @@ class Estimator:
             self._resize(outcome, table_a, rx_ticks)
 
     def process_height(self, height_m: float, std_m: float) -> int:
-        """Process the tag's height at the newest packet, as a sensor tells it; ``ACCEPTED`` or ``REJECTED``."""
+        """Process the tag's height at the newest packet, as a sensor measures it; ``ACCEPTED`` or ``REJECTED``."""
         return _process_height(self._state, height_m, std_m, self._levels, self._rows)
 
     def track(
@@ -658,7 +607,7 @@ class Estimator:
 
         Rows of ``motions``, shape (n, 2·dim), ``covariances``, shape (n, dim·dim), and ``levels``, shape
         (n, LEVELS + 2), are filled in after each packet; the last two columns of the levels are what became of the
-        packet and what can be said of the position.
+        packet and the state of the levels.
         """
         nothing, done = np.empty((0, 0)), 0
         motions = nothing if motions is None else motions
@@ -675,10 +624,10 @@ class Estimator:
             self._resize(NEW_ANCHOR if joins else SILENT_ANCHOR if silent else RESTARTED_CLOCK, index, rx_ticks)
 
     def _resize(self, outcome: int, table_index: int, rx_ticks: int) -> None:
-        """Let an anchor join or leave, as a packet asks for."""
+        """Let an anchor join or leave, as a packet requires."""
         state = self._state
         if outcome == NEW_ANCHOR:
-            is_open = table_index in self._left_out
+            is_open = table_index in self._misfits
             self._state = with_anchor(state, table_index, self._table_m[table_index], is_open)
         elif outcome == RESTARTED_CLOCK:
             state.status["clock_restarts"] += 1
@@ -702,7 +651,7 @@ class Estimator:
     @property
     def is_late_often(self) -> bool:
         """Whether single packets are late often."""
-        return bool(self._state.status[0]["late_share"] > OFTEN_LATE)
+        return bool(self._state.status[0]["late_share"] > LATE_OFTEN_SHARE)
 
     @property
     def jumps(self) -> int:
@@ -723,21 +672,23 @@ class Estimator:
         return bool(status["rejected_share"] > LOST_SHARE or in_row * (1.0 - 2.0 * late) >= LOST_IN_ROW)
 
     @property
-    def refuses_most(self) -> bool:
+    def rejects_most(self) -> bool:
         """Whether most measurements lie beyond the gate."""
         return bool(self._state.status[0]["rejected_share"] > LOST_SHARE)
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether most of what anchors received of each other does not fit: a wrong place draws all clocks with it."""
-        refused = self._state.status["relays_refused"].item()
-        return refused > MOST_REFUSED and bool(refused > self._state.status["relays_taken"].item())
+        """Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks."""
+        rejected = self._state.status["relays_lately_rejected"].item()
+        return rejected > MOST_RELAYS_REJECTED and bool(rejected > self._state.status["relays_lately_accepted"].item())
 
     @property
     def relays_fit(self) -> bool:
         """Whether most of what anchors received of each other fits, and that is more than a few receptions."""
         status = self._state.status[0]
-        return bool(status["relays_taken"] > max(MOST_REFUSED, 4.0 * float(status["relays_refused"])))
+        return bool(
+            status["relays_lately_accepted"] > max(MOST_RELAYS_REJECTED, 4.0 * float(status["relays_lately_rejected"]))
+        )
 
     @property
     def obstructed(self) -> tuple[int, ...]:
@@ -747,7 +698,7 @@ class Estimator:
         return tuple(self._identifiers[anchors["table_index"][faulty]].tolist()) if faulty.any() else ()
 
     def horizontal_variance_m2(self, ahead_s: float) -> float:
-        """Sum of the variances of x and y so much later, if nothing is received until then."""
+        """Sum of the variances of x and y ``ahead_s`` later, if nothing is received until then."""
         dim, (_, covariance) = self.dim, self.motion()
         total = 2.0 * self.settings.qa * float(self._state.status[0]["q_scale"]) * ahead_s**3 / 3.0
         for axis in range(2):

@@ -1,4 +1,4 @@
-"""Faults that the state does not hold: what they do to it, what innovations say of them, and taking them into it.
+"""Faults that the state does not hold: what they do to it, what innovations show of them, and adding them to it.
 
 Where all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b besides, and the
 innovation of a measurement h holds s_j·b (Friedland 1969):
@@ -7,7 +7,7 @@ innovation of a measurement h holds s_j·b (Friedland 1969):
 
 With y = Σ s·ν/S and M = Σ s·sᵀ/S over the innovations ν of variance S, and σ_f²·I the faults' variance beforehand, all
 anchors' faults are b̂ = (M + I/σ_f²)⁻¹·y with the covariance (M + I/σ_f²)⁻¹, and yᵀ·(M + I/σ_f²)⁻¹·y tests whether there
-are any. A fault that is sure is taken into the anchor's constant range error, which gives the state that the filter
+are any. A fault that is sure is added to the anchor's constant range error, which gives the state that the filter
 would have, had that error been open from the beginning.
 """
 
@@ -19,9 +19,9 @@ from skyless.kernels.arrays import Matrix
 from skyless.kernels.compiled import step
 from skyless.positioning.estimator.kalman import reset_state
 from skyless.positioning.estimator.state import (
-    LASTING,
+    ALL_RANGE_ERRORS,
+    CHANGING_RANGE_ERRORS,
     LASTING_STD_M,
-    PASSING,
     EstimatorState,
     layout,
     uncertain_states,
@@ -31,7 +31,7 @@ RECENT_PACKETS: Final = 16.0
 """Number of packets of each anchor over which a fault counts as recent."""
 
 OPENED_STD_M: Final = 1.0
-"""Standard deviation of a fault that is taken into the state, before anything is known of it."""
+"""Standard deviation of a fault that is added to the state, before anything is known of it."""
 
 SURE_CHI2: Final = 50.0
 """A test beyond this shows a lasting fault: χ² of eight degrees of freedom is larger with a probability of 4·10⁻⁸."""
@@ -39,17 +39,17 @@ SURE_CHI2: Final = 50.0
 EXPLAINED_CHI2: Final = 20.0
 """Largest part of the test that the faults of the right anchors may leave unexplained."""
 
-RIVAL_CHI2: Final = 20.0
+RIVAL_FAULT_CHI2: Final = 20.0
 """Least difference to what the faults of any other anchors explain."""
 
 MOST_FAULTS: Final = 2
-"""Largest number of anchors that are singled out."""
+"""Largest number of anchors that are selected."""
 
 EARLY_WEIGHT: Final = 0.8
 """Obstacles make packets late, not early; a fault that is early has to explain more by this."""
 
 JUMP_RISE: Final = 0.5
-"""By so much of its full size a jump raises the process noise of all range errors."""
+"""By this part of its full size a jump raises the process noise of all range errors."""
 
 FIRST_CHANGE_SCALE: Final = 25.0
 """Factor on the process noise of a range error that has just jumped: it may still be changing."""
@@ -79,7 +79,7 @@ def subtract_fault_input(s: EstimatorState, anchor: int) -> None:
 
 @step
 def gather_evidence(s: EstimatorState, innovation: float, innovation_variance: float) -> None:
-    """What an innovation says of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S."""
+    """What an innovation shows of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S."""
     evidence, information, fault_input, count = s.evidence, s.information, s.fault_input, len(s.anchors)
     for bank in range(2):
         begin = bank * count
@@ -110,9 +110,9 @@ def fade_recent_faults(s: EstimatorState) -> None:
 
 @step
 def whiten(work: Matrix, count: int, vectors: int) -> None:
-    """Make L⁻¹·r of the vectors r in the rows behind a symmetric matrix M = L·Lᵀ, in place, by Cholesky's method.
+    """Compute L⁻¹·r of the vectors r in the rows behind a symmetric matrix M = L·Lᵀ, in place, by Cholesky's method.
 
-    So r·M⁻¹·q is the product of what becomes of r and of q. Rows of vectors go the way of rows of the matrix.
+    So r·M⁻¹·q is the product of what becomes of r and of q. Rows of vectors are treated as rows of the matrix.
     """
     for column in range(count):
         total = work[column, column]
@@ -156,15 +156,15 @@ def explained_chi2(s: EstimatorState, one: int, other: int) -> float:
 
 @step
 def open_faults(s: EstimatorState, lasting_chi2: float, recent_chi2: float) -> None:
-    """Take faults into the state where a test of all of a kind is sure.
+    """Add faults to the state where a test of all of a kind is sure.
 
-    After a start that was contradicted, none are singled out: any number of anchors may be late then, and those that
+    After a start that was contradicted, none are selected: any number of anchors may be late then, and those that
     explain the test are now and then the wrong ones.
     """
-    singles_out = s.status[0]["fault_std_m"] <= LASTING_STD_M
-    if singles_out and recent_chi2 > SURE_CHI2 and _largest(s, 1) >= _largest(s, 0):
+    selects_faults = s.status[0]["fault_std_m"] <= LASTING_STD_M
+    if selects_faults and recent_chi2 > SURE_CHI2 and _largest(s, 1) >= _largest(s, 0):
         _open_recent_faults(s)
-    elif singles_out and lasting_chi2 > SURE_CHI2:
+    elif selects_faults and lasting_chi2 > SURE_CHI2:
         _open_lasting_faults(s, lasting_chi2)
 
 
@@ -188,14 +188,14 @@ def _explained_alone(s: EstimatorState, bank: int, anchor: int) -> float:
 def _open_recent_faults(s: EstimatorState) -> None:
     """Open the range errors of the anchors whose recent faults explain the innovations about as well as any other's.
 
-    A single one opens by itself; where it cannot be told which of several it is, the position rests on none of them,
+    A single one opens by itself; where it is open which of several it is, the position uses none of them,
     as long as enough anchors are left.
     """
     count, spare = len(s.anchors), len(s.anchors) - s.settings[0]["dim"] - 1
     for anchor in range(count):
         spare -= 1 if s.anchors[anchor]["is_obstructed"] else 0
         s.ph[anchor] = _explained_alone(s, 1, anchor)
-    limit = _largest(s, 1) - RIVAL_CHI2
+    limit = _largest(s, 1) - RIVAL_FAULT_CHI2
     first = 0
     while spare > 0 and first >= 0:
         first = -1
@@ -221,7 +221,7 @@ def begin_obstruction(s: EstimatorState, anchor: int) -> None:
 
 @step
 def _open_lasting_faults(s: EstimatorState, chi2: float) -> None:
-    """Take the lasting faults of one or two anchors into the state, where no others explain the test as well."""
+    """Add the lasting faults of one or two anchors to the state, where no others explain the test as well."""
     count, dim = len(s.anchors), s.settings[0]["dim"]
     most_faults, opened = min(MOST_FAULTS, count - dim - 2), False
     for faults in range(1, most_faults + 1):
@@ -234,7 +234,7 @@ def _open_lasting_faults(s: EstimatorState, chi2: float) -> None:
                         first, second, most, rival = one, other, explained, most
                     elif explained > rival:
                         rival = explained
-        if not opened and chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_CHI2:
+        if not opened and chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_FAULT_CHI2:
             opened = True
             for one in range(faults):
                 anchor = second if one else first
@@ -244,7 +244,7 @@ def _open_lasting_faults(s: EstimatorState, chi2: float) -> None:
 
 @step
 def end_lasting_fault(s: EstimatorState, anchor: int) -> None:
-    """Take it that an anchor's packets have been late since it joined, and are so no more."""
+    """End a fault: an anchor's packets have been late since it joined, and are not any more."""
     settings = s.settings[0]
     _open_fault(s, 0, anchor)
     reset_state(s, layout(settings["dim"], len(s.anchors)).constant + anchor, settings["range_std_m"] ** 2)
@@ -253,9 +253,9 @@ def end_lasting_fault(s: EstimatorState, anchor: int) -> None:
 
 @step
 def _open_fault(s: EstimatorState, bank: int, anchor: int) -> None:
-    """Take a fault into its anchor's range error; all other hypotheses are conditioned on it (Schur's complement)."""
+    """Add a fault to its anchor's range error; all other hypotheses are conditioned on it (Schur's complement)."""
     status = s.status[0]
-    status["range_errors"] = max(status["range_errors"], LASTING if bank == 0 else PASSING)
+    status["range_errors"] = max(status["range_errors"], ALL_RANGE_ERRORS if bank == 0 else CHANGING_RANGE_ERRORS)
     x, P, V, evidence, information, column = s.x, s.P, s.V, s.evidence, s.information, s.fault_input
     count, n = len(s.anchors), uncertain_states(s)
     where, chosen = layout(s.settings[0]["dim"], count), bank * count + anchor

@@ -5,8 +5,15 @@ from typing import Final
 import numpy as np
 
 from skyless.constants import TICK_S
-from skyless.kernels.arrays import Matrix
 from skyless.kernels.compiled import step
+from skyless.kernels.covariance import (
+    add_process_noise,
+    decay_state,
+    integrate_rates,
+    multiply_ph,
+    reset_covariance,
+    subtract_information,
+)
 from skyless.positioning.estimator.state import EstimatorState, layout, uncertain_states
 
 OBSTRUCTED_STD_M: Final = 0.08
@@ -20,8 +27,8 @@ OBSTRUCTED_WALK: Final = 0.004
 
 OBSTRUCTION_MEMORY_S: Final = 10.0
 
-REST_SHARE: Final = 2e-7
-"""Part of the process noise of motion that is left at rest: 5 cm within half a minute."""
+STATIONARY_NOISE_SHARE: Final = 2e-7
+"""Part of the process noise of motion that is left for a stationary tag: 5 cm within half a minute."""
 
 
 @step
@@ -42,32 +49,30 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
         status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
     _advance(s, where.velocity, dt)
     motion = settings["qa"] * status["q_scale"]
-    if is_at_rest(s):
-        motion *= REST_SHARE
+    if is_stationary(s):
+        motion *= STATIONARY_NOISE_SHARE
     for axis in range(dim):
-        _add_noise(s.P, axis, where.velocity + axis, dt, 0.0, motion)
+        add_process_noise(s.P, axis, where.velocity + axis, axis, where.velocity + axis, dt, 0.0, motion)
         s.V[2 * count + axis, axis] -= 0.5 * dt * dt  # an acceleration that the filter does not know of
         s.V[2 * count + axis, where.velocity + axis] -= dt
     walk = settings["walk"]
     for anchor in range(count):
-        scale = s.anchors[anchor]["walk_scale"]
-        _add_noise(s.P, where.offset + anchor, where.rate + anchor, dt, settings["white"], walk * scale)
+        offset, rate = where.offset + anchor, where.rate + anchor
+        add_process_noise(
+            s.P, offset, rate, offset, rate, dt, settings["white"], walk * s.anchors[anchor]["walk_scale"]
+        )
     common = walk * status["walk_scale"]
-    value, cross, rate = settings["white"] * dt + common * dt**3 / 3.0, common * dt**2 / 2.0, common * dt
     for i in range(where.offset, where.offset + count):
         for j in range(where.offset, where.offset + count):
-            s.P[i, j] += value
-            s.P[i, where.velocity + j] += cross
-            s.P[where.velocity + i, j] += cross
-            s.P[where.velocity + i, where.velocity + j] += rate
+            add_process_noise(s.P, i, where.velocity + i, j, where.velocity + j, dt, settings["white"], common)
     s.status[0]["epoch_ticks"] = rx_ticks
 
 
 @step
-def is_at_rest(s: EstimatorState) -> bool:
-    """Whether the tag has shown no motion for so long that it is taken to stand still."""
-    rest_s = s.settings[0]["rest_s"]
-    return bool(0.0 < rest_s < s.status[0]["rest_s"])
+def is_stationary(s: EstimatorState) -> bool:
+    """Whether the tag has shown no motion for long enough to count as stationary."""
+    stationary_s = s.settings[0]["stationary_s"]
+    return bool(0.0 < stationary_s < s.status[0]["stationary_s"])
 
 
 @step
@@ -76,35 +81,18 @@ def _advance(s: EstimatorState, values: int, dt: float) -> None:
     n = uncertain_states(s)
     for value in range(values):
         s.x[value] += dt * s.x[values + value]
-    for row in range(n):
-        for value in range(values):
-            s.P[row, value] += dt * s.P[row, values + value]
-    for value in range(values):
-        for column in range(n):
-            s.P[value, column] += dt * s.P[values + value, column]
-    for value in range(values):
-        for other in range(value):
-            s.P[value, other] = s.P[other, value]
+    integrate_rates(s.P, n, values, dt)
     for fault in range(len(s.fault_input)):
         for value in range(values):
             s.V[fault, value] += dt * s.V[fault, values + value]
 
 
 @step
-def _add_noise(P: Matrix, value: int, rate: int, dt: float, white: float, walk: float) -> None:
-    """Process noise of a value and its rate."""
-    P[value, value] += white * dt + walk * dt**3 / 3.0
-    P[value, rate] += walk * dt**2 / 2.0
-    P[rate, value] += walk * dt**2 / 2.0
-    P[rate, rate] += walk * dt
-
-
-@step
 def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float) -> None:
     """Time update of an anchor's range errors over what has passed and was walked since its newest packet.
 
-    The changing part is a Gauss–Markov process of the way and of time. Where range errors jump, both parts forget
-    within seconds; one that has jumped itself wanders from where it is.
+    The changing part is a Gauss–Markov process of walked distance and of time. Where range errors jump, both parts
+    forget within seconds; one that has jumped itself wanders from where it is.
     """
     status, settings = s.status[0], s.settings[0]
     where, share = layout(settings["dim"], len(s.anchors)), min(status["obstruction"], 1.0)
@@ -113,7 +101,7 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
     if s.anchors[anchor]["is_obstructed"]:
         s.P[change, change] += OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"] * dt
     else:
-        variance = s.anchors[anchor]["place_variance_m2"] + share * OBSTRUCTED_STD_M**2
+        variance = s.anchors[anchor]["change_variance_m2"] + share * OBSTRUCTED_STD_M**2
         usual = dt / settings["place_time_s"] + walked_m / settings["place_distance_m"]
         if variance > 0.0:
             _decay(s, change, np.exp(-obstructed - (1.0 - share) * usual), variance)
@@ -124,13 +112,9 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
 @step
 def _decay(s: EstimatorState, state: int, kept: float, variance: float) -> None:
     """A state decays towards zero and keeps, in the long run, that variance."""
-    x, P, V, n = s.x, s.P, s.V, uncertain_states(s)
+    x, V = s.x, s.V
     x[state] *= kept
-    for column in range(n):
-        P[state, column] *= kept
-    for row in range(n):
-        P[row, state] = P[state, row]
-    P[state, state] = kept * P[state, state] + (1.0 - kept * kept) * variance
+    decay_state(s.P, uncertain_states(s), state, kept, variance)
     for fault in range(V.shape[0]):
         V[fault, state] *= kept
 
@@ -138,13 +122,9 @@ def _decay(s: EstimatorState, state: int, kept: float, variance: float) -> None:
 @step
 def reset_state(s: EstimatorState, state: int, variance: float) -> None:
     """Forget a state: zero, uncorrelated, with that variance."""
-    x, P, V, n = s.x, s.P, s.V, uncertain_states(s)
+    x, V = s.x, s.V
     x[state] = 0.0
-    for column in range(n):
-        P[state, column] = 0.0
-    for row in range(n):
-        P[row, state] = 0.0
-    P[state, state] = variance
+    reset_covariance(s.P, uncertain_states(s), state, variance)
     for fault in range(V.shape[0]):
         V[fault, state] = 0.0
 
@@ -152,19 +132,7 @@ def reset_state(s: EstimatorState, state: int, variance: float) -> None:
 @step
 def compute_ph(s: EstimatorState, terms: int) -> float:
     """Compute P·h of a measurement with ``terms`` terms; returns hᵀ·P·h."""
-    P, h, h_index, ph, n = s.P, s.h, s.h_index, s.ph, uncertain_states(s)
-    for column in range(n):
-        ph[column] = 0.0
-    total = 0.0
-    for term in range(terms):
-        row, weight = h_index[term], h[term]
-        if row < n:
-            for column in range(n):
-                ph[column] += weight * P[row, column]
-    for term in range(terms):
-        if h_index[term] < n:
-            total += h[term] * ph[h_index[term]]
-    return total
+    return multiply_ph(s.P, uncertain_states(s), s.h, s.h_index, terms, s.ph)
 
 
 @step
@@ -174,15 +142,9 @@ def update(s: EstimatorState, innovation: float, innovation_variance: float, gai
     K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
     follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit.
     """
-    x, P, V, u, fault_input, n = s.x, s.P, s.V, s.ph, s.fault_input, uncertain_states(s)
-    root = np.sqrt(innovation_variance)
+    x, V, u, fault_input, n = s.x, s.V, s.ph, s.fault_input, uncertain_states(s)
+    root = subtract_information(s.P, n, updated, u, innovation_variance)
     step = gain_scale * innovation / root
-    for state in range(n):
-        u[state] /= root
-    for state in range(n):
-        factor = u[state]
-        for column in range(n if state < updated else updated):
-            P[state, column] -= factor * u[column]
     for state in range(min(updated, n)):
         x[state] += u[state] * step
     for fault in range(V.shape[0]):

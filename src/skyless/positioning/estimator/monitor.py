@@ -1,8 +1,8 @@
-"""Which measurements are used, and how process noise follows what innovations show.
+"""Which measurements are used, and how process noise is adapted to innovations.
 
-Late receptions are the rule where paths are blocked, early ones are not. A single late one is left out; where those
+Late receptions are the rule where paths are blocked, early ones are not. A single late one is rejected; where those
 that follow agree with it, the range error has jumped, and is estimated again from there. What is systematic in the
-innovations along an axis is motion, what all anchors have in common is the tag's clock, and what relays say of one
+innovations along an axis is motion, what all anchors have in common is the tag's clock, and what relays show of one
 anchor's clock is that clock.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from skyless.kernels.compiled import step
 from skyless.positioning.estimator.faults import begin_obstruction
-from skyless.positioning.estimator.state import PASSING, EstimatorState, layout
+from skyless.positioning.estimator.state import CHANGING_RANGE_ERRORS, EstimatorState, layout
 
 FORGETTING: Final = 0.02
 """Weight of the newest innovation in the running means, about the last 50."""
@@ -21,19 +21,19 @@ INCONSISTENT_NIS: Final = 1.6
 """Mean of the normalised innovations squared beyond which the tag moves more than assumed (noise alone: 1)."""
 
 SUSPECT: Final = 3.0
-"""Innovations beyond so many standard deviations, ..."""
+"""Innovations beyond this number of standard deviations, ..."""
 
 IN_ROW: Final = 2
-"""... so many of an anchor in a row, are a jump of its range error, ..."""
+"""... this number of an anchor in a row, are a jump of its range error, ..."""
 
 IN_ROW_WHERE_LATE: Final = 5
-"""... or so many where single receptions are late often, ..."""
+"""... or this number where single receptions are late often, ..."""
 
-OFTEN_LATE: Final = 0.02
+LATE_OFTEN_SHARE: Final = 0.02
 """... which is a larger share of them than this, ..."""
 
 TOGETHER: Final = 7.0
-"""... together beyond so many (by chance once in some million packets), ..."""
+"""... together beyond this number (by chance once in some million packets), ..."""
 
 OBSTRUCTED_SUSPECT: Final = 2.2
 OBSTRUCTED_TOGETHER: Final = 5.0
@@ -42,7 +42,7 @@ once in some thousand packets), while enough other anchors are not obstructed:
 else what all of them share, as the tag's clock, would open one after another."""
 
 AGREEMENT: Final = 3.0
-"""... if they agree within so many standard deviations of two receptions."""
+"""... if they agree within this number of standard deviations of two receptions."""
 
 JUMP_STD_M: Final = 0.2
 """Of a range error that has jumped, beyond what it was, unless it has jumped by more."""
@@ -58,26 +58,26 @@ MOST_CHANGE_SCALE: Final = 250.0
 
 ENDED_STD_M: Final = 0.05
 ENDED: Final = 2.0
-"""An obstruction has ended where its error is known to this, and less than so many standard deviations from none."""
+"""An obstruction has ended where its error is known to this, and within this number of standard deviations of 0."""
 
-SETTLED: Final = 2.0
+SETTLED_CHANGE_SCALE: Final = 2.0
 """A range error whose process noise is raised by less does not change any more."""
 
 LATE_FORGETTING: Final = 0.005
-LATE_DENSITY: Final = 0.05
+LATE_PROBABILITY_DENSITY: Final = 0.05
 """Probability density of a late reception's normalised innovation: a standard deviation of 5 cm, a metre late."""
 
-HUBER: Final = 1.5
-"""Where receptions are late often, innovations beyond so many standard deviations weigh less."""
+RECEPTION_HUBER: Final = 1.5
+"""Where receptions are late often, innovations beyond this number of standard deviations have less weight."""
 
 DIFFERENCE_HUBER: Final = 1.0
-"""Number of standard deviations beyond which the innovations of ready-made differences weigh less."""
+"""Number of standard deviations beyond which the innovations of ready-made differences have less weight."""
 
-MOST_PLACE_STD_M: Final = 0.5
-"""Of what range errors change along the way; larger ones are jumps."""
+MAX_CHANGE_STD_M: Final = 0.5
+"""Of the part of range errors that changes as the tag moves; larger ones are jumps."""
 
 MOVED: Final = 1.0
-"""Mean square of what a tag is away from where it was, over the variances, beyond which it is taken to move."""
+"""Mean square of what a tag is away from where it was, over the variances, beyond which it counts as moving."""
 
 LAG_GAIN: Final = 0.05
 LAG_FORGETTING: Final = 0.01
@@ -93,7 +93,7 @@ COMMON_LIMIT: Final = 9.0
 """Of the square of the running mean of all innovations, 1 where the filter is right; those of the tag's clock."""
 
 COMMON: Final = 1.5
-"""Where the newest innovations of all anchors lie beyond so many standard deviations on one side, the tag's
+"""Where the newest innovations of all anchors lie beyond this number of standard deviations on one side, the tag's
 clock has left its rate: nothing else makes all of them late, or early, at once."""
 
 WALK_GAIN: Final = 1.1
@@ -108,7 +108,7 @@ RELAY_WALK_LOSS: Final = 0.99
 def gate_of(s: EstimatorState) -> float:
     """Beyond how many standard deviations a reception is more likely late than not."""
     late = min(s.status[0]["late_share"], 0.9)
-    odds = late * LATE_DENSITY * 2.5066282746310002 / (1.0 - late)
+    odds = late * LATE_PROBABILITY_DENSITY * 2.5066282746310002 / (1.0 - late)
     gate = s.settings[0]["gate"]
     return float(min(gate, np.sqrt(-2.0 * np.log(odds)))) if odds > 1e-6 else float(gate)
 
@@ -140,13 +140,13 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
         agrees = agrees and both * both > together * together * innovation_variance
         a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
         a["outlier_m"] = innovation
-    needed = IN_ROW_WHERE_LATE if status["late_share"] > OFTEN_LATE else IN_ROW
+    needed = IN_ROW_WHERE_LATE if status["late_share"] > LATE_OFTEN_SHARE else IN_ROW
     return bool(a["outliers_in_row"] >= needed)
 
 
 @step
 def is_common(s: EstimatorState, normalised: float) -> bool:
-    """Whether the newest innovations of all anchors but one, which may say nothing, lie on the side of this one.
+    """Whether the newest innovations of all anchors but one, which may show nothing, lie on the side of this one.
 
     The tag's clock it is then. A faulty anchor draws the others to the opposite side of its own.
     """
@@ -167,11 +167,11 @@ def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
     s.status[0]["obstructions"] += 1
     begin_obstruction(s, anchor)
     s.P[change, change] += max(JUMP_STD_M**2, innovation * innovation)
-    s.status[0]["range_errors"] = max(s.status[0]["range_errors"], PASSING)
+    s.status[0]["range_errors"] = max(s.status[0]["range_errors"], CHANGING_RANGE_ERRORS)
 
 
 @step
-def follow_change(s: EstimatorState, anchor: int, normalised: float) -> None:
+def adapt_change_noise(s: EstimatorState, anchor: int, normalised: float) -> None:
     """Raise the process noise of an obstructed anchor's range error where its innovations stay on one side."""
     a = s.anchors[anchor]
     a["change_mean"] += CHANGE_GAIN * (normalised - a["change_mean"])
@@ -186,7 +186,7 @@ def end_small_obstruction(s: EstimatorState, anchor: int) -> None:
     """End an obstruction that has gone without a jump back: the range error is known, and is hardly there."""
     a, change = s.anchors[anchor], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
     error_m, variance = s.x[change], s.P[change, change]
-    settled = a["is_obstructed"] and a["change_scale"] < SETTLED and variance < ENDED_STD_M**2
+    settled = a["is_obstructed"] and a["change_scale"] < SETTLED_CHANGE_SCALE and variance < ENDED_STD_M**2
     if settled and error_m * error_m < ENDED * ENDED * variance:
         a["is_obstructed"] = 0
         s.status[0]["ends_of_obstructions"] += 1
@@ -212,8 +212,8 @@ def variance_scale(s: EstimatorState, innovation: float, innovation_variance: fl
         status["rejected_in_row"] = 0
         status["mean_nis"] += FORGETTING * (normalised * normalised - status["mean_nis"])
         status["mean_square_m2"] += FORGETTING * (innovation * innovation - status["mean_square_m2"])
-        if status["late_share"] > OFTEN_LATE and abs(normalised) > HUBER:
-            scale = abs(normalised) / HUBER
+        if status["late_share"] > LATE_OFTEN_SHARE and abs(normalised) > RECEPTION_HUBER:
+            scale = abs(normalised) / RECEPTION_HUBER
     return float(scale)
 
 
@@ -221,7 +221,7 @@ def variance_scale(s: EstimatorState, innovation: float, innovation_variance: fl
 def difference_scale(s: EstimatorState, innovation: float, innovation_variance: float) -> float:
     """Factor on the innovation's variance of a time difference; 0 if it is not to be used. Counts it.
 
-    Either of its anchors may be late, so large ones weigh less on both sides.
+    Either of its anchors may be late, so large ones have less weight on both sides.
     """
     status, normalised = s.status[0], abs(innovation) / np.sqrt(innovation_variance)
     used = normalised <= s.settings[0]["gate"]
@@ -239,32 +239,32 @@ def difference_scale(s: EstimatorState, innovation: float, innovation_variance: 
 
 
 @step
-def adapt_place_noise(s: EstimatorState, anchor: int, elapsed_s: float) -> None:
-    """Let the variance of an anchor's changing range error follow its estimate: the mean of its square.
+def adapt_change_variance(s: EstimatorState, anchor: int, elapsed_s: float) -> None:
+    """Let the variance of an anchor's changing range error track its estimate: the mean of its square.
 
     The maximisation step of expectation maximisation (Shumway and Stoffer 1982) with a memory that fades.
     """
     settings, a = s.settings[0], s.anchors[anchor]
-    memory_s = settings["place_memory_s"]
+    memory_s = settings["change_memory_s"]
     if memory_s > 0.0:
         change = layout(settings["dim"], len(s.anchors)).change + anchor
         square = s.x[change] ** 2 + s.P[change, change]
-        variance = a["place_variance_m2"] + min(elapsed_s / memory_s, 0.5) * (square - a["place_variance_m2"])
-        a["place_variance_m2"] = min(max(variance, settings["least_place_std_m"] ** 2), MOST_PLACE_STD_M**2)
+        variance = a["change_variance_m2"] + min(elapsed_s / memory_s, 0.5) * (square - a["change_variance_m2"])
+        a["change_variance_m2"] = min(max(variance, settings["least_change_std_m"] ** 2), MAX_CHANGE_STD_M**2)
 
 
 @step
-def follow_rest(s: EstimatorState, dt: float) -> None:
+def update_stationary(s: EstimatorState, dt: float) -> None:
     """Count for how long the tag has shown no motion: neither its position, nor innovations that stay on one side."""
     status, dim = s.status[0], s.settings[0]["dim"]
     square = 0.0
     for axis in range(dim):
-        square += (s.x[axis] - status["rest_m"][axis]) ** 2 / s.P[axis, axis]
-    status["rest_s"] += dt
+        square += (s.x[axis] - status["stationary_m"][axis]) ** 2 / s.P[axis, axis]
+    status["stationary_s"] += dt
     if square > MOVED * dim or status["lag_square"] > LAG_LIMIT or status["rejected_in_row"] > 1:
-        status["rest_s"] = 0.0
+        status["stationary_s"] = 0.0
         for axis in range(dim):
-            status["rest_m"][axis] = s.x[axis]
+            status["stationary_m"][axis] = s.x[axis]
 
 
 @step
@@ -295,7 +295,7 @@ def adapt_process_noise(s: EstimatorState, normalised: float) -> None:
 def covariance_scale(s: EstimatorState) -> float:
     """Factor on the position's covariance while innovations are larger than the filter expects.
 
-    Most of an innovation is the stamps' noise, so the state errs by more than the innovations tell.
+    Most of an innovation is the stamps' noise, so the state errs by more than the innovations show.
     """
     nis = s.status[0]["mean_nis"]
     return float(nis * nis) if nis > INCONSISTENT_NIS else 1.0
@@ -303,7 +303,7 @@ def covariance_scale(s: EstimatorState) -> float:
 
 @step
 def adapt_clock_noise(s: EstimatorState, anchor: int, normalised: float) -> None:
-    """Raise the process noise of an anchor's clock where what relays say of it stays on one side, else lower it."""
+    """Raise the process noise of an anchor's clock where what relays show of it stays on one side, else lower it."""
     a = s.anchors[anchor]
     a["relay_mean"] += RELAY_GAIN * (normalised - a["relay_mean"])
     if a["relay_mean"] ** 2 * (2.0 - RELAY_GAIN) / RELAY_GAIN > RELAY_LIMIT:

@@ -1,19 +1,19 @@
-"""The estimator's state: what is estimated, what is kept of each anchor, and how anchors join and leave.
+"""The estimator's state: what is estimated, data of each anchor, and how anchors join and leave.
 
 The state vector, all clocks against the tag's own counter, in metres and m/s:
 
     values      position (dim), then for each anchor the offset of its clock: tag's reading − anchor's reading (its
-                whole ticks stand in ``ANCHOR``)
+                whole ticks stand in ``ANCHOR_DTYPE``)
     rates       velocity (dim), then the rate of each offset
     tx noises   of each anchor's newest TX stamp, which all who received it share
-    changes     for each anchor the part of the tag's range error to it that changes along the way
+    changes     for each anchor the part of the tag's range error to it that changes as the tag moves
     constants   the part that stays
     slope       how ranges lengthen with distance
     height      the tag's true height − the one that is given, in two dimensions
     surveys     for each anchor (dim) its true position − its position in the almanac
 
 Everything before ``slope`` is updated by all measurements; what follows is updated by the tag's own receptions only
-and is a consider parameter (Schmidt 1966) of the others, which say next to nothing of it.
+and is a consider parameter (Schmidt 1966) of the others, which have next to no information on it.
 
 Range errors and surveys stand last because many a site calls them exact. What is exact has no variance and no
 covariance, so ``uncertain_states`` leaves it out of all arithmetic, until a jump or a fault shows otherwise.
@@ -23,27 +23,123 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
+from msgspec import Struct, structs
 from numpy.typing import NDArray
 
+from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.kernels.arrays import Array, Indices, Integers, Matrix, Records, Vector
 from skyless.kernels.compiled import jitted, step
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.integrity import RISK, limits_of
+
+MAX_CLOCK_RATE: Final = 50e-6
+"""Two crystals of ±20 ppm, and margin."""
+
+
+class EstimatorSettings(Struct, frozen=True):
+    """What the filter assumes; standard deviations are one sigma."""
+
+    qa: float = 0.5
+    """Spectral density of the tag's acceleration, m²/s³ per axis."""
+    white: float = 3.6e-5
+    """White frequency noise of each oscillator, m²/s."""
+    walk: float = 0.09
+    """Random walk of each oscillator's rate, m²/s³."""
+    tx_variance_m2: float = 9e-4
+    rx_variance_m2: float = 9e-4
+    """Of one stamp each."""
+    gate: float = 4.0
+    """Innovations beyond this number of standard deviations are not used."""
+    height_m: float | None = None
+    """Height of the tag where it is given; None to estimate it."""
+    height_std_m: float = 0.0
+    """Of the given one."""
+    lowest_m: float = -np.inf
+    highest_m: float = np.inf
+    """Between which the tag's height is known to be."""
+    drop_s: float = 2.0
+    """Anchors that are silent for longer leave the state."""
+    relay_age_s: float = 1.0
+    """Older packets are not relayed, as sequence numbers come around."""
+    survey_std_m: float = 0.02
+    """Of each coordinate of an anchor."""
+    range_std_m: float = 0.03
+    """Of the constant error of a tag's ranges to one anchor."""
+    slope_std_m: float = 0.05
+    """By how much ranges lengthen for each unit of clip((range − 4 m)/4 m, −1, 1)."""
+    place_std_m: float = 0.005
+    """Of the part of a range's error that changes as the tag moves (the site file's name)."""
+    place_distance_m: float = 1.0
+    """Distance over which that part changes, ..."""
+    place_time_s: float = 100.0
+    """... and time over which it changes while the tag is stationary."""
+    change_memory_s: float = 0.0
+    """Time within which the size of each anchor's changing part is estimated again; 0 where it is ``place_std_m``."""
+    least_change_std_m: float = 0.05
+    """No changing part is estimated to be smaller."""
+    difference_std_m: float = 0.12
+    """Of what is new in each ready-made time difference."""
+    stationary_s: float = 0.0
+    """A tag that has not shown any motion for this time counts as stationary; 0: never."""
+    max_acceleration_mps2: float = 0.0
+    """The tag's largest acceleration, as far as levels are to cover it beyond ``qa``."""
+    max_walk_scale: float = 1e4
+    """Largest factor on ``walk`` where innovations show that oscillators wander more."""
+    integrity_risk: float = RISK
+    alert_limit_m: float | None = None
+    """Fixes with a higher horizontal protection level have an alert."""
+
+    @property
+    def dim(self) -> int:
+        """Dimensions of the position that are estimated."""
+        return 3 if self.height_m is None else 2
+
+    def record(self) -> Records:
+        """The settings for the kernels, shape (1,)."""
+        record = np.zeros(1, SETTINGS_DTYPE)
+        for name, value in structs.asdict(self).items():
+            if name in _NAMES:
+                record[name] = 0.0 if value is None else value
+        record["dim"] = self.dim
+        record["clock_rate_variance"] = (MAX_CLOCK_RATE * SPEED_OF_LIGHT_MPS) ** 2
+        record["horizontal_k"], record["vertical_k"] = limits_of(self.integrity_risk)[:2]
+        return record
+
+
+_NAMES: Final = tuple(
+    name for name in EstimatorSettings.__struct_fields__ if name not in {"integrity_risk", "alert_limit_m"}
+)
+
+SETTINGS_DTYPE: Final = np.dtype(
+    [
+        ("dim", np.int64),
+        *((name, np.float64) for name in _NAMES),
+        ("clock_rate_variance", np.float64),
+        ("horizontal_k", np.float64),  # how many standard deviations the risk of levels allows
+        ("vertical_k", np.float64),
+    ],
+    align=True,
+)
+"""``EstimatorSettings`` for the kernels."""
+
+
+# The state
+
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-REMEMBERED: Final = 16
+PACKETS_KEPT: Final = 16
 """Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
 
 LANES: Final = 8
 """Numbers in the longest vectors of processors."""
 
-NONE, PASSING, LASTING = range(3)
+NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS, ALL_RANGE_ERRORS = range(3)
 """Which range errors are not known to be zero: none, those that change, or all of them, and surveys."""
 
 NEVER: Final = -(1 << 62)
 """A time before all others."""
 
-ANCHOR: Final = np.dtype(
+ANCHOR_DTYPE: Final = np.dtype(
     [
         ("table_index", np.int64),
         ("position_m", np.float64, (3,)),
@@ -52,7 +148,7 @@ ANCHOR: Final = np.dtype(
         ("offset_ticks", np.int64),  # whole ticks of the offset
         ("range_m", np.float64),  # at its newest packet
         ("slope_range_m", np.float64),  # at which its range errors' slope counts
-        ("walked_m", np.float64),  # the tag's way at its newest packet
+        ("walked_m", np.float64),  # the tag's walked distance at its newest packet
         ("is_relayed", np.int64),  # whether others relay its packets
         ("has_tx_noise", np.int64),  # whether its newest packet's TX noise is a state
         ("packets", np.int64),
@@ -63,20 +159,20 @@ ANCHOR: Final = np.dtype(
         ("is_obstructed", np.int64),  # whether its range error has jumped and not come back
         ("change_mean", np.float64),  # running mean of its innovations since then, normalised
         ("change_scale", np.float64),  # factor on the process noise of a range error that has jumped
-        ("has_fault", np.int64),  # whether a lasting fault of it was taken into the state
+        ("has_fault", np.int64),  # whether a lasting fault of it was added to the state
         ("relay_outliers_in_row", np.int64),
-        ("relay_mean", np.float64),  # running mean of what relays say of its clock, normalised
+        ("relay_mean", np.float64),  # running mean of what relays show of its clock, normalised
         ("walk_scale", np.float64),  # factor on its oscillator's random walk
-        ("place_variance_m2", np.float64),  # of the part of its range error that changes along the way
+        ("change_variance_m2", np.float64),  # of the part of its range error that changes as the tag moves
     ],
     align=True,
 )
-"""What is kept of an anchor beside its states."""
+"""What is kept of an anchor besides its states."""
 
-PACKET: Final = np.dtype([("sequence", np.int64), ("tx_ticks", np.int64), ("rx_ticks", np.int64)], align=True)
+PACKET_DTYPE: Final = np.dtype([("sequence", np.int64), ("tx_ticks", np.int64), ("rx_ticks", np.int64)], align=True)
 """A packet that others may relay."""
 
-LINK: Final = np.dtype(
+LINK_DTYPE: Final = np.dtype(
     [
         ("tx_ticks", np.int64),  # newest packet of the sender whose reception by the listener was processed
         ("constant_m", np.float64),  # of the pair, in the row of the lower index; its estimate ...
@@ -87,7 +183,7 @@ LINK: Final = np.dtype(
 )
 """A pair of anchors, listener and sender."""
 
-STATUS: Final = np.dtype(
+STATUS_DTYPE: Final = np.dtype(
     [
         ("epoch_ticks", np.int64),  # the tag's reading at the newest packet, ...
         ("start_ticks", np.int64),  # ... and at the start
@@ -111,8 +207,8 @@ STATUS: Final = np.dtype(
         ("mean_square_m2", np.float64),  # of innovations
         ("rejected_share", np.float64),
         ("late_share", np.float64),
-        ("relays_taken", np.float64),  # lately, older ones counting less
-        ("relays_refused", np.float64),
+        ("relays_lately_accepted", np.float64),  # lately, older ones counting less
+        ("relays_lately_rejected", np.float64),
         ("lag", np.float64, (3,)),  # running mean of innovations along each axis
         ("lag_square", np.float64),
         ("q_scale", np.float64),  # factor on qa
@@ -120,14 +216,17 @@ STATUS: Final = np.dtype(
         ("walk_scale", np.float64),  # factor on its random walk
         ("obstruction", np.float64),  # 1 where range errors have jumped lately, 0 where they do not
         ("walked_m", np.float64),
-        ("rest_s", np.float64),  # since the tag last showed motion ...
-        ("rest_m", np.float64, (3,)),  # ... and where it was then
+        ("stationary_s", np.float64),  # since the tag last showed motion ...
+        ("stationary_m", np.float64, (3,)),  # ... and where it was then
         ("withholds_levels", np.int64),  # whether the anchors' positions are known to be wrong
         ("height_ticks", np.int64),  # the tag's reading when a sensor's height was used last
         ("plane_m", np.float64, (3,)),  # a point of the plane that lies closest to the anchors, ...
         ("plane_normal", np.float64, (3,)),  # ... and its normal
-        ("open_range_errors", np.int64),  # whether anchors join with range errors beyond what the settings say
-        ("range_errors", np.int64),  # which of them there are: NONE, PASSING or LASTING
+        ("open_range_errors", np.int64),  # whether anchors join with range errors beyond those of the settings
+        (
+            "range_errors",
+            np.int64,
+        ),  # which of them there are: NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS
         ("fault_std_m", np.float64),  # of lasting faults, beforehand
     ],
     align=True,
@@ -136,7 +235,7 @@ STATUS: Final = np.dtype(
 
 
 class EstimatorState(NamedTuple):
-    """Everything that the kernels work on, for one tag with so many anchors and n states (``Layout.room``)."""
+    """Everything that the kernels work on, for one tag with its anchors and n states (``Layout.room``)."""
 
     x: Vector
     """Shape (n,)."""
@@ -149,28 +248,28 @@ class EstimatorState(NamedTuple):
     """Of both kinds of faults of all anchors in the innovations, and of lasting (row) with recent ones (column), shape
     (3, anchors, anchors)."""
     evidence: Matrix
-    """What innovations say of them, shape (2, anchors)."""
+    """What innovations show of them, shape (2, anchors)."""
     anchors: Records
-    """``ANCHOR``, shape (anchors,)."""
+    """``ANCHOR_DTYPE``, shape (anchors,)."""
     packets: Records
-    """``PACKET``, shape (anchors, REMEMBERED)."""
+    """``PACKET_DTYPE``, shape (anchors, PACKETS_KEPT)."""
     links: Records
-    """``LINK``, shape (anchors, anchors), listener and sender."""
+    """``LINK_DTYPE``, shape (anchors, anchors), listener and sender."""
     status: Records
-    """``STATUS``, shape (1,)."""
+    """``STATUS_DTYPE``, shape (1,)."""
     settings: Records
-    """``SETTINGS``, shape (1,)."""
+    """``SETTINGS_DTYPE``, shape (1,)."""
     index_of: Integers
     """Index among ``anchors`` of each anchor of the site's table, −1 for those that are not in the state."""
     h: Vector
-    """The measurement at hand where it is not zero, at the places in ``h_index``."""
+    """The measurement at hand where it is not zero, at the indices in ``h_index``."""
     h_index: Indices
     ph: Vector
     """P·h of the measurement at hand, shape (n,)."""
     fault_input: Vector
     """By how much each fault is in the innovation at hand, shape (2·anchors + dim,)."""
     work: Matrix
-    """Room for systems of equations of all faults of one kind, shape (anchors + 1 + dim, anchors)."""
+    """Scratch for systems of equations of all faults of one kind, shape (anchors + 1 + dim, anchors)."""
 
 
 class Layout(NamedTuple):
@@ -221,12 +320,18 @@ def most_terms(dim: int) -> int:
 
 @step
 def uncertain_states(s: EstimatorState) -> int:
-    """How many states count: all that follow are exact, and all that they have to do with others is zero.
+    """How many states count: all that follow are exact, and their covariances with others are zero.
 
     A multiple of ``LANES``.
     """
     where, range_errors = layout(s.settings[0]["dim"], len(s.anchors)), s.status[0]["range_errors"]
-    end = where.end if range_errors == LASTING else where.constant if range_errors == PASSING else where.change
+    end = (
+        where.end
+        if range_errors == ALL_RANGE_ERRORS
+        else where.constant
+        if range_errors == CHANGING_RANGE_ERRORS
+        else where.change
+    )
     return int(-(-end // LANES) * LANES)
 
 
@@ -234,16 +339,16 @@ def _expected_range_errors(settings: Records, status: Records) -> int:
     """Which of them there are from the beginning."""
     names = ("survey_std_m", "range_std_m", "slope_std_m", "height_std_m")
     if status["open_range_errors"] or any(settings[name] > 0.0 for name in names):
-        return LASTING
-    return PASSING if settings["place_std_m"] > 0.0 else NONE
+        return ALL_RANGE_ERRORS
+    return CHANGING_RANGE_ERRORS if settings["place_std_m"] > 0.0 else NO_RANGE_ERRORS
 
 
 def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors: bool = False) -> EstimatorState:
-    """A state without anchors at the origin, for a table of so many; see ``Estimator.start``."""
+    """A state without anchors at the origin, for a table of that size; see ``Estimator.start``."""
     dim = settings.dim
     where = layout(dim, 0)
     n = where.room
-    status = np.zeros(1, STATUS)
+    status = np.zeros(1, STATUS_DTYPE)
     status["open_range_errors"] = open_range_errors
     status["range_errors"] = _expected_range_errors(settings.record()[0], status[0])
     status["q_scale"] = status["mean_nis"] = 1.0
@@ -261,9 +366,9 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
         V=np.zeros((dim, n)),
         information=np.zeros((3, 0, 0)),
         evidence=np.zeros((2, 0)),
-        anchors=np.zeros(0, ANCHOR),
-        packets=np.zeros((0, REMEMBERED), PACKET),
-        links=np.zeros((0, 0), LINK),
+        anchors=np.zeros(0, ANCHOR_DTYPE),
+        packets=np.zeros((0, PACKETS_KEPT), PACKET_DTYPE),
+        links=np.zeros((0, 0), LINK_DTYPE),
         status=status,
         settings=settings.record(),
         index_of=np.full(table_size, -1, np.int64),
@@ -289,7 +394,7 @@ OPEN_SURVEY_STD_M: Final = 0.15
 """What a start expects of ranges and survey that follows one which was contradicted."""
 
 PAIR_STD_M: Final = 0.05
-"""Of the constant of a pair of anchors beside what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
+"""Of the constant of a pair of anchors besides what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
 
 
 def with_anchor(s: EstimatorState, table_index: int, position_m: Vector, is_open: bool = False) -> EstimatorState:
@@ -300,7 +405,7 @@ def with_anchor(s: EstimatorState, table_index: int, position_m: Vector, is_open
     last["table_index"], last["position_m"] = table_index, position_m
     last["tx_ticks"] = last["rx_ticks"] = NEVER
     last["walk_scale"] = 1.0
-    last["place_variance_m2"] = settings["place_std_m"] ** 2
+    last["change_variance_m2"] = settings["place_std_m"] ** 2
     grown.packets[count] = (NEVER, NEVER, NEVER)
     pair_variance = 0.0
     if settings["range_std_m"] > 0.0 or settings["survey_std_m"] > 0.0:
@@ -308,10 +413,10 @@ def with_anchor(s: EstimatorState, table_index: int, position_m: Vector, is_open
     for link in (grown.links[count], grown.links[:, count]):
         link["tx_ticks"], link["variance_m2"] = NEVER, pair_variance
     where = layout(dim, count + 1)
-    grown.P[where.change + count, where.change + count] = last["place_variance_m2"]
+    grown.P[where.change + count, where.change + count] = last["change_variance_m2"]
     range_std_m, survey_std_m = settings["range_std_m"], settings["survey_std_m"]
     if is_open or s.status[0]["open_range_errors"]:
-        s.status[0]["range_errors"] = LASTING
+        s.status[0]["range_errors"] = ALL_RANGE_ERRORS
         range_std_m, survey_std_m = OPEN_RANGE_STD_M, OPEN_SURVEY_STD_M
     grown.P[where.constant + count, where.constant + count] = range_std_m**2
     survey = where.survey + dim * count
@@ -333,33 +438,33 @@ def with_table(s: EstimatorState, table_size: int) -> EstimatorState:
     return s._replace(index_of=index_of)
 
 
-KEPT: Final = ("x", "P", "V", "information", "evidence", "anchors", "packets", "links", "status")
+KEPT_ARRAYS: Final = ("x", "P", "V", "information", "evidence", "anchors", "packets", "links", "status")
 """Arrays that a state consists of; the others follow from the settings or are rewritten by each measurement."""
 
 
 def packed_state(s: EstimatorState) -> dict[str, bytes]:
-    """The arrays ``KEPT`` as bytes."""
-    return {name: getattr(s, name).tobytes() for name in KEPT}
+    """The arrays ``KEPT_ARRAYS`` as bytes."""
+    return {name: getattr(s, name).tobytes() for name in KEPT_ARRAYS}
 
 
 def unpacked_state(settings: EstimatorSettings, table_size: int, arrays: Mapping[str, bytes]) -> EstimatorState:
     """The state whose arrays ``packed_state`` has turned into bytes, which may come from anywhere.
 
-    Kernels check no bounds: all arrays get the shapes that these settings and the number of anchors ask for, and what
+    Kernels check no bounds: all arrays get the shapes that these settings and the number of anchors require, and what
     is an index is checked. Any other numbers will do.
 
     Raises:
         ValueError: an array is missing or of another size, or an index is out of its range.
     """
-    count = len(arrays.get("anchors", b"")) // ANCHOR.itemsize
-    if set(arrays) != set(KEPT) or len(arrays["P"]) != 8 * layout(settings.dim, count).room ** 2:
-        raise ValueError("the estimator's arrays are incomplete, or not of so many anchors")
+    count = len(arrays.get("anchors", b"")) // ANCHOR_DTYPE.itemsize
+    if set(arrays) != set(KEPT_ARRAYS) or len(arrays["P"]) != 8 * layout(settings.dim, count).room ** 2:
+        raise ValueError("the estimator's arrays are incomplete, or of another number of anchors")
     empty = _selected(new_state(settings, table_size), [-1] * count)
-    found = {name: np.frombuffer(arrays[name], getattr(empty, name).dtype) for name in KEPT}
+    found = {name: np.frombuffer(arrays[name], getattr(empty, name).dtype) for name in KEPT_ARRAYS}
     s = empty._replace(**{name: array.reshape(getattr(empty, name).shape).copy() for name, array in found.items()})
     table_index = s.anchors["table_index"]
     in_table = len(set(table_index.tolist()) & set(range(table_size))) == count
-    if not in_table or not NONE <= s.status["range_errors"][0] <= LASTING:
+    if not in_table or not NO_RANGE_ERRORS <= s.status["range_errors"][0] <= ALL_RANGE_ERRORS:
         raise ValueError("an index of the estimator is out of its range")
     s.index_of[table_index] = np.arange(count)
     return s
@@ -383,14 +488,14 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
     n, of_states, of_anchors = len(states), np.array(states), np.array(kept, np.int64)
     index_of = np.full_like(s.index_of, -1)
     result = s._replace(
-        x=_take(s.x, of_states),
-        P=_take(s.P, of_states, of_states),
-        V=_take(s.V, np.array(faults), of_states),
-        information=_take(s.information, np.arange(3), of_anchors, of_anchors),
-        evidence=_take(s.evidence, np.arange(2), of_anchors),
-        anchors=_take(s.anchors, of_anchors),
-        packets=_take(s.packets, of_anchors),
-        links=_take(s.links, of_anchors, of_anchors),
+        x=_select(s.x, of_states),
+        P=_select(s.P, of_states, of_states),
+        V=_select(s.V, np.array(faults), of_states),
+        information=_select(s.information, np.arange(3), of_anchors, of_anchors),
+        evidence=_select(s.evidence, np.arange(2), of_anchors),
+        anchors=_select(s.anchors, of_anchors),
+        packets=_select(s.packets, of_anchors),
+        links=_select(s.links, of_anchors, of_anchors),
         index_of=index_of,
         ph=np.zeros(n),
         fault_input=np.zeros(2 * new + dim),
@@ -401,10 +506,10 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
     return result
 
 
-def _take(source: NDArray[Scalar], *indices: Integers) -> NDArray[Scalar]:
+def _select(source: NDArray[Scalar], *indices: Integers) -> NDArray[Scalar]:
     """Rows (and columns) of an array; zeros for an index of −1."""
     shape, axes = source.shape, len(indices)
     with_zeros = np.zeros([length + 1 for length in shape[:axes]] + list(shape[axes:]), source.dtype)
     with_zeros[tuple(slice(-1) for _ in indices)] = source  # the last ones, of index −1, are left
-    places = [index.reshape([-1] + [1] * (axes - 1 - axis)) for axis, index in enumerate(indices)]
-    return with_zeros[tuple(places)]
+    grid = [index.reshape([-1] + [1] * (axes - 1 - axis)) for axis, index in enumerate(indices)]
+    return with_zeros[tuple(grid)]

@@ -1,7 +1,7 @@
 """``joint`` for systems without a master: their packets as they are, instead of time differences made of them.
 
-Stamps are unwrapped along the tag's clock, receptions that anchors tell lose the antenna delays in them
-(``relay_delays``), and what cannot be used is counted. Whom to believe is left to the filter.
+Stamps are unwrapped along the tag's clock, antenna delays are subtracted from relayed receptions (``RelayDelays``), and
+what cannot be used is counted. The filter decides which measurements are used.
 """
 
 from collections import Counter
@@ -13,28 +13,25 @@ import numpy as np
 from msgspec.structs import replace
 
 from skyless.air.masterless_packets import Packet, Point, Relay
-from skyless.clocks.stamps import NOISE_TICKS
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
-from skyless.positioning.estimator.settings import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.fix_time import FixTime
-from skyless.positioning.masterless.calibration import NEAREST_M, NOTHING, DifferenceCalibration
-from skyless.positioning.masterless.difference_tracking import DIFFERENCES, MAX_STD_M
+from skyless.positioning.masterless.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
+from skyless.positioning.masterless.difference_tracking import DIFFERENCES, MAX_HORIZONTAL_STD_M, NEIGHBOURHOOD
 from skyless.positioning.masterless.pair_engine import MOST_ANCHORS, remember
-from skyless.positioning.masterless.relay_delays import RelayDelays
-from skyless.positioning.masterless.start import NEIGHBOURHOOD
 from skyless.positioning.methods.joint import Estimation
+from skyless.positioning.methods.observations import NOISE_TICKS, FixTime
 from skyless.positioning.observation import Observation
 from skyless.ticks import LAST_TICKS, Unwrapper, nearest
 
-RANDOM_WALK_FM: Final = 5e-9
+MASTERLESS_RANDOM_WALK_FM: Final = 5e-9
 """Of the oscillators, 1/√s. Between 1e-9 and 7e-9 on the captures of TDoA3 anchors; too much of it costs little."""
 
 MASTERLESS: Final = replace(
     DIFFERENCES,
     gate=4.0,
     white=EstimatorSettings().white,
-    walk=(RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2,
+    walk=(MASTERLESS_RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2,
     max_walk_scale=1.0,
     drop_s=EstimatorSettings().drop_s,
     rx_variance_m2=2e-3,
@@ -43,33 +40,33 @@ MASTERLESS: Final = replace(
 """Ranges err as those of differences do, and in those captures a reception is 4 cm off by itself."""
 
 PERIOD_S: Final = 0.15
-"""Anchors send 6 to 60 times a second; the filter is told the slowest."""
+"""Anchors send 6 to 60 times a second; the filter assumes the slowest."""
 
-MAX_AGE_S: Final = 0.5
-"""How long ago a relayed packet may have been heard; a 7-bit sequence number recurs."""
+RELAY_MAX_AGE_S: Final = 0.5
+"""How long ago a relayed packet may have been received; a 7-bit sequence number recurs."""
 
 RESTART_IN_ROW: Final = 3
-"""So many impossible stamps of one anchor in a row mean that its counter began anew; ..."""
+"""This number of impossible stamps of one anchor in a row mean that its counter has restarted; ..."""
 
 BACK_IN_ROW: Final = 8
-"""... so many packets in a row before the newest, that the tag's did."""
+"""... this number of packets in a row from before the newest, that the tag's has."""
 
 
 class _Anchor:
-    """What the tag knows of one anchor: where it is, its newest stamps, and when it heard its latest packets."""
+    """What the tag knows of one anchor: its position, its newest stamps, and when its latest packets were received."""
 
-    __slots__ = ("anchor_m", "heard", "impossible", "place", "rx_ticks", "tx_ticks")
+    __slots__ = ("anchor_m", "heard", "impossible", "position_m", "rx_ticks", "tx_ticks")
 
-    def __init__(self, place: Point, tx_ticks: int, rx_ticks: int) -> None:
-        self.place = place
-        self.anchor_m = np.array(place)
+    def __init__(self, position_m: Point, tx_ticks: int, rx_ticks: int) -> None:
+        self.position_m = position_m
+        self.anchor_m = np.array(position_m)
         self.tx_ticks, self.rx_ticks = tx_ticks, rx_ticks
         self.impossible = 0
         self.heard: dict[int, tuple[int, int]] = {}
         """Sequence number → unwrapped (tx_ticks of the anchor, rx_ticks of the tag)."""
 
-    def follow(self, tx_counter: int, rx_ticks: int, bits: int) -> bool:
-        """Take the stamps of another packet; False if no crystal went from the newest to these."""
+    def update(self, tx_counter: int, rx_ticks: int, bits: int) -> bool:
+        """Process the stamps of another packet; False if no crystal went from the newest to these."""
         elapsed = rx_ticks - self.rx_ticks
         tx_ticks = nearest(tx_counter, self.tx_ticks + elapsed, bits)
         if abs(tx_ticks - self.tx_ticks - elapsed) > MAX_DRIFT * elapsed + NOISE_TICKS:
@@ -80,7 +77,7 @@ class _Anchor:
 
 
 class PacketTracking:
-    """One tag that hears the packets of anchors without a master. No I/O; whatever is unusable is counted."""
+    """One tag that receives the packets of anchors without a master. No I/O; whatever is unusable is counted."""
 
     def __init__(
         self,
@@ -90,9 +87,9 @@ class PacketTracking:
         z_bounds_m: tuple[float, float] | None = None,
         calibration: DifferenceCalibration | None = None,
     ) -> None:
-        """``anchors_m`` places the anchors; positions that packets carry serve where it has none.
+        """``anchors_m``: the anchors' positions; where it has none, those that packets carry are used.
 
-        ``tx_bits``: width of the anchors' stamps. ``calibration`` is taken off the tag's receptions; without one
+        ``tx_bits``: width of the anchors' stamps. ``calibration`` is subtracted from the tag's receptions; without one
         the anchors' antenna delays are estimated from how they range each other.
         """
         self.reason = NoFixReason.NO_BEACONS
@@ -102,10 +99,10 @@ class PacketTracking:
         """Of the newest fix."""
         self._tx_bits = tx_bits
         self._half_wrap = 1 << (tx_bits - 1)
-        self._places = dict(anchors_m)
+        self._positions_m = dict(anchors_m)
         self._surveyed = frozenset(anchors_m)
         self._anchors: dict[int, _Anchor] = {}
-        self._delays = RelayDelays(self._places, estimate=calibration is None)
+        self._delays = RelayDelays(self._positions_m, estimate=calibration is None)
         self._calibration = calibration
         self._tag_clock = Unwrapper(TICK_BITS)
         self._newest_rx_ticks: int | None = None
@@ -115,7 +112,7 @@ class PacketTracking:
         self._tracking = self._new_tracking()
         self._area_m = (0.0, 0.0, 0.0)
         self._drops: Counter[str] = Counter()
-        self._refused_before = self._refused_now = 0
+        self._rejected_before = self._rejected_now = 0
 
     @property
     def tracking(self) -> Estimation:
@@ -126,19 +123,19 @@ class PacketTracking:
     def drops(self) -> Counter[str]:
         """What was not used, by reason."""
         self._count_relays()
-        return self._drops + Counter({"relay-outlier": self._refused_before + self._refused_now})
+        return self._drops + Counter({"relay-outlier": self._rejected_before + self._rejected_now})
 
     @property
     def contradictions_m(self) -> Mapping[tuple[int, int], float]:
         """Pairs of anchors whose own ranging contradicts the positions; fixes then have no protection level."""
         return self._delays.contradictions_m
 
-    def hear(self, packet: Packet) -> Fix | None:
-        """Take one packet; a fix, or None, and ``reason`` says why.
+    def on_packet(self, packet: Packet) -> Fix | None:
+        """Process one packet; a fix, or None, and ``reason`` states why.
 
         A fix's ``time_s`` counts from the first packet, by the tag's clock.
         """
-        anchor = self._follow(packet)
+        anchor = self._unwrap(packet)
         if anchor is None:
             return None
         relays = []
@@ -165,20 +162,20 @@ class PacketTracking:
         )
         if self._delays.contradictions_m:
             self._tracking.estimator.withhold_levels()
-        fix = self._tracking.hear(observation)
+        fix = self._tracking.update(observation)
         if not isinstance(fix, Fix):
             self._count_relays()
             if fix is NoFixReason.RESIDUALS:
                 self._drops["outlier"] += 1
                 if packet.anchor in self._tracking.excluded:
                     fix = self._tracking.coast(observation)
-        return self._sane(fix)
+        return self._checked(fix)
 
     def _new_tracking(self) -> Estimation:
         return Estimation(self._settings, self._z_bounds_m, self._time, PERIOD_S)
 
-    def _sane(self, fix: Fix | NoFixReason) -> Fix | None:
-        """A fix near the anchors, beyond which time differences tell nothing, that is known well enough."""
+    def _checked(self, fix: Fix | NoFixReason) -> Fix | None:
+        """A fix near the anchors, beyond which time differences have no information, that is known well enough."""
         if isinstance(fix, Fix):
             x_m, y_m, z_m = fix.position_m.tolist()
             self.position_m, self.time_s = (x_m, y_m, z_m), fix.time_s
@@ -187,14 +184,14 @@ class PacketTracking:
             if abs(x_m - middle_x_m) > reach_m or abs(y_m - middle_y_m) > reach_m:
                 fix = NoFixReason.NOT_CONVERGED
                 self._tracking = self._new_tracking()
-            elif covariance.item(0) + covariance.item(4) > MAX_STD_M**2:
+            elif covariance.item(0) + covariance.item(4) > MAX_HORIZONTAL_STD_M**2:
                 fix = NoFixReason.ACQUIRING
             else:
                 return fix
         self.reason = fix
         return None
 
-    def _follow(self, packet: Packet) -> _Anchor | None:
+    def _unwrap(self, packet: Packet) -> _Anchor | None:
         """Unwrap both stamps of a packet; None if it cannot be used."""
         rx_ticks = self._tag_clock.unwrap(packet.rx_ticks, packet.host_s)
         if abs(rx_ticks) > LAST_TICKS:
@@ -206,13 +203,13 @@ class PacketTracking:
         elif rx_ticks <= self._newest_rx_ticks and not self._has_new_counter(packet, rx_ticks):
             return None
         self._back_in_row = 0
-        place = self._place(packet)
+        position_m = self._position_of(packet)
         anchor = self._anchors.get(packet.anchor)
-        if place is None or (anchor is None and len(self._anchors) >= MOST_ANCHORS):
-            self._drops["unknown-anchor" if place is None else "too-many-anchors"] += 1
+        if position_m is None or (anchor is None and len(self._anchors) >= MOST_ANCHORS):
+            self._drops["unknown-anchor" if position_m is None else "too-many-anchors"] += 1
             self.reason = NoFixReason.NO_ALMANAC
             return None
-        if anchor is not None and not anchor.follow(packet.tx_ticks, rx_ticks, self._tx_bits):
+        if anchor is not None and not anchor.update(packet.tx_ticks, rx_ticks, self._tx_bits):
             self._drops["impossible-stamp"] += 1
             if anchor.impossible < RESTART_IN_ROW:
                 return None
@@ -220,17 +217,17 @@ class PacketTracking:
             self._delays.forget(packet.anchor)
             anchor = None
         if anchor is None:
-            anchor = self._anchors[packet.anchor] = _Anchor(place, packet.tx_ticks, rx_ticks)
-            self._learn_area()
-        elif anchor.place != place:
-            anchor.place, anchor.anchor_m = place, np.array(place)
-            self._learn_area()
+            anchor = self._anchors[packet.anchor] = _Anchor(position_m, packet.tx_ticks, rx_ticks)
+            self._update_area()
+        elif anchor.position_m != position_m:
+            anchor.position_m, anchor.anchor_m = position_m, np.array(position_m)
+            self._update_area()
         self._newest_rx_ticks = rx_ticks
         remember(anchor.heard, packet.sequence, anchor.tx_ticks, rx_ticks)
         return anchor
 
     def _has_new_counter(self, packet: Packet, rx_ticks: int) -> bool:
-        """Whether a packet from before the newest one is not late, but the tag's counter began anew."""
+        """Whether a packet from before the newest one is not late, but the tag's counter has restarted."""
         anchor = self._anchors.get(packet.anchor)
         known = None if anchor is None else anchor.heard.get(packet.sequence)
         if known is not None and known[1] == rx_ticks:
@@ -248,18 +245,18 @@ class PacketTracking:
         self._newest_rx_ticks = None
         self._anchors.clear()
 
-    def _place(self, packet: Packet) -> Point | None:
-        """Where the sender is: as surveyed, else where it says, or said last."""
-        known = self._places.get(packet.anchor)
-        told_m = None if packet.anchor in self._surveyed else packet.position_m
-        if told_m is None or (known is None and len(self._places) >= MOST_ANCHORS):
+    def _position_of(self, packet: Packet) -> Point | None:
+        """The sender's position: as surveyed, else as stated, now or last."""
+        known = self._positions_m.get(packet.anchor)
+        stated_m = None if packet.anchor in self._surveyed else packet.position_m
+        if stated_m is None or (known is None and len(self._positions_m) >= MOST_ANCHORS):
             return known
-        self._places[packet.anchor] = told_m
-        return told_m
+        self._positions_m[packet.anchor] = stated_m
+        return stated_m
 
-    def _learn_area(self) -> None:
-        places = np.array([anchor.place[:2] for anchor in self._anchors.values()])
-        low, high = places.min(axis=0), places.max(axis=0)
+    def _update_area(self) -> None:
+        positions = np.array([anchor.position_m[:2] for anchor in self._anchors.values()])
+        low, high = positions.min(axis=0), positions.max(axis=0)
         x_m, y_m = ((low + high) / 2.0).tolist()
         self._area_m = (x_m, y_m, NEIGHBOURHOOD * max(float(np.linalg.norm(high - low)), 5.0))
 
@@ -271,7 +268,7 @@ class PacketTracking:
             return "relay-of-unheard-packet"
         tx_ticks, rx_ticks_tag = heard
         age = anchor.rx_ticks - rx_ticks_tag
-        if age > MAX_AGE_S * TICK_RATE_HZ:
+        if age > RELAY_MAX_AGE_S * TICK_RATE_HZ:
             return "relay-too-old"
         expected, half = anchor.tx_ticks - age, self._half_wrap
         rx_ticks = expected + ((relay.rx_ticks - expected + half) & (2 * half - 1)) - half  # ``nearest`` in place
@@ -281,15 +278,15 @@ class PacketTracking:
     def _calibrated(self, name: int, anchor: _Anchor) -> int:
         """The tag's stamp of an anchor's newest packet without the bias that a calibration found."""
         assert self._calibration is not None
-        known = self._calibration.anchors.get(name, NOTHING)
+        known = self._calibration.anchors.get(name, NO_BIAS)
         bias_m = known.bias_m
         if known.slope_m and self.position_m is not None:
-            bias_m += known.slope_m * log(max(dist(self.position_m, anchor.place), NEAREST_M))
+            bias_m += known.slope_m * log(max(dist(self.position_m, anchor.position_m), SLOPE_NEAREST_M))
         return anchor.rx_ticks - round(bias_m / TICK_M)
 
     def _count_relays(self) -> None:
-        """Add up what filters refused: each start, before which there are packets without a fix, counts from zero."""
-        refused = int(self._tracking.estimator.state.status[0]["relays_rejected"])
-        if refused < self._refused_now:
-            self._refused_before += self._refused_now
-        self._refused_now = refused
+        """Add up what filters rejected: each start, before which there are packets without a fix, counts from zero."""
+        rejected = int(self._tracking.estimator.state.status[0]["relays_rejected"])
+        if rejected < self._rejected_now:
+            self._rejected_before += self._rejected_now
+        self._rejected_now = rejected

@@ -1,10 +1,10 @@
 """The cold start: where the tag is, from packets alone and without a guess.
 
-Wherever anchor i tells when it heard a packet of anchor j that the tag heard as well, the difference of their clocks
-at that moment is known but for noise. Along such links all TX times are carried to the clock of one anchor, unless more
-anchors tell theirs on the master's. The tag's clock runs up to 20 ppm off, so pseudoranges of one superframe drift by
-tens of metres. Two messages of the same anchor tell the drift; then all anchors' newest pseudoranges are carried to one
-time and solved in closed form.
+Wherever anchor i relays when it received a packet of anchor j that the tag received as well, the difference of their
+clocks at that moment is known but for noise. Along such links all TX times are carried to the clock of one anchor,
+unless more anchors state theirs on the master's. The tag's clock runs up to 20 ppm off, so pseudoranges of one
+superframe drift by tens of metres. Two messages of the same anchor give the drift; then all anchors' newest
+pseudoranges are carried to one time and solved in closed form.
 """
 
 from collections import deque
@@ -17,42 +17,42 @@ from msgspec import Struct
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.kernels.arrays import Array
 from skyless.positioning.fix import NoFixReason
+from skyless.positioning.methods.locate import RESIDUAL_TAIL, NoSolution, locate_pseudoranges
 from skyless.positioning.observation import Observation
-from skyless.positioning.solver.locate import RESIDUAL_TAIL, NoSolution, locate_pseudoranges
 
-MAX_AGE_S: Final = 0.5
-"""Older messages no longer serve the start, unless superframes are so long; and then only for the rate of the clock, as
+START_MAX_AGE_S: Final = 0.5
+"""Older messages are not used for the start, unless superframes are longer; and then only for the rate of the clock, as
 the tag may be elsewhere by now."""
 
-WIDE: Final = 0.05
+WIDE_START: Final = 0.05
 """With a standard deviation above this part of the mean range, ranges are not linear in the state: updates would make
-the filter sure of a wrong place. More anchors are waited for, ..."""
+the filter sure of a wrong position. It waits for more anchors, ..."""
 
-PATIENCE_S: Final = 0.5
-"""... for so long after the first such start, and four times as long for one wider by four times."""
+START_PATIENCE_S: Final = 0.5
+"""... for this time after the first such start, and four times as long for one wider by four times."""
 
 CONTRADICTIONS: Final = frozenset({NoFixReason.RESIDUALS, NoFixReason.BAD_GEOMETRY, NoFixReason.NOT_CONVERGED})
-"""What one lying anchor makes of a start; absurd pseudoranges count as bad geometry."""
+"""How a start fails with one faulty anchor; absurd pseudoranges count as bad geometry."""
 
-SPEED_STD_MPS: Final = 1.0
+TAG_SPEED_STD_MPS: Final = 1.0
 """Typical speed of a tag; it smears pseudoranges taken at different times and starts the velocity."""
 
-MAX_GAP_S: Final = 5.0
-"""After a longer silence the state says less than a new start would."""
+MAX_SILENCE_S: Final = 5.0
+"""After a longer silence the state is worse than a new start."""
 
-MAX_SPREAD: Final = 0.05
+MAX_RELATIVE_STD: Final = 0.05
 """With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
-state: updates would make it confident of a wrong place, so a new start is better."""
+state: updates would make it confident of a wrong position, so a new start is better."""
 
 SLOW_S: Final = 0.2
-SLOW_SPREAD: Final = 0.2
-"""Borne in longer superframes, where a new start takes seconds."""
+SLOW_MAX_RELATIVE_STD: Final = 0.2
+"""Accepted in longer superframes, where a new start takes seconds."""
 
 SHORT_SILENCE_S: Final = 0.1
 """Over shorter silences no state grows much wider."""
 
 EARLY_S: Final = 1.0
-"""A filter that is lost so soon after its start may have a tag that is faster than assumed; ..."""
+"""A filter that is lost within this time of its start may have a tag that is faster than assumed; ..."""
 
 SPEED_STD_GROWTH: Final = 4.0
 MAX_SPEED_STD_MPS: Final = 32.0
@@ -72,7 +72,7 @@ class _Link(Struct, frozen=True):
 
 
 class _Scale(Struct, frozen=True):
-    """How an anchor's TX times become those of the reference: the sum of links on the way to it."""
+    """How an anchor's TX times become those of the reference: the sum of links on the path to it."""
 
     ticks: int
     fraction_ticks: float
@@ -85,7 +85,7 @@ class Start(Struct, frozen=True):
     """A first position, and the speed that is assumed of the tag."""
 
     used: tuple[Observation, ...]
-    """The messages that it rests on, one of each anchor."""
+    """The messages that it uses, one of each anchor."""
     rx_ticks_tag: int
     solution: Array
     """[position (dim), clock offset], metres."""
@@ -93,7 +93,7 @@ class Start(Struct, frozen=True):
     speed_variance: float
     is_contradicted: bool = False
     """Whether the messages of all anchors contradict each other, ..."""
-    left_out: tuple[int, ...] = ()
+    misfitting: tuple[int, ...] = ()
     """... but not without these, which are not in ``used``."""
 
 
@@ -106,7 +106,7 @@ class Acquisition(Struct):
     _z_bounds_m: tuple[float, float] | None
     _max_age_s: float
     _speed_std_mps: float
-    """Of a tag that is taken for fast this makes a start wide, and more anchors do not help."""
+    """Of a tag that is assumed to be fast this makes a start wide, and more anchors do not help."""
     _heard: dict[int, list[Observation]] = {}
     _possible_ticks: int | None = None
     """When a start was first possible."""
@@ -123,8 +123,8 @@ class Acquisition(Struct):
         kept = [observation for pair in self._heard.values() for observation in pair]
         return sorted(kept, key=lambda observation: observation.rx_ticks_tag)
 
-    def learn(self, observation: Observation) -> None:
-        """Keep what an anchor relays; to be called before ``hear``."""
+    def add_relays(self, observation: Observation) -> None:
+        """Keep what an anchor relays; to be called before ``add``."""
         for anchor, sequence, rx_ticks in observation.all_relays():
             for packet in self._heard.get(anchor, ()):
                 if packet.sequence == sequence:
@@ -132,8 +132,8 @@ class Acquisition(Struct):
                     link = _Link(packet.rx_ticks_tag, rx_ticks - packet.tx_ticks_anchor, -range_ticks)
                     self._links[observation.anchor, anchor] = link
 
-    def hear(self, observation: Observation) -> Start | NoFixReason:
-        """Take one observation; try to start each time an anchor comes around again."""
+    def add(self, observation: Observation) -> Start | NoFixReason:
+        """Add one observation; try to start each time an anchor comes around again."""
         now = observation.rx_ticks_tag
         for anchor, kept in list(self._heard.items()):
             if (now - kept[-1].rx_ticks_tag) * TICK_S > self._max_age_s:
@@ -142,7 +142,7 @@ class Acquisition(Struct):
         came_around = len(kept) == 2
         self._heard[observation.anchor] = [*kept[-1:], observation]
         pairs = [kept for kept in self._heard.values() if len(kept) == 2]
-        pairs = [kept for kept in pairs if (now - kept[-1].rx_ticks_tag) * TICK_S < MAX_AGE_S]
+        pairs = [kept for kept in pairs if (now - kept[-1].rx_ticks_tag) * TICK_S < START_MAX_AGE_S]
         pairs = [kept for kept in self._on_one_scale(pairs) if _possible(*kept)]
         needed = 4 if self._height_m is None else 3
         if len(pairs) < needed:
@@ -223,9 +223,12 @@ class Acquisition(Struct):
         waited_s = (start.rx_ticks_tag - self._possible_ticks) * TICK_S
         dim = len(start.solution) - 1
         ranges_m = [np.linalg.norm(o.anchor_m[:dim] - start.solution[:dim]) for o in start.used]
-        spread = np.sqrt(np.trace(start.covariance[:2, :2])) / np.mean(ranges_m)
-        is_fast = self._speed_std_mps > SPEED_STD_MPS
-        patience_s = PATIENCE_S * min(spread / WIDE, 4.0) if spread > WIDE and not is_fast else 0.0
+        relative_std = np.sqrt(np.trace(start.covariance[:2, :2])) / np.mean(ranges_m)
+        patience_s = (
+            START_PATIENCE_S * min(relative_std / WIDE_START, 4.0)
+            if relative_std > WIDE_START and self._speed_std_mps <= TAG_SPEED_STD_MPS
+            else 0.0
+        )
         return start if waited_s >= patience_s else NoFixReason.ACQUIRING
 
     def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
@@ -237,13 +240,13 @@ class Acquisition(Struct):
             self._contradicted_ticks = now
         results = [self._solve(pairs[:k] + pairs[k + 1 :], now) for k in range(len(pairs))]
         starts = [
-            msgspec.structs.replace(result, is_contradicted=True, left_out=(pairs[k][0].anchor,))
+            msgspec.structs.replace(result, is_contradicted=True, misfitting=(pairs[k][0].anchor,))
             for k, result in enumerate(results)
             if isinstance(result, Start)
         ]
         if len(starts) == 1:
             return starts[0]
-        if (now - self._contradicted_ticks) * TICK_S < PATIENCE_S:
+        if (now - self._contradicted_ticks) * TICK_S < START_PATIENCE_S:
             return NoFixReason.RESIDUALS
         result = self._solve(pairs, now, residual_tail=0.0)
         return msgspec.structs.replace(result, is_contradicted=True) if isinstance(result, Start) else result
@@ -283,7 +286,7 @@ class Acquisition(Struct):
 
 
 def _offset_ticks(observation: Observation) -> tuple[int, float]:
-    """Tag's reading minus the master's TX time: whole ticks and the fraction to take off."""
+    """Tag's reading minus the master's TX time: whole ticks and the fraction to subtract."""
     assert observation.tx_ticks_master is not None
     return observation.rx_ticks_tag - observation.tx_ticks_master, observation.tx_fraction_ticks
 

@@ -1,4 +1,4 @@
-"""A tag's positioning method as an almanac asks for it."""
+"""A tag's positioning method as the almanac configures it."""
 
 from typing import Final
 
@@ -6,15 +6,14 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.air.almanac import AccuracyPage, NoisePage, SchedulePage
-from skyless.clocks.filter import clock_noise
+from skyless.clocks.filter import clock_noise, stamp_variance_m2
 from skyless.method_names import FILTERS
-from skyless.positioning.estimator.settings import EstimatorSettings
-from skyless.positioning.fix_time import FixTime
+from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.positioning.methods.joint import Estimation
+from skyless.positioning.methods.observations import FixTime
 from skyless.positioning.methods.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.ticks import to_seconds
-from skyless.uncertainty.tdoa import stamp_variance_m2
 
 DROP_S: Final = 2.0
 """An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""
@@ -22,41 +21,41 @@ DROP_S: Final = 2.0
 
 RELAY_AGE_S: Final = 1.0
 RELAY_SUPERFRAMES: Final = 2.5
-"""Relays of packets that are older than the one, or than so many superframes, are not used."""
+"""Relays of packets that are older than the one, or than this number of superframes, are not used."""
 
 
 class MethodOptions(Struct, frozen=True):
-    """What the tag's owner asks for."""
+    """What the tag's owner configures."""
 
     method: str
     """One of ``METHODS``."""
     qa: float
-    """The tag's agility in m²/s³ (filters)."""
+    """Spectral density of the tag's acceleration, m²/s³ per axis (filters)."""
     z_bounds_m: tuple[float, float] | None
     """Decides between mirror solutions."""
     integrity: IntegrityRequirement
-    """What is asked of the protection levels (``joint``)."""
+    """What is required of the protection levels (``joint``)."""
 
 
 def new_method(
-    wanted: MethodOptions, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage, time: FixTime
+    options: MethodOptions, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage, time: FixTime
 ) -> Estimation | Snapshots:
     """Make the method for a site with this schedule and noise, where that anchor is the master."""
     superframe_s = to_seconds(schedule.slot_ticks * schedule.slots)
-    if wanted.method not in FILTERS:
+    if options.method not in FILTERS:
         tx_variance, rx_variance = _stamp_variances(noise)
         settings = SnapshotSettings(
-            master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, wanted.z_bounds_m
+            master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, options.z_bounds_m
         )
-        return Snapshots(SnapshotMethod(wanted.method), settings, time)
+        return Snapshots(SnapshotMethod(options.method), settings, time)
     assumed = replace(
-        estimator_settings(wanted.qa, schedule.tag_height_m, noise, accuracy, superframe_s),
-        max_acceleration_mps2=wanted.integrity.max_acceleration_mps2,
-        integrity_risk=wanted.integrity.risk,
-        alert_limit_m=wanted.integrity.alert_limit_m,
-        height_std_m=wanted.integrity.height_std_m,
+        estimator_settings(options.qa, schedule.tag_height_m, noise, accuracy, superframe_s),
+        max_acceleration_mps2=options.integrity.max_acceleration_mps2,
+        integrity_risk=options.integrity.risk,
+        alert_limit_m=options.integrity.alert_limit_m,
+        height_std_m=options.integrity.height_std_m,
     )
-    return Estimation(assumed, wanted.z_bounds_m, time, superframe_s)
+    return Estimation(assumed, options.z_bounds_m, time, superframe_s)
 
 
 def _stamp_variances(noise: NoisePage) -> tuple[float, float]:

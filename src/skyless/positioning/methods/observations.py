@@ -1,22 +1,26 @@
-"""Observations out of beacons: the master's time unwrapped, and for each method what it asks for."""
+"""Observations out of beacons: stamps unwrapped, the master's time, variances of receptions, times of fixes."""
+
+import math
+from collections import Counter
+from typing import Final
+
+from msgspec import Struct
 
 from skyless.air.beacon import Beacon, Heard
 from skyless.air.codec import packed_relays
 from skyless.air.master_term import MasterTerm, master_term_of
-from skyless.constants import MAX_DRIFT, TICK_M
+from skyless.constants import MAX_DRIFT, TICK_M, TICK_S
 from skyless.kernels.arrays import Array
-from skyless.positioning.fix_time import SLACK_TICKS
-from skyless.positioning.methods.joint import Estimation
 from skyless.positioning.observation import Method, Observation
 from skyless.site.slots import Schedule
-from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, nearest
+from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, from_seconds, nearest, wrap
 
 
 class Observer:
     """What a tag must remember of beacons to make observations of those that follow."""
 
     def __init__(self) -> None:
-        self._for_joint = False
+        self._needs_relays = False
         self._schedule: Schedule | None = None
         self._master: int | None = None
         self._master_slot = 0
@@ -24,17 +28,17 @@ class Observer:
         """The master's time and the tag's, both unwrapped, when they were compared last."""
 
     def forget(self) -> None:
-        """Start anew."""
+        """Start again."""
         self.scale = None
 
-    def follow(self, master: int | None, master_slot: int) -> None:
-        """Go by this master, whose first slot in the superframe is given."""
+    def set_master(self, master: int | None, master_slot: int) -> None:
+        """Refer rounds to this master, whose first slot in the superframe is given."""
         self._master, self._master_slot = master, master_slot
 
-    def serve(self, method: Method, schedule: Schedule) -> None:
-        """Make what this method asks for."""
+    def set_method(self, method: Method, schedule: Schedule) -> None:
+        """Make observations with what this method needs."""
         self._schedule = schedule
-        self._for_joint = isinstance(method, Estimation)
+        self._needs_relays = method.needs_relays
 
     def observe(
         self,
@@ -44,11 +48,11 @@ class Observer:
         rx_ticks: int,
         tx_ticks: int,
         rx_variance_factor: float,
-        claim: MasterTerm | None,
+        master_term: MasterTerm | None,
     ) -> Observation:
-        """One observation of a beacon in a frame; ``claim``, the one that is followed, is mostly the beacon's too."""
+        """One observation of a beacon in a frame; ``master_term``, that of the receiver, is mostly the beacon's too."""
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
-        if not self._for_joint:
+        if not self._needs_relays:
             heard = beacon.master_heard if beacon.master == self._master else None
             master_sequence, master_rx_ticks = _stamp_of(heard, tx_ticks)
             return Observation(
@@ -56,12 +60,12 @@ class Observer:
                 master_rx_ticks, ticks_master, fraction, variance_m2, (), None, rx_variance_factor,
             )  # fmt: skip
         if ticks_master is None:
-            claim = None
-        elif claim is None or claim.master != beacon.master or claim.term != beacon.term:
-            claim = master_term_of(beacon)
+            master_term = None
+        elif master_term is None or master_term.master != beacon.master or master_term.term != beacon.term:
+            master_term = master_term_of(beacon)
         return Observation(
             beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, ticks_master, fraction,
-            variance_m2, (), claim, rx_variance_factor, packed_relays(frame, beacon),
+            variance_m2, (), master_term, rx_variance_factor, packed_relays(frame, beacon),
         )  # fmt: skip
 
     def _round(self, beacon: Beacon) -> int:
@@ -77,25 +81,168 @@ class Observer:
     def _master_time(self, beacon: Beacon, rx_ticks: int) -> tuple[int | None, float, float]:
         """TX time on the master's scale: unwrapped whole ticks, fraction, variance in m².
 
-        Only the master, and anchors that agree with what was heard before, lead the scale on.
+        Only the master, and anchors that agree with what was received before, continue the scale.
         """
         time, scale = beacon.master_time, self.scale
         if time is None:
             return None, 0.0, 0.0
         subticks = time.tx_subticks_master
         whole = subticks >> 8
-        follow = scale is None or beacon.anchor == self._master
+        updates = scale is None or beacon.anchor == self._master
         if scale is not None:
             elapsed = rx_ticks - scale[1]
             expected = scale[0] + elapsed
             least = expected - HALF_WRAP_TICKS
             whole = least + ((whole - least) & TICK_MASK)
-            follow = follow or abs(whole - expected) <= MAX_DRIFT * elapsed + SLACK_TICKS
-        if follow:
+            updates = updates or abs(whole - expected) <= MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS
+        if updates:
             self.scale = (whole, rx_ticks)
         return whole, (subticks & 0xFF) / 256.0, (time.std_ticks * TICK_M) ** 2
 
 
 def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[None, None]:
-    """Sequence number and unwrapped RX stamp of what the sender of a beacon heard before that."""
+    """Sequence number and unwrapped RX stamp of what the sender of a beacon received before that."""
     return (None, None) if heard is None else (heard.sequence, nearest(heard.rx_ticks, tx_ticks))
+
+
+# Stamps
+
+
+STAMPS_BEFORE_RESTART: Final = 3
+"""This number of impossible stamps of one anchor in a row mean that its counter has restarted."""
+
+MOST_TRACKS: Final = 256
+"""More anchors than a site can have; with more identifiers on the air, that received longest ago is forgotten."""
+
+NOISE_TICKS: Final = 64
+"""0.3 m allow for the noise of two stamps."""
+
+
+class _Track(Struct):
+    """The last stamps of one anchor, unwrapped."""
+
+    rx_ticks_tag: int
+    tx_ticks: int
+    sequence: int
+    impossible: int = 0
+
+
+class StampTracks(Struct):
+    """What ``AnchorStamps`` keeps."""
+
+    newest_rx_ticks: int | None = None
+    """RX stamp of the newest accepted frame, unwrapped: one impossible stamp must not make others late."""
+    of_anchor: dict[int, _Track] = {}
+
+
+class AnchorStamps:
+    """Unwraps every anchor's counter along the tag's own; counts what it rejects in ``counters``."""
+
+    def __init__(self, counters: Counter[str], tracks: StampTracks | None = None) -> None:
+        """``tracks``: those to continue with."""
+        self._counters = counters
+        self.tracks = tracks or StampTracks()
+
+    def forget(self) -> None:
+        """Start again."""
+        self.tracks = StampTracks()
+
+    def unwrap(self, beacon: Beacon, rx_ticks: int) -> int | None:
+        """TX stamp on the anchor's own unwrapped scale; None if the frame is repeated, late, or its stamp impossible.
+
+        ``rx_ticks`` is the tag's own reading, unwrapped. An anchor's first stamp keeps its own value.
+        """
+        tracks = self.tracks
+        track, newest = tracks.of_anchor.get(beacon.anchor), tracks.newest_rx_ticks
+        if newest is not None and rx_ticks <= newest:
+            repeated = track is not None and _is_repeated(beacon, track)
+            self._counters["duplicate" if repeated else "out-of-order"] += 1
+            return None
+        if track is None:
+            tracks.newest_rx_ticks = rx_ticks
+            return self._begin(beacon, rx_ticks)
+        elapsed = rx_ticks - track.rx_ticks_tag
+        least = track.tx_ticks + elapsed - HALF_WRAP_TICKS
+        off = ((beacon.tx_ticks - least) & TICK_MASK) - HALF_WRAP_TICKS
+        if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
+            self._reject(beacon, track)
+            return None
+        track.rx_ticks_tag = tracks.newest_rx_ticks = rx_ticks
+        track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
+        track.sequence, track.impossible = beacon.sequence, 0
+        return tx_ticks
+
+    def _begin(self, beacon: Beacon, rx_ticks: int) -> int:
+        tracks = self.tracks.of_anchor
+        if len(tracks) >= MOST_TRACKS:
+            del tracks[min(tracks, key=lambda anchor: tracks[anchor].rx_ticks_tag)]
+        tracks[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence)
+        return beacon.tx_ticks
+
+    def _reject(self, beacon: Beacon, track: _Track) -> None:
+        """Count the stamp; after a few that are impossible the anchor's next one is a beginning."""
+        if _is_repeated(beacon, track):
+            self._counters["duplicate"] += 1
+            return
+        self._counters["impossible-stamp"] += 1
+        track.impossible += 1
+        if track.impossible >= STAMPS_BEFORE_RESTART:
+            del self.tracks.of_anchor[beacon.anchor]
+            self._counters["anchor-restart"] += 1
+
+
+def _is_repeated(beacon: Beacon, track: _Track) -> bool:
+    return wrap(track.tx_ticks) == beacon.tx_ticks and track.sequence == beacon.sequence
+
+
+# Paths that look blocked
+
+
+CLEAR_DB: Final = 7.0
+BLOCKED_DB: Final = 11.0
+"""Up to the former nothing changes, from the latter on all that can: the maker's 6 and 10, and 1 dB. Lines of sight of
+the UTIL data set have up to 8.4 dB, paths through metal, the only ones that are much later, from 11.3."""
+
+MAX_VARIANCE_FACTOR: Final = 36.0
+"""Factor on the variance of a blocked path: metal made messages 0.2 to 0.4 m late, 4 to 8 times what noise does."""
+
+
+def variance_factor(rx_power_dbm: float | None, first_path_power_dbm: float | None) -> float:
+    """Factor on the variance of a reception, from 1 to ``MAX_VARIANCE_FACTOR``; it grows with the powers' difference.
+
+    Where a power is missing, not finite or impossible (a first path above the total) the factor is 1.
+    """
+    if rx_power_dbm is None or first_path_power_dbm is None:
+        return 1.0
+    difference_db = rx_power_dbm - first_path_power_dbm
+    if not CLEAR_DB < difference_db < math.inf:
+        return 1.0
+    part = min((difference_db - CLEAR_DB) / (BLOCKED_DB - CLEAR_DB), 1.0)
+    return float(MAX_VARIANCE_FACTOR ** (part * part * (3.0 - 2.0 * part)))
+
+
+# The time of fixes
+
+
+FLIGHT_SLACK_TICKS: Final = from_seconds(1e-6)
+"""Flight times differ between anchors by less than this (300 m)."""
+
+
+class FixTime(Struct):
+    """Counts from the first fix of a receiver and never goes back, also where master or method change."""
+
+    first_ticks_master: int | None = None
+    last_ticks_master: int = 0
+    last_rx_ticks_tag: int = 0
+
+    def time_s(self, ticks_master: int, rx_ticks_tag: int) -> float:
+        """Time in seconds of a fix that holds at this master time, given the tag's reading for it, both unwrapped."""
+        if self.first_ticks_master is None:
+            self.first_ticks_master = ticks_master
+        else:
+            elapsed = rx_ticks_tag - self.last_rx_ticks_tag
+            off = ticks_master - self.last_ticks_master - elapsed
+            if elapsed <= 0 or (abs(off) > FLIGHT_SLACK_TICKS and abs(off) > MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS):
+                self.first_ticks_master += off + elapsed - max(elapsed, 1)
+        self.last_ticks_master, self.last_rx_ticks_tag = ticks_master, rx_ticks_tag
+        return (ticks_master - self.first_ticks_master) * TICK_S

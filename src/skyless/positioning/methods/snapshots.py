@@ -1,8 +1,8 @@
 """The snapshot methods: one fix a round from two consecutive frames of every node.
 
-``literal`` is the paper to the letter (first messages, unweighted), ``literal-delayed`` its delayed messages,
-``weighted`` the paper's TDoAs with their full covariance, ``bracketed`` the free gain of a third (``docs/maths.md``
-section 5).
+``literal`` is the paper to the letter (Santoro et al., ROSE 2021; first messages, unweighted), ``literal-delayed`` its
+delayed messages, ``weighted`` the paper's TDoAs with their full covariance, ``bracketed`` the free gain of a third
+(``docs/maths.md`` section 5). Below the methods stand their covariances, and the paper's arithmetic.
 """
 
 from enum import StrEnum
@@ -12,13 +12,12 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.constants import MAX_DRIFT, TICK_M
-from skyless.kernels.arrays import Array
+from skyless.kernels.arrays import Array, Matrix, Vector
+from skyless.kernels.compiled import kernel, part
 from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.fix_time import SLACK_TICKS, FixTime
+from skyless.positioning.methods.locate import NoSolution, Solution, locate
+from skyless.positioning.methods.observations import FLIGHT_SLACK_TICKS, FixTime
 from skyless.positioning.observation import Observation
-from skyless.positioning.solver.locate import NoSolution, Solution, locate
-from skyless.positioning.solver.paper import bracketed_tdoa, literal_tdoa
-from skyless.uncertainty.tdoa import bracketed_covariance, literal_covariance, literal_delayed_covariance
 
 
 class SnapshotMethod(StrEnum):
@@ -28,6 +27,138 @@ class SnapshotMethod(StrEnum):
     LITERAL_DELAYED = "literal-delayed"
     WEIGHTED = "weighted"
     BRACKETED = "bracketed"
+
+
+# The paper's arithmetic
+
+
+@part
+def relative_rate(rx_interval_anchor: float, tx_interval_master: float) -> float:
+    """Relative rate ν̄_{i,m} of an anchor against the master from two messages (``eq:Synchro``)."""
+    return rx_interval_anchor / tx_interval_master
+
+
+@part
+def relative_offset(rx_anchor: float, tx_master: float, rate: float, tof_ticks: float) -> float:
+    """Relative offset ō_{i,m} of one synchronisation message, in ticks (``eq:SynchroOffset``)."""
+    return rx_anchor - rate * tx_master - tof_ticks
+
+
+@part
+def averaged_offset(first: float, delayed: float) -> float:
+    """Mean of the offsets of the two messages (``eq:AverageRelOff``).
+
+    With one two-point rate both are identical for any noise (``docs/maths.md`` E2): averaging changes nothing.
+    """
+    return (first + delayed) / 2.0
+
+
+@part
+def to_master(ticks_anchor: float, rate: float, offset: float) -> float:
+    """An anchor's reading on the master's scale (``eq:AnchorSync``), in ticks."""
+    return (ticks_anchor - offset) / rate
+
+
+@part
+def synchronise(
+    tx1_master: int, tx2_master: int, rx1_anchor: int, rx2_anchor: int, tof_ticks: float
+) -> tuple[float, float]:
+    """Rate and averaged offset of an anchor from two master messages.
+
+    The offset holds for master readings counted from ``tx1_master`` and anchor readings from ``rx1_anchor``.
+    """
+    tx_interval = float(tx2_master - tx1_master)
+    rx_interval = float(rx2_anchor - rx1_anchor)
+    rate = relative_rate(rx_interval, tx_interval)
+    first = relative_offset(0.0, 0.0, rate, tof_ticks)
+    delayed = relative_offset(rx_interval, tx_interval, rate, tof_ticks)
+    return rate, averaged_offset(first, delayed)
+
+
+@kernel
+def tag_rate(rx_interval_tag: float, tx_interval_master: float) -> float:
+    """Rate ν̄_m of the tag against the master (``eq:TagSynchro``); the motion toward the anchor is in it."""
+    return rx_interval_tag / tx_interval_master
+
+
+@kernel
+def protocol_interval(rate_tag: float, tx_anchor_master: float, tx_master: float) -> float:
+    """Protocol interval g(Δ_{i,m}) as the tag's clock would show it, in ticks (``eq:ProtocolInterval``)."""
+    return rate_tag * (tx_anchor_master - tx_master)
+
+
+@kernel
+def literal_tdoa(
+    m1: int,
+    m2: int,
+    s1: int,
+    s2: int,
+    a1: int,
+    a2: int,
+    r1: int,
+    r2: int,
+    rm1: int,
+    rm2: int,
+    tof_ticks: float,
+) -> tuple[float, float]:
+    """TDoAs of the first and of the delayed messages in ticks of the tag (``eq:GPSTDoA``), to the letter.
+
+    Both stamps of the anchor's pair are converted with the same synchronisation; converting each with the newest one
+    doubles the error (``docs/maths.md`` section 5, "the trap").
+    """
+    rate, offset = synchronise(m1, m2, s1, s2, tof_ticks)
+    first = to_master(float(a1 - s1), rate, offset)
+    delayed = to_master(float(a2 - s1), rate, offset)
+    rate_tag = tag_rate(float(r2 - r1), delayed - first)
+    tdoa_first = (r1 - rm1) - protocol_interval(rate_tag, first, 0.0)
+    tdoa_delayed = (r2 - rm2) - protocol_interval(rate_tag, delayed, float(m2 - m1))
+    return tdoa_first, tdoa_delayed
+
+
+@kernel
+def bracketed_tdoa(
+    m1: int, m2: int, s1: int, s2: int, a1: int, a2: int, r1: int, r2: int, rm2: int, tof_ticks: float
+) -> float:
+    """TDoA in ticks against the master's second message, which the anchor's two enclose (``docs/maths.md`` section 5).
+
+    The anchor's own RX stamp of that message shows where between its two transmissions it was sent; no
+    synchronisation parameter enters but the rate that scales the flight time.
+    """
+    rate = float(s2 - s1) / float(m2 - m1)
+    sent_after_first = (s2 - a1) - rate * tof_ticks
+    return (r1 - rm2) + float(r2 - r1) / float(a2 - a1) * sent_after_first
+
+
+# Covariances of the TDoAs
+
+
+def literal_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
+    """Of ``eq:GPSTDoA`` for the first messages, whose reference is one of the two sync messages; shape (n, n).
+
+    There the master's noise and the rate error β cancel exactly: Q_i + 1 stamps of the tag and of the anchor remain,
+    Q = (1 + κ)² + κ².
+    """
+    return _shared_reference((1.0 + kappa) ** 2 + kappa**2, tx_var_m2, rx_var_m2)
+
+
+def literal_delayed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
+    """Of ``eq:GPSTDoA`` for the delayed messages: the anchor's pair encloses the reference, Q = (1 - κ)² + κ²."""
+    return _shared_reference((1.0 - kappa) ** 2 + kappa**2, tx_var_m2, rx_var_m2)
+
+
+def bracketed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
+    """Of the bracketed TDoAs; the same stamps with the same weights as the delayed messages, so the same variance."""
+    return literal_delayed_covariance(kappa, tx_var_m2, rx_var_m2)
+
+
+def _shared_reference(q: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
+    """Each TDoA holds its pair (factor Q) and one RX stamp of the anchor; the tag's reference stamp is common."""
+    own = q * (tx_var_m2 + rx_var_m2) + rx_var_m2
+    covariance: Matrix = np.full((len(q), len(q)), rx_var_m2) + np.diag(own)
+    return covariance
+
+
+# The methods
 
 
 _COVARIANCES: Final = {
@@ -53,7 +184,7 @@ class SnapshotSettings(Struct, frozen=True):
 
 
 class SnapshotsState(Struct, frozen=True, tag="snapshots"):
-    """What ``Snapshots`` remembers."""
+    """What ``Snapshots`` keeps."""
 
     round: int | None
     previous: dict[int, Observation]
@@ -62,6 +193,8 @@ class SnapshotsState(Struct, frozen=True, tag="snapshots"):
 
 class Snapshots:
     """Collects two rounds of beacons and solves them."""
+
+    needs_relays = False
 
     def __init__(self, method: SnapshotMethod, settings: SnapshotSettings, fix_time: FixTime | None = None) -> None:
         """``fix_time``: the receiver's, where it outlives this method."""
@@ -73,15 +206,15 @@ class Snapshots:
         self._time = fix_time or FixTime()
 
     def state(self) -> SnapshotsState:
-        """What it remembers, as it is now."""
+        """All that it keeps, as it is now."""
         return SnapshotsState(self._round, self._previous, self._current)
 
     def restore(self, state: SnapshotsState) -> None:
         """Continue from a state."""
         self._round, self._previous, self._current = state.round, state.previous, state.current
 
-    def hear(self, observation: Observation) -> Fix | NoFixReason:
-        """Take one observation; a fix when it completes its round or is the first of the next one."""
+    def update(self, observation: Observation) -> Fix | NoFixReason:
+        """Process one observation; a fix when it completes its round or is the first of the next one."""
         result: Fix | NoFixReason = NoFixReason.ACQUIRING
         if observation.round != self._round:
             if self._current:
@@ -160,23 +293,23 @@ class Snapshots:
 
 
 def _synchronised(first: Observation, second: Observation, reference: tuple[Observation, Observation]) -> bool:
-    """Whether the anchor heard, before its two frames, the very master frames that the tag heard, and its clock ran."""
+    """Whether anchor and tag received the same two master frames, and no clock jumped in between."""
     return (
         first.anchor != reference[0].anchor
         and first.master_rx_ticks_anchor is not None
         and second.master_rx_ticks_anchor is not None
         and first.master_sequence == reference[0].sequence
         and second.master_sequence == reference[1].sequence
-        and _in_step(second.tx_ticks_anchor - first.tx_ticks_anchor, first, second)
-        and _in_step(second.master_rx_ticks_anchor - first.master_rx_ticks_anchor, *reference)
-        and _in_step(reference[1].tx_ticks_anchor - reference[0].tx_ticks_anchor, *reference)
+        and _is_plausible_interval(second.tx_ticks_anchor - first.tx_ticks_anchor, first, second)
+        and _is_plausible_interval(second.master_rx_ticks_anchor - first.master_rx_ticks_anchor, *reference)
+        and _is_plausible_interval(reference[1].tx_ticks_anchor - reference[0].tx_ticks_anchor, *reference)
     )
 
 
-def _in_step(elapsed_ticks: int, first: Observation, second: Observation) -> bool:
+def _is_plausible_interval(elapsed_ticks: int, first: Observation, second: Observation) -> bool:
     """Whether an interval on an anchor's clock can be the one that the tag measured between two receptions."""
     elapsed = second.rx_ticks_tag - first.rx_ticks_tag
-    return elapsed > 0 and abs(elapsed_ticks - elapsed) <= MAX_DRIFT * elapsed + SLACK_TICKS
+    return elapsed > 0 and abs(elapsed_ticks - elapsed) <= MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS
 
 
 def _kappa(first: Observation, second: Observation) -> float:

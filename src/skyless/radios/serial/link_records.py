@@ -1,5 +1,6 @@
-"""Records of the serial link as values; what is rounded to the line's units is rounded here, for all who ask."""
+"""Records of the serial link as values, and the rounding of measured values to the link's units."""
 
+import struct
 from typing import Final
 
 from msgspec import Struct
@@ -7,13 +8,13 @@ from msgspec import Struct
 from skyless.air.reception import Diagnostics
 from skyless.firmware import link
 
-POWER_STEPS_PER_DB: Final = 100
-OFFSET_STEPS_PER_PPM: Final = 1000
+_STEPS: Final = (100, 100, 1000)
+"""Units of powers and carrier offset: steps per dB and per ppm."""
 _GREATEST: Final = 0x7FFF
 
 
 class Hello(Struct, frozen=True):
-    """Who the board is."""
+    """The board's version and abilities."""
 
     major: int
     minor: int
@@ -47,7 +48,7 @@ class TooLate(Struct, frozen=True, gc=False):
 
 
 class Status(Struct, frozen=True):
-    """How the board does."""
+    """The board's state and counts."""
 
     ticks: int
     configured: bool
@@ -63,7 +64,7 @@ class Status(Struct, frozen=True):
 
 
 class NotDone(Struct, frozen=True):
-    """The board does not follow a command."""
+    """The board has refused a command."""
 
     command: int
     reason: int
@@ -81,26 +82,23 @@ def decode(record: bytes) -> Record | str:
     return decoder(record) or "malformed-record"
 
 
-def quantised(diagnostics: Diagnostics) -> Diagnostics:
-    """What is left of measured values after the serial link."""
-    powers = (diagnostics.rx_power_dbm, diagnostics.first_path_power_dbm)
-    rx_power, first_path = (_value(to_steps(power, POWER_STEPS_PER_DB), POWER_STEPS_PER_DB) for power in powers)
-    offset = to_steps(diagnostics.carrier_offset_ppm, OFFSET_STEPS_PER_PPM)
-    return Diagnostics(rx_power, first_path, _value(offset, OFFSET_STEPS_PER_PPM))
+def to_steps(measured: Diagnostics) -> tuple[int, int, int]:
+    """Received and first-path power and carrier offset, rounded to the link's units."""
+    values = (measured.rx_power_dbm, measured.first_path_power_dbm, measured.carrier_offset_ppm)
+    whole = [None if value is None else round(value * per_unit) for value, per_unit in zip(values, _STEPS, strict=True)]
+    rx_power, first_path, offset = (link.NOT_MEASURED if n is None or abs(n) > _GREATEST else n for n in whole)
+    return rx_power, first_path, offset
 
 
-def to_steps(value: float | None, steps: int) -> int:
-    """A measured value in the line's units; ``NOT_MEASURED`` for none and for what does not fit."""
-    whole = None if value is None else round(value * steps)
-    return link.NOT_MEASURED if whole is None or abs(whole) > _GREATEST else whole
+def from_steps(rx_power: int, first_path: int, offset: int) -> Diagnostics:
+    """The measured values of a record in the link's units."""
+    return Diagnostics(
+        *(_value(n, per_unit) for n, per_unit in zip((rx_power, first_path, offset), _STEPS, strict=True))
+    )
 
 
 def _value(steps: int, per_unit: int) -> float | None:
     return None if steps == link.NOT_MEASURED else steps / per_unit
-
-
-def _signed(record: bytes, at: int) -> int:
-    return int.from_bytes(record[at : at + 2], "little", signed=True)
 
 
 def _ticks(record: bytes, at: int = link.BODY_AT) -> int:
@@ -116,17 +114,14 @@ def _hello(record: bytes) -> Hello | None:
         return Hello(major, minor, (0, 0, 0), b"", 0, 0, can_transmit=False)
     if len(record) < link.HELLO_BYTES:
         return None
-    firmware = (record[4], record[5], record[6])
-    rate_khz = int.from_bytes(record[15:19], "little")
-    return Hello(major, minor, firmware, record[7:15], rate_khz, record[19], bool(record[20] & link.CAN_TRANSMIT))
+    *firmware, device_id, rate_khz, bits, abilities = struct.unpack_from("<3B8sIBB", record, 4)
+    return Hello(major, minor, tuple(firmware), device_id, rate_khz, bits, bool(abilities & link.CAN_TRANSMIT))
 
 
 def _heard(record: bytes) -> Heard | None:
     if not 1 <= len(record) - link.RX_FRAME_AT <= link.MAX_FRAME_BYTES:
         return None
-    powers = [_value(_signed(record, at), POWER_STEPS_PER_DB) for at in (7, 9)]
-    offset_ppm = _value(_signed(record, 11), OFFSET_STEPS_PER_PPM)
-    return Heard(_ticks(record), Diagnostics(powers[0], powers[1], offset_ppm), record[link.RX_FRAME_AT :])
+    return Heard(_ticks(record), from_steps(*struct.unpack_from("<3h", record, 7)), record[link.RX_FRAME_AT :])
 
 
 def _done(record: bytes) -> Done | None:
@@ -140,22 +135,17 @@ def _late(record: bytes) -> TooLate | None:
 def _status(record: bytes) -> Status | None:
     if len(record) < link.STATUS_BYTES:
         return None
-    received, errors, sent, late, garbled, unsent = (
-        int.from_bytes(record[at : at + 4], "little") for at in range(8, 32, 4)
+    state, received, errors, sent, late, garbled, unsent, centidegrees, millivolts = struct.unpack_from(
+        "<B6IhH", record, 7
     )
-    millivolts = int.from_bytes(record[34:36], "little")
+    supply_v = None if millivolts == link.NO_VOLTAGE else millivolts / 1000
     return Status(
-        ticks=_ticks(record),
-        configured=bool(record[7] & link.IS_CONFIGURED),
-        receiving=bool(record[7] & link.IS_RECEIVING),
-        received=received,
-        errors=errors,
-        sent=sent,
-        late=late,
-        garbled=garbled,
-        unsent_records=unsent,
-        temperature_c=_value(_signed(record, 32), 100),
-        supply_v=None if millivolts == link.NO_VOLTAGE else millivolts / 1000,
+        _ticks(record),
+        bool(state & link.IS_CONFIGURED),
+        bool(state & link.IS_RECEIVING),
+        *(received, errors, sent, late, garbled, unsent),
+        _value(centidegrees, 100),
+        supply_v,
     )
 
 

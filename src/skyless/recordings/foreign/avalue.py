@@ -113,7 +113,7 @@ def anchor_distances_m(path: str | PathLike[str], drops: Drops) -> dict[tuple[in
     ranging = TwoWayRanging(TICK_BITS, window=_RANGED)
     with open_source(path) as stream:
         for heard in cross_receptions(stream, drops):
-            ranging.hear(heard.sender, heard.receiver, heard.tx_ticks, heard.rx_ticks)
+            ranging.add(heard.sender, heard.receiver, heard.tx_ticks, heard.rx_ticks)
     return {pair: flight * TICK_M for pair, flight in ranging.flights_ticks().items()}
 
 

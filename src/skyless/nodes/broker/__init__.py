@@ -1,1 +1,0 @@
-"""The MQTT broker that comes with Skyless."""

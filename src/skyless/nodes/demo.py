@@ -1,0 +1,147 @@
+"""``skyless demo``: a whole site, with broker, ether, anchors, tags, page and recorder as processes, and its watch."""
+
+import asyncio
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.link import Link
+from skyless.nodes.broker import Broker, BrokerSettings, start_broker
+from skyless.nodes.children import Child, Program
+from skyless.nodes.ports import claim_next, hold_any
+from skyless.nodes.process import Log, outlasting, together
+from skyless.nodes.watch import Watch
+from skyless.positioning.integrity import RISK, IntegrityRequirement
+from skyless.site.model import Site
+
+_HOST: Final = "127.0.0.1"
+_PAGE_PORT: Final = 8080
+_TAGS_PER_PROCESS: Final = 25
+_BROKER_RESTART_S: Final = 0.2
+
+
+class SiteRun(Struct, frozen=True):
+    """What to run."""
+
+    site: Site
+    site_name: str
+    """Argument of the programs' ``--site``."""
+    tags: int
+    speed_mps: float
+    noise_ps: float | None
+    seed: int
+    method: str
+    integrity: IntegrityRequirement
+    broker: MqttAddress | None
+    """None: an embedded one."""
+    record: Path | None
+    record_limit_mb: float
+    apart: bool
+    """Whether every anchor and every tag is a process of its own."""
+    recordings: Path
+    """Folder of recordings that the page shows."""
+
+
+class WholeSite:
+    """Starts everything and keeps it alive; ``ready`` is set when the watch is connected."""
+
+    def __init__(self, asked: SiteRun, log: Log) -> None:
+        self._asked, self._log = asked, log
+        self.ether_port, self._ether_held = hold_any(_HOST)
+        self.page_port, self._page_claim = claim_next(_HOST, _PAGE_PORT)
+        self.address: MqttAddress | None = asked.broker
+        self.watch: Watch | None = None
+        self.children: list[Child] = []
+        self.ready = asyncio.Event()
+        """The broker is there and the programs are starting."""
+
+    @property
+    def page(self) -> str:
+        """Address of the page."""
+        return f"http://{_HOST}:{self.page_port}"
+
+    async def run(self) -> None:
+        """Keep everything alive until cancelled.
+
+        Raises:
+            SkylessError: the embedded broker cannot be started.
+        """
+        with self._ether_held, self._page_claim:
+            if self._asked.broker is not None:
+                await self._run_with(self._asked.broker, None)
+            else:
+                broker = await start_broker()
+                await self._run_with(broker.address, broker)
+
+    async def _run_with(self, address: MqttAddress, broker: Broker | None) -> None:
+        self.address = address
+        site = self._asked.site
+        link = Link(address, "demo", site=site.id, kind="watch")
+        self.watch = Watch(link, site.id, planar=site.tags.height_m is not None)
+        self.children = [Child(program, self._log) for program in self._programs(address)]
+        self.ready.set()
+        nodes = together(link.run(), *(child.run() for child in self.children))
+        await (nodes if broker is None else outlasting(self._keep(broker), nodes))  # they publish their end to it
+
+    async def _keep(self, broker: Broker) -> None:
+        """Start the embedded broker again, on the same port and with the same store, whenever it ends."""
+        settings = BrokerSettings(port=broker.address.port, data=broker.data)
+        try:
+            while True:
+                code = await broker.wait()
+                self._log(f"broker ended (exit code {code}); started again")
+                await broker.stop()
+                await asyncio.sleep(_BROKER_RESTART_S)
+                broker = await start_broker(settings)
+        finally:
+            await asyncio.shield(broker.stop())
+
+    def _programs(self, address: MqttAddress) -> list[Program]:
+        asked = self._asked
+        mqtt: tuple[str, ...] = ("--mqtt", str(replace(address, password=None)))
+        if address.ca is not None:
+            mqtt += ("--mqtt-ca", str(address.ca))
+        radio = ("--radio", f"ether:{_HOST}:{self.ether_port}")
+        site = ("--site", asked.site_name)
+        ether = ["ether", *site, *mqtt, "--listen", f"{_HOST}:{self.ether_port}", "--tags", str(asked.tags)]
+        ether += ["--speed", str(asked.speed_mps), "--seed", str(asked.seed)]
+        if asked.noise_ps is not None:
+            ether += ["--noise-ps", str(asked.noise_ps)]
+        programs = [Program("ether", tuple(ether))]
+        anchors = [str(anchor.id) for anchor in asked.site.anchors]
+        programs += [
+            Program(_named("anchor", some), ("anchor", *some, *site, *radio, *mqtt))
+            for some in _groups(anchors, 1 if asked.apart else len(anchors))
+        ]
+        computing = ["--method", asked.method]
+        if asked.integrity.risk != RISK:
+            computing += ["--integrity-risk", str(asked.integrity.risk)]
+        if asked.integrity.alert_limit_m is not None:
+            computing += ["--alert-limit-m", str(asked.integrity.alert_limit_m)]
+        if asked.integrity.max_acceleration_mps2 > 0.0:
+            computing += ["--max-acceleration", str(asked.integrity.max_acceleration_mps2)]
+        tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
+        programs += [
+            Program(_named("tag", some), ("tag", *some, *radio, *mqtt, *computing))
+            for some in _groups(tags, 1 if asked.apart else _TAGS_PER_PROCESS)
+        ]
+        page = ("dashboard", *mqtt, "--listen", f"{_HOST}:{self.page_port}", "--recordings", str(asked.recordings))
+        programs.append(Program("page", (*page, "--site-id", str(asked.site.id))))
+        if asked.record is not None:
+            limit = ("--limit-mb", str(asked.record_limit_mb))
+            programs.append(
+                Program("recorder", ("record", str(asked.record), *mqtt, *limit, "--site-id", str(asked.site.id)), 1)
+            )
+        return programs
+
+
+def _groups(names: list[str], size: int) -> list[list[str]]:
+    return [names[first : first + size] for first in range(0, len(names), size)]
+
+
+def _named(kind: str, names: list[str]) -> str:
+    """The name of a process in messages."""
+    return f"{kind} {names[0]}" if len(names) == 1 else f"{kind}s {names[0]} to {names[-1]}"

@@ -1,1 +1,0 @@
-"""Programs that stand in for hardware: the emulated air, emulated boards."""

@@ -1,0 +1,238 @@
+"""What the programs of a running site have in common: event loop, tasks, links, folders, use of the machine."""
+
+import asyncio
+import contextlib
+import ctypes
+import fcntl
+import gc
+import os
+import resource
+import selectors
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import IO, Any, Final
+
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import SiteMessage
+from skyless.mqtt.topics import floor_plan_topic, site_topic
+from skyless.site.model import Site
+
+HEALTH_S: Final = 1.0
+"""Interval of the health messages."""
+
+Log = Callable[[str], None]
+"""Called with one line for a person to read."""
+
+_PR_SET_PDEATHSIG: Final = 1
+
+_RADIO_NICE: Final = -10
+"""Priority of programs that serve a radio, where the system allows it (root, or a limit in limits.conf)."""
+
+
+# The event loop
+
+
+def run(main: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
+    """Run a program until it ends or is cancelled by SIGTERM, SIGHUP or Ctrl-C.
+
+    ``punctual``: ask the system for a higher priority, because a radio's slots do not wait.
+
+    Raises:
+        KeyboardInterrupt: it was Ctrl-C.
+    """
+    if punctual:
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, _RADIO_NICE)
+    gc.collect()
+    gc.freeze()
+    with asyncio.Runner(loop_factory=_new_loop) as runner, contextlib.suppress(asyncio.CancelledError):
+        runner.run(_until_terminated(main))
+
+
+def _new_loop() -> asyncio.AbstractEventLoop:
+    """A loop on select(), whose timers are exact to microseconds; those of epoll() are a millisecond late."""
+    return asyncio.SelectorEventLoop(selectors.SelectSelector())
+
+
+async def _until_terminated(main: Coroutine[Any, Any, None]) -> None:
+    task = asyncio.ensure_future(main)
+    with contextlib.suppress(NotImplementedError):
+        for number in ending_signals():
+            asyncio.get_running_loop().add_signal_handler(number, task.cancel)
+    await task
+
+
+def ending_signals() -> tuple[signal.Signals, ...]:
+    """Signals besides Ctrl-C that end a program: SIGTERM and, except under ``nohup``, SIGHUP of a closed terminal."""
+    is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return (signal.SIGTERM,) if is_ignored else (signal.SIGTERM, signal.SIGHUP)
+
+
+def end_with_parent(number: signal.Signals = signal.SIGTERM) -> Callable[[], None] | None:
+    """The ``preexec_fn`` of a child process that is to end with its parent, however the parent ends; Linux only."""
+    if not sys.platform.startswith("linux"):
+        return None
+    prctl = ctypes.CDLL(None).prctl
+    parent = os.getpid()
+
+    def request_signal() -> None:
+        prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0)
+        if os.getppid() != parent:  # the parent died before the request
+            os._exit(1)
+
+    return request_signal
+
+
+# Tasks
+
+
+async def together(*parts: Coroutine[Any, Any, None]) -> None:
+    """Run until one part fails or all are cancelled; a failure cancels the others and is raised as itself."""
+    tasks = [asyncio.ensure_future(part) for part in parts]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def every(seconds: float, act: Callable[[], None]) -> None:
+    """Call a function at an interval until cancelled."""
+    while True:
+        await asyncio.sleep(seconds)
+        act()
+
+
+async def outlasting(lasting: Coroutine[Any, Any, None], others: Coroutine[Any, Any, None]) -> None:
+    """Run both until one ends or all is cancelled; ``lasting`` is cancelled when the others have ended."""
+    last, first = asyncio.ensure_future(lasting), asyncio.ensure_future(others)
+    try:
+        done, _ = await asyncio.wait((last, first), return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in (first, last):
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+# Links
+
+
+def link_of(address: MqttAddress | None, name: int | str, *, site: int, kind: str) -> Link | None:
+    """The node's connection to the broker; None without one."""
+    return None if address is None else Link(address, name, site=site, kind=kind)
+
+
+async def keep(link: Link, log: Log) -> None:
+    """Run a link until cancelled; a fault in it is logged, and costs neither a fix nor a beacon."""
+    while True:
+        try:
+            await link.run()
+        except Exception as error:  # noqa: BLE001 - whatever it is, positioning goes on
+            log(f"the link to {link.address} failed ({error!r}); started again")
+        await asyncio.sleep(HEALTH_S)
+
+
+class SitePublisher:
+    """Publishes a site, retained, and again when its radios turn out to be simulated or not."""
+
+    def __init__(self, site: Site, is_simulated: Callable[[], bool], floor_plan: Path | None = None) -> None:
+        self._site, self._is_simulated, self._floor_plan = site, is_simulated, floor_plan
+        self._restarts: int | None = None
+        self._simulated = False
+        self._published: bool | None = None
+
+    def update(self, restarts: int) -> None:
+        """Call ``is_simulated`` after each restart of a radio: its port may lead to another device."""
+        if restarts != self._restarts:
+            self._restarts, self._simulated = restarts, self._is_simulated()
+
+    def publish(self, link: Link) -> None:
+        """Publish the site unless that has been done; retained, so that later subscribers get it at once."""
+        if self._simulated is self._published:
+            return
+        self._published = self._simulated
+        message = SiteMessage(self._site, self._simulated, time.time())
+        link.publish(site_topic(self._site.id), message, qos=1, retain=True)
+        if self._floor_plan is not None:
+            link.publish(floor_plan_topic(self._site.id), self._floor_plan.read_bytes(), qos=1, retain=True)
+
+
+# Folders and files
+
+
+def data_folder() -> Path:
+    """``skyless`` in the user's data folder (XDG), or a temporary folder where that cannot be written."""
+    shared = os.environ.get("XDG_DATA_HOME")
+    try:
+        home = Path(shared) if shared and Path(shared).is_absolute() else Path("~/.local/share").expanduser()
+        folder = home / "skyless"
+        if home == Path("/.local/share"):
+            raise PermissionError("HOME is empty")
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError("it cannot be written")
+    except (OSError, RuntimeError):  # RuntimeError: a user without a home
+        folder = Path(tempfile.gettempdir()) / f"skyless-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+    return folder
+
+
+def recordings_folder() -> Path:
+    """Folder of the recordings that the page shows; it is made."""
+    folder = data_folder() / "recordings"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def new_recording(folder: Path, kind: str) -> Path:
+    """File name for a recording that begins at this moment."""
+    return folder / f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
+
+
+def locked(file: Path) -> IO[str]:
+    """The file, locked for this process until it is closed. Raises OSError."""
+    lock = file.open("a", encoding="utf-8")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        raise
+    return lock
+
+
+# Use of the machine
+
+
+class Usage:
+    """Share of a core that this process uses, and its resident memory."""
+
+    def __init__(self) -> None:
+        self._wall_s = time.monotonic()
+        self._cpu_s = time.process_time()
+
+    def sample(self) -> tuple[float, int]:
+        """Share of a core since the last call, and resident memory in bytes."""
+        wall_s, cpu_s = time.monotonic(), time.process_time()
+        share = (cpu_s - self._cpu_s) / max(wall_s - self._wall_s, 1e-9)
+        self._wall_s, self._cpu_s = wall_s, cpu_s
+        return share, resident_bytes()
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process; its peak where the system does not report the present value."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, IndexError, ValueError):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else peak * 1024
+    return pages * os.sysconf("SC_PAGE_SIZE")

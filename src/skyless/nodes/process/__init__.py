@@ -1,1 +1,0 @@
-"""What every program of a running site needs of its process."""

@@ -1,1 +1,0 @@
-"""A position from time differences or pseudoranges of one moment, without a history."""

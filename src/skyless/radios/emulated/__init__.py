@@ -1,1 +1,0 @@
-"""Radios in an emulated ether, over TCP."""

@@ -1,0 +1,191 @@
+"""What emulated boards say and do, word by word, without ports and air."""
+
+import random
+from collections import Counter
+
+import pytest
+
+from skyless.air.beacon import Beacon, Heard
+from skyless.air.codec import encode
+from skyless.air.masterless_packets import Packet, Relay
+from skyless.air.reception import Reception, Transmission
+from skyless.anchor import Anchor
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.firmware import link
+from skyless.nodes.board import LinkProtocol, SnifferProtocol
+from skyless.radios.interface import Late, Restarted, Sent
+from skyless.radios.serial.foreign_radios import SnifferStream
+from skyless.radios.serial.link_records import Done, Hello, NotDone, Status, TooLate, decode
+from skyless.simulation.impairments import lab_impairments
+from skyless.simulation.stations import TagSpec
+from skyless.simulation.trajectory import Static
+from skyless.simulation.world import World
+from skyless.site.lab import ideal_lab_site
+
+DELAY = 16_450
+
+
+class Radio:
+    name = "a board with a long name"
+
+    def __init__(self):
+        self.counters, self.ticks, self.transmissions = Counter(), 77, []
+
+    def now_ticks(self):
+        return self.ticks
+
+    def transmit(self, transmission):
+        self.transmissions.append(transmission)
+
+
+class Host:
+    """Talks with a board."""
+
+    def __init__(self, can_transmit=True):
+        self.radio, self.said, self.full = Radio(), [], False
+        self._reader, self.writer = link.Reader(), link.Writer()
+        self.board = LinkProtocol(self.radio, self._take, can_transmit=can_transmit)
+
+    def _take(self, data):
+        at = 0
+        while at < len(data) and not self.full:
+            at = self._reader.read(bytearray(data), at, len(data))
+            if self._reader.length:
+                self.said.append(decode(bytes(self._reader.record[: self._reader.length])))
+        return not self.full
+
+    def say(self, end):
+        """What the board answers."""
+        self.said.clear()
+        self.board.on_host_data(bytes(self.writer.line[:end]))
+        return list(self.said)
+
+    def ready(self):
+        self.say(self.writer.config(DELAY, DELAY))
+        self.say(self.writer.ask(link.RX_ON))
+        return self
+
+
+def dx(ticks):
+    return bytearray(ticks.to_bytes(5, "little"))
+
+
+def test_it_greets_and_is_configured_step_by_step():
+    host = Host(can_transmit=False)
+    (hello,) = host.say(host.writer.ask(link.ASK_HELLO))
+    assert hello == Hello(1, 0, (0, 0, 0), b"a board ", 63_897_600, 40, can_transmit=False)
+    (status,) = host.say(host.writer.ask(link.ASK_STATUS))
+    assert (status.ticks, status.configured, status.receiving) == (77, False, False)
+    assert host.say(host.writer.ask(link.RX_ON)) == [NotDone(link.RX_ON, link.REFUSED_MALFORMED)]
+    (status,) = host.say(host.writer.config(DELAY, DELAY))
+    assert (status.configured, status.receiving) == (True, False)
+    host.board.on_radio_event(Reception(b"not wanted yet", 5))
+    (status,) = host.say(host.writer.ask(link.RX_ON))
+    assert (status.configured, status.receiving, status.received) == (True, True, 0)
+    host.said.clear()
+    host.board.on_radio_event(Restarted())
+    (hello,) = host.said
+    assert isinstance(hello, Hello)
+    (status,) = host.say(host.writer.ask(link.ASK_STATUS))
+    assert not status.configured
+
+
+@pytest.mark.parametrize("at", range(6))
+def test_another_channel_or_preamble_is_refused(at):
+    host = Host()
+    wanted = bytearray([5, 64, 2, 9, 128, 0, 1, 0, 1, 0, 0])
+    wanted[at] += 1
+    host.writer.begin(link.CONFIG)
+    host.writer.append_bytes(wanted, 0, 11)
+    assert host.say(host.writer.end()) == [NotDone(link.CONFIG, link.REFUSED_SETTING)]
+    host.writer.begin(link.CONFIG)
+    host.writer.append_bytes(wanted, 0, 10)
+    assert host.say(host.writer.end()) == [NotDone(link.CONFIG, link.REFUSED_MALFORMED)]
+
+
+def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later():
+    host = Host().ready()
+    frame = bytearray(b"a frame")
+    assert host.say(host.writer.tx_at(dx(2**40 - 1), frame, 7)) == []
+    tx_ticks = (2**40 - 512 + DELAY) % 2**40
+    assert host.radio.transmissions == [Transmission(b"a frame", tx_ticks)]
+    assert host.say(host.writer.tx_at(dx(512), frame, 7)) == [TooLate(512, link.LATE_BUSY)]
+    host.said.clear()
+    host.board.on_radio_event(Sent(tx_ticks))
+    assert host.said == [Done(2**40 - 1, tx_ticks)]
+    host.say(host.writer.tx_at(dx(512), frame, 7))
+    host.board.on_radio_event(Late(512 + DELAY))
+    assert host.said == [TooLate(512, link.LATE_FOR_RADIO)]
+    host.board.on_radio_event(Sent(5))  # none of its own
+    (status,) = host.say(host.writer.ask(link.ASK_STATUS))
+    assert (status.sent, status.late) == (1, 2)
+    for length in (0, 128):
+        host.writer.begin(link.TX_AT)
+        host.writer.append_bytes(bytearray(133), 0, 5 + length)
+        assert host.say(host.writer.end()) == [NotDone(link.TX_AT, link.REFUSED_MALFORMED)]
+    silent = Host(can_transmit=False).ready()
+    assert silent.say(silent.writer.tx_at(dx(512), frame, 7)) == [TooLate(512, link.LATE_NOT_READY)]
+
+
+def test_a_board_whose_radio_is_dead_logs_nothing_and_one_that_is_not_fetched_counts():
+    host = Host()
+    host.radio.ticks = None
+    assert host.say(host.writer.ask(link.ASK_HELLO)) == []
+    host.radio.ticks = 5
+    host.ready()
+    host.full = True
+    host.board.on_radio_event(Reception(b"lost", 5))
+    host.full = False
+    (status,) = host.say(host.writer.ask(link.ASK_STATUS))
+    assert isinstance(status, Status)
+    assert (status.received, status.unsent_records) == (1, 1)
+
+
+def test_garbage_from_the_host_is_counted_and_hurts_nothing():
+    host, rng = Host().ready(), random.Random(2)
+    for _ in range(500):
+        record = bytearray(host.writer.line[: host.writer.tx_at(dx(512), bytearray(b"frame"), 5)])
+        record[rng.randrange(len(record))] ^= 1 << rng.randrange(8)
+        host.board.on_host_data(rng.randbytes(rng.randrange(200)) + b"\0" + bytes(record))
+    host.board.on_host_data(b"\0")
+    host.say(host.writer.ask(0x7F))
+    (status,) = host.say(host.writer.ask(link.ASK_STATUS))
+    assert status.receiving
+    assert status.garbled > 900
+    assert host.radio.transmissions == []
+
+
+LAB = ideal_lab_site()
+
+
+def frames():
+    """Beacons of two seconds of the simulated lab, which tell the whole almanac."""
+    world = World(LAB, lambda anchor: Anchor(LAB, anchor), [TagSpec(Static(1.0, 1.0))], lab_impairments(100.0), 1)
+    return [reception.frame for broadcast in world.run(2.0) for _, reception, _ in broadcast.receptions()]
+
+
+@pytest.mark.parametrize("knows_binary", [True, False])
+def test_a_beacon_becomes_a_packet_of_a_tdoa3_system(knows_binary):
+    out = bytearray()
+    speech = SnifferProtocol(lambda data: out.extend(data) is None, knows_binary=knows_binary)
+    speech.on_host_data(b"b")
+    for frame in frames():
+        speech.on_radio_event(Reception(frame, 1))
+    out.clear()
+    heard = (Heard(3, 250, 2**39 + 7), Heard(300, 1, 5))
+    beacon = Beacon(LAB.id, 2, 200, 9, 1, 2**40 - 5, 1, 1, 0, Heard(1, 130, 9), None, heard, None)
+    speech.on_radio_event(Reception(encode(beacon), 2**40 - 1))
+    speech.on_radio_event(Reception(b"no beacon", 4))
+    assert out.startswith(b"\xbc" if knows_binary else b"From 02 to ff @ffffffffff: 30")
+    drops = Counter()
+    (packet,) = SnifferStream(drops).feed(bytes(out))
+    places = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in LAB.anchors}
+
+    def flight(other):
+        squared = sum((a - b) ** 2 for a, b in zip(places[2], places[other], strict=True))
+        return round(squared**0.5 / SPEED_OF_LIGHT_MPS * TICK_RATE_HZ)
+
+    relays = (Relay(1, 130 % 128, 9, flight(1)), Relay(3, 250 % 128, 7, flight(3)))
+    assert packet == Packet(None, 2, 200 % 128, 2**32 - 5, 2**40 - 1, relays)
+    assert speech.drops == {"not-translated": 1}
+    assert not drops
