@@ -8,6 +8,7 @@ from math import inf, isfinite
 from typing import Final
 
 import numpy as np
+from msgspec import Struct
 
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
@@ -18,10 +19,10 @@ from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.positioning.methods.factory import MethodOptions, new_method
-from skyless.positioning.methods.joint import Estimation
-from skyless.positioning.methods.observations import AnchorStamps, FixTime, Observer, variance_factor
-from skyless.positioning.observation import Method
-from skyless.site.almanac_pages import AlmanacAssembly
+from skyless.positioning.methods.joint import Estimation, EstimationState
+from skyless.positioning.methods.observations import AnchorStamps, FixTime, Observer, StampTracks, variance_factor
+from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
+from skyless.site.almanac_pages import AlmanacAssembly, AlmanacState
 from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 
@@ -33,6 +34,28 @@ NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump"
 
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
 """Stamps that go back farther than radios and hosts reorder them mean that the tag's own counter has restarted."""
+
+
+class ReceiverState(Struct, frozen=True):
+    """All that a ``Receiver`` keeps; to be used or encoded before its next frame, as they share some parts."""
+
+    options: MethodOptions
+    site: int | None
+    may_change_site: bool
+    site_heard_ticks: int
+    counters: dict[str, int]
+    reason: NoFixReason
+    almanac: AlmanacState
+    time: FixTime
+    own_ticks: Unwrapper
+    stamps: StampTracks
+    followed: FollowedMaster
+    master: int | None
+    master_scale: tuple[int, int] | None
+    superframe_ticks: int
+    has_method_key: bool
+    """Whether a method has been looked for since stamps were forgotten."""
+    method: EstimationState | SnapshotsState | None
 
 
 class Receiver:
@@ -69,12 +92,65 @@ class Receiver:
         self._own_ticks = Unwrapper()
         self._stamps = AnchorStamps(self.counters)
         self._observer = Observer()
-        self._method: Method | None = None
+        self._method: Estimation | Snapshots | None = None
         self._method_key: object = None
         self._superframe_ticks = 0
         self._followed = FollowedMaster()
         self._master: int | None = None
         self._positions: dict[int, Array] = {}
+
+    def state(self) -> ReceiverState:
+        """All that it keeps, as it is now."""
+        return ReceiverState(
+            options=self._options,
+            site=self._site,
+            may_change_site=self._may_change_site,
+            site_heard_ticks=self._site_heard_ticks,
+            counters=dict(self.counters),
+            reason=self.reason,
+            almanac=self.almanac.state(),
+            time=self._time,
+            own_ticks=self._own_ticks,
+            stamps=self._stamps.tracks,
+            followed=self._followed,
+            master=self._master,
+            master_scale=self._observer.scale,
+            superframe_ticks=self._superframe_ticks,
+            has_method_key=self._method_key is not None,
+            method=None if self._method is None else self._method.state(),
+        )
+
+    @classmethod
+    def from_state(cls, state: ReceiverState) -> "Receiver":
+        """A receiver that continues with the same bits as the one with this state.
+
+        Raises:
+            ValueError: no receiver has such a state.
+        """
+        options = state.options
+        made = cls(options.method, qa=options.qa, z_bounds_m=options.z_bounds_m, integrity=options.integrity)
+        made._site, made._may_change_site = state.site, state.may_change_site
+        made._site_heard_ticks, made._superframe_ticks = state.site_heard_ticks, state.superframe_ticks
+        made.counters.update(state.counters)
+        made.reason = state.reason
+        made._time, made._own_ticks, made._followed = state.time, state.own_ticks, state.followed
+        made._stamps = AnchorStamps(made.counters, state.stamps)
+        made.almanac.restore(state.almanac)
+        made._read_positions()
+        made._master, made._observer.scale = state.master, state.master_scale
+        made._observer.set_master(state.master, made.almanac.slot_of(state.master) or 0)
+        if state.has_method_key:
+            made._choose_method()
+        match made._method, state.method:
+            case Estimation() as method, EstimationState() as saved:
+                method.restore(saved)
+            case Snapshots() as method, SnapshotsState() as saved:
+                method.restore(saved)
+            case None, None:
+                pass
+            case other, saved:
+                raise ValueError(f"{type(saved).__name__} is not a state of {type(other).__name__}")
+        return made
 
     @property
     def site(self) -> int | None:
@@ -82,7 +158,7 @@ class Receiver:
         return self._site
 
     @property
-    def method(self) -> Method | None:
+    def method(self) -> Estimation | Snapshots | None:
         """The positioning method in use, None before the almanac is known."""
         return self._method
 
@@ -134,7 +210,7 @@ class Receiver:
 
     def _admit(self, beacon: Beacon, rx_ticks: int) -> int | None:
         """TX stamp, unwrapped, of a beacon of the site, by the present master, and of an anchor that may be there."""
-        newest = self._stamps.newest_rx_ticks
+        newest = self._stamps.tracks.newest_rx_ticks
         jumped = newest is not None and rx_ticks < newest - COUNTER_JUMP_TICKS
         if (jumped or not -LAST_TICKS <= rx_ticks <= LAST_TICKS) and not self._restart(rx_ticks):
             return None
@@ -190,13 +266,21 @@ class Receiver:
 
         So does another master where the method uses the master's own stamps; filters continue.
         """
-        almanac, options, master = self.almanac, self._options, self._followed.master
+        almanac, master = self.almanac, self._followed.master
         if almanac.add_page(beacon.almanac_issue, beacon.page):
-            self._positions = {anchor: np.array(point) for anchor, point in almanac.anchors_m.items()}
+            self._read_positions()
         elif self._method is not None and master == self._master:
             return
         self._master = master
         self._observer.set_master(master, almanac.slot_of(master) or 0)
+        self._choose_method()
+
+    def _read_positions(self) -> None:
+        self._positions = {anchor: np.array(point) for anchor, point in self.almanac.anchors_m.items()}
+
+    def _choose_method(self) -> None:
+        """Make the method that almanac and master require, unless it is in use already."""
+        almanac, options, master = self.almanac, self._options, self._master
         method_master = None if options.method in FILTERS else master
         schedule_page, noise, accuracy = almanac.schedule, almanac.noise, almanac.accuracy
         method_key = (almanac.issue, schedule_page, noise, accuracy, method_master)

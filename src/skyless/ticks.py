@@ -4,7 +4,9 @@ Ticks are subtracted as integers and only then turned into seconds or metres (``
 float64 seconds lose 0.6 mm after an hour, integers lose nothing.
 """
 
-from typing import Final
+from typing import Annotated, Final
+
+from msgspec import Meta, Struct
 
 from skyless.constants import TICK_BITS, TICK_RATE_HZ, TICK_S
 
@@ -46,7 +48,7 @@ def from_seconds(seconds: float) -> int:
     return round(seconds * TICK_RATE_HZ)
 
 
-class Unwrapper:
+class Unwrapper(Struct):
     """Turns one counter's wrapped stamps into int64 ticks that never wrap.
 
     Without a host time a stamp is assumed to lie within half a wrap (8.6 s for 40 bits) of the stamp before it,
@@ -54,30 +56,28 @@ class Unwrapper:
     host's clock errs by less than half a wrap over that gap. Stamps with and without a host time may alternate.
     """
 
-    def __init__(self, bits: int = TICK_BITS) -> None:
-        self._bits = bits
-        self._half_wrap, self._mask = 1 << (bits - 1), (1 << bits) - 1
-        self._last_ticks: int | None = None
-        self._last_host_s: float | None = None
+    bits: Annotated[int, Meta(ge=1, le=64)] = TICK_BITS
+    last_ticks: int | None = None
+    last_host_s: float | None = None
 
     def unwrap(self, counter: int, host_s: float | None = None) -> int:
         """Unwrapped ticks of a counter value; the first stamp keeps its own value.
 
         A stamp out of order is placed where it belongs, before the ones already seen.
         """
-        last, last_host_s = self._last_ticks, self._last_host_s
+        last, last_host_s, half_wrap = self.last_ticks, self.last_host_s, 1 << (self.bits - 1)
         if last is None:
             ticks = counter
         else:
-            least = last - self._half_wrap
+            least = last - half_wrap
             if host_s is not None and last_host_s is not None:
                 least += round((host_s - last_host_s) * TICK_RATE_HZ)
-            ticks = least + ((counter - least) & self._mask)
+            ticks = least + ((counter - least) & ((half_wrap << 1) - 1))
             if host_s is None and last_host_s is not None:
                 host_s = last_host_s + to_seconds(ticks - last)
-        self._last_ticks, self._last_host_s = ticks, host_s
+        self.last_ticks, self.last_host_s = ticks, host_s
         return ticks
 
     def expect(self, counter: int) -> int:
         """Unwrapped ticks of a counter value near the last stamp; it does not count as a stamp."""
-        return counter if self._last_ticks is None else nearest(counter, self._last_ticks, self._bits)
+        return counter if self.last_ticks is None else nearest(counter, self.last_ticks, self.bits)

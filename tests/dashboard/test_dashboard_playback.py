@@ -14,8 +14,7 @@ from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.mqtt import topics
 from skyless.mqtt.messages import ZonesMessage
-from skyless.recordings.mcap.file import McapFile
-from skyless.recordings.mcap.recorder import McapRecorder
+from skyless.recordings.mcap.recorder import McapFile, McapRecorder
 
 START_S = 1_700_000_000.0
 PLAN = b"\x89PNG\r\n\x1a\nplan"
@@ -27,7 +26,7 @@ def record(path, *, begin_s=START_S, seconds=DURATION_S, close=True):
     recorder = McapRecorder(McapFile(path))
 
     def take(topic, message, at_s):
-        recorder.take(topic, message if isinstance(message, bytes) else msgspec.json.encode(message), at_s)
+        recorder.add(topic, message if isinstance(message, bytes) else msgspec.json.encode(message), at_s)
 
     take(topics.site_topic(SITE_ID), SITE, begin_s)
     take(topics.floor_plan_topic(SITE_ID), PLAN, begin_s)
@@ -74,7 +73,7 @@ def test_a_recording_that_grows_is_read_to_its_end(folder):
     playback = Playback(folder)
     assert playback.summary("growing.mcap").end_unix_s == START_S + 1.0
     late = fix("t9", START_S + 2.0)
-    recorder.take(topics.fix_topic(SITE_ID, "t9"), msgspec.json.encode(late), START_S + 2.0)
+    recorder.add(topics.fix_topic(SITE_ID, "t9"), msgspec.json.encode(late), START_S + 2.0)
     recorder.file.flush()
     assert playback.summary("growing.mcap").end_unix_s == START_S + 2.0
     assert next(r for r in playback.recordings() if r.name == "growing.mcap").duration_s == pytest.approx(2.0)

@@ -536,7 +536,7 @@ def test_forged_anchors_take_no_memory():
                 rx_ticks = wrap(one.rx_ticks + 10**6 * (k + 1))
                 receiver.hear(replace_heard(one, frame=frame, rx_ticks=rx_ticks).reception)
     assert len(receiver.almanac.anchors_m) <= 255
-    assert len(receiver._stamps._tracks) <= 256
+    assert len(receiver._stamps.tracks.of_anchor) <= 256
     assert receiver.counters["unknown-anchor"] > 20_000
 
 

@@ -11,7 +11,7 @@ from skyless.nodes import packet_tags
 from skyless.nodes.open_radio import is_simulated, open_sniffers
 from skyless.nodes.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
 from skyless.radios.interface import Gone, Restarted
-from skyless.recordings.foreign.bitcraze_payload import decode
+from skyless.recordings.foreign.bitcraze import decode_payload
 
 SETTINGS = PacketTagSettings(hall.ANCHORS_M, site=7, publish_hz=1e5)
 
@@ -20,7 +20,7 @@ SETTINGS = PacketTagSettings(hall.ANCHORS_M, site=7, publish_hz=1e5)
 def packets():
     """Five seconds of a tag at rest; the host's clock begins at 100 s."""
     told = hall.tdoa3_capture(hall.MasterlessWorld(3), 5.0)
-    return [decode(payload, 100.0 + t_s, sender, rx_ticks) for t_s, sender, rx_ticks, payload in told]
+    return [decode_payload(payload, 100.0 + t_s, sender, rx_ticks) for t_s, sender, rx_ticks, payload in told]
 
 
 def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_again(packets):

@@ -9,7 +9,7 @@ from skyless.mqtt.messages import RawReception, ReceptionsMessage, SegmentStart,
 from skyless.mqtt.topics import receptions_topic, status_topic
 from skyless.nodes import record
 from skyless.nodes.record import RecorderNode
-from skyless.recordings.mcap.file import McapFile
+from skyless.recordings.mcap.recorder import McapFile
 
 ONE = RawReception(b"frame", 5, 1.0)
 START = SegmentStart(0, {"method": "joint"}, None)

@@ -11,7 +11,7 @@ import masterless_world as hall
 from skyless.positioning.fix import NoFixReason
 from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
-from skyless.recordings.foreign.bitcraze_payload import decode
+from skyless.recordings.foreign.bitcraze import decode_payload
 
 SECONDS = 6.0
 SPEED_MPS = 1.0
@@ -29,7 +29,7 @@ def capture(system, seed=7, **world):
     room = hall.MasterlessWorld(seed, **({"speed_mps": SPEED_MPS} | world))
     room.late_m = late_m
     records = hall.CAPTURES[system](room, SECONDS, **options)
-    return room, [(t_s, decode(payload, None, sender, rx_ticks)) for t_s, sender, rx_ticks, payload in records]
+    return room, [(t_s, decode_payload(payload, None, sender, rx_ticks)) for t_s, sender, rx_ticks, payload in records]
 
 
 @pytest.fixture(scope="module", params=list(hall.CAPTURES))

@@ -5,13 +5,12 @@ from msgspec.structs import replace
 
 from machines.bench import LAB, tape
 from skyless.mqtt import topics
+from skyless.mqtt.fix_message import fix_message
 from skyless.mqtt.messages import RequestMessage, SiteMessage, TrueMotion, TruthMessage
-from skyless.nodes.fix_log import fix_message
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.receiver import Receiver
-from skyless.recordings.mcap.file import McapFile
 from skyless.recordings.mcap.reception_log import ReceptionLog, receiver_settings
-from skyless.recordings.mcap.recorder import McapRecorder
+from skyless.recordings.mcap.recorder import McapFile, McapRecorder
 from skyless.site.model import GeoreferenceSite
 
 SITE = replace(LAB, georeference=GeoreferenceSite(52.5, 13.4, 34.0, 30.0))
@@ -38,7 +37,7 @@ def _of_tag(tag, seconds, method, join_s, publish_every, integrity):
         host_s = one.host_s
         if host_s >= join_s:
             log.request(RequestMessage("test", ("*",), 10.0), host_s)
-        log.hear(receiver, one.reception, serial)
+        log.add(receiver, one.reception, serial)
         fix = receiver.hear(one.reception)
         if fix is not None:
             serial += 1
@@ -57,7 +56,7 @@ def record(path, said, flush_s=1.0, close=True, **options):
     recorder = McapRecorder(McapFile(path, **options))
     flushed_s = said[0][0]
     for unix_s, topic, payload in said:
-        recorder.take(topic, payload, unix_s)
+        recorder.add(topic, payload, unix_s)
         if unix_s - flushed_s >= flush_s:
             recorder.file.flush()
             flushed_s = unix_s

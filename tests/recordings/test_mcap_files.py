@@ -19,10 +19,9 @@ from live_site import PLACES, SITE, UNIX_S, messages, record
 from skyless.errors import SkylessError
 from skyless.mqtt import messages as outputs
 from skyless.mqtt.messages import FixMessage
-from skyless.recordings.mcap import file as mcap_file
-from skyless.recordings.mcap.channels import place_of, schema_of
-from skyless.recordings.mcap.file import McapFile
+from skyless.recordings.mcap.channels import channel_of, schema_of
 from skyless.recordings.mcap.foxglove import ellipse_of
+from skyless.recordings.mcap.recorder import McapFile
 from skyless.recordings.mcap.recording import McapRecording
 
 PAYLOADS = (
@@ -47,7 +46,7 @@ def test_the_official_reader_reads_all_of_it(whole):
         found = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages(log_time_order=False)]
         schemas = {schema.name: schema for schema in reader.get_summary().schemas.values()}
     ours = [(topic, round(s * 1e9), payload) for s, topic, payload in SAID]
-    assert [one for one in found if place_of(one[0])] == ours
+    assert [one for one in found if channel_of(one[0])] == ours
     assert {name for name in schemas if name.startswith("skyless.")} == {
         *("skyless.Site", "skyless.Fix", "skyless.Receptions", "skyless.Truth")
     }
@@ -172,7 +171,7 @@ def test_a_growing_file_is_read_as_far_as_it_goes(tmp_path):
         assert fixes == list(McapRecordingOf(SAID[:half]).fixes())
         assert not recording.summary().finished
         for s, topic, payload in SAID[half:]:
-            recorder.take(topic, payload, s)
+            recorder.add(topic, payload, s)
         recorder.file.close()
         recording.refresh()
         assert recording.summary().finished
@@ -190,7 +189,7 @@ def small(tmp_path_factory):
     recorder = record(path, SMALL[:1], close=False)
     marks.append((path.stat().st_size, 1))
     for number, (s, topic, payload) in enumerate(SMALL[1:], 2):
-        recorder.take(topic, payload, s)
+        recorder.add(topic, payload, s)
         if number % 10 == 0:
             recorder.file.flush()
             marks.append((path.stat().st_size, number))
@@ -231,11 +230,11 @@ WRITER = """
 import sys, time
 sys.path[:0] = [{tests!r}, {here!r}]
 from live_site import messages
-from skyless.recordings.mcap.file import McapFile
+from skyless.recordings.mcap.recorder import McapFile
 from skyless.recordings.mcap.recorder import McapRecorder
 recorder = McapRecorder(McapFile(sys.argv[1]))
 for number, (s, topic, payload) in enumerate(messages(2.0)):
-    recorder.take(topic, payload, s)
+    recorder.add(topic, payload, s)
     if number % 50 == 49:
         recorder.file.flush()
         print(number + 1, flush=True)
@@ -270,7 +269,7 @@ def test_a_full_disk_ends_the_recording_once_and_leaves_a_whole_file(tmp_path, m
             raise OSError(errno.ENOSPC, "No space left on device")
         return write(handle, bytes(data)[:left])
 
-    monkeypatch.setattr(mcap_file.os, "write", full)
+    monkeypatch.setattr(os, "write", full)
     recorder = record(path, SAID, flush_s=0.1)
     assert "No space left" in recorder.file.ended
     assert recorder.file.lost > 0
@@ -305,12 +304,12 @@ def test_the_recorder_drops_and_counts_what_is_no_message(tmp_path):
     recorder = record(tmp_path / "bad2.mcap", SAID[:1], close=False)
     topic = f"skyless/v1/{SITE.id}/tag/a/fix"
     for payload in (b"{", b"\xff\xfe", b"[]", b"[" * 100_000):
-        recorder.take(topic, payload, UNIX_S)
-    recorder.take("skyless/v2/1/site", b"{}", UNIX_S)
-    recorder.take("elsewhere", b"{}", UNIX_S)
-    recorder.take(SAID[0][1], SAID[0][2], UNIX_S + 5.0)  # retained, repeated after a reconnect
+        recorder.add(topic, payload, UNIX_S)
+    recorder.add("skyless/v2/1/site", b"{}", UNIX_S)
+    recorder.add("elsewhere", b"{}", UNIX_S)
+    recorder.add(SAID[0][1], SAID[0][2], UNIX_S + 5.0)  # retained, repeated after a reconnect
     image = b"\x89PNG" + bytes(1000)
-    recorder.take(f"skyless/v1/{SITE.id}/floor_plan", image, UNIX_S)
+    recorder.add(f"skyless/v1/{SITE.id}/floor_plan", image, UNIX_S)
     assert recorder.drops == {"malformed-message": 4, "unknown-topic": 2}
     recorder.file.close()
     with McapRecording(tmp_path / "bad2.mcap") as recording:

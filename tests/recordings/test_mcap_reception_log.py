@@ -8,7 +8,7 @@ from skyless.air.reception import Diagnostics, Reception
 from skyless.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage
 from skyless.receiver import Receiver
 from skyless.recordings.mcap.checkpoint import load
-from skyless.recordings.mcap.reception_log import MOST_PENDING, ReceptionLog, raw, receiver_settings
+from skyless.recordings.mcap.reception_log import MOST_PENDING_RECEPTIONS, ReceptionLog, raw, receiver_settings
 
 SETTINGS = receiver_settings("joint")
 HEARD = [one.reception for one in tape(LAB, 2.0)]
@@ -30,7 +30,7 @@ class Bench:
 
     def hear(self, receptions):
         for number, reception in enumerate(receptions):
-            self.log.hear(self.receiver, reception, self.serial)
+            self.log.add(self.receiver, reception, self.serial)
             self.serial += self.receiver.hear(reception) is not None
             self.now_s += 0.0025
             if number % 8 == 0:
@@ -110,9 +110,9 @@ def test_a_lease_that_ended_and_one_who_joins_begin_other_segments():
 def test_a_log_that_nobody_collects_takes_no_memory():
     log, receiver = ReceptionLog("a", SETTINGS, "run"), Receiver()
     log.request(ask(lease_s=60.0), 0.0)
-    for _ in range(2 * MOST_PENDING + 3):
-        log.hear(receiver, HEARD[0], 0)
-    assert log.counters["not-collected"] == 2 * MOST_PENDING
+    for _ in range(2 * MOST_PENDING_RECEPTIONS + 3):
+        log.add(receiver, HEARD[0], 0)
+    assert log.counters["not-collected"] == 2 * MOST_PENDING_RECEPTIONS
     message = log.collect(1.0, 0.0)
     assert message is not None
     assert len(message.receptions) == 3

@@ -165,17 +165,11 @@ def forged(path, change):
     return replayed(path)[0]
 
 
-def with_node(start, change):
-    state = msgspec.msgpack.decode(start.state)
-    for node in state["nodes"]:
-        change(node)
+def nonsense(start):
+    """Figures that are sound as data, and of which no receiver can make anything."""
+    state = msgspec.msgpack.decode(start.state, strict=False)
+    state["receiver"]["own_ticks"]["last_host_s"] = float("nan")
     return replace(start, state=msgspec.msgpack.encode(state))
-
-
-def break_attributes(node):
-    """Every attribute of the receiver is a text: sound as data, nonsense as a receiver."""
-    if node[0] == "object" and node[2] == "Receiver":
-        node[4] = [node[4][0]] * len(node[4])
 
 
 @pytest.mark.parametrize(
@@ -184,7 +178,7 @@ def break_attributes(node):
         (lambda start: replace(start, state=b"\x80\x04damaged"), "checkpoint-damaged"),
         (lambda start: replace(start, state=start.state[:-1]), "checkpoint-damaged"),
         (lambda start: replace(start, state=start.state.replace(b"0.1.0", b"9.1.0")), "checkpoint-of-another-version"),
-        (lambda start: with_node(start, break_attributes), "checkpoint-damaged"),
+        (nonsense, "checkpoint-damaged"),
         (lambda start: replace(start, state=None), "no-checkpoint"),
         (lambda start: replace(start, state=b"", settings={"method": "rm -rf"}), "impossible-settings"),
         (lambda start: replace(start, state=b"", settings={"method": "tracker"}), "impossible-settings"),

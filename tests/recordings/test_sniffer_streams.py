@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.air.masterless_packets import Packet
-from skyless.recordings.foreign import sniffer_binary, sniffer_text, sniffer_yaml
+from skyless.recordings.foreign import bitcraze
 from skyless.recordings.source import CHUNK_BYTES, open_source
 
 READERS = {
-    "binary": (sniffer_binary, binary_record),
-    "text": (sniffer_text, text_line),
-    "yaml": (sniffer_yaml, yaml_document),
+    "binary": (bitcraze.read_binary, binary_record),
+    "text": (bitcraze.read_text, text_line),
+    "yaml": (bitcraze.read_yaml, yaml_document),
 }
 both = pytest.mark.parametrize("kind", READERS)
 
@@ -31,7 +31,7 @@ def heard(number):
 
 def read(kind, data):
     drops = Counter()
-    return list(READERS[kind][0].read(io.BytesIO(data), drops)), drops
+    return list(READERS[kind][0](io.BytesIO(data), drops)), drops
 
 
 def capture(kind, count):
@@ -150,7 +150,7 @@ def test_memory_stays_flat_with_packets_and_without_any_separator(kind):
     for piece in (capture(kind, 100), b"\xbc\x01a: " + b"x" * 95):
         drops = Counter()
         tracemalloc.start()
-        count = sum(1 for _ in READERS[kind][0].read(Endless(piece), drops))
+        count = sum(1 for _ in READERS[kind][0](Endless(piece), drops))
         _, peak_bytes = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert count > 10_000 or drops
@@ -201,10 +201,10 @@ def test_a_compressed_capture_cut_off_gives_what_was_readable(tmp_path):
     file.write_bytes(compressed[: len(compressed) * 3 // 4])
     drops = Counter()
     with open_source(file) as stream:
-        packets = list(sniffer_text.read(stream, drops))
+        packets = list(bitcraze.read_text(stream, drops))
     assert 2000 < len(packets) < 4000
     assert drops["compressed-stream-cut-off"] == 1
     file.write_bytes(compressed[:5000] + bytes(500) + compressed[5500:])
     with open_source(file) as stream:
-        assert len(list(sniffer_text.read(stream, drops))) < 4000
+        assert len(list(bitcraze.read_text(stream, drops))) < 4000
     assert drops["unreadable-bytes"] == 1

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from skyless.air.masterless_packets import PairTdoa
 from skyless.errors import ConfigurationError
 from skyless.recordings.anchor_table import read_anchors
-from skyless.recordings.foreign import tdoa_table as pair_table
+from skyless.recordings.foreign.tdoa_tables import read_tdoas
 from skyless.recordings.truth import read_truth
 
 HEADER = b"t_s,idA,idB,tdoa_m\n"
@@ -19,7 +19,7 @@ HEADER = b"t_s,idA,idB,tdoa_m\n"
 
 def tdoas(table):
     drops = Counter()
-    return list(pair_table.read(io.BytesIO(table), drops)), drops
+    return list(read_tdoas(io.BytesIO(table), drops)), drops
 
 
 def test_a_table_with_all_kinds_of_bad_lines():

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from skyless.air.beacon import Beacon
 from skyless.ticks import from_seconds
@@ -33,27 +33,25 @@ def is_newer(term: int, other: int) -> bool:
     return 0 < (term - other) % TERMS < TERMS // 2
 
 
-class Confirmations:
+class Confirmations(Struct):
     """Master terms received once, so that two frames are needed: one corrupted past its FCS makes no new master."""
 
-    def __init__(self) -> None:
-        self._seen: dict[MasterTerm, int] = {}
+    seen: dict[MasterTerm, int] = {}
 
     def confirm(self, master_term: MasterTerm, rx_ticks: int, within_ticks: int) -> bool:
         """Add a master term; whether it was received before, no longer ago than that."""
-        self._seen = {other: ticks for other, ticks in self._seen.items() if 0 < rx_ticks - ticks < within_ticks}
-        confirmed = master_term in self._seen
-        self._seen[master_term] = rx_ticks
+        self.seen = {other: ticks for other, ticks in self.seen.items() if 0 < rx_ticks - ticks < within_ticks}
+        confirmed = master_term in self.seen
+        self.seen[master_term] = rx_ticks
         return confirmed
 
 
-class FollowedMaster:
+class FollowedMaster(Struct):
     """The master term that a tag uses: the newest one, or what it receives once that one has fallen silent."""
 
-    def __init__(self) -> None:
-        self.master_term: MasterTerm | None = None
-        self._rx_ticks = 0
-        self._confirmations = Confirmations()
+    master_term: MasterTerm | None = None
+    rx_ticks: int = 0
+    confirmations: Confirmations = field(default_factory=Confirmations)
 
     @property
     def master(self) -> int | None:
@@ -69,18 +67,18 @@ class FollowedMaster:
         """
         present = self.master_term
         if present is not None and beacon.term == present.term and beacon.master == present.master:
-            self._rx_ticks = rx_ticks
+            self.rx_ticks = rx_ticks
             return True
         received = master_term_of(beacon)
         if present is not None and is_newer(received.term, present.term):
-            if self._confirmations.confirm(received, rx_ticks, _CONFIRMATION_TICKS):
-                self.master_term, self._rx_ticks = received, rx_ticks
+            if self.confirmations.confirm(received, rx_ticks, _CONFIRMATION_TICKS):
+                self.master_term, self.rx_ticks = received, rx_ticks
             return True
         if present is not None:
             silence_ticks = max(_OLDER_AFTER_TICKS, 3 * superframe_ticks)
             if received.term == present.term and superframe_ticks:
                 silence_ticks = 3 * superframe_ticks // 2
-            if 0 <= rx_ticks - self._rx_ticks < silence_ticks:
+            if 0 <= rx_ticks - self.rx_ticks < silence_ticks:
                 return False
-        self.master_term, self._rx_ticks = received, rx_ticks
+        self.master_term, self.rx_ticks = received, rx_ticks
         return True

@@ -11,23 +11,23 @@ from skyless.air.masterless_packets import Point
 from skyless.calibration.estimate import CalibrationEstimate, estimate
 from skyless.calibration.samples import (
     First,
-    PlaceAt,
+    PositionAt,
     Samples,
     Stay,
     gather,
     joined,
-    place_of_stays,
-    place_of_truth,
+    position_of_stays,
+    position_of_truth,
+    site_tdoas,
     tdoas_of,
 )
-from skyless.calibration.site import site_tdoas
 from skyless.constants import TICK_M
 from skyless.errors import ConfigurationError, SkylessError
 from skyless.evaluation.judge import Judge
 from skyless.recordings.foreign.formats import open_recording
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.recordings.truth import Truth
-from skyless.replay.site import FORMAT, recorded_site, recorded_truth
+from skyless.replay.site import SITE_FORMAT, recorded_site, recorded_truth
 from skyless.site.check import SITE_LIMITS
 from skyless.site.model import Site
 from skyless.site.rewrite import DELAY_KEY
@@ -46,7 +46,7 @@ class CalibrationRequest(Struct, frozen=True):
     first: First = First()
     anchors_m: dict[int, Point] = {}
     height_m: float | None = None
-    """Of stays that do not say theirs."""
+    """Of stays without one."""
     format: str | None = None
     listener: str | None = None
     tag: str | None = None
@@ -59,13 +59,13 @@ class Calibrated(Struct, frozen=True):
     estimate: CalibrationEstimate
     samples: Samples
     site: Site | None
-    """As the recording tells it; None for recordings of other systems."""
+    """As recorded; None for recordings of other systems."""
 
     def tx_delays_ticks(self) -> dict[int, tuple[int, int]]:
         """Old and new TX antenna delay of every anchor whose constant is determined; empty without a site.
 
-        A signal that leaves later than its stamp says needs a larger delay. What an anchor's receptions are off shows
-        in its clock, and so in the same place; it goes into the TX delay as well.
+        A signal that leaves later than its stamp needs a larger delay. What an anchor's receptions are off shows
+        in its clock, and so in the same differences; it goes into the TX delay as well.
 
         Raises:
             SkylessError: no radio has such a delay.
@@ -87,13 +87,13 @@ def calibrate_capture(request: CalibrationRequest) -> Calibrated:
     """Calibrate the anchors of another system; the zero is the mean of their constants.
 
     Raises:
-        SkylessError: the recording cannot be used, or holds nothing at a known place.
+        SkylessError: the recording cannot be used, or holds nothing at a known position.
     """
     with open_recording(request.path, request.format, request.listener) as recording:
         tdoas = tdoas_of(recording, request.anchors_m)
-        samples = gather(tdoas, request.anchors_m, partial(_place_from, request, request.truth), request.first)
+        samples = gather(tdoas, request.anchors_m, partial(_position_from, request, request.truth), request.first)
         name = recording.format.name
-    _see_that_there_are_some(samples)
+    _require_some(samples)
     return Calibrated(name, estimate(samples.differences), samples, None)
 
 
@@ -102,14 +102,14 @@ def calibrate_site(request: CalibrationRequest, identifier: int | None) -> Calib
 
     Raises:
         SkylessError: the recording cannot be used, is of another site than ``identifier``, or holds nothing at a
-            known place.
+            known position.
     """
     with McapRecording(request.path) as recording:
         site = recorded_site(recording, identifier)
         samples = joined([_of_tag(recording, site, tag, request) for tag in _tags(recording, request)])
-    _see_that_there_are_some(samples)
+    _require_some(samples)
     master = int(samples.differences.anchor_a[0])
-    return Calibrated(FORMAT, estimate(samples.differences, zero=master, slope=False), samples, site)
+    return Calibrated(SITE_FORMAT, estimate(samples.differences, zero=master, slope=False), samples, site)
 
 
 def _tags(recording: McapRecording, request: CalibrationRequest) -> tuple[str, ...]:
@@ -122,7 +122,7 @@ def _tags(recording: McapRecording, request: CalibrationRequest) -> tuple[str, .
             raise ConfigurationError(request.path, "tag", request.tag, f"one of {names}")
         return (request.tag,)
     if len(raw) > 1 and (request.stays or request.truth is not None):
-        raise SkylessError(f"--tag is missing; it should name the tag whose place is known, one of {names}")
+        raise SkylessError(f"--tag is missing; it should name the tag whose position is known, one of {names}")
     return raw
 
 
@@ -134,21 +134,21 @@ def _of_tag(recording: McapRecording, site: Site, tag: str, request: Calibration
     )
     drops: Counter[str] = Counter()
     tdoas = site_tdoas(recording, (tag,), site.id, drops)
-    samples = gather(tdoas, anchors_m, partial(_place_from, at_rest, truth), request.first)
+    samples = gather(tdoas, anchors_m, partial(_position_from, at_rest, truth), request.first)
     return Samples(samples.differences, samples.anchors_m, samples.seen, samples.drops | drops)
 
 
-def _place_from(request: CalibrationRequest, truth: Truth | None, begin_s: float) -> PlaceAt:
+def _position_from(request: CalibrationRequest, truth: Truth | None, begin_s: float) -> PositionAt:
     if request.stays:
-        return place_of_stays(request.stays, request.height_m, begin_s)
-    return place_of_truth(Judge(truth, planar=False), request.above_m)
+        return position_of_stays(request.stays, request.height_m, begin_s)
+    return position_of_truth(Judge(truth, planar=False), request.above_m)
 
 
-def _see_that_there_are_some(samples: Samples) -> None:
+def _require_some(samples: Samples) -> None:
     if len(samples.differences.t_s):
         return
     reasons = ", ".join(f"{count} × {reason}" for reason, count in samples.drops.items())
     raise SkylessError(
-        f"no time difference could be used ({reasons or 'the recording gives none'}); the recording should say "
+        f"no time difference could be used ({reasons or 'the recording gives none'}); the recording should hold "
         "where the tag was, or --truth or --at, and --anchors or --site where the anchors are"
     )

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from skyless.evaluation.judge import Judge
     from skyless.positioning.fix import Fix
     from skyless.recordings.truth import Truth
-    from skyless.replay.foreign import Replay, ReplayReport
+    from skyless.replay.captures import Replay, ReplayReport
     from skyless.replay.site import SiteReplay, TagReport
 
 FIXES_COLUMNS: Final = (
@@ -144,7 +144,7 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
     from skyless.evaluation.judge import Judge
     from skyless.recordings.anchor_table import read_calibration
     from skyless.recordings.foreign.formats import format_of
-    from skyless.replay.foreign import MEASUREMENTS, Replay, ReplayRequest
+    from skyless.replay.captures import MEASUREMENTS, Replay, ReplayRequest
 
     protection = asked.protection
     of_sites = {

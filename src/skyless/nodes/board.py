@@ -22,7 +22,7 @@ from skyless.firmware import link
 from skyless.nodes.process import Log
 from skyless.radios.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radios.serial.link_records import to_steps
-from skyless.recordings.foreign.bitcraze_payload import TDOA3
+from skyless.recordings.foreign.bitcraze import TDOA3
 from skyless.site.almanac_pages import AlmanacAssembly
 from skyless.ticks import wrap
 

@@ -17,9 +17,8 @@ from skyless.mqtt.link import Link
 from skyless.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage
 from skyless.mqtt.topics import request_topic, site_topic
 from skyless.nodes.process import Log, every, locked
-from skyless.recordings.mcap.file import McapFile
 from skyless.recordings.mcap.reception_log import EVERY_TAG
-from skyless.recordings.mcap.recorder import McapRecorder
+from skyless.recordings.mcap.recorder import McapFile, McapRecorder
 
 _LEASE_S: Final = 15.0
 _REQUEST_S: Final = 5.0
@@ -121,7 +120,7 @@ class RecorderNode:
             self._request()
 
     def _on_message(self, topic: str, payload: bytes) -> None:
-        message = self.recorder.take(topic, payload, time.time())
+        message = self.recorder.add(topic, payload, time.time())
         if isinstance(message, ReceptionsMessage):
             self._check_sequence(message)
         elif isinstance(message, StatusMessage) and message.kind == "tag" and message.online:

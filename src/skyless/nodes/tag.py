@@ -113,7 +113,7 @@ class Tag:
         self._fix_topic = self._health_topic = self._receptions_topic = ""
         asked = receiver_settings(settings.method, settings.site, settings.qa, integrity=settings.integrity)
         self.reception_log = ReceptionLog(radio.name, asked, secrets.token_hex(4))
-        self.node = TagNode(settings, radio, self._publish, log, self.reception_log.hear)
+        self.node = TagNode(settings, radio, self._publish, log, self.reception_log.add)
 
     async def run(self) -> None:
         """Serve until cancelled."""

@@ -9,12 +9,11 @@ from typing import Final
 from skyless.air.masterless_packets import Point
 from skyless.errors import ConfigurationError
 from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
-from skyless.recordings.source import read_lines
-from skyless.recordings.tables import finite
+from skyless.recordings.source import finite, read_lines
 
-COLUMNS: Final = ("id", "x_m", "y_m", "z_m")
+ANCHOR_COLUMNS: Final = ("id", "x_m", "y_m", "z_m")
 BIAS, SLOPE, NOISE = CALIBRATION_COLUMNS = ("bias_m", "bias_slope_m", "noise_m")
-"""What ``skyless calibrate`` adds; a blank field says that nothing is known."""
+"""What ``skyless calibrate`` adds; a blank field means that nothing is known."""
 
 
 def read_anchors(path: str | PathLike[str]) -> dict[int, Point]:
@@ -27,7 +26,7 @@ def read_anchors(path: str | PathLike[str]) -> dict[int, Point]:
     for number, identifier, row in _rows(path):
         if identifier in anchors:
             raise ConfigurationError(path, f"line {number}, column id", identifier, "an id that occurs only once")
-        x_m, y_m, z_m = (finite(row[column], path, number, column) for column in COLUMNS[1:])
+        x_m, y_m, z_m = (finite(row[column], path, number, column) for column in ANCHOR_COLUMNS[1:])
         anchors[identifier] = (x_m, y_m, z_m)
     if not anchors:
         raise ConfigurationError(path, "the table", "empty", "at least one anchor below the header")
@@ -44,8 +43,8 @@ def read_calibration(path: str | PathLike[str]) -> DifferenceCalibration | None:
     for number, identifier, row in _rows(path):
         known = {column: finite(row[column], path, number, column) for column in CALIBRATION_COLUMNS if row.get(column)}
         if known.get(NOISE, 0.0) < 0.0:
-            place = f"line {number}, column {NOISE}"
-            raise ConfigurationError(path, place, known[NOISE], "a number that is not negative")
+            column = f"line {number}, column {NOISE}"
+            raise ConfigurationError(path, column, known[NOISE], "a number that is not negative")
         if BIAS in known:
             anchors[identifier] = AnchorCalibration(known[BIAS], known.get(SLOPE, 0.0), known.get(NOISE))
     return DifferenceCalibration(anchors) if anchors else None
@@ -75,9 +74,9 @@ def calibrated_table(path: str | PathLike[str], calibration: DifferenceCalibrati
 
 def new_table(anchors_m: Mapping[int, Point], calibration: DifferenceCalibration) -> str:
     """A table of anchors that stood in none."""
-    rows = [",".join((*COLUMNS, *CALIBRATION_COLUMNS))]
-    for anchor, place_m in sorted(anchors_m.items()):
-        rows.append(",".join((str(anchor), *map(str, place_m), *_fields(calibration.anchors.get(anchor)))))
+    rows = [",".join((*ANCHOR_COLUMNS, *CALIBRATION_COLUMNS))]
+    for anchor, position_m in sorted(anchors_m.items()):
+        rows.append(",".join((str(anchor), *map(str, position_m), *_fields(calibration.anchors.get(anchor)))))
     return "\n".join(rows) + "\n"
 
 
@@ -91,7 +90,7 @@ def _rows(path: str | PathLike[str]) -> Iterator[tuple[int, int, dict[str, str]]
     """Line number, identifier and fields by column of every anchor."""
     table = list(csv.reader(read_lines(path)))
     names = [name.strip() for name in table[0]] if table else []
-    if not set(COLUMNS) <= set(names):
+    if not set(ANCHOR_COLUMNS) <= set(names):
         raise ConfigurationError(path, "line 1", ",".join(names), "a header with id,x_m,y_m,z_m")
     for number, row in enumerate(table[1:], start=2):
         if not any(field.strip() for field in row):

@@ -11,8 +11,7 @@ import numpy as np
 
 from skyless.errors import ConfigurationError
 from skyless.kernels.arrays import Array
-from skyless.recordings.source import read_lines
-from skyless.recordings.tables import finite
+from skyless.recordings.source import finite, read_lines
 
 POSITION_COLUMNS: Final = ("t_s", "x_m", "y_m", "z_m")
 LISTENER_COLUMNS: Final = ("t_s", "gt_L_x_m", "gt_L_y_m", "gt_L_z_m")
@@ -70,7 +69,7 @@ def _values(
     listener: str | None,
 ) -> Array:
     """Wanted columns, shape (n, len(columns)); blank lines are passed over."""
-    places = [names.index(column) for column in columns]
+    positions = [names.index(column) for column in columns]
     chosen = names.index("listener") if columns == LISTENER_COLUMNS and "listener" in names else None
     values: list[list[float]] = []
     for number, line in enumerate(table[1:], start=2):
@@ -84,6 +83,9 @@ def _values(
             if fields[chosen] != listener:
                 continue
         values.append(
-            [finite(fields[place], path, number, column) for place, column in zip(places, columns, strict=True)]
+            [
+                finite(fields[position], path, number, column)
+                for position, column in zip(positions, columns, strict=True)
+            ]
         )
     return np.array(values, dtype=np.float64).reshape(-1, len(columns))

@@ -12,7 +12,7 @@ from skyless.air.reception import Reception
 from skyless.site.model import Site
 from skyless.ticks import wrap
 
-SUBTICKS_MASK = (1 << 48) - 1
+_SITE_TIME_MASK = (1 << 48) - 1
 
 
 class DelayChange(Struct, frozen=True):
@@ -51,7 +51,7 @@ def _beacon(beacon: Beacon, changes: dict[int, DelayChange]) -> Beacon:
     later = master.tx_ticks if beacon.anchor == beacon.master else own.tx_ticks + own.rx_ticks + master.tx_ticks
     time = beacon.master_time
     if time is not None:
-        time = structs.replace(time, tx_subticks_master=(time.tx_subticks_master + 256 * later) & SUBTICKS_MASK)
+        time = structs.replace(time, tx_subticks_master=(time.tx_subticks_master + 256 * later) & _SITE_TIME_MASK)
     heard, *others = (
         None if one is None else structs.replace(one, rx_ticks=wrap(one.rx_ticks - own.rx_ticks))
         for one in (beacon.master_heard, *beacon.heard)

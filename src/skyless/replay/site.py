@@ -1,25 +1,301 @@
 """Replay of a running site: every tag's receptions once more, judged against the truth and the recorded fixes."""
 
+import math
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterable
-from typing import Final, cast
+from collections import Counter, OrderedDict, defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final, TypeVar, cast
 
+import msgspec
 import numpy as np
+from msgspec import Struct
 
+from skyless.air.reception import Diagnostics, Reception
+from skyless.constants import TICK_S
 from skyless.errors import ConfigurationError
 from skyless.evaluation.judge import Judge
-from skyless.mqtt.messages import FixMessage, ReceptionsMessage
-from skyless.positioning.integrity import IntegrityRequirement
+from skyless.method_names import DEFAULT_METHOD, METHODS
+from skyless.mqtt.fix_message import fix_message
+from skyless.mqtt.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart
+from skyless.positioning.fix import Fix
+from skyless.positioning.integrity import RISK, IntegrityRequirement
+from skyless.receiver import NOT_DROPS, Receiver
+from skyless.recordings.mcap.checkpoint import RefusedError, load
 from skyless.recordings.mcap.recording import McapRecording, Recorded
+from skyless.recordings.source import Drops
 from skyless.recordings.truth import Truth
-from skyless.replay.antenna_delays import delay_changes
-from skyless.replay.comparison import Identical
-from skyless.replay.foreign import ReplayReport
-from skyless.replay.tag import Replayed, TagReplay
+from skyless.replay.antenna_delays import DelayChange, delay_changes, with_delays
+from skyless.replay.captures import ReplayReport, common_figures
 from skyless.site.model import Site
+from skyless.ticks import WRAP_TICKS, Unwrapper
 
-FORMAT: Final = "skyless-mcap"
+# Recorded fixes against those of a replay: whether they are the same, bit by bit.
+
+_T = TypeVar("_T")
+
+_MOST_WAITING: Final = 20_000
+"""Fixes that wait for their counterpart; those that the recording lacks never get one."""
+
+SAME_FIX_S: Final = 2.0
+"""Serial numbers begin again with the tag; fixes of one number that are farther apart are different ones."""
+
+
+class Identical(Struct, frozen=True):
+    """Recorded fixes against those of the replay, bit by bit."""
+
+    compared: int
+    different: int
+
+
+class Comparison:
+    """Pairs of a recorded and a replayed fix, matched by serial number and time, whichever comes first."""
+
+    def __init__(self, tag: str) -> None:
+        self._tag = tag
+        self._recorded: OrderedDict[int, FixMessage] = OrderedDict()
+        self._replayed: OrderedDict[int, tuple[Fix, float]] = OrderedDict()
+        self._compared = self._different = 0
+
+    def result(self) -> Identical:
+        """How they compare so far."""
+        return Identical(self._compared, self._different)
+
+    def recorded(self, message: FixMessage) -> None:
+        """Add a recorded fix."""
+        found = self._replayed.pop(message.serial, None)
+        if found is None or abs(found[1] - message.unix_s) > SAME_FIX_S:
+            _keep(self._recorded, message.serial, message)
+        else:
+            self._judge(found[0], message)
+
+    def replayed(self, serial: int, fix: Fix, unix_s: float) -> None:
+        """Add one of the replay."""
+        found = self._recorded.pop(serial, None)
+        if found is None or abs(found.unix_s - unix_s) > SAME_FIX_S:
+            _keep(self._replayed, serial, (fix, unix_s))
+        else:
+            self._judge(fix, found)
+
+    def _judge(self, fix: Fix, message: FixMessage) -> None:
+        again = fix_message(self._tag, message.serial, fix, message.unix_s, message.latency_s)
+        self._compared += 1
+        self._different += msgspec.json.encode(again) != msgspec.json.encode(message)
+
+
+def _keep(waiting: OrderedDict[int, _T], serial: int, value: _T) -> None:
+    waiting[serial] = value
+    if len(waiting) > _MOST_WAITING:
+        waiting.popitem(last=False)
+
+
+# One tag of a recording once more: its receptions through its receiver, bit by bit as it was.
+
+HOST_DRIFT: Final = 1e-4
+"""By how much a host's clock and a tag's may differ in rate."""
+
+
+class Replayed(Struct, frozen=True):
+    """A fix of the replay."""
+
+    fix: Fix
+    unix_s: float
+    """The end of its last frame, without the delays of the host."""
+
+
+class HostClock:
+    """Unix time of receptions from the tag's counter: the host sees frames late by changing amounts."""
+
+    def __init__(self) -> None:
+        self._ticks = Unwrapper()
+        self._offset_s = math.inf
+        self._last_s = 0.0
+
+    def unix_s(self, reception: Reception, unix_less_host_s: float) -> float:
+        """Unix time of a reception: by its counter, which the least delayed receptions tie to Unix time."""
+        counter_s = self._ticks.unwrap(reception.rx_ticks, reception.host_s) * TICK_S
+        if reception.host_s is not None:
+            leak_s = HOST_DRIFT * max(counter_s - self._last_s, 0.0)
+            self._offset_s = min(self._offset_s + leak_s, reception.host_s + unix_less_host_s - counter_s)
+        self._last_s = counter_s
+        return counter_s + (0.0 if math.isinf(self._offset_s) else self._offset_s)
+
+
+class TagReplay:
+    """Processes the receptions of one tag in the order of the recording."""
+
+    def __init__(
+        self,
+        tag: str,
+        method: str | None = None,
+        delays: dict[int, DelayChange] | None = None,
+        integrity: IntegrityRequirement | None = None,
+    ) -> None:
+        """``method`` and ``integrity``: others than the tag's own; ``delays``: other antenna delays. All begin cold."""
+        self._delays = delays
+        self._integrity = integrity
+        self._is_as_it_was = method is None and delays is None and integrity is None
+        self.tag = tag
+        self.method = method
+        """As recorded, once known, or as asked for."""
+        self.receptions = self.fixes = self.segments = self.cold_starts = 0
+        self.begun_s: float | None = None
+        """Unix time of the first reception."""
+        self.drops: Drops = Counter()
+        self.reason = "no-beacons"
+        """Why there is no fix, as given last."""
+        self._asked = method
+        self._receiver: Receiver | None = None
+        self._serial: int | None = None
+        """Of the last fix; None where it cannot be known, as the receiver did not go on where the tag's was."""
+        self._restored = False
+        self._segment = ""
+        self._next = 0
+        self._clock = HostClock()
+        self._comparison = Comparison(tag)
+
+    def process(self, message: ReceptionsMessage) -> Iterator[Replayed]:
+        """Process a run of receptions; the fixes that they make."""
+        for raw in self._unheard(message):
+            reception = reception_of(raw)
+            if reception is None:
+                self.drops["impossible-reception"] += 1
+                continue
+            self.receptions += 1
+            if self._delays is not None:
+                reception = with_delays(reception, self._delays)
+            fix = self._fix(reception)
+            unix_s = self._clock.unix_s(reception, message.unix_less_host_s)
+            self.begun_s = unix_s if self.begun_s is None else self.begun_s
+            if fix is None:
+                continue
+            self.fixes += 1
+            if self._serial is not None:
+                self._serial += 1
+                self._comparison.replayed(self._serial, fix, unix_s)
+            yield Replayed(fix, unix_s)
+
+    def compare(self, recorded: FixMessage) -> None:
+        """Add a recorded fix."""
+        self._comparison.recorded(recorded)
+
+    @property
+    def identical(self) -> Identical | None:
+        """How the fixes compare; None with another method than the tag's own, or other antenna delays."""
+        return self._comparison.result() if self._is_as_it_was else None
+
+    def all_drops(self) -> dict[str, int]:
+        """What could not be used, by reason, the receiver's own included."""
+        own: Counter[str] = Counter() if self._receiver is None else self._receiver.counters
+        total = self.drops + Counter({reason: n for reason, n in own.items() if reason not in NOT_DROPS})
+        return {str(reason): number for reason, number in sorted(total.items()) if number}
+
+    def _unheard(self, message: ReceptionsMessage) -> tuple[RawReception, ...]:
+        """What a message has beyond those before it; it may come twice, or after a loss."""
+        if message.segment != self._segment:
+            if message.start is None:
+                self.drops["receptions-without-beginning"] += len(message.receptions)
+                return ()
+            self._begin(message.segment, message.start)
+        skip = self._next - message.first
+        if skip < 0:
+            self.drops["receptions-after-a-gap"] += len(message.receptions)
+            return ()
+        self._next = max(self._next, message.first + len(message.receptions))
+        return message.receptions[skip:]
+
+    def _begin(self, segment: str, start: SegmentStart) -> None:
+        self._segment, self._next = segment, 0
+        self.segments += 1
+        if not self._is_as_it_was:
+            if self._receiver is None:
+                self._start_cold(start)
+            return
+        self._clock = HostClock()
+        if start.state is None:
+            if start.serial:
+                self.drops["no-checkpoint"] += 1
+            self._start_cold(start)
+            self._serial = None if start.serial else 0
+            return
+        try:
+            self._receiver = load(start.state)
+        except RefusedError as refused:
+            self.drops[refused.reason] += 1
+            self._start_cold(start)
+            return
+        self.method = str(start.settings.get("method"))
+        self._serial, self._restored = start.serial, True
+        # what it had counted before belongs to no replay
+        self._receiver.counters.clear()
+
+    def _start_cold(self, start: SegmentStart) -> None:
+        self.cold_starts += 1
+        self._serial, self._restored = None, False
+        receiver = _receiver_of(start, self._asked, self._integrity)
+        if receiver is None:
+            self.drops["impossible-settings"] += 1
+            receiver = Receiver(self._asked or DEFAULT_METHOD, integrity=self._integrity)
+        self._receiver = receiver
+        self.method = self._asked or str(start.settings.get("method"))
+
+    def _fix(self, reception: Reception) -> Fix | None:
+        assert self._receiver is not None
+        if not self._restored:
+            fix = self._receiver.hear(reception)
+        else:
+            try:
+                fix = self._receiver.hear(reception)
+            except Exception:  # noqa: BLE001 - a forged checkpoint can make a receiver that fails in any way
+                self.drops["checkpoint-damaged"] += 1
+                self._start_cold(SegmentStart(0, {"method": self.method}, None))
+                return None
+        self.reason = str(self._receiver.reason)
+        return fix
+
+
+def reception_of(raw: RawReception) -> Reception | None:
+    """A recorded reception; None for one that no radio gives."""
+    if not 0 <= raw.rx_ticks < WRAP_TICKS or (raw.host_s is not None and not abs(raw.host_s) < 1e12):
+        return None
+    diagnostics = Diagnostics(raw.rx_power_dbm, raw.first_path_power_dbm, raw.carrier_offset_ppm)
+    return Reception(raw.frame, raw.rx_ticks, raw.host_s, None if diagnostics == Diagnostics() else diagnostics)
+
+
+def _receiver_of(start: SegmentStart, method: str | None, integrity: IntegrityRequirement | None) -> Receiver | None:
+    """A receiver that knows nothing, made as the tag's was; None where that makes no sense."""
+    settings = start.settings
+    name, site, qa = method or settings.get("method"), settings.get("site"), settings.get("qa", 0.3)
+    low_m, high_m = settings.get("z_low_m"), settings.get("z_high_m")
+    if not isinstance(name, str) or name not in METHODS or not isinstance(site, int | None):
+        return None
+    if not isinstance(qa, int | float) or not 0.0 < qa < 1e6:
+        return None
+    bounded = isinstance(low_m, int | float) and isinstance(high_m, int | float)
+    bounds_m = (float(low_m), float(high_m)) if bounded else None  # type: ignore[arg-type]
+    try:
+        asked = integrity or _integrity_of(start)
+    except (ValueError, TypeError):
+        return None
+    return Receiver(name, site=site, qa=float(qa), z_bounds_m=bounds_m, integrity=asked)
+
+
+def _integrity_of(start: SegmentStart) -> IntegrityRequirement:
+    """What was asked of the tag's levels; the defaults where a recording does not hold it.
+
+    Raises:
+        ValueError, TypeError: it makes no sense.
+    """
+    return IntegrityRequirement(
+        start.settings.get("integrity_risk", RISK),  # type: ignore[arg-type]
+        start.settings.get("alert_limit_m"),  # type: ignore[arg-type]
+        start.settings.get("max_acceleration_mps2", 0.0),  # type: ignore[arg-type]
+        start.settings.get("height_std_m", 0.0),  # type: ignore[arg-type]
+    )
+
+
+# Replay of a running site: every tag's receptions once more, judged against the truth and the recorded fixes.
+
+SITE_FORMAT: Final = "skyless-mcap"
 
 
 class TagReport(ReplayReport, frozen=True, kw_only=True):
@@ -81,23 +357,23 @@ class SiteReplay:
     def run(
         self, on_fix: Callable[[str, Replayed], None] | None, on_progress: Callable[[float], None]
     ) -> list[TagReport]:
-        """Replay all; ``on_progress`` is told now and then the recording's seconds done so far."""
+        """Replay all; ``on_progress`` gets now and then the recording's seconds done so far."""
         begun_s = time.perf_counter()
         for number, found in enumerate(self._recording.messages({"receptions", "fix"})):
-            if found.place.name in self.tags:
-                self._take(found, on_fix)
+            if found.channel.name in self.tags:
+                self._process(found, on_fix)
             if number % 256 == 0:
                 on_progress(found.time_s - self._begin_s)
         wall_s = time.perf_counter() - begun_s
         return [self._report(tag, wall_s) for tag in self.tags]
 
-    def _take(self, found: Recorded, on_fix: Callable[[str, Replayed], None] | None) -> None:
-        tag = found.place.name
+    def _process(self, found: Recorded, on_fix: Callable[[str, Replayed], None] | None) -> None:
+        tag = found.channel.name
         replay, judge = self.tags[tag], self.judges[tag]
-        if found.place.kind == "fix":
+        if found.channel.kind == "fix":
             replay.compare(cast("FixMessage", found.message))
             return
-        for made in replay.hear(cast("ReceptionsMessage", found.message)):
+        for made in replay.process(cast("ReceptionsMessage", found.message)):
             first_s, _ = self._spans.get(tag, (made.unix_s, 0.0))
             self._spans[tag] = (first_s, made.unix_s)
             x, y, z = made.fix.position_m.tolist()
@@ -106,34 +382,17 @@ class SiteReplay:
                 on_fix(tag, made)
 
     def _report(self, tag: str, wall_s: float) -> TagReport:
-        replay, judgement = self.tags[tag], self.judges[tag].judgement()
+        replay = self.tags[tag]
         first_s, last_s = self._spans.get(tag, (0.0, 0.0))
-        drops = replay.all_drops()
         return TagReport(
-            format=FORMAT,
-            receptions=replay.receptions,
-            fixes=replay.fixes,
-            dropped=sum(drops.values()),
-            median_m=judgement.median_m,
-            std_m=judgement.std_m,
-            rmse_2d_m=judgement.errors.rmse_2d_m,
-            rmse_3d_m=judgement.errors.rmse_3d_m,
-            p95_m=judgement.errors.p95_m,
-            max_m=judgement.errors.max_m,
+            format=SITE_FORMAT,
+            **common_figures(self.judges[tag].judgement(), replay.receptions, replay.fixes, replay.all_drops(), wall_s),
             rate_hz=replay.fixes / (last_s - first_s) if last_s > first_s else None,
-            tdoa_noise_m=None,
-            bias_m=judgement.errors.bias_m,
             first_fix_s=first_s - replay.begun_s if replay.fixes and replay.begun_s is not None else None,
             height_m=self.height_m,
             reason=None if replay.fixes else replay.reason,
-            drops=drops,
-            pairs=(),
-            wall_s=wall_s,
-            receptions_per_s=replay.receptions / wall_s if wall_s > 0.0 else 0.0,
             tag=tag,
             method=replay.method,
-            measurements=None,
-            contradictions_m={},
             identical=replay.identical,
             segments=replay.segments,
             cold_starts=replay.cold_starts,
@@ -144,14 +403,16 @@ def recorded_site(recording: McapRecording, identifier: int | None = None) -> Si
     """The site of a recording.
 
     Raises:
-        ConfigurationError: it does not tell its site, or another one than ``identifier`` is wanted.
+        ConfigurationError: it does not hold its site, or another one than ``identifier`` is wanted.
     """
-    told = recording.site
-    if told is None:
-        raise ConfigurationError(recording.summary().path, "the site", None, "told by the recording")
-    if identifier is not None and told.site.id != identifier:
-        raise ConfigurationError(recording.summary().path, "the site's id", told.site.id, f"{identifier}, as in --site")
-    return told.site
+    found = recording.site
+    if found is None:
+        raise ConfigurationError(recording.summary().path, "the site", None, "in the recording")
+    if identifier is not None and found.site.id != identifier:
+        raise ConfigurationError(
+            recording.summary().path, "the site's id", found.site.id, f"{identifier}, as in --site"
+        )
+    return found.site
 
 
 def recorded_truth(recording: McapRecording) -> dict[str, Truth]:

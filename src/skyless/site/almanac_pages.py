@@ -1,13 +1,15 @@
 """A site's almanac: its pages, which of them each frame carries, and their assembly by a listener."""
 
 from functools import lru_cache
-from typing import Final
+from typing import Annotated, Final
 from zlib import crc32
 
+from msgspec import Meta, Struct
 from msgspec.structs import asdict
 
 from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
-from skyless.air.page_codec import encode_page
+from skyless.air.beacon import Malformed
+from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
 from skyless.site.model import AccuracySite, Site
 from skyless.site.slots import first_slots, schedule_of
 
@@ -85,6 +87,20 @@ def _rotation(pages: int) -> tuple[int, int]:
     return positions, round(positions * (5**0.5 - 1) / 2)
 
 
+_PageBytes = Annotated[bytes, Meta(min_length=PAGE_BYTES, max_length=PAGE_BYTES)]
+
+
+class AlmanacState(Struct, frozen=True):
+    """What an ``AlmanacAssembly`` holds, pages as they are on the air."""
+
+    issue: int | None
+    pages: tuple[_PageBytes, ...]
+    unconfirmed: tuple[_PageBytes, ...]
+    next_issue: int | None
+    next_frames: int
+    next_pages: tuple[_PageBytes, ...]
+
+
 class AlmanacAssembly:
     """Collects the pages of one site from its beacons.
 
@@ -108,6 +124,27 @@ class AlmanacAssembly:
         self._noise: NoisePage | None = None
         self._accuracy = _ASSUMED_ACCURACY
         self._georeference: GeoreferencePage | None = None
+
+    def state(self) -> AlmanacState:
+        """All that it holds."""
+        pages, unconfirmed, next_pages = (
+            tuple(map(encode_page, group))
+            for group in (self._pages.values(), self._unconfirmed.values(), self._next_pages)
+        )
+        return AlmanacState(self._issue, pages, unconfirmed, self._next_issue, self._next_frames, next_pages)
+
+    def restore(self, state: AlmanacState) -> None:
+        """Continue from a state.
+
+        Raises:
+            ValueError: it holds something that is not a page.
+        """
+        self._clear()
+        for page in _decoded(state.pages):
+            self._add(_page_key(page), page)
+        self._unconfirmed = {_page_key(page): page for page in _decoded(state.unconfirmed)}
+        self._issue, self._next_issue, self._next_frames = state.issue, state.next_issue, state.next_frames
+        self._next_pages = _decoded(state.next_pages)
 
     @property
     def issue(self) -> int | None:
@@ -203,6 +240,13 @@ class AlmanacAssembly:
             case GeoreferencePage():
                 self._georeference = page
         return True
+
+
+def _decoded(pages: tuple[bytes, ...]) -> list[Page]:
+    found = [page for page in map(decode_page, pages) if page is not None and page is not Malformed.BAD_PAGE]
+    if len(found) < len(pages):
+        raise ValueError("a page of the almanac is damaged")
+    return found
 
 
 def _page_key(page: Page) -> object:

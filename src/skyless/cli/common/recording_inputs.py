@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def is_mcap(file: Path) -> bool:
     """Whether a file's content is an MCAP; one that cannot be opened is none."""
-    from skyless.recordings.mcap.scan import MAGIC
+    from skyless.recordings.mcap.recording import MAGIC
 
     try:
         with file.open("rb") as stream:

@@ -17,7 +17,7 @@ from skyless.errors import SkylessError
 if TYPE_CHECKING:
     from skyless.mqtt.address import MqttAddress
     from skyless.nodes.record import RecorderNode, RecorderState
-    from skyless.recordings.mcap.file import McapFile
+    from skyless.recordings.mcap.recorder import McapFile
 
 _STATUS_S = 0.5
 
@@ -55,7 +55,7 @@ def record(
         Write one JSON object at the end instead of text.
     """
     from skyless.nodes.process import run
-    from skyless.recordings.mcap.file import McapFile
+    from skyless.recordings.mcap.recorder import McapFile
 
     address = broker.address()
     if address is None:

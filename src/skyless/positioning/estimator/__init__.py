@@ -6,5 +6,5 @@ faults        range errors that the state does not hold: what they do to it, and
 monitor       which measurements are used, and how process noise is adapted to innovations
 measurements  the kinds of measurements, each with its Jacobian
 levels        protection levels, and whether they can be relied on
-estimator     packet by packet, or many in one loop; whether an estimator from elsewhere can be run
+estimator     packet by packet, or many in one loop; saved and restored
 """

@@ -3,12 +3,12 @@
 Anchors join and leave between packets, in NumPy; everything else is one kernel a packet.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, Final
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Final
 
 import numpy as np
-from msgspec import Struct
-from numpy.typing import DTypeLike, NDArray
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
 
 from skyless.air.beacon import HEARD
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
@@ -42,21 +42,15 @@ from skyless.positioning.estimator.measurements import (
 )
 from skyless.positioning.estimator.monitor import LATE_OFTEN_SHARE, covariance_scale, update_stationary
 from skyless.positioning.estimator.state import (
-    ALL_RANGE_ERRORS,
-    ANCHOR_DTYPE,
     LASTING_STD_M,
-    LINK_DTYPE,
     NEVER,
-    NO_RANGE_ERRORS,
-    PACKET_DTYPE,
     PACKETS_KEPT,
-    SETTINGS_DTYPE,
-    STATUS_DTYPE,
     EstimatorSettings,
     EstimatorState,
     layout,
-    most_terms,
     new_state,
+    packed_state,
+    unpacked_state,
     with_anchor,
     with_table,
     without_anchor,
@@ -430,6 +424,19 @@ def fill_motion(s: EstimatorState, rows: Matrix) -> None:
         rows[POSITION, 2] = s.settings[0]["height_m"]
 
 
+MOST_ANCHORS_IN_TABLE: Final = 4096
+"""Of an estimator that is restored."""
+
+
+class SavedEstimator(Struct, frozen=True):
+    """An ``Estimator`` in plain values: its table of anchors, and the arrays of its state as bytes."""
+
+    table: Annotated[tuple[tuple[int, float, float, float], ...], Meta(max_length=MOST_ANCHORS_IN_TABLE)]
+    """Identifier and position of each anchor."""
+    misfits: tuple[int, ...]
+    arrays: dict[str, bytes]
+
+
 class Estimator:
     """The filter of one tag."""
 
@@ -447,6 +454,24 @@ class Estimator:
         self._packed = np.zeros(MOST_PACKED * HEARD.size, np.uint8)
         self._listed = np.zeros((MOST_PACKED, 4), np.int64)
         self._state = new_state(settings, len(self._table_m))
+
+    def save(self) -> SavedEstimator:
+        """All that ``restore`` needs to continue with the same bits."""
+        table = tuple((anchor, *self._table_m[index].tolist()) for anchor, index in self.index_of.items())
+        return SavedEstimator(table, tuple(self._misfits), packed_state(self._state))
+
+    def restore(self, saved: SavedEstimator) -> None:
+        """Continue from what an estimator with the same settings has saved.
+
+        Raises:
+            ValueError: kernels could not run on it.
+        """
+        for anchor, *position_m in saved.table:
+            self.anchor_index(anchor, np.array(position_m))
+        if len(self._table_m) != len(saved.table):
+            raise ValueError("an anchor is in the estimator's table twice")
+        self._misfits = frozenset(saved.misfits)
+        self._state = unpacked_state(self.settings, len(self._table_m), saved.arrays)
 
     @property
     def state(self) -> EstimatorState:
@@ -697,87 +722,3 @@ class Estimator:
         where, x = layout(self.dim, len(self._state.anchors)), self._state.x
         rate = float(x[where.rate + anchor])
         return int(self._state.anchors[anchor]["offset_ticks"]), float(x[where.offset + anchor]), rate
-
-
-# Estimators from elsewhere
-
-
-_Expected = tuple[object, tuple[int, ...], DTypeLike]
-"""An array, its shape and its type."""
-
-MOST_ANCHORS_IN_TABLE: Final = 4096
-"""Anchors in the table."""
-
-
-def is_sound(estimator: Estimator) -> bool:
-    """Shapes and types of all arrays, and that the table names each anchor of the state once.
-
-    Any numbers will do elsewhere: ``h_index`` is written before it is read, and no other number is an index.
-    """
-    own = vars(estimator)
-    settings, state = own["settings"], own["_state"]
-    if not isinstance(settings, EstimatorSettings) or not isinstance(state, EstimatorState):
-        return False
-    known = all(type(index) is int and 0 <= index < len(state.index_of) for index in own["index_of"].values())
-    if not isinstance(own["_misfits"], frozenset) or not known:
-        return False
-    if (
-        own["dim"] != settings.dim
-        or not isinstance(own["_table_m"], list)
-        or len(own["_table_m"]) > MOST_ANCHORS_IN_TABLE
-    ):
-        return False
-    arrays = [*_of_state(state, settings.dim, len(own["_table_m"])), *_of_estimator(own)]
-    if not all(_is_array(*wanted) for wanted in arrays):
-        return False
-    if (
-        state.settings["dim"][0] != settings.dim
-        or not NO_RANGE_ERRORS <= state.status["range_errors"][0] <= ALL_RANGE_ERRORS
-    ):
-        return False
-    return _is_inverse(state.index_of, state.anchors["table_index"])
-
-
-def _of_state(s: EstimatorState, dim: int, table_size: int) -> Iterator[_Expected]:
-    count = len(s.anchors)
-    n, faults, terms = layout(dim, count).room, 2 * count + dim, most_terms(dim)
-    yield s.x, (n,), np.float64
-    yield s.P, (n, n), np.float64
-    yield s.V, (faults, n), np.float64
-    yield s.information, (3, count, count), np.float64
-    yield s.evidence, (2, count), np.float64
-    yield s.anchors, (count,), ANCHOR_DTYPE
-    yield s.packets, (count, PACKETS_KEPT), PACKET_DTYPE
-    yield s.links, (count, count), LINK_DTYPE
-    yield s.status, (1,), STATUS_DTYPE
-    yield s.settings, (1,), SETTINGS_DTYPE
-    yield s.index_of, (table_size,), np.int64
-    yield s.h, (terms,), np.float64
-    yield s.h_index, (terms,), np.uint32
-    yield s.ph, (n,), np.float64
-    yield s.fault_input, (faults,), np.float64
-    yield s.work, (count + 1 + dim, count), np.float64
-
-
-def _of_estimator(own: dict[str, Any]) -> Iterator[_Expected]:
-    table_m, listed = own["_table_m"], own["_listed"]
-    for position_m in table_m:
-        yield position_m, (3,), np.float64
-    yield own["_identifiers"], (len(table_m),), np.int64
-    yield own["_levels"], (LEVELS,), np.float64
-    yield own["_rows"], (PROTECTED_ROWS, 3), np.float64
-    yield own["_packed"], (MOST_PACKED * HEARD.size,), np.uint8
-    yield listed, (max(len(listed), MOST_PACKED), 4), np.int64
-
-
-def _is_array(value: object, shape: tuple[int, ...], kind: DTypeLike) -> bool:
-    return isinstance(value, np.ndarray) and value.shape == shape and value.dtype == kind and value.flags.carray
-
-
-def _is_inverse(index_of: Integers, table_index: Integers) -> bool:
-    """Whether the table names for every anchor of the state its index, and for no other an index."""
-    if not ((table_index >= 0) & (table_index < len(index_of))).all():
-        return False
-    expected = np.full(len(index_of), -1)
-    expected[table_index] = np.arange(len(table_index))
-    return bool((index_of == expected).all() and (expected >= 0).sum() == len(table_index))

@@ -19,6 +19,7 @@ Range errors and surveys stand last because many a site calls them exact. What i
 covariance, so ``uncertain_states`` leaves it out of all arithmetic, until a jump or a fault shows otherwise.
 """
 
+from collections.abc import Mapping
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -435,6 +436,38 @@ def with_table(s: EstimatorState, table_size: int) -> EstimatorState:
     index_of = np.full(table_size, -1, np.int64)
     index_of[: len(s.index_of)] = s.index_of
     return s._replace(index_of=index_of)
+
+
+KEPT_ARRAYS: Final = ("x", "P", "V", "information", "evidence", "anchors", "packets", "links", "status")
+"""Arrays that a state consists of; the others follow from the settings or are rewritten by each measurement."""
+
+
+def packed_state(s: EstimatorState) -> dict[str, bytes]:
+    """The arrays ``KEPT_ARRAYS`` as bytes."""
+    return {name: getattr(s, name).tobytes() for name in KEPT_ARRAYS}
+
+
+def unpacked_state(settings: EstimatorSettings, table_size: int, arrays: Mapping[str, bytes]) -> EstimatorState:
+    """The state whose arrays ``packed_state`` has turned into bytes, which may come from anywhere.
+
+    Kernels check no bounds: all arrays get the shapes that these settings and the number of anchors require, and what
+    is an index is checked. Any other numbers will do.
+
+    Raises:
+        ValueError: an array is missing or of another size, or an index is out of its range.
+    """
+    count = len(arrays.get("anchors", b"")) // ANCHOR_DTYPE.itemsize
+    if set(arrays) != set(KEPT_ARRAYS) or len(arrays["P"]) != 8 * layout(settings.dim, count).room ** 2:
+        raise ValueError("the estimator's arrays are incomplete, or of another number of anchors")
+    empty = _selected(new_state(settings, table_size), [-1] * count)
+    found = {name: np.frombuffer(arrays[name], getattr(empty, name).dtype) for name in KEPT_ARRAYS}
+    s = empty._replace(**{name: array.reshape(getattr(empty, name).shape).copy() for name, array in found.items()})
+    table_index = s.anchors["table_index"]
+    in_table = len(set(table_index.tolist()) & set(range(table_size))) == count
+    if not in_table or not NO_RANGE_ERRORS <= s.status["range_errors"][0] <= ALL_RANGE_ERRORS:
+        raise ValueError("an index of the estimator is out of its range")
+    s.index_of[table_index] = np.arange(count)
+    return s
 
 
 def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:

@@ -97,30 +97,22 @@ class Start(Struct, frozen=True):
     """... but not without these, which are not in ``used``."""
 
 
-class Acquisition:
+class Acquisition(Struct):
     """Gathers beacons until a start is possible."""
 
-    def __init__(
-        self,
-        height_m: float | None,
-        stamp_variance_m2: float,
-        z_bounds_m: tuple[float, float] | None,
-        max_age_s: float,
-        speed_std_mps: float,
-    ) -> None:
-        self._max_age_s = max_age_s
-        self._speed_variance = speed_std_mps**2
-        self._height_m = height_m
-        self._variance_m2 = stamp_variance_m2
-        self._z_bounds_m = z_bounds_m
-        self._heard: dict[int, list[Observation]] = {}
-        self._is_fast = speed_std_mps > TAG_SPEED_STD_MPS
-        """A tag that is assumed to be fast: its speed makes a start wide, and more anchors do not help."""
-        self._possible_ticks: int | None = None
-        """When a start was first possible."""
-        self._contradicted_ticks: int | None = None
-        """When packets first contradicted each other."""
-        self._links: dict[tuple[int, int], _Link] = {}
+    _height_m: float | None
+    _variance_m2: float
+    """Of a TX and an RX stamp."""
+    _z_bounds_m: tuple[float, float] | None
+    _max_age_s: float
+    _speed_std_mps: float
+    """Of a tag that is assumed to be fast this makes a start wide, and more anchors do not help."""
+    _heard: dict[int, list[Observation]] = {}
+    _possible_ticks: int | None = None
+    """When a start was first possible."""
+    _contradicted_ticks: int | None = None
+    """When packets first contradicted each other."""
+    _links: dict[tuple[int, int], _Link] = {}
 
     def expect_height(self, low_m: float, high_m: float) -> None:
         """Look only between these heights from now on."""
@@ -234,7 +226,7 @@ class Acquisition:
         relative_std = np.sqrt(np.trace(start.covariance[:2, :2])) / np.mean(ranges_m)
         patience_s = (
             START_PATIENCE_S * min(relative_std / WIDE_START, 4.0)
-            if relative_std > WIDE_START and not self._is_fast
+            if relative_std > WIDE_START and self._speed_std_mps <= TAG_SPEED_STD_MPS
             else 0.0
         )
         return start if waited_s >= patience_s else NoFixReason.ACQUIRING
@@ -266,12 +258,12 @@ class Acquisition:
         rates = np.array([_clock_rate(first, second) for first, second in pairs])
         intervals = np.array([(second.rx_ticks_tag - first.rx_ticks_tag) * TICK_S for first, second in pairs])
         rate = float(np.median(rates))
-        rate_variance = 2.0 * self._variance_m2 / float(np.min(intervals)) ** 2 + self._speed_variance
+        rate_variance = 2.0 * self._variance_m2 / float(np.min(intervals)) ** 2 + self._speed_std_mps**2
         newest = [second for _, second in pairs]
         ages_s = np.array([(now - o.rx_ticks_tag) * TICK_S for o in newest])
         pseudoranges = np.array([_pseudorange_m(o, base) for o in newest]) + rate * ages_s
         variances = np.array([o.rx_variance_factor * self._variance_m2 + o.tx_variance_m2 for o in newest])
-        variances += ages_s**2 * (rate_variance / len(pairs) + self._speed_variance)
+        variances += ages_s**2 * (rate_variance / len(pairs) + self._speed_std_mps**2)
         result = locate_pseudoranges(
             np.array([o.anchor_m for o in newest]),
             pseudoranges,
@@ -289,7 +281,7 @@ class Acquisition:
             now,
             solution,
             result.covariance_joint_m2,
-            self._speed_variance,
+            self._speed_std_mps**2,
         )
 
 

@@ -13,7 +13,6 @@ from skyless.positioning.integrity import IntegrityRequirement
 from skyless.positioning.methods.joint import Estimation
 from skyless.positioning.methods.observations import FixTime
 from skyless.positioning.methods.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
-from skyless.positioning.observation import Method
 from skyless.ticks import to_seconds
 
 DROP_S: Final = 2.0
@@ -40,7 +39,7 @@ class MethodOptions(Struct, frozen=True):
 
 def new_method(
     options: MethodOptions, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage, time: FixTime
-) -> Method:
+) -> Estimation | Snapshots:
     """Make the method for a site with this schedule and noise, where that anchor is the master."""
     superframe_s = to_seconds(schedule.slot_ticks * schedule.slots)
     if options.method not in FILTERS:

@@ -3,8 +3,10 @@
 from typing import Final
 
 import numpy as np
-from msgspec.structs import replace
+from msgspec import Struct
+from msgspec.structs import astuple, replace
 
+from skyless.air.master_term import MasterTerm
 from skyless.constants import SUBTICKS, TICK_S
 from skyless.kernels.arrays import Array
 from skyless.positioning.estimator.estimator import (
@@ -14,6 +16,7 @@ from skyless.positioning.estimator.estimator import (
     STALE,
     Estimator,
     Report,
+    SavedEstimator,
 )
 from skyless.positioning.estimator.faults import SURE_CHI2
 from skyless.positioning.estimator.levels import UNCOVERED_CHI2
@@ -77,6 +80,40 @@ SURELY_IN_REACH_TICKS: Final = from_seconds(SHORT_SILENCE_S) - 1
 """Silences up to this need no check of the filter."""
 
 
+class AnchorsInUseState(Struct, frozen=True):
+    """What ``AnchorsInUse`` keeps."""
+
+    used: tuple[Observation, ...]
+    checked_ticks: int
+    anchors_m: tuple[tuple[float, float, float], ...]
+    extent_m: float
+
+
+class MasterScaleState(Struct, frozen=True):
+    """What a ``MasterScale`` keeps: of each packet site time and its lead, each in ticks and subticks."""
+
+    master_term: MasterTerm | None
+    points: tuple[tuple[int, int, int, int], ...]
+
+
+class EstimationState(Struct, frozen=True, tag="joint"):
+    """All that an ``Estimation`` keeps."""
+
+    estimator: SavedEstimator
+    start: Acquisition | None
+    in_use: AnchorsInUseState
+    master_scale: MasterScaleState
+    speed_std_mps: float
+    open_range_errors: bool
+    is_open: bool
+    start_was_contradicted: bool
+    relays_may_contradict: bool
+    master_less_tag_ticks: int
+    started_ticks: int
+    newest_ticks: int
+    heights_rejected: int
+
+
 class Estimation:
     """One tag's estimator from the first beacon on."""
 
@@ -113,6 +150,31 @@ class Estimation:
         self._master_scale = MasterScale()
         self._relays_may_contradict = True
         self._heights_rejected = 0
+
+    def state(self) -> EstimationState:
+        """All that it keeps, as it is now."""
+        return EstimationState(
+            self._estimator.save(), self._start, self._in_use.state(), self._master_scale.state(),
+            self._speed_std_mps, self._open_range_errors, self._is_open, self._start_was_contradicted,
+            self._relays_may_contradict, self._master_less_tag_ticks, self._started_ticks, self._newest_ticks,
+            self._heights_rejected,
+        )  # fmt: skip
+
+    def restore(self, state: EstimationState) -> None:
+        """Continue from the state of one with the same settings.
+
+        Raises:
+            ValueError: the estimator's arrays are not sound.
+        """
+        self._start = state.start
+        self._estimator.restore(state.estimator)
+        self._in_use.restore(state.in_use)
+        self._master_scale.restore(state.master_scale)
+        (
+            self._speed_std_mps, self._open_range_errors, self._is_open, self._start_was_contradicted,
+            self._relays_may_contradict, self._master_less_tag_ticks, self._started_ticks, self._newest_ticks,
+            self._heights_rejected,
+        ) = astuple(state)[4:]  # fmt: skip
 
     @property
     def estimator(self) -> Estimator:
@@ -363,6 +425,17 @@ class AnchorsInUse:
         self.extent_m = 0.0
         """The largest span in x, y or z that anchors in use have had since the start."""
 
+    def state(self) -> AnchorsInUseState:
+        """All that it keeps."""
+        anchors_m = tuple((x, y, z) for x, y, z in self.anchors_m.tolist())
+        return AnchorsInUseState(tuple(self._used.values()), self._checked_ticks, anchors_m, self.extent_m)
+
+    def restore(self, state: AnchorsInUseState) -> None:
+        """Continue from a state."""
+        self._used = {observation.anchor: observation for observation in state.used}
+        self._checked_ticks, self.extent_m = state.checked_ticks, state.extent_m
+        self.anchors, self.anchors_m = tuple(self._used), np.array(state.anchors_m).reshape(len(self._used), 3)
+
     def begin(self, observations: tuple[Observation, ...]) -> None:
         """Forget all anchors but those of these observations."""
         self._used.clear()
@@ -408,9 +481,19 @@ class MasterScale:
     """The master's own counter against the site's time, which it may continue at another rate than its own."""
 
     def __init__(self) -> None:
-        self._master_term: object = None
+        self._master_term: MasterTerm | None = None
         self._points: tuple[tuple[int, int], ...] = ()
         """Site time in subticks and its lead on the master's counter, of the first and the last packet of the term."""
+
+    def state(self) -> MasterScaleState:
+        """All that it keeps; in 64 bits, which subticks exceed."""
+        points = ((*divmod(site, SUBTICKS), *divmod(lead, SUBTICKS)) for site, lead in self._points)
+        return MasterScaleState(self._master_term, tuple(points))
+
+    def restore(self, state: MasterScaleState) -> None:
+        """Continue from a state."""
+        self._master_term = state.master_term
+        self._points = tuple((site * SUBTICKS + a, lead * SUBTICKS + b) for site, a, lead, b in state.points)
 
     def update(self, observation: Observation) -> None:
         """Process a packet of the master."""

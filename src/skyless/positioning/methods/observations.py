@@ -24,12 +24,12 @@ class Observer:
         self._schedule: Schedule | None = None
         self._master: int | None = None
         self._master_slot = 0
-        self._scale: tuple[int, int] | None = None
+        self.scale: tuple[int, int] | None = None
         """The master's time and the tag's, both unwrapped, when they were compared last."""
 
     def forget(self) -> None:
         """Start again."""
-        self._scale = None
+        self.scale = None
 
     def set_master(self, master: int | None, master_slot: int) -> None:
         """Refer rounds to this master, whose first slot in the superframe is given."""
@@ -83,7 +83,7 @@ class Observer:
 
         Only the master, and anchors that agree with what was received before, continue the scale.
         """
-        time, scale = beacon.master_time, self._scale
+        time, scale = beacon.master_time, self.scale
         if time is None:
             return None, 0.0, 0.0
         subticks = time.tx_subticks_master
@@ -96,7 +96,7 @@ class Observer:
             whole = least + ((whole - least) & TICK_MASK)
             updates = updates or abs(whole - expected) <= MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS
         if updates:
-            self._scale = (whole, rx_ticks)
+            self.scale = (whole, rx_ticks)
         return whole, (subticks & 0xFF) / 256.0, (time.std_ticks * TICK_M) ** 2
 
 
@@ -127,32 +127,39 @@ class _Track(Struct):
     impossible: int = 0
 
 
+class StampTracks(Struct):
+    """What ``AnchorStamps`` keeps."""
+
+    newest_rx_ticks: int | None = None
+    """RX stamp of the newest accepted frame, unwrapped: one impossible stamp must not make others late."""
+    of_anchor: dict[int, _Track] = {}
+
+
 class AnchorStamps:
     """Unwraps every anchor's counter along the tag's own; counts what it rejects in ``counters``."""
 
-    def __init__(self, counters: Counter[str]) -> None:
+    def __init__(self, counters: Counter[str], tracks: StampTracks | None = None) -> None:
+        """``tracks``: those to continue with."""
         self._counters = counters
-        self._tracks: dict[int, _Track] = {}
-        self.newest_rx_ticks: int | None = None
-        """RX stamp of the newest accepted frame, unwrapped: one impossible stamp must not make others late."""
+        self.tracks = tracks or StampTracks()
 
     def forget(self) -> None:
         """Start again."""
-        self._tracks.clear()
-        self.newest_rx_ticks = None
+        self.tracks = StampTracks()
 
     def unwrap(self, beacon: Beacon, rx_ticks: int) -> int | None:
         """TX stamp on the anchor's own unwrapped scale; None if the frame is repeated, late, or its stamp impossible.
 
         ``rx_ticks`` is the tag's own reading, unwrapped. An anchor's first stamp keeps its own value.
         """
-        track, newest = self._tracks.get(beacon.anchor), self.newest_rx_ticks
+        tracks = self.tracks
+        track, newest = tracks.of_anchor.get(beacon.anchor), tracks.newest_rx_ticks
         if newest is not None and rx_ticks <= newest:
             repeated = track is not None and _is_repeated(beacon, track)
             self._counters["duplicate" if repeated else "out-of-order"] += 1
             return None
         if track is None:
-            self.newest_rx_ticks = rx_ticks
+            tracks.newest_rx_ticks = rx_ticks
             return self._begin(beacon, rx_ticks)
         elapsed = rx_ticks - track.rx_ticks_tag
         least = track.tx_ticks + elapsed - HALF_WRAP_TICKS
@@ -160,13 +167,13 @@ class AnchorStamps:
         if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
             self._reject(beacon, track)
             return None
-        track.rx_ticks_tag = self.newest_rx_ticks = rx_ticks
+        track.rx_ticks_tag = tracks.newest_rx_ticks = rx_ticks
         track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
         track.sequence, track.impossible = beacon.sequence, 0
         return tx_ticks
 
     def _begin(self, beacon: Beacon, rx_ticks: int) -> int:
-        tracks = self._tracks
+        tracks = self.tracks.of_anchor
         if len(tracks) >= MOST_TRACKS:
             del tracks[min(tracks, key=lambda anchor: tracks[anchor].rx_ticks_tag)]
         tracks[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence)
@@ -180,7 +187,7 @@ class AnchorStamps:
         self._counters["impossible-stamp"] += 1
         track.impossible += 1
         if track.impossible >= STAMPS_BEFORE_RESTART:
-            del self._tracks[beacon.anchor]
+            del self.tracks.of_anchor[beacon.anchor]
             self._counters["anchor-restart"] += 1
 
 
@@ -221,22 +228,21 @@ FLIGHT_SLACK_TICKS: Final = from_seconds(1e-6)
 """Flight times differ between anchors by less than this (300 m)."""
 
 
-class FixTime:
+class FixTime(Struct):
     """Counts from the first fix of a receiver and never goes back, also where master or method change."""
 
-    def __init__(self) -> None:
-        self._first_ticks_master: int | None = None
-        self._last_ticks_master = 0
-        self._last_rx_ticks_tag = 0
+    first_ticks_master: int | None = None
+    last_ticks_master: int = 0
+    last_rx_ticks_tag: int = 0
 
     def time_s(self, ticks_master: int, rx_ticks_tag: int) -> float:
         """Time in seconds of a fix that holds at this master time, given the tag's reading for it, both unwrapped."""
-        if self._first_ticks_master is None:
-            self._first_ticks_master = ticks_master
+        if self.first_ticks_master is None:
+            self.first_ticks_master = ticks_master
         else:
-            elapsed = rx_ticks_tag - self._last_rx_ticks_tag
-            off = ticks_master - self._last_ticks_master - elapsed
+            elapsed = rx_ticks_tag - self.last_rx_ticks_tag
+            off = ticks_master - self.last_ticks_master - elapsed
             if elapsed <= 0 or (abs(off) > FLIGHT_SLACK_TICKS and abs(off) > MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS):
-                self._first_ticks_master += off + elapsed - max(elapsed, 1)
-        self._last_ticks_master, self._last_rx_ticks_tag = ticks_master, rx_ticks_tag
-        return (ticks_master - self._first_ticks_master) * TICK_S
+                self.first_ticks_master += off + elapsed - max(elapsed, 1)
+        self.last_ticks_master, self.last_rx_ticks_tag = ticks_master, rx_ticks_tag
+        return (ticks_master - self.first_ticks_master) * TICK_S

@@ -183,6 +183,14 @@ class SnapshotSettings(Struct, frozen=True):
     z_bounds_m: tuple[float, float] | None = None
 
 
+class SnapshotsState(Struct, frozen=True, tag="snapshots"):
+    """What ``Snapshots`` keeps."""
+
+    round: int | None
+    previous: dict[int, Observation]
+    current: dict[int, Observation]
+
+
 class Snapshots:
     """Collects two rounds of beacons and solves them."""
 
@@ -196,6 +204,14 @@ class Snapshots:
         self._current: dict[int, Observation] = {}
         self._round: int | None = None
         self._time = fix_time or FixTime()
+
+    def state(self) -> SnapshotsState:
+        """All that it keeps, as it is now."""
+        return SnapshotsState(self._round, self._previous, self._current)
+
+    def restore(self, state: SnapshotsState) -> None:
+        """Continue from a state."""
+        self._round, self._previous, self._current = state.round, state.previous, state.current
 
     def update(self, observation: Observation) -> Fix | NoFixReason:
         """Process one observation; a fix when it completes its round or is the first of the next one."""

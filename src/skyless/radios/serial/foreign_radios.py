@@ -6,15 +6,17 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Final, Generic, TypeVar
 
+import msgspec
 from msgspec import structs
 
+from skyless.air.codec import MAX_FRAME_BYTES
 from skyless.air.masterless_packets import Packet
-from skyless.air.reception import Reception, Transmission
+from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.radios.interface import Gone, Late, RadioEvent, Restarted, ignore
 from skyless.radios.serial.serial_port import BoardClock, SerialPort, line_advice
-from skyless.recordings.foreign import sniffer_binary, sniffer_text
-from skyless.recordings.foreign.listener_lines import reception_of
-from skyless.recordings.source import LineCutter
+from skyless.recordings.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
+from skyless.recordings.source import Drops, LineCutter
+from skyless.ticks import wrap
 
 ASK_BINARY: Final = b"b"
 """What makes a sniffer change from text to binary; one that cannot stays with text."""
@@ -146,7 +148,7 @@ class SnifferStream:
         self._unused_bytes = 0
         """Since the last packet."""
         self._lines = LineCutter(drops)
-        self._binary = sniffer_binary.BinaryCutter(drops)
+        self._binary = BinaryCutter(drops)
         self._is_text: bool | None = None
 
     def feed(self, data: bytes) -> Iterator[Packet]:
@@ -164,12 +166,12 @@ class SnifferStream:
     def _determine(self, data: bytes) -> bytes:
         """All bytes that are to be read in the format found, or none while none is found."""
         self._head += data
-        text, binary = sniffer_text.recognise(self._head, ""), sniffer_binary.recognise(self._head, "")
+        text, binary = recognise_text(self._head), recognise_binary(self._head)
         if text or binary:
             data, self._head = self._head, b""
             self._is_text = text and not binary
             self._lines = LineCutter(self._drops)
-            self._binary = sniffer_binary.BinaryCutter(self._drops)
+            self._binary = BinaryCutter(self._drops)
             return data
         if len(self._head) > 2 * UNDECIDED_BYTES:
             self._drops["bytes-of-no-record"] += 1
@@ -181,6 +183,42 @@ class SnifferStream:
             yield from self._binary.feed(data)
             return
         for line in self._lines.feed(data):
-            packet = sniffer_text.packet_of(line, self._drops)
+            packet = packet_of_line(line, self._drops)
             if packet is not None:
                 yield packet
+
+
+# Lines of the uwb-apps listener (Mynewt): one JSON object for each frame, as it was received.
+#
+# Used keys: ``ts`` (RX stamp), ``rssi`` (dBm), ``d`` (the whole PSDU, hexadecimal) and ``dlen``, its length.
+
+
+class _Line(msgspec.Struct):
+    """What a line must hold; further keys are of no interest."""
+
+    ts: int
+    dlen: int
+    d: str
+    rssi: float | None = None
+
+
+_decode: Final = msgspec.json.Decoder(_Line).decode
+
+
+def reception_of(line: bytes, host_s: float, drops: Drops) -> Reception | None:
+    """Reception of a line that arrived then; None, and a count, for what is none."""
+    if not line:
+        return None
+    try:
+        found = _decode(line)
+        frame = bytes.fromhex(found.d)
+    except (msgspec.MsgspecError, ValueError):
+        drops["malformed-line"] += 1
+        return None
+    if len(frame) != found.dlen or not 1 <= len(frame) <= MAX_FRAME_BYTES:
+        drops["wrong-length"] += 1
+        return None
+    if found.ts < 0:
+        drops["impossible-stamp"] += 1
+        return None
+    return Reception(frame, wrap(found.ts), host_s, Diagnostics(rx_power_dbm=found.rssi))

@@ -1,7 +1,7 @@
 """Backhaul of an Avalue real-time location system: anchors that hear each other, raw 40-bit stamps.
 
 Each row of ``ccp.csv`` is one reception: ``slave`` heard message ``order`` of ``master``. Any anchor can play a tag
-that only listens: its packets are the transmissions that it heard, and each relays what the sender had heard since
+that only listens: its packets are the transmissions that it received, and each relays what the sender had heard since
 its own transmission before. Identifiers are hexadecimal.
 """
 
@@ -16,17 +16,16 @@ from msgspec import Struct
 from skyless.air.masterless_packets import Packet, Relay
 from skyless.clocks.two_way import TwoWayRanging
 from skyless.constants import TICK_BITS, TICK_M
-from skyless.recordings.source import Drops, open_source
-from skyless.recordings.tables import header_of, rows
+from skyless.recordings.source import Drops, header_of, open_source, rows
 
-COLUMNS: Final = ("t_host", "order", "slave", "master", "status", "tx_ticks_u40", "rx_ticks_u40")
+RECEPTION_COLUMNS: Final = ("t_host", "order", "slave", "master", "status", "tx_ticks_u40", "rx_ticks_u40")
 BLINK_COLUMNS: Final = ("tag", "anchor", "rx_ticks_u40")
-HELD_TRANSMISSIONS: Final = 6
-"""So many newer transmissions may begin before a row of an older one."""
+_HELD_TRANSMISSIONS: Final = 6
+"""Number of newer transmissions that may begin before a row of an older one."""
 
-RANGED: Final = 2001
-MOST_RELAYS: Final = 64
-MOST_ANCHORS: Final = 256
+_RANGED: Final = 2001
+_MOST_RELAYS: Final = 64
+_MOST_ANCHORS: Final = 256
 _LAST_HOST_S: Final = 1e11
 _LAST_STAMP: Final = (1 << TICK_BITS) - 1
 
@@ -51,15 +50,13 @@ class _Transmission(Struct):
     rx_ticks: dict[int, int]
 
 
-def recognise(head: bytes, name: str) -> bool:
-    """Tell whether the first line names the columns of the anchors' receptions."""
-    del name
-    return set(COLUMNS) <= set(header_of(head))
+def recognise(head: bytes) -> bool:
+    """Whether the first line names the columns of the anchors' receptions."""
+    return set(RECEPTION_COLUMNS) <= set(header_of(head))
 
 
-def recognise_blinks(head: bytes, name: str) -> bool:
-    """Tell whether this is the same system's table of tag blinks, which go the other way."""
-    del name
+def recognise_blinks(head: bytes) -> bool:
+    """Whether this is the same system's table of tag blinks, which go the other way."""
     return set(BLINK_COLUMNS) <= set(header_of(head))
 
 
@@ -79,15 +76,15 @@ def read(stream: BufferedIOBase, drops: Drops, listener: str | None = None) -> I
         else:
             yield Packet(first.host_s, first.sender, first.sequence, first.tx_ticks, rx_ticks, tuple(heard))
         for receiver, stamp in sent.rx_ticks.items():
-            if receiver != tag and (receiver in relays or len(relays) < MOST_ANCHORS):
+            if receiver != tag and (receiver in relays or len(relays) < _MOST_ANCHORS):
                 pending = relays.setdefault(receiver, [])
                 pending.append(Relay(first.sender, first.sequence, stamp, None))
-                del pending[:-MOST_RELAYS]
+                del pending[:-_MOST_RELAYS]
 
 
 def cross_receptions(stream: BufferedIOBase, drops: Drops) -> Iterator[CrossReception]:
     """Yield the receptions as they stand, row by row."""
-    for host, order, slave, master, status, tx, rx in rows(stream, drops, COLUMNS):
+    for host, order, slave, master, status, tx, rx in rows(stream, drops, RECEPTION_COLUMNS):
         try:
             reception = CrossReception(float(host), int(order), int(master, 16), int(slave, 16), int(tx), int(rx))
         except ValueError:
@@ -108,12 +105,12 @@ def cross_receptions(stream: BufferedIOBase, drops: Drops) -> Iterator[CrossRece
 def anchor_distances_m(path: str | PathLike[str], drops: Drops) -> dict[tuple[int, int], float]:
     """Distance of every pair of anchors that hear each other, by two-way ranging.
 
-    Each is the median of the latest ``RANGED`` exchanges, so that memory stays flat in the length of the capture.
+    Each is the median of the latest ``_RANGED`` exchanges, so that memory stays flat in the length of the capture.
 
     Raises:
         ConfigurationError: the file cannot be opened.
     """
-    ranging = TwoWayRanging(TICK_BITS, window=RANGED)
+    ranging = TwoWayRanging(TICK_BITS, window=_RANGED)
     with open_source(path) as stream:
         for heard in cross_receptions(stream, drops):
             ranging.add(heard.sender, heard.receiver, heard.tx_ticks, heard.rx_ticks)
@@ -132,10 +129,10 @@ def _transmissions(receptions: Iterator[CrossReception], drops: Drops) -> Iterat
             drops["late-row"] += 1
         else:
             held[key] = _Transmission(heard, {heard.receiver: heard.rx_ticks})
-            if len(held) > HELD_TRANSMISSIONS:
+            if len(held) > _HELD_TRANSMISSIONS:
                 finished, sent = held.popitem(last=False)
                 done[finished] = None
-                if len(done) > 8 * HELD_TRANSMISSIONS:
+                if len(done) > 8 * _HELD_TRANSMISSIONS:
                     done.popitem(last=False)
                 yield sent
     yield from held.values()

@@ -1,4 +1,4 @@
-"""The table of formats, and the one door to a recording of any of them."""
+"""The table of formats, and how a recording of any of them is opened."""
 
 import os
 from collections import Counter
@@ -12,8 +12,7 @@ from typing import Final
 from skyless.air.masterless_packets import Packet, PairTdoa
 from skyless.constants import TICK_BITS
 from skyless.errors import ConfigurationError
-from skyless.recordings.foreign import avalue, bitcraze_payload, miluv, sniffer_binary, sniffer_text, sniffer_yaml
-from skyless.recordings.foreign import tdoa_table as pair_table
+from skyless.recordings.foreign import avalue, bitcraze, tdoa_tables
 from skyless.recordings.source import Drops, open_source, read_head
 
 Record = Packet | PairTdoa
@@ -25,8 +24,8 @@ class Format:
 
     name: str
     summary: str
-    recognise: Callable[[bytes, str], bool]
-    """From the first bytes, decompressed, and the file's name."""
+    recognise: Callable[[bytes], bool]
+    """From the first bytes, decompressed."""
     read: Callable[..., Iterator[Record]]
     """From an open stream and a counter of drops; with ``listener`` where ``any_listener``."""
     tx_bits: int | None
@@ -41,22 +40,22 @@ FORMATS: Final = (
     Format(
         "bitcraze-yaml",
         "Bitcraze sniffer, YAML documents with base64 payloads (TDoA2, TDoA3)",
-        sniffer_yaml.recognise,
-        sniffer_yaml.read,
-        bitcraze_payload.STAMP_BITS,
+        bitcraze.recognise_yaml,
+        bitcraze.read_yaml,
+        bitcraze.STAMP_BITS,
     ),
     Format(
         "bitcraze-text",
         "Bitcraze sniffer, text lines 'From .. to .. @..: ..' (TDoA2, TDoA3)",
-        sniffer_text.recognise,
-        sniffer_text.read,
-        bitcraze_payload.STAMP_BITS,
+        bitcraze.recognise_text,
+        bitcraze.read_text,
+        bitcraze.STAMP_BITS,
     ),
     Format(
         "miluv",
         "MILUV passive ticks: three-message exchanges overheard by a listener",
-        miluv.recognise,
-        miluv.read,
+        tdoa_tables.recognise_miluv,
+        tdoa_tables.read_miluv,
         None,
         any_listener=True,
     ),
@@ -69,13 +68,13 @@ FORMATS: Final = (
         any_listener=True,
         hexadecimal=True,
     ),
-    Format("tdoa-table", "Table t_s,idA,idB,tdoa_m", pair_table.recognise, pair_table.read, None),
+    Format("tdoa-table", "Table t_s,idA,idB,tdoa_m", tdoa_tables.recognise_tdoas, tdoa_tables.read_tdoas, None),
     Format(
         "bitcraze-binary",
         "Bitcraze sniffer, binary records BC .. (TDoA2, TDoA3)",
-        sniffer_binary.recognise,
-        sniffer_binary.read,
-        bitcraze_payload.STAMP_BITS,
+        bitcraze.recognise_binary,
+        bitcraze.read_binary,
+        bitcraze.STAMP_BITS,
     ),
 )
 """In the order in which they are tried: the more particular first."""
@@ -114,7 +113,7 @@ class Recording:
 def open_recording(path: str | PathLike[str], format_name: str | None = None, listener: str | None = None) -> Recording:
     """Open a recording of a named format, or of the one that its first bytes show.
 
-    ``listener`` chooses whose ears to use where a recording holds several; by default those of the first row.
+    ``listener`` chooses one receiver where a recording holds several; by default that of the first row.
 
     Raises:
         ConfigurationError: the file cannot be opened, its format is not known, or the listener makes no sense.
@@ -145,11 +144,11 @@ def _named(path: str | PathLike[str], name: str) -> Format:
 def _recognised(path: str | PathLike[str]) -> Format:
     head = read_head(path)
     for known in FORMATS:
-        if known.recognise(head, fspath(path)):
+        if known.recognise(head):
             return known
     if not head:
         raise ConfigurationError(path, "the file", "empty", f"a recording of one of the formats {_names()}")
-    if avalue.recognise_blinks(head, fspath(path)):
+    if avalue.recognise_blinks(head):
         expected = "ccp.csv of the same system: what tags send up to anchors cannot be replayed as a tag's receptions"
         raise ConfigurationError(path, "the format", "tag blinks", expected)
     start = head[:24].decode("ascii", "backslashreplace")

@@ -35,11 +35,11 @@ Schema = dict[str, Any]
 FLOOR_PLAN: Final = "floor_plan"
 """An image, which has no schema; it is kept as an attachment."""
 
-LASTING: Final = frozenset({"site", "zones", "status", FLOOR_PLAN})
-"""Kinds that are retained: a repetition says nothing new."""
+RETAINED_KINDS: Final = frozenset({"site", "zones", "status", FLOOR_PLAN})
+"""Kinds that are retained: a repetition adds nothing."""
 
 
-class Place(Struct, frozen=True):
+class Channel(Struct, frozen=True):
     """What a topic means."""
 
     site: str
@@ -51,19 +51,19 @@ class Place(Struct, frozen=True):
 
 
 @lru_cache(maxsize=10_000)
-def place_of(topic: str) -> Place | None:
+def channel_of(topic: str) -> Channel | None:
     """What a topic means; None for one that is not of version 1."""
     if not topic.startswith(f"{ROOT}/"):
         return None
     match topic.removeprefix(f"{ROOT}/").split("/"):
         case [site, "floor_plan"]:
-            return Place(site, FLOOR_PLAN)
+            return Channel(site, FLOOR_PLAN)
         case [site, kind] if kind in _SITE_WIDE:
-            return Place(site, kind, "", _SITE_WIDE[kind])
+            return Channel(site, kind, "", _SITE_WIDE[kind])
         case [site, who, name, "health"] if who in _HEALTH:
-            return Place(site, "health", name, _HEALTH[who])
+            return Channel(site, "health", name, _HEALTH[who])
         case [site, _, name, kind] if kind in _OF_A_NODE:
-            return Place(site, kind, name, _OF_A_NODE[kind])
+            return Channel(site, kind, name, _OF_A_NODE[kind])
     return None
 
 
@@ -71,8 +71,8 @@ def place_of(topic: str) -> Place | None:
 def schema_of(payload: type[Struct]) -> tuple[str, bytes]:
     """Name and JSON schema of a payload, as far as viewers of MCAP understand one.
 
-    Foxglove takes objects, plain types and arrays of those, without references, alternatives or free keys; what cannot
-    be said so is left out, and what may be null stands as what it is otherwise.
+    Foxglove accepts objects, plain types and arrays of those, without references, alternatives or free keys; anything
+    else is left out, and a type that may be null is given without the null.
     """
     name = f"skyless.{payload.__name__.removesuffix('Message')}"
     schema = msgspec.json.schema(payload)
@@ -81,7 +81,7 @@ def schema_of(payload: type[Struct]) -> tuple[str, bytes]:
 
 
 def _viewable(schema: Schema, definitions: Schema) -> Schema | None:
-    """A schema without what viewers do not take; None if nothing is left."""
+    """A schema without what viewers do not accept; None if nothing is left."""
     schema = _resolved(schema, definitions)
     match schema.get("type"):
         case "boolean" | "integer" | "number" as kind:

@@ -1,37 +1,33 @@
 """A receiver as bytes and back, so that a replay can begin in the middle of a tag's life and go on with the same bits.
 
-The bytes are a graph of values in MessagePack, not a pickle: reading them makes only plain objects of the protocol
-machine's own classes, so that a recording of unknown origin can be read. Arrays go into compiled code that checks no
-bounds; the classes that hold some are therefore listed with what must hold of them (``_SOUND``).
+The bytes are the receiver's explicit state (``ReceiverState``) in MessagePack. Recordings may come from anywhere: types
+and sizes are checked as they are read, and nothing in the bytes names code.
 """
 
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 import numpy as np
 from msgspec import Struct
 
-from skyless.positioning.estimator.estimator import Estimator, is_sound
-from skyless.positioning.methods.acquisition import Start
-from skyless.positioning.methods.joint import AnchorsInUse
-from skyless.positioning.observation import Observation
-from skyless.receiver import Receiver
-from skyless.recordings.mcap.checkpoint_graph import Arrays
-from skyless.recordings.mcap.checkpoint_reader import DamagedGraphError, read_graph
-from skyless.recordings.mcap.checkpoint_writer import write_graph
+from skyless.kernels.arrays import Array
+from skyless.receiver import Receiver, ReceiverState
 
-FORMAT: Final = 14
-MAX_BYTES: Final = 1 << 23
+_FORMAT: Final = 15
+_MAX_BYTES: Final = 1 << 23
 """Enough for an estimator of a hundred anchors."""
 
 
-class _Envelope(Struct, frozen=True):
-    """What stands around a state."""
+class _Header(Struct, frozen=True):
+    """What every checkpoint says first."""
 
     format: int
     version: str
-    nodes: list[list[Any]]
+
+
+class _Checkpoint(_Header, frozen=True):
+    receiver: ReceiverState
 
 
 class RefusedError(Exception):
@@ -43,63 +39,38 @@ class RefusedError(Exception):
 
 
 def save(receiver: Receiver) -> bytes:
-    """Return the receiver's whole state.
-
-    Raises:
-        TypeError: it holds something that has no form here, a fault of the program.
-    """
-    return msgspec.msgpack.encode(_Envelope(FORMAT, version("skyless"), write_graph(receiver, _SOUND)))
+    """The receiver's whole state."""
+    return _ENCODER.encode(_Checkpoint(_FORMAT, version("skyless"), receiver.state()))
 
 
 def load(state: bytes) -> Receiver:
-    """Return the receiver as it was when ``state`` was taken.
+    """The receiver as it was when ``state`` was made.
 
     Raises:
         RefusedError: ``checkpoint-of-another-version``, ``checkpoint-damaged``.
     """
-    if len(state) > MAX_BYTES:
+    if len(state) > _MAX_BYTES:
         raise RefusedError("checkpoint-damaged")
     try:
-        envelope = msgspec.msgpack.decode(state, type=_Envelope)
-    except (msgspec.DecodeError, RecursionError, ValueError):
+        header = msgspec.msgpack.decode(state, type=_Header)
+        if header.format != _FORMAT or header.version != version("skyless"):
+            raise RefusedError("checkpoint-of-another-version")
+        return Receiver.from_state(_DECODER.decode(state).receiver)
+    except (msgspec.MsgspecError, ValueError, ArithmeticError, LookupError, RecursionError):
         raise RefusedError("checkpoint-damaged") from None
-    if envelope.format != FORMAT or envelope.version != version("skyless"):
-        raise RefusedError("checkpoint-of-another-version")
-    try:
-        receiver = read_graph(envelope.nodes, _SOUND)
-    except DamagedGraphError:
-        raise RefusedError("checkpoint-damaged") from None
-    if type(receiver) is not Receiver:
-        raise RefusedError("checkpoint-damaged")
-    return receiver
 
 
-def _floats(value: object, *shape: int) -> bool:
-    return isinstance(value, np.ndarray) and value.shape == shape and value.dtype == np.float64
+def _encode_array(value: object) -> bytes:
+    """A position, the only array in a state that is not bytes already."""
+    assert isinstance(value, np.ndarray)
+    return value.tobytes()
 
 
-def _observation(value: Observation) -> bool:
-    return _floats(value.anchor_m, 3)
+def _decode_array(_: type, data: object) -> Array:
+    if not isinstance(data, bytes) or len(data) != 24:
+        raise ValueError("a position is three numbers")
+    return np.frombuffer(data, np.float64).copy()
 
 
-def _start(value: Start) -> bool:
-    n = len(value.solution)
-    return n in (3, 4) and _floats(value.solution, n) and _floats(value.covariance, n, n)
-
-
-def _in_use(value: AnchorsInUse) -> bool:
-    return _floats(value.anchors_m, len(value.anchors), 3)
-
-
-def _receiver(value: Receiver) -> bool:
-    return all(_floats(place, 3) for place in vars(value)["_positions"].values())
-
-
-_SOUND: Final[Arrays] = {
-    Observation: _observation,
-    Start: _start,
-    AnchorsInUse: _in_use,
-    Estimator: is_sound,
-    Receiver: _receiver,
-}
-"""The classes that hold arrays, and whether one's arrays have the shapes that its kernels count on."""
+_ENCODER: Final = msgspec.msgpack.Encoder(enc_hook=_encode_array)
+_DECODER: Final = msgspec.msgpack.Decoder(_Checkpoint, dec_hook=_decode_array)

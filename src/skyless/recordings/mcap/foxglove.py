@@ -1,4 +1,4 @@
-"""What Foxglove shows without being told: poses, a scene, and places on the Earth.
+"""What Foxglove shows without configuration: poses, a scene, and positions on the Earth.
 
 Schemas as documented at https://docs.foxglove.dev/docs/sdk/schemas.
 """
@@ -16,7 +16,7 @@ from skyless.site.model import GeoreferenceSite, Site
 
 FRAME: Final = "site"
 KNOWN_COVARIANCE: Final = 3
-SIGMAS: Final = 2.0
+ELLIPSE_SIGMAS: Final = 2.0
 """How many standard deviations an ellipse shows."""
 
 WALL_HEIGHT_M: Final = 2.5
@@ -135,10 +135,10 @@ def ellipse(fix: FixMessage) -> bytes:
 
 
 def ellipse_of(fix: FixMessage) -> tuple[tuple[float, float], float]:
-    """Diameters of the ellipse of ``SIGMAS`` standard deviations, the longer first, and its direction in rad."""
+    """Diameters of the ellipse of ``ELLIPSE_SIGMAS``, the longer first, and its direction in rad."""
     xx, xy, _, _, yy = fix.covariance_m2[:5]
     values, vectors = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
-    short_m, long_m = (2.0 * SIGMAS * math.sqrt(max(float(value), 0.0)) for value in values)
+    short_m, long_m = (2.0 * ELLIPSE_SIGMAS * math.sqrt(max(float(value), 0.0)) for value in values)
     return (long_m, short_m), math.atan2(float(vectors[1, 1]), float(vectors[0, 1]))
 
 
@@ -201,9 +201,9 @@ def _entity(unix_s: float, name: str, **primitives: list[Schema]) -> Schema:
     }
 
 
-def _label(text: str, place_m: tuple[float, float, float]) -> Schema:
+def _label(text: str, position_m: tuple[float, float, float]) -> Schema:
     return {
-        "pose": _pose(place_m, 0.0),
+        "pose": _pose(position_m, 0.0),
         "billboard": True,
         "font_size": 0.25,
         "scale_invariant": False,
@@ -217,9 +217,9 @@ def _time(unix_s: float) -> dict[str, int]:
     return {"sec": sec, "nsec": nsec}
 
 
-def _pose(place_m: tuple[float, float, float], yaw: float) -> Schema:
+def _pose(position_m: tuple[float, float, float], yaw: float) -> Schema:
     half = {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2.0), "w": math.cos(yaw / 2.0)}
-    return {"position": _xyz(*place_m), "orientation": half}
+    return {"position": _xyz(*position_m), "orientation": half}
 
 
 def _xyz(x: float, y: float, z: float) -> dict[str, float]:

@@ -1,6 +1,6 @@
-"""What a tag keeps for those who record it: its receptions in runs, each with the receiver's state at its beginning.
+"""What a tag keeps for those who record it: receptions in segments, each with the receiver's state at its beginning.
 
-A run (segment) begins when somebody new asks, and whenever continuity was broken; within one, nothing is missing.
+A segment begins when somebody new asks, and whenever continuity was broken; within one, nothing is missing.
 No I/O and no clock: times are passed in, by any clock that does not go back.
 """
 
@@ -15,9 +15,9 @@ from skyless.recordings.mcap.checkpoint import save
 
 EVERY_TAG: Final = "*"
 INTERVAL_S: Final = 0.1
-"""Receptions of so long a time go into one message."""
+"""Receptions of this time go into one message."""
 
-MOST_PENDING: Final = 4096
+MOST_PENDING_RECEPTIONS: Final = 4096
 """Receptions; where nobody collects them, the segment ends instead of taking memory."""
 
 MOST_LEASES: Final = 64
@@ -52,7 +52,7 @@ class ReceptionLog:
         return bool(self._lease_until_s)
 
     def request(self, message: RequestMessage, now_s: float) -> None:
-        """Take a request; one who was not here before (or whose lease has ended) begins another segment."""
+        """Process a request; one who was not here before (or whose lease has ended) begins another segment."""
         self._end_leases(now_s)
         if not {self._tag, EVERY_TAG} & set(message.receptions):
             self._lease_until_s.pop(message.by, None)
@@ -64,15 +64,15 @@ class ReceptionLog:
             self.interrupt()
         self._lease_until_s[message.by] = now_s + min(max(message.lease_s, 0.0), MAX_LEASE_S)
 
-    def hear(self, receiver: Receiver, reception: Reception, serial: int) -> None:
-        """Take a reception, before the receiver hears it; ``serial`` is the number of fixes made so far."""
+    def add(self, receiver: Receiver, reception: Reception, serial: int) -> None:
+        """Add a reception, before the receiver hears it; ``serial`` is the number of fixes made so far."""
         if not self._lease_until_s:
             return
-        if len(self._pending) >= MOST_PENDING:
+        if len(self._pending) >= MOST_PENDING_RECEPTIONS:
             self.counters["not-collected"] += len(self._pending)
             self._pending.clear()
             self._open = False
-        if receiver is not self._receiver:  # the radio started anew, and the tag with it
+        if receiver is not self._receiver:  # the radio was restarted, and the tag with it
             self.interrupt()
             self._receiver = receiver
         if not self._open:
@@ -139,7 +139,7 @@ def receiver_settings(
     z_bounds_m: tuple[float, float] | None = None,
     integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
 ) -> Settings:
-    """How a receiver is made, as a segment tells it."""
+    """How a receiver is made, as it stands in a segment."""
     low_m, high_m = (None, None) if z_bounds_m is None else z_bounds_m
     asked = {
         "integrity_risk": integrity.risk,
@@ -151,15 +151,15 @@ def receiver_settings(
 
 
 def raw(reception: Reception) -> RawReception:
-    """A reception as it travels."""
-    told = reception.diagnostics
-    if told is None:
+    """A reception as it is published."""
+    diagnostics = reception.diagnostics
+    if diagnostics is None:
         return RawReception(reception.frame, reception.rx_ticks, reception.host_s)
     return RawReception(
         reception.frame,
         reception.rx_ticks,
         reception.host_s,
-        told.rx_power_dbm,
-        told.first_path_power_dbm,
-        told.carrier_offset_ppm,
+        diagnostics.rx_power_dbm,
+        diagnostics.first_path_power_dbm,
+        diagnostics.carrier_offset_ppm,
     )

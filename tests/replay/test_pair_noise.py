@@ -8,7 +8,7 @@ import pytest
 from skyless.air.masterless_packets import PairTdoa
 from skyless.evaluation.judge import Judge
 from skyless.recordings.truth import Truth
-from skyless.replay.noise import FEWEST, MOST_PAIRS, ROWS_PER_PAIR, NoiseByPair
+from skyless.replay.captures import MIN_PAIR_DIFFERENCES, MOST_PAIRS, ROWS_PER_PAIR, NoiseByPair
 
 ANCHORS_M = {1: (0.0, 0.0, 0.0), 2: (8.0, 0.0, 1.0), 3: (0.0, 6.0, 2.0)}
 
@@ -48,7 +48,7 @@ def test_noise_without_truth_is_about_the_median():
 def test_positions_that_come_with_the_difference_serve():
     book = NoiseByPair(Judge(moving(1.0), planar=False), {})
     at_m = (1.0, 2.0, 1.0)
-    for _ in range(FEWEST):
+    for _ in range(MIN_PAIR_DIFFERENCES):
         book.add(PairTdoa(0.0, 7, 8, dist(at_m, (5.0, 5.0, 5.0)) - dist(at_m, (0.0, 0.0, 0.0)), (0.0,) * 3, (5.0,) * 3))
     (pair,) = book.pairs()
     assert pair.against_truth
@@ -57,7 +57,7 @@ def test_positions_that_come_with_the_difference_serve():
 
 def test_a_pair_heard_too_seldom_says_nothing():
     book = NoiseByPair(Judge(None, planar=False), {})
-    for _ in range(FEWEST - 1):
+    for _ in range(MIN_PAIR_DIFFERENCES - 1):
         book.add(PairTdoa(0.0, 1, 2, 0.0))
     assert book.pairs() == ()
 
