@@ -257,7 +257,8 @@ def _outage(text: str) -> "AnchorOutage":
 
 def _silence(text: str) -> "Outage":
     """FROM_S or FROM_S:TO_S. Raises SkylessError."""
-    return _off_and_on("silence", text, finite_numbers("silence", text, (1, 2), ":"), "it should end after it has begun")
+    times_s = finite_numbers("silence", text, (1, 2), ":")
+    return _off_and_on("silence", text, times_s, "it should end after it has begun")
 
 
 def _off_and_on(option: str, text: str, times_s: Sequence[float], order: str) -> "Outage":

@@ -33,7 +33,7 @@ from skyless.studies.episodes import (
     draw_episode,
     settings_of,
 )
-from skyless.studies.picture import LEAST_SHARE, centimetres
+from skyless.studies.picture import LEAST_DRAWN_SHARE, centimetres
 from skyless.studies.plan import Cell, Plan, Row
 from skyless.studies.summary import clustered_interval
 
@@ -333,7 +333,7 @@ def _fill(line: Sequence[Axes], rows: list[Row]) -> None:
     available.set(ylabel="fixes with a level, %", ylim=(0.0, 103.0))
     misleading.axhline(rows[0].risk or 0.0, color=MUTED, linewidth=1.0, linestyle="--", zorder=1.5)
     misleading.set(
-        ylabel="misleading, with 99 % interval; stated risk: - -", yscale="log", ylim=(0.7 * LEAST_SHARE, None)
+        ylabel="misleading, with 99 % interval; stated risk: - -", yscale="log", ylim=(0.7 * LEAST_DRAWN_SHARE, None)
     )
     for axes in line:
         axes.set(xlabel="size of the fault in m", xscale="log")
@@ -358,9 +358,13 @@ def _curve(axes: Axes, rows: list[Row], value: _Values, colour: str, line: str, 
 
 def _shares(axes: Axes, rows: list[Row], colour: str) -> None:
     for row in rows:
-        share, (low, high) = max(row.hmi or 0.0, LEAST_SHARE), row.hmi_interval or (0.0, 0.0)
+        share, (low, high) = max(row.hmi or 0.0, LEAST_DRAWN_SHARE), row.hmi_interval or (0.0, 0.0)
         size_m = row.x or 0.0
         axes.plot(
-            [size_m, size_m], [max(low, LEAST_SHARE), max(high, LEAST_SHARE)], color=colour, linewidth=1.0, alpha=0.6
+            [size_m, size_m],
+            [max(low, LEAST_DRAWN_SHARE), max(high, LEAST_DRAWN_SHARE)],
+            color=colour,
+            linewidth=1.0,
+            alpha=0.6,
         )
         axes.plot(size_m, share, "o", color=colour, markersize=3.5)

@@ -53,12 +53,12 @@ def centimetres(value_m: float | None) -> float | None:
     return None if value_m is None else 100.0 * value_m
 
 
-LEAST_SHARE: Final = 1e-6
+LEAST_DRAWN_SHARE: Final = 1e-6
 """Smaller shares of exceeded levels, and none, are drawn here."""
 
 
 def _exceeded(row: Row) -> float | None:
-    return None if row.exceeded is None else 1e4 * max(row.exceeded, LEAST_SHARE)
+    return None if row.exceeded is None else 1e4 * max(row.exceeded, LEAST_DRAWN_SHARE)
 
 
 _PANELS: Final = {

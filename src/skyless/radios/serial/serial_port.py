@@ -16,7 +16,7 @@ from skyless.ticks import difference, wrap
 
 _REOPEN_S: Final = 0.2
 
-MAX_DRIFT: Final = 100e-6
+MAX_BOARD_DRIFT: Final = 100e-6
 """Two crystals drift apart by less; the estimate loses as much between stamps with a short delay."""
 
 JUMP_TICKS: Final = round(TICK_RATE_HZ)
@@ -177,7 +177,7 @@ class BoardClock:
 
     def update(self, ticks: int, host_s: float) -> None:
         """Add a stamp of the counter that arrived at a moment of the host's monotonic clock."""
-        known = self.read(host_s, MAX_DRIFT)
+        known = self.read(host_s, MAX_BOARD_DRIFT)
         if known is None or difference(ticks, known) >= 0 or difference(ticks, known) < -JUMP_TICKS:
             self._ticks, self._host_s = ticks, host_s
 
