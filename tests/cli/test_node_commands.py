@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import skyless
 from skyless.cli.main import main
 from skyless.cli.nodes.demo import _subscriber
 from skyless.mqtt.address import MqttAddress
@@ -109,6 +110,7 @@ def test_a_board_tells_where_it_is_and_takes_its_link_with_it(number, tmp_path):
         (*command, "--link", place), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as program:
         told = json.loads(program.stdout.readline())
+        assert told.pop("skyless_version") == skyless.__version__
         assert told == {"board": "tag1", "path": str(place), "format": "link", "radio": f"serial:{place}"}
         assert "no ether at 127.0.0.1:1" in program.stderr.readline()
         assert place.resolve().is_char_device()

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import Struct
 
+import skyless
 from skyless.cli.common.output import print_json, to_json, write_atomically
 
 
@@ -68,7 +69,7 @@ def test_what_has_no_form_is_refused():
 
 def test_print_json(capsys):
     print_json({"rmse_m": math.nan})
-    assert capsys.readouterr().out == '{"rmse_m":null}\n'
+    assert capsys.readouterr().out == f'{{"skyless_version":"{skyless.__version__}","rmse_m":null}}\n'
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):

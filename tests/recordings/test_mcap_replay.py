@@ -8,6 +8,7 @@ import pytest
 from live_site import PLACES, UNIX_S, messages, record
 from msgspec.structs import replace
 
+import skyless
 from skyless.cli.main import main
 from skyless.errors import SkylessError
 from skyless.method_names import METHODS
@@ -172,12 +173,15 @@ def nonsense(start):
     return replace(start, state=msgspec.msgpack.encode(state))
 
 
+VERSION = skyless.__version__.encode()
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
         (lambda start: replace(start, state=b"\x80\x04damaged"), "checkpoint-damaged"),
         (lambda start: replace(start, state=start.state[:-1]), "checkpoint-damaged"),
-        (lambda start: replace(start, state=start.state.replace(b"0.1.0", b"9.1.0")), "checkpoint-of-another-version"),
+        (lambda start: replace(start, state=start.state.replace(VERSION, b"9.1.0")), "checkpoint-of-another-version"),
         (nonsense, "checkpoint-damaged"),
         (lambda start: replace(start, state=None), "no-checkpoint"),
         (lambda start: replace(start, state=b"", settings={"method": "rm -rf"}), "impossible-settings"),
