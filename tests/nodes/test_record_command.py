@@ -225,7 +225,7 @@ def test_a_disk_that_takes_no_more_is_reported_once_and_leaves_a_whole_file(brok
     code, out, err = run(scenario, broker)
     assert code == 1
     assert err.count("cannot be written any more: File too large") == 1
-    assert "not written any more" in out
+    assert "not written at the end" in out
     _, summary = replayed(recorder.path)
     assert summary.unread_bytes == 0
     assert 100_000 < recorder.size() <= 250_000
