@@ -133,6 +133,29 @@ def test_the_pages_modules_import_each_other_in_no_circle():
     assert circles(folders) is None
 
 
+def package(module):
+    path = MODULES[module]
+    return module if path.name == "__init__.py" else module.rpartition(".")[0]
+
+
+def test_a_package_names_the_modules_that_others_import():
+    """Its docstring says which are public; commands are loaded by name, and firmware runs on boards."""
+    public = {}
+    for module, path in MODULES.items():
+        for other in imported_modules(path):
+            if package(other) not in {package(module), other, "skyless"}:
+                public.setdefault(package(other), set()).add(other.rpartition(".")[2])
+    named = {}
+    for name in public:
+        docstring = ast.get_docstring(ast.parse(MODULES[name].read_text("utf-8")))
+        said = re.search(r"^Public: ([^.]*)\.", docstring, re.MULTILINE)
+        named[name] = set(re.split(r",\s+", said[1])) if said else None
+    exempt = {name for name in public if name.split(".")[1] in {"cli", "firmware"}}
+    assert {name: names for name, names in named.items() if name not in exempt} == {
+        name: names for name, names in public.items() if name not in exempt
+    }
+
+
 def test_a_circle_is_found():
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
 

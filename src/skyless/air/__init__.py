@@ -1,1 +1,4 @@
-"""What is on the air: beacons and their bytes, the almanac's pages, and what a radio reports of a frame."""
+"""What is on the air: beacons and their bytes, the almanac's pages, and what a radio reports of a frame.
+
+Public: almanac, beacon, codec, ieee802154, master_term, masterless_packets, page_codec, reception.
+"""

@@ -1,1 +1,4 @@
-"""Antenna delays from a recording of a tag whose position is known."""
+"""Antenna delays from a recording of a tag whose position is known.
+
+Public: estimate, run, samples.
+"""

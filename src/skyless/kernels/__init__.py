@@ -1,1 +1,4 @@
-"""What estimation computes with: the compiler, array types, small linear algebra."""
+"""What estimation computes with: the compiler, array types, small linear algebra.
+
+Public: arrays, compiled, covariance, linear_algebra, two_state.
+"""

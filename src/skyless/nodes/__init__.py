@@ -1,1 +1,5 @@
-"""The programs of a running site, asyncio around the protocol machines."""
+"""The programs of a running site, asyncio around the protocol machines.
+
+Public: anchor, board, broker, demo, ether, find_site, open_radio, packet_tags, process, record, tag, watch.
+Within the package: children, fix_log, ports, radio_monitor.
+"""

@@ -1,1 +1,4 @@
-"""From pseudoranges and time differences to positions: solver, the paper's methods, the estimator."""
+"""From receptions to positions: the values that all methods share; methods, estimator and masterless sites below.
+
+Public: fix, integrity, observation.
+"""

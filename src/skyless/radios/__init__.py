@@ -1,1 +1,4 @@
-"""The narrow radio interface, and the radios behind it."""
+"""The narrow radio interface, and the radios behind it.
+
+Public: emulated, ether_wire, interface.
+"""

@@ -1,1 +1,4 @@
-"""Foreign recordings: what other people's tags wrote down, as a stream of packets or of time differences."""
+"""Recordings of a running site and of other systems; tables of anchors and of true positions.
+
+Public: anchor_table, source, truth.
+"""

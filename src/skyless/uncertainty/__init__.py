@@ -1,1 +1,4 @@
-"""How well positions are known: geometry (DOPs), propagated covariances, bounds."""
+"""How well positions are known: geometry (DOPs), propagated covariances, bounds.
+
+Public: bounds, chain, dop.
+"""

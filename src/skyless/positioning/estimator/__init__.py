@@ -7,4 +7,6 @@ monitor       which measurements are used, and how process noise is adapted to i
 measurements  the kinds of measurements, each with its Jacobian
 levels        protection levels, and whether they can be relied on
 estimator     packet by packet, or many in one loop; saved and restored
+
+Public: estimator, faults, kalman, levels, measurements, monitor, state.
 """

@@ -1,1 +1,5 @@
-"""The positioning methods for a tag of a Skyless site, and what beacons become for them."""
+"""The positioning methods for a tag of a Skyless site, and what beacons become for them.
+
+Public: factory, joint, locate, observations, snapshots.
+Within the package: acquisition.
+"""

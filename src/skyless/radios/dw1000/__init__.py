@@ -1,1 +1,4 @@
-"""A DW1000 on SPI, or a model of one."""
+"""A DW1000 on SPI, or a model of one.
+
+Public: model, radio, spi.
+"""

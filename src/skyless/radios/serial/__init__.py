@@ -1,1 +1,4 @@
-"""Radios on boards behind a serial port."""
+"""Radios on boards behind a serial port.
+
+Public: foreign_radios, link_records, serial_port, serial_radio.
+"""

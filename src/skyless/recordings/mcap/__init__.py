@@ -1,1 +1,5 @@
-"""Recordings of a running site, in MCAP."""
+"""Recordings of a running site, in MCAP.
+
+Public: checkpoint, reception_log, recorder, recording.
+Within the package: channels, foxglove.
+"""
