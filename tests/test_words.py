@@ -60,6 +60,61 @@ VERBS = {
 }
 """Names of functions that do not say what is done."""
 
+IDENTIFIERS = [
+    "_tell",
+    "_trust",
+    "_doubt",
+    "doubt_m2",
+    "JOIN_DOUBT",
+    "WEIGHT",
+    "TRUST",
+    "BENT",
+    "WORTH",
+    "CHI2",
+    "HASTE",
+    "CAUTION",
+    "CALMING",
+    "LOOSENED",
+    "SOON_S",
+    "unsettle",
+    "follow_lag",
+    "follow_clocks",
+    "along_h",
+    "joint_rest",
+    "liar",
+    "lying",
+    "take_back",
+    "leave_out",
+    "_believes_relays",
+    "made_of",
+    "Claim",
+    "claim_of",
+    "Sightings",
+    "Way",
+    "Script",
+    "Wanted",
+    "Exchanged",
+    "Seat",
+    "Guest",
+    "Speech",
+    "FixBook",
+    "PhaseBook",
+    "NoiseBook",
+    "AlmanacBook",
+    "Succession",
+    "DeafReceiver",
+    "deaf_receiver",
+    "latent_hosts",
+    "yardstick",
+    "reaching",
+    "truths",
+    "see_that_it_can_be_drawn",
+    "Say",
+    "place_of",
+    "site_of_anchor",
+]
+"""Names of version 0.1 that were replaced."""
+
 HEARING = {"anchor.py", "receiver.py", "simulation/world.py", "evaluation/fleet.py"}
 """Only what stands where a radio's receptions arrive has methods named ``hear``."""
 
@@ -94,6 +149,17 @@ def test_functions_are_named_by_what_they_do(path):
     assert not vague
     if path.relative_to(SOURCE).as_posix() not in HEARING:
         assert not {name for name in names if re.match(r"_?hear(_|$)", name)}
+
+
+def test_replaced_names_do_not_come_back():
+    pattern = re.compile(rf"\b({'|'.join(IDENTIFIERS)})\b")
+    found = []
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [getattr(node, key, None) for key in ("id", "attr", "name", "arg")]
+            found += [f"{path.name}: {name}" for name in names if isinstance(name, str) and pattern.fullmatch(name)]
+    assert found == []
+    assert not {path.stem for path in MODULES} & set(IDENTIFIERS)
 
 
 def public_constants():
