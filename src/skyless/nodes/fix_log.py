@@ -92,7 +92,7 @@ class FixLog:
 
 
 class _RateLimit:
-    """Passes at most so many events a second."""
+    """Passes at most a given number of events a second."""
 
     def __init__(self, most_hz: float) -> None:
         self._interval_s = 1.0 / most_hz

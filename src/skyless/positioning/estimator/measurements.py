@@ -147,7 +147,7 @@ def _curvature_m(s: EstimatorState, range_m: float, variance: float) -> float:
     """Half the position's variance across the direction, over the range: what the range is longer by on average.
 
     The second term of its Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 where that is
-    small beside that of the stamps. The direction stands in the first terms of the measurement.
+    small compared with that of the stamps. The direction stands in the first terms of the measurement.
     """
     dim, P, h = s.settings[0]["dim"], s.P, s.h
     across = 0.0

@@ -27,7 +27,7 @@ CHIP_POLL_S: Final = 0.5e-3
 _LINE_CHECK_S: Final = 0.02
 """And one with a line, should an edge have been missed."""
 MOST_VAIN_INTERRUPTS: Final = 8
-"""After so many interrupts in a row without an event the chip is polled instead."""
+"""Number of interrupts in a row without an event after which the chip is polled instead."""
 
 _VAIN: Final = (
     "rises though the chip has no event: is irq= the right pin, the wire sound? "

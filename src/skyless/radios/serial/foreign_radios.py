@@ -22,7 +22,7 @@ ASK_BINARY: Final = b"b"
 """What makes a sniffer change from text to binary; one that cannot stays with text."""
 
 UNDECIDED_BYTES: Final = 4096
-"""After so many bytes without a packet the format is determined again."""
+"""Number of bytes without a packet after which the format is determined again."""
 
 _Event = TypeVar("_Event")
 
