@@ -7,7 +7,6 @@ from zlib import crc32
 
 import numpy as np
 from msgspec import Meta, Struct
-from msgspec.structs import replace
 
 from skyless.air.almanac import AccuracyPage, GeoreferencePage, NoisePage, Page, SitePage
 from skyless.air.beacon2 import Beacon2, StatedPosition
