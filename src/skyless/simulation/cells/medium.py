@@ -94,9 +94,7 @@ def receive_in_cells(
                 arrival_ticks = fraction + np.sqrt(square_m2) / TICK_M - early_ticks
                 row = rows[count]
                 fill_truth(stations, node, t_s, row)
-                row["rx_ticks"] = rx_stamp(
-                    rules, knots, node, (keys[node], keys[sender], number), ticks, arrival_ticks
-                )
+                row["rx_ticks"] = rx_stamp(rules, knots, node, (keys[node], keys[sender], number), ticks, arrival_ticks)
                 count += 1
                 anchors += 1 - stations[node]["is_tag"]
         tally[stations[node]["is_tag"], outcome] += 1

@@ -115,9 +115,7 @@ def interference(
             base = (row * grid.columns + column) * buckets.bins
             start, stop = buckets.offsets[base + low_bin], buckets.offsets[base + high_bin + 1]
             if start < stop:
-                state = disturb(
-                    rules, buckets.frames, start, stop, scene.positions_m, listener, point_m, wanted, state
-                )
+                state = disturb(rules, buckets.frames, start, stop, scene.positions_m, listener, point_m, wanted, state)
     return state
 
 
@@ -229,7 +227,13 @@ def fill_relays(
 
 @kernel
 def receive_at_anchor(
-    scene: Scene, listener: int, from_ticks: int, to_ticks: int, senders: Integers, columns: Integers, rx_ticks: Integers
+    scene: Scene,
+    listener: int,
+    from_ticks: int,
+    to_ticks: int,
+    senders: Integers,
+    columns: Integers,
+    rx_ticks: Integers,
 ) -> int:
     """All receptions of an anchor of frames emitted in [from, to), newest first; returns their number."""
     found = candidates(scene, listener, from_ticks - 1, to_ticks - 1, senders, columns)

@@ -276,9 +276,7 @@ def given_table(
 
 
 @kernel
-def _fill_buckets(
-    table: Table, grid: Grid, start_ticks: int, bins: int, offsets: Integers, frames: Frames
-) -> None:
+def _fill_buckets(table: Table, grid: Grid, start_ticks: int, bins: int, offsets: Integers, frames: Frames) -> None:
     """Sort the frames of a table by cell and bin (counting sort)."""
     for anchor in range(table.count.shape[0]):
         for k in range(table.count[anchor]):
@@ -303,8 +301,6 @@ def make_buckets(table: Table, grid: Grid, from_ticks: int, to_ticks: int) -> Bu
     bins = ((to_ticks - from_ticks) >> BIN_BITS) + 1
     offsets = np.zeros(grid.columns * grid.rows * bins + 2, dtype=np.int64)
     most = int(table.count.sum())
-    frames = Frames(
-        np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty(most), np.empty(most)
-    )
+    frames = Frames(np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty(most), np.empty(most))
     _fill_buckets(table, grid, from_ticks, bins, offsets, frames)
     return Buckets(from_ticks, bins, offsets[1:], frames)

@@ -87,7 +87,9 @@ class CellAnchors(Struct, frozen=True):
                 f"{self.tx_delays_ticks.shape}; they should be ({count}, 3) and ({count},)"
             )
         if count == 0 or len(np.unique(self.ids)) < count:
-            raise ValueError(f"{count} anchors with {len(np.unique(self.ids))} different identifiers; all should differ")
+            raise ValueError(
+                f"{count} anchors with {len(np.unique(self.ids))} different identifiers; all should differ"
+            )
 
 
 def anchors_at(positions_m: Array) -> CellAnchors:
@@ -363,9 +365,7 @@ class CellWorld:
 
     # Anchors
 
-    def _at_anchors(
-        self, scene: Scene, anchors: Sequence[int], from_ticks: int, to_ticks: int
-    ) -> AnchorReceptions:
+    def _at_anchors(self, scene: Scene, anchors: Sequence[int], from_ticks: int, to_ticks: int) -> AnchorReceptions:
         table, ids = scene.table, self.anchors.ids
         most = max(self._most_neighbours, 1) * table.ticks.shape[1]
         scratch = tuple(np.empty(most, dtype=np.int64) for _ in range(3))
