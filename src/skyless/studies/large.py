@@ -1,11 +1,11 @@
 """The study ``large``: tags that walk through a site of a thousand anchors without a master (protocol 2).
 
-What anchors send and receive is simulated on demand (``simulation/cells``); each tag gets the bytes of the beacons that
-it receives, and nothing else. Nothing that keeps time for the site is on the air.
+What anchors send and receive is simulated on demand (``simulation/cells``); each tag gets the beacons that it receives,
+and nothing else. Nothing that keeps time for the site is on the air.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Final
 
@@ -13,25 +13,21 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.air.beacon import PackedHeard
-from skyless.air.beacon2 import Beacon2, StatedPosition
-from skyless.air.codec2 import encode_2
+from skyless.air.beacon2 import Beacon2
 from skyless.air.reception import Reception
+from skyless.evaluation.cell_fleet import SiteBeacons, schedule_in_cells
 from skyless.evaluation.scenarios import ROOM_QA_M2PS3, Room
 from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.positioning.fix import Fix
 from skyless.positioning.methods.joint import Estimation
 from skyless.receiver import Receiver
-from skyless.simulation.cells.timetable import FreeSchedule, Schedule, SlotSchedule
 from skyless.simulation.cells.world import CellWorld, TagReceptions, anchors_of
 from skyless.simulation.channel import ChannelModel
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Roaming, Trajectory, Waypoints
 from skyless.site.grid import grid_site
-from skyless.site.local_almanac import site_issue, site_page_for, site_pages_of
 from skyless.site.model import EXACT, AccuracySite, ScheduleMode, Site
-from skyless.site.slots import schedule_of
 from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.studies.summary import interval, jackknife
 from skyless.uncertainty.bounds import Biases, Sendings, bound_settings, received_bound
@@ -61,9 +57,6 @@ _TAG_COST_S: Final = 0.02
 """About what a second of a tag takes."""
 
 _PATH_KEY: Final = 41
-
-_ENTRY: Final = np.dtype([("anchor", "<u2"), ("sequence", "u1"), ("low", "<u4"), ("high", "u1")])
-"""A relayed reception as frames carry it (``air/beacon.HEARD``)."""
 
 
 class LargeCase(Struct, frozen=True):
@@ -170,45 +163,6 @@ def site_of(case: LargeCase) -> Site:
     return replace(site, accuracy=accuracy, schedule=schedule)
 
 
-def schedule_in_cells(site: Site) -> Schedule:
-    """The site's schedule for the simulated cells."""
-    if site.schedule.mode == "free":
-        return FreeSchedule(site.schedule.rate_hz)
-    schedule = schedule_of(site)
-    colours = np.array([anchor.slot for anchor in site.anchors])
-    return SlotSchedule(colours, schedule.slots, schedule.slot_ticks)
-
-
-def beacons_of(site: Site, received: TagReceptions) -> Iterator[tuple[Reception, int]]:
-    """The receptions of a tag with the bytes of their frames, and their rows."""
-    pages = site_pages_of(site)
-    issue = site_issue(pages)
-    std_m = site.accuracy.survey_std_m
-    positions = _stated(site, std_m)
-    entries = np.zeros(received.relay_anchor.shape, _ENTRY)
-    entries["anchor"], entries["sequence"] = received.relay_anchor, received.relay_sequence
-    entries["low"], entries["high"] = received.relay_rx_ticks & 0xFFFFFFFF, received.relay_rx_ticks >> 32
-    rows = zip(
-        received.anchor.tolist(), received.sequence.tolist(), received.tx_ticks.tolist(), received.rx_ticks.tolist(),
-        received.relays.tolist(), received.emission_s.tolist(), strict=True,
-    )  # fmt: skip
-    for row, (anchor, sequence, tx_ticks, rx_ticks, relays, emission_s) in enumerate(rows):
-        packed = entries[row, :relays].tobytes()
-        page = site_page_for(pages, sequence, anchor)
-        beacon = Beacon2(
-            site.id, anchor, sequence, tx_ticks, issue, None, positions[anchor], None, PackedHeard(packed), 0, page
-        )
-        yield Reception(encode_2(beacon), rx_ticks, emission_s), row
-
-
-@lru_cache(maxsize=4)
-def _stated(site: Site, std_m: float) -> dict[int, StatedPosition]:
-    return {
-        anchor.id: StatedPosition(anchor.x_m, anchor.y_m, anchor.z_m, std_m, anchor.floor, anchor.zone)
-        for anchor in site.anchors
-    }
-
-
 def paths(run: LargeRun) -> list[Trajectory]:
     """Where the tags of a cell go."""
     draw = np.random.default_rng(seed_of(run.plan.seed, _PATH_KEY, run.number))
@@ -262,13 +216,13 @@ def _judge_tag(run: LargeRun, site: Site, world: CellWorld, tag: int) -> LargeRe
     case, plan = run.case, run.plan
     seconds = 1.0 if case.starts else _BOUND_S if case.bounded else case.seconds or plan.seconds
     begin_s = float(np.random.default_rng(seed_of(plan.seed, run.number, tag)).uniform(1.0, 20.0))
-    log = _TagLog(Receiver(qa=plan.qa))
+    log, beacons = _TagLog(Receiver(qa=plan.qa)), SiteBeacons(site)
     spans: list[TagReceptions] = []
     at_s = begin_s
     while at_s < begin_s + seconds and not (case.starts and log.first_fix_s is not None):
         received = world.receptions(tag, at_s, min(at_s + _SPAN_S, begin_s + seconds))
-        for reception, row in beacons_of(site, received):
-            log.hear_one(reception, received, row)
+        for beacon, reception, row in beacons.received(received):
+            log.add(beacon, reception, received, row)
         if case.bounded:
             spans.append(received)
         at_s += _SPAN_S
@@ -289,15 +243,15 @@ class _TagLog:
         self._judged: list[tuple[int, float, float, float]] = []
         """Number of the beacon, squared error, its normalised square, variance."""
 
-    def hear_one(self, reception: Reception, received: TagReceptions, row: int) -> None:
+    def add(self, beacon: Beacon2, reception: Reception, received: TagReceptions, row: int) -> None:
         """Let the tag process one beacon."""
         at_s = float(received.emission_s[row]) if reception.host_s is None else reception.host_s
         if self._first_beacon_s is None:
             self._first_beacon_s = at_s
-        anchor, method = int(received.anchor[row]), self._receiver.method
+        anchor, method = beacon.anchor, self._receiver.method
         was_running = isinstance(method, Estimation) and not method.is_starting
         was_in = isinstance(method, Estimation) and was_running and method.estimator.has_anchor(anchor)
-        fix = self._receiver.hear(reception)
+        fix = self._receiver.hear_beacon(beacon, reception)
         method = self._receiver.method
         if isinstance(method, Estimation) and was_running:
             self._restarts += method.is_starting
