@@ -8,9 +8,9 @@ from msgspec import Struct
 
 from skyless.errors import ConfigurationError
 from skyless.kernels.arrays import Integers, Mask, Matrix, Vector
-from skyless.planning.links import anchor_positions
 from skyless.site.image import image_size
 from skyless.site.model import Site
+from skyless.site.near import anchor_positions
 
 Box = tuple[float, float, float, float]
 

@@ -15,7 +15,7 @@ from skyless.planning.tag_rates import TagRates, tag_rates
 from skyless.simulation.channel import ChannelModel
 from skyless.site.advice import anchors_in_reach, best_offered_hz, warnings_of
 from skyless.site.model import Site
-from skyless.site.near import pairs_within, positions_of
+from skyless.site.near import anchor_positions, pairs_within
 from skyless.site.slots import beacon_period_s
 
 FEWEST_ANCHORS: Final = 5
@@ -115,7 +115,7 @@ def nearest_sharing_m(site: Site) -> float | None:
     """Return the least distance between two placed anchors that share a slot, up to twice ``reuse_m``; else None."""
     slots = np.array([-1 if anchor.slot is None else anchor.slot for anchor in site.anchors])
     least_m = math.inf
-    for one, other, apart_m in pairs_within(positions_of(site), 2.0 * site.schedule.reuse_m):
+    for one, other, apart_m in pairs_within(anchor_positions(site), 2.0 * site.schedule.reuse_m):
         same = (slots[one] == slots[other]) & (slots[one] >= 0)
         least_m = min(least_m, float(apart_m[same].min(initial=math.inf)))
     return least_m if math.isfinite(least_m) else None

@@ -15,7 +15,7 @@ DISTANCE_ROUNDING_M: Final = 1e-6
 """Two points at exactly a limit must not count as nearer by the rounding of their coordinates."""
 
 
-def positions_of(site: Site) -> Matrix:
+def anchor_positions(site: Site) -> Matrix:
     """Return the positions of a site's placed anchors in the order of the file, shape (n, 3)."""
     return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]).reshape(-1, 3)
 
