@@ -247,22 +247,23 @@ class Receiver:
             return NoFixReason.NO_ALMANAC if self.local_almanac.pages is None else NoFixReason.NO_MASTER
         assert isinstance(self._method, Estimation)
         for waiting in self._waiting:
-            self._method.update(waiting)
+            if self._selection.is_confirmed(waiting.anchor, rx_ticks):
+                self._method.update(waiting)
         self._waiting = []
-        if not is_known and not self._may_join(self._method, observation):
+        if not self._may_join(self._method, observation):
             return NoFixReason.TOO_FEW_ANCHORS
         return self._method.update(observation)
 
     def _may_join(self, method: Estimation, observation: Observation) -> bool:
-        """Whether an anchor may join those in use: others have received it, and it is not weaker than 24 of them."""
+        """Whether an anchor is in use or may be: others have received it, and it is not weaker than 24 in use."""
         estimator, anchor = method.estimator, observation.anchor
-        if method.is_starting or estimator.has_anchor(anchor):
+        if estimator.has_anchor(anchor) and not method.is_starting:
             return True
         if not self._selection.is_confirmed(anchor, observation.rx_ticks_tag):
             self.counters["unconfirmed-anchor"] += 1
             return False
         in_use = estimator.anchors
-        if not is_full(in_use):
+        if method.is_starting or not is_full(in_use):
             return True
         position_m = estimator.state.x[: estimator.dim]
         ranges_m = {anchor: float(np.linalg.norm(observation.anchor_m[: estimator.dim] - position_m))}

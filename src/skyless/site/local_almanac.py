@@ -13,6 +13,7 @@ from skyless.air.beacon2 import Beacon2, StatedPosition
 from skyless.air.page_codec import encode_page
 from skyless.kernels.arrays import Array
 from skyless.site.almanac_pages import filter_pages_of, georeference_page_of
+from skyless.site.free_access import free_window_ticks
 from skyless.site.model import Site
 from skyless.site.slots import schedule_of
 from skyless.ticks import from_seconds
@@ -35,10 +36,14 @@ _MOST_TRIALS: Final = 256
 
 def site_pages_of(site: Site) -> tuple[Page, ...]:
     """Return the pages of a validated site of protocol 2, in the order of their types on the air."""
-    schedule, filters, earth = schedule_of(site), filter_pages_of(site), georeference_page_of(site)
+    filters, earth = filter_pages_of(site), georeference_page_of(site)
     others: list[Page] = [filters[0], *([] if earth is None else [earth]), filters[1]]
-    slots = schedule.slots if site.schedule.mode == "slots" else 0
-    return (*others, SitePage(len(others) + 1, schedule.slot_ticks, slots, site.tags.height_m))
+    if site.schedule.mode == "free":
+        superframe_ticks, slots = free_window_ticks(site.schedule.rate_hz), 0
+    else:
+        schedule = schedule_of(site)
+        superframe_ticks, slots = schedule.superframe_ticks, schedule.slots
+    return (*others, SitePage(len(others) + 1, superframe_ticks, slots, site.tags.height_m))
 
 
 def site_page_for(pages: tuple[Page, ...], sequence: int, anchor: int) -> Page:
