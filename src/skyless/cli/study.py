@@ -55,8 +55,8 @@ _OF_THE_ROOM: Final = (
     "in 10⁻⁴, with the interval where it truly lies with 99 % (tags as units); unwarned: those without an alert.",
 )
 _OF_A_LARGE_SITE: Final = (
-    "Simulated; every beacon that a tag receives counts. ± standard errors. NEES: per dimension. First fix: from a tag's",
-    "first beacon on, knowing nothing; 95 % of them are faster. Gap: the longest time between two fixes.",
+    "Simulated; every fix counts. ± standard errors. NEES: per dimension. First fix: from a tag's first beacon on,",
+    "knowing nothing; 95 % of them are faster. Gap: the longest time between two fixes.",
 )
 _LEGENDS: Final = {"integrity": _OF_LEVELS, "room": _OF_THE_ROOM, "large": _OF_A_LARGE_SITE}
 

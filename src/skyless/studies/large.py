@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.air.beacon import HEARD, PackedHeard
+from skyless.air.beacon import PackedHeard
 from skyless.air.beacon2 import Beacon2, StatedPosition
 from skyless.air.codec2 import encode_2
 from skyless.air.reception import Reception
@@ -61,6 +61,9 @@ _TAG_COST_S: Final = 0.02
 """About what a second of a tag takes."""
 
 _PATH_KEY: Final = 41
+
+_ENTRY: Final = np.dtype([("anchor", "<u2"), ("sequence", "u1"), ("low", "<u4"), ("high", "u1")])
+"""A relayed reception as frames carry it (``air/beacon.HEARD``)."""
 
 
 class LargeCase(Struct, frozen=True):
@@ -182,20 +185,15 @@ def beacons_of(site: Site, received: TagReceptions) -> Iterator[tuple[Reception,
     issue = site_issue(pages)
     std_m = site.accuracy.survey_std_m
     positions = _stated(site, std_m)
+    entries = np.zeros(received.relay_anchor.shape, _ENTRY)
+    entries["anchor"], entries["sequence"] = received.relay_anchor, received.relay_sequence
+    entries["low"], entries["high"] = received.relay_rx_ticks & 0xFFFFFFFF, received.relay_rx_ticks >> 32
     rows = zip(
         received.anchor.tolist(), received.sequence.tolist(), received.tx_ticks.tolist(), received.rx_ticks.tolist(),
         received.relays.tolist(), received.emission_s.tolist(), strict=True,
     )  # fmt: skip
     for row, (anchor, sequence, tx_ticks, rx_ticks, relays, emission_s) in enumerate(rows):
-        packed = b"".join(
-            HEARD.pack(other, number, stamp & 0xFFFFFFFF, stamp >> 32)
-            for other, number, stamp in zip(
-                received.relay_anchor[row, :relays].tolist(),
-                received.relay_sequence[row, :relays].tolist(),
-                received.relay_rx_ticks[row, :relays].tolist(),
-                strict=True,
-            )
-        )
+        packed = entries[row, :relays].tobytes()
         page = site_page_for(pages, sequence, anchor)
         beacon = Beacon2(
             site.id, anchor, sequence, tx_ticks, issue, None, positions[anchor], None, PackedHeard(packed), 0, page
@@ -248,7 +246,7 @@ def world_of_cells(run: LargeRun) -> CellWorld:
         schedule_in_cells(site),
         paths(run),
         impairments,
-        seed_of(plan.seed, _PATH_KEY, run.number, 2),
+        seed_of(plan.seed, _PATH_KEY, run.number, 2) >> 1,
         dead=(draw.random(len(site.anchors)) < case.dead_share).tolist(),
         survey_std_m=_ROOM.axis_std_m if case.in_room else 0.0,
     )
