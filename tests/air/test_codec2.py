@@ -195,9 +195,8 @@ def test_standard_deviations_are_rounded_up_and_saturate():
         ({"heard": (Heard(1, 0, 1 << 40),), "weak": 0}, r"heard\[0\]\.rx_ticks"),
         ({"heard": tuple(Heard(k, 0, 0) for k in range(6))}, "6 entries; 5 fit"),
         ({"weak": 1 << 4}, "weak is 16"),
-        ({"page": SitePage(0, 0, 0, None)}, r"SitePage\.pages"),
-        ({"page": SitePage(1, 0, 5, None)}, r"SitePage\.slot_ticks"),
-        ({"page": SitePage(1, 5, 0, None)}, r"SitePage\.slot_ticks"),
+        ({"page": SitePage(0, 1, 0, None)}, r"SitePage\.pages"),
+        ({"page": SitePage(1, 0, 5, None)}, r"SitePage\.superframe_ticks"),
     ],
 )
 def test_what_does_not_fit_is_named(change, message):
@@ -206,7 +205,9 @@ def test_what_does_not_fit_is_named(change, message):
 
 
 def test_a_site_page_has_its_17_bytes():
-    assert encode_page(SitePage(4, 0x01020304, 38, 1.2)).hex() == "06040403020126" + "01" + "b0040000" + "00" * 5
+    assert (
+        encode_page(SitePage(4, 0x0501020304, 38, 1.2)).hex() == "0604" + "0403020105" + "2601" + "b0040000" + "00" * 4
+    )
 
 
 def test_age_of_a_pulse_saturates():

@@ -64,8 +64,8 @@ class SitePage(Struct, frozen=True, gc=False, tag="site"):
 
     pages: int
     """Number of pages, this one included, so that a tag knows when it has them all."""
-    slot_ticks: int
-    """0 where anchors send at random instants."""
+    superframe_ticks: int
+    """Length of the superframe; where anchors send at random instants the mean time between two beacons of one."""
     slots: int
     """Slots in a superframe; 0 where anchors send at random instants."""
     tag_height_m: float | None

@@ -2,6 +2,7 @@
 
 import math
 import struct
+from functools import lru_cache
 from operator import index
 from typing import Final, SupportsIndex
 
@@ -159,6 +160,10 @@ def decode_2(frame: bytes) -> Beacon2 | Malformed:
         site, anchor, sequence, tx_low | tx_high << 32, issue, slot_time, position, site_time,
         PackedHeard(frame[heard_at:page_at]), weak, page,
     )  # fmt: skip
+
+
+decode_2_cached = lru_cache(maxsize=256)(decode_2)
+"""``decode_2`` that remembers the last 256 frames."""
 
 
 def _frame_fault(frame: bytes) -> Malformed | None:

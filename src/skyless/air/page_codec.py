@@ -21,7 +21,7 @@ _SCHEDULE: Final = struct.Struct("<BIBBHBBixx")
 _NOISE: Final = struct.Struct("<Bffff")
 _GEOREFERENCE: Final = struct.Struct("<BiiiI")
 _ACCURACY: Final = struct.Struct("<BHHHHHH4x")
-_SITE: Final = struct.Struct("<BBIBBi5x")
+_SITE: Final = struct.Struct("<BBIBBBi4x")
 
 _ANCHOR_TYPE: Final = 1
 _SCHEDULE_TYPE: Final = 2
@@ -156,14 +156,14 @@ def _encode_accuracy(page: AccuracyPage) -> bytes:
 
 
 def _encode_site(page: SitePage) -> bytes:
-    slots = _whole("SitePage.slots", page.slots, 0, 0xFF)
-    least, longest = min(slots, 1), min(0xFFFFFFFF, MAX_SUPERFRAME_TICKS // max(slots, 1)) if slots else 0
+    superframe_ticks = _whole("SitePage.superframe_ticks", page.superframe_ticks, 1, MAX_SUPERFRAME_TICKS)
     height_m = page.tag_height_m
     return _SITE.pack(
         _SITE_TYPE,
         _whole("SitePage.pages", page.pages, 1, 0xFF),
-        _whole("SitePage.slot_ticks", page.slot_ticks, least, longest),
-        slots,
+        superframe_ticks & 0xFFFFFFFF,
+        superframe_ticks >> 32,
+        _whole("SitePage.slots", page.slots, 0, 0xFF),
         0 if height_m is None else _HEIGHT_GIVEN,
         0 if height_m is None else _millimetres("SitePage.tag_height_m", height_m),
     )
@@ -215,14 +215,11 @@ def _decode_accuracy(data: bytes) -> AccuracyPage | None:
 
 
 def _decode_site(data: bytes) -> SitePage | None:
-    _, pages, slot_ticks, slots, flags, height_mm = _SITE.unpack(data)
-    possible = (
-        pages > 0
-        and (slots > 0) == (slot_ticks > 0)
-        and slot_ticks * slots <= MAX_SUPERFRAME_TICKS
-        and abs(height_mm) <= _MAX_COORDINATE_MM
-    )
-    return SitePage(pages, slot_ticks, slots, height_mm / 1000 if flags & _HEIGHT_GIVEN else None) if possible else None
+    _, pages, low, high, slots, flags, height_mm = _SITE.unpack(data)
+    superframe_ticks = low | high << 32
+    possible = pages > 0 and 0 < superframe_ticks <= MAX_SUPERFRAME_TICKS and abs(height_mm) <= _MAX_COORDINATE_MM
+    height_m = height_mm / 1000 if flags & _HEIGHT_GIVEN else None
+    return SitePage(pages, superframe_ticks, slots, height_m) if possible else None
 
 
 _DECODERS: Final = {
