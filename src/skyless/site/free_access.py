@@ -1,48 +1,53 @@
-"""Random instants: when an anchor of mode free sends (``docs/protocol.md``).
+"""When an anchor of a site without a schedule speaks: once in each window of its own counter, at a random instant.
 
-An anchor divides its own counter into windows of one beacon each, and sends at an instant in each that looks random
-and depends on nothing but its identifier and the window's number. So a simulator that knows the counter knows the
-instants, and two anchors that met once do not meet again in the next window.
+The instant is a function of the anchor's identifier and of the window's number alone, so that the anchor's machine and
+a simulation of thousands of anchors agree about it, and nobody has to be asked. Windows are counted from 0 of the
+unwrapped counter.
 """
 
 from typing import Final
 
-from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ
+from skyless.constants import TICK_RATE_HZ
 from skyless.kernels.compiled import jitted
-from skyless.ticks import from_seconds
 
-FREE_MARGIN_TICKS: Final = from_seconds(2.5e-3)
-"""Least time between two beacons of one anchor: the frame, and the time that a host needs for the next one."""
+FREE_REST_TICKS: Final = round(1.5e-3 * TICK_RATE_HZ)
+"""At the end of each window, without a frame's RMARKER. A driver asks for the next frame when one has ended (0.2 ms
+after its RMARKER) and needs it a lead time (1 ms) before its own RMARKER: with less rest windows would be left out."""
 
-_MIXER: Final = 0x45D9F3B
-_WORD: Final = 0xFFFFFFFF
-_UNIFORM_BITS: Final = 23
-"""So that a window of up to 2³⁹ ticks times the uniform number stays within 63 bits."""
+_LOW: Final = 0xFFFFFFFF
 
 
 def free_window_ticks(rate_hz: float) -> int:
-    """Length of a window in ticks of the sender's counter, given the beacons per second of each anchor.
+    """Length of the windows for that many frames per second.
 
-    A multiple of the radio's granularity, and at least twice the margin.
+    Raises:
+        ValueError: the rate is not above 0, or the windows would be shorter than twice the rest.
     """
-    steps = round(TICK_RATE_HZ / rate_hz / DELAYED_TX_GRANULARITY_TICKS)
-    return max(steps * DELAYED_TX_GRANULARITY_TICKS, 2 * FREE_MARGIN_TICKS)
+    if not 0.0 < rate_hz <= TICK_RATE_HZ / (2 * FREE_REST_TICKS):
+        most = TICK_RATE_HZ / (2 * FREE_REST_TICKS)
+        raise ValueError(f"rate_hz is {rate_hz:g}; it should be more than 0 and at most {most:.0f} frames per second")
+    return round(TICK_RATE_HZ / rate_hz)
 
 
 @jitted
-def _mixed(word: int) -> int:
-    """32 bits that depend on all 32 of the argument; every product fits 63 bits."""
-    word = ((word >> 16) ^ word) * _MIXER & _WORD
-    word = ((word >> 16) ^ word) * _MIXER & _WORD
-    return (word >> 16) ^ word
+def _mixed(value: int) -> int:
+    """32 bits that depend on all bits of 32 (Wellons' lowbias32); the same from Python's integers and from int64."""
+    value = ((value >> 16) ^ value) * 0x7FEB352D & _LOW
+    value = ((value >> 15) ^ value) * 0x846CA68B & _LOW
+    return (value >> 16) ^ value
 
 
 @jitted
 def free_instant_ticks(anchor_id: int, window_number: int, window_ticks: int) -> int:
-    """RMARKER of the beacon in a window of the anchor's own unwrapped counter.
+    """Instant in that window, own unwrapped ticks, uniform over the window less its rest; before the radio's grid."""
+    drawn = _mixed(_mixed(_mixed(anchor_id) ^ (window_number & _LOW)) ^ ((window_number >> 32) & _LOW))
+    return window_number * window_ticks + int((window_ticks - FREE_REST_TICKS) * (drawn / 4294967296.0))
 
-    Window k lasts from k · ``window_ticks`` to (k + 1) · ``window_ticks``; its last ``FREE_MARGIN_TICKS`` stay free.
-    """
-    word = _mixed((_mixed(window_number & _WORD) ^ (anchor_id * 0x9E3779B1)) & _WORD)
-    uniform = word >> (32 - _UNIFORM_BITS)
-    return window_number * window_ticks + ((window_ticks - FREE_MARGIN_TICKS) * uniform >> _UNIFORM_BITS)
+
+@jitted
+def first_free_window(anchor_id: int, earliest_ticks: int, window_ticks: int) -> int:
+    """Number of the first window whose instant is ``earliest_ticks`` (own unwrapped counter) or later."""
+    window = earliest_ticks // window_ticks
+    if free_instant_ticks(anchor_id, window, window_ticks) < earliest_ticks:
+        window += 1
+    return window
