@@ -1,4 +1,4 @@
-"""Claims on the slot time: whose counter leads it, as one anchor of protocol 2 sees it (``docs/protocol.md``, "Claims").
+"""Claims on the slot time of protocol 2: whose counter leads it, as one anchor sees it (``docs/protocol.md``, "Claims").
 
 Every beacon states the claim that its sender follows: term and root. Claims are in a total order, and the greatest one
 received is followed at once. Within a claim the root's superframe numbers, the pulses, show that it lives: they flood
@@ -120,7 +120,7 @@ class NewsWatch:
     """Learns in which gaps a living root's pulses bring news, and so how long to wait for them.
 
     Two models, of which the shorter wait counts. Where each superframe brings news with one chance, gaps are geometric.
-    After many lossy hops pulses have caught up with each other: gaps are longer but regular, as of a gamma distribution.
+    After many lossy hops pulses have caught up with each other: gaps are longer but regular (a gamma distribution).
     """
 
     def __init__(self) -> None:
@@ -167,7 +167,7 @@ class SlotClaims:
     """Which claim an anchor follows, how far it is from the root, and when it must lead or be silent."""
 
     def __init__(self, anchor_id: int, superframe_ticks: int, wait_superframes: int = 0) -> None:
-        """``wait_superframes``: how much longer than the others it listens before it leads (``first_wait_superframes``)."""
+        """``wait_superframes``: how much longer it listens before it leads (``first_wait_superframes``)."""
         self.role = SlotRole.LISTENING
         self.claim: SlotClaim | None = None
         self.hop = 0
@@ -267,6 +267,8 @@ class SlotClaims:
     def on_sent(self, tx_ticks: int) -> None:
         """Note a frame of its own."""
         self._sent_ticks = tx_ticks
+        if self._silent_until_ticks is not None and tx_ticks < self._silent_until_ticks:
+            self._begin_silence(tx_ticks)  # it was on its way when the phase changed
 
     def pulse_age(self, superframe: int) -> int:
         """Superframes since the newest pulse, as a beacon in ``superframe`` (32 bits or unwrapped) states it."""
@@ -359,7 +361,10 @@ class SlotClaims:
         """Be silent after the last frame in the old phase; where there was none, the change costs nothing."""
         if self._sent_ticks is not None:
             self._changes -= 1.0
-            self._silent_until_ticks = self._sent_ticks + round(SILENCE_SUPERFRAMES * self._superframe_ticks)
+            self._begin_silence(self._sent_ticks)
+
+    def _begin_silence(self, sent_ticks: int) -> None:
+        self._silent_until_ticks = sent_ticks + round(SILENCE_SUPERFRAMES * self._superframe_ticks)
 
 
 def _rank(name: int, one: _Neighbour, is_parent: bool) -> tuple[int, float, int]:

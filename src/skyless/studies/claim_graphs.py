@@ -11,10 +11,11 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skyless.air.beacon2 import SlotTime
-from skyless.kernels.arrays import Array
+from skyless.kernels.arrays import Array, Integers
 from skyless.slot_claims import (
     ClaimVerdict,
     Lead,
@@ -76,13 +77,13 @@ class ClaimGraph:
         """Take a node's power."""
         self.machines[node] = self.epochs[node] = self.sent[node] = None
 
-    def cut(self, side: Sequence[bool]) -> list[Array]:
+    def cut(self, side: Sequence[bool]) -> list[Integers]:
         """Remove all links between both sides; returns the links as they were, for ``join``."""
         before, of = self.links, np.asarray(side)
         self.links = [others[of[others] == of[node]] for node, others in enumerate(before)]
         return before
 
-    def join(self, links: list[Array]) -> None:
+    def join(self, links: list[Integers]) -> None:
         """Give links back."""
         self.links = links
 
@@ -128,8 +129,8 @@ class ClaimGraph:
         self._due = [(self._next_turn(node, start), node) for node in range(len(self.machines))]
         heapify(self._due)
         self._end_ticks = end
-        received = self._draw.random((len(self.machines), max((len(others) for others in self.links), default=0)))
-        received = received < self.reception
+        most = max((len(others) for others in self.links), default=0)
+        received = self._draw.random((len(self.machines), most)) < self.reception
         while self._due:
             ticks, node = heappop(self._due)
             machine = self.machines[node]
@@ -143,7 +144,7 @@ class ClaimGraph:
         turn = self._polls[node] if epoch is None else epoch + self.slots[node]
         return ticks + (turn - ticks) % SUPERFRAME_TICKS
 
-    def _act(self, node: int, machine: SlotClaims, ticks: int, received: Array) -> None:
+    def _act(self, node: int, machine: SlotClaims, ticks: int, received: NDArray[np.bool_]) -> None:
         lead = machine.advance(ticks)
         if lead is Lead.FIRST:
             self.epochs[node] = ticks - self.slots[node]
@@ -156,9 +157,7 @@ class ClaimGraph:
         following = machine.claim
         assert following is not None
         number = (ticks - epoch) // SUPERFRAME_TICKS & _NUMBERS
-        stated = SlotTime(
-            number, 0, following.root, following.term, machine.hop, machine.pulse_age(number), 0.0
-        )
+        stated = SlotTime(number, 0, following.root, following.term, machine.hop, machine.pulse_age(number), 0.0)
         machine.on_sent(ticks)
         self.sent[node] = Sent(ticks, epoch)
         others = self.links[node]
@@ -167,9 +166,7 @@ class ClaimGraph:
             if listener is not None:
                 self._receive(other, listener, node, stated, ticks, epoch)
 
-    def _receive(
-        self, other: int, listener: SlotClaims, node: int, stated: SlotTime, ticks: int, epoch: int
-    ) -> None:
+    def _receive(self, other: int, listener: SlotClaims, node: int, stated: SlotTime, ticks: int, epoch: int) -> None:
         own = self.epochs[other]
         off_phase = own is not None and abs(own - epoch) > GUARD_TICKS
         verdict = listener.on_beacon(node, stated, ticks, off_phase)
@@ -195,10 +192,8 @@ def grid_m(length_m: float, width_m: float, step_m: float) -> Array:
 
 def links_within(positions_m: Array, reach_m: float) -> list[list[int]]:
     """Neighbours of each position within a distance."""
-    tree = cKDTree(positions_m)
-    return [
-        [other for other in found if other != node] for node, found in enumerate(tree.query_ball_point(positions_m, reach_m))
-    ]
+    near = cKDTree(positions_m).query_ball_point(positions_m, reach_m)
+    return [[other for other in found if other != node] for node, found in enumerate(near)]
 
 
 def components(graph: ClaimGraph) -> list[list[int]]:
@@ -218,7 +213,7 @@ def components(graph: ClaimGraph) -> list[list[int]]:
     return found
 
 
-def hops_from(graph: ClaimGraph, root: int) -> list[int | None]:
+def hops_between(graph: ClaimGraph, root: int) -> list[int | None]:
     """Least number of links from a node to each that is on."""
     hops: list[int | None] = [None] * len(graph.links)
     hops[root], edge = 0, [root]

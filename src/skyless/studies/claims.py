@@ -172,9 +172,7 @@ def rows(plan: Plan, results: Sequence[ClaimResult]) -> list[Row]:
             passed = [result.superframes[index] for _, result in runs]
             most = None if None in passed else max(one for one in passed if one is not None)
             limit = _limit(site, event) if reception >= JUDGED_RECEPTION else None
-            found.append(
-                _row(plan, f"{case}, {event}", event, reception, runs, passed, most, limit)
-            )
+            found.append(_row(plan, f"{case}, {event}", event, reception, runs, passed, most, limit))
     return found
 
 
