@@ -19,7 +19,7 @@ from skyless.constants import TICK_BITS, TICK_S
 from skyless.errors import ConfigurationError
 from skyless.site.image import image_size
 from skyless.site.model import AnchorSite, Site, UnplacedAnchor
-from skyless.site.near import pairs_within, positions_of
+from skyless.site.near import DISTANCE_ROUNDING_M, pairs_within, positions_of
 from skyless.site.slots import Schedule, first_slots, schedule_of
 
 ANY_ADDRESS: Final = 65_533
@@ -269,7 +269,7 @@ def _check_shared_slots(site: Site, file: Path) -> None:
             right = f"a whole number from 0 to {slots - 1}; {_COLOURS}"
             raise ConfigurationError(file, _with_anchor(f"{row}.slot", site), anchor.slot, right)
     own = np.array([anchor.slot for anchor in site.anchors])
-    for one, other, apart_m in pairs_within(positions_of(site), site.schedule.reuse_m):
+    for one, other, apart_m in pairs_within(positions_of(site), site.schedule.reuse_m - 2 * DISTANCE_ROUNDING_M):
         same = np.flatnonzero(own[one] == own[other])
         if len(same):
             raise _too_near(site, file, int(one[same[0]]), int(other[same[0]]), float(apart_m[same[0]]))

@@ -82,7 +82,12 @@ def _separate_unplaced(path: Path, document: dict[str, Any]) -> _Rows | None:
     """
     schedule, entries = document.get("schedule"), document.get("anchors")
     mode = schedule.get("mode") if isinstance(schedule, dict) else None
-    if mode not in {"slots", "free"} or not isinstance(entries, list):
+    if mode not in {"slots", "free"}:
+        return None
+    if "anchors" not in document:
+        raise ConfigurationError(path, "anchors", None, expected("anchors"))
+    if not isinstance(entries, list):
+        document.setdefault("master", 0)
         return None
     if entries and isinstance(entries[0], dict) and "id" in entries[0]:
         document.setdefault("master", entries[0]["id"])

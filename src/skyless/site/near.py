@@ -11,6 +11,9 @@ from skyless.site.model import Site
 _DIRECTION: Final = np.array([0.8164, 0.5211, 0.2489])
 """Of a length just below one, and along no street of a grid, so that few points share a projection."""
 
+DISTANCE_ROUNDING_M: Final = 1e-6
+"""Two points at exactly a limit must not count as nearer by the rounding of their coordinates."""
+
 
 def positions_of(site: Site) -> Matrix:
     """Return the positions of a site's placed anchors in the order of the file, shape (n, 3)."""
