@@ -1,4 +1,4 @@
-"""Claims on the slot time of protocol 2: whose counter leads it, as one anchor sees it (``docs/protocol.md``, "Claims").
+"""Claims on the slot time of protocol 2: whose counter leads it, as one anchor sees it.
 
 Every beacon states the claim that its sender follows: term and root. Claims are in a total order, and the greatest one
 received is followed at once. Within a claim the root's superframe numbers, the pulses, show that it lives: they flood

@@ -7,6 +7,7 @@ from typing import Any, Final
 from msgspec.structs import replace
 
 from skyless.studies import (
+    claims,
     efficiency,
     integrity,
     loss,
@@ -64,6 +65,13 @@ STUDIES: Final = {
             _of_worlds("room", "the room", room.cases, Look("The room", ("rmse", "nees", "level", "exceeded"))),
             cells=room.cells,
             rows=room.rows,
+        ),
+        Study(
+            "claims",
+            "claims on the slot time",
+            claims.cells,
+            claims.rows,
+            partial(draw, Look("Superframes until one claim is left", ("superframes",))),
         ),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
     )

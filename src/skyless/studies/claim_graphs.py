@@ -11,11 +11,10 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skyless.air.beacon2 import SlotTime
-from skyless.kernels.arrays import Array, Integers
+from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.slot_claims import (
     ClaimVerdict,
     Lead,
@@ -144,7 +143,7 @@ class ClaimGraph:
         turn = self._polls[node] if epoch is None else epoch + self.slots[node]
         return ticks + (turn - ticks) % SUPERFRAME_TICKS
 
-    def _act(self, node: int, machine: SlotClaims, ticks: int, received: NDArray[np.bool_]) -> None:
+    def _act(self, node: int, machine: SlotClaims, ticks: int, received: Mask) -> None:
         lead = machine.advance(ticks)
         if lead is Lead.FIRST:
             self.epochs[node] = ticks - self.slots[node]

@@ -4,14 +4,15 @@ Two sites, hall and corridor, after a cold start, the death of the root, a cut i
 three islands, and the death of a fifth of all anchors; and how often a claim changes afterwards.
 """
 
+import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import numpy as np
 from msgspec import Struct
 
 from skyless.kernels.arrays import Array
-from skyless.slot_claims import MOST_TERM, SlotClaim
+from skyless.slot_claims import SlotClaim
 from skyless.studies.claim_graphs import (
     SUPERFRAME_TICKS,
     ClaimGraph,
@@ -20,10 +21,7 @@ from skyless.studies.claim_graphs import (
     hops_between,
     links_within,
 )
-from skyless.studies.plan import Cell, Plan, Row, seed_of
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of
 
 
 class ClaimSite(Struct, frozen=True):
@@ -84,12 +82,11 @@ def cells(plan: Plan) -> list[Cell]:
 
 
 def _runs(plan: Plan) -> list[tuple[str, ClaimRun]]:
-    worlds = plan.worlds or (2 if plan.quick else 5)
     found = []
     for site in SITES:
         for reception in (JUDGED_RECEPTION,) if plan.quick else RECEPTIONS:
-            for world in range(worlds):
-                long = reception == JUDGED_RECEPTION and world == 0 and not plan.quick
+            for world in range(max(plan.worlds // 2, 1) if plan.quick else plan.worlds):
+                long = reception == JUDGED_RECEPTION and world == 0 and not plan.quick  # an hour of a hall's air
                 run = ClaimRun(site, reception, seed_of(plan.seed, world), _LONG if long else _AFTERWARDS)
                 found.append((f"{site.name} {100 * reception:.0f} %", run))
     return found
@@ -148,7 +145,7 @@ def _islands(run: ClaimRun, positions_m: Array, draw: np.random.Generator) -> Cl
         members = np.flatnonzero(third == island).tolist()
         root = int(draw.choice(members))
         for node in members:
-            graph.switch_on(node, SlotClaim(min(term, MOST_TERM), root) if node == root else None)
+            graph.switch_on(node, SlotClaim(term, root) if node == root else None)
     graph.run_until_one(_PATIENCE, [np.flatnonzero(third == island).tolist() for island in range(3)])
     graph.run(_LEARNING)
     graph.join(links)
@@ -162,33 +159,53 @@ def _root(graph: ClaimGraph) -> int:
 
 
 def rows(plan: Plan, results: Sequence[ClaimResult]) -> list[Row]:
-    """A row for each site, reception and event; the limit holds where four of five frames are received."""
+    """A row for each site, reception and event; the limit holds where four of five frames are received or more."""
     found = []
     named = list(zip(_runs(plan), results, strict=True))
     for case in dict.fromkeys(case for (case, _), _ in named):
-        runs = [(run, result) for (name, run), result in named if name == case]
-        site, reception = runs[0][0].site, runs[0][0].reception
-        for index, event in enumerate(EVENTS):
-            passed = [result.superframes[index] for _, result in runs]
-            most = None if None in passed else max(one for one in passed if one is not None)
-            limit = _limit(site, event) if reception >= JUDGED_RECEPTION else None
-            found.append(_row(plan, f"{case}, {event}", event, reception, runs, passed, most, limit))
+        runs = [run for (name, run), _ in named if name == case]
+        of_case = [result for (name, _), result in named if name == case]
+        found += [_row(plan, case, runs[0], index, of_case) for index in range(len(EVENTS))]
     return found
 
 
-def _limit(site: ClaimSite, event: str) -> int:
-    """A half without a root has to wait for the hops that it was away from it."""
-    return (2 if event == "cut in half" else 1) * site.most
+def _row(plan: Plan, case: str, run: ClaimRun, index: int, results: Sequence[ClaimResult]) -> Row:
+    """Median and longest time of an event; after the last event also how often claims changed."""
+    passed = [math.inf if (one := result.superframes[index]) is None else one for result in results]
+    most = max(passed)
+    changes = sum(result.changes_afterwards for result in results) if index + 1 == len(EVENTS) else None
+    limit, limits, missed = _limit(run.site, EVENTS[index]), [], []
+    if run.reception >= JUDGED_RECEPTION:
+        limits.append(Limit("superframes_most", most=limit))
+        missed += ["superframes_most"] if most > limit else []
+        if changes is not None:
+            limits.append(Limit("changes", most=0))
+            missed += ["changes"] if changes else []
+    return Row(
+        study="claims",
+        method=plan.method,
+        case=f"{case}, {EVENTS[index]}",
+        series=f"{run.site.name}, {results[0].hops} hops",
+        x=None,
+        mesh=None,
+        noise_ps=plan.noise_ps,
+        runs=len(results),
+        fixes=0,
+        rmse_m=None,
+        superframes=_finite(float(np.median(passed))),
+        superframes_most=_finite(most),
+        changes=changes,
+        limits=tuple(limits),
+        missed=tuple(missed),
+        passed=not missed if limits else None,
+    )
 
 
-def _row(
-    plan: Plan,
-    case: str,
-    event: str,
-    reception: float,
-    runs: Sequence[tuple[ClaimRun, ClaimResult]],
-    passed: Sequence[int | None],
-    most: int | None,
-    limit: int | None,
-) -> Row:
-    raise NotImplementedError
+def _finite(superframes: float) -> float | None:
+    """None for runs that were given up."""
+    return superframes if math.isfinite(superframes) else None
+
+
+def _limit(site: ClaimSite, event: str) -> float:
+    """A half that has lost its root must wait for up to all the hops that it was away from it, twice a hop."""
+    return (2.5 if event == "cut in half" else 1.0) * site.most
