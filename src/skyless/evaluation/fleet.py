@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.air.reception import Reception
-from skyless.anchor import Anchor
+from skyless.anchors.factory import AnyAnchor, new_anchor
 from skyless.evaluation.statistics import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD
@@ -93,7 +93,7 @@ class TagRecord(Struct):
 def world_of(site: Site, trajectories: Sequence[Trajectory], impairments: Impairments, seed: int) -> World:
     """A world of the site's anchors, as they run on their hosts, and of tags on the trajectories."""
     tags = [TagSpec(trajectory) for trajectory in trajectories]
-    return World(site, lambda anchor: Anchor(site, anchor), tags, impairments, seed)
+    return World(site, lambda anchor: new_anchor(site, anchor), tags, impairments, seed)
 
 
 class TagFleet:
@@ -175,12 +175,12 @@ class Fleet(TagFleet):
         settings: FleetSettings,
     ) -> None:
         super().__init__(site, len(trajectories), settings)
-        self.anchors: dict[int, Anchor] = {}
+        self.anchors: dict[int, AnyAnchor] = {}
         specs = [TagSpec(trajectory) for trajectory in trajectories]
         self.world = World(site, self._new_anchor, specs, impairments, seed)
 
-    def _new_anchor(self, anchor: int) -> Anchor:
-        self.anchors[anchor] = Anchor(self.site, anchor)
+    def _new_anchor(self, anchor: int) -> AnyAnchor:
+        self.anchors[anchor] = new_anchor(self.site, anchor)
         return self.anchors[anchor]
 
     @property

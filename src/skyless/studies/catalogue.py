@@ -7,6 +7,7 @@ from typing import Any, Final
 from msgspec.structs import replace
 
 from skyless.studies import (
+    claims,
     efficiency,
     integrity,
     large,
@@ -72,6 +73,13 @@ STUDIES: Final = {
             large.cells,
             large.rows,
             partial(draw, Look("1,024 anchors, no master", ("rmse", "nees"))),
+        ),
+        Study(
+            "claims",
+            "claims on the slot time",
+            claims.cells,
+            claims.rows,
+            partial(draw, Look("Superframes until one claim is left", ("superframes",))),
         ),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
     )

@@ -39,7 +39,11 @@ class Plan(Struct, frozen=True):
 
 _QUICK_PLAN: Final = Plan(worlds=6, seconds=10.0, tags=2, episodes=200)
 
-_USUAL: Final = {"room": Plan(worlds=20, seconds=15.0, tags=5), "large": Plan(worlds=24, seconds=30.0)}
+_USUAL: Final = {
+    "room": Plan(worlds=20, seconds=15.0, tags=5),
+    "large": Plan(worlds=24, seconds=30.0),
+    "claims": Plan(worlds=3),
+}
 """Of studies that do not take the usual amounts; those of ``room`` are the room's own, its other cases have fewer."""
 
 
@@ -184,6 +188,12 @@ class Row(Struct, frozen=True):
     """How often a tag had to begin again (``large``)."""
     smallest_m: float | None = None
     """Horizontal error that the share ``risk`` of fixes exceeds, with or without a level."""
+    superframes: float | None = None
+    """Median over the runs until one claim was left (``claims``); None where too many were given up."""
+    superframes_most: float | None = None
+    """Of the slowest run."""
+    changes: int | None = None
+    """Anchors that changed their claim afterwards, in all runs."""
 
 
 def with_limits(row: Row, limits: Sequence[Limit]) -> Row:

@@ -242,6 +242,15 @@ def variance_factor(rx_power_dbm: float | None, first_path_power_dbm: float | No
     return float(MAX_VARIANCE_FACTOR ** (part * part * (3.0 - 2.0 * part)))
 
 
+WEAK_FACTOR: Final = math.sqrt(MAX_VARIANCE_FACTOR)
+"""From this factor on an anchor says that the first path of a reception that it relays was weak: 9 dB."""
+
+
+def is_weak_first_path(rx_power_dbm: float | None, first_path_power_dbm: float | None) -> bool:
+    """Whether a reception may be late, as its first path is weak; False where a power is missing or impossible."""
+    return variance_factor(rx_power_dbm, first_path_power_dbm) >= WEAK_FACTOR
+
+
 # The time of fixes
 
 
