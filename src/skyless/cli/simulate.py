@@ -28,7 +28,7 @@ from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
-    from skyless.evaluation.fleet import Fleet, FleetReport, JudgedFix
+    from skyless.evaluation.fleet import FleetReport, JudgedFix, TagFleet
     from skyless.evaluation.scenarios import Request
     from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Outage
     from skyless.site.model import Site
@@ -300,10 +300,10 @@ def _whole(option: str, text: str, anchor: float) -> int:
 def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.evaluation.fleet import report
-    from skyless.evaluation.scenarios import fleet_of
+    from skyless.evaluation.scenarios import fleet_of_any_size
 
     try:
-        fleet = fleet_of(request)
+        fleet = fleet_of_any_size(request)
     except ValueError as error:
         raise SkylessError(str(error)) from None
     with loading_kernels():
@@ -317,7 +317,7 @@ def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
     return report(fleet, request.method, started_s)
 
 
-def _advance(fleet: "Fleet", request: "Request", until_s: float, file: TextIO | None) -> None:
+def _advance(fleet: "TagFleet", request: "Request", until_s: float, file: TextIO | None) -> None:
     """Run the world in steps, so that the bar moves and the goal is noticed."""
     writer = None if file is None else csv.writer(file)
     if writer is not None:
@@ -326,14 +326,14 @@ def _advance(fleet: "Fleet", request: "Request", until_s: float, file: TextIO | 
     with progress_bar("simulating", fixes if fixes is not None else until_s) as bar:
         now_s = 0.0
         while now_s < until_s and not _enough(fleet, request, now_s):
-            now_s = min(now_s + 0.25, until_s)
+            now_s = min(now_s + fleet.step_s, until_s)
             for judged in fleet.run(now_s):
                 if writer is not None:
                     writer.writerow(_row(judged))
             bar.reach(fleet.errors.count / len(fleet.records) if fixes is not None else now_s)
 
 
-def _enough(fleet: "Fleet", request: "Request", now_s: float) -> bool:
+def _enough(fleet: "TagFleet", request: "Request", now_s: float) -> bool:
     """Whether all tags have their fixes, or those that have not wait too long, with nothing planned to come back."""
     fixes = request.most_fixes
     if fixes is None:

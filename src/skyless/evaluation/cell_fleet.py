@@ -27,8 +27,6 @@ from skyless.site.slots import schedule_of
 MOST_MACHINES: Final = 200
 """Sites with more anchors are simulated on demand."""
 
-_SPAN_S: Final = 0.5
-
 _ENTRY: Final = np.dtype([("anchor", "<u2"), ("sequence", "u1"), ("low", "<u4"), ("high", "u1")])
 """A relayed reception as frames carry it (``air/beacon.HEARD``)."""
 
@@ -84,6 +82,8 @@ class SiteBeacons:
 class CellFleet(TagFleet):
     """Tags that walk through a large site; each frame that one of them receives becomes fixes."""
 
+    step_s = 0.5
+
     def __init__(
         self,
         site: Site,
@@ -119,7 +119,7 @@ class CellFleet(TagFleet):
     def run(self, until_s: float) -> Iterator[JudgedFix]:
         """Let true time pass; every fix of every tag, tag by tag within each half second."""
         while self._now_s < until_s:
-            end_s = min(self._now_s + _SPAN_S, until_s)
+            end_s = min(self._now_s + self.step_s, until_s)
             for tag in range(len(self.receivers)):
                 received = self.cells.receptions(tag, self._now_s, end_s)
                 self._received += len(received)

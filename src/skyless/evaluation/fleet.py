@@ -99,6 +99,9 @@ def world_of(site: Site, trajectories: Sequence[Trajectory], impairments: Impair
 class TagFleet:
     """Tags that compute, and their errors; how they receive is the matter of ``Fleet`` and ``CellFleet``."""
 
+    step_s = 0.25
+    """True time in which it is best to run."""
+
     def __init__(self, site: Site, tags: int, settings: FleetSettings) -> None:
         self._settings = settings
         self.site = site

@@ -9,7 +9,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
-from skyless.evaluation.fleet import Fleet, FleetSettings
+from skyless.evaluation.cell_fleet import MOST_MACHINES, CellFleet
+from skyless.evaluation.fleet import Fleet, FleetSettings, TagFleet
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD
 from skyless.positioning.integrity import IntegrityRequirement
@@ -118,10 +119,49 @@ def fleet_of(request: Request) -> Fleet:
     if request.noise_ps is not None:
         noise = replace(site.noise, tx_stamp_ps=request.noise_ps, rx_stamp_ps=request.noise_ps)
         site = replace(site, noise=noise)
-    settings = FleetSettings(
+    return Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, _settings(request))
+
+
+def fleet_of_any_size(request: Request) -> TagFleet:
+    """As ``fleet_of``, but for anchors of protocol 2 that are too many to run their machines: simulated on demand.
+
+    Raises:
+        ValueError: as ``fleet_of``, or something is to go wrong that is not modelled at such a site.
+    """
+    site, room = request.site, request.room
+    if site.schedule.needs_master or len(site.anchors) <= MOST_MACHINES:
+        return fleet_of(request)
+    faults = impairments_of(request, site)
+    unfit = [
+        name
+        for name, given in (
+            ("--outage", request.outages),
+            ("--bias", request.biases),
+            ("--delay-error", request.delay_errors),
+            ("--silence", request.silences),
+            ("--nlos", request.nlos),
+            ("--power-bias", request.power_bias),
+            ("--temperature", request.temperature),
+            ("walls of the site file", site.walls),
+        )
+        if given
+    ]
+    if unfit:
+        raise ValueError(f"{unfit[0]}: not modelled at a site of more than {MOST_MACHINES} anchors")
+    return CellFleet(
+        site,
+        trajectories_of(request),
+        replace(faults, anchor_displacements=()),
+        request.seed,
+        _settings(request),
+        survey_std_m=0.0 if room is None else room.axis_std_m,
+    )
+
+
+def _settings(request: Request) -> FleetSettings:
+    return FleetSettings(
         request.method, request.qa, request.warmup_s, request.most_fixes, request.integrity, request.silences
     )
-    return Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, settings)
 
 
 def impairments_of(request: Request, site: Site) -> Impairments:

@@ -1,0 +1,64 @@
+import pytest
+
+from skyless.air.beacon import HEARD
+from skyless.positioning.methods.selection import (
+    BETTER_DB,
+    MOST_ANCHORS,
+    MOST_KEPT,
+    RELAYED_TICKS,
+    AnchorSelection,
+    is_full,
+)
+
+
+def relays(*anchors):
+    return b"".join(HEARD.pack(anchor, 0, 0, 0) for anchor in anchors)
+
+
+def test_a_relayed_reception_confirms_for_a_second():
+    selection = AnchorSelection()
+    selection.add_relays(relays(7, 8), 1000)
+    assert selection.is_confirmed(7, 1000 + RELAYED_TICKS - 1)
+    assert not selection.is_confirmed(7, 1000 + RELAYED_TICKS)
+    assert not selection.is_confirmed(9, 1000)
+    selection.forget_times()
+    assert not selection.is_confirmed(7, 1001)
+
+
+def test_the_weakest_leaves_for_one_that_is_stronger_by_3_db():
+    selection = AnchorSelection()
+    for anchor, power_dbm in ((1, -80.0), (2, -75.0), (3, -77.1), (4, -76.9)):
+        selection.add_power(anchor, power_dbm)
+    ranges_m = dict.fromkeys((1, 2), 10.0)
+    assert selection.replaced_by(3, {**ranges_m, 3: 10.0}) is None
+    assert selection.replaced_by(4, {**ranges_m, 4: 10.0}) == 1
+    assert BETTER_DB == 3.0
+
+
+def test_where_no_power_is_reported_the_farthest_leaves_for_a_nearer_one():
+    selection = AnchorSelection()
+    assert selection.replaced_by(3, {1: 10.0, 2: 30.0, 3: 20.0}) == 2
+    assert selection.replaced_by(3, {1: 10.0, 2: 30.0, 3: 25.0}) is None
+
+
+def test_powers_are_averaged_and_impossible_ones_passed_over():
+    selection = AnchorSelection()
+    selection.add_power(1, -80.0)
+    selection.add_power(1, float("nan"))
+    selection.add_power(1, -70.0)
+    assert selection.state().power_dbm[1] == pytest.approx(-79.0)
+
+
+def test_memory_is_bounded():
+    selection = AnchorSelection()
+    for anchor in range(2000):
+        selection.add_relays(relays(anchor), anchor)
+        selection.add_power(anchor, -80.0)
+    state = selection.state()
+    assert len(state.relayed_ticks) == len(state.power_dbm) == MOST_KEPT
+    assert min(state.relayed_ticks) == 2000 - MOST_KEPT
+
+
+def test_full_with_24():
+    assert not is_full(range(MOST_ANCHORS - 1))
+    assert is_full(range(MOST_ANCHORS))
