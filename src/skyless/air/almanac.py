@@ -59,4 +59,17 @@ class GeoreferencePage(Struct, frozen=True, gc=False, tag="georeference"):
     """Azimuth of the site's y axis, clockwise from true north."""
 
 
-Page = AnchorPage | SchedulePage | NoisePage | AccuracyPage | GeoreferencePage
+class SitePage(Struct, frozen=True, gc=False, tag="site"):
+    """What is common to a site of protocol 2 besides noise, accuracy and georeference."""
+
+    pages: int
+    """Number of pages, this one included, so that a tag knows when it has them all."""
+    superframe_ticks: int
+    """Length of the superframe; where anchors send at random instants the mean time between two beacons of one."""
+    slots: int
+    """Slots in a superframe; 0 where anchors send at random instants."""
+    tag_height_m: float | None
+    """Height at which every tag of the site moves (2-D positioning); None where height is to be estimated."""
+
+
+Page = AnchorPage | SchedulePage | NoisePage | AccuracyPage | GeoreferencePage | SitePage

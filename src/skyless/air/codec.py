@@ -22,13 +22,13 @@ AUTHENTICATION_BYTES: Final = 16
 STD_STEPS_PER_TICK: Final = 64
 SATURATED_STD: Final = 0xFFFF
 
-_FRAME_CONTROL: Final = 0x8841
+FRAME_CONTROL: Final = 0x8841
 """Data frame, PAN identifier compressed, 16-bit addresses."""
-_BROADCAST: Final = 0xFFFF
-_MAGIC: Final = 0xB053
+BROADCAST: Final = 0xFFFF
+MAGIC: Final = 0xB053
 """The bytes 53 B0; the low half of the second is the version."""
 _MAGIC_MASK: Final = 0xF0FF
-_VERSION_1: Final = _MAGIC | 0x0100
+_VERSION_1: Final = MAGIC | 0x0100
 
 _HAS_MASTER_HEARD: Final = 0x01
 _HAS_MASTER_TIME: Final = 0x02
@@ -41,7 +41,7 @@ _FLAGS_AT: Final = 11
 _START: Final = struct.Struct("<HBHHHH")
 _STAMP: Final = struct.Struct("<BIB")
 _TIME: Final = struct.Struct("<IHH")
-_FCS_BYTES: Final = 2
+FCS_BYTES: Final = 2
 _SHORTEST_MAC_FRAME_BYTES: Final = 5
 
 
@@ -54,7 +54,7 @@ def _bare_bytes(flags: int) -> int:
         + 1
         + (PAGE_BYTES if flags & _HAS_PAGE else 0)
         + (AUTHENTICATION_BYTES if flags & _HAS_AUTHENTICATION else 0)
-        + _FCS_BYTES
+        + FCS_BYTES
     )
 
 
@@ -109,14 +109,19 @@ decode_cached = lru_cache(maxsize=256)(decode)
 """``decode`` that remembers the last 256 frames: for a program that runs many tags which receive the same bytes."""
 
 
-def _foreign(frame: bytes) -> Malformed:
-    """Why an intact frame is no beacon of version 1, where it is none."""
-    if len(frame) < _START.size + _FCS_BYTES:
+def not_a_beacon(frame: bytes, version: int) -> Malformed | None:
+    """Why an intact frame is no beacon of a version (its magic number), None if it is one."""
+    if len(frame) < _START.size + FCS_BYTES:
         return Malformed.NOT_A_BEACON
     control, _, _, destination, _, magic = _START.unpack_from(frame)
-    if control != _FRAME_CONTROL or destination != _BROADCAST or magic & _MAGIC_MASK != _MAGIC:
+    if control != FRAME_CONTROL or destination != BROADCAST or magic & _MAGIC_MASK != MAGIC:
         return Malformed.NOT_A_BEACON
-    return Malformed.UNKNOWN_VERSION if magic != _VERSION_1 else Malformed.TOO_SHORT
+    return Malformed.UNKNOWN_VERSION if magic != version else None
+
+
+def _foreign(frame: bytes) -> Malformed:
+    """Why an intact frame is no beacon of version 1, where it is none or ends too early."""
+    return not_a_beacon(frame, _VERSION_1) or Malformed.TOO_SHORT
 
 
 def _decode_version_1(frame: bytes) -> Beacon | Malformed:
@@ -131,7 +136,7 @@ def _decode_version_1(frame: bytes) -> Beacon | Malformed:
         control, sequence, site, destination, anchor, magic, _, superframe, slot, tx_low, tx_high, issue, master,
         term,
     ) = _FIXED.unpack_from(frame)  # fmt: skip
-    if control != _FRAME_CONTROL or destination != _BROADCAST or magic != _VERSION_1:
+    if control != FRAME_CONTROL or destination != BROADCAST or magic != _VERSION_1:
         return _foreign(frame)
     relays_master, is_master = flags & _HAS_MASTER_HEARD, anchor == master
     named = {anchor, master, *_HEARD_ANCHORS[count].unpack_from(frame, count_at + 1)}
@@ -188,7 +193,7 @@ def _body(beacon: Beacon) -> bytes:
     flags = _flags(beacon)
     parts = [
         _FIXED.pack(
-            _FRAME_CONTROL, beacon.sequence, beacon.site, _BROADCAST, beacon.anchor, _VERSION_1, flags,
+            FRAME_CONTROL, beacon.sequence, beacon.site, BROADCAST, beacon.anchor, _VERSION_1, flags,
             beacon.superframe, beacon.slot, *_split(beacon.tx_ticks), beacon.almanac_issue, beacon.master,
             beacon.term,
         )

@@ -4,7 +4,7 @@ import struct
 from functools import lru_cache
 from typing import Final, Literal
 
-from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage
+from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage, SitePage
 from skyless.air.beacon import Malformed
 
 PAGE_BYTES: Final = 17
@@ -21,12 +21,14 @@ _SCHEDULE: Final = struct.Struct("<BIBBHBBixx")
 _NOISE: Final = struct.Struct("<Bffff")
 _GEOREFERENCE: Final = struct.Struct("<BiiiI")
 _ACCURACY: Final = struct.Struct("<BHHHHHH4x")
+_SITE: Final = struct.Struct("<BBIBBBi4x")
 
 _ANCHOR_TYPE: Final = 1
 _SCHEDULE_TYPE: Final = 2
 _NOISE_TYPE: Final = 3
 _GEOREFERENCE_TYPE: Final = 4
 _ACCURACY_TYPE: Final = 5
+_SITE_TYPE: Final = 6
 
 _HEIGHT_GIVEN: Final = 0x01
 _MAX_COORDINATE_MM: Final = round(MAX_COORDINATE_M * 1000)
@@ -59,6 +61,8 @@ def encode_page(page: Page) -> bytes:
             return _encode_georeference(page)
         case AccuracyPage():
             return _encode_accuracy(page)
+        case SitePage():
+            return _encode_site(page)
 
 
 @lru_cache(maxsize=1024)
@@ -151,6 +155,20 @@ def _encode_accuracy(page: AccuracyPage) -> bytes:
     )
 
 
+def _encode_site(page: SitePage) -> bytes:
+    superframe_ticks = _whole("SitePage.superframe_ticks", page.superframe_ticks, 1, MAX_SUPERFRAME_TICKS)
+    height_m = page.tag_height_m
+    return _SITE.pack(
+        _SITE_TYPE,
+        _whole("SitePage.pages", page.pages, 1, 0xFF),
+        superframe_ticks & 0xFFFFFFFF,
+        superframe_ticks >> 32,
+        _whole("SitePage.slots", page.slots, 0, 0xFF),
+        0 if height_m is None else _HEIGHT_GIVEN,
+        0 if height_m is None else _millimetres("SitePage.tag_height_m", height_m),
+    )
+
+
 def _decode_anchor(data: bytes) -> AnchorPage | None:
     _, anchor, x_mm, y_mm, z_mm, slot = _ANCHOR.unpack(data)
     if max(abs(x_mm), abs(y_mm), abs(z_mm)) > _MAX_COORDINATE_MM:
@@ -196,10 +214,19 @@ def _decode_accuracy(data: bytes) -> AccuracyPage | None:
     return AccuracyPage(survey_m, range_m, slope_m, place_m, distance_m, time_s)
 
 
+def _decode_site(data: bytes) -> SitePage | None:
+    _, pages, low, high, slots, flags, height_mm = _SITE.unpack(data)
+    superframe_ticks = low | high << 32
+    possible = pages > 0 and 0 < superframe_ticks <= MAX_SUPERFRAME_TICKS and abs(height_mm) <= _MAX_COORDINATE_MM
+    height_m = height_mm / 1000 if flags & _HEIGHT_GIVEN else None
+    return SitePage(pages, superframe_ticks, slots, height_m) if possible else None
+
+
 _DECODERS: Final = {
     _ANCHOR_TYPE: _decode_anchor,
     _SCHEDULE_TYPE: _decode_schedule,
     _NOISE_TYPE: _decode_noise,
     _GEOREFERENCE_TYPE: _decode_georeference,
     _ACCURACY_TYPE: _decode_accuracy,
+    _SITE_TYPE: _decode_site,
 }

@@ -17,8 +17,6 @@ from skyless.kernels.two_state import TwoState, predict, predicted_value_varianc
 MAX_RELATIVE_RATE: Final = 40e-6
 """Two crystals of ±20 ppm each, the widest that IEEE 802.15.4 allows."""
 
-_MAX_RATE_VARIANCE: Final = (MAX_RELATIVE_RATE * SPEED_OF_LIGHT_MPS) * (MAX_RELATIVE_RATE * SPEED_OF_LIGHT_MPS)
-
 
 class ClockNoise(Struct, frozen=True, gc=False):
     """Process noise of the difference of two clocks, in metres of light."""
@@ -96,11 +94,22 @@ class ClockFilter:
         self._epoch_master = tx_ticks_master
         return nis
 
-    def restart(self, tx_ticks_master: int, rx_ticks_own: int, range_m: float) -> None:
-        """Forget all and begin with this beacon: offset known to the stamps' noise, rate to the crystals' tolerance."""
+    def restart(
+        self,
+        tx_ticks_master: int,
+        rx_ticks_own: int,
+        range_m: float,
+        rate: float = 0.0,
+        rate_std: float = MAX_RELATIVE_RATE,
+    ) -> None:
+        """Forget all and begin with this beacon: offset known to the stamps' noise, rate to the crystals' tolerance.
+
+        A rate that is known better is given with its standard deviation, both fractional.
+        """
         self._whole_offset, self._epoch_master = rx_ticks_own - tx_ticks_master, tx_ticks_master
-        self._offset_m, self._rate_mps = -range_m, 0.0
-        self.covariance = (self._variance_m2, 0.0, _MAX_RATE_VARIANCE)
+        self._offset_m, self._rate_mps = -range_m, rate * SPEED_OF_LIGHT_MPS
+        rate_std_mps = rate_std * SPEED_OF_LIGHT_MPS
+        self.covariance = (self._variance_m2, 0.0, rate_std_mps * rate_std_mps)
         self.updates, self.rejected = 1, 0
 
     def inflate_covariance(self, factor: float) -> None:

@@ -7,8 +7,10 @@ from typing import Any, Final
 from msgspec.structs import replace
 
 from skyless.studies import (
+    claims,
     efficiency,
     integrity,
+    large,
     loss,
     motion,
     nlos,
@@ -64,6 +66,20 @@ STUDIES: Final = {
             _of_worlds("room", "the room", room.cases, Look("The room", ("rmse", "nees", "level", "exceeded"))),
             cells=room.cells,
             rows=room.rows,
+        ),
+        Study(
+            "large",
+            "a site of 1,024 anchors without a master",
+            large.cells,
+            large.rows,
+            partial(draw, Look("1,024 anchors, no master", ("rmse", "nees"))),
+        ),
+        Study(
+            "claims",
+            "claims on the slot time",
+            claims.cells,
+            claims.rows,
+            partial(draw, Look("Superframes until one claim is left", ("superframes",))),
         ),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
     )
