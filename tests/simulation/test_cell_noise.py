@@ -140,7 +140,7 @@ def test_plain_python_computes_the_same_world():
     for disabled in ("0", "1"):
         environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
         command = [sys.executable, "-W", "ignore::RuntimeWarning", "-c", PLAIN]
-        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)  # noqa: S603
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         printed.append(run.stdout)
     assert printed[0] == printed[1]
     assert not printed[0].startswith("0 ")
