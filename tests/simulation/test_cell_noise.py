@@ -1,5 +1,9 @@
 """Keyed random numbers and the clocks made of them: their statistics against closed forms."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -115,3 +119,28 @@ def test_a_shifted_counter_stays_shifted():
 def test_temperatures_are_refused():
     with pytest.raises(ValueError, match="temperature should be None"):
         clocks_of(OscillatorModel(temperature=Temperature()), 1)
+
+
+PLAIN = """
+import numpy as np
+from skyless.simulation.cells.timetable import FreeSchedule
+from skyless.simulation.cells.world import CellWorld, anchors_at
+from skyless.simulation.impairments import Impairments
+from skyless.simulation.trajectory import Static
+positions_m = np.array([(15.0 * x, 15.0 * y, 3.0) for y in range(3) for x in range(3)])
+world = CellWorld(anchors_at(positions_m), FreeSchedule(), [Static(12.0, 9.0, 1.0)], Impairments(), 5)
+received = world.receptions(0, 0.1, 0.15)
+print(len(received), received.rx_ticks.tolist(), received.relay_rx_ticks.tolist())
+"""
+
+
+def test_plain_python_computes_the_same_world():
+    """NumPy warns of the keys' overflow, which is wanted."""
+    printed = []
+    for disabled in ("0", "1"):
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
+        command = [sys.executable, "-W", "ignore::RuntimeWarning", "-c", PLAIN]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        printed.append(run.stdout)
+    assert printed[0] == printed[1]
+    assert not printed[0].startswith("0 ")

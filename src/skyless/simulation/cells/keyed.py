@@ -26,7 +26,7 @@ _S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(
 @kernel
 def mixed(key: np.uint64, value: int) -> np.uint64:
     """A key (64 bits) that depends on all bits of another and of a whole number, which may be negative."""
-    x = (key ^ np.uint64(value)) + _STEP
+    x = (key ^ np.uint64(np.int64(value))) + _STEP
     x = (x ^ (x >> _S30)) * _FIRST
     x = (x ^ (x >> _S27)) * _SECOND
     return x ^ (x >> _S31)

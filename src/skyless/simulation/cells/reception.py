@@ -147,7 +147,7 @@ def luck(rules: Rules, chance: float, pair: np.uint64, listener_key: int, sender
     return RECEIVED
 
 
-@kernel
+@step
 def disturb(
     rules: Rules,
     frames: Frames,
@@ -191,7 +191,7 @@ def disturb(
     return outcome, early_ticks
 
 
-@kernel
+@step
 def rx_stamp(
     rules: Rules,
     knots: Knots,

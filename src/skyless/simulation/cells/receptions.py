@@ -11,7 +11,7 @@ import numpy as np
 
 from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.kernels.arrays import Array, Integers, Records
-from skyless.kernels.compiled import kernel
+from skyless.kernels.compiled import kernel, step
 from skyless.simulation.cells.clocks import KNOT_TICKS, Knots, true_time
 from skyless.simulation.cells.grid import Grid, Neighbours, cells_within
 from skyless.simulation.cells.keyed import key_of, normal, uniform
@@ -97,7 +97,7 @@ class Path(NamedTuple):
     """Path length in m, or time in s, at true times of knots (``KNOT_TICKS`` apart), shape (knots,)."""
 
 
-@kernel
+@step
 def disturb_nearby(
     scene: Scene,
     listener: int,
@@ -111,21 +111,26 @@ def disturb_nearby(
     low_bin = max((wanted[1] - margin_ticks - buckets.start_ticks) >> BIN_BITS, 0)
     high_bin = min((wanted[1] + margin_ticks - buckets.start_ticks) >> BIN_BITS, buckets.bins - 1)
     first, last, low, high = cells_within(grid, point_m[0], point_m[1], radius_m)
-    state = (RECEIVED, 0.0)
-    for row in range(low, high + 1):
-        for column in range(first, last + 1):
-            base = (row * grid.columns + column) * buckets.bins
-            start, stop = buckets.offsets[base + low_bin], buckets.offsets[base + high_bin + 1]
-            if start < stop:
-                state = disturb(
-                    scene.rules, buckets.frames, start, stop, scene.positions_m, listener, point_m, wanted, state
+    outcome, early_ticks = RECEIVED, 0.0
+    for when in range(low_bin, high_bin + 1):
+        for row in range(low, high + 1):
+            base = (when * grid.rows + row) * grid.columns
+            if first <= last and outcome == RECEIVED:
+                outcome, early_ticks = disturb(
+                    scene.rules,
+                    buckets.frames,
+                    buckets.offsets[base + first],
+                    buckets.offsets[base + last + 1],
+                    scene.positions_m,
+                    listener,
+                    point_m,
+                    wanted,
+                    (outcome, early_ticks),
                 )
-                if state[0] != RECEIVED:
-                    return state
-    return state
+    return outcome, early_ticks
 
 
-@kernel
+@step
 def interference(
     scene: Scene,
     listener: int,
@@ -139,15 +144,15 @@ def interference(
     rules = scene.rules
     radius_m = min(math.sqrt(rules.capture * wanted[4]), rules.reach_m)
     margin = int(PREAMBLE_TICKS + wanted[3] + rules.reach_m / TICK_M) + 2
-    state = disturb_nearby(scene, listener, point_m, wanted, radius_m, margin)
-    if state[0] != RECEIVED:
-        return state
-    radius_m = min(math.sqrt(rules.first_path * wanted[4]), rules.reach_m)
-    margin = int(FIRST_PATH_TICKS + rules.reach_m / TICK_M) + 2
-    return disturb_nearby(scene, listener, point_m, wanted, radius_m, margin)
+    outcome, early_ticks = disturb_nearby(scene, listener, point_m, wanted, radius_m, margin)
+    if outcome == RECEIVED:
+        radius_m = min(math.sqrt(rules.first_path * wanted[4]), rules.reach_m)
+        margin = int(FIRST_PATH_TICKS + rules.reach_m / TICK_M) + 2
+        outcome, early_ticks = disturb_nearby(scene, listener, point_m, wanted, radius_m, margin)
+    return outcome, early_ticks
 
 
-@kernel
+@step
 def stamp_at_anchor(scene: Scene, listener: int, sender: int, k: int) -> int:
     """RX stamp at an anchor of a frame that is strong enough there; -1 if another frame destroys it."""
     table = scene.table
@@ -160,15 +165,15 @@ def stamp_at_anchor(scene: Scene, listener: int, sender: int, k: int) -> int:
     square_m2 = squared_m2(scene.positions_m, sender, x_m, y_m, z_m)
     wanted = (sender, ticks, fraction, float(table.after_ticks), square_m2)
     outcome, early_ticks = interference(scene, listener, (x_m, y_m, z_m), wanted)
-    if outcome != RECEIVED:
-        return -1
-    keys = (scene.keys[listener], scene.keys[sender], table.first_number[sender] + k)
-    return rx_stamp(
-        scene.rules, scene.knots, listener, keys, ticks, fraction + math.sqrt(square_m2) / TICK_M - early_ticks
-    )
+    stamp = -1
+    if outcome == RECEIVED:
+        keys = (scene.keys[listener], scene.keys[sender], table.first_number[sender] + k)
+        arrival_ticks = fraction + math.sqrt(square_m2) / TICK_M - early_ticks
+        stamp = rx_stamp(scene.rules, scene.knots, listener, keys, ticks, arrival_ticks)
+    return stamp
 
 
-@kernel
+@step
 def contains(values: Integers, wanted: int) -> bool:
     """Whether a value is among a few."""
     found = False
@@ -177,7 +182,7 @@ def contains(values: Integers, wanted: int) -> bool:
     return found
 
 
-@kernel
+@step
 def candidates(
     scene: Scene,
     listener: int,
@@ -212,7 +217,7 @@ def candidates(
     return count
 
 
-@kernel
+@step
 def newest_receptions(
     scene: Scene,
     sender: int,
@@ -272,24 +277,35 @@ def fill_relays(
 
 
 @kernel
-def receive_at_anchor(
+def receive_at_anchors(
     scene: Scene,
-    listener: int,
+    listeners: Integers,
     from_ticks: int,
     to_ticks: int,
-    senders: Integers,
-    columns: Integers,
-    rx_ticks: Integers,
-) -> int:
-    """All receptions of an anchor of frames emitted in [from, to), newest first; returns their number."""
-    found = candidates(scene, listener, from_ticks - 1, to_ticks - 1, senders, columns, senders[:0])
-    count = 0
-    for i in range(found):
-        stamp = stamp_at_anchor(scene, listener, senders[i], columns[i])
-        if stamp >= 0:
-            senders[count], columns[count], rx_ticks[count] = senders[i], columns[i], stamp
-            count += 1
-    return count
+    spare: int,
+    rows: tuple[Integers, Integers, Integers, Integers],
+) -> tuple[int, int]:
+    """All receptions of anchors of frames emitted in [from, to), anchor by anchor, each newest first.
+
+    Fills listeners, senders, columns of the table and RX stamps, shape (most,) each, until fewer than ``spare`` rows
+    are left before a listener. Returns how many listeners are done, and how many rows are filled.
+    """
+    listening, senders, columns, rx_ticks = rows
+    done, count = 0, 0
+    while done < listeners.shape[0] and count + spare <= listening.shape[0]:
+        listener, until = listeners[done], to_ticks - 1
+        while until >= from_ticks:
+            since = max(until - _STRIDE_TICKS, from_ticks - 1)
+            found = candidates(scene, listener, since, until, senders[count:], columns[count:], senders[:0])
+            for i in range(count, count + found):
+                sender, k = senders[i], columns[i]
+                stamp = stamp_at_anchor(scene, listener, sender, k)
+                if stamp >= 0:
+                    listening[count], senders[count], columns[count], rx_ticks[count] = listener, sender, k, stamp
+                    count += 1
+            until = since
+        done += 1
+    return done, count
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Who sends when: the frames of all anchors in a span of true time, and the same frames by cell and time.
+"""Who sends when: the frames of all anchors in a span of true time, and the same frames by time and cell.
 
 The anchors of ``FreeSchedule`` speak at the instants of ``site/free_access.py``; those of ``SlotSchedule`` at the
 starts of their slots, each off by a random error. Frames of other sources (machines) can be put into a table, too.
@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_S
 from skyless.kernels.arrays import Array, Integers
-from skyless.kernels.compiled import kernel
+from skyless.kernels.compiled import kernel, step
 from skyless.simulation.cells.clocks import Knots, own_time, true_time
 from skyless.simulation.cells.grid import Grid
 from skyless.simulation.cells.keyed import SLOT_ERROR, key_of, normal, purpose_key
@@ -22,7 +22,7 @@ from skyless.ticks import from_seconds
 FIRST_SLOT_TICKS: Final = from_seconds(2e-3)
 """True time at which superframe 0 starts: later than the lead time of its first frame."""
 
-BIN_BITS: Final = 24
+BIN_BITS: Final = 25
 """Frames are sorted into bins of 2^24 ticks, 0.26 ms."""
 
 _GRID_MASK: Final = DELAYED_TX_GRANULARITY_TICKS - 1
@@ -89,13 +89,16 @@ class Table(NamedTuple):
 
 
 class Buckets(NamedTuple):
-    """The frames of a table by cell and time."""
+    """The frames of a table by time and cell."""
 
     start_ticks: int
     """True time of the first bin."""
     bins: int
     offsets: Integers
-    """Shape (cells · bins + 1,): those of a cell and a bin are from ``offsets[cell · bins + bin]`` on."""
+    """Shape (bins · cells + 1,): those of a bin and a cell are from ``offsets[bin · cells + cell]`` on.
+
+    So those of neighbouring columns follow one another, and what is on the air at a time lies close together.
+    """
     frames: Frames
 
 
@@ -106,17 +109,14 @@ def on_radio_grid(own_ticks: int, tx_delay_ticks: int) -> int:
     return raw - (raw & _GRID_MASK) + tx_delay_ticks
 
 
-@kernel
+@step
 def latest(table: Table, anchor: int, true_ticks: int) -> int:
     """Column of an anchor's last frame at or before a true time; -1 for none."""
-    count = table.used[anchor]
-    if count == 0:
-        return -1
-    k = (true_ticks - table.ticks[anchor, 0]) // table.period_ticks
-    k = min(max(k, 0), count - 1)
+    used = table.used[anchor]
+    k = min(max((true_ticks - table.ticks[anchor, 0]) // table.period_ticks, 0), used - 1)
     while k >= 0 and table.ticks[anchor, k] > true_ticks:
         k -= 1
-    while k + 1 < count and table.ticks[anchor, k + 1] <= true_ticks:
+    while k + 1 < used and table.ticks[anchor, k + 1] <= true_ticks:
         k += 1
     return int(k)
 
@@ -277,20 +277,21 @@ def given_table(
 
 @kernel
 def _fill_buckets(table: Table, grid: Grid, start_ticks: int, bins: int, offsets: Integers, frames: Frames) -> None:
-    """Sort the frames of a table by cell and bin (counting sort)."""
+    """Sort the frames of a table by bin and cell (counting sort)."""
+    cells = grid.columns * grid.rows
     for anchor in range(table.used.shape[0]):
         for k in range(table.used[anchor]):
             when = (table.ticks[anchor, k] - start_ticks) >> BIN_BITS
             if 0 <= when < bins:
-                offsets[grid.cell_of[anchor] * bins + when + 1] += 1
+                offsets[when * cells + grid.cell_of[anchor] + 1] += 1
     for i in range(1, offsets.shape[0]):
         offsets[i] += offsets[i - 1]
     for anchor in range(table.used.shape[0] - 1, -1, -1):
         for k in range(table.used[anchor]):
             when = (table.ticks[anchor, k] - start_ticks) >> BIN_BITS
             if 0 <= when < bins:
-                i = offsets[grid.cell_of[anchor] * bins + when + 1] - 1
-                offsets[grid.cell_of[anchor] * bins + when + 1] = i
+                i = offsets[when * cells + grid.cell_of[anchor] + 1] - 1
+                offsets[when * cells + grid.cell_of[anchor] + 1] = i
                 frames.sender[i] = anchor
                 frames.ticks[i], frames.fraction[i] = table.ticks[anchor, k], table.fraction[anchor, k]
                 frames.after_ticks[i] = table.after_ticks

@@ -38,7 +38,7 @@ from skyless.simulation.cells.receptions import (
     Path,
     Scene,
     fill_relays,
-    receive_at_anchor,
+    receive_at_anchors,
     receive_at_tag,
 )
 from skyless.simulation.cells.timetable import (
@@ -61,6 +61,9 @@ MOST_RELAYS: Final = 6
 
 FRAME_BYTES: Final = 123
 """Length of every frame: a beacon of protocol 2 with six relays and a page."""
+
+_CHUNK_ROWS: Final = 1 << 18
+"""Receptions of anchors are computed in chunks of this many."""
 
 _CELL_M: Final = 100.0
 """Width of the cells in which interferers are looked for; the reach of a frame is 193 m."""
@@ -148,7 +151,7 @@ class TagReceptions:
 
 @dataclass(slots=True, eq=False)
 class AnchorReceptions:
-    """What anchors received in a span, one reception a row: listener by listener, each in the order of emission."""
+    """What anchors received in a span, one reception a row: by listener (as indexed), each in the order of emission."""
 
     listener: Integers
     """Identifiers of the listeners, shape (n,)."""
@@ -375,16 +378,18 @@ class CellWorld:
 
     def _at_anchors(self, scene: Scene, anchors: Sequence[int], from_ticks: int, to_ticks: int) -> AnchorReceptions:
         table, ids = scene.table, self.anchors.ids
-        most = max(self._most_neighbours, 1) * table.ticks.shape[1]
-        scratch = tuple(np.empty(most, dtype=np.int64) for _ in range(3))
-        parts = []
-        for listener in anchors:
-            if self._senders.dead[listener]:
-                continue
-            count = receive_at_anchor(scene, listener, from_ticks, to_ticks, *scratch)
-            rows = [row[:count][::-1] for row in scratch]
-            parts.append(np.stack((np.full(count, listener), *rows)))
-        listeners, senders, columns, rx_ticks = np.concatenate(parts, axis=1) if parts else np.zeros((4, 0), np.int64)
+        listening = np.array([one for one in anchors if not self._senders.dead[one]], dtype=np.int64)
+        spare = max(self._most_neighbours, 1) * table.ticks.shape[1]
+        free = np.empty((4, max(_CHUNK_ROWS, spare)), dtype=np.int64)
+        parts = [np.empty((4, 0), dtype=np.int64)]
+        while len(listening):
+            rows = (free[0], free[1], free[2], free[3])
+            done, count = receive_at_anchors(scene, listening, from_ticks, to_ticks, spare, rows)
+            parts.append(free[:, :count].copy())
+            listening = listening[done:]
+        listeners, senders, columns, rx_ticks = np.concatenate(parts, axis=1)
+        order = np.lexsort((table.ticks[senders, columns], listeners))
+        listeners, senders, columns, rx_ticks = (one[order] for one in (listeners, senders, columns, rx_ticks))
         return AnchorReceptions(
             ids[listeners],
             ids[senders],
