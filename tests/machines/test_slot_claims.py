@@ -174,8 +174,8 @@ def test_no_claim_outlives_its_root_for_long(graph, lived):
     graph.run(10 + lived)
     for claim in graph.claims() - {None}:
         graph.switch_off(claim.root)
-        longest = max((one.patience_superframes for one in graph.machines if one is not None), default=0)
-        graph.run(longest + HOP_PATIENCE * count + TURNS)
+        on_the_way = 20 * count  # the last pulse takes up to this where one frame of five is received
+        graph.run(MOST_PATIENCE + HOP_PATIENCE * count + TURNS + on_the_way)
         assert all(one is None or one.claim != claim for one in graph.machines)
 
 
