@@ -194,6 +194,10 @@ class Receiver:
         if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
             return None
+        return self.hear_beacon(beacon, reception)
+
+    def hear_beacon(self, beacon: AnyBeacon, reception: Reception) -> Fix | None:
+        """Process a beacon that is decoded already, as ``hear`` does; of protocol 2 the frame itself may be empty."""
         rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
         tx_ticks = self._admit(beacon, rx_ticks)
         if tx_ticks is None:

@@ -2,12 +2,12 @@
 
 from functools import lru_cache
 
-from bench import LAB, Heard
 from msgspec.structs import replace
 
+from bench import LAB, Heard
 from skyless.air.beacon2 import Beacon2
 from skyless.air.codec2 import decode_2, encode_2
-from tmp_free import new_anchor
+from skyless.anchors.factory import new_anchor
 from skyless.evaluation.scenarios import Request, impairments_of
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static

@@ -4,12 +4,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from bench import assert_honest, tape
 from free_site import FREE, beacon_of, free_tape, with_beacon
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from bench import assert_honest, tape
 from skyless.air.almanac import NoisePage, SitePage
 from skyless.air.beacon import Heard as Relay
 from skyless.air.beacon2 import SlotTime, StatedPosition
@@ -40,7 +40,7 @@ def drops(receiver):
 
 
 def false_frames(rate_hz, make, seconds=2.0, first_s=0.0):
-    """Frames of an attacker with its own counter that collide with none of the site's; ``make(n, tx_ticks)``: a beacon."""
+    """Frames of an attacker with its own counter that collide with none of the site's; ``make``: number, stamp."""
     tag, falses = free_tape()[0], []
     ends_s = np.array([one.host_s for one in free_tape()])
     for n in range(int((seconds - first_s) * rate_hz)):

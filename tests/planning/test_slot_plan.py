@@ -13,10 +13,16 @@ from skyless.planning.links import range_of, with_range
 from skyless.planning.slot_picture import draw_slots, slot_colour
 from skyless.planning.slot_plan import nearest_sharing_m, rate_map, slot_warnings
 from skyless.planning.tag_rates import RECEIVED_HZ, tag_rates
+from skyless.simulation.cells.timetable import FreeSchedule, SlotSchedule
+from skyless.simulation.cells.world import CellWorld, anchors_of
 from skyless.simulation.channel import ChannelModel, received_power_dbm
+from skyless.simulation.impairments import Impairments
+from skyless.simulation.trajectory import Static
 from skyless.site.advice import RADIO_REACH_M
 from skyless.site.grid import grid_site
 from skyless.site.model import AnchorSite, ScheduleSite, Site, TagsSite, WallSite
+from skyless.site.slot_colours import with_slots
+from skyless.site.slots import schedule_of
 
 SHARP = ChannelModel(sensitivity_width_db=1e-3)
 
@@ -95,8 +101,6 @@ def test_against_a_plain_loop(mode):
 )
 def test_rates_of_a_simulated_hall(spacing_m, reuse_m, median_hz, worst_hz):
     """A simulation of 10⁴ anchors by other code found these rates, with anchors a little off the grid."""
-    from skyless.site.slot_colours import with_slots
-
     site = grid_site(900.0, 600.0, spacing_m, 4.0, 1.2, "free")
     schedule = ScheduleSite(mode="slots", slot_s=1e-3, reuse_m=reuse_m)
     site = with_slots(replace(site, schedule=schedule))
@@ -104,6 +108,26 @@ def test_rates_of_a_simulated_hall(spacing_m, reuse_m, median_hz, worst_hz):
     found = tag_rates(site, points, ChannelModel()).beacons_per_s
     assert np.median(found) == pytest.approx(median_hz, rel=0.1)
     assert np.percentile(found, 5) == pytest.approx(worst_hz, rel=0.15)
+
+
+@pytest.mark.parametrize(("mode", "tolerance"), [("slots", 0.01), ("free", 0.06)])
+def test_rates_of_the_simulated_cells(mode, tolerance):
+    """Tags at rest for a second. Slots: only frames at the sensitivity are left to chance.
+
+    Random instants: 16 times about 155 beacons, so 2 % of chance, and anchors whose beacons are spaced more evenly than
+    at random.
+    """
+    site = grid_site(300.0, 300.0, 15.0, 4.0, 1.2, mode)
+    points = np.random.default_rng(4).uniform((60.0, 60.0, 1.2), (240.0, 240.0, 1.2), (16, 3))
+    if mode == "free":
+        schedule = FreeSchedule(site.schedule.rate_hz)
+    else:
+        own = schedule_of(site)
+        schedule = SlotSchedule(np.array([anchor.slot for anchor in site.anchors]), own.slots, own.slot_ticks)
+    tags = [Static(*point) for point in points.tolist()]
+    world = CellWorld(anchors_of(site), schedule, tags, Impairments(), 7)
+    simulated = np.mean([len(world.receptions(tag, 2.0, 3.0)) for tag in range(len(tags))])
+    assert simulated == pytest.approx(np.mean(tag_rates(site, points, ChannelModel()).beacons_per_s), rel=tolerance)
 
 
 def test_random_instants_give_what_theory_says():
@@ -128,8 +152,6 @@ def test_warnings_say_what_to_change(tmp_path):
     (warning,) = planned(site, tmp_path, exponent=2.5)[2]
     assert "only 2 anchors are in reach (16 m" in warning
     assert "hang anchors at 53 % of their distances" in warning
-    from skyless.site.slot_colours import with_slots
-
     tight = with_slots(replace(site, schedule=replace(site.schedule, reuse_m=47.0)))
     assert "a larger schedule.reuse_m than 47 m" in planned(tight, tmp_path)[2][0]
     slow = replace(site, schedule=replace(site.schedule, slot_s=2.1e-3))

@@ -11,7 +11,7 @@ from skyless.site.advice import warnings_of
 from skyless.site.grid import grid_site
 from skyless.site.load import load_site
 from skyless.site.model import UnplacedAnchor
-from skyless.site.near import pairs_within
+from skyless.site.near import pairs_within, pairs_within_groups
 from skyless.site.slots import beacon_period_s, first_slots, schedule_of
 from skyless.site.template import site_template
 
@@ -158,6 +158,31 @@ def test_grids():
         grid_site(10_000.0, 10_000.0, 15.0, 4.0)
 
 
+TOML_VALUES = [
+    "0", "-1", "1", "3", "70000", "1.5", "nan", "inf", "1e300", '"free"', '"slots"', '"master"', "true", "[]", "{}",
+]  # fmt: skip
+WRITTEN = SLOTS + "reuse_m = 20.0\nsite_time = true\nrate_hz = 5\nslot_s = 1e-3\nframes_per_node = 1\n"
+WRITTEN += anchor(1, 0.5, 0.5, slot=0, floor=1, zone=2, std_m=0.1) + anchor(2, slot=1)
+WRITTEN += anchor(3, 25.5, 0.5, slot=0) + anchor(4, slot=2)
+
+
+@given(st.integers(0, 60), st.sampled_from([*TOML_VALUES, None]))
+def test_one_changed_or_missing_value_is_accepted_or_named(tmp_path_factory, line, value):
+    lines = WRITTEN.splitlines()
+    keys = [number for number, text in enumerate(lines) if " = " in text]
+    number = keys[line % len(keys)]
+    lines[number] = "" if value is None else f"{lines[number].split(' = ')[0]} = {value}"
+    path = tmp_path_factory.getbasetemp() / "changed.toml"
+    path.write_text("\n".join(lines))
+    try:
+        site = load_site(path)
+    except ConfigurationError as error:
+        assert error.key
+        assert error.expected
+    else:
+        assert isinstance(warnings_of(site), list)
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.floats(0.01, 30.0), st.booleans())
 def test_near_pairs_are_those_of_a_table_of_all(seed, count, distance_m, flat):
     points = np.random.default_rng(seed).uniform(-10.0, 10.0, (count, 3)).round(0 if flat else 3)
@@ -165,4 +190,10 @@ def test_near_pairs_are_those_of_a_table_of_all(seed, count, distance_m, flat):
     found = [pair for ones, others, _ in batches for pair in zip(ones.tolist(), others.tolist(), strict=True)]
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     assert len(found) == len(set(found))
-    assert set(found) == {(i, j) for i in range(count) for j in range(i + 1, count) if apart[i, j] < distance_m}
+    near = {(i, j) for i in range(count) for j in range(i + 1, count) if apart[i, j] < distance_m}
+    assert set(found) == near
+    group = np.random.default_rng(seed).integers(-1, 4, count)
+    batches = pairs_within_groups(points, group, distance_m)
+    found = [pair for ones, others, _ in batches for pair in zip(ones.tolist(), others.tolist(), strict=True)]
+    assert len(found) == len(set(found))
+    assert set(found) == {(i, j) for i, j in near if group[i] == group[j] >= 0}

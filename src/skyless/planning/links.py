@@ -16,7 +16,6 @@ from skyless.simulation.channel import (
     delivery_probability,
     received_power_dbm,
 )
-from skyless.site.model import Site
 from skyless.uncertainty.dop import dops_at
 
 IN_VIEW: Final = 0.5
@@ -52,11 +51,6 @@ def with_range(channel: ChannelModel, range_m: float, exponent: float = 2.0) -> 
     sensitivity_dbm = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 10.0 * exponent * math.log10(range_m)
     values = {name: getattr(channel, name) for name in channel.__struct_fields__}
     return ChannelModel(**{**values, "sensitivity_dbm": sensitivity_dbm})
-
-
-def anchor_positions(site: Site) -> Matrix:
-    """Anchors of a site in the order of its file, shape (anchors, 3)."""
-    return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]).reshape(-1, 3)
 
 
 def link_budget(channel: ChannelModel) -> Vector:

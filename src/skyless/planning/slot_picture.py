@@ -14,7 +14,7 @@ from skyless.planning.floor import Floor
 from skyless.planning.picture import cells_box, draw_image, draw_outline_and_walls
 from skyless.planning.slot_plan import RateMap
 from skyless.site.model import Site
-from skyless.site.near import positions_of
+from skyless.site.near import anchor_positions
 
 MOST_LABELS: Final = 300
 """With more anchors the picture has no numbers in them."""
@@ -51,7 +51,7 @@ def draw_slots(site: Site, floor: Floor, mapped: RateMap, file: Path, described:
 
 def _draw_anchors(axes: Axes, site: Site, panel_in: float) -> None:
     """One dot for each anchor; its slot, in mode free its identifier, in it where there is space."""
-    points = positions_of(site)
+    points = anchor_positions(site)
     labelled = len(points) <= MOST_LABELS
     longest_m = max(float(np.ptp(points[:, :2], axis=0).max()), 1.0)
     apart_points = panel_in * _POINTS_PER_IN / max(longest_m / _spacing_m(points), 1.0)

@@ -15,7 +15,7 @@ from skyless.planning.tag_rates import TagRates, tag_rates
 from skyless.simulation.channel import ChannelModel
 from skyless.site.advice import anchors_in_reach, best_offered_hz, warnings_of
 from skyless.site.model import Site
-from skyless.site.near import pairs_within, positions_of
+from skyless.site.near import anchor_positions, pairs_within_groups
 from skyless.site.slots import beacon_period_s
 
 FEWEST_ANCHORS: Final = 5
@@ -113,11 +113,9 @@ def _distribution(values: Vector | Integers) -> Distribution:
 
 def nearest_sharing_m(site: Site) -> float | None:
     """Return the least distance between two placed anchors that share a slot, up to twice ``reuse_m``; else None."""
-    slots = np.array([-1 if anchor.slot is None else anchor.slot for anchor in site.anchors])
-    least_m = math.inf
-    for one, other, apart_m in pairs_within(positions_of(site), 2.0 * site.schedule.reuse_m):
-        same = (slots[one] == slots[other]) & (slots[one] >= 0)
-        least_m = min(least_m, float(apart_m[same].min(initial=math.inf)))
+    slots = np.array([-1 if anchor.slot is None else anchor.slot for anchor in site.anchors], np.int64)
+    batches = pairs_within_groups(anchor_positions(site), slots, 2.0 * site.schedule.reuse_m)
+    least_m = min((float(apart_m.min(initial=math.inf)) for _, _, apart_m in batches), default=math.inf)
     return least_m if math.isfinite(least_m) else None
 
 

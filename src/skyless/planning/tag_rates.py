@@ -24,7 +24,7 @@ from skyless.simulation.channel import (
     received_power_dbm,
 )
 from skyless.site.model import Site
-from skyless.site.near import positions_of
+from skyless.site.near import anchor_positions
 from skyless.site.slots import beacon_period_s, first_slots
 
 RECEIVED_HZ: Final = 2.0
@@ -50,7 +50,7 @@ def tag_rates(site: Site, points_m: Matrix, channel: ChannelModel, exponent: flo
     ``exponent``: of the path loss; the power falls by ten times this many decibels for each factor of ten in distance.
     Anchors without a position are left out.
     """
-    anchors_m = positions_of(site)
+    anchors_m = anchor_positions(site)
     order = np.argsort(anchors_m[:, 0], kind="stable")
     first = {} if site.schedule.mode == "free" else first_slots(site)
     slots = np.array([first.get(anchor.id, -1) for anchor in site.anchors], np.int64)

@@ -12,7 +12,7 @@ from skyless.air.codec import MAX_FRAME_BYTES
 from skyless.air.ieee802154 import air_time_s
 from skyless.kernels.arrays import Integers
 from skyless.site.model import Site
-from skyless.site.near import pairs_within, positions_of
+from skyless.site.near import anchor_positions, pairs_within
 
 _FLATTEST: Final = 0.05
 """Extent across the best plane (or line) over the whole extent, below which anchors count as in it."""
@@ -54,7 +54,7 @@ def _geometry(site: Site) -> list[str]:
     """Anchors in one line (2-D) or one plane (3-D) leave two mirror positions (``docs/maths.md`` section 5)."""
     flat = site.tags.height_m is not None
     dimensions = 2 if flat else 3
-    points = positions_of(site)[:, :dimensions]
+    points = anchor_positions(site)[:, :dimensions]
     if len(points) < dimensions + 1:
         return []
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -87,7 +87,7 @@ def _without_effect(site: Site) -> list[str]:
 
 def _neighbours(site: Site) -> list[str]:
     """Anchors without a neighbour in reach, and groups of anchors that have no link between them."""
-    points = positions_of(site)
+    points = anchor_positions(site)
     if len(points) < 2:
         return []
     ones, others = _links(site)
@@ -152,7 +152,7 @@ def best_offered_hz() -> float:
 
 def _links(site: Site) -> tuple[Integers, Integers]:
     """Rows of placed anchors in reach of each other."""
-    pairs = [(one, other) for one, other, _ in pairs_within(positions_of(site), RADIO_REACH_M)]
+    pairs = [(one, other) for one, other, _ in pairs_within(anchor_positions(site), RADIO_REACH_M)]
     nothing = np.empty(0, np.int64)
     ones, others = zip(*pairs, strict=True) if pairs else ((nothing,), (nothing,))
     return np.concatenate(ones), np.concatenate(others)

@@ -19,7 +19,7 @@ from skyless.constants import TICK_BITS, TICK_S
 from skyless.errors import ConfigurationError
 from skyless.site.image import image_size
 from skyless.site.model import AnchorSite, Site, UnplacedAnchor
-from skyless.site.near import DISTANCE_ROUNDING_M, pairs_within, positions_of
+from skyless.site.near import DISTANCE_ROUNDING_M, anchor_positions, pairs_within, pairs_within_groups
 from skyless.site.slots import Schedule, first_slots, schedule_of
 
 ANY_ADDRESS: Final = 65_533
@@ -243,7 +243,7 @@ def _rows(site: Site) -> Iterator[tuple[str, AnchorSite | UnplacedAnchor]]:
 
 def _near(site: Site, distance_m: float) -> Iterator[tuple[int, int, float]]:
     """Rows of placed anchors closer than a distance, and their distance."""
-    for one, other, apart_m in pairs_within(positions_of(site), distance_m):
+    for one, other, apart_m in pairs_within(anchor_positions(site), distance_m):
         yield from zip(one.tolist(), other.tolist(), apart_m.tolist(), strict=True)
 
 
@@ -268,11 +268,11 @@ def _check_shared_slots(site: Site, file: Path) -> None:
         if anchor.slot is None or anchor.slot >= slots:
             right = f"a whole number from 0 to {slots - 1}; {_COLOURS}"
             raise ConfigurationError(file, _with_anchor(f"{row}.slot", site), anchor.slot, right)
-    own = np.array([anchor.slot for anchor in site.anchors])
-    for one, other, apart_m in pairs_within(positions_of(site), site.schedule.reuse_m - 2 * DISTANCE_ROUNDING_M):
-        same = np.flatnonzero(own[one] == own[other])
-        if len(same):
-            raise _too_near(site, file, int(one[same[0]]), int(other[same[0]]), float(apart_m[same[0]]))
+    own = np.array([anchor.slot for anchor in site.anchors], np.int64)
+    reuse_m = site.schedule.reuse_m - 2 * DISTANCE_ROUNDING_M
+    for one, other, apart_m in pairs_within_groups(anchor_positions(site), own, reuse_m):
+        if len(one):
+            raise _too_near(site, file, int(one[0]), int(other[0]), float(apart_m[0]))
 
 
 def _too_near(site: Site, file: Path, one: int, other: int, apart_m: float) -> ConfigurationError:

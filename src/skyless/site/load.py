@@ -82,7 +82,7 @@ def _separate_unplaced(path: Path, document: dict[str, Any]) -> _Rows | None:
     """
     schedule, entries = document.get("schedule"), document.get("anchors")
     mode = schedule.get("mode") if isinstance(schedule, dict) else None
-    if mode not in {"slots", "free"}:
+    if mode not in ("slots", "free"):  # no set: the value may be a list
         return None
     if "anchors" not in document:
         raise ConfigurationError(path, "anchors", None, expected("anchors"))

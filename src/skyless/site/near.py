@@ -15,7 +15,7 @@ DISTANCE_ROUNDING_M: Final = 1e-6
 """Two points at exactly a limit must not count as nearer by the rounding of their coordinates."""
 
 
-def positions_of(site: Site) -> Matrix:
+def anchor_positions(site: Site) -> Matrix:
     """Return the positions of a site's placed anchors in the order of the file, shape (n, 3)."""
     return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]).reshape(-1, 3)
 
@@ -39,3 +39,15 @@ def pairs_within(points_m: Matrix, distance_m: float) -> Iterator[tuple[Integers
         near = apart_m < distance_m
         one, other = order[candidates[near]], order[candidates[near] + shift]
         yield np.minimum(one, other), np.maximum(one, other), apart_m[near]
+
+
+def pairs_within_groups(
+    points_m: Matrix, group: Integers, distance_m: float
+) -> Iterator[tuple[Integers, Integers, Vector]]:
+    """Pairs of points of one group that are closer than a distance; ``group``: shape (n,), numbers below 0 are none."""
+    order = np.argsort(group, kind="stable")
+    order = order[np.searchsorted(group[order], 0) :]
+    ends = np.flatnonzero(np.diff(group[order])) + 1
+    for rows in np.split(order, ends):
+        for one, other, apart_m in pairs_within(points_m[rows], distance_m):
+            yield rows[one], rows[other], apart_m

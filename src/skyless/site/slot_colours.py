@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from skyless.kernels.arrays import Integers, Matrix, Vector
 from skyless.site.model import Site
-from skyless.site.near import DISTANCE_ROUNDING_M, positions_of
+from skyless.site.near import DISTANCE_ROUNDING_M, anchor_positions
 
 MAX_SLOTS: Final = 255
 """Slots that a superframe can have; a beacon carries its slot in eight bits."""
@@ -60,7 +60,7 @@ def with_slots(site: Site, conflicts: Iterable[tuple[int, int]] = ()) -> Site:
     """
     row_of = {anchor.id: row for row, anchor in enumerate(site.anchors)}
     pairs = [(row_of[one], row_of[other]) for one, other in conflicts if one in row_of and other in row_of]
-    slots = slot_colours(positions_of(site), site.schedule.reuse_m, pairs)
+    slots = slot_colours(anchor_positions(site), site.schedule.reuse_m, pairs)
     colours = int(slots.max(initial=-1)) + 1
     needed = colours + len(site.unplaced)
     if needed > MAX_SLOTS:

@@ -10,6 +10,7 @@ from msgspec import Struct
 
 from skyless.air.almanac import SchedulePage
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ
+from skyless.site.free_access import free_window_ticks
 from skyless.site.model import AnchorSite, Site, UnplacedAnchor
 
 
@@ -81,6 +82,16 @@ def schedule_of(site: Site) -> Schedule:
         raise ValueError(f"site {site.name!r} has no schedule.slots yet; skyless plan --write colours its slots")
     slots = len(site.anchors) * plan.frames_per_node if plan.slots is None else plan.slots
     return Schedule(_slot_ticks(site), slots, plan.frames_per_node)
+
+
+def superframe_ticks_of(site: Site) -> int:
+    """Length of the superframe; in mode free of the window in which each anchor sends once.
+
+    Raises:
+        ValueError: the site is in mode slots and has none yet.
+    """
+    schedule = site.schedule
+    return free_window_ticks(schedule.rate_hz) if schedule.mode == "free" else schedule_of(site).superframe_ticks
 
 
 def _slot_ticks(site: Site) -> int:

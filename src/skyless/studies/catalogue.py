@@ -10,6 +10,7 @@ from skyless.studies import (
     claims,
     efficiency,
     integrity,
+    large,
     loss,
     motion,
     nlos,
@@ -65,6 +66,13 @@ STUDIES: Final = {
             _of_worlds("room", "the room", room.cases, Look("The room", ("rmse", "nees", "level", "exceeded"))),
             cells=room.cells,
             rows=room.rows,
+        ),
+        Study(
+            "large",
+            "a site of 1,024 anchors without a master",
+            large.cells,
+            large.rows,
+            partial(draw, Look("1,024 anchors, no master", ("rmse", "nees"))),
         ),
         Study(
             "claims",

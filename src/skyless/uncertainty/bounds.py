@@ -22,7 +22,7 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.kernels.arrays import Array, Indices, Mask, Matrix, Vector
+from skyless.kernels.arrays import Array, Indices, Integers, Mask, Matrix, Vector
 from skyless.kernels.compiled import jitted, kernel, threaded_kernel
 from skyless.kernels.covariance import (
     add_process_noise,
@@ -150,7 +150,7 @@ def biased_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSetting
 class Sendings(Struct, frozen=True):
     """Frames that do not come in the order of a superframe."""
 
-    senders: Indices
+    senders: Integers
     """Index of each frame's anchor, shape (frames,)."""
     times_s: Array
     """When they are sent, in order, shape (frames,)."""

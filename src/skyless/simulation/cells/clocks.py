@@ -72,9 +72,7 @@ def true_time(knots: Knots, node: int, own_ticks: int) -> tuple[int, float]:
 
 
 @kernel
-def start_clocks(
-    seed: int, nodes: Integers, offset_ppm: float, ticks: Integers, fraction: Array, rate: Array
-) -> None:
+def start_clocks(seed: int, nodes: Integers, offset_ppm: float, ticks: Integers, fraction: Array, rate: Array) -> None:
     """Random counters and rates at knot 0 of the nodes with those keys, shape (n,) each."""
     base = purpose_key(seed, START)
     for node in range(nodes.shape[0]):

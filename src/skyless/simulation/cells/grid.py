@@ -4,10 +4,11 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyless.kernels.arrays import Array, Integers
 from skyless.kernels.compiled import kernel
-from skyless.simulation.cells.reception import Rules, delivery_chance, squared_m2
+from skyless.simulation.cells.reception import Rules, delivery_chance, pair_key, squared_m2
 
 _MOST_CELLS: Final = 1_000_000
 """Anchors far apart get larger cells instead of more."""
@@ -37,6 +38,8 @@ class Neighbours(NamedTuple):
     anchors: Integers
     chance: Array
     """That a frame is strong enough."""
+    pair: NDArray[np.uint64]
+    """Keys of the pairs' chances."""
 
 
 def make_grid(positions_m: Array, cell_m: float) -> Grid:
@@ -56,10 +59,10 @@ def make_grid(positions_m: Array, cell_m: float) -> Grid:
 @kernel
 def cells_within(grid: Grid, x_m: float, y_m: float, radius_m: float) -> tuple[int, int, int, int]:
     """First and last column and row of the cells that a circle may touch; the last are before the first for none."""
-    first = max(int(math.floor((x_m - radius_m - grid.west_m) / grid.cell_m)), 0)
-    last = min(int(math.floor((x_m + radius_m - grid.west_m) / grid.cell_m)), grid.columns - 1)
-    low = max(int(math.floor((y_m - radius_m - grid.south_m) / grid.cell_m)), 0)
-    high = min(int(math.floor((y_m + radius_m - grid.south_m) / grid.cell_m)), grid.rows - 1)
+    first = max(math.floor((x_m - radius_m - grid.west_m) / grid.cell_m), 0)
+    last = min(math.floor((x_m + radius_m - grid.west_m) / grid.cell_m), grid.columns - 1)
+    low = max(math.floor((y_m - radius_m - grid.south_m) / grid.cell_m), 0)
+    high = min(math.floor((y_m + radius_m - grid.south_m) / grid.cell_m), grid.rows - 1)
     return first, last, low, high
 
 
@@ -82,10 +85,9 @@ def anchors_within(
 
 
 @kernel
-def _list_neighbours(
-    rules: Rules, grid: Grid, positions_m: Array, offsets: Integers, anchors: Integers, chance: Array
-) -> None:
-    """Fill the lists; with an empty ``anchors`` only ``offsets``."""
+def _list_neighbours(rules: Rules, grid: Grid, positions_m: Array, keys: Integers, lists: Neighbours) -> None:
+    """Fill the lists; where they are empty only their offsets."""
+    offsets, anchors, chance, pair = lists
     found = np.empty(positions_m.shape[0], dtype=np.int64)
     total = 0
     for one in range(positions_m.shape[0]):
@@ -98,15 +100,19 @@ def _list_neighbours(
                 chance[total] = delivery_chance(
                     rules, squared_m2(positions_m, found[i], point_m[0], point_m[1], point_m[2])
                 )
+                pair[total] = pair_key(rules, keys[one], keys[found[i]])
             total += 1
         offsets[one + 1] = total
 
 
-def list_neighbours(rules: Rules, grid: Grid, positions_m: Array) -> Neighbours:
-    """For each anchor the others that it may receive; ``positions_m`` has shape (n, 3)."""
-    offsets = np.zeros(len(positions_m) + 1, dtype=np.int64)
-    _list_neighbours(rules, grid, positions_m, offsets, np.empty(0, dtype=np.int64), np.empty(0))
-    anchors, chance = np.empty(offsets[-1], dtype=np.int64), np.empty(offsets[-1])
-    if offsets[-1] > 0:
-        _list_neighbours(rules, grid, positions_m, offsets, anchors, chance)
-    return Neighbours(offsets, anchors, chance)
+def list_neighbours(rules: Rules, grid: Grid, positions_m: Array, keys: Integers) -> Neighbours:
+    """For each anchor the others that it may receive; ``positions_m`` has shape (n, 3), ``keys`` (n,)."""
+    lists = _empty_lists(np.zeros(len(positions_m) + 1, dtype=np.int64), 0)
+    _list_neighbours(rules, grid, positions_m, keys, lists)
+    lists = _empty_lists(lists.offsets, int(lists.offsets[-1]))
+    _list_neighbours(rules, grid, positions_m, keys, lists)
+    return lists
+
+
+def _empty_lists(offsets: Integers, total: int) -> Neighbours:
+    return Neighbours(offsets, np.empty(total, dtype=np.int64), np.empty(total), np.empty(total, dtype=np.uint64))

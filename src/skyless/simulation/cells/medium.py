@@ -21,14 +21,15 @@ from skyless.kernels.compiled import kernel
 from skyless.simulation.cells.clocks import KNOT_TICKS, CellClocks, Knots, own_time, true_time
 from skyless.simulation.cells.keyed import START, TAG_NODES, key_of, purpose_key, uniform
 from skyless.simulation.cells.reception import (
-    HEARD,
     PREAMBLE_TICKS,
+    RECEIVED,
     Frames,
     Rules,
     delivery_chance,
     disturb,
     emission,
     luck,
+    pair_key,
     rules_of,
     rx_stamp,
     squared_m2,
@@ -76,8 +77,9 @@ def receive_in_cells(
         y_m = coordinate_m(stations, node, 1, t_s)
         z_m = coordinate_m(stations, node, 2, t_s)
         square_m2 = squared_m2(positions_m, sender, x_m, y_m, z_m)
-        outcome = luck(rules, delivery_chance(rules, square_m2), keys[node], keys[sender], number)
-        if outcome == HEARD:
+        pair = pair_key(rules, keys[node], keys[sender])
+        outcome = luck(rules, delivery_chance(rules, square_m2), pair, keys[node], keys[sender], number)
+        if outcome == RECEIVED:
             listener = node if stations[node]["is_tag"] == 0 else -1
             outcome, early_ticks = disturb(
                 rules,
@@ -88,15 +90,13 @@ def receive_in_cells(
                 listener,
                 (x_m, y_m, z_m),
                 (sender, ticks, fraction, frames.after_ticks[wanted], square_m2),
-                (HEARD, 0.0),
+                (RECEIVED, 0.0),
             )
-            if outcome == HEARD:
+            if outcome == RECEIVED:
                 arrival_ticks = fraction + np.sqrt(square_m2) / TICK_M - early_ticks
                 row = rows[count]
                 fill_truth(stations, node, t_s, row)
-                row["rx_ticks"] = rx_stamp(
-                    rules, knots, node, (keys[node], keys[sender], number), ticks, arrival_ticks
-                )
+                row["rx_ticks"] = rx_stamp(rules, knots, node, (keys[node], keys[sender], number), ticks, arrival_ticks)
                 count += 1
                 anchors += 1 - stations[node]["is_tag"]
         tally[stations[node]["is_tag"], outcome] += 1

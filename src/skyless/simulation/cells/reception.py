@@ -17,7 +17,7 @@ from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.kernels.arrays import Array, Integers
 from skyless.kernels.compiled import kernel, step
 from skyless.simulation.cells.clocks import Knots, own_time
-from skyless.simulation.cells.keyed import CHANCE, LOSS, RX_NOISE, TX_NOISE, key_of, normal, purpose_key, uniform
+from skyless.simulation.cells.keyed import CHANCE, LOSS, RX_NOISE, TX_NOISE, key_of, mixed, normal, purpose_key, uniform
 from skyless.simulation.channel import (
     FREE_SPACE_LOSS_1_M_DB,
     ChannelModel,
@@ -38,7 +38,7 @@ FIRST_PATH_TICKS: Final = 1e-6 * TICK_RATE_HZ
 
 PREAMBLE_TICKS: Final = from_seconds(preamble_s())
 
-HEARD: Final = OUTCOMES.index(Outcome.HEARD)
+RECEIVED: Final = OUTCOMES.index(Outcome.HEARD)
 WEAK: Final = OUTCOMES.index(Outcome.WEAK)
 HALF_DUPLEX: Final = OUTCOMES.index(Outcome.HALF_DUPLEX)
 COLLISION: Final = OUTCOMES.index(Outcome.COLLISION)
@@ -131,14 +131,20 @@ def delivery_chance(rules: Rules, square_m2: float) -> float:
 
 
 @kernel
-def luck(rules: Rules, chance: float, listener_key: int, sender_key: int, number: int) -> int:
-    """Outcome of power and chance for a frame without interferers: heard, weak or lost."""
-    if chance == 0.0 or uniform(key_of(rules.chance_key, listener_key, sender_key, number)) > chance:
+def pair_key(rules: Rules, listener_key: int, sender_key: int) -> np.uint64:
+    """Key of the chances of all frames from one node to another."""
+    return mixed(mixed(rules.chance_key, listener_key), sender_key)
+
+
+@kernel
+def luck(rules: Rules, chance: float, pair: np.uint64, listener_key: int, sender_key: int, number: int) -> int:
+    """Outcome of power and chance for a frame without interferers: heard, weak or lost; ``pair`` of ``pair_key``."""
+    if chance == 0.0 or uniform(mixed(pair, number)) > chance:
         return WEAK
-    if rules.loss_probability > 0.0:
-        if uniform(key_of(rules.loss_key, listener_key, sender_key, number)) < rules.loss_probability:
-            return LOST
-    return HEARD
+    loss = rules.loss_probability
+    if loss > 0.0 and uniform(key_of(rules.loss_key, listener_key, sender_key, number)) < loss:
+        return LOST
+    return RECEIVED
 
 
 @kernel
@@ -157,7 +163,7 @@ def disturb(
 
     ``listener`` is its index if it is an anchor, else -1, ``point_m`` its position, ``wanted`` the frame's sender,
     emission (whole and fraction), length after its RMARKER and squared distance. ``before`` is the result of other
-    frames, at first (HEARD, 0). Returns the outcome and by how many ticks the stamp is too early.
+    frames, at first (RECEIVED, 0). Returns the outcome and by how many ticks the stamp is too early.
     """
     outcome, early_ticks = before
     sender, ticks, fraction, after_ticks, square_m2 = wanted
@@ -201,7 +207,7 @@ def rx_stamp(
     carry = math.floor(arrival_ticks)
     ticks, fraction = own_time(knots, node, emission_ticks + int(carry), arrival_ticks - carry)
     fraction += rules.rx_noise_ticks * normal(key_of(rules.rx_key, keys[0], keys[1], keys[2]))
-    return (ticks + int(math.floor(fraction + 0.5))) & TICK_MASK
+    return (ticks + math.floor(fraction + 0.5)) & TICK_MASK
 
 
 @kernel

@@ -16,12 +16,14 @@ from skyless.simulation.cells.clocks import KNOT_TICKS, Knots, true_time
 from skyless.simulation.cells.grid import Grid, Neighbours, cells_within
 from skyless.simulation.cells.keyed import key_of, normal, uniform
 from skyless.simulation.cells.reception import (
-    HEARD,
+    FIRST_PATH_TICKS,
     PREAMBLE_TICKS,
+    RECEIVED,
     Rules,
     delivery_chance,
     disturb,
     luck,
+    pair_key,
     rx_stamp,
     squared_m2,
 )
@@ -37,7 +39,7 @@ LOOK_BACK_TICKS: Final = RELAY_AGE_TICKS + RELAY_AGE_TICKS // 1000
 """So far back that all clocks agree that it is older."""
 
 _STRIDE_TICKS: Final = 1 << 31
-"""Relays are looked for in strides of 34 ms."""
+"""Relays are looked for in strides, the first of 34 ms, each twice as long as the one before."""
 
 TAPS: Final = 50
 """Normals in the moving average of a changing range error."""
@@ -96,29 +98,53 @@ class Path(NamedTuple):
 
 
 @kernel
-def interference(
+def disturb_nearby(
     scene: Scene,
     listener: int,
     point_m: tuple[float, float, float],
     wanted: tuple[int, int, float, float, float],
+    radius_m: float,
+    margin_ticks: int,
 ) -> tuple[int, float]:
-    """What all frames on the air do to a wanted one at a listener; arguments and results as of ``disturb``."""
-    rules, buckets, grid = scene.rules, scene.buckets, scene.grid
-    radius_m = min(math.sqrt(rules.first_path * wanted[4]), rules.reach_m)
-    margin = int(PREAMBLE_TICKS + wanted[3] + radius_m / TICK_M) + 2
-    low_bin = max((wanted[1] - margin - buckets.start_ticks) >> BIN_BITS, 0)
-    high_bin = min((wanted[1] + margin - buckets.start_ticks) >> BIN_BITS, buckets.bins - 1)
+    """What the frames from within a radius, emitted less than a margin before or after a wanted one, do to it."""
+    buckets, grid = scene.buckets, scene.grid
+    low_bin = max((wanted[1] - margin_ticks - buckets.start_ticks) >> BIN_BITS, 0)
+    high_bin = min((wanted[1] + margin_ticks - buckets.start_ticks) >> BIN_BITS, buckets.bins - 1)
     first, last, low, high = cells_within(grid, point_m[0], point_m[1], radius_m)
-    state = (HEARD, 0.0)
+    state = (RECEIVED, 0.0)
     for row in range(low, high + 1):
         for column in range(first, last + 1):
             base = (row * grid.columns + column) * buckets.bins
             start, stop = buckets.offsets[base + low_bin], buckets.offsets[base + high_bin + 1]
             if start < stop:
                 state = disturb(
-                    rules, buckets.frames, start, stop, scene.positions_m, listener, point_m, wanted, state
+                    scene.rules, buckets.frames, start, stop, scene.positions_m, listener, point_m, wanted, state
                 )
+                if state[0] != RECEIVED:
+                    return state
     return state
+
+
+@kernel
+def interference(
+    scene: Scene,
+    listener: int,
+    point_m: tuple[float, float, float],
+    wanted: tuple[int, int, float, float, float],
+) -> tuple[int, float]:
+    """What all frames on the air do to a wanted one at a listener; arguments and results as of ``disturb``.
+
+    The near ones that may destroy it first; those that may shift its stamp are farther away, but closer in time.
+    """
+    rules = scene.rules
+    radius_m = min(math.sqrt(rules.capture * wanted[4]), rules.reach_m)
+    margin = int(PREAMBLE_TICKS + wanted[3] + rules.reach_m / TICK_M) + 2
+    state = disturb_nearby(scene, listener, point_m, wanted, radius_m, margin)
+    if state[0] != RECEIVED:
+        return state
+    radius_m = min(math.sqrt(rules.first_path * wanted[4]), rules.reach_m)
+    margin = int(FIRST_PATH_TICKS + rules.reach_m / TICK_M) + 2
+    return disturb_nearby(scene, listener, point_m, wanted, radius_m, margin)
 
 
 @kernel
@@ -134,12 +160,21 @@ def stamp_at_anchor(scene: Scene, listener: int, sender: int, k: int) -> int:
     square_m2 = squared_m2(scene.positions_m, sender, x_m, y_m, z_m)
     wanted = (sender, ticks, fraction, float(table.after_ticks), square_m2)
     outcome, early_ticks = interference(scene, listener, (x_m, y_m, z_m), wanted)
-    if outcome != HEARD:
+    if outcome != RECEIVED:
         return -1
     keys = (scene.keys[listener], scene.keys[sender], table.first_number[sender] + k)
     return rx_stamp(
         scene.rules, scene.knots, listener, keys, ticks, fraction + math.sqrt(square_m2) / TICK_M - early_ticks
     )
+
+
+@kernel
+def contains(values: Integers, wanted: int) -> bool:
+    """Whether a value is among a few."""
+    found = False
+    for value in values:
+        found = found or value == wanted
+    return found
 
 
 @kernel
@@ -150,16 +185,23 @@ def candidates(
     until_ticks: int,
     senders: Integers,
     columns: Integers,
+    known: Integers,
 ) -> int:
-    """Frames strong enough at an anchor, emitted after a time and until another, newest first; returns their number."""
+    """Frames strong enough at an anchor, emitted after a time and until another, newest first; returns their number.
+
+    Those of the anchors ``known``, shape (n,), are left out.
+    """
     table, neighbours = scene.table, scene.neighbours
     count = 0
     for i in range(neighbours.offsets[listener], neighbours.offsets[listener + 1]):
         sender = neighbours.anchors[i]
+        if contains(known, sender):
+            continue
         k = latest(table, sender, until_ticks)
         while k >= 0 and table.ticks[sender, k] > after_ticks:
             number = table.first_number[sender] + k
-            if luck(scene.rules, neighbours.chance[i], scene.keys[listener], scene.keys[sender], number) == HEARD:
+            pair, chance = neighbours.pair[i], neighbours.chance[i]
+            if luck(scene.rules, chance, pair, scene.keys[listener], scene.keys[sender], number) == RECEIVED:
                 at = count
                 while at > 0 and table.ticks[senders[at - 1], columns[at - 1]] < table.ticks[sender, k]:
                     senders[at], columns[at] = senders[at - 1], columns[at - 1]
@@ -189,14 +231,15 @@ def newest_receptions(
     until = fetch_ticks - table.after_ticks - 1
     oldest = fetch_ticks - LOOK_BACK_TICKS
     count = 0
+    stride = _STRIDE_TICKS
     while until > oldest and count < relays[0].shape[0]:
-        found = candidates(scene, sender, max(until - _STRIDE_TICKS, oldest), until, scratch[0], scratch[1])
+        since = max(until - stride, oldest)
+        found = candidates(scene, sender, since, until, scratch[0], scratch[1], relays[0][:count])
         for i in range(found):
             other, k = scratch[0][i], scratch[1][i]
-            known = False
-            for j in range(count):
-                known = known or relays[0][j] == other
-            if known or count == relays[0].shape[0]:
+            if count == relays[0].shape[0]:
+                break
+            if contains(relays[0][:count], other):
                 continue
             rx_ticks = stamp_at_anchor(scene, sender, other, k)
             age = (tx_ticks - rx_ticks) & TICK_MASK
@@ -204,7 +247,8 @@ def newest_receptions(
                 relays[0][count], relays[2][count] = other, rx_ticks
                 relays[1][count] = (table.first_number[other] + k) & 0xFF
                 count += 1
-        until -= _STRIDE_TICKS
+        until = since
+        stride *= 2
     return count
 
 
@@ -229,10 +273,16 @@ def fill_relays(
 
 @kernel
 def receive_at_anchor(
-    scene: Scene, listener: int, from_ticks: int, to_ticks: int, senders: Integers, columns: Integers, rx_ticks: Integers
+    scene: Scene,
+    listener: int,
+    from_ticks: int,
+    to_ticks: int,
+    senders: Integers,
+    columns: Integers,
+    rx_ticks: Integers,
 ) -> int:
     """All receptions of an anchor of frames emitted in [from, to), newest first; returns their number."""
-    found = candidates(scene, listener, from_ticks - 1, to_ticks - 1, senders, columns)
+    found = candidates(scene, listener, from_ticks - 1, to_ticks - 1, senders, columns, senders[:0])
     count = 0
     for i in range(found):
         stamp = stamp_at_anchor(scene, listener, senders[i], columns[i])
@@ -282,9 +332,10 @@ def receive_at_tag(
         if errors.constant_m > 0.0:
             drawn = uniform(key_of(errors.constant_key, key, scene.keys[sender], 0))
             constant_m = errors.constant_m * (2.0 * drawn - 1.0)
-        knot, before, after = np.int64(-1) << 62, 0.0, 0.0
+        pair = pair_key(rules, key, scene.keys[sender])
+        knot, before, after = -(1 << 62), 0.0, 0.0
         piece = 0
-        for k in range(latest(table, sender, from_ticks - 1) + 1, table.count[sender]):
+        for k in range(latest(table, sender, from_ticks - 1) + 1, table.used[sender]):
             ticks, fraction = table.ticks[sender, k], table.fraction[sender, k]
             if ticks >= to_ticks:
                 break
@@ -296,11 +347,11 @@ def receive_at_tag(
             z_m = coordinate_m(path.pieces, piece, 2, t_s)
             square_m2 = squared_m2(scene.positions_m, sender, x_m, y_m, z_m)
             number = table.first_number[sender] + k
-            if luck(rules, delivery_chance(rules, square_m2), key, scene.keys[sender], number) != HEARD:
+            if luck(rules, delivery_chance(rules, square_m2), pair, key, scene.keys[sender], number) != RECEIVED:
                 continue
             wanted = (sender, ticks, fraction, float(table.after_ticks), square_m2)
             outcome, early_ticks = interference(scene, -1, (x_m, y_m, z_m), wanted)
-            if outcome != HEARD:
+            if outcome != RECEIVED:
                 continue
             error_m = constant_m
             if errors.slope_m != 0.0:
@@ -309,7 +360,7 @@ def receive_at_tag(
                 at = ticks // KNOT_TICKS - path.first_knot
                 part = (ticks % KNOT_TICKS) / KNOT_TICKS
                 travelled = path.travelled[at] + part * (path.travelled[at + 1] - path.travelled[at])
-                now = int(math.floor(travelled / errors.step))
+                now = math.floor(travelled / errors.step)
                 if now != knot:
                     knot = now
                     before = changing_error(errors, key, scene.keys[sender], knot)

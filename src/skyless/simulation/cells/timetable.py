@@ -57,7 +57,7 @@ class SlotSchedule(Struct, frozen=True):
     def __post_init__(self) -> None:
         if self.slots < 1 or self.slot_ticks < 1:
             raise ValueError(f"a superframe of {self.slots} slots of {self.slot_ticks} ticks; both should be above 0")
-        if len(self.colours) and not (0 <= self.colours.min() and self.colours.max() < self.slots):
+        if len(self.colours) and not (self.colours.min() >= 0 and self.colours.max() < self.slots):
             low, high = self.colours.min(), self.colours.max()
             raise ValueError(f"colours are from {low} to {high}; they should be slots from 0 to {self.slots - 1}")
 
@@ -79,7 +79,7 @@ class Table(NamedTuple):
     """Length after the RMARKER, the same for all."""
     first_number: Integers
     """Number of the frame in column 0, counted from each anchor's first frame, shape (anchors,)."""
-    count: Integers
+    used: Integers
     """Columns in use, shape (anchors,)."""
     tx_ticks: Integers
     """TX stamps, own unwrapped counter, shape (anchors, columns)."""
@@ -109,7 +109,7 @@ def on_radio_grid(own_ticks: int, tx_delay_ticks: int) -> int:
 @kernel
 def latest(table: Table, anchor: int, true_ticks: int) -> int:
     """Column of an anchor's last frame at or before a true time; -1 for none."""
-    count = table.count[anchor]
+    count = table.used[anchor]
     if count == 0:
         return -1
     k = (true_ticks - table.ticks[anchor, 0]) // table.period_ticks
@@ -135,8 +135,8 @@ def _fill_free(
     keys, ids, delays, starts = nodes
     window_ticks = table.period_ticks
     for anchor in range(keys.shape[0]):
-        if table.count[anchor] < 0:
-            table.count[anchor] = 0
+        if table.used[anchor] < 0:
+            table.used[anchor] = 0
             continue
         opening = first_free_window(ids[anchor], starts[anchor] + lead_ticks + _GRID_MASK + 1, window_ticks)
         window = max(own_time(knots, anchor, from_ticks, 0.0)[0] // window_ticks, opening)
@@ -153,7 +153,7 @@ def _fill_free(
             table.fraction[anchor, count] = fraction
             count += 1
             window += 1
-        table.count[anchor] = count
+        table.used[anchor] = count
 
 
 @kernel
@@ -172,8 +172,8 @@ def _fill_slots(
     keys, colours, delays = nodes
     opening = max((from_ticks - FIRST_SLOT_TICKS) // table.period_ticks, 0)
     for anchor in range(keys.shape[0]):
-        if table.count[anchor] < 0:
-            table.count[anchor] = 0
+        if table.used[anchor] < 0:
+            table.used[anchor] = 0
             continue
         table.first_number[anchor] = opening
         count = 0
@@ -191,7 +191,7 @@ def _fill_slots(
             table.ticks[anchor, count] = ticks
             table.fraction[anchor, count] = fraction
             count += 1
-        table.count[anchor] = count
+        table.used[anchor] = count
 
 
 @kernel
@@ -201,11 +201,11 @@ def _fill_given(
     """Fill in given frames, in the order of each sender's; all counts are 0 at first."""
     for i in range(senders.shape[0]):
         anchor = senders[i]
-        k = table.count[anchor]
+        k = table.used[anchor]
         ticks, fraction = true_time(knots, anchor, tx_ticks[i])
         ticks, fraction = emission(rules, keys[anchor], k, ticks, fraction)
         table.tx_ticks[anchor, k], table.ticks[anchor, k], table.fraction[anchor, k] = tx_ticks[i], ticks, fraction
-        table.count[anchor] = k + 1
+        table.used[anchor] = k + 1
 
 
 def _empty(anchors: int, columns: int, period_ticks: int, after_ticks: int) -> Table:
@@ -241,7 +241,7 @@ def scheduled_table(
     """Frames of all anchors from one true time to another, and perhaps one before; ``knots`` cover a period more."""
     period = schedule.period_ticks
     table = _empty(len(senders.ids), (to_ticks - from_ticks) // period + 3, period, after_ticks)
-    table.count[:] = -senders.dead
+    table.used[:] = -senders.dead
     from_ticks = max(from_ticks, 0)
     if isinstance(schedule, FreeSchedule):
         nodes = (senders.keys, senders.ids, senders.tx_delays_ticks, senders.start_ticks)
@@ -276,19 +276,17 @@ def given_table(
 
 
 @kernel
-def _fill_buckets(
-    table: Table, grid: Grid, start_ticks: int, bins: int, offsets: Integers, frames: Frames
-) -> None:
+def _fill_buckets(table: Table, grid: Grid, start_ticks: int, bins: int, offsets: Integers, frames: Frames) -> None:
     """Sort the frames of a table by cell and bin (counting sort)."""
-    for anchor in range(table.count.shape[0]):
-        for k in range(table.count[anchor]):
+    for anchor in range(table.used.shape[0]):
+        for k in range(table.used[anchor]):
             when = (table.ticks[anchor, k] - start_ticks) >> BIN_BITS
             if 0 <= when < bins:
                 offsets[grid.cell_of[anchor] * bins + when + 1] += 1
     for i in range(1, offsets.shape[0]):
         offsets[i] += offsets[i - 1]
-    for anchor in range(table.count.shape[0] - 1, -1, -1):
-        for k in range(table.count[anchor]):
+    for anchor in range(table.used.shape[0] - 1, -1, -1):
+        for k in range(table.used[anchor]):
             when = (table.ticks[anchor, k] - start_ticks) >> BIN_BITS
             if 0 <= when < bins:
                 i = offsets[grid.cell_of[anchor] * bins + when + 1] - 1
@@ -302,9 +300,7 @@ def make_buckets(table: Table, grid: Grid, from_ticks: int, to_ticks: int) -> Bu
     """Sort the frames between two true times by cell and time."""
     bins = ((to_ticks - from_ticks) >> BIN_BITS) + 1
     offsets = np.zeros(grid.columns * grid.rows * bins + 2, dtype=np.int64)
-    most = int(table.count.sum())
-    frames = Frames(
-        np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty(most), np.empty(most)
-    )
+    most = int(table.used.sum())
+    frames = Frames(np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty(most), np.empty(most))
     _fill_buckets(table, grid, from_ticks, bins, offsets, frames)
     return Buckets(from_ticks, bins, offsets[1:], frames)

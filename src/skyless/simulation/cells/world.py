@@ -16,6 +16,7 @@ from msgspec import Struct
 from skyless.air.ieee802154 import after_rmarker_s
 from skyless.constants import DEFAULT_ANTENNA_DELAY_TICKS, TICK_S
 from skyless.kernels.arrays import Array, Integers
+from skyless.kernels.compiled import kernel
 from skyless.simulation.cells.clocks import KNOT_TICKS, CellClocks
 from skyless.simulation.cells.grid import anchors_within, list_neighbours, make_grid
 from skyless.simulation.cells.keyed import (
@@ -87,7 +88,9 @@ class CellAnchors(Struct, frozen=True):
                 f"{self.tx_delays_ticks.shape}; they should be ({count}, 3) and ({count},)"
             )
         if count == 0 or len(np.unique(self.ids)) < count:
-            raise ValueError(f"{count} anchors with {len(np.unique(self.ids))} different identifiers; all should differ")
+            raise ValueError(
+                f"{count} anchors with {len(np.unique(self.ids))} different identifiers; all should differ"
+            )
 
 
 def anchors_at(positions_m: Array) -> CellAnchors:
@@ -197,7 +200,9 @@ class CellWorld:
         keys = np.concatenate((anchors.ids, TAG_NODES + np.arange(len(self.tags)))).astype(np.int64)
         self._rules = rules_of(impairments.channel, impairments.tx_stamp_ps, impairments.rx_stamp_ps, seed)
         self._clocks = CellClocks(impairments.oscillator, keys, seed)
-        self.true_positions_m: Array = anchors.positions_m + survey_std_m * _survey(anchors.ids, seed)
+        errors_m = np.empty((count, 3))
+        survey_errors(seed, anchors.ids, survey_std_m, errors_m)
+        self.true_positions_m: Array = anchors.positions_m + errors_m
         """Shape (anchors, 3)."""
         self._near_grid = make_grid(self.true_positions_m, self._rules.audible_m / 2.0)
         self._senders = Senders(
@@ -209,7 +214,7 @@ class CellWorld:
         )
         self._keys = keys
         self._cells = make_grid(self.true_positions_m, _CELL_M)
-        self._neighbours = list_neighbours(self._rules, self._near_grid, self.true_positions_m)
+        self._neighbours = list_neighbours(self._rules, self._near_grid, self.true_positions_m, keys[:count])
         self._most_neighbours = int(np.diff(self._neighbours.offsets).max())
         model = impairments.range_errors
         self._errors = _pair_errors(model, seed)
@@ -217,13 +222,18 @@ class CellWorld:
         self._span = (0, 0)
         self._scene: Scene | None = None
 
-    def run(self, until_s: float, *, from_s: float = 0.0, span_s: float = 0.5) -> Iterator[TagReceptions]:
-        """What all tags receive, span by span and in each tag by tag; memory grows with ``span_s`` alone."""
-        spans = math.ceil((until_s - from_s) / span_s)
-        for number in range(spans):
+    def run(
+        self, until_s: float, *, from_s: float = 0.0, span_s: float = 0.5, tags: Sequence[int] | None = None
+    ) -> Iterator[TagReceptions]:
+        """What tags (by default all) receive, span by span and in each tag by tag; memory grows with ``span_s`` alone.
+
+        For several workers each makes the same world and runs some of the tags.
+        """
+        listening = range(len(self.tags)) if tags is None else tags
+        for number in range(math.ceil((until_s - from_s) / span_s)):
             begin_s = from_s + number * span_s
-            end_s = min(begin_s + span_s, until_s)
-            for tag in range(len(self.tags)):
+            end_s = min(from_s + (number + 1) * span_s, until_s)
+            for tag in listening:
                 yield self.receptions(tag, begin_s, end_s)
 
     def receptions(self, tag: int, from_s: float, to_s: float) -> TagReceptions:
@@ -315,7 +325,7 @@ class CellWorld:
         self, scene: Scene, tag: int, near: Integers, path: Path, from_ticks: int, to_ticks: int
     ) -> tuple[Integers, Integers, Integers, Array]:
         """Senders, columns of the table, RX stamps, and motion, in the order of emission."""
-        most = int(scene.table.count[near].sum())
+        most = int(scene.table.used[near].sum())
         senders, columns, rx_ticks = (np.empty(most, dtype=np.int64) for _ in range(3))
         motion = np.empty((most, 6))
         node = len(self.anchors.ids) + tag
@@ -363,9 +373,7 @@ class CellWorld:
 
     # Anchors
 
-    def _at_anchors(
-        self, scene: Scene, anchors: Sequence[int], from_ticks: int, to_ticks: int
-    ) -> AnchorReceptions:
+    def _at_anchors(self, scene: Scene, anchors: Sequence[int], from_ticks: int, to_ticks: int) -> AnchorReceptions:
         table, ids = scene.table, self.anchors.ids
         most = max(self._most_neighbours, 1) * table.ticks.shape[1]
         scratch = tuple(np.empty(most, dtype=np.int64) for _ in range(3))
@@ -393,11 +401,13 @@ def _span_ticks(from_s: float, to_s: float) -> tuple[int, int]:
     return from_seconds(from_s), from_seconds(to_s)
 
 
-def _survey(ids: Integers, seed: int) -> Array:
-    """Standard normals of anchors, shape (n, 3)."""
-    base = np.uint64(purpose_key(seed, SURVEY))
-    drawn = [[normal(np.uint64(key_of(base, int(one), axis, 0))) for axis in range(3)] for one in ids]
-    return np.array(drawn)
+@kernel
+def survey_errors(seed: int, ids: Integers, std_m: float, errors_m: Array) -> None:
+    """Fill in the errors of anchors' positions, shape (n, 3)."""
+    base = purpose_key(seed, SURVEY)
+    for anchor in range(ids.shape[0]):
+        for axis in range(3):
+            errors_m[anchor, axis] = std_m * normal(key_of(base, ids[anchor], axis, 0))
 
 
 def _pair_errors(model: RangeErrorModel, seed: int) -> PairErrors:
