@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from skyless.studies.plan import Plan, Row, Study
 
-_Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "scale"]
+_Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "scale", "sitetime"]
 
 _OF_EPISODES: Final = ("efficiency", "integrity")
 """Studies of the filter ``joint`` itself."""
@@ -54,9 +54,14 @@ _OF_THE_ROOM: Final = (
     "Level: share of fixes with a protection level. HPL: its median. Exceeded: share of those whose error is larger,",
     "in 10⁻⁴, with the interval where it truly lies with 99 % (tags as units); unwarned: those without an alert.",
 )
-_LEGENDS: Final = {"integrity": _OF_LEVELS, "room": _OF_THE_ROOM}
+_OF_SITE_TIME: Final = (
+    "Simulated. RMSE: error of an anchor's timeline, or difference of two in range. σ: as anchors state it.",
+    "Ratio: σ over RMSE. Max: largest difference of two anchors in range.",
+)
+_LEGENDS: Final = {"integrity": _OF_LEVELS, "room": _OF_THE_ROOM, "sitetime": _OF_SITE_TIME}
 
 _FIGURES: Final = {
+    "max_m": "max",
     "rmse_m": "RMSE",
     "nees": "NEES",
     "level": "level",
@@ -117,6 +122,7 @@ def study(name: _Name, /, *, asked: StudyOptions = StudyOptions()) -> None:
         efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
         sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
         room: the errors of real rooms, and what goes wrong in them. scale: numbers of tags and anchors.
+        sitetime: one timeline over many hops.
     """
     from skyless.studies.catalogue import STUDIES
 

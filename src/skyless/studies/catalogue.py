@@ -14,6 +14,7 @@ from skyless.studies import (
     nlos,
     room,
     scale,
+    sitetime,
     sync,
 )
 from skyless.studies.picture import Look, draw
@@ -65,6 +66,7 @@ STUDIES: Final = {
             cells=room.cells,
             rows=room.rows,
         ),
+        Study("sitetime", "one timeline over many hops", sitetime.cells, sitetime.rows, sitetime.draw),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
     )
 }
