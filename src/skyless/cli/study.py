@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
     from skyless.studies.plan import Plan, Row, Study
 
-_Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "large", "claims", "sitetime", "scale"]
+_Name = Literal[
+    "efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "large", "claims", "sitetime", "scale"
+]
 
 _OF_EPISODES: Final = ("efficiency", "integrity")
 """Studies of the filter ``joint`` itself."""
