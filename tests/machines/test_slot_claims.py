@@ -127,7 +127,9 @@ def graphs(draw):
             links[one].add(other)
             links[other].add(one)
     slots = [slot * (S // 16) for slot in draw(st.lists(st.integers(0, 15), min_size=count, max_size=count))]
-    return CheckedGraph([sorted(others) for others in links], slots, draw(st.floats(0.2, 1.0)), draw(st.integers(0, 99)))
+    return CheckedGraph(
+        [sorted(others) for others in links], slots, draw(st.floats(0.2, 1.0)), draw(st.integers(0, 99))
+    )
 
 
 EVENTS = st.tuples(st.sampled_from(("off", "on", "restart", "cut", "join", "lead")), st.integers(0, 8), TERMS)
@@ -225,7 +227,9 @@ def test_three_islands_of_any_terms_settle(terms):
 
 
 def line(count, reception, *, on=True, seed=3):
-    links = [[other for other in (node - 2, node - 1, node + 1, node + 2) if 0 <= other < count] for node in range(count)]
+    links = [
+        [other for other in (node - 2, node - 1, node + 1, node + 2) if 0 <= other < count] for node in range(count)
+    ]
     graph = CheckedGraph(links, [(7 * node % count) * (S // count) for node in range(count)], reception, seed)
     for node in range(count if on else 0):
         graph.switch_on(node)

@@ -174,7 +174,7 @@ def rows(plan: Plan, results: Sequence[ClaimResult]) -> list[Row]:
 def _row(plan: Plan, case: str, run: ClaimRun, index: int, results: Sequence[ClaimResult]) -> Row:
     """Median and longest time of an event; after the last event also how often claims changed."""
     passed = [math.inf if (one := result.superframes[index]) is None else one for result in results]
-    most = max(passed)
+    most = float(max(passed))
     changes = sum(result.changes_afterwards for result in results) if index + 1 == len(EVENTS) else None
     limit, limits, missed = _limit(run.site, EVENTS[index]), [], []
     if run.reception >= JUDGED_RECEPTION:
