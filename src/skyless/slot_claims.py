@@ -28,8 +28,12 @@ NEWS_CHANCE: Final = 1e-8
 """Chance of a silence, were the root alive, beyond which waiting for hops and identifier begins."""
 NEWS_MEMORY: Final = 256
 """Superframes over which the share of those with news is averaged."""
+LEARNED_GAPS: Final = 32
+"""Before this many the regularity of gaps is not relied on."""
+SUPPOSED_MISSES: Final = 3
+"""Superframes without news that are counted on top of those seen, so that few superframes prove little."""
 LEAST_PATIENCE: Final = 4
-MOST_PATIENCE: Final = 64
+MOST_PATIENCE: Final = 128
 """Limits of the wait that is learned, in superframes."""
 HOP_PATIENCE: Final = 2
 """Further superframes for each hop from the root."""
@@ -124,9 +128,9 @@ class NewsWatch:
     """
 
     def __init__(self) -> None:
-        self._share = 0.5
-        """Of superframes without news."""
-        self._turns = self._gaps = 0
+        self._misses = self._turns = 0.0
+        """Superframes without news, and all, each with the weight of its age."""
+        self._gaps = 0
         self._mean, self._square = 2.0, 8.0
         """Of gaps in superframes."""
         self.patience = MOST_PATIENCE
@@ -135,13 +139,15 @@ class NewsWatch:
     def update(self, superframes: int) -> None:
         """Process news that came this number of superframes after the last; those between brought none."""
         gap = min(superframes, NEWS_MEMORY)
-        for turn in range(1, gap + 1):
-            self._turns = min(self._turns + 1, NEWS_MEMORY)
-            self._share += ((turn < gap) - self._share) / (self._turns + 2)
+        kept = 1.0 - gap / NEWS_MEMORY
+        self._misses, self._turns = kept * self._misses + gap - 1, kept * self._turns + gap
         self._gaps = min(self._gaps + 1, NEWS_MEMORY)
         self._mean += (gap - self._mean) / (self._gaps + 1)
         self._square += (gap * gap - self._square) / (self._gaps + 1)
-        longest = min(math.log(NEWS_CHANCE) / math.log(self._share), self._regular_gap())
+        share = (self._misses + SUPPOSED_MISSES) / (self._turns + SUPPOSED_MISSES + 1)
+        longest = math.log(NEWS_CHANCE) / math.log(share)
+        if self._gaps >= LEARNED_GAPS:
+            longest = min(longest, self._regular_gap())
         self.patience = min(max(math.ceil(longest), LEAST_PATIENCE), MOST_PATIENCE)
 
     def _regular_gap(self) -> float:

@@ -99,3 +99,28 @@ def test_many_alerts_take_no_more_than_four_lines(stage, alert):
     assert text.count(alert) == MOST_ALERTS + 1
     assert "200 of 200 tags now" in " ".join(text.split())
     assert text.count("\n") <= 4
+
+
+def synchronisation(stage, **fields):
+    """The table of anchors, all of which have these fields."""
+    screen, watch = stage
+    for number, health in list(watch.anchors.items()):
+        watch.anchors[number] = msgspec.structs.replace(health, **fields)
+    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
+    console.print(screen._anchors())
+    return console.export_text()
+
+
+def test_without_a_master_the_table_shows_what_the_slot_time_follows(stage):
+    text = synchronisation(stage, mode="slots", master=None, root=4, term=2, hop=1, parents=(4, 5))
+    assert "parents" in text
+    assert "4 5" in text
+    assert "clock sigma" not in text
+    text = synchronisation(stage, mode="free", master=None, root=None, term=None, hop=None, parents=(), rate_ppm=None)
+    assert not any(word in text for word in ("root", "parents", "rate ppm", "clock sigma"))
+
+
+def test_with_a_master_the_table_shows_clocks(stage):
+    text = synchronisation(stage)
+    assert "clock sigma" in text
+    assert "parents" not in text

@@ -183,7 +183,7 @@ class SlotsAnchor:
                 self.counters["phase-change"] += 1
                 self._phase += 1
                 self._time.restart()
-            self._time.follow_parents()
+            self._time.stop_leading()
             self._time.set_parents((anchor,))
         if anchor in self._time.parents:
             site_time = admitted.beacon.site_time if self._states_site_time else None

@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
     from skyless.studies.plan import Plan, Row, Study
 
-_Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "large", "claims", "scale"]
+_Name = Literal[
+    "efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "large", "claims", "sitetime", "scale"
+]
 
 _OF_EPISODES: Final = ("efficiency", "integrity")
 """Studies of the filter ``joint`` itself."""
@@ -62,11 +64,22 @@ _OF_CLAIMS: Final = (
     "Simulated. Superframes until all anchors follow one claim whose root lives; longest: the slowest run.",
     "Changes: anchors that changed their claim once all was settled, in all runs.",
 )
-_LEGENDS: Final = {"integrity": _OF_LEVELS, "room": _OF_THE_ROOM, "large": _OF_A_LARGE_SITE, "claims": _OF_CLAIMS}
+_OF_SITE_TIME: Final = (
+    "Simulated. RMSE: error of an anchor's timeline, or difference of two in range. σ: as anchors state it.",
+    "Ratio: σ over RMSE. Max: largest difference of two anchors in range.",
+)
+_LEGENDS: Final = {
+    "integrity": _OF_LEVELS,
+    "room": _OF_THE_ROOM,
+    "large": _OF_A_LARGE_SITE,
+    "claims": _OF_CLAIMS,
+    "sitetime": _OF_SITE_TIME,
+}
 
 _FIGURES: Final = {
     "superframes_most": "superframes",
     "changes": "changes",
+    "max_m": "max",
     "rmse_m": "RMSE",
     "nees": "NEES",
     "level": "level",
@@ -133,7 +146,7 @@ def study(name: _Name, /, *, asked: StudyOptions = StudyOptions()) -> None:
         efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
         sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
         room: the errors of real rooms, and what goes wrong in them. large: 1,024 anchors without a master.
-        claims: whose counter leads protocol 2.
+        claims: whose counter leads protocol 2. sitetime: one timeline over many hops.
         scale: numbers of tags and anchors.
     """
     from skyless.studies.catalogue import STUDIES

@@ -11,8 +11,15 @@ from collections.abc import Iterable
 from typing import Final
 
 from skyless.air.beacon2 import SlotTime, StatedSiteTime
-from skyless.clocks.composition import GRID_VARIANCE_M2, MEAN_LATE_TICKS, SLOT_GAIN, shares
-from skyless.clocks.filter import ClockFilter, ClockNoise
+from skyless.clocks.composition import (
+    AVERAGING_S,
+    GRID_VARIANCE_M2,
+    MAX_SLOT_STD_M,
+    MEAN_LATE_TICKS,
+    SLOT_GAIN,
+    by_parent,
+)
+from skyless.clocks.filter import MAX_RELATIVE_RATE, ClockFilter, ClockNoise
 from skyless.clocks.site_clock import (
     GRID_SLACK_TICKS,
     MISFITS_BEFORE_RESTART,
@@ -21,7 +28,7 @@ from skyless.clocks.site_clock import (
     continued,
     own_counter,
 )
-from skyless.constants import MAX_DRIFT, SUBTICKS, TICK_M, TICK_S
+from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
 from skyless.site.slots import Schedule
 from skyless.ticks import nearest, wrap
 
@@ -30,7 +37,7 @@ MOST_PARENTS: Final = 3
 SUPERFRAME_BITS: Final = 32
 
 KNOWN_RATE_STD: Final = 1e-8
-"""Of a pair's rate that follows from both anchors' rates against one timeline: ten times what those err."""
+"""Least of a pair's rate that follows from both anchors' rates against one timeline: ten times what those err."""
 
 
 class _Parent:
@@ -67,6 +74,12 @@ class ComposedTime:
         self._map: SiteTime | None = None
         self._map_ticks = 0
         """Own reading of the last renewal of the map."""
+        self._rate_std = MAX_RELATIVE_RATE
+        """Of the own rate then, as far as the pairs go."""
+        self._age_s = 0.0
+        """Mean age of the parents' statements then."""
+        self._delay_s = 0.5 * schedule.superframe_ticks * TICK_S
+        """Mean age of the parents' statements at any time."""
         self._weights: list[tuple[_Parent, float]] = []
         self.is_root = False
 
@@ -104,7 +117,7 @@ class ComposedTime:
         if self._map is None:
             self._map, self._map_ticks = own_counter(), ticks_own
 
-    def follow_parents(self) -> None:
+    def stop_leading(self) -> None:
         """Be no root any longer: the next beacon of a parent counts."""
         self.is_root = False
 
@@ -130,13 +143,15 @@ class ComposedTime:
             return 0.0
         if not self._weights:
             return math.inf
-        effective = 1.0 / sum(weight * weight for _, weight in self._weights)
-        common = alone = 0.0
+        total = 0.0
         for parent, weight in self._weights:
-            shared, own = self._shares(parent, ticks_own, effective)
-            common += weight * math.sqrt(shared)
-            alone += weight * weight * own
-        return common * common + alone
+            common, alone = self._by_parent(parent, ticks_own)
+            total += weight * (common + weight * alone)
+        return total
+
+    def is_settled(self, ticks_own: int) -> bool:
+        """Whether the timeline is known well enough at an own reading to speak in a slot."""
+        return self.is_known and self.variance_m2(ticks_own) < MAX_SLOT_STD_M * MAX_SLOT_STD_M
 
     def stated(self, ticks_own: int, superframe: int, slot: int) -> StatedSiteTime:
         """What the own beacon states at its TX stamp, superframe unwrapped. Raises ValueError before it is known."""
@@ -194,7 +209,7 @@ class ComposedTime:
         rejected_before = state.pair.rejected
         state.pair.update(tx_ticks, rx_ticks, range_m)
         if before is not None:  # the filter has moved to this instant, so the line does as well
-            state.subticks = before + round(gone * SUBTICKS / (1.0 + rate))
+            state.subticks = before + gone * SUBTICKS - round(gone * SUBTICKS * (rate / (1.0 + rate)))
         state.tx_ticks, state.rx_ticks = tx_ticks, rx_ticks
         if state.pair.rejected > rejected_before:
             self._counters["clock-outlier"] += 1
@@ -225,7 +240,8 @@ class ComposedTime:
         if rate is None:
             state.pair.restart(tx_ticks, rx_ticks, range_m)
         else:
-            state.pair.restart(tx_ticks, rx_ticks, range_m, rate, KNOWN_RATE_STD)
+            rate_std = min(max(2.0 * self._rate_std, KNOWN_RATE_STD), MAX_RELATIVE_RATE)
+            state.pair.restart(tx_ticks, rx_ticks, range_m, rate, rate_std)
         state.tx_ticks, state.rx_ticks = tx_ticks, rx_ticks
         state.subticks, state.statements = None, 0
         state.misfits = state.line_misfits = 0
@@ -257,35 +273,38 @@ class ComposedTime:
         state.statements += 1
         return True
 
-    def _shares(self, parent: _Parent, ticks_own: int, effective: float) -> tuple[float, float]:
-        return shares(
-            parent.variance_m2,
-            parent.hop,
-            (ticks_own - parent.rx_ticks) * TICK_S,
-            0.5 * self._schedule.superframe_ticks * TICK_S,
-            effective,
-            parent.pair.covariance,
-            self._noise.white,
-            self._noise.walk,
-        )
+    def _by_parent(self, parent: _Parent, ticks_own: int) -> tuple[float, float]:
+        age_s = (ticks_own - parent.rx_ticks) * TICK_S
+        pair, noise = parent.pair.covariance, self._noise
+        return by_parent(parent.variance_m2, parent.hop, age_s, self._delay_s, pair, noise.white, noise.walk)
 
     def _renew(self, ticks_own: int) -> None:
         """The map from the mean of what follows by way of each parent, at this own reading."""
-        shown = [state for state in self._parents.values() if state.subticks is not None]
-        lines: list[tuple[_Parent, int, float, float, float]] = []
-        for state in shown:
-            whole, fraction, _ = state.pair.to_master(ticks_own)
-            elapsed = ((whole - state.tx_ticks) + fraction) / (1.0 + state.rate)
-            steps = math.floor(elapsed)
-            rate = (1.0 + state.pair.rate) * (1.0 + state.rate) - 1.0
-            information = 1.0 / sum(self._shares(state, ticks_own, 1.0))
-            assert state.subticks is not None
-            lines.append((state, state.subticks + steps * SUBTICKS, (elapsed - steps) * SUBTICKS, rate, information))
-        total = sum(line[4] for line in lines)
-        base = lines[0][1]
-        subticks = sum(line[4] * ((line[1] - base) + line[2]) for line in lines) / total
-        rate = sum(line[4] * line[3] for line in lines) / total
-        whole = base + math.floor(subticks)
-        self._map = continued(ticks_own, whole // SUBTICKS, (whole % SUBTICKS) / SUBTICKS, rate)
-        self._map_ticks = ticks_own
-        self._weights = [(line[0], line[4] / total) for line in lines]
+        if self._weights:
+            elapsed_s = (ticks_own - self._map_ticks) * TICK_S
+            age_s = self._age_s + 0.5 * elapsed_s
+            self._delay_s += min(elapsed_s / AVERAGING_S, 1.0) * (age_s - self._delay_s)
+        base: int | None = None
+        total = mean = mean_rate = ages_s = 0.0
+        weights: list[tuple[_Parent, float]] = []
+        for state in self._parents.values():
+            if state.subticks is None:
+                continue
+            weight = 1.0 / sum(self._by_parent(state, ticks_own))
+            ticks_parent, fraction, _ = state.pair.to_master(ticks_own)
+            elapsed = (ticks_parent - state.tx_ticks) * SUBTICKS
+            line = state.subticks + elapsed - round(elapsed * (state.rate / (1.0 + state.rate)))
+            base = line if base is None else base
+            total += weight
+            mean += weight * ((line - base) + fraction * SUBTICKS)
+            mean_rate += weight * ((1.0 + state.pair.rate) * (1.0 + state.rate) - 1.0)
+            ages_s += (ticks_own - state.rx_ticks) * TICK_S
+            weights.append((state, weight))
+        assert base is not None
+        subticks = base + math.floor(mean / total + 0.5)
+        ticks, rest = divmod(subticks, SUBTICKS)
+        self._map = continued(ticks_own, ticks, rest / SUBTICKS, mean_rate / total)
+        rate_variance = min(state.pair.covariance[2] for state, _ in weights)
+        self._rate_std = math.sqrt(rate_variance) / SPEED_OF_LIGHT_MPS
+        self._map_ticks, self._age_s = ticks_own, ages_s / len(weights)
+        self._weights = [(state, weight / total) for state, weight in weights]

@@ -1,4 +1,4 @@
-"""What of an anchor's site time comes from each parent, and how certain it is (``docs/maths.md`` section 6).
+"""What of an anchor's timeline comes from each parent, and how certain it is (``docs/maths.md`` section 6).
 
 Plain arithmetic on floats, in metres of light and seconds: ``clocks/composed_time.py`` uses it in Python, the study
 ``sitetime`` in a kernel.
@@ -16,47 +16,35 @@ MEAN_LATE_TICKS: Final = DELAYED_TX_GRANULARITY_TICKS // 2
 GRID_VARIANCE_M2: Final = (DELAYED_TX_GRANULARITY_TICKS * TICK_M) ** 2 / 12.0
 
 SLOT_GAIN: Final = 1.0 / 16.0
-"""Of the first-order loop on stated slots: their grid's noise falls to a sixth, 0.4 ns a hop."""
+"""Of the first-order loop on stated slots: the grid's noise falls to a sixth, 0.4 ns a hop."""
 
-NOISE_SHARE: Final = (0.75, 0.5, 0.25)
-"""Parts of a settled filter's variance, covariance and rate variance that come from its measurements' noise.
+MAX_SLOT_STD_M: Final = 3.0
+"""An anchor speaks only while its slots are known to 10 ns: neighbours' slots are to lie within 50."""
 
-The steady state of continuous measurements and a rate that walks; the rest comes half from each of the two clocks.
-"""
+AVERAGING_S: Final = 10.0
+"""Time over which an anchor averages the age of its parents' statements, which losses make longer."""
 
 
 @jitted
-def shares(
-    stated_variance: float,
-    hop: int,
-    age_s: float,
-    delay_s: float,
-    parents: float,
-    pair: TwoState,
-    white: float,
-    walk: float,
+def by_parent(
+    stated_variance: float, hop: int, age_s: float, delay_s: float, pair: TwoState, white: float, walk: float
 ) -> tuple[float, float]:
-    """Variance in m² of the timeline by way of one parent: what all parents share, and what is this pair's alone.
+    """Variance in m² of the timeline by way of one parent: what parents have in common, and this pair's noise.
 
-    ``stated_variance`` is the parent's at its last TX stamp and ``hop`` its own; that was ``age_s`` ago. ``delay_s`` is
-    the mean age at a hop, ``parents`` the effective number of parents that each hop averages. ``white`` and ``walk``
-    are the process noise of the difference of two clocks.
+    ``stated_variance`` is the parent's at its last TX stamp, ``age_s`` ago, and ``hop`` its distance from the root;
+    each hop between delays the root's time by ``delay_s``. ``white`` and ``walk`` are the process noise of the
+    difference of two clocks.
+
+    A settled filter owes its measurements' noise 3/4 of the variance, 1/2 of the covariance and 1/4 of the rate's
+    variance; the rest comes half from each of its two clocks. A clock between two pairs enters both with opposite
+    signs, so that of the clocks only the root's and the own one remain, and the root's grows with the delay.
     """
     variance, covariance, rate_variance = pair
-    noise = 0.75 * variance, 0.5 * covariance, 0.25 * rate_variance
-    clocks = 0.25 * variance, 0.5 * covariance, 0.75 * rate_variance
     way_s = hop * delay_s
-    rate_noise = hop * noise[2] / parents
-    common_rate = clocks[2] + rate_noise + 0.5 * walk * way_s
-    common_covariance = (
-        clocks[1]
-        + hop * noise[1] / parents
-        + 0.5 * way_s * rate_noise
-        + way_s * 0.5 * clocks[2]
-        + 0.25 * walk * way_s * way_s
-    )
-    common = stated_variance if hop > 0 else clocks[0]
-    common += age_s * (2.0 * common_covariance + age_s * common_rate)
+    rates = 0.75 * rate_variance + 0.5 * walk * way_s
+    covariances = 0.5 * covariance + way_s * (0.375 * rate_variance + 0.25 * walk * way_s)
+    common = stated_variance if hop > 0 else 0.25 * variance
+    common += age_s * (2.0 * covariances + age_s * rates)
     common += abs(age_s) * (white + walk * age_s * age_s / 3.0)
-    own = noise[0] + age_s * (2.0 * noise[1] + age_s * noise[2])
-    return common, own
+    alone = 0.75 * variance + age_s * (covariance + 0.25 * age_s * rate_variance)
+    return common, alone

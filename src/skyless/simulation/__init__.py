@@ -1,4 +1,5 @@
 """The emulated radio world: oscillators, channel, medium and moving tags, deterministic by seed.
 
-Public: channel, impairments, listening, medium, oscillator, range_errors, stations, streams, trajectory, world.
+Public: channel, impairments, listening, medium, oscillator, range_errors, site_time, stations, streams, trajectory,
+world.
 """

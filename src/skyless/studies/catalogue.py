@@ -16,6 +16,7 @@ from skyless.studies import (
     nlos,
     room,
     scale,
+    sitetime,
     sync,
 )
 from skyless.studies.picture import Look, draw
@@ -81,6 +82,7 @@ STUDIES: Final = {
             claims.rows,
             partial(draw, Look("Superframes until one claim is left", ("superframes",))),
         ),
+        Study("sitetime", "one timeline over many hops", sitetime.cells, sitetime.rows, sitetime.draw),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
     )
 }

@@ -35,21 +35,23 @@ class ClaimSite(Struct, frozen=True):
     slots: int
     most: int
     """Superframes within which one claim should be left after an event, where four of five frames are received."""
+    receptions: tuple[float, ...]
+    """Shares of frames that are received."""
+    afterwards: int
+    """Superframes after all events, in one run of several, in which no claim should change."""
 
 
-HALL: Final = ClaimSite("hall", 300.0, 167.0, 7.0, 28.2, 93, 10)
-CORRIDOR: Final = ClaimSite("corridor", 1000.0, 60.0, 15.0, 22.0, 17, 40)
-SITES: Final = (HALL, CORRIDOR)
+CLAIM_HALL: Final = ClaimSite("hall", 300.0, 167.0, 7.0, 28.2, 93, 10, (1.0, 0.8, 0.15), 2_000)
+CLAIM_CORRIDOR: Final = ClaimSite("corridor", 1000.0, 60.0, 15.0, 22.0, 17, 40, (1.0, 0.8, 0.5, 0.3, 0.15), 10_000)
+SITES: Final = (CLAIM_HALL, CLAIM_CORRIDOR)
 
 EVENTS: Final = ("cold start", "root killed", "cut in half", "joined", "three islands", "a fifth dead")
-RECEPTIONS: Final = (1.0, 0.8, 0.5, 0.3, 0.15)
 JUDGED_RECEPTION: Final = 0.8
 
 _PATIENCE: Final = 1_500
 _LEARNING: Final = 100
 """Superframes between events, in which anchors learn how regularly news comes."""
 _AFTERWARDS: Final = 200
-_LONG: Final = 10_000
 _ISLAND_TERMS: Final = (0, 100, 200)
 
 
@@ -84,16 +86,16 @@ def cells(plan: Plan) -> list[Cell]:
 def _runs(plan: Plan) -> list[tuple[str, ClaimRun]]:
     found = []
     for site in SITES:
-        for reception in (JUDGED_RECEPTION,) if plan.quick else RECEPTIONS:
+        for reception in (JUDGED_RECEPTION,) if plan.quick else site.receptions:
             for world in range(max(plan.worlds // 2, 1) if plan.quick else plan.worlds):
-                long = reception == JUDGED_RECEPTION and world == 0 and not plan.quick  # an hour of a hall's air
-                run = ClaimRun(site, reception, seed_of(plan.seed, world), _LONG if long else _AFTERWARDS)
+                long = reception == JUDGED_RECEPTION and world == 0 and not plan.quick
+                run = ClaimRun(site, reception, seed_of(plan.seed, world), site.afterwards if long else _AFTERWARDS)
                 found.append((f"{site.name} {100 * reception:.0f} %", run))
     return found
 
 
 def _weight_s(run: ClaimRun) -> float:
-    return (1_000 + run.afterwards) * (0.05 if run.site is HALL else 0.008) * run.reception
+    return (1_000 + run.afterwards) * (0.05 if run.site is CLAIM_HALL else 0.008) * run.reception
 
 
 def run_claims(run: ClaimRun) -> ClaimResult:
@@ -172,7 +174,7 @@ def rows(plan: Plan, results: Sequence[ClaimResult]) -> list[Row]:
 def _row(plan: Plan, case: str, run: ClaimRun, index: int, results: Sequence[ClaimResult]) -> Row:
     """Median and longest time of an event; after the last event also how often claims changed."""
     passed = [math.inf if (one := result.superframes[index]) is None else one for result in results]
-    most = max(passed)
+    most = float(max(passed))
     changes = sum(result.changes_afterwards for result in results) if index + 1 == len(EVENTS) else None
     limit, limits, missed = _limit(run.site, EVENTS[index]), [], []
     if run.reception >= JUDGED_RECEPTION:
