@@ -3,7 +3,7 @@ import pytest
 from skyless.air.beacon import HEARD
 from skyless.positioning.methods.selection import (
     BETTER_DB,
-    MOST_ANCHORS,
+    MOST_ANCHORS_IN_USE,
     MOST_KEPT,
     RELAYED_TICKS,
     AnchorSelection,
@@ -60,5 +60,5 @@ def test_memory_is_bounded():
 
 
 def test_full_with_24():
-    assert not is_full(range(MOST_ANCHORS - 1))
-    assert is_full(range(MOST_ANCHORS))
+    assert not is_full(range(MOST_ANCHORS_IN_USE - 1))
+    assert is_full(range(MOST_ANCHORS_IN_USE))

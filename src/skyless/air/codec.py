@@ -25,10 +25,10 @@ SATURATED_STD: Final = 0xFFFF
 FRAME_CONTROL: Final = 0x8841
 """Data frame, PAN identifier compressed, 16-bit addresses."""
 BROADCAST: Final = 0xFFFF
-MAGIC: Final = 0xB053
+BEACON_MAGIC: Final = 0xB053
 """The bytes 53 B0; the low half of the second is the version."""
 _MAGIC_MASK: Final = 0xF0FF
-_VERSION_1: Final = MAGIC | 0x0100
+_VERSION_1: Final = BEACON_MAGIC | 0x0100
 
 _HAS_MASTER_HEARD: Final = 0x01
 _HAS_MASTER_TIME: Final = 0x02
@@ -114,7 +114,7 @@ def not_a_beacon(frame: bytes, version: int) -> Malformed | None:
     if len(frame) < _START.size + FCS_BYTES:
         return Malformed.NOT_A_BEACON
     control, _, _, destination, _, magic = _START.unpack_from(frame)
-    if control != FRAME_CONTROL or destination != BROADCAST or magic & _MAGIC_MASK != MAGIC:
+    if control != FRAME_CONTROL or destination != BROADCAST or magic & _MAGIC_MASK != BEACON_MAGIC:
         return Malformed.NOT_A_BEACON
     return Malformed.UNKNOWN_VERSION if magic != version else None
 

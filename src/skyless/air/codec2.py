@@ -12,7 +12,7 @@ from skyless.air.codec import (
     BROADCAST,
     FCS_BYTES,
     FRAME_CONTROL,
-    MAGIC,
+    BEACON_MAGIC,
     MAX_FRAME_BYTES,
     SATURATED_STD,
     STD_STEPS_PER_TICK,
@@ -22,7 +22,7 @@ from skyless.air.ieee802154 import fcs, is_intact
 from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
 from skyless.constants import SUBTICKS
 
-VERSION_2: Final = MAGIC | 0x0200
+VERSION_2: Final = BEACON_MAGIC | 0x0200
 AUTHENTICATION_BYTES_2: Final = 8
 """Bytes that every frame reserves for authentication."""
 

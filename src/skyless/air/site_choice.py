@@ -14,7 +14,7 @@ PRESENT_TICKS: Final = from_seconds(1.0)
 """Anchors received within this time count."""
 
 MOST_SITES: Final = 8
-MOST_ANCHORS: Final = 32
+MOST_COUNTED: Final = 32
 """Of one site, as far as they are counted."""
 
 
@@ -79,7 +79,7 @@ class SiteChoice(Struct):
         anchors = self.anchors.setdefault(number, {})
         anchors.pop(anchor, None)
         anchors[anchor] = rx_ticks
-        if len(anchors) > MOST_ANCHORS:
+        if len(anchors) > MOST_COUNTED:
             del anchors[next(iter(anchors))]
 
     def _prefers(self, key: SiteKey, rx_ticks: int) -> bool:

@@ -12,7 +12,7 @@ from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.positioning.methods.joint import Estimation
 from skyless.positioning.methods.observations import FixTime
-from skyless.positioning.methods.selection import MOST_ANCHORS
+from skyless.positioning.methods.selection import MOST_ANCHORS_IN_USE
 from skyless.positioning.methods.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.site.local_almanac import CommonPages
 from skyless.ticks import to_seconds
@@ -63,7 +63,7 @@ def new_method_2(options: MethodOptions, pages: CommonPages, time: FixTime) -> E
     superframe_s = to_seconds(pages.site.superframe_ticks)
     settings = estimator_settings(options.qa, pages.site.tag_height_m, pages.noise, pages.accuracy, superframe_s)
     settings = replace(_as_required(settings, options), drop_s=max(CELL_DROP_S, 4.0 * superframe_s))
-    return Estimation(settings, options.z_bounds_m, time, superframe_s, MOST_ANCHORS)
+    return Estimation(settings, options.z_bounds_m, time, superframe_s, MOST_ANCHORS_IN_USE)
 
 
 def _as_required(settings: EstimatorSettings, options: MethodOptions) -> EstimatorSettings:

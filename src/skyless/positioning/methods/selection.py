@@ -9,7 +9,7 @@ from msgspec import Struct
 from skyless.air.beacon import HEARD
 from skyless.ticks import from_seconds
 
-MOST_ANCHORS: Final = 24
+MOST_ANCHORS_IN_USE: Final = 24
 """In the estimator's state; more cost accuracy, as each then sends less, and time."""
 
 BETTER_DB: Final = 3.0
@@ -88,7 +88,7 @@ class AnchorSelection:
 
 def is_full(anchors: Collection[int]) -> bool:
     """Whether another anchor can only be used instead of one of these."""
-    return len(anchors) >= MOST_ANCHORS
+    return len(anchors) >= MOST_ANCHORS_IN_USE
 
 
 def _nominal_dbm(range_m: float) -> float:
