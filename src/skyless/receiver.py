@@ -10,24 +10,37 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.air.beacon import Beacon
-from skyless.air.codec import decode_cached
+from skyless.air.beacon import Beacon, Malformed
+from skyless.air.beacon2 import Beacon2
+from skyless.air.codec2 import packed_relays_2
+from skyless.air.frames import AnyBeacon, decode_any
 from skyless.air.master_term import FollowedMaster
 from skyless.air.reception import Diagnostics, Reception
+from skyless.air.site_choice import SiteChoice, SiteKey, SiteUse
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.integrity import IntegrityRequirement
-from skyless.positioning.methods.factory import MethodOptions, new_method
+from skyless.positioning.methods.factory import MethodOptions, new_method, new_method_2
 from skyless.positioning.methods.joint import Estimation, EstimationState
-from skyless.positioning.methods.observations import AnchorStamps, FixTime, Observer, StampTracks, variance_factor
+from skyless.positioning.methods.observations import (
+    AnchorStamps,
+    FixTime,
+    Observer,
+    StampTracks,
+    observe_2,
+    variance_factor,
+)
+from skyless.positioning.methods.selection import AnchorSelection, AnchorSelectionState, is_full
 from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
+from skyless.positioning.observation import Observation
 from skyless.site.almanac_pages import AlmanacAssembly, AlmanacState
+from skyless.site.local_almanac import LocalAlmanac, LocalAlmanacState
 from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 
-SITE_SILENCE_TICKS: Final = from_seconds(2.0)
-"""A tag that may choose its site leaves one that has been silent for this time when it hears another."""
+MOST_WAITING: Final = 128
+"""Beacons that are kept while the site's pages are not complete (protocol 2)."""
 
 NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
 """Counters of a receiver that do not count dropped frames."""
@@ -40,9 +53,7 @@ class ReceiverState(Struct, frozen=True):
     """All that a ``Receiver`` keeps; to be used or encoded before its next frame, as they share some parts."""
 
     options: MethodOptions
-    site: int | None
-    may_change_site: bool
-    site_heard_ticks: int
+    choice: SiteChoice
     counters: dict[str, int]
     reason: NoFixReason
     almanac: AlmanacState
@@ -56,6 +67,9 @@ class ReceiverState(Struct, frozen=True):
     has_method_key: bool
     """Whether a method has been looked for since stamps were forgotten."""
     method: EstimationState | SnapshotsState | None
+    local_almanac: LocalAlmanacState
+    selection: AnchorSelectionState
+    waiting: tuple[Observation, ...]
 
 
 class Receiver:
@@ -72,7 +86,7 @@ class Receiver:
     ) -> None:
         """Make a tag that knows nothing yet.
 
-        ``method`` is one of ``METHODS``; ``site`` the only site to listen to, by default the first that is heard;
+        ``method`` is one of ``METHODS``; ``site`` the only site to listen to, by default that with most anchors;
         ``qa`` the tag's process noise in m²/s³ (filters); ``z_bounds_m`` decides between mirror solutions;
         ``integrity`` is the requirement for the protection levels (``joint``).
 
@@ -84,10 +98,11 @@ class Receiver:
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self.almanac = AlmanacAssembly()
+        """Of a site of protocol 1."""
+        self.local_almanac = LocalAlmanac()
+        """Of a site of protocol 2."""
         self._options = MethodOptions(method, qa, z_bounds_m, integrity or IntegrityRequirement())
-        self._site = site
-        self._may_change_site = site is None
-        self._site_heard_ticks = 0
+        self._choice = SiteChoice(site)
         self._time = FixTime()
         self._own_ticks = Unwrapper()
         self._stamps = AnchorStamps(self.counters)
@@ -98,14 +113,14 @@ class Receiver:
         self._followed = FollowedMaster()
         self._master: int | None = None
         self._positions: dict[int, Array] = {}
+        self._selection = AnchorSelection()
+        self._waiting: list[Observation] = []
 
     def state(self) -> ReceiverState:
         """All that it keeps, as it is now."""
         return ReceiverState(
             options=self._options,
-            site=self._site,
-            may_change_site=self._may_change_site,
-            site_heard_ticks=self._site_heard_ticks,
+            choice=self._choice,
             counters=dict(self.counters),
             reason=self.reason,
             almanac=self.almanac.state(),
@@ -118,6 +133,9 @@ class Receiver:
             superframe_ticks=self._superframe_ticks,
             has_method_key=self._method_key is not None,
             method=None if self._method is None else self._method.state(),
+            local_almanac=self.local_almanac.state(),
+            selection=self._selection.state(),
+            waiting=tuple(self._waiting),
         )
 
     @classmethod
@@ -129,8 +147,10 @@ class Receiver:
         """
         options = state.options
         made = cls(options.method, qa=options.qa, z_bounds_m=options.z_bounds_m, integrity=options.integrity)
-        made._site, made._may_change_site = state.site, state.may_change_site
-        made._site_heard_ticks, made._superframe_ticks = state.site_heard_ticks, state.superframe_ticks
+        made._choice, made._superframe_ticks = state.choice, state.superframe_ticks
+        made.local_almanac.restore(state.local_almanac)
+        made._selection.restore(state.selection)
+        made._waiting = list(state.waiting)
         made.counters.update(state.counters)
         made.reason = state.reason
         made._time, made._own_ticks, made._followed = state.time, state.own_ticks, state.followed
@@ -139,8 +159,11 @@ class Receiver:
         made._read_positions()
         made._master, made._observer.scale = state.master, state.master_scale
         made._observer.set_master(state.master, made.almanac.slot_of(state.master) or 0)
-        if state.has_method_key:
-            made._choose_method()
+        if state.has_method_key and state.choice.key is not None:
+            if state.choice.key.version == 1:
+                made._choose_method()
+            else:
+                made._choose_method_2()
         match made._method, state.method:
             case Estimation() as method, EstimationState() as saved:
                 method.restore(saved)
@@ -155,7 +178,7 @@ class Receiver:
     @property
     def site(self) -> int | None:
         """Identifier of the site that it receives, None before the first beacon."""
-        return self._site
+        return self._choice.only_site if self._choice.key is None else self._choice.key.site
 
     @property
     def method(self) -> Estimation | Snapshots | None:
@@ -167,30 +190,97 @@ class Receiver:
 
         What does not belong here is counted in ``counters`` and dropped; nothing on the air raises.
         """
-        frame, diagnostics = reception.frame, reception.diagnostics
-        beacon = decode_cached(frame)
-        if not isinstance(beacon, Beacon):
+        beacon = decode_any(reception.frame)
+        if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
             return None
+        return self.hear_beacon(beacon, reception)
+
+    def hear_beacon(self, beacon: AnyBeacon, reception: Reception) -> Fix | None:
+        """Process a beacon that is decoded already, as ``hear`` does; of protocol 2 the frame itself may be empty."""
         rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
         tx_ticks = self._admit(beacon, rx_ticks)
         if tx_ticks is None:
             return None
         self.counters["heard"] += 1
-        self._read_almanac(beacon)
-        method, anchor_m = self._method, self._positions.get(beacon.anchor)
-        if method is None or anchor_m is None:
-            self.reason = NoFixReason.NO_ALMANAC
-            return None
-        scale, master_term = 1.0 if diagnostics is None else _variance_scale(diagnostics), self._followed.master_term
-        result = method.update(self._observer.observe(frame, beacon, anchor_m, rx_ticks, tx_ticks, scale, master_term))
+        if isinstance(beacon, Beacon2):
+            result = self._process_2(beacon, rx_ticks, tx_ticks, reception.diagnostics)
+        else:
+            result = self._process(beacon, reception, rx_ticks, tx_ticks)
         if isinstance(result, Fix):
             self.counters["fixes"] += 1
+            self._choice.fix_ticks = rx_ticks
             return result
         self.reason = result
         if result is NoFixReason.RESIDUALS:
             self.counters["outlier"] += 1
         return None
+
+    def _process(self, beacon: Beacon, reception: Reception, rx_ticks: int, tx_ticks: int) -> Fix | NoFixReason:
+        """Process a beacon of protocol 1."""
+        self._read_almanac(beacon)
+        method, anchor_m = self._method, self._positions.get(beacon.anchor)
+        if method is None or anchor_m is None:
+            return NoFixReason.NO_ALMANAC
+        frame, diagnostics = reception.frame, reception.diagnostics
+        scale, master_term = 1.0 if diagnostics is None else _variance_scale(diagnostics), self._followed.master_term
+        return method.update(self._observer.observe(frame, beacon, anchor_m, rx_ticks, tx_ticks, scale, master_term))
+
+    def _process_2(
+        self, beacon: Beacon2, rx_ticks: int, tx_ticks: int, diagnostics: Diagnostics | None
+    ) -> Fix | NoFixReason:
+        """Process a beacon of protocol 2: the claims in it do not matter, its own position does."""
+        anchor, relays = beacon.anchor, packed_relays_2(beacon)
+        if diagnostics is not None and diagnostics.rx_power_dbm is not None:
+            self._selection.add_power(anchor, diagnostics.rx_power_dbm)
+        method = self._method
+        is_known = not isinstance(method, Estimation) or method.is_starting or method.estimator.has_anchor(anchor)
+        if is_known:
+            self._selection.add_relays(relays, rx_ticks)
+        if self.local_almanac.on_beacon(beacon, rx_ticks, self._selection.is_confirmed(anchor, rx_ticks)):
+            self._choose_method_2()
+        anchor_m = self.local_almanac.position_m(anchor)
+        if anchor_m is None:
+            self.counters["no-position"] += 1
+            return NoFixReason.NO_ALMANAC
+        scale = 1.0 if diagnostics is None else _variance_scale(diagnostics)
+        std_m = self.local_almanac.std_m(anchor)
+        observation = observe_2(beacon, relays, anchor_m, std_m, rx_ticks, tx_ticks, scale)
+        if self._method is None:
+            self._waiting = [*self._waiting[1 - MOST_WAITING :], observation]
+            return NoFixReason.NO_ALMANAC if self.local_almanac.pages is None else NoFixReason.NO_MASTER
+        assert isinstance(self._method, Estimation)
+        for waiting in self._waiting:
+            if self._selection.is_confirmed(waiting.anchor, rx_ticks):
+                self._method.update(waiting)
+        self._waiting = []
+        if not self._may_join(self._method, observation):
+            return NoFixReason.TOO_FEW_ANCHORS
+        return self._method.update(observation)
+
+    def _may_join(self, method: Estimation, observation: Observation) -> bool:
+        """Whether an anchor is in use or may be: others have received it, and it is not weaker than 24 in use."""
+        estimator, anchor = method.estimator, observation.anchor
+        if estimator.has_anchor(anchor) and not method.is_starting:
+            return True
+        if not self._selection.is_confirmed(anchor, observation.rx_ticks_tag):
+            self.counters["unconfirmed-anchor"] += 1
+            return False
+        in_use = estimator.anchors
+        if method.is_starting or not is_full(in_use):
+            return True
+        position_m = estimator.state.x[: estimator.dim]
+        ranges_m = {anchor: float(np.linalg.norm(observation.anchor_m[: estimator.dim] - position_m))}
+        for one in in_use:
+            one_m = self.local_almanac.position_m(one)
+            if one_m is not None:
+                ranges_m[one] = float(np.linalg.norm(one_m[: estimator.dim] - position_m))
+        replaced = self._selection.replaced_by(anchor, ranges_m)
+        if replaced is None:
+            self.counters["weaker-anchor"] += 1
+            return False
+        estimator.remove_anchor(replaced)
+        return True
 
     def hear_height(self, height_m: float, std_m: float) -> bool:
         """Process a reading of the tag's height sensor, above the site's origin, at the present; True if it was used.
@@ -208,23 +298,23 @@ class Receiver:
         method = self._method
         return isinstance(method, Estimation) and method.update_height(height_m, std_m)
 
-    def _admit(self, beacon: Beacon, rx_ticks: int) -> int | None:
+    def _admit(self, beacon: AnyBeacon, rx_ticks: int) -> int | None:
         """TX stamp, unwrapped, of a beacon of the site, by the present master, and of an anchor that may be there."""
         newest = self._stamps.tracks.newest_rx_ticks
         jumped = newest is not None and rx_ticks < newest - COUNTER_JUMP_TICKS
         if (jumped or not -LAST_TICKS <= rx_ticks <= LAST_TICKS) and not self._restart(rx_ticks):
             return None
-        if beacon.site != self._site and not self._change_site(beacon.site, rx_ticks):
+        if not self._is_of_site(beacon, rx_ticks):
             self.counters["foreign-site"] += 1
             return None
-        if beacon.anchor not in self._positions and self.almanac.complete:
+        if isinstance(beacon, Beacon) and beacon.anchor not in self._positions and self.almanac.complete:
             self.counters["unknown-anchor"] += 1
             return None
         tx_ticks = self._stamps.unwrap(beacon, rx_ticks)
         if tx_ticks is None:
             return None
-        self._site_heard_ticks = rx_ticks
-        if self._followed.on_beacon(beacon, rx_ticks, self._superframe_ticks):
+        self._choice.heard_ticks = rx_ticks
+        if isinstance(beacon, Beacon2) or self._followed.on_beacon(beacon, rx_ticks, self._superframe_ticks):
             return tx_ticks
         self.counters["stale-master"] += 1
         return None
@@ -232,34 +322,38 @@ class Receiver:
     def _restart(self, rx_ticks: int) -> bool:
         """Forget all stamps, as the tag's counter restarted; False where the host's clock jumped by over a year."""
         self._forget_stamps()
+        self._choice.forget_times()
         if abs(rx_ticks) <= LAST_TICKS:
             self.counters["counter-jump"] += 1
-            self._site_heard_ticks = rx_ticks
+            self._choice.heard_ticks = rx_ticks
             return True
         self.counters["impossible-host-time"] += 1
-        self._own_ticks, self._site_heard_ticks = Unwrapper(), 0
+        self._own_ticks, self._choice.heard_ticks = Unwrapper(), 0
         return False
 
-    def _change_site(self, site: int, rx_ticks: int) -> bool:
-        """Whether to use this site from now on: the first one, or another when the present one is silent."""
-        if not self._may_change_site:
-            return False
-        if self._site is not None:
-            if rx_ticks - self._site_heard_ticks < SITE_SILENCE_TICKS:
-                return False
+    def _is_of_site(self, beacon: AnyBeacon, rx_ticks: int) -> bool:
+        """Whether a beacon is of the site in use, which may be another one from now on."""
+        key = SiteKey(beacon.site, 1 if isinstance(beacon, Beacon) else 2)
+        had_site = self._choice.key is not None
+        use = self._choice.on_beacon(key, beacon.anchor, rx_ticks)
+        if use is SiteUse.CHANGED and had_site:
             self.counters["site-change"] += 1
-            self.almanac = AlmanacAssembly()
+            self.almanac, self.local_almanac = AlmanacAssembly(), LocalAlmanac()
             self._positions = {}
             self._forget_stamps()
-        self._site, self._site_heard_ticks = site, rx_ticks
-        return True
+        return use is not SiteUse.FOREIGN
 
     def _forget_stamps(self) -> None:
         """Restart everything but the almanac."""
         self._stamps.forget()
         self._observer.forget()
         self._followed = FollowedMaster()
+        self.local_almanac.forget_times()
+        self._selection.forget_times()
+        self._waiting = []
         self._method = self._method_key = None
+        if self.local_almanac.pages is not None:
+            self._choose_method_2()
 
     def _read_almanac(self, beacon: Beacon) -> None:
         """Add the page; another issue, schedule, noise or accuracy replaces the method.
@@ -291,6 +385,15 @@ class Receiver:
                 self._superframe_ticks = schedule.superframe_ticks
                 self._method = new_method(options, master, schedule_page, noise, accuracy, self._time)
                 self._observer.set_method(self._method, schedule)
+
+    def _choose_method_2(self) -> None:
+        """Make the method that the common pages require, unless it is in use already."""
+        pages = self.local_almanac.pages
+        assert pages is not None
+        method_key = (pages.site.superframe_ticks, pages.site.tag_height_m, pages.noise, pages.accuracy)
+        if method_key != self._method_key:
+            self._method_key = method_key
+            self._method = new_method_2(self._options, pages, self._time)
 
 
 def _variance_scale(diagnostics: Diagnostics) -> float:

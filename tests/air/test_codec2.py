@@ -195,7 +195,7 @@ def test_standard_deviations_are_rounded_up_and_saturate():
         ({"heard": (Heard(1, 0, 1 << 40),), "weak": 0}, r"heard\[0\]\.rx_ticks"),
         ({"heard": tuple(Heard(k, 0, 0) for k in range(6))}, "6 entries; 5 fit"),
         ({"weak": 1 << 4}, "weak is 16"),
-        ({"page": SitePage(0, 0, 0, None)}, r"SitePage\.pages"),
+        ({"page": SitePage(0, 1, 0, None)}, r"SitePage\.pages"),
         ({"page": SitePage(1, 0, 5, None)}, r"SitePage\.superframe_ticks"),
     ],
 )

@@ -251,7 +251,7 @@ def test_impossible_stamps_of_one_anchor_cost_only_its_frames(method):
     fixes = listen(receiver, heard)
     assert receiver.counters["impossible-stamp"] + receiver.counters["outlier"] > 80
     assert len(fixes) > 60
-    assert receiver.counters["anchor-restart"] > 10
+    assert 5 < receiver.counters["anchor-restart"] <= 10  # each takes 0.2 s of 2 s
 
 
 @pytest.mark.parametrize("method", EVERY_METHOD)

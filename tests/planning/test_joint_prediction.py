@@ -8,11 +8,12 @@ from scipy.stats import binom
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.planning.anchor_clocks import anchor_clocks, relays_of, stamp_variances
 from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
-from skyless.planning.links import anchor_links, anchor_positions, link_budget
+from skyless.planning.links import anchor_links, link_budget
 from skyless.planning.predict import PlanSettings, Predictor
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import ideal_lab_site, lab_site
 from skyless.site.model import EXACT, AnchorSite, Site, TagsSite, WallSite
+from skyless.site.near import anchor_positions
 from skyless.site.slots import schedule_of
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 

@@ -21,7 +21,7 @@ from skyless.planning.columns import (
     SIGMA_Z,
     TDOP,
 )
-from skyless.planning.links import anchor_positions, link, link_budget, range_of, with_range
+from skyless.planning.links import link, link_budget, range_of, with_range
 from skyless.planning.predict import PlanSettings, Predictor, with_noise
 from skyless.planning.snapshot_sigma import delays, phase_covariance
 from skyless.positioning.methods.snapshots import (
@@ -33,6 +33,7 @@ from skyless.positioning.methods.snapshots import (
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, NoiseSite, Site, TagsSite, WallSite
+from skyless.site.near import anchor_positions
 from skyless.uncertainty.dop import dops_at
 
 LAB = ideal_lab_site(100.0)

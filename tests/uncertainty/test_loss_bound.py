@@ -6,7 +6,7 @@ import pytest
 from skyless.site.lab import lab_site
 from skyless.studies import loss
 from skyless.studies.plan import Plan
-from skyless.uncertainty.bounds import bound_settings, known_receptions, received_bound, tracking_bound
+from skyless.uncertainty.bounds import Sendings, bound_settings, known_receptions, received_bound, tracking_bound
 
 LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors])
 PATH_M = np.tile([2.0, 3.0, 0.0], (600, 1))
@@ -58,3 +58,34 @@ def test_the_limits_of_the_study_lie_below_the_bound():
         at_tags, everywhere = (bounds[kind, share] / clean for kind in (loss.AT_TAGS, loss.EVERYWHERE))
         assert limit < at_tags < everywhere
         assert everywhere < 1.9 * limit
+
+
+def test_sendings_in_turn_are_the_superframe():
+    plain = received_bound(LAB_M, PATH_M, settings(True), known(600, 0.2, 0.1, True))
+    in_turn = Sendings(np.arange(600) % 6, np.arange(600) * 2.5e-3)
+    again = received_bound(LAB_M, PATH_M, settings(True), known(600, 0.2, 0.1, True), in_turn)
+    np.testing.assert_allclose(again, plain, rtol=1e-9)
+
+
+def test_sendings_in_any_order_are_those_of_another_numbering():
+    """The first anchor, against which clocks are counted, is nothing special."""
+    order = np.array([3, 1, 4, 0, 5, 2])
+    rows = known(600, 0.0, 0.0, True)
+    times_s = np.arange(600) * 2.5e-3
+    expected = received_bound(LAB_M, PATH_M, settings(True), rows, Sendings(np.tile(np.arange(6), 100), times_s))
+    renamed = np.argsort(order)
+    found = received_bound(
+        LAB_M[order],
+        PATH_M,
+        settings(True),
+        rows[:, [*order, 6]],
+        Sendings(np.tile(renamed, 100), times_s),
+    )
+    np.testing.assert_allclose(found[-1], expected[-1], rtol=1e-3)
+
+
+def test_there_is_one_sending_for_each_position():
+    with pytest.raises(ValueError, match="600"):
+        received_bound(
+            LAB_M, PATH_M, settings(True), known(600, 0.0, 0.0, True), Sendings(np.zeros(5, int), np.zeros(5))
+        )

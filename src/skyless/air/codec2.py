@@ -2,10 +2,11 @@
 
 import math
 import struct
+from functools import lru_cache
 from operator import index
 from typing import Final, SupportsIndex
 
-from skyless.air.beacon import HEARD, Malformed, PackedHeard
+from skyless.air.beacon import HEARD, Heard, Malformed, PackedHeard
 from skyless.air.beacon2 import MAX_HEARD, MOST_PULSE_AGE, Beacon2, SlotTime, StatedPosition, StatedSiteTime
 from skyless.air.codec import (
     BROADCAST,
@@ -118,9 +119,7 @@ def encode_2(beacon: Beacon2) -> bytes:
         std_steps = min(math.ceil(site_time.std_ticks * STD_STEPS_PER_TICK), SATURATED_STD)
         parts.append(_SITE_TIME.pack(*_split24(round(site_time.residual_ticks * SUBTICKS)), std_steps))
     parts.append(_COUNT.pack(len(beacon.heard) | beacon.weak << _COUNT_BITS))
-    parts += [
-        HEARD.pack(one.anchor, one.sequence, one.rx_ticks & 0xFFFFFFFF, one.rx_ticks >> 32) for one in beacon.heard
-    ]
+    parts.append(_packed(beacon.heard))
     if beacon.page is not None:
         parts.append(encode_page(beacon.page))
     body = b"".join(parts)
@@ -161,6 +160,10 @@ def decode_2(frame: bytes) -> Beacon2 | Malformed:
     )  # fmt: skip
 
 
+decode_2_cached = lru_cache(maxsize=256)(decode_2)
+"""``decode_2`` that remembers the last 256 frames."""
+
+
 def _frame_fault(frame: bytes) -> Malformed | None:
     """Why bytes are no beacon of version 2, as far as length, header and flags show it."""
     length = len(frame)
@@ -196,6 +199,14 @@ def _position(frame: bytes, at: int) -> StatedPosition:
     return StatedPosition(x_mm / 1000, y_mm / 1000, z_mm / 1000, std / _STD_STEPS_PER_M, floor, zone)
 
 
+def _packed(heard: tuple[Heard, ...] | PackedHeard) -> bytes:
+    if isinstance(heard, PackedHeard):
+        return heard.packed
+    return b"".join(
+        HEARD.pack(entry.anchor, entry.sequence, entry.rx_ticks & 0xFFFFFFFF, entry.rx_ticks >> 32) for entry in heard
+    )
+
+
 def packed_relays_2(beacon: Beacon2) -> bytes:
     """The receptions that a decoded beacon relays, ``HEARD`` after ``HEARD``, without those of a weak first path."""
     packed: bytes = beacon.heard.packed  # type: ignore[union-attr]  # it is of a frame
@@ -229,9 +240,13 @@ def _fault(beacon: Beacon2, capacity: int) -> str | None:
         return "site_time needs slot_time, to whose slot it refers"
     if len(beacon.heard) > capacity:
         return f"heard has {len(beacon.heard)} entries; {capacity} fit"
-    named = [beacon.anchor, *(entry.anchor for entry in beacon.heard)]
-    if len(set(named)) < len(named):
-        return f"heard has the sender {beacon.anchor}, or an anchor twice: {named[1:]}"
+    others: tuple[int, ...]
+    if isinstance(beacon.heard, PackedHeard):
+        others = _HEARD_ANCHORS[len(beacon.heard)].unpack(beacon.heard.packed)
+    else:
+        others = tuple(entry.anchor for entry in beacon.heard)
+    if len({beacon.anchor, *others}) <= len(others):
+        return f"heard has the sender {beacon.anchor}, or an anchor twice: {list(others)}"
     if not isinstance(beacon.weak, SupportsIndex) or not 0 <= beacon.weak < 1 << len(beacon.heard):
         return f"weak is {beacon.weak!r}; it must have one bit for each of {len(beacon.heard)} entries of heard"
     return _whole_fault(beacon) or _real_fault(beacon)
@@ -245,7 +260,7 @@ def _whole_fault(beacon: Beacon2) -> str | None:
         ("tx_ticks", beacon.tx_ticks, 40),
         ("almanac_issue", beacon.almanac_issue, 16),
     ]
-    for number, entry in enumerate(beacon.heard):
+    for number, entry in enumerate(() if isinstance(beacon.heard, PackedHeard) else beacon.heard):
         fields.append((f"heard[{number}].anchor", entry.anchor, 16))
         fields.append((f"heard[{number}].sequence", entry.sequence, 8))
         fields.append((f"heard[{number}].rx_ticks", entry.rx_ticks, 40))

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
@@ -11,6 +11,15 @@ from skyless.cli.common.options import Positive, Seed, check_method, check_outpu
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import progress_bar
 from skyless.cli.plan_output import report, show, write_files, write_site
+from skyless.cli.plan_slots import (
+    conflicts_of,
+    described,
+    has_slots,
+    show_slots,
+    slot_report,
+    with_planned_slots,
+    write_slots,
+)
 from skyless.errors import ConfigurationError, SkylessError
 from skyless.method_names import DEFAULT_METHOD
 
@@ -20,6 +29,7 @@ if TYPE_CHECKING:
     from skyless.planning.maps import PlanMap
     from skyless.planning.optimise import Optimised
     from skyless.planning.predict import PlanSettings, Predictor
+    from skyless.planning.slot_plan import RateMap
     from skyless.planning.verify import Verification
     from skyless.site.model import Site
 
@@ -62,6 +72,14 @@ class PlanOptions:
     """Heights at which anchors may hang, h1,h2,... in metres; by default the lowest and highest of the site's."""
     mounts: list[str] | None = None
     """A wall on which anchors may hang, x1,y1,x2,y2 in metres; may be given several times; by default the outline."""
+    exponent: Annotated[float | None, Parameter(validator=Number(gte=1.5, lte=6.0))] = None
+    """Modes slots and free: exponent of the path loss; 2 by default (free space), 2.5 to 3 among metal racks."""
+    conflicts: Path | None = None
+    """Mode slots: a file with two anchors' identifiers in each line (17,903) that were received at once."""
+    write: bool = False
+    """Mode slots: write the slots into the site file; everything else in it stays."""
+    force: bool = False
+    """With --write: replace slots that the site file has already."""
     seconds: Positive = 60.0
     """Time after which the search for positions ends in any case."""
     verify: Annotated[int, Parameter(validator=Number(gte=1, lte=200))] | None = None
@@ -83,7 +101,8 @@ class PlanOptions:
 def plan(file: Path, /, *, asked: PlanOptions = PlanOptions()) -> None:
     """Predict the errors that tags at rest will have at a site, and where one more anchor would help.
 
-    With --optimise the anchors are placed from the start, and the plan is of that site.
+    With --optimise the anchors are placed from the start, and the plan is of that site. At a site in mode slots or free
+    the plan is of the slots that anchors share, and of the beacons that reach tags.
 
     Parameters
     ----------
@@ -96,6 +115,10 @@ def plan(file: Path, /, *, asked: PlanOptions = PlanOptions()) -> None:
 
     started_s = time.perf_counter()
     site = _load(file, asked)
+    if not site.schedule.needs_master:
+        _plan_slots(site, file, asked, started_s)
+        return
+    _refuse(asked, _FOR_PROTOCOL_2, "mode master, whose anchors share no slots")
     settings = _settings(asked)
     if asked.optimise is None:
         _check_count(site, file)
@@ -122,6 +145,72 @@ def plan(file: Path, /, *, asked: PlanOptions = PlanOptions()) -> None:
         show(file, result)
 
 
+_FOR_PROTOCOL_2: Final = ("exponent", "conflicts", "write", "force")
+_FOR_ONE_MASTER: Final = (
+    "method", "noise_ps", "qa", "target", "grid", "html", "optimise", "out", "heights", "mounts", "verify",
+)  # fmt: skip
+
+
+def _refuse(asked: PlanOptions, names: tuple[str, ...], mode: str) -> None:
+    """See that options which mean nothing here are not given. Raises SkylessError."""
+    plain = PlanOptions()
+    for name in names:
+        if getattr(asked, name) != getattr(plain, name):
+            option = name.replace("_", "-")
+            raise SkylessError(f"--{option} is not for this site, which is in {mode}; leave it out")
+
+
+def _plan_slots(site: "Site", file: Path, asked: PlanOptions, started_s: float) -> None:
+    """Plan a site of protocol 2: its slots, and the beacons that reach tags."""
+    from skyless.planning.floor import floor_of
+    from skyless.planning.links import with_range
+    from skyless.planning.slot_plan import rate_map
+    from skyless.simulation.channel import ChannelModel
+
+    mode = site.schedule.mode
+    _refuse(asked, _FOR_ONE_MASTER, f"mode {mode}: errors are predicted for sites with one master only")
+    if mode == "free":
+        _refuse(asked, ("conflicts", "write", "force"), "mode free, which has no slots")
+    if asked.write and not asked.force and has_slots(site):
+        raise SkylessError(f"{file} has slots already; --write --force replaces them")
+    channel, exponent = ChannelModel(), asked.exponent or 2.0
+    if asked.range_m is not None:
+        channel = with_range(channel, asked.range_m, exponent)
+    recoloured = None
+    if mode == "slots":
+        site, recoloured = with_planned_slots(site, file, conflicts_of(asked.conflicts, site), asked.write)
+    floor = floor_of(site, file, _outline(asked.outline), _region(asked.region)) if site.anchors else None
+    mapped = None
+    if floor is not None:
+        try:
+            mapped = rate_map(site, floor, _tag_heights(asked.slices, site), asked.step, channel, exponent)
+        except ValueError as error:
+            raise SkylessError(f"no map: {error}") from None
+    elif asked.plot is not None:
+        raise SkylessError("--plot needs anchors with positions, and this site has none")
+    if asked.write:
+        write_slots(site, file)
+    result = slot_report(site, floor, mapped, channel, exponent, recoloured, asked.write)
+    if asked.plot is not None and floor is not None and mapped is not None:
+        _draw_slots(site, floor, mapped, file, described(result), asked.plot)
+    result["wall_s"] = time.perf_counter() - started_s
+    if asked.json:
+        print_json(result)
+    else:
+        show_slots(file, result)
+
+
+def _draw_slots(site: "Site", floor: "Floor", mapped: "RateMap", file: Path, title: str, plot: Path) -> None:
+    """Write the picture. Raises SkylessError when it cannot be written."""
+    from skyless.evaluation.figures import save_figure
+    from skyless.planning.slot_picture import draw_slots
+
+    try:
+        save_figure(draw_slots(site, floor, mapped, file, title), plot)
+    except (OSError, ValueError) as error:
+        raise SkylessError(f"{plot} cannot be written: {error}") from None
+
+
 # From files and texts to values
 
 
@@ -129,8 +218,10 @@ def _load(file: Path, asked: PlanOptions) -> "Site":
     """Read the site and its image, and see that no output is an input or another output. Raises SkylessError."""
     from skyless.site.load import load_site
 
-    site = load_site(file)
+    site = load_site(file, slots_given=False)
     image = None if site.floor_plan is None else file.parent / site.floor_plan.image
+    for name, path in (("plot", asked.plot), ("grid", asked.grid), ("html", asked.html), ("out", asked.out)):
+        check_output(name, path, asked.conflicts)
     outputs = {"plot": asked.plot, "grid": asked.grid, "html": asked.html, "out": asked.out}
     for name, path in outputs.items():
         check_output(name, path, file, image, *(other for key, other in outputs.items() if key != name))

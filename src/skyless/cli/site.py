@@ -1,7 +1,7 @@
 """``skyless site``: write and check site files."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
 from cyclopts import App, Parameter
@@ -11,9 +11,16 @@ from skyless.cli.common.output import console, print_json, print_warnings, write
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+    from rich.text import Text
+
     from skyless.site.model import Site
 
 _Metres = Annotated[float, Parameter(validator=Number(gt=0, lte=10_000))]
+_GRID_HEIGHT_M: Final = 4.0
+_TAGS_BELOW_A_GRID_M: Final = 1.2
+_LONGEST_TABLE: Final = 40
+"""Anchors that are shown one a row; of more only a summary."""
 _Count = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
 
 app = App(name="site", help_epilogue="Example: skyless site check site.toml")
@@ -29,10 +36,12 @@ def new(
     depth: _Metres | None = None,
     anchors: _Count | None = None,
     height: _Metres | None = None,
+    grid: _Metres | None = None,
+    free: bool = False,
     tag_height: float | None = None,
     force: bool = False,
 ) -> None:
-    """Write a commented site file to start from: the lab, or with --width and --depth a room.
+    """Write a commented site file to start from: the lab, with --width and --depth a room, with --grid a large hall.
 
     Parameters
     ----------
@@ -47,9 +56,16 @@ def new(
     anchors
         How many anchors hang evenly along the room's walls; 6 by default.
     height
-        The room's height in metres, 3 by default; the anchors alternate between floor and ceiling.
+        The room's height in metres, 3 by default; the anchors alternate between floor and ceiling. With --grid the
+        height of all anchors, 4 by default.
+    grid
+        Spacing in metres of a square grid of anchors that needs no master (protocol 2) and may be of any size; they
+        get slots, which anchors far apart share.
+    free
+        With --grid: anchors send at random instants (mode free) instead of in slots.
     tag_height
-        Height in metres at which all tags move (2-D); by default their height is estimated (3-D).
+        Height in metres at which all tags move (2-D); by default their height is estimated (3-D), with --grid, whose
+        anchors lie in one plane, it is 1.2.
     force
         Overwrite the file if it exists.
     """
@@ -57,7 +73,11 @@ def new(
     from skyless.site.lab import lab_site
     from skyless.site.template import rectangular_site, site_template
 
-    if width is not None and depth is not None:
+    if grid is not None and width is not None and depth is not None and anchors is None:
+        site = _grid(width, depth, grid, height, tag_height, free)
+    elif grid is not None or free:
+        raise SkylessError("a grid needs --grid, --width and --depth; how many --anchors follows from them")
+    elif width is not None and depth is not None:
         site = rectangular_site(width, depth, anchors or 6, height or 3.0, tag_height)
     elif (width, depth, anchors, height, tag_height) == (None,) * 5:
         site = lab_site()
@@ -69,6 +89,18 @@ def new(
         raise SkylessError(f"{file} exists; --force overwrites it")
     write_file(file, site_template(site).encode())
     console().print(f"wrote {file}; next: skyless site check {file}", markup=False)
+
+
+def _grid(
+    width_m: float, depth_m: float, spacing_m: float, height_m: float | None, tag_height_m: float | None, free: bool
+) -> "Site":
+    from skyless.site.grid import grid_site
+
+    tags_m = _TAGS_BELOW_A_GRID_M if tag_height_m is None else tag_height_m
+    try:
+        return grid_site(width_m, depth_m, spacing_m, height_m or _GRID_HEIGHT_M, tags_m, "free" if free else "slots")
+    except ValueError as error:
+        raise SkylessError(f"no grid of {spacing_m:g} m: {error}") from None
 
 
 @app.command(help_epilogue="Example: skyless site check site.toml --json")
@@ -98,60 +130,149 @@ def _report(site: "Site") -> dict[str, Any]:
     """The report on a valid site, SI units."""
     from skyless.air.codec import MAX_FRAME_BYTES
     from skyless.air.ieee802154 import air_time_s
-    from skyless.constants import TICK_S
     from skyless.site.advice import warnings_of
-    from skyless.site.slots import first_slots, schedule_of
+    from skyless.site.slots import beacon_period_s
 
-    schedule = schedule_of(site)
-    first = first_slots(site)
-    messages_per_s = schedule.messages_per_s(len(site.anchors))
-    return {
+    report: dict[str, Any] = {
         "name": site.name,
         "id": site.id,
-        "master": site.master,
+        "mode": site.schedule.mode,
+        "master": site.master if site.schedule.needs_master else None,
         "tag_height_m": site.tags.height_m,
-        "anchors": [
-            {
-                "id": anchor.id,
-                "x_m": anchor.x_m,
-                "y_m": anchor.y_m,
-                "z_m": anchor.z_m,
-                "slots": schedule.slots_of(first[anchor.id]),
-            }
-            for anchor in site.anchors
-        ],
+        "anchors": _anchors(site),
+        "unplaced": [{"id": anchor.id, "slots": _own_slots(anchor.slot)} for anchor in site.unplaced],
+        "beacons_per_s_of_each_anchor": 1.0 / beacon_period_s(site),
+        "longest_frame_s": air_time_s(MAX_FRAME_BYTES),
+    }
+    if site.schedule.mode != "free":
+        report |= _superframe(site)
+    if site.schedule.needs_master:
+        report["occupancy"] = report["messages_per_s"] * report["longest_frame_s"]
+    else:
+        report |= _in_reach(site)
+    return report | {"warnings": warnings_of(site)}
+
+
+def _anchors(site: "Site") -> list[dict[str, Any]]:
+    from skyless.site.slots import first_slots, schedule_of
+
+    slots: dict[int, tuple[int, ...]] = {anchor.id: () for anchor in site.anchors}
+    if site.schedule.mode != "free":
+        schedule = schedule_of(site)
+        slots = {number: schedule.slots_of(first) for number, first in first_slots(site).items()}
+    return [
+        {"id": anchor.id, "x_m": anchor.x_m, "y_m": anchor.y_m, "z_m": anchor.z_m, "slots": slots[anchor.id]}
+        for anchor in site.anchors
+    ]
+
+
+def _own_slots(slot: int | None) -> tuple[int, ...]:
+    return () if slot is None else (slot,)
+
+
+def _superframe(site: "Site") -> dict[str, Any]:
+    """What the slots make."""
+    from skyless.constants import TICK_S
+    from skyless.site.slots import schedule_of
+
+    schedule = schedule_of(site)
+    return {
         "slots": schedule.slots,
         "slot_s": schedule.slot_ticks * TICK_S,
         "superframe_s": schedule.superframe_ticks * TICK_S,
         "superframes_per_s": schedule.superframe_rate_hz,
-        "messages_per_s": messages_per_s,
-        "longest_frame_s": air_time_s(MAX_FRAME_BYTES),
-        "occupancy": messages_per_s * air_time_s(MAX_FRAME_BYTES),
-        "warnings": warnings_of(site),
+        "messages_per_s": schedule.messages_per_s(len(site.all_anchors)),
+    }
+
+
+def _in_reach(site: "Site") -> dict[str, Any]:
+    """How many anchors are in reach of one another, and what they send."""
+    import numpy as np
+
+    from skyless.site.advice import RADIO_REACH_M, anchors_in_reach, best_offered_hz
+    from skyless.site.slots import beacon_period_s
+
+    in_reach = anchors_in_reach(site) if site.anchors else np.zeros(1)
+    return {
+        "reach_m": RADIO_REACH_M,
+        "fewest_in_reach": int(in_reach.min()),
+        "median_in_reach": float(np.median(in_reach)),
+        "most_in_reach": int(in_reach.max()),
+        "offered_in_reach_per_s": float(np.median(in_reach)) / beacon_period_s(site),
+        "best_offered_per_s": best_offered_hz() if site.schedule.mode == "free" else None,
     }
 
 
 def _show(file: Path, report: dict[str, Any]) -> None:
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table("anchor", "x / m", "y / m", "z / m", "slots", title=Text(f"{report['name']} ({file})"))
-    for column in table.columns:
-        column.justify = "right"
-    for anchor in report["anchors"]:
-        role = " (master)" if anchor["id"] == report["master"] else ""
-        position = [f"{anchor[axis]:.3f}" for axis in ("x_m", "y_m", "z_m")]
-        table.add_row(f"{anchor['id']}{role}", *position, " ".join(map(str, anchor["slots"])))
+    title = Text(f"{report['name']} ({file})")
+    everybody = [*report["anchors"], *report["unplaced"]]
     out = console()
-    out.print(table)
+    out.print(_rows(title, everybody, report) if len(everybody) <= _LONGEST_TABLE else _summary(title, report))
     height = report["tag_height_m"]
     tags = "estimate their height (3-D)" if height is None else f"move at a height of {height:g} m (2-D)"
-    out.print(
-        f"{report['slots']} slots of {report['slot_s'] * 1e3:.3f} ms: "
-        f"{report['superframes_per_s']:.1f} superframes/s, {report['messages_per_s']:.0f} messages/s\n"
-        f"the longest frame takes {report['longest_frame_s'] * 1e6:.0f} µs; "
-        f"the air is occupied {report['occupancy']:.0%} of the time at most\n"
-        f"tags {tags}"
-    )
+    out.print(f"{_schedule_lines(report)}\ntags {tags}")
     print_warnings(report["warnings"])
     out.print("the site file is valid" if not report["warnings"] else "the site file is valid, with warnings")
+
+
+def _rows(title: "Text", anchors: list[dict[str, Any]], report: dict[str, Any]) -> "Table":
+    """One row for each anchor."""
+    from rich.table import Table
+
+    with_slots = report["mode"] != "free"
+    table = Table("anchor", "x / m", "y / m", "z / m", *(["slots"] if with_slots else []), title=title)
+    for column in table.columns:
+        column.justify = "right"
+    for anchor in anchors:
+        role = " (master)" if anchor["id"] == report["master"] else ""
+        position = [f"{anchor[axis]:.3f}" if axis in anchor else "?" for axis in ("x_m", "y_m", "z_m")]
+        slots = [" ".join(map(str, anchor["slots"]))] if with_slots else []
+        table.add_row(f"{anchor['id']}{role}", *position, *slots)
+    return table
+
+
+def _summary(title: "Text", report: dict[str, Any]) -> "Table":
+    """Many anchors in a few lines."""
+    from collections import Counter
+
+    from rich.table import Table
+
+    anchors, unplaced = report["anchors"], report["unplaced"]
+    table = Table("", "", title=title, show_header=False)
+    table.add_row("anchors", str(len(anchors) + len(unplaced)))
+    if unplaced:
+        table.add_row("without a position", str(len(unplaced)))
+    for axis in ("x_m", "y_m", "z_m") if anchors else ():
+        values = [anchor[axis] for anchor in anchors]
+        table.add_row(f"{axis[0]} / m", f"{min(values):.3f} … {max(values):.3f}")
+    if report["mode"] != "free":
+        users = Counter(slot for anchor in [*anchors, *unplaced] for slot in anchor["slots"])
+        table.add_row("anchors in a slot", f"{min(users.values())} … {max(users.values())}")
+    if report["mode"] != "master":
+        reach = f"within {report['reach_m']:.0f} m of an anchor"
+        in_reach = (f"{report['fewest_in_reach']} … {report['most_in_reach']}", f"{report['median_in_reach']:.0f}")
+        table.add_row(reach, "{} anchors with itself, median {}".format(*in_reach))
+    return table
+
+
+def _schedule_lines(report: dict[str, Any]) -> str:
+    """Who sends how often, and how much of the air that takes."""
+    frame = f"the longest frame takes {report['longest_frame_s'] * 1e6:.0f} µs"
+    rate = f"each anchor sends {report['beacons_per_s_of_each_anchor']:.1f} beacons/s"
+    if report["mode"] == "free":
+        return (
+            f"mode free: {rate} at random instants\n"
+            f"anchors in reach of one another send {report['offered_in_reach_per_s']:.0f} beacons/s in all, "
+            f"best is {report['best_offered_per_s']:.0f}\n{frame}"
+        )
+    slots = (
+        f"{report['slots']} slots of {report['slot_s'] * 1e3:.3f} ms: {report['superframes_per_s']:.1f} superframes/s"
+    )
+    if report["mode"] == "slots":
+        return f"mode slots: {slots}\n{rate}; {frame}"
+    return (
+        f"{slots}, {report['messages_per_s']:.0f} messages/s\n"
+        f"{frame}; the air is occupied {report['occupancy']:.0%} of the time at most"
+    )

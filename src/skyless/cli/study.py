@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
     from skyless.studies.plan import Plan, Row, Study
 
-_Name = Literal["efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "scale", "sitetime"]
+_Name = Literal[
+    "efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "large", "claims", "scale", "sitetime"
+]
 
 _OF_EPISODES: Final = ("efficiency", "integrity")
 """Studies of the filter ``joint`` itself."""
@@ -58,16 +60,38 @@ _OF_SITE_TIME: Final = (
     "Simulated. RMSE: error of an anchor's timeline, or difference of two in range. σ: as anchors state it.",
     "Ratio: σ over RMSE. Max: largest difference of two anchors in range.",
 )
-_LEGENDS: Final = {"integrity": _OF_LEVELS, "room": _OF_THE_ROOM, "sitetime": _OF_SITE_TIME}
+_OF_A_LARGE_SITE: Final = (
+    "Simulated; every fix counts. ± standard errors. NEES: per dimension. First fix: from a tag's first beacon on,",
+    "knowing nothing; 95 % of them are faster. Gap: the longest time between two fixes.",
+)
+_OF_CLAIMS: Final = (
+    "Simulated. Superframes until all anchors follow one claim whose root lives; longest: the slowest run.",
+    "Changes: anchors that changed their claim once all was settled, in all runs.",
+)
+_LEGENDS: Final = {
+    "integrity": _OF_LEVELS,
+    "room": _OF_THE_ROOM,
+    "large": _OF_A_LARGE_SITE,
+    "claims": _OF_CLAIMS,
+    "sitetime": _OF_SITE_TIME,
+}
 
 _FIGURES: Final = {
     "max_m": "max",
+    "superframes_most": "superframes",
+    "changes": "changes",
     "rmse_m": "RMSE",
     "nees": "NEES",
     "level": "level",
     "exceeded": "exceeded",
     "hpl_m": "HPL",
     "ratio": "ratio",
+    "p95_m": "95 %",
+    "beacons_per_s": "beacons",
+    "first_fix_s": "first fix",
+    "gap_s": "gap",
+    "gap_superframes": "gap",
+    "restarts": "restarts",
 }
 """How the table names what may have limits."""
 
@@ -116,13 +140,19 @@ class StudyOptions:
 def study(name: _Name, /, *, asked: StudyOptions = StudyOptions()) -> None:
     """Measure errors over many simulated runs: a table with standard errors, a picture, JSON.
 
-    Parameters
-    ----------
-    name
-        efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
-        sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
-        room: the errors of real rooms, and what goes wrong in them. scale: numbers of tags and anchors.
-        sitetime: one timeline over many hops.
+        Parameters
+        ----------
+        name
+            efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
+            sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
+    <<<<<<< HEAD
+            room: the errors of real rooms, and what goes wrong in them. scale: numbers of tags and anchors.
+            sitetime: one timeline over many hops.
+    =======
+            room: the errors of real rooms, and what goes wrong in them. large: 1,024 anchors without a master.
+            claims: whose counter leads protocol 2.
+            scale: numbers of tags and anchors.
+    >>>>>>> 3a690a82903f8a162a455124021ac2c47bc5f208
     """
     from skyless.studies.catalogue import STUDIES
 
@@ -187,8 +217,9 @@ def _run(chosen: "Study", plan: "Plan", asked: StudyOptions) -> "list[Row]":
 
     check_method(plan.method)
     cells = chosen.cells(plan)
-    with loading_kernels():
-        compile_kernels(plan.method)
+    if chosen.name != "claims":  # whose anchors compute no positions
+        with loading_kernels():
+            compile_kernels(plan.method)
     try:
         with progress_bar(f"studying {chosen.title}", 1.0) as bar:
             if asked.scheduler is None:
@@ -253,7 +284,8 @@ def _table(study: "Study", plan: "Plan", rows: "Sequence[Row]") -> "Table":
     heads = (
         *("case", "RMSE in cm", "95 %", "max", "σ", "NEES", "", "fixes", "bound"),
         *("level", "HPL in cm", "VPL", "misleading", "", "vertical", "", "exceeded", "", "unwarned"),
-        *("ratio", "limit", "CPU in µs"),
+        *("beacons/s", "first fix in s", "gap in s", "superframes", "joins", "restarts"),
+        *("superframes", "longest", "changes", "ratio", "limit", "CPU in µs"),
     )
     cells = [_cells(row) for row in rows]
     used = [column for column in range(len(heads)) if any(line[column] for line in cells)]
@@ -265,7 +297,7 @@ def _table(study: "Study", plan: "Plan", rows: "Sequence[Row]") -> "Table":
 
 
 def _cells(row: "Row") -> tuple[str, ...]:
-    in_a_room = row.study == "room"  # its table is wide enough without the columns that have no limits
+    in_a_room = row.study in {"room", "large"}  # its table is wide enough without the columns that have no limits
     return (
         row.case,
         _figure(row.rmse_m, 100.0, row.rmse_error_m),
@@ -286,6 +318,15 @@ def _cells(row: "Row") -> tuple[str, ...]:
         _rare(row.exceeded),
         "" if row.exceeded_interval is None else "–".join(map(_rare, row.exceeded_interval)),
         _rare(row.exceeded_unwarned),
+        _figure(row.beacons_per_s, digits=0),
+        _figure(row.first_fix_s, digits=3),
+        _figure(row.gap_s, digits=3),
+        _figure(row.gap_superframes, digits=1),
+        "" if row.joins is None else str(row.joins),
+        "" if row.restarts is None else str(row.restarts),
+        _figure(row.superframes, digits=0),
+        _figure(row.superframes_most, digits=0),
+        _figure(row.changes, digits=0),
         _figure(row.ratio, 1.0, row.ratio_error, 3),
         _limit(row),
         "" if in_a_room else _figure(row.cpu_us_per_message, digits=0),

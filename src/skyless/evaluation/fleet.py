@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.air.reception import Reception
-from skyless.anchor import Anchor
+from skyless.anchors.factory import AnyAnchor, new_anchor
 from skyless.evaluation.statistics import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD
@@ -20,7 +20,7 @@ from skyless.simulation.impairments import Impairments, Outage
 from skyless.simulation.medium import Tally
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Trajectory
-from skyless.simulation.world import Broadcast, World
+from skyless.simulation.world import World
 from skyless.site.model import Site
 
 _LEVEL_ROWS: Final = 1 << 16
@@ -93,35 +93,35 @@ class TagRecord(Struct):
 def world_of(site: Site, trajectories: Sequence[Trajectory], impairments: Impairments, seed: int) -> World:
     """A world of the site's anchors, as they run on their hosts, and of tags on the trajectories."""
     tags = [TagSpec(trajectory) for trajectory in trajectories]
-    return World(site, lambda anchor: Anchor(site, anchor), tags, impairments, seed)
+    return World(site, lambda anchor: new_anchor(site, anchor), tags, impairments, seed)
 
 
-class Fleet:
-    """Tags listening in a world; each frame on the air becomes fixes."""
+class TagFleet:
+    """Tags that compute, and their errors; how they receive is the matter of ``Fleet`` and ``CellFleet``."""
 
-    def __init__(
-        self,
-        site: Site,
-        trajectories: Sequence[Trajectory],
-        impairments: Impairments,
-        seed: int,
-        settings: FleetSettings,
-    ) -> None:
+    def __init__(self, site: Site, tags: int, settings: FleetSettings) -> None:
         self._settings = settings
         self.site = site
-        self.anchors: dict[int, Anchor] = {}
-        specs = [TagSpec(trajectory) for trajectory in trajectories]
-        self.world = World(site, self._new_anchor, specs, impairments, seed)
-        self.receivers = [self._new_receiver() for _ in specs]
-        self.records = [TagRecord() for _ in specs]
-        self._first_fixes = FirstFixes(site, len(specs))
+        self.receivers = [self._new_receiver() for _ in range(tags)]
+        self.records = [TagRecord() for _ in range(tags)]
+        self._first_fixes = FirstFixes(site, tags)
         self.errors = ErrorStatistics(planar=site.tags.height_m is not None)
         self.sigma_squared_sum = 0.0
-        self.levels = LevelTally(len(specs), _LEVEL_ROWS)
+        self.levels = LevelTally(tags, _LEVEL_ROWS)
 
-    def _new_anchor(self, anchor: int) -> Anchor:
-        self.anchors[anchor] = Anchor(self.site, anchor)
-        return self.anchors[anchor]
+    @property
+    def now_s(self) -> float:
+        """True time that has passed."""
+        raise NotImplementedError
+
+    @property
+    def tally(self) -> Tally:
+        """What was on the air."""
+        raise NotImplementedError
+
+    def run(self, until_s: float) -> Iterator[JudgedFix]:
+        """Let true time pass; every fix of every tag, with the truth."""
+        raise NotImplementedError
 
     def _new_receiver(self) -> Receiver:
         asked = self._settings
@@ -129,26 +129,18 @@ class Fleet:
             return ReceiverWithOutages(asked.method, qa=asked.qa, integrity=asked.integrity, silences=asked.silences)
         return Receiver(asked.method, qa=asked.qa, integrity=asked.integrity)
 
-    def run(self, until_s: float) -> Iterator[JudgedFix]:
-        """Let true time pass; every fix of every tag, with the truth."""
-        for broadcast in self.world.run(until_s):
-            for tag, reception, truth_m in broadcast.receptions():
-                judged = self._add(tag, reception, truth_m, broadcast)
-                if judged is not None:
-                    yield judged
-
-    def _add(self, tag: int, reception: Reception, truth_m: Array, broadcast: Broadcast) -> JudgedFix | None:
+    def add(self, tag: int, fix: Fix | None, truth_m: Array, at_s: float) -> JudgedFix | None:
+        """Count a frame that a tag has processed, which ended at that true time, and judge the fix if it made one."""
         record = self.records[tag]
         record.messages += 1
-        fix = self.receivers[tag].hear(reception)
         if fix is None:
             return None
         record.fixes += 1
         if record.first_fix_s is None:
-            record.first_fix_s = broadcast.end_s
-        judged = JudgedFix(tag, broadcast.end_s, fix, truth_m)
+            record.first_fix_s = at_s
+        judged = JudgedFix(tag, at_s, fix, truth_m)
         record.last = judged
-        if broadcast.end_s >= self._settings.warmup_s:
+        if at_s >= self._settings.warmup_s:
             self._judge(judged)
         return judged
 
@@ -169,6 +161,45 @@ class Fleet:
         for receiver in self.receivers:
             total.update(receiver.counters)
         return {reason: count for reason, count in sorted(total.items()) if reason not in NOT_DROPS}
+
+
+class Fleet(TagFleet):
+    """Tags listening in a world; each frame on the air becomes fixes."""
+
+    def __init__(
+        self,
+        site: Site,
+        trajectories: Sequence[Trajectory],
+        impairments: Impairments,
+        seed: int,
+        settings: FleetSettings,
+    ) -> None:
+        super().__init__(site, len(trajectories), settings)
+        self.anchors: dict[int, AnyAnchor] = {}
+        specs = [TagSpec(trajectory) for trajectory in trajectories]
+        self.world = World(site, self._new_anchor, specs, impairments, seed)
+
+    def _new_anchor(self, anchor: int) -> AnyAnchor:
+        self.anchors[anchor] = new_anchor(self.site, anchor)
+        return self.anchors[anchor]
+
+    @property
+    def now_s(self) -> float:
+        """See ``TagFleet``."""
+        return self.world.now_s
+
+    @property
+    def tally(self) -> Tally:
+        """See ``TagFleet``."""
+        return self.world.tally
+
+    def run(self, until_s: float) -> Iterator[JudgedFix]:
+        """See ``TagFleet``."""
+        for broadcast in self.world.run(until_s):
+            for tag, reception, truth_m in broadcast.receptions():
+                judged = self.add(tag, self.receivers[tag].hear(reception), truth_m, broadcast.end_s)
+                if judged is not None:
+                    yield judged
 
 
 class FleetReport(Struct, frozen=True):
@@ -203,11 +234,11 @@ class FleetReport(Struct, frozen=True):
     """Simulated seconds per second."""
 
 
-def report(fleet: Fleet, method: str, started_s: float) -> FleetReport:
+def report(fleet: TagFleet, method: str, started_s: float) -> FleetReport:
     """Sum a run up; ``started_s`` is ``time.perf_counter()`` at its start."""
     wall_s = time.perf_counter() - started_s
     summary = fleet.errors.summary()
-    simulated_s = fleet.world.now_s
+    simulated_s = fleet.now_s
     firsts = [record.first_fix_s for record in fleet.records if record.first_fix_s is not None]
     fixes = sum(record.fixes for record in fleet.records)
     listening_s = sum(simulated_s - first for first in firsts)
@@ -229,7 +260,7 @@ def report(fleet: Fleet, method: str, started_s: float) -> FleetReport:
         tags_without_fix=len(fleet.records) - len(firsts),
         levels=fleet.levels.report(),
         drops=fleet.drops,
-        air=fleet.world.tally,
+        air=fleet.tally,
         simulated_s=simulated_s,
         wall_s=wall_s,
         speed=simulated_s / wall_s if wall_s > 0.0 else 0.0,

@@ -109,7 +109,7 @@ class Request(Struct, frozen=True):
 
 
 def fleet_of(request: Request) -> Fleet:
-    """Make the world and its tags.
+    """Make the world and its tags; the anchors are the machines that would run on radios.
 
     Raises:
         ValueError: the method, or an anchor that is to fail, does not exist; a path has equal neighbouring points.

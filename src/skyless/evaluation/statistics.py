@@ -11,11 +11,12 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
+from skyless.constants import TICK_RATE_HZ
 from skyless.kernels.arrays import Array
 from skyless.positioning.fix import Fix
 from skyless.positioning.integrity import Alert
 from skyless.site.model import Site
-from skyless.site.slots import schedule_of
+from skyless.site.slots import superframe_ticks_of
 
 _SAMPLE_ROWS: Final = 1 << 17
 """Rows kept at most; with fewer, percentiles are exact."""
@@ -25,7 +26,7 @@ class FirstFixes:
     """Picks the first fix of each tag and superframe, so that all methods are judged at the same times."""
 
     def __init__(self, site: Site, tags: int) -> None:
-        self.superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
+        self.superframe_s = 1.0 / (TICK_RATE_HZ / superframe_ticks_of(site))
         self._last = [-1] * tags
 
     def is_first(self, tag: int, time_s: float) -> bool:

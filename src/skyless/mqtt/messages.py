@@ -131,15 +131,18 @@ class AnchorHealth(Struct, frozen=True):
     anchor: int
     unix_s: float
     uptime_s: float
-    role: Literal["master", "anchor", "listening"]
+    role: Literal["master", "root", "anchor", "listening"]
+    """``root``: its counter leads the slot time of protocol 2."""
     master: int | None
-    """The anchor whose time it uses."""
-    term: int
+    """The anchor whose time it uses; None in protocol 2, which has no master."""
+    term: int | None
+    """Of the master, or of the claim on the slot time; None in mode free."""
     synchronised: bool
+    """Whether it may send; always in mode free."""
     offset_s: float | None
-    """Own counter less the master's scale, modulo the wrap, in (-8.6, 8.6]."""
+    """Own counter less the master's scale, or the slot time, modulo the wrap, in (-8.6, 8.6]."""
     rate_ppm: float | None
-    """Own rate against the master's scale."""
+    """Own rate against the same."""
     offset_std_m: float | None
     sent: int
     late: int
@@ -150,6 +153,14 @@ class AnchorHealth(Struct, frozen=True):
     """Time since each other anchor was last heard."""
     counters: dict[str, int]
     mqtt: Counters
+    mode: Literal["master", "slots", "free"] = "master"
+    """Of the site's schedule."""
+    root: int | None = None
+    """Mode slots: the anchor whose counter leads the slot time that it follows."""
+    hop: int | None = None
+    """Mode slots: links from that anchor; 0 for the root itself."""
+    parents: tuple[int, ...] = ()
+    """Mode slots: the anchors whose slot time it follows."""
 
 
 class EtherHealth(Struct, frozen=True):

@@ -7,10 +7,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
-from skyless.air.beacon import Beacon
-from skyless.air.codec import decode_cached
+from msgspec.structs import replace
+
+from skyless.air.beacon import Malformed
+from skyless.air.frames import decode_any
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
+from skyless.anchors.factory import AnyAnchor, new_anchor
+from skyless.anchors.slots import SlotsAnchor
 from skyless.constants import TICK_RATE_HZ
 from skyless.master_election import Role
 from skyless.mqtt.address import MqttAddress
@@ -20,6 +24,7 @@ from skyless.nodes.process import HEALTH_S, Log, SitePublisher, every, keep, lin
 from skyless.nodes.radio_monitor import RadioMonitor
 from skyless.radios.interface import Gone, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.site.model import Site
+from skyless.slot_claims import SlotRole
 from skyless.ticks import difference
 
 LEAD_S: Final = 1.8e-3
@@ -35,17 +40,20 @@ ASK_AGAIN_S: Final = 5e-3
 LOST_ANSWER_S: Final = 0.25
 """A radio that has not reported the end of a frame within this time will not report it."""
 
-_NOT_DROPS: Final = frozenset({"heard", "sent", "takeover"})
+_NOT_DROPS: Final = frozenset({"heard", "sent", "takeover", "claim-change", "phase-change"})
 
-_ROLES: Final[dict[Role, Literal["master", "anchor", "listening"]]] = {
+_ROLES: Final[dict[Role | SlotRole, Literal["master", "root", "anchor", "listening"]]] = {
     Role.MASTER: "master",
     Role.FOLLOWER: "anchor",
     Role.LISTENING: "listening",
+    SlotRole.ROOT: "root",
+    SlotRole.FOLLOWER: "anchor",
+    SlotRole.LISTENING: "listening",
 }
 
 
 class AnchorNode:
-    """Runs ``Anchor`` on a radio."""
+    """Runs the machine of an anchor on a radio."""
 
     def __init__(self, site: Site, anchor_id: int, radio: Radio, log: Log) -> None:
         self.site, self.id, self.radio = site, anchor_id, radio
@@ -60,8 +68,8 @@ class AnchorNode:
         self._received = 0
         self._timer: asyncio.TimerHandle | None = None
 
-    def _new_machine(self) -> Anchor:
-        return Anchor(self.site, self.id, lead_s=LEAD_S)
+    def _new_machine(self) -> AnyAnchor:
+        return new_anchor(self.site, self.id, lead_s=LEAD_S)
 
     async def run(self) -> None:
         """Serve until cancelled."""
@@ -99,8 +107,8 @@ class AnchorNode:
         self.monitor.check(now_s, self._received, counters["heard"], drops + self.radio.counters)
 
     def _note(self, reception: Reception) -> None:
-        beacon = decode_cached(reception.frame)
-        if isinstance(beacon, Beacon) and beacon.site == self.site.id:
+        beacon = decode_any(reception.frame)
+        if not isinstance(beacon, Malformed) and beacon.site == self.site.id:
             self.heard_s[beacon.anchor] = time.monotonic()
 
     def _wait(self, seconds: float | None, then: Callable[[], None]) -> None:
@@ -151,29 +159,61 @@ class Anchors:
         await together(*parts, every(HEALTH_S, self._publish_health))
 
     def _publish_health(self) -> None:
-        """Health of all anchors, and the site by its master."""
+        """Health of all anchors, and the site by its master or root, or by the first anchor of each process."""
         unix_s, now_s = time.time(), time.monotonic()
         self._site_publisher.update(sum(node.monitor.restarts for node in self.nodes))
         for node, link in zip(self.nodes, self._links, strict=True):
             node.check_reception(now_s)
             if link is not None:
-                if node.machine.is_master:
+                if leads(node.machine, is_first=node is self.nodes[0]):
                     self._site_publisher.publish(link)
                 health = health_of(node, link.counters, unix_s, now_s)
                 link.publish(health_topic(self._site.id, "anchor", node.id), health)
 
 
+def leads(machine: AnyAnchor, *, is_first: bool) -> bool:
+    """Whether an anchor publishes the site: the master or the root; in mode free the first of its process."""
+    if isinstance(machine, Anchor):
+        return machine.is_master
+    return machine.synchronisation.role is SlotRole.ROOT if isinstance(machine, SlotsAnchor) else is_first
+
+
 def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> AnchorHealth:
     """State of an anchor; ``now_s`` is the host's monotonic clock."""
     machine = node.machine
-    state = machine.synchronisation
     now_ticks = node.radio.now_ticks()
-    reading = None if now_ticks is None else machine.site_time(now_ticks)
-    known = machine.is_master or (state.role is Role.FOLLOWER and state.beacons > 1)
-    return AnchorHealth(
+    health = AnchorHealth(
         anchor=node.id,
         unix_s=unix_s,
         uptime_s=now_s - node.started_s,
+        role="anchor",
+        master=None,
+        term=None,
+        synchronised=True,
+        offset_s=None,
+        rate_ppm=None,
+        offset_std_m=None,
+        sent=machine.counters["sent"],
+        late=node.late,
+        heard=machine.counters["heard"],
+        superframe=None,
+        heard_age_s={str(anchor): now_s - heard_s for anchor, heard_s in sorted(node.heard_s.items())},
+        counters=machine.counters | node.radio.counters,
+        mqtt=mqtt,
+        mode=node.site.schedule.mode,
+    )
+    if isinstance(machine, Anchor):
+        return _with_master(health, machine, now_ticks)
+    return _with_root(health, machine, now_ticks) if isinstance(machine, SlotsAnchor) else health
+
+
+def _with_master(health: AnchorHealth, machine: Anchor, now_ticks: int | None) -> AnchorHealth:
+    """What an anchor of protocol 1 knows of its master."""
+    state = machine.synchronisation
+    reading = None if now_ticks is None else machine.site_time(now_ticks)
+    known = machine.is_master or (state.role is Role.FOLLOWER and state.beacons > 1)
+    return replace(
+        health,
         role=_ROLES[state.role],
         master=state.master,
         term=state.term or 0,
@@ -181,11 +221,23 @@ def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> 
         offset_s=None if reading is None else reading[0],
         rate_ppm=state.rate_ppm if known else None,
         offset_std_m=state.offset_std_m if known else None,
-        sent=machine.counters["sent"],
-        late=node.late,
-        heard=machine.counters["heard"],
         superframe=None if reading is None else reading[1],
-        heard_age_s={str(anchor): now_s - heard_s for anchor, heard_s in sorted(node.heard_s.items())},
-        counters=machine.counters | node.radio.counters,
-        mqtt=mqtt,
+    )
+
+
+def _with_root(health: AnchorHealth, machine: SlotsAnchor, now_ticks: int | None) -> AnchorHealth:
+    """What an anchor in slots knows of the slot time."""
+    state = machine.synchronisation
+    reading = None if now_ticks is None else machine.slot_time(now_ticks)
+    return replace(
+        health,
+        role=_ROLES[state.role],
+        term=state.term,
+        synchronised=reading is not None,
+        offset_s=None if reading is None else reading[0],
+        rate_ppm=None if reading is None else state.rate_ppm,
+        superframe=None if reading is None else reading[1],
+        root=state.root,
+        hop=state.hop,
+        parents=state.parents,
     )

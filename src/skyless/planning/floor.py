@@ -8,9 +8,9 @@ from msgspec import Struct
 
 from skyless.errors import ConfigurationError
 from skyless.kernels.arrays import Integers, Mask, Matrix, Vector
-from skyless.planning.links import anchor_positions
 from skyless.site.image import image_size
 from skyless.site.model import Site
+from skyless.site.near import anchor_positions
 
 Box = tuple[float, float, float, float]
 
@@ -53,8 +53,8 @@ def floor_of(site: Site, file: Path, outline_m: Matrix | None, region_m: Box | N
     if abs(area(outline_m)) < 1e-6:
         right = "anchors that are not all in one line, or a floor plan; --outline gives the room else"
         raise ConfigurationError(file, "anchors", f"{len(anchors)} in one line", right)
-    for index, position in enumerate(anchors):
-        if distance_outside(position, outline_m) > _OUTSIDE_M:
+    for index in np.flatnonzero(~inside(anchors, outline_m)).tolist():
+        if distance_outside(anchors[index], outline_m) > _OUTSIDE_M:
             raise _outside(site, file, index, outline_m)
     low, high = outline_m.min(axis=0), outline_m.max(axis=0)
     return Floor(outline_m, region_m or (*low.tolist(), *high.tolist()))

@@ -16,7 +16,6 @@ from skyless.simulation.channel import (
     delivery_probability,
     received_power_dbm,
 )
-from skyless.site.model import Site
 from skyless.uncertainty.dop import dops_at
 
 IN_VIEW: Final = 0.5
@@ -41,22 +40,17 @@ class AnchorLinks(Struct, frozen=True):
     """By how much walls delay them."""
 
 
-def range_of(channel: ChannelModel) -> float:
-    """Distance in metres at which half of the frames arrive with nothing between."""
+def range_of(channel: ChannelModel, exponent: float = 2.0) -> float:
+    """Distance in metres at which half of the frames arrive with nothing between, by the path loss's exponent."""
     budget_db = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - channel.sensitivity_dbm
-    return float(10.0 ** (budget_db / 20.0))
+    return float(10.0 ** (budget_db / (10.0 * exponent)))
 
 
-def with_range(channel: ChannelModel, range_m: float) -> ChannelModel:
+def with_range(channel: ChannelModel, range_m: float, exponent: float = 2.0) -> ChannelModel:
     """A channel like this one with another range, by another sensitivity."""
-    sensitivity_dbm = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 20.0 * math.log10(range_m)
+    sensitivity_dbm = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 10.0 * exponent * math.log10(range_m)
     values = {name: getattr(channel, name) for name in channel.__struct_fields__}
     return ChannelModel(**{**values, "sensitivity_dbm": sensitivity_dbm})
-
-
-def anchor_positions(site: Site) -> Matrix:
-    """Anchors of a site in the order of its file, shape (anchors, 3)."""
-    return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]).reshape(-1, 3)
 
 
 def link_budget(channel: ChannelModel) -> Vector:

@@ -12,8 +12,8 @@ from msgspec import Struct
 
 from skyless.kernels.arrays import Array
 from skyless.planning.columns import ANCHORS_IN_VIEW, BIAS, FIX_SHARE, HDOP, PDOP, RMSE, SIGMA, VDOP
-from skyless.planning.floor import Floor, floor_plan_box
-from skyless.planning.maps import PlanMap
+from skyless.planning.floor import Box, Floor, floor_plan_box
+from skyless.planning.maps import Grid, PlanMap
 from skyless.site.model import Site
 
 _NO_FIX: Final = "#d9d9d9"
@@ -119,9 +119,9 @@ def _slice(
     axes: Axes, plan: PlanMap, values: Array, norm: LogNorm | BoundaryNorm | None, layer: Layer, background: Background
 ) -> AxesImage:
     grid = plan.grid
-    _image(axes, background)
+    draw_image(axes, background.site, background.file)
     shown = np.where(grid.within, values, np.nan)
-    extent = (*_extent(grid.x_m), *_extent(grid.y_m))
+    extent = cells_box(grid)
     without_fix = grid.within & ~np.isfinite(values)
     opacity = 0.75 if background.site.floor_plan else 1.0
     axes.imshow(
@@ -142,6 +142,11 @@ def _slice(
     return mesh
 
 
+def cells_box(grid: Grid) -> Box:
+    """Return the outer edges of a grid's cells as an image's extent: left, right, bottom, top, metres."""
+    return (*_extent(grid.x_m), *_extent(grid.y_m))
+
+
 def _extent(centres: Array) -> tuple[float, float]:
     half = (centres[1] - centres[0]) / 2.0 if len(centres) > 1 else 0.5
     return float(centres[0] - half), float(centres[-1] + half)
@@ -159,28 +164,36 @@ def _contours(axes: Axes, plan: PlanMap, shown: Array, norm: LogNorm, layer: Lay
         text.set_bbox({"facecolor": "black", "alpha": 0.55, "pad": 0.8, "edgecolor": "none"})
 
 
-def _image(axes: Axes, background: Background) -> None:
-    """The image of the floor, below everything else."""
-    plan = background.site.floor_plan
-    box = floor_plan_box(background.site, background.file)
+def draw_image(axes: Axes, site: Site, file: Path) -> None:
+    """Draw the image of the floor, below everything else; the path of it is relative to the site's file."""
+    plan = site.floor_plan
+    box = floor_plan_box(site, file)
     if plan is None or box is None:
         return
     from matplotlib.image import imread  # noqa: PLC0415 (only with a floor plan)
 
-    image = imread(background.file.parent / plan.image)
+    image = imread(file.parent / plan.image)
     axes.imshow(image, extent=(box[0], box[2], box[1], box[3]), zorder=0, cmap="gray")
 
 
-def _site_plan(axes: Axes, background: Background) -> None:
-    """Outline, walls, and anchors with their identifiers; the master is a star."""
-    site, outline = background.site, background.floor.outline_m
-    closed = np.vstack([outline, outline[:1]])
+def draw_outline_and_walls(axes: Axes, site: Site, floor: Floor) -> None:
+    """Draw the floor's outline and the walls; the first wall has a label, and the axes end just outside."""
+    closed = np.vstack([floor.outline_m, floor.outline_m[:1]])
     axes.plot(closed[:, 0], closed[:, 1], color=_EDGE, linewidth=1.2, zorder=4)
     for index, wall in enumerate(site.walls):
         label = "wall" if index == 0 else None
         ends = ([wall.x1_m, wall.x2_m], [wall.y1_m, wall.y2_m])
         axes.plot(*ends, color="white", linewidth=5.0, zorder=4, solid_capstyle="butt")
         axes.plot(*ends, color="#b2182b", linewidth=3.0, zorder=5, solid_capstyle="butt", label=label)
+    margin = 0.05 * float(np.ptp(closed, axis=0).max())
+    low, high = closed.min(axis=0) - margin, closed.max(axis=0) + margin
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+
+
+def _site_plan(axes: Axes, background: Background) -> None:
+    """Outline, walls, and anchors with their identifiers; the master is a star."""
+    site = background.site
+    draw_outline_and_walls(axes, site, background.floor)
     for anchor in site.anchors:
         master = anchor.id == site.master
         axes.plot(
@@ -194,6 +207,3 @@ def _site_plan(axes: Axes, background: Background) -> None:
         )  # fmt: skip
     for marker, name in (("*", "master"), ("^", "anchor")):
         axes.plot([], [], marker, color="white", markeredgecolor=_EDGE, label=name)
-    margin = 0.05 * float(np.ptp(closed, axis=0).max())
-    low, high = closed.min(axis=0) - margin, closed.max(axis=0) + margin
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))

@@ -19,7 +19,6 @@ from skyless.planning.links import (
     AnchorLinks,
     Scene,
     anchor_links,
-    anchor_positions,
     fill_dops,
     link_budget,
     weighted_pdop,
@@ -30,6 +29,7 @@ from skyless.positioning.methods.snapshots import SnapshotMethod
 from skyless.simulation.channel import ChannelModel, pack_walls
 from skyless.site.almanac_pages import filter_pages_of
 from skyless.site.model import Site
+from skyless.site.near import anchor_positions
 from skyless.site.slots import schedule_of
 
 Fill = Callable[[Matrix, Matrix], None]

@@ -42,6 +42,8 @@ class NoFixReason(StrEnum):
     NOT_CONVERGED = "not-converged"
     RESIDUALS = "residuals-too-large"
     ACQUIRING = "acquiring"
+    NO_MASTER = "no-master"
+    """The method needs a master, and the site has none (protocol 2)."""
 
 
 class Fix(Struct, frozen=True, gc=False):
@@ -51,7 +53,7 @@ class Fix(Struct, frozen=True, gc=False):
     """
 
     time_s: float
-    """Master time at which the position holds, since the receiver's first fix."""
+    """Master time at which the position holds, since the receiver's first fix; without a master the tag's own."""
     rows: bytes
     """Rows of float64 (``POSITION`` and the following), as far as the method knows them."""
     anchors: tuple[int, ...]

@@ -41,6 +41,8 @@ class Observation(Struct, frozen=True, gc=False):
     """On the variance of this reception, at least 1: from the radio's diagnostics (``variance_factor``)."""
     packed_relays: bytes = b""
     """Relays besides ``relays``, as frames carry them (``codec.packed_relays``)."""
+    anchor_std_m: float | None = None
+    """Standard deviation of each coordinate of the anchor; None for that of the site; for ``joint`` only."""
 
     def all_relays(self) -> Iterator[tuple[int, int, int]]:
         """``relays`` and ``packed_relays``."""

@@ -16,7 +16,7 @@ from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Array, Integers
 from skyless.simulation.impairments import Impairments
-from skyless.simulation.medium import Delivery, Medium, Tally
+from skyless.simulation.medium import Delivery, Medium, Tally, Timeline
 from skyless.simulation.stations import TagSpec
 from skyless.site.model import Site
 from skyless.ticks import difference, from_seconds, wrap
@@ -82,6 +82,44 @@ class Broadcast:
             yield tag, Reception(frame, rx_ticks, host_s, diagnostics), position_m
 
 
+class Air(Protocol):
+    """A medium as a world uses it (``Medium``, ``CellMedium``); its methods are described in ``Medium``."""
+
+    node_of: dict[int, int]
+    boots: list[int]
+    timeline: Timeline[Broadcast]
+
+    @property
+    def tally(self) -> Tally:
+        """What was sent, heard and lost so far, by reason."""
+
+    @property
+    def now_s(self) -> float:
+        """True time that has passed."""
+
+    def run(self, until_s: float) -> Iterator[Broadcast]:
+        """Let true time pass."""
+
+    def switch_off(self, node: int) -> None:
+        """Switch a node off."""
+
+    def switch_on(self, node: int) -> None:
+        """Switch a node on."""
+
+    def read_counter(self, node: int) -> int:
+        """A node's unwrapped counter at present."""
+
+    def foresee(self, node: int, local_ticks: int) -> int:
+        """True time in whole ticks at which a node's unwrapped counter will show a value."""
+
+    def transmit(self, node: int, transmission: Transmission) -> bool:
+        """Plan the flight of a frame; False if it comes too late."""
+
+
+AirMaker = Callable[[Site, Sequence[TagSpec], Impairments, int, Callable[[Delivery], Broadcast | None]], Air]
+"""Makes the medium of a world: a class such as ``Medium``."""
+
+
 def diagnostics_of(row: np.void) -> Diagnostics:
     """Diagnostics in a row (``RECEPTION_RECORD``) of a node."""
     return Diagnostics(float(row["rx_power_dbm"]), float(row["first_path_power_dbm"]), float(row["carrier_offset_ppm"]))
@@ -100,14 +138,16 @@ class World:
         *,
         lead_s: float = 1e-3,
         on_tag_restart: Callable[[int], None] | None = None,
+        medium: AirMaker = Medium,
     ) -> None:
         """``lead_s``: how long before its RMARKER a frame is fetched; ``on_tag_restart`` is given a tag's index.
 
-        Raises ValueError when an impairment names an anchor that the site has not.
+        ``medium``: ``Medium``, or ``CellMedium`` for sites of several cells. Raises ValueError when an impairment names
+        an anchor that the site has not, or is not modelled by the medium.
         """
         self._anchors, self._tags, self._impairments = site.anchors, tuple(tags), impairments
         self._factory, self._on_tag_restart = anchor_factory, on_tag_restart
-        self.medium: Medium[Broadcast] = Medium(site, self._tags, impairments, seed, self._deliver)
+        self.medium = medium(site, self._tags, impairments, seed, self._deliver)
         self._timeline = self.medium.timeline
         self._lead_ticks = from_seconds(lead_s)
         nodes = len(self._anchors) + len(self._tags)

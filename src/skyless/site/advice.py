@@ -1,24 +1,38 @@
 """Soft problems of a valid site: geometry and distances that reduce accuracy or prevent a fix."""
 
+from collections import Counter
 from math import dist
 from typing import Final
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from skyless.kernels.arrays import Array
+from skyless.air.codec import MAX_FRAME_BYTES
+from skyless.air.ieee802154 import air_time_s
+from skyless.kernels.arrays import Integers
 from skyless.site.model import Site
+from skyless.site.near import anchor_positions, pairs_within
 
 _FLATTEST: Final = 0.05
 """Extent across the best plane (or line) over the whole extent, below which anchors count as in it."""
 _REACH_M: Final = 100.0
 """Range of a DW1000 in the open at 6.8 Mbit/s, at best; walls shorten it."""
+RADIO_REACH_M: Final = 31.0
+"""Range in the open that the planner's and the simulation's link budget give; half of the frames arrive there."""
+_MOST_OVERLOAD: Final = 2.0
+"""Over the best number of frames in reach; half or double of it costs a tag less than 8 %."""
+_MOST_NAMED: Final = 8
 _SHORTEST_GUARD_S: Final = 0.35e-3
 """Shortest turn-around of a host that reads one frame and prepares the next (firmware in C)."""
 
 
 def warnings_of(site: Site) -> list[str]:
     """Soft problems of a valid site, each a sentence; empty when there is none."""
-    return [*_count(site), *_geometry(site), *_reach(site), *_guard(site), *_accuracy(site)]
+    general = [*_count(site), *_geometry(site), *_guard(site), *_accuracy(site)]
+    if site.schedule.needs_master:
+        return [*general, *_reach(site), *_without_effect(site)]
+    return [*general, *_neighbours(site), *(_unplaced(site) if site.schedule.mode == "slots" else _load(site))]
 
 
 def _count(site: Site) -> list[str]:
@@ -26,6 +40,9 @@ def _count(site: Site) -> list[str]:
     needed = 3 if flat else 4
     count = len(site.anchors)
     what = "at a known height" if flat else "with its height"
+    if count < needed and site.unplaced:
+        without = f"{len(site.unplaced)} of {len(site.all_anchors)} anchors have no position yet"
+        return [f"{without}: a tag's position {what} needs {needed} that have"]
     if count < needed:
         return [f"{count} anchors give no position: one {what} needs {needed}"]
     if count == needed:
@@ -37,7 +54,7 @@ def _geometry(site: Site) -> list[str]:
     """Anchors in one line (2-D) or one plane (3-D) leave two mirror positions (``docs/maths.md`` section 5)."""
     flat = site.tags.height_m is not None
     dimensions = 2 if flat else 3
-    points = _points(site)[:, :dimensions]
+    points = anchor_positions(site)[:, :dimensions]
     if len(points) < dimensions + 1:
         return []
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -61,9 +78,96 @@ def _reach(site: Site) -> list[str]:
     ]
 
 
+def _without_effect(site: Site) -> list[str]:
+    stated = [anchor.id for anchor in site.anchors if anchor.std_m is not None]
+    if not stated:
+        return []
+    return [f"{_named(stated)}: std_m has no effect in mode master, whose beacons do not carry it"]
+
+
+def _neighbours(site: Site) -> list[str]:
+    """Anchors without a neighbour in reach, and groups of anchors that have no link between them."""
+    points = anchor_positions(site)
+    if len(points) < 2:
+        return []
+    ones, others = _links(site)
+    graph = coo_array((np.ones(len(ones)), (ones, others)), shape=(len(points), len(points)))
+    count, group = connected_components(graph, directed=False)
+    sizes = np.bincount(group)
+    alone = [site.anchors[row].id for row in np.flatnonzero(sizes[group] == 1)]
+    found = []
+    if alone:
+        found.append(
+            f"{_named(alone)}: no other anchor within {RADIO_REACH_M:.0f} m, the range in the open; "
+            "nothing ties its clock to others', so tags hardly gain from it"
+        )
+    if count - len(alone) > 1 or (alone and count > len(alone)):
+        found.append(
+            f"the anchors form {count} groups with no link of {RADIO_REACH_M:.0f} m or less between them: each keeps "
+            "a slot time of its own, and a tag between two groups positions itself by one at a time"
+        )
+    return found
+
+
+def _unplaced(site: Site) -> list[str]:
+    """Anchors without a position that share a slot: nothing says that they are far enough from the others."""
+    users = Counter(anchor.slot for anchor in site.all_anchors if anchor.slot is not None)
+    shared = [anchor.id for anchor in site.unplaced if anchor.slot is not None and users[anchor.slot] > 1]
+    if not shared:
+        return []
+    return [
+        f"{_named(shared)}: shares its slot, and nothing is known of its distance from the others in it until it has "
+        "a position"
+    ]
+
+
+def _load(site: Site) -> list[str]:
+    """Frames at random instants: above the best number in reach they destroy each other."""
+    in_reach = float(np.median(anchors_in_reach(site))) if site.anchors else 0.0
+    offered_hz = in_reach * site.schedule.rate_hz
+    best_hz = best_offered_hz()
+    if offered_hz <= _MOST_OVERLOAD * best_hz:
+        return []
+    return [
+        f"schedule.rate_hz is {site.schedule.rate_hz:g}: the {in_reach:.0f} anchors in reach of one another send "
+        f"{offered_hz:.0f} beacons/s, and most collide; {max(best_hz / in_reach, 1.0):.3g} is enough for all that "
+        f"random instants can give a tag"
+    ]
+
+
+def anchors_in_reach(site: Site) -> Integers:
+    """Number of placed anchors within the range in the open of each placed anchor, itself included; shape (n,)."""
+    ones, others = _links(site)
+    return np.bincount(np.concatenate([ones, others]), minlength=len(site.anchors)) + 1
+
+
+def best_offered_hz() -> float:
+    """Beacons per second that the anchors in reach of a tag should send at random instants in all.
+
+    In free space a frame of length tau is lost to others within sqrt(10) times its sender's distance, so a tag gets
+    1 / (20 tau) * (1 - exp(-20 tau * offered)) beacons a second, which 3 / (20 tau) brings to 95 % of its most.
+    """
+    return 3.0 / (20.0 * air_time_s(MAX_FRAME_BYTES))
+
+
+def _links(site: Site) -> tuple[Integers, Integers]:
+    """Rows of placed anchors in reach of each other."""
+    pairs = [(one, other) for one, other, _ in pairs_within(anchor_positions(site), RADIO_REACH_M)]
+    nothing = np.empty(0, np.int64)
+    ones, others = zip(*pairs, strict=True) if pairs else ((nothing,), (nothing,))
+    return np.concatenate(ones), np.concatenate(others)
+
+
+def _named(identifiers: list[int]) -> str:
+    """Anchors by their identifiers, the first few of many."""
+    shown = ", ".join(map(str, identifiers[:_MOST_NAMED]))
+    more = f" and {len(identifiers) - _MOST_NAMED} more" if len(identifiers) > _MOST_NAMED else ""
+    return f"anchor{'s' if len(identifiers) > 1 else ''} {shown}{more}"
+
+
 def _guard(site: Site) -> list[str]:
     guard_s = site.schedule.guard_s
-    if guard_s >= _SHORTEST_GUARD_S:
+    if guard_s >= _SHORTEST_GUARD_S or site.schedule.mode == "free":
         return []
     return [
         f"a guard of {guard_s * 1e6:.0f} µs is shorter than a radio's host needs between two frames "
@@ -78,7 +182,3 @@ def _accuracy(site: Site) -> list[str]:
         "[accuracy] states that survey and ranges are exact; no real site is: the standard deviations that tags report "
         "will be too small; set survey_std_m and range_std_m"
     ]
-
-
-def _points(site: Site) -> Array:
-    return np.array([[anchor.x_m, anchor.y_m, anchor.z_m] for anchor in site.anchors])

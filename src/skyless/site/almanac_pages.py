@@ -28,7 +28,7 @@ def pages_of(site: Site) -> tuple[Page, ...]:
     Raises:
         ValueError: two anchors would share a slot (see ``first_slots``).
     """
-    schedule, slots, earth = schedule_of(site), first_slots(site), site.georeference
+    schedule, slots, earth = schedule_of(site), first_slots(site), georeference_page_of(site)
     pages: list[Page] = [
         SchedulePage(
             schedule.slot_ticks,
@@ -41,10 +41,7 @@ def pages_of(site: Site) -> tuple[Page, ...]:
         *filter_pages_of(site),
     ]
     pages += [AnchorPage(node.id, node.x_m, node.y_m, node.z_m, slots[node.id]) for node in site.anchors]
-    if earth is not None:
-        heading_deg = earth.heading_deg % 360.0
-        pages.append(GeoreferencePage(earth.latitude_deg, earth.longitude_deg, earth.height_m, heading_deg))
-    return tuple(pages)
+    return (*pages,) if earth is None else (*pages, earth)
 
 
 def filter_pages_of(site: Site) -> tuple[NoisePage, AccuracyPage]:
@@ -54,6 +51,14 @@ def filter_pages_of(site: Site) -> tuple[NoisePage, AccuracyPage]:
         NoisePage(noise.tx_stamp_ps * 1e-12, noise.rx_stamp_ps * 1e-12, noise.white_fm, noise.random_walk_fm),
         AccuracyPage(**asdict(site.accuracy)),
     )
+
+
+def georeference_page_of(site: Site) -> GeoreferencePage | None:
+    """The page with the site's position on the Earth, None where that is not known."""
+    earth = site.georeference
+    if earth is None:
+        return None
+    return GeoreferencePage(earth.latitude_deg, earth.longitude_deg, earth.height_m, earth.heading_deg % 360.0)
 
 
 def page_for(pages: tuple[Page, ...], superframe: int, slot: int) -> Page:

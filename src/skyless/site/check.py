@@ -5,12 +5,11 @@ Every violation is a configuration error.
 
 import math
 import re
-from collections.abc import Iterable, Iterator
-from itertools import combinations
-from math import dist
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 from msgspec import Struct
 
 from skyless.air.codec import MAX_FRAME_BYTES
@@ -19,7 +18,8 @@ from skyless.air.page_codec import MAX_COORDINATE_M
 from skyless.constants import TICK_BITS, TICK_S
 from skyless.errors import ConfigurationError
 from skyless.site.image import image_size
-from skyless.site.model import AnchorSite, Site
+from skyless.site.model import AnchorSite, Site, UnplacedAnchor
+from skyless.site.near import DISTANCE_ROUNDING_M, anchor_positions, pairs_within, pairs_within_groups
 from skyless.site.slots import Schedule, first_slots, schedule_of
 
 ANY_ADDRESS: Final = 65_533
@@ -53,6 +53,9 @@ _ADDRESS = Limits(0, ANY_ADDRESS, whole=True)
 _COORDINATE = Limits(-MAX_COORDINATE_M, MAX_COORDINATE_M, "metres")
 _STD = Limits(0, 6.5, "metres")
 """Sent as a 16-bit number of 0.1 mm (``docs/protocol.md``, "Pages")."""
+_STATED_STD = Limits(0, 0.255, "metres")
+"""Sent as an 8-bit number of millimetres in protocol 2."""
+_SLOT = Limits(0, 254, whole=True)
 _DELAY = Limits(0, 65_535, "ticks (15.65 ps)", whole=True)
 
 SITE_LIMITS: Final = {
@@ -62,13 +65,18 @@ SITE_LIMITS: Final = {
     "anchors.x_m": _COORDINATE,
     "anchors.y_m": _COORDINATE,
     "anchors.z_m": _COORDINATE,
-    "anchors.slot": Limits(0, 254, whole=True),
+    "anchors.slot": _SLOT,
     "anchors.tx_antenna_delay_ticks": _DELAY,
     "anchors.rx_antenna_delay_ticks": _DELAY,
+    "anchors.floor": Limits(-128, 127, whole=True),
+    "anchors.zone": Limits(0, 255, whole=True),
+    "anchors.std_m": _STATED_STD,
     "schedule.slot_s": Limits(0, 0.067, "seconds", above=True),
     "schedule.slots": Limits(1, 255, whole=True),
     "schedule.frames_per_node": Limits(1, 255, whole=True),
     "schedule.guard_s": Limits(0, 1, "seconds"),
+    "schedule.rate_hz": Limits(1, 200, "beacons per second"),
+    "schedule.reuse_m": Limits(1, 10_000, "metres"),
     "noise.tx_stamp_ps": Limits(0, 1e6, "picoseconds", above=True),
     "noise.rx_stamp_ps": Limits(0, 1e6, "picoseconds", above=True),
     "noise.white_fm": Limits(0, 1e-6, above=True),
@@ -96,7 +104,19 @@ SITE_LIMITS: Final = {
 }
 """By key, without the indices in lists."""
 
+_STATED_COORDINATE = Limits(-8388, 8388, "metres in modes slots and free, where anchors state their positions,")
+"""Sent as a 24-bit number of millimetres."""
+
+PROTOCOL_2_LIMITS: Final = {
+    "anchors.x_m": _STATED_COORDINATE,
+    "anchors.y_m": _STATED_COORDINATE,
+    "anchors.z_m": _STATED_COORDINATE,
+}
+"""Those that are narrower in protocol 2."""
+
 _OTHERS: Final = {
+    "schedule.mode": 'one of "master", "slots" and "free"',
+    "schedule.site_time": "true or false",
     "name": "a text",
     "anchors": "a list of [[anchors]] tables, one for each anchor",
     "walls": "a list of [[walls]] tables",
@@ -115,22 +135,34 @@ HALF_WRAP_S: Final = (1 << (TICK_BITS - 1)) * TICK_S
 """Longest gap over which a stamp can be unwrapped without a host time."""
 
 _CLOSEST_M: Final = 1e-3
+_MOST_LISTED: Final = 20
+_COLOURS: Final = "skyless plan --write colours the slots"
 
 
-def check_site(site: Site, file: Path) -> None:
+def check_site(site: Site, file: Path, *, slots_given: bool = True) -> None:
     """Check the values of a site.
+
+    ``slots_given``: whether a site in mode slots must have its slots; without it they are not checked.
 
     Raises:
         ConfigurationError: naming ``file``, the key, its value and what would be right.
     """
     if not site.name.strip():
         raise ConfigurationError(file, "name", site.name, "a text of at least one character")
-    for path, value in _numbers(site):
-        key = re.sub(r"\[\d+\]", "", path)
-        if not SITE_LIMITS[key].contains(value):
-            raise ConfigurationError(file, with_anchor(path, site.anchors), value, expected(key))
+    limits = SITE_LIMITS if site.schedule.needs_master else {**SITE_LIMITS, **PROTOCOL_2_LIMITS}
+    for key, row, value in _numbers(site):
+        name, _, field = key.partition(".")
+        limit = limits[f"anchors.{field}" if name == "unplaced" else key]
+        if not limit.contains(value):
+            path = key if row is None else f"{name}[{row}].{field}"
+            raise ConfigurationError(file, _with_anchor(path, site), value, str(limit))
     _check_anchors(site, file)
-    _check_slots(site, file)
+    if site.schedule.needs_master:
+        _check_slots(site, file)
+    else:
+        _check_protocol_2(site, file)
+        if site.schedule.mode == "slots" and slots_given:
+            _check_shared_slots(site, file)
     _check_times(site, file)
 
 
@@ -155,46 +187,101 @@ def check_floor_plan(site: Site, file: Path) -> None:
         raise ConfigurationError(file, "floor_plan.image", image, "a PNG or JPEG image")
 
 
-def with_anchor(path: str, anchors: Iterable[object]) -> str:
-    """Add the anchor's identifier, which its owner knows, to the path of a value in the list of anchors."""
-    match = re.match(r"anchors\[(\d+)\]", path)
+def with_anchor(path: str, anchors: Sequence[object], unplaced: Sequence[object] = ()) -> str:
+    """Add the anchor's identifier, which its owner knows, to the path of a value in the lists of anchors."""
+    match = re.match(r"(anchors|unplaced)\[(\d+)\]", path)
     if match is None:
         return path
-    anchor = list(anchors)[int(match[1])]
+    anchor = (anchors if match[1] == "anchors" else unplaced)[int(match[2])]
     identifier = anchor.get("id") if isinstance(anchor, dict) else getattr(anchor, "id", None)
     return path if identifier is None else f"{path} (anchor {identifier})"
 
 
-def _numbers(value: object, path: str = "") -> Iterator[tuple[str, float]]:
-    """Every number in a tree of structs, with its path."""
+def _with_anchor(path: str, site: Site) -> str:
+    return with_anchor(path, site.anchors, site.unplaced)
+
+
+def _numbers(value: object, path: str = "", row: int | None = None) -> Iterator[tuple[str, int | None, float]]:
+    """Every number in a tree of structs: its key without indices, its row where it is in a list, and itself."""
     if isinstance(value, Struct):
         for field in value.__struct_fields__:
-            yield from _numbers(getattr(value, field), f"{path}.{field}".lstrip("."))
+            yield from _numbers(getattr(value, field), f"{path}.{field}" if path else field, row)
     elif isinstance(value, tuple):
         for index, entry in enumerate(value):
-            yield from _numbers(entry, f"{path}[{index}]")
-    elif isinstance(value, int | float):
-        yield path, value
+            yield from _numbers(entry, path, index)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield path, row, value
 
 
 def _check_anchors(site: Site, file: Path) -> None:
-    if not site.anchors:
+    if not site.all_anchors:
         raise ConfigurationError(file, "anchors", [], "at least one [[anchors]] table")
-    identifiers = [anchor.id for anchor in site.anchors]
-    for index, identifier in enumerate(identifiers):
-        if identifier in identifiers[:index]:
-            first = identifiers.index(identifier)
-            right = f"an identifier of its own; anchors[{first}] has this one already"
-            raise ConfigurationError(file, f"anchors[{index}].id", identifier, right)
-    if site.master not in identifiers:
-        right = f"the id of an anchor: {', '.join(map(str, identifiers))}"
+    rows: dict[int, str] = {}
+    for row, anchor in _rows(site):
+        if anchor.id in rows:
+            right = f"an identifier of its own; {rows[anchor.id]} has this one already"
+            raise ConfigurationError(file, f"{row}.id", anchor.id, right)
+        rows[anchor.id] = row
+    if site.master not in rows:
+        identifiers = ", ".join(map(str, sorted(rows)[:_MOST_LISTED]))
+        right = f"the id of an anchor: {identifiers}{', …' if len(rows) > _MOST_LISTED else ''}"
         raise ConfigurationError(file, "master", site.master, right)
-    for (_, one), (index, other) in combinations(enumerate(site.anchors), 2):
-        if dist(_point(one), _point(other)) < _CLOSEST_M:
-            key = with_anchor(f"anchors[{index}]", site.anchors)
-            raise ConfigurationError(
-                file, key, f"at {_point(other)}", f"elsewhere; anchor {one.id} is at the same point"
-            )
+    same_point = min(((i, j) for i, j, _ in _near(site, _CLOSEST_M)), key=lambda pair: pair[1], default=None)
+    if same_point is not None:
+        one, other = (site.anchors[row] for row in same_point)
+        key = _with_anchor(f"anchors[{same_point[1]}]", site)
+        point = other.x_m, other.y_m, other.z_m
+        raise ConfigurationError(file, key, f"at {point}", f"elsewhere; anchor {one.id} is at the same point")
+
+
+def _rows(site: Site) -> Iterator[tuple[str, AnchorSite | UnplacedAnchor]]:
+    """Every anchor with its row, as ``anchors[3]``."""
+    for index, anchor in enumerate(site.all_anchors):
+        placed = index < len(site.anchors)
+        yield f"anchors[{index}]" if placed else f"unplaced[{index - len(site.anchors)}]", anchor
+
+
+def _near(site: Site, distance_m: float) -> Iterator[tuple[int, int, float]]:
+    """Rows of placed anchors closer than a distance, and their distance."""
+    for one, other, apart_m in pairs_within(anchor_positions(site), distance_m):
+        yield from zip(one.tolist(), other.tolist(), apart_m.tolist(), strict=True)
+
+
+def _check_protocol_2(site: Site, file: Path) -> None:
+    """Check what modes slots and free have in common."""
+    frames = site.schedule.frames_per_node
+    if frames != 1:
+        right = f"1 in mode {site.schedule.mode}: every anchor has one frame in a superframe"
+        raise ConfigurationError(file, "schedule.frames_per_node", frames, right)
+    most = _STATED_STD.high
+    if site.accuracy.survey_std_m > most and any(anchor.std_m is None for anchor in site.anchors):
+        right = f"at most {most:g} in mode {site.schedule.mode}, which is the largest std_m that an anchor can state"
+        raise ConfigurationError(file, "accuracy.survey_std_m", site.accuracy.survey_std_m, right)
+
+
+def _check_shared_slots(site: Site, file: Path) -> None:
+    """Check that every anchor has a slot, and that those which share one are far enough apart."""
+    slots = site.schedule.slots
+    if slots is None:
+        raise ConfigurationError(file, "schedule.slots", None, f"{SITE_LIMITS['schedule.slots']}; {_COLOURS}")
+    for row, anchor in _rows(site):
+        if anchor.slot is None or anchor.slot >= slots:
+            right = f"a whole number from 0 to {slots - 1}; {_COLOURS}"
+            raise ConfigurationError(file, _with_anchor(f"{row}.slot", site), anchor.slot, right)
+    own = np.array([anchor.slot for anchor in site.anchors], np.int64)
+    reuse_m = site.schedule.reuse_m - 2 * DISTANCE_ROUNDING_M
+    for one, other, apart_m in pairs_within_groups(anchor_positions(site), own, reuse_m):
+        if len(one):
+            raise _too_near(site, file, int(one[0]), int(other[0]), float(apart_m[0]))
+
+
+def _too_near(site: Site, file: Path, one: int, other: int, apart_m: float) -> ConfigurationError:
+    first, second = site.anchors[one], site.anchors[other]
+    right = (
+        f"another slot: anchors {first.id} and {second.id} share it and are {apart_m:.1f} m apart, less than "
+        f"schedule.reuse_m, {site.schedule.reuse_m:g} m; {_COLOURS}"
+    )
+    return ConfigurationError(file, _with_anchor(f"anchors[{other}].slot", site), second.slot, right)
 
 
 def _check_slots(site: Site, file: Path) -> None:
@@ -221,7 +308,7 @@ def _check_own_slots(site: Site, schedule: Schedule, file: Path) -> None:
     for index, anchor in enumerate(site.anchors):
         if anchor.slot is None:
             continue
-        key = with_anchor(f"anchors[{index}].slot", site.anchors)
+        key = _with_anchor(f"anchors[{index}].slot", site)
         if anchor.slot >= schedule.slots:
             raise ConfigurationError(file, key, anchor.slot, f"a whole number from 0 to {schedule.slots - 1}")
         for slot in schedule.slots_of(anchor.slot):
@@ -233,6 +320,8 @@ def _check_own_slots(site: Site, schedule: Schedule, file: Path) -> None:
 
 def _check_times(site: Site, file: Path) -> None:
     schedule = site.schedule
+    if schedule.mode == "free":
+        return
     longest_s = air_time_s(MAX_FRAME_BYTES)
     if schedule.slot_s < longest_s + schedule.guard_s:
         right = (
@@ -240,6 +329,8 @@ def _check_times(site: Site, file: Path) -> None:
             f"air and schedule.guard_s is {schedule.guard_s * 1e6:.0f} µs"
         )
         raise ConfigurationError(file, "schedule.slot_s", schedule.slot_s, right)
+    if schedule.slots is None and not schedule.needs_master:
+        return
     slots = schedule_of(site).slots
     if slots * schedule.slot_s >= HALF_WRAP_S:
         right = (
@@ -247,7 +338,3 @@ def _check_times(site: Site, file: Path) -> None:
             f"wrap of the radios' counters ({HALF_WRAP_S:.2f} s)"
         )
         raise ConfigurationError(file, "schedule.slot_s", schedule.slot_s, right)
-
-
-def _point(anchor: AnchorSite) -> tuple[float, float, float]:
-    return anchor.x_m, anchor.y_m, anchor.z_m

@@ -20,6 +20,7 @@ from skyless.site.model import (
     ScheduleSite,
     Site,
     TagsSite,
+    UnplacedAnchor,
     WallSite,
 )
 
@@ -37,8 +38,11 @@ _FINDING = re.compile(r"(?P<finding>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTA
 _MISSING = re.compile(r"Object missing required field `(?P<name>\w+)`")
 
 
-def load_site(path: Path | str) -> Site:
+def load_site(path: Path | str, *, slots_given: bool = True) -> Site:
     """The site that a TOML file describes.
+
+    ``slots_given``: False for a planner that is about to give slots to the anchors of a site in mode slots; slots in
+    the file are then not checked.
 
     Raises:
         ConfigurationError: naming the file, the key, its value and what would be right.
@@ -46,13 +50,76 @@ def load_site(path: Path | str) -> Site:
     path = Path(path)
     document = _parse(path)
     _refuse_unknown_keys(path, document)
+    rows = _separate_unplaced(path, document)
     try:
-        site = msgspec.convert(document, Site)
-    except msgspec.ValidationError as error:
-        raise _wrong_type(path, document, str(error)) from None
-    check_site(site, path)
+        site = _converted(path, document)
+        check_site(site, path, slots_given=slots_given)
+    except ConfigurationError as error:
+        key, right = _in_file(error.key, rows), _in_file(error.expected, rows)
+        raise ConfigurationError(path, key, error.value, right) from None
     check_floor_plan(site, path)
     return site
+
+
+def _converted(path: Path, document: dict[str, Any]) -> Site:
+    try:
+        return msgspec.convert(document, Site)
+    except msgspec.ValidationError as error:
+        raise _wrong_type(path, document, str(error)) from None
+
+
+class _Rows(Struct):
+    """Where the anchors stand in the file's list: those with a position, and those without."""
+
+    anchors: list[int]
+    unplaced: list[int]
+
+
+def _separate_unplaced(path: Path, document: dict[str, Any]) -> _Rows | None:
+    """Move a protocol 2 document's anchors without a position to a list of their own; name a master if it has none.
+
+    Returns None for protocol 1, and for a document that the conversion will refuse.
+    """
+    schedule, entries = document.get("schedule"), document.get("anchors")
+    mode = schedule.get("mode") if isinstance(schedule, dict) else None
+    if mode not in ("slots", "free"):  # no set: the value may be a list
+        return None
+    if "anchors" not in document:
+        raise ConfigurationError(path, "anchors", None, expected("anchors"))
+    if not isinstance(entries, list):
+        document.setdefault("master", 0)
+        return None
+    if entries and isinstance(entries[0], dict) and "id" in entries[0]:
+        document.setdefault("master", entries[0]["id"])
+    rows = _Rows([], [])
+    for row, entry in enumerate(entries):
+        unplaced = isinstance(entry, dict) and "x_m" not in entry and "y_m" not in entry
+        (rows.unplaced if unplaced else rows.anchors).append(row)
+        if unplaced:
+            _refuse_without_position(path, f"anchors[{row}]", entry)
+    document["anchors"] = [entries[row] for row in rows.anchors]
+    document["unplaced"] = [entries[row] for row in rows.unplaced]
+    return rows
+
+
+def _refuse_without_position(path: Path, row: str, entry: dict[str, Any]) -> None:
+    """Refuse what only an anchor with a position may have."""
+    for key, value in entry.items():
+        if key not in UnplacedAnchor.__struct_fields__:
+            right = "left out, or given with x_m and y_m: this anchor has no position"
+            raise ConfigurationError(path, f"{row}.{key} (anchor {entry.get('id')})", value, right)
+
+
+def _in_file(text: str, rows: _Rows | None) -> str:
+    """A text with the rows of separate lists of anchors changed to those of the file's one list."""
+    if rows is None:
+        return text
+
+    def row_in_file(match: re.Match[str]) -> str:
+        in_file: list[int] = getattr(rows, match[1])
+        return f"anchors[{in_file[int(match[2])]}]"
+
+    return re.sub(r"\b(anchors|unplaced)\[(\d+)\]", row_in_file, text)
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -69,7 +136,7 @@ def _parse(path: Path) -> dict[str, Any]:
 
 
 def _refuse_unknown_keys(path: Path, document: dict[str, Any]) -> None:
-    _refuse_unknown(path, document, "", document, Site)
+    _refuse_unknown(path, document, "", document, Site, absent=("unplaced",))
     for name, struct in _TABLES.items():
         _refuse_unknown(path, document, f"{name}.", document.get(name), struct)
     for name, struct in _LISTS.items():
@@ -78,10 +145,18 @@ def _refuse_unknown_keys(path: Path, document: dict[str, Any]) -> None:
             _refuse_unknown(path, document, f"{name}[{index}].", entry, struct)
 
 
-def _refuse_unknown(path: Path, document: dict[str, Any], prefix: str, table: object, struct: type[Struct]) -> None:
+def _refuse_unknown(
+    path: Path,
+    document: dict[str, Any],
+    prefix: str,
+    table: object,
+    struct: type[Struct],
+    absent: tuple[str, ...] = (),
+) -> None:
+    """Refuse keys that are no field of a struct, and fields that the file does not have."""
     if not isinstance(table, dict):
         return  # a wrong type, which the conversion reports
-    known = struct.__struct_fields__
+    known = [name for name in struct.__struct_fields__ if name not in absent]
     for key, value in table.items():
         if key not in known:
             near = difflib.get_close_matches(key, known, n=2)
@@ -96,14 +171,14 @@ def _wrong_type(path: Path, document: dict[str, Any], message: str) -> Configura
     missing = _MISSING.match(message)
     if missing:
         key_path = f"{key_path}.{missing['name']}".lstrip(".")
-    key = re.sub(r"\[\d+\]", "", key_path)
+    key = re.sub(r"\[\d+\]", "", key_path).replace("unplaced.", "anchors.")
     value = None if missing else _value_at(document, key_path)
     return ConfigurationError(path, _named(document, key_path), value, expected(key))
 
 
 def _named(document: dict[str, Any], key_path: str) -> str:
-    anchors = document.get("anchors")
-    return with_anchor(key_path, anchors) if isinstance(anchors, list) else key_path
+    anchors, unplaced = document.get("anchors"), document.get("unplaced", [])
+    return with_anchor(key_path, anchors, unplaced) if isinstance(anchors, list) else key_path
 
 
 def _value_at(document: object, key_path: str) -> object:

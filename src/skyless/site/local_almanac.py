@@ -7,15 +7,15 @@ from zlib import crc32
 
 import numpy as np
 from msgspec import Meta, Struct
-from msgspec.structs import replace
 
 from skyless.air.almanac import AccuracyPage, GeoreferencePage, NoisePage, Page, SitePage
+from skyless.air.beacon import Malformed
 from skyless.air.beacon2 import Beacon2, StatedPosition
-from skyless.air.page_codec import encode_page
+from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
 from skyless.kernels.arrays import Array
 from skyless.site.almanac_pages import filter_pages_of, georeference_page_of
 from skyless.site.model import Site
-from skyless.site.slots import schedule_of
+from skyless.site.slots import schedule_of, superframe_ticks_of
 from skyless.ticks import from_seconds
 
 PRESENT_TICKS: Final = from_seconds(1.0)
@@ -36,10 +36,10 @@ _MOST_TRIALS: Final = 256
 
 def site_pages_of(site: Site) -> tuple[Page, ...]:
     """Return the pages of a validated site of protocol 2, in the order of their types on the air."""
-    schedule, filters, earth = schedule_of(site), filter_pages_of(site), georeference_page_of(site)
+    filters, earth = filter_pages_of(site), georeference_page_of(site)
     others: list[Page] = [filters[0], *([] if earth is None else [earth]), filters[1]]
-    slots = schedule.slots if site.schedule.mode == "slots" else 0
-    return (*others, SitePage(len(others) + 1, schedule.slot_ticks, slots, site.tags.height_m))
+    slots = 0 if site.schedule.mode == "free" else schedule_of(site).slots
+    return (*others, SitePage(len(others) + 1, superframe_ticks_of(site), slots, site.tags.height_m))
 
 
 def site_page_for(pages: tuple[Page, ...], sequence: int, anchor: int) -> Page:
@@ -74,7 +74,13 @@ class AnchorStatement(Struct):
     """Another one, stated once; used when it is stated twice in a row."""
 
 
-_PageContents = dict[Annotated[bytes, Meta(max_length=17)], set[int]]
+class CollectedPage(Struct, frozen=True):
+    """A page of an issue that is not complete yet."""
+
+    issue: int
+    page: Annotated[bytes, Meta(min_length=PAGE_BYTES, max_length=PAGE_BYTES)]
+    anchors: tuple[int, ...]
+    """Those that have sent it."""
 
 
 class LocalAlmanacState(Struct, frozen=True):
@@ -84,6 +90,7 @@ class LocalAlmanacState(Struct, frozen=True):
     issue: int | None
     pages: CommonPages | None
     anchors: dict[int, AnchorStatement]
+    collected: tuple[CollectedPage, ...]
 
 
 class LocalAlmanac:
@@ -105,16 +112,32 @@ class LocalAlmanac:
         """For each issue the pages received, and from which anchors."""
 
     def state(self) -> LocalAlmanacState:
-        """All that it holds, but for pages that are not complete."""
-        return LocalAlmanacState(self._first_ticks, self.issue, self.pages, self._anchors)
+        """All that it holds."""
+        collected = tuple(
+            CollectedPage(issue, encode_page(page), tuple(anchors))
+            for issue, by_type in self._contents.items()
+            for contents in by_type.values()
+            for page, anchors in contents.items()
+        )
+        return LocalAlmanacState(self._first_ticks, self.issue, self.pages, self._anchors, collected)
 
     def restore(self, state: LocalAlmanacState) -> None:
-        """Continue from a state."""
+        """Continue from a state.
+
+        Raises:
+            ValueError: it holds something that is not a page.
+        """
         self._first_ticks, self.issue, self.pages = state.first_ticks, state.issue, state.pages
         self._anchors = dict(state.anchors)
         self._positions_m = {
             anchor: _position_m(one.position) for anchor, one in self._anchors.items() if one.position is not None
         }
+        for one in state.collected:
+            page = decode_page(one.page)
+            if page is None or isinstance(page, Malformed):
+                raise ValueError("a page of the almanac is damaged")
+            for anchor in one.anchors:
+                self._collect(anchor, one.issue, page)
 
     def position_m(self, anchor: int) -> Array | None:
         """Position of an anchor, shape (3,), the same array until it moves; None while it has stated none."""

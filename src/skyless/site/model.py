@@ -1,10 +1,13 @@
 """The values of a site file, already validated (``skyless.site.load`` makes them)."""
 
-from typing import Final
+from typing import Final, Literal
 
 from msgspec import Struct
 
 from skyless.constants import DEFAULT_ANTENNA_DELAY_TICKS
+
+ScheduleMode = Literal["master", "slots", "free"]
+"""How the anchors of a site share the air; ``slots`` and ``free`` are protocol 2, which needs no master."""
 
 
 class AnchorSite(Struct, frozen=True, forbid_unknown_fields=True):
@@ -15,22 +18,51 @@ class AnchorSite(Struct, frozen=True, forbid_unknown_fields=True):
     y_m: float
     z_m: float = 0.0
     slot: int | None = None
-    """Its first slot; by default the anchors send in the order of the file, the master first."""
+    """Its first slot; in mode master by default in the order of the file, the master first."""
+    tx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+    rx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+    floor: int = 0
+    """Storey on which it hangs; sent with its position in protocol 2, as are the next two."""
+    zone: int = 0
+    """Zone of the site in which it hangs; 0 for none."""
+    std_m: float | None = None
+    """How well this position is known, per axis; by default ``AccuracySite.survey_std_m``."""
+
+
+class UnplacedAnchor(Struct, frozen=True, forbid_unknown_fields=True):
+    """An anchor of protocol 2 whose position is not known yet; it keeps the schedule and relays."""
+
+    id: int
+    slot: int | None = None
     tx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
     rx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
 
 
 class ScheduleSite(Struct, frozen=True, forbid_unknown_fields=True):
-    """The superframe."""
+    """Who sends when."""
 
+    mode: ScheduleMode = "master"
+    """master: slots on the master's clock (protocol 1); slots: slots that anchors far apart share, on a time that
+    needs no master; free: every anchor sends at random instants."""
     slot_s: float = 2**27 / 63.8976e9
     """Length of a slot; rounded to whole steps of the delayed transmission (8.013 ns)."""
     slots: int | None = None
-    """Slots in a superframe; by default one for each frame of each anchor."""
+    """Slots in a superframe; in mode master by default one for each frame of each anchor."""
     frames_per_node: int = 1
     """1: one frame per node and superframe; 2: the paper's pair in every superframe."""
     guard_s: float = 0.5e-3
     """Time at the end of each slot in which no frame may be on the air."""
+    rate_hz: float = 30.0
+    """Mode free: beacons per second of each anchor."""
+    site_time: bool = False
+    """Mode slots: whether beacons carry site time."""
+    reuse_m: float = 78.0
+    """Mode slots: least distance between two anchors that share a slot."""
+
+    @property
+    def needs_master(self) -> bool:
+        """Whether the site speaks protocol 1."""
+        return self.mode == "master"
 
 
 class NoiseSite(Struct, frozen=True, forbid_unknown_fields=True):
@@ -116,8 +148,11 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     id: int
     """Identifier on the air, 16 bits."""
     master: int
-    """The anchor that starts the site's time; when it fails the others take over in the order of the file."""
+    """The anchor that starts the site's time; when it fails the others take over in the order of the file.
+
+    In protocol 2 it means nothing, and is the first anchor where the file has none."""
     anchors: tuple[AnchorSite, ...]
+    """Those whose positions are known; in protocol 1 all."""
     schedule: ScheduleSite = ScheduleSite()
     noise: NoiseSite = NoiseSite()
     tags: TagsSite = TagsSite()
@@ -125,3 +160,10 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     walls: tuple[WallSite, ...] = ()
     floor_plan: FloorPlanSite | None = None
     georeference: GeoreferenceSite | None = None
+    unplaced: tuple[UnplacedAnchor, ...] = ()
+    """Those whose positions are not known yet, in protocol 2."""
+
+    @property
+    def all_anchors(self) -> tuple[AnchorSite | UnplacedAnchor, ...]:
+        """All anchors, those with known positions first."""
+        return (*self.anchors, *self.unplaced)

@@ -1,4 +1,4 @@
-"""Writes antenna delays into the text of a site file; everything else stays unchanged, comments included."""
+"""Writes antenna delays and slots into the text of a site file; everything else stays unchanged, comments included."""
 
 import re
 import tomllib
@@ -13,8 +13,8 @@ DELAY_KEY: Final = "tx_antenna_delay_ticks"
 
 _HEADER = re.compile(r"\s*\[")
 _ANCHOR = re.compile(r"\s*\[\[\s*anchors\s*\]\]")
+_SCHEDULE = re.compile(r"\s*\[\s*schedule\s*\]")
 _ID = re.compile(r"\s*id\s*=\s*(\d+)\s*(#.*)?$")
-_DELAY = re.compile(rf"(\s*{DELAY_KEY}\s*=\s*)([\d_]+)(.*)", re.DOTALL)
 _ASSIGNMENT = re.compile(r"(\s*)[\w-]+\s*=.*?(\r?\n)?$", re.DOTALL)
 
 
@@ -24,42 +24,65 @@ def with_tx_delays(text: str, delays_ticks: Mapping[int, int], path: str | PathL
     Raises:
         ConfigurationError: the anchors are written in a form that this cannot edit, such as inline tables.
     """
+    return _with_values(text, DELAY_KEY, delays_ticks, None, path)
+
+
+def with_slots_written(text: str, slots: Mapping[int, int], count: int, path: str | PathLike[str]) -> str:
+    """The text with the slots of some anchors and ``schedule.slots`` changed, or added where the key is missing.
+
+    Raises:
+        ConfigurationError: the anchors or the schedule are written in a form that this cannot edit.
+    """
+    return _with_values(text, "slot", slots, count, path)
+
+
+def _with_values(
+    text: str, key: str, of_anchors: Mapping[int, int], slots: int | None, path: str | PathLike[str]
+) -> str:
+    """The text with one key of anchors, by identifier, and ``schedule.slots`` if given."""
     lines = text.splitlines(keepends=True)
     starts = [number for number, line in enumerate(lines) if _HEADER.match(line)]
-    for start, end in reversed([*pairwise([*starts, len(lines)])]):
+    changed = lines[: starts[0]] if starts else lines
+    for start, end in pairwise([*starts, len(lines)]):
+        table = lines[start + 1 : end]
         if _ANCHOR.match(lines[start]):
-            lines[start + 1 : end] = _with_delay(lines[start + 1 : end], delays_ticks)
-    changed = "".join(lines)
-    if not _parses_to(changed, _expected(text, delays_ticks)):
-        expected = "in [[anchors]] tables, one line for each key, so that the delays can be written into them"
+            identifier = next((int(match[1]) for match in map(_ID.match, table) if match), None)
+            if identifier is not None and identifier in of_anchors:
+                table = _with_value(table, key, of_anchors[identifier])
+        elif slots is not None and _SCHEDULE.match(lines[start]):
+            table = _with_value(table, "slots", slots)
+        changed += [lines[start], *table]
+    result = "".join(changed)
+    if not _parses_to(result, _expected(text, key, of_anchors, slots)):
+        what = "delays" if slots is None else "slots"
+        expected = f"in [[anchors]] tables, one line for each key, so that the {what} can be written into them"
         raise ConfigurationError(path, "anchors", "written otherwise", expected)
-    return changed
+    return result
 
 
-def _with_delay(lines: list[str], delays_ticks: Mapping[int, int]) -> list[str]:
-    """The lines of one [[anchors]] table."""
-    identifier = next((int(match[1]) for match in map(_ID.match, lines) if match), None)
-    if identifier is None or identifier not in delays_ticks:
-        return lines
-    ticks = delays_ticks[identifier]
+def _with_value(lines: list[str], key: str, value: int) -> list[str]:
+    """The lines of one table with a key's value changed, or added after the last key."""
+    present = re.compile(rf"(\s*{key}\s*=\s*)([\d_]+)(.*)", re.DOTALL)
     for number, line in enumerate(lines):
-        match = _DELAY.match(line)
+        match = present.match(line)
         if match:
-            return [*lines[:number], f"{match[1]}{ticks}{match[3]}", *lines[number + 1 :]]
+            return [*lines[:number], f"{match[1]}{value}{match[3]}", *lines[number + 1 :]]
     last = max((number for number, line in enumerate(lines) if _ASSIGNMENT.match(line)), default=-1)
     match = _ASSIGNMENT.match(lines[last]) if last >= 0 else None
     if match is None:
         return lines
     end = match[2] or "\n"
     before = lines[last] if match[2] else lines[last] + end
-    return [*lines[:last], before, f"{match[1]}{DELAY_KEY} = {ticks}{end}", *lines[last + 1 :]]
+    return [*lines[:last], before, f"{match[1]}{key} = {value}{end}", *lines[last + 1 :]]
 
 
-def _expected(text: str, delays_ticks: Mapping[int, int]) -> dict[str, Any]:
+def _expected(text: str, key: str, of_anchors: Mapping[int, int], slots: int | None) -> dict[str, Any]:
     document = tomllib.loads(text)
     for anchor in document["anchors"]:
-        if anchor["id"] in delays_ticks:
-            anchor[DELAY_KEY] = delays_ticks[anchor["id"]]
+        if anchor["id"] in of_anchors:
+            anchor[key] = of_anchors[anchor["id"]]
+    if slots is not None:
+        document.setdefault("schedule", {})["slots"] = slots
     return document
 
 

@@ -1,5 +1,7 @@
 """The schedule: the superframe and its slots.
 
+In mode slots (protocol 2) anchors far apart share a slot, and the scale below is the slot time.
+
 The RMARKER of a frame lies at the start of its slot on the master's scale, which counts from the start of superframe 0.
 So a frame's preamble is sent in the last 138 µs of the slot before.
 """
@@ -8,7 +10,8 @@ from msgspec import Struct
 
 from skyless.air.almanac import SchedulePage
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ
-from skyless.site.model import Site
+from skyless.site.free_access import free_window_ticks
+from skyless.site.model import AnchorSite, Site, UnplacedAnchor
 
 
 class Schedule(Struct, frozen=True, gc=False):
@@ -67,23 +70,56 @@ def schedule_from_page(page: SchedulePage) -> Schedule:
 
 
 def schedule_of(site: Site) -> Schedule:
-    """Return the schedule of a validated site, its slot rounded to steps of the delayed transmission."""
+    """Return the schedule of a validated site, its slot rounded to steps of the delayed transmission.
+
+    Raises:
+        ValueError: the site is in mode free, which has no slots, or in mode slots and has none yet.
+    """
     plan = site.schedule
-    steps = round(plan.slot_s * TICK_RATE_HZ / DELAYED_TX_GRANULARITY_TICKS)
+    if plan.mode == "free":
+        raise ValueError(f"site {site.name!r} is in mode free: its anchors send at random instants, not in slots")
+    if plan.slots is None and not plan.needs_master:
+        raise ValueError(f"site {site.name!r} has no schedule.slots yet; skyless plan --write colours its slots")
     slots = len(site.anchors) * plan.frames_per_node if plan.slots is None else plan.slots
-    return Schedule(steps * DELAYED_TX_GRANULARITY_TICKS, slots, plan.frames_per_node)
+    return Schedule(_slot_ticks(site), slots, plan.frames_per_node)
+
+
+def superframe_ticks_of(site: Site) -> int:
+    """Length of the superframe; in mode free of the window in which each anchor sends once.
+
+    Raises:
+        ValueError: the site is in mode slots and has none yet.
+    """
+    schedule = site.schedule
+    return free_window_ticks(schedule.rate_hz) if schedule.mode == "free" else schedule_of(site).superframe_ticks
+
+
+def _slot_ticks(site: Site) -> int:
+    steps = round(site.schedule.slot_s * TICK_RATE_HZ / DELAYED_TX_GRANULARITY_TICKS)
+    return steps * DELAYED_TX_GRANULARITY_TICKS
+
+
+def beacon_period_s(site: Site) -> float:
+    """Return the mean time between two beacons of one anchor of a validated site, seconds."""
+    if site.schedule.mode == "free":
+        return 1.0 / site.schedule.rate_hz
+    schedule = schedule_of(site)
+    return 1.0 / (schedule.superframe_rate_hz * schedule.frames_per_node)
 
 
 def first_slots(site: Site) -> dict[int, int]:
     """Return the first slot of each anchor, in the order of the site file.
 
-    Anchors without a slot of their own get the lowest free ones: the master first, then in the order of the file.
+    Mode master: anchors without a slot of their own get the lowest free ones: the master first, then in the order of
+    the file. Mode slots: every anchor's own, those without a position included.
 
     Raises:
-        ValueError: two anchors would share a slot, an anchor's slot is outside the superframe, or no slot is left;
-            the message names the anchor and the key.
+        ValueError: two anchors would share a slot in mode master, an anchor's slot is outside the superframe, no slot
+            is left, or the site has no slots; the message names the anchor and the key.
     """
     schedule = schedule_of(site)
+    if not site.schedule.needs_master:
+        return {anchor.id: _own_slot(anchor, schedule) for anchor in site.all_anchors}
     given = [anchor for anchor in site.anchors if anchor.slot is not None]
     others = [anchor for anchor in site.anchors if anchor.slot is None]
     others.sort(key=lambda anchor: anchor.id != site.master)
@@ -96,6 +132,12 @@ def first_slots(site: Site) -> dict[int, int]:
         taken.update(schedule.slots_of(slot))
         first[anchor.id] = slot
     return {anchor.id: first[anchor.id] for anchor in site.anchors}
+
+
+def _own_slot(anchor: AnchorSite | UnplacedAnchor, schedule: Schedule) -> int:
+    if anchor.slot is None or not 0 <= anchor.slot < schedule.slots:
+        raise ValueError(f"anchor {anchor.id}: slot is {anchor.slot}; it must be from 0 to {schedule.slots - 1}")
+    return anchor.slot
 
 
 def _free_slot(schedule: Schedule, taken: set[int]) -> int | None:

@@ -5,7 +5,7 @@ from typing import Final
 
 from msgspec import structs
 
-from skyless.site.model import AnchorSite, FloorPlanSite, GeoreferenceSite, ScheduleSite, Site, TagsSite
+from skyless.site.model import AnchorSite, FloorPlanSite, GeoreferenceSite, ScheduleSite, Site, TagsSite, UnplacedAnchor
 
 _HEAD = """\
 # A Skyless site. Lengths are metres in the site's own frame: x and y on the floor, z up.
@@ -13,13 +13,19 @@ _HEAD = """\
 
 name = {name}
 id = {id}                          # of the site on the air, 0 to 65533; neighbouring sites need different ones
-master = {master}                      # the anchor whose clock is the site's time; best in the middle, in range of all
+{no_master}master = {master}                      # its clock is the site's time; best in the middle, in range of all
 
-[schedule]                      # the anchors send in turn, one in each slot; all slots make a superframe
-slot_s = {slot_s}                 # length of a slot in seconds
+[schedule]                      # who sends when
+# "master": all anchors hear one master and send in turn. "slots": no master, any size; anchors far apart share a slot,
+# `skyless plan FILE --write` colours the slots. "free": no master, no slots; anchors send at random instants.
+{master_mode}mode = "{mode}"
+slot_s = {slot_s}                 # length of a slot in seconds; all slots make a superframe
 guard_s = {guard_s}                # silence at the end of each slot, for the hosts to prepare the next frame
-frames_per_node = {frames}             # frames of each anchor in a superframe
-# slots = {slots}                     # slots in a superframe; by default as many as there are frames
+frames_per_node = {frames}             # frames of each anchor in a superframe; 1 in modes slots and free
+{no_slots}slots = {slots}                     # slots in a superframe; in mode master by default one for each frame
+{no_reuse}reuse_m = {reuse_m}                # mode slots: anchors that share a slot are at least this far apart
+{no_site_time}site_time = {site_time}             # mode slots: whether beacons carry site time; no position needs it
+{no_rate}rate_hz = {rate_hz}                # mode free: beacons per second of each anchor
 
 [noise]                         # what the filters assume; too small costs more than too large
 tx_stamp_ps = {tx_ps}             # standard deviation of a transmit stamp in picoseconds
@@ -53,6 +59,11 @@ _ANCHORS = """
 #   slot = 0                         its first slot; otherwise the master sends first, the others as listed
 #   tx_antenna_delay_ticks = 16436   antenna delays in ticks of 15.65 ps
 #   rx_antenna_delay_ticks = 16436
+# In modes slots and free an anchor states its position itself. It may also be listed without x_m, y_m and z_m: it then
+# keeps its slot and relays, and tags do not use it. Further keys:
+#   floor = 0                        storey
+#   zone = 0                         zone of the site, 0 to 255; 0 for none
+#   std_m = 0.02                     how well its position is known; by default survey_std_m
 """
 
 _ANCHOR = """
@@ -62,6 +73,13 @@ x_m = {x}
 y_m = {y}
 z_m = {z}
 """
+
+_UNPLACED = """
+[[anchors]]
+id = {id}
+"""
+
+_SLOT = "slot = {slot}\n"
 
 _NO_WALLS = """
 # Walls, full height, for planning and simulation; one table for each.
@@ -114,7 +132,7 @@ _FROM_FLOOR_AND_CEILING_M: Final = 0.5
 
 
 def site_template(site: Site) -> str:
-    """Site file, with a comment on every key, of a site without slots and antenna delays of its own.
+    """Site file, with a comment on every key, of a site whose anchors have no keys but position and slot.
 
     Walls, floor plan and georeference that the site has not are commented examples.
     """
@@ -126,7 +144,17 @@ def site_template(site: Site) -> str:
         slot_s=schedule.slot_s,
         guard_s=schedule.guard_s,
         frames=schedule.frames_per_node,
-        slots=len(site.anchors) * schedule.frames_per_node,
+        slots=schedule.slots or len(site.all_anchors) * schedule.frames_per_node,
+        mode="slots" if schedule.needs_master else schedule.mode,
+        reuse_m=schedule.reuse_m,
+        site_time=str(schedule.site_time).lower(),
+        rate_hz=schedule.rate_hz,
+        no_master=_off(schedule.needs_master),
+        no_slots=_off(schedule.slots is not None),
+        master_mode=_off(not schedule.needs_master),
+        no_reuse=_off(schedule.mode == "slots"),
+        no_site_time=_off(schedule.mode == "slots"),
+        no_rate=_off(schedule.mode == "free"),
         tx_ps=noise.tx_stamp_ps,
         rx_ps=noise.rx_stamp_ps,
         white=noise.white_fm,
@@ -135,11 +163,19 @@ def site_template(site: Site) -> str:
     )
     height = site.tags.height_m
     tags = _ESTIMATED_HEIGHT if height is None else _KNOWN_HEIGHT.format(height=height)
-    return head + tags + _ANCHORS + "".join(map(_anchor, site.anchors)) + _tail(site)
+    return head + tags + _ANCHORS + "".join(map(_anchor, site.all_anchors)) + _tail(site)
 
 
-def _anchor(anchor: AnchorSite) -> str:
-    return _ANCHOR.format(id=anchor.id, x=anchor.x_m, y=anchor.y_m, z=anchor.z_m)
+def _off(given: bool) -> str:
+    """The comment sign before a key that is not given."""
+    return "" if given else "# "
+
+
+def _anchor(anchor: AnchorSite | UnplacedAnchor) -> str:
+    slot = "" if anchor.slot is None else _SLOT.format(slot=anchor.slot)
+    if isinstance(anchor, UnplacedAnchor):
+        return _UNPLACED.format(id=anchor.id) + slot
+    return _ANCHOR.format(id=anchor.id, x=anchor.x_m, y=anchor.y_m, z=anchor.z_m) + slot
 
 
 def _tail(site: Site) -> str:
@@ -149,8 +185,8 @@ def _tail(site: Site) -> str:
     image = json.dumps(plan.image, ensure_ascii=False)
     return (
         (_WALLS + walls if walls else _NO_WALLS)
-        + _FLOOR_PLAN.format(**{**structs.asdict(plan), "image": image}, off="" if site.floor_plan else "# ")
-        + _GEOREFERENCE.format(**structs.asdict(earth), off="" if site.georeference else "# ")
+        + _FLOOR_PLAN.format(**{**structs.asdict(plan), "image": image}, off=_off(site.floor_plan is not None))
+        + _GEOREFERENCE.format(**structs.asdict(earth), off=_off(site.georeference is not None))
     )
 
 

@@ -7,8 +7,10 @@ from typing import Any, Final
 from msgspec.structs import replace
 
 from skyless.studies import (
+    claims,
     efficiency,
     integrity,
+    large,
     loss,
     motion,
     nlos,
@@ -67,6 +69,20 @@ STUDIES: Final = {
             rows=room.rows,
         ),
         Study("sitetime", "one timeline over many hops", sitetime.cells, sitetime.rows, sitetime.draw),
+        Study(
+            "large",
+            "a site of 1,024 anchors without a master",
+            large.cells,
+            large.rows,
+            partial(draw, Look("1,024 anchors, no master", ("rmse", "nees"))),
+        ),
+        Study(
+            "claims",
+            "claims on the slot time",
+            claims.cells,
+            claims.rows,
+            partial(draw, Look("Superframes until one claim is left", ("superframes",))),
+        ),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),
     )
 }

@@ -81,6 +81,13 @@ _PANELS: Final = {
         log=False,
     ),
     "exceeded": _Panel("levels exceeded in 10⁻⁴", _exceeded, lambda _: None, figure="exceeded", scale=1e4, log=True),
+    "superframes": _Panel(
+        "superframes, the slowest run",
+        lambda row: row.superframes_most,
+        lambda _: None,
+        figure="superframes_most",
+        log=True,
+    ),
     "cpu": _Panel("CPU in µs a message", lambda row: row.cpu_us_per_message, lambda _: None),
 }
 

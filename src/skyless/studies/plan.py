@@ -39,7 +39,11 @@ class Plan(Struct, frozen=True):
 
 _QUICK_PLAN: Final = Plan(worlds=6, seconds=10.0, tags=2, episodes=200)
 
-_USUAL: Final = {"room": Plan(worlds=20, seconds=15.0, tags=5)}
+_USUAL: Final = {
+    "room": Plan(worlds=20, seconds=15.0, tags=5),
+    "large": Plan(worlds=24, seconds=30.0),
+    "claims": Plan(worlds=3),
+}
 """Of studies that do not take the usual amounts; those of ``room`` are the room's own, its other cases have fewer."""
 
 
@@ -171,8 +175,25 @@ class Row(Struct, frozen=True):
     """Where that share truly lies, with 99 %, with tags as independent units."""
     exceeded_unwarned: float | None = None
     """Share of the fixes with a level whose error is larger, and which carry no alert."""
+    beacons_per_s: float | None = None
+    """That a tag receives (``large``)."""
+    first_fix_s: float | None = None
+    """From a tag's first beacon to its first fix, which 95 % of the tags do not exceed (``large``)."""
+    gap_s: float | None = None
+    """Longest time between two fixes (``large``)."""
+    gap_superframes: float | None = None
+    joins: int | None = None
+    """How often an anchor joined those in use (``large``)."""
+    restarts: int | None = None
+    """How often a tag had to begin again (``large``)."""
     smallest_m: float | None = None
     """Horizontal error that the share ``risk`` of fixes exceeds, with or without a level."""
+    superframes: float | None = None
+    """Median over the runs until one claim was left (``claims``); None where too many were given up."""
+    superframes_most: float | None = None
+    """Of the slowest run."""
+    changes: int | None = None
+    """Anchors that changed their claim afterwards, in all runs."""
 
 
 def with_limits(row: Row, limits: Sequence[Limit]) -> Row:

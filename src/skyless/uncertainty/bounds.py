@@ -22,7 +22,7 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.kernels.arrays import Array, Indices, Mask, Matrix, Vector
+from skyless.kernels.arrays import Array, Indices, Integers, Mask, Matrix, Vector
 from skyless.kernels.compiled import jitted, kernel, threaded_kernel
 from skyless.kernels.covariance import (
     add_process_noise,
@@ -147,21 +147,39 @@ def biased_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSetting
     return _superframe_bound(anchors_m, path_m, settings, biases)
 
 
-def received_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSettings, known: Mask) -> Array:
+class Sendings(Struct, frozen=True):
+    """Frames that do not come in the order of a superframe."""
+
+    senders: Integers
+    """Index of each frame's anchor, shape (frames,)."""
+    times_s: Array
+    """When they are sent, in order, shape (frames,)."""
+
+
+def received_bound(
+    anchors_m: ArrayLike,
+    path_m: ArrayLike,
+    settings: BoundSettings,
+    known: Mask,
+    sendings: Sendings | None = None,
+    biases: Biases | None = None,
+) -> Array:
     """Posterior bound of the position after every frame, shape (frames, dims, dims), in m², where frames are lost.
 
     ``anchors_m``: shape (n, 3), in the order of their slots, the reference first. ``path_m``: where the tag is at each
     frame, shape (frames, 3). ``known``: as of ``known_receptions``, shape (frames, n + 1); it, not the settings, states
-    what of the mesh is known.
+    what of the mesh is known. ``sendings``: who sends when, if not one anchor after the other in equal slots.
 
     Raises:
-        ValueError: there is not one row of ``known`` for each position.
+        ValueError: there is not one row of ``known`` and one sending for each position.
     """
     anchors = np.ascontiguousarray(anchors_m, np.float64)
     path = np.ascontiguousarray(path_m, np.float64)
     if known.shape != (len(path), len(anchors) + 1):
         raise ValueError(f"known has shape {known.shape}; it should be {(len(path), len(anchors) + 1)}")
-    return _frame_bound(anchors, path, settings, known, at_once=True, biases=None)
+    if sendings is not None and not len(sendings.senders) == len(sendings.times_s) == len(path):
+        raise ValueError(f"sendings has {len(sendings.senders)} frames; it should be {len(path)}")
+    return _frame_bound(anchors, path, settings, known, True, biases, sendings)
 
 
 def known_receptions(
@@ -201,18 +219,28 @@ def _superframe_bound(anchors_m: ArrayLike, path_m: ArrayLike, settings: BoundSe
 
 
 def _frame_bound(
-    anchors: Array, path: Array, settings: BoundSettings, known: Mask, at_once: bool, biases: Biases | None
+    anchors: Array,
+    path: Array,
+    settings: BoundSettings,
+    known: Mask,
+    at_once: bool,
+    biases: Biases | None,
+    sendings: Sendings | None = None,
 ) -> Array:
     """Bound after every frame; where receptions are not known at once it holds at the end of a superframe."""
     n, dims = len(anchors), settings.dims
     errors = Biases() if biases is None else biases
+    senders, intervals_s = np.arange(len(path), dtype=np.uint32) % n, np.full(len(path), settings.slot_s)
+    if sendings is not None:
+        senders, intervals_s = sendings.senders.astype(np.uint32), np.diff(sendings.times_s, prepend=0.0)
     model = _Model(
         anchors,
         path,
         known,
+        senders,
+        intervals_s,
         dims,
         biases is not None,
-        settings.slot_s,
         settings.qa,
         settings.white,
         settings.walk,
@@ -254,7 +282,7 @@ def _prior(anchors: int, settings: BoundSettings, biases: Biases | None) -> Matr
             _of_each("constant_std_m", biases.constant_std_m, anchors),
             _of_each("changing_std_m", biases.changing_std_m, anchors),
             np.array([biases.slope_std_m]),
-            np.full(anchors * (anchors - 1) // 2, biases.pair_std_m),
+            np.full(anchors * (anchors - 1) // 2 if biases.pair_std_m > 0.0 else 0, biases.pair_std_m),
         ]
     return np.diag(np.square(np.concatenate([*parts, np.zeros(1)])))
 
@@ -266,9 +294,12 @@ class _Model(NamedTuple):
     path: Array
     known: Mask
     """Receptions, shape (frames, anchors + 1), the tag's own in the last column."""
+    senders: Indices
+    """Of each frame, shape (frames,)."""
+    intervals_s: Vector
+    """Since the frame before, shape (frames,)."""
     dims: int
     has_biases: bool
-    slot_s: float
     qa: float
     white: float
     walk: float
@@ -324,9 +355,9 @@ def _run(
 @kernel
 def _process_frame(m: _Model, frame: int, at_once: bool, P: Matrix, h: Vector, h_index: Indices, ph: Vector) -> None:
     """Process the receptions of a frame: the tag's, and those of anchors that are relayed."""
-    n, sender = len(m.anchors), frame % len(m.anchors)
+    n, sender = len(m.anchors), m.senders[frame]
     if frame > 0:
-        _predict(m, P)
+        _predict(m, m.intervals_s[frame], P)
         if m.has_biases:
             _decay_changes(m, frame, P)
     reset_covariance(P, len(P), len(P) - 1, m.tx_variance_m2)
@@ -338,16 +369,16 @@ def _process_frame(m: _Model, frame: int, at_once: bool, P: Matrix, h: Vector, h
 
 
 @kernel
-def _predict(m: _Model, P: Matrix) -> None:
-    """Time update by a slot: constant velocity, and clocks whose differences all hold the first anchor's oscillator."""
+def _predict(m: _Model, dt_s: float, P: Matrix) -> None:
+    """Time update: constant velocity, and clocks whose differences all hold the first anchor's oscillator."""
     values = m.dims + len(m.anchors)
-    integrate_rates(P, len(P), values, m.slot_s)
+    integrate_rates(P, len(P), values, dt_s)
     for axis in range(m.dims):
-        add_process_noise(P, axis, values + axis, axis, values + axis, m.slot_s, 0.0, m.qa)
+        add_process_noise(P, axis, values + axis, axis, values + axis, dt_s, 0.0, m.qa)
     for i in range(m.dims, values):
         for j in range(m.dims, values):
             share = 2.0 if i == j else 1.0
-            add_process_noise(P, i, values + i, j, values + j, m.slot_s, share * m.white, share * m.walk)
+            add_process_noise(P, i, values + i, j, values + j, dt_s, share * m.white, share * m.walk)
 
 
 @kernel
@@ -355,7 +386,7 @@ def _decay_changes(m: _Model, frame: int, P: Matrix) -> None:
     """Time update of the part of range errors that changes."""
     n, first = len(m.anchors), _layout(m.dims, len(m.anchors)).change
     walked_m = _distance_m(m.path[frame - 1], m.path[frame])
-    kept = math.exp(-m.slot_s * m.changes_per_s - walked_m * m.changes_per_m)
+    kept = math.exp(-m.intervals_s[frame] * m.changes_per_s - walked_m * m.changes_per_m)
     for anchor in range(n):
         decay_state(P, len(P), first + anchor, kept, m.changing_m2[anchor])
 
@@ -385,7 +416,7 @@ def _tag_terms(m: _Model, frame: int, size: int, h: Vector, h_index: Indices) ->
 
     With biases the range also holds the anchor's displacement and all errors of ranges.
     """
-    sender, position = frame % len(m.anchors), m.path[frame]
+    sender, position = m.senders[frame], m.path[frame]
     towards = direction(m.anchors, sender, position)
     term = _set_term(h, h_index, 0, m.dims, 1.0)
     for axis in range(m.dims):
@@ -417,7 +448,8 @@ def _anchor_terms(m: _Model, sender: int, listener: int, size: int, h: Vector, h
             term = _set_term(h, h_index, term, where.survey + m.dims * listener + axis, towards[axis])
             term = _set_term(h, h_index, term, where.survey + m.dims * sender + axis, -towards[axis])
         low, high = min(sender, listener), max(sender, listener)
-        term = _set_term(h, h_index, term, where.pair + low * (2 * n - low - 1) // 2 + high - low - 1, 1.0)
+        if where.pair < size - 1:
+            term = _set_term(h, h_index, term, where.pair + low * (2 * n - low - 1) // 2 + high - low - 1, 1.0)
     return term
 
 

@@ -323,18 +323,25 @@ class Screen:
     def _anchors(self) -> "RenderableType":
         from rich.table import Table
 
-        table = Table("anchor", "role", "heard", "rate ppm", "clock sigma cm", "sent", "late", title="synchronisation")
         anchors = {} if self._watch is None else self._watch.anchors
+        modes = {health.mode for health in anchors.values()}
+        follows = {"slots": ("root", "term", "hop", "parents"), "free": ()}.get(
+            min(modes, default="master"), ("clock sigma cm",)
+        )
+        rate = () if modes == {"free"} else ("rate ppm",)
+        table = Table("anchor", "role", "heard", *rate, *follows, "sent", "late", title="synchronisation")
         for anchor, health in sorted(anchors.items()):
-            table.add_row(
-                str(anchor),
-                health.role,
-                str(health.heard),
-                "–" if health.role == "master" else number(health.rate_ppm, "{:+.4f}"),
-                "–" if health.role == "master" else number(health.offset_std_m, "{:.2f}", 100.0),
-                str(health.sent),
-                str(health.late),
-            )
+            leads = health.role in {"master", "root"}
+            shown = {
+                "rate ppm": "–" if leads else number(health.rate_ppm, "{:+.4f}"),
+                "clock sigma cm": "–" if leads else number(health.offset_std_m, "{:.2f}", 100.0),
+                "root": number(health.root, "{:.0f}"),
+                "term": number(health.term, "{:.0f}"),
+                "hop": number(health.hop, "{:.0f}"),
+                "parents": " ".join(map(str, health.parents)) or "–",
+            }
+            cells = [shown[name] for name in (*rate, *follows)]
+            table.add_row(str(anchor), health.role, str(health.heard), *cells, str(health.sent), str(health.late))
         return table
 
     def summary(self) -> dict[str, Any]:

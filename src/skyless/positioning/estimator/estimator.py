@@ -424,15 +424,15 @@ def fill_motion(s: EstimatorState, rows: Matrix) -> None:
         rows[POSITION, 2] = s.settings[0]["height_m"]
 
 
-MOST_ANCHORS_IN_TABLE: Final = 4096
-"""Of an estimator that is restored."""
+MOST_ANCHORS_IN_TABLE: Final = 256
+"""With more, one that is not in the state is forgotten for each new one."""
 
 
 class SavedEstimator(Struct, frozen=True):
     """An ``Estimator`` in plain values: its table of anchors, and the arrays of its state as bytes."""
 
-    table: Annotated[tuple[tuple[int, float, float, float], ...], Meta(max_length=MOST_ANCHORS_IN_TABLE)]
-    """Identifier and position of each anchor."""
+    table: Annotated[tuple[tuple[int, float, float, float, float | None], ...], Meta(max_length=MOST_ANCHORS_IN_TABLE)]
+    """Identifier and position of each anchor, and the standard deviation of its coordinates where that is its own."""
     misfits: tuple[int, ...]
     arrays: dict[str, bytes]
 
@@ -445,6 +445,7 @@ class Estimator:
         self.settings = settings
         self.dim = settings.dim
         self._table_m: list[Vector] = [] if table_m is None else [np.array(row, np.float64) for row in table_m]
+        self._table_std_m: list[float | None] = [None] * len(self._table_m)
         self._identifiers = np.arange(len(self._table_m))
         self.index_of = {index: index for index in range(len(self._table_m))}
         """Index in the table of each anchor identifier, by which frames name it."""
@@ -457,7 +458,10 @@ class Estimator:
 
     def save(self) -> SavedEstimator:
         """All that ``restore`` needs to continue with the same bits."""
-        table = tuple((anchor, *self._table_m[index].tolist()) for anchor, index in self.index_of.items())
+        table = tuple(
+            (anchor, *self._table_m[index].tolist(), self._table_std_m[index])
+            for anchor, index in sorted(self.index_of.items(), key=lambda one: one[1])
+        )
         return SavedEstimator(table, tuple(self._misfits), packed_state(self._state))
 
     def restore(self, saved: SavedEstimator) -> None:
@@ -466,9 +470,9 @@ class Estimator:
         Raises:
             ValueError: kernels could not run on it.
         """
-        for anchor, *position_m in saved.table:
-            self.anchor_index(anchor, np.array(position_m))
-        if len(self._table_m) != len(saved.table):
+        for anchor, x_m, y_m, z_m, std_m in saved.table:
+            self._add_to_table(anchor, np.array((x_m, y_m, z_m)), std_m)
+        if len(self.index_of) != len(saved.table):
             raise ValueError("an anchor is in the estimator's table twice")
         self._misfits = frozenset(saved.misfits)
         self._state = unpacked_state(self.settings, len(self._table_m), saved.arrays)
@@ -483,24 +487,57 @@ class Estimator:
         """What a fix carries (``POSITION`` and the following), as of the newest packet."""
         return self._rows
 
-    def anchor_index(self, identifier: int, position_m: Vector) -> int:
+    def anchor_index(self, identifier: int, position_m: Vector, std_m: float | None = None) -> int:
         """Index in the table of an anchor: a new one, or one that may have moved.
 
-        ``position_m``, shape (3,), counts as unchanged as long as it is the same array.
+        ``position_m``, shape (3,), counts as unchanged as long as it is the same array. ``std_m`` is that of each
+        coordinate, None for that of the settings; it counts when the anchor joins.
         """
         index = self.index_of.get(identifier)
         if index is None:
-            index = self.index_of[identifier] = len(self._table_m)
-            self._table_m.append(position_m)
-            self._identifiers = np.append(self._identifiers, identifier)
-            self._state = with_table(self._state, len(self._table_m))
+            index = self._add_to_table(identifier, position_m, std_m)
         elif self._table_m[index] is not position_m:
-            self._table_m[index] = position_m
+            self._table_m[index], self._table_std_m[index] = position_m, std_m
             anchor = self._state.index_of[index]
             if anchor >= 0:
                 self._state.anchors[anchor]["position_m"] = position_m
                 fit_plane(self._state)
         return index
+
+    def _add_to_table(self, identifier: int, position_m: Vector, std_m: float | None) -> int:
+        """Index of a new anchor; a tag that comes through a large site reuses those of anchors left behind."""
+        index = len(self._table_m)
+        if index >= MOST_ANCHORS_IN_TABLE:
+            index = int(np.argmax(self._state.index_of < 0))
+            del self.index_of[int(self._identifiers[index])]
+            self.index_of[identifier] = index
+            self._table_m[index], self._table_std_m[index] = position_m, std_m
+            self._identifiers[index] = identifier
+            self._misfits -= {index}
+        else:
+            self.index_of[identifier] = index
+            self._table_m.append(position_m)
+            self._table_std_m.append(std_m)
+            self._identifiers = np.append(self._identifiers, identifier)
+            self._state = with_table(self._state, len(self._table_m))
+        return index
+
+    def has_anchor(self, identifier: int) -> bool:
+        """Whether an anchor is in the state."""
+        index = self.index_of.get(identifier)
+        return index is not None and self._state.index_of.item(index) >= 0
+
+    @property
+    def anchors(self) -> tuple[int, ...]:
+        """Identifiers of the anchors in the state."""
+        return tuple(self._identifiers[self._state.anchors["table_index"]].tolist())
+
+    def remove_anchor(self, identifier: int) -> None:
+        """Let an anchor leave the state, if it is there."""
+        if self.has_anchor(identifier):
+            anchor = self._state.index_of.item(self.index_of[identifier])
+            self._state = without_anchor(self._state, anchor)
+            fit_plane(self._state)
 
     def inflate_range_error(self, table_index: int) -> None:
         """Expect that the ranges to an anchor are wrong by metres."""
@@ -628,7 +665,8 @@ class Estimator:
         state = self._state
         if outcome == NEW_ANCHOR:
             is_open = table_index in self._misfits
-            self._state = with_anchor(state, table_index, self._table_m[table_index], is_open)
+            std_m = self._table_std_m[table_index]
+            self._state = with_anchor(state, table_index, self._table_m[table_index], is_open, std_m)
         elif outcome == RESTARTED_CLOCK:
             state.status["clock_restarts"] += 1
             self._state = without_anchor(state, int(state.index_of[table_index]))

@@ -397,8 +397,13 @@ PAIR_STD_M: Final = 0.05
 """Of the constant of a pair of anchors besides what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
 
 
-def with_anchor(s: EstimatorState, table_index: int, position_m: Vector, is_open: bool = False) -> EstimatorState:
-    """The state with one more anchor, nothing known of its clock; if it is open, next to nothing of its range error."""
+def with_anchor(
+    s: EstimatorState, table_index: int, position_m: Vector, is_open: bool = False, std_m: float | None = None
+) -> EstimatorState:
+    """The state with one more anchor, nothing known of its clock; if it is open, next to nothing of its range error.
+
+    ``std_m``: of each coordinate of this anchor; None for that of the settings.
+    """
     settings, count = s.settings[0], len(s.anchors)
     grown = _selected(s, [*range(count), -1])
     dim, last = int(settings["dim"]), grown.anchors[count]
@@ -408,13 +413,15 @@ def with_anchor(s: EstimatorState, table_index: int, position_m: Vector, is_open
     last["change_variance_m2"] = settings["place_std_m"] ** 2
     grown.packets[count] = (NEVER, NEVER, NEVER)
     pair_variance = 0.0
-    if settings["range_std_m"] > 0.0 or settings["survey_std_m"] > 0.0:
+    if settings["range_std_m"] > 0.0 or settings["survey_std_m"] > 0.0 or std_m:
         pair_variance = PAIR_STD_M**2
     for link in (grown.links[count], grown.links[:, count]):
         link["tx_ticks"], link["variance_m2"] = NEVER, pair_variance
     where = layout(dim, count + 1)
     grown.P[where.change + count, where.change + count] = last["change_variance_m2"]
-    range_std_m, survey_std_m = settings["range_std_m"], settings["survey_std_m"]
+    range_std_m, survey_std_m = settings["range_std_m"], settings["survey_std_m"] if std_m is None else std_m
+    if survey_std_m > 0.0:
+        s.status[0]["range_errors"] = ALL_RANGE_ERRORS
     if is_open or s.status[0]["open_range_errors"]:
         s.status[0]["range_errors"] = ALL_RANGE_ERRORS
         range_std_m, survey_std_m = OPEN_RANGE_STD_M, OPEN_SURVEY_STD_M

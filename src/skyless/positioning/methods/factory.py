@@ -12,12 +12,16 @@ from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.positioning.methods.joint import Estimation
 from skyless.positioning.methods.observations import FixTime
+from skyless.positioning.methods.selection import MOST_ANCHORS
 from skyless.positioning.methods.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
+from skyless.site.local_almanac import CommonPages
 from skyless.ticks import to_seconds
 
 DROP_S: Final = 2.0
 """An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""
 
+CELL_DROP_S: Final = 1.0
+"""The same at a site of protocol 2, where tags move from cell to cell."""
 
 RELAY_AGE_S: Final = 1.0
 RELAY_SUPERFRAMES: Final = 2.5
@@ -48,14 +52,29 @@ def new_method(
             master, schedule.anchors, tx_variance, rx_variance, schedule.tag_height_m, options.z_bounds_m
         )
         return Snapshots(SnapshotMethod(options.method), settings, time)
-    assumed = replace(
-        estimator_settings(options.qa, schedule.tag_height_m, noise, accuracy, superframe_s),
+    assumed = estimator_settings(options.qa, schedule.tag_height_m, noise, accuracy, superframe_s)
+    return Estimation(_as_required(assumed, options), options.z_bounds_m, time, superframe_s)
+
+
+def new_method_2(options: MethodOptions, pages: CommonPages, time: FixTime) -> Estimation | None:
+    """Make the method for a site of protocol 2; None for methods that need a master."""
+    if options.method not in FILTERS:
+        return None
+    superframe_s = to_seconds(pages.site.superframe_ticks)
+    settings = estimator_settings(options.qa, pages.site.tag_height_m, pages.noise, pages.accuracy, superframe_s)
+    settings = replace(_as_required(settings, options), drop_s=max(CELL_DROP_S, 4.0 * superframe_s))
+    return Estimation(settings, options.z_bounds_m, time, superframe_s, MOST_ANCHORS)
+
+
+def _as_required(settings: EstimatorSettings, options: MethodOptions) -> EstimatorSettings:
+    """The settings with what is required of the protection levels."""
+    return replace(
+        settings,
         max_acceleration_mps2=options.integrity.max_acceleration_mps2,
         integrity_risk=options.integrity.risk,
         alert_limit_m=options.integrity.alert_limit_m,
         height_std_m=options.integrity.height_std_m,
     )
-    return Estimation(assumed, options.z_bounds_m, time, superframe_s)
 
 
 def _stamp_variances(noise: NoisePage) -> tuple[float, float]:

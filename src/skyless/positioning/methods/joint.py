@@ -125,8 +125,12 @@ class Estimation:
         z_bounds_m: tuple[float, float] | None = None,
         fix_time: FixTime | None = None,
         superframe_s: float = 0.0,
+        most_anchors: int | None = None,
     ) -> None:
-        """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites."""
+        """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites.
+
+        ``most_anchors``: with which to begin, the nearest, and none that does not belong to the start; None: with all.
+        """
         if z_bounds_m is not None:
             settings = replace(settings, lowest_m=z_bounds_m[0], highest_m=z_bounds_m[1])
         self._settings = settings
@@ -135,6 +139,7 @@ class Estimation:
             settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2, settings.height_std_m
         )
         self._superframe_s = superframe_s
+        self._most_anchors = most_anchors
         self._max_relative_std = MAX_RELATIVE_STD if superframe_s < SLOW_S else SLOW_MAX_RELATIVE_STD
         self._z_bounds_m = z_bounds_m
         self._speed_std_mps = TAG_SPEED_STD_MPS
@@ -180,6 +185,11 @@ class Estimation:
     def estimator(self) -> Estimator:
         """The filter with all its states."""
         return self._estimator
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether no position is known yet."""
+        return self._start is not None
 
     def clock(self, anchor: int) -> tuple[int, float, float] | None:
         """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""
@@ -320,6 +330,9 @@ class Estimation:
     def _begin(self, start: Start, packets: list[Observation]) -> None:
         """Begin at the start's position, and process the packets that led there."""
         self._start = None
+        if self._most_anchors is not None:
+            kept = _nearest(start, self._most_anchors)
+            packets = [packet for packet in packets if packet.anchor in kept]
         self._newest_ticks = self._started_ticks = packets[-1].rx_ticks_tag
         self._in_use.begin(start.used)
         dim, begin_ticks = self._estimator.dim, packets[0].rx_ticks_tag
@@ -340,7 +353,7 @@ class Estimation:
             self._is_open,
             CONTRADICTED_STD_M if self._start_was_contradicted else LASTING_STD_M,
             [
-                self._estimator.anchor_index(packet.anchor, packet.anchor_m)
+                self._estimator.anchor_index(packet.anchor, packet.anchor_m, packet.anchor_std_m)
                 for packet in packets
                 if is_contradicted and packet.anchor in start.misfitting
             ],
@@ -350,7 +363,7 @@ class Estimation:
 
     def _process(self, observation: Observation) -> int:
         return self._estimator.process(
-            self._estimator.anchor_index(observation.anchor, observation.anchor_m),
+            self._estimator.anchor_index(observation.anchor, observation.anchor_m, observation.anchor_std_m),
             observation.sequence,
             observation.rx_ticks_tag,
             observation.tx_ticks_anchor,
@@ -403,6 +416,14 @@ class Estimation:
         return Fix(
             time_s, estimator.rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", known, 1, self._requirement
         )
+
+
+def _nearest(start: Start, most: int) -> set[int]:
+    """The anchors of a start that are nearest to its position, and those that do not fit."""
+    dim = len(start.solution) - 1
+    away = [float(np.linalg.norm(one.anchor_m[:dim] - start.solution[:dim])) for one in start.used]
+    nearest = np.argsort(away, kind="stable")[:most]
+    return {start.used[index].anchor for index in nearest} | set(start.misfitting)
 
 
 # Anchors in use

@@ -7,7 +7,9 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.air.beacon import Beacon, Heard
+from skyless.air.beacon2 import Beacon2
 from skyless.air.codec import packed_relays
+from skyless.air.frames import AnyBeacon
 from skyless.air.master_term import MasterTerm, master_term_of
 from skyless.constants import MAX_DRIFT, TICK_M, TICK_S
 from skyless.kernels.arrays import Array
@@ -100,6 +102,22 @@ class Observer:
         return whole, (subticks & 0xFF) / 256.0, (time.std_ticks * TICK_M) ** 2
 
 
+def observe_2(
+    beacon: Beacon2,
+    relays: bytes,
+    anchor_m: Array,
+    anchor_std_m: float,
+    rx_ticks: int,
+    tx_ticks: int,
+    rx_variance_factor: float,
+) -> Observation:
+    """One observation of a beacon of protocol 2, which states no master's time; ``relays``: ``packed_relays_2``."""
+    return Observation(
+        beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, None, 0.0, 0.0, (), None,
+        rx_variance_factor, relays, anchor_std_m,
+    )  # fmt: skip
+
+
 def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[None, None]:
     """Sequence number and unwrapped RX stamp of what the sender of a beacon received before that."""
     return (None, None) if heard is None else (heard.sequence, nearest(heard.rx_ticks, tx_ticks))
@@ -109,7 +127,10 @@ def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[Non
 
 
 STAMPS_BEFORE_RESTART: Final = 3
-"""This number of impossible stamps of one anchor in a row mean that its counter has restarted."""
+"""This number of impossible stamps of one anchor in a row mean that its counter has restarted, ..."""
+
+RESTART_SILENCE_TICKS: Final = from_seconds(0.2)
+"""... if none has fitted for this time: forged frames in between do not replace an anchor that still sends."""
 
 MOST_TRACKS: Final = 256
 """More anchors than a site can have; with more identifiers on the air, that received longest ago is forgotten."""
@@ -147,7 +168,7 @@ class AnchorStamps:
         """Start again."""
         self.tracks = StampTracks()
 
-    def unwrap(self, beacon: Beacon, rx_ticks: int) -> int | None:
+    def unwrap(self, beacon: AnyBeacon, rx_ticks: int) -> int | None:
         """TX stamp on the anchor's own unwrapped scale; None if the frame is repeated, late, or its stamp impossible.
 
         ``rx_ticks`` is the tag's own reading, unwrapped. An anchor's first stamp keeps its own value.
@@ -165,33 +186,33 @@ class AnchorStamps:
         least = track.tx_ticks + elapsed - HALF_WRAP_TICKS
         off = ((beacon.tx_ticks - least) & TICK_MASK) - HALF_WRAP_TICKS
         if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
-            self._reject(beacon, track)
+            self._reject(beacon, track, elapsed)
             return None
         track.rx_ticks_tag = tracks.newest_rx_ticks = rx_ticks
         track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
         track.sequence, track.impossible = beacon.sequence, 0
         return tx_ticks
 
-    def _begin(self, beacon: Beacon, rx_ticks: int) -> int:
+    def _begin(self, beacon: AnyBeacon, rx_ticks: int) -> int:
         tracks = self.tracks.of_anchor
         if len(tracks) >= MOST_TRACKS:
             del tracks[min(tracks, key=lambda anchor: tracks[anchor].rx_ticks_tag)]
         tracks[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence)
         return beacon.tx_ticks
 
-    def _reject(self, beacon: Beacon, track: _Track) -> None:
+    def _reject(self, beacon: AnyBeacon, track: _Track, silent_ticks: int) -> None:
         """Count the stamp; after a few that are impossible the anchor's next one is a beginning."""
         if _is_repeated(beacon, track):
             self._counters["duplicate"] += 1
             return
         self._counters["impossible-stamp"] += 1
         track.impossible += 1
-        if track.impossible >= STAMPS_BEFORE_RESTART:
+        if track.impossible >= STAMPS_BEFORE_RESTART and silent_ticks > RESTART_SILENCE_TICKS:
             del self.tracks.of_anchor[beacon.anchor]
             self._counters["anchor-restart"] += 1
 
 
-def _is_repeated(beacon: Beacon, track: _Track) -> bool:
+def _is_repeated(beacon: AnyBeacon, track: _Track) -> bool:
     return wrap(track.tx_ticks) == beacon.tx_ticks and track.sequence == beacon.sequence
 
 
@@ -219,6 +240,15 @@ def variance_factor(rx_power_dbm: float | None, first_path_power_dbm: float | No
         return 1.0
     part = min((difference_db - CLEAR_DB) / (BLOCKED_DB - CLEAR_DB), 1.0)
     return float(MAX_VARIANCE_FACTOR ** (part * part * (3.0 - 2.0 * part)))
+
+
+WEAK_FACTOR: Final = math.sqrt(MAX_VARIANCE_FACTOR)
+"""From this factor on an anchor says that the first path of a reception that it relays was weak: 9 dB."""
+
+
+def is_weak_first_path(rx_power_dbm: float | None, first_path_power_dbm: float | None) -> bool:
+    """Whether a reception may be late, as its first path is weak; False where a power is missing or impossible."""
+    return variance_factor(rx_power_dbm, first_path_power_dbm) >= WEAK_FACTOR
 
 
 # The time of fixes

@@ -127,6 +127,9 @@ function anchorFacts(id, health) {
   return {
     State: `${CONDITIONS[condition(id)].words}, ${health.role}`,
     "Synchronised to": health.master === null || health.master === id ? null : `anchor ${health.master}`,
+    "Slot time led by": health.root == null || health.root === id ? null : `anchor ${health.root}`,
+    Hops: number(health.hop),
+    Parents: health.parents?.length ? health.parents.map((parent) => `anchor ${parent}`).join(", ") : null,
     Term: number(health.term),
     Superframe: number(health.superframe),
     Sent: number(health.sent),

@@ -1,0 +1,4 @@
+"""The protocol machines of anchors of protocol 2, and the choice of the machine for a site.
+
+Public: factory, free, slots. Only within: neighbours.
+"""

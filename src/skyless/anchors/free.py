@@ -1,0 +1,58 @@
+"""``FreeAnchor``: an anchor that sends at random instants of its own counter and knows of no other time."""
+
+from collections import Counter
+
+from skyless.air.beacon2 import Beacon2
+from skyless.air.codec2 import encode_2, heard_capacity_2
+from skyless.air.reception import Reception, Transmission
+from skyless.anchors.neighbours import Neighbours, anchor_of, on_radio_grid
+from skyless.constants import DELAYED_TX_GRANULARITY_TICKS
+from skyless.site.free_access import first_free_window, free_instant_ticks, free_window_ticks
+from skyless.site.local_almanac import site_issue, site_page_for, site_pages_of
+from skyless.site.model import Site
+from skyless.ticks import from_seconds, wrap
+
+
+class FreeAnchor:
+    """One anchor of a site of mode free. Like ``Anchor`` it does no I/O and reads no clock."""
+
+    def __init__(self, site: Site, anchor_id: int, lead_s: float = 1e-3) -> None:
+        """``lead_s``: how long before its RMARKER a frame must be in the driver's hands.
+
+        Raises:
+            KeyError: the site has no such anchor.
+        """
+        self.id = anchor_id
+        self.counters: Counter[str] = Counter()
+        self._site_id = site.id
+        self._lead_ticks = from_seconds(lead_s)
+        self._window_ticks = free_window_ticks(site.schedule.rate_hz)
+        self._delay_ticks = anchor_of(site, anchor_id).tx_antenna_delay_ticks
+        self._pages = site_pages_of(site)
+        self._issue = site_issue(self._pages)
+        self._neighbours = Neighbours(site, anchor_id, self.counters)
+        self._sequence = 0
+
+    def hear(self, reception: Reception) -> None:
+        """Process a frame from the air; one that does not belong here is counted and dropped."""
+        self._neighbours.admit(reception)
+
+    def next_transmission_ticks(self, now_ticks: int) -> int:
+        """TX stamp (40-bit, own counter) of the next frame that can still be made."""
+        now = self._neighbours.own_ticks.unwrap(now_ticks)
+        earliest = now + self._lead_ticks + DELAYED_TX_GRANULARITY_TICKS
+        window = first_free_window(self.id, earliest, self._window_ticks)
+        return wrap(on_radio_grid(free_instant_ticks(self.id, window, self._window_ticks), self._delay_ticks))
+
+    def transmission(self, tx_ticks: int) -> Transmission:
+        """The frame for a time that ``next_transmission_ticks`` gave."""
+        position = self._neighbours.position
+        capacity = heard_capacity_2(slot_time=False, position=position is not None, site_time=False, page=True)
+        heard, weak = self._neighbours.relayed(self._neighbours.own_ticks.expect(tx_ticks), capacity)
+        page = site_page_for(self._pages, self._sequence, self.id)
+        beacon = Beacon2(
+            self._site_id, self.id, self._sequence, tx_ticks, self._issue, None, position, None, heard, weak, page
+        )
+        self._sequence = (self._sequence + 1) & 0xFF
+        self.counters["sent"] += 1
+        return Transmission(encode_2(beacon), tx_ticks)

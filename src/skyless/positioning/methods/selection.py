@@ -1,0 +1,102 @@
+"""Which anchors of a large site a tag uses: those that others receive as well, and of these the strongest."""
+
+import math
+from collections.abc import Collection
+from typing import Final, TypeVar
+
+from msgspec import Struct
+
+from skyless.air.beacon import HEARD
+from skyless.ticks import from_seconds
+
+MOST_ANCHORS: Final = 24
+"""In the estimator's state; more cost accuracy, as each then sends less, and time."""
+
+BETTER_DB: Final = 3.0
+"""By which another anchor must be stronger to replace the weakest."""
+
+RELAYED_TICKS: Final = from_seconds(1.0)
+"""A reception by another anchor confirms its sender for this time."""
+
+MOST_KEPT: Final = 256
+"""Identifiers kept: more than there are in reach, so that forged ones use no memory."""
+
+POWER_GAIN: Final = 0.1
+"""Of the running mean of an anchor's received power."""
+
+NOMINAL_POWER_DBM: Final = -63.0
+"""At 1 m: what is assumed of an anchor where the radio reports no power, so that nearer ones count as stronger."""
+
+
+Value = TypeVar("Value")
+
+
+class AnchorSelectionState(Struct, frozen=True):
+    """What an ``AnchorSelection`` keeps."""
+
+    relayed_ticks: dict[int, int]
+    power_dbm: dict[int, float]
+
+
+class AnchorSelection:
+    """Which anchors have been received by others, and with which power by the tag."""
+
+    def __init__(self) -> None:
+        self._relayed_ticks: dict[int, int] = {}
+        """The tag's reading when a reception of the anchor by another one was relayed last."""
+        self._power_dbm: dict[int, float] = {}
+
+    def state(self) -> AnchorSelectionState:
+        """All that it keeps."""
+        return AnchorSelectionState(dict(self._relayed_ticks), dict(self._power_dbm))
+
+    def restore(self, state: AnchorSelectionState) -> None:
+        """Continue from a state."""
+        self._relayed_ticks, self._power_dbm = dict(state.relayed_ticks), dict(state.power_dbm)
+
+    def forget_times(self) -> None:
+        """The tag's counter has restarted."""
+        self._relayed_ticks = {}
+
+    def add_power(self, anchor: int, power_dbm: float) -> None:
+        """Process the power of a beacon."""
+        if math.isfinite(power_dbm):
+            mean = self._power_dbm.pop(anchor, power_dbm)
+            _keep(self._power_dbm, anchor, mean + POWER_GAIN * (power_dbm - mean))
+
+    def add_relays(self, relays: bytes, rx_ticks: int) -> None:
+        """Process what an anchor that is trusted relays (``packed_relays_2``)."""
+        for anchor, _, _, _ in HEARD.iter_unpack(relays):
+            self._relayed_ticks.pop(anchor, None)
+            _keep(self._relayed_ticks, anchor, rx_ticks)
+
+    def is_confirmed(self, anchor: int, rx_ticks: int) -> bool:
+        """Whether an anchor has lately been received by another one."""
+        relayed_ticks = self._relayed_ticks.get(anchor)
+        return relayed_ticks is not None and rx_ticks - relayed_ticks < RELAYED_TICKS
+
+    def replaced_by(self, anchor: int, ranges_m: dict[int, float]) -> int | None:
+        """The anchor that should leave for another one, None where that is too weak.
+
+        ``ranges_m``: ranges of this anchor and of all that are in use.
+        """
+        powers = {one: self._power_dbm.get(one, _nominal_dbm(range_m)) for one, range_m in ranges_m.items()}
+        own_dbm = powers.pop(anchor)
+        weakest = min(powers, key=lambda one: powers[one])
+        return weakest if own_dbm > powers[weakest] + BETTER_DB else None
+
+
+def is_full(anchors: Collection[int]) -> bool:
+    """Whether another anchor can only be used instead of one of these."""
+    return len(anchors) >= MOST_ANCHORS
+
+
+def _nominal_dbm(range_m: float) -> float:
+    return NOMINAL_POWER_DBM - 20.0 * math.log10(max(range_m, 0.1))
+
+
+def _keep(kept: dict[int, Value], anchor: int, value: Value) -> None:
+    """Set the value of an anchor as the newest one; that kept longest is forgotten."""
+    kept[anchor] = value
+    if len(kept) > MOST_KEPT:
+        del kept[next(iter(kept))]

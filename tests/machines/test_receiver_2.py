@@ -1,0 +1,271 @@
+"""A tag at a site of protocol 2: what it learns from beacons alone, and what cannot disturb it."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from free_site import FREE, beacon_of, free_tape, with_beacon
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from bench import assert_honest, tape
+from skyless.air.almanac import NoisePage, SitePage
+from skyless.air.beacon import Heard as Relay
+from skyless.air.beacon2 import SlotTime, StatedPosition
+from skyless.air.codec2 import encode_2
+from skyless.positioning.fix import NoFixReason
+from skyless.receiver import NOT_DROPS, Receiver
+from skyless.recordings.mcap.checkpoint import load, save
+from skyless.site.local_almanac import site_issue, site_pages_of
+from skyless.site.model import GeoreferenceSite
+from skyless.ticks import from_seconds, wrap
+
+STRANGER = 999
+ANCHORS = len(FREE.anchors)
+
+
+def fixes_of(receiver, heard):
+    """Rows of the fixes, by the frames that made them."""
+    made = {}
+    for one in heard:
+        fix = receiver.hear(one.reception)
+        if fix is not None:
+            made[one.frame, one.rx_ticks] = fix.rows
+    return made
+
+
+def drops(receiver):
+    return {reason for reason in receiver.counters if reason not in NOT_DROPS}
+
+
+def false_frames(rate_hz, make, seconds=2.0, first_s=0.0):
+    """Frames of an attacker with its own counter that collide with none of the site's; ``make``: number, stamp."""
+    tag, falses = free_tape()[0], []
+    ends_s = np.array([one.host_s for one in free_tape()])
+    for n in range(int((seconds - first_s) * rate_hz)):
+        at_s = first_s + (n + 0.37) / rate_hz
+        if np.min(np.abs(ends_s - at_s)) < 0.4e-3:
+            continue  # the two would collide
+        ticks = from_seconds(at_s - tag.host_s)
+        beacon = make(n, wrap(12345 + from_seconds(at_s)))
+        falses.append(replace_heard(tag, beacon.anchor, encode_2(beacon), wrap(tag.rx_ticks + ticks), at_s))
+    return falses
+
+
+def replace_heard(heard, anchor, frame, rx_ticks, host_s):
+    return type(heard)(anchor, frame, rx_ticks, host_s, heard.truth_m)
+
+
+def merged(*parts):
+    return sorted((one for part in parts for one in part), key=lambda one: one.host_s)
+
+
+def a_beacon(**fields):
+    return replace(beacon_of(free_tape()[50]), **{"anchor": STRANGER, "heard": (), "weak": 0, **fields})
+
+
+def test_a_tag_that_knows_nothing_has_fixes_at_once_and_they_are_honest():
+    receiver, first = Receiver(), None
+    for one in free_tape():
+        fix = receiver.hear(one.reception)
+        if fix is not None:
+            first = one.host_s if first is None else first
+            assert_honest(fix, one.truth_m)
+    assert first < 0.3
+    assert drops(receiver) <= {"unconfirmed-anchor"}
+    assert receiver.site == FREE.id
+
+
+@pytest.mark.parametrize("method", ["literal", "weighted"])
+def test_methods_that_need_a_master_say_so(method):
+    receiver = Receiver(method)
+    assert not fixes_of(receiver, free_tape())
+    assert receiver.reason is NoFixReason.NO_MASTER
+
+
+CLAIMS = st.builds(
+    SlotTime,
+    *[st.integers(0, (1 << bits) - 1) for bits in (32, 8, 16, 32, 8, 8)],
+    st.integers(-(2**23) + 1, 2**23 - 1).map(lambda step: step / 2.0**36),
+)
+
+
+@given(st.lists(CLAIMS, min_size=1, max_size=8))
+@settings(max_examples=10, deadline=None)
+def test_fixes_are_the_same_bits_whatever_is_claimed(claims):
+    short = [with_beacon(one, heard=tuple(beacon_of(one).heard)[:6], weak=0) for one in free_tape()[:150]]
+    claimed = [with_beacon(one, slot_time=claims[n % len(claims)]) for n, one in enumerate(short)]
+    assert list(fixes_of(Receiver(), claimed).values()) == list(fixes_of(Receiver(), short).values())
+
+
+def undisturbed(falses):
+    """Whether a tag has the same fixes with these frames in between, bit for bit; and its counters."""
+    expected = fixes_of(Receiver(), free_tape())
+    receiver = Receiver()
+    made = fixes_of(receiver, merged(free_tape(), falses))
+    assert made == expected
+    assert len(expected) > 550
+    return receiver.counters
+
+
+def test_a_false_master_has_no_effect():
+    """Claims of a root that does not exist, 2.2 times a second, and a master of protocol 1."""
+
+    def claim(n, tx_ticks):
+        return a_beacon(tx_ticks=tx_ticks, sequence=n & 0xFF, slot_time=SlotTime(n, 0, STRANGER, 2**32 - 1, 0, 0, 0.0))
+
+    counters = undisturbed(false_frames(2.2, claim))
+    assert counters["unconfirmed-anchor"] > 0
+    masters = [replace_heard(one, one.anchor, one.frame, one.rx_ticks, one.host_s) for one in tape(seconds=1.9)[::30]]
+    assert undisturbed(masters)["foreign-site"] == len(masters)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_foreign_site_that_was_there_first_does_not_hold_the_tag(version):
+    if version == 1:
+        falses = list(tape(replace(bench_site(), id=77), seconds=2.0)[::3])
+        falses = [one for one in falses if one.anchor in {1, 2}]
+    else:
+        falses = false_frames(
+            60.0, lambda n, tx_ticks: a_beacon(site=77, tx_ticks=tx_ticks, sequence=n & 0xFF, position=None)
+        )
+    late = [one for one in free_tape() if one.host_s > 0.5]
+    receiver = Receiver()
+    made = fixes_of(receiver, merged(late, falses))
+    assert receiver.site == FREE.id
+    first_s = min(one.host_s for one in late if (one.frame, one.rx_ticks) in made)
+    assert first_s < 0.5 + 0.3
+    assert receiver.counters["site-change"] == 1
+
+
+def bench_site():
+    return replace(FREE, schedule=replace(FREE.schedule, mode="master", rate_hz=30.0))
+
+
+def test_false_pages_of_a_stranger_have_no_effect():
+    """40 times a second, under the site's issue and under others."""
+    sound = site_issue(site_pages_of(FREE))
+    pages = [SitePage(4, 1 << 20, 3, 17.0), NoisePage(1e-6, 1e-6, 1e-7, 1e-7)]
+
+    def false_page(n, tx_ticks):
+        issue = sound if n % 2 else (n * 7919) & 0xFFFF
+        return a_beacon(
+            tx_ticks=tx_ticks,
+            sequence=n & 0xFF,
+            almanac_issue=issue,
+            page=pages[n % 2],
+            position=StatedPosition(1, 2, 3),
+        )
+
+    counters = undisturbed(false_frames(40.0, false_page))
+    assert counters["unconfirmed-anchor"] > 50
+
+
+def test_one_anchor_that_sends_false_pages_has_no_effect():
+    """All that it measures is right, but it states another issue, and other pages."""
+    page = SitePage(3, 1 << 20, 3, 17.0)
+    falses = [
+        with_beacon(one, almanac_issue=0xBAD, page=page) if one.anchor == FREE.anchors[2].id else one
+        for one in free_tape()
+    ]
+    receiver = Receiver()
+    made = fixes_of(receiver, falses)
+    assert list(made.values())[-100:] == list(fixes_of(Receiver(), free_tape()).values())[-100:]
+    assert receiver.local_almanac.pages.site.tag_height_m == FREE.tags.height_m
+
+
+def test_forged_stamps_under_the_name_of_an_anchor_are_dropped():
+    """40 times a second, more often than its own beacons between two of which there may be three."""
+    name = FREE.anchors[1].id
+    counters = undisturbed(
+        false_frames(
+            120.0, lambda n, tx_ticks: replace(a_beacon(tx_ticks=tx_ticks, sequence=n & 0xFF), anchor=name), 2.0, 0.3
+        )
+    )
+    assert counters["impossible-stamp"] + counters["duplicate"] > 140
+    assert counters["anchor-restart"] == 0
+
+
+def test_a_flood_of_identifiers_does_not_displace_the_anchors():
+    counters = undisturbed(
+        false_frames(
+            500.0,
+            lambda n, tx_ticks: replace(
+                a_beacon(tx_ticks=tx_ticks, sequence=0, heard=()), anchor=1000 + n, almanac_issue=n, page=None
+            ),
+        )
+    )
+    assert counters["unconfirmed-anchor"] > 500
+
+
+def test_an_anchor_without_a_position_is_counted_and_its_relays_confirm_others():
+    silent = FREE.anchors[0].id
+    heard = [with_beacon(one, position=None) if one.anchor == silent else one for one in free_tape()]
+    receiver = Receiver()
+    made = fixes_of(receiver, heard)
+    assert len(made) > 450
+    assert receiver.counters["no-position"] > 50
+    assert silent not in receiver.method.estimator.anchors
+
+
+def test_a_moved_anchor_counts_once_it_is_stated_twice_in_a_row():
+    moved, heard = FREE.anchors[3].id, free_tape()
+    first = next(k for k, one in enumerate(heard) if one.anchor == moved and one.host_s > 1.0)
+    once = [
+        with_beacon(one, position=StatedPosition(50.0, 50.0, 2.0)) if k == first else one for k, one in enumerate(heard)
+    ]
+    assert list(fixes_of(Receiver(), once).values()) == list(fixes_of(Receiver(), heard).values())
+    receiver = Receiver()
+    fixes_of(
+        receiver,
+        [with_beacon(one, position=StatedPosition(1.0, 2.0, 3.0)) if one.anchor == moved else one for one in heard],
+    )
+    assert receiver.local_almanac.position_m(moved).tolist() == [1.0, 2.0, 3.0]
+
+
+def test_changed_pages_are_used_when_most_anchors_state_them():
+    changed_site = replace(FREE, georeference=GeoreferenceSite(48.0, 11.0, 500.0, 10.0))
+    old, new = free_tape(), free_tape(changed_site)
+    receiver = Receiver()
+    switch_s = 1.0
+    mixed = [one for one in old if one.host_s < switch_s] + [one for one in new if one.host_s >= switch_s]
+    made = fixes_of(receiver, mixed)
+    assert receiver.local_almanac.pages.georeference.latitude_deg == 48.0
+    assert len(made) > 550  # nothing that the estimator assumes has changed: it has gone on
+
+
+def test_a_tag_from_a_checkpoint_goes_on_with_the_same_bits():
+    heard, whole = free_tape(), Receiver()
+    for cut in (3, 12, 40, 400):
+        whole = Receiver()
+        for one in heard[:cut]:
+            whole.hear(one.reception)
+        again = load(save(whole))
+        rest = heard[cut : cut + 60]
+        assert fixes_of(again, rest) == fixes_of(whole, rest)
+        assert again.counters == whole.counters
+
+
+def test_relays_of_a_weak_first_path_are_not_used():
+    late = [
+        with_beacon(
+            one,
+            weak=(1 << len(beacon_of(one).heard)) - 1,
+            heard=tuple(Relay(r.anchor, r.sequence, wrap(r.rx_ticks + 60)) for r in beacon_of(one).heard),
+        )
+        if one.host_s > 1.0
+        else one
+        for one in free_tape()
+    ]
+    receiver = Receiver()
+    fixes_of(receiver, late)
+    assert receiver.method.estimator.state.status[0]["relays_rejected"] < 20
+
+
+def test_fixes_follow_one_another_by_the_tags_own_clock():
+    receiver = Receiver()
+    times = [fix.time_s for one in free_tape() if (fix := receiver.hear(one.reception)) is not None]
+    assert all(later > earlier for earlier, later in pairwise(times))
+    assert times[-1] - times[0] == pytest.approx(free_tape()[-1].host_s, abs=0.1)
+    assert np.isfinite(times).all()
