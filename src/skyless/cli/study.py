@@ -140,19 +140,14 @@ class StudyOptions:
 def study(name: _Name, /, *, asked: StudyOptions = StudyOptions()) -> None:
     """Measure errors over many simulated runs: a table with standard errors, a picture, JSON.
 
-        Parameters
-        ----------
-        name
-            efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
-            sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
-    <<<<<<< HEAD
-            room: the errors of real rooms, and what goes wrong in them. scale: numbers of tags and anchors.
-            sitetime: one timeline over many hops.
-    =======
-            room: the errors of real rooms, and what goes wrong in them. large: 1,024 anchors without a master.
-            claims: whose counter leads protocol 2.
-            scale: numbers of tags and anchors.
-    >>>>>>> 3a690a82903f8a162a455124021ac2c47bc5f208
+    Parameters
+    ----------
+    name
+        efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
+        sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
+        room: the errors of real rooms, and what goes wrong in them. large: 1,024 anchors without a master.
+        claims: whose counter leads protocol 2. scale: numbers of tags and anchors.
+        sitetime: one timeline over many hops.
     """
     from skyless.studies.catalogue import STUDIES
 
