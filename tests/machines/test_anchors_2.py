@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from bench import LAB, Stage
 from msgspec.structs import replace
 
+from bench import LAB, Stage
 from skyless.air.beacon2 import Beacon2
 from skyless.air.codec2 import decode_2, encode_2
 from skyless.air.reception import Diagnostics, Reception

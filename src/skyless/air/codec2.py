@@ -9,10 +9,10 @@ from typing import Final, SupportsIndex
 from skyless.air.beacon import HEARD, Heard, Malformed, PackedHeard
 from skyless.air.beacon2 import MAX_HEARD, MOST_PULSE_AGE, Beacon2, SlotTime, StatedPosition, StatedSiteTime
 from skyless.air.codec import (
+    BEACON_MAGIC,
     BROADCAST,
     FCS_BYTES,
     FRAME_CONTROL,
-    BEACON_MAGIC,
     MAX_FRAME_BYTES,
     SATURATED_STD,
     STD_STEPS_PER_TICK,

@@ -114,7 +114,7 @@ class LocalAlmanac:
     def state(self) -> LocalAlmanacState:
         """All that it holds."""
         collected = tuple(
-            CollectedPage(issue, encode_page(page), tuple(anchors))
+            CollectedPage(issue, encode_page(page), tuple(sorted(anchors)))
             for issue, by_type in self._contents.items()
             for contents in by_type.values()
             for page, anchors in contents.items()
