@@ -115,7 +115,14 @@ IDENTIFIERS = [
 ]
 """Names of version 0.1 that were replaced."""
 
-HEARING = {"anchor.py", "anchors/free.py", "anchors/slots.py", "receiver.py", "simulation/world.py", "evaluation/fleet.py"}
+HEARING = {
+    "anchor.py",
+    "anchors/free.py",
+    "anchors/slots.py",
+    "receiver.py",
+    "simulation/world.py",
+    "evaluation/fleet.py",
+}
 """Only what stands where a radio's receptions arrive has methods named ``hear``."""
 
 

@@ -150,7 +150,7 @@ def test_raw_stamps_run_on_at_the_rate_of_the_crystal():
 
 
 def test_islands_with_other_phases_merge_after_a_silence():
-    """Two anchors that lead alone, then receive each other: one changes its phase, after a superframe without a frame."""
+    """Two anchors lead alone, then receive each other: one changes its phase, after a superframe without a frame."""
     site = site_of(2, 1, 4.0)
     late = (AnchorOutage(2, Outage(0.0, 0.5)),)
     apart = Stage(site, seed=4, make=new_anchor, anchor_outages=late)
