@@ -51,13 +51,13 @@ PARENT_BONUS_DB: Final = 6.0
 """A parent is replaced only by a neighbour that is better by more than one of these."""
 
 SILENCE_SUPERFRAMES: Final = 0.5
-"""From the last frame in one phase to the first in another, at least. A wave of new phases waits for it at every hop."""
+"""From the last frame in one phase to the first in another, at least; what spreads waits for it at each hop."""
 MISFITS_BEFORE_CHANGE: Final = 3
 """After this many beacons of the own claim in a row that are out of phase and have news, the own phase is wrong."""
 MOST_CHANGES: Final = 8.0
 CHANGES_PER_SUPERFRAME: Final = 1.0 / 16.0
-"""Changes of phase that an anchor makes at once, and on average: each costs a frame or two, and whoever
-forges claims must not silence the site."""
+"""Changes of phase that an anchor makes at once, and on average: each costs a frame or two, and forged claims must not
+silence the site."""
 
 _PULSE_BITS: Final = 32
 _PULSE_HALF: Final = 1 << (_PULSE_BITS - 1)
