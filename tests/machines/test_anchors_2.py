@@ -24,7 +24,7 @@ from skyless.slot_claims import SILENCE_SUPERFRAMES, SlotRole
 from skyless.ticks import Unwrapper, wrap
 
 ALIGNED_S = 50e-9
-"""Slots of neighbours differ by less (``shared/LARGE.md`` 3.4)."""
+"""Slots of neighbours differ by less (``docs/protocol2.md``)."""
 
 
 def site_of(columns, rows, step_m, mode="slots", **schedule) -> Site:

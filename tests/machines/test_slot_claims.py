@@ -1,4 +1,4 @@
-"""Claims on the slot time: what must hold on random graphs (LARGE.md section 4), and what forged frames do."""
+"""Claims on the slot time: what must hold on random graphs (``docs/protocol2.md``), and what forged frames do."""
 
 from itertools import pairwise
 

@@ -268,3 +268,17 @@ def test_wrong_arrays_and_spans_are_refused():
         SlotSchedule(np.arange(3), 2, 512)
     with pytest.raises(ValueError, match="a span from 1 to 0"):
         CellWorld(anchors_at(POSITIONS_M), FreeSchedule(), paths(), Impairments(), 1).receptions(0, 1.0, 0.0)
+
+
+@pytest.mark.parametrize("dead", [None, (np.arange(400) % 17 == 0).tolist()])
+def test_pairs_whose_frames_always_collide_are_left_out_without_a_change(dead):
+    def world():
+        return CellWorld(anchors_at(POSITIONS_M), slots(), paths(), ROOM, 5, dead=dead)
+
+    quick, plain = world(), world()
+    assert len(quick._in_slots.anchors) < len(plain._neighbours.anchors) / 4
+    plain._in_slots = plain._neighbours
+    found, expected = columns(list(quick.run(1.5))), columns(list(plain.run(1.5)))
+    assert len(found["anchor"]) > 500
+    for name, column in expected.items():
+        np.testing.assert_array_equal(found[name], column, err_msg=name)

@@ -9,8 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from skyless.air.beacon import PackedHeard
+from skyless.air.almanac import Page
+from skyless.air.beacon import Malformed, PackedHeard
 from skyless.air.beacon2 import Beacon2, StatedPosition
+from skyless.air.page_codec import decode_page, encode_page
 from skyless.air.reception import Reception
 from skyless.evaluation.fleet import FleetSettings, JudgedFix, TagFleet
 from skyless.kernels.arrays import Array
@@ -49,7 +51,7 @@ class SiteBeacons:
 
     def __init__(self, site: Site) -> None:
         """Raises ValueError for a site without slots."""
-        self._site, self._pages = site.id, site_pages_of(site)
+        self._site, self._pages = site.id, tuple(map(_on_air, site_pages_of(site)))
         self._issue = site_issue(self._pages)
         std_m = site.accuracy.survey_std_m
         self._positions = {
@@ -77,6 +79,13 @@ class SiteBeacons:
                 self._site, anchor, sequence, tx_ticks, self._issue, None, self._positions[anchor], None, heard, 0, page
             )
             yield beacon, Reception(b"", rx_ticks, emission_s), row
+
+
+def _on_air(page: Page) -> Page:
+    """A page as its bytes state it: noise in single precision, lengths in millimetres."""
+    decoded = decode_page(encode_page(page))
+    assert decoded is not None and not isinstance(decoded, Malformed)
+    return decoded
 
 
 class CellFleet(TagFleet):

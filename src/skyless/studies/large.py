@@ -42,6 +42,11 @@ _EDGE_M: Final = 40.0
 """Tags stay this far inside of the outermost anchors."""
 
 _LEG_M: Final = (40.0, 100.0)
+"""From point to point; tags that drive go farther."""
+
+_POINTS: Final = 40
+"""Of a path, after which a tag comes back to the first."""
+
 _CORNER_S: Final = 2.0
 _SETTLED_S: Final = 2.0
 """After a tag's first fix, from when on it is judged."""
@@ -176,10 +181,10 @@ def _path(case: LargeCase, draw: np.random.Generator, low_m: float, high_m: floa
         middle_m = [*draw.uniform(low_m, high_m, 2), _TAG_HEIGHT_M]
         std_m = (_ROAM_STD_M, _ROAM_STD_M, 0.0)
         return Roaming(middle_m, std_m, qa_m2ps3=ROOM_QA_M2PS3, seed=int(draw.integers(2**62)))
-    points = [draw.uniform(low_m, high_m, 2)]
-    while len(points) < 40:
+    points, longest_m = [draw.uniform(low_m, high_m, 2)], _LEG_M[1] if case.speed_mps <= _WALK_MPS else math.inf
+    while len(points) < _POINTS or np.linalg.norm(points[0] - points[-1]) < _LEG_M[0]:
         point = draw.uniform(low_m, high_m, 2)
-        if case.speed_mps > _WALK_MPS or _LEG_M[0] <= np.linalg.norm(point - points[-1]) <= _LEG_M[1]:
+        if _LEG_M[0] <= np.linalg.norm(point - points[-1]) <= longest_m:
             points.append(point)
     points_m = [(x_m, y_m, _TAG_HEIGHT_M) for x_m, y_m in points]
     return Waypoints(points_m, case.speed_mps, loop=True, corner_s=_CORNER_S)
@@ -365,7 +370,8 @@ def _known(spans: Sequence[TagReceptions], index_of: dict[int, int], senders: In
 # Cells and rows
 
 
-def _runs(plan: Plan, case: LargeCase) -> list[LargeRun]:
+def tag_runs(plan: Plan, case: LargeCase) -> list[LargeRun]:
+    """The cells of a case."""
     tags = 12 if case.starts else 1
     count = (8 if plan.quick else 16) if case.starts else min(plan.worlds, 2) if case.seconds else plan.worlds
     return [LargeRun(case, plan, number, tags) for number in range(count)]
@@ -376,17 +382,20 @@ def cells(plan: Plan) -> list[Cell]:
     return [
         Cell(case.name, run_large, run, _TAG_COST_S * run.tags * (case.seconds or plan.seconds) + 1.0)
         for case in cases(plan)
-        for run in _runs(plan, case)
+        for run in tag_runs(plan, case)
     ]
 
 
 def rows(plan: Plan, results: Sequence[LargeResult]) -> list[Row]:
     """A row for each case; the results stand in the order of ``cells``."""
     rest = iter(results)
-    return [with_limits(_row(plan, case, [next(rest) for _ in _runs(plan, case)]), case.limits) for case in cases(plan)]
+    return [
+        with_limits(row_of(plan, case, [next(rest) for _ in tag_runs(plan, case)]), case.limits) for case in cases(plan)
+    ]
 
 
-def _row(plan: Plan, case: LargeCase, each: list[LargeResult]) -> Row:
+def row_of(plan: Plan, case: LargeCase, each: list[LargeResult]) -> Row:
+    """The results of a case, without its limits."""
     whole, site = _sum(each), site_of(case)
     superframe_s = 0.0 if case.slot_s is None else (site.schedule.slots or 0) * case.slot_s
     row = Row(

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.kernels.arrays import Array, Integers
+from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.kernels.compiled import kernel
 from skyless.simulation.cells.reception import Rules, delivery_chance, pair_key, squared_m2
 
@@ -112,6 +112,51 @@ def list_neighbours(rules: Rules, grid: Grid, positions_m: Array, keys: Integers
     lists = _empty_lists(lists.offsets, int(lists.offsets[-1]))
     _list_neighbours(rules, grid, positions_m, keys, lists)
     return lists
+
+
+@kernel
+def _survivors(
+    rules: Rules,
+    positions_m: Array,
+    colours: Integers,
+    dead: Integers,
+    senders: Integers,
+    first: Integers,
+    lists: Neighbours,
+    survives: Mask,
+) -> None:
+    """Which entries of the lists another frame of the same slot does not destroy in every superframe.
+
+    ``senders``: the anchors in the order of their colours, those of a colour from ``first`` of it on.
+    """
+    reach_m2 = rules.reach_m * rules.reach_m
+    for listener in range(positions_m.shape[0]):
+        x_m, y_m, z_m = positions_m[listener, 0], positions_m[listener, 1], positions_m[listener, 2]
+        for i in range(lists.offsets[listener], lists.offsets[listener + 1]):
+            sender = lists.anchors[i]
+            destroyed_m2 = min(rules.capture * squared_m2(positions_m, sender, x_m, y_m, z_m), reach_m2)
+            survives[i] = colours[listener] != colours[sender] and dead[sender] == 0
+            colour = colours[sender]
+            for k in range(first[colour], first[colour + 1]):
+                other = senders[k]
+                if other != sender and dead[other] == 0 and survives[i]:
+                    survives[i] = squared_m2(positions_m, other, x_m, y_m, z_m) >= destroyed_m2
+
+
+def without_collisions(
+    rules: Rules, positions_m: Array, colours: Integers, dead: Integers, lists: Neighbours
+) -> Neighbours:
+    """The lists without pairs whose frames never arrive, as another anchor always sends in the same slot.
+
+    Only pairs that the rules of reception would refuse in each superframe: what is received does not change.
+    """
+    survives = np.zeros(len(lists.anchors), dtype=np.bool_)
+    senders = np.argsort(colours, kind="stable")
+    first = np.searchsorted(colours[senders], np.arange(int(colours.max()) + 2))
+    _survivors(rules, positions_m, colours, dead, senders, first, lists, survives)
+    survives &= lists.chance > 0.0
+    before = np.concatenate(([0], np.cumsum(survives)))
+    return Neighbours(before[lists.offsets], lists.anchors[survives], lists.chance[survives], lists.pair[survives])
 
 
 def _empty_lists(offsets: Integers, total: int) -> Neighbours:

@@ -18,7 +18,7 @@ from skyless.constants import DEFAULT_ANTENNA_DELAY_TICKS, TICK_S
 from skyless.kernels.arrays import Array, Integers
 from skyless.kernels.compiled import kernel
 from skyless.simulation.cells.clocks import KNOT_TICKS, CellClocks
-from skyless.simulation.cells.grid import anchors_within, list_neighbours, make_grid
+from skyless.simulation.cells.grid import Neighbours, anchors_within, list_neighbours, make_grid, without_collisions
 from skyless.simulation.cells.keyed import (
     RANGE_CHANGING,
     RANGE_CONSTANT,
@@ -218,6 +218,11 @@ class CellWorld:
         self._keys = keys
         self._cells = make_grid(self.true_positions_m, _CELL_M)
         self._neighbours = list_neighbours(self._rules, self._near_grid, self.true_positions_m, keys[:count])
+        self._in_slots = self._neighbours
+        if isinstance(schedule, SlotSchedule):
+            self._in_slots = without_collisions(
+                self._rules, self.true_positions_m, schedule.colours, self._senders.dead, self._neighbours
+            )
         self._most_neighbours = int(np.diff(self._neighbours.offsets).max())
         model = impairments.range_errors
         self._errors = _pair_errors(model, seed)
@@ -273,7 +278,7 @@ class CellWorld:
         knots = self._clocks.cover(0, to_ticks + from_seconds(1.0))
         count = len(self.anchors.ids)
         table = given_table(self._rules, knots, self._keys[:count], senders, tx_ticks, self._after_ticks)
-        scene = self._scene_of(table, 0, to_ticks + from_seconds(1.0))
+        scene = self._scene_of(table, self._neighbours, 0, to_ticks + from_seconds(1.0))
         by_tags = []
         for tag in range(len(self.tags)):
             path = self._paths[tag].cover(from_ticks, to_ticks)
@@ -303,16 +308,14 @@ class CellWorld:
                 from_ticks=begin,
                 to_ticks=end,
             )
-            self._scene = self._scene_of(table, begin, end)
+            self._scene = self._scene_of(table, self._in_slots, begin, end)
             self._span = (from_ticks, to_ticks)
         return self._scene
 
-    def _scene_of(self, table: Table, from_ticks: int, to_ticks: int) -> Scene:
+    def _scene_of(self, table: Table, neighbours: Neighbours, from_ticks: int, to_ticks: int) -> Scene:
         knots = self._clocks.cover(from_ticks, to_ticks)
         buckets = make_buckets(table, self._cells, from_ticks, to_ticks)
-        return Scene(
-            self._rules, knots, table, buckets, self._cells, self._neighbours, self.true_positions_m, self._keys
-        )
+        return Scene(self._rules, knots, table, buckets, self._cells, neighbours, self.true_positions_m, self._keys)
 
     # Tags
 

@@ -1,0 +1,53 @@
+"""The study ``large``: a thousand anchors without a master. What its commands show is in docs/studies.md."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from skyless.studies import large
+from skyless.studies.plan import Plan
+
+PLAN = Plan(seed=5, worlds=2, seconds=8.0)
+CASES = {case.name: case for case in large.cases(PLAN)}
+
+
+def results(name, count=2, plan=PLAN, **changes):
+    case = replace(CASES[name], **changes)
+    runs = large.tag_runs(plan, case)[:count]
+    return large.row_of(plan, case, [large.run_large(run) for run in runs])
+
+
+@pytest.mark.parametrize("name", ["1 ms slots", "random instants"])
+def test_walking_tags_meet_the_limits(name):
+    row = results(name)
+    assert 0.01 < row.rmse_m < 0.03  # two tags: one standard error is about a tenth
+    assert 0.4 < row.nees < 1.4
+    assert row.restarts == 0
+    assert row.gap_s < 0.15
+    assert row.beacons_per_s > 120.0
+
+
+def test_a_tag_that_drives_through_the_site_never_begins_again():
+    row = results("5 m/s through the whole site", 1, seconds=60.0)
+    assert row.joins > 30
+    assert row.restarts == 0
+    assert row.gap_superframes < 4.0
+
+
+def test_in_rooms_it_is_near_the_bound():
+    row = results("room, 1 ms slots", 3)
+    assert row.bound_m > 0.02
+    assert 0.5 < row.ratio < 1.9  # three tags: constants of the ranges dominate, a few draws of each
+
+
+def test_cold_starts_anywhere():
+    row = results("cold starts, 1 ms slots", 1)
+    assert row.fixes == 12
+    assert row.first_fix_s <= 0.3
+
+
+def test_the_same_seed_gives_the_same_numbers_wherever_it_runs():
+    run = large.tag_runs(PLAN, CASES["1 ms slots"])[1]
+    one, other = large.run_large(run), large.run_large(run)
+    assert one.fixes == other.fixes
+    np.testing.assert_array_equal(one.errors_m, other.errors_m)
