@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from node_stage import receptions
 
+from skyless.air.beacon2 import Beacon2, SlotTime
 from skyless.air.codec import decode
+from skyless.air.codec2 import encode_2
 from skyless.errors import SkylessError
 from skyless.nodes.fix_log import Latencies, PhaseLog
 from skyless.nodes.process import Usage, data_folder, every, new_recording, recordings_folder, resident_bytes, together
@@ -76,6 +79,16 @@ def test_the_phase_log_does_not_grow_while_one_superframe_goes_on_for_ever():
     other = next(r for r in receptions(0.2) if decode(r.frame).superframe != decode(first.frame).superframe)
     phases.add(other.frame, 1.0, 1.0, made_fix=False)
     assert len(phases.last) == 64
+
+
+def test_phases_of_slots_that_no_master_keeps():
+    phases = PhaseLog()
+    for superframe, slot in ((7, 0), (7, 3), (8, 1)):
+        slot_time = SlotTime(superframe, slot, root=5, term=0, hop=1, pulse_age=0, rate=0.0)
+        beacon = Beacon2(1, 20 + slot, 0, 0, 0, slot_time, None, None, (), 0, None)
+        phases.add(encode_2(beacon), superframe + 0.001 * slot, superframe + 0.001 * slot + 1e-4, made_fix=True)
+        phases.add(encode_2(replace(beacon, slot_time=None)), superframe, superframe, made_fix=False)
+    assert [(phase.superframe, phase.slot, phase.anchor) for phase in phases.last] == [(7, 0, 20), (7, 3, 23)]
 
 
 # Usage

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from skyless.air.beacon import Malformed
-from skyless.air.codec import decode_cached
+from skyless.air.beacon2 import Beacon2
+from skyless.air.frames import decode_any
 from skyless.mqtt.fix_message import fix_message
 from skyless.mqtt.messages import Counters, FixMessage, Phase, TagHealth
 from skyless.nodes.process import HEALTH_S
@@ -136,16 +137,19 @@ class PhaseLog:
 
     def add(self, frame: bytes, ended_s: float, done_s: float, *, made_fix: bool) -> None:
         """Add one frame: when it ended, and when its processing did, by the host's monotonic clock."""
-        beacon = decode_cached(frame)
+        beacon = decode_any(frame)
         if isinstance(beacon, Malformed):
             return
-        if beacon.superframe != self._superframe:
+        sent = beacon.slot_time if isinstance(beacon, Beacon2) else beacon
+        if sent is None:  # sent at a random instant
+            return
+        if sent.superframe != self._superframe:
             self.last = tuple(self._present)
             self._present.clear()
-            self._superframe, self._begin_s = beacon.superframe, ended_s
+            self._superframe, self._begin_s = sent.superframe, ended_s
         if len(self._present) >= _MOST_PHASES:
             return
         begin_s = self._begin_s
         self._present.append(
-            Phase(beacon.superframe, beacon.slot, beacon.anchor, ended_s - begin_s, done_s - begin_s, made_fix)
+            Phase(sent.superframe, sent.slot, beacon.anchor, ended_s - begin_s, done_s - begin_s, made_fix)
         )
