@@ -13,9 +13,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from skyless.cli.common.simulated_site import check_live
 from skyless.cli.main import main
 from skyless.cli.simulate import FIXES_CSV_COLUMNS
 from skyless.site.lab import lab_site
+from skyless.site.load import load_site
 
 C = 299_792_458.0
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "simulate"]
@@ -310,6 +312,13 @@ def test_anchors_without_a_position_are_not_simulated(run, tmp_path):
     code, out, err = run("--site", protocol_2(tmp_path, CORNERS + new), "--duration", "3", "--json")
     assert (code, err) == (0, "not simulated, as the site file has no position: anchor 7, 8\n")
     assert json.loads(out)["fixes"] > 0
+
+
+def test_a_site_too_large_for_real_time_is_warned_of(tmp_path, capsys):
+    large = "".join(f"[[anchors]]\nid = {k}\nx_m = {15 * k}\ny_m = 0\n" for k in range(140))
+    for anchors, warned in ((large, True), (CORNERS, False)):
+        check_live(load_site(protocol_2(tmp_path, anchors)))
+        assert ("140 anchors send 4200 beacons/s" in capsys.readouterr().err) is warned
 
 
 def test_tags_without_a_fix_are_counted(run):

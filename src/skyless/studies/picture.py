@@ -96,6 +96,7 @@ def draw(look: Look, rows: Sequence[Row]) -> Figure:
     """Draw the rows of a study; error bars are standard errors."""
     with report_style():
         series = [(name, list(group)) for name, group in groupby(rows, key=lambda row: row.series)]
+        series = [(name, group) for name, group in series if _has_values(group, look)] or series
         heights = [_CURVE_IN if _is_curve(group) else 0.8 + _BAR_IN * len(group) for _, group in series]
         figure = Figure(figsize=(_WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
         methods = ", ".join(dict.fromkeys(row.method for row in rows))
@@ -110,6 +111,11 @@ def draw(look: Look, rows: Sequence[Row]) -> Figure:
                     axes.set_yticklabels([])
             line[0].set_title(name, loc="left")
     return figure
+
+
+def _has_values(rows: Sequence[Row], look: Look) -> bool:
+    """Whether any panel shows something of these rows; cold starts, for one, have no errors."""
+    return any(_PANELS[panel].value(row) is not None for panel in look.panels for row in rows)
 
 
 def _is_curve(rows: Sequence[Row]) -> bool:

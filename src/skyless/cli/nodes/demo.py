@@ -22,7 +22,7 @@ from skyless.cli.common.options import (
 )
 from skyless.cli.common.output import console, number, print_json
 from skyless.cli.common.progress import loading_kernels
-from skyless.cli.common.simulated_site import check_simulated
+from skyless.cli.common.simulated_site import check_live
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, log, site_named
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
@@ -126,7 +126,7 @@ def _settings(asked: DemoOptions) -> "SiteRun":
         raise SkylessError("--mqtt-ca is for another broker; give it together with --mqtt")
     name = f"lab:{asked.noise_ps:g}" if asked.site is None else str(asked.site.absolute())
     site = site_named(name)
-    check_simulated(site, asked.method)
+    check_live(site, asked.method)
     folder = recordings_folder()
     return SiteRun(
         site=site,
