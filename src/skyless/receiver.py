@@ -387,10 +387,10 @@ class Receiver:
                 self._observer.set_method(self._method, schedule)
 
     def _choose_method_2(self) -> None:
-        """Make the method that the common pages require, unless it is in use already."""
+        """Make the method that the common pages require, unless it is in use already; the schedule is no matter."""
         pages = self.local_almanac.pages
         assert pages is not None
-        method_key = (pages.site.superframe_ticks, pages.site.tag_height_m, pages.noise, pages.accuracy)
+        method_key = (pages.site.tag_height_m, pages.noise, pages.accuracy)
         if method_key != self._method_key:
             self._method_key = method_key
             self._method = new_method_2(self._options, pages, self._time)
