@@ -31,7 +31,13 @@ from skyless.positioning.methods.observations import (
     observe_2,
     variance_factor,
 )
-from skyless.positioning.methods.selection import AnchorSelection, AnchorSelectionState, is_full
+from skyless.positioning.methods.selection import (
+    LEAST_FITTING,
+    AnchorSelection,
+    AnchorSelectionState,
+    fitting_relays,
+    is_full,
+)
 from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
 from skyless.positioning.observation import Observation
 from skyless.site.almanac_pages import AlmanacAssembly, AlmanacState
@@ -234,10 +240,17 @@ class Receiver:
         if diagnostics is not None and diagnostics.rx_power_dbm is not None:
             self._selection.add_power(anchor, diagnostics.rx_power_dbm)
         method = self._method
-        is_known = not isinstance(method, Estimation) or method.is_starting or method.estimator.has_anchor(anchor)
-        if is_known:
+        was_starting = not isinstance(method, Estimation) or method.is_starting
+        in_use = isinstance(method, Estimation) and not was_starting and method.estimator.has_anchor(anchor)
+        is_confirmed = in_use or self._selection.is_confirmed(anchor, rx_ticks)
+        if not is_confirmed and not was_starting:
+            fitting = fitting_relays(relays, tx_ticks, rx_ticks, self._packet_in_use)
+            if fitting >= LEAST_FITTING:
+                self._selection.confirm(anchor, rx_ticks)
+                is_confirmed = True
+        if is_confirmed or was_starting:
             self._selection.add_relays(relays, rx_ticks)
-        if self.local_almanac.on_beacon(beacon, rx_ticks, self._selection.is_confirmed(anchor, rx_ticks)):
+        if self.local_almanac.on_beacon(beacon, rx_ticks, is_confirmed):
             self._choose_method_2()
         anchor_m = self.local_almanac.position_m(anchor)
         if anchor_m is None:
@@ -256,7 +269,16 @@ class Receiver:
         self._waiting = []
         if not self._may_join(self._method, observation):
             return NoFixReason.TOO_FEW_ANCHORS
-        return self._method.update(observation)
+        result = self._method.update(observation)
+        if was_starting and not self._method.is_starting:
+            self._selection.forget_times()  # from now on what anchors in use have received counts, and what those have
+        return result
+
+    def _packet_in_use(self, anchor: int) -> tuple[int, int] | None:
+        """Sequence number and own RX stamp of the last beacon of an anchor in use."""
+        track = self._stamps.tracks.of_anchor.get(anchor)
+        in_use = isinstance(self._method, Estimation) and self._method.estimator.has_anchor(anchor)
+        return (track.sequence, track.rx_ticks_tag) if track is not None and in_use else None
 
     def _may_join(self, method: Estimation, observation: Observation) -> bool:
         """Whether an anchor is in use or may be: others have received it, and it is not weaker than 24 in use."""
@@ -387,10 +409,10 @@ class Receiver:
                 self._observer.set_method(self._method, schedule)
 
     def _choose_method_2(self) -> None:
-        """Make the method that the common pages require, unless it is in use already."""
+        """Make the method that the common pages require, unless it is in use already; the schedule is no matter."""
         pages = self.local_almanac.pages
         assert pages is not None
-        method_key = (pages.site.superframe_ticks, pages.site.tag_height_m, pages.noise, pages.accuracy)
+        method_key = (pages.site.tag_height_m, pages.noise, pages.accuracy)
         if method_key != self._method_key:
             self._method_key = method_key
             self._method = new_method_2(self._options, pages, self._time)

@@ -17,7 +17,7 @@ from skyless.air.codec2 import encode_2
 from skyless.positioning.fix import NoFixReason
 from skyless.receiver import NOT_DROPS, Receiver
 from skyless.recordings.mcap.checkpoint import load, save
-from skyless.site.local_almanac import site_issue, site_pages_of
+from skyless.site.local_almanac import site_issue, site_page_for, site_pages_of
 from skyless.site.model import GeoreferenceSite
 from skyless.ticks import from_seconds, wrap
 
@@ -187,6 +187,18 @@ def test_forged_stamps_under_the_name_of_an_anchor_are_dropped():
     assert counters["anchor-restart"] == 0
 
 
+def test_a_copy_of_a_beacon_under_another_name_is_not_there():
+    """With all that the anchor has relayed, 40 times a second, some milliseconds later."""
+    honest = free_tape()[::8]
+
+    def copy(n, _):
+        beacon = beacon_of(honest[min(n * len(honest) // 80, len(honest) - 1)])
+        return replace(beacon, anchor=STRANGER, position=StatedPosition(50.0, 50.0, 1.0), sequence=n & 0xFF)
+
+    counters = undisturbed(false_frames(40.0, copy, 2.0, 0.3))
+    assert counters["unconfirmed-anchor"] + counters["impossible-stamp"] > 40
+
+
 def test_a_flood_of_identifiers_does_not_displace_the_anchors():
     counters = undisturbed(
         false_frames(
@@ -233,6 +245,25 @@ def test_changed_pages_are_used_when_most_anchors_state_them():
     made = fixes_of(receiver, mixed)
     assert receiver.local_almanac.pages.georeference.latitude_deg == 48.0
     assert len(made) > 550  # nothing that the estimator assumes has changed: it has gone on
+
+
+@pytest.mark.parametrize(("rate_hz", "height_m", "goes_on"), [(50.0, 0.0, True), (60.0, 0.2, False)])
+def test_another_schedule_restarts_nothing_but_another_height_does(rate_hz, height_m, goes_on):
+    schedule = replace(FREE.schedule, rate_hz=rate_hz)
+    changed = site_pages_of(replace(FREE, schedule=schedule, tags=replace(FREE.tags, height_m=height_m)))
+    receiver = Receiver()
+    fixes_of(receiver, [one for one in free_tape() if one.host_s < 1.0])
+    before = receiver.method
+    later = [
+        with_beacon(
+            one, almanac_issue=site_issue(changed), page=site_page_for(changed, beacon_of(one).sequence, one.anchor)
+        )
+        for one in free_tape()
+        if one.host_s >= 1.0
+    ]
+    assert len(fixes_of(receiver, later)) > 100
+    assert receiver.local_almanac.issue == site_issue(changed)
+    assert (receiver.method is before) == goes_on
 
 
 def test_a_tag_from_a_checkpoint_goes_on_with_the_same_bits():

@@ -7,11 +7,11 @@ import subprocess
 import sys
 import time
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
 from node_stage import receptions
 
 from skyless.air.beacon2 import Beacon2, SlotTime
@@ -71,6 +71,17 @@ def test_the_book_of_phases_shows_the_last_whole_superframe():
     assert {phase.fix for phase in phases.last} == {True, False}
 
 
+def test_frames_of_protocol_2_have_phases_where_they_have_slots():
+    phases, free = PhaseLog(), Beacon2(1, 7, 0, 0, 0, None, None, None, (), 0, None)
+    for superframe in (5, 6, 7):
+        for slot in (0, 3):
+            slot_time = SlotTime(superframe, slot, 1, 0, 0, 0, 0.0)
+            frame = encode_2(msgspec.structs.replace(free, anchor=10 + slot, slot_time=slot_time))
+            phases.add(frame, superframe + 0.1 * slot, superframe + 0.1 * slot + 0.01, made_fix=True)
+            phases.add(encode_2(free), superframe + 0.1 * slot + 0.05, superframe + 0.1 * slot + 0.06, made_fix=True)
+    assert [(phase.superframe, phase.slot, phase.anchor) for phase in phases.last] == [(6, 0, 10), (6, 3, 13)]
+
+
 def test_the_phase_log_does_not_grow_while_one_superframe_goes_on_for_ever():
     phases = PhaseLog()
     first, *_ = receptions(0.1)
@@ -79,16 +90,6 @@ def test_the_phase_log_does_not_grow_while_one_superframe_goes_on_for_ever():
     other = next(r for r in receptions(0.2) if decode(r.frame).superframe != decode(first.frame).superframe)
     phases.add(other.frame, 1.0, 1.0, made_fix=False)
     assert len(phases.last) == 64
-
-
-def test_phases_of_slots_that_no_master_keeps():
-    phases = PhaseLog()
-    for superframe, slot in ((7, 0), (7, 3), (8, 1)):
-        slot_time = SlotTime(superframe, slot, root=5, term=0, hop=1, pulse_age=0, rate=0.0)
-        beacon = Beacon2(1, 20 + slot, 0, 0, 0, slot_time, None, None, (), 0, None)
-        phases.add(encode_2(beacon), superframe + 0.001 * slot, superframe + 0.001 * slot + 1e-4, made_fix=True)
-        phases.add(encode_2(replace(beacon, slot_time=None)), superframe, superframe, made_fix=False)
-    assert [(phase.superframe, phase.slot, phase.anchor) for phase in phases.last] == [(7, 0, 20), (7, 3, 23)]
 
 
 # Usage

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from skyless.air.beacon import Malformed
+from skyless.air.beacon import Beacon, Malformed
 from skyless.air.beacon2 import Beacon2
 from skyless.air.frames import decode_any
 from skyless.mqtt.fix_message import fix_message
@@ -136,20 +136,21 @@ class PhaseLog:
         self.last: tuple[Phase, ...] = ()
 
     def add(self, frame: bytes, ended_s: float, done_s: float, *, made_fix: bool) -> None:
-        """Add one frame: when it ended, and when its processing did, by the host's monotonic clock."""
+        """Add one frame: when it ended, and when its processing did, by the host's monotonic clock.
+
+        Frames without slots, of anchors that send at random instants, are left out.
+        """
         beacon = decode_any(frame)
-        if isinstance(beacon, Malformed):
+        when = beacon if isinstance(beacon, Beacon) else beacon.slot_time if isinstance(beacon, Beacon2) else None
+        if when is None or isinstance(beacon, Malformed):
             return
-        sent = beacon.slot_time if isinstance(beacon, Beacon2) else beacon
-        if sent is None:  # sent at a random instant
-            return
-        if sent.superframe != self._superframe:
+        if when.superframe != self._superframe:
             self.last = tuple(self._present)
             self._present.clear()
-            self._superframe, self._begin_s = sent.superframe, ended_s
+            self._superframe, self._begin_s = when.superframe, ended_s
         if len(self._present) >= _MOST_PHASES:
             return
         begin_s = self._begin_s
         self._present.append(
-            Phase(sent.superframe, sent.slot, beacon.anchor, ended_s - begin_s, done_s - begin_s, made_fix)
+            Phase(when.superframe, when.slot, beacon.anchor, ended_s - begin_s, done_s - begin_s, made_fix)
         )
