@@ -179,9 +179,10 @@ def _named(axes: Axes, panel: _Panel, rows: list[Row], values: Array, errors: Ar
         else:
             axes.barh(row_y, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
     wide = np.nanmax(values, initial=0.0) > _WIDE_RATIO * np.nanmin(values, initial=np.inf)
-    if (wide if panel.log is None else panel.log) and np.isfinite(values).any():
+    positive = values[values > 0.0]  # a logarithmic axis has no 0
+    if (wide if panel.log is None else panel.log) and len(positive):
         axes.set_xscale("log")
-        axes.set_xlim(left=0.6 * float(np.nanmin(values)))
+        axes.set_xlim(left=0.6 * float(positive.min()))
         _plain_numbers(axes.xaxis, between=panel.log is None)
     axes.set_yticks(rows_y, [row.case for row in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
