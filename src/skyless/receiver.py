@@ -17,6 +17,7 @@ from skyless.air.frames import AnyBeacon, decode_any
 from skyless.air.master_term import FollowedMaster
 from skyless.air.reception import Diagnostics, Reception
 from skyless.air.site_choice import SiteChoice, SiteKey, SiteUse
+from skyless.constants import TICK_S
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
@@ -35,7 +36,7 @@ from skyless.positioning.methods.selection import AnchorSelection, AnchorSelecti
 from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
 from skyless.positioning.observation import Observation
 from skyless.site.almanac_pages import AlmanacAssembly, AlmanacState
-from skyless.site.local_almanac import LocalAlmanac, LocalAlmanacState
+from skyless.site.local_almanac import LEAST_ANCHORS, LocalAlmanac, LocalAlmanacState
 from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 
@@ -209,7 +210,7 @@ class Receiver:
             result = self._process(beacon, reception, rx_ticks, tx_ticks)
         if isinstance(result, Fix):
             self.counters["fixes"] += 1
-            self._choice.fix_ticks = rx_ticks
+            self._choice.on_fix(rx_ticks)
             return result
         self.reason = result
         if result is NoFixReason.RESIDUALS:
@@ -233,9 +234,7 @@ class Receiver:
         anchor, relays = beacon.anchor, packed_relays_2(beacon)
         if diagnostics is not None and diagnostics.rx_power_dbm is not None:
             self._selection.add_power(anchor, diagnostics.rx_power_dbm)
-        method = self._method
-        is_known = not isinstance(method, Estimation) or method.is_starting or method.estimator.has_anchor(anchor)
-        if is_known:
+        if self._is_trusted(anchor, rx_ticks):
             self._selection.add_relays(relays, rx_ticks)
         if self.local_almanac.on_beacon(beacon, rx_ticks, self._selection.is_confirmed(anchor, rx_ticks)):
             self._choose_method_2()
@@ -257,6 +256,18 @@ class Receiver:
         if not self._may_join(self._method, observation):
             return NoFixReason.TOO_FEW_ANCHORS
         return self._method.update(observation)
+
+    def _is_trusted(self, anchor: int, rx_ticks: int) -> bool:
+        """Whether what an anchor relays confirms others: it is in use, or too few of those that are still come in.
+
+        A tag may come to where its anchors do not receive the next ones, through a steel door or out of a lift.
+        """
+        method = self._method
+        if not isinstance(method, Estimation) or method.is_starting or method.estimator.has_anchor(anchor):
+            return True
+        anchors, drop_s = method.estimator.state.anchors, method.estimator.state.settings[0]["drop_s"]
+        is_present = (anchors["packets"] > 0) & ((rx_ticks - anchors["rx_ticks"]) * TICK_S <= drop_s)
+        return int(np.count_nonzero(is_present)) < LEAST_ANCHORS
 
     def _may_join(self, method: Estimation, observation: Observation) -> bool:
         """Whether an anchor is in use or may be: others have received it, and it is not weaker than 24 in use."""
@@ -310,7 +321,7 @@ class Receiver:
         if isinstance(beacon, Beacon) and beacon.anchor not in self._positions and self.almanac.complete:
             self.counters["unknown-anchor"] += 1
             return None
-        tx_ticks = self._stamps.unwrap(beacon, rx_ticks)
+        tx_ticks = self._stamps.unwrap(beacon, rx_ticks, self._superframe_ticks)
         if tx_ticks is None:
             return None
         self._choice.heard_ticks = rx_ticks
@@ -322,13 +333,13 @@ class Receiver:
     def _restart(self, rx_ticks: int) -> bool:
         """Forget all stamps, as the tag's counter restarted; False where the host's clock jumped by over a year."""
         self._forget_stamps()
-        self._choice.forget_times()
         if abs(rx_ticks) <= LAST_TICKS:
             self.counters["counter-jump"] += 1
-            self._choice.heard_ticks = rx_ticks
+            self._choice.restart(rx_ticks)
             return True
         self.counters["impossible-host-time"] += 1
-        self._own_ticks, self._choice.heard_ticks = Unwrapper(), 0
+        self._own_ticks = Unwrapper()
+        self._choice.restart(0)
         return False
 
     def _is_of_site(self, beacon: AnyBeacon, rx_ticks: int) -> bool:
@@ -339,7 +350,7 @@ class Receiver:
         if use is SiteUse.CHANGED and had_site:
             self.counters["site-change"] += 1
             self.almanac, self.local_almanac = AlmanacAssembly(), LocalAlmanac()
-            self._positions = {}
+            self._positions, self._superframe_ticks = {}, 0
             self._forget_stamps()
         return use is not SiteUse.FOREIGN
 
@@ -392,7 +403,7 @@ class Receiver:
         assert pages is not None
         method_key = (pages.site.superframe_ticks, pages.site.tag_height_m, pages.noise, pages.accuracy)
         if method_key != self._method_key:
-            self._method_key = method_key
+            self._method_key, self._superframe_ticks = method_key, pages.site.superframe_ticks
             self._method = new_method_2(self._options, pages, self._time)
 
 

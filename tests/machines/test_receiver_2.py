@@ -269,3 +269,40 @@ def test_fixes_follow_one_another_by_the_tags_own_clock():
     assert all(later > earlier for earlier, later in pairwise(times))
     assert times[-1] - times[0] == pytest.approx(free_tape()[-1].host_s, abs=0.1)
     assert np.isfinite(times).all()
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 1.5])
+def test_a_tag_comes_to_anchors_that_none_of_its_own_has_received(pause_s):
+    """Through a steel door, or out of a lift: both groups have the same site, and none relays the other's beacons."""
+    others = replace(FREE, anchors=tuple(replace(anchor, id=anchor.id + 100) for anchor in FREE.anchors))
+    first, then = free_tape(), free_tape(others, seed=2, seconds=4.0 + pause_s)
+    zero = wrap(first[0].rx_ticks - from_seconds(first[0].host_s) - then[0].rx_ticks + from_seconds(then[0].host_s))
+    moved = [
+        replace_heard(one, one.anchor, one.frame, wrap(one.rx_ticks + zero), one.host_s)
+        for one in then
+        if one.host_s > 2.0 + pause_s
+    ]
+    receiver, latest_s = Receiver(), []
+    for one in (*first, *moved):
+        fix = receiver.hear(one.reception)
+        if fix is not None:
+            latest_s.append(one.host_s)
+            assert_honest(fix, one.truth_m)
+    seconds = np.array(latest_s)
+    assert np.min(seconds[seconds > 2.0]) < 2.0 + max(1.0, pause_s) + 0.2
+    assert np.count_nonzero(seconds > 3.2 + pause_s) > 200
+
+
+def test_a_foreign_site_of_more_anchors_delays_the_first_fix_but_does_not_hold_the_tag():
+    """It gives no fix: its anchors do not receive each other."""
+    heard = free_tape(seconds=6.0)
+    falses = [
+        replace_heard(one, 0, encode_2(a_beacon(
+            site=77, anchor=200 + n % 9, sequence=n // 9 & 0xFF, tx_ticks=wrap(from_seconds(one.host_s))
+        )), wrap(one.rx_ticks + from_seconds(0.9e-3)), one.host_s + 0.9e-3)
+        for n, one in enumerate(heard)
+    ]  # fmt: skip
+    receiver = Receiver()
+    made = fixes_of(receiver, merged(heard, falses))
+    assert receiver.site == FREE.id
+    assert min(one.host_s for one in heard if (one.frame, one.rx_ticks) in made) < 5.3
