@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.air.beacon2 import Beacon2, SlotTime, StatedSiteTime
+from skyless.air.beacon2 import SlotTime, StatedSiteTime
 from skyless.clocks.composed_time import ComposedTime
 from skyless.clocks.composition import MEAN_LATE_TICKS, by_parent
 from skyless.clocks.filter import clock_noise, stamp_variance_m2
-from skyless.clocks.tag_time import TagTime
 from skyless.constants import SUBTICKS, TICK_M, TICK_S
 from skyless.site.slots import Schedule
 from skyless.ticks import WRAP_TICKS, wrap
@@ -200,19 +199,8 @@ def test_one_step_of_the_stated_time_is_left_out_and_a_lasting_one_accepted():
 def test_nothing_is_known_before_a_beacon():
     time = composed()
     assert not time.is_known
-    assert not time.is_settled(0)
     with pytest.raises(ValueError, match="not known yet"):
         time.subticks(0)
-
-
-def test_settled_only_when_the_rate_is_known():
-    time, link = composed(), Link()
-    time.set_parents([1])
-    link.beacon(time, 0)
-    assert not time.is_settled(link.receiver(SCHEDULE.slot_start_ticks(1, 0)))
-    link.beacon(time, 1)
-    link.beacon(time, 2)
-    assert time.is_settled(link.receiver(SCHEDULE.slot_start_ticks(3, 0)))
 
 
 def test_restart_forgets_the_timeline_and_keeps_the_pairs():
@@ -240,23 +228,3 @@ def test_variance_grows_with_age_delay_and_the_parents(stated, hop, age_s, delay
 def test_a_child_of_the_root_has_its_filters_variance():
     pair = (4e-4, 1e-3, 3e-2)
     assert sum(by_parent(0.0, 0, 0.0, 0.0, pair, NOISE.white, NOISE.walk)) == pytest.approx(pair[0])
-
-
-def test_a_tag_knows_the_site_time_from_three_anchors():
-    counters = Counter()
-    tag = TagTime(NOISE, VARIANCE_M2, SCHEDULE, counters)
-    links = {anchor: Link(sender_ppm=anchor, sender_start=anchor << 33) for anchor in range(1, 6)}
-    assert tag.at(0) is None
-    for superframe in range(40):
-        for anchor, link in links.items():
-            at = SCHEDULE.slot_start_ticks(superframe, anchor)
-            claim = SlotTime(superframe, anchor, 9, 0, 2, 0, link.sender_rate)
-            beacon = Beacon2(
-                1, anchor, superframe, wrap(link.sender(at)), 0, claim, None, StatedSiteTime(0.0, 3.0), (), 0, None
-            )
-            accepted = tag.on_beacon(beacon, link.receiver(at) + 1000, RANGE_M)
-            assert accepted == (anchor <= 3)
-    later = SCHEDULE.slot_start_ticks(40, 0)
-    subticks, variance_m2 = tag.at(links[1].receiver(later))
-    assert subticks / SUBTICKS == pytest.approx(later, abs=1.5)
-    assert 3.0 * TICK_M < math.sqrt(variance_m2) < 8.0 * TICK_M
