@@ -164,7 +164,7 @@ class Receiver:
             if state.choice.key.version == 1:
                 made._choose_method()
             else:
-                made._choose_method_2()
+                made._choose_method_2(state.superframe_ticks)
         match made._method, state.method:
             case Estimation() as method, EstimationState() as saved:
                 method.restore(saved)
@@ -397,14 +397,18 @@ class Receiver:
                 self._method = new_method(options, master, schedule_page, noise, accuracy, self._time)
                 self._observer.set_method(self._method, schedule)
 
-    def _choose_method_2(self) -> None:
-        """Make the method that the common pages require, unless it is in use already."""
+    def _choose_method_2(self, superframe_ticks: int | None = None) -> None:
+        """Make the method that the common pages require, unless it is in use already; the schedule is no matter.
+
+        ``superframe_ticks``: that with which the method was made, where it continues from a state.
+        """
         pages = self.local_almanac.pages
         assert pages is not None
-        method_key = (pages.site.superframe_ticks, pages.site.tag_height_m, pages.noise, pages.accuracy)
+        method_key = (pages.site.tag_height_m, pages.noise, pages.accuracy)
         if method_key != self._method_key:
-            self._method_key, self._superframe_ticks = method_key, pages.site.superframe_ticks
-            self._method = new_method_2(self._options, pages, self._time)
+            self._method_key = method_key
+            self._superframe_ticks = superframe_ticks or pages.site.superframe_ticks
+            self._method = new_method_2(self._options, pages, self._superframe_ticks, self._time)
 
 
 def _variance_scale(diagnostics: Diagnostics) -> float:

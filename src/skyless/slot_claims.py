@@ -50,14 +50,14 @@ PARENT_BONUS_HOPS: Final = 0.5
 PARENT_BONUS_DB: Final = 6.0
 """A parent is replaced only by a neighbour that is better by more than one of these."""
 
-SILENCE_SUPERFRAMES: Final = 1
-"""From the last frame in one phase to the first in another, at least."""
+SILENCE_SUPERFRAMES: Final = 0.5
+"""From the last frame in one phase to the first in another, at least; what spreads waits for it at each hop."""
 MISFITS_BEFORE_CHANGE: Final = 3
 """After this many beacons of the own claim in a row that are out of phase and have news, the own phase is wrong."""
 MOST_CHANGES: Final = 8.0
 CHANGES_PER_SUPERFRAME: Final = 1.0 / 16.0
-"""Changes of phase that an anchor makes at once, and on average: each costs a superframe of silence, and whoever
-forges claims must not silence the site."""
+"""Changes of phase that an anchor makes at once, and on average: each costs a frame or two, and forged claims must not
+silence the site."""
 
 _PULSE_BITS: Final = 32
 _PULSE_HALF: Final = 1 << (_PULSE_BITS - 1)
@@ -370,7 +370,7 @@ class SlotClaims:
             self._begin_silence(self._sent_ticks)
 
     def _begin_silence(self, sent_ticks: int) -> None:
-        self._silent_until_ticks = sent_ticks + SILENCE_SUPERFRAMES * self._superframe_ticks
+        self._silent_until_ticks = sent_ticks + round(SILENCE_SUPERFRAMES * self._superframe_ticks)
 
 
 def _rank(name: int, one: _Neighbour, is_parent: bool) -> tuple[int, float, int]:

@@ -17,7 +17,7 @@ from skyless.air.codec2 import encode_2
 from skyless.positioning.fix import NoFixReason
 from skyless.receiver import NOT_DROPS, Receiver
 from skyless.recordings.mcap.checkpoint import load, save
-from skyless.site.local_almanac import site_issue, site_pages_of
+from skyless.site.local_almanac import site_issue, site_page_for, site_pages_of
 from skyless.site.model import GeoreferenceSite
 from skyless.ticks import from_seconds, wrap
 
@@ -235,6 +235,25 @@ def test_changed_pages_are_used_when_most_anchors_state_them():
     assert len(made) > 550  # nothing that the estimator assumes has changed: it has gone on
 
 
+@pytest.mark.parametrize(("rate_hz", "height_m", "goes_on"), [(50.0, 0.0, True), (60.0, 0.2, False)])
+def test_another_schedule_restarts_nothing_but_another_height_does(rate_hz, height_m, goes_on):
+    schedule = replace(FREE.schedule, rate_hz=rate_hz)
+    changed = site_pages_of(replace(FREE, schedule=schedule, tags=replace(FREE.tags, height_m=height_m)))
+    receiver = Receiver()
+    fixes_of(receiver, [one for one in free_tape() if one.host_s < 1.0])
+    before = receiver.method
+    later = [
+        with_beacon(
+            one, almanac_issue=site_issue(changed), page=site_page_for(changed, beacon_of(one).sequence, one.anchor)
+        )
+        for one in free_tape()
+        if one.host_s >= 1.0
+    ]
+    assert len(fixes_of(receiver, later)) > 100
+    assert receiver.local_almanac.issue == site_issue(changed)
+    assert (receiver.method is before) == goes_on
+
+
 def test_a_tag_from_a_checkpoint_goes_on_with_the_same_bits():
     heard, whole = free_tape(), Receiver()
     for cut in (3, 12, 40, 400):
@@ -245,6 +264,28 @@ def test_a_tag_from_a_checkpoint_goes_on_with_the_same_bits():
         rest = heard[cut : cut + 60]
         assert fixes_of(again, rest) == fixes_of(whole, rest)
         assert again.counters == whole.counters
+
+
+def test_a_checkpoint_after_a_change_of_the_schedule_goes_on_with_the_same_bits():
+    """The method goes on as it was made, also where anchors are silent for longer than it allows."""
+    slower = replace(FREE, schedule=replace(FREE.schedule, rate_hz=1.1))
+    pages = site_pages_of(slower)
+    changed = [
+        with_beacon(
+            one, almanac_issue=site_issue(pages), page=pages[(beacon_of(one).sequence + one.anchor) % len(pages)]
+        )
+        if one.host_s > 1.0
+        else one
+        for one in free_tape(seconds=4.0)
+    ]
+    cut = next(k for k, one in enumerate(changed) if one.host_s > 1.5)
+    whole = Receiver()
+    fixes_of(whole, changed[:cut])
+    assert whole.local_almanac.issue == site_issue(pages)
+    again = load(save(whole))
+    silent = {anchor.id for anchor in FREE.anchors[:2]}
+    rest = [one for one in changed[cut:] if one.anchor not in silent or one.host_s > 2.8]
+    assert fixes_of(again, rest) == fixes_of(whole, rest)
 
 
 def test_relays_of_a_weak_first_path_are_not_used():

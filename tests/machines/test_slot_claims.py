@@ -15,6 +15,7 @@ from skyless.slot_claims import (
     MOST_PARENTS,
     MOST_PATIENCE,
     MOST_TERM,
+    SILENCE_SUPERFRAMES,
     TURNS,
     ClaimVerdict,
     Lead,
@@ -69,7 +70,7 @@ class CheckedGraph(ClaimGraph):
         if sent is before:
             return
         if before is not None and sent.epoch_ticks != before.epoch_ticks:
-            assert sent.ticks - before.ticks >= S, "no silence before another phase"
+            assert sent.ticks - before.ticks >= SILENCE_SUPERFRAMES * S, "no silence before another phase"
         claim = machine.claim
         if self.root_boots.get(claim) == self.boots[claim.root] == 1:  # else it may lead the same claim once more
             assert self.epoch_of.setdefault(claim, sent.epoch_ticks) == sent.epoch_ticks, "two phases in one claim"

@@ -7,13 +7,16 @@ import subprocess
 import sys
 import time
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from node_stage import receptions
 
+from skyless.air.beacon2 import Beacon2, SlotTime
 from skyless.air.codec import decode
+from skyless.air.codec2 import encode_2
 from skyless.errors import SkylessError
 from skyless.nodes.fix_log import Latencies, PhaseLog
 from skyless.nodes.process import Usage, data_folder, every, new_recording, recordings_folder, resident_bytes, together
@@ -66,6 +69,17 @@ def test_the_book_of_phases_shows_the_last_whole_superframe():
         assert phase.heard_s == pytest.approx(reception.host_s - inside[0].host_s)
         assert phase.done_s == pytest.approx(phase.heard_s + 1e-4)
     assert {phase.fix for phase in phases.last} == {True, False}
+
+
+def test_frames_of_protocol_2_have_phases_where_they_have_slots():
+    phases, free = PhaseLog(), Beacon2(1, 7, 0, 0, 0, None, None, None, (), 0, None)
+    for superframe in (5, 6, 7):
+        for slot in (0, 3):
+            slot_time = SlotTime(superframe, slot, 1, 0, 0, 0, 0.0)
+            frame = encode_2(msgspec.structs.replace(free, anchor=10 + slot, slot_time=slot_time))
+            phases.add(frame, superframe + 0.1 * slot, superframe + 0.1 * slot + 0.01, made_fix=True)
+            phases.add(encode_2(free), superframe + 0.1 * slot + 0.05, superframe + 0.1 * slot + 0.06, made_fix=True)
+    assert [(phase.superframe, phase.slot, phase.anchor) for phase in phases.last] == [(6, 0, 10), (6, 3, 13)]
 
 
 def test_the_phase_log_does_not_grow_while_one_superframe_goes_on_for_ever():

@@ -118,7 +118,11 @@ def changed(state, path, value):
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        (["site"], "1"),
+        (["choice", "only_site"], "1"),
+        (["choice", "anchors"], [1]),
+        (["local_almanac", "anchors"], [1]),
+        (["selection", "power_dbm"], {"1": "loud"}),
+        (["waiting"], [1]),
         (["options", "method"], "tracker"),
         (["options", "integrity", "risk"], 0.5),
         (["reason"], "bored"),

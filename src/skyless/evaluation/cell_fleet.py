@@ -101,8 +101,11 @@ class CellFleet(TagFleet):
         seed: int,
         settings: FleetSettings,
         survey_std_m: float = 0.0,
+        only: Sequence[int] | None = None,
     ) -> None:
         """``survey_std_m``: true less stated positions of the anchors, per axis.
+
+        ``only``: the tags that are simulated here; others may be in other processes, with the same results.
 
         Raises:
             ValueError: an impairment that is not modelled, or a site without slots.
@@ -111,6 +114,7 @@ class CellFleet(TagFleet):
         self.cells = CellWorld(
             anchors_of(site), schedule_in_cells(site), trajectories, impairments, seed, survey_std_m=survey_std_m
         )
+        self._only = range(len(trajectories)) if only is None else only
         self._beacons = SiteBeacons(site)
         self._now_s = 0.0
         self._received = 0
@@ -129,7 +133,7 @@ class CellFleet(TagFleet):
         """Let true time pass; every fix of every tag, tag by tag within each half second."""
         while self._now_s < until_s:
             end_s = min(self._now_s + self.step_s, until_s)
-            for tag in range(len(self.receivers)):
+            for tag in self._only:
                 received = self.cells.receptions(tag, self._now_s, end_s)
                 self._received += len(received)
                 truths_m: Array = received.positions_m

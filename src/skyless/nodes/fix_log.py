@@ -5,8 +5,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from skyless.air.beacon import Malformed
-from skyless.air.codec import decode_cached
+from skyless.air.beacon import Beacon, Malformed
+from skyless.air.beacon2 import Beacon2
+from skyless.air.frames import decode_any
 from skyless.mqtt.fix_message import fix_message
 from skyless.mqtt.messages import Counters, FixMessage, Phase, TagHealth
 from skyless.nodes.process import HEALTH_S
@@ -135,17 +136,21 @@ class PhaseLog:
         self.last: tuple[Phase, ...] = ()
 
     def add(self, frame: bytes, ended_s: float, done_s: float, *, made_fix: bool) -> None:
-        """Add one frame: when it ended, and when its processing did, by the host's monotonic clock."""
-        beacon = decode_cached(frame)
-        if isinstance(beacon, Malformed):
+        """Add one frame: when it ended, and when its processing did, by the host's monotonic clock.
+
+        Frames without slots, of anchors that send at random instants, are left out.
+        """
+        beacon = decode_any(frame)
+        when = beacon if isinstance(beacon, Beacon) else beacon.slot_time if isinstance(beacon, Beacon2) else None
+        if when is None or isinstance(beacon, Malformed):
             return
-        if beacon.superframe != self._superframe:
+        if when.superframe != self._superframe:
             self.last = tuple(self._present)
             self._present.clear()
-            self._superframe, self._begin_s = beacon.superframe, ended_s
+            self._superframe, self._begin_s = when.superframe, ended_s
         if len(self._present) >= _MOST_PHASES:
             return
         begin_s = self._begin_s
         self._present.append(
-            Phase(beacon.superframe, beacon.slot, beacon.anchor, ended_s - begin_s, done_s - begin_s, made_fix)
+            Phase(when.superframe, when.slot, beacon.anchor, ended_s - begin_s, done_s - begin_s, made_fix)
         )

@@ -209,5 +209,5 @@ def _finite(superframes: float) -> float | None:
 
 
 def _limit(site: ClaimSite, event: str) -> float:
-    """A half that has lost its root must wait for up to all the hops that it was away from it, twice a hop."""
-    return (2.5 if event == "cut in half" else 1.0) * site.most
+    """What was cut off from its root must wait for all the hops that it was away from it, twice a hop."""
+    return (2.5 if event in {"cut in half", "a fifth dead"} else 1.0) * site.most
