@@ -32,7 +32,13 @@ from skyless.positioning.methods.observations import (
     observe_2,
     variance_factor,
 )
-from skyless.positioning.methods.selection import AnchorSelection, AnchorSelectionState, is_full
+from skyless.positioning.methods.selection import (
+    LEAST_FITTING,
+    AnchorSelection,
+    AnchorSelectionState,
+    fitting_relays,
+    is_full,
+)
 from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
 from skyless.positioning.observation import Observation
 from skyless.site.almanac_pages import AlmanacAssembly, AlmanacState
@@ -234,9 +240,18 @@ class Receiver:
         anchor, relays = beacon.anchor, packed_relays_2(beacon)
         if diagnostics is not None and diagnostics.rx_power_dbm is not None:
             self._selection.add_power(anchor, diagnostics.rx_power_dbm)
-        if self._is_trusted(anchor, rx_ticks):
+        method = self._method
+        was_starting = not isinstance(method, Estimation) or method.is_starting
+        in_use = isinstance(method, Estimation) and not was_starting and method.estimator.has_anchor(anchor)
+        is_confirmed = in_use or self._selection.is_confirmed(anchor, rx_ticks)
+        if not is_confirmed and not was_starting:
+            fitting = fitting_relays(relays, tx_ticks, rx_ticks, self._packet_in_use)
+            if fitting >= LEAST_FITTING:
+                self._selection.confirm(anchor, rx_ticks)
+                is_confirmed = True
+        if is_confirmed or was_starting or self._has_too_few(rx_ticks):
             self._selection.add_relays(relays, rx_ticks)
-        if self.local_almanac.on_beacon(beacon, rx_ticks, self._selection.is_confirmed(anchor, rx_ticks)):
+        if self.local_almanac.on_beacon(beacon, rx_ticks, is_confirmed):
             self._choose_method_2()
         anchor_m = self.local_almanac.position_m(anchor)
         if anchor_m is None:
@@ -255,19 +270,26 @@ class Receiver:
         self._waiting = []
         if not self._may_join(self._method, observation):
             return NoFixReason.TOO_FEW_ANCHORS
-        return self._method.update(observation)
+        result = self._method.update(observation)
+        if was_starting and not self._method.is_starting:
+            self._selection.forget_times()  # from now on what anchors in use have received counts, and what those have
+        return result
 
-    def _is_trusted(self, anchor: int, rx_ticks: int) -> bool:
-        """Whether what an anchor relays confirms others: it is in use, or too few of those that are still come in.
+    def _packet_in_use(self, anchor: int) -> tuple[int, int] | None:
+        """Sequence number and own RX stamp of the last beacon of an anchor in use."""
+        track = self._stamps.tracks.of_anchor.get(anchor)
+        in_use = isinstance(self._method, Estimation) and self._method.estimator.has_anchor(anchor)
+        return (track.sequence, track.rx_ticks_tag) if track is not None and in_use else None
 
-        A tag may come to where its anchors do not receive the next ones, through a steel door or out of a lift.
+    def _has_too_few(self, rx_ticks: int) -> bool:
+        """Whether fewer anchors in use are still received than a fix takes, so that relays of any anchor confirm.
+
+        A tag may come to where none of its anchors is received, nor receives the next ones: out of a lift.
         """
-        method = self._method
-        if not isinstance(method, Estimation) or method.is_starting or method.estimator.has_anchor(anchor):
-            return True
-        anchors, drop_s = method.estimator.state.anchors, method.estimator.state.settings[0]["drop_s"]
-        is_present = (anchors["packets"] > 0) & ((rx_ticks - anchors["rx_ticks"]) * TICK_S <= drop_s)
-        return int(np.count_nonzero(is_present)) < LEAST_ANCHORS
+        assert isinstance(self._method, Estimation)
+        state = self._method.estimator.state
+        is_present = (rx_ticks - state.anchors["rx_ticks"]) * TICK_S <= state.settings[0]["drop_s"]
+        return int(np.count_nonzero(is_present & (state.anchors["packets"] > 0))) < LEAST_ANCHORS
 
     def _may_join(self, method: Estimation, observation: Observation) -> bool:
         """Whether an anchor is in use or may be: others have received it, and it is not weaker than 24 in use."""

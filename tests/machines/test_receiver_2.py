@@ -187,6 +187,18 @@ def test_forged_stamps_under_the_name_of_an_anchor_are_dropped():
     assert counters["anchor-restart"] == 0
 
 
+def test_a_copy_of_a_beacon_under_another_name_is_not_there():
+    """With all that the anchor has relayed, 40 times a second, some milliseconds later."""
+    honest = free_tape()[::8]
+
+    def copy(n, _):
+        beacon = beacon_of(honest[min(n * len(honest) // 80, len(honest) - 1)])
+        return replace(beacon, anchor=STRANGER, position=StatedPosition(50.0, 50.0, 1.0), sequence=n & 0xFF)
+
+    counters = undisturbed(false_frames(40.0, copy, 2.0, 0.3))
+    assert counters["unconfirmed-anchor"] + counters["impossible-stamp"] > 40
+
+
 def test_a_flood_of_identifiers_does_not_displace_the_anchors():
     counters = undisturbed(
         false_frames(

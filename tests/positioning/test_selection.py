@@ -7,8 +7,10 @@ from skyless.positioning.methods.selection import (
     MOST_KEPT,
     RELAYED_TICKS,
     AnchorSelection,
+    fitting_relays,
     is_full,
 )
+from skyless.ticks import from_seconds, wrap
 
 
 def relays(*anchors):
@@ -47,6 +49,18 @@ def test_powers_are_averaged_and_impossible_ones_passed_over():
     selection.add_power(1, float("nan"))
     selection.add_power(1, -70.0)
     assert selection.state().power_dbm[1] == pytest.approx(-79.0)
+
+
+@pytest.mark.parametrize(
+    ("off_ticks", "fitting"), [(0, 2), (from_seconds(0.9e-6), 2), (from_seconds(3e-6), 0), (-from_seconds(1e-3), 0)]
+)
+def test_receptions_that_an_anchor_relays_show_whether_it_is_there(off_ticks, fitting):
+    """It received anchors 1 to 3, 5, 10 and 20 ms before its own frame; the tag has another packet of anchor 3."""
+    tx_ticks, rx_ticks, ages = (1 << 40) + 7, 5_000_000_000, [from_seconds(1e-3 * age) for age in (5, 10, 20)]
+    stamps = [wrap(tx_ticks - age + off_ticks) for age in ages]
+    packed = b"".join(HEARD.pack(n, 9, stamp & 0xFFFFFFFF, stamp >> 32) for n, stamp in enumerate(stamps, start=1))
+    packets = {n: (9 if n < 3 else 8, rx_ticks - age) for n, age in enumerate(ages, start=1)}
+    assert fitting_relays(packed, tx_ticks, rx_ticks, packets.get) == fitting
 
 
 def test_memory_is_bounded():

@@ -34,6 +34,12 @@ def test_a_tag_that_drives_through_the_site_never_begins_again():
     assert row.gap_superframes < 4.0
 
 
+def test_where_more_than_24_anchors_are_in_reach_the_nearest_are_used():
+    row = results("7 m apart, 1 ms slots", 1, plan=replace(PLAN, seed=31), seconds=30.0)
+    assert row.max_m < 0.2  # a tag that could not confirm those that it meets was left with three, and 1.5 m off
+    assert row.restarts == 0
+
+
 def test_in_rooms_it_is_near_the_bound():
     row = results("room, 1 ms slots", 3)
     assert row.bound_m > 0.02

@@ -1,13 +1,15 @@
 """Which anchors of a large site a tag uses: those that others receive as well, and of these the strongest."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Final, TypeVar
 
 from msgspec import Struct
 
 from skyless.air.beacon import HEARD
-from skyless.ticks import from_seconds
+from skyless.constants import MAX_DRIFT
+from skyless.positioning.methods.observations import FLIGHT_SLACK_TICKS
+from skyless.ticks import difference, from_seconds, wrap
 
 MOST_ANCHORS_IN_USE: Final = 24
 """In the estimator's state; more cost accuracy, as each then sends less, and time."""
@@ -15,8 +17,11 @@ MOST_ANCHORS_IN_USE: Final = 24
 BETTER_DB: Final = 3.0
 """By which another anchor must be stronger to replace the weakest."""
 
-RELAYED_TICKS: Final = from_seconds(1.0)
-"""A reception by another anchor confirms its sender for this time."""
+RELAYED_TICKS: Final = from_seconds(2.0)
+"""A reception by an anchor in use, or by one that is confirmed itself, confirms its sender for this time."""
+
+LEAST_FITTING: Final = 2
+"""An anchor that relays this number of receptions of anchors in use, and they fit, is there."""
 
 MOST_KEPT: Final = 256
 """Identifiers kept: more than there are in reach, so that forged ones use no memory."""
@@ -65,13 +70,17 @@ class AnchorSelection:
             _keep(self._power_dbm, anchor, mean + POWER_GAIN * (power_dbm - mean))
 
     def add_relays(self, relays: bytes, rx_ticks: int) -> None:
-        """Process what an anchor that is trusted relays (``packed_relays_2``)."""
+        """Process what an anchor in use, or a confirmed one, relays (``packed_relays_2``)."""
         for anchor, _, _, _ in HEARD.iter_unpack(relays):
-            self._relayed_ticks.pop(anchor, None)
-            _keep(self._relayed_ticks, anchor, rx_ticks)
+            self.confirm(anchor, rx_ticks)
+
+    def confirm(self, anchor: int, rx_ticks: int) -> None:
+        """An anchor is there: what it relays itself shows it (``fitting_relays``)."""
+        self._relayed_ticks.pop(anchor, None)
+        _keep(self._relayed_ticks, anchor, rx_ticks)
 
     def is_confirmed(self, anchor: int, rx_ticks: int) -> bool:
-        """Whether an anchor has lately been received by another one."""
+        """Whether an anchor has lately been received by another one, or shown that it is there."""
         relayed_ticks = self._relayed_ticks.get(anchor)
         return relayed_ticks is not None and rx_ticks - relayed_ticks < RELAYED_TICKS
 
@@ -84,6 +93,25 @@ class AnchorSelection:
         own_dbm = powers.pop(anchor)
         weakest = min(powers, key=lambda one: powers[one])
         return weakest if own_dbm > powers[weakest] + BETTER_DB else None
+
+
+def fitting_relays(
+    relays: bytes, tx_ticks_anchor: int, rx_ticks_tag: int, packets: Callable[[int], tuple[int, int] | None]
+) -> int:
+    """How many receptions that an anchor relays fit what the tag has received itself: so it really receives them.
+
+    The stamps are those of the anchor's beacon; ``packets`` gives sequence number and the tag's stamp of the last
+    beacon of another anchor, None for one that does not count. A reception fits if, on the anchor's counter, it lies as
+    long before its own frame as on the tag's, to 1 µs (300 m) and the drift of crystals.
+    """
+    fitting = 0
+    for anchor, sequence, low, high in HEARD.iter_unpack(relays):
+        packet = packets(anchor)
+        if packet is not None and packet[0] == sequence:
+            elapsed = rx_ticks_tag - packet[1]
+            off = difference(low | high << 32, wrap(tx_ticks_anchor - elapsed))
+            fitting += abs(off) <= FLIGHT_SLACK_TICKS + MAX_DRIFT * elapsed
+    return fitting
 
 
 def is_full(anchors: Collection[int]) -> bool:
