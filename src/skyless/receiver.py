@@ -243,15 +243,12 @@ class Receiver:
         method = self._method
         was_starting = not isinstance(method, Estimation) or method.is_starting
         in_use = isinstance(method, Estimation) and not was_starting and method.estimator.has_anchor(anchor)
-        is_confirmed = in_use or self._selection.is_confirmed(anchor, rx_ticks)
-        if not is_confirmed and not was_starting:
-            fitting = fitting_relays(relays, tx_ticks, rx_ticks, self._packet_in_use)
-            if fitting >= LEAST_FITTING:
-                self._selection.confirm(anchor, rx_ticks)
-                is_confirmed = True
-        if is_confirmed or was_starting or self._has_too_few(rx_ticks):
+        is_vouched_for = self._selection.is_vouched_for(anchor, rx_ticks, in_use=in_use)
+        if is_vouched_for or was_starting or self._has_too_few(rx_ticks):
             self._selection.add_relays(relays, rx_ticks)
-        if self.local_almanac.on_beacon(beacon, rx_ticks, is_confirmed):
+        elif fitting_relays(relays, tx_ticks, rx_ticks, self._packet_in_use) >= LEAST_FITTING:
+            self._selection.show(anchor, rx_ticks)
+        if self.local_almanac.on_beacon(beacon, rx_ticks, is_vouched_for):
             self._choose_method_2()
         anchor_m = self.local_almanac.position_m(anchor)
         if anchor_m is None:

@@ -359,3 +359,34 @@ def test_a_foreign_site_of_more_anchors_delays_the_first_fix_but_does_not_hold_t
     made = fixes_of(receiver, merged(heard, falses))
     assert receiver.site == FREE.id
     assert min(one.host_s for one in heard if (one.frame, one.rx_ticks) in made) < 5.3
+
+
+def test_one_radio_of_many_names_that_measures_truly_changes_no_page():
+    """Twelve names that relay true receptions of anchors in use: they join, but are no majority."""
+    heard, pages = (
+        free_tape(),
+        tuple(replace(page, tag_height_m=17.0) if isinstance(page, SitePage) else page for page in site_pages_of(FREE)),
+    )
+    tag = heard[0]
+
+    def name(n, tx_ticks):
+        now = from_seconds(0.5 + (n + 0.37) / 60.0)
+        newest = {one.anchor: one for one in heard if one.host_s < 0.499 + (n + 0.37) / 60.0}
+        relays = tuple(
+            Relay(
+                one.anchor,
+                beacon_of(one).sequence,
+                wrap(tx_ticks - wrap(tag.rx_ticks + now - from_seconds(tag.host_s) - one.rx_ticks)),
+            )
+            for one in sorted(newest.values(), key=lambda one: -one.host_s)[:3]
+        )
+        return a_beacon(
+            anchor=1000 + n % 12, sequence=n // 12, tx_ticks=tx_ticks, heard=relays, almanac_issue=site_issue(pages),
+            page=pages[(n + n // 12) % len(pages)], position=StatedPosition(500.0, 500.0, 2.0),
+        )  # fmt: skip
+
+    receiver = Receiver()
+    made = fixes_of(receiver, merged(heard, false_frames(60.0, name, first_s=0.5)))
+    assert 1000 in receiver.method.estimator.anchors
+    assert receiver.local_almanac.issue == site_issue(site_pages_of(FREE))
+    assert len(made) > 550
