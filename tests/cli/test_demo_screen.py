@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from skyless.cli.nodes.demo import ALERT_SHOWN_S, MOST_ALERTS, Screen
-from skyless.mqtt.messages import AnchorHealth, Counters, FixMessage
+from skyless.mqtt.messages import AnchorHealth, Counters, FixMessage, TagHealth
 from skyless.nodes.watch import Watch
 from skyless.positioning.integrity import Alert
 
@@ -124,3 +124,19 @@ def test_with_a_master_the_table_shows_clocks(stage):
     text = synchronisation(stage)
     assert "clock sigma" in text
     assert "parents" not in text
+
+
+def test_an_anchor_that_has_stopped_has_no_role(stage):
+    rows = {row.split()[1]: row.split()[3] for row in synchronisation(stage).splitlines() if row.startswith("│")}
+    assert rows == {"1": "anchor", "2": "anchor", "3": "anchor", "4": "anchor", "5": "anchor", "6": "offline"}
+
+
+def test_updates_per_second_of_a_tag_that_was_restarted(stage):
+    _, watch = stage
+    watch._on_fix(fix("t1", None))
+    for unix_s, fixes in ((0.0, 10), (1.0, 510), (2.0, 300), (3.0, 800)):
+        health = TagHealth(
+            "t1", unix_s, unix_s, "joint", 0, fixes, 0.0, None, 0.1, None, None, {}, Counters(0, 0, 0), 0.0, 0, ()
+        )
+        watch._on_tag(health)
+    assert watch.tags["t1"].updates_per_s == 500.0

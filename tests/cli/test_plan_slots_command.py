@@ -109,6 +109,11 @@ def test_slots_are_coloured_shown_and_written(hall, tmp_path, capsys):
     assert planned(capsys, hall)["slots_of_file"]
 
     assert "--force" in refused(capsys, "plan", hall, "--write")
+    whole = hall.read_text()
+    hall.write_text(whole.replace("slot = 0\n", "", 1))
+    assert "plan --write --force colours" in refused(capsys, "site", "check", hall)
+    assert planned(capsys, hall)["warnings"][-1].endswith("--write --force writes them into it")
+    hall.write_text(whole)
     pairs = tmp_path / "pairs.csv"
     pairs.write_text(f"# heard at once\n10,{next(k for k in slots if k != 10 and slots[k] == slots[10])}\n")
     again = planned(capsys, hall, "--write", "--force", "--conflicts", pairs)

@@ -13,9 +13,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from skyless.cli.common.simulated_site import check_live
 from skyless.cli.main import main
 from skyless.cli.simulate import FIXES_CSV_COLUMNS
 from skyless.site.lab import lab_site
+from skyless.site.load import load_site
 
 C = 299_792_458.0
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "simulate"]
@@ -284,3 +286,42 @@ def test_an_interrupted_run_keeps_what_it_has_written(tmp_path):
     assert len(table) > 10
     assert all(len(row) == len(FIXES_CSV_COLUMNS) for row in table)
     assert path.read_bytes().endswith(b"\n")
+
+
+def protocol_2(tmp_path, anchors):
+    file = tmp_path / "hall.toml"
+    file.write_text('name = "hall"\nid = 1\n[schedule]\nmode = "free"\n[tags]\nheight_m = 1.0\n' + anchors)
+    return file
+
+
+CORNERS = "".join(
+    f"[[anchors]]\nid = {k}\nx_m = {x}\ny_m = {y}\n" for k, (x, y) in enumerate(((0, 0), (9, 0), (0, 9), (9, 9)))
+)
+
+
+def test_methods_that_need_a_master_are_refused_where_there_is_none(run, tmp_path):
+    code, out, err = run("--site", protocol_2(tmp_path, CORNERS), "--method", "weighted", "--duration", "5")
+    assert (code, out) == (2, "")
+    assert "needs a master, and site 'hall' has none (mode free); it should be joint" in err
+
+
+def test_anchors_without_a_position_are_not_simulated(run, tmp_path):
+    new = "[[anchors]]\nid = 7\n[[anchors]]\nid = 8\n"
+    code, _, err = run("--site", protocol_2(tmp_path, new), "--duration", "5")
+    assert (code, err) == (2, "skyless: no anchor of site 'hall' has a position, so it cannot be simulated\n")
+    code, out, err = run("--site", protocol_2(tmp_path, CORNERS + new), "--duration", "3", "--json")
+    assert (code, err) == (0, "not simulated, as the site file has no position: anchor 7, 8\n")
+    assert json.loads(out)["fixes"] > 0
+
+
+def test_a_site_too_large_for_real_time_is_warned_of(tmp_path, capsys):
+    large = "".join(f"[[anchors]]\nid = {k}\nx_m = {15 * k}\ny_m = 0\n" for k in range(140))
+    for anchors, warned in ((large, True), (CORNERS, False)):
+        check_live(load_site(protocol_2(tmp_path, anchors)))
+        assert ("140 anchors send 4200 beacons/s" in capsys.readouterr().err) is warned
+
+
+def test_tags_without_a_fix_are_counted(run):
+    code, out, _ = run("--position", "3,4", "--silence", "0", "--duration", "3")
+    assert code == 0
+    assert re.search("tags without a fix +│ 1 of 1", out)

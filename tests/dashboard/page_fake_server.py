@@ -30,10 +30,11 @@ DOCK = {"id": "dock", "name": "Dock", "polygon_m": [[14, 2.5], [21, 2.5], [21, 6
 class FakeServer:
     """Serves on a free port of loopback in a thread of its own; its attributes are the switches of the tests."""
 
-    def __init__(self, tags=3, rate_hz=10.0, zones=(DOCK,), site=True, floor_plan=None):
+    def __init__(self, tags=3, rate_hz=10.0, zones=(DOCK,), site=True, floor_plan=None, mode="master"):
         self.tags, self.rate_hz, self.site = tags, rate_hz, site
         self.zones = [dict(zone) for zone in zones]
         self.floor_plan = floor_plan
+        self.mode = mode
         self.stored = []
         self.silent_tags = set()
         self.refuse = False
@@ -150,7 +151,7 @@ class FakeServer:
 
     def _hello(self):
         plan = {"image": "hall.png", "width_m": 24.0, "x_m": 0.0, "y_m": -1.0} if self.floor_plan else None
-        site = made_up.site_message(self.started, plan) if self.site else None
+        site = made_up.site_message(self.started, plan, self.mode) if self.site else None
         return {"type": "hello", "version": "0.1.0", "site": site, "zones": self.zones, "events": [], "mqtt": True}
 
     async def _states(self, websocket, lock):
@@ -173,6 +174,8 @@ class FakeServer:
         """A health message: one anchor is not synchronised, and one is offline."""
         since = now - self.started
         anchors = [made_up.anchor_health(n, since, now - (20 if n == 8 else 0), n != 5) for n in range(1, 9)]
+        if self.mode != "master":
+            anchors = [made_up.anchor_health_2(n, since, now, self.mode) for n in range(1, 9)]
         tags = []
         for number, name in enumerate(made_up.names(self.tags)):
             reason = "too-few-anchors" if name in self.silent_tags else None

@@ -13,14 +13,14 @@ def anchor_positions():
     return [(number, x, y) for number, (x, y) in enumerate(((x, y) for y in (1.0, 13.0) for x in COLUMNS_X), start=1)]
 
 
-def site_message(unix_s, floor_plan=None):
+def site_message(unix_s, floor_plan=None, mode="master"):
     walls = ((0, 0, 24, 0), (24, 0, 24, 14), (24, 14, 0, 14), (0, 14, 0, 0), (12, 0, 12, 5), (12, 9, 12, 14))
     site = {
         "name": "Hall 7",
         "id": 7,
         "master": 2,
         "anchors": [{"id": n, "x_m": x, "y_m": y, "z_m": 2.8, "slot": None} for n, x, y in anchor_positions()],
-        "schedule": {"slot_s": SLOT_S, "slots": None, "frames_per_node": 1, "guard_s": 0.5e-3},
+        "schedule": {"mode": mode, "slot_s": SLOT_S, "slots": None, "frames_per_node": 1, "guard_s": 0.5e-3},
         "noise": {},
         "tags": {"height_m": 1.2},
         "walls": [{"x1_m": a, "y1_m": b, "x2_m": c, "y2_m": d} for a, b, c, d in walls],
@@ -80,6 +80,15 @@ def tag_health(name, number, time_s, unix_s, reason=None):
         "counters": {"late": 3, "foreign": 0}, "mqtt": mqtt(), "cpu": 0.021, "memory_bytes": 143_000_000,
         "phases": phases(number, int(time_s / (SUPERFRAME * SLOT_S))),
     }  # fmt: skip
+
+
+def anchor_health_2(anchor, time_s, unix_s, mode):
+    """Of protocol 2: anchor 3 leads the slot time."""
+    shared = {"master": None, "mode": mode, "synchronised": True, "role": "anchor", "term": None, "root": None}
+    if mode == "slots":
+        role, hop, parents = ("root", 0, []) if anchor == 3 else ("anchor", 2, [3, 4])
+        shared |= {"role": role, "root": 3, "term": 1, "hop": hop, "parents": parents}
+    return anchor_health(anchor, time_s, unix_s) | shared
 
 
 def anchor_health(anchor, time_s, unix_s, synchronised=True):

@@ -111,3 +111,11 @@ def test_nothing_is_computed_after_the_end():
         return await asyncio.gather(began, waited, return_exceptions=True)
 
     assert all(isinstance(answer, NoOverlayError) for answer in asyncio.run(ask()))
+
+
+def test_no_errors_are_predicted_without_a_master():
+    """The planner's superframe is that of one master: anchors out of its reach would count as silent."""
+    site = replace(LAB, schedule=replace(LAB.schedule, mode="free"))
+    assert overlay_grids(overlay_task(site, None, "joint", 1.0)).error == (
+        "errors are predicted for sites with one master only"
+    )

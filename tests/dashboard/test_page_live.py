@@ -160,6 +160,36 @@ def test_health_and_phases_are_shown(hall):
     assert page.locator("#phases .fix").count() == 3 * (made_up.SUPERFRAME - 3)
 
 
+def test_a_site_in_slots_shows_the_root_and_what_it_leads(serve, visit):
+    page = visit(serve(mode="slots")).page
+    page.click("#tab-anchors")
+    page.wait_for_selector("#panel-anchors tr.good:has-text('3 root')")
+    assert "master" not in page.locator("#panel-anchors").inner_text()
+    page.click("#panel-anchors button:has-text('5')")
+    facts = page.locator("#panel-anchors .detail .facts")
+    facts.locator("dt:has-text('Slot time led by')").wait_for()
+    shown = facts.inner_text()
+    assert all(words in shown for words in ("anchor 3", "Hops", "anchor 3, anchor 4"))
+    page.click("#legend summary")
+    marks = page.locator(".marks").inner_text()
+    assert "root: its clock leads the slot time" in marks
+    assert "master" not in marks
+
+
+def test_a_site_with_random_instants_has_no_leader_and_no_superframe(serve, visit):
+    page = visit(serve(mode="free", tags=0)).page
+    page.click("#tab-anchors")
+    page.wait_for_selector("#panel-anchors tr.good")
+    assert page.locator("#panel-anchors td:first-child >> nth=0").get_attribute("title") == "on the air"
+    assert "master" not in page.locator("#panel-anchors").inner_text()
+    page.click("#legend summary")
+    assert "anchor on the air" in page.locator(".marks").inner_text()
+    assert "master" not in page.locator(".marks").inner_text()
+    page.click("#tab-timing")
+    page.wait_for_selector("text=No superframe: the anchors send at random instants.")
+    assert "slots of" not in page.locator("#panel-timing").inner_text()
+
+
 def test_a_floor_plan_lies_where_the_site_says(serve, visit):
     file = io.BytesIO()
     Image.new("RGB", (480, 300), (200, 30, 30)).save(file, "PNG")

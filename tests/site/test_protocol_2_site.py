@@ -197,3 +197,45 @@ def test_near_pairs_are_those_of_a_table_of_all(seed, count, distance_m, flat):
     found = [pair for ones, others, _ in batches for pair in zip(ones.tolist(), others.tolist(), strict=True)]
     assert len(found) == len(set(found))
     assert set(found) == {(i, j) for i, j in near if group[i] == group[j] >= 0}
+
+
+CORNERS = anchor(1, 0, 0) + anchor(2, 9, 0) + anchor(3, 0, 9) + anchor(4, 9, 9)
+FLAT = "[tags]\nheight_m = 1.0\n"
+
+
+def test_keys_that_mean_nothing_in_a_mode_are_warned_of(load):
+    (warning,) = warnings_of(load(FREE + "site_time = true\n" + FLAT + CORNERS))
+    assert warning == "schedule.site_time is true, which has no effect in mode free"
+    document = 'name = "x"\nid = 1\nmaster = 1\n[schedule]\nrate_hz = 50.0\n' + FLAT + CORNERS
+    rate, floor = warnings_of(load(document.replace("id = 3\n", "id = 3\nfloor = 2\n")))
+    assert rate == "schedule.rate_hz is 50.0, which has no effect in mode master"
+    assert floor == "anchor 3: floor has no effect in mode master, whose beacons do not carry it"
+
+
+def test_a_height_that_no_anchor_reaches_is_warned_of(load):
+    assert warnings_of(load(FREE + FLAT.replace("1.0", "30.0") + CORNERS)) == []
+    (warning,) = warnings_of(load(FREE + FLAT.replace("1.0", "-32.0") + CORNERS))
+    assert warning.startswith("tags.height_m is -32: no anchor is within 31 m")
+
+
+def test_lines_are_judged_by_what_is_in_reach(load):
+    """A corridor of three rows is no line, however long; a row that leaves a hall is one."""
+    corridor = "".join(anchor(3 * k + row + 1, 15 * k, 15 * row) for k in range(60) for row in range(3))
+    assert warnings_of(load(FREE + FLAT + corridor)) == []
+    row = "".join(anchor(500 + k, 15 * (60 + k), 0) for k in range(8))
+    (warning,) = warnings_of(load(FREE + FLAT + corridor + row))
+    assert warning.startswith("anchors 501, 502, 503, 504, 505, 506, 507: all anchors in reach lie nearly in one line")
+    (warning,) = warnings_of(load(FREE + FLAT + row))
+    assert warning.startswith("all anchors lie nearly in one line")
+
+
+def test_a_missing_coordinate_has_the_limits_of_the_mode(load):
+    with pytest.raises(ConfigurationError, match="from -8388 to 8388"):
+        load(FREE + anchor(1, 0))
+
+
+def test_slots_that_are_there_are_replaced_with_force(load):
+    with pytest.raises(ConfigurationError, match="plan --write colours"):
+        load(SLOTS.replace("slots = 3\n", "") + anchor(1, 0, 0) + anchor(2, 9, 0))
+    with pytest.raises(ConfigurationError, match="plan --write --force colours"):
+        load(SLOTS + anchor(1, 0, 0, slot=0) + anchor(2, 9, 0))

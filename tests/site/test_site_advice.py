@@ -62,7 +62,7 @@ def test_one_plane_however_it_lies(angles, shift):
 @given(angle, st.floats(-1e4, 1e4))
 def test_one_line_on_the_floor(turn, shift):
     line = [(0, 0, 0), (5, 0.1, 0), (9, 0, 0), (12, -0.1, 0)]
-    (warning,) = warnings_of(site_of(rotated(line, (turn, 0)) + shift, height_m=1.0))
+    (warning,) = warnings_of(site_of(rotated(line, (turn, 0)) + shift, height_m=shift))
     assert "one line" in warning
 
 

@@ -14,7 +14,6 @@ from skyless.cli.plan_output import report, show, write_files, write_site
 from skyless.cli.plan_slots import (
     conflicts_of,
     described,
-    has_slots,
     show_slots,
     slot_report,
     with_planned_slots,
@@ -166,6 +165,7 @@ def _plan_slots(site: "Site", file: Path, asked: PlanOptions, started_s: float) 
     from skyless.planning.links import with_range
     from skyless.planning.slot_plan import rate_map
     from skyless.simulation.channel import ChannelModel
+    from skyless.site.check import has_slots
 
     mode = site.schedule.mode
     _refuse(asked, _FOR_ONE_MASTER, f"mode {mode}: errors are predicted for sites with one master only")
@@ -176,7 +176,7 @@ def _plan_slots(site: "Site", file: Path, asked: PlanOptions, started_s: float) 
     channel, exponent = ChannelModel(), asked.exponent or 2.0
     if asked.range_m is not None:
         channel = with_range(channel, asked.range_m, exponent)
-    recoloured = None
+    recoloured, had_slots = None, has_slots(site)
     if mode == "slots":
         site, recoloured = with_planned_slots(site, file, conflicts_of(asked.conflicts, site), asked.write)
     floor = floor_of(site, file, _outline(asked.outline), _region(asked.region)) if site.anchors else None
@@ -191,6 +191,9 @@ def _plan_slots(site: "Site", file: Path, asked: PlanOptions, started_s: float) 
     if asked.write:
         write_slots(site, file)
     result = slot_report(site, floor, mapped, channel, exponent, recoloured, asked.write)
+    if recoloured is not None and not asked.write:
+        how = "--write --force writes" if had_slots else "--write writes"
+        result["warnings"].append(f"these slots are not in the site file ({recoloured}); {how} them into it")
     if asked.plot is not None and floor is not None and mapped is not None:
         _draw_slots(site, floor, mapped, file, described(result), asked.plot)
     result["wall_s"] = time.perf_counter() - started_s

@@ -49,7 +49,7 @@ def with_planned_slots(
 
     Raises SkylessError when a superframe has too few slots.
     """
-    from skyless.site.check import check_site
+    from skyless.site.check import check_site, has_slots
     from skyless.site.slot_colours import SlotShortageError, with_slots
 
     reason = "new slots were asked for"
@@ -66,11 +66,6 @@ def with_planned_slots(
         raise SkylessError(f"{file}: {error}") from None
     check_site(coloured, file)
     return coloured, reason
-
-
-def has_slots(site: "Site") -> bool:
-    """Whether the file gives any slot."""
-    return site.schedule.slots is not None or any(anchor.slot is not None for anchor in site.all_anchors)
 
 
 def write_slots(site: "Site", file: Path) -> None:
@@ -98,8 +93,6 @@ def slot_report(
 
     with_slots = site.schedule.mode == "slots"
     warnings = slot_warnings(site, mapped, channel, exponent)
-    if recoloured is not None and not written:
-        warnings.append(f"these slots are not in the site file ({recoloured}); --write writes them into it")
     return {
         "site": site.name,
         "mode": site.schedule.mode,

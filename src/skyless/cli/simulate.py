@@ -24,6 +24,7 @@ from skyless.cli.common.options import (
 )
 from skyless.cli.common.output import cm, open_for_writing, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
+from skyless.cli.common.simulated_site import check_simulated
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
 
@@ -154,6 +155,7 @@ def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
     Anchors and tags are the machines that would run on radios; clocks, noise, air and motion are simulated.
     """
     request = _request(asked)
+    check_simulated(request.site, request.method)
     if asked.warmup >= asked.until_s:
         raise SkylessError(
             f"--warmup is {asked.warmup:g}; a run of {asked.until_s:g} s (--duration) ends before any fix is judged"
@@ -358,12 +360,19 @@ def _row(judged: "JudgedFix") -> tuple[object, ...]:
 # The report
 
 
+def _without_fix(result: "FleetReport") -> list[tuple[str, str]]:
+    """How many tags have had no fix at all, where there are any: nothing else in the table counts them."""
+    without = result.tags_without_fix
+    return [("tags without a fix", f"{without} of {result.tags}")] if without else []
+
+
 def _show(result: "FleetReport") -> None:
     facts = [
         ("simulated time", f"{result.simulated_s:.1f} s in {result.wall_s:.1f} s ({result.speed:.1f} × real time)"),
         ("messages at tags", f"{result.messages} ({result.dropped} dropped)"),
         ("fixes judged", f"{result.fixes}"),
         ("updates", f"{result.updates_per_s:.1f} per second and tag"),
+        *_without_fix(result),
         ("first fix", "none" if result.first_fix_s is None else f"{result.first_fix_s:.3f} s after power-on"),
         ("RMSE", cm(result.rmse_m)),
         ("predicted σ", cm(result.sigma_m)),

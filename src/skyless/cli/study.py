@@ -63,6 +63,7 @@ _OF_A_LARGE_SITE: Final = (
 _OF_CLAIMS: Final = (
     "Simulated. Superframes until all anchors follow one claim whose root lives; longest: the slowest run.",
     "Changes: anchors that changed their claim once all was settled, in all runs.",
+    "Limits: 10 in the hall, 40 in the corridor; 25 and 100 for cut in half and a fifth dead.",
 )
 _OF_SITE_TIME: Final = (
     "Simulated. RMSE: error of an anchor's timeline, or difference of two in range. σ: as anchors state it.",

@@ -30,6 +30,8 @@ def main() -> None:
 
 def overlay_grids(task: OverlayTask) -> OverlayGrids:
     """PDOP, HDOP and predicted sigma at the known height of the tags, or half-way up the anchors."""
+    if not task.site.schedule.needs_master:
+        return OverlayGrids(error="errors are predicted for sites with one master only")
     needed = 4 if task.site.tags.height_m is None else 3
     if len(task.site.anchors) < needed:
         return OverlayGrids(error=f"a position needs {needed} anchors or more; this site has {len(task.site.anchors)}")

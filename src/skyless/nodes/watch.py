@@ -112,8 +112,9 @@ class Watch:
     def _on_tag(self, health: TagHealth) -> None:
         tag = self.tags.get(health.tag)
         if tag is not None:
+            restarted = tag.health is not None and health.fixes < tag.health.fixes
             tag.health = health
-            if tag.began is None or health.fixes < tag.began[1]:
+            if tag.began is None or restarted:
                 tag.began = health.unix_s, health.fixes
 
     def _on_anchor(self, health: AnchorHealth) -> None:

@@ -10,8 +10,8 @@ from scipy.sparse.csgraph import connected_components
 
 from skyless.air.codec import MAX_FRAME_BYTES
 from skyless.air.ieee802154 import air_time_s
-from skyless.kernels.arrays import Integers
-from skyless.site.model import Site
+from skyless.kernels.arrays import Array, Integers
+from skyless.site.model import ScheduleSite, Site
 from skyless.site.near import anchor_positions, pairs_within
 
 _FLATTEST: Final = 0.05
@@ -23,15 +23,17 @@ RADIO_REACH_M: Final = 31.0
 _MOST_OVERLOAD: Final = 2.0
 """Over the best number of frames in reach; half or double of it costs a tag less than 8 %."""
 _MOST_NAMED: Final = 8
+_ONLY_IN: Final = {"rate_hz": ("free",), "reuse_m": ("slots",), "site_time": ("slots",)}
+"""Keys of the schedule that mean something in some modes only."""
 _SHORTEST_GUARD_S: Final = 0.35e-3
 """Shortest turn-around of a host that reads one frame and prepares the next (firmware in C)."""
 
 
 def warnings_of(site: Site) -> list[str]:
     """Soft problems of a valid site, each a sentence; empty when there is none."""
-    general = [*_count(site), *_geometry(site), *_guard(site), *_accuracy(site)]
+    general = [*_count(site), *_geometry(site), *_height(site), *_guard(site), *_accuracy(site), *_without_effect(site)]
     if site.schedule.needs_master:
-        return [*general, *_reach(site), *_without_effect(site)]
+        return [*general, *_reach(site)]
     return [*general, *_neighbours(site), *(_unplaced(site) if site.schedule.mode == "slots" else _load(site))]
 
 
@@ -57,15 +59,52 @@ def _geometry(site: Site) -> list[str]:
     points = anchor_positions(site)[:, :dimensions]
     if len(points) < dimensions + 1:
         return []
-    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if extents[-1] >= _FLATTEST * extents[0]:
+    which = _flat_everywhere(points) if site.schedule.needs_master else _flat_in_reach(site, points)
+    if which is None:
         return []
+    mirror = "the mirror image of a tag's position fits its beacons as well"
     if flat:
-        return ["all anchors lie nearly in one line: the mirror image of a tag's position fits its beacons as well"]
+        return [f"{which} lie nearly in one line: {mirror}"]
     return [
-        "all anchors lie nearly in one plane: the mirror image of a tag's position fits its beacons as well, "
+        f"{which} lie nearly in one plane: {mirror}, "
         "and the direction across is poor; alternate the anchors' heights, or set tags.height_m if it is known"
     ]
+
+
+def _flat_everywhere(points: Array) -> str | None:
+    """Say that all anchors lie in one line or plane; None where they do not."""
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return "all anchors" if extents[-1] < _FLATTEST * extents[0] else None
+
+
+def _flat_in_reach(site: Site, points: Array) -> str | None:
+    """Name the anchors around which all others in reach lie in one line or plane: tags there receive no more."""
+    ones, others = _links(site)
+    count, dimensions = points.shape
+    pairs = np.concatenate([ones, others]), np.concatenate([others, ones])
+    apart_m = points[pairs[1]] - points[pairs[0]]
+    sums, squares = np.zeros((count, dimensions)), np.zeros((count, dimensions, dimensions))
+    np.add.at(sums, pairs[0], apart_m)
+    np.add.at(squares, pairs[0], apart_m[:, :, None] * apart_m[:, None, :])
+    around = np.bincount(pairs[0], minlength=count) + 1  # with the anchor itself, at the origin
+    means = sums / around[:, None]
+    extents_2 = np.linalg.eigvalsh(squares / around[:, None, None] - means[:, :, None] * means[:, None, :])
+    flat = (extents_2[:, 0] < _FLATTEST**2 * extents_2[:, -1]) & (around > dimensions)
+    if not flat.any():
+        return None
+    if flat.all():
+        return "all anchors"
+    return f"{_named([site.anchors[row].id for row in np.flatnonzero(flat)])}: all anchors in reach"
+
+
+def _height(site: Site) -> list[str]:
+    """Tags at a height from which no anchor is in reach."""
+    height_m = site.tags.height_m
+    heights_m = [anchor.z_m for anchor in site.anchors]
+    if height_m is None or any(abs(z_m - height_m) <= RADIO_REACH_M for z_m in heights_m) or not heights_m:
+        return []
+    reach = f"{RADIO_REACH_M:.0f} m, the range in the open"
+    return [f"tags.height_m is {height_m:g}: no anchor is within {reach}, of that height"]
 
 
 def _reach(site: Site) -> list[str]:
@@ -79,10 +118,20 @@ def _reach(site: Site) -> list[str]:
 
 
 def _without_effect(site: Site) -> list[str]:
-    stated = [anchor.id for anchor in site.anchors if anchor.std_m is not None]
-    if not stated:
-        return []
-    return [f"{_named(stated)}: std_m has no effect in mode master, whose beacons do not carry it"]
+    """Keys that are set and mean nothing in the site's mode."""
+    schedule, usual = site.schedule, ScheduleSite()
+    found = [
+        f"schedule.{key} is {str(getattr(schedule, key)).lower()}, which has no effect in mode {schedule.mode}"
+        for key, modes in _ONLY_IN.items()
+        if schedule.mode not in modes and getattr(schedule, key) != getattr(usual, key)
+    ]
+    if not schedule.needs_master:
+        return found
+    for key in ("std_m", "floor", "zone"):
+        stated = [anchor.id for anchor in site.anchors if getattr(anchor, key)]
+        if stated:
+            found.append(f"{_named(stated)}: {key} has no effect in mode master, whose beacons do not carry it")
+    return found
 
 
 def _neighbours(site: Site) -> list[str]:

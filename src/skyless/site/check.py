@@ -124,10 +124,11 @@ _OTHERS: Final = {
 }
 
 
-def expected(key: str) -> str:
+def expected(key: str, *, protocol_2: bool = False) -> str:
     """What the value of a key (without indices in lists) should be."""
-    if key in SITE_LIMITS:
-        return str(SITE_LIMITS[key])
+    limits = {**SITE_LIMITS, **PROTOCOL_2_LIMITS} if protocol_2 else SITE_LIMITS
+    if key in limits:
+        return str(limits[key])
     return _OTHERS.get(key, f"a [{key}] table")
 
 
@@ -136,7 +137,6 @@ HALF_WRAP_S: Final = (1 << (TICK_BITS - 1)) * TICK_S
 
 _CLOSEST_M: Final = 1e-3
 _MOST_LISTED: Final = 20
-_COLOURS: Final = "skyless plan --write colours the slots"
 
 
 def check_site(site: Site, file: Path, *, slots_given: bool = True) -> None:
@@ -164,6 +164,11 @@ def check_site(site: Site, file: Path, *, slots_given: bool = True) -> None:
         if site.schedule.mode == "slots" and slots_given:
             _check_shared_slots(site, file)
     _check_times(site, file)
+
+
+def has_slots(site: Site) -> bool:
+    """Whether the file gives any slot."""
+    return site.schedule.slots is not None or any(anchor.slot is not None for anchor in site.all_anchors)
 
 
 def check_floor_plan(site: Site, file: Path) -> None:
@@ -263,10 +268,10 @@ def _check_shared_slots(site: Site, file: Path) -> None:
     """Check that every anchor has a slot, and that those which share one are far enough apart."""
     slots = site.schedule.slots
     if slots is None:
-        raise ConfigurationError(file, "schedule.slots", None, f"{SITE_LIMITS['schedule.slots']}; {_COLOURS}")
+        raise ConfigurationError(file, "schedule.slots", None, f"{SITE_LIMITS['schedule.slots']}; {_colours(site)}")
     for row, anchor in _rows(site):
         if anchor.slot is None or anchor.slot >= slots:
-            right = f"a whole number from 0 to {slots - 1}; {_COLOURS}"
+            right = f"a whole number from 0 to {slots - 1}; {_colours(site)}"
             raise ConfigurationError(file, _with_anchor(f"{row}.slot", site), anchor.slot, right)
     own = np.array([anchor.slot for anchor in site.anchors], np.int64)
     reuse_m = site.schedule.reuse_m - 2 * DISTANCE_ROUNDING_M
@@ -275,11 +280,16 @@ def _check_shared_slots(site: Site, file: Path) -> None:
             raise _too_near(site, file, int(one[0]), int(other[0]), float(apart_m[0]))
 
 
+def _colours(site: Site) -> str:
+    """How the planner gives the anchors slots; without --force it leaves those that the file has."""
+    return f"skyless plan --write {'--force ' if has_slots(site) else ''}colours the slots"
+
+
 def _too_near(site: Site, file: Path, one: int, other: int, apart_m: float) -> ConfigurationError:
     first, second = site.anchors[one], site.anchors[other]
     right = (
         f"another slot: anchors {first.id} and {second.id} share it and are {apart_m:.1f} m apart, less than "
-        f"schedule.reuse_m, {site.schedule.reuse_m:g} m; {_COLOURS}"
+        f"schedule.reuse_m, {site.schedule.reuse_m:g} m; {_colours(site)}"
     )
     return ConfigurationError(file, _with_anchor(f"anchors[{other}].slot", site), second.slot, right)
 

@@ -173,7 +173,7 @@ def _wrong_type(path: Path, document: dict[str, Any], message: str) -> Configura
         key_path = f"{key_path}.{missing['name']}".lstrip(".")
     key = re.sub(r"\[\d+\]", "", key_path).replace("unplaced.", "anchors.")
     value = None if missing else _value_at(document, key_path)
-    return ConfigurationError(path, _named(document, key_path), value, expected(key))
+    return ConfigurationError(path, _named(document, key_path), value, expected(key, protocol_2="unplaced" in document))
 
 
 def _named(document: dict[str, Any], key_path: str) -> str:

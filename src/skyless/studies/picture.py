@@ -96,6 +96,7 @@ def draw(look: Look, rows: Sequence[Row]) -> Figure:
     """Draw the rows of a study; error bars are standard errors."""
     with report_style():
         series = [(name, list(group)) for name, group in groupby(rows, key=lambda row: row.series)]
+        series = [(name, group) for name, group in series if _has_values(group, look)] or series
         heights = [_CURVE_IN if _is_curve(group) else 0.8 + _BAR_IN * len(group) for _, group in series]
         figure = Figure(figsize=(_WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
         methods = ", ".join(dict.fromkeys(row.method for row in rows))
@@ -110,6 +111,11 @@ def draw(look: Look, rows: Sequence[Row]) -> Figure:
                     axes.set_yticklabels([])
             line[0].set_title(name, loc="left")
     return figure
+
+
+def _has_values(rows: Sequence[Row], look: Look) -> bool:
+    """Whether any panel shows something of these rows; cold starts, for one, have no errors."""
+    return any(_PANELS[panel].value(row) is not None for panel in look.panels for row in rows)
 
 
 def _is_curve(rows: Sequence[Row]) -> bool:
@@ -173,9 +179,10 @@ def _named(axes: Axes, panel: _Panel, rows: list[Row], values: Array, errors: Ar
         else:
             axes.barh(row_y, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
     wide = np.nanmax(values, initial=0.0) > _WIDE_RATIO * np.nanmin(values, initial=np.inf)
-    if (wide if panel.log is None else panel.log) and np.isfinite(values).any():
+    positive = values[values > 0.0]  # a logarithmic axis has no 0
+    if (wide if panel.log is None else panel.log) and len(positive):
         axes.set_xscale("log")
-        axes.set_xlim(left=0.6 * float(np.nanmin(values)))
+        axes.set_xlim(left=0.6 * float(positive.min()))
         _plain_numbers(axes.xaxis, between=panel.log is None)
     axes.set_yticks(rows_y, [row.case for row in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)

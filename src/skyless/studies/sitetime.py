@@ -194,5 +194,7 @@ def draw(rows: Sequence[Row]) -> Figure:
         ratio.plot([row.x for row in mine], [row.ratio for row in mine])
     error.set(xlabel="hops from the root", ylabel="error of site time in cm", yscale="log")
     ratio.set(xlabel="hops from the root", ylabel="stated σ over error", ylim=(0.5, 1.7))
+    error.yaxis.set_major_formatter("{x:g}")
+    error.yaxis.set_minor_formatter("{x:g}")
     error.legend(fontsize=6)
     return figure

@@ -44,7 +44,7 @@ def anchor(
     from skyless.radios.interface import AntennaDelays
 
     plan, address = site_named(site), broker.address()
-    nodes = {node.id: node for node in plan.anchors}
+    nodes = {node.id: node for node in plan.all_anchors}
     if not ids or len(set(ids)) < len(ids) or not set(ids) <= set(nodes):
         given = " ".join(map(str, ids)) or "missing"
         raise SkylessError(

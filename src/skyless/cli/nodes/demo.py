@@ -12,9 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.common.options import Picoseconds, Positive, ProtectionOptions, Seed, check_method, options
+from skyless.cli.common.options import (
+    Picoseconds,
+    Positive,
+    ProtectionOptions,
+    Seed,
+    check_method,
+    options,
+)
 from skyless.cli.common.output import console, number, print_json
 from skyless.cli.common.progress import loading_kernels
+from skyless.cli.common.simulated_site import check_live
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, log, site_named
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
@@ -117,9 +125,11 @@ def _settings(asked: DemoOptions) -> "SiteRun":
     if asked.mqtt is None and asked.mqtt_ca is not None:
         raise SkylessError("--mqtt-ca is for another broker; give it together with --mqtt")
     name = f"lab:{asked.noise_ps:g}" if asked.site is None else str(asked.site.absolute())
+    site = site_named(name)
+    check_live(site, asked.method)
     folder = recordings_folder()
     return SiteRun(
-        site=site_named(name),
+        site=site,
         site_name=name,
         tags=asked.tags,
         speed_mps=asked.speed,
@@ -329,9 +339,12 @@ class Screen:
             min(modes, default="master"), ("clock sigma cm",)
         )
         rate = () if modes == {"free"} else ("rate ppm",)
-        table = Table("anchor", "role", "heard", *rate, *follows, "sent", "late", title="synchronisation")
+        title = "anchors" if modes == {"free"} else "synchronisation"
+        table = Table("anchor", "role", "heard", *rate, *follows, "sent", "late", title=title)
+        now_s = time.time()
         for anchor, health in sorted(anchors.items()):
-            leads = health.role in {"master", "root"}
+            role = health.role if now_s - health.unix_s < _SENDING_S else "offline"
+            leads = role in {"master", "root"}
             shown = {
                 "rate ppm": "–" if leads else number(health.rate_ppm, "{:+.4f}"),
                 "clock sigma cm": "–" if leads else number(health.offset_std_m, "{:.2f}", 100.0),
@@ -341,7 +354,7 @@ class Screen:
                 "parents": " ".join(map(str, health.parents)) or "–",
             }
             cells = [shown[name] for name in (*rate, *follows)]
-            table.add_row(str(anchor), health.role, str(health.heard), *cells, str(health.sent), str(health.late))
+            table.add_row(str(anchor), role, str(health.heard), *cells, str(health.sent), str(health.late))
         return table
 
     def summary(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.common.options import Picoseconds, Seed, options
+from skyless.cli.common.simulated_site import check_live
 from skyless.cli.nodes.options import MqttOptions, WalkingSpeed, listen_address, log, site_named
 from skyless.errors import SkylessError
 from skyless.radios.ether_wire import DEFAULT_PORT
@@ -55,6 +56,7 @@ def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOpt
     from skyless.nodes.process import run
 
     site, address = site_named(asked.site), broker.address()
+    check_live(site)
     host, port = listen_address(asked.listen, DEFAULT_PORT)
     request = Request(site, noise_ps=asked.noise_ps, loss=asked.loss, nlos=asked.nlos, seed=asked.seed)
     compile_kernels()

@@ -4,7 +4,7 @@ import { changed, on, saveSetting, savedSetting, state } from "./store.js";
 import { byId, h, options, text } from "./dom.js";
 import { DELAY_S, GONE_S, GREY_S, stillMotion } from "./clock.js";
 import { length, number } from "./format.js";
-import { CONDITIONS, anchorMark } from "./map/anchors.js";
+import { CONDITIONS, anchorMark, siteMode, wordsOf } from "./map/anchors.js";
 import { KINDS, choose, colourAt } from "./map/overlay.js";
 import { NAMED } from "./map/tags.js";
 
@@ -14,6 +14,11 @@ const SWITCHES = {
   ellipses: "Ellipse of 95 % of the errors, by the tag's reported σ",
   levels: "Protection level, a dashed circle: the tag is outside with at most the configured probability",
   truth: "True position, a faint ring (simulated sites)",
+};
+/** Anchors with a frame, by the mode of the site. */
+const LEADERS = {
+  master: "master: its clock is the site's time",
+  slots: "root: its clock leads the slot time of anchors linked to it",
 };
 
 /** Fill the legend. */
@@ -26,10 +31,17 @@ export function start() {
   byId("legend").addEventListener("toggle", () => saveSetting(KEY, byId("legend").open ? "open" : "shut"));
 }
 
+/** The marks of anchors, with the words of the site's mode. */
 function marks() {
-  const rows = Object.entries(CONDITIONS).map(([kind, { words }]) => h("li", {}, anchorMark(kind), `anchor ${words}`));
-  const master = h("li", {}, anchorMark("good", true), "master: its clock is the site's time");
-  return h("ul", { class: "marks" }, ...rows, master);
+  const list = h("ul", { class: "marks" });
+  const show = () => {
+    const rows = Object.keys(CONDITIONS).map((kind) => h("li", {}, anchorMark(kind), `anchor ${wordsOf(kind)}`));
+    const leader = LEADERS[siteMode()];
+    list.replaceChildren(...rows, ...(leader ? [h("li", {}, anchorMark("good", true), leader)] : []));
+  };
+  on(["site"], show);
+  show();
+  return list;
 }
 
 function switchFor([key, words]) {

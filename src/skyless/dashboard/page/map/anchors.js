@@ -30,25 +30,41 @@ export function condition(id) {
   return health.synchronised || health.role === "master" ? "good" : "warn";
 }
 
+/** How the site's anchors share the air: master, slots or free. */
+export function siteMode() {
+  return state.site?.schedule?.mode ?? "master";
+}
+
+/** Words for a condition; anchors that send at random instants are synchronised to nothing. */
+export function wordsOf(kind) {
+  return kind === "good" && siteMode() === "free" ? "on the air" : CONDITIONS[kind].words;
+}
+
+/** What the anchor leads: "master" of the site, "root" of a slot time (islands have one each), or "". */
+export function leads(id) {
+  if (siteMode() === "master") return id === masterNow() ? "master" : "";
+  const root = state.mode === "live" && state.health.anchors.get(id)?.role === "root";
+  return root && condition(id) !== "bad" ? "root" : "";
+}
+
 /** The current master: as the anchors report it, or else as in the site file. */
-export function masterNow() {
+function masterNow() {
   const master = [...state.health.anchors.values()].filter((health) => health.role === "master");
   master.sort((a, b) => b.term - a.term);
   if (state.mode === "live" && master.length && condition(master[0].anchor) !== "bad") return master[0].anchor;
   return state.site?.master ?? null;
 }
 
-/** A condition's mark as a small picture; the master's has a frame. */
-export function anchorMark(kind, master = false) {
+/** A condition's mark as a small picture; that of a master or root has a frame. */
+export function anchorMark(kind, leading = false) {
   const path = s("path", { d: CONDITIONS[kind].shape, transform: "translate(9 9) scale(5)" });
   const mark = s("svg", { viewBox: "0 0 18 18", class: `mark ${kind}`, "aria-hidden": "true" }, path);
-  if (master) mark.append(s("path", { class: "frame", d: "M1.5 1.5h15v15h-15z" }));
+  if (leading) mark.append(s("path", { class: "frame", d: "M1.5 1.5h15v15h-15z" }));
   return mark;
 }
 
-/** Draw all anchors; the master has a frame around it, the selected one a ring. */
+/** Draw all anchors; a master or root has a frame around it, the selected one a ring. */
 export function drawAnchors(context) {
-  const master = masterNow();
   context.font = "600 11px system-ui, sans-serif";
   context.textAlign = "center";
   context.textBaseline = "top";
@@ -58,7 +74,8 @@ export function drawAnchors(context) {
     const kind = condition(anchor.id);
     const colour = palette[CONDITIONS[kind].colour];
     mark(context, kind, x, y, colour);
-    if (anchor.id === master) {
+    const leading = leads(anchor.id);
+    if (leading) {
       context.strokeStyle = colour;
       context.lineWidth = 1.5;
       context.strokeRect(x - MARK - 4.5, y - MARK - 4.5, 2 * MARK + 9, 2 * MARK + 9);
@@ -66,7 +83,7 @@ export function drawAnchors(context) {
     if (anchor.id === state.selection.anchor) ring(context, x, y, MARK + 9);
     label(
       context,
-      anchor.id === master ? `${anchor.id} master` : String(anchor.id),
+      leading ? `${anchor.id} ${leading}` : String(anchor.id),
       x,
       y + MARK + (anchor.id === state.selection.anchor ? 12 : 7),
     );

@@ -5,7 +5,7 @@ import { Chart } from "../chart.js";
 import { Rows, h, text } from "../dom.js";
 import { DASH, duration, length, number } from "../format.js";
 import { anchorHistory } from "../history.js";
-import { CONDITIONS, anchorMark, condition, masterNow } from "../map/anchors.js";
+import { anchorMark, condition, leads, wordsOf } from "../map/anchors.js";
 import { facts, selectionTable, split } from "./parts.js";
 
 export const title = "Anchors";
@@ -52,18 +52,18 @@ function healthOf(id) {
 
 function describe(id) {
   const kind = condition(id);
-  const master = id === masterNow();
+  const leading = leads(id);
   const health = healthOf(id);
   return {
     condition: kind,
-    words: CONDITIONS[kind].words,
-    key: kind + master,
-    mark: () => anchorMark(kind, master),
-    name: master ? `${id} master` : String(id),
+    words: wordsOf(kind),
+    key: wordsOf(kind) + leading,
+    mark: () => anchorMark(kind, leading !== ""),
+    name: leading ? `${id} ${leading}` : String(id),
     figures: [
-      master ? "reference" : number(health?.offset_s, 4, "s"),
-      master ? DASH : number(health?.rate_ppm, 3, "ppm"),
-      master ? DASH : sigma(health?.offset_std_m),
+      leading ? "reference" : number(health?.offset_s, 4, "s"),
+      leading ? DASH : number(health?.rate_ppm, 3, "ppm"),
+      leading ? DASH : sigma(health?.offset_std_m),
       number(health?.late),
     ],
   };
@@ -78,6 +78,9 @@ function makeDetail() {
   const list = facts([
     "State",
     "Synchronised to",
+    "Slot time led by",
+    "Hops",
+    "Parents",
     "Term",
     "Superframe",
     "Sent",
@@ -93,7 +96,7 @@ function makeDetail() {
   const around = { zero: false };
   const offsets = new Chart("Change of clock offset (µs)", [{ name: "offset", colour: "accent" }], tenths, 1, around);
   const rate = { name: "rate", colour: "warn" };
-  const rates = new Chart("Clock rate relative to the master (ppm)", [rate], thousandths, 0.01, around);
+  const rates = new Chart("Clock rate relative to the site's (ppm)", [rate], thousandths, 0.01, around);
   const sigmas = new Chart("σ of the clock offset (mm)", [{ name: "σ", colour: "good" }], tenths, 1);
   const charts = h("div", {}, offsets.element, rates.element, sigmas.element);
   const attributes = { class: "detail", "aria-label": "Selected anchor", hidden: true };
@@ -104,7 +107,7 @@ function makeDetail() {
     if (!health) return;
     text(heading, `Anchor ${id}`);
     list.show(anchorFacts(id, health));
-    charts.hidden = id === masterNow();
+    charts.hidden = leads(id) !== "";
     const past = anchorHistory.get(id);
     if (!past || charts.hidden) return;
     const now = past.time.at(-1);
@@ -125,7 +128,7 @@ function anchorFacts(id, health) {
   const ages = Object.entries(health.heard_age_s ?? {}).sort((a, b) => b[1] - a[1]);
   const counted = Object.entries(health.counters).filter(([name, count]) => count && !SHOWN.has(name));
   return {
-    State: `${CONDITIONS[condition(id)].words}, ${health.role}`,
+    State: `${wordsOf(condition(id))}, ${health.role}`,
     "Synchronised to": health.master === null || health.master === id ? null : `anchor ${health.master}`,
     "Slot time led by": health.root == null || health.root === id ? null : `anchor ${health.root}`,
     Hops: number(health.hop),

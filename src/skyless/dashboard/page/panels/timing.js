@@ -3,6 +3,7 @@
 import { state } from "../store.js";
 import { byId, h, s, text } from "../dom.js";
 import { duration, number, roundStep } from "../format.js";
+import { siteMode } from "../map/anchors.js";
 import { facts } from "./parts.js";
 
 export const title = "Timing";
@@ -45,7 +46,11 @@ export function show() {
   parts.picture.replaceChildren(...(shown.length ? [draw(shown)] : []));
   text(
     parts.empty,
-    state.mode === "live" ? "No positioning phases reported yet." : "Phases are shown on the live site only.",
+    siteMode() === "free"
+      ? "No superframe: the anchors send at random instants."
+      : state.mode === "live"
+        ? "No positioning phases reported yet."
+        : "Phases are shown on the live site only.",
   );
   const { slot_s = 0 } = state.site?.schedule ?? {};
   const slots = slotCount();
@@ -68,7 +73,7 @@ function read(health) {
 }
 
 function slotCount() {
-  const site = state.site;
+  const site = siteMode() === "free" ? null : state.site;
   return site ? (site.schedule.slots ?? site.anchors.length * site.schedule.frames_per_node) : 0;
 }
 
