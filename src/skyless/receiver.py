@@ -17,6 +17,7 @@ from skyless.air.frames import AnyBeacon, decode_any
 from skyless.air.master_term import FollowedMaster
 from skyless.air.reception import Diagnostics, Reception
 from skyless.air.site_choice import SiteChoice, SiteKey, SiteUse
+from skyless.constants import TICK_S
 from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
@@ -41,7 +42,7 @@ from skyless.positioning.methods.selection import (
 from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
 from skyless.positioning.observation import Observation
 from skyless.site.almanac_pages import AlmanacAssembly, AlmanacState
-from skyless.site.local_almanac import LocalAlmanac, LocalAlmanacState
+from skyless.site.local_almanac import LEAST_ANCHORS, LocalAlmanac, LocalAlmanacState
 from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 
@@ -169,7 +170,7 @@ class Receiver:
             if state.choice.key.version == 1:
                 made._choose_method()
             else:
-                made._choose_method_2()
+                made._choose_method_2(state.superframe_ticks)
         match made._method, state.method:
             case Estimation() as method, EstimationState() as saved:
                 method.restore(saved)
@@ -215,7 +216,7 @@ class Receiver:
             result = self._process(beacon, reception, rx_ticks, tx_ticks)
         if isinstance(result, Fix):
             self.counters["fixes"] += 1
-            self._choice.fix_ticks = rx_ticks
+            self._choice.on_fix(rx_ticks)
             return result
         self.reason = result
         if result is NoFixReason.RESIDUALS:
@@ -242,15 +243,12 @@ class Receiver:
         method = self._method
         was_starting = not isinstance(method, Estimation) or method.is_starting
         in_use = isinstance(method, Estimation) and not was_starting and method.estimator.has_anchor(anchor)
-        is_confirmed = in_use or self._selection.is_confirmed(anchor, rx_ticks)
-        if not is_confirmed and not was_starting:
-            fitting = fitting_relays(relays, tx_ticks, rx_ticks, self._packet_in_use)
-            if fitting >= LEAST_FITTING:
-                self._selection.confirm(anchor, rx_ticks)
-                is_confirmed = True
-        if is_confirmed or was_starting:
+        is_vouched_for = self._selection.is_vouched_for(anchor, rx_ticks, in_use=in_use)
+        if is_vouched_for or was_starting or self._has_too_few(rx_ticks):
             self._selection.add_relays(relays, rx_ticks)
-        if self.local_almanac.on_beacon(beacon, rx_ticks, is_confirmed):
+        elif fitting_relays(relays, tx_ticks, rx_ticks, self._packet_in_use) >= LEAST_FITTING:
+            self._selection.show(anchor, rx_ticks)
+        if self.local_almanac.on_beacon(beacon, rx_ticks, is_vouched_for):
             self._choose_method_2()
         anchor_m = self.local_almanac.position_m(anchor)
         if anchor_m is None:
@@ -279,6 +277,16 @@ class Receiver:
         track = self._stamps.tracks.of_anchor.get(anchor)
         in_use = isinstance(self._method, Estimation) and self._method.estimator.has_anchor(anchor)
         return (track.sequence, track.rx_ticks_tag) if track is not None and in_use else None
+
+    def _has_too_few(self, rx_ticks: int) -> bool:
+        """Whether fewer anchors in use are still received than a fix takes, so that relays of any anchor confirm.
+
+        A tag may come to where none of its anchors is received, nor receives the next ones: out of a lift.
+        """
+        assert isinstance(self._method, Estimation)
+        state = self._method.estimator.state
+        is_present = (rx_ticks - state.anchors["rx_ticks"]) * TICK_S <= state.settings[0]["drop_s"]
+        return int(np.count_nonzero(is_present & (state.anchors["packets"] > 0))) < LEAST_ANCHORS
 
     def _may_join(self, method: Estimation, observation: Observation) -> bool:
         """Whether an anchor is in use or may be: others have received it, and it is not weaker than 24 in use."""
@@ -332,7 +340,7 @@ class Receiver:
         if isinstance(beacon, Beacon) and beacon.anchor not in self._positions and self.almanac.complete:
             self.counters["unknown-anchor"] += 1
             return None
-        tx_ticks = self._stamps.unwrap(beacon, rx_ticks)
+        tx_ticks = self._stamps.unwrap(beacon, rx_ticks, self._superframe_ticks)
         if tx_ticks is None:
             return None
         self._choice.heard_ticks = rx_ticks
@@ -344,13 +352,13 @@ class Receiver:
     def _restart(self, rx_ticks: int) -> bool:
         """Forget all stamps, as the tag's counter restarted; False where the host's clock jumped by over a year."""
         self._forget_stamps()
-        self._choice.forget_times()
         if abs(rx_ticks) <= LAST_TICKS:
             self.counters["counter-jump"] += 1
-            self._choice.heard_ticks = rx_ticks
+            self._choice.restart(rx_ticks)
             return True
         self.counters["impossible-host-time"] += 1
-        self._own_ticks, self._choice.heard_ticks = Unwrapper(), 0
+        self._own_ticks = Unwrapper()
+        self._choice.restart(0)
         return False
 
     def _is_of_site(self, beacon: AnyBeacon, rx_ticks: int) -> bool:
@@ -361,7 +369,7 @@ class Receiver:
         if use is SiteUse.CHANGED and had_site:
             self.counters["site-change"] += 1
             self.almanac, self.local_almanac = AlmanacAssembly(), LocalAlmanac()
-            self._positions = {}
+            self._positions, self._superframe_ticks = {}, 0
             self._forget_stamps()
         return use is not SiteUse.FOREIGN
 
@@ -408,14 +416,18 @@ class Receiver:
                 self._method = new_method(options, master, schedule_page, noise, accuracy, self._time)
                 self._observer.set_method(self._method, schedule)
 
-    def _choose_method_2(self) -> None:
-        """Make the method that the common pages require, unless it is in use already; the schedule is no matter."""
+    def _choose_method_2(self, superframe_ticks: int | None = None) -> None:
+        """Make the method that the common pages require, unless it is in use already; the schedule is no matter.
+
+        ``superframe_ticks``: that with which the method was made, where it continues from a state.
+        """
         pages = self.local_almanac.pages
         assert pages is not None
         method_key = (pages.site.tag_height_m, pages.noise, pages.accuracy)
         if method_key != self._method_key:
             self._method_key = method_key
-            self._method = new_method_2(self._options, pages, self._time)
+            self._superframe_ticks = superframe_ticks or pages.site.superframe_ticks
+            self._method = new_method_2(self._options, pages, self._superframe_ticks, self._time)
 
 
 def _variance_scale(diagnostics: Diagnostics) -> float:

@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.site_choice import MOST_SITES, SITE_SILENCE_TICKS, SiteChoice, SiteKey, SiteUse
+from skyless.air.site_choice import MOST_SITES, SITE_SILENCE_TICKS, TRIAL_TICKS, SiteChoice, SiteKey, SiteUse
 from skyless.ticks import from_seconds
 
 HOME, OTHER = SiteKey(1, 2), SiteKey(77, 2)
@@ -61,3 +61,35 @@ def test_memory_is_bounded_and_the_site_in_use_is_kept(rows):
     if rows:
         assert choice.key is not None
         assert choice.key.site << 8 | 2 in choice.anchors
+
+
+def sites_used(choice, rows, start=0):
+    """The site in use at each beacon of (site, anchor), one every 10 ms, all of which are accepted."""
+    used = []
+    for number, (key, anchor) in enumerate(rows):
+        if choice.on_beacon(key, anchor, start + number * STEP) is not SiteUse.FOREIGN:
+            choice.heard_ticks = start + number * STEP
+        used.append(choice.key)
+    return used
+
+
+def test_a_site_that_gives_no_fix_makes_way_and_does_not_return_by_its_number_of_anchors():
+    """Eight foreign anchors from the start, three of the own site: these give fixes, once they are used."""
+    choice, trial = SiteChoice(), round(TRIAL_TICKS / STEP)
+    rows = [row for n in range(trial) for row in ((OTHER, n % 8), (HOME, n % 3))]
+    used = sites_used(choice, rows)
+    assert set(used[20 : trial - 1]) == {OTHER}
+    assert set(used[trial + 1 : 2 * trial - 1]) == {HOME}
+    choice.on_fix(2 * trial * STEP)
+    assert set(sites_used(choice, rows[: trial // 5], start=2 * trial * STEP)) == {HOME}
+
+
+def test_a_site_that_failed_is_tried_again_after_the_other_one_has_failed():
+    trial = round(TRIAL_TICKS / STEP)
+    used = sites_used(SiteChoice(), [((HOME, OTHER)[n % 2], n % 8) for n in range(round(2.5 * trial))])
+    assert [used[number * trial // 4] for number in (2, 6, 9)] == [HOME, OTHER, HOME]
+
+
+def test_a_site_of_two_anchors_is_not_tried():
+    rows = [row for n in range(600) for row in ((OTHER, n % 8), (HOME, n % 2))]
+    assert set(sites_used(SiteChoice(), rows)[20:]) == {OTHER}

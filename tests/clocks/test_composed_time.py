@@ -199,19 +199,8 @@ def test_one_step_of_the_stated_time_is_left_out_and_a_lasting_one_accepted():
 def test_nothing_is_known_before_a_beacon():
     time = composed()
     assert not time.is_known
-    assert not time.is_settled(0)
     with pytest.raises(ValueError, match="not known yet"):
         time.subticks(0)
-
-
-def test_settled_only_when_the_rate_is_known():
-    time, link = composed(), Link()
-    time.set_parents([1])
-    link.beacon(time, 0)
-    assert not time.is_settled(link.receiver(SCHEDULE.slot_start_ticks(1, 0)))
-    link.beacon(time, 1)
-    link.beacon(time, 2)
-    assert time.is_settled(link.receiver(SCHEDULE.slot_start_ticks(3, 0)))
 
 
 def test_restart_forgets_the_timeline_and_keeps_the_pairs():

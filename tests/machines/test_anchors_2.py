@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from bench import LAB, Stage
-from skyless.air.beacon2 import Beacon2
+from skyless.air.beacon2 import Beacon2, SlotTime, StatedPosition
 from skyless.air.codec2 import decode_2, encode_2
 from skyless.air.reception import Diagnostics, Reception
 from skyless.anchor import Anchor
@@ -298,3 +298,26 @@ def test_a_false_master_of_real_anchors_does_not_stop_the_others():
     frames = Counter(beacon.anchor for time_s, beacon in sent if time_s >= 1.0)
     for anchor in range(1, 7):
         assert frames[anchor] >= 0.9 * 5.0 / 7e-3
+
+
+@pytest.mark.parametrize("late_s", [-1.5e-6, 0.0, 1.5e-6])
+def test_a_frame_that_was_due_when_the_timeline_moved_is_sent_with_what_still_holds(late_s):
+    """A greater claim within the guard moves the slot by more than site time has bits for: then it is not stated."""
+    site = site_of(3, 1, 4.0, site_time=True)
+    machine, now, tx_ticks = new_anchor(site, 1), 0, None
+    while tx_ticks is None or machine.synchronisation.role is not SlotRole.ROOT:
+        now += round(1e-3 * TICK_RATE_HZ)
+        tx_ticks = machine.next_transmission_ticks(now)
+    superframe = machine.slot_time(now)[1]
+    start = machine.slot_start_ticks(superframe, 1)
+    late = round(late_s * TICK_RATE_HZ)
+    claimed = SlotTime(superframe, 1, 2, 7, 0, 0, 0.0)
+    position = StatedPosition(site.anchors[1].x_m, site.anchors[1].y_m, site.anchors[1].z_m)
+    for slot_time, ticks in ((None, start - 10**7), (claimed, start)):
+        beacon = a_beacon(site, 2, ticks, slot_time=slot_time, position=position, site_time=None)
+        receive(machine, beacon, ticks + late)
+    assert machine.synchronisation.root == 2
+    assert machine.counters["phase-change"] == 0
+    sent = decode_2(machine.transmission(tx_ticks).frame)
+    assert sent.slot_time.root == 2
+    assert (sent.site_time is None) == (late_s != 0.0)

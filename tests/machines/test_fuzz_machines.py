@@ -10,14 +10,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from bench import EVERY_METHOD, LAB, ROOM, assert_honest, tape
+from bench import EVERY_METHOD, LAB, ROOM, Stage, assert_honest, tape
+from skyless.air.beacon2 import Beacon2
 from skyless.air.codec import MAX_FRAME_BYTES
+from skyless.air.codec2 import decode_2
 from skyless.air.ieee802154 import fcs
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
+from skyless.anchors.factory import new_anchor
 from skyless.constants import TICK_RATE_HZ
 from skyless.receiver import Receiver
+from skyless.site.model import AnchorSite, ScheduleSite, UnplacedAnchor
 from skyless.ticks import wrap
 
 FRAMES = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
@@ -187,3 +192,79 @@ def test_any_bytes_at_any_time(receptions):
             assert np.array_equal(one_fix.position_m, other_fix.position_m)
     assert sum(receiver.counters.values()) - sum(undisturbed.counters.values()) == len(receptions)
     assert sum(anchor.counters.values()) == len(receptions)
+
+
+MOST_ANCHORS = 6
+
+
+class Noise2(Noise):
+    """Hostile frames of protocol 2: claims, superframes, rates, stamps and senders of valid beacons, changed."""
+
+    def frame(self):
+        if self.generator.random() < 0.3:
+            return super().frame()
+        body, draw = bytearray(self.a_body()), self.generator
+        kind = draw.integers(4)
+        if kind == 0:  # another claim: of low terms, or the highest
+            term = int(draw.integers(5)) if draw.random() < 0.7 else 2**32 - 1
+            body[24:26], body[26:30] = int(draw.integers(8)).to_bytes(2, "little"), term.to_bytes(4, "little")
+            body[31] = int(draw.integers(4))
+        elif kind == 1:  # another sender
+            body[7:9] = int(draw.integers(1, 9)).to_bytes(2, "little")
+        elif kind == 2:  # a superframe and a rate that are near
+            superframe = int.from_bytes(body[19:23], "little") + int(draw.integers(-3, 4))
+            body[19:23] = (superframe % 2**32).to_bytes(4, "little")
+            body[32:35] = draw.bytes(2) + bytes([int(draw.integers(40))])
+        else:  # a stamp that nearly fits
+            tx_ticks = int.from_bytes(body[12:17], "little") + int(draw.integers(-200_000, 200_000))
+            body[12:17] = wrap(tx_ticks).to_bytes(5, "little")
+        return bytes(body) + fcs(bytes(body))
+
+
+class Recorder:
+    """An anchor, and what it receives."""
+
+    def __init__(self, machine, received):
+        self.id, self.machine, self.received = machine.id, machine, received
+        self.next_transmission_ticks, self.transmission = machine.next_transmission_ticks, machine.transmission
+
+    def hear(self, reception):
+        self.received.append(reception)
+        self.machine.hear(reception)
+
+
+@pytest.mark.parametrize("mode", ["slots", "free"])
+@pytest.mark.parametrize("is_placed", [True, False])
+def test_machines_of_protocol_2_on_a_hostile_channel(mode, is_placed):
+    """Nothing raises, also where the timeline moves between the time and the frame; what is sent can be received."""
+    schedule = (
+        ScheduleSite(mode="slots", slot_s=1e-3, slots=MOST_ANCHORS, site_time=True)
+        if mode == "slots"
+        else ScheduleSite(mode="free", rate_hz=160.0)
+    )
+    anchors = tuple(
+        AnchorSite(n + 1, 4.0 * n, float(n % 2), 3.0, n if mode == "slots" else None) for n in range(MOST_ANCHORS)
+    )
+    site, received = replace(LAB, anchors=anchors, master=1, schedule=schedule), []
+    own = replace(site, anchors=anchors[:3] + anchors[4:], unplaced=(UnplacedAnchor(4, anchors[3].slot),))
+
+    def make(_, anchor):
+        machine = new_anchor(site, anchor)
+        return Recorder(machine, received) if anchor == 4 else machine
+
+    for _ in Stage(site, make=make).world.run(1.5):
+        pass
+    noise, tag = Noise2(7, [one.frame for one in received]), Receiver(site=site.id)
+    anchor, sent = new_anchor(site if is_placed else own, 4), 0
+    for one in received:
+        tag.hear(one)
+        anchor.hear(one)
+        tx_ticks = anchor.next_transmission_ticks(wrap(one.rx_ticks + 10**5))
+        for k in range(3):
+            false = Reception(noise.frame(), wrap(one.rx_ticks + 10**6 * (k + 1)), one.host_s)
+            tag.hear(false)
+            anchor.hear(false)
+        if tx_ticks is not None:
+            assert isinstance(decode_2(anchor.transmission(tx_ticks).frame), Beacon2)
+            sent += 1
+    assert sent > 0.5 * len(received) > 300

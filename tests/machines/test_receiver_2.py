@@ -278,6 +278,28 @@ def test_a_tag_from_a_checkpoint_goes_on_with_the_same_bits():
         assert again.counters == whole.counters
 
 
+def test_a_checkpoint_after_a_change_of_the_schedule_goes_on_with_the_same_bits():
+    """The method goes on as it was made, also where anchors are silent for longer than it allows."""
+    slower = replace(FREE, schedule=replace(FREE.schedule, rate_hz=1.1))
+    pages = site_pages_of(slower)
+    changed = [
+        with_beacon(
+            one, almanac_issue=site_issue(pages), page=pages[(beacon_of(one).sequence + one.anchor) % len(pages)]
+        )
+        if one.host_s > 1.0
+        else one
+        for one in free_tape(seconds=4.0)
+    ]
+    cut = next(k for k, one in enumerate(changed) if one.host_s > 1.5)
+    whole = Receiver()
+    fixes_of(whole, changed[:cut])
+    assert whole.local_almanac.issue == site_issue(pages)
+    again = load(save(whole))
+    silent = {anchor.id for anchor in FREE.anchors[:2]}
+    rest = [one for one in changed[cut:] if one.anchor not in silent or one.host_s > 2.8]
+    assert fixes_of(again, rest) == fixes_of(whole, rest)
+
+
 def test_relays_of_a_weak_first_path_are_not_used():
     late = [
         with_beacon(
@@ -300,3 +322,71 @@ def test_fixes_follow_one_another_by_the_tags_own_clock():
     assert all(later > earlier for earlier, later in pairwise(times))
     assert times[-1] - times[0] == pytest.approx(free_tape()[-1].host_s, abs=0.1)
     assert np.isfinite(times).all()
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 1.5])
+def test_a_tag_comes_to_anchors_that_none_of_its_own_has_received(pause_s):
+    """Through a steel door, or out of a lift: both groups have the same site, and none relays the other's beacons."""
+    others = replace(FREE, anchors=tuple(replace(anchor, id=anchor.id + 100) for anchor in FREE.anchors))
+    first, then = free_tape(), free_tape(others, seed=2, seconds=4.0 + pause_s)
+    zero = wrap(first[0].rx_ticks - from_seconds(first[0].host_s) - then[0].rx_ticks + from_seconds(then[0].host_s))
+    moved = [
+        replace_heard(one, one.anchor, one.frame, wrap(one.rx_ticks + zero), one.host_s)
+        for one in then
+        if one.host_s > 2.0 + pause_s
+    ]
+    receiver, latest_s = Receiver(), []
+    for one in (*first, *moved):
+        fix = receiver.hear(one.reception)
+        if fix is not None:
+            latest_s.append(one.host_s)
+            assert_honest(fix, one.truth_m)
+    seconds = np.array(latest_s)
+    assert np.min(seconds[seconds > 2.0]) < 2.0 + max(1.0, pause_s) + 0.2
+    assert np.count_nonzero(seconds > 3.2 + pause_s) > 200
+
+
+def test_a_foreign_site_of_more_anchors_delays_the_first_fix_but_does_not_hold_the_tag():
+    """It gives no fix: its anchors do not receive each other."""
+    heard = free_tape(seconds=6.0)
+    falses = [
+        replace_heard(one, 0, encode_2(a_beacon(
+            site=77, anchor=200 + n % 9, sequence=n // 9 & 0xFF, tx_ticks=wrap(from_seconds(one.host_s))
+        )), wrap(one.rx_ticks + from_seconds(0.9e-3)), one.host_s + 0.9e-3)
+        for n, one in enumerate(heard)
+    ]  # fmt: skip
+    receiver = Receiver()
+    made = fixes_of(receiver, merged(heard, falses))
+    assert receiver.site == FREE.id
+    assert min(one.host_s for one in heard if (one.frame, one.rx_ticks) in made) < 5.3
+
+
+def test_one_radio_of_many_names_that_measures_truly_changes_no_page():
+    """Twelve names that relay true receptions of anchors in use: they join, but are no majority."""
+    heard, pages = (
+        free_tape(),
+        tuple(replace(page, tag_height_m=17.0) if isinstance(page, SitePage) else page for page in site_pages_of(FREE)),
+    )
+    tag = heard[0]
+
+    def name(n, tx_ticks):
+        now = from_seconds(0.5 + (n + 0.37) / 60.0)
+        newest = {one.anchor: one for one in heard if one.host_s < 0.499 + (n + 0.37) / 60.0}
+        relays = tuple(
+            Relay(
+                one.anchor,
+                beacon_of(one).sequence,
+                wrap(tx_ticks - wrap(tag.rx_ticks + now - from_seconds(tag.host_s) - one.rx_ticks)),
+            )
+            for one in sorted(newest.values(), key=lambda one: -one.host_s)[:3]
+        )
+        return a_beacon(
+            anchor=1000 + n % 12, sequence=n // 12, tx_ticks=tx_ticks, heard=relays, almanac_issue=site_issue(pages),
+            page=pages[(n + n // 12) % len(pages)], position=StatedPosition(500.0, 500.0, 2.0),
+        )  # fmt: skip
+
+    receiver = Receiver()
+    made = fixes_of(receiver, merged(heard, false_frames(60.0, name, first_s=0.5)))
+    assert 1000 in receiver.method.estimator.anchors
+    assert receiver.local_almanac.issue == site_issue(site_pages_of(FREE))
+    assert len(made) > 550

@@ -136,3 +136,20 @@ def test_memory_is_bounded_whatever_comes_and_a_state_goes_on_the_same(rows):
 def test_the_issue_does_not_depend_on_the_order_of_the_pages():
     assert site_issue(reversed(PAGES)) == ISSUE
     assert site_issue((*PAGES[:-1], replace(PAGES[-1], tag_height_m=0.5))) != ISSUE
+
+
+def test_strangers_do_not_displace_anchors_that_others_have_received():
+    """Neither their positions nor the pages that they state, however many there are."""
+    almanac, good = LocalAlmanac(), rotation(190)
+    for n, one in enumerate(good):
+        if n % 100 == 0:
+            almanac.on_beacon(one, n * STEP, True)
+        else:
+            page = replace(PAGES[n % 2 * 2], **({"tag_height_m": float(n % 7)} if n % 2 else {"rx_stamp_s": n * 1e-12}))
+            almanac.on_beacon(beacon(1000 + n % 90, page, ISSUE if n % 3 else n % 7), n * STEP, False)
+    assert almanac.position_m(1) is not None
+    assert any(one.issue == ISSUE for one in almanac.state().collected)
+    run(almanac, rotation(9), start=from_seconds(2.0))
+    assert almanac.pages is not None
+    assert almanac.issue == ISSUE
+    assert len(almanac.state().anchors) <= MOST_POSITIONS

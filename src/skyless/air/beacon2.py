@@ -1,4 +1,4 @@
-"""The beacon of protocol 2, which needs no master: each anchor states its own position (``docs/protocol.md``)."""
+"""The beacon of protocol 2, which needs no master: each anchor states its own position (``docs/protocol2.md``)."""
 
 from typing import Final
 

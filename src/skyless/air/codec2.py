@@ -1,4 +1,4 @@
-"""Beacons of protocol 2 and their bytes (``docs/protocol.md``); little endian throughout, 127 bytes at most."""
+"""Beacons of protocol 2 and their bytes (``docs/protocol2.md``); little endian throughout, 127 bytes at most."""
 
 import math
 import struct
@@ -30,6 +30,8 @@ RATE_STEPS: Final = 2.0**36
 MAX_RATE: Final = ((1 << 23) - 1) / RATE_STEPS
 MAX_STATED_COORDINATE_M: Final = ((1 << 23) - 1) / 1000.0
 """8388.6 m, along each axis from the origin."""
+MOST_RESIDUAL_TICKS: Final = ((1 << 23) - 1) / SUBTICKS
+"""0.51 µs, of site time about the nominal start of the slot."""
 
 _HAS_SLOT_TIME: Final = 0x01
 _HAS_POSITION: Final = 0x02
@@ -294,8 +296,8 @@ def _real_fault(beacon: Beacon2) -> str | None:
         fields += [(f"position.{axis}_m", getattr(position, f"{axis}_m"), -reach_m, reach_m) for axis in "xyz"]
         fields.append(("position.std_m", position.std_m, 0.0, math.inf))
     if site_time is not None:
-        most_ticks = ((1 << 23) - 1) / SUBTICKS
-        fields.append(("site_time.residual_ticks", site_time.residual_ticks, -most_ticks, most_ticks))
+        residual_ticks = site_time.residual_ticks
+        fields.append(("site_time.residual_ticks", residual_ticks, -MOST_RESIDUAL_TICKS, MOST_RESIDUAL_TICKS))
         fields.append(("site_time.std_ticks", site_time.std_ticks, 0.0, math.inf))
     for name, value, low, high in fields:
         if not low <= value <= high:

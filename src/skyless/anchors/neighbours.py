@@ -14,6 +14,7 @@ from skyless.anchor import MAX_RELAY_AGE_S
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ
 from skyless.positioning.methods.observations import AnchorStamps, is_weak_first_path
 from skyless.site.model import AnchorSite, Site, UnplacedAnchor
+from skyless.site.slots import superframe_ticks_of
 from skyless.ticks import Unwrapper, nearest
 
 _SENT_KEPT: Final = 64
@@ -47,6 +48,7 @@ class Neighbours:
         self._known = frozenset(anchor.id for anchor in site.all_anchors) - {anchor_id}
         self._counters = counters
         self._stamps = AnchorStamps(counters)
+        self._superframe_ticks = superframe_ticks_of(site)
         self._heard: dict[int, tuple[Heard, int, bool]] = {}
         """Last reception of each, its unwrapped stamp, and whether its first path was weak; the newest last."""
         self._sent: dict[int, int] = {}
@@ -70,7 +72,7 @@ class Neighbours:
             return None
         rx_ticks = self.own_ticks.unwrap(reception.rx_ticks, reception.host_s)
         fits = beacon.anchor in self._stamps.tracks.of_anchor
-        tx_ticks = self._stamps.unwrap(beacon, rx_ticks)
+        tx_ticks = self._stamps.unwrap(beacon, rx_ticks, self._superframe_ticks)
         if tx_ticks is None:
             return None
         self._counters["heard"] += 1

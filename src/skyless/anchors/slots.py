@@ -4,13 +4,14 @@ Claims say whose counter leads (``skyless.slot_claims``), the composed time carr
 (``skyless.clocks.composed_time``). The own counter itself is never set: tags compute with raw stamps.
 """
 
+import math
 from collections import Counter
 from typing import Final
 
 from msgspec import Struct
 
 from skyless.air.beacon2 import Beacon2, SlotTime, StatedSiteTime
-from skyless.air.codec2 import encode_2, heard_capacity_2
+from skyless.air.codec2 import MOST_RESIDUAL_TICKS, encode_2, heard_capacity_2
 from skyless.air.reception import Reception, Transmission
 from skyless.anchors.neighbours import Admitted, Neighbours, anchor_of, on_radio_grid
 from skyless.clocks.composed_time import SUPERFRAME_BITS, ComposedTime
@@ -214,10 +215,14 @@ class SlotsAnchor:
         claims, claim = self._claims, self._claims.claim
         if claim is None or pending.phase != self._phase or not self._time.is_known:
             return None, None
+        if abs(self._time.rate) > MAX_DRIFT:
+            return None, None  # nobody would accept it
         superframe = wrap(pending.superframe, SUPERFRAME_BITS)
         slot_time = SlotTime(
             superframe, pending.slot, claim.root, claim.term, claims.hop, claims.pulse_age(superframe), self._time.rate
         )
-        if not self._states_site_time or self._time.variance_m2(tx_ticks) == float("inf"):
+        if not self._states_site_time or self._time.variance_m2(tx_ticks) == math.inf:
             return slot_time, None
-        return slot_time, self._time.stated(tx_ticks, pending.superframe, pending.slot)
+        site_time = self._time.stated(tx_ticks, pending.superframe, pending.slot)
+        fits = abs(site_time.residual_ticks) <= MOST_RESIDUAL_TICKS
+        return slot_time, site_time if fits else None  # it does not where the timeline moved after the time was given

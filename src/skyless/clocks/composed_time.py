@@ -14,7 +14,6 @@ from skyless.air.beacon2 import SlotTime, StatedSiteTime
 from skyless.clocks.composition import (
     AVERAGING_S,
     GRID_VARIANCE_M2,
-    MAX_SLOT_STD_M,
     MEAN_LATE_TICKS,
     SLOT_GAIN,
     by_parent,
@@ -148,10 +147,6 @@ class ComposedTime:
             common, alone = self._by_parent(parent, ticks_own)
             total += weight * (common + weight * alone)
         return total
-
-    def is_settled(self, ticks_own: int) -> bool:
-        """Whether the timeline is known well enough at an own reading to speak in a slot."""
-        return self.is_known and self.variance_m2(ticks_own) < MAX_SLOT_STD_M * MAX_SLOT_STD_M
 
     def stated(self, ticks_own: int, superframe: int, slot: int) -> StatedSiteTime:
         """What the own beacon states at its TX stamp, superframe unwrapped. Raises ValueError before it is known."""

@@ -25,7 +25,8 @@ LEAST_ANCHORS: Final = 3
 """With fewer no majority counts, unless that is all that a tag receives for ``PRESENT_TICKS``."""
 
 MOST_POSITIONS: Final = 64
-"""Positions kept; that of the anchor received longest ago is forgotten."""
+"""Positions kept; that of the anchor received longest ago is forgotten, unless others confirm it: strangers must not
+displace anchors."""
 
 MOST_ISSUES: Final = 4
 MOST_PAGES: Final = 4
@@ -184,20 +185,31 @@ class LocalAlmanac:
         elif stated is not None:
             one.other = None
         if len(self._anchors) > MOST_POSITIONS:
-            oldest = next(iter(self._anchors))
-            del self._anchors[oldest]
-            self._positions_m.pop(oldest, None)
+            self._forget_one(rx_ticks - PRESENT_TICKS)
+
+    def _forget_one(self, oldest_ticks: int) -> None:
+        """Forget the anchor received longest ago of those that are not confirmed, or gone; never the newest."""
+        others = list(self._anchors.items())[:-1]
+        gone = (name for name, one in others if not one.is_confirmed or one.rx_ticks <= oldest_ticks)
+        forgotten = next(gone, others[0][0])
+        del self._anchors[forgotten]
+        self._positions_m.pop(forgotten, None)
 
     def _collect(self, anchor: int, issue: int, page: Page) -> None:
         if issue not in self._contents and len(self._contents) >= MOST_ISSUES:
-            del self._contents[min(self._contents, key=self._support)]
+            del self._contents[min(self._contents, key=self._issue_support)]
         contents = self._contents.setdefault(issue, {}).setdefault(type(page), {})
         if page not in contents and len(contents) >= MOST_PAGES:
-            del contents[min(contents, key=lambda one: len(contents[one]))]
+            del contents[min(contents, key=lambda one: self._page_support(contents[one]))]
         contents.setdefault(page, set()).add(anchor)
 
-    def _support(self, issue: int) -> int:
-        return sum(one.issue == issue for one in self._anchors.values())
+    def _issue_support(self, issue: int) -> int:
+        """By how many anchors an issue is stated, of those that others have received: strangers are any number."""
+        return sum(one.is_confirmed and one.issue == issue for one in self._anchors.values())
+
+    def _page_support(self, anchors: set[int]) -> int:
+        """How many of the anchors that have sent a page others have received."""
+        return sum(anchor in self._anchors and self._anchors[anchor].is_confirmed for anchor in anchors)
 
     def _is_majority(self, issue: int, rx_ticks: int) -> bool:
         """Whether most of the anchors that are there state this issue."""
@@ -210,7 +222,10 @@ class LocalAlmanac:
     def _complete(self, issue: int) -> bool:
         """Use the pages of an issue if they are all there; of several contents those of most anchors that fit it."""
         by_type = self._contents.get(issue, {})
-        ranked = [sorted(by, key=lambda page, by=by: -len(by[page])) for by in by_type.values()]  # type: ignore[misc]
+        ranked = [
+            sorted(by, key=lambda page, by=by: -self._page_support(by[page]))  # type: ignore[misc]
+            for by in by_type.values()
+        ]
         for pages in islice(product(*ranked), _MOST_TRIALS):
             found = _common_pages(pages)
             if found is not None and site_issue(pages) == issue:

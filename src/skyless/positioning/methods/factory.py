@@ -56,11 +56,11 @@ def new_method(
     return Estimation(_as_required(assumed, options), options.z_bounds_m, time, superframe_s)
 
 
-def new_method_2(options: MethodOptions, pages: CommonPages, time: FixTime) -> Estimation | None:
+def new_method_2(options: MethodOptions, pages: CommonPages, superframe_ticks: int, time: FixTime) -> Estimation | None:
     """Make the method for a site of protocol 2; None for methods that need a master."""
     if options.method not in FILTERS:
         return None
-    superframe_s = to_seconds(pages.site.superframe_ticks)
+    superframe_s = to_seconds(superframe_ticks)
     settings = estimator_settings(options.qa, pages.site.tag_height_m, pages.noise, pages.accuracy, superframe_s)
     settings = replace(_as_required(settings, options), drop_s=max(CELL_DROP_S, 4.0 * superframe_s))
     return Estimation(settings, options.z_bounds_m, time, superframe_s, MOST_ANCHORS_IN_USE)

@@ -130,10 +130,12 @@ STAMPS_BEFORE_RESTART: Final = 3
 """This number of impossible stamps of one anchor in a row mean that its counter has restarted, ..."""
 
 RESTART_SILENCE_TICKS: Final = from_seconds(0.2)
-"""... if none has fitted for this time: forged frames in between do not replace an anchor that still sends."""
+RESTART_SILENCE_SUPERFRAMES: Final = 4
+"""... if none has fitted for both of these: forged frames in between do not replace an anchor that still sends."""
 
 MOST_TRACKS: Final = 256
-"""More anchors than a site can have; with more identifiers on the air, that received longest ago is forgotten."""
+"""More anchors than there are in reach; with more identifiers on the air, that received longest ago is forgotten, those
+of a single stamp first."""
 
 NOISE_TICKS: Final = 64
 """0.3 m allow for the noise of two stamps."""
@@ -146,6 +148,8 @@ class _Track(Struct):
     tx_ticks: int
     sequence: int
     impossible: int = 0
+    is_single: bool = True
+    """Whether no stamp after the first has fitted."""
 
 
 class StampTracks(Struct):
@@ -168,10 +172,11 @@ class AnchorStamps:
         """Start again."""
         self.tracks = StampTracks()
 
-    def unwrap(self, beacon: AnyBeacon, rx_ticks: int) -> int | None:
+    def unwrap(self, beacon: AnyBeacon, rx_ticks: int, superframe_ticks: int = 0) -> int | None:
         """TX stamp on the anchor's own unwrapped scale; None if the frame is repeated, late, or its stamp impossible.
 
-        ``rx_ticks`` is the tag's own reading, unwrapped. An anchor's first stamp keeps its own value.
+        ``rx_ticks`` is the tag's own reading, unwrapped; ``superframe_ticks`` the time between two frames of an anchor,
+        as far as it is known. An anchor's first stamp keeps its own value.
         """
         tracks = self.tracks
         track, newest = tracks.of_anchor.get(beacon.anchor), tracks.newest_rx_ticks
@@ -186,28 +191,29 @@ class AnchorStamps:
         least = track.tx_ticks + elapsed - HALF_WRAP_TICKS
         off = ((beacon.tx_ticks - least) & TICK_MASK) - HALF_WRAP_TICKS
         if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
-            self._reject(beacon, track, elapsed)
+            silence_ticks = max(RESTART_SILENCE_TICKS, RESTART_SILENCE_SUPERFRAMES * superframe_ticks)
+            self._reject(beacon, track, is_silent=elapsed > silence_ticks)
             return None
         track.rx_ticks_tag = tracks.newest_rx_ticks = rx_ticks
         track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
-        track.sequence, track.impossible = beacon.sequence, 0
+        track.sequence, track.impossible, track.is_single = beacon.sequence, 0, False
         return tx_ticks
 
     def _begin(self, beacon: AnyBeacon, rx_ticks: int) -> int:
         tracks = self.tracks.of_anchor
         if len(tracks) >= MOST_TRACKS:
-            del tracks[min(tracks, key=lambda anchor: tracks[anchor].rx_ticks_tag)]
+            del tracks[min(tracks, key=lambda anchor: (not tracks[anchor].is_single, tracks[anchor].rx_ticks_tag))]
         tracks[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence)
         return beacon.tx_ticks
 
-    def _reject(self, beacon: AnyBeacon, track: _Track, silent_ticks: int) -> None:
-        """Count the stamp; after a few that are impossible the anchor's next one is a beginning."""
+    def _reject(self, beacon: AnyBeacon, track: _Track, *, is_silent: bool) -> None:
+        """Count the stamp; after a few that are impossible the next one of a silent anchor is a beginning."""
         if _is_repeated(beacon, track):
             self._counters["duplicate"] += 1
             return
         self._counters["impossible-stamp"] += 1
         track.impossible += 1
-        if track.impossible >= STAMPS_BEFORE_RESTART and silent_ticks > RESTART_SILENCE_TICKS:
+        if track.impossible >= STAMPS_BEFORE_RESTART and is_silent:
             del self.tracks.of_anchor[beacon.anchor]
             self._counters["anchor-restart"] += 1
 

@@ -40,6 +40,7 @@ class AnchorSelectionState(Struct, frozen=True):
     """What an ``AnchorSelection`` keeps."""
 
     relayed_ticks: dict[int, int]
+    shown_ticks: dict[int, int]
     power_dbm: dict[int, float]
 
 
@@ -49,19 +50,23 @@ class AnchorSelection:
     def __init__(self) -> None:
         self._relayed_ticks: dict[int, int] = {}
         """The tag's reading when a reception of the anchor by another one was relayed last."""
+        self._shown_ticks: dict[int, int] = {}
+        """The same when it showed itself last that it is there, of those that no other one has relayed since."""
         self._power_dbm: dict[int, float] = {}
 
     def state(self) -> AnchorSelectionState:
         """All that it keeps."""
-        return AnchorSelectionState(dict(self._relayed_ticks), dict(self._power_dbm))
+        return AnchorSelectionState(dict(self._relayed_ticks), dict(self._shown_ticks), dict(self._power_dbm))
 
     def restore(self, state: AnchorSelectionState) -> None:
         """Continue from a state."""
-        self._relayed_ticks, self._power_dbm = dict(state.relayed_ticks), dict(state.power_dbm)
+        self._relayed_ticks, self._shown_ticks = dict(state.relayed_ticks), dict(state.shown_ticks)
+        self._power_dbm = dict(state.power_dbm)
 
     def forget_times(self) -> None:
         """The tag's counter has restarted."""
         self._relayed_ticks = {}
+        self._shown_ticks = {}
 
     def add_power(self, anchor: int, power_dbm: float) -> None:
         """Process the power of a beacon."""
@@ -70,19 +75,24 @@ class AnchorSelection:
             _keep(self._power_dbm, anchor, mean + POWER_GAIN * (power_dbm - mean))
 
     def add_relays(self, relays: bytes, rx_ticks: int) -> None:
-        """Process what an anchor in use, or a confirmed one, relays (``packed_relays_2``)."""
+        """Process what an anchor relays that others vouch for (``packed_relays_2``)."""
         for anchor, _, _, _ in HEARD.iter_unpack(relays):
-            self.confirm(anchor, rx_ticks)
+            self._shown_ticks.pop(anchor, None)
+            self._relayed_ticks.pop(anchor, None)
+            _keep(self._relayed_ticks, anchor, rx_ticks)
 
-    def confirm(self, anchor: int, rx_ticks: int) -> None:
-        """An anchor is there: what it relays itself shows it (``fitting_relays``)."""
-        self._relayed_ticks.pop(anchor, None)
-        _keep(self._relayed_ticks, anchor, rx_ticks)
+    def show(self, anchor: int, rx_ticks: int) -> None:
+        """An anchor is there: what it relays itself shows it (``fitting_relays``); nobody vouches for it."""
+        self._shown_ticks.pop(anchor, None)
+        _keep(self._shown_ticks, anchor, rx_ticks)
+
+    def is_vouched_for(self, anchor: int, rx_ticks: int, *, in_use: bool) -> bool:
+        """Whether others have lately received an anchor, or had when it came into use: then its word counts."""
+        return _is_recent(self._relayed_ticks, anchor, rx_ticks) or (in_use and anchor not in self._shown_ticks)
 
     def is_confirmed(self, anchor: int, rx_ticks: int) -> bool:
         """Whether an anchor has lately been received by another one, or shown that it is there."""
-        relayed_ticks = self._relayed_ticks.get(anchor)
-        return relayed_ticks is not None and rx_ticks - relayed_ticks < RELAYED_TICKS
+        return _is_recent(self._relayed_ticks, anchor, rx_ticks) or _is_recent(self._shown_ticks, anchor, rx_ticks)
 
     def replaced_by(self, anchor: int, ranges_m: dict[int, float]) -> int | None:
         """The anchor that should leave for another one, None where that is too weak.
@@ -117,6 +127,11 @@ def fitting_relays(
 def is_full(anchors: Collection[int]) -> bool:
     """Whether another anchor can only be used instead of one of these."""
     return len(anchors) >= MOST_ANCHORS_IN_USE
+
+
+def _is_recent(times: dict[int, int], anchor: int, rx_ticks: int) -> bool:
+    ticks = times.get(anchor)
+    return ticks is not None and rx_ticks - ticks < RELAYED_TICKS
 
 
 def _nominal_dbm(range_m: float) -> float:
