@@ -27,6 +27,17 @@ def test_forged_stamps_do_not_replace_an_anchor_that_sends_twice_a_second(superf
     assert (counters["anchor-restart"] == 0) == (superframe_ticks > 0)
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_false_stamp_that_came_first_does_not_keep_an_anchor_out(first):
+    """Five frames a second of a counter that runs on, under the name of an anchor that sends 28."""
+    stamps, counters = AnchorStamps(Counter()), Counter()
+    forged = [(n * from_seconds(0.2), 10**9) for n in range(20)]
+    own = [(from_seconds(0.01 + first * 0.3) + n * from_seconds(1 / 28), 0) for n in range(110)]
+    for n, (now, start) in enumerate(sorted(forged + own)):
+        counters[start, stamps.unwrap(beacon(1, now + start, n), now) is not None] += 1
+    assert counters[0, True] > 100 if first == 0 else counters[10**9, True] > 18
+
+
 def test_a_counter_that_restarts_counts_again_after_a_few_superframes():
     stamps = AnchorStamps(Counter())
     for n in range(4):

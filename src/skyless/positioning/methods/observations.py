@@ -15,7 +15,7 @@ from skyless.constants import MAX_DRIFT, TICK_M, TICK_S
 from skyless.kernels.arrays import Array
 from skyless.positioning.observation import Method, Observation
 from skyless.site.slots import Schedule
-from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, from_seconds, nearest, wrap
+from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK, difference, from_seconds, nearest, wrap
 
 
 class Observer:
@@ -150,6 +150,8 @@ class _Track(Struct):
     impossible: int = 0
     is_single: bool = True
     """Whether no stamp after the first has fitted."""
+    rival: tuple[int, int] | None = None
+    """The tag's stamp and the TX stamp of the last frame that did not fit a single one."""
 
 
 class StampTracks(Struct):
@@ -192,7 +194,7 @@ class AnchorStamps:
         off = ((beacon.tx_ticks - least) & TICK_MASK) - HALF_WRAP_TICKS
         if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
             silence_ticks = max(RESTART_SILENCE_TICKS, RESTART_SILENCE_SUPERFRAMES * superframe_ticks)
-            self._reject(beacon, track, is_silent=elapsed > silence_ticks)
+            self._reject(beacon, track, rx_ticks, is_silent=elapsed > silence_ticks)
             return None
         track.rx_ticks_tag = tracks.newest_rx_ticks = rx_ticks
         track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
@@ -206,16 +208,29 @@ class AnchorStamps:
         tracks[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence)
         return beacon.tx_ticks
 
-    def _reject(self, beacon: AnyBeacon, track: _Track, *, is_silent: bool) -> None:
-        """Count the stamp; after a few that are impossible the next one of a silent anchor is a beginning."""
+    def _reject(self, beacon: AnyBeacon, track: _Track, rx_ticks: int, *, is_silent: bool) -> None:
+        """Count the stamp; after a few that are impossible the next one of a silent anchor is a beginning.
+
+        Where only the first stamp stands against it, which may have been a false one, two that fit each other are.
+        """
         if _is_repeated(beacon, track):
             self._counters["duplicate"] += 1
             return
         self._counters["impossible-stamp"] += 1
         track.impossible += 1
+        if track.is_single and track.rival is not None and _fits(*track.rival, rx_ticks, beacon.tx_ticks):
+            self.tracks.of_anchor[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence, is_single=False)
+            return
+        track.rival = (rx_ticks, beacon.tx_ticks)
         if track.impossible >= STAMPS_BEFORE_RESTART and is_silent:
             del self.tracks.of_anchor[beacon.anchor]
             self._counters["anchor-restart"] += 1
+
+
+def _fits(before_rx_ticks: int, before_tx_ticks: int, rx_ticks: int, tx_ticks: int) -> bool:
+    """Whether a counter may have gone from one stamp (40 bits) to the next by the time on the tag's."""
+    elapsed = rx_ticks - before_rx_ticks
+    return abs(difference(tx_ticks, wrap(before_tx_ticks + elapsed))) <= MAX_DRIFT * elapsed + NOISE_TICKS
 
 
 def _is_repeated(beacon: AnyBeacon, track: _Track) -> bool:
