@@ -6,10 +6,10 @@ Every violation is a configuration error.
 import math
 import re
 from collections.abc import Iterator, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 from msgspec import Struct
 
 from skyless.air.codec import MAX_FRAME_BYTES
@@ -19,7 +19,6 @@ from skyless.constants import TICK_BITS, TICK_S
 from skyless.errors import ConfigurationError
 from skyless.site.image import image_size
 from skyless.site.model import AnchorSite, Site, UnplacedAnchor
-from skyless.site.near import DISTANCE_ROUNDING_M, anchor_positions, pairs_within, pairs_within_groups
 from skyless.site.slots import Schedule, first_slots, schedule_of
 
 ANY_ADDRESS: Final = 65_533
@@ -56,6 +55,9 @@ _STD = Limits(0, 6.5, "metres")
 _STATED_STD = Limits(0, 0.255, "metres")
 """Sent as an 8-bit number of millimetres in protocol 2."""
 _SLOT = Limits(0, 254, whole=True)
+_MOST_BY_PAIRS: Final = 255
+"""Up to so large a site all pairs are compared one by one."""
+
 _DELAY = Limits(0, 65_535, "ticks (15.65 ps)", whole=True)
 
 SITE_LIMITS: Final = {
@@ -248,8 +250,17 @@ def _rows(site: Site) -> Iterator[tuple[str, AnchorSite | UnplacedAnchor]]:
 
 def _near(site: Site, distance_m: float) -> Iterator[tuple[int, int, float]]:
     """Rows of placed anchors closer than a distance, and their distance."""
-    for one, other, apart_m in pairs_within(anchor_positions(site), distance_m):
-        yield from zip(one.tolist(), other.tolist(), apart_m.tolist(), strict=True)
+    if len(site.anchors) <= _MOST_BY_PAIRS:
+        points = [(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]
+        for one, other in combinations(range(len(points)), 2):
+            apart_m = math.dist(points[one], points[other])
+            if apart_m < distance_m:
+                yield one, other, apart_m
+        return
+    from skyless.site.near import anchor_positions, pairs_within  # noqa: PLC0415 - only large sites need NumPy
+
+    for ones, others, apart in pairs_within(anchor_positions(site), distance_m):
+        yield from zip(ones.tolist(), others.tolist(), apart.tolist(), strict=True)
 
 
 def _check_protocol_2(site: Site, file: Path) -> None:
@@ -273,6 +284,10 @@ def _check_shared_slots(site: Site, file: Path) -> None:
         if anchor.slot is None or anchor.slot >= slots:
             right = f"a whole number from 0 to {slots - 1}; {_colours(site)}"
             raise ConfigurationError(file, _with_anchor(f"{row}.slot", site), anchor.slot, right)
+    import numpy as np  # noqa: PLC0415 - as in ``_near``
+
+    from skyless.site.near import DISTANCE_ROUNDING_M, anchor_positions, pairs_within_groups  # noqa: PLC0415
+
     own = np.array([anchor.slot for anchor in site.anchors], np.int64)
     reuse_m = site.schedule.reuse_m - 2 * DISTANCE_ROUNDING_M
     for one, other, apart_m in pairs_within_groups(anchor_positions(site), own, reuse_m):

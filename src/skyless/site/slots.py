@@ -10,7 +10,6 @@ from msgspec import Struct
 
 from skyless.air.almanac import SchedulePage
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ
-from skyless.site.free_access import free_window_ticks
 from skyless.site.model import AnchorSite, Site, UnplacedAnchor
 
 
@@ -90,8 +89,11 @@ def superframe_ticks_of(site: Site) -> int:
     Raises:
         ValueError: the site is in mode slots and has none yet.
     """
-    schedule = site.schedule
-    return free_window_ticks(schedule.rate_hz) if schedule.mode == "free" else schedule_of(site).superframe_ticks
+    if site.schedule.mode != "free":
+        return schedule_of(site).superframe_ticks
+    from skyless.site.free_access import free_window_ticks  # noqa: PLC0415 - only mode free needs Numba
+
+    return free_window_ticks(site.schedule.rate_hz)
 
 
 def _slot_ticks(site: Site) -> int:
