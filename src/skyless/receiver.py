@@ -240,15 +240,8 @@ class Receiver:
         anchor, relays = beacon.anchor, packed_relays_2(beacon)
         if diagnostics is not None and diagnostics.rx_power_dbm is not None:
             self._selection.add_power(anchor, diagnostics.rx_power_dbm)
-        method = self._method
-        was_starting = not isinstance(method, Estimation) or method.is_starting
-        in_use = isinstance(method, Estimation) and not was_starting and method.estimator.has_anchor(anchor)
-        is_vouched_for = self._selection.is_vouched_for(anchor, rx_ticks, in_use=in_use)
-        if is_vouched_for or was_starting or self._has_too_few(rx_ticks):
-            self._selection.add_relays(relays, rx_ticks)
-        elif fitting_relays(relays, tx_ticks, rx_ticks, self._packet_in_use) >= LEAST_FITTING:
-            self._selection.show(anchor, rx_ticks)
-        if self.local_almanac.on_beacon(beacon, rx_ticks, is_vouched_for):
+        was_starting = not isinstance(self._method, Estimation) or self._method.is_starting
+        if self.local_almanac.on_beacon(beacon, rx_ticks, self._confirm(anchor, relays, rx_ticks, tx_ticks)):
             self._choose_method_2()
         anchor_m = self.local_almanac.position_m(anchor)
         if anchor_m is None:
@@ -271,6 +264,18 @@ class Receiver:
         if was_starting and not self._method.is_starting:
             self._selection.forget_times()  # from now on what anchors in use have received counts, and what those have
         return result
+
+    def _confirm(self, anchor: int, relays: bytes, rx_ticks: int, tx_ticks: int) -> bool:
+        """Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender."""
+        method = self._method
+        is_starting = not isinstance(method, Estimation) or method.is_starting
+        in_use = isinstance(method, Estimation) and not is_starting and method.estimator.has_anchor(anchor)
+        by_others = self._selection.is_confirmed_by_others(anchor, rx_ticks, in_use=in_use)
+        if by_others or is_starting or self._has_too_few(rx_ticks):
+            self._selection.add_relays(relays, rx_ticks)
+        elif fitting_relays(relays, tx_ticks, rx_ticks, self._packet_in_use) >= LEAST_FITTING:
+            self._selection.confirm_by_own_relays(anchor, rx_ticks)
+        return by_others
 
     def _packet_in_use(self, anchor: int) -> tuple[int, int] | None:
         """Sequence number and own RX stamp of the last beacon of an anchor in use."""

@@ -97,7 +97,7 @@ class ClaimVerdict(StrEnum):
     LESSER = "lesser-claim"
     OFF_PHASE = "off-phase"
     """The own claim, but not in the own phase: it does not count."""
-    GHOST = "ghost-claim"
+    EXPIRED = "expired-claim"
     """Its root is dead: its newest pulse is too old, or it was given up here."""
     HELD = "held-claim"
     """It would change the phase once more within too short a time."""
@@ -197,7 +197,7 @@ class SlotClaims:
         self._misfits = 0
         self._changes = MOST_CHANGES
         self._changed_ticks = 0
-        self._ghost: tuple[SlotClaim, int] | None = None
+        self._expired: tuple[SlotClaim, int] | None = None
 
     def on_beacon(
         self, anchor: int, stated: SlotTime, rx_ticks: int, off_phase: bool, power_dbm: float = 0.0
@@ -247,7 +247,7 @@ class SlotClaims:
         if claim.term < MOST_TERM:
             self.lead(SlotClaim(claim.term + 1, self._own))
         else:  # no term is left: the claim is given up, and the order begins again
-            self._ghost = (claim, self.pulse)
+            self._expired = (claim, self.pulse)
             self.lead(SlotClaim(0, self._own))
         return Lead.TAKEOVER
 
@@ -312,7 +312,7 @@ class SlotClaims:
         pulse = (stated.superframe - stated.pulse_age) & _PULSE_MASK
         overdue = stated.pulse_age - HOP_PATIENCE * (stated.hop + 1)
         if overdue > MOST_PATIENCE or stated.pulse_age == MOST_PULSE_AGE or self._was_given_up(offered, pulse):
-            return ClaimVerdict.GHOST
+            return ClaimVerdict.EXPIRED
         if off_phase and not self._may_change(rx_ticks):
             return ClaimVerdict.HELD
         self.role, self.claim = SlotRole.FOLLOWER, offered
@@ -352,9 +352,9 @@ class SlotClaims:
         self._depth += (self.hop - self._depth) * DEPTH_GAIN
 
     def _was_given_up(self, offered: SlotClaim, pulse: int) -> bool:
-        if self._ghost is None or self._ghost[0] != offered:
+        if self._expired is None or self._expired[0] != offered:
             return False
-        return (self._ghost[1] - pulse) & _PULSE_MASK < _PULSE_HALF
+        return (self._expired[1] - pulse) & _PULSE_MASK < _PULSE_HALF
 
     def _may_change(self, now_ticks: int) -> bool:
         """Whether the phase may change now."""

@@ -292,8 +292,8 @@ def test_at_the_last_term_the_order_begins_again_and_the_dead_claim_does_not_ret
     late = (number + MOST_PATIENCE) * S
     assert machine.advance(late) is Lead.TAKEOVER
     assert machine.claim == SlotClaim(0, 9)
-    ghost = stated(number - 1, term=MOST_TERM)
-    assert machine.on_beacon(2, ghost, late + 1, off_phase=False) is ClaimVerdict.GHOST
+    expired = stated(number - 1, term=MOST_TERM)
+    assert machine.on_beacon(2, expired, late + 1, off_phase=False) is ClaimVerdict.EXPIRED
     alive = stated(number + MOST_PATIENCE, term=MOST_TERM)
     assert machine.on_beacon(2, alive, late + 2, off_phase=False) is ClaimVerdict.ADOPTED
 
@@ -302,7 +302,7 @@ def test_at_the_last_term_the_order_begins_again_and_the_dead_claim_does_not_ret
 def test_a_claim_whose_pulse_is_too_old_is_not_adopted(age):
     machine, number = follower()
     old = stated(number, term=5, age=age)
-    assert machine.on_beacon(2, old, number * S, off_phase=True) is ClaimVerdict.GHOST
+    assert machine.on_beacon(2, old, number * S, off_phase=True) is ClaimVerdict.EXPIRED
     assert machine.claim == SlotClaim(0, 1)
 
 

@@ -13,6 +13,7 @@ from skyless.air.reception import Reception
 from skyless.anchor import MAX_RELAY_AGE_S
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ
 from skyless.positioning.methods.observations import AnchorStamps, is_weak_first_path
+from skyless.site.local_almanac import stated_position
 from skyless.site.model import AnchorSite, Site, UnplacedAnchor
 from skyless.site.slots import superframe_ticks_of
 from skyless.ticks import Unwrapper, nearest
@@ -139,10 +140,7 @@ def anchor_of(site: Site, anchor_id: int) -> AnchorSite | UnplacedAnchor:
 def position_of(site: Site, anchor_id: int) -> StatedPosition | None:
     """What an anchor states of its position; None while the site file has none."""
     anchor = anchor_of(site, anchor_id)
-    if isinstance(anchor, UnplacedAnchor):
-        return None
-    std_m = site.accuracy.survey_std_m if anchor.std_m is None else anchor.std_m
-    return StatedPosition(anchor.x_m, anchor.y_m, anchor.z_m, std_m, anchor.floor, anchor.zone)
+    return None if isinstance(anchor, UnplacedAnchor) else stated_position(site, anchor)
 
 
 def on_radio_grid(ticks_own: int, tx_antenna_delay_ticks: int) -> int:

@@ -28,7 +28,7 @@ GUARD_S: Final = 2e-6
 """Slots that differ by more are another phase, before which an anchor is silent; and an oscillator's tolerance for a
 superframe comes on top, for anchors that do not know their rate yet."""
 
-_DROPPED: Final = frozenset({ClaimVerdict.OFF_PHASE, ClaimVerdict.GHOST, ClaimVerdict.HELD, ClaimVerdict.LESSER})
+_DROPPED: Final = frozenset({ClaimVerdict.OFF_PHASE, ClaimVerdict.EXPIRED, ClaimVerdict.HELD, ClaimVerdict.LESSER})
 
 
 class SlotSynchronisation(Struct, frozen=True):

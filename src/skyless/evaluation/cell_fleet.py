@@ -11,7 +11,7 @@ import numpy as np
 
 from skyless.air.almanac import Page
 from skyless.air.beacon import Malformed, PackedHeard
-from skyless.air.beacon2 import Beacon2, StatedPosition
+from skyless.air.beacon2 import Beacon2
 from skyless.air.page_codec import decode_page, encode_page
 from skyless.air.reception import Reception
 from skyless.evaluation.fleet import FleetSettings, JudgedFix, TagFleet
@@ -22,7 +22,7 @@ from skyless.simulation.impairments import Impairments
 from skyless.simulation.listening import Outcome
 from skyless.simulation.medium import Tally
 from skyless.simulation.trajectory import Trajectory
-from skyless.site.local_almanac import site_issue, site_page_for, site_pages_of
+from skyless.site.local_almanac import site_issue, site_page_for, site_pages_of, stated_position
 from skyless.site.model import Site
 from skyless.site.slots import schedule_of
 
@@ -53,13 +53,7 @@ class SiteBeacons:
         """Raises ValueError for a site without slots."""
         self._site, self._pages = site.id, tuple(map(_on_air, site_pages_of(site)))
         self._issue = site_issue(self._pages)
-        std_m = site.accuracy.survey_std_m
-        self._positions = {
-            one.id: StatedPosition(
-                one.x_m, one.y_m, one.z_m, std_m if one.std_m is None else one.std_m, one.floor, one.zone
-            )
-            for one in site.anchors
-        }
+        self._positions = {anchor.id: stated_position(site, anchor) for anchor in site.anchors}
 
     def received(self, received: TagReceptions) -> Iterator[tuple[Beacon2, Reception, int]]:
         """The beacons that a tag has received, its receptions of them (without their bytes), and their rows.

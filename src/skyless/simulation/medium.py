@@ -19,7 +19,7 @@ from msgspec import Struct
 from skyless.air.ieee802154 import after_rmarker_s, preamble_s
 from skyless.air.reception import Transmission
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
-from skyless.kernels.arrays import Array, Integers, Records
+from skyless.kernels.arrays import Array, Records
 from skyless.simulation.channel import pack_channel, pack_walls
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.listening import OUTCOMES, RECEPTION_RECORD, receive_frame
@@ -146,12 +146,6 @@ class Tally(Struct, frozen=True):
     at_tags: dict[str, int]
 
 
-def make_tally(transmissions: int, late: int, counts: Integers) -> Tally:
-    """Tally from the kernels' counts, shape (2, outcomes)."""
-    at_anchors, at_tags = (dict(zip((str(o) for o in OUTCOMES), row.tolist(), strict=True)) for row in counts)
-    return Tally(transmissions, late, at_anchors, at_tags)
-
-
 @dataclass(slots=True, eq=False)
 class Delivery:
     """A frame that has just ended, and the rows (``RECEPTION_RECORD``) of the nodes that received it."""
@@ -161,11 +155,73 @@ class Delivery:
     by_tags: Records
 
 
-class Medium(Generic[Result]):
+class MediumBase(Generic[Result]):
+    """What every medium of a site has: true time, nodes and their power, the tags' motion, counts.
+
+    Nodes are numbered: the site's anchors in the order of its file, then the tags; all are off at first.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        tags: Sequence[TagSpec],
+        impairments: Impairments,
+        deliver: Callable[[Delivery], Result | None],
+    ) -> None:
+        self._anchors, self._tags = site.anchors, tuple(tags)
+        self.node_of = {anchor.id: node for node, anchor in enumerate(site.anchors)}
+        """Nodes of the anchors, by their identifiers."""
+        self.stations = make_stations(site.anchors, self._tags, impairments)
+        self._piece_ends_s = np.full(len(self._tags), -math.inf)
+        self.boots = [0] * len(self.stations)
+        """How often each node was switched off."""
+        self._counts = np.zeros((2, len(OUTCOMES)), dtype=np.int64)
+        self._transmissions = self._late = 0
+        self._deliver = deliver
+        self.timeline: Timeline[Result] = Timeline()
+
+    @property
+    def tally(self) -> Tally:
+        """What was sent, heard and lost so far, by reason."""
+        names = [str(outcome) for outcome in OUTCOMES]
+        at_anchors, at_tags = (dict(zip(names, row, strict=True)) for row in self._counts.tolist())
+        return Tally(self._transmissions, self._late, at_anchors, at_tags)
+
+    @property
+    def now_s(self) -> float:
+        """True time that has passed."""
+        return self.timeline.now_ticks * TICK_S
+
+    def run(self, until_s: float) -> Iterator[Result]:
+        """Let true time pass up to ``until_s``. Can be called again."""
+        return self.timeline.run(from_seconds(until_s))
+
+    def switch_off(self, node: int) -> None:
+        """Switch a node off; its frame is not sent if the RMARKER has not left."""
+        self.stations[node]["on"] = 0
+        self.boots[node] += 1
+
+    def switch_on(self, node: int) -> None:
+        """Switch a node on, with a new counter except at time 0."""
+        self.stations[node]["on"] = 1
+        if self.timeline.now_ticks > 0:
+            self._restart_counter(node)
+
+    def _restart_counter(self, node: int) -> None:
+        raise NotImplementedError
+
+    def _move_tags(self, t_s: float) -> None:
+        """Set the next piece of every trajectory whose present one has ended."""
+        for tag in np.flatnonzero(self._piece_ends_s <= t_s).tolist():
+            piece = self._tags[tag].trajectory.piece(t_s)
+            set_piece(self.stations, len(self._anchors) + tag, piece)
+            self._piece_ends_s[tag] = piece.end_s
+
+
+class Medium(MediumBase[Result]):
     """A site's air, deterministic by its seed; memory stays flat however long it runs.
 
-    Nodes are numbered: the site's anchors in the order of its file, then the tags; all are off at first. A node's noise
-    depends on the seed and on its own key alone: more tags do not change what the others receive.
+    A node's noise depends on the seed and on its own key alone: more tags do not change what the others receive.
     """
 
     def __init__(
@@ -180,58 +236,25 @@ class Medium(Generic[Result]):
 
         Raises ValueError when an impairment names an anchor that the site has not.
         """
-        self._anchors, self._tags, self._impairments = site.anchors, tuple(tags), impairments
-        self.node_of = {anchor.id: node for node, anchor in enumerate(site.anchors)}
-        """Nodes of the anchors, by their identifiers."""
+        super().__init__(site, tags, impairments, deliver)
+        self._impairments = impairments
         _check_names(impairments, self.node_of)
         keys = [(ANCHOR_KEY, anchor.id) for anchor in site.anchors] + [(TAG_KEY, tag) for tag in range(len(tags))]
         self._setups = [stream(seed, *key, purpose=1) for key in keys]
         self._streams = Streams([stream(seed, *key) for key in keys])
         self.clocks = make_clocks(impairments.oscillator, self._setups)
         self._warm_up()
-        self.stations = make_stations(site.anchors, self._tags, impairments)
         self.range_errors = RangeErrors(
             impairments.range_errors, [tag.range_errors_m for tag in self._tags], len(site.anchors), seed
         )
         self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
-        self._piece_ends_s = np.full(len(self._tags), -math.inf)
-        self.boots = [0] * len(keys)
-        """How often each node was switched off."""
         self._air = OnAir()
         self._received = np.zeros(len(keys), dtype=RECEPTION_RECORD)
-        self._counts = np.zeros((2, len(OUTCOMES)), dtype=np.int64)
-        self._transmissions = self._late = 0
-        self._deliver = deliver
-        self.timeline: Timeline[Result] = Timeline()
-
-    @property
-    def tally(self) -> Tally:
-        """What was sent, heard and lost so far, by reason."""
-        return make_tally(self._transmissions, self._late, self._counts)
-
-    @property
-    def now_s(self) -> float:
-        """True time that has passed."""
-        return self.timeline.now_ticks * TICK_S
-
-    def run(self, until_s: float) -> Iterator[Result]:
-        """Let true time pass up to ``until_s``. Can be called again."""
-        return self.timeline.run(from_seconds(until_s))
-
-    # Power
-
-    def switch_off(self, node: int) -> None:
-        """Switch a node off; its frame is not sent if the RMARKER has not left."""
-        self.stations[node]["on"] = 0
-        self.boots[node] += 1
-
-    def switch_on(self, node: int) -> None:
-        """Switch a node on, with a new counter except at time 0."""
-        self.stations[node]["on"] = 1
-        if self.timeline.now_ticks > 0:
-            restart_counter(self.clocks, node, self._setups[node])
 
     # Clocks
+
+    def _restart_counter(self, node: int) -> None:
+        restart_counter(self.clocks, node, self._setups[node])
 
     def _warm_up(self) -> None:
         """Let crystals warm up, those of all tags where no anchor is named."""
@@ -250,15 +273,6 @@ class Medium(Generic[Result]):
     def foresee(self, node: int, local_ticks: int) -> int:
         """True time in whole ticks at which a node's unwrapped counter will show a value."""
         return foresee(self.clocks, node, local_ticks)
-
-    # Tags
-
-    def _move_tags(self, t_s: float) -> None:
-        """Set the next piece of every trajectory whose present one has ended."""
-        for tag in np.flatnonzero(self._piece_ends_s <= t_s).tolist():
-            piece = self._tags[tag].trajectory.piece(t_s)
-            set_piece(self.stations, len(self._anchors) + tag, piece)
-            self._piece_ends_s[tag] = piece.end_s
 
     # Transmissions
 

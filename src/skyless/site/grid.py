@@ -32,7 +32,7 @@ def grid_site(
 
     Raises:
         ValueError: there are more anchors than identifiers.
-        SlotShortageError: so many anchors are near each other that a superframe has not slots enough.
+        SlotShortageError: a superframe has not enough slots for the anchors that are near each other.
     """
     count = _along(width_m, spacing_m) * _along(depth_m, spacing_m)
     if count > ANY_ADDRESS:

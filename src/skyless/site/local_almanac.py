@@ -14,7 +14,7 @@ from skyless.air.beacon2 import Beacon2, StatedPosition
 from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
 from skyless.kernels.arrays import Array
 from skyless.site.almanac_pages import filter_pages_of, georeference_page_of
-from skyless.site.model import Site
+from skyless.site.model import AnchorSite, Site
 from skyless.site.slots import schedule_of, superframe_ticks_of
 from skyless.ticks import from_seconds
 
@@ -41,6 +41,12 @@ def site_pages_of(site: Site) -> tuple[Page, ...]:
     others: list[Page] = [filters[0], *([] if earth is None else [earth]), filters[1]]
     slots = 0 if site.schedule.mode == "free" else schedule_of(site).slots
     return (*others, SitePage(len(others) + 1, superframe_ticks_of(site), slots, site.tags.height_m))
+
+
+def stated_position(site: Site, anchor: AnchorSite) -> StatedPosition:
+    """What an anchor of a site states of its position."""
+    std_m = site.accuracy.survey_std_m if anchor.std_m is None else anchor.std_m
+    return StatedPosition(anchor.x_m, anchor.y_m, anchor.z_m, std_m, anchor.floor, anchor.zone)
 
 
 def site_page_for(pages: tuple[Page, ...], sequence: int, anchor: int) -> Page:

@@ -40,7 +40,7 @@ class AnchorSelectionState(Struct, frozen=True):
     """What an ``AnchorSelection`` keeps."""
 
     relayed_ticks: dict[int, int]
-    shown_ticks: dict[int, int]
+    own_relays_ticks: dict[int, int]
     power_dbm: dict[int, float]
 
 
@@ -50,23 +50,23 @@ class AnchorSelection:
     def __init__(self) -> None:
         self._relayed_ticks: dict[int, int] = {}
         """The tag's reading when a reception of the anchor by another one was relayed last."""
-        self._shown_ticks: dict[int, int] = {}
-        """The same when it showed itself last that it is there, of those that no other one has relayed since."""
+        self._own_relays_ticks: dict[int, int] = {}
+        """The same when its own relays fitted last, of those that no other one has relayed since."""
         self._power_dbm: dict[int, float] = {}
 
     def state(self) -> AnchorSelectionState:
         """All that it keeps."""
-        return AnchorSelectionState(dict(self._relayed_ticks), dict(self._shown_ticks), dict(self._power_dbm))
+        return AnchorSelectionState(dict(self._relayed_ticks), dict(self._own_relays_ticks), dict(self._power_dbm))
 
     def restore(self, state: AnchorSelectionState) -> None:
         """Continue from a state."""
-        self._relayed_ticks, self._shown_ticks = dict(state.relayed_ticks), dict(state.shown_ticks)
+        self._relayed_ticks, self._own_relays_ticks = dict(state.relayed_ticks), dict(state.own_relays_ticks)
         self._power_dbm = dict(state.power_dbm)
 
     def forget_times(self) -> None:
         """The tag's counter has restarted."""
         self._relayed_ticks = {}
-        self._shown_ticks = {}
+        self._own_relays_ticks = {}
 
     def add_power(self, anchor: int, power_dbm: float) -> None:
         """Process the power of a beacon."""
@@ -75,24 +75,27 @@ class AnchorSelection:
             _keep(self._power_dbm, anchor, mean + POWER_GAIN * (power_dbm - mean))
 
     def add_relays(self, relays: bytes, rx_ticks: int) -> None:
-        """Process what an anchor relays that others vouch for (``packed_relays_2``)."""
+        """Process what an anchor relays (``packed_relays_2``), so that it confirms others."""
         for anchor, _, _, _ in HEARD.iter_unpack(relays):
-            self._shown_ticks.pop(anchor, None)
+            self._own_relays_ticks.pop(anchor, None)
             self._relayed_ticks.pop(anchor, None)
             _keep(self._relayed_ticks, anchor, rx_ticks)
 
-    def show(self, anchor: int, rx_ticks: int) -> None:
-        """An anchor is there: what it relays itself shows it (``fitting_relays``); nobody vouches for it."""
-        self._shown_ticks.pop(anchor, None)
-        _keep(self._shown_ticks, anchor, rx_ticks)
+    def confirm_by_own_relays(self, anchor: int, rx_ticks: int) -> None:
+        """An anchor is there, as what it relays fits (``fitting_relays``), but no other has received it."""
+        self._own_relays_ticks.pop(anchor, None)
+        _keep(self._own_relays_ticks, anchor, rx_ticks)
 
-    def is_vouched_for(self, anchor: int, rx_ticks: int, *, in_use: bool) -> bool:
-        """Whether others have lately received an anchor, or had when it came into use: then its word counts."""
-        return _is_recent(self._relayed_ticks, anchor, rx_ticks) or (in_use and anchor not in self._shown_ticks)
+    def is_confirmed_by_others(self, anchor: int, rx_ticks: int, *, in_use: bool) -> bool:
+        """Whether others have lately received an anchor, or had when it came into use.
+
+        Only then its pages take part in the majority, and its relays confirm others.
+        """
+        return _is_recent(self._relayed_ticks, anchor, rx_ticks) or (in_use and anchor not in self._own_relays_ticks)
 
     def is_confirmed(self, anchor: int, rx_ticks: int) -> bool:
-        """Whether an anchor has lately been received by another one, or shown that it is there."""
-        return _is_recent(self._relayed_ticks, anchor, rx_ticks) or _is_recent(self._shown_ticks, anchor, rx_ticks)
+        """Whether an anchor has lately been received by another one, or its own relays have fitted."""
+        return _is_recent(self._relayed_ticks, anchor, rx_ticks) or _is_recent(self._own_relays_ticks, anchor, rx_ticks)
 
     def replaced_by(self, anchor: int, ranges_m: dict[int, float]) -> int | None:
         """The anchor that should leave for another one, None where that is too weak.

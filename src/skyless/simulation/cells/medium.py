@@ -6,10 +6,10 @@ functions decides receptions.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, Generic, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -35,9 +35,9 @@ from skyless.simulation.cells.reception import (
     squared_m2,
 )
 from skyless.simulation.impairments import Impairments
-from skyless.simulation.listening import OUTCOMES, RECEPTION_RECORD, fill_truth
-from skyless.simulation.medium import TURNAROUND_S, Delivery, Flight, Tally, Timeline, make_tally
-from skyless.simulation.stations import TagSpec, coordinate_m, make_stations, set_piece
+from skyless.simulation.listening import RECEPTION_RECORD, fill_truth
+from skyless.simulation.medium import TURNAROUND_S, Delivery, Flight, MediumBase
+from skyless.simulation.stations import TagSpec, coordinate_m
 from skyless.site.model import Site
 from skyless.ticks import WRAP_TICKS, difference, from_seconds, wrap
 
@@ -112,7 +112,7 @@ class NumberedFlight(Flight):
     """Length after its RMARKER."""
 
 
-class CellMedium(Generic[Result]):
+class CellMedium(MediumBase[Result]):
     """A site's air by the rules of several cells, with the interface of ``Medium`` as a ``World`` uses it.
 
     Nodes are numbered as there. Free space only: impairments that several cells do not model are refused.
@@ -133,9 +133,7 @@ class CellMedium(Generic[Result]):
         """
         refuse_unmodelled(impairments, range_errors=False)
         _refuse_unmodelled_site(site, tags)
-        self._anchors, self._tags = site.anchors, tuple(tags)
-        self.node_of = {anchor.id: node for node, anchor in enumerate(site.anchors)}
-        """Nodes of the anchors, by their identifiers."""
+        super().__init__(site, tags, impairments, deliver)
         named = {one.anchor for one in impairments.anchor_outages}
         unknown = named.union(one.anchor for one in impairments.anchor_displacements) - self.node_of.keys()
         if unknown:
@@ -146,44 +144,14 @@ class CellMedium(Generic[Result]):
         self._start_key = np.uint64(purpose_key(seed, START))
         self._rules = rules_of(impairments.channel, impairments.tx_stamp_ps, impairments.rx_stamp_ps, seed)
         self._clocks = CellClocks(impairments.oscillator, self._keys, seed)
-        self._stations = make_stations(site.anchors, self._tags, impairments)
-        self._positions_m = self._stations["position_m"][: len(site.anchors)].copy()
-        self._piece_ends_s = np.full(len(self._tags), -np.inf)
-        self.boots = [0] * len(keys)
-        """How often each node was switched off."""
+        self._positions_m = self.stations["position_m"][: len(site.anchors)].copy()
         self._numbers = [0] * len(keys)
         self._on_air: deque[NumberedFlight] = deque()
         self._rows = np.zeros(len(keys), dtype=RECEPTION_RECORD)
-        self._counts = np.zeros((2, len(OUTCOMES)), dtype=np.int64)
-        self._transmissions = self._late = 0
-        self._deliver = deliver
-        self.timeline: Timeline[Result] = Timeline()
 
-    @property
-    def tally(self) -> Tally:
-        """What was sent, heard and lost so far, by reason."""
-        return make_tally(self._transmissions, self._late, self._counts)
-
-    @property
-    def now_s(self) -> float:
-        """True time that has passed."""
-        return self.timeline.now_ticks * TICK_S
-
-    def run(self, until_s: float) -> Iterator[Result]:
-        """Let true time pass up to ``until_s``. Can be called again."""
-        return self.timeline.run(from_seconds(until_s))
-
-    def switch_off(self, node: int) -> None:
-        """Switch a node off; its frame is not sent if the RMARKER has not left."""
-        self._stations[node]["on"] = 0
-        self.boots[node] += 1
-
-    def switch_on(self, node: int) -> None:
-        """Switch a node on, with a new counter except at time 0."""
-        self._stations[node]["on"] = 1
-        if self.timeline.now_ticks > 0:
-            key = np.uint64(key_of(self._start_key, int(self._keys[node]), self.boots[node], 3))
-            self._clocks.shift(node, int(uniform(key) * WRAP_TICKS))
+    def _restart_counter(self, node: int) -> None:
+        key = np.uint64(key_of(self._start_key, int(self._keys[node]), self.boots[node], 3))
+        self._clocks.shift(node, int(uniform(key) * WRAP_TICKS))
 
     def read_counter(self, node: int) -> int:
         """A node's unwrapped counter at present."""
@@ -247,7 +215,7 @@ class CellMedium(Generic[Result]):
             self._rules,
             self._knots(0),
             frames,
-            self._stations,
+            self.stations,
             self._positions_m,
             self._keys,
             self._on_air.index(flight),
@@ -258,13 +226,6 @@ class CellMedium(Generic[Result]):
         self._transmissions += 1
         delivery = Delivery(flight, self._rows[:anchors].copy(), self._rows[anchors:count].copy())
         self.timeline.at(flight.end_ticks, partial(self._deliver, delivery))
-
-    def _move_tags(self, t_s: float) -> None:
-        """Set the next piece of every trajectory whose present one has ended."""
-        for tag in np.flatnonzero(self._piece_ends_s <= t_s).tolist():
-            piece = self._tags[tag].trajectory.piece(t_s)
-            set_piece(self._stations, len(self._anchors) + tag, piece)
-            self._piece_ends_s[tag] = piece.end_s
 
 
 def refuse_unmodelled(impairments: Impairments, *, range_errors: bool) -> None:
