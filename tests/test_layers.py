@@ -20,7 +20,7 @@ LAYERS = (
     {"site"},
     {"clocks", "radios.interface"},
     {"positioning"},
-    {"master_election", "slot_claims"},
+    {"master_election", "slot_claims", "survey"},
     {"anchor", "anchors", "receiver", "mqtt"},
     {"simulation", "recordings"},
     {"radios"},

@@ -8,7 +8,9 @@ from typing import Literal
 
 from msgspec import Struct
 
-from skyless.site.model import Site
+from skyless.site.model import FloorPlanSite, Site
+from skyless.survey.facts import Facts
+from skyless.survey.result import Survey
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
@@ -199,6 +201,8 @@ class RequestMessage(Struct, frozen=True):
     receptions: tuple[str, ...]
     """Names of tags; ``*`` means all of them. Empty ends the request."""
     lease_s: float
+    stamps: bool = False
+    """Whether anchors are to publish their stamps (``StampsMessage``)."""
 
 
 class RawReception(Struct, frozen=True, array_like=True):
@@ -262,3 +266,106 @@ class ZoneEvent(Struct, frozen=True):
     kind: Literal["enter", "leave"]
     unix_s: float
     position_m: Vector
+
+
+class Stamp(Struct, frozen=True, array_like=True):
+    """One reception of an anchor by another."""
+
+    anchor: int
+    """Which was received."""
+    tx_ticks: int
+    """Its TX stamp, as its frame states it, 40 bits."""
+    rx_ticks: int
+    """The publishing anchor's RX stamp, 40 bits."""
+
+
+class StampsMessage(Struct, frozen=True):
+    """What an anchor has received of the others since its last message, in order."""
+
+    anchor: int
+    run: str
+    """Changes when its counter has restarted."""
+    unix_s: float
+    stamps: tuple[Stamp, ...]
+    missed: int = 0
+    """Stamps that were dropped before these, as nobody collected them in time."""
+
+
+class SurveyFactsMessage(Struct, frozen=True):
+    """What a user knows of a site; replaces what was given before."""
+
+    facts: Facts
+    floor_plan: FloorPlanSite | None = None
+    """Where the image of the floor lies; ``image`` is empty for the one on MQTT."""
+    by: str = ""
+
+
+class SurveySaveMessage(Struct, frozen=True):
+    """Use the result of this number: write the site file, and let the anchors adopt it."""
+
+    by: str
+    serial: int
+
+
+class SurveyProgress(Struct, frozen=True):
+    """Of one pair of anchors."""
+
+    a: int
+    b: int
+    exchanges: int
+    range_m: float
+    std_m: float
+
+
+class SurveyMessage(Struct, frozen=True):
+    """State of the survey program."""
+
+    unix_s: float
+    serial: int
+    """Of the result; ``SurveySaveMessage`` names it."""
+    anchors: tuple[int, ...]
+    """Those that have been received."""
+    missing: tuple[int, ...]
+    """Those of the site file that have not."""
+    duration_s: float
+    pairs: tuple[SurveyProgress, ...]
+    facts: Facts
+    survey: Survey | None
+    """None while too few pairs are known."""
+    error: str | None = None
+    """A sentence: why there is no result, or why the last one could not be saved."""
+    saved_serial: int | None = None
+    file: str | None = None
+    """The site file that it writes."""
+
+
+class PlacementMessage(Struct, frozen=True):
+    """The site after a survey. An anchor adopts it if its own site is the one before, and ignores it otherwise."""
+
+    unix_s: float
+    before: str
+    """Digest of the site before the survey."""
+    site: Site
+
+
+class WatchFinding(Struct, frozen=True):
+    """Something at the anchors has changed since the survey."""
+
+    kind: Literal["moved", "delay", "link", "check"]
+    """An anchor has moved; its delay has changed; one link is blocked; something has changed, unclear what."""
+    anchors: tuple[int, ...]
+    """The anchor, or both ends of the link; for ``check`` those in question."""
+    size_m: float
+    std_m: float | None
+    since_unix_s: float
+    sentence: str
+
+
+class WatchMessage(Struct, frozen=True):
+    """What the watch of the anchors sees at present."""
+
+    unix_s: float
+    state: Literal["learning", "watching", "no data"]
+    findings: tuple[WatchFinding, ...]
+    pairs: int
+    """Pairs of anchors that are watched."""

@@ -55,3 +55,33 @@ def zones_topic(site: int | str) -> str:
 def zone_event_topic(site: int | str, zone: str) -> str:
     """``ZoneEvent``."""
     return f"{ROOT}/{site}/zone/{zone}/event"
+
+
+def stamps_topic(site: int | str, anchor: int | str) -> str:
+    """``StampsMessage``, on request."""
+    return f"{ROOT}/{site}/anchor/{anchor}/stamps"
+
+
+def survey_topic(site: int | str) -> str:
+    """Retained ``SurveyMessage``: what the survey program has found, and what it asks for."""
+    return f"{ROOT}/{site}/survey/state"
+
+
+def survey_facts_topic(site: int | str) -> str:
+    """``SurveyFactsMessage``: what a user knows, for the survey program."""
+    return f"{ROOT}/{site}/survey/facts"
+
+
+def survey_save_topic(site: int | str) -> str:
+    """``SurveySaveMessage``: use the present result."""
+    return f"{ROOT}/{site}/survey/save"
+
+
+def placement_topic(site: int | str) -> str:
+    """Retained ``PlacementMessage``: positions and delays that running anchors adopt."""
+    return f"{ROOT}/{site}/survey/placement"
+
+
+def watch_topic(site: int | str) -> str:
+    """Retained ``WatchMessage``: anchors that have moved, delays that have changed, links that are blocked."""
+    return f"{ROOT}/{site}/survey/watch"
