@@ -40,7 +40,7 @@ def _noise(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> float:
     own, weight = [], []
     for values in ranges_m.values():
         if len(values) >= _LEAST_COUNT:
-            own.append(_spread(np.asarray(values)) ** 2)
+            own.append(_robust_std(np.asarray(values)) ** 2)
             weight.append(len(values) - 1)
     if not own:
         return _UNKNOWN_NOISE_M
@@ -48,7 +48,7 @@ def _noise(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> float:
     return max(math.sqrt(float(np.average(np.array(own)[quiet], weights=np.array(weight)[quiet]))), _LEAST_NOISE_M)
 
 
-def _spread(values: Array) -> float:
+def _robust_std(values: Array) -> float:
     """Robust standard deviation; of few values corrected for their number."""
     deviation = float(np.median(np.abs(values - np.median(values))))
     return _SIGMAS_OF_MAD * deviation * math.sqrt(len(values) / (len(values) - 1.0))
@@ -70,5 +70,5 @@ def _earliest_cluster(values_m: Array, noise_m: float) -> Array:
     least = max(_LEAST_COUNT, _LEAST_SHARE * len(values_m))
     clusters = np.split(values_m, np.flatnonzero(np.diff(values_m) > _GAP_SIGMAS * noise_m) + 1)
     cluster = next((one for one in clusters if len(one) >= least), values_m)
-    near = np.abs(cluster - np.median(cluster)) <= _GAP_SIGMAS * max(_spread(cluster), noise_m)
+    near = np.abs(cluster - np.median(cluster)) <= _GAP_SIGMAS * max(_robust_std(cluster), noise_m)
     return cluster[near]
