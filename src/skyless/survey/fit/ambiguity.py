@@ -55,7 +55,9 @@ def find_ambiguities(problem: Problem, fit: RobustFit) -> tuple[OtherFit, ...]:
             if elsewhere.size:
                 used = minima.used[index]
                 reason = _reason(problem, fit.used, used, is_mirrored)
-                others.append((float(minima.cost[index]), OtherFit(position_m, used, tuple(elsewhere.tolist()), reason)))
+                others.append(
+                    (float(minima.cost[index]), OtherFit(position_m, used, tuple(elsewhere.tolist()), reason))
+                )
     others.sort(key=lambda item: item[0])
     kept: list[OtherFit] = []
     for _, other in others:
@@ -70,7 +72,9 @@ def unchecked_reason(problem: Problem, fit: RobustFit) -> str | None:
     checks = redundancy(fit.problem, fit.solution, fit.used)
     out = int(np.count_nonzero(~fit.used))
     if checks < _LEAST_CHECKS:
-        return f"Nothing checks this survey: {np.count_nonzero(fit.used)} ranges in use, all but {checks:.1f} are needed."
+        return (
+            f"Nothing checks this survey: {np.count_nonzero(fit.used)} ranges in use, all but {checks:.1f} are needed."
+        )
     if out > _LARGEST_SHARE_OUT * (checks + out):
         return f"{out} late ranges were left out; only {checks:.1f} of the rest check the result."
     return None
@@ -135,4 +139,3 @@ def _rigid_motions(problem: Problem, position_m: Array) -> Array:
             turn[:, axis], turn[:, other] = -centred[:, other], centred[:, axis]
             motions.append(turn.ravel())
     return np.column_stack(motions) if motions else np.zeros((position_m.size, 0))
-
