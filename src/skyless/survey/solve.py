@@ -1,286 +1,179 @@
 """A survey: positions and delays of all anchors from the ranges of their pairs and what the user knows.
 
-Counting comes first (``fit/links.py``): only anchors with enough ranges are fitted. The fit finds a shape; known points
-hold it where they agree with it; then follow what the shape is worth (``fit/determined.py``) and its frame.
+Counting comes first (``fit/links.py``): only anchors with enough ranges are fitted. The fit finds a shape
+(``fit/shape.py``), which is moved to its frame (``frame.py``); then follows what is not determined (``findings.py``).
 """
 
 import math
 from typing import Final
 
 import numpy as np
-from msgspec import Struct, structs
-from scipy.special import chdtri
 
-from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.kernels.arrays import Array, Mask
 from skyless.survey.facts import Facts
-from skyless.survey.fit import determined as determination
-from skyless.survey.fit.build import (
-    Measured,
-    as_array,
-    build_problem,
-    levels,
-    usable,
-    with_free_delays,
+from skyless.survey.findings import (
+    advised_tapes,
+    anchor_reasons,
+    held_by_expected_delays,
+    missing_sentences,
+    unchecked,
 )
-from skyless.survey.fit.gauge import align, fitting_points
-from skyless.survey.fit.kept import delays_of_kept_positions
+from skyless.survey.fit.ambiguity import find_ambiguities
+from skyless.survey.fit.build import Measured, as_array, levels, usable
+from skyless.survey.fit.determined import position_stds_m
 from skyless.survey.fit.links import Links, adjacency, count_links
-from skyless.survey.fit.problem import Problem, Solution, solve_least_squares
-from skyless.survey.fit.robust import fit_robustly
-from skyless.survey.fit.start import start_positions
-from skyless.survey.fit.tapes import best_tapes, mending_tapes
+from skyless.survey.fit.shape import Fitted, fit_shape, redundancy
 from skyless.survey.frame import Framed, in_frame
+from skyless.survey.kept import survey_of_kept_positions
 from skyless.survey.ranges import PairRange, PairRanges
-from skyless.survey.result import Ambiguity, Survey, SurveyedAnchor, SurveyedPair, TapeAdvice
-from skyless.survey.sentences import anchors_named, are, joined, tapes_named
+from skyless.survey.result import Ambiguity, Survey, SurveyedAnchor, SurveyedPair
+from skyless.survey.sentences import anchors_named
 
-_LEAST_REDUNDANCY: Final = 4
-"""Ranges more than unknowns from which on residuals show how good the ranges are."""
-
-_LEAST_CHECKS: Final = 3
-_FALSE_ALARM: Final = 0.01
-"""Share of sites with ranges as good as stated whose residuals nevertheless seem to contradict that."""
-
-_MOST_ROUNDS: Final = 4
 _MOVED_M: Final = 0.1
-"""An anchor whose position differs less in another result is at the same place."""
-
-
-class Fitted(Struct, frozen=True, eq=False):
-    """The fit of the anchors that have enough ranges, and what it is worth. ``k`` anchors."""
-
-    measured: Measured
-    kept: Integers
-    """Shape (k,): indices of the fitted anchors."""
-    problem: Problem
-    pairs: tuple[PairRange, ...]
-    solution: Solution
-    used: Mask
-    """Shape (m,): ranges in use."""
-    range_std_m: float
-    rows: Array
-    """Jacobian without the sketch, shape (rows, 4 k)."""
-    core: Mask
-    """Shape (k,): anchors that are determined."""
-    covariance_m2: Array
-    """Of coordinates and delays, shape (4 k, 4 k), aligned over the core; over all where no anchor is determined."""
-    points_used: tuple[int, ...]
-    """Identifiers of the known points that hold the shape."""
-    notes: tuple[str, ...]
-
-    @property
-    def anchors(self) -> tuple[int, ...]:
-        """Identifiers of the fitted anchors."""
-        return tuple(self.measured.anchors[index] for index in self.kept)
+"""An anchor whose position differs less in another result is at the same position."""
 
 
 def run_survey(ranges: PairRanges, facts: Facts) -> Survey:
     """Positions and delays, or, where there are none, why.
 
-    What is not determined has no figures. Raises nothing for ranges and facts that do not suffice or do not fit:
-    ``not_determined`` and ``notes`` say so.
+    What is not determined has no figures. Ranges and facts that do not suffice or do not fit raise nothing:
+    ``not_determined`` and ``notes`` name them.
     """
     measured = usable(ranges, facts)
     if facts.keep_positions:
-        return delays_of_kept_positions(measured)
+        return survey_of_kept_positions(measured)
     links = _links(measured)
     kept = np.flatnonzero(links.has_enough)
-    if not kept.size or not any({pair.a, pair.b} <= {measured.anchors[i] for i in kept} for pair in measured.pairs):
-        return _nothing(measured, links)
-    fitted = _fit(measured, kept)
+    fitted_ids = {measured.anchors[index] for index in kept}
+    if not any(pair.a in fitted_ids and pair.b in fitted_ids for pair in measured.pairs):
+        return _nothing(measured, links, None)
+    fitted = fit_shape(measured, kept)
     if not fitted.core.any():
-        return _shapeless(fitted, links)
-    return _result(fitted, links)
+        return _nothing(measured, links, fitted)
+    framed = in_frame(measured, kept, fitted.solution.position_m, fitted.covariance_m2, fitted.core, fitted.points_used)
+    return Survey(
+        anchors=_anchors(measured, links, fitted, framed),
+        pairs=_pairs(measured, fitted),
+        range_std_m=fitted.range_std_m,
+        redundancy=redundancy(fitted),
+        unchecked=unchecked(fitted),
+        not_determined=(*missing_sentences(measured, links, fitted), *held_by_expected_delays(fitted, framed)),
+        ambiguities=_ambiguities(fitted, framed),
+        tapes=advised_tapes(fitted),
+        frame=framed.sentence,
+        gauge=framed.gauge,
+        notes=(*measured.notes, *fitted.notes, *framed.notes),
+    )
 
 
 def _links(measured: Measured) -> Links:
     facts, index = measured.facts, {anchor: number for number, anchor in enumerate(measured.anchors)}
-    ends = [(index[item.a], index[item.b]) for item in (*measured.pairs, *measured.tapes)]
+    ends = [(index[pair.a], index[pair.b]) for pair in measured.pairs]
+    ends += [(index[tape.a], index[tape.b]) for tape in measured.tapes]
     both = np.array(ends, np.int64).reshape(-1, 2)
     unknown = np.full(len(index), facts.dimensions)
-    if facts.dimensions == 3:
-        for anchor in facts.heights_m:
-            unknown[index[anchor]] -= levels(measured)
-    for anchor in facts.sketch_m:
-        # A sketch says which of two positions is the right one.
-        unknown[index[anchor]] -= 1
-    is_known = np.isfinite(as_array(facts.points, measured.anchors)[:, : facts.dimensions]).all(axis=1)
-    least = facts.dimensions + 1 if facts.dimensions == 2 or not levels(measured) else 3
+    if facts.dimensions == 3 and levels(measured):
+        unknown[[index[anchor] for anchor in facts.heights_m]] -= 1
+    # A sketch shows which of two positions is the right one.
+    unknown[[index[anchor] for anchor in facts.sketch_m]] -= 1
+    is_known: Mask = np.asarray(
+        np.isfinite(as_array(facts.points, measured.anchors)[:, : facts.dimensions]).all(axis=1)
+    )
+    least = 3 if levels(measured) else 4
     return count_links(adjacency(len(index), [(both[:, 0], both[:, 1])]), unknown, is_known, least)
 
 
-def _fit(measured: Measured, kept: Integers) -> Fitted:
-    """The shape, without and then with known points, with the error of ranges that its residuals show."""
-    facts = measured.facts
-    anchors = tuple(measured.anchors[index] for index in kept)
-    sketch = as_array(facts.sketch_m, anchors) if facts.sketch_m else None
-    point = as_array(facts.points, anchors)
-    range_std_m, notes, extra = facts.pair_std_m, [], []
-    is_held = np.zeros(len(kept), bool)
-    if np.isfinite(point[:, :2]).all(axis=1).any():
-        free = _round(measured, kept, range_std_m, None, sketch, [])
-        is_held, moved, sketch, notes = _held_by_points(free, point, sketch)
-        extra = [] if moved is None else [moved]
-    held = np.where(is_held[:, None], point, np.nan)
-    for _ in range(_MOST_ROUNDS):
-        fitted = _round(measured, kept, range_std_m, held if is_held.any() else None, sketch, extra)
-        shown = _shown_std_m(fitted)
-        if shown <= fitted.range_std_m:
-            break
-        range_std_m = shown
-    used = tuple(anchor for anchor, chosen in zip(anchors, is_held, strict=True) if chosen)
-    return structs.replace(fitted, points_used=used, notes=tuple(notes))
-
-
-def _round(
-    measured: Measured, kept: Integers, range_std_m: float, point: Array | None, sketch: Array | None, extra: list[Array]
-) -> Fitted:
-    problem, pairs = build_problem(measured, kept, range_std_m, point, sketch)
-    # A known point decides more than a sketch; a start needs no more than the latter.
-    robust = fit_robustly(problem, [*start_positions(problem, sketch), *extra], range_std_m)
-    problem, solution, used = robust.problem, robust.solution, robust.used
-    if sketch is not None:
-        solution = _settled(problem, solution, used, sketch)
-    weight = used.astype(np.float64)
-    surveyed = structs.replace(problem, coordinate_variance_m2=_without_sketch(measured, kept, point))
-    rows = determination.jacobian(surveyed, solution.position_m, weight)
-    least = 1 if point is not None else 3 if levels(measured) else 4
-    core = determination.determined_core(surveyed, rows, solution.position_m, least)
-    aligned_over = core if core.any() else np.ones(len(kept), bool)
-    covariance = determination.aligned_covariance(surveyed, rows, solution.position_m, aligned_over)
-    for direction in determination.weak_directions(surveyed, covariance, core, 0.02, 4):
-        if determination.folds(surveyed, solution.position_m, solution.delay_m, weight, direction):
-            core = core & ~direction.anchors
-    if core.sum() < least:
-        core = np.zeros(len(kept), bool)
-    if core.any():
-        full = determination.jacobian(problem, solution.position_m, weight)
-        covariance = determination.aligned_covariance(problem, full, solution.position_m, core)
-    return Fitted(
-        measured, kept, problem, tuple(pairs), solution, used, robust.range_std_m, rows, core, covariance, (), ()
-    )
-
-
-def _settled(problem: Problem, solution: Solution, used: Mask, sketch: Array) -> Solution:
-    """The solution in the sketch's frame."""
-    known = np.isfinite(sketch[:, :2]).all(axis=1)
-    if known.sum() < 2:
-        return solution
-    axes = 3 if problem.is_free[:, 2].all() and np.isfinite(sketch[known]).all() and known.sum() > 2 else 2
-    there = np.where(np.isfinite(sketch), sketch, solution.position_m)
-    alignment = align(solution.position_m[known], there[known], 0.3, axes)
-    moved = alignment.motion.moved(solution.position_m)
-    moved = np.where(problem.is_free, moved, solution.position_m)
-    return solve_least_squares(problem, moved, used.astype(np.float64))
-
-
-def _without_sketch(measured: Measured, kept: Integers, point: Array | None) -> Array:
-    """Variances of known coordinates, shape (k, 3), infinite for those of the sketch."""
-    return build_problem(measured, kept, 0.0, point, None)[0].coordinate_variance_m2
-
-
-def _held_by_points(
-    free: Fitted, point: Array, sketch: Array | None
-) -> tuple[Mask, Array | None, Array | None, list[str]]:
-    """Points that agree with the shape, the shape and the sketch moved to them, and sentences about the others."""
-    facts, anchors, position = free.measured.facts, free.anchors, free.solution.position_m
-    is_given = np.isfinite(point[:, :2]).all(axis=1)
-    axes = 2 if levels(free.measured) else 3
-    whole = is_given & np.isfinite(point[:, :axes]).all(axis=1)
-    tested = np.flatnonzero(whole & free.core)
-    if len(tested) < axes:
-        return is_given, None, sketch, []
-    there = np.where(np.isfinite(point), point, position)[tested]
-    columns = (3 * tested[:, None] + np.arange(3)).ravel()
-    covariance = free.covariance_m2[np.ix_(columns, columns)]
-    fits = fitting_points(position[tested], covariance, there, facts.point_std_m)
-    good = tested[fits]
-    stds = determination.position_stds_m(free.problem, free.covariance_m2)
-    std = math.hypot(facts.point_std_m, float(np.median(stds[tested])))
-    motion = align(position[good], there[fits], std, axes).motion
-    moved = np.where(free.problem.is_free, motion.moved(position), position)
-    notes = []
-    error = np.linalg.norm((moved[tested] - there)[:, :axes], axis=1)
-    if len(good) == axes == 2 and not np.all(error[fits] <= 3.0 * std * math.sqrt(2.0)):
-        by_points, by_ranges = (float(np.linalg.norm(np.diff(item[:2], axis=0))) for item in (there, moved[tested]))
-        names = joined(anchors[index] for index in good)
-        notes.append(
-            f"points of anchors {names} are {by_points:.2f} m apart, {by_ranges:.2f} m by the ranges: "
-            "one has moved or is mistyped?"
+def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -> tuple[SurveyedAnchor, ...]:
+    reasons = anchor_reasons(measured, links, fitted)
+    number = {anchor: k for k, anchor in enumerate(fitted.anchors)}
+    stds = position_stds_m(fitted.problem, fitted.covariance_m2)
+    delays, delay_stds = _delays(fitted)
+    found = []
+    for anchor in measured.anchors:
+        k = number.get(anchor)
+        if k is None or not fitted.core[k]:
+            found.append(SurveyedAnchor(anchor, determined=False, reason=reasons[anchor]))
+            continue
+        x, y, z = framed.position_m[k].tolist()
+        covariance = tuple(tuple(row) for row in framed.covariance_m2[k].tolist())
+        found.append(
+            SurveyedAnchor(
+                anchor,
+                determined=True,
+                x_m=x,
+                y_m=y,
+                z_m=z,
+                std_m=float(stds[k]),
+                covariance_m2=covariance,
+                delay_m=float(delays[k]),
+                delay_std_m=float(delay_stds[k]),
+            )
         )
-        return np.zeros(len(point), bool), moved, _moved_sketch(sketch, motion.moved), notes
-    for index, chosen, distance in zip(tested, fits, error, strict=True):
-        if not chosen:
-            notes.append(f"point of anchor {anchors[index]} does not fit by {distance:.2f} m: moved or mistyped?")
-    held = is_given.copy()
-    held[tested[~fits]] = False
-    return held, moved, _moved_sketch(sketch, motion.moved), notes
+    return tuple(found)
 
 
-def _moved_sketch(sketch: Array | None, moved: object) -> Array | None:
-    if sketch is None:
-        return None
-    flat = np.where(np.isnan(sketch[:, 2:]), 0.0, sketch[:, 2:])
-    found = np.asarray(moved(np.concatenate([sketch[:, :2], flat], axis=1)))  # type: ignore[operator]
-    return np.where(np.isnan(sketch), np.nan, found)
+def _delays(fitted: Fitted) -> tuple[Array, Array]:
+    """Delays without the error of TX stamps that all ranges of an anchor share, and standard deviations, shape (k,)."""
+    problem, k = fitted.problem, len(fitted.kept)
+    shared = np.array([fitted.measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in fitted.anchors])
+    own = np.maximum(problem.delay_variance_m2 - shared, 0.0)
+    part = own / np.maximum(problem.delay_variance_m2, 1e-10)
+    delay = problem.delay_m + part * (fitted.solution.delay_m - problem.delay_m)
+    variance = np.diag(fitted.covariance_m2)[3 * k :]
+    return delay, np.sqrt(np.maximum(part**2 * variance + part * shared, 0.0))
 
 
-def _shown_std_m(fitted: Fitted) -> float:
-    """Constant error of a pair that the residuals show, if they contradict the assumed one; 0 otherwise."""
-    problem, used = fitted.problem, fitted.used
-    full = determination.jacobian(problem, fitted.solution.position_m, used.astype(np.float64))
-    everyone = np.ones(len(fitted.kept), bool)
-    covariance = determination.aligned_covariance(problem, full, fitted.solution.position_m, everyone)
-    rows = full[: len(used)]
-    freedom = float(used.sum()) - float(np.einsum("ij,jk,ik->", rows, covariance, rows, optimize=True))
-    squares = fitted.solution.residual_m[used] ** 2
-    noise = np.array([pair.std_m for pair in fitted.pairs])[used] ** 2 + 1e-10
-    if redundancy(fitted) < _LEAST_REDUNDANCY or freedom < 1.0:
-        return 0.0
-    if float(np.sum(squares / problem.variance_m2[used])) <= chdtri(freedom, _FALSE_ALARM):
-        return 0.0
-    low, high = 0.0, 10.0 * math.sqrt(float(squares.max()))
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if np.sum(squares / (noise + middle**2)) > freedom else (low, middle)
-    return high
+def _pairs(measured: Measured, fitted: Fitted | None) -> tuple[SurveyedPair, ...]:
+    number = {} if fitted is None else {(pair.a, pair.b): index for index, pair in enumerate(fitted.pairs)}
+    return tuple(_pair(measured, fitted, pair, number.get((pair.a, pair.b))) for pair in measured.pairs)
 
 
-def redundancy(fitted: Fitted) -> int:
-    """Measurements in use less unknowns that they determine; delays count as unknown unless known to a range's error."""
-    problem, _ = with_free_delays(fitted.problem)
-    variance = _without_sketch(fitted.measured, fitted.kept, _points(fitted))
-    problem = structs.replace(problem, coordinate_variance_m2=variance)
-    rows = determination.jacobian(problem, fitted.solution.position_m, fitted.used.astype(np.float64))
-    return int(np.any(rows != 0.0, axis=1).sum()) - determination.rank(rows)
+def _pair(measured: Measured, fitted: Fitted | None, pair: PairRange, index: int | None) -> SurveyedPair:
+    if fitted is None or index is None:
+        std = math.hypot(pair.std_m, measured.facts.pair_std_m)
+        return SurveyedPair(pair.a, pair.b, pair.range_m, None, std, excluded=False)
+    problem = fitted.problem
+    both = fitted.core[problem.first[index]] and fitted.core[problem.second[index]]
+    residual = float(fitted.solution.residual_m[index]) if both else None
+    std = math.sqrt(problem.variance_m2[index])
+    return SurveyedPair(pair.a, pair.b, pair.range_m, residual, std, excluded=not fitted.used[index])
 
 
-def _points(fitted: Fitted) -> Array | None:
-    points = {anchor: fitted.measured.facts.points[anchor] for anchor in fitted.points_used}
-    return as_array(points, fitted.anchors) if points else None
+def _ambiguities(fitted: Fitted, framed: Framed) -> tuple[Ambiguity, ...]:
+    found = []
+    for other in find_ambiguities(fitted.problem, fitted.robust):
+        position = framed.motion.moved(other.position_m)
+        distance = np.linalg.norm(position - framed.position_m, axis=1)
+        moved: Mask = (distance > _MOVED_M) & fitted.core
+        if not moved.any():
+            continue
+        anchors = tuple(anchor for anchor, is_one in zip(fitted.anchors, moved, strict=True) if is_one)
+        positions = {anchor: _xyz(position[fitted.anchors.index(anchor)]) for anchor in anchors}
+        sentence = f"{anchors_named(anchors)} may be elsewhere, by up to {distance[moved].max():.2f} m: {other.reason}"
+        found.append(Ambiguity(sentence, anchors, positions))
+    return tuple(found)
 
 
-def _result(fitted: Fitted, links: Links) -> Survey:
-    framed = in_frame(
-        fitted.measured,
-        fitted.kept,
-        fitted.solution.position_m,
-        fitted.covariance_m2,
-        fitted.core,
-        fitted.points_used,
-    )
-    held, weak_tapes = _held_by_expected_delays(fitted, framed)
-    checks, excluded = redundancy(fitted), int((~fitted.used).sum())
+def _xyz(position_m: Array) -> tuple[float, float, float]:
+    x, y, z = position_m.tolist()
+    return x, y, z
+
+
+def _nothing(measured: Measured, links: Links, fitted: Fitted | None) -> Survey:
+    """No anchor is determined."""
+    reasons = anchor_reasons(measured, links, fitted)
     return Survey(
-        anchors=_anchors(fitted, framed, links),
-        pairs=_pairs(fitted),
-        range_std_m=fitted.range_std_m,
-        redundancy=checks,
-        unchecked=_unchecked(fitted, checks, excluded),
-        not_determined=(*_missing(fitted, links), *held),
-        ambiguities=_ambiguities(fitted, framed),
-        tapes=weak_tapes,
-        frame=framed.sentence,
-        gauge=framed.gauge,
-        notes=(*fitted.measured.notes, *fitted.notes, *framed.notes),
+        anchors=tuple(
+            SurveyedAnchor(anchor, determined=False, reason=reasons.get(anchor)) for anchor in measured.anchors
+        ),
+        pairs=_pairs(measured, fitted),
+        range_std_m=measured.facts.pair_std_m if fitted is None else fitted.range_std_m,
+        redundancy=0,
+        unchecked="nothing checks this survey: no anchor is determined",
+        not_determined=missing_sentences(measured, links, fitted),
+        ambiguities=(),
+        tapes=(),
+        frame="no anchor is determined, so there is no frame",
+        gauge=None,
+        notes=measured.notes if fitted is None else (*measured.notes, *fitted.notes),
     )

@@ -7,11 +7,17 @@ from msgspec import Struct
 
 from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.survey.fit.neighbours import mirrored
-from skyless.survey.fit.problem import Problem
+from skyless.survey.fit.problem import Problem, solve_least_squares
 from skyless.survey.fit.robust import RobustFit, cut_off, redundancy
 
-_AS_GOOD: Final = 16.0
-"""Weighted squares by which another result may fit worse."""
+_MIRROR_AS_GOOD: Final = 16.0
+"""Weighted squares by which a result that uses the same ranges may fit worse."""
+
+_OTHERS_AS_GOOD: Final = 12.0
+"""And one that takes other ranges for late."""
+
+_LATE_GAIN: Final = 16.0
+"""Weighted squares that leaving ranges out must save; below, no range is late and no other result takes any for it."""
 
 _MOVED_STDS: Final = 3.0
 _MOVED_M: Final = 0.1
@@ -46,16 +52,22 @@ def find_ambiguities(problem: Problem, fit: RobustFit) -> tuple[OtherFit, ...]:
     delay_m = np.tile(fit.solution.delay_m, (len(starts), 1))
     by_mirror = cut_off(problem, starts, delay_m)
     std_m = aligned_std_m(problem, fit)
+    is_late = solve_least_squares(problem, fit.solution.position_m).cost > fit.cost + _LATE_GAIN
     others: list[tuple[float, OtherFit]] = []
     for minima, is_mirrored in ((by_mirror, True), (fit.others, False)):
-        for index in np.flatnonzero(minima.cost < fit.cost + _AS_GOOD):
+        for index in np.flatnonzero(minima.cost < fit.cost + _MIRROR_AS_GOOD):
+            fewer = bool(np.any(fit.used & ~minima.used[index]))
+            if fewer and not (is_late and minima.cost[index] < fit.cost + _OTHERS_AS_GOOD):
+                continue
             position_m = aligned_to(problem, minima.position_m[index], fit.solution.position_m)
             motion_m = np.linalg.norm(position_m - fit.solution.position_m, axis=1)
             elsewhere = np.flatnonzero((motion_m > _MOVED_M) & (motion_m > _MOVED_STDS * std_m))
             if elsewhere.size:
                 used = minima.used[index]
                 reason = _reason(problem, fit.used, used, is_mirrored)
-                others.append((float(minima.cost[index]), OtherFit(position_m, used, tuple(elsewhere.tolist()), reason)))
+                others.append(
+                    (float(minima.cost[index]), OtherFit(position_m, used, tuple(elsewhere.tolist()), reason))
+                )
     others.sort(key=lambda item: item[0])
     kept: list[OtherFit] = []
     for _, other in others:
@@ -70,7 +82,9 @@ def unchecked_reason(problem: Problem, fit: RobustFit) -> str | None:
     checks = redundancy(fit.problem, fit.solution, fit.used)
     out = int(np.count_nonzero(~fit.used))
     if checks < _LEAST_CHECKS:
-        return f"Nothing checks this survey: {np.count_nonzero(fit.used)} ranges in use, all but {checks:.1f} are needed."
+        return (
+            f"Nothing checks this survey: {np.count_nonzero(fit.used)} ranges in use, all but {checks:.1f} are needed."
+        )
     if out > _LARGEST_SHARE_OUT * (checks + out):
         return f"{out} late ranges were left out; only {checks:.1f} of the rest check the result."
     return None
@@ -135,4 +149,3 @@ def _rigid_motions(problem: Problem, position_m: Array) -> Array:
             turn[:, axis], turn[:, other] = -centred[:, other], centred[:, axis]
             motions.append(turn.ravel())
     return np.column_stack(motions) if motions else np.zeros((position_m.size, 0))
-

@@ -67,7 +67,7 @@ def _finite(points: dict[int, Point]) -> dict[int, Point]:
 
 
 def fixed_heights_m(measured: Measured) -> Array:
-    """z of all anchors in two dimensions, shape (n,): given ones, else the middle one of these, else 0."""
+    """Z of all anchors in two dimensions, shape (n,): given ones, else the middle one of these, else 0."""
     facts = measured.facts
     given = {anchor: point[2] for source in (facts.sketch_m, facts.points) for anchor, point in source.items()}
     given.update(facts.heights_m)

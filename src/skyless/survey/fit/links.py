@@ -1,7 +1,7 @@
 """Which anchors have enough ranges: counting, before anything is computed.
 
-An anchor with ``k`` unknown coordinates needs ``k + 1`` distances to anchors that have enough themselves: with ``k``, two
-positions fit. Groups of anchors between which there are too few distances cannot be laid out as one site.
+An anchor with ``k`` unknown coordinates needs ``k + 1`` distances to anchors that have enough themselves: with ``k``,
+two positions fit. Groups of anchors between which there are too few distances cannot be laid out as one site.
 """
 
 import numpy as np

@@ -124,7 +124,9 @@ def without_ranges(problem: Problem, solution: Solution, used: Mask) -> Mask:
     np.fill_diagonal(free, own < _UNCONTROLLED)
     late = np.minimum(first, second) > _LEAST_LATE
     rows, columns = np.nonzero(np.triu(late | free))
-    gain = first[rows, columns] * residual[rows] + np.where(rows == columns, 0.0, second[rows, columns] * residual[columns])
+    gain = first[rows, columns] * residual[rows] + np.where(
+        rows == columns, 0.0, second[rows, columns] * residual[columns]
+    )
     order = np.argsort(9.0 * (1.0 + (rows != columns)) - gain, kind="stable")[:20_000]
     rows, columns = rows[order], columns[order]
     change = influence[:, rows] * first[rows, columns] + np.where(
@@ -152,7 +154,9 @@ def derivatives(problem: Problem, solution: Solution, ranges: Integers) -> Array
     whole[row, second, :3] = -unit
     whole[row, first, 3] = 1.0
     whole[row, second, 3] = 1.0
-    return np.concatenate([whole[:, :, :3].reshape(len(ranges), -1)[:, problem.is_free.ravel()], whole[:, :, 3]], axis=1)
+    return np.concatenate(
+        [whole[:, :, :3].reshape(len(ranges), -1)[:, problem.is_free.ravel()], whole[:, :, 3]], axis=1
+    )
 
 
 def regular(information: Array) -> Array:

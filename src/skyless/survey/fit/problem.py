@@ -182,7 +182,9 @@ class _Equations:
         priors = np.concatenate([self._of_coordinate.ravel()[self._free], self._of_delay])
         np.einsum("bii->bi", information)[:] += priors
         from_delays = self._of_delay * (self._problem.delay_m - delay_m)
-        gradient = gradient + np.concatenate([from_coordinates.reshape(b, self._problem.is_free.size)[:, self._free], from_delays], axis=1)
+        gradient = gradient + np.concatenate(
+            [from_coordinates.reshape(b, self._problem.is_free.size)[:, self._free], from_delays], axis=1
+        )
         return information, gradient
 
     def cost(self, position_m: Array, delay_m: Array, weight: Array) -> Array:

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.kernels.arrays import Array, Mask
 from skyless.survey.fit.neighbours import derivatives, regular, relocated, without_ranges
@@ -30,6 +31,14 @@ _LAST_CONTROL: Final = 30.0
 
 _MOST_CHANGES: Final = 10
 """Of the set of used ranges, while it is brought to rest."""
+
+_LEAST_CHECKS: Final = 4.0
+_SIGNIFICANT: Final = 2.6
+"""Standard deviations by which squares of residuals must exceed what is expected before a larger error is assumed."""
+
+_MOST_WIDENINGS: Final = 20
+_LEAST_STD_M: Final = 0.005
+_LARGEST_STD_M: Final = 0.3
 
 _MOST_IMPROVEMENTS: Final = 8
 _LEAST_GAIN: Final = 0.01
@@ -71,16 +80,42 @@ class Minima(Struct, frozen=True, eq=False):
 def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0) -> RobustFit:
     """Fit positions and delays to the ranges that agree, from several starts of shape (n, 3).
 
-    ``pair_std_m``: the part of the ranges' standard deviations that is a pair's constant error.
+    ``pair_std_m``: the part of the ranges' standard deviations that is a pair's constant error. Where the residuals
+    show that it is larger, the larger one is used.
     """
-    minima = _from_starts(problem, np.stack(starts))
+    start_m = np.stack(starts)
+    minima = _from_starts(problem, start_m)
+    wider, std_m = _widened(problem, minima, pair_std_m)
+    if std_m > pair_std_m:
+        problem, minima = wider, _from_starts(wider, start_m)
     for _ in range(_MOST_IMPROVEMENTS):
         used, cost = minima.used[0], float(minima.cost[0])
         solution = solve_least_squares(problem, minima.position_m[0], used.astype(np.float64))
         minima = _near(problem, solution, used)
         if not len(minima.cost) or minima.cost[0] > cost - _LEAST_GAIN:
             break
-    return RobustFit(problem, solution, used, cost, pair_std_m, minima)
+    return RobustFit(problem, solution, used, cost, std_m, minima)
+
+
+def _widened(problem: Problem, minima: Minima, pair_std_m: float) -> tuple[Problem, float]:
+    """The problem with the constant error that residuals of ranges in use show, where they show more than expected."""
+    position_m, delay_m, std_m = minima.position_m[:1], minima.delay_m[:1], pair_std_m
+    used = minima.used[0]
+    wider = problem
+    for round_ in range(_MOST_WIDENINGS):
+        solution = solve_least_squares(wider, position_m[0], used.astype(np.float64))
+        checks = redundancy(wider, solution, used)
+        squares = float(np.sum(used * solution.residual_m**2 / wider.variance_m2))
+        # Normal approximation of chi-square by its cube root (Wilson and Hilferty).
+        spread = 2.0 / (9.0 * max(checks, 1e-6))
+        limit = checks * (1.0 - spread + _SIGNIFICANT * np.sqrt(spread)) ** 3 if round_ == 0 else checks
+        if checks < _LEAST_CHECKS or squares <= limit or std_m >= _LARGEST_STD_M:
+            break
+        std_m = min(max(std_m, _LEAST_STD_M) * float(np.clip(np.sqrt(squares / checks), 1.05, 1.5)), _LARGEST_STD_M)
+        wider = replace(problem, variance_m2=problem.variance_m2 - pair_std_m**2 + std_m**2)
+        near = graduated(wider, position_m, delay_m, np.full(1, 0.1))
+        position_m, delay_m, used = near.position_m, near.delay_m, near.used[0]
+    return wider, std_m
 
 
 def _near(problem: Problem, solution: Solution, used: Mask) -> Minima:
