@@ -96,8 +96,7 @@ def _anchors(survey: "Survey") -> "Table":
     for one in survey.anchors:
         position = [number(value) for value in (one.x_m, one.y_m, one.z_m)]
         others = [number(value, "{:.2f}", 100.0) for value in (one.std_m, one.delay_m, one.delay_std_m)]
-        note = "" if one.determined else f"not determined: {one.reason or 'its ranges leave it open'}"
-        table.add_row(str(one.id), *position, *others, note)
+        table.add_row(str(one.id), *position, *others, "" if one.determined else "not determined")
     return table
 
 
