@@ -344,8 +344,10 @@ class PlacementMessage(Struct, frozen=True):
 
     unix_s: float
     before: str
-    """Digest of the site before the survey."""
+    """Digest of the site before the survey (``site/digest.py``)."""
     site: Site
+    earlier: tuple[str, ...] = ()
+    """Digests of the sites before that, the newest first: an anchor with an older file adopts it, too."""
 
 
 class WatchFinding(Struct, frozen=True):
