@@ -50,8 +50,10 @@ MOST_WAITING: Final = 128
 """Beacons that are kept while the site's pages are not complete (protocol 2)."""
 
 MOVED_HOLD_TICKS: Final = from_seconds(0.3)
-"""An anchor that states another position joins the others after this time: a survey moves all anchors of a site, each
-of them a little earlier or later, and positions from before and after it must not be mixed."""
+LONGEST_MOVED_HOLD_TICKS: Final = from_seconds(2.0)
+"""An anchor that states another position joins again when none has done so for the former time, and after the latter in
+any case: a survey moves all anchors of a site, one a little after the other, and positions from before and after it
+must not be mixed."""
 
 NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
 """Counters of a receiver that do not count dropped frames."""
@@ -299,9 +301,10 @@ class Receiver:
         since_ticks = self._moved_ticks.get(anchor)
         if since_ticks is None:
             return False
-        if 0 <= rx_ticks - since_ticks < MOVED_HOLD_TICKS:
-            return True
         method, moved = self._method, self._moved_ticks
+        calm_ticks, own_ticks = rx_ticks - max(moved.values()), rx_ticks - since_ticks
+        if calm_ticks < MOVED_HOLD_TICKS and own_ticks < LONGEST_MOVED_HOLD_TICKS:
+            return True
         if isinstance(method, Estimation) and not method.is_starting and len(moved) > len(method.estimator.anchors):
             self._renew_method()
         del moved[anchor]
