@@ -27,3 +27,17 @@ class PairRanges(Struct, frozen=True):
     tx_std_m: dict[int, float] = {}
     """Error of an anchor's TX stamps in the mean, which all its ranges share as if it were a delay; 0 where missing."""
     duration_s: float = 0.0
+
+
+class PairBlock(Struct, frozen=True, gc=False):
+    """The ranges of one pair within a short time, a second or so."""
+
+    a: int
+    b: int
+    """Identifiers, a < b."""
+    t_s: float
+    """Middle of that time."""
+    mean_m: float
+    std_m: float
+    """Of the mean, from the scatter of its exchanges."""
+    exchanges: int
