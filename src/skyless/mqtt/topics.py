@@ -23,7 +23,7 @@ def fix_topic(site: int | str, tag: str) -> str:
 
 
 def status_topic(site: int | str, kind: str, name: int | str) -> str:
-    """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard`` or ``recorder``; its last will."""
+    """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard``, ``recorder`` or ``survey``; its will."""
     return f"{ROOT}/{site}/{kind}/{name}/status"
 
 
