@@ -12,13 +12,12 @@ import numpy as np
 
 from skyless.kernels.arrays import Array
 from skyless.survey.ranges import PairRange, PairRanges
+from skyless.survey.stamps.clusters import LEAST_SHARE, earliest_cluster
 
 _ENOUGH: Final = 5
 """Ranges of a pair from which it has clusters; of fewer the median is used."""
-_LEAST_SHARE: Final = 0.1
-"""Of a pair's ranges that the earliest cluster holds, and three at least."""
 _LEAST_COUNT: Final = 3
-_GAP_SIGMAS: Final = 4.0
+"""Ranges in a cluster, and of a pair whose scatter is looked at."""
 _SIGMAS_OF_MAD: Final = 1.4826
 _MEDIAN_OVER_MEAN: Final = 1.25
 """Standard deviation of a median over that of the mean."""
@@ -40,7 +39,7 @@ def _noise(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> float:
     own, weight = [], []
     for values in ranges_m.values():
         if len(values) >= _LEAST_COUNT:
-            own.append(_spread(np.asarray(values)) ** 2)
+            own.append(_robust_std(np.asarray(values)) ** 2)
             weight.append(len(values) - 1)
     if not own:
         return _UNKNOWN_NOISE_M
@@ -48,7 +47,7 @@ def _noise(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> float:
     return max(math.sqrt(float(np.average(np.array(own)[quiet], weights=np.array(weight)[quiet]))), _LEAST_NOISE_M)
 
 
-def _spread(values: Array) -> float:
+def _robust_std(values: Array) -> float:
     """Robust standard deviation; of few values corrected for their number."""
     deviation = float(np.median(np.abs(values - np.median(values))))
     return _SIGMAS_OF_MAD * deviation * math.sqrt(len(values) / (len(values) - 1.0))
@@ -60,15 +59,8 @@ def _mean(a: int, b: int, values_m: Array, noise_m: float) -> PairRange:
     if count < _ENOUGH:
         std_m = noise_m * (_MEDIAN_OVER_MEAN if count > 2 else 1.0) / math.sqrt(count)
         return PairRange(a, b, float(np.median(values_m)), std_m, count)
-    cluster = _earliest_cluster(values_m, noise_m)
-    std_m = max(float(np.std(cluster, ddof=1)), noise_m) / math.sqrt(len(cluster))
-    return PairRange(a, b, float(cluster.mean()), std_m, len(cluster), 1.0 - len(cluster) / count)
-
-
-def _earliest_cluster(values_m: Array, noise_m: float) -> Array:
-    """Values without a gap of four sigmas between them: the first such run that is large enough."""
-    least = max(_LEAST_COUNT, _LEAST_SHARE * len(values_m))
-    clusters = np.split(values_m, np.flatnonzero(np.diff(values_m) > _GAP_SIGMAS * noise_m) + 1)
-    cluster = next((one for one in clusters if len(one) >= least), values_m)
-    near = np.abs(cluster - np.median(cluster)) <= _GAP_SIGMAS * max(_spread(cluster), noise_m)
-    return cluster[near]
+    total = max(float(count), _LEAST_COUNT / LEAST_SHARE)
+    cluster = values_m[earliest_cluster(values_m, np.ones(count), noise_m, total)]
+    std_m = max(float(np.std(cluster, ddof=1)) if len(cluster) > 1 else 0.0, noise_m) / math.sqrt(len(cluster))
+    late_share = float(np.mean(values_m > cluster.max()))
+    return PairRange(a, b, float(cluster.mean()), std_m, len(cluster), late_share)
