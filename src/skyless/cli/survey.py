@@ -11,6 +11,7 @@ from skyless.cli.common.options import check_left_out, check_output, check_pictu
 from skyless.cli.common.output import console, write_file
 from skyless.cli.common.progress import status
 from skyless.cli.common.recording_inputs import is_mcap
+from skyless.cli.nodes.survey_live import LiveOptions, gather_live, serve_live
 from skyless.cli.survey_facts import FactOptions, facts_of
 from skyless.cli.survey_report import SurveyReport, print_report, show_report
 from skyless.errors import SkylessError
@@ -35,6 +36,7 @@ class SurveyOptions:
 
     ranges: Path | None = None
     """A table of ranges instead of a recording: anchor_a,anchor_b,range_m, each pair any number of times."""
+    live: LiveOptions = LiveOptions()
     known: FactOptions = FactOptions()
     out: Path | None = None
     """Write the site file of --site with the survey in it here (.toml), or a table of anchors (.csv)."""
@@ -55,9 +57,12 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
     Parameters
     ----------
     recording
-        A recording of skyless record; --ranges takes a table instead.
+        A recording of skyless record; --ranges takes a table instead, --mqtt and --radio survey a running site.
     """
     _check(recording, asked)
+    if asked.live.serve:
+        serve_live(asked.live, asked.known)
+        return 0
     site, own_ranges = _inputs(recording, asked)
     ranges = _with_all_anchors(own_ranges, site)
     facts, warnings = facts_of(asked.known, ranges.anchors, site)
@@ -86,8 +91,12 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
 def _check(recording: Path | None, asked: SurveyOptions) -> None:
     """See that the inputs are clear and the outputs can be written, before the work. Raises SkylessError."""
     inputs = (recording, asked.ranges, asked.known.heights)
-    if (recording is None) == (asked.ranges is None):
-        raise SkylessError("a survey needs a recording of skyless record, or else a table of ranges by --ranges")
+    asked.live.check(asked.known)
+    if (recording is not None) + (asked.ranges is not None) + asked.live.given != 1:
+        raise SkylessError(
+            "a survey needs a recording of skyless record, or else a table of ranges by --ranges, or else a running site "
+            "by --mqtt or --radio"
+        )
     if recording is not None and not is_mcap(recording):
         raise SkylessError(
             f"{recording} is no recording of skyless record; ranges of other systems are given by --ranges"
@@ -115,6 +124,8 @@ def _inputs(recording: Path | None, asked: SurveyOptions) -> "tuple[Site | None,
     """The site, if one is known, and the ranges. Raises SkylessError."""
     from skyless.site.load import load_site
 
+    if asked.live.given:
+        return gather_live(asked.live, asked.known)
     site = None if asked.known.site is None else load_site(asked.known.site)
     if asked.ranges is not None:
         from skyless.recordings.range_table import read_ranges

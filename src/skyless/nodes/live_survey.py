@@ -106,6 +106,10 @@ class LiveSurvey:
         found = self._ranger.ranges()
         return replace(found, anchors=tuple(sorted(self._known)))
 
+    def finish(self) -> None:
+        """Nothing more comes: what has come since the last full second counts as well."""
+        self._ranger.finish()
+
     def add_result(self, survey: Survey, ranges: PairRanges) -> None:
         """Keep a result; the oldest of many is dropped."""
         self.serial += 1

@@ -248,7 +248,11 @@ class SurveyNode:
     def _begin(self, site: Site) -> None:
         """Survey a site from now on."""
         record = _record_of(self._settings.file, site, self._log)
-        facts = self._facts_of(site) if self._given is None else self._given.facts
+        try:
+            facts = self._facts_of(site) if self._given is None else self._given.facts
+        except SkylessError as error:  # options name anchors that the site on MQTT has not
+            self._log(f"survey: {error}")
+            facts = Facts()
         self.live = LiveSurvey(site, facts, record, watches=self._settings.watches)
         self.live.set_facts(facts)
         self._next_solve_s = 0.0
