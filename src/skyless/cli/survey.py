@@ -94,8 +94,8 @@ def _check(recording: Path | None, asked: SurveyOptions) -> None:
     asked.live.check(asked.known)
     if (recording is not None) + (asked.ranges is not None) + asked.live.given != 1:
         raise SkylessError(
-            "a survey needs a recording of skyless record, or else a table of ranges by --ranges, or else a running site "
-            "by --mqtt or --radio"
+            "a survey needs a recording of skyless record, or else a table of ranges by --ranges, or else a running "
+            "site by --mqtt or --radio"
         )
     if recording is not None and not is_mcap(recording):
         raise SkylessError(

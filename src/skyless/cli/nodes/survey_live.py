@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import sys
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from skyless.cli.common.options import Positive, check_left_out, options
@@ -13,8 +12,7 @@ from skyless.cli.survey_facts import FactOptions, facts_of
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.mqtt.address import MqttAddress
-    from skyless.nodes.survey import SurveyNode, SurveySettings
+    from skyless.nodes.survey import SurveyNode
     from skyless.radios.interface import Radio
     from skyless.site.model import Site
     from skyless.survey.facts import Facts
@@ -83,7 +81,7 @@ def gather_live(asked: LiveOptions, known: FactOptions) -> "tuple[Site, PairRang
     if not ranges.pairs:
         where = asked.mqtt or asked.radio
         raise SkylessError(
-            f"the anchors of site {live.site.name!r} have no ranges yet at {where}: they should run and receive each other"
+            f"the anchors of site {live.site.name!r} have no ranges at {where} yet; they should be running"
         )
     return live.site, ranges
 
