@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from skyless.cli.common.options import check_left_out, check_output, check_picture, options
 from skyless.cli.common.output import console, write_file
 from skyless.cli.common.progress import status
+from skyless.cli.nodes.survey_live import LiveOptions, gather_live, serve_live
 from skyless.cli.survey_facts import FactOptions, facts_of
 from skyless.cli.survey_report import SurveyReport, print_report, show_report
 from skyless.errors import SkylessError
@@ -37,6 +38,7 @@ class SurveyOptions:
     """A table of ranges instead of a recording: anchor_a,anchor_b,range_m, each pair any number of times."""
     format: str | None = None
     """Name of the recording's format, if the content should not decide."""
+    live: LiveOptions = LiveOptions()
     known: FactOptions = FactOptions()
     out: Path | None = None
     """Write the site file of --site with the survey in it here (.toml), or a table of anchors (.csv)."""
@@ -58,9 +60,12 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
     ----------
     recording
         A recording of skyless record, or of another system whose anchors relay their stamps; --ranges takes a table
-        instead.
+        instead, --mqtt and --radio survey a running site.
     """
     _check(recording, asked)
+    if asked.live.serve:
+        serve_live(asked.live, asked.known)
+        return 0
     given = _inputs(recording, asked)
     site, ranges = given.site, _with_all_anchors(given.ranges, given.site)
     facts, warnings = facts_of(asked.known, ranges.anchors, site)
@@ -89,8 +94,12 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
 def _check(recording: Path | None, asked: SurveyOptions) -> None:
     """See that the inputs are clear and the outputs can be written, before the work. Raises SkylessError."""
     inputs = (recording, asked.ranges, asked.known.heights)
-    if (recording is None) == (asked.ranges is None):
-        raise SkylessError("a survey needs a recording of skyless record, or else a table of ranges by --ranges")
+    asked.live.check(asked.known)
+    if (recording is not None) + (asked.ranges is not None) + asked.live.given != 1:
+        raise SkylessError(
+            "a survey needs a recording of skyless record, or else a table of ranges by --ranges, or else a running "
+            "site by --mqtt or --radio"
+        )
     if recording is None:
         check_left_out({"format": asked.format}, "it is for recordings")
     check_output("out", asked.out, *inputs)
@@ -126,6 +135,8 @@ def _inputs(recording: Path | None, asked: SurveyOptions) -> _Inputs:
     """The ranges, and the site if one is known. Raises SkylessError."""
     from skyless.site.load import load_site
 
+    if asked.live.given:
+        return _Inputs(*gather_live(asked.live, asked.known))
     site = None if asked.known.site is None else load_site(asked.known.site)
     if asked.ranges is not None:
         from skyless.recordings.range_table import read_ranges

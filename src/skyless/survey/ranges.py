@@ -37,3 +37,16 @@ class PairRanges(Struct, frozen=True):
             for pair in self.pairs
         )
         return structs.replace(self, pairs=tuple(shorter))
+
+class PairBlock(Struct, frozen=True, gc=False):
+    """The ranges of one pair within a short time, a second or so."""
+
+    a: int
+    b: int
+    """Identifiers, a < b."""
+    t_s: float
+    """Middle of that time."""
+    mean_m: float
+    std_m: float
+    """Of the mean, from the scatter of its exchanges."""
+    exchanges: int
