@@ -183,8 +183,8 @@ class PairRanger:
             return
         legs = _joined(self._kept, _legs_of(self._open))
         self._open = []
-        legs = legs.part(legs.t_s > self._last_s - _KEPT_S)
-        flights, self._kept, impossible = flights_of(legs, self._longest_ticks)
+        flights, kept, impossible = flights_of(legs, self._longest_ticks)
+        self._kept = kept.part(kept.t_s > self._last_s - _KEPT_S)
         self._duration_s += self._last_s - self._first_s
         self._first_s = self._last_s
         self.counters["impossible"] += impossible
