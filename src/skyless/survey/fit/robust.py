@@ -152,7 +152,7 @@ def _squares(problem: Problem, solution: Solution, used: Mask) -> float:
 
 
 def _excess(squares: float, checks: float) -> float:
-    """Standard deviations by which weighted squares exceed what is expected: chi-square's cube root is nearly normal."""
+    """Standard deviations by which weighted squares exceed what is expected: their cube root is nearly normal."""
     variance = 2.0 / (9.0 * max(checks, 1e-6))
     return float((np.cbrt(squares / max(checks, 1e-6)) - 1.0 + variance) / np.sqrt(variance))
 
@@ -206,7 +206,7 @@ def _huber(problem: Problem, start: Solutions) -> Solutions:
 
 
 def graduated(problem: Problem, position_m: Array, delay_m: Array, least_control: Array) -> Minima:
-    """Graduated non-convexity from ``b`` starts: a control of 0 begins with a convex cost, of 1 near the cut-off one."""
+    """Graduated non-convexity from ``b`` starts: controls of 0 begin with a convex cost, of 1 near the cut-off one."""
     scaled = _in_cutoffs(problem, residuals_m(problem, position_m, delay_m))
     convex = 1.0 / np.maximum(2.0 * np.max(scaled, axis=1, initial=0.0) - 1.0, 1.0 / _LAST_CONTROL)
     control = np.maximum(convex, least_control)
