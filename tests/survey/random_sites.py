@@ -66,9 +66,7 @@ def draw(layout, seed, *, dimensions=2, late=0.0, missing=0.0, delay_std_m=0.0, 
     is_late = rng.random(len(first)) < late
     range_m = np.linalg.norm(layout[first] - layout[second], axis=1) + delay_m[first] + delay_m[second]
     range_m += rng.normal(0, std_m, len(first)) + is_late * rng.uniform(0.2, 1.0, len(first))
-    problem = problem_of(
-        layout, first, second, range_m, dimensions=dimensions, delay_std_m=delay_std_m, std_m=std_m
-    )
+    problem = problem_of(layout, first, second, range_m, dimensions=dimensions, delay_std_m=delay_std_m, std_m=std_m)
     sketch_m = None
     if sketch_std_m is not None:
         sketch_m = layout + rng.normal(0, sketch_std_m, layout.shape)

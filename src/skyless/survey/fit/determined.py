@@ -23,8 +23,8 @@ _UNKNOWN_STD_M: Final = 30.0
 """What an unknown that nothing determines is given, so that matrices stay regular."""
 
 _SAME: Final = 1e-9
-_BARRIER: Final = 4.0
-"""Increase of the cost that separates two shapes."""
+_BARRIER_SIGMA: Final = 3.0
+"""What separates two shapes, in standard deviations: the root of the cost's increase."""
 
 
 class Direction(Struct, frozen=True, eq=False):
@@ -172,16 +172,16 @@ def weak_directions(
 
 
 def folds(problem: Problem, position_m: Array, delay_m: Array, weight: Array, direction: Direction) -> bool:
-    """Whether the shape can be moved by 2 × ``MOST_STD_M`` along a direction without ranges that contradict.
+    """Whether the shape can be moved by 3 × ``MOST_STD_M`` along a direction without ranges that contradict.
 
     That a linear model does not show: anchors on a line have no first-order hold across it, and their noise puts them
     next to the line, where they seem to have one.
     """
     start = cost(problem, position_m, delay_m, weight)
     for sign in (1.0, -1.0):
-        for step in np.arange(0.05, 2.0 * MOST_STD_M + 0.01, 0.05):
+        for step in np.arange(0.05, _BARRIER_SIGMA * MOST_STD_M + 0.01, 0.05):
             moved = position_m + sign * step * direction.shift_m
-            if cost(problem, moved, delay_m + sign * step * direction.delay_m, weight) > start + _BARRIER:
+            if cost(problem, moved, delay_m + sign * step * direction.delay_m, weight) > start + _BARRIER_SIGMA**2:
                 break
         else:
             return True
