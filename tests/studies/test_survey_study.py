@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 from skyless.evaluation.figures import picture
+from skyless.evaluation.surveys.air import AirErrors, drawn_errors
+from skyless.evaluation.surveys.judge import aligned, tag_error_m
+from skyless.evaluation.surveys.layouts import survey_layouts
+from skyless.studies import survey as study
 from skyless.studies.catalogue import STUDIES
 from skyless.studies.plan import Plan
-from skyless.studies.survey_layouts import survey_layouts
-from skyless.studies.surveys import study
-from skyless.studies.surveys.air import drawn_errors
-from skyless.studies.surveys.cases import GROUPS, Group, Variant, limits_of
-from skyless.studies.surveys.judge import aligned, tag_error_m
+from skyless.studies.survey import GROUPS, Group, Variant, limits_of
 
 SMALL = {
     "lab": (
         Group("exact", (Variant("delays known", 0.0), Variant("positions kept", 0.15, keeps=True)), seconds=1.0),
-        Group("late", (Variant("late", 0.0),), pair_std_m=0.02, late_share=0.2, missing_share=0.1, seconds=1.0),
+        Group("late", (Variant("late", 0.0),), AirErrors(pair_std_m=0.02, late_share=0.2, missing_share=0.1), 1.0),
     )
 }
 
@@ -68,7 +68,7 @@ def test_what_all_anchors_share_does_not_move_a_tag():
 
 def test_shares_of_late_and_missing_pairs():
     layout, draw = survey_layouts()["hall"], np.random.default_rng(2)
-    group = Group("g", (), late_share=0.3, missing_share=0.25)
+    group = AirErrors(late_share=0.3, missing_share=0.25)
     drawn = [drawn_errors(group, layout, draw) for _ in range(100)]
     missing, late = (sum(len(getattr(one, name)) for one in drawn) for name in ("missing", "late"))
     pairs = 6600

@@ -7,7 +7,7 @@ import pytest
 from msgspec import structs
 from scipy.stats import chi2
 
-from skyless.studies.survey_layouts import drawn_ranges, survey_layouts
+from skyless.evaluation.surveys.layouts import drawn_ranges, survey_layouts
 from skyless.survey.facts import Facts, Tape
 from skyless.survey.fit import determined as determination
 from skyless.survey.fit.build import build_problem, own_delays, usable

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 
-from skyless.studies.survey_layouts import SurveyLayout, drawn_ranges, survey_layouts
+from skyless.evaluation.surveys.layouts import SurveyLayout, drawn_ranges, survey_layouts
 from skyless.survey.facts import Facts, Gauge
 from skyless.survey.fit.gauge import align, axes_through
 from skyless.survey.ranges import PairRange, PairRanges

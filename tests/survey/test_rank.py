@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from skyless.studies.survey_layouts import drawn_ranges, survey_layouts
+from skyless.evaluation.surveys.layouts import drawn_ranges, survey_layouts
 from skyless.survey.facts import Facts, Tape
 from skyless.survey.ranges import PairRange, PairRanges
 from skyless.survey.solve import run_survey

@@ -13,7 +13,7 @@ from skyless.errors import ConfigurationError
 from skyless.recordings.anchor_table import anchor_identifier
 from skyless.recordings.source import finite, read_lines
 from skyless.survey.ranges import PairRanges
-from skyless.survey.repeats import mean_ranges
+from skyless.survey.stamps.repeats import mean_ranges
 
 RANGE_COLUMNS: Final = ("anchor_a", "anchor_b", "range_m")
 HEIGHT_COLUMNS: Final = ("id", "z_m")

@@ -8,9 +8,9 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
+from skyless.evaluation.surveys.air import DrawnErrors, free_axes
+from skyless.evaluation.surveys.layouts import SLOT_S, SurveyLayout
 from skyless.kernels.arrays import Array
-from skyless.studies.survey_layouts import SLOT_S, SurveyLayout
-from skyless.studies.surveys.air import DrawnErrors, free_axes
 from skyless.survey.facts import Facts
 from skyless.survey.fit.determined import aligned_covariance, jacobian
 from skyless.survey.fit.problem import Problem

@@ -8,18 +8,30 @@ from msgspec.structs import replace
 
 from skyless.constants import TICK_M
 from skyless.evaluation.anchor_stamps import stamps_of
+from skyless.evaluation.surveys.layouts import SLOT_S, SurveyLayout
 from skyless.kernels.arrays import Array
 from skyless.simulation.channel import ChannelModel
 from skyless.simulation.impairments import DelayError, PairError, lab_impairments
 from skyless.site.model import EXACT, AnchorSite, ScheduleSite, Site
-from skyless.studies.survey_layouts import SLOT_S, SurveyLayout
-from skyless.studies.surveys.cases import LATE_M, Group
 from skyless.survey.ranges import PairRanges
 
+LATE_M: Final = (0.2, 1.0)
+"""By how much late pairs are."""
 _SENSITIVITY_DBM: Final = -105.0
 """All anchors receive one another."""
 _SETTLE_S: Final = 1.0
 """Until anchors without a master keep their slots."""
+
+
+class AirErrors(Struct, frozen=True):
+    """How errors are drawn."""
+
+    delay_std_m: float = 0.0
+    pair_std_m: float = 0.0
+    """Constant error of each pair."""
+    late_share: float = 0.0
+    missing_share: float = 0.0
+    """Of all pairs."""
 
 
 class DrawnErrors(Struct, frozen=True, eq=False):
@@ -37,16 +49,16 @@ def free_axes(layout: SurveyLayout) -> Array:
     return np.array([1.0, 1.0, 1.0 if layout.dimensions == 3 else 0.0])
 
 
-def drawn_errors(group: Group, layout: SurveyLayout, draw: np.random.Generator) -> DrawnErrors:
+def drawn_errors(errors_of: AirErrors, layout: SurveyLayout, draw: np.random.Generator) -> DrawnErrors:
     """Delays, and errors of pairs; each pair is late or missing for itself."""
     anchors = layout.anchors
-    delay_m = draw.normal(0.0, group.delay_std_m, len(anchors)) if group.delay_std_m else np.zeros(len(anchors))
+    delay_m = draw.normal(0.0, errors_of.delay_std_m, len(anchors)) if errors_of.delay_std_m else np.zeros(len(anchors))
     late, missing, errors = [], [], []
     for index, a in enumerate(anchors):
         for b in anchors[index + 1 :]:
-            error_m = draw.normal(0.0, group.pair_std_m) if group.pair_std_m else 0.0
-            is_late, is_missing, late_m = draw.random() < group.late_share, draw.random(), draw.uniform(*LATE_M)
-            if is_missing < group.missing_share:
+            error_m = draw.normal(0.0, errors_of.pair_std_m) if errors_of.pair_std_m else 0.0
+            is_late, is_missing, late_m = draw.random() < errors_of.late_share, draw.random(), draw.uniform(*LATE_M)
+            if is_missing < errors_of.missing_share:
                 missing.append((a, b))
                 errors.append(PairError(a, b, blocked=True))
                 continue

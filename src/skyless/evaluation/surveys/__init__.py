@@ -1,0 +1,7 @@
+"""Surveys of anchors through simulated air, judged against the truth.
+
+In the order of reading: ``layouts`` (sites), ``air`` (one run, with errors that are drawn), ``judge`` (a survey against
+the truth and its bound).
+
+Public: air, judge, layouts.
+"""
