@@ -37,7 +37,7 @@ _SIGNIFICANT: Final = 2.6
 """Standard deviations by which squares of residuals must exceed what is expected if no range was left out."""
 
 _EXCESS_WEIGHT: Final = 10.0
-_LEAST_EVIDENCE: Final = 13.0
+_LEAST_EVIDENCE: Final = 25.0
 """For a larger error: twice the logarithm of likelihoods, and these standard deviations times a weight. Late ranges
 that were left out say nothing of the error of the others; so likelihoods alone mistake many late ranges for it."""
 
