@@ -140,3 +140,8 @@ def test_kept_positions_need_ranges_and_a_sketch():
     assert by_id[6].delay_m is None
     assert by_id[1].delay_std_m < 0.05
     assert len(survey.not_determined) == 2
+
+
+def test_whole_numbers_are_numbers():
+    survey = run_survey(RANGES, Facts(delay_std_m=0, pair_std_m=0, sketch_std_m=1))
+    assert all(anchor.determined for anchor in survey.anchors)
