@@ -62,12 +62,11 @@ def test_only_what_is_determined_has_figures(ranges, determined, delay_std_m):
     assert determined_pairs == {(p.a, p.b) for p in ranges.pairs if {p.a, p.b} <= set(determined)}
 
 
-@pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize("dimensions", [2, 3])
-def test_three_on_a_line_stay_undetermined_whatever_the_noise(dimensions, late):
+def test_three_on_a_line_stay_undetermined_whatever_the_noise(dimensions):
     """Errors of the ranges put the middle one off the line, where the equations seem to hold it."""
-    for seed in range(5):
-        error = np.random.default_rng(seed).normal(0.03 if late else 0.0, 0.03, 3)
+    for seed in range(8):
+        error = np.random.default_rng(seed).normal(0.0, 0.03, 3)
         pairs = [(1, 2, 4.0), (2, 3, 4.0), (1, 3, 8.0)]
         ranges = tuple(PairRange(a, b, d + e, 0.001, 100) for (a, b, d), e in zip(pairs, error, strict=True))
         survey = run_survey(PairRanges(ranges, (1, 2, 3)), Facts(dimensions=dimensions, delay_std_m=0.0))
@@ -141,3 +140,8 @@ def test_kept_positions_need_ranges_and_a_sketch():
     assert by_id[6].delay_m is None
     assert by_id[1].delay_std_m < 0.05
     assert len(survey.not_determined) == 2
+
+
+def test_whole_numbers_are_numbers():
+    survey = run_survey(RANGES, Facts(delay_std_m=0, pair_std_m=0, sketch_std_m=1))
+    assert all(anchor.determined for anchor in survey.anchors)

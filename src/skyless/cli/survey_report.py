@@ -133,8 +133,8 @@ def _tapes(tapes: Sequence["TapeAdvice"]) -> list[str]:
     """What to measure next, and what it would bring."""
     lines = []
     for rank, tape in enumerate(tapes):
-        before = "not determined" if tape.std_before_m is None else cm(tape.std_before_m)
-        after = "not determined" if tape.std_after_m is None else cm(tape.std_after_m)
         ask = "most would help a tape between" if rank == 0 else "then between"
-        lines.append(f"{ask} {tape.a} and {tape.b}: {before} → {after} (--distance {tape.a}-{tape.b}=METRES)")
+        lines.append(
+            f"{ask} {tape.a} and {tape.b}: {cm(tape.std_before_m)} → {cm(tape.std_after_m)} (--distance {tape.a}-{tape.b}=METRES)"
+        )
     return lines

@@ -6,20 +6,20 @@ from typing import Final
 import numpy as np
 
 from skyless.kernels.arrays import Array, Mask
+from skyless.survey.build import Measured, levels, with_free_delays
 from skyless.survey.fit import determined as determination
-from skyless.survey.fit.build import Measured, levels, with_free_delays
 from skyless.survey.fit.links import Links
 from skyless.survey.fit.problem import Problem
-from skyless.survey.fit.shape import Fitted, redundancy, surveyed_problem
 from skyless.survey.fit.tapes import TapeChoice, best_tapes, mending_tapes
 from skyless.survey.frame import Framed
 from skyless.survey.result import TapeAdvice
 from skyless.survey.sentences import anchors_named, are, joined, tapes_named
+from skyless.survey.shape import Fitted, redundancy, surveyed_problem
 
 LEAST_CHECKS: Final = 3
 """Ranges more than unknowns below which nothing checks a result."""
 
-_FLAT: Final = 0.1
+_FLAT: Final = 0.3
 """Extent of a site across, as a part of its extent along, below which it is flat."""
 
 _ONE_AXIS: Final = 0.7

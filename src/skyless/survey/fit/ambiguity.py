@@ -26,6 +26,9 @@ _MOVED_M: Final = 0.1
 _LEAST_CHECKS: Final = 3.0
 _LARGEST_SHARE_OUT: Final = 0.5
 
+_NO_MOTION: Final = 1e-9
+"""Of a site, such as a line's around itself."""
+
 _MOST_OTHERS: Final = 4
 """That are reported."""
 
@@ -127,8 +130,10 @@ def aligned_std_m(problem: Problem, fit: RobustFit) -> Array:
     """Of each anchor's distance from the truth, after the best rigid alignment, shape (n,)."""
     free = np.flatnonzero(problem.is_free.ravel())
     motions = _rigid_motions(problem, fit.solution.position_m)[free]
-    basis = np.zeros((len(fit.solution.information), motions.shape[1]))
-    basis[: len(free)] = np.linalg.qr(motions)[0]
+    direction, length, _ = np.linalg.svd(motions, full_matrices=False)
+    direction = direction[:, length > _NO_MOTION * length.max(initial=0.0)]
+    basis = np.zeros((len(fit.solution.information), direction.shape[1]))
+    basis[: len(free)] = direction
     covariance = np.linalg.inv(fit.solution.information + basis @ basis.T + 1e-6 * np.eye(len(basis)))
     keep = np.eye(len(basis)) - basis @ basis.T
     variance = np.zeros(problem.is_free.size)

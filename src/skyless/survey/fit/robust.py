@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from skyless.kernels.arrays import Array, Mask
 from skyless.survey.fit.neighbours import derivatives, regular, relocated, without_ranges
+from skyless.survey.fit.presence import Presence
 from skyless.survey.fit.problem import Problem, Solution, Solutions, residuals_m, solve_least_squares, solve_many
 
 LATE_CUTOFF: Final = 3.0
@@ -37,7 +38,7 @@ _SIGNIFICANT: Final = 2.6
 """Standard deviations by which squares of residuals must exceed what is expected if no range was left out."""
 
 _EXCESS_WEIGHT: Final = 10.0
-_LEAST_EVIDENCE: Final = 13.0
+_LEAST_EVIDENCE: Final = 25.0
 """For a larger error: twice the logarithm of likelihoods, and these standard deviations times a weight. Late ranges
 that were left out say nothing of the error of the others; so likelihoods alone mistake many late ranges for it."""
 
@@ -111,14 +112,22 @@ def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0)
 
 
 def _best_near(problem: Problem, minima: Minima, pair_std_m: float) -> RobustFit:
-    """The first of some minima, or a better one that is found from there."""
+    """The best of some minima, or a better one that is found from there."""
+    presence = Presence(problem, minima.position_m[0])
+    best_whole = np.inf
+    fit: RobustFit | None = None
     for _ in range(_MOST_IMPROVEMENTS):
-        used, cost = minima.used[0], float(minima.cost[0])
-        solution = solve_least_squares(problem, minima.position_m[0], used.astype(np.float64))
-        minima = _near(problem, solution, used)
-        if not len(minima.cost) or minima.cost[0] > cost - _LEAST_GAIN:
+        whole = minima.cost + presence.cost(minima.position_m)
+        if fit is not None and (not len(whole) or whole.min() > best_whole - _LEAST_GAIN):
             break
-    return RobustFit(problem, solution, used, cost, pair_std_m, minima)
+        best = int(np.argmin(whole))
+        best_whole, used = float(whole[best]), minima.used[best]
+        solution = solve_least_squares(problem, minima.position_m[best], used.astype(np.float64))
+        cost = float(minima.cost[best])
+        minima = _joined(_near(problem, solution, used), minima)
+        fit = RobustFit(problem, solution, used, cost, pair_std_m, minima)
+    assert fit is not None
+    return fit
 
 
 def _shown_std_m(fit: RobustFit) -> float:
@@ -165,7 +174,12 @@ def _near(problem: Problem, solution: Solution, used: Mask) -> Minima:
     sets = without_ranges(problem, solution, used)
     position_m, delay_m = np.tile(solution.position_m, (len(sets), 1, 1)), np.tile(solution.delay_m, (len(sets), 1))
     fewer = cut_off(problem, position_m, delay_m, sets)
-    both = [np.concatenate(parts) for parts in zip(_fields(elsewhere), _fields(fewer), strict=True)]
+    return _joined(elsewhere, fewer)
+
+
+def _joined(some: Minima, more: Minima) -> Minima:
+    """All of them, the best first."""
+    both = [np.concatenate(parts) for parts in zip(_fields(some), _fields(more), strict=True)]
     order = np.argsort(both[3], kind="stable")
     return Minima(*(part[order] for part in both))
 
