@@ -10,8 +10,8 @@ import pytest
 
 from machines.bench import LAB, Heard, Stage
 from recordings import live_site
+from skyless.cli.common.survey_facts import FactOptions, facts_of
 from skyless.cli.main import main
-from skyless.cli.survey_facts import FactOptions, facts_of
 from skyless.constants import TICK_M
 from skyless.errors import SkylessError
 from skyless.recordings.anchor_table import read_anchors, read_calibration

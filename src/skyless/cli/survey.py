@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from skyless.cli.common.options import check_left_out, check_output, check_picture, options
 from skyless.cli.common.output import console, write_file
 from skyless.cli.common.progress import status
+from skyless.cli.common.survey_facts import FactOptions, facts_of
 from skyless.cli.nodes.survey_live import LiveOptions, gather_live, serve_live
-from skyless.cli.survey_facts import FactOptions, facts_of
 from skyless.cli.survey_report import SurveyReport, print_report, show_report
 from skyless.errors import SkylessError
 

@@ -134,7 +134,6 @@ def _tapes(tapes: Sequence["TapeAdvice"]) -> list[str]:
     lines = []
     for rank, tape in enumerate(tapes):
         ask = "most would help a tape between" if rank == 0 else "then between"
-        lines.append(
-            f"{ask} {tape.a} and {tape.b}: {cm(tape.std_before_m)} → {cm(tape.std_after_m)} (--distance {tape.a}-{tape.b}=METRES)"
-        )
+        gain = f"{cm(tape.std_before_m)} → {cm(tape.std_after_m)}"
+        lines.append(f"{ask} {tape.a} and {tape.b}: {gain} (--distance {tape.a}-{tape.b}=METRES)")
     return lines

@@ -7,8 +7,8 @@ import time
 from typing import TYPE_CHECKING
 
 from skyless.cli.common.options import Positive, check_left_out, options
+from skyless.cli.common.survey_facts import FactOptions, facts_of
 from skyless.cli.nodes.options import MqttCa, SiteId, log
-from skyless.cli.survey_facts import FactOptions, facts_of
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
