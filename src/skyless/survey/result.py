@@ -52,9 +52,10 @@ class TapeAdvice(Struct, frozen=True):
 
     a: int
     b: int
-    std_before_m: float
+    std_before_m: float | None
+    """None where an anchor is not determined; JSON has no infinity."""
     std_after_m: float
-    """rms over all anchors' ``std_m``; infinite before where an anchor is not determined."""
+    """rms over all anchors' ``std_m``."""
 
 
 class Survey(Struct, frozen=True):
