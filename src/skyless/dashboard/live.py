@@ -309,7 +309,8 @@ class LiveSite:
         page = PageQueue(encode("hello", hello))
         page.replace("mqtt", self._connection())
         page.replace("health", self.state.health_message(self.dropped))
-        page.replace("floor_plan", self._floor_plan_message())
+        if self.floor_plan is not None:
+            page.replace("floor_plan", self._floor_plan_message())
         for kind, message in self.survey.messages().items():
             page.replace(kind, message)
         self.pages.add(page)

@@ -46,7 +46,8 @@ class Newest(Generic[_M]):
 
     def __init__(self, kind: type[_M], clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
         self.message: _M | None = None
-        self._kind, self._clock, self._wall_clock = kind, clock, wall_clock
+        self._kind: type[_M] = kind
+        self._clock, self._wall_clock = clock, wall_clock
         self._first = True
         self._made_s = 0.0
 
@@ -88,10 +89,12 @@ class SiteSurvey:
 
     def messages(self) -> dict[str, bytes]:
         """The messages that a new page needs, by kind."""
-        return {
-            "survey": encode("survey", {"survey": self._survey.message, "age_s": self._survey.age_s()}),
-            "watch": encode("watch", {"watch": self._watch.message, "age_s": self._watch.age_s()}),
-        }
+        found = {}
+        if self._survey.message is not None:
+            found["survey"] = self._encoded_survey()
+        if self._watch.message is not None:
+            found["watch"] = self._encoded_watch()
+        return found
 
     def expect_kept(self) -> None:
         """The broker is connected again: it sends the messages that it kept."""
@@ -122,11 +125,17 @@ class SiteSurvey:
 
     def _on_survey(self, _topic: str, payload: bytes) -> None:
         self._survey.read(payload)
-        self._broadcast("survey", self.messages()["survey"])
+        self._broadcast("survey", self._encoded_survey())
 
     def _on_watch(self, _topic: str, payload: bytes) -> None:
         self._watch.read(payload)
-        self._broadcast("watch", self.messages()["watch"])
+        self._broadcast("watch", self._encoded_watch())
+
+    def _encoded_survey(self) -> bytes:
+        return encode("survey", {"survey": self._survey.message, "age_s": self._survey.age_s()})
+
+    def _encoded_watch(self) -> bytes:
+        return encode("watch", {"watch": self._watch.message, "age_s": self._watch.age_s()})
 
 
 def topic_of(message: SurveyFactsMessage | SurveySaveMessage, site_id: int) -> str:
