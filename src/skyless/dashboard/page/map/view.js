@@ -39,13 +39,12 @@ export function zoom(factor, x = view.width / 2, y = view.height / 2) {
   view.touched = true;
 }
 
-/** Show the whole site, clear of the buttons; `floor` is the floor plan's image, where there is one. */
-export function fit(site, zones, floor) {
+/** Show the whole site and some further corners, clear of the buttons. */
+export function fit(site, zones, further) {
   view.touched = false;
-  const corners = zones.flatMap((zone) => zone.polygon_m);
+  const corners = [...zones.flatMap((zone) => zone.polygon_m), ...further];
   for (const anchor of site?.anchors ?? []) corners.push([anchor.x_m, anchor.y_m]);
   for (const wall of site?.walls ?? []) corners.push([wall.x1_m, wall.y1_m], [wall.x2_m, wall.y2_m]);
-  if (floor) corners.push([floor.x_m, floor.y_m], [floor.x_m + floor.width_m, floor.y_m + floor.height_m]);
   if (!corners.length) corners.push([-5, -4], [5, 4]);
   const xs = corners.map(([x]) => x);
   const ys = corners.map(([, y]) => y);

@@ -109,6 +109,11 @@ export function placeFloorPlan(plan) {
   return changeFacts({});
 }
 
+/** Whether the map shows the survey's picture: during the set-up, and at a site that has no positions yet. */
+export function surveyShown() {
+  return state.mode === "live" && state.survey !== null && (state.setup.open || !state.site?.anchors.length);
+}
+
 /** Anchors that are known from anywhere, in ascending order. */
 export function anchorIds() {
   const ids = new Set([...(state.survey?.anchors ?? []), ...(state.survey?.missing ?? [])]);
