@@ -231,7 +231,7 @@ def _recorded(from_s, to_s, rate_hz):
 
 def _guarded(response):
     """What the real server sends: anything from elsewhere is refused by the browser."""
-    response.headers["content-security-policy"] = "default-src 'self'"
+    response.headers["content-security-policy"] = "default-src 'self'; img-src 'self' data: blob:"
     return response
 
 

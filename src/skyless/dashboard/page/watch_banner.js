@@ -2,6 +2,7 @@
 
 import { on, select } from "./store.js";
 import { byId, h } from "./dom.js";
+import { open } from "./tabs.js";
 import { findings, outdated, sentence } from "./survey/watch.js";
 
 const MOST = 2;
@@ -26,6 +27,6 @@ function show() {
   if (found.length > MOST) lines.push(h("p", {}, `And ${found.length - MOST} more: see the anchors.`));
   if (old) lines.push(h("p", { class: "fine" }, "The watch does not report any more; this may have changed."));
   const first = found[0]?.anchors[0];
-  const go = h("button", { type: "button", onclick: () => select("anchor", first) }, "Show");
+  const go = h("button", { type: "button", onclick: () => (open("anchors"), select("anchor", first)) }, "Show");
   box.replaceChildren(h("div", {}, ...lines), go);
 }

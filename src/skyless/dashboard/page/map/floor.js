@@ -3,6 +3,7 @@
 import { faint, palette } from "../theme.js";
 import { state } from "../store.js";
 import { metres } from "../format.js";
+import { surveyShown } from "../survey/model.js";
 import { height_m, moving, plan } from "../survey/plan.js";
 import { px, py, roundLength, toSite, view } from "./view.js";
 
@@ -35,7 +36,7 @@ export function drawFloor(context) {
   if (!shown) return;
   const [left, top] = [px(shown.x_m), py(shown.y_m + shown.height_m)];
   const [width, height] = [shown.width_m * view.scale, shown.height_m * view.scale];
-  context.globalAlpha = 0.75;
+  context.globalAlpha = surveyShown() ? 0.5 : 0.75; // thin lines of the survey's picture lie over it
   context.drawImage(shown.image, left, top, width, height);
   context.globalAlpha = 1;
   if (!moving) return;

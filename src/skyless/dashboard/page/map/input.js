@@ -3,10 +3,10 @@
 import { changed, select, state } from "../store.js";
 import { byId, text } from "../dom.js";
 import { length, metres, number } from "../format.js";
-import { addPoint, begin, cancel, editor, finish, moveCorner, setCursor, storeShown, undoPoint } from "./editor.js";
-import { move as movePlan, moving as movingPlan } from "../survey/plan.js";
 import { surveyShown } from "../survey/model.js";
 import { picking, stopPicking } from "../survey/picking.js";
+import { move as movePlan, moving as movingPlan } from "../survey/plan.js";
+import { addPoint, begin, cancel, editor, finish, moveCorner, setCursor, storeShown, undoPoint } from "./editor.js";
 import { valueAt } from "./overlay.js";
 import { anchorNear } from "./survey.js";
 import { drawn } from "./tags.js";

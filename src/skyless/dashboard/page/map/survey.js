@@ -5,15 +5,15 @@ import { roundStep } from "../format.js";
 import { facts, surveyShown } from "../survey/model.js";
 import { faint, palette } from "../theme.js";
 import { label, ring } from "./anchors.js";
-import { px, py, toSite, view } from "./view.js";
+import { isNarrow, px, py, toSite, view } from "./view.js";
 
 const MARK = 6;
 /** Half axes of an ellipse that holds 95 % of the errors, in standard deviations. */
 const SIGMAS_95 = 2.4477;
 /** The largest ellipse is enlarged to about this half axis in pixels. */
 const ELLIPSE = 34;
-/** Anchors without any position stand in rows from here, in pixels. */
-const TRAY = { x: 20, y: 88, step: 34 };
+/** Anchors without any position stand in rows from here, in pixels; clear of the buttons and of the set-up's bar. */
+const TRAY = { wide: { x: 20, y: 90, right: 64 }, narrow: { x: 20, y: 34, right: 196 }, step: 34 };
 /** With more pairs their lines are fainter. */
 const FEW_PAIRS = 100;
 
@@ -68,7 +68,7 @@ export function drawSurvey(context) {
     if (shape) ellipse(context, px(x_m), py(y_m), shape, factor * view.scale);
   }
   if (factor) caption(context, factor);
-  if (state.survey.survey) axes(context);
+  if (axesNamed()) axes(context);
   tray(context, positions);
   context.font = "600 11px system-ui, sans-serif";
   context.textAlign = "center";
@@ -160,7 +160,14 @@ function caption(context, factor) {
   context.font = "11px system-ui, sans-serif";
   context.textAlign = "right";
   context.textBaseline = "bottom";
-  label(context, `Ellipses: 95 % of the errors${times}`, view.width - 16, view.height - 54, palette.text);
+  label(context, `Ellipses: 95 % of the errors${times}`, view.width - 16, view.height - (isNarrow() ? 74 : 54), palette.text);
+}
+
+/** Whether anything names the axes; otherwise origin and direction mean nothing. */
+function axesNamed() {
+  const { gauge, points, sketch_m } = facts();
+  const given = Object.keys(points).length > 1 || Object.keys(sketch_m).length > 1;
+  return Boolean(state.survey.survey) && (gauge !== null || given);
 }
 
 /** The axes at the origin. */
@@ -192,15 +199,16 @@ function axes(context) {
 function tray(context, positions) {
   const ids = state.survey.anchors.filter((id) => !positions.has(id));
   if (!ids.length) return;
-  const columns = Math.max(1, Math.floor((view.width - 2 * TRAY.x) / TRAY.step));
+  const { x, y, right } = isNarrow() ? TRAY.narrow : TRAY.wide;
+  const columns = Math.max(1, Math.floor((view.width - x - right) / TRAY.step));
   ids.forEach((id, index) => {
     const [column, row] = [index % columns, Math.floor(index / columns)];
-    drawn.push({ id, x: TRAY.x + column * TRAY.step, y: TRAY.y + row * TRAY.step });
+    drawn.push({ id, x: x + column * TRAY.step, y: y + row * TRAY.step });
   });
   context.font = "12px system-ui, sans-serif";
   context.textAlign = "left";
   context.textBaseline = "bottom";
-  label(context, "Received, no position yet:", TRAY.x - MARK, TRAY.y - MARK - 6, palette.muted);
+  label(context, "Without a position yet:", x - MARK, y - MARK - 5, palette.muted);
 }
 
 function mark(context, x, y, sure, colour) {
@@ -219,6 +227,7 @@ function mark(context, x, y, sure, colour) {
 export function surveyCorners() {
   const corners = [...surveyPositions().values()].map(({ x_m, y_m }) => [x_m, y_m]);
   if (!surveyShown()) return corners;
+  if (corners.length && axesNamed()) corners.push([0, 0]);
   for (const other of state.survey.survey?.ambiguities ?? []) {
     for (const [x_m, y_m] of Object.values(other.positions_m)) corners.push([x_m, y_m]);
   }

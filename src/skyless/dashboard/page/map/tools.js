@@ -2,9 +2,9 @@
 
 import { changed, on } from "../store.js";
 import { byId, text } from "../dom.js";
-import { begin, cancel, editor, finish, undoPoint } from "./editor.js";
 import { picking, stopPicking } from "../survey/picking.js";
 import { moving, setMoving } from "../survey/plan.js";
+import { begin, cancel, editor, finish, undoPoint } from "./editor.js";
 import { fitAll, redraw } from "./map.js";
 import { view, zoom } from "./view.js";
 

@@ -8,6 +8,11 @@ const MAX_SCALE = 2000;
 
 export const view = { width: 1, height: 1, ratio: 1, x_m: 0, y_m: 0, scale: 50, touched: false };
 
+/** Whether the map is as narrow as on a phone. */
+export function isNarrow() {
+  return view.width < 600;
+}
+
 /** Pixels (of CSS) from the left. */
 export function px(x_m) {
   return view.width / 2 + (x_m - view.x_m) * view.scale;
@@ -50,8 +55,7 @@ export function fit(site, zones, further) {
   const ys = corners.map(([, y]) => y);
   const [left, right] = [Math.min(...xs), Math.max(...xs)];
   const [bottom, top] = [Math.min(...ys), Math.max(...ys)];
-  const edge =
-    view.width < 600 ? { left: 34, right: 22, top: 62, bottom: 82 } : { left: 48, right: 64, top: 32, bottom: 104 };
+  const edge = isNarrow() ? { left: 34, right: 22, top: 62, bottom: 92 } : { left: 48, right: 64, top: 32, bottom: 104 };
   const across = (view.width - edge.left - edge.right) / Math.max(right - left, 1);
   const up = (view.height - edge.top - edge.bottom) / Math.max(top - bottom, 1);
   view.scale = Math.min(Math.max(Math.min(across, up), MIN_SCALE), MAX_SCALE);

@@ -81,7 +81,7 @@ function makeTapes() {
     other.show(b);
     distance.input.focus();
   };
-  const adviceRows = new Rows(advice, (_key, tape) => ({ element: adviceItem(tape, () => use(tape.a, tape.b)) }));
+  const adviceRows = new Rows(advice, (_key, tape) => ({ element: adviceItem(tape, use) }));
   const givenRows = new Rows(given, (_key, tape) => tapeItem(tape));
   const intro = h("p", { class: "fine" }, "A distance between two anchors, by tape or laser, from antenna to antenna.");
   const show = () => {
@@ -89,16 +89,17 @@ function makeTapes() {
     other.show();
     const { tapes } = facts();
     const asked = (state.survey?.survey?.tapes ?? []).filter((tape) => !tapes.some((known) => isPair(known, tape.a, tape.b)));
-    adviceRows.show(asked.map((tape) => [JSON.stringify(tape), tape]));
+    adviceRows.show(asked.map((tape, index) => [JSON.stringify([index, tape]), { ...tape, index }]));
     givenRows.show(tapes.map((tape) => [JSON.stringify(tape), tape]));
   };
   return { element: section("Distances", intro, advice, given, form, fault), show };
 }
 
-function adviceItem({ a, b, std_before_m, std_after_m }, use) {
+/** The later ones help after the earlier ones. */
+function adviceItem({ a, b, std_before_m, std_after_m, index }, use) {
   const before = std_before_m === null ? "not determined" : length(std_before_m);
-  const words = h("span", {}, h("strong", {}, `Measure ${a}–${b}:`), ` ${before} → ${length(std_after_m)}`);
-  return h("li", {}, words, h("button", { type: "button", onclick: use, "aria-label": `Type ${a}–${b}` }, "Type it"));
+  const words = h("span", {}, h("strong", {}, `${index ? "Then" : "Measure"} ${a}–${b}:`), ` ${before} → ${length(std_after_m)}`);
+  return h("li", {}, words, h("button", { type: "button", onclick: () => use(a, b), "aria-label": `Type ${a}–${b}` }, "Type it"));
 }
 
 /** A tape, with what the ranges say where that is far off. */
@@ -148,7 +149,7 @@ function makeHeights() {
 }
 
 const HEIGHTS = [
-  ["2", "as typed, or all the same"],
+  ["2", "are as typed here"],
   ["3", "are estimated too"],
 ];
 

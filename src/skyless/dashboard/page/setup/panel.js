@@ -65,7 +65,10 @@ function makeStep(step, index) {
   }
   element.addEventListener("toggle", () => {
     stopPicking();
-    if (element.open) step.show();
+    setMoving(false);
+    if (!element.open) return;
+    step.show();
+    head.scrollIntoView({ block: "nearest" });
   });
   return { element, show: () => element.open && step.show(), summary: () => text(summary, step.summary()) };
 }

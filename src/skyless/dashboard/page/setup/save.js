@@ -69,6 +69,8 @@ function changes() {
   const others = survey.anchors.filter((anchor) => !anchor.determined).map((anchor) => anchor.id);
   const lines = [`positions and antenna delays of ${placed.length} ${placed.length === 1 ? "anchor" : "anchors"}`];
   if (others.length) lines.push(`unchanged, as not determined: ${list(others, 12)}`);
+  const { missing } = state.survey;
+  if (missing.length) lines.push(`unchanged, as not received: ${list(missing, 12)}`);
   lines.push(`the file ${file ?? "of the site"}; the old one is kept`);
   if (plan) lines.push(plan.blob ? `the floor plan ${plan.name}` : "where the floor plan is");
   return lines;

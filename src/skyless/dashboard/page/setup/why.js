@@ -38,11 +38,11 @@ export function show() {
 function reasons(survey) {
   const undetermined = survey.anchors.filter((anchor) => !anchor.determined && anchor.reason);
   return [
-    ...survey.not_determined.map((words) => ["bad", "Not determined", words]),
-    ...undetermined.map((anchor) => ["bad", `Anchor ${anchor.id}`, anchor.reason]),
-    ...survey.ambiguities.map((other) => ["warn", "Ambiguous", other.sentence]),
-    ...(survey.unchecked ? [["warn", "Unchecked", survey.unchecked]] : []),
-    ...survey.notes.map((words) => ["note", "Note", words]),
+    ...survey.not_determined.map((words) => ["bad", "Not determined:", words]),
+    ...undetermined.map((anchor) => ["bad", `Anchor ${anchor.id}:`, anchor.reason]),
+    ...survey.ambiguities.map((other) => ["warn", "Ambiguous:", other.sentence]),
+    ...(survey.unchecked ? [["warn", "Unchecked:", survey.unchecked]] : []),
+    ...survey.notes.map((words) => ["note", "Note:", words]),
   ];
 }
 
@@ -58,7 +58,8 @@ function elements(survey, found) {
 function pairWords(survey) {
   const used = survey.pairs.filter((pair) => !pair.excluded);
   const late = survey.pairs.filter((pair) => pair.excluded).map((pair) => `${pair.a}–${pair.b}`);
-  const assumed = `Ranges are taken to be off by ${length(survey.range_std_m)} each; ${survey.redundancy} of them check the result.`;
+  const extra = survey.redundancy > 0 ? `${survey.redundancy} more` : "no more";
+  const assumed = `Ranges are taken to be off by ${length(survey.range_std_m)} each; ${extra} than the result needs check it.`;
   if (!late.length) return `${used.length} pairs are used. ${assumed}`;
   const listed = late.length > 12 ? `${late.slice(0, 12).join(", ")} and ${late.length - 12} more` : late.join(", ");
   return `${used.length} pairs are used; left out as late: ${listed} (dashed lines). ${assumed}`;
