@@ -160,7 +160,7 @@ function caption(context, factor) {
   context.font = "11px system-ui, sans-serif";
   context.textAlign = "right";
   context.textBaseline = "bottom";
-  label(context, `Ellipses: 95 % of the errors${times}`, view.width - 16, view.height - (isNarrow() ? 74 : 54), palette.text);
+  label(context, `Ellipses: 95 % of the errors${times}`, view.width - 16, view.height - 74, palette.text);
 }
 
 /** Whether anything names the axes; otherwise origin and direction mean nothing. */

@@ -26,7 +26,7 @@ export function start(body) {
   const sure = h("input", { type: "checkbox", id: "save-sure" });
   sure.addEventListener("change", show);
   const confirm = h("label", { class: "switch", hidden: true }, sure, "Save it all the same");
-  const button = h("button", { type: "button", class: "primary", id: "save", onclick: save }, "Save and use");
+  const button = h("button", { type: "button", class: "primary", id: "save", disabled: true, onclick: save }, "Save and use");
   const state = h("p", { id: "save-state", role: "status" });
   parts = { what, warning, sure, confirm, button, state, shown: "" };
   body.append(h("p", {}, "Saving writes the site file and lets the anchors adopt it; no program restarts:"));
