@@ -30,7 +30,9 @@ DOCK = {"id": "dock", "name": "Dock", "polygon_m": [[14, 2.5], [21, 2.5], [21, 6
 class FakeServer:
     """Serves on a free port of loopback in a thread of its own; its attributes are the switches of the tests."""
 
-    def __init__(self, tags=3, rate_hz=10.0, zones=(DOCK,), site=True, floor_plan=None, mode="master", survey=None, placed=True):
+    def __init__(
+        self, tags=3, rate_hz=10.0, zones=(DOCK,), site=True, floor_plan=None, mode="master", survey=None, placed=True
+    ):
         self.tags, self.rate_hz, self.site = tags, rate_hz, site
         self.zones = [dict(zone) for zone in zones]
         self.floor_plan = floor_plan
@@ -157,7 +159,10 @@ class FakeServer:
         lock = asyncio.Lock()
         await _send(websocket, lock, self._hello())
         self.sockets[websocket] = lock
-        jobs = [asyncio.create_task(job(websocket, lock)) for job in (self._states, self._health, self._surveys, self._pongs)]
+        jobs = [
+            asyncio.create_task(job(websocket, lock))
+            for job in (self._states, self._health, self._surveys, self._pongs)
+        ]
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
         for job in jobs:

@@ -33,8 +33,10 @@ class FakeSurvey:
         self.refuse_save = None
         self.saved_serial = None
         self.silent = False
+        self.state = "surveyed"
         self.serial = 1
         self.given = []
+        self.cleared = False
         self.started = time.time()
 
     def use(self, body):
@@ -51,7 +53,7 @@ class FakeSurvey:
         if self.refuse_save:
             self.error = self.refuse_save
         else:
-            self.saved_serial = self.serial
+            self.saved_serial, self.cleared = self.serial, True  # ranges begin again: delays are others
 
     def message(self):
         """The message that the server forwards."""
@@ -65,8 +67,8 @@ class FakeSurvey:
         survey = {
             "unix_s": now, "serial": self.serial, "anchors": ids, "missing": list(self.missing),
             "duration_s": now - self.started, "pairs": pairs, "facts": self.facts, "error": self.error,
-            "survey": self._result(pairs) if len(ids) > 2 else None, "saved_serial": self.saved_serial,
-            "file": "/srv/hall/site.toml",
+            "survey": self._result(pairs) if len(ids) > 2 and not self.cleared else None,
+            "saved_serial": self.saved_serial, "file": "/srv/hall/site.toml", "state": self.state,
         }  # fmt: skip
         return {"type": "survey", "survey": survey, "age_s": 0.0}
 
@@ -99,7 +101,9 @@ class FakeSurvey:
                 "covariance_m2": [[xx, xy, 0], [xy, yy, 0], [0, 0, 0]], "delay_m": 0.03, "delay_std_m": 0.02,
             }  # fmt: skip
             reason = None if known else "it is linked to one other anchor only"
-            anchors.append({"id": number, "determined": known, **(figures if known else dict.fromkeys(figures)), "reason": reason})
+            anchors.append(
+                {"id": number, "determined": known, **(figures if known else dict.fromkeys(figures)), "reason": reason}
+            )
         other = positions[4] + (positions[5] - positions[4]) * 1j * 0.6
         return {
             "anchors": anchors,
@@ -115,7 +119,7 @@ class FakeSurvey:
             }] if self.ambiguous else [],
             "tapes": [] if taped else [{"a": 1, "b": 4, "std_before_m": 0.06, "std_after_m": 0.004},
                                        {"a": 3, "b": 6, "std_before_m": 0.004, "std_after_m": 0.003}],
-            "frame": "Anchor 1 is the origin." if self.facts["gauge"] else "Nothing names the axes: any turn and the mirror image are as good.",
+            "frame": "anchor 1 is the origin" if self.facts["gauge"] else "nothing names the axes",
             "gauge": self.facts["gauge"], "notes": list(self.notes),
         }  # fmt: skip
 
@@ -123,10 +127,21 @@ class FakeSurvey:
 def watch(*findings, state="watching"):
     """A message of the watch."""
     now = time.time()
-    return {"type": "watch", "watch": {"unix_s": now, "state": state, "findings": list(findings), "pairs": 28}, "age_s": 0.0}
+    return {
+        "type": "watch",
+        "watch": {"unix_s": now, "state": state, "findings": list(findings), "pairs": 28},
+        "age_s": 0.0,
+    }
 
 
 def moved(anchor, size_m=0.11, since=1_780_000_000.0):
     """A finding of the watch."""
-    sentence = f"Anchor {anchor} has moved by about {100 * size_m:.0f} cm."
-    return {"kind": "moved", "anchors": [anchor], "size_m": size_m, "std_m": 0.01, "since_unix_s": since, "sentence": sentence}
+    sentence = f"anchor {anchor} has moved by about {100 * size_m:.0f} cm"
+    return {
+        "kind": "moved",
+        "anchors": [anchor],
+        "size_m": size_m,
+        "std_m": 0.01,
+        "since_unix_s": since,
+        "sentence": sentence,
+    }

@@ -125,7 +125,7 @@ def test_the_picture_shows_late_pairs_ghosts_and_what_is_not_determined(site):
     assert (seen["dashed"], seen["ellipses"], seen["squares"]) == (2, 5, 1)  # one late pair, one way to a ghost
     assert seen["words"].count("4?") == 2
     assert {"6", "Without a position yet:"} <= set(seen["words"])
-    assert any("drawn" in words for words in seen["words"])
+    assert any("larger" in words for words in seen["words"])
 
 
 def test_axes_are_named_by_clicks_on_the_map(site):
@@ -138,7 +138,9 @@ def test_axes_are_named_by_clicks_on_the_map(site):
     assert here.given(lambda facts: facts["gauge"] and facts["gauge"]["left"])["gauge"] == {
         "origin": 1, "x_axis": 3, "left": 6,
     }  # fmt: skip
-    until(here.page, f"({POSITIONS})().then((at) => Math.hypot(...at[1]) < 1e-9 && at[3][1] ** 2 < 1e-9 && at[6][1] > 5)")
+    until(
+        here.page, f"({POSITIONS})().then((at) => Math.hypot(...at[1]) < 1e-9 && at[3][1] ** 2 < 1e-9 && at[6][1] > 5)"
+    )
     here.page.wait_for_selector(".frame:has-text('Anchor 1 is the origin.')")
     assert "origin 1, x axis 3" in here.page.locator("#step-2 summary").inner_text()
 
@@ -322,14 +324,15 @@ def test_the_reasons_are_listed_and_the_verdict_is_good_only_where_nothing_speak
         ({"unchecked": "Nothing checks this survey."}, "Nothing checks this survey."),
         ({"ambiguous": True}, "1 other result fits"),
         ({"undetermined": (5,)}, "1 anchor is not determined: 5."),
-        ({"error": "the disk is full"}, "the disk is full"),
+        ({"error": "the disk is full"}, "The disk is full."),
+        ({"state": "no data"}, "No data."),
     ):
         for name, value in change.items():
             setattr(survey, name, value)
         here.says(words)
         assert not here.page.evaluate(good)
     shown = here.page.locator("#why").inner_text()
-    for words in ("does not fit", "Nothing checks", "further to the right", "linked to one other anchor only"):
+    for words in ("does not fit", "Nothing checks", "further to the right", "It is linked to one other anchor only."):
         assert words in shown
 
 

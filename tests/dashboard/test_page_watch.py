@@ -58,5 +58,7 @@ def test_the_line_fits_a_phone(serve, visit):
     page.wait_for_selector("#watch")
     page.click("#watch button")
     page.wait_for_selector("#panel-anchors .findings li")
-    wide = "[...document.querySelectorAll('html, body, #panels, #watch')].some((e) => e.scrollWidth > e.clientWidth + 1)"
+    wide = (
+        "[...document.querySelectorAll('html, body, #panels, #watch')].some((e) => e.scrollWidth > e.clientWidth + 1)"
+    )
     assert not page.evaluate(wide)

@@ -53,9 +53,8 @@ class TapeAdvice(Struct, frozen=True):
     a: int
     b: int
     std_before_m: float | None
-    """None where an anchor is not determined; JSON has no infinity."""
-    std_after_m: float
-    """rms over all anchors' ``std_m``."""
+    std_after_m: float | None
+    """rms over all anchors' ``std_m``; None where an anchor is not determined (JSON has no infinity)."""
 
 
 class Survey(Struct, frozen=True):

@@ -3,7 +3,7 @@
 import { on, select } from "./store.js";
 import { byId, h } from "./dom.js";
 import { open } from "./tabs.js";
-import { findings, outdated, sentence } from "./survey/watch.js";
+import { findingWords, findings, outdated } from "./survey/watch.js";
 
 const MOST = 2;
 let shown = "[]";
@@ -23,7 +23,7 @@ function show() {
   const box = byId("watch");
   box.hidden = found.length === 0;
   box.className = found.some((finding) => finding.kind === "moved") ? "bad" : "";
-  const lines = found.slice(0, MOST).map((finding) => h("p", {}, `${sentence(finding)}.`));
+  const lines = found.slice(0, MOST).map((finding) => h("p", {}, findingWords(finding)));
   if (found.length > MOST) lines.push(h("p", {}, `And ${found.length - MOST} more: see the anchors.`));
   if (old) lines.push(h("p", { class: "fine" }, "The watch does not report any more; this may have changed."));
   const first = found[0]?.anchors[0];

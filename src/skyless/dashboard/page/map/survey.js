@@ -156,11 +156,12 @@ function ellipse(context, x, y, [long_m, short_m, angle], scale) {
 }
 
 function caption(context, factor) {
-  const times = factor > 1 ? `, drawn ${factor} × larger` : "";
+  const times = factor > 1 ? `, ${isNarrow() ? "" : "drawn "}${factor} × larger` : "";
+  const words = isNarrow() ? "95 % ellipses" : "Ellipses: 95 % of the errors";
   context.font = "11px system-ui, sans-serif";
   context.textAlign = "right";
   context.textBaseline = "bottom";
-  label(context, `Ellipses: 95 % of the errors${times}`, view.width - 16, view.height - 74, palette.text);
+  label(context, `${words}${times}`, view.width - 16, view.height - 74, palette.text);
 }
 
 /** Whether anything names the axes; otherwise origin and direction mean nothing. */

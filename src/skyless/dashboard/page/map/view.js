@@ -55,7 +55,7 @@ export function fit(site, zones, further) {
   const ys = corners.map(([, y]) => y);
   const [left, right] = [Math.min(...xs), Math.max(...xs)];
   const [bottom, top] = [Math.min(...ys), Math.max(...ys)];
-  const edge = isNarrow() ? { left: 34, right: 22, top: 62, bottom: 92 } : { left: 48, right: 64, top: 32, bottom: 104 };
+  const edge = isNarrow() ? { left: 34, right: 22, top: 62, bottom: 104 } : { left: 48, right: 64, top: 32, bottom: 104 };
   const across = (view.width - edge.left - edge.right) / Math.max(right - left, 1);
   const up = (view.height - edge.top - edge.bottom) / Math.max(top - bottom, 1);
   view.scale = Math.min(Math.max(Math.min(across, up), MIN_SCALE), MAX_SCALE);

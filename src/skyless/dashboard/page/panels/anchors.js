@@ -6,7 +6,7 @@ import { Rows, h, text } from "../dom.js";
 import { DASH, duration, length, number } from "../format.js";
 import { anchorHistory } from "../history.js";
 import { anchorMark, condition, leads, wordsOf } from "../map/anchors.js";
-import { findingAt, findings, markWords, sentence } from "../survey/watch.js";
+import { findingAt, findingWords, findings, markWords } from "../survey/watch.js";
 import { facts, selectionTable, split } from "./parts.js";
 
 export const title = "Anchors";
@@ -27,7 +27,7 @@ export function start(panel) {
   const note = h("p", { class: "empty" }, "Anchor health is shown on the live site only.");
   const box = h("div", { class: "scroll-x" }, table.element);
   const list = h("ul", { class: "reasons findings" });
-  const found = new Rows(list, (_key, finding) => ({ element: h("li", { class: "bad" }, `${sentence(finding)}.`) }));
+  const found = new Rows(list, (_key, finding) => ({ element: h("li", { class: "bad" }, findingWords(finding)) }));
   parts = { panel, note, list, found, box, rows: table.rows, detail: makeDetail(), nodes: new Rows(nodes, makeNode) };
   panel.append(note, list, box, parts.detail.element, h("section", {}, h("h2", {}, "Programs"), nodes));
 }

@@ -2,6 +2,7 @@
 
 import { state } from "../store.js";
 import { h, text, toast } from "../dom.js";
+import { sentence } from "../format.js";
 import { changeFacts, facts, surveyed } from "../survey/model.js";
 import { pickAnchor, stopPicking } from "../survey/picking.js";
 import { anchorList } from "./fields.js";
@@ -44,7 +45,7 @@ export function show() {
   parts.pick.disabled = !state.survey?.anchors.length;
   parts.mirror.disabled = !gauge || !state.survey?.survey;
   text(parts.hint, hintWords());
-  text(parts.frame, state.survey?.survey?.frame ?? "");
+  text(parts.frame, state.survey?.survey ? sentence(state.survey.survey.frame) : "");
 }
 
 /** The farthest anchor makes the best x axis: an error across it turns the site least. */

@@ -4,8 +4,9 @@ import { h, text } from "../dom.js";
 import { anchorIds } from "../survey/model.js";
 import { lengthFault, readLength } from "../survey/values.js";
 
-/** Limits of coordinates, as on the air; and of distances. */
-export const COORDINATE = [-8000, 8000];
+/** Limits in metres: of coordinates as on the air, of heights, of distances. */
+export const COORDINATE = [-1e6, 1e6];
+export const HEIGHT = [-100, 1000];
 export const DISTANCE = [0.05, 10_000];
 
 let serial = 0;
@@ -35,7 +36,9 @@ export function lengthField({ label, limits, unseen = false, optional = true, ap
   };
   const change = () => {
     const value = read();
-    if (value !== undefined && value !== shown) apply?.(value);
+    if (value === undefined || value === shown) return;
+    shown = value;
+    apply?.(value);
   };
   input.addEventListener("change", change);
   input.addEventListener("keydown", (event) => event.key === "Enter" && apply && input.blur());

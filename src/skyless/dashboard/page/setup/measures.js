@@ -4,7 +4,7 @@ import { state } from "../store.js";
 import { Rows, h, options, text } from "../dom.js";
 import { length, metres } from "../format.js";
 import { anchorIds, changeFacts, facts } from "../survey/model.js";
-import { COORDINATE, DISTANCE, anchorList, givenItem, lengthField } from "./fields.js";
+import { COORDINATE, DISTANCE, HEIGHT, anchorList, givenItem, lengthField } from "./fields.js";
 
 export const title = "Heights, tapes, points";
 
@@ -97,8 +97,8 @@ function makeTapes() {
 
 /** The later ones help after the earlier ones. */
 function adviceItem({ a, b, std_before_m, std_after_m, index }, use) {
-  const before = std_before_m === null ? "not determined" : length(std_before_m);
-  const words = h("span", {}, h("strong", {}, `${index ? "Then" : "Measure"} ${a}–${b}:`), ` ${before} → ${length(std_after_m)}`);
+  const [before, after] = [std_before_m, std_after_m].map((std_m) => (std_m === null ? "not determined" : length(std_m)));
+  const words = h("span", {}, h("strong", {}, `${index ? "Then" : "Measure"} ${a}–${b}:`), ` ${before} → ${after}`);
   return h("li", {}, words, h("button", { type: "button", onclick: () => use(a, b), "aria-label": `Type ${a}–${b}` }, "Type it"));
 }
 
@@ -127,10 +127,10 @@ function makeHeights() {
   const how = options({ "aria-label": "Heights" }, HEIGHTS, (value) => changeFacts({ dimensions: Number(value) }));
   const rows = new Rows(body, (id) => {
     const apply = (value) => changeFacts({ heights_m: withEntry(facts().heights_m, id, value) });
-    const field = lengthField({ label: `Anchor ${id}`, limits: COORDINATE, apply });
+    const field = lengthField({ label: `Anchor ${id}`, limits: HEIGHT, apply });
     return { element: field.element, update: () => field.show(facts().heights_m[id]) };
   });
-  const all = lengthField({ label: "All anchors at", limits: COORDINATE });
+  const all = lengthField({ label: "All anchors at", limits: HEIGHT });
   const fill = h("button", { type: "button" }, "Set all");
   fill.addEventListener("click", () => {
     const value = all.read();

@@ -2,7 +2,7 @@
 
 import { state } from "../store.js";
 import { h, text } from "../dom.js";
-import { length } from "../format.js";
+import { length, sentence } from "../format.js";
 
 export const title = "What is uncertain";
 
@@ -38,11 +38,11 @@ export function show() {
 function reasons(survey) {
   const undetermined = survey.anchors.filter((anchor) => !anchor.determined && anchor.reason);
   return [
-    ...survey.not_determined.map((words) => ["bad", "Not determined:", words]),
-    ...undetermined.map((anchor) => ["bad", `Anchor ${anchor.id}:`, anchor.reason]),
-    ...survey.ambiguities.map((other) => ["warn", "Ambiguous:", other.sentence]),
-    ...(survey.unchecked ? [["warn", "Unchecked:", survey.unchecked]] : []),
-    ...survey.notes.map((words) => ["note", "Note:", words]),
+    ...survey.not_determined.map((words) => ["bad", "Not determined:", sentence(words)]),
+    ...undetermined.map((anchor) => ["bad", `Anchor ${anchor.id}:`, sentence(anchor.reason)]),
+    ...survey.ambiguities.map((other) => ["warn", "Ambiguous:", sentence(other.sentence)]),
+    ...(survey.unchecked ? [["warn", "Unchecked:", sentence(survey.unchecked)]] : []),
+    ...survey.notes.map((words) => ["note", "Note:", sentence(words)]),
   ];
 }
 

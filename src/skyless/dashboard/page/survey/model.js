@@ -4,8 +4,11 @@ import { changed, state } from "../store.js";
 import { putFacts } from "../api.js";
 import { toast } from "../dom.js";
 
-/** A message older than this is reported as old. */
-export const FRESH_S = 5;
+/** A message older than this is reported as old; the program of a large site sends this many pairs a second. */
+const FRESH_S = 5;
+const PAIRS_PER_S = 400;
+/** Without stamps of the anchors the program, which says so, sends every ten seconds. */
+const IDLE_S = 15;
 /** Facts that were given count as not used when no message shows them for this long. */
 const ANSWER_S = 10;
 
@@ -68,10 +71,16 @@ export function watchAge_s() {
 
 /** Whether the survey program is there: "fresh", "old", or "none". */
 export function presence() {
-  const status = state.health.nodes.find((node) => node.kind === "survey");
+  const programs = state.health.nodes.filter((node) => node.kind === "survey");
   const age = age_s();
-  if (age === null || status?.online === false) return "none";
-  return age < FRESH_S ? "fresh" : "old";
+  if (age === null || (programs.length && !programs.some((node) => node.online))) return "none";
+  const interval_s = state.survey.pairs.length / PAIRS_PER_S;
+  return age < (noData() ? IDLE_S : Math.max(FRESH_S, 2 * interval_s)) ? "fresh" : "old";
+}
+
+/** Whether the survey program receives nothing of the anchors. */
+export function noData() {
+  return state.survey?.state === "no data";
 }
 
 /** All facts, with those that are on their way. */

@@ -1,8 +1,8 @@
 /** How the survey stands, in one sentence: it is good only where nothing speaks against it. */
 
 import { state } from "../store.js";
-import { length } from "../format.js";
-import { age_s, pending, presence } from "./model.js";
+import { length, sentence } from "../format.js";
+import { age_s, noData, pending, presence } from "./model.js";
 
 /** Start of the survey program; `ADDRESS` is the broker's. */
 export function command() {
@@ -36,7 +36,8 @@ function absent() {
 /** Why there is no complete result. */
 function unfinished() {
   const { survey, error, anchors } = state.survey;
-  if (error) return bad("Problem", error);
+  if (noData()) return bad("No data", sentence(error ?? "the survey program receives nothing of the anchors"));
+  if (error) return bad("Problem", sentence(error));
   if (pending() === "late") {
     return bad("Not used yet", "The survey program does not use what you have given. Give it again, or look at its log.");
   }
@@ -49,7 +50,7 @@ function unfinished() {
   if (open.length) {
     return bad("Not determined", `${count(open.length, "anchor is", "anchors are")} not determined: ${list(open)}.`);
   }
-  if (survey.not_determined.length) return bad("Not determined", survey.not_determined[0]);
+  if (survey.not_determined.length) return bad("Not determined", sentence(survey.not_determined[0]));
   return null;
 }
 
@@ -60,7 +61,7 @@ function weak() {
     const others = count(survey.ambiguities.length, "other result fits", "other results fit");
     return warn("Ambiguous", `${others} the ranges as well. Step 5 says which.`);
   }
-  if (survey.unchecked) return warn("Unchecked", survey.unchecked);
+  if (survey.unchecked) return warn("Unchecked", sentence(survey.unchecked));
   if (missing.length) {
     return warn("Incomplete", `${count(missing.length, "anchor has", "anchors have")} not been received: ${list(missing)}.`);
   }
@@ -71,7 +72,7 @@ function good() {
   const { survey } = state.survey;
   const worst = Math.max(...survey.anchors.map((anchor) => anchor.std_m ?? 0));
   const words = `All ${survey.anchors.length} anchors are determined and checked, to ±${length(worst)} or better.`;
-  if (survey.notes.length) return { kind: "note", title: "Read the notes", words: `${words} ${survey.notes[0]}` };
+  if (survey.notes.length) return { kind: "note", title: "Read the notes", words: `${words} ${sentence(survey.notes[0])}` };
   return { kind: "good", title: "Good", words };
 }
 

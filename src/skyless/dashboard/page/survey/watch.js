@@ -1,7 +1,7 @@
 /** What the watch of the anchors finds: which anchors it concerns, and its words. */
 
 import { state } from "../store.js";
-import { length, timeOfDay } from "../format.js";
+import { length, sentence, timeOfDay } from "../format.js";
 import { watchAge_s } from "./model.js";
 
 /** After this long without a message the watch is not running. */
@@ -30,7 +30,7 @@ export function markWords(finding) {
 }
 
 /** A finding as a sentence with its time. */
-export function sentence(finding) {
+export function findingWords(finding) {
   const since = timeOfDay(finding.since_unix_s).slice(0, 5);
-  return `${finding.sentence.replace(/\.$/, "")}, since ${since}`;
+  return sentence(`${finding.sentence.replace(/\.$/, "")}, since ${since}`);
 }
