@@ -2,6 +2,7 @@
 
 import { on, state } from "../store.js";
 import { byId } from "../dom.js";
+import { surveyShown } from "../survey/model.js";
 import { drawAnchors } from "./anchors.js";
 import { drawFindings } from "./findings.js";
 import { drawFloor, drawGrid, drawOverlay, drawScale, drawWalls, floorCorners, loadFloor } from "./floor.js";
@@ -68,7 +69,7 @@ function drawStill() {
   drawSurvey(context);
   drawFindings(context);
   drawScale(context);
-  byId("waiting").hidden = state.site !== null || state.survey !== null;
+  byId("waiting").hidden = state.site !== null || (surveyShown() && state.survey.anchors.length > 0);
   return flashes;
 }
 
