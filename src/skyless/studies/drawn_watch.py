@@ -12,7 +12,7 @@ from skyless.studies.survey_layouts import SLOT_S, STAMP_PS, SurveyLayout, surve
 from skyless.survey.ranges import PairBlock
 from skyless.survey.watch.causes import Pairs, weight_of
 from skyless.survey.watch.explain import is_striking
-from skyless.survey.watch.finding import Finding
+from skyless.survey.watch.finding import Finding, Kind
 from skyless.survey.watch.monitor import FAST_SETTINGS, AnchorWatch, WatchSettings
 
 Event = Literal["none", "moved", "delay", "link", "door", "two moved", "slow"]
@@ -183,13 +183,13 @@ def _undisturbed(site: _Site, windows: int) -> WatchResult:
     return WatchResult(0, 0, 0, 0, 0, 0, 0, (), alarms, alarms_moved, windows)
 
 
-_Truth = set[tuple[str, tuple[int, ...]]]
+_Truth = set[tuple[Kind, tuple[int, ...]]]
 
 
 def _happen(site: _Site, run: WatchRun, draw: np.random.Generator) -> tuple[_Truth, tuple[Finding, ...], float, int]:
     """One event, until it is found and for one window more; then all is as before. Also the number of steps."""
     before_m, position_m = site.true_m(), site.position_m.copy()
-    truth = _begin(site, run, draw)
+    truth: _Truth = _begin(site, run, draw)
     share = float(draw.uniform()) if run.is_fast else 0.0
     findings: tuple[Finding, ...] = ()
     passed_s, took = -share * site.step_s, 0
@@ -197,14 +197,14 @@ def _happen(site: _Site, run: WatchRun, draw: np.random.Generator) -> tuple[_Tru
     if run.event == "slow":
         most = round(2.0 * run.size_m / _SLOW_MPS / site.step_s)
     apart_m = site.position_m - position_m
-    while took < most and not findings:
+    while took < most and (not findings or (run.is_fast and took <= site.settings.steps)):
         if run.event == "slow":
             part = min((took + 1) * site.step_s * _SLOW_MPS / run.size_m, 1.0)
             site.position_m = position_m + part * apart_m
         site.run_step(before_m if took == 0 else None, share)
         took += 1
-        passed_s += site.step_s
-        findings = site.watch.findings
+        passed_s += 0.0 if findings else site.step_s
+        findings = site.watch.findings or findings
     if findings and not run.is_fast:  # what is said once all of it has been seen
         site.run_step()
         findings = site.watch.findings or findings

@@ -147,12 +147,12 @@ class RangeHistory:
         return np.asarray(np.sqrt(np.maximum(learned_m2, floor_m2)))
 
     def restart(self, pairs: Mask, windows: int) -> None:
-        """Make what these pairs had in the last windows their usual range."""
+        """Make what these pairs had in the last windows their usual range, to be learned further."""
         length = self._settings.drift_windows
         recent = np.arange(max(self._windows - min(windows, length), 0), self._windows) % length
         for pair in np.flatnonzero(pairs & np.isfinite(self._values[:, recent]).any(axis=1)).tolist():
             now_m = float(np.nanmedian(self._values[pair, recent]))
-            self._used[pair] = max(round(_GIVEN_SHARE * self._settings.usual_windows), 1)
+            self._used[pair] = 1
             self._usual[pair] = np.nan
-            self._usual[pair, : self._used[pair]] = now_m
+            self._usual[pair, 0] = now_m
             self._usual_m[pair] = self.first_m[pair] = now_m
