@@ -2,5 +2,5 @@
 
 ``ranges`` and ``facts`` go in, ``result`` comes out; ``fit/`` computes, ``stamps/`` makes ranges of stamps.
 
-Public: facts, result.
+Public: facts, ranges, result.
 """
