@@ -11,6 +11,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from skyless.studies.air_watch import AirRun, run_air_watch
 from skyless.studies.drawn_watch import Event, WatchResult, WatchRun, run_watch, striking_windows
 from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of
 
@@ -26,6 +27,9 @@ _NOISE_WINDOWS: Final = 1_000_000
 _NOISE_WINDOW_S: Final = 0.1
 _NOISE_ALARM: Final = 1e-7
 _NOISE_CASE: Final = "lab, fast, 10⁶ windows of noise"
+_AIR_CASE: Final = "lab, fast, moved 10 cm, through the air"
+_AIR_EVENTS: Final = 20
+_AIR_EVENT_S: Final = 1.0
 
 _IN_TIME_S: Final = 30.0
 _FAST_IN_TIME_S: Final = 0.1501
@@ -109,10 +113,13 @@ def cells(plan: Plan) -> list[Cell]:
                 seed_of(plan.seed, number, world),
             )
             worlds.append(Cell(case.name, run_watch, run, events * (_WINDOW_S if case.event == "none" else _EVENT_S)))
-    noise = _Noise(_NOISE_WINDOWS // plan.worlds, 0)
+    windows = _NOISE_WINDOWS // plan.worlds
     for world in range(plan.worlds):
-        one = _Noise(noise.windows, seed_of(plan.seed, len(_cases()), world))
-        worlds.append(Cell(_NOISE_CASE, _run_noise, one, 4e-6 * noise.windows))
+        noise = _Noise(windows, seed_of(plan.seed, len(_cases()), world))
+        worlds.append(Cell(_NOISE_CASE, _run_noise, noise, 4e-6 * windows))
+    for world in range(plan.worlds):
+        air = AirRun(0.1, _AIR_EVENTS, seed_of(plan.seed, len(_cases()) + 1, world))
+        worlds.append(Cell(_AIR_CASE, run_air_watch, air, _AIR_EVENT_S * _AIR_EVENTS))
     return worlds
 
 
@@ -122,13 +129,13 @@ def _run_noise(noise: _Noise) -> int:
 
 def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
     """One for each case."""
-    found = []
-    for number, case in enumerate(_cases()):
-        found.append(_row(plan, case, results[number * plan.worlds : (number + 1) * plan.worlds]))
-    alarms = sum(results[-plan.worlds :])
-    limit = Limit("alarms", most=1)
-    noise = _empty(plan, _NOISE_CASE, found[0].series, plan.worlds * (_NOISE_WINDOWS // plan.worlds))
-    found.insert(1, _judged(noise, (limit,), alarms=alarms))
+    of_case = [results[start : start + plan.worlds] for start in range(0, len(results), plan.worlds)]
+    *of_drawn, of_noise, of_air = of_case
+    found = [_row(plan, case, one) for case, one in zip(_cases(), of_drawn, strict=True)]
+    fast = _cases()[0]
+    noise = _empty(plan, _NOISE_CASE, fast.series, plan.worlds * (_NOISE_WINDOWS // plan.worlds))
+    found.insert(1, _row(plan, replace(fast, name=_AIR_CASE), of_air))
+    found.insert(2, _judged(noise, (Limit("alarms", most=1),), alarms=sum(of_noise)))
     return found
 
 
