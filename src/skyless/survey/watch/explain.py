@@ -185,7 +185,7 @@ def _parts(pairs: Pairs, best: _Set, rivals: list[_Set]) -> list[Part]:
         elsewhere = [one for one in against if len({_anchors(pairs, other) for other in one}) > 1]
         if elsewhere:
             uncertain += [tuple(one) for one in elsewhere]
-        elif not _is_checked(pairs, best, cause):
+        elif not _is_checked(pairs, best, cause, or_else=bool(against)):
             uncertain.append((cause,))
         else:
             parts.append(_part(pairs, best, number, or_else=bool(against)))
@@ -194,8 +194,8 @@ def _parts(pairs: Pairs, best: _Set, rivals: list[_Set]) -> list[Part]:
     return parts
 
 
-def _is_checked(pairs: Pairs, best: _Set, cause: int) -> bool:
-    """Whether a range is left over that checks a displacement or a delay."""
+def _is_checked(pairs: Pairs, best: _Set, cause: int, *, or_else: bool) -> bool:
+    """Whether a range is left over that checks a displacement or a delay, and the other ``or_else``."""
     n = pairs.anchors
     if cause >= 2 * n:
         return True
@@ -203,7 +203,7 @@ def _is_checked(pairs: Pairs, best: _Set, cause: int) -> bool:
     late = [other - 2 * n for other in best.causes if other >= 2 * n]
     ranged = np.flatnonzero((pairs.first == anchor) | (pairs.second == anchor))
     ranged = ranged[~np.isin(ranged, late)]
-    return len(ranged) > (pairs.dimensions if cause < n else 1)
+    return len(ranged) > (pairs.dimensions if cause < n or or_else else 1)
 
 
 def _anchors(pairs: Pairs, cause: int) -> tuple[int, ...]:
