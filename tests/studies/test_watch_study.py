@@ -3,9 +3,9 @@
 import pytest
 
 from skyless.evaluation.figures import picture
+from skyless.evaluation.watch.drawn import WatchResult, WatchRun, run_watch
 from skyless.studies import watch
 from skyless.studies.catalogue import STUDIES
-from skyless.studies.drawn_watch import WatchResult, WatchRun, run_watch
 from skyless.studies.plan import Plan
 
 
@@ -42,5 +42,7 @@ def test_cells_compute_and_runs_of_one_seed_are_the_same(few):
 
 
 def test_a_late_link_is_no_displacement():
-    result = run_watch(WatchRun("lab", "link", 0.35, (0.02, 0.02), 60.0, 0.0, 0.0, 5, is_fast=False, seed=5))
+    result = run_watch(
+        WatchRun(watch.watched_layout("lab"), "link", 0.35, (0.02, 0.02), 60.0, 0.0, 0.0, 5, is_fast=False, seed=5)
+    )
     assert (result.tries, result.found, result.wrong, result.alarms_moved) == (5, 5, 0, 0)

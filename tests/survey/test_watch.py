@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.studies.air_watch import AirRun, run_air_watch
-from skyless.studies.drawn_watch import WatchRun, run_watch, striking_windows
+from skyless.evaluation.watch.air import AirRun, run_air_watch
+from skyless.evaluation.watch.drawn import WatchRun, run_watch, striking_windows
+from skyless.studies.watch import watched_layout
 from skyless.survey.ranges import PairBlock
 from skyless.survey.watch.finding import sentence_of
 from skyless.survey.watch.monitor import AnchorWatch, WatchSettings
@@ -48,14 +49,20 @@ class Ranges:
 
 
 def drawn(layout, event, size_m, events, seed, drift_m=(0.02, 0.02), *, missing=0.0, is_fast=False):
-    return run_watch(WatchRun(layout, event, size_m, drift_m, 60.0, 0.0, missing, events, is_fast, seed))
+    return run_watch(
+        WatchRun(watched_layout(layout), event, size_m, drift_m, 60.0, 0.0, missing, events, is_fast, seed)
+    )
 
 
 def test_noise_strikes_no_more_often_than_stated():
     """Fewer than stated, as causes overlap; 5 sigma above it would be wrong."""
     expected = 1e-3 * 100_000
-    assert expected / 10.0 < striking_windows("lab", 0.1, 1e-3, 100_000, 81) < expected + 5.0 * math.sqrt(expected)
-    assert striking_windows("lab", 0.1, 1e-7, 100_000, 82) == 0
+    assert (
+        expected / 10.0
+        < striking_windows(watched_layout("lab"), 0.1, 1e-3, 100_000, 81)
+        < expected + 5.0 * math.sqrt(expected)
+    )
+    assert striking_windows(watched_layout("lab"), 0.1, 1e-7, 100_000, 82) == 0
 
 
 def test_ten_centimetres_are_found_at_once_where_nothing_drifts():
@@ -87,7 +94,7 @@ def test_an_anchor_that_creeps_is_found():
 
 
 def test_drift_of_a_real_room_is_no_finding():
-    run = WatchRun("lab", "none", 0.0, (0.008, 0.025), 60.0, 0.09, 0.0, 500, is_fast=False, seed=87)
+    run = WatchRun(watched_layout("lab"), "none", 0.0, (0.008, 0.025), 60.0, 0.09, 0.0, 500, is_fast=False, seed=87)
     assert run_watch(run).alarms == 0
 
 

@@ -11,9 +11,10 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.studies.air_watch import AirRun, run_air_watch
-from skyless.studies.drawn_watch import Event, WatchResult, WatchRun, run_watch, striking_windows
+from skyless.evaluation.watch.air import AirRun, run_air_watch
+from skyless.evaluation.watch.drawn import Event, WatchedLayout, WatchResult, WatchRun, run_watch, striking_windows
 from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of
+from skyless.studies.survey_layouts import survey_layouts
 
 _LAYOUTS: Final = ("lab", "room", "hall")
 _EVENTS: Final = 50
@@ -94,6 +95,12 @@ def _cases() -> list[_Case]:
     return found
 
 
+def watched_layout(name: str) -> WatchedLayout:
+    """Of ``survey_layouts``."""
+    layout = survey_layouts()[name]
+    return WatchedLayout(layout.dimensions, tuple((x, y, z) for x, y, z in layout.position_m.tolist()))
+
+
 def cells(plan: Plan) -> list[Cell]:
     """One for each case and world."""
     worlds = []
@@ -101,7 +108,7 @@ def cells(plan: Plan) -> list[Cell]:
         events = _QUIET_WINDOWS if case.event == "none" else _EVENTS
         for world in range(plan.worlds):
             run = WatchRun(
-                case.layout,
+                watched_layout(case.layout),
                 case.event,
                 case.size_m,
                 case.drift_m,
@@ -124,7 +131,7 @@ def cells(plan: Plan) -> list[Cell]:
 
 
 def _run_noise(noise: _Noise) -> int:
-    return striking_windows("lab", _NOISE_WINDOW_S, _NOISE_ALARM, noise.windows, noise.seed)
+    return striking_windows(watched_layout("lab"), _NOISE_WINDOW_S, _NOISE_ALARM, noise.windows, noise.seed)
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:

@@ -256,8 +256,8 @@ class AnchorWatch:
         """The window's range of each pair, NaN where there is none, and its exchanges as far as they make the noise."""
         range_m, exchanges = np.full(len(self._row), np.nan), np.zeros(len(self._row))
         gathered: dict[int, list[PairBlock]] = {}
-        for step in self._steps:
-            for row, blocks in step.items():
+        for one in self._steps:
+            for row, blocks in one.items():
                 gathered.setdefault(row, []).extend(blocks)
         for row, blocks in gathered.items():
             count = sum(block.exchanges for block in blocks)

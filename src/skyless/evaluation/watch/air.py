@@ -7,10 +7,10 @@ from msgspec import Struct
 
 from skyless.anchors.factory import new_anchor
 from skyless.evaluation.anchor_stamps import RecordedAnchor
+from skyless.evaluation.watch.drawn import WatchResult
 from skyless.simulation.impairments import AnchorDisplacement, Impairments
 from skyless.simulation.world import World
 from skyless.site.lab import lab_site
-from skyless.studies.drawn_watch import WatchResult
 from skyless.survey.stamps.pair_ranger import PairRanger
 from skyless.survey.watch.finding import Finding
 from skyless.survey.watch.monitor import FAST_SETTINGS, AnchorWatch

@@ -8,7 +8,6 @@ from msgspec import Struct
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.kernels.arrays import Array, Integers, Mask
-from skyless.studies.survey_layouts import SLOT_S, STAMP_PS, SurveyLayout, survey_layouts
 from skyless.survey.ranges import PairBlock
 from skyless.survey.watch.causes import Pairs, weight_of
 from skyless.survey.watch.explain import is_striking
@@ -16,6 +15,10 @@ from skyless.survey.watch.finding import Finding, Kind
 from skyless.survey.watch.monitor import FAST_SETTINGS, AnchorWatch, WatchSettings
 
 Event = Literal["none", "moved", "delay", "link", "door", "two moved", "slow"]
+
+_SLOT_S: Final = 2.5e-3
+_STAMP_S: Final = 100e-12
+"""Noise of every TX and RX stamp."""
 
 LEARNING_WINDOWS: Final = 60
 _LASTS_WINDOWS: Final = 4
@@ -34,10 +37,17 @@ _Truth = set[tuple[Kind, tuple[int, ...]]]
 """Kinds and anchors of true findings."""
 
 
+class WatchedLayout(Struct, frozen=True):
+    """Anchors 1 to n."""
+
+    dimensions: Literal[2, 3]
+    position_m: tuple[tuple[float, float, float], ...]
+
+
 class WatchRun(Struct, frozen=True):
     """One site that is watched while one thing after another happens."""
 
-    layout: str
+    layout: WatchedLayout
     event: Event
     size_m: float
     """Of displacements, delays and lateness; the direction is drawn, and what happens to whom."""
@@ -82,8 +92,8 @@ class _Site:
     """Ranges as they are at the moment."""
 
     def __init__(self, run: WatchRun, draw: np.random.Generator) -> None:
-        self.layout: SurveyLayout = survey_layouts()[run.layout]
-        self.position_m = self.layout.position_m.copy()
+        self.layout = run.layout
+        self.position_m = np.array(run.layout.position_m)
         self.draw = draw
         n = len(self.position_m)
         self.first, self.second = np.triu_indices(n, 1)
@@ -98,14 +108,11 @@ class _Site:
             self._drift_std_m[draw.integers(m)] = run.lively_m
         self._drift_m = self._drift_std_m * draw.standard_normal(m)
         self._kept = math.exp(-self.step_s / run.drift_s)
-        self._superframe_s = n * SLOT_S
-        self._stamp_m = STAMP_PS * 1e-12 * SPEED_OF_LIGHT_MPS
+        self._superframe_s = n * _SLOT_S
+        self._stamp_m = _STAMP_S * SPEED_OF_LIGHT_MPS
         self.step = 0
-        positions = {anchor: (float(x), float(y), float(z)) for anchor, (x, y, z) in self._by_anchor()}
+        positions = dict(enumerate(run.layout.position_m, start=1))
         self.watch = AnchorWatch(positions, self.layout.dimensions, None, self.settings)
-
-    def _by_anchor(self) -> list[tuple[int, list[float]]]:
-        return list(zip(self.layout.anchors, self.position_m.tolist(), strict=True))
 
     def true_m(self) -> Array:
         """Without drift and noise, shape (m,)."""
@@ -243,16 +250,16 @@ def _crossing(site: _Site, person_m: Array) -> Integers:
     return np.flatnonzero(np.linalg.norm(start + part[:, None] * along - person_m, axis=1) < _DOOR_REACH_M)
 
 
-def striking_windows(layout: str, window_s: float, alarm: float, windows: int, seed: int) -> int:
+def striking_windows(layout: WatchedLayout, window_s: float, alarm: float, windows: int, seed: int) -> int:
     """How many windows of white noise alone strike."""
     draw = np.random.default_rng(seed)
-    position_m = survey_layouts()[layout].position_m
+    position_m = np.array(layout.position_m)
     n = len(position_m)
     first, second = np.triu_indices(n, 1)
     m = len(first)
-    std_m = STAMP_PS * 1e-12 * SPEED_OF_LIGHT_MPS / math.sqrt(window_s / (n * SLOT_S))
+    std_m = _STAMP_S * SPEED_OF_LIGHT_MPS / math.sqrt(window_s / (n * _SLOT_S))
     weight = weight_of(first, second, n, np.full(m, std_m), np.zeros(m))
-    pairs = Pairs(position_m, first, second, survey_layouts()[layout].dimensions, weight)
+    pairs = Pairs(position_m, first, second, layout.dimensions, weight)
     found = 0
     for start in range(0, windows, _CHUNK):
         count = min(_CHUNK, windows - start)
