@@ -66,23 +66,23 @@ def test_noise_strikes_no_more_often_than_stated():
 
 
 def test_ten_centimetres_are_found_at_once_where_nothing_drifts():
-    """99 % are; of 40 more than 3 are missed with less than 10⁻³."""
-    result = drawn("lab", "moved", 0.1, 40, 83, (0.0, 0.0), is_fast=True)
-    assert sum(time_s <= 0.1501 for time_s in result.found_s) >= 37
-    assert result.named >= 37
+    """99 % are; of 15 more than 2 are missed with less than 10⁻³."""
+    result = drawn("lab", "moved", 0.1, 15, 83, (0.0, 0.0), is_fast=True)
+    assert sum(time_s <= 0.1501 for time_s in result.found_s) >= 13
+    assert result.named >= 13
     assert (result.wrong, result.alarms_moved) == (0, 0)
 
 
 def test_ten_centimetres_are_found_at_once_through_the_air():
-    result = run_air_watch(AirRun(0.1, 3, 84))
-    assert (result.found, result.named, result.wrong, result.alarms) == (3, 3, 0, 0)
+    result = run_air_watch(AirRun(0.1, 1, 84))
+    assert (result.found, result.named, result.wrong, result.alarms) == (1, 1, 0, 0)
 
 
 @pytest.mark.parametrize("event", ["moved", "two moved", "link"])
 def test_drift_of_two_centimetres_hides_nothing_in_the_hall(event):
     size_m = {"moved": 0.1, "two moved": 0.3, "link": 0.35}[event]
-    result = drawn("hall", event, size_m, 10, 85)
-    assert result.found >= 9
+    result = drawn("hall", event, size_m, 5, 85)
+    assert result.found == 5
     assert max(result.found_s) <= 30.0
     assert result.wrong == 0
     assert result.alarms_moved == 0

@@ -15,7 +15,7 @@ from skyless.survey.stamps.pair_ranger import PairRanger
 from skyless.survey.watch.finding import Finding
 from skyless.survey.watch.monitor import FAST_SETTINGS, AnchorWatch
 
-_LEARNING_S: Final = 14.0
+_LEARNING_S: Final = 11.5
 _LASTS_S: Final = 1.0
 _PERIOD_S: Final = 2.0
 _FOUND_WITHIN_S: Final = 0.15

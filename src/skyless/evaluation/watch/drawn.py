@@ -145,7 +145,7 @@ def run_watch(run: WatchRun) -> WatchResult:
     draw = np.random.default_rng(run.seed)
     site = _Site(run, draw)
     steps = site.settings.steps
-    for _ in range(site.settings.history.usual_windows if run.is_fast else LEARNING_WINDOWS * steps):
+    for _ in range(site.settings.history.usual_windows // 2 if run.is_fast else LEARNING_WINDOWS * steps):
         site.run_step()
     if run.event == "none":
         return _undisturbed(site, run.events)
