@@ -19,6 +19,7 @@ from skyless.studies import (
     sitetime,
     survey,
     sync,
+    watch,
 )
 from skyless.studies.picture import Look, draw
 from skyless.studies.plan import Cell, Plan, Row, Study
@@ -89,6 +90,13 @@ STUDIES: Final = {
             survey.cells,
             survey.rows,
             partial(draw, Look("Anchors that survey themselves", ("rmse", "nees"))),
+        ),
+        Study(
+            "watch",
+            "the watch of the anchors",
+            watch.cells,
+            watch.rows,
+            partial(draw, Look("The watch of the anchors", ("found", "found_s"))),
         ),
         Study("sitetime", "one timeline over many hops", sitetime.cells, sitetime.rows, sitetime.draw),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),

@@ -44,6 +44,7 @@ _USUAL: Final = {
     "large": Plan(worlds=24, seconds=30.0),
     "claims": Plan(worlds=3),
     "survey": Plan(worlds=200, seconds=10.0),
+    "watch": Plan(worlds=20),
 }
 """Of studies that do not take the usual amounts; those of ``room`` are the room's own, its other cases have fewer."""
 
@@ -201,7 +202,7 @@ class Row(Struct, frozen=True):
     """Share of surveys that say something is not determined: an anchor, or delays against positions."""
     flagged: float | None = None
     """Share of surveys that say they are ambiguous or not checked, or leave an anchor without a position."""
-    wrong: int | None = None
+    wrong_runs: int | None = None
     """Surveys of all anchors that are 10 cm and four of their own standard deviations off."""
     wrong_flagged: float | None = None
     """Share of these that say they are ambiguous or not checked."""
@@ -215,6 +216,20 @@ class Row(Struct, frozen=True):
     """Systematic error of tags' positions, rms, by the survey."""
     hand_tag_m: float | None = None
     """The same by positions measured by hand to 2 cm per axis, with delays unknown."""
+    found: float | None = None
+    """Share of events that the watch of the anchors found in time (``watch``)."""
+    named: float | None = None
+    """Share of those found whose anchors or links were named, and no others."""
+    kind: float | None = None
+    """Share of those found of which it was right as well what had happened to them."""
+    wrong: float | None = None
+    """Share of events in which an anchor was said to have moved, or its delay to have changed, that has not."""
+    found_s: float | None = None
+    """From the event to the finding, which 99 % of those found do not exceed."""
+    alarms_per_day: float | None = None
+    """Findings while nothing happened."""
+    alarms: int | None = None
+    """How many of them there were, or how many windows struck."""
 
 
 def with_limits(row: Row, limits: Sequence[Limit]) -> Row:

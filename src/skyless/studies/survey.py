@@ -264,7 +264,7 @@ def _row(plan: Plan, layout: str, variant: str, outcomes: Sequence[Outcome]) -> 
         near=float(np.mean([one.error_m is not None and one.error_m < NEAR_M for one in outcomes])),
         undetermined=float(np.mean([one.is_open for one in outcomes])),
         flagged=float(np.mean([one.is_flagged for one in outcomes])),
-        wrong=len(wrong),
+        wrong_runs=len(wrong),
         wrong_flagged=float(np.mean([one.is_flagged for one in wrong])) if wrong else None,
         found_late=sum(one.found for one in outcomes) / late if late else None,
         excluded_wrongly=sum(one.excluded_wrongly for one in outcomes) / direct if direct else None,
