@@ -28,7 +28,7 @@ import numpy as np
 from plain_flight_filter import plain_positions
 from scipy.stats import chi2
 
-from skyless.calibration.run import CalibrationRequest, calibrate_capture
+from skyless.survey_inputs.run import CalibrationRequest, calibrate_capture
 from skyless.cli.common.recording_inputs import flight_height, height_to_hold, known_anchors, known_truth
 from skyless.evaluation.judge import Judge
 from skyless.recordings.foreign.avalue import anchor_distances_m

@@ -12,9 +12,9 @@ from skyless.cli.common.recording_inputs import flight_height, is_mcap, known_an
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.calibration.estimate import CalibrationEstimate
-    from skyless.calibration.run import Calibrated
-    from skyless.calibration.samples import First, Stay
+    from skyless.survey.tags.estimate import CalibrationEstimate
+    from skyless.survey_inputs.run import Calibrated
+    from skyless.survey_inputs.samples import First, Stay
 
 _MANY_OUTLIERS: Final = 0.05
 _UNEXPLAINED_SHARE: Final = 0.5
@@ -72,7 +72,7 @@ def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) ->
     file
         The recording, plain or gzip.
     """
-    from skyless.calibration.run import CalibrationRequest, calibrate_capture, calibrate_site
+    from skyless.survey_inputs.run import CalibrationRequest, calibrate_capture, calibrate_site
 
     check_output("out", asked.out, file, asked.truth)
     own = is_mcap(file)
@@ -135,7 +135,7 @@ def _identifier_of(site: Path | None) -> int | None:
 
 def _stay(text: str) -> "Stay":
     """Position of a tag at rest: x,y[,z][@FROM:TO]. Raises SkylessError."""
-    from skyless.calibration.samples import Stay
+    from skyless.survey_inputs.samples import Stay
 
     position, mark, span = text.partition("@")
     x_m, y_m, *z_m = finite_numbers("at", position, (2, 3))
@@ -149,7 +149,7 @@ def _stay(text: str) -> "Stay":
 
 def _first(text: str | None) -> "First":
     """How much of the beginning to use: a number, seconds with s, a part with %. Raises SkylessError."""
-    from skyless.calibration.samples import First
+    from skyless.survey_inputs.samples import First
 
     if text is None:
         return First()

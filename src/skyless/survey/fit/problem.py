@@ -4,7 +4,7 @@ Positions are only known up to a rigid motion here, unless facts name coordinate
 solution stays where its start was (a free network).
 """
 
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from msgspec import Struct
@@ -17,6 +17,14 @@ _LEAST_STD_M: Final = 1e-5
 _MOST_STEPS: Final = 60
 _SMALLEST_STEP_M: Final = 1e-7
 _LEAST_DAMPING: Final = 1e-9
+
+
+class MoreRows(Protocol):
+    """What else constrains positions and delays, such as a tag's receptions."""
+
+    def rows(self, position_m: Array, delay_m: Array) -> tuple[Array, Array]:
+        """Weighted Jacobian, shape (r, 4n): coordinates anchor by anchor, then delays; weighted residuals, (r,)."""
+        ...
 
 
 class Problem(Struct, frozen=True, eq=False):
@@ -42,6 +50,7 @@ class Problem(Struct, frozen=True, eq=False):
     tape_m: Array
     tape_variance_m2: Array
     """Shape (t,)."""
+    more: tuple[MoreRows, ...] = ()
 
 
 class Solution(Struct, frozen=True, eq=False):
@@ -139,4 +148,7 @@ def _rows(
     row = m + t + n + np.arange(len(known))
     whole[row, known] = of_coordinate.ravel()[known]
     residual[row] = of_coordinate.ravel()[known] * (problem.coordinate_m - position_m).ravel()[known]
+    for more in problem.more:
+        more_whole, more_residual = more.rows(position_m, delay_m)
+        whole, residual = np.vstack([whole, more_whole]), np.concatenate([residual, more_residual])
     return whole[:, np.concatenate([free, 3 * n + np.arange(n)])], residual

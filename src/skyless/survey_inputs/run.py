@@ -8,8 +8,8 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.air.masterless_packets import Point
-from skyless.calibration.estimate import CalibrationEstimate, estimate
-from skyless.calibration.samples import (
+from skyless.survey.tags.estimate import CalibrationEstimate, estimate
+from skyless.survey_inputs.samples import (
     First,
     PositionAt,
     Samples,

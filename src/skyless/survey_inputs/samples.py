@@ -13,7 +13,7 @@ from skyless.air.beacon import Beacon, Malformed, MasterTime
 from skyless.air.codec import decode_cached
 from skyless.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.air.reception import Reception
-from skyless.calibration.estimate import Differences
+from skyless.survey.tags.estimate import Differences
 from skyless.constants import TICK_M
 from skyless.errors import SkylessError
 from skyless.evaluation.judge import Judge
