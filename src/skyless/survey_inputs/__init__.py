@@ -1,4 +1,6 @@
-"""Antenna delays from a recording of a tag whose position is known.
+"""What a survey needs, out of recordings: differences of tags at known positions, and tags that were carried around.
 
-Public: estimate, run, samples.
+``run`` is all of ``skyless calibrate`` on a recording.
+
+Public: run, samples, walk.
 """

@@ -8,6 +8,16 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.air.masterless_packets import Point
+from skyless.constants import TICK_M
+from skyless.errors import ConfigurationError, SkylessError
+from skyless.evaluation.judge import Judge
+from skyless.recordings.foreign.formats import open_recording
+from skyless.recordings.mcap.recording import McapRecording
+from skyless.recordings.truth import Truth
+from skyless.replay.site import SITE_FORMAT, recorded_site, recorded_truth
+from skyless.site.check import SITE_LIMITS
+from skyless.site.model import Site
+from skyless.site.rewrite import DELAY_KEY
 from skyless.survey.tags.estimate import CalibrationEstimate, estimate
 from skyless.survey_inputs.samples import (
     First,
@@ -21,16 +31,6 @@ from skyless.survey_inputs.samples import (
     site_tdoas,
     tdoas_of,
 )
-from skyless.constants import TICK_M
-from skyless.errors import ConfigurationError, SkylessError
-from skyless.evaluation.judge import Judge
-from skyless.recordings.foreign.formats import open_recording
-from skyless.recordings.mcap.recording import McapRecording
-from skyless.recordings.truth import Truth
-from skyless.replay.site import SITE_FORMAT, recorded_site, recorded_truth
-from skyless.site.check import SITE_LIMITS
-from skyless.site.model import Site
-from skyless.site.rewrite import DELAY_KEY
 
 _DELAY: Final = SITE_LIMITS[f"anchors.{DELAY_KEY}"]
 

@@ -139,7 +139,8 @@ def tag_ranges(epochs: TagEpochs, pair_ranges_m: Mapping[tuple[int, int], float]
     strength = np.minimum(count, _FLOOR_COUNT) / _LONE_STD_M**2
     columns = np.stack([first, second, n + first, n + second], axis=1)
     factors = np.stack([-np.ones(len(first)), np.ones(len(first)), -since_s, since_s], axis=1)
-    solution, weight = np.zeros((k, 2 * n)), strength
+    solution: Array = np.zeros((k, 2 * n))
+    weight = strength
     for _ in range(_ROUNDS):
         normal = np.zeros((k, 2 * n, 2 * n))
         diagonal = np.arange(2 * n)
@@ -150,7 +151,7 @@ def tag_ranges(epochs: TagEpochs, pair_ranges_m: Mapping[tuple[int, int], float]
             np.add.at(right, (epoch, columns[:, i]), weight * factors[:, i] * value_m)
             for j in range(4):
                 np.add.at(normal, (epoch, columns[:, i], columns[:, j]), weight * factors[:, i] * factors[:, j])
-        solution = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+        solution = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0])
         model_m = (factors * np.take_along_axis(solution[epoch], columns, axis=1)).sum(axis=1)
         away = np.abs(value_m - model_m)
         weight = strength * np.minimum(1.0, _HUBER_M / np.maximum(away, _HUBER_M))

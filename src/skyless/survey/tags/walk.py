@@ -44,8 +44,8 @@ class WalkRows:
         self._known_m = epochs.known_m
         self._prior = np.where(np.isfinite(epochs.known_m), 1.0 / np.array(epochs.known_std_m) ** 2, 0.0)
         self._fewest = 2 + (self._prior == 0.0).sum(axis=1)
-        self._measured = self._with_enough(np.isfinite(range_m))
-        self.used: Mask = self._measured
+        self.measured = self._with_enough(np.isfinite(range_m))
+        self.used: Mask = self.measured
         self._range_m = np.where(self.used, range_m, 0.0)
         self._offset_std_m = epochs.offset_std_m
         self._offset_m, self._slope_m = np.zeros(range_m.shape[1]), _SLOPE_M
@@ -61,7 +61,7 @@ class WalkRows:
     @property
     def excluded_share(self) -> float:
         """Part of the ranges that is not in use."""
-        return 1.0 - float(self.used.sum()) / max(int(self._measured.sum()), 1)
+        return 1.0 - float(self.used.sum()) / max(int(self.measured.sum()), 1)
 
     @property
     def freedom(self) -> int:
@@ -73,13 +73,13 @@ class WalkRows:
         """Measured less modelled ranges with the latest positions of the tag, shape (k, n); 0 where none was made."""
         distance = self._distances(position_m)
         model = distance + delay_m + self._offset_m + self._slope_m * np.log(distance / _SLOPE_RANGE_M)
-        return np.asarray(np.where(self._measured, self._range_m - model - self._clock_m[:, None], 0.0))
+        return np.asarray(np.where(self.measured, self._range_m - model - self._clock_m[:, None], 0.0))
 
     def use_within(self, position_m: Array, delay_m: Array, limit: float) -> None:
         """Use ranges whose residual is within ``limit`` standard deviations, of robust ones if these are larger."""
         residual = np.abs(self.residuals_m(position_m, delay_m))
-        typical = 1.4826 * float(np.median(residual[self._measured])) if self._measured.any() else 0.0
-        self.used = self._with_enough(self._measured & (residual <= limit * max(TAG_STD_M, typical)))
+        typical = 1.4826 * float(np.median(residual[self.measured])) if self.measured.any() else 0.0
+        self.used = self._with_enough(self.measured & (residual <= limit * max(TAG_STD_M, typical)))
 
     def rows(self, position_m: Array, delay_m: Array) -> tuple[Array, Array]:
         """Jacobian and residuals as ``MoreRows`` has them; the last residual is what no position changes."""
@@ -164,7 +164,7 @@ class WalkRows:
 
     def _distances(self, position_m: Array) -> Array:
         apart = self.tag_m[:, None, :] - position_m[None, :, :]
-        return np.maximum(np.sqrt(np.einsum("kja,kja->kj", apart, apart)), _NEAREST_M)
+        return np.asarray(np.maximum(np.sqrt(np.einsum("kja,kja->kj", apart, apart)), _NEAREST_M))
 
     def _with_enough(self, usable: Mask) -> Mask:
         """Without epochs that have no more ranges than unknowns."""
