@@ -1,0 +1,160 @@
+"""A fit that late ranges do not spoil: those that the others contradict are left out.
+
+Radio may take a longer way, never a shorter one: a range counts as wrong if it comes 3 σ later than the positions say,
+or 6 σ earlier. The weighted squares, each cut off there, have many minima; graduated non-convexity (Yang and others,
+2020) leads from plain least squares to a good one, from several starts, and the best is improved anchor by anchor.
+"""
+
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.kernels.arrays import Array, Mask
+from skyless.survey.fit.problem import Problem, Solution, Solutions, residuals_m, solve_least_squares, solve_many
+
+LATE_CUTOFF: Final = 3.0
+EARLY_CUTOFF: Final = 6.0
+"""In standard deviations of a range."""
+
+_LATE_BEND: Final = 0.5
+_EARLY_BEND: Final = 3.0
+"""Where Huber's cost becomes linear, in standard deviations: absolute values on the late side, nearly."""
+
+_HUBER_ROUNDS: Final = 12
+_STEPS_A_ROUND: Final = 2
+_GROWTH: Final = 1.4
+_LAST_CONTROL: Final = 30.0
+"""Where the graduated cost is as good as cut off."""
+
+_MOST_CHANGES: Final = 10
+"""Of the set of used ranges, while it is brought to rest."""
+
+_SAME_M: Final = 0.005
+"""Residuals that differ by less belong to one minimum."""
+
+
+class RobustFit(Struct, frozen=True, eq=False):
+    """The best fit found."""
+
+    problem: Problem
+    """With the variances that were used."""
+    solution: Solution
+    """Of the ranges in use."""
+    used: Mask
+    """Shape (m,): ranges in use; the others are late."""
+    cost: float
+    """All weighted squares, each range's cut off."""
+    range_std_m: float
+    """Constant error of a pair that the fit assumes."""
+
+
+class Minima(Struct, frozen=True, eq=False):
+    """Minima of the cut-off cost, the best first."""
+
+    position_m: Array
+    delay_m: Array
+    """Shapes (b, n, 3) and (b, n)."""
+    used: Mask
+    """Shape (b, m)."""
+    cost: Array
+    """Shape (b,)."""
+
+
+def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0) -> RobustFit:
+    """Fit positions and delays to the ranges that agree, from several starts of shape (n, 3).
+
+    ``pair_std_m``: the part of the ranges' standard deviations that is a pair's constant error.
+    """
+    minima = _from_starts(problem, np.stack(starts))
+    used = minima.used[0]
+    solution = solve_least_squares(problem, minima.position_m[0], used.astype(np.float64))
+    return RobustFit(problem, solution, used, float(minima.cost[0]), pair_std_m)
+
+
+def _from_starts(problem: Problem, start_m: Array) -> Minima:
+    """Minima that plain and one-sided least squares and graduated non-convexity reach."""
+    everything = np.ones((len(start_m), len(problem.range_m)))
+    plain = _distinct(solve_many(problem, start_m, everything, most_steps=15))
+    bent = _distinct(_huber(problem, plain))
+    position_m = np.concatenate([plain.position_m, bent.position_m, bent.position_m])
+    delay_m = np.concatenate([plain.delay_m, bent.delay_m, bent.delay_m])
+    # A bent start comes twice: from the convex cost, and from one that trusts it.
+    nearly_cut = np.arange(len(position_m)) >= len(plain.position_m) + len(bent.position_m)
+    return graduated(problem, position_m, delay_m, np.where(nearly_cut, 0.3, 0.0))
+
+
+def _huber(problem: Problem, start: Solutions) -> Solutions:
+    """Least squares with late residuals by their absolute value."""
+    fit = start
+    for _ in range(_HUBER_ROUNDS):
+        scaled = fit.residual_m / np.sqrt(problem.variance_m2)
+        bend = np.where(scaled > 0.0, _LATE_BEND, _EARLY_BEND)
+        weight = bend / np.maximum(np.abs(scaled), bend)
+        fit = solve_many(problem, fit.position_m, weight, fit.delay_m, _STEPS_A_ROUND)
+    return fit
+
+
+def graduated(problem: Problem, position_m: Array, delay_m: Array, least_control: Array) -> Minima:
+    """Graduated non-convexity from ``b`` starts: a control of 0 begins with a convex cost, of 1 near the cut-off one."""
+    scaled = _in_cutoffs(problem, residuals_m(problem, position_m, delay_m))
+    convex = 1.0 / np.maximum(2.0 * np.max(scaled, axis=1, initial=0.0) - 1.0, 1.0 / _LAST_CONTROL)
+    control = np.maximum(convex, least_control)
+    while np.any(control < _LAST_CONTROL):
+        mu = control[:, None]
+        weight = np.sqrt(mu * (mu + 1.0) / np.maximum(scaled, 1e-12)) - mu
+        weight = np.clip(weight, 0.0, 1.0)
+        fit = solve_many(problem, position_m, weight, delay_m, _STEPS_A_ROUND)
+        position_m, delay_m = fit.position_m, fit.delay_m
+        scaled = _in_cutoffs(problem, fit.residual_m)
+        control = control * _GROWTH
+    return cut_off(problem, position_m, delay_m)
+
+
+def cut_off(problem: Problem, position_m: Array, delay_m: Array, used: Mask | None = None) -> Minima:
+    """Minima of the cut-off cost near ``b`` positions, where least squares and the set of used ranges agree.
+
+    ``used``: shape (b, m), the first set; by default what the positions' residuals say.
+    """
+    nearby = _in_cutoffs(problem, residuals_m(problem, position_m, delay_m)) < 1.0
+    used = nearby if used is None else used.copy()
+    position_m, delay_m = position_m.copy(), delay_m.copy()
+    cost = np.full(len(position_m), np.inf)
+    found = used.copy()
+    busy = np.arange(len(position_m))
+    for _ in range(_MOST_CHANGES):
+        weight = used[busy].astype(np.float64)
+        fit = solve_many(problem, position_m[busy], weight, delay_m[busy])
+        scaled = _in_cutoffs(problem, fit.residual_m)
+        new = scaled < 1.0
+        # Squares of all ranges, those that are out by what leaving them out costs.
+        squares = fit.residual_m**2 / problem.variance_m2
+        limit = np.where(fit.residual_m > 0.0, LATE_CUTOFF**2, EARLY_CUTOFF**2)
+        whole = fit.cost + np.sum(np.where(new, squares, limit) - weight * squares, axis=1)
+        better = whole < cost[busy]
+        chosen = busy[better]
+        cost[chosen], position_m[chosen], delay_m[chosen] = whole[better], fit.position_m[better], fit.delay_m[better]
+        found[chosen] = new[better]
+        changed = better & np.any(new != used[busy], axis=1)
+        used[busy] = new
+        busy = busy[changed]
+        if not busy.size:
+            break
+    order = np.argsort(cost, kind="stable")
+    return Minima(position_m[order], delay_m[order], found[order], cost[order])
+
+
+def _in_cutoffs(problem: Problem, residual_m: Array) -> Array:
+    """Squares of residuals, 1 where they are cut off; shape as given."""
+    cutoff = np.where(residual_m > 0.0, LATE_CUTOFF, EARLY_CUTOFF)
+    return np.asarray(residual_m**2 / (problem.variance_m2 * cutoff**2))
+
+
+def _distinct(fits: Solutions) -> Solutions:
+    """One of each minimum, by residuals, the cheapest first: these do not see how a site is turned."""
+    kept: list[int] = []
+    for index in np.argsort(fits.cost, kind="stable"):
+        apart = np.abs(fits.residual_m[kept] - fits.residual_m[index])
+        if not kept or np.all(np.max(apart, axis=1, initial=0.0) > _SAME_M):
+            kept.append(int(index))
+    return Solutions(fits.position_m[kept], fits.delay_m[kept], fits.residual_m[kept], fits.cost[kept])
