@@ -25,7 +25,7 @@ _ALIKE: Final = 4.0
 _CLEARLY: Final = 16.0
 """A result whose cost is higher by this is not the right one."""
 
-_ROUNDS: Final = 3
+_ROUNDS: Final = 6
 
 
 class JointFit(Struct, frozen=True, eq=False):
@@ -93,8 +93,8 @@ def _trial(problem: Problem, start_m: Array, epochs: TagEpochs, range_m: Array, 
     solution = solve_least_squares(both, start_m, weight)
     for _ in range(_ROUNDS):
         before = rows.used
-        rows.use_within(solution.position_m, solution.delay_m, _LIMIT)
-        if np.array_equal(before, rows.used):
+        rows.exclude_beyond(solution.position_m, solution.delay_m, _LIMIT)
+        if rows.used is before:
             break
         solution = solve_least_squares(both, solution.position_m, weight)
     excluded = int(rows.measured.sum() - rows.used.sum())

@@ -13,8 +13,15 @@ import numpy as np
 from skyless.kernels.arrays import Array, Mask
 from skyless.survey.tags.epochs import TagEpochs
 
-TAG_STD_M: Final = 0.07
-"""Of a range in one epoch: its noise, and reflections that change along the way."""
+TAG_STD_M: Final = 0.1
+"""Of a range in one epoch. Noise and reflections make 0.07 m, but some reflections return with each round through a
+room: with 0.07 m, flights of four minutes spoil a room's horizontal positions by a fifth (test_walk.py)."""
+
+_LEAST_SCALE_M: Final = 0.05
+"""Of residuals, where ranges are looked for that do not fit."""
+
+_LEAST_FREE: Final = 0.05
+"""Part of a range's error that shows in its residual, at least."""
 
 _SLOPE_M: Final = 0.025
 _SLOPE_STD_M: Final = 0.03
@@ -80,11 +87,19 @@ class WalkRows:
         model = distance + delay_m + self._offset_m + self._slope_m * np.log(distance / _SLOPE_RANGE_M)
         return np.asarray(np.where(self.measured, self._range_m - model - self._clock_m[:, None], 0.0))
 
-    def use_within(self, position_m: Array, delay_m: Array, limit: float) -> None:
-        """Use ranges whose residual is within ``limit`` standard deviations, of robust ones if these are larger."""
-        residual = np.abs(self.residuals_m(position_m, delay_m))
-        typical = 1.4826 * float(np.median(residual[self.measured])) if self.measured.any() else 0.0
-        self.used = self._with_enough(self.measured & (residual <= limit * max(TAG_STD_M, typical)))
+    def exclude_beyond(self, position_m: Array, delay_m: Array, limit: float) -> None:
+        """Exclude of each epoch the range that fits worst, if it is off by more than ``limit`` standard deviations.
+
+        Residuals are scaled up by what the tag's free position and clock take out of them.
+        """
+        local, _, residual = self._derivatives(position_m, delay_m)
+        inverse = self._inverse_local(local)
+        leverage = np.einsum("kjl,klm,kjm->kj", local, inverse, local) / TAG_STD_M**2
+        away = np.abs(residual) / np.sqrt(np.maximum(1.0 - leverage, _LEAST_FREE))
+        typical = 1.4826 * float(np.median(away[self.used])) if self.used.any() else 0.0
+        worst = (away == away.max(axis=1, initial=0.0, keepdims=True)) & (away > limit * max(_LEAST_SCALE_M, typical))
+        if (worst & self.used).any():
+            self.used = self._with_enough(self.used & ~worst)
 
     def rows(self, position_m: Array, delay_m: Array) -> tuple[Array, Array]:
         """Jacobian and residuals as ``MoreRows`` has them; the last residual is what no position changes."""
@@ -153,10 +168,7 @@ class WalkRows:
     ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
         """Normal matrix and gradient of ``whole``'s g columns without tag and clocks; and what gives these back."""
         weight = self.used / TAG_STD_M**2
-        normal_local = np.einsum("kjl,kj,kjm->klm", local, weight, local)
-        diagonal = np.arange(3)
-        normal_local[:, diagonal, diagonal] += self._prior
-        inverse = np.linalg.pinv(normal_local, rcond=_SINGULAR, hermitian=True)
+        inverse = self._inverse_local(local)
         right = np.einsum("kjl,kj->kl", local, weight * residual)
         right[:, :3] += self._prior * np.where(self._prior > 0.0, self._known_m - self.tag_m, 0.0)
         weighted = whole * weight[:, :, None]
@@ -167,6 +179,13 @@ class WalkRows:
         normal = weighted.reshape(-1, columns).T @ flat - cross.reshape(-1, columns).T @ inner.reshape(-1, columns)
         gradient = weighted.reshape(-1, columns).T @ residual.ravel() - np.einsum("klg,kl->g", inner, right)
         return normal, gradient, (inverse, cross, right)
+
+    def _inverse_local(self, local: Array) -> Array:
+        """Covariance of tag and clock in each epoch while all else is known, shape (k, 4, 4)."""
+        normal = np.einsum("kjl,kj,kjm->klm", local, self.used / TAG_STD_M**2, local)
+        diagonal = np.arange(3)
+        normal[:, diagonal, diagonal] += self._prior
+        return np.asarray(np.linalg.pinv(normal, rcond=_SINGULAR, hermitian=True))
 
     def _constants_prior(self) -> tuple[Array, Array]:
         """Information on constants and slope, and how far they are from what is expected, each (n + 1,)."""
