@@ -20,6 +20,7 @@ _COMMANDS = (
     ("demo", "nodes.demo", "Show a site and walking tags in real time."),
     ("simulate", "simulate", "Run a site in the simulated world and judge it against the truth."),
     ("replay", "replay", "Turn a recording into fixes and judge them against the truth."),
+    ("survey", "survey", "Find where anchors hang and their antenna delays, from what they receive of one another."),
     ("calibrate", "calibrate", "Find wrong antenna delays from a tag whose position is known."),
     ("paper", "paper", "Reproduce the paper's figures and claims in one report."),
     ("study", "study", "Measure the receiver's errors over many simulated runs."),

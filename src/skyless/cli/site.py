@@ -38,10 +38,13 @@ def new(
     height: _Metres | None = None,
     grid: _Metres | None = None,
     free: bool = False,
+    unplaced: _Count | None = None,
     tag_height: float | None = None,
     force: bool = False,
 ) -> None:
     """Write a commented site file to start from: the lab, with --width and --depth a room, with --grid a large hall.
+
+    With --unplaced the anchors have no positions yet, which skyless survey then finds.
 
     Parameters
     ----------
@@ -63,6 +66,8 @@ def new(
         get slots, which anchors far apart share.
     free
         With --grid: anchors send at random instants (mode free) instead of in slots.
+    unplaced
+        How many anchors, 1 to this number, without positions, each with a slot of its own (protocol 2).
     tag_height
         Height in metres at which all tags move (2-D); by default their height is estimated (3-D), with --grid, whose
         anchors lie in one plane, it is 1.2.
@@ -71,15 +76,20 @@ def new(
     """
     from skyless.site.check import check_site
     from skyless.site.lab import lab_site
-    from skyless.site.template import rectangular_site, site_template
+    from skyless.site.template import rectangular_site, site_template, unplaced_site
 
-    if grid is not None and width is not None and depth is not None and anchors is None:
+    sizes = (width, depth, anchors, height)
+    if unplaced is not None:
+        if sizes != (None,) * 4 or grid is not None or free:
+            raise SkylessError(f"--unplaced is {unplaced}; it takes no sizes: anchors without positions fill no room")
+        site = unplaced_site(unplaced, tag_height)
+    elif grid is not None and width is not None and depth is not None and anchors is None:
         site = _grid(width, depth, grid, height, tag_height, free)
     elif grid is not None or free:
         raise SkylessError("a grid needs --grid, --width and --depth; how many --anchors follows from them")
     elif width is not None and depth is not None:
         site = rectangular_site(width, depth, anchors or 6, height or 3.0, tag_height)
-    elif (width, depth, anchors, height, tag_height) == (None,) * 5:
+    elif (*sizes, tag_height) == (None,) * 5:
         site = lab_site()
     else:
         raise SkylessError("a room needs both --width and --depth; without them the lab is written")

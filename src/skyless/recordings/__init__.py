@@ -1,4 +1,4 @@
-"""Recordings of a running site and of other systems; tables of anchors and of true positions.
+"""Recordings of a running site and of other systems; tables of anchors, ranges and true positions.
 
-Public: anchor_table, source, truth.
+Public: anchor_table, range_table, source, truth.
 """

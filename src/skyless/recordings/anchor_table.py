@@ -98,15 +98,20 @@ def _rows(path: str | PathLike[str]) -> Iterator[tuple[int, int, dict[str, str]]
         if len(row) != len(names):
             raise ConfigurationError(path, f"line {number}", ",".join(row), f"{len(names)} columns as in the header")
         fields = {name: field.strip() for name, field in zip(names, row, strict=True)}
-        yield number, _identifier(fields["id"], path, number), fields
+        yield number, anchor_identifier(fields["id"], path, number), fields
 
 
-def _identifier(field: str, path: str | PathLike[str], line: int) -> int:
+def anchor_identifier(field: str, path: str | PathLike[str], line: int, column: str = "id") -> int:
+    """The identifier in one field of a table.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
     try:
         identifier = int(field, 0) if field.lower().startswith("0x") else int(field)
     except ValueError:
         identifier = -1
     if identifier < 0:
         expected = "a whole number, or a hexadecimal one after 0x"
-        raise ConfigurationError(path, f"line {line}, column id", field, expected)
+        raise ConfigurationError(path, f"line {line}, column {column}", field, expected)
     return identifier

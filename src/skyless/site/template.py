@@ -212,6 +212,19 @@ def rectangular_site(width_m: float, depth_m: float, anchors: int, height_m: flo
     )
 
 
+def unplaced_site(anchors: int, tag_height_m: float | None) -> Site:
+    """Anchors 1 to ``anchors`` whose positions are not known yet, each with a slot of its own."""
+    return Site(
+        name="site",
+        id=1,
+        master=1,
+        anchors=(),
+        schedule=ScheduleSite(mode="slots", slot_s=2.5e-3, slots=anchors),
+        tags=TagsSite(height_m=tag_height_m),
+        unplaced=tuple(UnplacedAnchor(id=number, slot=number - 1) for number in range(1, anchors + 1)),
+    )
+
+
 def _along_walls(share: float, width_m: float, depth_m: float) -> tuple[float, float]:
     """The point at a share of the way around the walls, to the millimetre."""
     way_m = share * 2 * (width_m + depth_m)

@@ -17,6 +17,7 @@ from skyless.studies import (
     room,
     scale,
     sitetime,
+    survey,
     sync,
 )
 from skyless.studies.picture import Look, draw
@@ -81,6 +82,13 @@ STUDIES: Final = {
             claims.cells,
             claims.rows,
             partial(draw, Look("Superframes until one claim is left", ("superframes",))),
+        ),
+        Study(
+            "survey",
+            "anchors that survey themselves",
+            survey.cells,
+            survey.rows,
+            partial(draw, Look("Anchors that survey themselves", ("rmse", "nees"))),
         ),
         Study("sitetime", "one timeline over many hops", sitetime.cells, sitetime.rows, sitetime.draw),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),

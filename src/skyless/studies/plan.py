@@ -43,6 +43,7 @@ _USUAL: Final = {
     "room": Plan(worlds=20, seconds=15.0, tags=5),
     "large": Plan(worlds=24, seconds=30.0),
     "claims": Plan(worlds=3),
+    "survey": Plan(worlds=200, seconds=10.0),
 }
 """Of studies that do not take the usual amounts; those of ``room`` are the room's own, its other cases have fewer."""
 
@@ -194,6 +195,26 @@ class Row(Struct, frozen=True):
     """Of the slowest run."""
     changes: int | None = None
     """Anchors that changed their claim afterwards, in all runs."""
+    near: float | None = None
+    """Share of surveys whose anchors are less than 10 cm off, rms (``survey``, as all below)."""
+    undetermined: float | None = None
+    """Share of surveys that leave an anchor without a position."""
+    flagged: float | None = None
+    """Share of surveys that say they are ambiguous or not checked, or leave an anchor without a position."""
+    wrong: int | None = None
+    """Surveys of all anchors that are 10 cm and four of their own standard deviations off."""
+    wrong_flagged: float | None = None
+    """Share of these that say they are ambiguous or not checked."""
+    found_late: float | None = None
+    """Share of the late pairs that were left out."""
+    excluded_wrongly: float | None = None
+    """Share of the other pairs that were left out."""
+    delay_m: float | None = None
+    """Error of delays less their mean, rms."""
+    tag_m: float | None = None
+    """Systematic error of tags' positions, rms, by the survey."""
+    hand_tag_m: float | None = None
+    """The same by positions measured by hand to 2 cm per axis, with delays unknown."""
 
 
 def with_limits(row: Row, limits: Sequence[Limit]) -> Row:

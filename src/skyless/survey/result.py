@@ -52,9 +52,9 @@ class TapeAdvice(Struct, frozen=True):
 
     a: int
     b: int
-    std_before_m: float
-    std_after_m: float
-    """rms over all anchors' ``std_m``; infinite before where an anchor is not determined."""
+    std_before_m: float | None
+    std_after_m: float | None
+    """rms over all anchors' ``std_m``; None where an anchor is not determined (JSON has no infinity)."""
 
 
 class Survey(Struct, frozen=True):

@@ -136,9 +136,8 @@ class CellMedium(MediumBase[Result]):
         super().__init__(site, tags, impairments, deliver)
         moving = next((one for one in impairments.anchor_displacements if one.from_s > 0.0), None)
         if moving is not None:
-            raise ValueError(
-                f"anchor_displacements has from_s {moving.from_s:g}; it should be 0: anchors of several cells do not move"
-            )
+            text = f"anchor_displacements has from_s {moving.from_s:g}; it should be 0"
+            raise ValueError(f"{text}: anchors of several cells do not move")
         named = {one.anchor for one in impairments.anchor_outages}
         unknown = named.union(one.anchor for one in impairments.anchor_displacements) - self.node_of.keys()
         if unknown:

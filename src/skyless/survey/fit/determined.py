@@ -176,7 +176,7 @@ def folds(problem: Problem, position_m: Array, delay_m: Array, weight: Array, di
     """Whether the shape can be moved by 2 × ``MOST_STD_M`` along a direction without ranges that contradict.
 
     That a linear model does not show: anchors on a line have no first-order hold across it, and their noise puts them
-    beside the line, where they seem to have one.
+    next to the line, where they seem to have one.
     """
     start = cost(problem, position_m, delay_m, weight)
     for sign in (1.0, -1.0):

@@ -194,7 +194,9 @@ class _Equations:
         priors = np.concatenate([self._of_coordinate.ravel()[self._free], self._of_delay])
         np.einsum("bii->bi", information)[:] += priors
         from_delays = self._of_delay * (self._problem.delay_m - delay_m)
-        gradient = gradient + np.concatenate([from_coordinates.reshape(b, -1)[:, self._free], from_delays], axis=1)
+        gradient = gradient + np.concatenate(
+            [from_coordinates.reshape(b, self._problem.is_free.size)[:, self._free], from_delays], axis=1
+        )
         for one, more in product(range(b), self._problem.more):
             jacobian, residual_more = more.rows(position_m[one], delay_m[one])
             of_unknowns = jacobian[:, self._more_columns]
@@ -216,7 +218,7 @@ class _Equations:
 
     def moved(self, position_m: Array, delay_m: Array, step: Array) -> tuple[Array, Array]:
         """Positions and delays after steps of shape (b, u)."""
-        flat = position_m.reshape(len(position_m), -1).copy()
+        flat = position_m.reshape(len(position_m), self._problem.is_free.size).copy()
         flat[:, self._free] += step[:, : len(self._free)]
         return flat.reshape(position_m.shape), delay_m + step[:, len(self._free) :]
 

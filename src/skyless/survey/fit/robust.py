@@ -9,8 +9,10 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.kernels.arrays import Array, Mask
+from skyless.survey.fit.neighbours import derivatives, regular, relocated, without_ranges
 from skyless.survey.fit.problem import Problem, Solution, Solutions, residuals_m, solve_least_squares, solve_many
 
 LATE_CUTOFF: Final = 3.0
@@ -30,6 +32,18 @@ _LAST_CONTROL: Final = 30.0
 _MOST_CHANGES: Final = 10
 """Of the set of used ranges, while it is brought to rest."""
 
+_LEAST_CHECKS: Final = 4.0
+_SIGNIFICANT: Final = 2.6
+"""Standard deviations by which squares of residuals must exceed what is expected before a larger error is assumed."""
+
+_MOST_WIDENINGS: Final = 20
+_LEAST_STD_M: Final = 0.005
+_LARGEST_STD_M: Final = 0.3
+
+_MOST_IMPROVEMENTS: Final = 8
+_LEAST_GAIN: Final = 0.01
+"""Of the cost, by a better result nearby."""
+
 _SAME_M: Final = 0.005
 """Residuals that differ by less belong to one minimum."""
 
@@ -47,6 +61,8 @@ class RobustFit(Struct, frozen=True, eq=False):
     """All weighted squares, each range's cut off."""
     range_std_m: float
     """Constant error of a pair that the fit assumes."""
+    others: "Minima"
+    """Minima found near this one, for the search of ambiguities."""
 
 
 class Minima(Struct, frozen=True, eq=False):
@@ -64,12 +80,67 @@ class Minima(Struct, frozen=True, eq=False):
 def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0) -> RobustFit:
     """Fit positions and delays to the ranges that agree, from several starts of shape (n, 3).
 
-    ``pair_std_m``: the part of the ranges' standard deviations that is a pair's constant error.
+    ``pair_std_m``: the part of the ranges' standard deviations that is a pair's constant error. Where the residuals
+    show that it is larger, the larger one is used.
     """
-    minima = _from_starts(problem, np.stack(starts))
+    start_m = np.stack(starts)
+    minima = _from_starts(problem, start_m)
+    wider, std_m = _widened(problem, minima, pair_std_m)
+    if std_m > pair_std_m:
+        problem, minima = wider, _from_starts(wider, start_m)
+    for _ in range(_MOST_IMPROVEMENTS):
+        used, cost = minima.used[0], float(minima.cost[0])
+        solution = solve_least_squares(problem, minima.position_m[0], used.astype(np.float64))
+        minima = _near(problem, solution, used)
+        if not len(minima.cost) or minima.cost[0] > cost - _LEAST_GAIN:
+            break
+    return RobustFit(problem, solution, used, cost, std_m, minima)
+
+
+def _widened(problem: Problem, minima: Minima, pair_std_m: float) -> tuple[Problem, float]:
+    """The problem with the constant error that residuals of ranges in use show, where they show more than expected."""
+    position_m, delay_m, std_m = minima.position_m[:1], minima.delay_m[:1], pair_std_m
     used = minima.used[0]
-    solution = solve_least_squares(problem, minima.position_m[0], used.astype(np.float64))
-    return RobustFit(problem, solution, used, float(minima.cost[0]), pair_std_m)
+    wider = problem
+    for round_ in range(_MOST_WIDENINGS):
+        solution = solve_least_squares(wider, position_m[0], used.astype(np.float64))
+        checks = redundancy(wider, solution, used)
+        squares = float(np.sum(used * solution.residual_m**2 / wider.variance_m2))
+        # Normal approximation of chi-square by its cube root (Wilson and Hilferty).
+        spread = 2.0 / (9.0 * max(checks, 1e-6))
+        limit = checks * (1.0 - spread + _SIGNIFICANT * np.sqrt(spread)) ** 3 if round_ == 0 else checks
+        if checks < _LEAST_CHECKS or squares <= limit or std_m >= _LARGEST_STD_M:
+            break
+        std_m = min(max(std_m, _LEAST_STD_M) * float(np.clip(np.sqrt(squares / checks), 1.05, 1.5)), _LARGEST_STD_M)
+        wider = replace(problem, variance_m2=problem.variance_m2 - pair_std_m**2 + std_m**2)
+        near = graduated(wider, position_m, delay_m, np.full(1, 0.1))
+        position_m, delay_m, used = near.position_m, near.delay_m, near.used[0]
+    return wider, std_m
+
+
+def _near(problem: Problem, solution: Solution, used: Mask) -> Minima:
+    """Minima with an anchor elsewhere, or with one or two ranges fewer."""
+    start_m = relocated(problem, solution.position_m, solution.delay_m)
+    delay_m = np.tile(solution.delay_m, (len(start_m), 1))
+    elsewhere = graduated(problem, start_m, delay_m, np.full(len(start_m), 0.3))
+    sets = without_ranges(problem, solution, used)
+    position_m, delay_m = np.tile(solution.position_m, (len(sets), 1, 1)), np.tile(solution.delay_m, (len(sets), 1))
+    fewer = cut_off(problem, position_m, delay_m, sets)
+    both = [np.concatenate(parts) for parts in zip(_fields(elsewhere), _fields(fewer), strict=True)]
+    order = np.argsort(both[3], kind="stable")
+    return Minima(*(part[order] for part in both))
+
+
+def _fields(minima: Minima) -> tuple[Array, Array, Mask, Array]:
+    return minima.position_m, minima.delay_m, minima.used, minima.cost
+
+
+def redundancy(problem: Problem, solution: Solution, used: Mask) -> float:
+    """Ranges in use less the unknowns that they determine; what is expected of delays and coordinates counts, too."""
+    in_use = np.flatnonzero(used)
+    derivative = derivatives(problem, solution, in_use) / np.sqrt(problem.variance_m2[in_use])[:, None]
+    influence = np.linalg.solve(regular(solution.information), derivative.T)
+    return float(len(in_use) - np.einsum("ij,ji->", derivative, influence))
 
 
 def _from_starts(problem: Problem, start_m: Array) -> Minima:

@@ -37,7 +37,9 @@ def start_positions(problem: Problem, sketch_m: Array | None = None) -> list[Arr
         kept = np.triu(rng.random(distance_m.shape) < _KEPT_SHARE, 1)
         fewer_m = np.where(kept | kept.T, distance_m, np.inf)
         position_m = _layout(_completed(np.where(_connects(fewer_m), fewer_m, distance_m)), len(axes))
-        laid_out.append(position_m + rng.normal(0.0, _MOVED_SHARE * max(float(position_m.std()), 0.1), position_m.shape))
+        laid_out.append(
+            position_m + rng.normal(0.0, _MOVED_SHARE * max(float(position_m.std()), 0.1), position_m.shape)
+        )
     starts = []
     if sketch_m is not None:
         nearby_m = _moved_to(laid_out[0], known_m, axes)

@@ -57,7 +57,8 @@ def best_tapes(
             columns += unit[:, axis] * (a - b)
         number = np.arange(len(first))
         variance = sum(
-            unit[:, axis] * (columns[3 * first + axis, number] - columns[3 * second + axis, number]) for axis in range(3)
+            unit[:, axis] * (columns[3 * first + axis, number] - columns[3 * second + axis, number])
+            for axis in range(3)
         )
         variance = np.maximum(variance, 0.0) + TAPE_STD_M**2
         gain = np.sum(columns[: 3 * n][inside] ** 2, axis=0) / variance

@@ -1,0 +1,194 @@
+"""``skyless survey``: positions and antenna delays of anchors, from what they receive of one another."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from cyclopts import App
+from msgspec.structs import replace
+
+from skyless.cli.common.options import check_left_out, check_output, check_picture, options
+from skyless.cli.common.output import console, write_file
+from skyless.cli.common.progress import status
+from skyless.cli.common.recording_inputs import is_mcap
+from skyless.cli.survey_facts import FactOptions, facts_of
+from skyless.cli.survey_report import SurveyReport, print_report, show_report
+from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from skyless.site.model import Site
+    from skyless.survey.ranges import PairRanges
+    from skyless.survey.result import Survey
+
+NOTHING_DETERMINED: Final = 1
+"""Exit code of a survey without a position or a delay."""
+
+app = App(
+    name="survey",
+    help_epilogue="Example: skyless survey site.mcap --site site.toml --distance 1-5=8.94 --out surveyed.toml",
+)
+
+
+@options
+class SurveyOptions:
+    """Options of ``skyless survey``."""
+
+    ranges: Path | None = None
+    """A table of ranges instead of a recording: anchor_a,anchor_b,range_m, each pair any number of times."""
+    known: FactOptions = FactOptions()
+    out: Path | None = None
+    """Write the site file of --site with the survey in it here (.toml), or a table of anchors (.csv)."""
+    force: bool = False
+    """Overwrite --out if it exists; what was there is kept under another name."""
+    json: bool = False
+    """Write one JSON object instead of the tables."""
+    plot: Path | None = None
+    """Draw the anchors from above into this file (PNG, SVG or PDF)."""
+
+
+@app.default
+def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOptions()) -> int:
+    """Find where anchors hang and what their antenna delays are off, and say what cannot be known.
+
+    Ends with exit code 1 if no anchor is determined.
+
+    Parameters
+    ----------
+    recording
+        A recording of skyless record; --ranges takes a table instead.
+    """
+    _check(recording, asked)
+    site, own_ranges = _inputs(recording, asked)
+    ranges = _with_all_anchors(own_ranges, site)
+    facts, warnings = facts_of(asked.known, ranges.anchors, site)
+    from skyless.survey.count import count
+
+    counted = count(ranges, facts)
+    warnings += [] if counted.warning is None else [counted.warning]
+    if not asked.json:
+        console().print(counted.sentence, markup=False)
+    with status("surveying"):
+        from skyless.survey.solve import run_survey
+
+        result = run_survey(ranges, facts)
+    report = SurveyReport(result, counted, tuple(warnings))
+    if asked.out is not None and report.usable:
+        report = _written(report, ranges, site, asked, asked.out)
+    if asked.plot is not None:
+        _draw(asked.plot, result)
+    if asked.json:
+        print_report(report)
+    else:
+        show_report(report)
+    return 0 if report.usable else NOTHING_DETERMINED
+
+
+def _check(recording: Path | None, asked: SurveyOptions) -> None:
+    """See that the inputs are clear and the outputs can be written, before the work. Raises SkylessError."""
+    inputs = (recording, asked.ranges, asked.known.heights)
+    if (recording is None) == (asked.ranges is None):
+        raise SkylessError("a survey needs a recording of skyless record, or else a table of ranges by --ranges")
+    if recording is not None and not is_mcap(recording):
+        raise SkylessError(
+            f"{recording} is no recording of skyless record; ranges of other systems are given by --ranges"
+        )
+    check_output("out", asked.out, *inputs)
+    check_output("plot", asked.plot, *inputs, asked.known.site, asked.out)
+    check_picture(asked.plot)
+    out = asked.out
+    if out is None:
+        check_left_out({"force": asked.force or None}, "nothing is written without --out")
+        return
+    if out.suffix.lower() not in {".toml", ".csv"}:
+        raise SkylessError(f"--out is {str(out)!r}; its ending should be .toml for a site or .csv for a table")
+    if out.suffix.lower() == ".toml" and asked.known.site is None:
+        raise SkylessError(
+            f"--out is {str(out)!r}; a site file needs --site to start from (skyless site new --unplaced makes one)"
+        )
+    if not out.parent.is_dir():
+        raise SkylessError(f"--out is {str(out)!r}; it should be in a folder that exists")
+    if out.exists() and not asked.force:
+        raise SkylessError(f"{out} exists; --force overwrites it")
+
+
+def _inputs(recording: Path | None, asked: SurveyOptions) -> "tuple[Site | None, PairRanges]":
+    """The site, if one is known, and the ranges. Raises SkylessError."""
+    from skyless.site.load import load_site
+
+    site = None if asked.known.site is None else load_site(asked.known.site)
+    if asked.ranges is not None:
+        from skyless.recordings.range_table import read_ranges
+
+        return site, read_ranges(asked.ranges)
+    raise SkylessError("recordings")
+
+
+def _with_all_anchors(ranges: "PairRanges", site: "Site | None") -> "PairRanges":
+    """Anchors of the site of which nothing was received belong to the survey, too."""
+    everybody = set(ranges.anchors) | ({anchor.id for anchor in site.all_anchors} if site is not None else set())
+    return replace(ranges, anchors=tuple(sorted(everybody)))
+
+
+def _written(
+    report: SurveyReport, ranges: "PairRanges", site: "Site | None", asked: SurveyOptions, out: Path
+) -> SurveyReport:
+    """The report after --out was written. Raises SkylessError."""
+    if out.suffix.lower() == ".csv":
+        kept = _keep(out)
+        write_file(out, _table(report.survey).encode())
+        return replace(report, written=(*kept, str(out)))
+    from skyless.survey.record import SurveyRecord, encode_record, record_path
+    from skyless.survey.surveyed_site import delay_changes_ticks, surveyed_text, unchanged_anchors
+
+    if site is None or asked.known.site is None:
+        raise SkylessError(f"--out is {str(out)!r}, and there is no --site")
+    result = report.survey
+    text = surveyed_text(asked.known.site.read_bytes().decode(), result, site, asked.known.site)
+    record = SurveyRecord(site.name, site.id, time.time(), ranges, result, delay_changes_ticks(site, result))
+    strangers = [one.id for one in result.anchors if one.determined and one.id not in _identifiers(site)]
+    more = [f"anchor {one} is not in {asked.known.site} and was not written" for one in strangers]
+    kept = _keep(out)
+    write_file(out, text.encode())
+    write_file(record_path(out), encode_record(record))
+    return replace(
+        report,
+        warnings=(*report.warnings, *more),
+        unchanged=unchanged_anchors(site, result),
+        written=(*kept, str(out), str(record_path(out))),
+    )
+
+
+def _identifiers(site: "Site") -> set[int]:
+    return {anchor.id for anchor in site.all_anchors}
+
+
+def _keep(out: Path) -> tuple[str, ...]:
+    """Keep what a file holds under a name that is free, ``NAME.before-survey-1.toml``. Raises SkylessError."""
+    if not out.exists():
+        return ()
+    number = 1
+    while (kept := out.with_name(f"{out.stem}.before-survey-{number}{out.suffix}")).exists():
+        number += 1
+    write_file(kept, out.read_bytes())
+    return (str(kept),)
+
+
+def _table(result: "Survey") -> str:
+    """A table of anchors with their delays as ``skyless replay --anchors`` uses them."""
+    from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
+    from skyless.recordings.anchor_table import new_table
+
+    found = [one for one in result.anchors if one.determined]
+    positions_m = {one.id: (one.x_m or 0.0, one.y_m or 0.0, one.z_m or 0.0) for one in found}
+    delays = {one.id: AnchorCalibration(one.delay_m, 0.0, None) for one in found if one.delay_m is not None}
+    rounded = {anchor: tuple(round(value, 4) for value in position) for anchor, position in positions_m.items()}
+    return new_table({anchor: (x, y, z) for anchor, (x, y, z) in rounded.items()}, DifferenceCalibration(delays))
+
+
+def _draw(path: Path, result: "Survey") -> None:
+    from skyless.cli.survey_picture import draw
+
+    try:
+        draw(path, result)
+    except OSError as error:
+        raise SkylessError(f"{path} cannot be written: {error.strerror}") from None

@@ -1,0 +1,136 @@
+"""A survey's report: first what it is not sure of, then tables; or one JSON object."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct
+
+from skyless.cli.common.output import cm, console, number, print_json, print_warnings
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from skyless.survey.count import Count
+    from skyless.survey.result import Survey, SurveyedPair, TapeAdvice
+
+_WORST: Final = 8
+"""Pairs that are shown, those with the largest residuals."""
+
+
+class SurveyReport(Struct, frozen=True):
+    """A survey and what belongs to its report."""
+
+    survey: "Survey"
+    count: "Count"
+    warnings: tuple[str, ...]
+    """About inputs and facts."""
+    unchanged: tuple[int, ...] = ()
+    """Anchors of the site file that stay as they are."""
+    written: tuple[str, ...] = ()
+    """Files."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether any anchor is determined."""
+        return any(anchor.determined for anchor in self.survey.anchors)
+
+
+def print_report(report: SurveyReport) -> None:
+    """Write it as one line of JSON."""
+    print_json(report_object(report))
+
+
+def report_object(report: SurveyReport) -> dict[str, Any]:
+    """All of the survey, under the names of its fields, but for a shorter ``ambiguous`` and ``excluded_pairs``."""
+    import msgspec
+
+    survey: dict[str, Any] = msgspec.to_builtins(report.survey)
+    survey["ambiguous"] = survey.pop("ambiguities")
+    survey["excluded_pairs"] = [[pair.a, pair.b] for pair in report.survey.pairs if pair.excluded]
+    return survey | {
+        "usable": report.usable,
+        "count": msgspec.to_builtins(report.count),
+        "warnings": list(report.warnings),
+        "unchanged": list(report.unchanged),
+        "written": list(report.written),
+    }
+
+
+def show_report(report: SurveyReport) -> None:
+    """Show it to people."""
+    survey, screen = report.survey, console()
+    print_warnings(
+        [
+            *report.warnings,
+            *(f"ambiguous: {one.sentence}" for one in survey.ambiguities),
+            *([] if survey.unchecked is None else [survey.unchecked]),
+            *survey.not_determined,
+            *survey.notes,
+        ]
+    )
+    screen.print(_anchors(survey))
+    checked = [pair for pair in survey.pairs if pair.residual_m is not None]
+    if checked:
+        screen.print(_pairs(checked))
+    excluded = ", ".join(f"{pair.a}–{pair.b}{_late(pair)}" for pair in survey.pairs if pair.excluded)
+    lines = [
+        f"left out as late: {excluded or 'no pair'}",
+        f"constant error of a pair: {cm(survey.range_std_m)}; {_checks(survey.redundancy)}",
+        *_tapes(survey.tapes),
+        survey.frame,
+    ]
+    if report.unchanged and report.written:
+        lines.append(f"unchanged in the file: anchor {', '.join(map(str, report.unchanged))}")
+    lines += [f"wrote {file}" for file in report.written]
+    for line in lines:
+        screen.print(line, markup=False)
+
+
+def _anchors(survey: "Survey") -> "Table":
+    from rich.table import Table
+
+    table = Table(title="anchors")
+    for name in ("anchor", "x / m", "y / m", "z / m", "± / cm", "delay / cm", "± / cm"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for one in survey.anchors:
+        position = [number(value) for value in (one.x_m, one.y_m, one.z_m)]
+        others = [number(value, "{:.2f}", 100.0) for value in (one.std_m, one.delay_m, one.delay_std_m)]
+        note = "" if one.determined else f"not determined: {one.reason or 'its ranges leave it open'}"
+        table.add_row(str(one.id), *position, *others, note)
+    return table
+
+
+def _pairs(checked: Sequence["SurveyedPair"]) -> "Table":
+    """Those whose ranges differ most from the result."""
+    from rich.table import Table
+
+    worst = sorted(checked, key=lambda pair: -abs(pair.residual_m or 0.0))[:_WORST]
+    shown = "all pairs" if len(worst) == len(checked) else f"the {len(worst)} of {len(checked)} pairs that fit worst"
+    table = Table(title=shown)
+    for name in ("pair", "range / m", "range − result / cm", "± / cm"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for pair in worst:
+        figures = [number(pair.residual_m, "{:+.2f}", 100.0), number(pair.std_m, "{:.2f}", 100.0)]
+        table.add_row(f"{pair.a}–{pair.b}", number(pair.range_m), *figures, "left out" if pair.excluded else "")
+    return table
+
+
+def _late(pair: "SurveyedPair") -> str:
+    return "" if pair.residual_m is None else f" ({pair.residual_m:+.2f} m)"
+
+
+def _checks(redundancy: int) -> str:
+    return f"{redundancy} ranges check the result" if redundancy > 0 else "no range checks the result"
+
+
+def _tapes(tapes: Sequence["TapeAdvice"]) -> list[str]:
+    """What to measure next, and what it would bring."""
+    lines = []
+    for rank, tape in enumerate(tapes):
+        before = "not determined" if tape.std_before_m is None else cm(tape.std_before_m)
+        after = "not determined" if tape.std_after_m is None else cm(tape.std_after_m)
+        ask = "most would help a tape between" if rank == 0 else "then between"
+        lines.append(f"{ask} {tape.a} and {tape.b}: {before} → {after} (--distance {tape.a}-{tape.b}=METRES)")
+    return lines

@@ -1,0 +1,195 @@
+"""What a survey does not determine, why, and which tapes would mend it: sentences."""
+
+from typing import Final
+
+import numpy as np
+
+from skyless.kernels.arrays import Array, Mask
+from skyless.survey.fit import determined as determination
+from skyless.survey.fit.build import Measured, levels, with_free_delays
+from skyless.survey.fit.links import Links
+from skyless.survey.fit.shape import Fitted, redundancy, surveyed_problem
+from skyless.survey.fit.tapes import TapeChoice, best_tapes, mending_tapes
+from skyless.survey.frame import Framed
+from skyless.survey.result import TapeAdvice
+from skyless.survey.sentences import anchors_named, are, joined, tapes_named
+
+LEAST_CHECKS: Final = 3
+"""Ranges more than unknowns below which nothing checks a result."""
+
+_FLAT: Final = 0.1
+"""Extent of a site across, as a part of its extent along, below which it is flat."""
+
+_ONE_AXIS: Final = 0.7
+"""Part of a direction's squares along one axis from which on it is named after it."""
+
+
+def anchor_reasons(measured: Measured, links: Links, fitted: Fitted | None) -> dict[int, str]:
+    """Why each anchor, by identifier, is not determined."""
+    reasons = {}
+    names = np.array(measured.anchors)
+    groups = len(links.groups) > 1
+    inside = set() if fitted is None else set(fitted.kept.tolist())
+    for index, anchor in enumerate(measured.anchors):
+        others = names[np.flatnonzero(links.adjacent[index])].tolist()
+        if index in inside:
+            continue
+        if not others:
+            reasons[anchor] = "no range to any other anchor"
+        elif len(others) < links.needed[index]:
+            reasons[anchor] = f"only {_links_named(others)}, of {links.needed[index]} that it needs"
+        elif groups and not any(index in group for group in links.groups[:1] if inside):
+            group = next((group for group in links.groups if index in group), ())
+            rest = sorted(set(range(len(names))) - set(group))
+            reasons[anchor] = (
+                f"its group, {anchors_named(names[list(group)].tolist())}, has too few ranges to "
+                f"{anchors_named(names[rest].tolist())}"
+                if group
+                else "its ranges lead to anchors that are not determined themselves"
+            )
+        else:
+            reasons[anchor] = "its ranges lead to anchors that are not determined themselves"
+    if fitted is not None:
+        reasons.update(_loose(fitted))
+    return reasons
+
+
+def _links_named(others: list[int]) -> str:
+    return f"one range, to {others[0]}" if len(others) == 1 else f"{len(others)} ranges, to {joined(others)}"
+
+
+def _loose(fitted: Fitted) -> dict[int, str]:
+    """Fitted anchors that the ranges do not hold."""
+    anchors = [anchor for anchor, fixed in zip(fitted.anchors, fitted.core, strict=True) if not fixed]
+    if not anchors:
+        return {}
+    position = fitted.solution.position_m - fitted.solution.position_m.mean(axis=0)
+    axes = 2 if levels(fitted.measured) else 3
+    extent = np.linalg.svd(position[:, :axes], compute_uv=False)
+    if (not fitted.core.any() and len(extent) and extent[-1] < _FLAT * extent[0]) or len(extent) < axes:
+        shape = "on one line" if axes == 2 or extent[1] < _FLAT * extent[0] else "nearly in one plane"
+        why = f"all anchors are {shape}, and nothing holds them across it"
+    elif levels(fitted.measured) and fitted.measured.facts.dimensions == 2:
+        why = f"its ranges leave it more than {determination.MOST_STD_M} m of play"
+    else:
+        why = f"its ranges leave it more than {determination.MOST_STD_M} m of play; heights may be what is missing"
+    return dict.fromkeys(anchors, why)
+
+
+def missing_sentences(measured: Measured, links: Links, fitted: Fitted | None) -> tuple[str, ...]:
+    """One for each reason: which anchors, why, and what would mend it."""
+    if not measured.anchors:
+        return ("no anchor is determined: there are no anchors",)
+    by_reason: dict[str, list[int]] = {}
+    for anchor, reason in anchor_reasons(measured, links, fitted).items():
+        by_reason.setdefault(reason, []).append(anchor)
+    return tuple(
+        f"{anchors_named(anchors)} {are(anchors)} not determined: {reason}{_mending(measured, links, fitted, anchors)}"
+        for reason, anchors in by_reason.items()
+    )
+
+
+def _mending(measured: Measured, links: Links, fitted: Fitted | None, anchors: list[int]) -> str:
+    """Which distances would suffice."""
+    if fitted is None or len(fitted.anchors) < 3:
+        return ""
+    placed = [index for index, fixed in zip(fitted.kept.tolist(), fitted.core, strict=True) if fixed]
+    if not placed:
+        chosen = mending_tapes(surveyed_problem(fitted), fitted.solution.position_m, fitted.covariance_m2, ~fitted.core)
+        pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in chosen]
+        return f"; {_would(pairs)}" if pairs else ""
+    pairs = []
+    for anchor in anchors:
+        index = measured.anchors.index(anchor)
+        near = [other for other in placed if not links.adjacent[index, other]]
+        lacking = int(links.needed[index]) - sum(bool(links.adjacent[index, other]) for other in placed)
+        if index in fitted.kept or lacking > len(near):
+            return ""
+        pairs += [(anchor, measured.anchors[other]) for other in _far_apart(near, placed, fitted, lacking)]
+    return f"; {_would(pairs)}" if pairs else ""
+
+
+def _far_apart(near: list[int], placed: list[int], fitted: Fitted, count: int) -> list[int]:
+    """Anchors of ``near`` that are far from one another."""
+    number = {index: k for k, index in enumerate(fitted.kept.tolist())}
+    position = fitted.solution.position_m
+    chosen: list[int] = []
+    centre = position[[number[index] for index in placed]].mean(axis=0)
+    while len(chosen) < count:
+        anchors_m = position[[number[index] for index in chosen]] if chosen else centre[None]
+        left = [index for index in near if index not in chosen]
+        chosen.append(
+            max(left, key=lambda index: float(np.linalg.norm(position[number[index]] - anchors_m, axis=1).min()))
+        )
+    return sorted(chosen)
+
+
+def _would(pairs: list[tuple[int, int]]) -> str:
+    return f"{tapes_named(pairs)} would mend it"
+
+
+def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
+    """A sentence where only the expected delays separate delays from positions."""
+    surveyed, unknown = with_free_delays(surveyed_problem(fitted))
+    if not unknown.any():
+        return ()
+    weight = fitted.used.astype(np.float64)
+    position = fitted.solution.position_m
+    rows = determination.jacobian(surveyed, position, weight)
+    covariance = determination.aligned_covariance(surveyed, rows, position, fitted.core)
+    stds = determination.position_stds_m(surveyed, covariance)
+    if not np.any(fitted.core & (stds > determination.MOST_STD_M)):
+        return ()
+    most = 3 * len(position)
+    directions = determination.weak_directions(surveyed, covariance, fitted.core, determination.MOST_STD_M, most)
+    if not directions:
+        return ()
+    delays = np.sqrt(sum((direction.delay_m * direction.std_m) ** 2 for direction in directions))
+    chosen = _touched(np.asarray(delays), unknown & fitted.core)
+    anchors = [anchor for anchor, is_one in zip(fitted.anchors, chosen, strict=True) if is_one]
+    against = _axis([direction.shift_m @ framed.motion.rotation.T for direction in directions])
+    expected = float(np.sqrt(np.median(surveyed_problem(fitted).delay_variance_m2[unknown])))
+    mending = mending_tapes(surveyed, position, covariance, fitted.core)
+    pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in mending]
+    return (
+        f"delays of {anchors_named(anchors)} against {against} are not determined by the ranges: only the expected "
+        f"delays (±{expected:.2f} m) hold them" + (f"; {_would(pairs)}" if pairs else ""),
+    )
+
+
+def _touched(size: Array, allowed: Mask) -> Mask:
+    limit = determination.TOUCHED * float(size[allowed].max()) if allowed.any() else 0.0
+    return np.asarray(allowed & (size > limit))
+
+
+def _axis(shifts_m: list[Array]) -> str:
+    squares = sum(np.sum(shift**2, axis=0) for shift in shifts_m)
+    part = np.asarray(squares) / np.sum(squares)
+    return "xyz"[int(np.argmax(part))] if part.max() > _ONE_AXIS else "positions"
+
+
+def unchecked(fitted: Fitted) -> str | None:
+    """A sentence where too few ranges check the result."""
+    checks, excluded = redundancy(fitted), int((~fitted.used).sum())
+    if checks <= 0:
+        return "nothing checks this survey: there are as many unknowns as ranges"
+    if checks < LEAST_CHECKS:
+        return f"hardly anything checks this survey: {checks} range{'s' if checks > 1 else ''} more than unknowns"
+    if excluded > checks:
+        return (
+            f"{excluded} ranges were left out as late, more than half of the {checks + excluded} that could check "
+            "this survey"
+        )
+    return None
+
+
+def advised_tapes(fitted: Fitted) -> tuple[TapeAdvice, ...]:
+    """The three distances that would help most, one after another."""
+    problem = fitted.problem
+    chosen = best_tapes(problem, fitted.solution.position_m, fitted.covariance_m2, fitted.core)
+    return tuple(_advice(fitted, item) for item in chosen)
+
+
+def _advice(fitted: Fitted, choice: TapeChoice) -> TapeAdvice:
+    a, b = sorted((fitted.anchors[choice.first], fitted.anchors[choice.second]))
+    return TapeAdvice(a, b, choice.std_before_m, choice.std_after_m)

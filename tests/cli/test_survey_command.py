@@ -1,0 +1,290 @@
+"""``skyless survey`` as its user meets it: tables of ranges, what is stated of a site, files, and what goes wrong."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from skyless.cli.main import main
+from skyless.cli.survey_facts import FactOptions, facts_of
+from skyless.constants import TICK_M
+from skyless.errors import SkylessError
+from skyless.recordings.anchor_table import read_anchors, read_calibration
+from skyless.recordings.range_table import read_ranges
+from skyless.site.lab import lab_site
+from skyless.site.load import load_site
+from skyless.site.model import AnchorSite, ScheduleSite, Site
+from skyless.site.template import site_template
+from skyless.survey.count import count
+from skyless.survey.facts import Facts, Gauge, KnownDelay, Tape
+from skyless.survey.record import read_record
+from skyless.survey.result import Survey
+
+DRAW = np.random.default_rng(12)
+HALL_M = np.column_stack(
+    [*(a.ravel() for a in np.meshgrid([0.0, 12.0, 24.0, 36.0], [0.0, 12.0, 24.0])), np.full(12, 6.0)]
+)
+HALL_M[:, :2] += DRAW.uniform(-1.0, 1.0, (12, 2))
+HALL_M[:, 2] += DRAW.uniform(-0.3, 0.3, 12)
+DELAY_M = DRAW.normal(0.0, 0.05, 12)
+NOISE_M = 0.02
+
+
+def table_of_ranges(path, late=(), missing=(), repeats=12):
+    """Every pair of the hall in either direction; ``late``: pairs of indices that come half a metre late."""
+    draw = np.random.default_rng(4)
+    with path.open("w") as file:
+        rows = csv.writer(file)
+        rows.writerow(("anchor_a", "anchor_b", "range_m"))
+        for a in range(12):
+            for b in range(a):
+                if (a, b) in missing or 11 in (a, b):
+                    continue
+                true_m = np.linalg.norm(HALL_M[a] - HALL_M[b]) + DELAY_M[a] + DELAY_M[b] + 0.5 * ((a, b) in late)
+                for k in range(repeats):
+                    first, second = (a, b) if k % 2 else (b, a)
+                    rows.writerow((first + 1, second + 1, f"{true_m + draw.normal(0.0, NOISE_M):.4f}"))
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory):
+    """Ranges and heights of eleven anchors, and a site of twelve whose positions are known within 0.1 m."""
+    folder = tmp_path_factory.mktemp("hall")
+    table_of_ranges(folder / "ranges.csv", late=((5, 2), (9, 0)), missing=((3, 1),))
+    heights = "".join(f"{k + 1},{z:.3f}\n" for k, z in enumerate(HALL_M[:, 2]))
+    (folder / "heights.csv").write_text("id,z_m\n" + heights)
+    rough_m = HALL_M.copy()
+    rough_m[:, :2] += np.random.default_rng(8).normal(0.0, 0.1, (12, 2))
+    anchors = tuple(AnchorSite(k + 1, *np.round(rough_m[k], 3).tolist(), slot=k) for k in range(12))
+    site = Site("hall", 3, 1, anchors, ScheduleSite(mode="slots", slots=12, slot_s=2.5e-3))
+    (folder / "site.toml").write_text(site_template(site))
+    assert main(["site", "new", str(folder / "blank.toml"), "--unplaced", "12"]) == 0
+    return folder
+
+
+def run(capsys, *arguments, code=0):
+    assert main(["survey", *map(str, arguments), "--json"]) == code
+    out, err = capsys.readouterr()
+    assert err == ""
+    return json.loads(out)
+
+
+def complaint(capsys, *arguments):
+    assert main(["survey", *map(str, arguments)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    return err
+
+
+def aligned_rmse_m(report):
+    """Of the positions that were found, horizontal, after the best rigid alignment."""
+    found = [one for one in report["anchors"] if one["determined"]]
+    at_m = np.array([(one["x_m"], one["y_m"]) for one in found])
+    true_m = np.array([HALL_M[one["id"] - 1, :2] for one in found])
+    at_m, true_m = at_m - at_m.mean(axis=0), true_m - true_m.mean(axis=0)
+    u, _, vt = np.linalg.svd(at_m.T @ true_m)
+    return np.sqrt(((at_m @ u @ vt - true_m) ** 2).sum(axis=1).mean())
+
+
+def test_a_table_of_ranges_and_heights_with_default_options(hall, capsys):
+    report = run(capsys, "--ranges", hall / "ranges.csv", "--heights", hall / "heights.csv")
+    assert {"id", "x_m", "y_m", "z_m", "std_m", "determined"} <= report["anchors"][0].keys()
+    assert [one["id"] for one in report["anchors"]] == list(range(1, 12))
+    assert all(one["determined"] for one in report["anchors"])
+    assert sorted(map(sorted, report["excluded_pairs"])) == [[1, 10], [3, 6]]
+    assert report["ambiguous"] == []
+    assert report["range_std_m"] >= 0.0
+    assert aligned_rmse_m(report) < 0.1
+    assert {*Survey.__struct_fields__} - {"ambiguities"} <= report.keys()
+    assert report["warnings"] == []
+    assert report["count"]["spare"] == 54 - (2 * 11 - 3) - 11
+
+
+def test_the_report_for_people(hall, capsys):
+    assert main(["survey", "--ranges", str(hall / "ranges.csv"), "--heights", str(hall / "heights.csv")]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert out.index("11 anchors, 54 of 55 pairs, 30 unknowns: 24 ranges check the result") < out.index("anchors ┏")
+    assert "left out as late: 1–10 (+0.5" in out
+    assert "delay / cm" in out
+
+
+def test_an_anchor_that_nobody_receives_is_not_determined_and_stays(hall, capsys, tmp_path):
+    out = tmp_path / "new.toml"
+    out.write_text("what was there")
+    command = ("--ranges", hall / "ranges.csv", "--site", hall / "site.toml", "--out", out)
+    assert "--force overwrites it" in complaint(capsys, *command)
+    assert out.read_text() == "what was there"
+    report = run(capsys, *command, "--force")
+    assert [one["id"] for one in report["anchors"] if not one["determined"]] == [12]
+    assert report["unchanged"] == [12]
+    assert report["written"] == [
+        str(tmp_path / name) for name in ("new.before-survey-1.toml", "new.toml", "new.survey.json")
+    ]
+    assert (tmp_path / "new.before-survey-1.toml").read_text() == "what was there"
+    old, new = load_site(hall / "site.toml"), load_site(out)
+    assert new.anchors[11] == old.anchors[11]
+    for one in report["anchors"][:11]:
+        anchor, before = new.anchors[one["id"] - 1], old.anchors[one["id"] - 1]
+        assert (anchor.x_m, anchor.y_m) == pytest.approx((one["x_m"], one["y_m"]), abs=1e-4)
+        assert anchor.z_m == before.z_m
+        assert anchor.tx_antenna_delay_ticks == before.tx_antenna_delay_ticks + round(2 * one["delay_m"] / TICK_M)
+    record = read_record(tmp_path / "new.survey.json")
+    assert record.ranges.anchors == tuple(range(1, 13))
+    assert len(record.ranges.pairs) == 54
+
+
+def test_anchors_without_positions_get_theirs(hall, capsys, tmp_path):
+    out = tmp_path / "placed.toml"
+    report = run(
+        capsys, "--ranges", hall / "ranges.csv", "--heights", hall / "heights.csv", "--site", hall / "blank.toml",
+        "--origin", 1, "--x-axis", 4, "--left", 9, "--out", out,
+    )  # fmt: skip
+    site = load_site(out)
+    assert [anchor.id for anchor in site.unplaced] == [12]
+    assert len(site.anchors) == 11
+    first, fourth, ninth = (site.anchors[k] for k in (0, 3, 8))
+    assert (first.x_m, first.y_m, fourth.y_m) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+    assert fourth.x_m > 30.0
+    assert ninth.y_m > 20.0
+    assert all(0.0 < anchor.std_m < 0.255 for anchor in site.anchors)
+    assert main(["site", "check", str(out)]) == 0
+    assert aligned_rmse_m(report) < 0.1
+
+
+def test_only_delays_with_positions_kept(hall, capsys, tmp_path):
+    out = tmp_path / "delays.toml"
+    report = run(
+        capsys, "--ranges", hall / "ranges.csv", "--site", hall / "site.toml", "--keep-positions", "--out", out
+    )
+    old, new = load_site(hall / "site.toml"), load_site(out)
+    at = lambda site: [(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]  # noqa: E731
+    assert at(new) == at(old)
+    assert any(
+        a.tx_antenna_delay_ticks != b.tx_antenna_delay_ticks for a, b in zip(old.anchors, new.anchors, strict=True)
+    )
+    assert all(one["delay_m"] is not None for one in report["anchors"] if one["determined"])
+
+
+def test_a_table_of_anchors_with_their_delays(hall, capsys, tmp_path):
+    out = tmp_path / "anchors.csv"
+    report = run(
+        capsys, "--ranges", hall / "ranges.csv", "--heights", hall / "heights.csv", "--out", out,
+        "--plot", tmp_path / "hall.png",
+    )  # fmt: skip
+    assert read_anchors(out)[3][:2] == pytest.approx([report["anchors"][2][axis] for axis in ("x_m", "y_m")], abs=1e-4)
+    assert read_calibration(out).anchors[3].bias_m == pytest.approx(report["anchors"][2]["delay_m"], abs=1e-4)
+    assert (tmp_path / "hall.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_nothing_determined_writes_nothing_and_ends_with_1(capsys, tmp_path):
+    (tmp_path / "one.csv").write_text("anchor_a,anchor_b,range_m\n1,2,5.0\n")
+    report = run(capsys, "--ranges", tmp_path / "one.csv", "--out", tmp_path / "a.csv", code=1)
+    assert not report["usable"]
+    assert report["not_determined"]
+    assert report["written"] == []
+    assert not (tmp_path / "a.csv").exists()
+    assert any("too few ranges check" in warning for warning in report["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "needs a recording"),
+        (("{hall}/ranges.csv",), "is no recording of skyless record"),
+        (("{hall}/none.mcap",), "is no recording"),
+        (("--ranges", "{hall}/heights.csv"), "a header with anchor_a,anchor_b,range_m"),
+        (("--ranges", "{hall}/ranges.csv", "--heights", "{hall}/ranges.csv"), "a header with id,z_m"),
+        (("--out", "a.toml"), "a site file needs --site"),
+        (("--out", "a.txt"), "its ending should be .toml"),
+        (("--out", "no/such/a.csv"), "a folder that exists"),
+        (("--out", "{hall}/ranges.csv", "--force"), "would destroy it"),
+        (("--force",), "nothing is written without --out"),
+        (("--plot", "a.txt"), "its ending should be one of"),
+        (("--keep-positions",), "needs positions to keep"),
+        (("--site", "{hall}/blank.toml", "--keep-positions"), "needs positions to keep"),
+        (("--site", "{hall}/site.toml", "--keep-positions", "--no-sketch"), "give either"),
+        (("--site", "{hall}/site.toml", "--keep-positions", "--delays-known"), "give either"),
+        (("--sketch-std", "0.2"), "it needs the positions of --site"),
+        (("--delays-known", "--delay-std", "0.1"), "--delay-std is 0.1"),
+        (("--height-std", "0.1"), "it is for --dimensions 3"),
+        (("--height", "tall"), "--height is 'tall'"),
+        (("--height", "77=2"), "there is no anchor 77; there are 1, 2"),
+        (("--height", "2", "--height", "3"), "given once"),
+        (("--distance", "1-2"), "--distance is '1-2'; it should be like"),
+        (("--distance", "1-1=3"), "between two anchors"),
+        (("--distance", "1-2=-3"), "a positive distance"),
+        (("--distance", "1-77=3"), "no anchor 77"),
+        (("--point", "1=3"), "2 or 3 number(s)"),
+        (("--point", "x=3,4"), "'x' should be the identifier of an anchor"),
+        (("--origin", "1"), "--origin and --x-axis"),
+        (("--origin", "1", "--x-axis", "1"), "different anchors"),
+        (("--origin", "1", "--x-axis", "77"), "no anchor 77"),
+        (("--dimensions", "4"), "dimensions"),
+    ],
+)
+def test_what_the_user_can_mend_is_named(hall, capsys, arguments, words):
+    given = [one.format(hall=hall) for one in arguments]
+    if given and given[0].startswith("--") and given[0] != "--ranges":
+        given = ["--ranges", str(hall / "ranges.csv"), *given]
+    assert words in complaint(capsys, *given)
+    assert (hall / "ranges.csv").read_text().startswith("anchor_a")
+
+
+def test_facts_from_options(hall):
+    site = load_site(hall / "site.toml")
+    everybody = tuple(range(1, 13))
+    facts, warnings = facts_of(
+        FactOptions(
+            height=["2.5", "3=2.4"], distance=["1-4=7.21", "0x1-5=8±0.01", "2-3=4+-0.02"], point=["7=1,-2,3", "8=0,0"],
+            delay_std=0.15, pair_std=0.0, origin=1, x_axis=4,
+        ),
+        everybody,
+        site,
+    )  # fmt: skip
+    assert warnings == []
+    assert facts.heights_m == {**dict.fromkeys(everybody, 2.5), 3: 2.4, 7: 3.0}
+    assert facts.tapes == (Tape(1, 4, 7.21), Tape(1, 5, 8.0, 0.01), Tape(2, 3, 4.0, 0.02))
+    assert facts.points == {7: (1.0, -2.0, 3.0), 8: (0.0, 0.0, None)}
+    assert facts.sketch_m[12] == (site.anchors[11].x_m, site.anchors[11].y_m, site.anchors[11].z_m)
+    assert (facts.sketch_std_m, facts.delay_std_m, facts.pair_std_m) == (0.3, 0.15, 0.0)
+    assert facts.gauge == Gauge(1, 4)
+    assert facts_of(FactOptions(), everybody, None) == (Facts(), [])
+    bare, _ = facts_of(FactOptions(no_sketch=True, delays_known=True), everybody, site)
+    assert (bare.sketch_m, bare.delay_std_m, bare.heights_m[1]) == ({}, 0.0, site.anchors[0].z_m)
+    kept, _ = facts_of(FactOptions(keep_positions=True), everybody, site)
+    assert (kept.keep_positions, kept.sketch_std_m) == (True, pytest.approx(site.accuracy.survey_std_m))
+    free, _ = facts_of(FactOptions(dimensions=3, heights=hall / "heights.csv", height_std=0.1), (1, 2, 99), site)
+    assert (free.dimensions, sorted(free.heights_m), free.height_std_m) == (3, [1, 2], 0.1)
+
+
+def test_missing_heights_are_those_of_the_others(hall):
+    facts, warnings = facts_of(FactOptions(height=["1=2", "2=3", "3=7"]), (1, 2, 3, 4), None)
+    assert facts.heights_m == {1: 2.0, 2: 3.0, 3: 7.0, 4: 3.0}
+    assert "anchor 4; 3 m is assumed" in warnings[0]
+    with pytest.raises(SkylessError, match="no anchor 9"):
+        facts_of(FactOptions(height=["9=2"]), (1, 2), None)
+
+
+def test_ranges_are_counted_before(hall):
+    ranges = read_ranges(hall / "ranges.csv")
+    assert count(ranges, Facts(delay_std_m=0.0)).spare == 54 - 19
+    assert count(ranges, Facts(dimensions=3)).spare == 54 - 27 - 11
+    assert count(ranges, Facts(tapes=(Tape(1, 2, 3.0),), delays=(KnownDelay(1, 0.0, 0.01),))).spare == 54 - 30 + 2
+    assert count(ranges, Facts(points={1: (0.0, 0.0, None), 2: (1.0, 0.0, None)})).spare == 54 - 30 + 1
+    assert count(ranges, Facts(keep_positions=True)).spare == 54 - 11
+    lab = lab_site()
+    assert len(lab.anchors) == 6
+    of_lab = count(_complete(6), Facts())
+    assert (of_lab.spare, of_lab.possible) == (0, 15)
+    assert "(--distance)" in of_lab.warning
+    assert "expected delays decide" in count(_complete(5), Facts()).sentence
+    assert count(_complete(12), Facts()).warning is None
+
+
+def _complete(n):
+    from skyless.survey.ranges import PairRange, PairRanges
+
+    pairs = tuple(PairRange(a, b, 1.0, 0.01, 1) for b in range(1, n + 1) for a in range(1, b))
+    return PairRanges(pairs, tuple(range(1, n + 1)))
