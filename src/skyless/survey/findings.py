@@ -21,7 +21,10 @@ _FLAT: Final = 0.1
 """Extent of a site across, as a part of its extent along, below which it is flat."""
 
 _ONE_AXIS: Final = 0.7
-"""Part of a direction's squares along one axis from which on it is named after it."""
+"""Part of all squares along one direction from which on positions change along it."""
+
+_AXIS_PART: Final = 0.9
+"""Square of the cosine from which on a direction is an axis's."""
 
 
 def anchor_reasons(measured: Measured, links: Links, fitted: Fitted | None) -> dict[int, str]:
@@ -147,7 +150,7 @@ def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
     delays = np.sqrt(sum((direction.delay_m * direction.std_m) ** 2 for direction in directions))
     chosen = _touched(np.asarray(delays), unknown & fitted.core)
     anchors = [anchor for anchor, is_one in zip(fitted.anchors, chosen, strict=True) if is_one]
-    against = _axis([direction.shift_m @ framed.motion.rotation.T for direction in directions])
+    against = _axis(fitted, framed, directions)
     expected = float(np.sqrt(np.median(surveyed_problem(fitted).delay_variance_m2[unknown])))
     mending = mending_tapes(surveyed, position, covariance, fitted.core)
     pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in mending]
@@ -162,10 +165,21 @@ def _touched(size: Array, allowed: Mask) -> Mask:
     return np.asarray(allowed & (size > limit))
 
 
-def _axis(shifts_m: list[Array]) -> str:
-    squares = sum(np.sum(shift**2, axis=0) for shift in shifts_m)
-    part = np.asarray(squares) / np.sum(squares)
-    return "xyz"[int(np.argmax(part))] if part.max() > _ONE_AXIS else "positions"
+def _axis(fitted: Fitted, framed: Framed, directions: list[determination.Direction]) -> str:
+    """Along what the positions change: an axis, or the pair of anchors that is the most parallel."""
+    shift = np.concatenate([direction.shift_m @ framed.motion.rotation.T for direction in directions])
+    values, vectors = np.linalg.eigh(shift.T @ shift)
+    if values[-1] < _ONE_AXIS * values.sum():
+        return "positions"
+    along = vectors[:, -1]
+    axis = int(np.argmax(np.abs(along)))
+    if along[axis] ** 2 > _AXIS_PART:
+        return "xyz"[axis]
+    first, second = np.triu_indices(int(fitted.core.sum()), 1)
+    core = np.flatnonzero(fitted.core)
+    apart = framed.position_m[core[first]] - framed.position_m[core[second]]
+    best = int(np.argmax(np.abs(apart @ along) / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)))
+    return f"the direction from {fitted.anchors[core[first[best]]]} to {fitted.anchors[core[second[best]]]}"
 
 
 def unchecked(fitted: Fitted) -> str | None:

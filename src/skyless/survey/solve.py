@@ -19,7 +19,7 @@ from skyless.survey.findings import (
     unchecked,
 )
 from skyless.survey.fit.ambiguity import find_ambiguities
-from skyless.survey.fit.build import Measured, as_array, levels, usable
+from skyless.survey.fit.build import Measured, as_array, levels, own_delays, usable
 from skyless.survey.fit.determined import position_stds_m
 from skyless.survey.fit.links import Links, adjacency, count_links
 from skyless.survey.fit.shape import Fitted, fit_shape, redundancy
@@ -27,7 +27,7 @@ from skyless.survey.frame import Framed, in_frame
 from skyless.survey.kept import survey_of_kept_positions
 from skyless.survey.ranges import PairRange, PairRanges
 from skyless.survey.result import Ambiguity, Survey, SurveyedAnchor, SurveyedPair
-from skyless.survey.sentences import anchors_named
+from skyless.survey.sentences import anchors_named, joined
 
 _MOVED_M: Final = 0.1
 """An anchor whose position differs less in another result is at the same position."""
@@ -87,7 +87,8 @@ def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -
     reasons = anchor_reasons(measured, links, fitted)
     number = {anchor: k for k, anchor in enumerate(fitted.anchors)}
     stds = position_stds_m(fitted.problem, fitted.covariance_m2)
-    delays, delay_stds = _delays(fitted)
+    variance = np.diag(fitted.covariance_m2)[3 * len(number) :]
+    delays, delay_stds = own_delays(measured, fitted.anchors, fitted.problem, fitted.solution.delay_m, variance)
     found = []
     for anchor in measured.anchors:
         k = number.get(anchor)
@@ -110,17 +111,6 @@ def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -
             )
         )
     return tuple(found)
-
-
-def _delays(fitted: Fitted) -> tuple[Array, Array]:
-    """Delays without the error of TX stamps that all ranges of an anchor share, and standard deviations, shape (k,)."""
-    problem, k = fitted.problem, len(fitted.kept)
-    shared = np.array([fitted.measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in fitted.anchors])
-    own = np.maximum(problem.delay_variance_m2 - shared, 0.0)
-    part = own / np.maximum(problem.delay_variance_m2, 1e-10)
-    delay = problem.delay_m + part * (fitted.solution.delay_m - problem.delay_m)
-    variance = np.diag(fitted.covariance_m2)[3 * k :]
-    return delay, np.sqrt(np.maximum(part**2 * variance + part * shared, 0.0))
 
 
 def _pairs(measured: Measured, fitted: Fitted | None) -> tuple[SurveyedPair, ...]:
@@ -149,9 +139,14 @@ def _ambiguities(fitted: Fitted, framed: Framed) -> tuple[Ambiguity, ...]:
             continue
         anchors = tuple(anchor for anchor, is_one in zip(fitted.anchors, moved, strict=True) if is_one)
         positions = {anchor: _xyz(position[fitted.anchors.index(anchor)]) for anchor in anchors}
-        sentence = f"{anchors_named(anchors)} may be elsewhere, by up to {distance[moved].max():.2f} m: {other.reason}"
+        sentence = f"{anchors_named(anchors)} may be elsewhere, by up to {distance[moved].max():.2f} m, {_reason(fitted, other.used)}"
         found.append(Ambiguity(sentence, anchors, positions))
     return tuple(found)
+
+
+def _reason(fitted: Fitted, used: Mask) -> str:
+    late = [f"{fitted.pairs[index].a}–{fitted.pairs[index].b}" for index in np.flatnonzero(fitted.used & ~used)]
+    return f"if {joined(late)} came late" if late else "the ranges fit there as well, as in a mirror"
 
 
 def _xyz(position_m: Array) -> tuple[float, float, float]:

@@ -148,6 +148,20 @@ def with_free_delays(problem: Problem) -> tuple[Problem, Mask]:
     return structs.replace(problem, delay_variance_m2=np.where(unknown, np.inf, problem.delay_variance_m2)), unknown
 
 
+def own_delays(
+    measured: Measured, anchors: tuple[int, ...], problem: Problem, delay_m: Array, variance_m2: Array
+) -> tuple[Array, Array]:
+    """Delays less the error of TX stamps that all ranges of an anchor share, and standard deviations, shape (k,).
+
+    ``delay_m``, ``variance_m2``: of both together, as fitted. What is known of their shares is in the expected delays.
+    """
+    shared = np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in anchors])
+    own = np.maximum(problem.delay_variance_m2 - shared, 0.0)
+    part = own / np.maximum(problem.delay_variance_m2, 1e-10)
+    own_m = problem.delay_m + part * (delay_m - problem.delay_m)
+    return np.asarray(own_m), np.asarray(np.sqrt(np.maximum(part**2 * variance_m2 + part * shared, 0.0)))
+
+
 def _heights(measured: Measured, kept: Integers) -> Array:
     """Known heights as points, shape (k, 3); none where fewer than three level the site."""
     known = np.full((len(kept), 3), np.nan)
