@@ -17,7 +17,7 @@ from skyless.simulation.trajectory import Waypoints
 from skyless.simulation.world import World
 from skyless.survey.fit.problem import Problem, solve_least_squares
 from skyless.survey.tags.epochs import EpochCollector, TagEpochs, tag_ranges
-from skyless.survey.tags.joint import fit_with_walk
+from skyless.survey.tags.joint import fit_with_tag
 from skyless.survey.tags.relayed import RelayedDifferences
 from skyless.survey.tags.walk import TAG_STD_M, WalkRows
 
@@ -133,7 +133,7 @@ def test_a_minute_of_walking(positions_m, planar, height_m, xy, z):
         start_m = positions_m + rng.normal(0.0, 0.1, positions_m.shape) * [1.0, 1.0, 0.0 if planar else 1.0]
         alone = solve_least_squares(problem, start_m)
         epochs = epochs_of(rng, positions_m, delay_m, path_of(rng, positions_m, 120, height_m), known_height=planar)
-        joint = fit_with_walk(problem, range(len(positions_m)), [alone], epochs, {})
+        joint = fit_with_tag(problem, range(len(positions_m)), [alone], epochs, {})
         assert joint.solution is not None, joint.sentence
         alone_m.append(errors_m(alone.position_m, positions_m))
         joint_m.append(errors_m(joint.solution.position_m, positions_m))
@@ -153,7 +153,7 @@ def test_the_stated_errors_are_true():
         path_m = path_of(rng, ROOM_M, 60, 1.2)
         epochs = epochs_of(rng, ROOM_M, delay_m + offset_m, path_m, noise_m=TAG_STD_M, reflection_m=0.0)
         alone = solve_least_squares(problem, ROOM_M)
-        joint = fit_with_walk(problem, range(8), [alone], epochs, {}).solution
+        joint = fit_with_tag(problem, range(8), [alone], epochs, {}).solution
         covariance = np.linalg.pinv(joint.information, rcond=1e-10, hermitian=True)
         direction = np.append(np.zeros(24), np.eye(8)[seed % 8] - np.eye(8)[(seed + 3) % 8])
         error = direction[24:] @ (joint.delay_m - delay_m)
@@ -179,7 +179,7 @@ def test_a_walk_chooses_between_results_that_the_ranges_cannot_tell_apart():
     both = [solve_least_squares(problem, one) for one in (mirrored_m, positions_m)]
     assert abs(both[0].cost - both[1].cost) < 4.0
     path_m = path_of(rng, positions_m, 60, 0.0)
-    joint = fit_with_walk(problem, range(6), both, epochs_of(rng, positions_m, delay_m, path_m, known_height=True), {})
+    joint = fit_with_tag(problem, range(6), both, epochs_of(rng, positions_m, delay_m, path_m, known_height=True), {})
     assert (joint.chosen, joint.possible) == (1, (1,))
 
 
@@ -196,7 +196,7 @@ def test_a_walk_that_does_not_fit_is_not_used(fault, words):
     if fault == "relayed":
         epochs = replace(epochs, relayed=True)
     alone = solve_least_squares(problem, ROOM_M)
-    joint = fit_with_walk(problem, range(8), [alone], epochs, {})
+    joint = fit_with_tag(problem, range(8), [alone], epochs, {})
     assert joint.solution is None
     assert words in joint.sentence
 
@@ -209,7 +209,7 @@ def test_late_receptions_are_left_out():
     late = (epochs.epoch % 10 == 0) & (epochs.second == 1 + epochs.epoch // 10 % 7)
     spoilt = replace(epochs, difference_m=epochs.difference_m + 0.6 * late)
     alone = solve_least_squares(problem, ROOM_M)
-    clean, joint = (fit_with_walk(problem, range(8), [alone], one, {}) for one in (epochs, spoilt))
+    clean, joint = (fit_with_tag(problem, range(8), [alone], one, {}) for one in (epochs, spoilt))
     assert joint.rows.excluded_share > 0.5 * late.sum() / (8 * 120)
     assert np.abs(clean.solution.position_m - joint.solution.position_m).max() < 0.03
 
@@ -302,7 +302,7 @@ def test_flights_mend_the_heights_of_a_room(recordings):
         problem, _ = problem_of(rng, positions_m, planar=False, range_std_m=0.055, delay_std_m=0.0)
         alone = solve_least_squares(problem, positions_m + rng.normal(0.0, 0.3, positions_m.shape))
         for epochs in flights:
-            joint = fit_with_walk(problem, range(8), [alone], epochs, {})
+            joint = fit_with_tag(problem, range(8), [alone], epochs, {})
             assert joint.solution is not None, joint.sentence
             alone_m.append(errors_m(alone.position_m, positions_m))
             joint_m.append(errors_m(joint.solution.position_m, positions_m))

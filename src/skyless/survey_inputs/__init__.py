@@ -1,6 +1,6 @@
-"""What a survey needs, out of recordings: differences of tags at known positions, and tags that were carried around.
+"""What a survey needs, out of recordings: ranges of anchors, tags at known positions, tags that were carried around.
 
 ``run`` is all of ``skyless calibrate`` on a recording.
 
-Public: run, samples, walk.
+Public: recorded_stamps, run, samples, walk.
 """

@@ -58,6 +58,8 @@ class TagEpochs(Struct, frozen=True, eq=False):
     known_std_m: tuple[float, float, float] = (0.01, 0.01, 0.01)
     offset_std_m: float = WALK_OFFSET_STD_M
     """Of each anchor's own constant at the tag, besides its delay."""
+    name: str = "the walk"
+    """For sentences."""
 
 
 class EpochCollector:

@@ -1,4 +1,4 @@
-"""Ranges of anchors and a tag's walk in one fit: which of several results the walk confirms, and whether both fit."""
+"""Ranges of anchors and of a tag in one fit: which of several results the tag confirms, and whether both fit."""
 
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from skyless.kernels.arrays import Array
 from skyless.survey.fit.problem import Problem, Solution, solve_least_squares
-from skyless.survey.tags.epochs import TagEpochs, tag_ranges
+from skyless.survey.tags.epochs import EPOCH_S, TagEpochs, tag_ranges
 from skyless.survey.tags.walk import WalkRows
 
 _FEWEST_EPOCHS: Final = 10
@@ -50,7 +50,7 @@ class _Trial(Struct, frozen=True, eq=False):
     """With what ranges of the tag that are not used cost at the limit."""
 
 
-def fit_with_walk(
+def fit_with_tag(
     problem: Problem,
     anchors: Sequence[int],
     alone: Sequence[Solution],
@@ -63,17 +63,20 @@ def fit_with_walk(
     ``anchors``: identifiers in the problem's order. ``pair_ranges_m``: see ``tag_ranges``. ``weight``: of ranges, as
     for ``solve_least_squares``.
     """
-    everything = tuple(range(len(alone)))
+    everything, name = tuple(range(len(alone))), epochs.name
     range_m = _of_anchors(tag_ranges(epochs, pair_ranges_m), epochs.anchors, anchors)
     trials = [_trial(problem, start.position_m, epochs, range_m, weight) for start in alone]
     chosen = min(everything, key=lambda number: trials[number].cost)
     best = trials[chosen]
     reason = _unfit(problem, alone[chosen], best)
     if reason is not None:
-        return JointFit(None, 0, everything, f"the walk was not used: {reason}", None)
+        return JointFit(None, 0, everything, f"what {name} received was not used: {reason}", None)
     possible = tuple(number for number in everything if trials[number].cost <= best.cost + _CLEARLY)
     apart = [number for number in possible if number == chosen or not _same(best.solution, trials[number].solution)]
-    sentence = f"a walk of {best.rows.epochs} epochs was used; {best.rows.excluded_share:.0%} of its ranges were not"
+    seconds, excluded = best.rows.epochs * EPOCH_S, best.rows.excluded_share
+    sentence = f"{seconds:g} s of {name} were used" + (
+        f"; {excluded:.0%} of its ranges were left out" if excluded else ""
+    )
     return JointFit(best.solution, chosen, tuple(apart), sentence, best.rows)
 
 
