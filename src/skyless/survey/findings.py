@@ -1,5 +1,6 @@
 """What a survey does not determine, why, and which tapes would mend it: sentences."""
 
+import re
 from typing import Final
 
 import numpy as np
@@ -29,32 +30,30 @@ _AXIS_PART: Final = 0.9
 
 def anchor_reasons(measured: Measured, links: Links, fitted: Fitted | None) -> dict[int, str]:
     """Why each anchor, by identifier, is not determined."""
-    reasons = {}
-    names = np.array(measured.anchors)
-    groups = len(links.groups) > 1
+    names = measured.anchors
     inside = set() if fitted is None else set(fitted.kept.tolist())
-    for index, anchor in enumerate(measured.anchors):
-        others = names[np.flatnonzero(links.adjacent[index])].tolist()
+    reasons = {}
+    for index, anchor in enumerate(names):
+        others = [names[other] for other in np.flatnonzero(links.adjacent[index])]
+        group = next((group for group in links.groups if index in group), ())
         if index in inside:
             continue
-        if not others:
+        if group and len(links.groups) > 1:
+            rest = [names[other] for other in range(len(names)) if other not in group]
+            own = anchors_named([names[other] for other in group])
+            reasons[anchor] = f"the group of {own} has too few ranges to {anchors_named(rest)}"
+        elif not others:
             reasons[anchor] = "no range to any other anchor"
         elif len(others) < links.needed[index]:
-            reasons[anchor] = f"only {_links_named(others)}, of {links.needed[index]} that it needs"
-        elif groups and not any(index in group for group in links.groups[:1] if inside):
-            group = next((group for group in links.groups if index in group), ())
-            rest = sorted(set(range(len(names))) - set(group))
-            reasons[anchor] = (
-                f"its group, {anchors_named(names[list(group)].tolist())}, has too few ranges to "
-                f"{anchors_named(names[rest].tolist())}"
-                if group
-                else "its ranges lead to anchors that are not determined themselves"
-            )
+            reasons[anchor] = f"only {_links_named(others)}; it needs {links.needed[index]}"
         else:
-            reasons[anchor] = "its ranges lead to anchors that are not determined themselves"
+            reasons[anchor] = _LEADS_NOWHERE
     if fitted is not None:
         reasons.update(_loose(fitted))
     return reasons
+
+
+_LEADS_NOWHERE: Final = "its ranges lead to anchors that are not determined themselves"
 
 
 def _links_named(others: list[int]) -> str:
@@ -73,9 +72,9 @@ def _loose(fitted: Fitted) -> dict[int, str]:
         shape = "on one line" if axes == 2 or extent[1] < _FLAT * extent[0] else "nearly in one plane"
         why = f"all anchors are {shape}, and nothing holds them across it"
     elif levels(fitted.measured) and fitted.measured.facts.dimensions == 2:
-        why = f"its ranges leave it more than {determination.MOST_STD_M} m of play"
+        why = f"its ranges leave more than {determination.MOST_STD_M} m of play"
     else:
-        why = f"its ranges leave it more than {determination.MOST_STD_M} m of play; heights may be what is missing"
+        why = f"its ranges leave more than {determination.MOST_STD_M} m of play; heights may be what is missing"
     return dict.fromkeys(anchors, why)
 
 
@@ -83,12 +82,21 @@ def missing_sentences(measured: Measured, links: Links, fitted: Fitted | None) -
     """One for each reason: which anchors, why, and what would mend it."""
     if not measured.anchors:
         return ("no anchor is determined: there are no anchors",)
+    reasons = anchor_reasons(measured, links, fitted)
     by_reason: dict[str, list[int]] = {}
-    for anchor, reason in anchor_reasons(measured, links, fitted).items():
-        by_reason.setdefault(reason, []).append(anchor)
+    for anchor, reason in reasons.items():
+        # Anchors with equally few ranges share a sentence, which then does not name to whom they are.
+        by_reason.setdefault(re.sub(r", to .*;", ";", reason), []).append(anchor)
+    by_reason = {reasons[anchors[0]] if len(anchors) == 1 else reason: anchors for reason, anchors in by_reason.items()}
     return tuple(
-        f"{anchors_named(anchors)} {are(anchors)} not determined: {reason}{_mending(measured, links, fitted, anchors)}"
+        f"{anchors_named(anchors)} {are(anchors)} not determined: {_plural(reason, anchors)}{_mending(measured, links, fitted, anchors)}"
         for reason, anchors in by_reason.items()
+    )
+
+
+def _plural(reason: str, anchors: list[int]) -> str:
+    return (
+        reason if len(anchors) == 1 else reason.replace("it needs", "each needs").replace("its ranges", "their ranges")
     )
 
 

@@ -11,7 +11,7 @@ from skyless.survey.fit.build import Measured, as_array, levels
 from skyless.survey.fit.gauge import Axes, Motion, align, axes_through, gauge_of
 from skyless.survey.sentences import anchors_named, joined
 
-_NEAR: Final = 0.6
+_NEAR: Final = 0.5
 """Distance of the x axis's anchor from the origin, as a part of the farthest one's, below which advice is due."""
 
 
@@ -66,6 +66,8 @@ def _motion(
     mirror = "" if decided else "; the ranges do not show whether this is a mirror image: name an anchor on the left"
     if by_points is not None:
         motion = still if points_used else by_points
+        if not decided and axes == 2:
+            motion = _left_of_points(measured, anchors, motion, position_m, core)
         return motion, f"axes follow the known points{mirror}", None, notes
     if by_sketch is not None:
         return by_sketch, f"axes fit the sketch best{mirror}", None, notes
@@ -89,7 +91,7 @@ def _by_gauge(
     decided: bool,
     notes: list[str],
 ) -> tuple[Motion, str, Gauge | None, list[str]]:
-    """Axes through named anchors; where none is named for the left, points or the sketch choose between mirror images."""
+    """Axes through named anchors; if none is named for the left, points or the sketch choose the mirror image."""
     origin, x_axis = chosen[:2]
     if known is not None:
         position_m = known.moved(position_m)
@@ -124,6 +126,21 @@ def _by_points(
     """The motion to the known points, and whether they exclude the mirror image."""
     facts = measured.facts
     return _best(as_array(facts.points, tuple(anchors.tolist())), position_m, core, axes, max(facts.point_std_m, 0.03))
+
+
+def _left_of_points(measured: Measured, anchors: Integers, motion: Motion, position_m: Array, core: Mask) -> Motion:
+    """Of both mirror images the one that has the first anchor clearly off the points' line on its left."""
+    given = [number for number, anchor in enumerate(anchors) if int(anchor) in measured.facts.points and core[number]]
+    moved = motion.moved(position_m)
+    found = axes_through(moved, core, 2, given[0], given[1])
+    if np.linalg.det(found.motion.rotation) > 0.0:
+        return motion
+    along = found.motion.rotation[0]
+    mirror = 2.0 * np.outer(along, along) - np.eye(3)
+    mirror[2, 2] = 1.0
+    origin = moved[given[0]]
+    whole = Motion(mirror, origin - mirror @ origin)
+    return Motion(mirror @ motion.rotation, whole.moved(motion.shift_m))
 
 
 def _by_sketch(

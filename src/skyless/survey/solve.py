@@ -139,7 +139,8 @@ def _ambiguities(fitted: Fitted, framed: Framed) -> tuple[Ambiguity, ...]:
             continue
         anchors = tuple(anchor for anchor, is_one in zip(fitted.anchors, moved, strict=True) if is_one)
         positions = {anchor: _xyz(position[fitted.anchors.index(anchor)]) for anchor in anchors}
-        sentence = f"{anchors_named(anchors)} may be elsewhere, by up to {distance[moved].max():.2f} m, {_reason(fitted, other.used)}"
+        size = f"by up to {distance[moved].max():.2f} m"
+        sentence = f"{anchors_named(anchors)} may be elsewhere, {size}, {_reason(fitted, other.used)}"
         found.append(Ambiguity(sentence, anchors, positions))
     return tuple(found)
 

@@ -198,7 +198,7 @@ def _shown_std_m(fitted: Fitted) -> float:
 
 
 def redundancy(fitted: Fitted) -> int:
-    """Measurements in use less unknowns that they determine; delays count as unknown unless known to a range's error."""
+    """Measurements in use less unknowns that they determine; delays known to a range's error are no unknowns."""
     problem, _ = with_free_delays(surveyed_problem(fitted))
     rows = determination.jacobian(problem, fitted.solution.position_m, fitted.used.astype(np.float64))
     return int(np.any(rows != 0.0, axis=1).sum()) - determination.rank(rows)
