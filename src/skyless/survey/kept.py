@@ -81,8 +81,7 @@ def _with_tags(
     information = np.zeros((4 * len(ids), 4 * len(ids)))
     sentences: list[str] = []
     for epochs in measured.facts.tags:
-        weight = fit.used.astype(np.float64)
-        joint = fit_with_tag(fit.problem, ids, [fit.solution], epochs, ranges_m, weight)
+        joint = fit_with_tag(fit.problem, ids, [fit.solution], epochs, ranges_m, [fit.used])
         sentences.append(joint.sentence)
         if joint.solution is not None and joint.rows is not None:
             problem = structs.replace(fit.problem, more=(*fit.problem.more, joint.rows))

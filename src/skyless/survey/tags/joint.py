@@ -8,7 +8,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from scipy.stats import chi2
 
-from skyless.kernels.arrays import Array
+from skyless.kernels.arrays import Array, Mask
 from skyless.survey.fit.problem import Problem, Solution, solve_least_squares
 from skyless.survey.tags.epochs import EPOCH_S, TagEpochs, tag_ranges
 from skyless.survey.tags.walk import WalkRows
@@ -16,6 +16,9 @@ from skyless.survey.tags.walk import WalkRows
 _FEWEST_EPOCHS: Final = 10
 _LIMIT: Final = 4.0
 """Standard deviations beyond which a range of the tag is not used."""
+
+_LATE: Final = 3.0
+"""The same for ranges between anchors, as in the robust fit."""
 
 _MOST_EXCLUDED: Final = 0.2
 _CONFIDENCE: Final = 0.9999
@@ -47,7 +50,7 @@ class _Trial(Struct, frozen=True, eq=False):
     solution: Solution
     rows: WalkRows
     cost: float
-    """With what ranges of the tag that are not used cost at the limit."""
+    """With what ranges that are not used cost at the limit, those of the tag and those of anchors."""
 
 
 def fit_with_tag(
@@ -56,22 +59,26 @@ def fit_with_tag(
     alone: Sequence[Solution],
     epochs: TagEpochs,
     pair_ranges_m: Mapping[tuple[int, int], float],
-    weight: Array | None = None,
+    used: Sequence[Mask] = (),
 ) -> JointFit:
-    """Fit ranges and walk together, from each of the results of the ranges ``alone``, of which the first is the best.
+    """Fit ranges and tag together, from each of the results of the ranges ``alone``, of which the first is the best.
 
-    ``anchors``: identifiers in the problem's order. ``pair_ranges_m``: see ``tag_ranges``. ``weight``: of ranges, as
-    for ``solve_least_squares``.
+    The first remains, unless the tag contradicts it clearly. ``anchors``: identifiers in the problem's order.
+    ``pair_ranges_m``: see ``tag_ranges``. ``used``: ranges in use, of each result; by default all.
     """
     everything, name = tuple(range(len(alone))), epochs.name
     range_m = _of_anchors(tag_ranges(epochs, pair_ranges_m), epochs.anchors, anchors)
-    trials = [_trial(problem, start.position_m, epochs, range_m, weight) for start in alone]
-    chosen = min(everything, key=lambda number: trials[number].cost)
+    in_use = used or [np.ones(len(problem.range_m), dtype=bool)] * len(alone)
+    trials = [
+        _trial(problem, start.position_m, epochs, range_m, mask) for start, mask in zip(alone, in_use, strict=True)
+    ]
+    least = min(trial.cost for trial in trials)
+    possible = tuple(number for number in everything if trials[number].cost <= least + _CLEARLY)
+    chosen = 0 if 0 in possible else min(possible, key=lambda number: trials[number].cost)
     best = trials[chosen]
     reason = _unfit(problem, alone[chosen], best)
     if reason is not None:
         return JointFit(None, 0, everything, f"what {name} received was not used: {reason}", None)
-    possible = tuple(number for number in everything if trials[number].cost <= best.cost + _CLEARLY)
     apart = [number for number in possible if number == chosen or not _same(best.solution, trials[number].solution)]
     seconds, excluded = best.rows.epochs * EPOCH_S, best.rows.excluded_share
     sentence = f"{seconds:g} s of {name} were used" + (
@@ -90,9 +97,10 @@ def _of_anchors(range_m: Array, have: Sequence[int], wanted: Sequence[int]) -> A
     return found
 
 
-def _trial(problem: Problem, start_m: Array, epochs: TagEpochs, range_m: Array, weight: Array | None) -> _Trial:
+def _trial(problem: Problem, start_m: Array, epochs: TagEpochs, range_m: Array, used: Mask) -> _Trial:
     rows = WalkRows(epochs, range_m, start_m)
     both = replace(problem, more=(*problem.more, rows))
+    weight = used.astype(np.float64)
     solution = solve_least_squares(both, start_m, weight)
     for _ in range(_ROUNDS):
         before = rows.used
@@ -101,7 +109,7 @@ def _trial(problem: Problem, start_m: Array, epochs: TagEpochs, range_m: Array, 
             break
         solution = solve_least_squares(both, solution.position_m, weight)
     excluded = int(rows.measured.sum() - rows.used.sum())
-    return _Trial(solution, rows, solution.cost + _LIMIT**2 * excluded)
+    return _Trial(solution, rows, solution.cost + _LIMIT**2 * excluded + _LATE**2 * int((~used).sum()))
 
 
 def _unfit(problem: Problem, alone: Solution, trial: _Trial) -> str | None:
