@@ -20,7 +20,7 @@ from skyless.clocks.site_clock import SiteClock
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, SUBTICKS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.master_election import MasterElection, Role, Verdict
 from skyless.site.almanac_pages import almanac_issue, page_for, pages_of
-from skyless.site.model import AnchorSite, Site
+from skyless.site.model import AnchorSite, Site, UnplacedAnchor
 from skyless.site.slots import first_slots, schedule_of
 from skyless.ticks import Unwrapper, difference, wrap
 
@@ -54,12 +54,17 @@ class Anchor:
     """One anchor of a site."""
 
     def __init__(self, site: Site, anchor_id: int, lead_s: float = 1e-3) -> None:
-        """``lead_s``: how long before its RMARKER a frame must be in the driver's hands."""
+        """``lead_s``: how long before its RMARKER a frame must be in the driver's hands.
+
+        The radio is configured with the antenna delays of ``site``, and keeps them.
+        """
         self.id = anchor_id
         self.counters: Counter[str] = Counter()
         self._site = site
         self._anchors = {anchor.id: anchor for anchor in site.anchors}
-        self._own = self._anchors[anchor_id]
+        self._radio_delay_ticks = self._anchors[anchor_id].tx_antenna_delay_ticks
+        self._correction_ticks = 0
+        """What frames state of their TX stamps beyond the radio's, as another site corrects its delays."""
         self._lead_ticks = round(lead_s * TICK_RATE_HZ)
         self._schedule = schedule_of(site)
         self._slots = self._schedule.slots_of(first_slots(site)[anchor_id])
@@ -72,6 +77,19 @@ class Anchor:
         self._heard: dict[int, tuple[Heard, int]] = {}
         self._pending: dict[int, tuple[int, int]] = {}
         self._sequence = 0
+
+    def place(self, site: Site) -> None:
+        """Use other positions and antenna delays of the same anchors, with the same schedule, and go on.
+
+        Own stamps stay as the radio makes them; frames state them corrected.
+        """
+        self._anchors = {anchor.id: anchor for anchor in site.anchors}
+        self._correction_ticks = delay_change_ticks(self._site, site, self.id)
+        self._pages = pages_of(site)
+        self._issue = almanac_issue(self._pages)
+        master_term = self._election.master_term
+        if self._election.role is Role.FOLLOWER and master_term is not None:
+            self._clock.correct_range(_distance_m(self._anchors[self.id], self._anchors[master_term.master]))
 
     @property
     def is_master(self) -> bool:
@@ -124,7 +142,7 @@ class Anchor:
             self.counters[verdict] += 1
         if verdict in {Verdict.FROM_NEW_MASTER, Verdict.FROM_FIRST_MASTER}:
             self._master_heard = None
-            range_m = _distance_m(self._own, self._anchors[beacon.anchor])
+            range_m = _distance_m(self._anchors[self.id], self._anchors[beacon.anchor])
             self._clock.track_master(range_m, restart=verdict is Verdict.FROM_FIRST_MASTER)
         elif verdict is not Verdict.FROM_MASTER:
             return
@@ -181,12 +199,12 @@ class Anchor:
             sequence=self._sequence,
             superframe=superframe,
             slot=slot,
-            tx_ticks=tx_ticks,
+            tx_ticks=wrap(tx_ticks + self._correction_ticks),
             almanac_issue=self._issue,
             master=master_term.master,
             term=master_term.term,
             master_heard=self._master_heard,
-            master_time=self._master_time(self._own_ticks.expect(tx_ticks)),
+            master_time=self._master_time(self._own_ticks.expect(tx_ticks) + self._correction_ticks),
             heard=self._relayed(self._own_ticks.expect(tx_ticks), master_term.master)[:capacity],
             page=page,
         )
@@ -215,8 +233,8 @@ class Anchor:
 
     def _on_radio_grid(self, ticks_own: int) -> int:
         """The radio starts on multiples of 512 of its raw counter; the antenna's delay comes on top."""
-        raw = ticks_own - self._own.tx_antenna_delay_ticks
-        return raw - raw % DELAYED_TX_GRANULARITY_TICKS + self._own.tx_antenna_delay_ticks
+        raw = ticks_own - self._radio_delay_ticks
+        return raw - raw % DELAYED_TX_GRANULARITY_TICKS + self._radio_delay_ticks
 
 
 def _filter_of(site: Site) -> ClockFilter:
@@ -224,6 +242,25 @@ def _filter_of(site: Site) -> ClockFilter:
     variance = stamp_variance_m2(noise.tx_stamp_ps * 1e-12, rounded=False)
     variance += stamp_variance_m2(noise.rx_stamp_ps * 1e-12, rounded=True)
     return ClockFilter(clock_noise(noise.white_fm, noise.random_walk_fm), variance)
+
+
+def delay_change_ticks(before: Site, after: Site, anchor_id: int) -> int:
+    """By how much later an anchor's frames leave than its radio states, if the delays of ``after`` are right.
+
+    The radio uses those of ``before``. Only TX and RX delay together can be observed, so a change of the latter counts
+    as one of the former. Raises KeyError where a site has no such anchor.
+    """
+    old, new = anchor_of(before, anchor_id), anchor_of(after, anchor_id)
+    change_ticks = new.tx_antenna_delay_ticks - old.tx_antenna_delay_ticks
+    return change_ticks + new.rx_antenna_delay_ticks - old.rx_antenna_delay_ticks
+
+
+def anchor_of(site: Site, anchor_id: int) -> AnchorSite | UnplacedAnchor:
+    """An anchor of a site by its identifier. Raises KeyError where the site has none of it."""
+    for anchor in site.all_anchors:
+        if anchor.id == anchor_id:
+            return anchor
+    raise KeyError(anchor_id)
 
 
 def _distance_m(one: AnchorSite, other: AnchorSite) -> float:

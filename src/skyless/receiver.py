@@ -49,6 +49,12 @@ from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 MOST_WAITING: Final = 128
 """Beacons that are kept while the site's pages are not complete (protocol 2)."""
 
+MOVED_HOLD_TICKS: Final = from_seconds(0.3)
+LONGEST_MOVED_HOLD_TICKS: Final = from_seconds(2.0)
+"""An anchor that states another position joins again when none has done so for the former time, and after the latter in
+any case: a survey moves all anchors of a site, one a little after the other, and positions from before and after it
+must not be mixed."""
+
 NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
 """Counters of a receiver that do not count dropped frames."""
 
@@ -77,6 +83,7 @@ class ReceiverState(Struct, frozen=True):
     local_almanac: LocalAlmanacState
     selection: AnchorSelectionState
     waiting: tuple[Observation, ...]
+    moved_ticks: dict[int, int]
 
 
 class Receiver:
@@ -120,8 +127,11 @@ class Receiver:
         self._followed = FollowedMaster()
         self._master: int | None = None
         self._positions: dict[int, Array] = {}
+        self._positions_issue: int | None = None
         self._selection = AnchorSelection()
         self._waiting: list[Observation] = []
+        self._moved_ticks: dict[int, int] = {}
+        """When anchors of protocol 2 stated another position than before, until they join again."""
 
     def state(self) -> ReceiverState:
         """All that it keeps, as it is now."""
@@ -143,6 +153,7 @@ class Receiver:
             local_almanac=self.local_almanac.state(),
             selection=self._selection.state(),
             waiting=tuple(self._waiting),
+            moved_ticks=dict(self._moved_ticks),
         )
 
     @classmethod
@@ -158,6 +169,7 @@ class Receiver:
         made.local_almanac.restore(state.local_almanac)
         made._selection.restore(state.selection)
         made._waiting = list(state.waiting)
+        made._moved_ticks = dict(state.moved_ticks)
         made.counters.update(state.counters)
         made.reason = state.reason
         made._time, made._own_ticks, made._followed = state.time, state.own_ticks, state.followed
@@ -241,9 +253,15 @@ class Receiver:
         if diagnostics is not None and diagnostics.rx_power_dbm is not None:
             self._selection.add_power(anchor, diagnostics.rx_power_dbm)
         was_starting = not isinstance(self._method, Estimation) or self._method.is_starting
+        before_m = self.local_almanac.position_m(anchor)
         if self.local_almanac.on_beacon(beacon, rx_ticks, self._confirm(anchor, relays, rx_ticks, tx_ticks)):
             self._choose_method_2()
         anchor_m = self.local_almanac.position_m(anchor)
+        if anchor_m is not before_m and before_m is not None:
+            self._separate_moved(anchor, rx_ticks)
+        if self._is_kept_apart(anchor, rx_ticks):
+            self.counters["moved-anchor"] += 1
+            return NoFixReason.ACQUIRING
         if anchor_m is None:
             self.counters["no-position"] += 1
             return NoFixReason.NO_ALMANAC
@@ -264,6 +282,38 @@ class Receiver:
         if was_starting and not self._method.is_starting:
             self._selection.forget_times()  # from now on what anchors in use have received counts, and what those have
         return result
+
+    def _separate_moved(self, anchor: int, rx_ticks: int) -> None:
+        """An anchor states another position: it leaves, and where too few are left that have not, all begin again."""
+        self._moved_ticks[anchor] = rx_ticks
+        self._waiting = [one for one in self._waiting if one.anchor != anchor]
+        method = self._method
+        if isinstance(method, Estimation):
+            was_starting, remaining = method.is_starting, method.remove_anchor(anchor)
+            if not was_starting and remaining < LEAST_ANCHORS:
+                self._renew_method()
+
+    def _is_kept_apart(self, anchor: int, rx_ticks: int) -> bool:
+        """Whether an anchor has moved too recently to be mixed with others.
+
+        When it joins again, and more have moved than have not, the position begins again with those that have.
+        """
+        since_ticks = self._moved_ticks.get(anchor)
+        if since_ticks is None:
+            return False
+        method, moved = self._method, self._moved_ticks
+        calm_ticks, own_ticks = rx_ticks - max(moved.values()), rx_ticks - since_ticks
+        if calm_ticks < MOVED_HOLD_TICKS and own_ticks < LONGEST_MOVED_HOLD_TICKS:
+            return True
+        if isinstance(method, Estimation) and not method.is_starting and len(moved) > len(method.estimator.anchors):
+            self._renew_method()
+        del moved[anchor]
+        return False
+
+    def _renew_method(self) -> None:
+        """Begin again with the same pages."""
+        self._method_key = None
+        self._choose_method_2(self._superframe_ticks)
 
     def _confirm(self, anchor: int, relays: bytes, rx_ticks: int, tx_ticks: int) -> bool:
         """Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender."""
@@ -386,6 +436,7 @@ class Receiver:
         self.local_almanac.forget_times()
         self._selection.forget_times()
         self._waiting = []
+        self._moved_ticks = {}
         self._method = self._method_key = None
         if self.local_almanac.pages is not None:
             self._choose_method_2()
@@ -397,7 +448,10 @@ class Receiver:
         """
         almanac, master = self.almanac, self._followed.master
         if almanac.add_page(beacon.almanac_issue, beacon.page):
+            before, issue = self._positions, self._positions_issue
             self._read_positions()
+            if issue == almanac.issue and any(tuple(before[a]) != almanac.anchors_m.get(a) for a in before):
+                self._method_key = None  # other positions happen to have the same issue
         elif self._method is not None and master == self._master:
             return
         self._master = master
@@ -405,6 +459,7 @@ class Receiver:
         self._choose_method()
 
     def _read_positions(self) -> None:
+        self._positions_issue = self.almanac.issue
         self._positions = {anchor: np.array(point) for anchor, point in self.almanac.anchors_m.items()}
 
     def _choose_method(self) -> None:

@@ -26,6 +26,12 @@ STRUCTS = {
     topics.truth_topic(SITE): messages.TruthMessage,
     topics.zones_topic(SITE): messages.ZonesMessage,
     topics.zone_event_topic(SITE, "<zone>"): messages.ZoneEvent,
+    topics.stamps_topic(SITE, "<id>"): messages.StampsMessage,
+    topics.survey_topic(SITE): messages.SurveyMessage,
+    topics.survey_facts_topic(SITE): messages.SurveyFactsMessage,
+    topics.survey_save_topic(SITE): messages.SurveySaveMessage,
+    topics.placement_topic(SITE): messages.PlacementMessage,
+    topics.watch_topic(SITE): messages.WatchMessage,
 }
 
 

@@ -5,7 +5,8 @@ from collections import Counter
 from skyless.air.beacon2 import Beacon2
 from skyless.air.codec2 import encode_2, heard_capacity_2
 from skyless.air.reception import Reception, Transmission
-from skyless.anchors.neighbours import Neighbours, anchor_of, on_radio_grid
+from skyless.anchor import anchor_of, delay_change_ticks
+from skyless.anchors.neighbours import Neighbours, on_radio_grid
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS
 from skyless.site.free_access import first_free_window, free_instant_ticks, free_window_ticks
 from skyless.site.local_almanac import site_issue, site_page_for, site_pages_of
@@ -24,14 +25,22 @@ class FreeAnchor:
         """
         self.id = anchor_id
         self.counters: Counter[str] = Counter()
-        self._site_id = site.id
         self._lead_ticks = from_seconds(lead_s)
         self._window_ticks = free_window_ticks(site.schedule.rate_hz)
+        self._site = site
         self._delay_ticks = anchor_of(site, anchor_id).tx_antenna_delay_ticks
+        self._correction_ticks = 0
         self._pages = site_pages_of(site)
         self._issue = site_issue(self._pages)
         self._neighbours = Neighbours(site, anchor_id, self.counters)
         self._sequence = 0
+
+    def place(self, site: Site) -> None:
+        """Use other positions and antenna delays of the same anchors, as ``Anchor.place``."""
+        self._correction_ticks = delay_change_ticks(self._site, site, self.id)
+        self._pages = site_pages_of(site)
+        self._issue = site_issue(self._pages)
+        self._neighbours.place(site)
 
     def hear(self, reception: Reception) -> None:
         """Process a frame from the air; one that does not belong here is counted and dropped."""
@@ -51,8 +60,9 @@ class FreeAnchor:
         heard, weak = self._neighbours.relayed(self._neighbours.own_ticks.expect(tx_ticks), capacity)
         page = site_page_for(self._pages, self._sequence, self.id)
         beacon = Beacon2(
-            self._site_id, self.id, self._sequence, tx_ticks, self._issue, None, position, None, heard, weak, page
-        )
+            self._site.id, self.id, self._sequence, wrap(tx_ticks + self._correction_ticks), self._issue, None,
+            position, None, heard, weak, page,
+        )  # fmt: skip
         self._sequence = (self._sequence + 1) & 0xFF
         self.counters["sent"] += 1
         return Transmission(encode_2(beacon), tx_ticks)

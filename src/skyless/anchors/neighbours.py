@@ -10,11 +10,11 @@ from skyless.air.beacon import Heard, Malformed
 from skyless.air.beacon2 import Beacon2, StatedPosition
 from skyless.air.frames import decode_any
 from skyless.air.reception import Reception
-from skyless.anchor import MAX_RELAY_AGE_S
+from skyless.anchor import MAX_RELAY_AGE_S, anchor_of
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ
 from skyless.positioning.methods.observations import AnchorStamps, is_weak_first_path
 from skyless.site.local_almanac import stated_position
-from skyless.site.model import AnchorSite, Site, UnplacedAnchor
+from skyless.site.model import Site, UnplacedAnchor
 from skyless.site.slots import superframe_ticks_of
 from skyless.ticks import Unwrapper, nearest
 
@@ -56,6 +56,12 @@ class Neighbours:
         self._ranges_m: dict[int, float] = {}
         """Measured by two-way exchanges, to anchors where a position is missing."""
 
+    def place(self, site: Site) -> None:
+        """Use the own position in another file of the same anchors; ranges by exchanges begin again."""
+        self.position = position_of(site, self._own)
+        self._ranges_m.clear()
+        self._sent.clear()
+
     def admit(self, reception: Reception) -> Admitted | None:
         """The beacon of a reception; one that does not belong here is counted and dropped."""
         beacon = decode_any(reception.frame)
@@ -92,7 +98,7 @@ class Neighbours:
         return tuple(heard for heard, _ in recent), sum(weak << place for place, (_, weak) in enumerate(recent))
 
     def on_sent(self, sequence: int, tx_ticks: int) -> None:
-        """Note an own frame, for two-way exchanges; only an anchor that needs them calls it."""
+        """Note an own frame and the stamp that it states, unwrapped, for two-way exchanges; who needs none does not."""
         self._sent.pop(sequence, None)
         self._sent[sequence] = tx_ticks
         if len(self._sent) > _SENT_KEPT:
@@ -127,14 +133,6 @@ class Neighbours:
             return None
         range_m = 0.5 * ((around - there) - there * rate) * TICK_M
         return range_m if 0.0 <= range_m <= _MOST_RANGE_M else None
-
-
-def anchor_of(site: Site, anchor_id: int) -> AnchorSite | UnplacedAnchor:
-    """An anchor of a site by its identifier. Raises KeyError where the site has none of it."""
-    for anchor in site.all_anchors:
-        if anchor.id == anchor_id:
-            return anchor
-    raise KeyError(anchor_id)
 
 
 def position_of(site: Site, anchor_id: int) -> StatedPosition | None:

@@ -13,7 +13,8 @@ from msgspec import Struct
 from skyless.air.beacon2 import Beacon2, SlotTime, StatedSiteTime
 from skyless.air.codec2 import MOST_RESIDUAL_TICKS, encode_2, heard_capacity_2
 from skyless.air.reception import Reception, Transmission
-from skyless.anchors.neighbours import Admitted, Neighbours, anchor_of, on_radio_grid
+from skyless.anchor import anchor_of, delay_change_ticks
+from skyless.anchors.neighbours import Admitted, Neighbours, on_radio_grid
 from skyless.clocks.composed_time import SUPERFRAME_BITS, ComposedTime
 from skyless.clocks.composition import MEAN_LATE_TICKS
 from skyless.clocks.filter import MAX_RELATIVE_RATE, clock_noise, stamp_variance_m2
@@ -65,11 +66,12 @@ class SlotsAnchor:
         """
         self.id = anchor_id
         self.counters: Counter[str] = Counter()
-        self._site_id = site.id
+        self._site = site
         self._lead_ticks = from_seconds(lead_s)
         self._schedule = schedule_of(site)
         self._slots = self._schedule.slots_of(first_slots(site)[anchor_id])
         self._delay_ticks = anchor_of(site, anchor_id).tx_antenna_delay_ticks
+        self._correction_ticks = 0
         self._states_site_time = site.schedule.site_time
         self._pages = site_pages_of(site)
         self._issue = site_issue(self._pages)
@@ -88,6 +90,14 @@ class SlotsAnchor:
         self._pending: dict[int, _Pending] = {}
         self._phase = 0
         self._sequence = 0
+
+    def place(self, site: Site) -> None:
+        """Use other positions and antenna delays of the same anchors, as ``Anchor.place``; the slot time goes on."""
+        self._correction_ticks = delay_change_ticks(self._site, site, self.id)
+        self._pages = site_pages_of(site)
+        self._issue = site_issue(self._pages)
+        self._neighbours.place(site)
+        self._time.correct_ranges()
 
     @property
     def synchronisation(self) -> SlotSynchronisation:
@@ -151,7 +161,8 @@ class SlotsAnchor:
         pending = self._pending.pop(tx_ticks)
         unwrapped = self._neighbours.own_ticks.expect(tx_ticks)
         self._advance(unwrapped - self._lead_ticks)
-        slot_time, site_time = self._stated(pending, unwrapped)
+        stated_ticks = unwrapped + self._correction_ticks
+        slot_time, site_time = self._stated(pending, stated_ticks)
         position = self._neighbours.position
         capacity = heard_capacity_2(
             slot_time=slot_time is not None, position=position is not None, site_time=site_time is not None, page=True
@@ -159,11 +170,11 @@ class SlotsAnchor:
         heard, weak = self._neighbours.relayed(unwrapped, capacity)
         page = site_page_for(self._pages, self._sequence, self.id)
         beacon = Beacon2(
-            self._site_id, self.id, self._sequence, tx_ticks, self._issue, slot_time, position, site_time, heard, weak,
-            page,
+            self._site.id, self.id, self._sequence, wrap(stated_ticks), self._issue, slot_time, position, site_time,
+            heard, weak, page,
         )  # fmt: skip
         self._claims.on_sent(unwrapped)
-        self._neighbours.on_sent(self._sequence, unwrapped)
+        self._neighbours.on_sent(self._sequence, stated_ticks)
         self._sequence = (self._sequence + 1) & 0xFF
         self.counters["sent"] += 1
         return Transmission(encode_2(beacon), tx_ticks)

@@ -33,7 +33,18 @@ if TYPE_CHECKING:
     from skyless.studies.plan import Plan, Row, Study
 
 _Name = Literal[
-    "efficiency", "loss", "nlos", "motion", "sync", "integrity", "room", "large", "claims", "survey", "sitetime", "scale"
+    "efficiency",
+    "loss",
+    "nlos",
+    "motion",
+    "sync",
+    "integrity",
+    "room",
+    "large",
+    "claims",
+    "survey",
+    "sitetime",
+    "scale",
 ]
 
 _OF_EPISODES: Final = ("efficiency", "integrity")
@@ -67,8 +78,8 @@ _OF_CLAIMS: Final = (
 )
 _OF_SURVEYS: Final = (
     "Simulated air. RMSE, bound: of anchors after the best rigid alignment. Delays: less their mean. Tag: what its",
-    "position is off by the survey alone; by hand: by positions good to 2 cm per axis and unknown delays. < 10 cm: share",
-    "of runs. Flagged: not determined, ambiguous or not checked. Wrong: off by 10 cm and four of their own sigmas.",
+    "position is off by the survey alone; by hand: by positions good to 2 cm per axis and unknown delays. < 10 cm:",
+    "share of runs. Flagged: not determined, ambiguous or not checked. Wrong: 10 cm and four of their own sigmas off.",
 )
 _OF_SITE_TIME: Final = (
     "Simulated. RMSE: error of an anchor's timeline, or difference of two in range. σ: as anchors state it.",
@@ -160,8 +171,8 @@ def study(name: _Name, /, *, asked: StudyOptions = StudyOptions()) -> None:
         efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
         sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
         room: the errors of real rooms, and what goes wrong in them. large: 1,024 anchors without a master.
-        claims: whose counter leads protocol 2. survey: anchors that survey themselves. sitetime: one timeline over many hops.
-        scale: numbers of tags and anchors.
+        claims: whose counter leads protocol 2. survey: anchors that survey themselves. sitetime: one timeline over
+        many hops. scale: numbers of tags and anchors.
     """
     from skyless.studies.catalogue import STUDIES
 
@@ -295,7 +306,17 @@ def _table(study: "Study", plan: "Plan", rows: "Sequence[Row]") -> "Table":
         *("level", "HPL in cm", "VPL", "misleading", "", "vertical", "", "exceeded", "", "unwarned"),
         *("beacons/s", "first fix in s", "gap in s", "superframes", "joins", "restarts"),
         *("superframes", "longest", "changes", "ratio"),
-        *("delays in cm", "tag", "by hand", "< 10 cm", "late found", "wrongly out", "flagged", "wrong", "of these flagged"),
+        *(
+            "delays in cm",
+            "tag",
+            "by hand",
+            "< 10 cm",
+            "late found",
+            "wrongly out",
+            "flagged",
+            "wrong",
+            "of these flagged",
+        ),
         *("limit", "CPU in µs"),
     )
     cells = [_cells(row) for row in rows]

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from cyclopts import App
+from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.cli.common.options import check_left_out, check_output, check_picture, options
 from skyless.cli.common.output import console, write_file
 from skyless.cli.common.progress import status
-from skyless.cli.common.recording_inputs import is_mcap
+from skyless.cli.nodes.survey_live import LiveOptions, gather_live, serve_live
 from skyless.cli.survey_facts import FactOptions, facts_of
 from skyless.cli.survey_report import SurveyReport, print_report, show_report
 from skyless.errors import SkylessError
@@ -35,6 +36,9 @@ class SurveyOptions:
 
     ranges: Path | None = None
     """A table of ranges instead of a recording: anchor_a,anchor_b,range_m, each pair any number of times."""
+    format: str | None = None
+    """Name of the recording's format, if the content should not decide."""
+    live: LiveOptions = LiveOptions()
     known: FactOptions = FactOptions()
     out: Path | None = None
     """Write the site file of --site with the survey in it here (.toml), or a table of anchors (.csv)."""
@@ -55,11 +59,15 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
     Parameters
     ----------
     recording
-        A recording of skyless record; --ranges takes a table instead.
+        A recording of skyless record, or of another system whose anchors relay their stamps; --ranges takes a table
+        instead, --mqtt and --radio survey a running site.
     """
     _check(recording, asked)
-    site, own_ranges = _inputs(recording, asked)
-    ranges = _with_all_anchors(own_ranges, site)
+    if asked.live.serve:
+        serve_live(asked.live, asked.known)
+        return 0
+    given = _inputs(recording, asked)
+    site, ranges = given.site, _with_all_anchors(given.ranges, given.site)
     facts, warnings = facts_of(asked.known, ranges.anchors, site)
     from skyless.survey.count import count
 
@@ -71,7 +79,7 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
         from skyless.survey.solve import run_survey
 
         result = run_survey(ranges, facts)
-    report = SurveyReport(result, counted, tuple(warnings))
+    report = SurveyReport(result, counted, tuple(warnings), given.drops)
     if asked.out is not None and report.usable:
         report = _written(report, ranges, site, asked, asked.out)
     if asked.plot is not None:
@@ -86,12 +94,14 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
 def _check(recording: Path | None, asked: SurveyOptions) -> None:
     """See that the inputs are clear and the outputs can be written, before the work. Raises SkylessError."""
     inputs = (recording, asked.ranges, asked.known.heights)
-    if (recording is None) == (asked.ranges is None):
-        raise SkylessError("a survey needs a recording of skyless record, or else a table of ranges by --ranges")
-    if recording is not None and not is_mcap(recording):
+    asked.live.check(asked.known)
+    if (recording is not None) + (asked.ranges is not None) + asked.live.given != 1:
         raise SkylessError(
-            f"{recording} is no recording of skyless record; ranges of other systems are given by --ranges"
+            "a survey needs a recording of skyless record, or else a table of ranges by --ranges, or else a running "
+            "site by --mqtt or --radio"
         )
+    if recording is None:
+        check_left_out({"format": asked.format}, "it is for recordings")
     check_output("out", asked.out, *inputs)
     check_output("plot", asked.plot, *inputs, asked.known.site, asked.out)
     check_picture(asked.plot)
@@ -111,16 +121,38 @@ def _check(recording: Path | None, asked: SurveyOptions) -> None:
         raise SkylessError(f"{out} exists; --force overwrites it")
 
 
-def _inputs(recording: Path | None, asked: SurveyOptions) -> "tuple[Site | None, PairRanges]":
-    """The site, if one is known, and the ranges. Raises SkylessError."""
+class _Inputs(Struct, frozen=True):
+    """What a survey starts from."""
+
+    site: "Site | None"
+    """Of --site, else of the recording."""
+    ranges: "PairRanges"
+    drops: tuple[str, ...] = ()
+    """What of a recording could not be used."""
+
+
+def _inputs(recording: Path | None, asked: SurveyOptions) -> _Inputs:
+    """The ranges, and the site if one is known. Raises SkylessError."""
     from skyless.site.load import load_site
 
+    if asked.live.given:
+        return _Inputs(*gather_live(asked.live, asked.known))
     site = None if asked.known.site is None else load_site(asked.known.site)
     if asked.ranges is not None:
         from skyless.recordings.range_table import read_ranges
 
-        return site, read_ranges(asked.ranges)
-    raise SkylessError("recordings")
+        return _Inputs(site, read_ranges(asked.ranges))
+    if recording is None:
+        raise SkylessError("a survey needs a recording or --ranges")
+    from skyless.survey.surveyed_site import with_delays_of
+    from skyless.survey_inputs.recorded_stamps import ranges_of
+
+    with status("reading stamps"):
+        found = ranges_of(recording, asked.format, identifier=None if site is None else site.id)
+    warnings = tuple(f"left out: {number} × {reason}" for reason, number in found.drops.items())
+    if site is None or found.site is None:
+        return _Inputs(site or found.site, found.ranges, warnings)
+    return _Inputs(site, with_delays_of(found.ranges, found.site, site), warnings)
 
 
 def _with_all_anchors(ranges: "PairRanges", site: "Site | None") -> "PairRanges":

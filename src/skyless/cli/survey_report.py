@@ -24,6 +24,8 @@ class SurveyReport(Struct, frozen=True):
     count: "Count"
     warnings: tuple[str, ...]
     """About inputs and facts."""
+    drops: tuple[str, ...] = ()
+    """What of the recording could not be used."""
     unchanged: tuple[int, ...] = ()
     """Anchors of the site file that stay as they are."""
     written: tuple[str, ...] = ()
@@ -31,8 +33,9 @@ class SurveyReport(Struct, frozen=True):
 
     @property
     def usable(self) -> bool:
-        """Whether any anchor is determined."""
-        return any(anchor.determined for anchor in self.survey.anchors)
+        """Whether any anchor is determined, and by a range."""
+        found = any(anchor.determined for anchor in self.survey.anchors)
+        return found and any(pair.residual_m is not None for pair in self.survey.pairs)
 
 
 def print_report(report: SurveyReport) -> None:
@@ -51,6 +54,7 @@ def report_object(report: SurveyReport) -> dict[str, Any]:
         "usable": report.usable,
         "count": msgspec.to_builtins(report.count),
         "warnings": list(report.warnings),
+        "drops": list(report.drops),
         "unchanged": list(report.unchanged),
         "written": list(report.written),
     }
@@ -78,6 +82,7 @@ def show_report(report: SurveyReport) -> None:
         f"constant error of a pair: {cm(survey.range_std_m)}; {_checks(survey.redundancy)}",
         *_tapes(survey.tapes),
         survey.frame,
+        *report.drops,
     ]
     if report.unchanged and report.written:
         lines.append(f"unchanged in the file: anchor {', '.join(map(str, report.unchanged))}")
@@ -96,8 +101,7 @@ def _anchors(survey: "Survey") -> "Table":
     for one in survey.anchors:
         position = [number(value) for value in (one.x_m, one.y_m, one.z_m)]
         others = [number(value, "{:.2f}", 100.0) for value in (one.std_m, one.delay_m, one.delay_std_m)]
-        note = "" if one.determined else f"not determined: {one.reason or 'its ranges leave it open'}"
-        table.add_row(str(one.id), *position, *others, note)
+        table.add_row(str(one.id), *position, *others, "" if one.determined else "not determined")
     return table
 
 

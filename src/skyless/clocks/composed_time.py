@@ -22,6 +22,7 @@ from skyless.clocks.filter import MAX_RELATIVE_RATE, ClockFilter, ClockNoise
 from skyless.clocks.site_clock import (
     GRID_SLACK_TICKS,
     MISFITS_BEFORE_RESTART,
+    PLACEMENT_STD_M,
     STAMP_SLACK_TICKS,
     SiteTime,
     continued,
@@ -119,6 +120,11 @@ class ComposedTime:
     def stop_leading(self) -> None:
         """Be no root any longer: the next beacon of a parent counts."""
         self.is_root = False
+
+    def correct_ranges(self) -> None:
+        """Expect other distances to the parents, and corrected antenna delays; the timeline goes on."""
+        for parent in self._parents.values():
+            parent.pair.add_offset_variance(PLACEMENT_STD_M**2)
 
     def restart(self) -> None:
         """Forget the timeline, as another one counts from now on; the pairs' filters on raw counters stay."""

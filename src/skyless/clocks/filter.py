@@ -117,6 +117,11 @@ class ClockFilter:
         variance, covariance, rate_variance = self.covariance
         self.covariance = (variance * factor, covariance * factor, rate_variance * factor)
 
+    def add_offset_variance(self, variance_m2: float) -> None:
+        """Let the offset alone be uncertain: range or antenna delays have changed, the clocks have not."""
+        variance, covariance, rate_variance = self.covariance
+        self.covariance = (variance + variance_m2, covariance, rate_variance)
+
     def to_master(self, ticks_own: int) -> tuple[int, float, float]:
         """Own time on the master's scale: whole ticks, the fraction of a tick in [0, 1), and the variance in m²."""
         elapsed_own = (ticks_own - self._whole_offset - self._epoch_master) - self._offset_m / TICK_M

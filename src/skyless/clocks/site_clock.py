@@ -22,6 +22,9 @@ GRID_SLACK_TICKS: Final = 8 * DELAYED_TX_GRANULARITY_TICKS
 MASTER_CHANGE_INFLATION: Final = 2.0
 """A new master's clock was known as well as the own one: their difference has at most twice the variance."""
 
+PLACEMENT_STD_M: Final = 1.0
+"""By which the offset may change when a survey has corrected positions and antenna delays."""
+
 
 class SiteClock:
     """Own time to site time and back, and where the superframes lie."""
@@ -64,6 +67,11 @@ class SiteClock:
             self._last = None
         else:
             self._clock.inflate_covariance(MASTER_CHANGE_INFLATION)
+
+    def correct_range(self, range_m: float) -> None:
+        """Use another distance to the same master, whose antenna delay may have been corrected with it."""
+        self._range_m = range_m
+        self._clock.add_offset_variance(PLACEMENT_STD_M**2)
 
     def become_master(self, ticks_own: int) -> None:
         """Become the master: the site's time goes on from here as far as it is known, else the own counter is it."""

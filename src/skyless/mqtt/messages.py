@@ -337,6 +337,8 @@ class SurveyMessage(Struct, frozen=True):
     saved_serial: int | None = None
     file: str | None = None
     """The site file that it writes."""
+    state: Literal["collecting", "surveyed", "no data"] = "collecting"
+    """``no data``: no stamps have come for 5 s, so that ``survey``, if there is one, is of before."""
 
 
 class PlacementMessage(Struct, frozen=True):
@@ -344,8 +346,10 @@ class PlacementMessage(Struct, frozen=True):
 
     unix_s: float
     before: str
-    """Digest of the site before the survey."""
+    """Digest of the site before the survey (``site/digest.py``)."""
     site: Site
+    earlier: tuple[str, ...] = ()
+    """Digests of the sites before that, the newest first: an anchor with an older file adopts it, too."""
 
 
 class WatchFinding(Struct, frozen=True):

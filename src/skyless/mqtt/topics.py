@@ -23,7 +23,10 @@ def fix_topic(site: int | str, tag: str) -> str:
 
 
 def status_topic(site: int | str, kind: str, name: int | str) -> str:
-    """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard`` or ``recorder``; its last will."""
+    """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard``, ``recorder`` or ``survey``.
+
+    It is the node's last will, too.
+    """
     return f"{ROOT}/{site}/{kind}/{name}/status"
 
 

@@ -1,12 +1,14 @@
 """``skyless anchor``: one process with one or several anchors, each with its own radio and its own MQTT connection."""
 
 import asyncio
+import secrets
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
+import msgspec
 from msgspec.structs import replace
 
 from skyless.air.beacon import Malformed
@@ -16,13 +18,18 @@ from skyless.anchor import Anchor
 from skyless.anchors.factory import AnyAnchor, new_anchor
 from skyless.anchors.slots import SlotsAnchor
 from skyless.constants import TICK_RATE_HZ
+from skyless.errors import SkylessError
 from skyless.master_election import Role
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.messages import AnchorHealth, Counters
-from skyless.mqtt.topics import health_topic
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import AnchorHealth, Counters, PlacementMessage, RequestMessage
+from skyless.mqtt.topics import health_topic, placement_topic, request_topic, stamps_topic
 from skyless.nodes.process import HEALTH_S, Log, SitePublisher, every, keep, link_of, together
 from skyless.nodes.radio_monitor import RadioMonitor
+from skyless.nodes.stamp_log import StampLog
 from skyless.radios.interface import Gone, Late, Radio, RadioEvent, Restarted, Sent
+from skyless.site.check import check_site
+from skyless.site.digest import is_same_but_placed, site_digest
 from skyless.site.model import Site
 from skyless.slot_claims import SlotRole
 from skyless.ticks import difference
@@ -40,7 +47,13 @@ ASK_AGAIN_S: Final = 5e-3
 LOST_ANSWER_S: Final = 0.25
 """A radio that has not reported the end of a frame within this time will not report it."""
 
+STAMPS_S: Final = 0.05
+"""Interval at which stamps are looked through for a message that is due."""
+
 _NOT_DROPS: Final = frozenset({"heard", "sent", "takeover", "claim-change", "phase-change"})
+
+_decode_request: Final = msgspec.json.Decoder(RequestMessage).decode
+_decode_placement: Final = msgspec.json.Decoder(PlacementMessage).decode
 
 _ROLES: Final[dict[Role | SlotRole, Literal["master", "root", "anchor", "listening"]]] = {
     Role.MASTER: "master",
@@ -57,7 +70,12 @@ class AnchorNode:
 
     def __init__(self, site: Site, anchor_id: int, radio: Radio, log: Log) -> None:
         self.site, self.id, self.radio = site, anchor_id, radio
+        self._radio_site, self._log = site, log
+        """The radio is configured with the antenna delays of this site, and keeps them."""
         self.machine = self._new_machine()
+        self.stamps = StampLog(anchor_id, secrets.token_hex(4))
+        self.refused = Counter[str]()
+        """Messages on MQTT that could not be used."""
         self.monitor = RadioMonitor(f"anchor {anchor_id}", "on the air", log, radio.advice)
         self.started_s = time.monotonic()
         self.late = 0
@@ -65,11 +83,49 @@ class AnchorNode:
         """How long before its RMARKER the next frame is made."""
         self.heard_s: dict[int, float] = {}
         """When each other anchor was last heard, by the host's monotonic clock."""
+        self._others = frozenset(anchor.id for anchor in site.all_anchors) - {anchor_id}
         self._received = 0
         self._timer: asyncio.TimerHandle | None = None
 
     def _new_machine(self) -> AnyAnchor:
-        return new_anchor(self.site, self.id, lead_s=LEAD_S)
+        machine = new_anchor(self._radio_site, self.id, lead_s=LEAD_S)
+        if self.site is not self._radio_site:
+            machine.place(self.site)
+        return machine
+
+    def place(self, message: PlacementMessage) -> bool:
+        """Adopt the positions and delays of a survey; True if the site is another one from now on.
+
+        One that was made for another site than the present one is ignored, as others keep to what their files say.
+        """
+        present, offered = site_digest(self.site), site_digest(message.site)
+        if offered == present:
+            return False
+        fault = None
+        if present not in (message.before, *message.earlier):
+            fault = f"they are for site file {message.before}, not {present}"
+        elif not is_same_but_placed(self.site, message.site):
+            fault = "its anchors, slots or schedule are not those of the site file"
+        else:
+            try:
+                check_site(message.site, Path("placement"))
+            except SkylessError as error:
+                fault = str(error)
+        if fault is not None:
+            self.refused["placement-refused"] += 1
+            self._log(f"anchor {self.id}: a survey's positions are ignored: {fault}")
+            return False
+        self.site = message.site
+        self.machine.place(message.site)
+        self._log(f"anchor {self.id}: positions and antenna delays of the survey adopted ({offered})")
+        return True
+
+    def on_request(self, _topic: str, payload: bytes) -> None:
+        """A subscriber requests stamps; a request that cannot be read is counted."""
+        try:
+            self.stamps.request(_decode_request(payload), time.monotonic())
+        except msgspec.MsgspecError:
+            self.refused["bad-request"] += 1
 
     async def run(self) -> None:
         """Serve until cancelled."""
@@ -96,6 +152,7 @@ class AnchorNode:
             self.monitor.on_event(event)
             if isinstance(event, Restarted):
                 self.machine = self._new_machine()
+                self.stamps.restart(secrets.token_hex(4))
                 self._schedule()
             elif isinstance(event, Gone):
                 self._wait(None, self._schedule)
@@ -108,8 +165,10 @@ class AnchorNode:
 
     def _note(self, reception: Reception) -> None:
         beacon = decode_any(reception.frame)
-        if not isinstance(beacon, Malformed) and beacon.site == self.site.id:
-            self.heard_s[beacon.anchor] = time.monotonic()
+        if isinstance(beacon, Malformed) or beacon.site != self.site.id or beacon.anchor not in self._others:
+            return
+        self.heard_s[beacon.anchor] = time.monotonic()
+        self.stamps.add(beacon.anchor, beacon.tx_ticks, reception.rx_ticks)
 
     def _wait(self, seconds: float | None, then: Callable[[], None]) -> None:
         """Call a function later, instead of the one planned before; None plans nothing."""
@@ -150,13 +209,41 @@ class Anchors:
         self._site, self._log = site, log
         self._site_publisher = SitePublisher(site, simulated, floor_plan)
         self.nodes = tuple(AnchorNode(site, int(radio.name), radio, log) for radio in radios)
-        self._links = tuple(link_of(address, node.id, site=site.id, kind="anchor") for node in self.nodes)
+        self._links = tuple(self._link(node, address) for node in self.nodes)
+
+    def _link(self, node: AnchorNode, address: MqttAddress | None) -> Link | None:
+        """An anchor's connection to the broker."""
+        link = link_of(address, node.id, site=self._site.id, kind="anchor")
+        if link is not None:
+            link.subscribe(request_topic(self._site.id), node.on_request, qos=1)
+            link.subscribe(placement_topic(self._site.id), lambda _, payload: self._on_placement(node, payload), qos=1)
+        return link
+
+    def _on_placement(self, node: AnchorNode, payload: bytes) -> None:
+        """Let an anchor adopt a placement; one that cannot be read is counted."""
+        if not payload:
+            return  # it was withdrawn
+        try:
+            message = _decode_placement(payload)
+        except msgspec.MsgspecError:
+            node.refused["bad-placement"] += 1
+            return
+        if node.place(message):
+            self._site_publisher.place(node.site)
 
     async def run(self) -> None:
         """Serve until cancelled."""
         parts = [node.run() for node in self.nodes]
         parts += [keep(link, self._log) for link in self._links if link is not None]
-        await together(*parts, every(HEALTH_S, self._publish_health))
+        await together(*parts, every(HEALTH_S, self._publish_health), every(STAMPS_S, self._publish_stamps))
+
+    def _publish_stamps(self) -> None:
+        """Publish the stamps that were requested and are due."""
+        now_s, unix_s = time.monotonic(), time.time()
+        for node, link in zip(self.nodes, self._links, strict=True):
+            message = None if link is None else node.stamps.collect(now_s, unix_s)
+            if link is not None and message is not None:
+                link.publish(stamps_topic(self._site.id, node.id), message, qos=1)
 
     def _publish_health(self) -> None:
         """Health of all anchors, and the site by its master or root, or by the first anchor of each process."""
@@ -198,7 +285,7 @@ def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> 
         heard=machine.counters["heard"],
         superframe=None,
         heard_age_s={str(anchor): now_s - heard_s for anchor, heard_s in sorted(node.heard_s.items())},
-        counters=machine.counters | node.radio.counters,
+        counters=machine.counters | node.radio.counters | node.refused,
         mqtt=mqtt,
         mode=node.site.schedule.mode,
     )

@@ -1,4 +1,4 @@
-"""``skyless demo``: a whole site, with broker, ether, anchors, tags, page and recorder as processes, and its watch."""
+"""``skyless demo``: a site with broker, ether, anchors, tags, page, survey and recorder as processes, and its watch."""
 
 import asyncio
 from pathlib import Path
@@ -130,6 +130,7 @@ class WholeSite:
         ]
         page = ("dashboard", *mqtt, "--listen", f"{_HOST}:{self.page_port}", "--recordings", str(asked.recordings))
         programs.append(Program("page", (*page, "--site-id", str(asked.site.id))))
+        programs.append(Program("survey", ("survey", "--serve", *mqtt, "--site-id", str(asked.site.id))))
         if asked.record is not None:
             limit = ("--limit-mb", str(asked.record_limit_mb))
             programs.append(

@@ -150,6 +150,12 @@ class SitePublisher:
         self._restarts: int | None = None
         self._simulated = False
         self._published: bool | None = None
+        self._has_floor_plan = False
+
+    def place(self, site: Site) -> None:
+        """Publish the site of a survey from now on."""
+        if site != self._site:
+            self._site, self._published = site, None
 
     def update(self, restarts: int) -> None:
         """Call ``is_simulated`` after each restart of a radio: its port may lead to another device."""
@@ -163,7 +169,8 @@ class SitePublisher:
         self._published = self._simulated
         message = SiteMessage(self._site, self._simulated, time.time())
         link.publish(site_topic(self._site.id), message, qos=1, retain=True)
-        if self._floor_plan is not None:
+        if self._floor_plan is not None and not self._has_floor_plan:
+            self._has_floor_plan = True
             link.publish(floor_plan_topic(self._site.id), self._floor_plan.read_bytes(), qos=1, retain=True)
 
 

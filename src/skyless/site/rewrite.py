@@ -1,5 +1,6 @@
 """Writes values of anchors and sections into the text of a site file; all else stays unchanged, comments included."""
 
+import json
 import re
 import tomllib
 from collections.abc import Mapping
@@ -13,7 +14,7 @@ DELAY_KEY: Final = "tx_antenna_delay_ticks"
 
 OfAnchors = Mapping[int, Mapping[str, float]]
 """Values by anchor and key."""
-OfSections = Mapping[str, Mapping[str, float]]
+OfSections = Mapping[str, Mapping[str, float | str]]
 """Values by section and key."""
 
 _HEADER = re.compile(r"\s*\[")
@@ -74,15 +75,16 @@ def with_values(text: str, of_anchors: OfAnchors, of_sections: OfSections, path:
     return result
 
 
-def _with_all(lines: list[str], values: Mapping[str, float]) -> list[str]:
+def _with_all(lines: list[str], values: Mapping[str, float | str] | Mapping[str, float]) -> list[str]:
     for key, value in values.items():
         lines = _with_value(lines, key, value)
     return lines
 
 
-def _with_value(lines: list[str], key: str, value: float) -> list[str]:
+def _with_value(lines: list[str], key: str, new: float | str) -> list[str]:
     """The lines of one table with a key's value changed, or added after the last key."""
-    present = re.compile(rf"(\s*{key}\s*=\s*)([^\s#]+)(.*)", re.DOTALL)
+    present = re.compile(rf"(\s*{key}\s*=\s*)(\"[^\"]*\"|[^\s#]+)(.*)", re.DOTALL)
+    value = _toml(new)
     for number, line in enumerate(lines):
         match = present.match(line)
         if match:
@@ -96,10 +98,14 @@ def _with_value(lines: list[str], key: str, value: float) -> list[str]:
     return [*lines[:last], before, f"{match[1]}{key} = {value}{end}", *lines[last + 1 :]]
 
 
-def _new_section(text: str, name: str, values: Mapping[str, float]) -> str:
+def _toml(value: float | str) -> str:
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)
+
+
+def _new_section(text: str, name: str, values: Mapping[str, float | str]) -> str:
     """A section that the file has not, after its last line."""
     end = "\r\n" if "\r\n" in text else "\n"
-    rows = [f"{key} = {value}" for key, value in values.items()]
+    rows = [f"{key} = {_toml(value)}" for key, value in values.items()]
     return ("" if text.endswith("\n") or not text else end) + end.join(["", f"[{name}]", *rows, ""])
 
 

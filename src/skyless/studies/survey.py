@@ -90,9 +90,7 @@ _DELAYS: Final = Group(
 )
 _PAIRS: Final = Group("pairs", (Variant("pairs 2 cm, delays 7 cm", 0.07),), delay_std_m=0.07, pair_std_m=0.02)
 _CLEAN: Final = Group("clean", (Variant("pairs 3 cm", 0.0),), pair_std_m=0.03, seconds=_LATE_S)
-_LATE: Final = Group(
-    "late", (Variant("10 % late", 0.0),), pair_std_m=0.03, late_share=0.1, seconds=_LATE_S
-)
+_LATE: Final = Group("late", (Variant("10 % late", 0.0),), pair_std_m=0.03, late_share=0.1, seconds=_LATE_S)
 _LATE_HALL: Final = Group(
     "late",
     (Variant("10 % late, 25 % missing, delays 7 cm", 0.07),),
@@ -149,7 +147,7 @@ def _limits(layout: str, case: str) -> tuple[Limit, ...]:
         "30 % late, 25 % missing": (Limit("wrong_flagged", 0.9),),
         "30 % late, 25 % missing, sketch": (Limit("near", 0.8), Limit("wrong_flagged", 0.9)),
     }
-    return found[case]
+    return found.get(case, ())
 
 
 class SurveyRuns(Struct, frozen=True):
@@ -271,8 +269,8 @@ def _drawn(group: Group, layout: SurveyLayout, draw: np.random.Generator) -> _Dr
 def _ranges(runs: SurveyRuns, layout: SurveyLayout, drawn: _Drawn, seed: int) -> PairRanges:
     """What the anchors of a site in such air receive of one another."""
     anchors = tuple(
-        AnchorSite(anchor, *(float(one) for one in position))
-        for anchor, position in zip(layout.anchors, layout.position_m, strict=True)
+        AnchorSite(anchor, x_m, y_m, z_m)
+        for anchor, (x_m, y_m, z_m) in zip(layout.anchors, layout.position_m.tolist(), strict=True)
     )
     site = Site(layout.name, 1, 1, anchors, ScheduleSite(slot_s=SLOT_S), accuracy=EXACT)
     delays = tuple(
@@ -388,7 +386,7 @@ def _judged(layout: SurveyLayout, survey: Survey, drawn: _Drawn, outcome: Outcom
 
 
 def aligned(true_m: Array, found_m: Array, axes: int) -> Array:
-    """True positions, shape (n, 3), turned, mirrored and shifted to fit the found ones best; about the vertical in 2-D."""
+    """True positions, shape (n, 3), turned, mirrored and shifted to fit the found ones best; in 2-D on the floor."""
     moved = true_m.copy()
     own, other = true_m[:, :axes], found_m[:, :axes]
     u, _, vt = np.linalg.svd((own - own.mean(axis=0)).T @ (other - other.mean(axis=0)))
@@ -460,8 +458,8 @@ def _row(plan: Plan, layout: str, variant: str, outcomes: Sequence[Outcome]) -> 
         fixes=len(outcomes),
         rmse_m=rmse_m,
         rmse_error_m=error,
-        p95_m=float(np.quantile(errors_m, 0.95)) if len(whole) else None,
-        max_m=float(errors_m.max()) if len(whole) else None,
+        p95_m=float(np.quantile(errors_m, 0.95)) if whole else None,
+        max_m=float(errors_m.max()) if whole else None,
         said_m=_root_mean([one.said_m for one in whole]),
         nees=_mean([one.nees for one in whole]),
         bound_m=_root_mean([one.bound_m for one in outcomes]),

@@ -1,6 +1,8 @@
 """Ranges of pairs of anchors, as a survey uses them."""
 
-from msgspec import Struct
+from collections.abc import Mapping
+
+from msgspec import Struct, structs
 
 
 class PairRange(Struct, frozen=True, gc=False):
@@ -27,3 +29,24 @@ class PairRanges(Struct, frozen=True):
     tx_std_m: dict[int, float] = {}
     """Error of an anchor's TX stamps in the mean, which all its ranges share as if it were a delay; 0 where missing."""
     duration_s: float = 0.0
+
+    def without_delays(self, delays_m: Mapping[int, float]) -> "PairRanges":
+        """The ranges less delays of some of the anchors."""
+        shorter = (
+            structs.replace(pair, range_m=pair.range_m - delays_m.get(pair.a, 0.0) - delays_m.get(pair.b, 0.0))
+            for pair in self.pairs
+        )
+        return structs.replace(self, pairs=tuple(shorter))
+
+class PairBlock(Struct, frozen=True, gc=False):
+    """The ranges of one pair within a short time, a second or so."""
+
+    a: int
+    b: int
+    """Identifiers, a < b."""
+    t_s: float
+    """Middle of that time."""
+    mean_m: float
+    std_m: float
+    """Of the mean, from the scatter of its exchanges."""
+    exchanges: int

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
-from msgspec import Struct, structs
+from msgspec import Struct
 
 from skyless.constants import TICK_M
 from skyless.errors import ConfigurationError
@@ -57,11 +57,6 @@ def baseline(record: SurveyRecord) -> PairRanges:
 
     A range holds half of each anchor's TX delay.
     """
-    half_m = {anchor: ticks * TICK_M / 2.0 for anchor, ticks in record.delay_changes_ticks.items()}
-    return structs.replace(
-        record.ranges,
-        pairs=tuple(
-            structs.replace(pair, range_m=pair.range_m - half_m.get(pair.a, 0.0) - half_m.get(pair.b, 0.0))
-            for pair in record.ranges.pairs
-        ),
+    return record.ranges.without_delays(
+        {anchor: ticks * TICK_M / 2.0 for anchor, ticks in record.delay_changes_ticks.items()}
     )

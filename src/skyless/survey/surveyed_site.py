@@ -22,6 +22,7 @@ from skyless.errors import SkylessError
 from skyless.site.check import SITE_LIMITS, check_site
 from skyless.site.model import AccuracySite, AnchorSite, Site, UnplacedAnchor
 from skyless.site.rewrite import DELAY_KEY, with_values
+from skyless.survey.ranges import PairRanges
 from skyless.survey.result import Survey, SurveyedAnchor
 
 _DELAY: Final = SITE_LIMITS[f"anchors.{DELAY_KEY}"]
@@ -86,6 +87,18 @@ def delay_changes_ticks(site: Site, survey: Survey) -> dict[int, int]:
         for anchor in site.all_anchors
         if anchor.id in found
     }
+
+
+def with_delays_of(ranges: PairRanges, recorded: Site, site: Site) -> PairRanges:
+    """The ranges as they would have been measured with the antenna delays of another file of the same site."""
+    half_m = {}
+    before = {anchor.id: anchor for anchor in recorded.all_anchors}
+    for anchor in site.all_anchors:
+        if (old := before.get(anchor.id)) is not None:
+            more = anchor.tx_antenna_delay_ticks - old.tx_antenna_delay_ticks
+            more += anchor.rx_antenna_delay_ticks - old.rx_antenna_delay_ticks
+            half_m[anchor.id] = more * TICK_M / 2.0
+    return ranges.without_delays(half_m)
 
 
 def _placed(

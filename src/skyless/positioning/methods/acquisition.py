@@ -118,6 +118,11 @@ class Acquisition(Struct):
         """Look only between these heights from now on."""
         self._z_bounds_m = low_m, high_m
 
+    def remove_anchor(self, anchor: int) -> None:
+        """Forget what was received of an anchor, because its position was another one."""
+        self._heard.pop(anchor, None)
+        self._links = {ends: link for ends, link in self._links.items() if anchor not in ends}
+
     def packets(self) -> list[Observation]:
         """The last two packets of each anchor, in the order of their receptions."""
         kept = [observation for pair in self._heard.values() for observation in pair]

@@ -186,6 +186,14 @@ class Estimation:
         """The filter with all its states."""
         return self._estimator
 
+    def remove_anchor(self, anchor: int) -> int:
+        """Use nothing more of what was received of an anchor; how many others remain, if a position is known."""
+        self._estimator.remove_anchor(anchor)
+        if self._start is None:
+            return len(self._estimator.anchors)
+        self._start.remove_anchor(anchor)
+        return 0
+
     @property
     def is_starting(self) -> bool:
         """Whether no position is known yet."""
@@ -469,7 +477,8 @@ class AnchorsInUse:
     def add(self, observation: Observation) -> None:
         """Add an accepted message."""
         now = observation.rx_ticks_tag
-        changed = observation.anchor not in self._used
+        before = self._used.get(observation.anchor)
+        changed = before is None or before.anchor_m is not observation.anchor_m
         self._used[observation.anchor] = observation
         if (now - self._checked_ticks) * TICK_S > self._in_use_s:
             self._checked_ticks = now

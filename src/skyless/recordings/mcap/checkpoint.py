@@ -14,7 +14,7 @@ from msgspec import Struct
 from skyless.kernels.arrays import Array
 from skyless.receiver import Receiver, ReceiverState
 
-_FORMAT: Final = 16
+_FORMAT: Final = 17
 _MAX_BYTES: Final = 1 << 23
 """Enough for an estimator of a hundred anchors."""
 

@@ -8,6 +8,7 @@ from collections import Counter, deque
 from typing import Final
 
 from skyless.air.reception import Reception
+from skyless.mqtt.leases import Leases
 from skyless.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage, SegmentStart
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.receiver import Receiver
@@ -19,9 +20,6 @@ INTERVAL_S: Final = 0.1
 
 MOST_PENDING_RECEPTIONS: Final = 4096
 """Receptions; where nobody collects them, the segment ends instead of taking memory."""
-
-MOST_LEASES: Final = 64
-MAX_LEASE_S: Final = 60.0
 
 Settings = dict[str, str | float | int | None]
 
@@ -35,7 +33,7 @@ class ReceptionLog:
         self._tag = tag
         self._settings = settings
         self._run = run
-        self._lease_until_s: dict[str, float] = {}
+        self._leases = Leases()
         self._segments = 0
         self._open = False
         self._receiver: Receiver | None = None
@@ -49,24 +47,23 @@ class ReceptionLog:
     @property
     def wanted(self) -> bool:
         """Whether somebody holds a lease."""
-        return bool(self._lease_until_s)
+        return self._leases.are_held
 
     def request(self, message: RequestMessage, now_s: float) -> None:
         """Process a request; one who was not here before (or whose lease has ended) begins another segment."""
         self._end_leases(now_s)
         if not {self._tag, EVERY_TAG} & set(message.receptions):
-            self._lease_until_s.pop(message.by, None)
+            self._leases.end(message.by)
             return
-        if message.by not in self._lease_until_s:
-            if len(self._lease_until_s) >= MOST_LEASES:
-                self.counters["lease-refused"] += 1
-                return
+        is_new = not self._leases.holds(message.by)
+        if not self._leases.grant(message.by, message.lease_s, now_s):
+            self.counters["lease-refused"] += 1
+        elif is_new:
             self.interrupt()
-        self._lease_until_s[message.by] = now_s + min(max(message.lease_s, 0.0), MAX_LEASE_S)
 
     def add(self, receiver: Receiver, reception: Reception, serial: int) -> None:
         """Add a reception, before the receiver hears it; ``serial`` is the number of fixes made so far."""
-        if not self._lease_until_s:
+        if not self._leases.are_held:
             return
         if len(self._pending) >= MOST_PENDING_RECEPTIONS:
             self.counters["not-collected"] += len(self._pending)
@@ -126,9 +123,8 @@ class ReceptionLog:
         self._start = None
 
     def _end_leases(self, now_s: float) -> None:
-        for by in [by for by, until_s in self._lease_until_s.items() if until_s <= now_s]:
-            del self._lease_until_s[by]
-        if not self._lease_until_s and self._open:
+        self._leases.expire(now_s)
+        if not self._leases.are_held and self._open:
             self.interrupt()
 
 

@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from skyless.constants import TICK_BITS, TICK_M, TICK_RATE_HZ
 from skyless.kernels.arrays import Array, Integers, Mask
-from skyless.survey.ranges import PairRange, PairRanges
+from skyless.survey.ranges import PairBlock, PairRange, PairRanges
 from skyless.survey.stamps.brackets import Flights, Legs, flights_of
 from skyless.survey.stamps.clusters import earliest_cluster
 from skyless.ticks import Unwrapper
@@ -39,21 +39,6 @@ _PRIOR_PRODUCTS: Final = 200.0
 _LEAST_BATCHES: Final = 6
 _LEAST_OWN_SHARE: Final = 0.2
 """Of a mean's variance that is the pair's own."""
-
-
-class PairBlock(Struct, frozen=True, gc=False):
-    """The mean of one pair's ranges within a block of time."""
-
-    a: int
-    b: int
-    """Identifiers, a < b."""
-    t_s: float
-    """Middle of the block."""
-    mean_m: float
-    """Distance plus both anchors' delays, ``d + h_a + h_b``."""
-    std_m: float
-    """Of the mean, from stamps' noise, that which other pairs share included."""
-    exchanges: int
 
 
 class PairRanger:

@@ -1,0 +1,244 @@
+"""A survey while stamps come in: what is known so far, its newest results, and the watch once the site is surveyed.
+
+No I/O and no clock: times are passed in, ``now_s`` by one clock that does not go back.
+"""
+
+from collections.abc import Callable
+from typing import Final, Literal
+
+from msgspec.structs import replace
+
+from skyless.mqtt.messages import StampsMessage, SurveyMessage, SurveyProgress, WatchFinding, WatchMessage
+from skyless.site.digest import site_digest
+from skyless.site.model import Site
+from skyless.survey.facts import Facts
+from skyless.survey.ranges import PairBlock, PairRanges
+from skyless.survey.record import SurveyRecord, baseline
+from skyless.survey.result import Survey
+from skyless.survey.stamps.legs import AnchorLeg
+from skyless.survey.stamps.pair_ranger import PairRanger
+from skyless.survey.watch.monitor import AnchorWatch
+
+NO_DATA_S: Final = 5.0
+"""Without stamps for this time a result is out of date."""
+
+PRESENT_S: Final = 10.0
+"""An anchor of which nothing came for longer is missing."""
+
+ADOPTION_S: Final = 2.0
+"""Stamps of this time after a placement are not used: anchors adopt it one after the other."""
+
+_RESULTS_KEPT: Final = 64
+"""A user saves the result that is on the page, while newer ones are made."""
+
+_MOST_BACKLOG_S: Final = 60.0
+"""A message that is later than this against others of its sender shows that a clock was set, not that it waited."""
+
+FactsOf = Callable[[Site], Facts]
+"""What is known of a site without a user's help."""
+
+State = Literal["collecting", "surveyed", "no data"]
+
+
+class LiveSurvey:
+    """One site's survey."""
+
+    def __init__(self, site: Site, facts: Facts, record: SurveyRecord | None = None, *, watches: bool = True) -> None:
+        """``record``: of the survey that gave the site its positions; without one the watch learns the usual ranges."""
+        self.site, self.facts = site, facts
+        self.serial = 0
+        """Of the newest result."""
+        self.error: str | None = None
+        self.saved_serial: int | None = None
+        self.missed = 0
+        """Stamps that anchors had to drop."""
+        self._watches = watches
+        self._watch: AnchorWatch | None = None
+        self._results: dict[int, tuple[Survey, PairRanges]] = {}
+        self._runs: dict[int, str] = {}
+        self._heard_s: dict[int, float] = {}
+        self._lags_s: dict[int, float] = {}
+        self._newest_s: float | None = None
+        self._pause_until_s: float | None = None
+        self._begin_ranges()
+        self._begin_watch(record)
+
+    # What comes in
+
+    def add_stamps(self, message: StampsMessage, now_s: float) -> None:
+        """Process what an anchor has received of others; stamps of anchors that the site has not are dropped."""
+        known = self._known
+        if message.anchor not in known or self._is_paused(now_s):
+            return
+        self.missed += message.missed
+        if self._runs.setdefault(message.anchor, message.run) != message.run:
+            self._runs[message.anchor] = message.run
+            self._ranger.forget(message.anchor)
+        t_s = self._sent_s(message.anchor, message.unix_s, now_s)
+        for stamp in message.stamps:
+            if stamp.anchor in known:
+                self._add(stamp.anchor, message.anchor, stamp.tx_ticks, stamp.rx_ticks, t_s, now_s)
+
+    def add_leg(self, leg: AnchorLeg, now_s: float) -> None:
+        """Process a reception that was relayed."""
+        if leg.sender in self._known and leg.receiver in self._known and not self._is_paused(now_s):
+            self._add(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s, now_s)
+
+    def set_facts(self, facts: Facts) -> None:
+        """Replace what is known; facts of anchors that the site has not are dropped."""
+        known = self._known
+        gauge = facts.gauge
+        named = set() if gauge is None else {gauge.origin, gauge.x_axis, gauge.left} - {None}
+        self.facts = replace(
+            facts,
+            heights_m={anchor: one for anchor, one in facts.heights_m.items() if anchor in known},
+            tapes=tuple(one for one in facts.tapes if {one.a, one.b} <= known and one.a != one.b),
+            points={anchor: one for anchor, one in facts.points.items() if anchor in known},
+            sketch_m={anchor: one for anchor, one in facts.sketch_m.items() if anchor in known},
+            delays=tuple(one for one in facts.delays if one.anchor in known),
+            gauge=gauge if named <= known else None,
+        )
+
+    # Results
+
+    def ranges(self) -> PairRanges:
+        """All ranges so far; anchors without one, too."""
+        found = self._ranger.ranges()
+        return replace(found, anchors=tuple(sorted(self._known)))
+
+    def finish(self) -> None:
+        """Nothing more comes: what has come since the last full second counts as well."""
+        self._ranger.finish()
+
+    def add_result(self, survey: Survey, ranges: PairRanges) -> None:
+        """Keep a result; the oldest of many is dropped."""
+        self.serial += 1
+        self._results[self.serial] = (survey, ranges)
+        if len(self._results) > _RESULTS_KEPT:
+            del self._results[next(iter(self._results))]
+
+    def result(self, serial: int) -> tuple[Survey, PairRanges] | None:
+        """A result by its number, with the ranges that it was made of; None if it is no longer kept."""
+        return self._results.get(serial)
+
+    def place(self, site: Site, record: SurveyRecord, now_s: float) -> None:
+        """The site is the surveyed one from now on: ranges begin again, as antenna delays are others."""
+        self.site, self.saved_serial, self.error = site, self.serial, None
+        if self.facts.sketch_m:
+            sketch = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
+            self.facts = replace(self.facts, sketch_m=sketch)
+        self._pause_until_s = now_s + ADOPTION_S
+        self._begin_ranges()
+        self._begin_watch(record)
+
+    # What goes out
+
+    def state(self, now_s: float) -> State:
+        """Whether stamps come, and whether there is a result."""
+        if self._newest_s is None or now_s - self._newest_s > NO_DATA_S:
+            return "no data"
+        return "surveyed" if self._results else "collecting"
+
+    def message(self, now_s: float, unix_s: float, file: str | None) -> SurveyMessage:
+        """All of it for those who watch."""
+        newest, state = self._results.get(self.serial), self.state(now_s)
+        present = {anchor for anchor, heard_s in self._heard_s.items() if now_s - heard_s <= PRESENT_S}
+        ranges = self._ranger.ranges()
+        error = self.error
+        if error is None and state == "no data":
+            ago = "yet" if self._newest_s is None else f"for {now_s - self._newest_s:.0f} s"
+            error = f"no stamps have come from the anchors {ago}"
+        return SurveyMessage(
+            unix_s=unix_s,
+            serial=self.serial,
+            anchors=tuple(sorted(present)),
+            missing=tuple(sorted(self._known - present)),
+            duration_s=ranges.duration_s,
+            pairs=tuple(SurveyProgress(one.a, one.b, one.exchanges, one.range_m, one.std_m) for one in ranges.pairs),
+            facts=self.facts,
+            survey=None if newest is None else newest[0],
+            error=error,
+            saved_serial=self.saved_serial,
+            file=file,
+            state=state,
+        )
+
+    def watch_message(self, now_s: float, unix_s: float) -> WatchMessage | None:
+        """What the watch sees; None while there is none, as too few anchors have positions."""
+        watch = self._watch
+        if watch is None:
+            return None
+        watch.advance(now_s)
+        findings = tuple(
+            WatchFinding(one.kind, one.anchors, one.size_m, one.std_m, one.since_s + unix_s - now_s, one.sentence)
+            for one in watch.findings
+        )
+        has_data = self.state(now_s) != "no data"
+        return WatchMessage(unix_s, watch.state if has_data else "no data", findings, watch.pairs)
+
+    def restart_ranges(self) -> None:
+        """Forget all ranges and results: an anchor is where it was not before."""
+        self._begin_ranges()
+
+    # Within
+
+    @property
+    def _known(self) -> set[int]:
+        return self._identifiers
+
+    def _add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float, now_s: float) -> None:
+        self._newest_s = self._heard_s[sender] = self._heard_s[receiver] = now_s
+        self._ranger.add(sender, receiver, tx_ticks, rx_ticks, t_s)
+
+    def _is_paused(self, now_s: float) -> bool:
+        if self._pause_until_s is not None and now_s >= self._pause_until_s:
+            self._pause_until_s = None
+        return self._pause_until_s is not None
+
+    def _sent_s(self, anchor: int, unix_s: float, now_s: float) -> float:
+        """When a message was sent: by its sender's clock, less what the quickest of its messages shows that to be off.
+
+        A message may have waited behind others, and hosts' clocks differ.
+        """
+        lag_s = now_s - unix_s
+        least_s = self._lags_s.get(anchor)
+        if least_s is None or not 0.0 <= lag_s - least_s < _MOST_BACKLOG_S:
+            self._lags_s[anchor] = least_s = lag_s
+        return unix_s + least_s
+
+    def _begin_ranges(self) -> None:
+        self._identifiers = {anchor.id for anchor in self.site.all_anchors}
+        self._ranger = PairRanger(on_block=self._on_block)
+        self._results.clear()
+
+    def _begin_watch(self, record: SurveyRecord | None) -> None:
+        """Watch the anchors that have positions, if these are enough to say anything."""
+        placed = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in self.site.anchors}
+        self._watch = None
+        if self._watches and len(placed) > 2:
+            known = None if record is None else {(one.a, one.b): one.range_m for one in baseline(record).pairs}
+            self._watch = AnchorWatch(placed, self.facts.dimensions, known)
+
+    def _on_block(self, block: PairBlock) -> None:
+        if self._watch is not None:
+            self._watch.add(block)
+
+
+def is_record_of(record: SurveyRecord, site: Site) -> bool:
+    """Whether a site still has the positions that a survey gave it."""
+    found = {one.id: one for one in record.survey.anchors if one.determined}
+    placed = {anchor.id: anchor for anchor in site.anchors}
+    return record.site_id == site.id and all(
+        anchor in placed and _is_near(placed[anchor].x_m, one.x_m) and _is_near(placed[anchor].y_m, one.y_m)
+        for anchor, one in found.items()
+        if anchor in {known.id for known in site.all_anchors}
+    )
+
+
+def _is_near(value_m: float, found_m: float | None) -> bool:
+    return found_m is not None and abs(value_m - found_m) < 1e-3
+
+
+def is_same_site(one: Site, other: Site) -> bool:
+    """Whether two sites have the same anchors at the same positions with the same delays."""
+    return site_digest(one) == site_digest(other)

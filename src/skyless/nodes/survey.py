@@ -1,0 +1,424 @@
+"""``skyless survey`` at a running site: gathers anchors' stamps, publishes results, saves them, watches the anchors."""
+
+import asyncio
+import secrets
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import msgspec
+from msgspec import Struct
+
+from skyless.air.reception import Reception
+from skyless.errors import SkylessError
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.link import Handler, Link
+from skyless.mqtt.messages import (
+    PlacementMessage,
+    RequestMessage,
+    SiteMessage,
+    StampsMessage,
+    SurveyFactsMessage,
+    SurveySaveMessage,
+    WatchMessage,
+)
+from skyless.mqtt.topics import (
+    EVERY_NODE,
+    floor_plan_topic,
+    placement_topic,
+    request_topic,
+    site_topic,
+    stamps_topic,
+    survey_facts_topic,
+    survey_save_topic,
+    survey_topic,
+    watch_topic,
+)
+from skyless.nodes.live_survey import FactsOf, LiveSurvey, is_record_of
+from skyless.nodes.process import Log, every, keep, outlasting, together
+from skyless.nodes.radio_monitor import RadioMonitor
+from skyless.nodes.survey_files import FloorImage, Saved, save_survey, saved_without_file
+from skyless.radios.interface import Gone, Hint, Radio, RadioEvent, Restarted
+from skyless.site.digest import is_same_but_placed, site_digest
+from skyless.site.model import Site
+from skyless.survey.facts import Facts
+from skyless.survey.ranges import PairRanges
+from skyless.survey.record import SurveyRecord, read_record, record_path
+from skyless.survey.result import Survey
+from skyless.survey.stamps.legs import LegCollector
+
+NAME: Final = "survey"
+"""On MQTT: one site has one survey program."""
+
+LEASE_S: Final = 15.0
+_REQUEST_S: Final = 5.0
+"""Each request for stamps is repeated at this interval, before its lease ends."""
+
+_UPDATE_S: Final = 1.0
+_QUIET_S: Final = 10.0
+"""The watch and a survey without stamps are published at least so often."""
+
+_PAIRS_PER_S: Final = 400
+"""Pairs that are published a second: larger sites publish less often."""
+
+_COST: Final = 5.0
+"""The next result is not begun before this many times the time that the last one took."""
+
+_SETTLED_S: Final = 60.0
+_SETTLED_UPDATE_S: Final = 5.0
+"""After a minute of data results change little, and are made less often."""
+
+_EARLIER_KEPT: Final = 32
+"""Sites before the present one that a placement names."""
+
+Solve = Callable[[PairRanges, Facts], Survey]
+_M = TypeVar("_M", bound=Struct)
+
+
+class SurveySettings(Struct, frozen=True):
+    """What a survey program serves."""
+
+    site_id: int
+    site: Site | None = None
+    """None: that on MQTT."""
+    file: Path | None = None
+    """The site's file, which is written on request."""
+    watches: bool = True
+    serves: bool = True
+    """False: it only gathers, next to a program that serves; nothing is computed, published or saved."""
+
+
+class SurveyNode:
+    """The survey program of one site, with stamps by MQTT or from what a radio of its own receives."""
+
+    def __init__(
+        self,
+        settings: SurveySettings,
+        facts_of: FactsOf,
+        solve: Solve,
+        address: MqttAddress | None,
+        log: Log,
+        radio: Radio | None = None,
+    ) -> None:
+        """``facts_of``: what is known of a site before anybody gives facts; ``solve``: ``survey.solve.run_survey``."""
+        self.live: LiveSurvey | None = None
+        """None before the site is known."""
+        self.problems = 0
+        """Messages that could not be read."""
+        self.saved: Saved | None = None
+        self._settings, self._facts_of, self._solve, self._log, self._radio = settings, facts_of, solve, log, radio
+        self._given: SurveyFactsMessage | None = None
+        self._running: Site | None = None
+        """The site of the anchors, as they publish it."""
+        self._placement: PlacementMessage | None = None
+        """The newest on MQTT."""
+        self._image: bytes | None = None
+        self._legs = LegCollector(settings.site_id)
+        self._monitor = None if radio is None else RadioMonitor(NAME, "listening", log, radio.advice)
+        self._received = 0
+        self._facts_changed = False
+        self._solving: asyncio.Task[None] | None = None
+        self._next_solve_s = 0.0
+        self._next_publish_s = 0.0
+        self._watch_published: tuple[WatchMessage, float] | None = None
+        self._findings: frozenset[str] = frozenset()
+        self._moved: frozenset[str] = frozenset()
+        self._said_state = ""
+        self._name = NAME if settings.serves else f"{NAME}-{secrets.token_hex(4)}"
+        self.link = None if address is None else Link(address, self._name, site=settings.site_id, kind=NAME)
+        if self.link is not None:
+            self._subscribe(self.link)
+        if settings.site is not None:
+            self._begin(settings.site)
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        if self.link is None:
+            await self._work()
+        else:
+            await outlasting(keep(self.link, self._log), self._work())  # what is withdrawn is still sent
+
+    async def _work(self) -> None:
+        parts = [every(_UPDATE_S, self.update), every(_REQUEST_S, self._request)]
+        if self._radio is not None:
+            parts.append(self._radio.run(self.on_event))
+        try:
+            await together(*parts)
+        finally:
+            if self._solving is not None:
+                self._solving.cancel()
+            self._withdraw()
+
+    def _withdraw(self) -> None:
+        """End the lease, and clear what is retained for as long as this runs."""
+        link, site_id = self.link, self._settings.site_id
+        if link is None:
+            return
+        link.publish(request_topic(site_id), RequestMessage(self._name, (), 0.0), qos=1)
+        if self._settings.serves:
+            for topic in (survey_topic(site_id), watch_topic(site_id)):
+                link.publish(topic, b"", qos=1, retain=True)
+
+    # What comes in
+
+    def _subscribe(self, link: Link) -> None:
+        site_id = self._settings.site_id
+        link.on_state.append(self._on_state)
+        link.subscribe(site_topic(site_id), self._reader(SiteMessage, self._on_site), qos=1)
+        if self._radio is None:
+            link.subscribe(stamps_topic(site_id, EVERY_NODE), self._reader(StampsMessage, self._on_stamps))
+        if self._settings.serves:
+            for topic, kind, handle in (
+                (survey_facts_topic(site_id), SurveyFactsMessage, self._on_facts),
+                (survey_save_topic(site_id), SurveySaveMessage, self._on_save),
+                (placement_topic(site_id), PlacementMessage, self._on_placement),
+            ):
+                link.subscribe(topic, self._reader(kind, handle), qos=1)
+            link.subscribe(floor_plan_topic(site_id), self._on_image)
+
+    def _reader(self, kind: type[_M], handle: Callable[[Any], None]) -> Handler:
+        """A handler that reads messages; one that cannot be read is counted."""
+        decode = msgspec.json.Decoder(kind).decode
+
+        def read(_topic: str, payload: bytes) -> None:
+            if not payload:
+                return  # it was withdrawn
+            try:
+                message = decode(payload)
+            except msgspec.MsgspecError:
+                self.problems += 1
+            else:
+                handle(message)
+
+        return read
+
+    def _on_state(self, connected: bool) -> None:
+        if connected:
+            self._request()
+
+    def _request(self) -> None:
+        if self.link is not None and self._radio is None:
+            message = RequestMessage(self._name, (), LEASE_S, stamps=True)
+            self.link.publish(request_topic(self._settings.site_id), message, qos=1)
+
+    def _on_site(self, message: SiteMessage) -> None:
+        self._running = message.site
+        live = self.live
+        if live is None:
+            self._begin(message.site)
+        elif site_digest(message.site) == site_digest(live.site):
+            return
+        elif self._settings.file is not None:
+            self._log(f"the anchors run with another site than {self._settings.file}: its positions or delays differ")
+        else:
+            self._log("the anchors run with another site than before: the survey begins again")
+            self._begin(message.site)
+
+    def _on_stamps(self, message: StampsMessage) -> None:
+        if self.live is not None:
+            self.live.add_stamps(message, time.monotonic())
+
+    def on_event(self, event: RadioEvent) -> None:
+        """Process an event of the own radio."""
+        if isinstance(event, Reception):
+            self._received += 1
+            for leg in self._legs.add(event):
+                if self.live is not None:
+                    self.live.add_leg(leg, time.monotonic())
+        elif isinstance(event, Restarted | Gone | Hint):
+            if isinstance(event, Restarted) and self._received:
+                self._legs = LegCollector(self._settings.site_id)
+            if self._monitor is not None:
+                self._monitor.on_event(event)
+
+    def _on_facts(self, message: SurveyFactsMessage) -> None:
+        self._given = message
+        if self.live is not None:
+            self.live.set_facts(message.facts)
+            self._facts_changed = True
+            self._next_solve_s = self._next_publish_s = 0.0
+
+    def _on_image(self, _topic: str, payload: bytes) -> None:
+        self._image = payload or None
+
+    def _on_placement(self, message: PlacementMessage) -> None:
+        self._placement = message
+
+    def _begin(self, site: Site) -> None:
+        """Survey a site from now on."""
+        record = _record_of(self._settings.file, site, self._log)
+        try:
+            facts = self._facts_of(site) if self._given is None else self._given.facts
+        except SkylessError as error:  # options name anchors that the site on MQTT has not
+            self._log(f"survey: {error}")
+            facts = Facts()
+        self.live = LiveSurvey(site, facts, record, watches=self._settings.watches)
+        self.live.set_facts(facts)
+        self._next_solve_s = 0.0
+
+    # Results
+
+    def update(self) -> None:
+        """Begin another result if it is time, and publish what is due."""
+        live, now_s, unix_s = self.live, time.monotonic(), time.time()
+        if self._monitor is not None and self._radio is not None:
+            self._monitor.check(now_s, self._received, self._legs.counters["legs"], self._legs.counters)
+        if live is None or not self._settings.serves:
+            return
+        if (self._solving is None or self._solving.done()) and now_s >= self._next_solve_s:
+            has_news = live.state(now_s) != "no data" or self._facts_changed
+            if has_news:
+                self._solving = asyncio.ensure_future(self._make_result(live))
+        self._log_state(live, now_s)
+        watch = live.watch_message(now_s, unix_s)
+        if watch is not None:
+            self._log_findings(live, watch)
+        if self.link is not None:
+            self._publish(self.link, live, now_s, unix_s, watch)
+
+    async def _make_result(self, live: LiveSurvey) -> None:
+        """One result, made in a thread so that the loop goes on."""
+        self._facts_changed = False
+        ranges, facts = live.ranges(), live.facts
+        if not ranges.pairs:
+            return
+        begin_s = time.monotonic()
+        try:
+            survey = await asyncio.to_thread(self._solve, ranges, facts)
+        except SkylessError as error:
+            live.error = str(error)
+            return
+        except Exception as error:  # noqa: BLE001 - whatever it is, the next result may be one
+            live.error = f"no result: {error!r}"
+            self._log(live.error)
+            return
+        finally:
+            took_s = time.monotonic() - begin_s
+            pause_s = _SETTLED_UPDATE_S if ranges.duration_s > _SETTLED_S else _UPDATE_S
+            if not self._facts_changed:
+                self._next_solve_s = time.monotonic() + max(pause_s, _COST * took_s) - 0.5 * _UPDATE_S
+        if self.live is live and live.facts is facts:
+            live.error = None
+            live.add_result(survey, ranges)
+
+    def _publish(self, link: Link, live: LiveSurvey, now_s: float, unix_s: float, watch: WatchMessage | None) -> None:
+        site_id, file = self._settings.site_id, self._settings.file
+        if now_s >= self._next_publish_s:
+            message = live.message(now_s, unix_s, None if file is None else str(file))
+            link.publish(survey_topic(site_id), message, qos=1, retain=True)
+            pause_s = _QUIET_S if message.state == "no data" else max(_UPDATE_S, len(message.pairs) / _PAIRS_PER_S)
+            self._next_publish_s = now_s + pause_s - 0.5 * _UPDATE_S
+        if watch is not None:
+            published = self._watch_published
+            is_news = published is None or _without_time(watch) != _without_time(published[0])
+            if is_news or published is None or now_s - published[1] >= _QUIET_S:
+                self._watch_published = watch, now_s
+                link.publish(watch_topic(site_id), watch, qos=1, retain=True)
+
+    def _log_state(self, live: LiveSurvey, now_s: float) -> None:
+        state = live.state(now_s)
+        if state != self._said_state:
+            if state == "no data" and self._said_state:
+                self._log("survey: no stamps come from the anchors any more")
+                self._next_publish_s = 0.0
+            elif state != "no data" and self._said_state in ("", "no data"):
+                self._log("survey: stamps come from the anchors")
+            self._said_state = state
+
+    def _log_findings(self, live: LiveSurvey, watch: WatchMessage) -> None:
+        """Log what is new; an anchor that has moved makes the ranges of before useless for another survey."""
+        present = frozenset(one.sentence for one in watch.findings)
+        kinds = {(one.kind, one.anchors) for one in watch.findings}
+        for one in watch.findings:
+            if one.sentence not in self._findings:
+                self._log(f"watch: {one.sentence}")
+        for sentence in sorted(self._findings - present):
+            self._log(f"watch: over: {sentence}")
+        moved = frozenset(f"{kind} {anchors}" for kind, anchors in kinds if kind in ("moved", "delay"))
+        if moved - self._moved:
+            live.restart_ranges()
+        self._findings, self._moved = present, moved
+
+    # Saving
+
+    def _on_save(self, message: SurveySaveMessage) -> None:
+        live = self.live
+        if live is None:
+            return
+        try:
+            self.save(message.serial)
+        except SkylessError as error:
+            live.error = f"not saved: {error}"
+            self._log(f"survey: {live.error}")
+        self._next_publish_s = 0.0
+        self.update()
+
+    def save(self, serial: int | None = None) -> Saved:
+        """Use a result, by default the newest: write the site's file, and let the anchors adopt it.
+
+        Raises:
+            SkylessError: there is no such result, or it cannot be used.
+        """
+        live = self.live
+        if live is None:
+            raise SkylessError("the site is not known yet")
+        number = live.serial if serial is None else serial
+        kept = live.result(number)
+        if kept is None:
+            raise SkylessError(f"result {number} is not there; the newest is {live.serial}")
+        survey, ranges = kept
+        if not any(anchor.determined for anchor in survey.anchors):
+            raise SkylessError(f"result {number} determines no anchor")
+        file, before, running = self._settings.file, live.site, self._running
+        if running is not None and site_digest(running) != site_digest(before):
+            raise SkylessError(f"the anchors run with another site than {file or 'before'}: start them with that file")
+        unix_s = time.time()
+        if file is None:
+            saved = saved_without_file(before, survey, ranges, unix_s)
+        else:
+            saved = save_survey(file, survey, ranges, unix_s, self._floor())
+        if not is_same_but_placed(before, saved.site):
+            raise SkylessError(f"{file} is not the site that was surveyed: it has been changed meanwhile")
+        self._place(live, before, saved)
+        return saved
+
+    def _place(self, live: LiveSurvey, before: Site, saved: Saved) -> None:
+        """Publish the new site for the anchors, and survey and watch that from now on."""
+        earlier: tuple[str, ...] = ()
+        old = self._placement
+        if old is not None and site_digest(old.site) == site_digest(before):
+            earlier = (old.before, *old.earlier)[:_EARLIER_KEPT]
+        self._placement = PlacementMessage(time.time(), site_digest(before), saved.site, earlier)
+        if self.link is not None:
+            self.link.publish(placement_topic(self._settings.site_id), self._placement, qos=1, retain=True)
+        self._running = None  # until the anchors publish it
+        self.saved = saved
+        live.place(saved.site, saved.record, time.monotonic())
+        written = "".join(f", {path} written" for path in saved.written)
+        self._log(f"survey: saved{written}")
+
+    def _floor(self) -> FloorImage | None:
+        plan = None if self._given is None else self._given.floor_plan
+        return None if plan is None else FloorImage(plan, self._image)
+
+
+def _record_of(file: Path | None, site: Site, log: Log) -> SurveyRecord | None:
+    """The record of the survey that a site file comes from; without one the watch learns what is usual."""
+    if file is None or not record_path(file).exists():
+        return None
+    try:
+        record = read_record(record_path(file))
+    except SkylessError as error:
+        log(f"not used: {error}")
+        return None
+    if is_record_of(record, site):
+        return record
+    log(f"not used: {record_path(file)} is of other positions than those in {file}")
+    return None
+
+
+def _without_time(message: WatchMessage) -> object:
+    """What makes two messages of the watch say the same."""
+    findings = [(one.kind, one.anchors, one.sentence) for one in message.findings]
+    return message.state, message.pairs, findings

@@ -1,0 +1,111 @@
+"""A survey into the files of a site: the site's own, the record next to it, and the image of the floor."""
+
+from pathlib import Path
+from typing import Final
+from zlib import crc32
+
+from msgspec import Struct
+
+from skyless.errors import SkylessError
+from skyless.site.check import check_site
+from skyless.site.image import image_size
+from skyless.site.load import load_site
+from skyless.site.model import FloorPlanSite, Site
+from skyless.site.rewrite import with_values
+from skyless.survey.ranges import PairRanges
+from skyless.survey.record import SurveyRecord, encode_record, record_path
+from skyless.survey.result import Survey
+from skyless.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text
+
+_ENDINGS: Final = {b"\x89PNG": ".png"}
+
+
+class FloorImage(Struct, frozen=True):
+    """Where the image of the floor lies, and its bytes; None for that of the site file."""
+
+    plan: FloorPlanSite
+    image: bytes | None
+
+
+class Saved(Struct, frozen=True):
+    """The site after a survey."""
+
+    site: Site
+    record: SurveyRecord
+    written: tuple[Path, ...] = ()
+
+
+def saved_without_file(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> Saved:
+    """The site after a survey, where there is no file to write.
+
+    Raises:
+        SkylessError: the result is no valid site.
+    """
+    placed = surveyed_site(site, survey)
+    check_site(placed, Path("the survey's result"))
+    return Saved(placed, _record(site, survey, ranges, unix_s))
+
+
+def save_survey(
+    file: Path, survey: Survey, ranges: PairRanges, unix_s: float, floor: FloorImage | None = None
+) -> Saved:
+    """Write a result into a site's file, and its record next to it; the file before is kept under another name.
+
+    Raises:
+        SkylessError: a file cannot be read or written, or the result is no valid site.
+    """
+    site = load_site(file)
+    record, kept = _record(site, survey, ranges, unix_s), _free_name(file)
+    images: list[Path] = []
+    try:
+        text = surveyed_text(file.read_bytes().decode(), survey, site, file)
+        if floor is not None:
+            image_name, images = _floor_image(file, site, floor)
+            if image_name is not None:
+                plan = floor.plan
+                values: dict[str, float | str] = {
+                    "image": image_name,
+                    "width_m": plan.width_m,
+                    "x_m": plan.x_m,
+                    "y_m": plan.y_m,
+                }
+                text = with_values(text, {}, {"floor_plan": values}, file, "the floor plan")
+        kept.write_bytes(file.read_bytes())
+        _replace(record_path(file), encode_record(record))
+        _replace(file, text.encode())
+    except OSError as error:
+        raise SkylessError(f"{error.filename or file} cannot be written: {error.strerror}") from None
+    return Saved(load_site(file), record, (file, record_path(file), kept, *images))
+
+
+def _record(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> SurveyRecord:
+    return SurveyRecord(site.name, site.id, unix_s, ranges, survey, delay_changes_ticks(site, survey))
+
+
+def _free_name(file: Path) -> Path:
+    """``NAME.before-survey-1.toml``, or the next number that is free."""
+    number = 1
+    while (kept := file.with_name(f"{file.stem}.before-survey-{number}{file.suffix}")).exists():
+        number += 1
+    return kept
+
+
+def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None, list[Path]]:
+    """Name of the image in the site file, and what was written for it; None where there is no image."""
+    present = None if site.floor_plan is None else site.floor_plan.image
+    if floor.image is None or image_size(floor.image) is None:
+        return present, []
+    if present is not None and (file.parent / present).read_bytes() == floor.image:
+        return present, []
+    path = file.with_name(f"{file.stem}.floor{_ENDINGS.get(floor.image[:4], '.jpg')}")
+    if path.exists() and path.read_bytes() != floor.image:
+        path = path.with_stem(f"{path.stem}-{crc32(floor.image):08x}")
+    _replace(path, floor.image)
+    return path.name, [path]
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Write a file so that a reader finds the old one or the whole new one. Raises OSError."""
+    scratch = path.with_name(f".{path.name}.part")
+    scratch.write_bytes(data)
+    scratch.replace(path)
