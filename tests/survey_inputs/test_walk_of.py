@@ -1,5 +1,6 @@
 """From recordings to surveys with a tag: a walk past anchors on two lines, and what the recording lacks."""
 
+import json
 from functools import partial
 
 import numpy as np
@@ -9,6 +10,7 @@ from msgspec.structs import replace
 from machines.bench import LAB, Heard
 from recordings import live_site
 from skyless.anchor import Anchor
+from skyless.cli.main import main
 from skyless.constants import TICK_M
 from skyless.errors import SkylessError
 from skyless.evaluation.scenarios import Request, impairments_of
@@ -83,3 +85,23 @@ def test_a_part_of_the_walk(walk):
 def test_what_the_recording_lacks(walk, tag, span, words):
     with McapRecording(walk) as recording, pytest.raises(SkylessError, match=words):
         walk_of(recording, LAB.id, tag, span)
+
+
+def test_the_command_uses_the_walk(walk, capsys):
+    assert main(["survey", str(walk), "--no-sketch", "--walk", "a@2:20", "--walk-height", "0", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert any("of the walk of a were used" in note for note in report["notes"] + report.get("warnings", []))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--walk", "b"), "tag"),
+        (("--walk", "a@9:4"), "later one last"),
+        (("--walk-height", "1"), "walk"),
+        (("--walk", "a@90:99"), "90:99"),
+    ],
+)
+def test_what_the_command_does_not_take(walk, capsys, arguments, words):
+    assert main(["survey", str(walk), *arguments]) == 2
+    assert words in capsys.readouterr().err
