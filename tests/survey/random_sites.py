@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from skyless.site.lab import lab_site
 from skyless.survey.fit.problem import Problem
@@ -66,18 +67,15 @@ def draw(layout, seed, *, dimensions=2, late=0.0, missing=0.0, delay_std_m=0.0, 
     is_late = rng.random(len(first)) < late
     range_m = np.linalg.norm(layout[first] - layout[second], axis=1) + delay_m[first] + delay_m[second]
     range_m += rng.normal(0, std_m, len(first)) + is_late * rng.uniform(0.2, 1.0, len(first))
-    problem = problem_of(
-        layout, first, second, range_m, dimensions=dimensions, delay_std_m=delay_std_m, std_m=std_m
-    )
+    problem = problem_of(layout, first, second, range_m, dimensions=dimensions, delay_std_m=delay_std_m, std_m=std_m)
     sketch_m = None
     if sketch_std_m is not None:
         sketch_m = layout + rng.normal(0, sketch_std_m, layout.shape)
         sketch_m[:, dimensions:] = layout[:, dimensions:]
         variance = problem.coordinate_variance_m2.copy()
         variance[:, :dimensions] = sketch_std_m**2
-        fields = {name: getattr(problem, name) for name in problem.__struct_fields__}
         coordinate_m = np.where(problem.is_free, sketch_m, problem.coordinate_m)
-        problem = Problem(**fields | {"coordinate_m": coordinate_m, "coordinate_variance_m2": variance})
+        problem = replace(problem, coordinate_m=coordinate_m, coordinate_variance_m2=variance)
     return Drawn(problem, layout, is_late, sketch_m)
 
 
@@ -102,8 +100,7 @@ def draw_plant(seed, *, delay_std_m=0.07, std_m=0.03):
     range_m = distance + error_m + rng.normal(0, 0.1, 105) / np.sqrt(count)
     problem = problem_of(position_m, first, second, range_m, dimensions=2, delay_std_m=delay_std_m, std_m=std_m)
     variance = problem.variance_m2 + 0.1**2 / count
-    fields = {name: getattr(problem, name) for name in problem.__struct_fields__}
-    return Drawn(Problem(**fields | {"variance_m2": variance}), position_m, is_late, None)
+    return Drawn(replace(problem, variance_m2=variance), position_m, is_late, None)
 
 
 def aligned_error_m(position_m, truth_m, dimensions=2):

@@ -6,23 +6,28 @@ from typing import Final
 import numpy as np
 
 from skyless.kernels.arrays import Array, Mask
+from skyless.survey.build import Measured, levels, with_free_delays
 from skyless.survey.fit import determined as determination
-from skyless.survey.fit.build import Measured, levels, with_free_delays
 from skyless.survey.fit.links import Links
-from skyless.survey.fit.shape import Fitted, redundancy, surveyed_problem
+from skyless.survey.fit.problem import Problem
 from skyless.survey.fit.tapes import TapeChoice, best_tapes, mending_tapes
 from skyless.survey.frame import Framed
 from skyless.survey.result import TapeAdvice
 from skyless.survey.sentences import anchors_named, are, joined, tapes_named
+from skyless.survey.shape import Fitted, redundancy, surveyed_problem
 
 LEAST_CHECKS: Final = 3
 """Ranges more than unknowns below which nothing checks a result."""
 
-_FLAT: Final = 0.1
+_FLAT: Final = 0.3
 """Extent of a site across, as a part of its extent along, below which it is flat."""
 
 _ONE_AXIS: Final = 0.7
 """Part of all squares along one direction from which on positions change along it."""
+
+_BENDS_M: Final = 0.01
+_BENT_SIGMA: Final = 3.0
+"""Least standard deviation of a shape that is looked at when bent, and how far it is bent."""
 
 _AXIS_PART: Final = 0.9
 """Square of the cosine from which on a direction is an axis's."""
@@ -88,10 +93,11 @@ def missing_sentences(measured: Measured, links: Links, fitted: Fitted | None) -
         # Anchors with equally few ranges share a sentence, which then does not name to whom they are.
         by_reason.setdefault(re.sub(r", to .*;", ";", reason), []).append(anchor)
     by_reason = {reasons[anchors[0]] if len(anchors) == 1 else reason: anchors for reason, anchors in by_reason.items()}
-    return tuple(
-        f"{anchors_named(anchors)} {are(anchors)} not determined: {_plural(reason, anchors)}{_mending(measured, links, fitted, anchors)}"
-        for reason, anchors in by_reason.items()
-    )
+    sentences = []
+    for reason, anchors in by_reason.items():
+        named = f"{anchors_named(anchors)} {are(anchors)} not determined: {_plural(reason, anchors)}"
+        sentences.append(named + _mending(measured, links, fitted, anchors))
+    return tuple(sentences)
 
 
 def _plural(reason: str, anchors: list[int]) -> str:
@@ -144,10 +150,7 @@ def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
     surveyed, unknown = with_free_delays(surveyed_problem(fitted))
     if not unknown.any():
         return ()
-    weight = fitted.used.astype(np.float64)
-    position = fitted.solution.position_m
-    rows = determination.jacobian(surveyed, position, weight)
-    covariance = determination.aligned_covariance(surveyed, rows, position, fitted.core)
+    position, covariance = _least_held(fitted, surveyed)
     stds = determination.position_stds_m(surveyed, covariance)
     if not np.any(fitted.core & (stds > determination.MOST_STD_M)):
         return ()
@@ -166,6 +169,33 @@ def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
         f"delays of {anchors_named(anchors)} against {against} are not determined by the ranges: only the expected "
         f"delays (±{expected:.2f} m) hold them" + (f"; {_would(pairs)}" if pairs else ""),
     )
+
+
+def _least_held(fitted: Fitted, surveyed: Problem) -> tuple[Array, Array]:
+    """Of the positions that the fit does not exclude those that ranges alone hold least, with their covariance.
+
+    Where only expected delays hold a shape, they are off, and bend it: a bent shape seems to be held by its ranges,
+    although the true one is not. So the shapes along the least certain direction are looked at, up to 3 σ.
+    """
+    weight = fitted.used.astype(np.float64)
+    start = fitted.solution.position_m
+
+    def covariance_at(position_m: Array) -> tuple[float, Array]:
+        rows = determination.jacobian(surveyed, position_m, weight)
+        covariance = determination.aligned_covariance(surveyed, rows, position_m, fitted.core)
+        return float(determination.position_stds_m(surveyed, covariance)[fitted.core].max()), covariance
+
+    worst, covariance = covariance_at(start)
+    least_held = start
+    for direction in determination.weak_directions(surveyed, fitted.covariance_m2, fitted.core, _BENDS_M, 1):
+        middle = 0.0
+        for half, step in ((_BENT_SIGMA, 0.5), (0.5, 0.1)):
+            for sigma in np.arange(middle - half, middle + half + 0.01, step).tolist():
+                position = start + sigma * direction.std_m * direction.shift_m
+                std, found = covariance_at(position)
+                if std > worst:
+                    worst, covariance, least_held, middle = std, found, position, sigma
+    return least_held, covariance
 
 
 def _touched(size: Array, allowed: Mask) -> Mask:

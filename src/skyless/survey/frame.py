@@ -6,9 +6,9 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.survey.build import Measured, as_array, levels
 from skyless.survey.facts import Gauge
-from skyless.survey.fit.build import Measured, as_array, levels
-from skyless.survey.fit.gauge import Axes, Motion, align, axes_through, gauge_of
+from skyless.survey.fit.gauge import Axes, Motion, align, axes_through
 from skyless.survey.sentences import anchors_named, joined
 
 _NEAR: Final = 0.5
@@ -75,7 +75,7 @@ def _motion(
     if core.sum() < 2:
         return Motion(np.eye(3), -position_m[lowest] * ([1, 1, 0] if axes == 2 else [1, 1, 1])), "", None, notes
     found = axes_through(position_m, core, axes, lowest)
-    return found.motion, f"{_sentence(anchors, found, axes)}; {_MIRROR}", gauge_of(found, anchors), notes
+    return found.motion, f"{_sentence(anchors, found, axes)}; {_MIRROR}", _gauge_of(found, anchors), notes
 
 
 _MIRROR = "nobody has named origin and axes, and the picture may be a mirror image"
@@ -116,8 +116,8 @@ def _by_gauge(
     sentence = _sentence(anchors, found, axes) + mirror
     if known is not None:
         whole = Motion(found.motion.rotation @ known.rotation, found.motion.moved(known.shift_m))
-        return whole, sentence, gauge_of(found, anchors), notes
-    return found.motion, sentence, gauge_of(found, anchors), notes
+        return whole, sentence, _gauge_of(found, anchors), notes
+    return found.motion, sentence, _gauge_of(found, anchors), notes
 
 
 def _by_points(
@@ -169,3 +169,9 @@ def _level_notes(measured: Measured) -> list[str]:
     if levels(measured):
         return []
     return ["nothing levels the site: heights of three anchors that are not on one line would"]
+
+
+def _gauge_of(axes: Axes, anchors: Integers) -> Gauge:
+    """The frame by identifiers."""
+    left = None if axes.left is None else int(anchors[axes.left])
+    return Gauge(int(anchors[axes.origin]), int(anchors[axes.x_axis]), left)

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import structs
 
 from skyless.kernels.arrays import Array
-from skyless.survey.fit.build import Measured, as_array, build_problem, fixed_heights_m, own_delays
+from skyless.survey.build import Measured, as_array, build_problem, fixed_heights_m, own_delays
 from skyless.survey.fit.problem import Problem
 from skyless.survey.fit.robust import RobustFit, fit_robustly
 from skyless.survey.ranges import PairRange

@@ -1,7 +1,7 @@
 """A survey: positions and delays of all anchors from the ranges of their pairs and what the user knows.
 
 Counting comes first (``fit/links.py``): only anchors with enough ranges are fitted. The fit finds a shape
-(``fit/shape.py``), which is moved to its frame (``frame.py``); then follows what is not determined (``findings.py``).
+(``shape.py``), which is moved to its frame (``frame.py``); then follows what is not determined (``findings.py``).
 """
 
 import math
@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from skyless.kernels.arrays import Array, Mask
+from skyless.survey.build import Measured, as_array, levels, own_delays, usable
 from skyless.survey.facts import Facts
 from skyless.survey.findings import (
     advised_tapes,
@@ -19,15 +20,14 @@ from skyless.survey.findings import (
     unchecked,
 )
 from skyless.survey.fit.ambiguity import OtherFit, find_ambiguities
-from skyless.survey.fit.build import Measured, as_array, levels, own_delays, usable
 from skyless.survey.fit.determined import position_stds_m
 from skyless.survey.fit.links import Links, adjacency, count_links
-from skyless.survey.fit.shape import Fitted, fit_shape, redundancy
 from skyless.survey.frame import Framed, in_frame
 from skyless.survey.kept import survey_of_kept_positions
 from skyless.survey.ranges import PairRange, PairRanges
 from skyless.survey.result import Ambiguity, Survey, SurveyedAnchor, SurveyedPair
 from skyless.survey.sentences import anchors_named, joined
+from skyless.survey.shape import Fitted, fit_shape, redundancy
 from skyless.survey.tagged import with_tags
 
 _MOVED_M: Final = 0.1

@@ -5,7 +5,7 @@ from msgspec import structs
 
 from skyless.survey.fit.ambiguity import OtherFit
 from skyless.survey.fit.problem import solve_least_squares
-from skyless.survey.fit.shape import Fitted, with_tag
+from skyless.survey.shape import Fitted, with_tag
 from skyless.survey.tags.joint import fit_with_tag
 
 

@@ -26,6 +26,9 @@ _MOVED_M: Final = 0.1
 _LEAST_CHECKS: Final = 3.0
 _LARGEST_SHARE_OUT: Final = 0.5
 
+_NO_MOTION: Final = 1e-9
+"""Of a site, such as a line's around itself."""
+
 _MOST_OTHERS: Final = 4
 """That are reported."""
 
@@ -54,20 +57,19 @@ def find_ambiguities(problem: Problem, fit: RobustFit) -> tuple[OtherFit, ...]:
     std_m = aligned_std_m(problem, fit)
     is_late = solve_least_squares(problem, fit.solution.position_m).cost > fit.cost + _LATE_GAIN
     others: list[tuple[float, OtherFit]] = []
-    for minima, is_mirrored in ((by_mirror, True), (fit.others, False)):
+    for minima in (by_mirror, fit.others):
         for index in np.flatnonzero(minima.cost < fit.cost + _MIRROR_AS_GOOD):
-            fewer = bool(np.any(fit.used & ~minima.used[index]))
-            if fewer and not (is_late and minima.cost[index] < fit.cost + _OTHERS_AS_GOOD):
+            same = not np.any(fit.used & ~minima.used[index])
+            if not same and not (is_late and minima.cost[index] < fit.cost + _OTHERS_AS_GOOD):
                 continue
             position_m = aligned_to(problem, minima.position_m[index], fit.solution.position_m)
             motion_m = np.linalg.norm(position_m - fit.solution.position_m, axis=1)
             elsewhere = np.flatnonzero((motion_m > _MOVED_M) & (motion_m > _MOVED_STDS * std_m))
             if elsewhere.size:
                 used = minima.used[index]
-                reason = _reason(problem, fit.used, used, is_mirrored)
-                others.append(
-                    (float(minima.cost[index]), OtherFit(position_m, used, tuple(elsewhere.tolist()), reason))
-                )
+                reason = _reason(problem, fit.used, used)
+                other = OtherFit(position_m, used, tuple(elsewhere.tolist()), reason)
+                others.append((float(minima.cost[index]), other))
     others.sort(key=lambda item: item[0])
     kept: list[OtherFit] = []
     for _, other in others:
@@ -78,22 +80,25 @@ def find_ambiguities(problem: Problem, fit: RobustFit) -> tuple[OtherFit, ...]:
 
 
 def unchecked_reason(problem: Problem, fit: RobustFit) -> str | None:
-    """A sentence where a wrong range would not show, None where enough ranges check the result."""
-    checks = redundancy(fit.problem, fit.solution, fit.used)
+    """A sentence where a wrong range would not show, None where enough ranges check the result.
+
+    ``problem``: as given to the fit; the fit's own variances are used.
+    """
+    problem = fit.problem
+    checks = redundancy(problem, fit.solution, fit.used)
     out = int(np.count_nonzero(~fit.used))
     if checks < _LEAST_CHECKS:
-        return (
-            f"Nothing checks this survey: {np.count_nonzero(fit.used)} ranges in use, all but {checks:.1f} are needed."
-        )
+        used = np.count_nonzero(fit.used)
+        return f"Nothing checks this survey: of {used} ranges in use, all but {checks:.1f} are needed."
     if out > _LARGEST_SHARE_OUT * (checks + out):
         return f"{out} late ranges were left out; only {checks:.1f} of the rest check the result."
     return None
 
 
-def _reason(problem: Problem, used: Mask, other: Mask, is_mirrored: bool) -> str:
-    if is_mirrored and np.array_equal(used, other):
-        return "mirrored"
+def _reason(problem: Problem, used: Mask, other: Mask) -> str:
     out = np.flatnonzero(used & ~other)
+    if not out.size:
+        return "mirrored"
     return "other ranges late: " + ", ".join(f"{problem.first[k]}–{problem.second[k]}" for k in out)
 
 
@@ -118,20 +123,22 @@ def _aligned(position_m: Array, target_m: Array, weight: Array, axes: Integers) 
     u, _, v = np.linalg.svd((share * (own - own_centre)).T @ (other - other_centre))
     moved_m = position_m.copy()
     moved_m[:, axes] = (own - own_centre) @ (u @ v) + other_centre
-    return moved_m
+    return np.asarray(moved_m)
 
 
 def aligned_std_m(problem: Problem, fit: RobustFit) -> Array:
     """Of each anchor's distance from the truth, after the best rigid alignment, shape (n,)."""
     free = np.flatnonzero(problem.is_free.ravel())
     motions = _rigid_motions(problem, fit.solution.position_m)[free]
-    basis = np.zeros((len(fit.solution.information), motions.shape[1]))
-    basis[: len(free)] = np.linalg.qr(motions)[0]
+    direction, length, _ = np.linalg.svd(motions, full_matrices=False)
+    direction = direction[:, length > _NO_MOTION * length.max(initial=0.0)]
+    basis = np.zeros((len(fit.solution.information), direction.shape[1]))
+    basis[: len(free)] = direction
     covariance = np.linalg.inv(fit.solution.information + basis @ basis.T + 1e-6 * np.eye(len(basis)))
     keep = np.eye(len(basis)) - basis @ basis.T
     variance = np.zeros(problem.is_free.size)
     variance[free] = np.einsum("ij,jk,ik->i", keep, covariance, keep)[: len(free)]
-    return np.sqrt(np.maximum(variance.reshape(-1, 3).sum(axis=1), 0.0))
+    return np.asarray(np.sqrt(np.maximum(variance.reshape(-1, 3).sum(axis=1), 0.0)))
 
 
 def _rigid_motions(problem: Problem, position_m: Array) -> Array:

@@ -7,10 +7,10 @@ aligned. An anchor whose standard deviation remains above ``MOST_STD_M`` leaves 
 from typing import Final
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from skyless.kernels.arrays import Array, Integers, Mask
-from skyless.survey.fit.problem import Problem, residuals_m
+from skyless.survey.fit.problem import Problem, residuals_m, solve_least_squares
 
 MOST_STD_M: Final = 0.25
 """Standard deviation per axis above which an anchor is not determined."""
@@ -25,6 +25,12 @@ _UNKNOWN_STD_M: Final = 30.0
 _SAME: Final = 1e-9
 _BARRIER: Final = 4.0
 """Increase of the cost that separates two shapes."""
+
+_NEARLY_FLAT: Final = 0.3
+"""Extent across, as a part of the extent along, below which a shape may be flat."""
+
+_FLAT_BARRIER: Final = 11.0
+"""Increase of the cost (3.3 σ) by which a flat shape must fit worse for the extent across to be real."""
 
 
 class Direction(Struct, frozen=True, eq=False):
@@ -173,11 +179,7 @@ def weak_directions(
 
 
 def folds(problem: Problem, position_m: Array, delay_m: Array, weight: Array, direction: Direction) -> bool:
-    """Whether the shape can be moved by 2 × ``MOST_STD_M`` along a direction without ranges that contradict.
-
-    That a linear model does not show: anchors on a line have no first-order hold across it, and their noise puts them
-    next to the line, where they seem to have one.
-    """
+    """Whether the shape can be moved by 2 × ``MOST_STD_M`` along a direction without ranges that contradict."""
     start = cost(problem, position_m, delay_m, weight)
     for sign in (1.0, -1.0):
         for step in np.arange(0.05, 2.0 * MOST_STD_M + 0.01, 0.05):
@@ -187,6 +189,30 @@ def folds(problem: Problem, position_m: Array, delay_m: Array, weight: Array, di
         else:
             return True
     return False
+
+
+def may_be_flat(problem: Problem, position_m: Array, delay_m: Array, weight: Array, axes: int) -> bool:
+    """Whether all anchors may stand on one line (``axes`` 2, seen from above) or in one plane (3).
+
+    Anchors on a line have no first-order hold across it; their ranges' errors put them next to the line, where they
+    seem to have one. So the anchors are fitted on the line, which must fit worse.
+    """
+    if np.isfinite(problem.coordinate_variance_m2[:, :axes]).any() or len(position_m) < 2:
+        return False
+    centred = position_m[:, :axes] - position_m[:, :axes].mean(axis=0)
+    _, extent, directions = np.linalg.svd(centred, full_matrices=False)
+    if len(extent) == axes and extent[-1] > _NEARLY_FLAT * extent[0]:
+        return False
+    flat_m = position_m.copy()
+    flat_m[:, :axes] = 0.0
+    flat_m[:, : axes - 1] = centred @ directions[: axes - 1].T
+    is_free = problem.is_free.copy()
+    is_free[:, axes - 1] = False
+    flat = structs.replace(problem, is_free=is_free, coordinate_m=np.where(is_free, problem.coordinate_m, flat_m))
+    found = solve_least_squares(flat, flat_m, weight)
+    return cost(flat, found.position_m, found.delay_m, weight) < (
+        cost(problem, position_m, delay_m, weight) + _FLAT_BARRIER
+    )
 
 
 def cost(problem: Problem, position_m: Array, delay_m: Array, weight: Array) -> float:

@@ -5,8 +5,7 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.kernels.arrays import Array, Integers, Mask
-from skyless.survey.facts import Gauge
+from skyless.kernels.arrays import Array, Mask
 from skyless.survey.fit.links import distances_m
 
 _DECIDED: Final = 16.0
@@ -132,12 +131,6 @@ def axes_through(
     if axes == 2:
         shift[2] = 0.0
     return Axes(Motion(rotation, shift), origin, x_axis, chosen if decided else None, decided)
-
-
-def gauge_of(axes: Axes, anchors: Integers) -> Gauge:
-    """The frame by identifiers."""
-    left = None if axes.left is None else int(anchors[axes.left])
-    return Gauge(int(anchors[axes.origin]), int(anchors[axes.x_axis]), left)
 
 
 def _first(chosen: Mask) -> int | None:

@@ -24,8 +24,8 @@ _LOOSE_STD_M: Final = 0.05
 _LOOSE_COST: Final = 40.0
 """By which a relocation may be worse while all other anchors stay."""
 
-_APART_M: Final = 0.1
-"""Positions that differ by less are the same."""
+_APART_M: Final = 0.25
+"""Positions of an anchor that differ by less are the same: leaving ranges out leads from one to the other."""
 
 _LEAST_LATE: Final = 1.5
 """Standard deviations by which a range is late if it is left out, by a linear prediction that errs."""
@@ -45,17 +45,29 @@ _REFIT_WORK: Final = 6e5
 def relocated(problem: Problem, position_m: Array, delay_m: Array) -> Array:
     """Starts with one anchor where circles (spheres) of two (three) of its ranges meet, shape (b, n, 3)."""
     axes = np.flatnonzero(problem.is_free.all(axis=0))
-    starts = []
+    found: list[tuple[float, int, Array]] = []
     for anchor in range(len(position_m)):
-        for other_m in _other_positions(problem, position_m, delay_m, anchor, axes):
-            start_m = position_m.copy()
-            start_m[anchor] = other_m
-            starts.append(start_m)
+        for worse, other_m in _other_positions(problem, position_m, delay_m, anchor, axes):
+            found.append((worse, anchor, other_m))
+    found.sort(key=lambda item: item[:2])
+    unknowns = int(np.count_nonzero(problem.is_free)) + len(position_m)
+    starts = []
+    for _, anchor, other_m in found[: _most_refits(unknowns)]:
+        start_m = position_m.copy()
+        start_m[anchor] = other_m
+        starts.append(start_m)
     return np.array(starts).reshape(-1, *position_m.shape)
 
 
-def _other_positions(problem: Problem, position_m: Array, delay_m: Array, anchor: int, axes: Integers) -> list[Array]:
-    """Where one anchor may be as well, the best first, while all others stay."""
+def _most_refits(unknowns: int) -> int:
+    """As many as large sites allow in little time."""
+    return int(np.clip(_REFIT_WORK / unknowns**2, _LEAST_REFITS, _MOST_REFITS))
+
+
+def _other_positions(
+    problem: Problem, position_m: Array, delay_m: Array, anchor: int, axes: Integers
+) -> list[tuple[float, Array]]:
+    """Where one anchor may be as well, the best first, while all others stay; and by how much worse that fits."""
     own = np.flatnonzero((problem.first == anchor) | (problem.second == anchor))
     neighbour = problem.first[own] + problem.second[own] - anchor
     if len(own) < len(axes) or len(axes) < 2:
@@ -76,13 +88,14 @@ def _other_positions(problem: Problem, position_m: Array, delay_m: Array, anchor
     known = np.where(problem.is_free[anchor], candidate_m - np.nan_to_num(problem.coordinate_m[anchor]), 0.0)
     cost = np.minimum(residual_m**2 / variance, cutoff).sum(axis=1)
     cost = cost + np.sum(known**2 / np.maximum(problem.coordinate_variance_m2[anchor], 1e-10), axis=1)
-    kept: list[Array] = [position_m[anchor]]
+    kept, worse = [position_m[anchor]], [0.0]
     for index in np.argsort(cost, kind="stable"):
         if cost[index] > cost[0] + _LOOSE_COST or len(kept) > _MOST_RELOCATIONS:
             break
         if np.linalg.norm(np.array(kept) - candidate_m[index], axis=1).min() > _APART_M:
             kept.append(candidate_m[index])
-    return kept[1:]
+            worse.append(float(cost[index] - cost[0]))
+    return list(zip(worse, kept, strict=True))[1:]
 
 
 def _meeting_points(centre_m: Array, radius_m: Array) -> Array:
@@ -124,9 +137,8 @@ def without_ranges(problem: Problem, solution: Solution, used: Mask) -> Mask:
     np.fill_diagonal(free, own < _UNCONTROLLED)
     late = np.minimum(first, second) > _LEAST_LATE
     rows, columns = np.nonzero(np.triu(late | free))
-    gain = first[rows, columns] * residual[rows] + np.where(
-        rows == columns, 0.0, second[rows, columns] * residual[columns]
-    )
+    gain = first[rows, columns] * residual[rows]
+    gain += np.where(rows == columns, 0.0, second[rows, columns] * residual[columns])
     order = np.argsort(9.0 * (1.0 + (rows != columns)) - gain, kind="stable")[:20_000]
     rows, columns = rows[order], columns[order]
     change = influence[:, rows] * first[rows, columns] + np.where(
@@ -135,7 +147,7 @@ def without_ranges(problem: Problem, solution: Solution, used: Mask) -> Mask:
     coordinates = np.count_nonzero(problem.is_free)
     motion = np.abs(change[:coordinates]).max(axis=0, initial=0.0)
     moves = (motion > _LEAST_MOTION_M) | free[rows, columns]
-    most = int(np.clip(_REFIT_WORK / len(solution.information) ** 2, _LEAST_REFITS, _MOST_REFITS))
+    most = _most_refits(len(solution.information))
     rows, columns = rows[moves][:most], columns[moves][:most]
     sets = np.tile(used, (len(rows), 1))
     sets[np.arange(len(rows)), in_use[rows]] = False
@@ -154,9 +166,8 @@ def derivatives(problem: Problem, solution: Solution, ranges: Integers) -> Array
     whole[row, second, :3] = -unit
     whole[row, first, 3] = 1.0
     whole[row, second, 3] = 1.0
-    return np.concatenate(
-        [whole[:, :, :3].reshape(len(ranges), -1)[:, problem.is_free.ravel()], whole[:, :, 3]], axis=1
-    )
+    coordinates = whole[:, :, :3].reshape(len(ranges), 3 * n)[:, problem.is_free.ravel()]
+    return np.concatenate([coordinates, whole[:, :, 3]], axis=1)
 
 
 def regular(information: Array) -> Array:
@@ -165,7 +176,10 @@ def regular(information: Array) -> Array:
 
 
 def mirrored(problem: Problem, position_m: Array) -> Array:
-    """Starts with parts reflected in the line (plane) through the two (three) anchors they hang on, shape (b, n, 3)."""
+    """Starts with parts reflected in the line (plane) through the two (three) anchors they hang on, shape (b, n, 3).
+
+    Single anchors are among those of ``relocated``.
+    """
     axes = np.flatnonzero(problem.is_free.all(axis=0))
     n = len(position_m)
     joined = np.zeros((n, n), dtype=np.bool_)
@@ -181,9 +195,9 @@ def mirrored(problem: Problem, position_m: Array) -> Array:
 
 
 def _hanging_parts(joined: Mask, dimensions: int) -> list[Mask]:
-    """Single anchors, and groups that hang on no more others than there are dimensions; each shape (n,)."""
+    """Pairs of anchors that hang on no more others than there are dimensions; each shape (n,)."""
     n = len(joined)
-    parts = [np.arange(n) == anchor for anchor in range(n)] if n > dimensions + 1 else []
+    parts = []
     for pair in combinations(range(n), 2):
         part = np.isin(np.arange(n), pair)
         if np.count_nonzero(joined[part].any(axis=0) & ~part) <= dimensions < n - 2:

@@ -1,7 +1,9 @@
 """Unknowns, rows and least squares of a survey: a range of a pair is ``d + h_a + h_b`` (``docs/survey.md``).
 
 Normal equations are summed pair by pair, for many starts and weights at once: a robust fit and the search for other
-results need hundreds of small solutions. Positions are only known up to a rigid motion here, unless facts name coordinates: steps have minimum norm, so that a
+results need hundreds of small solutions.
+
+Positions are only known up to a rigid motion here, unless facts name coordinates: steps have minimum norm, so that a
 solution stays where its start was (a free network).
 """
 
@@ -115,7 +117,7 @@ def solve_many(
         damped = information.copy()
         floor = 1e-6 * diagonal.max(axis=1, initial=0.0)[:, None]
         np.einsum("bii->bi", damped)[:] += damping[busy, None] * np.maximum(diagonal, floor)
-        step = np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
+        step = np.asarray(np.linalg.solve(damped, gradient[:, :, None])[:, :, 0], dtype=np.float64)
         trial_m, trial_delay_m = equations.moved(position_m[busy], delay_m[busy], step)
         trial_cost = equations.cost(trial_m, trial_delay_m, weight[busy])
         better = trial_cost <= cost[busy]
@@ -194,9 +196,8 @@ class _Equations:
         priors = np.concatenate([self._of_coordinate.ravel()[self._free], self._of_delay])
         np.einsum("bii->bi", information)[:] += priors
         from_delays = self._of_delay * (self._problem.delay_m - delay_m)
-        gradient = gradient + np.concatenate(
-            [from_coordinates.reshape(b, self._problem.is_free.size)[:, self._free], from_delays], axis=1
-        )
+        from_coordinates = from_coordinates.reshape(b, self._problem.is_free.size)[:, self._free]
+        gradient = gradient + np.concatenate([from_coordinates, from_delays], axis=1)
         for one, more in product(range(b), self._problem.more):
             jacobian, residual_more = more.rows(position_m[one], delay_m[one])
             of_unknowns = jacobian[:, self._more_columns]

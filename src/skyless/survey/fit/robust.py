@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from skyless.kernels.arrays import Array, Mask
 from skyless.survey.fit.neighbours import derivatives, regular, relocated, without_ranges
+from skyless.survey.fit.presence import Presence
 from skyless.survey.fit.problem import Problem, Solution, Solutions, residuals_m, solve_least_squares, solve_many
 
 LATE_CUTOFF: Final = 3.0
@@ -34,9 +35,18 @@ _MOST_CHANGES: Final = 10
 
 _LEAST_CHECKS: Final = 4.0
 _SIGNIFICANT: Final = 2.6
-"""Standard deviations by which squares of residuals must exceed what is expected before a larger error is assumed."""
+"""Standard deviations by which squares of residuals must exceed what is expected if no range was left out."""
+
+_EXCESS_WEIGHT: Final = 10.0
+_LEAST_EVIDENCE: Final = 25.0
+"""For a larger error: twice the logarithm of likelihoods, and these standard deviations times a weight. Late ranges
+that were left out say nothing of the error of the others; so likelihoods alone mistake many late ranges for it."""
+
+_FIRST_WIDTH: Final = 4.0
+"""Of the expected error."""
 
 _MOST_WIDENINGS: Final = 20
+_SAME_WIDTH: Final = 0.03
 _LEAST_STD_M: Final = 0.005
 _LARGEST_STD_M: Final = 0.3
 
@@ -84,38 +94,76 @@ def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0)
     show that it is larger, the larger one is used.
     """
     start_m = np.stack(starts)
-    minima = _from_starts(problem, start_m)
-    wider, std_m = _widened(problem, minima, pair_std_m)
-    if std_m > pair_std_m:
-        problem, minima = wider, _from_starts(wider, start_m)
+    narrow = _best_near(problem, _from_starts(problem, start_m), pair_std_m)
+    checks = redundancy(problem, narrow.solution, narrow.used)
+    excess = _excess(_squares(problem, narrow.solution, narrow.used), checks)
+    if checks < _LEAST_CHECKS or (narrow.used.all() and excess < _SIGNIFICANT):
+        return narrow
+    std_m = _shown_std_m(narrow)
+    if std_m <= pair_std_m:
+        return narrow
+    wider = replace(problem, variance_m2=problem.variance_m2 - pair_std_m**2 + std_m**2)
+    wide = _best_near(wider, _from_starts(wider, start_m), std_m)
+    # Twice the logarithm of how much likelier the ranges are: a larger error makes each range in use less likely.
+    in_use = wide.used
+    width = np.mean(np.log(wider.variance_m2 / problem.variance_m2)[in_use])
+    likelier = narrow.cost - wide.cost - redundancy(wider, wide.solution, in_use) * width
+    return wide if likelier + _EXCESS_WEIGHT * excess > _LEAST_EVIDENCE else narrow
+
+
+def _best_near(problem: Problem, minima: Minima, pair_std_m: float) -> RobustFit:
+    """The best of some minima, or a better one that is found from there."""
+    presence = Presence(problem, minima.position_m[0])
+    best_whole = np.inf
+    fit: RobustFit | None = None
     for _ in range(_MOST_IMPROVEMENTS):
-        used, cost = minima.used[0], float(minima.cost[0])
-        solution = solve_least_squares(problem, minima.position_m[0], used.astype(np.float64))
-        minima = _near(problem, solution, used)
-        if not len(minima.cost) or minima.cost[0] > cost - _LEAST_GAIN:
+        whole = minima.cost + presence.cost(minima.position_m)
+        if fit is not None and (not len(whole) or whole.min() > best_whole - _LEAST_GAIN):
             break
-    return RobustFit(problem, solution, used, cost, std_m, minima)
+        best = int(np.argmin(whole))
+        best_whole, used = float(whole[best]), minima.used[best]
+        solution = solve_least_squares(problem, minima.position_m[best], used.astype(np.float64))
+        cost = float(minima.cost[best])
+        minima = _joined(_near(problem, solution, used), minima)
+        fit = RobustFit(problem, solution, used, cost, pair_std_m, minima)
+    assert fit is not None
+    return fit
 
 
-def _widened(problem: Problem, minima: Minima, pair_std_m: float) -> tuple[Problem, float]:
-    """The problem with the constant error that residuals of ranges in use show, where they show more than expected."""
-    position_m, delay_m, std_m = minima.position_m[:1], minima.delay_m[:1], pair_std_m
-    used = minima.used[0]
-    wider = problem
-    for round_ in range(_MOST_WIDENINGS):
-        solution = solve_least_squares(wider, position_m[0], used.astype(np.float64))
-        checks = redundancy(wider, solution, used)
-        squares = float(np.sum(used * solution.residual_m**2 / wider.variance_m2))
-        # Normal approximation of chi-square by its cube root (Wilson and Hilferty).
-        spread = 2.0 / (9.0 * max(checks, 1e-6))
-        limit = checks * (1.0 - spread + _SIGNIFICANT * np.sqrt(spread)) ** 3 if round_ == 0 else checks
-        if checks < _LEAST_CHECKS or squares <= limit or std_m >= _LARGEST_STD_M:
-            break
-        std_m = min(max(std_m, _LEAST_STD_M) * float(np.clip(np.sqrt(squares / checks), 1.05, 1.5)), _LARGEST_STD_M)
-        wider = replace(problem, variance_m2=problem.variance_m2 - pair_std_m**2 + std_m**2)
+def _shown_std_m(fit: RobustFit) -> float:
+    """The constant error of a pair that residuals of ranges in use show, if it is more than the fit assumes.
+
+    Few ranges too many can be made to agree by leaving out those that do not, whatever their error: so the search
+    begins with a larger error, and goes on to what the residuals show until both agree.
+    """
+    least_m, problem = fit.range_std_m, fit.problem
+    position_m, delay_m = fit.solution.position_m[None], fit.solution.delay_m[None]
+    std_m = _FIRST_WIDTH * max(least_m, _LEAST_STD_M)
+    for _ in range(_MOST_WIDENINGS):
+        wider = replace(problem, variance_m2=problem.variance_m2 - least_m**2 + std_m**2)
         near = graduated(wider, position_m, delay_m, np.full(1, 0.1))
         position_m, delay_m, used = near.position_m, near.delay_m, near.used[0]
-    return wider, std_m
+        solution = solve_least_squares(wider, position_m[0], used.astype(np.float64))
+        checks = redundancy(wider, solution, used)
+        if checks < _LEAST_CHECKS:
+            return least_m
+        before_m = std_m
+        ratio = np.sqrt(_squares(wider, solution, used) / checks)
+        std_m = float(np.clip(std_m * np.clip(ratio, 0.5, 1.5), least_m, _LARGEST_STD_M))
+        if abs(std_m - before_m) <= _SAME_WIDTH * before_m:
+            break
+    return std_m
+
+
+def _squares(problem: Problem, solution: Solution, used: Mask) -> float:
+    """Weighted squares of the ranges in use."""
+    return float(np.sum(used * solution.residual_m**2 / problem.variance_m2))
+
+
+def _excess(squares: float, checks: float) -> float:
+    """Standard deviations by which weighted squares exceed what is expected: their cube root is nearly normal."""
+    variance = 2.0 / (9.0 * max(checks, 1e-6))
+    return float((np.cbrt(squares / max(checks, 1e-6)) - 1.0 + variance) / np.sqrt(variance))
 
 
 def _near(problem: Problem, solution: Solution, used: Mask) -> Minima:
@@ -126,7 +174,12 @@ def _near(problem: Problem, solution: Solution, used: Mask) -> Minima:
     sets = without_ranges(problem, solution, used)
     position_m, delay_m = np.tile(solution.position_m, (len(sets), 1, 1)), np.tile(solution.delay_m, (len(sets), 1))
     fewer = cut_off(problem, position_m, delay_m, sets)
-    both = [np.concatenate(parts) for parts in zip(_fields(elsewhere), _fields(fewer), strict=True)]
+    return _joined(elsewhere, fewer)
+
+
+def _joined(some: Minima, more: Minima) -> Minima:
+    """All of them, the best first."""
+    both = [np.concatenate(parts) for parts in zip(_fields(some), _fields(more), strict=True)]
     order = np.argsort(both[3], kind="stable")
     return Minima(*(part[order] for part in both))
 
@@ -167,7 +220,7 @@ def _huber(problem: Problem, start: Solutions) -> Solutions:
 
 
 def graduated(problem: Problem, position_m: Array, delay_m: Array, least_control: Array) -> Minima:
-    """Graduated non-convexity from ``b`` starts: a control of 0 begins with a convex cost, of 1 near the cut-off one."""
+    """Graduated non-convexity from ``b`` starts: controls of 0 begin with a convex cost, of 1 near the cut-off one."""
     scaled = _in_cutoffs(problem, residuals_m(problem, position_m, delay_m))
     convex = 1.0 / np.maximum(2.0 * np.max(scaled, axis=1, initial=0.0) - 1.0, 1.0 / _LAST_CONTROL)
     control = np.maximum(convex, least_control)

@@ -37,9 +37,8 @@ def start_positions(problem: Problem, sketch_m: Array | None = None) -> list[Arr
         kept = np.triu(rng.random(distance_m.shape) < _KEPT_SHARE, 1)
         fewer_m = np.where(kept | kept.T, distance_m, np.inf)
         position_m = _layout(_completed(np.where(_connects(fewer_m), fewer_m, distance_m)), len(axes))
-        laid_out.append(
-            position_m + rng.normal(0.0, _MOVED_SHARE * max(float(position_m.std()), 0.1), position_m.shape)
-        )
+        moved_m = _MOVED_SHARE * max(float(position_m.std()), 0.1)
+        laid_out.append(position_m + rng.normal(0.0, moved_m, position_m.shape))
     starts = []
     if sketch_m is not None:
         nearby_m = _moved_to(laid_out[0], known_m, axes)
@@ -64,7 +63,7 @@ def _known_distances(problem: Problem, axes: Integers) -> Array:
     np.minimum.at(distance_m, (first, second), along_m)
     distance_m = np.minimum(distance_m, distance_m.T)
     np.fill_diagonal(distance_m, 0.0)
-    return distance_m
+    return np.asarray(distance_m)
 
 
 def _completed(distance_m: Array) -> Array:
@@ -73,7 +72,7 @@ def _completed(distance_m: Array) -> Array:
     for middle in range(len(path_m)):
         np.minimum(path_m, path_m[:, middle, None] + path_m[middle], out=path_m)
     finite = np.isfinite(path_m)
-    return np.where(finite, path_m, path_m[finite].max(initial=1.0))
+    return np.asarray(np.where(finite, path_m, path_m[finite].max(initial=1.0)))
 
 
 def _connects(distance_m: Array) -> bool:

@@ -19,6 +19,14 @@ _LEAST_GAIN: Final = 0.02
 """Part of the standard deviation that a tape must save to be named."""
 
 
+_AS_GOOD: Final = 0.98
+_AS_LITTLE: Final = 1.2
+"""Gain, as a part of the best one, and what remains, as a multiple of the least, that are no worse.
+
+Of equal tapes the first is named, whatever the noise.
+"""
+
+
 class TapeChoice(Struct, frozen=True, eq=False):
     """A distance, by indices, and what it would change."""
 
@@ -62,7 +70,9 @@ def best_tapes(
         )
         variance = np.maximum(variance, 0.0) + TAPE_STD_M**2
         gain = np.sum(columns[: 3 * n][inside] ** 2, axis=0) / variance
-        best = int(np.argmax(gain))
+        left = max(float(np.diag(covariance)[: 3 * n][inside].sum()), 0.0) - gain
+        as_good = (gain >= _AS_GOOD * gain.max()) & (left <= _AS_LITTLE * left.min() + 1e-12)
+        best = int(np.flatnonzero(as_good | (gain == gain.max()))[0])
         before = _rms(position_stds_m(problem, covariance)[core])
         covariance = covariance - np.outer(columns[:, best], columns[:, best]) / variance[best]
         stds = position_stds_m(problem, covariance)[core]

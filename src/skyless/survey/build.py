@@ -115,7 +115,7 @@ def build_problem(
         is_free[:, 2] = False
         coordinate[:, 2], variance[:, 2] = fixed_heights_m(measured)[kept], np.inf
     delay = np.zeros(n)
-    delay_variance = np.full(n, facts.delay_std_m**2)
+    delay_variance = np.full(n, facts.delay_std_m**2, np.float64)
     for item in facts.delays:
         if item.anchor in index:
             delay[index[item.anchor]], delay_variance[index[item.anchor]] = item.delay_m, item.std_m**2

@@ -8,8 +8,8 @@ from msgspec import Struct, structs
 from scipy.special import chdtri
 
 from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.survey.build import Measured, as_array, build_problem, levels, with_free_delays
 from skyless.survey.fit import determined as determination
-from skyless.survey.fit.build import Measured, as_array, build_problem, levels, with_free_delays
 from skyless.survey.fit.gauge import Motion, align, fitting_points
 from skyless.survey.fit.problem import MoreRows, Problem, Solution, solve_least_squares
 from skyless.survey.fit.robust import RobustFit, fit_robustly
@@ -113,7 +113,10 @@ def _worth(
     for direction in determination.weak_directions(surveyed, covariance, core, 0.02, 4):
         if determination.folds(surveyed, solution.position_m, solution.delay_m, weight, direction):
             core = core & ~direction.anchors
-    if core.sum() < least:
+    flat = determination.may_be_flat(
+        surveyed, solution.position_m, solution.delay_m, weight, 2 if levels(measured) else 3
+    )
+    if core.sum() < least or flat:
         core = np.zeros(len(kept), bool)
     if core.any():
         full = determination.jacobian(problem, solution.position_m, weight)
