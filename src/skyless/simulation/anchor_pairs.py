@@ -11,7 +11,7 @@ from skyless.kernels.arrays import Array
 from skyless.simulation.impairments import PairError
 from skyless.simulation.streams import PAIR_KEY, stream
 
-BLOCKED_M: Final = math.inf
+_BLOCKED_M: Final = math.inf
 """The error of a pair that does not receive one another."""
 
 _KNOTS: Final = 20
@@ -61,5 +61,5 @@ class AnchorPairErrors:
         for a, b, error, drift in self._errors:
             drift_m = 0.0 if drift is None else drift.at(t_s)
             if error.from_s <= t_s < error.to_s:
-                present_m[a, b] += BLOCKED_M if error.blocked else error.late_m + drift_m
+                present_m[a, b] += _BLOCKED_M if error.blocked else error.late_m + drift_m
                 present_m[b, a] = present_m[a, b]
