@@ -81,3 +81,14 @@ def test_check_shows_warnings(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "warning: all anchors lie nearly in one plane" in shown
     assert "valid, with warnings" in shown
+
+
+def test_new_writes_anchors_without_positions(tmp_path, capsys):
+    path = tmp_path / "blank.toml"
+    assert main(["site", "new", str(path), "--unplaced", "7", "--tag-height", "1.1"]) == 0
+    site = load_site(path)
+    assert (site.anchors, site.schedule.mode, site.schedule.slots, site.tags.height_m) == ((), "slots", 7, 1.1)
+    assert [(anchor.id, anchor.slot) for anchor in site.unplaced] == [(k, k - 1) for k in range(1, 8)]
+    assert main(["site", "check", str(path)]) == 0
+    assert main(["site", "new", str(path), "--unplaced", "7", "--width", "3", "--force"]) == 2
+    assert "--unplaced is 7; it takes no sizes" in capsys.readouterr().err

@@ -17,12 +17,12 @@ from skyless.studies import (
     room,
     scale,
     sitetime,
-    survey,
     sync,
 )
 from skyless.studies.picture import Look, draw
 from skyless.studies.plan import Cell, Plan, Row, Study
 from skyless.studies.summary import Case, world_cells, world_rows
+from skyless.studies.surveys import study as survey
 
 
 def _of_worlds(name: str, title: str, cases: Callable[[Plan], list[Case]], look: Look) -> Study:

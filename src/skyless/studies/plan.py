@@ -198,7 +198,7 @@ class Row(Struct, frozen=True):
     near: float | None = None
     """Share of surveys whose anchors are less than 10 cm off, rms (``survey``, as all below)."""
     undetermined: float | None = None
-    """Share of surveys that leave an anchor without a position."""
+    """Share of surveys that say something is not determined: an anchor, or delays against positions."""
     flagged: float | None = None
     """Share of surveys that say they are ambiguous or not checked, or leave an anchor without a position."""
     wrong: int | None = None

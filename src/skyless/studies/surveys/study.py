@@ -1,0 +1,190 @@
+"""The study ``survey``: anchors that survey themselves through simulated air, against their bound.
+
+Each run is one site in the air: real machines of anchors, whose receptions of one another become ranges and these a
+survey. Delays, errors of pairs, late and missing pairs are drawn for each run and are in the air, not added afterwards.
+Several surveys with other facts may use the air of one run.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.kernels.arrays import Array
+from skyless.studies.plan import Cell, Plan, Row, seed_of, with_limits
+from skyless.studies.survey_layouts import SurveyLayout, survey_layouts
+from skyless.studies.surveys.air import drawn_errors, free_axes, ranges_in_air
+from skyless.studies.surveys.cases import GROUPS, Group, Variant, limits_of
+from skyless.studies.surveys.judge import Outcome, judged, survey_bound_m, tag_error_m
+from skyless.survey.facts import Facts, Point, Tape
+from skyless.survey.solve import run_survey
+
+HAND_STD_M: Final = 0.02
+"""Of positions measured by hand, per axis."""
+TAPE_STD_M: Final = 0.005
+NEAR_M: Final = 0.1
+"""A result whose anchors are farther off (rms) is wrong."""
+_WRONG_SIGMAS: Final = 4.0
+"""It should say so, if it is also farther off than this many of its own standard deviations."""
+
+_RUNS_IN_A_CELL: Final = 5
+_SKETCH_STD_M: Final = 0.3
+
+
+class SurveyRuns(Struct, frozen=True):
+    """Runs of one group on one layout."""
+
+    layout: str
+    group: Group
+    seeds: tuple[int, ...]
+    seconds: float
+    noise_ps: float
+
+
+def cells(plan: Plan) -> list[Cell]:
+    """Some runs of one group on one layout each."""
+    return [Cell(f"{runs.layout}, {runs.group.name}", survey_runs, runs, _weight_s(runs)) for runs in _all_runs(plan)]
+
+
+def _all_runs(plan: Plan) -> list[SurveyRuns]:
+    found = []
+    for number, (layout, groups) in enumerate(GROUPS.items()):
+        for kind, group in enumerate(groups):
+            seeds = [seed_of(plan.seed, number, kind, world) for world in range(plan.worlds)]
+            seconds = plan.seconds if group.seconds is None else min(group.seconds, plan.seconds)
+            found += [
+                SurveyRuns(layout, group, tuple(seeds[first : first + _RUNS_IN_A_CELL]), seconds, plan.noise_ps)
+                for first in range(0, plan.worlds, _RUNS_IN_A_CELL)
+            ]
+    return found
+
+
+def _weight_s(runs: SurveyRuns) -> float:
+    return len(runs.seeds) * (0.06 * runs.seconds + 0.3 * len(runs.group.variants))
+
+
+def survey_runs(runs: SurveyRuns) -> tuple[tuple[Outcome, ...], ...]:
+    """Outcomes of each run, one for each variant."""
+    return tuple(_run(runs, survey_layouts()[runs.layout], seed) for seed in runs.seeds)
+
+
+def _run(runs: SurveyRuns, layout: SurveyLayout, seed: int) -> tuple[Outcome, ...]:
+    draw = np.random.default_rng(seed)
+    drawn = drawn_errors(runs.group, layout, draw)
+    ranges = ranges_in_air(layout, drawn, runs.seconds, runs.noise_ps, int(draw.integers(1 << 60)))
+    hand_m = draw.normal(0.0, HAND_STD_M, layout.position_m.shape) * free_axes(layout)
+    sketch_m = draw.normal(0.0, _SKETCH_STD_M, layout.position_m.shape) * free_axes(layout)
+    tape_m = draw.normal(0.0, TAPE_STD_M, 3)
+    hand_tag_m = tag_error_m(layout, layout.position_m + hand_m, np.zeros(len(hand_m)), drawn.delay_m)
+    outcomes, asked_for = [], tuple[tuple[int, int], ...]()
+    for variant in runs.group.variants:
+        facts = _facts(layout, runs.group, variant, asked_for[: variant.tapes], tape_m, (hand_m, sketch_m))
+        survey = run_survey(ranges, facts)
+        if not variant.tapes and not variant.keeps:
+            asked_for = tuple((tape.a, tape.b) for tape in survey.tapes)
+        bound_m = survey_bound_m(layout, ranges, facts, drawn, runs.seconds, runs.noise_ps)
+        outcomes.append(judged(layout, survey, drawn, Outcome(variant.name, bound_m, False, False, False, hand_tag_m)))
+    return tuple(outcomes)
+
+
+def _facts(
+    layout: SurveyLayout,
+    group: Group,
+    variant: Variant,
+    tapes: Sequence[tuple[int, int]],
+    tape_m: Array,
+    off_m: tuple[Array, Array],
+) -> Facts:
+    """What a survey is given; ``off_m``: errors of positions by hand and of a sketch."""
+    at_m = dict(zip(layout.anchors, layout.position_m, strict=True))
+    sketch: dict[int, Point] = {}
+    if variant.keeps or variant.sketched:
+        rough_m = layout.position_m + (off_m[0] if variant.keeps else off_m[1])
+        sketch = {anchor: (x, y, z) for anchor, (x, y, z) in zip(layout.anchors, rough_m.tolist(), strict=True)}
+    return Facts(
+        dimensions=layout.dimensions,
+        heights_m=layout.heights_m,
+        tapes=tuple(
+            Tape(a, b, float(np.linalg.norm(at_m[a] - at_m[b])) + float(error_m), TAPE_STD_M)
+            for (a, b), error_m in zip(tapes, tape_m, strict=False)
+        ),
+        sketch_m=sketch,
+        sketch_std_m=HAND_STD_M if variant.keeps else _SKETCH_STD_M,
+        keep_positions=variant.keeps,
+        delay_std_m=variant.delay_std_m,
+        pair_std_m=group.pair_std_m,
+    )
+
+
+def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
+    """A row for each layout and variant."""
+    found: dict[tuple[str, str], list[Outcome]] = {}
+    for runs, outcomes in zip(_all_runs(plan), results, strict=True):
+        for of_run in outcomes:
+            for outcome in of_run:
+                found.setdefault((runs.layout, outcome.variant), []).append(outcome)
+    return [_row(plan, layout, variant, outcomes) for (layout, variant), outcomes in found.items()]
+
+
+def _row(plan: Plan, layout: str, variant: str, outcomes: Sequence[Outcome]) -> Row:
+    whole = [one for one in outcomes if one.is_determined]
+    errors_m = np.array([one.error_m for one in whole], float)
+    bounds_m2 = np.array([one.bound_m**2 for one in whole])
+    wrong = [one for one in whole if _is_wrong(one)]
+    squares_m2 = errors_m**2
+    rmse_m = _root_mean(errors_m.tolist())
+    ratio = error = None
+    if rmse_m is not None and bounds_m2.sum() > 0.0:
+        ratio = math.sqrt(float(squares_m2.sum() / bounds_m2.sum()))
+        spread = float(np.std(squares_m2)) / math.sqrt(len(squares_m2))
+        error = spread / (2.0 * rmse_m)
+    late, direct = sum(one.late for one in outcomes), sum(one.direct for one in outcomes)
+    row = Row(
+        study="survey",
+        method=plan.method,
+        case=f"{layout}, {variant}",
+        series=layout,
+        x=None,
+        mesh=None,
+        noise_ps=plan.noise_ps,
+        runs=len(outcomes),
+        fixes=len(outcomes),
+        rmse_m=rmse_m,
+        rmse_error_m=error,
+        p95_m=float(np.quantile(errors_m, 0.95)) if whole else None,
+        max_m=float(errors_m.max()) if whole else None,
+        said_m=_root_mean([one.said_m for one in whole]),
+        nees=_mean([one.nees for one in whole]),
+        bound_m=_root_mean([one.bound_m for one in outcomes]),
+        ratio=ratio,
+        ratio_error=None if ratio is None or error is None or not rmse_m else ratio * error / rmse_m,
+        near=float(np.mean([one.error_m is not None and one.error_m < NEAR_M for one in outcomes])),
+        undetermined=float(np.mean([one.is_open for one in outcomes])),
+        flagged=float(np.mean([one.is_flagged for one in outcomes])),
+        wrong=len(wrong),
+        wrong_flagged=float(np.mean([one.is_flagged for one in wrong])) if wrong else None,
+        found_late=sum(one.found for one in outcomes) / late if late else None,
+        excluded_wrongly=sum(one.excluded_wrongly for one in outcomes) / direct if direct else None,
+        delay_m=_root_mean([one.delay_m for one in whole]),
+        tag_m=_root_mean([one.tag_m for one in whole]),
+        hand_tag_m=_root_mean([one.hand_tag_m for one in outcomes]),
+    )
+    limits = [] if plan.quick else [one for one in limits_of(layout, variant) if one.figure != "wrong_flagged" or wrong]
+    return with_limits(row, limits)
+
+
+def _is_wrong(one: Outcome) -> bool:
+    """Whether a result is far off, and farther than it says."""
+    return one.error_m is not None and one.error_m > max(NEAR_M, _WRONG_SIGMAS * (one.said_m or 0.0))
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _root_mean(values: Sequence[float | None]) -> float | None:
+    known = [value**2 for value in values if value is not None]
+    return math.sqrt(float(np.mean(known))) if known else None
