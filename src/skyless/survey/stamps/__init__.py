@@ -3,5 +3,5 @@
 In the order of reading: ``legs`` (what a listener of beacons learns of anchors' receptions), ``brackets`` (times of
 flight of a block of legs), ``clusters`` (which blocks of a pair agree), ``pair_ranger`` (ranges as legs arrive).
 
-Public: legs, pair_ranger.
+Public: clusters, legs, pair_ranger.
 """
