@@ -71,6 +71,9 @@ def test_the_delays_of_a_site_are_found_and_written_back(site_recording, capsys,
         expected_m = wanted[one["anchor"]] * TICK_M
         assert one["bias_m"] == pytest.approx(expected_m, abs=max(5.0 * one["std_m"], 1e-9))
         assert one["std_m"] < 0.01
+    for one in report["delays"]:
+        assert one["delay_m"] == pytest.approx(wanted[one["anchor"]] * TICK_M / 2.0, abs=0.01)
+        assert 0.005 < one["std_m"] < 0.03  # it counts reflections, of which these simulated ways have none
     before = {anchor.id: anchor.tx_antenna_delay_ticks for anchor in LAB.anchors}
     after = {anchor.id: anchor.tx_antenna_delay_ticks for anchor in load_site(out).anchors}
     assert {i: after[i] - before[i] for i in after} == pytest.approx(wanted, abs=4.0)

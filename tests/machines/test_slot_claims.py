@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.air.beacon2 import MOST_PULSE_AGE, SlotTime
+from skyless.evaluation.claim_graphs import SUPERFRAME_TICKS, ClaimGraph, components
 from skyless.slot_claims import (
     HOP_PATIENCE,
     LEAST_PATIENCE,
@@ -25,7 +26,6 @@ from skyless.slot_claims import (
     SlotRole,
     first_wait_superframes,
 )
-from skyless.evaluation.claim_graphs import SUPERFRAME_TICKS, ClaimGraph, components
 
 S = SUPERFRAME_TICKS
 TERMS = st.one_of(st.integers(0, 3), st.integers(0, MOST_TERM), st.just(MOST_TERM))

@@ -211,7 +211,9 @@ def test_a_site_without_positions_is_surveyed_and_serves_tags(tmp_path):
 @pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
 def test_a_sketch_of_protocol_1_becomes_a_surveyed_site(tmp_path):
     off_m = np.random.default_rng(5).uniform(-0.3, 0.3, (len(TRUE_M), 2))
-    sketch = {anchor: tuple((np.array(TRUE_M[anchor]) + one).tolist()) for anchor, one in zip(TRUE_M, off_m, strict=True)}
+    sketch = {
+        anchor: tuple((np.array(TRUE_M[anchor]) + one).tolist()) for anchor, one in zip(TRUE_M, off_m, strict=True)
+    }
     known = {1: (*TRUE_M[1], None), 2: (*TRUE_M[2], None), 4: (*TRUE_M[4], None)}
     facts = Facts(
         heights_m=dict.fromkeys(TRUE_M, 0.0),

@@ -12,9 +12,10 @@ from skyless.cli.common.recording_inputs import flight_height, is_mcap, known_an
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.calibration.estimate import CalibrationEstimate
-    from skyless.calibration.run import Calibrated
-    from skyless.calibration.samples import First, Stay
+    from skyless.survey.result import SurveyedAnchor
+    from skyless.survey.tags.estimate import CalibrationEstimate
+    from skyless.survey_inputs.run import Calibrated
+    from skyless.survey_inputs.samples import First, Stay
 
 _MANY_OUTLIERS: Final = 0.05
 _UNEXPLAINED_SHARE: Final = 0.5
@@ -72,7 +73,7 @@ def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) ->
     file
         The recording, plain or gzip.
     """
-    from skyless.calibration.run import CalibrationRequest, calibrate_capture, calibrate_site
+    from skyless.survey_inputs.run import CalibrationRequest, calibrate_capture, calibrate_site
 
     check_output("out", asked.out, file, asked.truth)
     own = is_mcap(file)
@@ -135,7 +136,7 @@ def _identifier_of(site: Path | None) -> int | None:
 
 def _stay(text: str) -> "Stay":
     """Position of a tag at rest: x,y[,z][@FROM:TO]. Raises SkylessError."""
-    from skyless.calibration.samples import Stay
+    from skyless.survey_inputs.samples import Stay
 
     position, mark, span = text.partition("@")
     x_m, y_m, *z_m = finite_numbers("at", position, (2, 3))
@@ -149,7 +150,7 @@ def _stay(text: str) -> "Stay":
 
 def _first(text: str | None) -> "First":
     """How much of the beginning to use: a number, seconds with s, a part with %. Raises SkylessError."""
-    from skyless.calibration.samples import First
+    from skyless.survey_inputs.samples import First
 
     if text is None:
         return First()
@@ -191,9 +192,10 @@ def _report(done: "Calibrated", out: Path | None) -> dict[str, Any]:
     return {
         "format": done.format,
         **msgspec.to_builtins(done.estimate),
+        "delays": [] if done.survey is None else [_delay(one) for one in done.survey.anchors],
         "tx_antenna_delay_ticks": {str(anchor): new for anchor, (_, new) in done.tx_delays_ticks().items()},
         "drops": done.samples.drops,
-        "notes": _notes(done.estimate),
+        "notes": _notes(done.estimate) + _survey_notes(done),
         "written": out,
     }
 
@@ -209,30 +211,47 @@ def _show(done: "Calibrated", out: Path | None) -> None:
         "std error / m",
         "noise / m",
         "differences",
-        *(["TX delay / ticks"] if delays else []),
+        *(["delay / m", "std / m", "TX delay / ticks"] if delays else []),
     ]
     table = Table(title=f"{done.format}: {found.used} differences used, {found.rejected} outliers")
     for name in names:
         table.add_column(name, justify="right")
+    surveyed = {} if done.survey is None else {one.id: one for one in done.survey.anchors}
     for anchor in found.anchors:
-        old, new = delays.get(anchor.anchor, (0, 0))
         fields = [number(value) for value in (anchor.bias_m, anchor.std_m, anchor.noise_m)]
-        change = [f"{old} → {new}" if anchor.anchor in delays else "–"] if delays else []
+        change = ["–", "–", "–"] if delays else []
+        if anchor.anchor in delays:
+            (old, new), one = delays[anchor.anchor], surveyed[anchor.anchor]
+            change = [number(one.delay_m), number(one.delay_std_m), f"{old} → {new}"]
         table.add_row(str(anchor.anchor), *fields, str(anchor.count), *change)
     screen = console()
     screen.print(table)
     zero = "the mean of the constants" if found.zero == "mean" else f"{found.zero}, the master"
-    screen.print(f"only differences can be seen; the zero is {zero}")
+    screen.print(f"of biases only differences can be seen; the zero is {zero}")
+    if delays:
+        screen.print("delays come from ranges between anchors and from the tag; TX delays grow by twice these")
     screen.print(f"noise of a difference: {number(found.noise_before_m)} m before, {number(found.noise_m)} m after")
     if found.slope_m is not None:
         slope = f"{found.slope_m:.3f} ± {number(found.slope_std_m)} m while the range grows by the factor e"
         screen.print(f"range bias (received power): {slope}")
-    for note in _notes(found):
+    for note in _notes(found) + _survey_notes(done):
         screen.print(f"note: {note}", markup=False)
     for reason, count in done.samples.drops.items():
         screen.print(f"left out: {count} × {reason}")
     if out is not None:
         screen.print(f"wrote {out}", markup=False)
+
+
+def _delay(one: "SurveyedAnchor") -> dict[str, Any]:
+    return {"anchor": one.id, "delay_m": one.delay_m, "std_m": one.delay_std_m}
+
+
+def _survey_notes(done: "Calibrated") -> list[str]:
+    """What the survey says about the delays."""
+    found = done.survey
+    if found is None:
+        return []
+    return [*([] if found.unchecked is None else [found.unchecked]), *found.not_determined, *found.notes]
 
 
 def _notes(found: "CalibrationEstimate") -> list[str]:

@@ -1,6 +1,7 @@
 """``skyless survey``: positions and antenna delays of anchors, from what they receive of one another."""
 
 import time
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -8,9 +9,10 @@ from cyclopts import App
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.cli.common.options import check_left_out, check_output, check_picture, options
+from skyless.cli.common.options import Finite, check_left_out, check_output, check_picture, finite_numbers, options
 from skyless.cli.common.output import console, write_file
 from skyless.cli.common.progress import status
+from skyless.cli.common.recording_inputs import is_mcap
 from skyless.cli.common.survey_facts import FactOptions, facts_of
 from skyless.cli.nodes.survey_live import LiveOptions, gather_live, serve_live
 from skyless.cli.survey_report import SurveyReport, print_report, show_report
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from skyless.site.model import Site
     from skyless.survey.ranges import PairRanges
     from skyless.survey.result import Survey
+    from skyless.survey.tags.epochs import TagEpochs
 
 NOTHING_DETERMINED: Final = 1
 """Exit code of a survey without a position or a delay."""
@@ -38,6 +41,11 @@ class SurveyOptions:
     """A table of ranges instead of a recording: anchor_a,anchor_b,range_m, each pair any number of times."""
     format: str | None = None
     """Name of the recording's format, if the content should not decide."""
+    walk: list[str] | None = None
+    """A tag of the recording that was carried around, and when in seconds since its first reception: tag1,
+    tag1@60:120. Several times for several tags. Used only where it fits the ranges."""
+    walk_height: Finite | None = None
+    """Height at which it was carried, metres, within some 0.1 m; by default it is free."""
     live: LiveOptions = LiveOptions()
     known: FactOptions = FactOptions()
     out: Path | None = None
@@ -69,6 +77,7 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
     given = _inputs(recording, asked)
     site, ranges = given.site, _with_all_anchors(given.ranges, given.site)
     facts, warnings = facts_of(asked.known, ranges.anchors, site)
+    facts = replace(facts, tags=_walks(recording, asked, site))
     from skyless.survey.count import count
 
     counted = count(ranges, facts)
@@ -101,7 +110,9 @@ def _check(recording: Path | None, asked: SurveyOptions) -> None:
             "site by --mqtt or --radio"
         )
     if recording is None:
-        check_left_out({"format": asked.format}, "it is for recordings")
+        check_left_out({"format": asked.format, "walk": asked.walk}, "it is for recordings")
+    if not asked.walk:
+        check_left_out({"walk-height": asked.walk_height}, "it is the height of a tag that --walk names")
     check_output("out", asked.out, *inputs)
     check_output("plot", asked.plot, *inputs, asked.known.site, asked.out)
     check_picture(asked.plot)
@@ -153,6 +164,27 @@ def _inputs(recording: Path | None, asked: SurveyOptions) -> _Inputs:
     if site is None or found.site is None:
         return _Inputs(site or found.site, found.ranges, warnings)
     return _Inputs(site, with_delays_of(found.ranges, found.site, site), warnings)
+
+
+def _walks(recording: Path | None, asked: SurveyOptions, site: "Site | None") -> "tuple[TagEpochs, ...]":
+    """What tags received that were carried around. Raises SkylessError."""
+    if recording is None or not asked.walk:
+        return ()
+    if site is None or not is_mcap(recording):
+        raise SkylessError("--walk names a tag of a recording of skyless record")
+    from skyless.recordings.mcap.recording import McapRecording
+    from skyless.survey_inputs.walk import walk_of
+
+    walks = []
+    with McapRecording(recording) as opened, status("reading the walk"):
+        for text in asked.walk:
+            tag, mark, span = text.partition("@")
+            from_s, to_s = finite_numbers("walk", span, (2,), ":") if mark else (0.0, inf)
+            if not 0.0 <= from_s < to_s:
+                raise SkylessError(f"--walk is {text!r}; what follows @ should be two times, the later one last")
+            epochs = walk_of(opened, site.id, tag, (from_s, to_s), asked.walk_height)
+            walks.append(replace(epochs, name=f"the walk of {tag}"))
+    return tuple(walks)
 
 
 def _with_all_anchors(ranges: "PairRanges", site: "Site | None") -> "PairRanges":

@@ -4,6 +4,8 @@ from typing import Literal
 
 from msgspec import Struct
 
+from skyless.survey.tags.epochs import TagEpochs
+
 Point = tuple[float, float, float | None]
 """Site coordinates x, y, z in metres; z None where it is not known."""
 
@@ -55,3 +57,5 @@ class Facts(Struct, frozen=True):
     """Constant error of each pair's range, which no averaging removes."""
     delays: tuple[KnownDelay, ...] = ()
     gauge: Gauge | None = None
+    tags: tuple[TagEpochs, ...] = ()
+    """Tags that were carried around or stood at known positions."""

@@ -17,6 +17,7 @@ from skyless.survey.fit.robust import RobustFit, fit_robustly
 from skyless.survey.ranges import PairRange
 from skyless.survey.result import Survey, SurveyedAnchor, SurveyedPair
 from skyless.survey.sentences import anchors_named, are
+from skyless.survey.tags.joint import fit_with_tag
 
 _NO_POSITION = "no position is given for it"
 
@@ -40,9 +41,11 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
     delays: dict[int, tuple[float, float]] = {}
     residuals: dict[tuple[int, int], tuple[float, bool]] = {}
     redundancy, range_std_m = 0, facts.pair_std_m
+    notes: tuple[str, ...] = ()
     if pairs:
         fit = fit_robustly(problem, [position], math.hypot(facts.pair_std_m, math.sqrt(2.0) * facts.sketch_std_m))
-        variance = np.diag(_delay_covariance(fit, position, facts.sketch_std_m, facts.dimensions))
+        fit, tag_information, notes = _with_tags(fit, measured, ids, position)
+        variance = np.diag(_delay_covariance(fit, position, facts.sketch_std_m, facts.dimensions, tag_information))
         own, std = own_delays(measured, ids, fit.problem, fit.solution.delay_m, variance)
         delays = {anchor: (float(own[k]), float(std[k])) for k, anchor in enumerate(ids) if anchor in linked}
         for index, pair in enumerate(pairs):
@@ -66,17 +69,38 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
         tapes=(),
         frame="positions are the given ones, which stay",
         gauge=None,
-        notes=measured.notes,
+        notes=(*measured.notes, *notes),
     )
 
 
-def _delay_covariance(fit: RobustFit, position_m: Array, position_std_m: float, dimensions: int) -> Array:
+def _with_tags(
+    fit: RobustFit, measured: Measured, ids: tuple[int, ...], position_m: Array
+) -> tuple[RobustFit, Array, tuple[str, ...]]:
+    """The fit with what tags received, their information on coordinates and delays, (4 k, 4 k), and sentences."""
+    ranges_m = {(pair.a, pair.b): pair.range_m for pair in measured.pairs}
+    information = np.zeros((4 * len(ids), 4 * len(ids)))
+    sentences: list[str] = []
+    for epochs in measured.facts.tags:
+        joint = fit_with_tag(fit.problem, ids, [fit.solution], epochs, ranges_m, [fit.used])
+        sentences.append(joint.sentence)
+        if joint.solution is not None and joint.rows is not None:
+            problem = structs.replace(fit.problem, more=(*fit.problem.more, joint.rows))
+            fit = structs.replace(fit, problem=problem, solution=joint.solution)
+            jacobian, _ = joint.rows.rows(position_m, joint.solution.delay_m)
+            information += jacobian.T @ jacobian
+    return fit, information, tuple(sentences)
+
+
+def _delay_covariance(
+    fit: RobustFit, position_m: Array, position_std_m: float, dimensions: int, tag_information: Array
+) -> Array:
     """Of the estimated delays, shape (k, k); errors of positions are shared by all ranges of an anchor."""
     problem, k = fit.problem, len(position_m)
     weight = fit.used / problem.variance_m2
     incidence = _incidence(problem)
     prior = 1.0 / np.maximum(problem.delay_variance_m2, 1e-10)
-    inverse = np.linalg.inv(incidence.T @ (weight[:, None] * incidence) + np.diag(prior))
+    of_tags = tag_information[3 * k :, 3 * k :]
+    inverse = np.linalg.inv(incidence.T @ (weight[:, None] * incidence) + np.diag(prior) + of_tags)
     gain = inverse @ (incidence.T * weight)
     apart = position_m[problem.first] - position_m[problem.second]
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None]
@@ -84,10 +108,11 @@ def _delay_covariance(fit: RobustFit, position_m: Array, position_std_m: float, 
     number = np.arange(len(problem.first))
     shift[number, problem.first] = unit[:, :dimensions]
     shift[number, problem.second] = -unit[:, :dimensions]
-    moved = gain @ shift.reshape(len(number), -1)
+    by_tags = tag_information[3 * k :, : 3 * k].reshape(k, k, 3)[:, :, :dimensions]
+    moved = gain @ shift.reshape(len(number), -1) + inverse @ by_tags.reshape(k, -1)
     noise = np.maximum(problem.variance_m2 - 2.0 * position_std_m**2, 0.0)
     return np.asarray(
-        (gain * noise) @ gain.T + position_std_m**2 * moved @ moved.T + inverse @ np.diag(prior) @ inverse
+        (gain * noise) @ gain.T + position_std_m**2 * moved @ moved.T + inverse @ (np.diag(prior) + of_tags) @ inverse
     )
 
 

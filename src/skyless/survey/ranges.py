@@ -38,6 +38,7 @@ class PairRanges(Struct, frozen=True):
         )
         return structs.replace(self, pairs=tuple(shorter))
 
+
 class PairBlock(Struct, frozen=True, gc=False):
     """The mean of one pair's ranges within a block of time, a second or so."""
 

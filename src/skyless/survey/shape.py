@@ -11,7 +11,7 @@ from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.survey.build import Measured, as_array, build_problem, levels, with_free_delays
 from skyless.survey.fit import determined as determination
 from skyless.survey.fit.gauge import Motion, align, fitting_points
-from skyless.survey.fit.problem import Problem, Solution, solve_least_squares
+from skyless.survey.fit.problem import MoreRows, Problem, Solution, solve_least_squares
 from skyless.survey.fit.robust import RobustFit, fit_robustly
 from skyless.survey.fit.start import start_positions
 from skyless.survey.ranges import PairRange
@@ -93,6 +93,16 @@ def _round(
     if sketch is not None:
         solution = _settled(problem, solution, used, sketch)
         robust = structs.replace(robust, solution=solution)
+    core, covariance = _worth(measured, kept, problem, solution, used, point)
+    return Fitted(
+        measured, kept, robust, problem, tuple(pairs), solution, used, robust.range_std_m, core, covariance, (), ()
+    )
+
+
+def _worth(
+    measured: Measured, kept: Integers, problem: Problem, solution: Solution, used: Mask, point: Array | None
+) -> tuple[Mask, Array]:
+    """Which anchors are determined, and the covariance aligned over them."""
     weight = used.astype(np.float64)
     surveyed = structs.replace(problem, coordinate_variance_m2=_without_sketch(measured, kept, point))
     rows = determination.jacobian(surveyed, solution.position_m, weight)
@@ -111,9 +121,14 @@ def _round(
     if core.any():
         full = determination.jacobian(problem, solution.position_m, weight)
         covariance = determination.aligned_covariance(problem, full, solution.position_m, core)
-    return Fitted(
-        measured, kept, robust, problem, tuple(pairs), solution, used, robust.range_std_m, core, covariance, (), ()
-    )
+    return core, covariance
+
+
+def with_tag(fitted: Fitted, rows: MoreRows, solution: Solution, used: Mask) -> Fitted:
+    """The shape with what a tag received, where that is in the solution."""
+    problem = structs.replace(fitted.problem, more=(*fitted.problem.more, rows))
+    core, covariance = _worth(fitted.measured, fitted.kept, problem, solution, used, _points(fitted))
+    return structs.replace(fitted, problem=problem, solution=solution, used=used, core=core, covariance_m2=covariance)
 
 
 def _settled(problem: Problem, solution: Solution, used: Mask, sketch: Array) -> Solution:

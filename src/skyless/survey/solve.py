@@ -19,7 +19,7 @@ from skyless.survey.findings import (
     missing_sentences,
     unchecked,
 )
-from skyless.survey.fit.ambiguity import find_ambiguities
+from skyless.survey.fit.ambiguity import OtherFit, find_ambiguities
 from skyless.survey.fit.determined import position_stds_m
 from skyless.survey.fit.links import Links, adjacency, count_links
 from skyless.survey.frame import Framed, in_frame
@@ -28,6 +28,7 @@ from skyless.survey.ranges import PairRange, PairRanges
 from skyless.survey.result import Ambiguity, Survey, SurveyedAnchor, SurveyedPair
 from skyless.survey.sentences import anchors_named, joined
 from skyless.survey.shape import Fitted, fit_shape, redundancy
+from skyless.survey.tagged import with_tags
 
 _MOVED_M: Final = 0.1
 """An anchor whose position differs less in another result is at the same position."""
@@ -48,6 +49,7 @@ def run_survey(ranges: PairRanges, facts: Facts) -> Survey:
     if not any(pair.a in fitted_ids and pair.b in fitted_ids for pair in measured.pairs):
         return _nothing(measured, links, None)
     fitted = fit_shape(measured, kept)
+    fitted, others = with_tags(fitted, find_ambiguities(fitted.problem, fitted.robust))
     if not fitted.core.any():
         return _nothing(measured, links, fitted)
     framed = in_frame(measured, kept, fitted.solution.position_m, fitted.covariance_m2, fitted.core, fitted.points_used)
@@ -58,7 +60,7 @@ def run_survey(ranges: PairRanges, facts: Facts) -> Survey:
         redundancy=redundancy(fitted),
         unchecked=unchecked(fitted),
         not_determined=(*missing_sentences(measured, links, fitted), *held_by_expected_delays(fitted, framed)),
-        ambiguities=_ambiguities(fitted, framed),
+        ambiguities=_ambiguities(fitted, framed, others),
         tapes=advised_tapes(fitted),
         frame=framed.sentence,
         gauge=framed.gauge,
@@ -129,9 +131,9 @@ def _pair(measured: Measured, fitted: Fitted | None, pair: PairRange, index: int
     return SurveyedPair(pair.a, pair.b, pair.range_m, residual, std, excluded=not fitted.used[index])
 
 
-def _ambiguities(fitted: Fitted, framed: Framed) -> tuple[Ambiguity, ...]:
+def _ambiguities(fitted: Fitted, framed: Framed, others: tuple[OtherFit, ...]) -> tuple[Ambiguity, ...]:
     found = []
-    for other in find_ambiguities(fitted.problem, fitted.robust):
+    for other in others:
         position = framed.motion.moved(other.position_m)
         distance = np.linalg.norm(position - framed.position_m, axis=1)
         moved: Mask = (distance > _MOVED_M) & fitted.core

@@ -1,4 +1,6 @@
-"""What a survey needs, out of recordings.
+"""What a survey needs, out of recordings: ranges of anchors, tags at known positions, tags that were carried around.
 
-Public: recorded_stamps.
+``run`` is all of ``skyless calibrate`` on a recording.
+
+Public: recorded_stamps, run, samples, walk.
 """

@@ -82,6 +82,7 @@ def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -
     rows[number[:m], 3 * n + problem.second] = of_range
     rows[m + t + np.arange(n), 3 * n + np.arange(n)] = of_delay
     rows[m + t + n + np.arange(len(known)), known] = of_coordinate[known]
+    rows = np.vstack([rows, *(more.rows(position_m, problem.delay_m)[0] for more in problem.more)])
     rows[:, : 3 * n] *= problem.is_free.ravel()
     return rows
 

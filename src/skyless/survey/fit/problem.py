@@ -7,7 +7,8 @@ Positions are only known up to a rigid motion here, unless facts name coordinate
 solution stays where its start was (a free network).
 """
 
-from typing import Final
+from itertools import product
+from typing import Final, Protocol
 
 import numpy as np
 from msgspec import Struct
@@ -20,6 +21,14 @@ _LEAST_STD_M: Final = 1e-5
 _MOST_STEPS: Final = 60
 _SMALLEST_STEP_M: Final = 1e-7
 _LEAST_DAMPING: Final = 1e-9
+
+
+class MoreRows(Protocol):
+    """What else constrains positions and delays, such as a tag's receptions."""
+
+    def rows(self, position_m: Array, delay_m: Array) -> tuple[Array, Array]:
+        """Weighted Jacobian, shape (r, 4n): coordinates anchor by anchor, then delays; weighted residuals, (r,)."""
+        ...
 
 
 class Problem(Struct, frozen=True, eq=False):
@@ -45,6 +54,8 @@ class Problem(Struct, frozen=True, eq=False):
     tape_m: Array
     tape_variance_m2: Array
     """Shape (t,)."""
+    more: tuple[MoreRows, ...] = ()
+    """Costly: for a last fit, not for searches."""
 
 
 class Solution(Struct, frozen=True, eq=False):
@@ -143,6 +154,7 @@ class _Equations:
         n, m, t = len(problem.delay_m), len(problem.range_m), len(problem.tape_m)
         self._free = np.flatnonzero(problem.is_free.ravel())
         self._unknowns = len(self._free) + n
+        self._more_columns = np.concatenate([self._free, 3 * n + np.arange(n)])
         # Coordinates that stay have the column behind the last one, which is cut off again.
         column = np.full((n, 4), self._unknowns)
         flat = np.full(3 * n, self._unknowns)
@@ -186,6 +198,11 @@ class _Equations:
         from_delays = self._of_delay * (self._problem.delay_m - delay_m)
         from_coordinates = from_coordinates.reshape(b, self._problem.is_free.size)[:, self._free]
         gradient = gradient + np.concatenate([from_coordinates, from_delays], axis=1)
+        for one, more in product(range(b), self._problem.more):
+            jacobian, residual_more = more.rows(position_m[one], delay_m[one])
+            of_unknowns = jacobian[:, self._more_columns]
+            information[one] += of_unknowns.T @ of_unknowns
+            gradient[one] += of_unknowns.T @ residual_more
         return information, gradient
 
     def cost(self, position_m: Array, delay_m: Array, weight: Array) -> Array:
@@ -194,7 +211,11 @@ class _Equations:
         squares = np.sum(self._weights(weight) * residual**2, axis=1)
         of_delays = np.sum(self._of_delay * (self._problem.delay_m - delay_m) ** 2, axis=1)
         of_coordinates = np.sum(self._of_coordinate * (self._coordinate_m - position_m) ** 2, axis=(1, 2))
-        return np.asarray(squares + of_delays + of_coordinates)
+        whole = np.asarray(squares + of_delays + of_coordinates)
+        for one, more in product(range(len(whole)), self._problem.more):
+            _, residual_more = more.rows(position_m[one], delay_m[one])
+            whole[one] += residual_more @ residual_more
+        return whole
 
     def moved(self, position_m: Array, delay_m: Array, step: Array) -> tuple[Array, Array]:
         """Positions and delays after steps of shape (b, u)."""

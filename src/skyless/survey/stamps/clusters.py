@@ -6,7 +6,7 @@ import numpy as np
 
 from skyless.kernels.arrays import Array, Mask
 
-_LEAST_SHARE: Final = 0.1
+LEAST_CLUSTER_SHARE: Final = 0.1
 """Of all exchanges: an earlier cluster with fewer is an error."""
 
 _SIGMAS: Final = 4.0
@@ -26,7 +26,7 @@ def earliest_cluster(value: Array, weight: Array, std: float, total: float | Non
     width = 2.0 * _SIGMAS * max(std, _densest(ordered, until) / _DENSE_WIDTH)
     ends = np.searchsorted(ordered, ordered + width, side="right") - 1
     held = until[ends] - until + weight[order]
-    enough = np.flatnonzero(held >= _LEAST_SHARE * max(until[-1], total or 0.0))
+    enough = np.flatnonzero(held >= LEAST_CLUSTER_SHARE * max(until[-1], total or 0.0))
     begin = int(enough[0]) if len(enough) else int(np.argmax(held))
     centre = half_sample_mode(ordered[begin : ends[begin] + 1])
     for _ in range(2):

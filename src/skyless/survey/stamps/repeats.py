@@ -12,7 +12,7 @@ import numpy as np
 
 from skyless.kernels.arrays import Array
 from skyless.survey.ranges import PairRange, PairRanges
-from skyless.survey.stamps.clusters import earliest_cluster
+from skyless.survey.stamps.clusters import LEAST_CLUSTER_SHARE, earliest_cluster
 
 _ENOUGH: Final = 5
 """Ranges of a pair from which it has clusters; of fewer the median is used."""
@@ -59,7 +59,7 @@ def _mean(a: int, b: int, values_m: Array, noise_m: float) -> PairRange:
     if count < _ENOUGH:
         std_m = noise_m * (_MEDIAN_OVER_MEAN if count > 2 else 1.0) / math.sqrt(count)
         return PairRange(a, b, float(np.median(values_m)), std_m, count)
-    total = max(float(count), 10.0 * _LEAST_COUNT)  # of which a cluster holds a tenth
+    total = max(float(count), _LEAST_COUNT / LEAST_CLUSTER_SHARE)
     cluster = values_m[earliest_cluster(values_m, np.ones(count), noise_m, total)]
     std_m = max(float(np.std(cluster, ddof=1)) if len(cluster) > 1 else 0.0, noise_m) / math.sqrt(len(cluster))
     late_share = float(np.mean(values_m > cluster.max()))

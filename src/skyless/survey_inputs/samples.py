@@ -13,17 +13,17 @@ from skyless.air.beacon import Beacon, Malformed, MasterTime
 from skyless.air.codec import decode_cached
 from skyless.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.air.reception import Reception
-from skyless.calibration.estimate import Differences
 from skyless.constants import TICK_M
 from skyless.errors import SkylessError
 from skyless.evaluation.judge import Judge
 from skyless.evaluation.statistics import EvenSample
-from skyless.mqtt.messages import RawReception, ReceptionsMessage
+from skyless.mqtt.messages import ReceptionsMessage
 from skyless.positioning.masterless.pair_engine import PairEngine
 from skyless.recordings.foreign.formats import Recording
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.recordings.source import Drops
 from skyless.replay.site import HostClock, reception_of
+from skyless.survey.tags.estimate import Differences
 from skyless.ticks import difference, from_seconds
 
 # Time differences out of a tag's recorded receptions: every anchor against the master, both in the site's time.
@@ -47,35 +47,53 @@ class _TimedBeacon(Struct, frozen=True):
     unix_s: float
 
 
+class NewReceptions:
+    """One tag's receptions, as they come, each once."""
+
+    def __init__(self) -> None:
+        self._clock = HostClock()
+        self._segment = ""
+        self._next = 0
+
+    def begins(self, message: ReceptionsMessage) -> bool:
+        """Whether the tag has started again; receptions before are of another counter."""
+        if message.segment == self._segment:
+            return False
+        self._segment, self._next, self._clock = message.segment, message.first, HostClock()
+        return True
+
+    def read(self, message: ReceptionsMessage) -> Iterator[tuple[Reception, float]]:
+        """Receptions of a run, some of which may have come before, with Unix time."""
+        new = message.receptions[max(self._next - message.first, 0) :]
+        self._next = max(self._next, message.first + len(message.receptions))
+        for raw in new:
+            reception = reception_of(raw)
+            if reception is not None:
+                yield reception, self._clock.unix_s(reception, message.unix_less_host_s)
+
+
 class SiteListener:
     """One tag's receptions, as they come, to time differences against the master."""
 
     def __init__(self, site: int) -> None:
         self._site = site
-        self._clock = HostClock()
-        self._segment = ""
-        self._next = 0
+        self._receptions = NewReceptions()
         self._before: _TimedBeacon | None = None
         self._between: list[_TimedBeacon] = []
 
     def process(self, message: ReceptionsMessage) -> Iterator[PairTdoa]:
         """Process a run of receptions, some of which may have come before; times are Unix seconds."""
-        if message.segment != self._segment:
-            self._segment, self._next = message.segment, message.first
-            self._clock, self._before, self._between = HostClock(), None, []
-        new = message.receptions[max(self._next - message.first, 0) :]
-        self._next = max(self._next, message.first + len(message.receptions))
-        for raw in new:
-            heard = self._beacon(raw, message.unix_less_host_s)
+        if self._receptions.begins(message):
+            self._before, self._between = None, []
+        for reception, unix_s in self._receptions.read(message):
+            heard = self._beacon(reception, unix_s)
             if heard is not None:
                 yield from self._differences(heard)
 
-    def _beacon(self, raw: RawReception, unix_less_host_s: float) -> _TimedBeacon | None:
-        reception: Reception | None = reception_of(raw)
-        beacon = Malformed.NOT_A_BEACON if reception is None else decode_cached(reception.frame)
-        if reception is None or isinstance(beacon, Malformed) or beacon.site != self._site:
+    def _beacon(self, reception: Reception, unix_s: float) -> _TimedBeacon | None:
+        beacon = decode_cached(reception.frame)
+        if isinstance(beacon, Malformed) or beacon.site != self._site:
             return None
-        unix_s = self._clock.unix_s(reception, unix_less_host_s)
         time = beacon.master_time
         if time is None or time.std_ticks > _WORST_CLOCK_TICKS:
             return None

@@ -1,4 +1,8 @@
-"""A calibration from a recording to the anchors' constants, and to the antenna delays of a site."""
+"""A calibration from a recording to the anchors' constants, and to the antenna delays of a site.
+
+Delays of a site are a survey with kept positions (``skyless.survey``): what the tag received at known positions, and
+the ranges between the anchors, which its receptions hold as well.
+"""
 
 from collections import Counter
 from functools import partial
@@ -6,10 +10,26 @@ from os import PathLike
 from typing import Final
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.air.masterless_packets import Point
-from skyless.calibration.estimate import CalibrationEstimate, estimate
-from skyless.calibration.samples import (
+from skyless.constants import TICK_M
+from skyless.errors import ConfigurationError, SkylessError
+from skyless.evaluation.judge import Judge
+from skyless.recordings.foreign.formats import open_recording
+from skyless.recordings.mcap.recording import McapRecording
+from skyless.recordings.truth import Truth
+from skyless.replay.site import SITE_FORMAT, recorded_site, recorded_truth
+from skyless.site.check import SITE_LIMITS
+from skyless.site.model import Site
+from skyless.site.rewrite import DELAY_KEY
+from skyless.survey.facts import Facts
+from skyless.survey.result import Survey
+from skyless.survey.solve import run_survey
+from skyless.survey.tags.epochs import EPOCH_S, TagEpochs
+from skyless.survey.tags.estimate import CalibrationEstimate, estimate
+from skyless.survey_inputs.recorded_stamps import ranges_of
+from skyless.survey_inputs.samples import (
     First,
     PositionAt,
     Samples,
@@ -21,16 +41,16 @@ from skyless.calibration.samples import (
     site_tdoas,
     tdoas_of,
 )
-from skyless.constants import TICK_M
-from skyless.errors import ConfigurationError, SkylessError
-from skyless.evaluation.judge import Judge
-from skyless.recordings.foreign.formats import open_recording
-from skyless.recordings.mcap.recording import McapRecording
-from skyless.recordings.truth import Truth
-from skyless.replay.site import SITE_FORMAT, recorded_site, recorded_truth
-from skyless.site.check import SITE_LIMITS
-from skyless.site.model import Site
-from skyless.site.rewrite import DELAY_KEY
+from skyless.survey_inputs.walk import at_positions, walk_of
+
+_TAG_STD_M: Final = 0.02
+"""Of a tag's known position, per axis."""
+
+_OFFSET_STD_M: Final = 0.03
+"""Of each anchor's own constant at the tag, which is no delay: reflections that are always there."""
+
+_DELAY_STD_M: Final = 0.15
+"""How much delays of boards that nobody has calibrated are expected to be off."""
 
 _DELAY: Final = SITE_LIMITS[f"anchors.{DELAY_KEY}"]
 
@@ -60,23 +80,25 @@ class Calibrated(Struct, frozen=True):
     samples: Samples
     site: Site | None
     """As recorded; None for recordings of other systems."""
+    survey: Survey | None = None
+    """Delays from ranges and tags together; None for recordings of other systems."""
 
     def tx_delays_ticks(self) -> dict[int, tuple[int, int]]:
-        """Old and new TX antenna delay of every anchor whose constant is determined; empty without a site.
+        """Old and new TX antenna delay of every anchor whose delay is determined; empty without a site.
 
         A signal that leaves later than its stamp needs a larger delay. What an anchor's receptions are off shows
-        in its clock, and so in the same differences; it goes into the TX delay as well.
+        in the same differences and ranges; it goes into the TX delay as well.
 
         Raises:
             SkylessError: no radio has such a delay.
         """
-        bias_m = {anchor.anchor: anchor.bias_m for anchor in self.estimate.anchors}
+        delays_m = {} if self.survey is None else {anchor.id: anchor.delay_m for anchor in self.survey.anchors}
         changes: dict[int, tuple[int, int]] = {}
         for anchor in () if self.site is None else self.site.anchors:
-            found_m = bias_m.get(anchor.id)
-            if found_m is None:
+            delay_m = delays_m.get(anchor.id)
+            if delay_m is None:
                 continue
-            ticks = anchor.tx_antenna_delay_ticks + round(found_m / TICK_M)
+            ticks = anchor.tx_antenna_delay_ticks + round(2.0 * delay_m / TICK_M)
             if not _DELAY.contains(ticks):
                 raise SkylessError(f"anchor {anchor.id} would need an antenna delay of {ticks}; it should be {_DELAY}")
             changes[anchor.id] = (anchor.tx_antenna_delay_ticks, ticks)
@@ -98,7 +120,9 @@ def calibrate_capture(request: CalibrationRequest) -> Calibrated:
 
 
 def calibrate_site(request: CalibrationRequest, identifier: int | None) -> Calibrated:
-    """Calibrate the anchors of a site from a recording of ``skyless record``; the zero is the master.
+    """Calibrate the anchors of a site from a recording of ``skyless record``.
+
+    The constants of the estimate are what the tag alone shows, against the master; the survey's delays are absolute.
 
     Raises:
         SkylessError: the recording cannot be used, is of another site than ``identifier``, or holds nothing at a
@@ -106,10 +130,35 @@ def calibrate_site(request: CalibrationRequest, identifier: int | None) -> Calib
     """
     with McapRecording(request.path) as recording:
         site = recorded_site(recording, identifier)
-        samples = joined([_of_tag(recording, site, tag, request) for tag in _tags(recording, request)])
-    _require_some(samples)
+        tags = _tags(recording, request)
+        samples = joined([_of_tag(recording, site, tag, request) for tag in tags])
+        _require_some(samples)
+        end_s = float(samples.differences.t_s[-1])
+        epochs = tuple(_at_known_positions(recording, site, tag, request, end_s) for tag in tags)
     master = int(samples.differences.anchor_a[0])
-    return Calibrated(SITE_FORMAT, estimate(samples.differences, zero=master, slope=False), samples, site)
+    found = estimate(samples.differences, zero=master, slope=False)
+    ranges = ranges_of(request.path, identifier=identifier).ranges
+    facts = Facts(
+        dimensions=3,
+        sketch_m={anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors},
+        sketch_std_m=site.accuracy.survey_std_m,
+        keep_positions=True,
+        delay_std_m=_DELAY_STD_M,
+        tags=epochs,
+    )
+    return Calibrated(SITE_FORMAT, found, samples, site, run_survey(ranges, facts))
+
+
+def _at_known_positions(
+    recording: McapRecording, site: Site, tag: str, request: CalibrationRequest, end_s: float
+) -> TagEpochs:
+    """What a tag received while its position was known, until a Unix time."""
+    truth = recorded_truth(recording).get(tag) if request.truth is None else request.truth
+    epochs = walk_of(recording, site.id, tag)
+    at_rest = replace(request, height_m=site.tags.height_m)
+    known = _position_from(at_rest, truth, float(epochs.t_s[0]) - EPOCH_S / 2.0)
+    in_use = at_positions(epochs, lambda time_s: known(time_s) if time_s <= end_s else None, _TAG_STD_M, _OFFSET_STD_M)
+    return replace(in_use, name=f"{tag} at known positions")
 
 
 def _tags(recording: McapRecording, request: CalibrationRequest) -> tuple[str, ...]:

@@ -1,4 +1,0 @@
-"""Antenna delays from a recording of a tag whose position is known.
-
-Public: estimate, run, samples.
-"""

@@ -1,0 +1,107 @@
+"""From recordings to surveys with a tag: a walk past anchors on two lines, and what the recording lacks."""
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from machines.bench import LAB, Heard
+from recordings import live_site
+from skyless.anchor import Anchor
+from skyless.cli.main import main
+from skyless.constants import TICK_M
+from skyless.errors import SkylessError
+from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.recordings.mcap.recording import McapRecording
+from skyless.simulation.impairments import DelayError
+from skyless.simulation.stations import TagSpec
+from skyless.simulation.trajectory import Waypoints
+from skyless.simulation.world import World
+from skyless.survey.facts import Facts
+from skyless.survey.solve import run_survey
+from skyless.survey_inputs.recorded_stamps import ranges_of
+from skyless.survey_inputs.walk import walk_of
+
+HEIGHT_M = 0.0
+WAY = [(1.0, 1.0, HEIGHT_M), (5.0, 7.0, HEIGHT_M), (5.0, 1.0, HEIGHT_M), (1.0, 7.0, HEIGHT_M), (3.0, 4.0, HEIGHT_M)]
+RNG = np.random.default_rng(1)
+ERRORS = tuple(DelayError(anchor.id, *(RNG.normal(0.0, 0.07, 2) / TICK_M)) for anchor in LAB.anchors)
+DELAYS_M = {one.anchor: (one.tx_ticks + one.rx_ticks) / 2.0 * TICK_M for one in ERRORS}
+
+
+def walked(site, seconds, seed, _):
+    """All that a tag receives that is carried around; delays are off."""
+    faults = replace(impairments_of(Request(site), site), delay_errors=ERRORS)
+    world = World(site, partial(Anchor, site), [TagSpec(Waypoints(WAY, 1.0, loop=True, corner_s=0.5))], faults, seed)
+    return tuple(
+        Heard(broadcast.anchor, reception.frame, reception.rx_ticks, reception.host_s, truth_m)
+        for broadcast in world.run(seconds)
+        for _, reception, truth_m in broadcast.receptions()
+    )
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    file = tmp_path_factory.mktemp("walk") / "walk.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(live_site, "tape", walked)
+        live_site.record(file, live_site.messages(25.0, ("a",), join_s=0.0))
+    return file
+
+
+def rms_m(survey):
+    """Of the positions, after the best rigid alignment."""
+    true_m = np.array([(anchor.x_m, anchor.y_m) for anchor in LAB.anchors])
+    found_m = np.array([(anchor.x_m, anchor.y_m) for anchor in survey.anchors])
+    true_m, found_m = true_m - true_m.mean(axis=0), found_m - found_m.mean(axis=0)
+    u, _, vt = np.linalg.svd(found_m.T @ true_m)
+    return np.sqrt((((found_m @ (u @ vt)) - true_m) ** 2).sum(axis=1).mean())
+
+
+def test_a_walk_separates_delays_from_positions_where_the_anchors_are_on_two_lines(walk):
+    """The lab's ranges alone cannot (SURVEY.md 2): its left side is as well wider, with other delays."""
+    ranges = ranges_of(walk).ranges
+    with McapRecording(walk) as recording:
+        epochs = walk_of(recording, LAB.id, "a", height_m=HEIGHT_M)
+    facts = Facts(delay_std_m=0.15, pair_std_m=0.01)
+    alone, joint = run_survey(ranges, facts), run_survey(ranges, replace(facts, tags=(epochs,)))
+    assert any("the walk" in note for note in joint.notes)
+    stds = [np.sqrt(np.mean([one.std_m**2 for one in survey.anchors])) for survey in (alone, joint)]
+    assert stds[1] < 0.93 * stds[0]
+    assert rms_m(joint) < rms_m(alone)
+    assert rms_m(joint) < 3.0 * np.sqrt(2.0) * stds[1]
+
+
+def test_a_part_of_the_walk(walk):
+    with McapRecording(walk) as recording:
+        epochs = walk_of(recording, LAB.id, "a", (5.0, 12.0))
+    assert 6.0 <= epochs.t_s[-1] - epochs.t_s[0] <= 7.5
+    assert np.isnan(epochs.known_m).all()
+
+
+@pytest.mark.parametrize(("tag", "span", "words"), [("b", (0.0, 9.0), "tag"), ("a", (90.0, 99.0), "90:99")])
+def test_what_the_recording_lacks(walk, tag, span, words):
+    with McapRecording(walk) as recording, pytest.raises(SkylessError, match=words):
+        walk_of(recording, LAB.id, tag, span)
+
+
+def test_the_command_uses_the_walk(walk, capsys):
+    assert main(["survey", str(walk), "--no-sketch", "--walk", "a@2:20", "--walk-height", "0", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert any("of the walk of a were used" in note for note in report["notes"] + report.get("warnings", []))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--walk", "b"), "tag"),
+        (("--walk", "a@9:4"), "later one last"),
+        (("--walk-height", "1"), "walk"),
+        (("--walk", "a@90:99"), "90:99"),
+    ],
+)
+def test_what_the_command_does_not_take(walk, capsys, arguments, words):
+    assert main(["survey", str(walk), *arguments]) == 2
+    assert words in capsys.readouterr().err
