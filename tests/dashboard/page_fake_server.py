@@ -30,11 +30,15 @@ DOCK = {"id": "dock", "name": "Dock", "polygon_m": [[14, 2.5], [21, 2.5], [21, 6
 class FakeServer:
     """Serves on a free port of loopback in a thread of its own; its attributes are the switches of the tests."""
 
-    def __init__(self, tags=3, rate_hz=10.0, zones=(DOCK,), site=True, floor_plan=None, mode="master"):
+    def __init__(
+        self, tags=3, rate_hz=10.0, zones=(DOCK,), site=True, floor_plan=None, mode="master", survey=None, placed=True
+    ):
         self.tags, self.rate_hz, self.site = tags, rate_hz, site
         self.zones = [dict(zone) for zone in zones]
         self.floor_plan = floor_plan
         self.mode = mode
+        self.survey = survey
+        self.placed = placed
         self.stored = []
         self.silent_tags = set()
         self.refuse = False
@@ -91,6 +95,18 @@ class FakeServer:
         async def floor_plan(_request):
             return Response(self.floor_plan, media_type="image/png")
 
+        async def put_floor_plan(request):
+            self.survey.image = await request.body()
+            return JSONResponse({"bytes": len(self.survey.image)})
+
+        async def put_facts(request):
+            self.survey.use(await request.json())
+            return JSONResponse(self.survey.given[-1])
+
+        async def save(request):
+            self.survey.save((await request.json())["serial"])
+            return JSONResponse({"serial": self.survey.saves[-1]})
+
         async def overlay(request):
             query = request.query_params
             return JSONResponse(made_up.overlay(query["kind"], float(query["step_m"])))
@@ -123,6 +139,9 @@ class FakeServer:
             routes=[
                 Route("/", index),
                 Route("/api/floor_plan", floor_plan),
+                Route("/api/floor_plan", put_floor_plan, methods=["PUT"]),
+                Route("/api/survey/facts", put_facts, methods=["PUT"]),
+                Route("/api/survey/save", save, methods=["POST"]),
                 Route("/api/overlay", overlay),
                 Route("/api/zones", put_zones, methods=["PUT"]),
                 Route("/api/recordings", recordings),
@@ -140,7 +159,10 @@ class FakeServer:
         lock = asyncio.Lock()
         await _send(websocket, lock, self._hello())
         self.sockets[websocket] = lock
-        jobs = [asyncio.create_task(job(websocket, lock)) for job in (self._states, self._health, self._pongs)]
+        jobs = [
+            asyncio.create_task(job(websocket, lock))
+            for job in (self._states, self._health, self._surveys, self._pongs)
+        ]
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
         for job in jobs:
@@ -151,7 +173,7 @@ class FakeServer:
 
     def _hello(self):
         plan = {"image": "hall.png", "width_m": 24.0, "x_m": 0.0, "y_m": -1.0} if self.floor_plan else None
-        site = made_up.site_message(self.started, plan, self.mode) if self.site else None
+        site = made_up.site_message(self.started, plan, self.mode, self.placed) if self.site else None
         return {"type": "hello", "version": "0.1.0", "site": site, "zones": self.zones, "events": [], "mqtt": True}
 
     async def _states(self, websocket, lock):
@@ -169,6 +191,12 @@ class FakeServer:
             if not self.mute:
                 await _send(websocket, lock, self.health(time.time()))
             await asyncio.sleep(1.0)
+
+    async def _surveys(self, websocket, lock):
+        while True:
+            if self.survey and not self.survey.silent and not self.mute:
+                await _send(websocket, lock, self.survey.message())
+            await asyncio.sleep(0.2)
 
     def health(self, now):
         """A health message: one anchor is not synchronised, and one is offline."""
@@ -208,7 +236,7 @@ def _recorded(from_s, to_s, rate_hz):
 
 def _guarded(response):
     """What the real server sends: anything from elsewhere is refused by the browser."""
-    response.headers["content-security-policy"] = "default-src 'self'"
+    response.headers["content-security-policy"] = "default-src 'self'; img-src 'self' data: blob:"
     return response
 
 

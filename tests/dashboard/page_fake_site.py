@@ -13,7 +13,7 @@ def anchor_positions():
     return [(number, x, y) for number, (x, y) in enumerate(((x, y) for y in (1.0, 13.0) for x in COLUMNS_X), start=1)]
 
 
-def site_message(unix_s, floor_plan=None, mode="master"):
+def site_message(unix_s, floor_plan=None, mode="master", placed=True):
     walls = ((0, 0, 24, 0), (24, 0, 24, 14), (24, 14, 0, 14), (0, 14, 0, 0), (12, 0, 12, 5), (12, 9, 12, 14))
     site = {
         "name": "Hall 7",
@@ -27,6 +27,8 @@ def site_message(unix_s, floor_plan=None, mode="master"):
         "floor_plan": floor_plan,
         "georeference": None,
     }
+    if not placed:
+        site |= {"anchors": [], "unplaced": [{"id": n, "slot": None} for n in range(1, 7)], "walls": []}
     return {"site": site, "simulated": True, "unix_s": unix_s}
 
 

@@ -18,10 +18,12 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyless.dashboard.guard import AccessRules, Guard
-from skyless.dashboard.live import LiveSite
+from skyless.dashboard.live import LiveSite, NoBrokerError
 from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
+from skyless.dashboard.site_survey import BadFactsError, NoResultError
 from skyless.dashboard.zones import BadZonesError, read_zones
+from skyless.site.image import image_size
 
 _PAGE: Final = Path(__file__).parent / "page"
 MAX_PAGES: Final = 50
@@ -30,9 +32,19 @@ PAGE_TIMEOUT_S: Final = 10.0
 
 _MAX_STATES_S: Final = 60.01
 _MAX_BODY_BYTES: Final = 1_000_000
+MAX_FLOOR_PLAN_BYTES: Final = 8_000_000
+"""As on MQTT (``docs/mqtt.md``); the page's ``survey/plan.js`` has the same limit."""
+
 _TRY_LATER: Final = 1013
 _GOING_AWAY: Final = 1001
-_STATUSES: Final[dict[type[Exception], int]] = {BadZonesError: 400, NoRecordingError: 404, NoOverlayError: 422}
+_STATUSES: Final[dict[type[Exception], int]] = {
+    BadZonesError: 400,
+    BadFactsError: 400,
+    NoRecordingError: 404,
+    NoResultError: 409,
+    NoOverlayError: 422,
+    NoBrokerError: 503,
+}
 
 
 class Services(Struct, frozen=True):
@@ -57,8 +69,11 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
     routes = [
         Route("/", index),
         Route("/api/floor_plan", _floor_plan),
+        Route("/api/floor_plan", _put_floor_plan, methods=["PUT"]),
         Route("/api/overlay", _overlay),
         Route("/api/zones", _put_zones, methods=["PUT"]),
+        Route("/api/survey/facts", _put_facts, methods=["PUT"]),
+        Route("/api/survey/save", _save_survey, methods=["POST"]),
         Route("/api/recordings", _recordings),
         Route("/api/recordings/{name}", _recording),
         Route("/api/recordings/{name}/states", _recorded_states),
@@ -143,12 +158,40 @@ def _number(request: Request, name: str, default: float, least: float, most: flo
     return value
 
 
-async def _put_zones(request: Request) -> Response:
-    body = b""
+async def _put_floor_plan(request: Request) -> Response:
+    image = await _body(request, MAX_FLOOR_PLAN_BYTES, f"the image is larger than {MAX_FLOOR_PLAN_BYTES // 10**6} MB")
+    if _image_type(image) is None or image_size(image) is None:
+        raise HTTPException(400, "this is no image that can be read; it should be a PNG or JPEG")
+    _services(request).live.store_floor_plan(image)
+    return _json({"bytes": len(image)})
+
+
+async def _put_facts(request: Request) -> Response:
+    live = _services(request).live
+    message = live.survey.facts_message(await _body(request, _MAX_BODY_BYTES, "too many facts"))
+    live.publish_survey(message)
+    return _json(message)
+
+
+async def _save_survey(request: Request) -> Response:
+    live = _services(request).live
+    message = live.survey.save_message(await _body(request, _MAX_BODY_BYTES, "the request is too long"))
+    live.publish_survey(message)
+    return _json(message)
+
+
+async def _body(request: Request, most_bytes: int, fault: str) -> bytes:
+    """The request's body; status 413 with the given words where it is too long."""
+    body = bytearray()
     async for chunk in request.stream():
         body += chunk
-        if len(body) > _MAX_BODY_BYTES:
-            raise HTTPException(413, "too many zones")
+        if len(body) > most_bytes:
+            raise HTTPException(413, fault)
+    return bytes(body)
+
+
+async def _put_zones(request: Request) -> Response:
+    body = await _body(request, _MAX_BODY_BYTES, "too many zones")
     live = _services(request).live
     live.store_zones(read_zones(body))
     return _json({"zones": live.monitor.zones})

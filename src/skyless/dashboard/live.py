@@ -6,16 +6,19 @@ Everything here belongs to one event loop.
 import asyncio
 import logging
 import time
+import zlib
 from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Final, Protocol
 
 import msgspec
 from msgspec import Struct
 
 import skyless
+from skyless.dashboard.site_survey import SiteSurvey, topic_of
 from skyless.dashboard.state import SiteState, encode
+from skyless.dashboard.wire import WrongMessageError, read_message
 from skyless.dashboard.zones import (
     MAX_EVENTS,
     BadZonesError,
@@ -33,6 +36,8 @@ from skyless.mqtt.messages import (
     FixMessage,
     SiteMessage,
     StatusMessage,
+    SurveyFactsMessage,
+    SurveySaveMessage,
     TagHealth,
     TruthMessage,
     Zone,
@@ -45,7 +50,6 @@ _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0
 
 _HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
-_T = TypeVar("_T")
 _log = logging.getLogger("skyless.dashboard")
 
 
@@ -62,8 +66,8 @@ class MqttLink(Protocol):
         """Stop repeating a retained message."""
 
 
-class WrongMessageError(ValueError):
-    """A message that does not fit its topic."""
+class NoBrokerError(Exception):
+    """Nothing can be published now."""
 
 
 class PageQueue:
@@ -132,6 +136,7 @@ class LiveSite:
         self.monitor = ZoneMonitor()
         self.events = EventQueue()
         self.pages: set[PageQueue] = set()
+        self.survey = SiteSurvey(name, self._broadcast, clock, wall_clock)
         self.dropped: Counter[str] = Counter()
         """Wrong messages by kind."""
         self._clock, self._wall_clock = clock, wall_clock
@@ -156,9 +161,10 @@ class LiveSite:
             topics.truth_topic(site_id): self._on_truth,
             topics.zones_topic(site_id): self._on_zones,
             topics.zone_event_topic(site_id, "+"): self._on_zone_event,
+            **self.survey.handlers(site_id),
         }
         for topic, handler in handlers.items():
-            link.subscribe(topic, self._counting(topic.rsplit("/", 1)[-1], handler), 1 if "zone" in topic else 0)
+            link.subscribe(topic, self._counting(topic.rsplit("/", 1)[-1], handler), _qos(topic))
         if self._drawn is not None:
             link.publish(topics.zones_topic(site_id), self._drawn, qos=1, retain=True)
 
@@ -166,6 +172,7 @@ class LiveSite:
         """Update whether the broker is connected."""
         if connected != self.connected:
             self.connected = connected
+            self.survey.expect_kept()
             self._broadcast("mqtt", self._connection())
 
     def _counting(self, kind: str, handler: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
@@ -180,18 +187,32 @@ class LiveSite:
         return handle
 
     def _on_site(self, _topic: str, payload: bytes) -> None:
-        message = _decode(payload, SiteMessage)
+        message = read_message(payload, SiteMessage)
         check_site(message.site, Path("the site on MQTT"))
         if message.site.id != self._site_id:
             raise WrongMessageError(f"it is of site {message.site.id}")
         self.site = message
         self._broadcast("site", encode("site", {"site": message}))
 
-    def _on_floor_plan(self, _topic: str, payload: bytes) -> None:
-        self.floor_plan = payload or None
+    def _on_floor_plan(self, topic: str, payload: bytes) -> None:
+        image = payload or None
+        if image == self.floor_plan:
+            return
+        if self._link is not None:
+            self._link.forget(topic)  # an image that was stored here must not come back after a reconnect
+        self._show_floor_plan(image)
+
+    def _show_floor_plan(self, image: bytes | None) -> None:
+        self.floor_plan = image
+        self._broadcast("floor_plan", self._floor_plan_message())
+
+    def _floor_plan_message(self) -> bytes:
+        """Lets pages load the image again when it is another one."""
+        digest = None if self.floor_plan is None else f"{zlib.crc32(self.floor_plan):08x}"
+        return encode("floor_plan", {"digest": digest})
 
     def _on_fix(self, topic: str, payload: bytes) -> None:
-        fix = _decode(payload, FixMessage)
+        fix = read_message(payload, FixMessage)
         _check_name(fix.tag, topic)
         now_s = self._clock()
         self.state.add_fix(fix, now_s)
@@ -200,7 +221,7 @@ class LiveSite:
     def _on_status(self, topic: str, payload: bytes) -> None:
         if not payload:
             return  # a retained status was cleared
-        status = _decode(payload, StatusMessage)
+        status = read_message(payload, StatusMessage)
         _check_name(status.name, topic)
         self.state.add_status(status)
         if status.kind == "tag" and not status.online:
@@ -209,10 +230,10 @@ class LiveSite:
     def _on_health(self, topic: str, payload: bytes) -> None:
         _, kind, name, _ = topic.rsplit("/", 3)
         if kind in _HEALTHS:
-            self.state.add_health(name, _decode(payload, _HEALTHS[kind]), self._clock())  # type: ignore[arg-type]
+            self.state.add_health(name, read_message(payload, _HEALTHS[kind]), self._clock())  # type: ignore[arg-type]
 
     def _on_truth(self, _topic: str, payload: bytes) -> None:
-        self.state.add_truth(_decode(payload, TruthMessage))
+        self.state.add_truth(read_message(payload, TruthMessage))
 
     def _on_zones(self, topic: str, payload: bytes) -> None:
         zones = read_zones(payload) if payload else ()
@@ -225,7 +246,7 @@ class LiveSite:
         self._set_zones(zones)
 
     def _on_zone_event(self, topic: str, payload: bytes) -> None:
-        event = _decode(payload, ZoneEvent)
+        event = read_message(payload, ZoneEvent)
         _check_name(event.zone, topic)
         if self.events.add_published(event):
             self._broadcast_event(event)
@@ -256,6 +277,24 @@ class LiveSite:
             if self._link is not None and self._site_id is not None:
                 self._link.publish(topics.zone_event_topic(self._site_id, event.zone), event, qos=1)
 
+    # Survey
+
+    def publish_survey(self, message: SurveyFactsMessage | SurveySaveMessage) -> None:
+        """Give the survey program facts or the request to save. Raises NoBrokerError."""
+        link, site_id = self._connected()
+        link.publish(topic_of(message, site_id), message, qos=1)
+
+    def store_floor_plan(self, image: bytes) -> None:
+        """Store the image of the floor, a PNG or JPEG, at the broker. Raises NoBrokerError."""
+        link, site_id = self._connected()
+        link.publish(topics.floor_plan_topic(site_id), image, qos=1, retain=True)
+        self._show_floor_plan(image)
+
+    def _connected(self) -> tuple[MqttLink, int]:
+        if self._link is None or self._site_id is None or not self.connected:
+            raise NoBrokerError(f"the broker {self.broker} is not connected; try again when it is")
+        return self._link, self._site_id
+
     # Pages
 
     def open_page(self) -> PageQueue:
@@ -270,6 +309,10 @@ class LiveSite:
         page = PageQueue(encode("hello", hello))
         page.replace("mqtt", self._connection())
         page.replace("health", self.state.health_message(self.dropped))
+        if self.floor_plan is not None:
+            page.replace("floor_plan", self._floor_plan_message())
+        for kind, message in self.survey.messages().items():
+            page.replace(kind, message)
         self.pages.add(page)
         return page
 
@@ -315,12 +358,9 @@ class LiveSite:
             page.add_event(message)
 
 
-def _decode(payload: bytes, kind: type[_T]) -> _T:
-    """A message from JSON. Raises WrongMessageError."""
-    try:
-        return msgspec.json.decode(payload, type=kind)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise WrongMessageError(str(error)) from None
+def _qos(topic: str) -> int:
+    """Messages that are sent once only must not be lost."""
+    return 1 if "/zone" in topic or "/survey/" in topic else 0
 
 
 def _check_name(name: str, topic: str) -> None:

@@ -121,6 +121,8 @@ def overlay_task(site: Site, floor_plan: bytes | None, method: str, step_m: floa
 
 
 def _box(site: Site, floor_plan: bytes | None) -> Box:
+    if not site.anchors:
+        raise NoOverlayError("no anchor of this site has a position yet; survey it first")
     xs, ys = [anchor.x_m for anchor in site.anchors], [anchor.y_m for anchor in site.anchors]
     size = image_size(floor_plan) if floor_plan is not None else None
     plan = site.floor_plan

@@ -337,6 +337,8 @@ class SurveyMessage(Struct, frozen=True):
     saved_serial: int | None = None
     file: str | None = None
     """The site file that it writes."""
+    state: Literal["collecting", "surveyed", "no data"] = "collecting"
+    """``no data``: no stamps have come for 5 s, so that ``survey``, if there is one, is of before."""
 
 
 class PlacementMessage(Struct, frozen=True):

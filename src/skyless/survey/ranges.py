@@ -27,3 +27,18 @@ class PairRanges(Struct, frozen=True):
     tx_std_m: dict[int, float] = {}
     """Error of an anchor's TX stamps in the mean, which all its ranges share as if it were a delay; 0 where missing."""
     duration_s: float = 0.0
+
+
+class PairBlock(Struct, frozen=True, gc=False):
+    """The mean of one pair's ranges within a block of time, a second or so."""
+
+    a: int
+    b: int
+    """Identifiers, a < b."""
+    t_s: float
+    """Middle of the block."""
+    mean_m: float
+    """Distance plus both anchors' delays, ``d + h_a + h_b``."""
+    std_m: float
+    """Of the mean, from stamps' noise, that which other pairs share included."""
+    exchanges: int

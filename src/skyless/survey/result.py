@@ -54,7 +54,7 @@ class TapeAdvice(Struct, frozen=True):
     b: int
     std_before_m: float
     std_after_m: float
-    """rms over all anchors' ``std_m``; infinite before where an anchor is not determined."""
+    """rms over the ``std_m`` of all anchors that are determined, with the earlier tapes measured."""
 
 
 class Survey(Struct, frozen=True):

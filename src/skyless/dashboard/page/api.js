@@ -26,6 +26,25 @@ export async function putZones(zones) {
   return (await fetchJson("api/zones", { method: "PUT", headers, body })).zones;
 }
 
+/** Give the survey program all that the user knows; throws an Error that names the field that is wrong. */
+export function putFacts(facts, floor_plan) {
+  const body = JSON.stringify({ facts, floor_plan });
+  const headers = { "content-type": "application/json" };
+  return fetchJson("api/survey/facts", { method: "PUT", headers, body });
+}
+
+/** Have the survey program save the result of a number. */
+export function saveSurvey(serial) {
+  const body = JSON.stringify({ serial });
+  const headers = { "content-type": "application/json" };
+  return fetchJson("api/survey/save", { method: "POST", headers, body });
+}
+
+/** Store the image of the floor, a PNG or JPEG. @param {Blob} image */
+export function putFloorPlan(image) {
+  return fetchJson("api/floor_plan", { method: "PUT", headers: { "content-type": image.type }, body: image });
+}
+
 /** The values of an overlay on a grid. */
 export function overlay(kind, step_m) {
   return fetchJson(`api/overlay?kind=${encodeURIComponent(kind)}&step_m=${step_m}`);

@@ -37,6 +37,11 @@ export function duration(value_s) {
   return `${Math.floor(value_s / 3600)} h ${Math.floor((value_s % 3600) / 60)} min`;
 }
 
+/** Words as a sentence: with a capital at the start and a full stop at the end. */
+export function sentence(words) {
+  return words.charAt(0).toUpperCase() + words.slice(1) + (/[.!?]$/.test(words) ? "" : ".");
+}
+
 /** Minutes and seconds on a player. */
 export function clock(value_s) {
   const tenths = Math.floor(value_s * 10 + 1e-6);

@@ -4,6 +4,7 @@ import { changed, state } from "./store.js";
 import { live, resetOffset, updateOffset } from "./clock.js";
 import { toast } from "./dom.js";
 import { addHealth } from "./history.js";
+import { receiveSurvey, receiveWatch, restart } from "./survey/model.js";
 
 const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 3000;
@@ -101,6 +102,7 @@ function process(text) {
 const handlers = {
   hello(message) {
     resetOffset();
+    restart();
     retry_ms = FIRST_RETRY_MS;
     lastMotion = 0;
     state.connection = { phase: "open", since: performance.now(), reason: "" };
@@ -138,6 +140,16 @@ const handlers = {
     if (state.mode !== "live") return;
     state.zones = zones;
     changed("zones");
+  },
+  survey(message) {
+    receiveSurvey(message.survey, message.age_s);
+  },
+  watch(message) {
+    receiveWatch(message.watch, message.age_s);
+  },
+  floor_plan(message) {
+    state.floorDigest = message.digest;
+    changed("site");
   },
   zone_event(message) {
     state.events = [message, ...state.events].slice(0, MAX_EVENTS);

@@ -9,6 +9,7 @@ import * as replay from "./replay_bar.js";
 import * as tabs from "./tabs.js";
 import * as theme from "./theme.js";
 import * as tools from "./map/tools.js";
+import * as watch from "./watch_banner.js";
 import { live as liveTracks, replayed, shown_s } from "./clock.js";
 import { byId, text } from "./dom.js";
 
@@ -26,6 +27,7 @@ legend.start();
 tabs.start();
 replay.start();
 banner.start();
+watch.start();
 on(["site"], () => {
   text(byId("site-name"), state.site?.name ?? "");
   byId("simulated").hidden = !state.simulated;

@@ -2,7 +2,7 @@
  * The one state of the page. Modules change it and notify the topics; callbacks run at most once a frame.
  *
  * Topics: connection, site, zones, events, health, tags, mode, player, recordings, selection, options, overlay, editor,
- * theme.
+ * theme, survey, watch, setup, picking, plan.
  */
 
 /** @type {Map<string, Set<() => void>>} */
@@ -27,6 +27,14 @@ export const state = {
   /** @type {any[]} newest first */
   events: [],
   health: { anchors: new Map(), tags: new Map(), ether: null, nodes: [], atMs: 0 },
+  /** @type {any} the newest message of the survey program; `survey/model.js` says how old it is */
+  survey: null,
+  /** @type {any} the newest message of the watch of the anchors */
+  watch: null,
+  /** Whether the tab Set up is open: the map then shows the survey instead of the site file's positions. */
+  setup: { open: false },
+  /** @type {string|null} changes with the floor plan's image */
+  floorDigest: null,
   /** @type {any[]|null} */
   recordings: null,
   /** @type {any} the recording that `player.js` plays */

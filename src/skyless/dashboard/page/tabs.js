@@ -1,19 +1,22 @@
 /** The side panel: tabs by the pattern of the ARIA authoring guide, and on a phone a sheet of three heights. */
 
-import { on, state } from "./store.js";
+import { changed, on, state } from "./store.js";
 import { byId, h, throttle } from "./dom.js";
+import { picking } from "./survey/picking.js";
 import * as anchors from "./panels/anchors.js";
 import * as recordings from "./panels/recordings.js";
 import * as tags from "./panels/tags.js";
 import * as timing from "./panels/timing.js";
 import * as zones from "./panels/zones.js";
+import * as setup from "./setup/panel.js";
 
 /** Each has a title, the topics that it shows, the interval at which it shows changes, `start(panel)` and `show()`. */
-const TABS = { tags, anchors, timing, zones, recordings };
+const TABS = { tags, anchors, timing, zones, setup, recordings };
 const KEYS = Object.keys(TABS);
 const SHEET = ["low", "half", "high"];
 
 let current = "tags";
+let offered = false;
 
 /** Build the panel. */
 export function start() {
@@ -33,14 +36,23 @@ export function start() {
   document.body.dataset.sheet = "half";
   byId("sheet").addEventListener("click", () => sheet(SHEET[(SHEET.indexOf(document.body.dataset.sheet) + 1) % 3]));
   open("tags");
+  on(["site"], openWhereNothingIsPlaced);
+  on(["picking"], () => picking && matchMedia("(max-width: 760px)").matches && sheet("half"));
   setInterval(() => TABS[current].changesWithTime && show(), 1000);
   on(["mode"], () => state.mode === "replay" && matchMedia("(max-width: 760px)").matches && sheet("low"));
   on(["selection"], () => {
     const { tag, anchor, zone } = state.selection;
     if (tag !== null && current !== "timing") open("tags");
-    else if (anchor !== null) open("anchors");
+    else if (anchor !== null && current !== "setup") open("anchors");
     else if (zone !== null) open("zones");
   });
+}
+
+/** Open the tab Set up at a site without any position, once: there is nothing else to see. */
+function openWhereNothingIsPlaced() {
+  if (offered || state.mode !== "live" || !state.site) return;
+  offered = true;
+  if (!state.site.anchors.length && current === "tags") open("setup");
 }
 
 /** Bring the open tab up to date, if it is visible. */
@@ -48,8 +60,13 @@ function show() {
   if (document.body.dataset.sheet !== "low") TABS[current].show();
 }
 
-function open(key) {
+/** Open a tab. */
+export function open(key) {
   current = key;
+  if (state.setup.open !== (key === "setup")) {
+    state.setup.open = key === "setup";
+    changed("setup");
+  }
   for (const name of KEYS) {
     const button = byId(`tab-${name}`);
     button.setAttribute("aria-selected", String(name === key));

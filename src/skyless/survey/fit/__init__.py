@@ -1,8 +1,8 @@
 """Fitting positions and delays to ranges of pairs.
 
-In the order of reading: ``problem`` (unknowns, rows, least squares), ``start`` (where a fit begins), ``neighbours``
-(other results close to one), ``presence`` (which pairs have a range), ``robust`` (late ranges left out), ``ambiguity``
-(whether another result fits as well).
+In the order of reading: ``problem`` (unknowns, rows, least squares), ``links`` (counting), ``start``, ``robust`` and
+``neighbours`` (a fit that late ranges do not spoil), ``ambiguity`` and ``presence`` (other results), ``determined``
+(covariance), ``tapes``, ``gauge``.
 
-Public: none.
+Public: ambiguity, determined, gauge, links, problem, robust, start, tapes.
 """

@@ -2,6 +2,7 @@
 
 import { s } from "../dom.js";
 import { state } from "../store.js";
+import { surveyShown } from "../survey/model.js";
 import { palette } from "../theme.js";
 import { px, py } from "./view.js";
 
@@ -63,8 +64,9 @@ export function anchorMark(kind, leading = false) {
   return mark;
 }
 
-/** Draw all anchors; a master or root has a frame around it, the selected one a ring. */
+/** Draw all anchors, unless the survey's picture shows them; a master or root has a frame around it, the selected one a ring. */
 export function drawAnchors(context) {
+  if (surveyShown()) return;
   context.font = "600 11px system-ui, sans-serif";
   context.textAlign = "center";
   context.textBaseline = "top";

@@ -3,6 +3,8 @@
 import { faint, palette } from "../theme.js";
 import { state } from "../store.js";
 import { metres } from "../format.js";
+import { surveyShown } from "../survey/model.js";
+import { height_m, moving, plan } from "../survey/plan.js";
 import { px, py, roundLength, toSite, view } from "./view.js";
 
 /** @type {{image: HTMLImageElement, x_m: number, y_m: number, width_m: number, height_m: number}|null} */
@@ -11,15 +13,17 @@ let floorOf = null;
 
 /** Load the site's floor plan, if it has one, and call `done` when it is loaded. */
 export function loadFloor(done) {
-  const plan = state.site?.floor_plan ?? null;
-  if (JSON.stringify(plan) === floorOf) return;
-  floorOf = JSON.stringify(plan);
+  const stated = state.site?.floor_plan ?? null;
+  const key = JSON.stringify([stated, stated && state.floorDigest]);
+  if (key === floorOf) return;
+  floorOf = key;
   floor = null;
-  if (!plan) return;
+  if (!stated) return;
   const image = new Image();
   image.onload = () => {
-    const height_m = (plan.width_m * image.naturalHeight) / image.naturalWidth;
-    floor = { image, x_m: plan.x_m, y_m: plan.y_m, width_m: plan.width_m, height_m };
+    if (key !== floorOf) return;
+    const { x_m, y_m, width_m } = stated;
+    floor = { image, x_m, y_m, width_m, height_m: height_m({ image, width_m }) };
     done();
   };
   image.onerror = () => (floorOf = null);
@@ -28,12 +32,34 @@ export function loadFloor(done) {
 
 /** Draw the floor plan's image. */
 export function drawFloor(context) {
-  if (!floor) return;
-  context.globalAlpha = 0.75;
-  const width = floor.width_m * view.scale;
-  const height = floor.height_m * view.scale;
-  context.drawImage(floor.image, px(floor.x_m), py(floor.y_m + floor.height_m), width, height);
+  const shown = laid();
+  if (!shown) return;
+  const [left, top] = [px(shown.x_m), py(shown.y_m + shown.height_m)];
+  const [width, height] = [shown.width_m * view.scale, shown.height_m * view.scale];
+  context.globalAlpha = surveyShown() ? 0.5 : 0.75; // thin lines of the survey's picture lie over it
+  context.drawImage(shown.image, left, top, width, height);
   context.globalAlpha = 1;
+  if (!moving) return;
+  context.setLineDash([6, 4]);
+  context.strokeStyle = palette.accent;
+  context.lineWidth = 2;
+  context.strokeRect(left, top, width, height);
+  context.setLineDash([]);
+}
+
+/** The plan that the set-up lays under the picture, or else the site's. */
+function laid() {
+  return plan ? { ...plan, height_m: height_m() } : floor;
+}
+
+/** Corners of the floor plan in metres, where there is one. */
+export function floorCorners() {
+  const shown = laid();
+  if (!shown) return [];
+  return [
+    [shown.x_m, shown.y_m],
+    [shown.x_m + shown.width_m, shown.y_m + shown.height_m],
+  ];
 }
 
 /** Draw the overlay's picture. */

@@ -3,8 +3,12 @@
 import { changed, select, state } from "../store.js";
 import { byId, text } from "../dom.js";
 import { length, metres, number } from "../format.js";
+import { surveyShown } from "../survey/model.js";
+import { picking, stopPicking } from "../survey/picking.js";
+import { move as movePlan, moving as movingPlan } from "../survey/plan.js";
 import { addPoint, begin, cancel, editor, finish, moveCorner, setCursor, storeShown, undoPoint } from "./editor.js";
 import { valueAt } from "./overlay.js";
+import { anchorNear } from "./survey.js";
 import { drawn } from "./tags.js";
 import { pan, px, py, toSite, view, zoom } from "./view.js";
 import { inside } from "./zones.js";
@@ -41,7 +45,7 @@ export function listen(target, redraw, fitAll) {
     if (pointers.size === 2) pinch(event.pointerId, before, at);
     else if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
     else if (travelled + Math.hypot(at.x - before.x, at.y - before.y) >= MAX_TAP_TRAVEL)
-      pan(at.x - before.x, at.y - before.y);
+      drag(at.x - before.x, at.y - before.y);
     travelled += Math.hypot(at.x - before.x, at.y - before.y);
     pointers.set(event.pointerId, at);
     redraw(true);
@@ -74,6 +78,12 @@ export function listen(target, redraw, fitAll) {
   });
 }
 
+/** A drag moves the map, or the floor plan while that is being laid. */
+function drag(dx, dy) {
+  if (movingPlan && !picking) movePlan(dx / view.scale, -dy / view.scale);
+  else pan(dx, dy);
+}
+
 function pinch(moved, before, at) {
   const other = [...pointers].find(([id]) => id !== moved)[1];
   const apart = Math.hypot(before.x - other.x, before.y - other.y);
@@ -85,6 +95,7 @@ function pinch(moved, before, at) {
 
 function tap({ x, y }) {
   const site = toSite(x, y);
+  if (picking) return pickAt(site, anchorNear(x, y, 1.5 * HIT));
   if (editor.drawing) {
     const [first] = editor.points;
     if (editor.points.length > 2 && near(px(first[0]), py(first[1]), x, y)) return finish();
@@ -93,10 +104,18 @@ function tap({ x, y }) {
   }
   const tag = drawn.findLast((one) => near(one.x, one.y, x, y));
   if (tag) return select("tag", tag.name);
-  const anchor = state.site?.anchors.find((one) => near(px(one.x_m), py(one.y_m), x, y));
-  if (anchor) return select("anchor", anchor.id);
+  const anchor = surveyShown()
+    ? anchorNear(x, y, HIT)
+    : state.site?.anchors.find((one) => near(px(one.x_m), py(one.y_m), x, y))?.id;
+  if (anchor !== undefined) return select("anchor", anchor);
   const zone = state.zones.findLast((one) => inside(one.polygon_m, site[0], site[1]));
   return zone ? select("zone", zone.id) : select(null);
+}
+
+/** Give a step of the set-up what it has asked for; a click elsewhere is none. */
+function pickAt(site, anchor) {
+  if (picking.point) picking.point(site);
+  else if (anchor !== undefined) picking.anchor(anchor);
 }
 
 function near(x1, y1, x2, y2) {
@@ -104,7 +123,7 @@ function near(x1, y1, x2, y2) {
 }
 
 function cornerAt({ x, y }) {
-  if (editor.drawing || state.mode !== "live") return null;
+  if (editor.drawing || picking || movingPlan || state.mode !== "live") return null;
   const zone = state.zones.find((one) => one.id === state.selection.zone);
   const index = zone?.polygon_m.findIndex(([x_m, y_m]) => near(px(x_m), py(y_m), x, y)) ?? -1;
   return index < 0 ? null : { id: zone.id, index };
@@ -123,7 +142,10 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowD
 
 function mapKey(event, fitAll) {
   const arrow = ARROWS[event.key];
-  if (arrow) pan(-60 * arrow[0], 60 * arrow[1]);
+  const step = event.shiftKey ? 0.02 : 0.2;
+  if (event.key === "Escape" && picking) stopPicking();
+  else if (arrow && movingPlan) movePlan(step * arrow[0], step * arrow[1]);
+  else if (arrow) pan(-60 * arrow[0], 60 * arrow[1]);
   else if (event.key === "+" || event.key === "=") zoom(1.25);
   else if (event.key === "-") zoom(0.8);
   else if (event.key === "0") fitAll();

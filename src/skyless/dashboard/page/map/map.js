@@ -2,9 +2,12 @@
 
 import { on, state } from "../store.js";
 import { byId } from "../dom.js";
+import { surveyShown } from "../survey/model.js";
 import { drawAnchors } from "./anchors.js";
-import { drawFloor, drawGrid, drawOverlay, drawScale, drawWalls, floor, loadFloor } from "./floor.js";
+import { drawFindings } from "./findings.js";
+import { drawFloor, drawGrid, drawOverlay, drawScale, drawWalls, floorCorners, loadFloor } from "./floor.js";
 import { listen } from "./input.js";
+import { drawSurvey, surveyCorners, surveyOutOfSight } from "./survey.js";
 import { drawTags, visibleTags } from "./tags.js";
 import { drawTrails, due } from "./trails.js";
 import { fit, prepare, view } from "./view.js";
@@ -63,14 +66,16 @@ function drawStill() {
   const flashes = drawZones(context);
   drawWalls(context);
   drawAnchors(context);
+  drawSurvey(context);
+  drawFindings(context);
   drawScale(context);
-  byId("waiting").hidden = state.site !== null;
+  byId("waiting").hidden = state.site !== null || (surveyShown() && state.survey.anchors.length > 0);
   return flashes;
 }
 
 /** Show the whole site. */
 export function fitAll() {
-  fit(state.site, state.zones, floor);
+  fit(state.site, state.zones, [...floorCorners(), ...surveyCorners()]);
   redraw();
 }
 
@@ -92,11 +97,19 @@ export function start() {
     if (key !== shown) fitAll();
     shown = key;
   });
+  let surveyed = "";
+  on(["survey", "setup"], () => {
+    const box = surveyCorners().map(([x, y]) => [Math.round(x), Math.round(y)]);
+    const key = JSON.stringify([state.setup.open, box]);
+    if (key !== surveyed && (!view.touched || surveyOutOfSight())) fitAll();
+    surveyed = key;
+  });
   on(["events"], () => {
     const newest = state.events[0];
     if (newest && newest !== lastEvent && lastEvent !== null) flash(newest.zone);
     lastEvent = newest ?? 0;
   });
-  on(["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode"], () => redraw(true));
+  const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode"];
+  on([...still, "survey", "watch", "setup", "plan"], () => redraw(true));
   on(["tags", "editor", "player"], () => redraw(false));
 }

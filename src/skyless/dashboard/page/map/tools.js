@@ -2,6 +2,8 @@
 
 import { changed, on } from "../store.js";
 import { byId, text } from "../dom.js";
+import { picking, stopPicking } from "../survey/picking.js";
+import { moving, setMoving } from "../survey/plan.js";
 import { begin, cancel, editor, finish, undoPoint } from "./editor.js";
 import { fitAll, redraw } from "./map.js";
 import { view, zoom } from "./view.js";
@@ -16,7 +18,9 @@ export function start() {
   click("drawing-finish", finish);
   click("drawing-undo", undoPoint);
   click("drawing-cancel", cancel);
+  click("picking-cancel", () => (picking ? stopPicking() : setMoving(false)));
   on(["editor"], show);
+  on(["picking", "plan"], showPicking);
   on(["mode"], () => {
     byId("draw").disabled = document.body.classList.contains("replaying");
     if (editor.drawing) cancel();
@@ -28,6 +32,15 @@ export function startDrawing(keyboard) {
   begin(keyboard ? [view.x_m, view.y_m] : null);
   byId("canvas").focus({ preventScroll: true });
   changed("editor");
+}
+
+/** The bar with what the set-up asks for on the map. */
+function showPicking() {
+  const moved = moving && !picking;
+  byId("picking").hidden = !picking && !moved;
+  byId("canvas").classList.toggle("drawing", picking !== null);
+  text(byId("picking-help"), picking?.help ?? (moved ? "Drag the floor plan, or move it by the arrow keys." : ""));
+  text(byId("picking-cancel"), moved ? "Done" : "Cancel");
 }
 
 function show() {

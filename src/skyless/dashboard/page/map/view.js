@@ -8,6 +8,11 @@ const MAX_SCALE = 2000;
 
 export const view = { width: 1, height: 1, ratio: 1, x_m: 0, y_m: 0, scale: 50, touched: false };
 
+/** Whether the map is as narrow as on a phone. */
+export function isNarrow() {
+  return view.width < 600;
+}
+
 /** Pixels (of CSS) from the left. */
 export function px(x_m) {
   return view.width / 2 + (x_m - view.x_m) * view.scale;
@@ -39,20 +44,18 @@ export function zoom(factor, x = view.width / 2, y = view.height / 2) {
   view.touched = true;
 }
 
-/** Show the whole site, clear of the buttons; `floor` is the floor plan's image, where there is one. */
-export function fit(site, zones, floor) {
+/** Show the whole site and some further corners, clear of the buttons. */
+export function fit(site, zones, further) {
   view.touched = false;
-  const corners = zones.flatMap((zone) => zone.polygon_m);
+  const corners = [...zones.flatMap((zone) => zone.polygon_m), ...further];
   for (const anchor of site?.anchors ?? []) corners.push([anchor.x_m, anchor.y_m]);
   for (const wall of site?.walls ?? []) corners.push([wall.x1_m, wall.y1_m], [wall.x2_m, wall.y2_m]);
-  if (floor) corners.push([floor.x_m, floor.y_m], [floor.x_m + floor.width_m, floor.y_m + floor.height_m]);
   if (!corners.length) corners.push([-5, -4], [5, 4]);
   const xs = corners.map(([x]) => x);
   const ys = corners.map(([, y]) => y);
   const [left, right] = [Math.min(...xs), Math.max(...xs)];
   const [bottom, top] = [Math.min(...ys), Math.max(...ys)];
-  const edge =
-    view.width < 600 ? { left: 34, right: 22, top: 62, bottom: 82 } : { left: 48, right: 64, top: 32, bottom: 104 };
+  const edge = isNarrow() ? { left: 34, right: 22, top: 62, bottom: 104 } : { left: 48, right: 64, top: 32, bottom: 104 };
   const across = (view.width - edge.left - edge.right) / Math.max(right - left, 1);
   const up = (view.height - edge.top - edge.bottom) / Math.max(top - bottom, 1);
   view.scale = Math.min(Math.max(Math.min(across, up), MIN_SCALE), MAX_SCALE);

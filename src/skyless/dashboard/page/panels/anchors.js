@@ -6,10 +6,11 @@ import { Rows, h, text } from "../dom.js";
 import { DASH, duration, length, number } from "../format.js";
 import { anchorHistory } from "../history.js";
 import { anchorMark, condition, leads, wordsOf } from "../map/anchors.js";
+import { findingAt, findingWords, findings, markWords } from "../survey/watch.js";
 import { facts, selectionTable, split } from "./parts.js";
 
 export const title = "Anchors";
-export const topics = ["health", "selection", "site", "mode"];
+export const topics = ["health", "selection", "site", "mode", "watch"];
 export const interval_ms = 200;
 export const changesWithTime = true;
 
@@ -25,14 +26,19 @@ export function start(panel) {
   const nodes = h("ul", { class: "nodes" });
   const note = h("p", { class: "empty" }, "Anchor health is shown on the live site only.");
   const box = h("div", { class: "scroll-x" }, table.element);
-  parts = { panel, note, box, rows: table.rows, detail: makeDetail(), nodes: new Rows(nodes, makeNode) };
-  panel.append(note, box, parts.detail.element, h("section", {}, h("h2", {}, "Programs"), nodes));
+  const list = h("ul", { class: "reasons findings" });
+  const found = new Rows(list, (_key, finding) => ({ element: h("li", { class: "bad" }, findingWords(finding)) }));
+  parts = { panel, note, list, found, box, rows: table.rows, detail: makeDetail(), nodes: new Rows(nodes, makeNode) };
+  panel.append(note, list, box, parts.detail.element, h("section", {}, h("h2", {}, "Programs"), nodes));
 }
 
 /** Bring the tab up to date. */
 export function show() {
   parts.note.hidden = state.mode === "live";
+  parts.list.hidden = !findings().length;
+  parts.found.show(findings().map((finding) => [JSON.stringify(finding), finding]));
   const ids = new Set((state.site?.anchors ?? []).map((anchor) => anchor.id));
+  for (const { id } of state.site?.unplaced ?? []) ids.add(id);
   for (const id of state.health.anchors.keys()) ids.add(id);
   parts.rows.show([...ids].map((id) => [id, id]));
   parts.detail.show(state.selection.anchor);
@@ -54,12 +60,14 @@ function describe(id) {
   const kind = condition(id);
   const leading = leads(id);
   const health = healthOf(id);
+  const finding = findingAt(id);
+  const words = finding ? `${wordsOf(kind)}; ${markWords(finding)}` : wordsOf(kind);
   return {
-    condition: kind,
-    words: wordsOf(kind),
-    key: wordsOf(kind) + leading,
+    condition: finding ? "bad" : kind,
+    words,
+    key: words + leading,
     mark: () => anchorMark(kind, leading !== ""),
-    name: leading ? `${id} ${leading}` : String(id),
+    name: [id, leading, finding && markWords(finding)].filter(Boolean).join(" "),
     figures: [
       leading ? "reference" : number(health?.offset_s, 4, "s"),
       leading ? DASH : number(health?.rate_ppm, 3, "ppm"),

@@ -74,7 +74,8 @@ function read(health) {
 
 function slotCount() {
   const site = siteMode() === "free" ? null : state.site;
-  return site ? (site.schedule.slots ?? site.anchors.length * site.schedule.frames_per_node) : 0;
+  const anchors = site ? site.anchors.length + (site.unplaced?.length ?? 0) : 0;
+  return site ? (site.schedule.slots ?? anchors * site.schedule.frames_per_node) : 0;
 }
 
 function draw(tags) {

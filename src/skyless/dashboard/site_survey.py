@@ -1,0 +1,193 @@
+"""The survey of a site as pages see it: the newest messages of the survey program, and what pages give to it.
+
+The survey program computes; here its messages are forwarded, and what a page sends is checked and published.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Final, Generic, TypeVar
+
+import msgspec
+from msgspec.structs import replace
+
+from skyless.air.page_codec import MAX_COORDINATE_M
+from skyless.dashboard.state import encode
+from skyless.dashboard.wire import read_message
+from skyless.mqtt.messages import SurveyFactsMessage, SurveyMessage, SurveySaveMessage, WatchMessage
+from skyless.mqtt.topics import survey_facts_topic, survey_save_topic, survey_topic, watch_topic
+from skyless.site.check import Limits
+from skyless.survey.facts import Facts
+
+MAX_FACTS: Final = 10_000
+"""Heights, tapes, points and the like, each."""
+
+_COORDINATE: Final = Limits(-MAX_COORDINATE_M, MAX_COORDINATE_M, "metres")
+_LENGTH: Final = Limits(0, MAX_COORDINATE_M, "metres", above=True)
+_STD: Final = Limits(0, 100, "metres")
+_POSITIVE_STD: Final = Limits(0, 100, "metres", above=True)
+
+Handler = Callable[[str, bytes], None]
+_M = TypeVar("_M", SurveyMessage, WatchMessage)
+
+
+class BadFactsError(ValueError):
+    """What is wrong with the facts that a page has sent, or with its request to save."""
+
+
+class NoResultError(Exception):
+    """Why there is no result that could be saved."""
+
+
+class Newest(Generic[_M]):
+    """The newest message of a retained topic, and how old it is.
+
+    The first after a connection may be old: the broker kept it, and only its own time says how long. The others are
+    new when they arrive, whatever their sender's clock shows.
+    """
+
+    def __init__(self, kind: type[_M], clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
+        self.message: _M | None = None
+        self._kind: type[_M] = kind
+        self._clock, self._wall_clock = clock, wall_clock
+        self._first = True
+        self._made_s = 0.0
+
+    def expect_kept(self) -> None:
+        """The next message may be one that the broker kept."""
+        self._first = True
+
+    def read(self, payload: bytes) -> None:
+        """Replace the message; an empty payload removes it. Raises WrongMessageError."""
+        self.message = read_message(payload, self._kind) if payload else None
+        self._made_s = self._clock()
+        if self.message is not None and self._first:
+            self._made_s -= max(0.0, self._wall_clock() - self.message.unix_s)
+        self._first = False
+
+    def age_s(self) -> float | None:
+        """Seconds since the message was made; None without one."""
+        return None if self.message is None else self._clock() - self._made_s
+
+
+class SiteSurvey:
+    """The newest messages of the survey program; each change is handed to ``broadcast`` for the open pages."""
+
+    def __init__(
+        self,
+        name: str,
+        broadcast: Callable[[str, bytes], None],
+        clock: Callable[[], float],
+        wall_clock: Callable[[], float],
+    ) -> None:
+        """``name`` is the dashboard's on MQTT."""
+        self._name, self._broadcast = name, broadcast
+        self._survey = Newest(SurveyMessage, clock, wall_clock)
+        self._watch = Newest(WatchMessage, clock, wall_clock)
+
+    def handlers(self, site_id: int) -> dict[str, Handler]:
+        """What is to be subscribed to, and who handles it."""
+        return {survey_topic(site_id): self._on_survey, watch_topic(site_id): self._on_watch}
+
+    def messages(self) -> dict[str, bytes]:
+        """The messages that a new page needs, by kind."""
+        found = {}
+        if self._survey.message is not None:
+            found["survey"] = self._encoded_survey()
+        if self._watch.message is not None:
+            found["watch"] = self._encoded_watch()
+        return found
+
+    def expect_kept(self) -> None:
+        """The broker is connected again: it sends the messages that it kept."""
+        self._survey.expect_kept()
+        self._watch.expect_kept()
+
+    def facts_message(self, body: bytes) -> SurveyFactsMessage:
+        """What a page's user knows, ready to be published. Raises BadFactsError."""
+        try:
+            message = msgspec.json.decode(body, type=SurveyFactsMessage)
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            raise BadFactsError(f"these are no facts of a survey: {error}") from None
+        check_facts(message)
+        return replace(message, by=self._name)
+
+    def save_message(self, body: bytes) -> SurveySaveMessage:
+        """The request to save a result, ready to be published. Raises BadFactsError and NoResultError."""
+        try:
+            serial = msgspec.json.decode(body, type=dict[str, int])["serial"]
+        except (msgspec.MsgspecError, ValueError, RecursionError, KeyError) as error:
+            raise BadFactsError(f'this is no request to save, such as {{"serial": 12}}: {error}') from None
+        newest = self._survey.message
+        if newest is None or newest.survey is None:
+            raise NoResultError("the survey has no result yet")
+        if not 0 <= serial <= newest.serial:
+            raise NoResultError(f"there is no result {serial}; the newest is {newest.serial}")
+        return SurveySaveMessage(self._name, serial)
+
+    def _on_survey(self, _topic: str, payload: bytes) -> None:
+        self._survey.read(payload)
+        self._broadcast("survey", self._encoded_survey())
+
+    def _on_watch(self, _topic: str, payload: bytes) -> None:
+        self._watch.read(payload)
+        self._broadcast("watch", self._encoded_watch())
+
+    def _encoded_survey(self) -> bytes:
+        return encode("survey", {"survey": self._survey.message, "age_s": self._survey.age_s()})
+
+    def _encoded_watch(self) -> bytes:
+        return encode("watch", {"watch": self._watch.message, "age_s": self._watch.age_s()})
+
+
+def topic_of(message: SurveyFactsMessage | SurveySaveMessage, site_id: int) -> str:
+    """Where a message to the survey program goes."""
+    return survey_facts_topic(site_id) if isinstance(message, SurveyFactsMessage) else survey_save_topic(site_id)
+
+
+def check_facts(message: SurveyFactsMessage) -> None:
+    """Check that facts can be computed with. Raises BadFactsError, which names field, value and what would be right."""
+    facts = message.facts
+    for name in ("heights_m", "tapes", "points", "sketch_m", "delays"):
+        count = len(getattr(facts, name))
+        if count > MAX_FACTS:
+            raise BadFactsError(f"facts.{name} has {count} entries; at most {MAX_FACTS} are allowed")
+    for path, value, limits in _limited(message):
+        if not limits.contains(value):
+            raise BadFactsError(f"{path} is {value:g}; it should be {limits}")
+    for index, tape in enumerate(facts.tapes):
+        if tape.a == tape.b:
+            raise BadFactsError(f"facts.tapes[{index}] is from anchor {tape.a} to itself; it should be between two")
+    if facts.gauge is not None:
+        named = [anchor for anchor in msgspec.structs.astuple(facts.gauge) if anchor is not None]
+        if len(set(named)) < len(named):
+            listed = ", ".join(map(str, named))
+            raise BadFactsError(f"facts.gauge names anchors {listed}; origin, x axis and left should be different ones")
+
+
+def _limited(message: SurveyFactsMessage) -> Iterator[tuple[str, float, Limits]]:
+    """Every number of metres: its path, itself, and what is allowed."""
+    facts, plan = message.facts, message.floor_plan
+    for anchor, height_m in facts.heights_m.items():
+        yield f"facts.heights_m of anchor {anchor}", height_m, _COORDINATE
+    for index, tape in enumerate(facts.tapes):
+        yield f"facts.tapes[{index}].distance_m", tape.distance_m, _LENGTH
+        yield f"facts.tapes[{index}].std_m", tape.std_m, _POSITIVE_STD
+    for name in ("points", "sketch_m"):
+        for anchor, point in getattr(facts, name).items():
+            for axis, value in zip("xyz", point, strict=True):
+                if value is not None:
+                    yield f"facts.{name} of anchor {anchor}, {axis}", value, _COORDINATE
+    for index, delay in enumerate(facts.delays):
+        yield f"facts.delays[{index}].delay_m", delay.delay_m, _COORDINATE
+        yield f"facts.delays[{index}].std_m", delay.std_m, _POSITIVE_STD
+    yield from _stds(facts)
+    if plan is not None:
+        yield "floor_plan.width_m", plan.width_m, _LENGTH
+        yield "floor_plan.x_m", plan.x_m, _COORDINATE
+        yield "floor_plan.y_m", plan.y_m, _COORDINATE
+
+
+def _stds(facts: Facts) -> Iterator[tuple[str, float, Limits]]:
+    for name in ("height_std_m", "point_std_m", "sketch_std_m"):
+        yield f"facts.{name}", getattr(facts, name), _POSITIVE_STD
+    for name in ("delay_std_m", "pair_std_m"):
+        yield f"facts.{name}", getattr(facts, name), _STD

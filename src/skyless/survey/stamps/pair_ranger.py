@@ -1,0 +1,354 @@
+"""Ranges of all pairs of anchors as their stamps arrive: brackets, means of blocks, the earliest cluster of blocks.
+
+Two kinds of noise are in a pair's mean (``docs/survey.md``): RX stamps, each pair's own, and TX stamps, which all
+pairs of an anchor share. Two pairs that were bracketed with the same frame of an anchor show the part that is shared.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.constants import TICK_BITS, TICK_M, TICK_RATE_HZ
+from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.survey.ranges import PairBlock, PairRange, PairRanges
+from skyless.survey.stamps.brackets import Flights, Legs, flights_of
+from skyless.survey.stamps.clusters import earliest_cluster
+from skyless.ticks import Unwrapper
+
+_KEPT_S: Final = 5.0
+"""Legs wait so long for the other direction, which another anchor may publish later."""
+
+_MOST_BLOCKS: Final = 256
+_MOST_PAIRS: Final = 1 << 16
+_MOST_OPEN_LEGS: Final = 1 << 18
+"""A block with more legs is closed before its time."""
+
+_OUTLIER_SIGMAS: Final = 5.0
+_MAD_STD: Final = 1.4826
+"""Standard deviation of normally distributed values over the median of their distances from the median."""
+
+_PRIOR_WEIGHT: Final = 500.0
+"""Of the site's noise in that of a pair, in flights."""
+_PRIOR_PRODUCTS: Final = 200.0
+"""Weight of the assumption that TX and RX stamps are equally good, in products of two pairs."""
+
+_LEAST_BATCHES: Final = 6
+_LEAST_OWN_SHARE: Final = 0.2
+"""Of a mean's variance that is the pair's own."""
+
+
+class PairRanger:
+    """Gathers directed legs between anchors; memory does not grow with time.
+
+    ``counters``: ``legs``, and what was dropped: ``impossible`` (brackets that cannot be of one pair of counters),
+    ``unusable`` (legs from an anchor to itself, or without a finite time), ``too-many-pairs``.
+    """
+
+    def __init__(
+        self,
+        bits: int = TICK_BITS,
+        block_s: float = 1.0,
+        longest_bracket_s: float = 0.5,
+        on_block: Callable[[PairBlock], None] | None = None,
+    ) -> None:
+        """``bits``: of the counters; ``block_s``: length of a block.
+
+        ``longest_bracket_s``: between two frames of an anchor that bracket one of another; four superframes are good,
+        and it is at most half a wrap. ``on_block`` is given every block of every pair when its time is over, late ones
+        too, and the blocks of one time directly after one another.
+        """
+        self.counters: Counter[str] = Counter()
+        self._bits, self._block_s, self._on_block = bits, block_s, on_block
+        self._longest_ticks = min(round(longest_bracket_s * TICK_RATE_HZ), (1 << (bits - 1)) - 1)
+        self._clocks: dict[int, Unwrapper] = {}
+        self._number: dict[tuple[int, int], int] = {}
+        self._open: list[tuple[int, int, int, bool, float]] = []
+        self._kept = _legs_of([])
+        self._histories: list[_History] = []
+        self._shared_m2 = self._products = 0.0
+        """Sum of the products of two pairs that share an anchor's frame, and their number."""
+        self._block: int | None = None
+        """Number of the open block since time 0."""
+        self._first_s = self._last_s = math.nan
+        self._duration_s = 0.0
+
+    def add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float) -> None:
+        """Add one reception. ``t_s``: of any clock that all legs share, good to a second, and to a quarter of a wrap.
+
+        Order matters little: directions of a pair may come one after the other, seconds late.
+        """
+        if sender == receiver or not math.isfinite(t_s):
+            self.counters["unusable"] += 1
+            return
+        pair = (sender, receiver) if sender < receiver else (receiver, sender)
+        number = self._number.get(pair)
+        if number is None:
+            if len(self._number) >= _MOST_PAIRS:
+                self.counters["too-many-pairs"] += 1
+                return
+            number = self._number[pair] = len(self._number)
+            self._histories.append(_History())
+        self._pass_to(t_s)
+        tx = self._clock(sender).unwrap(tx_ticks, t_s)
+        rx = self._clock(receiver).unwrap(rx_ticks, t_s)
+        self.counters["legs"] += 1
+        is_back = sender > receiver
+        self._open.append((number, rx, tx, True, t_s) if is_back else (number, tx, rx, False, t_s))
+        if len(self._open) >= _MOST_OPEN_LEGS:
+            self._close_block()
+
+    def forget(self, anchor: int) -> None:
+        """Drop the open legs of an anchor whose counter has restarted; its ranges stay."""
+        self._clocks.pop(anchor, None)
+        numbers = [number for pair, number in self._number.items() if anchor in pair]
+        self._open = [leg for leg in self._open if leg[0] not in set(numbers)]
+        self._kept = self._kept.part(~np.isin(self._kept.pair, numbers))
+
+    def finish(self) -> None:
+        """Close the block that is open, at the end of the data."""
+        self._close_block()
+
+    @property
+    def tx_stamp_std_m(self) -> float:
+        """Noise of one TX stamp, as far as it can be separated from that of RX stamps; 0 before the first block.
+
+        The means of two pairs that share an anchor have the covariance ``tx_stamp_std_m²/(4·exchanges)``.
+        """
+        assumed_m2 = self._leg_variance_m2() / 2.0
+        shared_m2 = 4.0 * self._shared_m2 + _PRIOR_PRODUCTS * assumed_m2
+        variance_m2 = shared_m2 / (self._products + _PRIOR_PRODUCTS)
+        return math.sqrt(min(max(variance_m2, 0.0), 2.0 * assumed_m2))
+
+    def ranges(self) -> PairRanges:
+        """The ranges from all closed blocks."""
+        site_m2, means = self._leg_variance_m2(), []
+        for (a, b), number in sorted(self._number.items()):
+            history = self._histories[number]
+            if history.blocks:
+                means.append((a, b, history.mean(history.leg_variance_m2(site_m2))))
+        anchors = tuple(sorted({anchor for pair in self._number for anchor in pair}))
+        tx_std_m = {}
+        for anchor in anchors:
+            exchanges = [mean.exchanges for a, b, mean in means if anchor in {a, b}]
+            if exchanges:
+                tx_std_m[anchor] = self.tx_stamp_std_m / (2.0 * math.sqrt(float(np.median(exchanges))))
+        pairs = []
+        for a, b, mean in means:
+            own_m2 = mean.noise_m2 - tx_std_m[a] ** 2 - tx_std_m[b] ** 2
+            std_m = math.sqrt(max(own_m2, _LEAST_OWN_SHARE * mean.noise_m2) + mean.wander_m2)
+            pairs.append(PairRange(a, b, mean.range_m, std_m, max(1, round(mean.exchanges)), mean.late_share))
+        return PairRanges(tuple(pairs), anchors, tx_std_m, self._duration_s)
+
+    def _clock(self, anchor: int) -> Unwrapper:
+        clock = self._clocks.get(anchor)
+        if clock is None:
+            clock = self._clocks[anchor] = Unwrapper(self._bits)
+        return clock
+
+    def _pass_to(self, t_s: float) -> None:
+        """Close the open block if its time is over; a clock that was set starts the blocks again."""
+        block, number = self._block, math.floor(t_s / self._block_s)
+        if block is None or number > block or t_s < block * self._block_s - _KEPT_S:
+            if block is not None:
+                self._close_block()
+            if block is None or not -_KEPT_S < t_s - self._last_s < _KEPT_S:
+                self._kept, self._clocks, self._first_s = _legs_of([]), {}, t_s
+            self._block = number
+            self._last_s = t_s
+        self._last_s = max(self._last_s, t_s)
+
+    # Blocks
+
+    def _close_block(self) -> None:
+        if not self._open or self._block is None:
+            return
+        legs = _joined(self._kept, _legs_of(self._open))
+        self._open = []
+        flights, kept, impossible = flights_of(legs, self._longest_ticks)
+        self._kept = kept.part(kept.t_s > self._last_s - _KEPT_S)
+        self._duration_s += self._last_s - self._first_s
+        self._first_s = self._last_s
+        self.counters["impossible"] += impossible
+        if len(flights.leg):
+            self._add_block(legs, flights, (self._block + 0.5) * self._block_s)
+
+    def _add_block(self, legs: Legs, flights: Flights, t_s: float) -> None:
+        """Means of the pairs' flights without outliers, and what their scatter says of the stamps' noise."""
+        pair, range_m = legs.pair[flights.leg], flights.ticks * TICK_M
+        good = _inliers(pair, range_m)
+        leg, pair, range_m, part = flights.leg[good], pair[good], range_m[good], flights.part[good]
+        count = len(self._histories)
+        n = np.bincount(pair, minlength=count)
+        back = np.bincount(pair, legs.is_back[leg], minlength=count)
+        one_each = 1.0 / np.maximum(back, 1.0) + 1.0 / np.maximum(n - back, 1.0)
+        mean_m = np.bincount(pair, range_m, minlength=count) / np.maximum(n, 1)
+        residual_m = range_m - mean_m[pair]
+        squares_m2 = np.bincount(pair, residual_m**2, minlength=count)
+        # A flight is half of one leg and of the two legs beside it, with weights 1 - part and part.
+        flight_weight = np.bincount(pair, 1.0 + part**2 + (1.0 - part) ** 2, minlength=count)
+        freedom = flight_weight - n * one_each
+        self._share(legs, leg, residual_m, n)
+        for number in np.flatnonzero(n).tolist():
+            history = self._histories[number]
+            if freedom[number] > 0.0 and n[number] > 2:
+                history.squares_m2 += 4.0 * float(squares_m2[number])
+                history.freedom += float(freedom[number])
+            history.add(t_s, float(mean_m[number]), 2.0 / float(one_each[number]), self._leg_variance_m2)
+        if self._on_block is not None:
+            pairs, site_m2 = list(self._number), self._leg_variance_m2()
+            for number in np.flatnonzero(n).tolist():
+                variance_m2 = self._histories[number].leg_variance_m2(site_m2) * float(one_each[number]) / 4.0
+                exchanges = max(1, round(2.0 / float(one_each[number])))
+                a, b = pairs[number]
+                self._on_block(PairBlock(a, b, t_s, float(mean_m[number]), math.sqrt(variance_m2), exchanges))
+
+    def _share(self, legs: Legs, leg: Integers, residual_m: Array, n: Integers) -> None:
+        """Add up the products of residuals of two pairs that were bracketed with the same frame of an anchor."""
+        anchors = np.array(list(self._number), dtype=np.int64).reshape(-1, 2)
+        pair, is_back = legs.pair[leg], legs.is_back[leg]
+        sender = np.where(is_back, anchors[pair, 1], anchors[pair, 0])
+        tx_ticks = np.where(is_back, legs.b_ticks[leg], legs.a_ticks[leg])
+        order = np.lexsort((tx_ticks, sender))
+        first = np.ones(len(order), dtype=bool)
+        first[1:] = (np.diff(sender[order]) != 0) | (np.diff(tx_ticks[order]) != 0)
+        group = np.cumsum(first) - 1
+        total_m = np.bincount(group, residual_m[order])
+        squares_m2 = np.bincount(group, residual_m[order] ** 2)
+        size = np.bincount(group)
+        # The pairs' means have been subtracted, and share 2/n of that covariance.
+        freedom = 1.0 - 2.0 * float(np.mean(1.0 / np.maximum(n[pair], 2)))
+        self._shared_m2 += float(np.sum(total_m**2 - squares_m2))
+        self._products += float(np.sum(size * (size - 1))) * max(freedom, 0.0)
+
+    def _leg_variance_m2(self) -> float:
+        """Noise of one TX and one RX stamp together: the median over the pairs."""
+        known = [one.squares_m2 / one.freedom for one in self._histories if one.freedom > 0.0]
+        return float(np.median(known)) if known else 0.0
+
+
+class _Mean(Struct, frozen=True):
+    """The mean of a pair's earliest cluster."""
+
+    range_m: float
+    noise_m2: float
+    """Variance of the mean from stamps' noise."""
+    wander_m2: float
+    """What the scatter between the blocks shows beyond that."""
+    exchanges: float
+    late_share: float
+
+
+class _History:
+    """The blocks of one pair, in the order of time; neighbours are merged when there are too many."""
+
+    def __init__(self) -> None:
+        self.blocks: list[tuple[float, float, float]] = []
+        """Middle, mean range in metres, exchanges."""
+        self.squares_m2 = self.freedom = 0.0
+        """Their ratio is the noise of a TX and an RX stamp together."""
+        self._early = self._late = 0.0
+        """Exchanges of blocks outside the cluster that were dropped."""
+
+    def leg_variance_m2(self, site_m2: float) -> float:
+        """Noise of one TX and one RX stamp together; that of the site counts as much as some hundred flights."""
+        return (self.squares_m2 + _PRIOR_WEIGHT * site_m2) / (self.freedom + _PRIOR_WEIGHT)
+
+    def add(self, t_s: float, range_m: float, exchanges: float, site_m2: Callable[[], float]) -> None:
+        """Add a block; ``site_m2`` gives the noise of a leg at the site."""
+        self.blocks.append((t_s, range_m, exchanges))
+        if len(self.blocks) > _MOST_BLOCKS:
+            self._merge(self.leg_variance_m2(site_m2()))
+
+    def mean(self, leg_m2: float) -> _Mean:
+        """The mean of the earliest cluster; ``leg_m2`` is the noise of a leg."""
+        blocks = np.array(self.blocks)
+        inside, late, total = self._cluster(blocks, leg_m2)
+        range_m, exchanges = blocks[inside, 1], blocks[inside, 2]
+        noise_m2 = 0.5 * leg_m2 / float(np.sum(exchanges))
+        wander_m2 = _wander_m2(range_m, exchanges, noise_m2)
+        mean_m = float(np.average(range_m, weights=exchanges))
+        return _Mean(mean_m, noise_m2, wander_m2, float(np.sum(exchanges)), late / total)
+
+    def _cluster(self, blocks: Array, leg_m2: float) -> tuple[Mask, float, float]:
+        """The blocks inside the earliest cluster, exchanges that are later, and all exchanges."""
+        range_m, exchanges = blocks[:, 1], blocks[:, 2]
+        total = self._early + self._late + float(np.sum(exchanges))
+        std_m = math.sqrt(0.5 * leg_m2 / float(np.median(exchanges)))
+        inside = earliest_cluster(range_m, exchanges, std_m, total)
+        is_late = ~inside & (range_m > np.mean(range_m[inside]))
+        return inside, self._late + float(np.sum(exchanges[is_late])), total
+
+    def _merge(self, leg_m2: float) -> None:
+        """Drop what is outside the cluster, and join neighbours of the rest."""
+        blocks = np.array(self.blocks)
+        inside, self._late, total = self._cluster(blocks, leg_m2)
+        self._early = total - self._late - float(np.sum(blocks[inside, 2]))
+        rest, merged = blocks[inside].tolist(), []
+        for index in range(0, len(rest) - 1, 2):
+            (t_s, range_m, exchanges), (next_s, next_m, more) = rest[index], rest[index + 1]
+            part = more / (exchanges + more)
+            merged.append((t_s + part * (next_s - t_s), range_m + part * (next_m - range_m), exchanges + more))
+        self.blocks = merged + [tuple(row) for row in rest[len(rest) // 2 * 2 :]]
+
+
+def _wander_m2(range_m: Array, exchanges: Array, noise_m2: float) -> float:
+    """Variance of the mean beyond stamps' noise: the scatter of blocks, joined until errors that persist show.
+
+    Only what chance does not explain counts, so that a pair without such errors keeps the variance of its noise.
+    """
+    wander_m2, value, weight = 0.0, range_m, exchanges
+    while len(value) >= _LEAST_BATCHES:
+        freedom = len(value) - 1
+        deviation = value - np.average(value, weights=weight)
+        scatter_m2 = float(np.sum(weight * deviation**2)) / (freedom * float(np.sum(weight)))
+        if scatter_m2 > noise_m2 * (1.0 + 4.0 * math.sqrt(2.0 / freedom)):
+            wander_m2 = max(wander_m2, scatter_m2 - noise_m2)
+        even = len(value) // 2 * 2
+        joined = weight[:even].reshape(-1, 2)
+        value = np.sum(value[:even].reshape(-1, 2) * joined, axis=1) / np.sum(joined, axis=1)
+        weight = np.sum(joined, axis=1)
+    return wander_m2
+
+
+def _inliers(pair: Integers, value: Array) -> Mask:
+    """Flights near the median of their pair, shape (n,): within 5 sigma, by the pair's or the site's scatter."""
+    order = np.lexsort((value, pair))
+    begin = np.flatnonzero(np.append(True, np.diff(pair[order]) != 0))
+    size = np.diff(np.append(begin, len(order)))
+    median = np.zeros(int(pair.max()) + 1)
+    median[pair[order[begin]]] = value[order[begin + size // 2]]
+    distance = np.abs(value - median[pair])
+    order = np.lexsort((distance, pair))
+    scatter = np.zeros(len(median))
+    scatter[pair[order[begin]]] = distance[order[begin + size // 2]]
+    scatter = _MAD_STD * np.maximum(scatter, np.median(distance))
+    return np.asarray(distance <= _OUTLIER_SIGMAS * scatter[pair] + TICK_M)
+
+
+def _legs_of(rows: list[tuple[int, int, int, bool, float]]) -> Legs:
+    pair, a_ticks, b_ticks, is_back, t_s = zip(*rows, strict=True) if rows else ((),) * 5
+    whole = np.int64
+    return Legs(
+        np.array(pair, whole),
+        np.array(a_ticks, whole),
+        np.array(b_ticks, whole),
+        np.array(is_back, bool),
+        np.zeros(len(rows), bool),
+        np.array(t_s, np.float64),
+    )
+
+
+def _joined(one: Legs, other: Legs) -> Legs:
+    """The rows of both, the first one's first."""
+    return Legs(
+        np.concatenate([one.pair, other.pair]),
+        np.concatenate([one.a_ticks, other.a_ticks]),
+        np.concatenate([one.b_ticks, other.b_ticks]),
+        np.concatenate([one.is_back, other.is_back]),
+        np.concatenate([one.is_used, other.is_used]),
+        np.concatenate([one.t_s, other.t_s]),
+    )
