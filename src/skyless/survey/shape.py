@@ -91,7 +91,7 @@ def _round(
     robust = fit_robustly(problem, [*start_positions(problem, sketch), *extra], range_std_m)
     problem, solution, used = robust.problem, robust.solution, robust.used
     if sketch is not None:
-        solution = _settled(problem, solution, used, sketch)
+        solution = _settled(problem, solution, robust.weight, sketch)
         robust = structs.replace(robust, solution=solution)
     core, covariance = _worth(measured, kept, problem, solution, used, point)
     return Fitted(
@@ -131,7 +131,7 @@ def with_tag(fitted: Fitted, rows: MoreRows, solution: Solution, used: Mask) -> 
     return structs.replace(fitted, problem=problem, solution=solution, used=used, core=core, covariance_m2=covariance)
 
 
-def _settled(problem: Problem, solution: Solution, used: Mask, sketch: Array) -> Solution:
+def _settled(problem: Problem, solution: Solution, weight: Array, sketch: Array) -> Solution:
     """The solution in the sketch's frame."""
     known = np.isfinite(sketch[:, :2]).all(axis=1)
     if known.sum() < 2:
@@ -141,7 +141,7 @@ def _settled(problem: Problem, solution: Solution, used: Mask, sketch: Array) ->
     alignment = align(solution.position_m[known], there[known], 0.3, axes)
     moved = alignment.motion.moved(solution.position_m)
     moved = np.where(problem.is_free, moved, solution.position_m)
-    return solve_least_squares(problem, moved, used.astype(np.float64))
+    return solve_least_squares(problem, moved, weight)
 
 
 def _without_sketch(measured: Measured, kept: Integers, point: Array | None) -> Array:
