@@ -4,8 +4,8 @@ What is judged is order and content, not speed: every wait is for something that
 """
 
 import asyncio
+import logging
 import math
-import sys
 
 import msgspec
 import numpy as np
@@ -28,6 +28,8 @@ from skyless.mqtt.messages import (
 )
 from skyless.site.load import load_site
 from skyless.survey.facts import Facts, Gauge
+
+_log = logging.getLogger(__name__)
 
 SITE = 78
 TRUE_M = {1: (0.0, 0.0), 2: (8.0, 0.0), 3: (9.0, 4.0), 4: (7.0, 8.0), 5: (-1.0, 7.0), 6: (-2.0, 3.0)}
@@ -158,7 +160,7 @@ async def run(folder, positions, protocol, facts, judge):
         assert fresh.newest[StatusMessage].online is False
     except BaseException:
         for program in fresh.programs:
-            print(program.arguments, program.said[-20:], file=sys.stderr)
+            _log.warning("%s: %s", program.arguments, program.said[-20:])
         raise
     finally:
         for program in fresh.programs:
@@ -211,7 +213,9 @@ def test_a_site_without_positions_is_surveyed_and_serves_tags(tmp_path):
 @pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
 def test_a_sketch_of_protocol_1_becomes_a_surveyed_site(tmp_path):
     off_m = np.random.default_rng(5).uniform(-0.3, 0.3, (len(TRUE_M), 2))
-    sketch = {anchor: tuple((np.array(TRUE_M[anchor]) + one).tolist()) for anchor, one in zip(TRUE_M, off_m, strict=True)}
+    sketch = {
+        anchor: tuple((np.array(TRUE_M[anchor]) + one).tolist()) for anchor, one in zip(TRUE_M, off_m, strict=True)
+    }
     known = {1: (*TRUE_M[1], None), 2: (*TRUE_M[2], None), 4: (*TRUE_M[4], None)}
     facts = Facts(
         heights_m=dict.fromkeys(TRUE_M, 0.0),
