@@ -1,5 +1,8 @@
 """Unknowns, rows and least squares of a survey: a range of a pair is ``d + h_a + h_b`` (``docs/survey.md``).
 
+Normal equations are summed pair by pair, for many starts and weights at once: a robust fit and the search for other
+results need hundreds of small solutions.
+
 Positions are only known up to a rigid motion here, unless facts name coordinates: steps have minimum norm, so that a
 solution stays where its start was (a free network).
 """
@@ -23,7 +26,7 @@ class Problem(Struct, frozen=True, eq=False):
     """What is fitted. ``n`` anchors, ``m`` ranges, ``t`` tapes."""
 
     is_free: Mask
-    """Shape (n, 3): coordinates that are estimated; the others stay as in the start."""
+    """Shape (n, 3): coordinates that are estimated; the others stay as in the start, ``coordinate_m`` by default."""
     first: Integers
     second: Integers
     """Shape (m,): indices of the anchors of each range."""
@@ -56,7 +59,20 @@ class Solution(Struct, frozen=True, eq=False):
     cost: float
     """Sum of all weighted squares."""
     information: Array
-    """Shape (u, u), of ``unknowns(problem)`` in their order: free coordinates (anchor by anchor), then delays."""
+    """Shape (u, u): free coordinates in their order (anchor by anchor), then delays."""
+
+
+class Solutions(Struct, frozen=True, eq=False):
+    """``b`` solutions of one problem, from other starts or with other weights."""
+
+    position_m: Array
+    """Shape (b, n, 3)."""
+    delay_m: Array
+    """Shape (b, n)."""
+    residual_m: Array
+    """Shape (b, m)."""
+    cost: Array
+    """Shape (b,): sum of all weighted squares."""
 
 
 def solve_least_squares(problem: Problem, position_m: Array, weight: Array | None = None) -> Solution:
@@ -64,79 +80,136 @@ def solve_least_squares(problem: Problem, position_m: Array, weight: Array | Non
 
     ``weight``: of each range, shape (m,), multiplies 1/variance; by default 1.
     """
-    free = np.flatnonzero(problem.is_free.ravel())
-    position_m, delay_m = position_m.astype(np.float64).copy(), problem.delay_m.copy()
-    root = _roots(problem, weight)
-    jacobian, residual = _rows(problem, position_m, delay_m, free, root)
-    cost, damping = float(residual @ residual), 1e-3
-    information = jacobian.T @ jacobian
-    for _ in range(_MOST_STEPS):
-        gradient = jacobian.T @ residual
-        scale = np.diag_indices_from(information)
+    given = np.ones(len(problem.range_m)) if weight is None else weight
+    many = solve_many(problem, position_m[None], given[None])
+    equations = _Equations(problem)
+    information = equations.normal(many.position_m, many.delay_m, given[None])[0][0]
+    return Solution(many.position_m[0], many.delay_m[0], many.residual_m[0], float(many.cost[0]), information)
+
+
+def solve_many(
+    problem: Problem, position_m: Array, weight: Array, delay_m: Array | None = None, most_steps: int = _MOST_STEPS
+) -> Solutions:
+    """Levenberg–Marquardt from ``b`` starts, shape (b, n, 3), with weights of shape (b, m), all at once.
+
+    ``delay_m``: shape (b, n), their starts; by default their expectation.
+    """
+    equations = _Equations(problem)
+    position_m = position_m.astype(np.float64).copy()
+    delay_m = np.tile(problem.delay_m, (len(position_m), 1)) if delay_m is None else delay_m.astype(np.float64).copy()
+    damping = np.full(len(position_m), 1e-3)
+    cost = equations.cost(position_m, delay_m, weight)
+    busy = np.arange(len(position_m))
+    information, gradient = equations.normal(position_m, delay_m, weight)
+    for _ in range(most_steps):
+        diagonal = np.einsum("bii->bi", information)
         damped = information.copy()
-        damped[scale] += damping * np.maximum(information[scale], 1e-6 * information[scale].max())
-        step = np.linalg.solve(damped, gradient)
-        trial_m = position_m.copy()
-        trial_m.ravel()[free] += step[: len(free)]
-        trial_delay_m = delay_m + step[len(free) :]
-        trial_jacobian, trial_residual = _rows(problem, trial_m, trial_delay_m, free, root)
-        trial_cost = float(trial_residual @ trial_residual)
-        if trial_cost <= cost:
-            position_m, delay_m, jacobian, residual = trial_m, trial_delay_m, trial_jacobian, trial_residual
-            information, cost = jacobian.T @ jacobian, trial_cost
-            damping = max(damping * 0.1, _LEAST_DAMPING)
-            if np.abs(step).max() < _SMALLEST_STEP_M:
-                break
-        elif damping > 1e9:
+        floor = 1e-6 * diagonal.max(axis=1, initial=0.0)[:, None]
+        np.einsum("bii->bi", damped)[:] += damping[busy, None] * np.maximum(diagonal, floor)
+        step = np.asarray(np.linalg.solve(damped, gradient[:, :, None])[:, :, 0], dtype=np.float64)
+        trial_m, trial_delay_m = equations.moved(position_m[busy], delay_m[busy], step)
+        trial_cost = equations.cost(trial_m, trial_delay_m, weight[busy])
+        better = trial_cost <= cost[busy]
+        chosen = busy[better]
+        position_m[chosen], delay_m[chosen], cost[chosen] = trial_m[better], trial_delay_m[better], trial_cost[better]
+        ended = np.where(better, np.abs(step).max(axis=1, initial=0.0) < _SMALLEST_STEP_M, damping[busy] > 1e9)
+        damping[busy] = np.where(better, np.maximum(damping[busy] * 0.1, _LEAST_DAMPING), damping[busy] * 10.0)
+        busy = busy[~ended]
+        if not busy.size:
             break
+        if better.all():
+            information, gradient = equations.normal(position_m[busy], delay_m[busy], weight[busy])
         else:
-            damping *= 10.0
-    return Solution(position_m, delay_m, residuals_m(problem, position_m, delay_m), cost, information)
+            information, gradient = information[~ended], gradient[~ended]
+            moved = better[~ended]
+            some = busy[moved]
+            if some.size:
+                information[moved], gradient[moved] = equations.normal(position_m[some], delay_m[some], weight[some])
+    return Solutions(position_m, delay_m, residuals_m(problem, position_m, delay_m), cost)
 
 
 def residuals_m(problem: Problem, position_m: Array, delay_m: Array) -> Array:
-    """Ranges less distances and delays, shape (m,)."""
-    apart = position_m[problem.first] - position_m[problem.second]
-    distance = np.sqrt(np.einsum("ij,ij->i", apart, apart))
-    return np.asarray(problem.range_m - distance - delay_m[problem.first] - delay_m[problem.second])
+    """Ranges less distances and delays, shape (..., m), of positions (..., n, 3) and delays (..., n)."""
+    apart = position_m[..., problem.first, :] - position_m[..., problem.second, :]
+    distance = np.sqrt(np.einsum("...ij,...ij->...i", apart, apart))
+    return np.asarray(problem.range_m - distance - delay_m[..., problem.first] - delay_m[..., problem.second])
 
 
-def _roots(problem: Problem, weight: Array | None) -> tuple[Array, Array, Array, Array]:
-    """Square roots of the weights of ranges, delays, coordinates and tapes."""
-    ranges = 1.0 / np.sqrt(problem.variance_m2) if weight is None else np.sqrt(weight / problem.variance_m2)
-    delays = 1.0 / np.sqrt(np.maximum(problem.delay_variance_m2, _LEAST_STD_M**2))
-    coordinates = 1.0 / np.sqrt(np.maximum(problem.coordinate_variance_m2, _LEAST_STD_M**2))
-    return ranges, delays, coordinates, 1.0 / np.sqrt(np.maximum(problem.tape_variance_m2, _LEAST_STD_M**2))
+class _Equations:
+    """Normal equations of a problem; rows are ranges, then tapes."""
 
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        n, m, t = len(problem.delay_m), len(problem.range_m), len(problem.tape_m)
+        self._free = np.flatnonzero(problem.is_free.ravel())
+        self._unknowns = len(self._free) + n
+        # Coordinates that stay have the column behind the last one, which is cut off again.
+        column = np.full((n, 4), self._unknowns)
+        flat = np.full(3 * n, self._unknowns)
+        flat[self._free] = np.arange(len(self._free))
+        column[:, :3] = flat.reshape(n, 3)
+        column[:, 3] = len(self._free) + np.arange(n)
+        self._axes = np.flatnonzero(problem.is_free.any(axis=0))
+        column = column[:, [*self._axes, 3]]
+        self._first = np.concatenate([problem.first, problem.tape_first])
+        self._second = np.concatenate([problem.second, problem.tape_second])
+        self._measured = np.concatenate([problem.range_m, problem.tape_m])
+        self._has_delay = np.repeat([1.0, 0.0], [m, t])
+        self._row_columns = np.concatenate([column[self._first], column[self._second]], axis=1)
+        size = self._unknowns + 1
+        self._cells = (self._row_columns[:, :, None] * size + self._row_columns[:, None, :]).ravel()
+        self._of_range = 1.0 / problem.variance_m2
+        self._of_tape = 1.0 / np.maximum(problem.tape_variance_m2, _LEAST_STD_M**2)
+        self._of_delay = 1.0 / np.maximum(problem.delay_variance_m2, _LEAST_STD_M**2)
+        of_coordinate = 1.0 / np.maximum(problem.coordinate_variance_m2, _LEAST_STD_M**2)
+        self._of_coordinate = np.where(problem.is_free, of_coordinate, 0.0)
+        self._coordinate_m = np.where(self._of_coordinate > 0.0, problem.coordinate_m, 0.0)
 
-def _rows(
-    problem: Problem, position_m: Array, delay_m: Array, free: Integers, root: tuple[Array, Array, Array, Array]
-) -> tuple[Array, Array]:
-    """Weighted Jacobian of the modelled values and weighted residuals, measured less modelled."""
-    n, m, t = len(position_m), len(problem.range_m), len(problem.tape_m)
-    of_range, of_delay, of_coordinate, of_tape = root
-    known = np.flatnonzero((of_coordinate.ravel() > 0.0) & problem.is_free.ravel())
-    whole = np.zeros((m + t + n + len(known), 4 * n))
-    residual = np.zeros(len(whole))
-    row = np.arange(m + t)
-    first = np.concatenate([problem.first, problem.tape_first])
-    second = np.concatenate([problem.second, problem.tape_second])
-    apart = position_m[first] - position_m[second]
-    distance = np.sqrt(np.einsum("ij,ij->i", apart, apart))
-    unit = apart / np.maximum(distance, 1e-9)[:, None]
-    weight = np.concatenate([of_range, of_tape])
-    for axis in range(3):
-        whole[row, 3 * first + axis] = weight * unit[:, axis]
-        whole[row, 3 * second + axis] = -weight * unit[:, axis]
-    residual[:m] = of_range * (problem.range_m - distance[:m] - delay_m[problem.first] - delay_m[problem.second])
-    residual[m : m + t] = of_tape * (problem.tape_m - distance[m:])
-    row = np.arange(m)
-    whole[row, 3 * n + problem.first] = of_range
-    whole[row, 3 * n + problem.second] = of_range
-    row = m + t + np.arange(n)
-    whole[row, 3 * n + np.arange(n)] = of_delay
-    residual[row] = of_delay * (problem.delay_m - delay_m)
-    row = m + t + n + np.arange(len(known))
-    whole[row, known] = of_coordinate.ravel()[known]
-    residual[row] = of_coordinate.ravel()[known] * (problem.coordinate_m - position_m).ravel()[known]
-    return whole[:, np.concatenate([free, 3 * n + np.arange(n)])], residual
+    def normal(self, position_m: Array, delay_m: Array, weight: Array) -> tuple[Array, Array]:
+        """Information, shape (b, u, u), and gradient towards the minimum, shape (b, u)."""
+        b, size = len(position_m), self._unknowns + 1
+        apart, distance, residual = self._rows(position_m, delay_m)
+        weights = self._weights(weight)
+        unit = (apart / np.maximum(distance, 1e-9)[:, :, None])[:, :, self._axes]
+        delays = np.broadcast_to(self._has_delay[None, :, None], (*distance.shape, 1))
+        derivative = np.concatenate([unit, delays, -unit, delays], axis=2)
+        weighted = weights[:, :, None] * derivative
+        item = np.arange(b)[:, None]
+        cells = (item * size**2 + self._cells).ravel()
+        products = (weighted[:, :, :, None] * derivative[:, :, None, :]).ravel()
+        information = np.bincount(cells, products, b * size**2).reshape(b, size, size)[:, :-1, :-1].astype(np.float64)
+        columns = (item * size + self._row_columns.ravel()).ravel()
+        gradient = np.bincount(columns, (weighted * residual[:, :, None]).ravel(), b * size).reshape(b, size)[:, :-1]
+        from_coordinates = self._of_coordinate * (self._coordinate_m - position_m)
+        priors = np.concatenate([self._of_coordinate.ravel()[self._free], self._of_delay])
+        np.einsum("bii->bi", information)[:] += priors
+        from_delays = self._of_delay * (self._problem.delay_m - delay_m)
+        from_coordinates = from_coordinates.reshape(b, self._problem.is_free.size)[:, self._free]
+        gradient = gradient + np.concatenate([from_coordinates, from_delays], axis=1)
+        return information, gradient
+
+    def cost(self, position_m: Array, delay_m: Array, weight: Array) -> Array:
+        """Sum of all weighted squares, shape (b,)."""
+        _, _, residual = self._rows(position_m, delay_m)
+        squares = np.sum(self._weights(weight) * residual**2, axis=1)
+        of_delays = np.sum(self._of_delay * (self._problem.delay_m - delay_m) ** 2, axis=1)
+        of_coordinates = np.sum(self._of_coordinate * (self._coordinate_m - position_m) ** 2, axis=(1, 2))
+        return np.asarray(squares + of_delays + of_coordinates)
+
+    def moved(self, position_m: Array, delay_m: Array, step: Array) -> tuple[Array, Array]:
+        """Positions and delays after steps of shape (b, u)."""
+        flat = position_m.reshape(len(position_m), self._problem.is_free.size).copy()
+        flat[:, self._free] += step[:, : len(self._free)]
+        return flat.reshape(position_m.shape), delay_m + step[:, len(self._free) :]
+
+    def _rows(self, position_m: Array, delay_m: Array) -> tuple[Array, Array, Array]:
+        """Vectors from the second anchor of a row to its first, their lengths, residuals."""
+        apart = position_m[:, self._first] - position_m[:, self._second]
+        distance = np.sqrt(np.einsum("bij,bij->bi", apart, apart))
+        delays = self._has_delay * (delay_m[:, self._first] + delay_m[:, self._second])
+        return apart, distance, self._measured - distance - delays
+
+    def _weights(self, weight: Array) -> Array:
+        """Of all rows, shape (b, m + t)."""
+        of_tape = np.broadcast_to(self._of_tape, (len(weight), len(self._of_tape)))
+        return np.concatenate([weight * self._of_range, of_tape], axis=1)

@@ -1,0 +1,176 @@
+"""From ranges and facts to a ``Problem`` of some of the site's anchors."""
+
+import math
+from typing import Final
+
+import numpy as np
+from msgspec import Struct, structs
+
+from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.survey.facts import Facts, Point, Tape
+from skyless.survey.fit.problem import Problem
+from skyless.survey.ranges import PairRange, PairRanges
+
+LEAST_RANGE_STD_M: Final = 1e-5
+
+
+class Measured(Struct, frozen=True, eq=False):
+    """Ranges and facts that can be used, with sentences about those that cannot."""
+
+    anchors: tuple[int, ...]
+    pairs: tuple[PairRange, ...]
+    tapes: tuple[Tape, ...]
+    tx_std_m: dict[int, float]
+    facts: Facts
+    notes: tuple[str, ...]
+
+
+def usable(ranges: PairRanges, facts: Facts) -> Measured:
+    """Leave out what is not finite or names anchors that are not there."""
+    notes = []
+    known = set(ranges.anchors)
+    best: dict[tuple[int, int], PairRange] = {}
+    for pair in ranges.pairs:
+        ends = (min(pair.a, pair.b), max(pair.a, pair.b))
+        if not (math.isfinite(pair.range_m) and math.isfinite(pair.std_m) and pair.std_m >= 0.0):
+            notes.append(f"the range of anchors {ends[0]} and {ends[1]} is no finite number: not used")
+        elif pair.a == pair.b or not known.issuperset(ends) or ends in best:
+            notes.append(f"the range of anchors {pair.a} and {pair.b} is of no pair of this site: not used")
+        else:
+            best[ends] = structs.replace(pair, a=ends[0], b=ends[1])
+    tapes = []
+    for tape in facts.tapes:
+        if tape.a != tape.b and {tape.a, tape.b} <= known and 0.0 < tape.distance_m < math.inf:
+            tapes.append(tape)
+        else:
+            notes.append(f"the measured distance of anchors {tape.a} and {tape.b} fits no pair of this site: not used")
+    for kind, values in (("point", facts.points), ("height", facts.heights_m)):
+        unknown = sorted(set(values) - known)
+        notes += [f"a {kind} is given for anchor {anchor}, which has no ranges: not used" for anchor in unknown]
+    kept = structs.replace(
+        facts,
+        points=_finite({anchor: point for anchor, point in facts.points.items() if anchor in known}),
+        heights_m={anchor: z for anchor, z in facts.heights_m.items() if anchor in known and math.isfinite(z)},
+        sketch_m=_finite({anchor: point for anchor, point in facts.sketch_m.items() if anchor in known}),
+        delays=tuple(item for item in facts.delays if item.anchor in known and math.isfinite(item.delay_m)),
+    )
+    tx_std_m = {anchor: std for anchor, std in ranges.tx_std_m.items() if math.isfinite(std)}
+    return Measured(tuple(ranges.anchors), tuple(best.values()), tuple(tapes), tx_std_m, kept, tuple(notes))
+
+
+def _finite(points: dict[int, Point]) -> dict[int, Point]:
+    return {
+        anchor: (x, y, z if z is not None and math.isfinite(z) else None)
+        for anchor, (x, y, z) in points.items()
+        if math.isfinite(x) and math.isfinite(y)
+    }
+
+
+def fixed_heights_m(measured: Measured) -> Array:
+    """Z of all anchors in two dimensions, shape (n,): given ones, else the middle one of these, else 0."""
+    facts = measured.facts
+    given = {anchor: point[2] for source in (facts.sketch_m, facts.points) for anchor, point in source.items()}
+    given.update(facts.heights_m)
+    known = [z for z in given.values() if z is not None]
+    common = float(np.median(known)) if known else 0.0
+    heights = [given.get(anchor) for anchor in measured.anchors]
+    return np.array([common if z is None else z for z in heights])
+
+
+def levels(measured: Measured) -> bool:
+    """Whether the vertical is known: in two dimensions, or by heights of three anchors or more."""
+    return measured.facts.dimensions == 2 or len(measured.facts.heights_m) >= 3
+
+
+def as_array(points: dict[int, Point], anchors: tuple[int, ...]) -> Array:
+    """Shape (n, 3), NaN where a coordinate is not given."""
+    nothing = (math.nan, math.nan, math.nan)
+    rows = [points.get(anchor, nothing) for anchor in anchors]
+    return np.array([[math.nan if value is None else value for value in row] for row in rows]).reshape(-1, 3)
+
+
+def indices_of(measured: Measured, kept: Integers) -> dict[int, int]:
+    """Index of each kept anchor, by identifier."""
+    return {measured.anchors[index]: number for number, index in enumerate(kept)}
+
+
+def build_problem(
+    measured: Measured, kept: Integers, pair_std_m: float, point_m: Array | None, sketch_m: Array | None
+) -> tuple[Problem, list[PairRange]]:
+    """The problem of the kept anchors (indices), and the pairs of its ranges in their order.
+
+    ``point_m``, ``sketch_m``: known and rough coordinates of the kept anchors, shape (k, 3), NaN where there are none.
+    """
+    facts, index = measured.facts, indices_of(measured, kept)
+    n = len(kept)
+    pairs = [pair for pair in measured.pairs if pair.a in index and pair.b in index]
+    tapes = [tape for tape in measured.tapes if tape.a in index and tape.b in index]
+    is_free = np.ones((n, 3), bool)
+    coordinate = np.zeros((n, 3))
+    variance = np.full((n, 3), np.inf)
+    for source, std in ((sketch_m, facts.sketch_std_m), (_heights(measured, kept), facts.height_std_m)):
+        _add(coordinate, variance, source, std)
+    _add(coordinate, variance, point_m, facts.point_std_m)
+    if facts.dimensions == 2:
+        is_free[:, 2] = False
+        coordinate[:, 2], variance[:, 2] = fixed_heights_m(measured)[kept], np.inf
+    delay = np.zeros(n)
+    delay_variance = np.full(n, facts.delay_std_m**2)
+    for item in facts.delays:
+        if item.anchor in index:
+            delay[index[item.anchor]], delay_variance[index[item.anchor]] = item.delay_m, item.std_m**2
+    delay_variance += np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in index]).reshape(n)
+    problem = Problem(
+        is_free=is_free,
+        first=np.array([index[pair.a] for pair in pairs], np.int64),
+        second=np.array([index[pair.b] for pair in pairs], np.int64),
+        range_m=np.array([pair.range_m for pair in pairs], np.float64),
+        variance_m2=np.array([pair.std_m**2 + pair_std_m**2 + LEAST_RANGE_STD_M**2 for pair in pairs], np.float64),
+        delay_m=delay,
+        delay_variance_m2=delay_variance,
+        coordinate_m=coordinate,
+        coordinate_variance_m2=variance,
+        tape_first=np.array([index[tape.a] for tape in tapes], np.int64),
+        tape_second=np.array([index[tape.b] for tape in tapes], np.int64),
+        tape_m=np.array([tape.distance_m for tape in tapes], np.float64),
+        tape_variance_m2=np.array([tape.std_m**2 for tape in tapes], np.float64),
+    )
+    return problem, pairs
+
+
+def with_free_delays(problem: Problem) -> tuple[Problem, Mask]:
+    """Without the expected delays that are coarser than a range: what the measurements alone determine.
+
+    Also which delays, shape (n,), are unknown in this sense.
+    """
+    typical = float(np.median(problem.variance_m2)) if len(problem.variance_m2) else 0.0
+    unknown = problem.delay_variance_m2 > typical
+    return structs.replace(problem, delay_variance_m2=np.where(unknown, np.inf, problem.delay_variance_m2)), unknown
+
+
+def own_delays(
+    measured: Measured, anchors: tuple[int, ...], problem: Problem, delay_m: Array, variance_m2: Array
+) -> tuple[Array, Array]:
+    """Delays less the error of TX stamps that all ranges of an anchor share, and standard deviations, shape (k,).
+
+    ``delay_m``, ``variance_m2``: of both together, as fitted. What is known of their shares is in the expected delays.
+    """
+    shared = np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in anchors])
+    own = np.maximum(problem.delay_variance_m2 - shared, 0.0)
+    part = own / np.maximum(problem.delay_variance_m2, 1e-10)
+    own_m = problem.delay_m + part * (delay_m - problem.delay_m)
+    return np.asarray(own_m), np.asarray(np.sqrt(np.maximum(part**2 * variance_m2 + part * shared, 0.0)))
+
+
+def _heights(measured: Measured, kept: Integers) -> Array:
+    """Known heights as points, shape (k, 3); none where fewer than three level the site."""
+    known = np.full((len(kept), 3), np.nan)
+    if levels(measured):
+        known[:, 2] = [measured.facts.heights_m.get(measured.anchors[index], math.nan) for index in kept]
+    return known
+
+
+def _add(coordinate: Array, variance: Array, known_m: Array | None, std_m: float) -> None:
+    if known_m is not None:
+        given = np.isfinite(known_m)
+        coordinate[given], variance[given] = known_m[given], std_m**2

@@ -1,0 +1,171 @@
+"""A shape's frame: named anchors, known points, the sketch, or by default the first and the farthest anchor."""
+
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.survey.facts import Gauge
+from skyless.survey.fit.build import Measured, as_array, levels
+from skyless.survey.fit.gauge import Axes, Motion, align, axes_through, gauge_of
+from skyless.survey.sentences import anchors_named, joined
+
+_NEAR: Final = 0.5
+"""Distance of the x axis's anchor from the origin, as a part of the farthest one's, below which advice is due."""
+
+
+class Framed(Struct, frozen=True, eq=False):
+    """A shape in its frame. ``k`` anchors."""
+
+    motion: Motion
+    position_m: Array
+    """Shape (k, 3)."""
+    covariance_m2: Array
+    """Of each anchor's position, shape (k, 3, 3)."""
+    sentence: str
+    gauge: Gauge | None
+    notes: tuple[str, ...]
+
+
+def in_frame(
+    measured: Measured,
+    kept: Integers,
+    position_m: Array,
+    covariance_m2: Array,
+    core: Mask,
+    points_used: tuple[int, ...],
+) -> Framed:
+    """Move positions, shape (k, 3), and their covariance, shape (4 k, 4 k), to the frame that the facts name."""
+    anchors = np.array([measured.anchors[index] for index in kept])
+    motion, sentence, gauge, notes = _motion(measured, anchors, position_m, core, points_used)
+    k = len(kept)
+    blocks = covariance_m2[: 3 * k, : 3 * k].reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
+    rotated = motion.rotation @ blocks @ motion.rotation.T
+    return Framed(motion, motion.moved(position_m), rotated, sentence, gauge, tuple(notes))
+
+
+def _motion(
+    measured: Measured, anchors: Integers, position_m: Array, core: Mask, points_used: tuple[int, ...]
+) -> tuple[Motion, str, Gauge | None, list[str]]:
+    axes = 2 if levels(measured) else 3
+    still = Motion(np.eye(3), np.zeros(3))
+    by_points, points_decide = _by_points(measured, anchors, position_m, core, axes)
+    by_sketch, sketch_decides = _by_sketch(measured, anchors, position_m, core, axes)
+    decided = points_decide or sketch_decides
+    gauge, notes = measured.facts.gauge, _level_notes(measured)
+    if gauge is not None:
+        index = {int(anchor): number for number, anchor in enumerate(anchors) if core[number]}
+        named = [gauge.origin, gauge.x_axis, *([] if gauge.left is None else [gauge.left])]
+        missing = [anchor for anchor in dict.fromkeys(named) if anchor not in index]
+        if not missing and len(set(named)) == len(named):
+            chosen = [index[anchor] for anchor in named]
+            return _by_gauge(anchors, position_m, core, axes, chosen, by_points or by_sketch, decided, notes)
+        why = f"{anchors_named(missing)} has no position" if missing else "it names one anchor twice"
+        notes.append(f"the frame cannot follow origin {joined(named)}: {why}")
+    mirror = "" if decided else "; the ranges do not show whether this is a mirror image: name an anchor on the left"
+    if by_points is not None:
+        motion = still if points_used else by_points
+        if not decided and axes == 2:
+            motion = _left_of_points(measured, anchors, motion, position_m, core)
+        return motion, f"axes follow the known points{mirror}", None, notes
+    if by_sketch is not None:
+        return by_sketch, f"axes fit the sketch best{mirror}", None, notes
+    lowest = int(np.flatnonzero(core)[0])
+    if core.sum() < 2:
+        return Motion(np.eye(3), -position_m[lowest] * ([1, 1, 0] if axes == 2 else [1, 1, 1])), "", None, notes
+    found = axes_through(position_m, core, axes, lowest)
+    return found.motion, f"{_sentence(anchors, found, axes)}; {_MIRROR}", gauge_of(found, anchors), notes
+
+
+_MIRROR = "nobody has named origin and axes, and the picture may be a mirror image"
+
+
+def _by_gauge(
+    anchors: Integers,
+    position_m: Array,
+    core: Mask,
+    axes: int,
+    chosen: list[int],
+    known: Motion | None,
+    decided: bool,
+    notes: list[str],
+) -> tuple[Motion, str, Gauge | None, list[str]]:
+    """Axes through named anchors; if none is named for the left, points or the sketch choose the mirror image."""
+    origin, x_axis = chosen[:2]
+    if known is not None:
+        position_m = known.moved(position_m)
+    length = np.linalg.norm((position_m - position_m[origin])[:, :axes], axis=1)
+    far = int(np.argmax(np.where(core, length, 0.0)))
+    if length[x_axis] < _NEAR * length[far]:
+        notes.append(
+            f"anchor {anchors[x_axis]} names the x axis from {length[x_axis]:.1f} m away; "
+            f"anchor {anchors[far]}, {length[far]:.1f} m away, would name it better"
+        )
+    found = axes_through(position_m, core, axes, origin, x_axis, chosen[2] if len(chosen) > 2 else None)
+    mirror = ""
+    if len(chosen) > 2 and not found.side_decided:
+        notes.append(f"anchor {anchors[chosen[2]]} stands on the x axis and cannot name the left")
+    if len(chosen) < 3 and known is not None and decided and axes == 2:
+        motion = found.motion
+        if np.linalg.det(motion.rotation) < 0.0:
+            motion = Motion(motion.rotation * [[1.0], [-1.0], [1.0]], motion.shift_m * [1.0, -1.0, 1.0])
+        found = Axes(motion, found.origin, found.x_axis, None, True)
+    elif len(chosen) < 3 or not found.side_decided:
+        mirror = "; nobody has named an anchor on the left, and the picture may be a mirror image"
+    sentence = _sentence(anchors, found, axes) + mirror
+    if known is not None:
+        whole = Motion(found.motion.rotation @ known.rotation, found.motion.moved(known.shift_m))
+        return whole, sentence, gauge_of(found, anchors), notes
+    return found.motion, sentence, gauge_of(found, anchors), notes
+
+
+def _by_points(
+    measured: Measured, anchors: Integers, position_m: Array, core: Mask, axes: int
+) -> tuple[Motion | None, bool]:
+    """The motion to the known points, and whether they exclude the mirror image."""
+    facts = measured.facts
+    return _best(as_array(facts.points, tuple(anchors.tolist())), position_m, core, axes, max(facts.point_std_m, 0.03))
+
+
+def _left_of_points(measured: Measured, anchors: Integers, motion: Motion, position_m: Array, core: Mask) -> Motion:
+    """Of both mirror images the one that has the first anchor clearly off the points' line on its left."""
+    given = [number for number, anchor in enumerate(anchors) if int(anchor) in measured.facts.points and core[number]]
+    moved = motion.moved(position_m)
+    found = axes_through(moved, core, 2, given[0], given[1])
+    if np.linalg.det(found.motion.rotation) > 0.0:
+        return motion
+    along = found.motion.rotation[0]
+    mirror = 2.0 * np.outer(along, along) - np.eye(3)
+    mirror[2, 2] = 1.0
+    origin = moved[given[0]]
+    whole = Motion(mirror, origin - mirror @ origin)
+    return Motion(mirror @ motion.rotation, whole.moved(motion.shift_m))
+
+
+def _by_sketch(
+    measured: Measured, anchors: Integers, position_m: Array, core: Mask, axes: int
+) -> tuple[Motion | None, bool]:
+    facts = measured.facts
+    return _best(as_array(facts.sketch_m, tuple(anchors.tolist())), position_m, core, axes, facts.sketch_std_m)
+
+
+def _best(there_m: Array, position_m: Array, core: Mask, axes: int, std_m: float) -> tuple[Motion | None, bool]:
+    known = core & np.isfinite(there_m[:, :axes]).all(axis=1)
+    if known.sum() < axes:
+        return None, False
+    there_m = np.where(np.isfinite(there_m), there_m, position_m)
+    alignment = align(position_m[known], there_m[known], std_m, axes)
+    return alignment.motion, alignment.mirror_decided
+
+
+def _sentence(anchors: Integers, found: Axes, axes: int) -> str:
+    left = f", anchor {anchors[found.left]} on the left (y > 0)" if found.left is not None else ""
+    level = "" if axes == 2 else "; these three lie at z = 0, as fewer than three heights are given"
+    return f"anchor {anchors[found.origin]} is the origin, anchor {anchors[found.x_axis]} on the x axis{left}{level}"
+
+
+def _level_notes(measured: Measured) -> list[str]:
+    if levels(measured):
+        return []
+    return ["nothing levels the site: heights of three anchors that are not on one line would"]
