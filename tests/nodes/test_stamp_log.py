@@ -2,7 +2,7 @@
 
 from skyless.mqtt.leases import MAX_LEASE_S, MOST_LEASES, Leases
 from skyless.mqtt.messages import RequestMessage, Stamp
-from skyless.nodes.stamp_log import INTERVAL_S, MOST_PENDING_STAMPS, StampLog
+from skyless.nodes.stamp_log import STAMPS_INTERVAL_S, MOST_PENDING_STAMPS, StampLog
 
 
 def request(by, lease_s=10.0, stamps=True):
@@ -25,9 +25,9 @@ def test_messages_come_at_an_interval_also_when_nobody_is_received():
     log = StampLog(2, "a")
     log.request(request("me"), 100.0)
     assert log.collect(100.0, 0.0).stamps == ()
-    assert log.collect(100.0 + 0.9 * INTERVAL_S, 0.0) is None
+    assert log.collect(100.0 + 0.9 * STAMPS_INTERVAL_S, 0.0) is None
     log.add(1, 10, 20)
-    assert log.collect(100.0 + INTERVAL_S, 0.0).stamps == (Stamp(1, 10, 20),)
+    assert log.collect(100.0 + STAMPS_INTERVAL_S, 0.0).stamps == (Stamp(1, 10, 20),)
 
 
 def test_what_is_not_collected_takes_no_memory_and_is_counted():
