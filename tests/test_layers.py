@@ -28,7 +28,7 @@ LAYERS = (
     {"replay"},
     {"nodes", "paper", "planning"},
     {"studies"},
-    {"calibration", "bench", "dashboard"},
+    {"calibration", "survey_inputs", "bench", "dashboard"},
     {"cli"},
 )
 LAYER_OF = {name: number for number, names in enumerate(LAYERS) for name in names}

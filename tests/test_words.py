@@ -121,6 +121,7 @@ HEARING = {
     "anchors/slots.py",
     "receiver.py",
     "simulation/world.py",
+    "evaluation/anchor_stamps.py",
     "evaluation/fleet.py",
 }
 """Only what stands where a radio's receptions arrive has methods named ``hear``."""

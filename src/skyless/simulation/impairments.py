@@ -37,6 +37,8 @@ class DelayError(Struct, frozen=True, forbid_unknown_fields=True):
     anchor: int
     tx_ticks: float = 0.0
     rx_ticks: float = 0.0
+    from_s: float = 0.0
+    """True time at which the delays become these; another error of the same anchor may hold before."""
 
 
 class AnchorDisplacement(Struct, frozen=True, forbid_unknown_fields=True):
@@ -46,6 +48,38 @@ class AnchorDisplacement(Struct, frozen=True, forbid_unknown_fields=True):
     x_m: float = 0.0
     y_m: float = 0.0
     z_m: float = 0.0
+    from_s: float = 0.0
+    """True time at which the anchor moves there; another displacement of the same anchor may hold before."""
+
+
+class PairError(Struct, frozen=True, forbid_unknown_fields=True):
+    """An error of the range between two anchors, the same in both directions; those of one pair add up.
+
+    Raises:
+        ValueError: one anchor twice, or a drift without a correlation time.
+    """
+
+    a: int
+    b: int
+    late_m: float = 0.0
+    """What either receives the other late."""
+    drift_std_m: float = 0.0
+    """Standard deviation of an error that changes, a Gauss–Markov process."""
+    drift_time_s: float = 60.0
+    """Time in which its correlation falls to 1/e."""
+    from_s: float = 0.0
+    to_s: float = math.inf
+    """With ``from_s``: the interval of true time that has the error."""
+    blocked: bool = False
+    """Neither receives the other at all."""
+
+    def __post_init__(self) -> None:
+        if self.a == self.b:
+            raise ValueError(f"a pair of anchors is {self.a} and {self.b}; it should be two")
+        if not self.drift_time_s > 0.0:
+            raise ValueError(
+                f"a pair's error drifts with drift_time_s {self.drift_time_s:g}; it should be more than 0 s"
+            )
 
 
 class WarmUp(Struct, frozen=True, forbid_unknown_fields=True):
@@ -103,6 +137,7 @@ class Impairments(Struct, frozen=True, forbid_unknown_fields=True):
     delay_errors: tuple[DelayError, ...] = ()
     anchor_outages: tuple[AnchorOutage, ...] = ()
     anchor_displacements: tuple[AnchorDisplacement, ...] = ()
+    anchor_pair_errors: tuple[PairError, ...] = ()
     range_errors: RangeErrorModel = RangeErrorModel()
     body: Body | None = None
     warm_ups: tuple[WarmUp, ...] = ()

@@ -229,9 +229,10 @@ def receive_frame(
     """Let every node that is on receive one frame, or lose it.
 
     ``span_s`` is the frame's begin and end from its RMARKER, ``others`` as from ``OnAir.others``, ``range_errors_m``
-    has shape (nodes, anchors), and ``slope_m`` is that of ``RangeErrorModel``. Fills ``heard``
-    (``RECEPTION_RECORD``, one row a node that received it) and counts into ``tally``, shape (2, outcomes), for anchors
-    and tags. Returns how many anchors and how many nodes received it, and the highest cursor.
+    has shape (nodes, anchors), with infinity for a listener that the sender does not reach, and ``slope_m`` is that of
+    ``RangeErrorModel``. Fills ``heard`` (``RECEPTION_RECORD``, one row a node that received it) and counts into
+    ``tally``, shape (2, outcomes), for anchors and tags. Returns how many anchors and how many nodes received it, and
+    the highest cursor.
     """
     t_s = (emission_ticks + emission_fraction) * TICK_S
     anchors, count, highest = 0, 0, 0
@@ -243,7 +244,9 @@ def receive_frame(
         flight_s = (distance_m + extra_m) / SPEED_OF_LIGHT_MPS
         arrival_s = (span_s[0] + flight_s, span_s[1] + flight_s)
         outcome = overlap_outcome(stations, channel, walls, others, node, t_s, arrival_s, power_dbm)
-        if outcome == _HEARD:
+        if outcome == _HEARD and range_errors_m[node, sender] == math.inf:
+            outcome = _WEAK
+        elif outcome == _HEARD:
             outcome = reception_outcome(channel, normals, cursors, node, power_dbm)
         tally[station["is_tag"], outcome] += 1
         if outcome == _HEARD:

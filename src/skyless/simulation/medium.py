@@ -20,12 +20,13 @@ from skyless.air.ieee802154 import after_rmarker_s, preamble_s
 from skyless.air.reception import Transmission
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
 from skyless.kernels.arrays import Array, Records
+from skyless.simulation.anchor_pairs import AnchorPairErrors
 from skyless.simulation.channel import pack_channel, pack_walls
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.listening import OUTCOMES, RECEPTION_RECORD, receive_frame
 from skyless.simulation.oscillator import advance, emit, foresee, make_clocks, restart_counter, warm_up
 from skyless.simulation.range_errors import RangeErrors
-from skyless.simulation.stations import TagSpec, make_stations, set_piece
+from skyless.simulation.stations import TagSpec, displace, make_stations, set_delays, set_piece
 from skyless.simulation.streams import ANCHOR_KEY, TAG_KEY, Streams, stream
 from skyless.site.model import Site
 from skyless.ticks import difference, from_seconds, wrap
@@ -247,6 +248,8 @@ class Medium(MediumBase[Result]):
         self.range_errors = RangeErrors(
             impairments.range_errors, [tag.range_errors_m for tag in self._tags], len(site.anchors), seed
         )
+        self._pair_errors = AnchorPairErrors(impairments.anchor_pair_errors, self.node_of, seed)
+        self._plan_changes()
         self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
         self._air = OnAir()
         self._received = np.zeros(len(keys), dtype=RECEPTION_RECORD)
@@ -273,6 +276,20 @@ class Medium(MediumBase[Result]):
     def foresee(self, node: int, local_ticks: int) -> int:
         """True time in whole ticks at which a node's unwrapped counter will show a value."""
         return foresee(self.clocks, node, local_ticks)
+
+    # Anchors
+
+    def _plan_changes(self) -> None:
+        """Plan the displacements and errors of delays that begin later."""
+        for shift in self._impairments.anchor_displacements:
+            if shift.from_s > 0.0:
+                node = self.node_of[shift.anchor]
+                happen = partial(displace, self.stations, node, self._anchors[node], shift)
+                self.timeline.at(from_seconds(shift.from_s), happen)
+        for error in self._impairments.delay_errors:
+            if error.from_s > 0.0:
+                happen = partial(set_delays, self.stations, self.node_of[error.anchor], error)
+                self.timeline.at(from_seconds(error.from_s), happen)
 
     # Transmissions
 
@@ -308,6 +325,7 @@ class Medium(MediumBase[Result]):
         t_s = ticks * TICK_S
         self._move_tags(t_s)
         self.range_errors.advance_to(t_s, self.stations)
+        self._pair_errors.set_present(t_s, self.range_errors.present_m)
         anchors, count, highest = receive_frame(
             self.clocks,
             normals,
@@ -338,14 +356,16 @@ class Medium(MediumBase[Result]):
 
 
 def _check_names(faults: Impairments, node_of: dict[int, int]) -> None:
-    for name, values in (
-        ("anchor_biases", faults.anchor_biases),
-        ("delay_errors", faults.delay_errors),
-        ("anchor_outages", faults.anchor_outages),
-        ("anchor_displacements", faults.anchor_displacements),
-        ("warm_ups", faults.warm_ups),
-    ):
-        unknown = {value.anchor for value in values if value.anchor is not None} - node_of.keys()
+    named: dict[str, list[int | None]] = {
+        "anchor_biases": [one.anchor for one in faults.anchor_biases],
+        "delay_errors": [one.anchor for one in faults.delay_errors],
+        "anchor_outages": [one.anchor for one in faults.anchor_outages],
+        "anchor_displacements": [one.anchor for one in faults.anchor_displacements],
+        "warm_ups": [one.anchor for one in faults.warm_ups],
+        "anchor_pair_errors": [end for one in faults.anchor_pair_errors for end in (one.a, one.b)],
+    }
+    for name, anchors in named.items():
+        unknown = {anchor for anchor in anchors if anchor is not None} - node_of.keys()
         if unknown:
             known = ", ".join(map(str, node_of))
             raise ValueError(f"{name} names anchor {min(unknown)}; it should be one of the site's: {known}")

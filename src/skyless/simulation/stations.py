@@ -10,7 +10,7 @@ from msgspec import Struct
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Records
 from skyless.kernels.compiled import kernel, part
-from skyless.simulation.impairments import Impairments, Outage
+from skyless.simulation.impairments import AnchorDisplacement, DelayError, Impairments, Outage
 from skyless.simulation.trajectory import Piece, Trajectory
 from skyless.site.model import AnchorSite
 
@@ -59,14 +59,23 @@ def make_stations(anchors: Sequence[AnchorSite], tags: Sequence[TagSpec], impair
         carried = stations[len(anchors) :]
         carried["body_m"], carried["body_direction_rad"] = body.delay_m, body.direction_rad
         carried["body_cosine"] = math.cos(0.5 * body.sector_rad)
-    errors = {error.anchor: error for error in impairments.delay_errors}
-    shifts_m = {shift.anchor: (shift.x_m, shift.y_m, shift.z_m) for shift in impairments.anchor_displacements}
-    for station, anchor in zip(stations, anchors, strict=False):
-        station["position_m"] = np.add((anchor.x_m, anchor.y_m, anchor.z_m), shifts_m.get(anchor.id, (0.0, 0.0, 0.0)))
+    errors = {error.anchor: error for error in impairments.delay_errors if error.from_s <= 0.0}
+    shifts = {shift.anchor: shift for shift in impairments.anchor_displacements if shift.from_s <= 0.0}
+    for node, anchor in enumerate(anchors):
+        displace(stations, node, anchor, shifts.get(anchor.id, AnchorDisplacement(anchor.id)))
         if anchor.id in errors:
-            station["tx_error_ticks"] = errors[anchor.id].tx_ticks
-            station["rx_error_ticks"] = errors[anchor.id].rx_ticks
+            set_delays(stations, node, errors[anchor.id])
     return stations
+
+
+def displace(stations: Records, node: int, anchor: AnchorSite, shift: AnchorDisplacement) -> None:
+    """Move an anchor to its displaced position."""
+    stations[node]["position_m"] = np.add((anchor.x_m, anchor.y_m, anchor.z_m), (shift.x_m, shift.y_m, shift.z_m))
+
+
+def set_delays(stations: Records, node: int, error: DelayError) -> None:
+    """Set the errors of an anchor's antenna delays."""
+    stations[node]["tx_error_ticks"], stations[node]["rx_error_ticks"] = error.tx_ticks, error.rx_ticks
 
 
 def set_piece(stations: Records, node: int, piece: Piece) -> None:

@@ -12,7 +12,7 @@ from typing import Final
 import yaml
 
 from skyless.air.masterless_packets import Packet, Point, Relay
-from skyless.constants import TICK_BITS
+from skyless.constants import TICK_BITS, TICK_M
 from skyless.recordings.source import Drops, chunks, lines
 
 # Payloads of Bitcraze's loco positioning anchors, TDoA2 and TDoA3, to packets.
@@ -29,6 +29,9 @@ from skyless.recordings.source import Drops, chunks, lines
 TDOA2: Final = 0x22
 TDOA3: Final = 0x30
 STAMP_BITS: Final = 32
+
+ANTENNA_DELAYS_TICKS: Final = round(154.6 / TICK_M)
+"""Of a sender and a receiver together, which the stamps include: 154.6 m by the firmware of Crazyflies."""
 
 _TDOA2: Final = Layout("<B8B8I8H")
 _TDOA3_HEAD: Final = Layout("<BBIB")

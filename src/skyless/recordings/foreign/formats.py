@@ -34,6 +34,8 @@ class Format:
     """One recording holds several listeners, one of which is chosen."""
     hexadecimal: bool = False
     """Identifiers are hexadecimal."""
+    delays_ticks: int = 0
+    """Antenna delays of a sender and a receiver together, where its stamps include them."""
 
 
 FORMATS: Final = (
@@ -43,6 +45,7 @@ FORMATS: Final = (
         bitcraze.recognise_yaml,
         bitcraze.read_yaml,
         bitcraze.STAMP_BITS,
+        delays_ticks=bitcraze.ANTENNA_DELAYS_TICKS,
     ),
     Format(
         "bitcraze-text",
@@ -50,6 +53,7 @@ FORMATS: Final = (
         bitcraze.recognise_text,
         bitcraze.read_text,
         bitcraze.STAMP_BITS,
+        delays_ticks=bitcraze.ANTENNA_DELAYS_TICKS,
     ),
     Format(
         "miluv",
@@ -75,6 +79,7 @@ FORMATS: Final = (
         bitcraze.recognise_binary,
         bitcraze.read_binary,
         bitcraze.STAMP_BITS,
+        delays_ticks=bitcraze.ANTENNA_DELAYS_TICKS,
     ),
 )
 """In the order in which they are tried: the more particular first."""

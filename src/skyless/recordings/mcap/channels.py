@@ -27,6 +27,7 @@ _HEALTH: Final[dict[str, type[Struct]]] = {
 _OF_A_NODE: Final[dict[str, type[Struct]]] = {
     "fix": messages.FixMessage,
     "receptions": messages.ReceptionsMessage,
+    "stamps": messages.StampsMessage,
     "status": messages.StatusMessage,
     "event": messages.ZoneEvent,
 }
@@ -44,7 +45,7 @@ class Channel(Struct, frozen=True):
 
     site: str
     kind: str
-    """``fix``, ``receptions``, ``status``, ``health``, ``event``, ``site``, ``request``, ``truth``, ``zones``, ..."""
+    """``fix``, ``receptions``, ``stamps``, ``status``, ``health``, ``event``, ``site``, ``request``, ``zones``, ..."""
     name: str = ""
     """Of the tag, anchor or zone."""
     payload: type[Struct] | None = None

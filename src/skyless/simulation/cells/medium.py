@@ -134,6 +134,10 @@ class CellMedium(MediumBase[Result]):
         refuse_unmodelled(impairments, range_errors=False)
         _refuse_unmodelled_site(site, tags)
         super().__init__(site, tags, impairments, deliver)
+        moving = next((one for one in impairments.anchor_displacements if one.from_s > 0.0), None)
+        if moving is not None:
+            text = f"anchor_displacements has from_s {moving.from_s:g}; it should be 0"
+            raise ValueError(f"{text}: anchors of several cells do not move")
         named = {one.anchor for one in impairments.anchor_outages}
         unknown = named.union(one.anchor for one in impairments.anchor_displacements) - self.node_of.keys()
         if unknown:
@@ -235,7 +239,7 @@ def refuse_unmodelled(impairments: Impairments, *, range_errors: bool) -> None:
         ValueError: names the key, its value and what it should be.
     """
     plain = Impairments()
-    names = ["anchor_biases", "delay_errors", "body", "warm_ups", "diagnostics"]
+    names = ["anchor_biases", "delay_errors", "anchor_pair_errors", "body", "warm_ups", "diagnostics"]
     for name in names if range_errors else [*names, "range_errors"]:
         value, wanted = getattr(impairments, name), getattr(plain, name)
         if value != wanted:

@@ -6,12 +6,13 @@ import numpy as np
 
 from skyless.kernels.arrays import Array, Mask
 
-LEAST_SHARE: Final = 0.1
+_LEAST_SHARE: Final = 0.1
 """Of all exchanges: an earlier cluster with fewer is an error."""
 
 _SIGMAS: Final = 4.0
-_HALF_WIDTH: Final = 1.349
-"""Width of the middle half of a normal distribution, in standard deviations."""
+_DENSE_SHARE: Final = 0.3
+_DENSE_WIDTH: Final = 0.771
+"""Width of that middle part of a normal distribution, in standard deviations."""
 
 
 def earliest_cluster(value: Array, weight: Array, std: float, total: float | None = None) -> Mask:
@@ -22,10 +23,10 @@ def earliest_cluster(value: Array, weight: Array, std: float, total: float | Non
     """
     order = np.argsort(value, kind="stable")
     ordered, until = value[order], np.cumsum(weight[order])
-    width = 2.0 * _SIGMAS * max(std, _shortest_half(ordered, until) / _HALF_WIDTH)
+    width = 2.0 * _SIGMAS * max(std, _densest(ordered, until) / _DENSE_WIDTH)
     ends = np.searchsorted(ordered, ordered + width, side="right") - 1
     held = until[ends] - until + weight[order]
-    enough = np.flatnonzero(held >= LEAST_SHARE * max(until[-1], total or 0.0))
+    enough = np.flatnonzero(held >= _LEAST_SHARE * max(until[-1], total or 0.0))
     begin = int(enough[0]) if len(enough) else int(np.argmax(held))
     centre = half_sample_mode(ordered[begin : ends[begin] + 1])
     for _ in range(2):
@@ -45,9 +46,9 @@ def half_sample_mode(ordered: Array) -> float:
     return float(np.mean(ordered))
 
 
-def _shortest_half(ordered: Array, until: Array) -> float:
-    """Length of the shortest interval that holds half of the weight."""
+def _densest(ordered: Array, until: Array) -> float:
+    """Length of the shortest interval that holds ``_DENSE_SHARE`` of the weight."""
     before = np.concatenate([[0.0], until[:-1]])
-    ends = np.searchsorted(until, before + 0.5 * until[-1] * (1.0 - 1e-9))
+    ends = np.searchsorted(until, before + _DENSE_SHARE * until[-1] * (1.0 - 1e-9))
     whole = ends < len(ordered)
     return float(np.min(ordered[ends[whole]] - ordered[whole]))

@@ -5,6 +5,7 @@ received that frame, too, knows both stamps of the leg. An anchor's own receptio
 """
 
 from collections import Counter
+from collections.abc import Iterable
 from typing import Final
 
 from msgspec import Struct
@@ -13,7 +14,7 @@ from skyless.air.beacon import Beacon, Heard, Malformed
 from skyless.air.frames import AnyBeacon, decode_any
 from skyless.air.reception import Reception
 from skyless.clocks.two_way import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS
-from skyless.constants import TICK_RATE_HZ
+from skyless.constants import TICK_BITS, TICK_RATE_HZ
 from skyless.ticks import Unwrapper, difference, to_seconds
 
 _LONGEST_AGE_TICKS: Final = round(2.0 * TICK_RATE_HZ)
@@ -30,35 +31,103 @@ class AnchorLeg(Struct, frozen=True, gc=False):
     sender: int
     receiver: int
     tx_ticks: int
-    """In the counter of the sender, 40 bits."""
+    """In the counter of the sender."""
     rx_ticks: int
-    """In the counter of the receiver, 40 bits."""
+    """In the counter of the receiver."""
     t_s: float
-    """On the listener's clock, when it received the frame that relays the leg."""
+    """When the listener received the same broadcast, on its own clock."""
+
+
+class Relayed(Struct, frozen=True, gc=False):
+    """The sender of a frame has received a frame of another anchor."""
+
+    anchor: int
+    sequence: int
+    rx_ticks: int
 
 
 class _Received(Struct, frozen=True, gc=False):
     tx_ticks: int
     listener_ticks: int
     """Unwrapped."""
+    t_s: float
 
 
-class LegCollector:
-    """The legs between the anchors of one site, from all that one listener receives.
+class RelayMatcher:
+    """Finds the frames that relays name, among those that one listener has received.
 
-    Memory is bounded by the frames of two seconds. What cannot be used is counted in ``counters``:
-    ``frame-not-received`` (the listener missed the frame that a relay names), ``other-frame`` (the relay names a frame
-    before that of this sequence number, or a counter has restarted) and the reasons of ``decode_any``.
+    Memory is bounded by the frames of two seconds. ``counters``: ``legs``, and relays without one:
+    ``frame-not-received`` (the listener missed the frame that it names), ``other-frame`` (it names a frame before that
+    of this sequence number, or a counter has restarted).
     """
 
-    def __init__(self, site_id: int) -> None:
+    def __init__(self, bits: int = TICK_BITS) -> None:
+        """``bits``: of the anchors' counters."""
         self.counters: Counter[str] = Counter()
-        self._site_id = site_id
-        self._ticks = Unwrapper()
+        self._bits = bits
         self._frames: dict[tuple[int, int], _Received] = {}
         """By anchor and sequence number, in the order of reception."""
         self._last: dict[tuple[int, int], int] = {}
         """RX stamp of each directed pair's last leg: a stamp is relayed until there is another."""
+
+    def add(
+        self, anchor: int, sequence: int, tx_ticks: int, relays: Iterable[Relayed | Heard], now_ticks: int, t_s: float
+    ) -> list[AnchorLeg]:
+        """The legs that a frame's relays complete. ``now_ticks``: the listener's counter, unwrapped, and its clock."""
+        legs = []
+        for relay in relays:
+            leg = self._leg(anchor, tx_ticks, relay, now_ticks)
+            if leg is not None:
+                legs.append(leg)
+        self._frames.pop((anchor, sequence), None)
+        self._frames[anchor, sequence] = _Received(tx_ticks, now_ticks, t_s)
+        self._prune(now_ticks)
+        return legs
+
+    def _leg(self, anchor: int, tx_ticks: int, relay: Relayed | Heard, now_ticks: int) -> AnchorLeg | None:
+        """The leg that a relay describes, if the listener has received the same frame."""
+        pair = (relay.anchor, anchor)
+        if relay.anchor == anchor or self._last.get(pair) == relay.rx_ticks:
+            return None
+        frame = self._frames.get((relay.anchor, relay.sequence))
+        if frame is None:
+            self.counters["frame-not-received"] += 1
+            return None
+        # Between the two frames the listener's counter and that of the anchor that relays advance alike: a check that
+        # another frame of the same sequence number, or a counter that has restarted, does not pass.
+        age_ticks = now_ticks - frame.listener_ticks
+        apart_ticks = abs(difference(tx_ticks, relay.rx_ticks + age_ticks, self._bits))
+        if not 0 < age_ticks <= _LONGEST_AGE_TICKS or apart_ticks > 2 * MAX_FLIGHT_TICKS + MAX_BRACKET_RATE * age_ticks:
+            self.counters["other-frame"] += 1
+            return None
+        self._last.pop(pair, None)
+        self._last[pair] = relay.rx_ticks
+        self.counters["legs"] += 1
+        return AnchorLeg(relay.anchor, anchor, frame.tx_ticks, relay.rx_ticks, frame.t_s)
+
+    def _prune(self, now_ticks: int) -> None:
+        """Remove frames that no relay can name any more."""
+        oldest_ticks = now_ticks - _LONGEST_AGE_TICKS
+        while self._frames:
+            key = next(iter(self._frames))
+            if len(self._frames) <= _MOST_FRAMES and oldest_ticks <= self._frames[key].listener_ticks:
+                break
+            del self._frames[key]
+        while len(self._last) > _MOST_LEGS:
+            del self._last[next(iter(self._last))]
+
+
+class LegCollector:
+    """The legs between the anchors of one site, from the beacons (of either protocol) that one listener receives.
+
+    ``counters``: those of ``RelayMatcher``, ``foreign-site``, and the reasons of ``decode_any``.
+    """
+
+    def __init__(self, site_id: int) -> None:
+        self._site_id = site_id
+        self._ticks = Unwrapper()
+        self._matcher = RelayMatcher()
+        self.counters = self._matcher.counters
 
     def add(self, reception: Reception) -> list[AnchorLeg]:
         """The legs that a reception completes."""
@@ -71,47 +140,11 @@ class LegCollector:
             return []
         now_ticks = self._ticks.unwrap(reception.rx_ticks, reception.host_s)
         t_s = to_seconds(now_ticks) if reception.host_s is None else reception.host_s
-        legs = [leg for heard in _relayed(beacon) if (leg := self._leg(beacon, heard, now_ticks, t_s)) is not None]
-        self._frames.pop((beacon.anchor, beacon.sequence), None)
-        self._frames[beacon.anchor, beacon.sequence] = _Received(beacon.tx_ticks, now_ticks)
-        self._prune(now_ticks)
-        return legs
-
-    def _leg(self, beacon: AnyBeacon, heard: Heard, now_ticks: int, t_s: float) -> AnchorLeg | None:
-        """The leg that a relay describes, if the listener has received the same frame."""
-        pair = (heard.anchor, beacon.anchor)
-        if self._last.get(pair) == heard.rx_ticks:
-            return None
-        frame = self._frames.get((heard.anchor, heard.sequence))
-        if frame is None:
-            self.counters["frame-not-received"] += 1
-            return None
-        # Between the two frames the listener's counter and that of the anchor that relays advance alike: a check that
-        # another frame of the same sequence number, or a counter that has restarted, does not pass.
-        age_ticks = now_ticks - frame.listener_ticks
-        apart = abs(difference(beacon.tx_ticks, heard.rx_ticks) - age_ticks)
-        if not 0 < age_ticks <= _LONGEST_AGE_TICKS or apart > 2 * MAX_FLIGHT_TICKS + MAX_BRACKET_RATE * age_ticks:
-            self.counters["other-frame"] += 1
-            return None
-        self._last.pop(pair, None)
-        self._last[pair] = heard.rx_ticks
-        self.counters["legs"] += 1
-        return AnchorLeg(heard.anchor, beacon.anchor, frame.tx_ticks, heard.rx_ticks, t_s)
-
-    def _prune(self, now_ticks: int) -> None:
-        """Remove frames that no relay can name any more."""
-        oldest_ticks = now_ticks - _LONGEST_AGE_TICKS
-        while self._frames:
-            key = next(iter(self._frames))
-            if len(self._frames) <= _MOST_FRAMES and oldest_ticks <= self._frames[key].listener_ticks:
-                break
-            del self._frames[key]
-        if len(self._last) > _MOST_LEGS:
-            del self._last[next(iter(self._last))]
+        return self._matcher.add(beacon.anchor, beacon.sequence, beacon.tx_ticks, _relays(beacon), now_ticks, t_s)
 
 
-def _relayed(beacon: AnyBeacon) -> list[Heard]:
-    relayed = list(beacon.heard)
+def _relays(beacon: AnyBeacon) -> list[Heard]:
+    relays = list(beacon.heard)
     if isinstance(beacon, Beacon) and beacon.master_heard is not None:
-        relayed.append(beacon.master_heard)
-    return relayed
+        relays.append(beacon.master_heard)
+    return relays

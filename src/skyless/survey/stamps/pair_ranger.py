@@ -71,7 +71,8 @@ class PairRanger:
         self._histories: list[_History] = []
         self._shared_m2 = self._products = 0.0
         """Sum of the products of two pairs that share an anchor's frame, and their number."""
-        self._begin_s: float | None = None
+        self._block: int | None = None
+        """Number of the open block since time 0."""
         self._first_s = self._last_s = math.nan
         self._duration_s = 0.0
 
@@ -150,30 +151,30 @@ class PairRanger:
 
     def _pass_to(self, t_s: float) -> None:
         """Close the open block if its time is over; a clock that was set starts the blocks again."""
-        begin_s = self._begin_s
-        if begin_s is None or t_s >= begin_s + self._block_s or t_s < begin_s - _KEPT_S:
-            if begin_s is not None:
+        block, number = self._block, math.floor(t_s / self._block_s)
+        if block is None or number > block or t_s < block * self._block_s - _KEPT_S:
+            if block is not None:
                 self._close_block()
-            if begin_s is None or not -_KEPT_S < t_s - self._last_s < _KEPT_S:
+            if block is None or not -_KEPT_S < t_s - self._last_s < _KEPT_S:
                 self._kept, self._clocks, self._first_s = _legs_of([]), {}, t_s
-            self._begin_s = math.floor(t_s / self._block_s) * self._block_s
+            self._block = number
             self._last_s = t_s
         self._last_s = max(self._last_s, t_s)
 
     # Blocks
 
     def _close_block(self) -> None:
-        if not self._open or self._begin_s is None:
+        if not self._open or self._block is None:
             return
         legs = _joined(self._kept, _legs_of(self._open))
         self._open = []
-        legs = legs.part(legs.t_s > self._last_s - _KEPT_S)
-        flights, self._kept, impossible = flights_of(legs, self._longest_ticks)
+        flights, kept, impossible = flights_of(legs, self._longest_ticks)
+        self._kept = kept.part(kept.t_s > self._last_s - _KEPT_S)
         self._duration_s += self._last_s - self._first_s
         self._first_s = self._last_s
         self.counters["impossible"] += impossible
         if len(flights.leg):
-            self._add_block(legs, flights, self._begin_s + self._block_s / 2.0)
+            self._add_block(legs, flights, (self._block + 0.5) * self._block_s)
 
     def _add_block(self, legs: Legs, flights: Flights, t_s: float) -> None:
         """Means of the pairs' flights without outliers, and what their scatter says of the stamps' noise."""

@@ -1,0 +1,4 @@
+"""What a survey needs, out of recordings.
+
+Public: recorded_stamps.
+"""

@@ -1,0 +1,30 @@
+"""Ranges from simulated air: as good as their stamps, from all anchors and from one listener alike."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from skyless.evaluation.anchor_stamps import stamps_of
+from skyless.simulation.impairments import lab_impairments
+from skyless.site.lab import lab_site
+
+LAB = lab_site()
+
+
+@pytest.mark.parametrize("listener_m", [None, (3.0, 4.0, 0.0)], ids=["all anchors", "one listener"])
+def test_ranges_of_the_lab_have_the_errors_that_they_state(listener_m):
+    """5 pieces of 1 s: squared errors over the stated covariance, shared TX noise included, are chi square."""
+    position_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in LAB.anchors}
+    squares, pieces = 0.0, 5
+    for seed in range(pieces):
+        ranges = stamps_of(LAB, lab_impairments(100.0), 1.0, seed, listener_m=listener_m, settle_s=0.5).ranges()
+        assert len(ranges.pairs) == 15
+        assert ranges.duration_s == pytest.approx(1.0, abs=0.02)
+        ends = np.array([[anchor in {pair.a, pair.b} for anchor in ranges.anchors] for pair in ranges.pairs], float)
+        shared = ends @ np.diag([ranges.tx_std_m[anchor] ** 2 for anchor in ranges.anchors]) @ ends.T
+        error = np.array([pair.range_m - math.dist(position_m[pair.a], position_m[pair.b]) for pair in ranges.pairs])
+        squares += error @ np.linalg.solve(np.diag([pair.std_m**2 for pair in ranges.pairs]) + shared, error)
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 15 * pieces)
+    assert low < squares < high
