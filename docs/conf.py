@@ -15,7 +15,15 @@ from sphinx.writers.html5 import HTML5Translator
 
 NAVIGATION = {
     "Start": ["docs/architecture", "docs/glossary", "CHANGELOG", "CONTRIBUTING"],
-    "Run a site": ["docs/sites", "docs/mqtt", "docs/planning", "docs/survey", "docs/calibration", "docs/recordings"],
+    "Run a site": [
+        "docs/sites",
+        "docs/mqtt",
+        "docs/planning",
+        "docs/survey",
+        "docs/calibration",
+        "docs/watch",
+        "docs/recordings",
+    ],
     "How it works": ["docs/protocol", "docs/protocol2", "docs/maths", "docs/studies", "docs/speed"],
     "The paper": ["docs/paper", "docs/errata"],
     "Radios and boards": ["docs/radio", "docs/serial", "docs/hardware", "docs/dw1000", "firmware/README"],

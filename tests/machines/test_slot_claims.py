@@ -25,7 +25,7 @@ from skyless.slot_claims import (
     SlotRole,
     first_wait_superframes,
 )
-from skyless.studies.claim_graphs import SUPERFRAME_TICKS, ClaimGraph, components
+from skyless.evaluation.claim_graphs import SUPERFRAME_TICKS, ClaimGraph, components
 
 S = SUPERFRAME_TICKS
 TERMS = st.one_of(st.integers(0, 3), st.integers(0, MOST_TERM), st.just(MOST_TERM))

@@ -4,11 +4,11 @@ import warnings
 
 import pytest
 
+from skyless.evaluation.claim_graphs import SUPERFRAME_TICKS, ClaimGraph, components, grid_m, links_within
 from skyless.evaluation.figures import picture
 from skyless.slot_claims import MOST_PATIENCE
 from skyless.studies import claims
 from skyless.studies.catalogue import STUDIES
-from skyless.studies.claim_graphs import SUPERFRAME_TICKS, ClaimGraph, components, grid_m, links_within
 from skyless.studies.claims import EVENTS, ClaimRun, ClaimSite, run_claims
 from skyless.studies.plan import Plan
 

@@ -18,6 +18,7 @@ from skyless.studies import (
     scale,
     sitetime,
     sync,
+    watch,
 )
 from skyless.studies.picture import Look, draw
 from skyless.studies.plan import Cell, Plan, Row, Study
@@ -81,6 +82,13 @@ STUDIES: Final = {
             claims.cells,
             claims.rows,
             partial(draw, Look("Superframes until one claim is left", ("superframes",))),
+        ),
+        Study(
+            "watch",
+            "the watch of the anchors",
+            watch.cells,
+            watch.rows,
+            partial(draw, Look("The watch of the anchors", ("found", "found_s"))),
         ),
         Study("sitetime", "one timeline over many hops", sitetime.cells, sitetime.rows, sitetime.draw),
         _of_worlds("scale", "numbers of tags and anchors", scale.cases, Look("Scale", ("rmse", "cpu"), log=True)),

@@ -11,9 +11,7 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.kernels.arrays import Array
-from skyless.slot_claims import SlotClaim
-from skyless.studies.claim_graphs import (
+from skyless.evaluation.claim_graphs import (
     SUPERFRAME_TICKS,
     ClaimGraph,
     components,
@@ -21,6 +19,8 @@ from skyless.studies.claim_graphs import (
     hops_between,
     links_within,
 )
+from skyless.kernels.arrays import Array
+from skyless.slot_claims import SlotClaim
 from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of
 
 

@@ -88,6 +88,15 @@ _PANELS: Final = {
         figure="superframes_most",
         log=True,
     ),
+    "found": _Panel(
+        "events found in %",
+        lambda row: None if row.found is None else 100.0 * row.found,
+        lambda _: None,
+        figure="found",
+        scale=100.0,
+        log=False,
+    ),
+    "found_s": _Panel("seconds to the finding, 99 %", lambda row: row.found_s, lambda _: None, log=True),
     "cpu": _Panel("CPU in µs a message", lambda row: row.cpu_us_per_message, lambda _: None),
 }
 

@@ -43,6 +43,7 @@ _USUAL: Final = {
     "room": Plan(worlds=20, seconds=15.0, tags=5),
     "large": Plan(worlds=24, seconds=30.0),
     "claims": Plan(worlds=3),
+    "watch": Plan(worlds=20),
 }
 """Of studies that do not take the usual amounts; those of ``room`` are the room's own, its other cases have fewer."""
 
@@ -194,6 +195,20 @@ class Row(Struct, frozen=True):
     """Of the slowest run."""
     changes: int | None = None
     """Anchors that changed their claim afterwards, in all runs."""
+    found: float | None = None
+    """Share of events that the watch of the anchors found in time (``watch``)."""
+    named: float | None = None
+    """Share of those found whose anchors or links were named, and no others."""
+    kind: float | None = None
+    """Share of those found of which it was right as well what had happened to them."""
+    wrong: float | None = None
+    """Share of events in which an anchor was said to have moved, or its delay to have changed, that has not."""
+    found_s: float | None = None
+    """From the event to the finding, which 99 % of those found do not exceed."""
+    alarms_per_day: float | None = None
+    """Findings while nothing happened."""
+    alarms: int | None = None
+    """How many of them there were, or how many windows struck."""
 
 
 def with_limits(row: Row, limits: Sequence[Limit]) -> Row:

@@ -30,14 +30,15 @@ class PairRanges(Struct, frozen=True):
 
 
 class PairBlock(Struct, frozen=True, gc=False):
-    """The ranges of one pair within a short time, a second or so."""
+    """The mean of one pair's ranges within a block of time, a second or so."""
 
     a: int
     b: int
     """Identifiers, a < b."""
     t_s: float
-    """Middle of that time."""
+    """Middle of the block."""
     mean_m: float
+    """Distance plus both anchors' delays, ``d + h_a + h_b``."""
     std_m: float
-    """Of the mean, from the scatter of its exchanges."""
+    """Of the mean, from stamps' noise, that which other pairs share included."""
     exchanges: int

@@ -22,9 +22,9 @@ from skyless.recordings.mcap.recording import MAGIC, McapRecording, Recorded
 from skyless.recordings.source import Drops, open_source, read_head
 from skyless.replay.site import SITE_FORMAT, recorded_site
 from skyless.site.model import Site
-from skyless.survey.ranges import PairRanges
+from skyless.survey.ranges import PairBlock, PairRanges
 from skyless.survey.stamps.legs import AnchorLeg, LegCollector, Relayed, RelayMatcher
-from skyless.survey.stamps.pair_ranger import PairBlock, PairRanger
+from skyless.survey.stamps.pair_ranger import PairRanger
 from skyless.ticks import Unwrapper, to_seconds
 
 _REPORT_EVERY: Final = 1000

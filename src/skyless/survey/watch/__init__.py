@@ -4,5 +4,5 @@ In the order of reading: ``finding`` (what comes out), ``history`` (what a pair'
 ``causes`` (what a cause does to the ranges, and the evidence for it), ``explain`` (which causes explain the changes of
 a window, and which others would as well), ``monitor`` (two of three windows).
 
-Public: finding, monitor.
+Public: causes, explain, finding, monitor.
 """

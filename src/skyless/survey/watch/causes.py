@@ -5,6 +5,7 @@ all change by as much), or one late link. Its evidence is by how much chi-square
 are numbered: displacements of the ``n`` anchors, their delays, then the ``m`` links.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -63,14 +64,15 @@ class Fit(Struct, frozen=True, eq=False):
 
 def weight_of(first: Integers, second: Integers, anchors: int, white_m: Array, drift_m: Array) -> Array:
     """Inverse covariance, shape (m, m), of changes with white noise of stamps and drift, each shape (m,)."""
-    incidence = np.zeros((len(first), anchors))
     rows = np.arange(len(first))
-    incidence[rows, first] = incidence[rows, second] = 1.0
-    shared: Array = _SHARED * incidence @ incidence.T  # of TX noise; on the diagonal 1/2, and the RX noise as much
-    shared[rows, rows] = 1.0
-    covariance = shared * np.outer(white_m, white_m)
-    covariance[rows, rows] += drift_m**2
-    return np.asarray(np.linalg.inv(covariance), np.float64)
+    shared = np.zeros((len(first), anchors))  # what an anchor's TX noise does to its pairs
+    shared[rows, first] = shared[rows, second] = math.sqrt(_SHARED) * white_m
+    own = 1.0 / ((1.0 - 2.0 * _SHARED) * white_m**2 + drift_m**2)
+    weighted = own[:, None] * shared
+    inner = np.linalg.inv(np.eye(anchors) + shared.T @ weighted)  # of anchors, not of pairs: the matrix inversion lemma
+    weight: Array = -(weighted @ inner) @ weighted.T
+    weight[rows, rows] += own
+    return weight
 
 
 def evidence(pairs: Pairs, weight: Array, weighted_m: Array) -> tuple[Array, Integers]:

@@ -14,7 +14,7 @@ from skyless.kernels.arrays import Array, Integers
 from skyless.survey.watch.causes import Fit, Pairs, evidence, fit, thresholds, weight_without
 from skyless.survey.watch.finding import Kind
 
-_ADDED: Final = 1e-3
+_ADDED: Final = 1e-4
 """Probability that chance adds a cause to a set."""
 
 _MARGIN: Final = 9.0
@@ -24,10 +24,10 @@ _BEAM: Final = 5
 _BRANCHES: Final = 8
 _MOST_CAUSES: Final = 5
 
-_SURE_REDUNDANCY: Final = 2
-"""Ranges that check a displacement or a delay, so that it cannot be late links by chance."""
-_SHORTER: Final = 4.0
-"""Standard deviations by which a range is shorter: no obstacle does that, so one checking range suffices."""
+_FURTHER_LINK: Final = 9.0
+"""By how much less evidence every late link after the first needs in comparisons of sets: one body blocks several."""
+_LATE: Final = 3.0
+"""Standard deviations from which on a link counts as late there."""
 
 
 class Part(Struct, frozen=True):
@@ -77,12 +77,13 @@ def nothing(pairs: Pairs, change_m: Array) -> Explanation:
 def explain(pairs: Pairs, change_m: Array) -> Explanation:
     """Of a window in which something strikes. ``change_m``: shape (m,)."""
     sets = _grown(pairs, change_m)
+    sets += _blocked(pairs, change_m, max(sets, key=lambda one: one.score))
     best = max(sets, key=lambda one: one.score)
     if not best.causes:
         return nothing(pairs, change_m)
     if best.is_complete:
         rivals = [one for one in sets if one is not best and one.score > best.score - _MARGIN]
-        parts = _parts(pairs, change_m, best, rivals)
+        parts = _parts(pairs, best, rivals)
     else:
         parts = [_check(pairs, [best.causes], best)]
     return Explanation(tuple(parts), weight_without(pairs, best.fit), pairs.weight @ best.fit.residual_m)
@@ -131,11 +132,36 @@ def _best_sets(
             continue
         causes = (*one.causes, cause)
         found = fit(pairs, change_m, causes, one.fit)
-        grown[key] = _Set(causes, found, whole - found.chi2 - float(worth[list(causes)].sum()))
+        grown[key] = _Set(causes, found, whole - found.chi2 - _cost(pairs, causes, worth))
     ordered = sorted(grown.values(), key=lambda one: -one.score)
     for one in ordered[_BEAM:]:
         known[frozenset(one.causes)] = one
     return ordered[:_BEAM]
+
+
+def _cost(pairs: Pairs, causes: tuple[int, ...], worth: Array) -> float:
+    links = sum(cause >= 2 * pairs.anchors for cause in causes)
+    return float(worth[list(causes)].sum()) - _FURTHER_LINK * max(links - 1, 0)
+
+
+def _blocked(pairs: Pairs, change_m: Array, best: _Set) -> list[_Set]:
+    """Of each displaced or delayed anchor, the set in which its late links are blocked instead."""
+    n = pairs.anchors
+    whole = float(change_m @ pairs.weight @ change_m)
+    _, dof = evidence(pairs, pairs.weight, change_m @ pairs.weight)
+    worth = thresholds(dof, _ADDED)
+    found = []
+    for cause in best.causes:
+        if cause >= 2 * n:
+            continue
+        others = tuple(one for one in best.causes if one != cause)
+        residual_m = fit(pairs, change_m, others).residual_m
+        is_late = (pairs.first == cause % n) | (pairs.second == cause % n)
+        is_late &= residual_m > _LATE / np.sqrt(np.diagonal(pairs.weight))
+        causes = (*others, *(link for link in (2 * n + np.flatnonzero(is_late)).tolist() if link not in others))
+        instead = fit(pairs, change_m, causes)
+        found.append(_Set(causes, instead, whole - instead.chi2 - _cost(pairs, causes, worth), is_complete=True))
+    return found
 
 
 def _displaced(pairs: Pairs, one: _Set) -> Pairs:
@@ -149,7 +175,7 @@ def _displaced(pairs: Pairs, one: _Set) -> Pairs:
     return Pairs(position_m, pairs.first, pairs.second, pairs.dimensions, pairs.weight)
 
 
-def _parts(pairs: Pairs, change_m: Array, best: _Set, rivals: list[_Set]) -> list[Part]:
+def _parts(pairs: Pairs, best: _Set, rivals: list[_Set]) -> list[Part]:
     """Each cause of the best set as certain as the rivals leave it."""
     differences = [frozenset(best.causes) ^ frozenset(rival.causes) for rival in rivals]
     uncertain: list[tuple[int, ...]] = []
@@ -159,7 +185,7 @@ def _parts(pairs: Pairs, change_m: Array, best: _Set, rivals: list[_Set]) -> lis
         elsewhere = [one for one in against if len({_anchors(pairs, other) for other in one}) > 1]
         if elsewhere:
             uncertain += [tuple(one) for one in elsewhere]
-        elif not _is_checked(pairs, change_m, best, cause):
+        elif not _is_checked(pairs, best, cause, or_else=bool(against)):
             uncertain.append((cause,))
         else:
             parts.append(_part(pairs, best, number, or_else=bool(against)))
@@ -168,8 +194,8 @@ def _parts(pairs: Pairs, change_m: Array, best: _Set, rivals: list[_Set]) -> lis
     return parts
 
 
-def _is_checked(pairs: Pairs, change_m: Array, best: _Set, cause: int) -> bool:
-    """Whether enough ranges are left over that chance among late links is no explanation."""
+def _is_checked(pairs: Pairs, best: _Set, cause: int, *, or_else: bool) -> bool:
+    """Whether a range is left over that checks a displacement or a delay, and the other ``or_else``."""
     n = pairs.anchors
     if cause >= 2 * n:
         return True
@@ -177,11 +203,7 @@ def _is_checked(pairs: Pairs, change_m: Array, best: _Set, cause: int) -> bool:
     late = [other - 2 * n for other in best.causes if other >= 2 * n]
     ranged = np.flatnonzero((pairs.first == anchor) | (pairs.second == anchor))
     ranged = ranged[~np.isin(ranged, late)]
-    left_over = len(ranged) - (pairs.dimensions if cause < n else 1)
-    if left_over >= _SURE_REDUNDANCY:
-        return True
-    std_m = 1.0 / np.sqrt(np.diagonal(pairs.weight)[ranged])
-    return left_over == 1 and bool((change_m[ranged] < -_SHORTER * std_m).any())
+    return len(ranged) > (pairs.dimensions if cause < n or or_else else 1)
 
 
 def _anchors(pairs: Pairs, cause: int) -> tuple[int, ...]:

@@ -20,6 +20,9 @@ _PRIOR_DIFFERENCES: Final = 4
 _PRIOR_DRIFT_M: Final = 0.03
 """What is expected of a pair's drift, and as how many observed differences that counts."""
 
+_LEAST_LAGS: Final = 6
+"""Known windows over the distance of those compared, at least."""
+
 _NOISE_MEMORY: Final = 2000.0
 """Exchanges after which the estimate of their noise forgets."""
 _NOISE_JUMP: Final = 9.0
@@ -104,13 +107,13 @@ class RangeHistory:
         self._noise_m2[pair] += (variance_m2 - self._noise_m2[pair]) * exchanges / total
         self._noise_exchanges[pair] = min(total, _NOISE_MEMORY)
 
-    def add_window(self, range_m: Array, is_usable: Mask, is_expected: Mask) -> None:
+    def add_window(self, range_m: Array, is_usable: Mask, is_drifting: Mask, is_expected: Mask) -> None:
         """Add the ranges of a window, shape (m,), NaN where there is none.
 
-        ``is_usable``: where nothing has changed, so that the usual range may follow it. ``is_expected``: where a
-        missing range counts for ``presence``.
+        ``is_usable``: where nothing has changed, so that the usual range may follow it. ``is_drifting``: where changes
+        may count as drift. ``is_expected``: where a missing range counts for ``presence``.
         """
-        self._values[:, self._windows % self._settings.drift_windows] = range_m
+        self._values[:, self._windows % self._settings.drift_windows] = np.where(is_drifting, range_m, np.nan)
         self._windows += 1
         is_present = np.isfinite(range_m)
         rows = np.flatnonzero(is_present & is_usable)
@@ -125,8 +128,8 @@ class RangeHistory:
     def drift_m(self) -> Array:
         """Standard deviation of each pair's drift about its usual range, shape (m,).
 
-        From differences of windows half the median's length apart: a step spoils few of them, and drift that is slower
-        than the median is left to the median.
+        From differences of windows up to half the median's length apart: a step spoils few of them, and drift that is
+        slower than the median is left to the median.
         """
         settings = self._settings
         floor_m2 = settings.drift_floor_m**2
@@ -134,7 +137,7 @@ class RangeHistory:
             return np.full(len(self), settings.drift_floor_m)
         length = settings.drift_windows
         known = min(self._windows, length)
-        lag = max(min(settings.usual_windows // 2, known // 2), 1)
+        lag = max(min(settings.usual_windows // 2, known // _LEAST_LAGS), 1)
         newest = np.arange(self._windows - known + lag, self._windows)
         apart = np.abs(self._values[:, newest % length] - self._values[:, (newest - lag) % length])
         count = np.isfinite(apart).sum(axis=1)
@@ -146,13 +149,9 @@ class RangeHistory:
         learned_m2 = (count * scale_m2 + _PRIOR_DIFFERENCES * prior_m2) / (count + _PRIOR_DIFFERENCES)
         return np.asarray(np.sqrt(np.maximum(learned_m2, floor_m2)))
 
-    def restart(self, pairs: Mask, windows: int) -> None:
-        """Make what these pairs had in the last windows their usual range."""
-        length = self._settings.drift_windows
-        recent = np.arange(max(self._windows - min(windows, length), 0), self._windows) % length
-        for pair in np.flatnonzero(pairs & np.isfinite(self._values[:, recent]).any(axis=1)).tolist():
-            now_m = float(np.nanmedian(self._values[pair, recent]))
-            self._used[pair] = max(round(_GIVEN_SHARE * self._settings.usual_windows), 1)
-            self._usual[pair] = np.nan
-            self._usual[pair, : self._used[pair]] = now_m
-            self._usual_m[pair] = self.first_m[pair] = now_m
+    def restart(self, pairs: Mask) -> None:
+        """Forget the usual ranges of these pairs, which are learned from the start."""
+        self._used[pairs] = 0
+        self._usual[pairs] = np.nan
+        self._usual_m[pairs] = self.first_m[pairs] = np.nan
+        self._values[pairs] = np.nan

@@ -27,6 +27,9 @@ _REGULAR: Final = 0.8
 """Share of windows in which a pair must have had ranges for their absence to be a finding."""
 _KNOWN_WINDOWS: Final = 12
 
+_FARTHEST_M: Final = 1e5
+"""Of ranges, delays included."""
+
 _MEDIAN_BLOCKS: Final = 3
 """From so many blocks on their median counts, which short obstacles do not change."""
 _MEDIAN_VARIANCE: Final = math.pi / 2.0
@@ -156,7 +159,8 @@ class AnchorWatch:
         if block.a not in self._number or block.b not in self._number or block.a == block.b:
             self.counters["unknown-anchor"] += 1
             return
-        if not (math.isfinite(block.t_s) and math.isfinite(block.mean_m) and block.exchanges > 0):
+        is_possible = abs(block.mean_m) < _FARTHEST_M and 0.0 <= block.std_m < _FARTHEST_M and block.exchanges > 0
+        if not is_possible or not math.isfinite(block.t_s):
             self.counters["impossible-block"] += 1
             return
         step = math.floor(block.t_s / self._step_s)
@@ -167,7 +171,7 @@ class AnchorWatch:
             self.counters["late-block"] += 1
             return
         row = self._pair_row(min(block.a, block.b), max(block.a, block.b))
-        if block.exchanges > 1 and math.isfinite(block.std_m) and block.std_m > 0.0:
+        if block.exchanges > 1 and block.std_m > 0.0:
             self._history.add_noise(row, block.std_m**2 * block.exchanges, block.exchanges)
         self._pending.setdefault(step, {}).setdefault(row, []).append(block)
         self.advance(block.t_s)
@@ -188,13 +192,13 @@ class AnchorWatch:
             self._open += 1
 
     def accept(self, anchors: Iterable[int] | None = None) -> None:
-        """Make what is now what it should be: for all pairs, or for those of some anchors. Their findings end.
+        """Learn again what is usual: for all pairs, or for those of some anchors. Their findings end.
 
         A site that was surveyed again gets a new watch instead, as positions differ.
         """
         chosen = set(self._ids if anchors is None else anchors)
         rows = np.array([self._ids[a] in chosen or self._ids[b] in chosen for a, b in self._ends()], dtype=np.bool_)
-        self._history.restart(rows, self._settings.of)
+        self._history.restart(rows)
         self._held = [one for one in self._held if not chosen & set(one.finding.anchors)]
         self._windows.clear()
         for row in [row for row in self._blocked if rows[row]]:
@@ -245,14 +249,15 @@ class AnchorWatch:
             self._windows.append(_Window(start_s, tuple(parts)))
             self._update(known, seen, {self._ids[end] for row in known.tolist() for end in self._ends()[row]})
         is_expected = self._note_silence(is_present, start_s)
-        self._history.add_window(range_m, ~is_touched, is_expected)
+        is_displaced = self._touched(one.finding for one in self._held if one.finding.kind != "link")
+        self._history.add_window(range_m, ~is_touched, ~is_displaced, is_expected)
 
     def _ranges(self) -> tuple[Array, Array]:
         """The window's range of each pair, NaN where there is none, and its exchanges as far as they make the noise."""
         range_m, exchanges = np.full(len(self._row), np.nan), np.zeros(len(self._row))
         gathered: dict[int, list[PairBlock]] = {}
-        for step in self._steps:
-            for row, blocks in step.items():
+        for one in self._steps:
+            for row, blocks in one.items():
                 gathered.setdefault(row, []).extend(blocks)
         for row, blocks in gathered.items():
             count = sum(block.exchanges for block in blocks)

@@ -1,0 +1,4 @@
+"""The watch of the anchors, tried: on drawn ranges and through simulated air.
+
+Public: air, drawn.
+"""
