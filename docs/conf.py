@@ -16,7 +16,14 @@ from sphinx.writers.html5 import HTML5Translator
 NAVIGATION = {
     "Start": ["docs/architecture", "docs/glossary", "CHANGELOG", "CONTRIBUTING"],
     "Run a site": [
-        "docs/setup", "docs/sites", "docs/mqtt", "docs/planning", "docs/survey", "docs/calibration", "docs/watch", "docs/recordings",
+        "docs/setup",
+        "docs/sites",
+        "docs/mqtt",
+        "docs/planning",
+        "docs/survey",
+        "docs/calibration",
+        "docs/watch",
+        "docs/recordings",
     ],
     "How it works": ["docs/protocol", "docs/protocol2", "docs/maths", "docs/studies", "docs/speed"],
     "The paper": ["docs/paper", "docs/errata"],

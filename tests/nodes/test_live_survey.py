@@ -4,8 +4,8 @@ What is judged is order and content, not speed: every wait is for something that
 """
 
 import asyncio
+import logging
 import math
-import sys
 
 import msgspec
 import numpy as np
@@ -28,6 +28,8 @@ from skyless.mqtt.messages import (
 )
 from skyless.site.load import load_site
 from skyless.survey.facts import Facts, Gauge
+
+_log = logging.getLogger(__name__)
 
 SITE = 78
 TRUE_M = {1: (0.0, 0.0), 2: (8.0, 0.0), 3: (9.0, 4.0), 4: (7.0, 8.0), 5: (-1.0, 7.0), 6: (-2.0, 3.0)}
@@ -158,7 +160,7 @@ async def run(folder, positions, protocol, facts, judge):
         assert fresh.newest[StatusMessage].online is False
     except BaseException:
         for program in fresh.programs:
-            print(program.arguments, program.said[-20:], file=sys.stderr)
+            _log.warning("%s: %s", program.arguments, program.said[-20:])
         raise
     finally:
         for program in fresh.programs:

@@ -121,9 +121,9 @@ class LiveSurvey:
         """A result by its number, with the ranges that it was made of; None if it is no longer kept."""
         return self._results.get(serial)
 
-    def place(self, site: Site, record: SurveyRecord, now_s: float) -> None:
-        """The site is the surveyed one from now on: ranges begin again, as antenna delays are others."""
-        self.site, self.saved_serial, self.error = site, self.serial, None
+    def place(self, site: Site, record: SurveyRecord, serial: int, now_s: float) -> None:
+        """The site is that of a result from now on: ranges begin again, as antenna delays are others."""
+        self.site, self.saved_serial, self.error = site, serial, None
         if self.facts.sketch_m:
             sketch = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
             self.facts = replace(self.facts, sketch_m=sketch)

@@ -9,7 +9,7 @@ from typing import Final
 from skyless.mqtt.leases import Leases
 from skyless.mqtt.messages import RequestMessage, Stamp, StampsMessage
 
-INTERVAL_S: Final = 0.2
+STAMPS_INTERVAL_S: Final = 0.2
 """Stamps of this time go into one message."""
 
 MOST_PENDING_STAMPS: Final = 4096
@@ -60,7 +60,7 @@ class StampLog:
             self._pending.clear()
             self._missed = 0
             return None
-        if 0.0 <= now_s - self._sent_s < INTERVAL_S:
+        if 0.0 <= now_s - self._sent_s < STAMPS_INTERVAL_S:
             return None
         self._sent_s = now_s
         message = StampsMessage(self._anchor, self._run, unix_s, tuple(self._pending), self._missed)

@@ -41,6 +41,7 @@ from skyless.nodes.radio_monitor import RadioMonitor
 from skyless.nodes.survey_files import FloorImage, Saved, save_survey, saved_without_file
 from skyless.radios.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.site.digest import is_same_but_placed, site_digest
+from skyless.site.load import load_site
 from skyless.site.model import Site
 from skyless.survey.facts import Facts
 from skyless.survey.ranges import PairRanges
@@ -377,13 +378,14 @@ class SurveyNode:
         if file is None:
             saved = saved_without_file(before, survey, ranges, unix_s)
         else:
+            present = load_site(file)
+            if site_digest(present) != site_digest(before) or not is_same_but_placed(before, present):
+                raise SkylessError(f"{file} is not the site that was surveyed: it has been changed meanwhile")
             saved = save_survey(file, survey, ranges, unix_s, self._floor())
-        if not is_same_but_placed(before, saved.site):
-            raise SkylessError(f"{file} is not the site that was surveyed: it has been changed meanwhile")
-        self._place(live, before, saved)
+        self._place(live, before, saved, number)
         return saved
 
-    def _place(self, live: LiveSurvey, before: Site, saved: Saved) -> None:
+    def _place(self, live: LiveSurvey, before: Site, saved: Saved, serial: int) -> None:
         """Publish the new site for the anchors, and survey and watch that from now on."""
         earlier: tuple[str, ...] = ()
         old = self._placement
@@ -394,7 +396,7 @@ class SurveyNode:
             self.link.publish(placement_topic(self._settings.site_id), self._placement, qos=1, retain=True)
         self._running = None  # until the anchors publish it
         self.saved = saved
-        live.place(saved.site, saved.record, time.monotonic())
+        live.place(saved.site, saved.record, serial, time.monotonic())
         written = "".join(f", {path} written" for path in saved.written)
         self._log(f"survey: saved{written}")
 

@@ -1,0 +1,400 @@
+"""The survey program without processes: stamps in, results out, a site file written, the watch begun."""
+
+import asyncio
+import json
+from functools import cache
+from types import SimpleNamespace
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from skyless.air.codec2 import decode_2
+from skyless.anchors.slots import SlotsAnchor
+from skyless.errors import SkylessError
+from skyless.mqtt import topics
+from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.messages import (
+    PlacementMessage,
+    RequestMessage,
+    SiteMessage,
+    StampsMessage,
+    SurveyFactsMessage,
+    SurveyMessage,
+    SurveySaveMessage,
+    WatchMessage,
+)
+from skyless.nodes import survey as survey_module
+from skyless.nodes.live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey, is_record_of
+from skyless.nodes.stamp_log import StampLog
+from skyless.nodes.survey import SurveyNode, SurveySettings
+from skyless.simulation.impairments import DelayError, lab_impairments
+from skyless.simulation.world import World
+from skyless.site.digest import site_digest
+from skyless.site.image import image_size
+from skyless.site.lab import lab_site
+from skyless.site.load import load_site
+from skyless.site.model import FloorPlanSite, ScheduleSite, UnplacedAnchor
+from skyless.survey.facts import Facts, Gauge, Tape
+from skyless.survey.record import read_record, record_path
+from skyless.survey.result import Survey, SurveyedAnchor
+
+POSITIONS_M = {1: (0.0, 0.0), 2: (6.0, 0.0), 3: (6.5, 4.0), 4: (6.0, 8.0), 5: (0.0, 8.0), 6: (-1.0, 3.5)}
+SCHEDULE = ScheduleSite(mode="slots", slot_s=2.5e-3, slots=6)
+SITE = replace(
+    lab_site(),
+    anchors=tuple(
+        replace(one, x_m=POSITIONS_M[one.id][0], y_m=POSITIONS_M[one.id][1], slot=slot)
+        for slot, one in enumerate(lab_site().anchors)
+    ),
+    schedule=SCHEDULE,
+)
+FRESH = replace(SITE, anchors=(), unplaced=tuple(UnplacedAnchor(one.id, one.slot) for one in SITE.anchors))
+TEXT = "\n".join(
+    [
+        'name = "lab"',
+        "id = 1",
+        "[tags]",
+        "height_m = 0.0",
+        "[schedule]",
+        'mode = "slots"',
+        "slot_s = 0.0025",
+        "slots = 6",
+    ]
+    + [line for one in SITE.anchors for line in ("[[anchors]]", f"id = {one.id}", f"slot = {one.slot}")]
+)
+DELAY_TICKS = {anchor: 20 * anchor - 60 for anchor in POSITIONS_M}
+PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
+BEGIN_S = 5000.0
+
+
+class Collecting:
+    """An anchor's machine that keeps the stamps of what it receives, as the anchor's program does."""
+
+    def __init__(self, anchor):
+        self.machine, self.log = SlotsAnchor(FRESH, anchor), StampLog(anchor, "run1")
+        self.id, self.next_transmission_ticks = anchor, self.machine.next_transmission_ticks
+        self.transmission = self.machine.transmission
+        self.log.request(RequestMessage("test", (), 60.0, True), 0.0)
+
+    def hear(self, reception):
+        self.machine.hear(reception)
+        beacon = decode_2(reception.frame)
+        self.log.add(beacon.anchor, beacon.tx_ticks, reception.rx_ticks)
+
+
+@cache
+def messages():
+    """What the anchors publish in 12 s: times since the beginning, and messages."""
+    machines, found = {}, []
+
+    def make(anchor):
+        machines[anchor] = Collecting(anchor)
+        return machines[anchor]
+
+    errors = tuple(DelayError(anchor, float(ticks)) for anchor, ticks in DELAY_TICKS.items())
+    world = World(SITE, make, [], replace(lab_impairments(100.0), delay_errors=errors), 3)
+    for _ in world.run(12.0):
+        for machine in machines.values():
+            message = machine.log.collect(world.now_s, 1e9 + 1000.0 * machine.id + world.now_s)  # hosts' clocks differ
+            if message is not None:
+                found.append((world.now_s, message))
+    return tuple(found)
+
+
+def live_after(seconds, site=FRESH, facts=None, **options):
+    live = LiveSurvey(site, facts or Facts(), **options)
+    for t_s, message in messages():
+        if t_s <= seconds:
+            live.add_stamps(message, BEGIN_S + t_s)
+    return live
+
+
+def true_survey(anchors=tuple(POSITIONS_M)):
+    """What a right survey finds."""
+    found = tuple(
+        SurveyedAnchor(
+            one, True, *POSITIONS_M[one], 0.0, 0.01, delay_m=DELAY_TICKS[one] * 0.00469176 / 2.0, delay_std_m=0.01
+        )
+        if one in anchors
+        else SurveyedAnchor(one, False, reason="too few ranges")
+        for one in POSITIONS_M
+    )
+    return Survey(found, (), 0.03, 3, None, (), (), (), "true", None, ())
+
+
+def test_ranges_come_of_the_stamps_that_anchors_publish():
+    live = live_after(6.0)
+    ranges = live.ranges()
+    assert ranges.anchors == tuple(POSITIONS_M)
+    assert len(ranges.pairs) == 15
+    for pair in ranges.pairs:
+        (xa, ya), (xb, yb) = POSITIONS_M[pair.a], POSITIONS_M[pair.b]
+        expected_m = ((xa - xb) ** 2 + (ya - yb) ** 2) ** 0.5
+        expected_m += (DELAY_TICKS[pair.a] + DELAY_TICKS[pair.b]) * 0.00469176 / 2.0
+        std_m = (pair.std_m**2 + ranges.tx_std_m[pair.a] ** 2 + ranges.tx_std_m[pair.b] ** 2) ** 0.5
+        assert abs(pair.range_m - expected_m) < 5.0 * std_m
+        assert std_m < 0.003  # 3 cm in each of 300 superframes, as docs/survey.md says
+    message = live.message(BEGIN_S + 6.0, 0.0, None)
+    assert (message.anchors, message.missing) == (tuple(POSITIONS_M), ())
+    assert message.state == "collecting"
+
+
+def test_what_does_not_come_any_more_is_visible():
+    live = live_after(3.0)
+    live.add_result(true_survey(), live.ranges())
+    assert live.message(BEGIN_S + 4.0, 0.0, None).state == "surveyed"
+    message = live.message(BEGIN_S + 3.0 + NO_DATA_S + 1.0, 0.0, None)
+    assert message.state == "no data"
+    assert message.error == "no stamps have come from the anchors for 6 s"
+    assert message.survey is not None
+    assert live.message(BEGIN_S + 60.0, 0.0, None).missing == tuple(POSITIONS_M)
+    assert LiveSurvey(FRESH, Facts()).message(0.0, 0.0, None).error == "no stamps have come from the anchors yet"
+
+
+def test_stamps_of_strangers_are_dropped_and_a_restarted_counter_harms_no_range():
+    live = LiveSurvey(FRESH, Facts())
+    stranger = StampsMessage(99, "x", 0.0, ((1, 5, 5),))
+    for t_s, message in messages():
+        shifted = tuple(replace(one, rx_ticks=(one.rx_ticks + 2**38) % 2**40) for one in message.stamps)
+        restarted = message.anchor == 2 and t_s > 3.0
+        live.add_stamps(stranger, BEGIN_S + t_s)
+        if t_s > 6.0:
+            break
+        if not restarted:
+            live.add_stamps(message, BEGIN_S + t_s)
+        elif t_s > 3.5:  # its own stamps are of another counter; the others' of it would be as well: they miss it
+            live.add_stamps(replace(message, run="run2", stamps=shifted), BEGIN_S + t_s)
+    for pair in live.ranges().pairs:
+        (xa, ya), (xb, yb) = POSITIONS_M[pair.a], POSITIONS_M[pair.b]
+        assert abs(pair.range_m - ((xa - xb) ** 2 + (ya - yb) ** 2) ** 0.5) < 0.6
+
+
+def test_facts_of_other_anchors_are_dropped():
+    live = LiveSurvey(FRESH, Facts())
+    facts = Facts(heights_m={1: 2.0, 9: 3.0}, tapes=(Tape(1, 9, 3.0), Tape(1, 2, 6.0)), gauge=Gauge(1, 9))
+    live.set_facts(facts)
+    assert live.facts == replace(facts, heights_m={1: 2.0}, tapes=(Tape(1, 2, 6.0),), gauge=None)
+
+
+class FakeLink:
+    """A link to no broker: the test calls the handlers, and reads what is published."""
+
+    def __init__(self, *_, **__):
+        self.handlers, self.published, self.on_state = {}, [], []
+
+    def subscribe(self, topic, handler, qos=0):
+        self.handlers[topic] = handler
+
+    def publish(self, topic, message, **options):
+        self.published.append((topic, message, options))
+
+    async def run(self):
+        await asyncio.Event().wait()
+
+    def receive(self, topic, message):
+        for name, handler in self.handlers.items():
+            if name == topic or (name.endswith("/stamps") and topic.endswith("/stamps")):
+                handler(topic, msgspec.json.encode(message))
+
+    def newest(self, kind):
+        found = [message for _, message, _ in self.published if isinstance(message, kind)]
+        return found[-1] if found else None
+
+
+class Stage:
+    """The program with a fake link, a clock that the test sets, and a solver that knows the truth."""
+
+    def __init__(self, monkeypatch, **settings):
+        self.now_s, self.said, self.asked = BEGIN_S, [], []
+        monkeypatch.setattr(survey_module, "Link", FakeLink)
+        monkeypatch.setattr(survey_module, "time", SimpleNamespace(monotonic=lambda: self.now_s, time=lambda: 1e9))
+        self.found = true_survey()
+        self.node = SurveyNode(
+            SurveySettings(1, **settings), lambda _: Facts(), self.solve, MqttAddress("127.0.0.1", 1), self.said.append
+        )
+        self.link = self.node.link
+
+    def solve(self, ranges, facts):
+        self.asked.append((ranges, facts))
+        if isinstance(self.found, Exception):
+            raise self.found
+        return self.found
+
+    async def play(self, from_s=0.0, until_s=4.0):
+        """What anchors publish in this time, and the program's work."""
+        next_s = from_s
+        for t_s, message in messages():
+            if from_s < t_s <= until_s:
+                self.now_s = BEGIN_S + t_s
+                self.link.receive(topics.stamps_topic(1, message.anchor), message)
+                if t_s >= next_s + 1.0:
+                    next_s = t_s
+                    await self.step()
+
+    async def step(self):
+        """Twice, so that a result that is begun is published, too."""
+        self.node.update()
+        if self.node._solving is not None:
+            await self.node._solving
+        self.now_s += 0.001
+
+
+def test_results_are_published_and_saved_and_anchors_get_their_placement(monkeypatch, tmp_path):
+    async def main():
+        file = tmp_path / "lab.toml"
+        file.write_text(TEXT, encoding="utf-8")
+        site = load_site(file)
+        stage = Stage(monkeypatch, site=site, file=file)
+        facts = Facts(gauge=Gauge(1, 2, 4))
+        plan = FloorPlanSite("", 12.0, -1.0, -2.0)
+        stage.link.receive(topics.survey_facts_topic(1), SurveyFactsMessage(facts, plan, "page"))
+        stage.link.handlers[topics.floor_plan_topic(1)]("", PNG)
+        await stage.play()
+        message = stage.link.newest(SurveyMessage)
+        assert message.survey == true_survey()
+        assert message.facts == facts
+        assert message.file == str(file)
+        assert stage.link.newest(WatchMessage) is None  # anchors have no positions yet
+        stage.link.receive(topics.site_topic(1), SiteMessage(site, True, 0.0))
+        stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", message.serial))
+        assert stage.link.newest(SurveyMessage).error is None
+        assert stage.link.newest(SurveyMessage).saved_serial == message.serial
+
+        saved, placement = load_site(file), stage.link.newest(PlacementMessage)
+        assert placement.site == saved
+        assert placement.before == site_digest(site)
+        assert [(one.x_m, one.y_m) for one in saved.anchors] == list(POSITIONS_M.values())
+        usual = FRESH.unplaced[0].tx_antenna_delay_ticks
+        assert [one.tx_antenna_delay_ticks - usual for one in saved.anchors] == list(DELAY_TICKS.values())
+        assert (tmp_path / "lab.before-survey-1.toml").read_text(encoding="utf-8") == TEXT
+        assert (tmp_path / saved.floor_plan.image).read_bytes() == PNG
+        assert image_size(PNG) is not None
+        assert (saved.floor_plan.width_m, saved.floor_plan.x_m, saved.floor_plan.y_m) == (12.0, -1.0, -2.0)
+        record = read_record(record_path(file))
+        assert is_record_of(record, saved)
+        assert record.delay_changes_ticks == DELAY_TICKS
+
+        # stamps from while anchors adopt it are not used; then the watch has all pairs
+        count = len(stage.asked)
+        await stage.play(4.0, 4.0 + 0.9 * ADOPTION_S)
+        assert len(stage.asked) == count
+        assert stage.node.live.ranges().pairs == ()
+        await stage.play(6.0, 8.0)
+        assert len(stage.asked) > count
+        assert stage.link.newest(WatchMessage).findings == ()
+
+    asyncio.run(main())
+
+
+def test_a_second_survey_names_the_sites_before_it(monkeypatch):
+    async def main():
+        stage = Stage(monkeypatch, site=SITE)
+        first = replace(SITE, anchors=(replace(SITE.anchors[0], x_m=0.5), *SITE.anchors[1:]))
+        stage.link.receive(topics.placement_topic(1), PlacementMessage(0.0, site_digest(first), SITE, ("ab",)))
+        await stage.play()
+        stage.node.save()
+        placement = stage.link.newest(PlacementMessage)
+        assert placement.before == site_digest(SITE)
+        assert placement.earlier == (site_digest(first), "ab")
+        assert stage.node.saved.written == ()  # there is no file
+
+    asyncio.run(main())
+
+
+def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, tmp_path):
+    async def main():
+        file = tmp_path / "lab.toml"
+        file.write_text(TEXT, encoding="utf-8")
+        stage = Stage(monkeypatch, site=load_site(file), file=file)
+
+        def refused(serial):
+            stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", serial))
+            assert stage.link.newest(PlacementMessage) is None
+            return stage.link.newest(SurveyMessage).error
+
+        assert "result 1 is not there" in refused(1)
+        stage.found = true_survey(())
+        await stage.play(0.0, 3.0)
+        assert "determines no anchor" in refused(stage.node.live.serial)
+        stage.found = true_survey()
+        await stage.play(3.0, 6.0)
+        stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
+        assert "another site" in refused(stage.node.live.serial)
+        stage.link.receive(topics.site_topic(1), SiteMessage(load_site(file), True, 0.0))
+        file.write_text(TEXT.replace("slot_s = 0.0025", "slot_s = 0.003"), encoding="utf-8")
+        changed = file.read_text(encoding="utf-8")
+        assert "has been changed" in refused(stage.node.live.serial)
+        assert file.read_text(encoding="utf-8") == changed
+        file.write_text("nonsense", encoding="utf-8")
+        assert str(file) in refused(stage.node.live.serial)
+
+    asyncio.run(main())
+
+
+def test_a_solver_that_fails_is_reported_and_asked_again(monkeypatch):
+    async def main():
+        stage = Stage(monkeypatch, site=SITE)
+        for until_s, error in ((3.0, SkylessError("too few ranges")), (6.0, ZeroDivisionError("no"))):
+            stage.found = error
+            await stage.play(until_s - 3.0, until_s)
+            stage.now_s += 1.0
+            await stage.step()
+            assert str(error.args[0]) in stage.link.newest(SurveyMessage).error
+            assert stage.node.live.serial == 0
+        stage.found = true_survey()
+        await stage.play(7.0, 10.0)
+        assert stage.link.newest(SurveyMessage).error is None
+
+    asyncio.run(main())
+
+
+def test_the_site_on_mqtt_does_where_there_is_no_file_and_bad_messages_are_counted(monkeypatch):
+    async def main():
+        stage = Stage(monkeypatch)
+        await stage.step()
+        assert stage.node.live is None
+        with pytest.raises(SkylessError, match="not known"):
+            stage.node.save()
+        stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
+        await stage.play(0.0, 2.0)
+        assert stage.node.live.serial > 0
+        other = replace(SITE, anchors=(replace(SITE.anchors[0], x_m=0.5), *SITE.anchors[1:]))
+        stage.link.receive(topics.site_topic(1), SiteMessage(other, True, 0.0))
+        assert stage.node.live.site == other
+        assert stage.node.live.serial == 0
+        for topic in (topics.survey_facts_topic(1), topics.survey_save_topic(1), topics.site_topic(1)):
+            stage.link.handlers[topic](topic, json.dumps({"x": 1}).encode())
+        assert stage.node.problems == 3
+
+    asyncio.run(main())
+
+
+def test_what_is_retained_and_the_lease_end_with_the_program(monkeypatch):
+    async def main():
+        stage = Stage(monkeypatch, site=SITE)
+        task = asyncio.ensure_future(stage.node.run())
+        await asyncio.sleep(0)
+        for callback in stage.link.on_state:
+            callback(True)
+        request = stage.link.newest(RequestMessage)
+        assert request.stamps
+        await asyncio.sleep(0.01)
+        task.cancel()
+        await asyncio.wait([task])
+        cleared = {topic for topic, message, options in stage.link.published if message == b"" and options["retain"]}
+        assert cleared == {topics.survey_topic(1), topics.watch_topic(1)}
+        assert not stage.link.newest(RequestMessage).stamps
+
+    asyncio.run(main())
+
+
+def test_one_that_gathers_computes_and_publishes_nothing_but_its_request(monkeypatch):
+    async def main():
+        stage = Stage(monkeypatch, site=SITE, serves=False)
+        await stage.play(0.0, 3.0)
+        assert not stage.asked
+        assert len(stage.node.live.ranges().pairs) == 15
+        assert {type(message) for _, message, _ in stage.link.published} <= {RequestMessage}
+
+    asyncio.run(main())
