@@ -2,7 +2,7 @@
 
 from skyless.mqtt.leases import MAX_LEASE_S, MOST_LEASES, Leases
 from skyless.mqtt.messages import RequestMessage, Stamp
-from skyless.nodes.stamp_log import STAMPS_INTERVAL_S, MOST_PENDING_STAMPS, StampLog
+from skyless.nodes.stamp_log import MOST_PENDING_STAMPS, STAMPS_INTERVAL_S, StampLog
 
 
 def request(by, lease_s=10.0, stamps=True):
