@@ -1,5 +1,6 @@
 """What a survey does not determine, why, and which tapes would mend it: sentences."""
 
+import math
 import re
 from typing import Final
 
@@ -9,7 +10,7 @@ from skyless.kernels.arrays import Array, Mask
 from skyless.survey.build import Measured, levels, with_free_delays
 from skyless.survey.fit import determined as determination
 from skyless.survey.fit.links import Links
-from skyless.survey.fit.problem import Problem
+from skyless.survey.fit.problem import Problem, delay_weights
 from skyless.survey.fit.tapes import TapeChoice, best_tapes, mending_tapes
 from skyless.survey.frame import Framed
 from skyless.survey.result import TapeAdvice
@@ -162,13 +163,21 @@ def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
     chosen = _touched(np.asarray(delays), unknown & fitted.core)
     anchors = [anchor for anchor, is_one in zip(fitted.anchors, chosen, strict=True) if is_one]
     against = _axis(fitted, framed, directions)
-    expected = float(np.sqrt(np.median(surveyed_problem(fitted).delay_variance_m2[unknown])))
+    expected = max(_expected_m(fitted.problem, direction.delay_m) for direction in directions)
     mending = mending_tapes(surveyed, position, covariance, fitted.core)
     pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in mending]
     return (
         f"delays of {anchors_named(anchors)} against {against} are not determined by the ranges: only the expected "
         f"delays (±{expected:.2f} m) hold them" + (f"; {_would(pairs)}" if pairs else ""),
     )
+
+
+def _expected_m(problem: Problem, delay_m: Array) -> float:
+    """How much one delay is expected to be off in such a change of delays."""
+    along = float(np.sum((delay_weights(problem) @ delay_m) ** 2))
+    common = 0.0 if problem.common_delay_m is None else float(np.median(problem.common_delay_m))
+    one = math.sqrt(float(np.median(problem.delay_variance_m2)) + common**2)
+    return min(one, math.sqrt(float(np.sum(delay_m**2)) / max(along, 1e-12)))
 
 
 def _least_held(fitted: Fitted, surveyed: Problem) -> tuple[Array, Array]:

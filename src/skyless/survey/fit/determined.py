@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct, structs
 
 from skyless.kernels.arrays import Array, Integers, Mask
-from skyless.survey.fit.problem import Problem, residuals_m, solve_least_squares
+from skyless.survey.fit.problem import Problem, delay_weights, residuals_m, solve_least_squares
 
 MOST_STD_M: Final = 0.25
 """Standard deviation per axis above which an anchor is not determined."""
@@ -65,7 +65,6 @@ def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -
     n, m, t = len(position_m), len(problem.range_m), len(problem.tape_m)
     of_range = np.sqrt((1.0 if weight is None else weight) / problem.variance_m2)
     of_tape = 1.0 / np.sqrt(np.maximum(problem.tape_variance_m2, _LEAST_STD_M**2))
-    of_delay = 1.0 / np.sqrt(np.maximum(problem.delay_variance_m2, _LEAST_STD_M**2))
     of_coordinate = 1.0 / np.sqrt(np.maximum(problem.coordinate_variance_m2, _LEAST_STD_M**2)).ravel()
     known = np.flatnonzero((of_coordinate > 0.0) & problem.is_free.ravel())
     rows = np.zeros((m + t + n + len(known), 4 * n))
@@ -80,7 +79,7 @@ def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -
         rows[number, 3 * second + axis] = -factor * unit[:, axis]
     rows[number[:m], 3 * n + problem.first] = of_range
     rows[number[:m], 3 * n + problem.second] = of_range
-    rows[m + t + np.arange(n), 3 * n + np.arange(n)] = of_delay
+    rows[m + t : m + t + n, 3 * n :] = delay_weights(problem)
     rows[m + t + n + np.arange(len(known)), known] = of_coordinate[known]
     rows = np.vstack([rows, *(more.rows(position_m, problem.delay_m)[0] for more in problem.more)])
     rows[:, : 3 * n] *= problem.is_free.ravel()
@@ -220,7 +219,7 @@ def cost(problem: Problem, position_m: Array, delay_m: Array, weight: Array) -> 
     ranges = residuals_m(problem, position_m, delay_m) ** 2 * weight / problem.variance_m2
     apart = np.linalg.norm(position_m[problem.tape_first] - position_m[problem.tape_second], axis=1)
     tapes = (problem.tape_m - apart) ** 2 / np.maximum(problem.tape_variance_m2, _LEAST_STD_M**2)
-    delays = (problem.delay_m - delay_m) ** 2 / np.maximum(problem.delay_variance_m2, _LEAST_STD_M**2)
+    delays = (delay_weights(problem) @ (problem.delay_m - delay_m)) ** 2
     known = np.isfinite(problem.coordinate_variance_m2) & problem.is_free
     coordinates = (problem.coordinate_m - position_m)[known] ** 2
     coordinates = coordinates / np.maximum(problem.coordinate_variance_m2[known], _LEAST_STD_M**2)
