@@ -15,6 +15,10 @@ LEAST_RANGE_STD_M: Final = 1e-5
 _NO_STD_M: Final = 1e3
 """As good as unknown."""
 
+_OFTEN_LATE_STD_M: Final = 0.15
+"""Times the share of a pair's ranges that came late: something stands near its path, and the earliest ones have passed
+by it, too."""
+
 
 class Measured(Struct, frozen=True, eq=False):
     """Ranges and facts that can be used, with sentences about those that cannot."""
@@ -34,7 +38,8 @@ def usable(ranges: PairRanges, facts: Facts) -> Measured:
     best: dict[tuple[int, int], PairRange] = {}
     for pair in ranges.pairs:
         ends = (min(pair.a, pair.b), max(pair.a, pair.b))
-        if not (math.isfinite(pair.range_m) and math.isfinite(pair.std_m) and pair.std_m >= 0.0):
+        figures = (pair.range_m, pair.std_m, pair.late_share)
+        if not (all(math.isfinite(figure) for figure in figures) and pair.std_m >= 0.0):
             notes.append(f"the range of anchors {ends[0]} and {ends[1]} is no finite number: not used")
         elif pair.a == pair.b or not known.issuperset(ends) or ends in best:
             notes.append(f"the range of anchors {pair.a} and {pair.b} is of no pair of this site: not used")
@@ -129,7 +134,7 @@ def build_problem(
         first=np.array([index[pair.a] for pair in pairs], np.int64),
         second=np.array([index[pair.b] for pair in pairs], np.int64),
         range_m=np.array([pair.range_m for pair in pairs], np.float64),
-        variance_m2=np.array([pair.std_m**2 + pair_std_m**2 + LEAST_RANGE_STD_M**2 for pair in pairs], np.float64),
+        variance_m2=np.array([own_variance_m2(pair) + pair_std_m**2 for pair in pairs], np.float64),
         delay_m=delay,
         delay_variance_m2=delay_variance,
         common_delay_m=common if common.any() else None,
@@ -141,6 +146,11 @@ def build_problem(
         tape_variance_m2=np.array([tape.std_m**2 for tape in tapes], np.float64),
     )
     return problem, pairs
+
+
+def own_variance_m2(pair: PairRange) -> float:
+    """Of a range, but for the constant error that any pair has."""
+    return pair.std_m**2 + (_OFTEN_LATE_STD_M * pair.late_share) ** 2 + LEAST_RANGE_STD_M**2
 
 
 def with_free_delays(problem: Problem) -> tuple[Problem, Mask]:

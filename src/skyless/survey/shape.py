@@ -8,7 +8,7 @@ from msgspec import Struct, structs
 from scipy.special import chdtri
 
 from skyless.kernels.arrays import Array, Integers, Mask
-from skyless.survey.build import Measured, as_array, build_problem, levels, with_free_delays
+from skyless.survey.build import Measured, as_array, build_problem, levels, own_variance_m2, with_free_delays
 from skyless.survey.fit import determined as determination
 from skyless.survey.fit.gauge import Motion, align, fitting_points
 from skyless.survey.fit.problem import MoreRows, Problem, Solution, solve_least_squares
@@ -203,7 +203,7 @@ def _shown_std_m(fitted: Fitted) -> float:
     rows = full[: len(used)]
     freedom = float(used.sum()) - float(np.einsum("ij,jk,ik->", rows, covariance, rows, optimize=True))
     squares = fitted.solution.residual_m[used] ** 2
-    noise = np.array([pair.std_m for pair in fitted.pairs])[used] ** 2 + 1e-10
+    noise = np.array([own_variance_m2(pair) for pair in fitted.pairs])[used]
     if redundancy(fitted) < _LEAST_REDUNDANCY or freedom < 1.0:
         return 0.0
     if float(np.sum(squares / problem.variance_m2[used])) <= chdtri(freedom, _FALSE_ALARM):

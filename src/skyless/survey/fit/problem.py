@@ -199,7 +199,8 @@ class _Equations:
         weights = self._weights(weight)
         unit = (apart / np.maximum(distance, 1e-9)[:, :, None])[:, :, self._axes]
         delays = np.broadcast_to(self._has_delay[None, :, None], (*distance.shape, 1))
-        derivative = np.concatenate([unit, delays, -unit, delays], axis=2)
+        # In this order in memory: products of another one would have to be copied.
+        derivative = np.ascontiguousarray(np.concatenate([unit, delays, -unit, delays], axis=2))
         weighted = weights[:, :, None] * derivative
         item = np.arange(b)[:, None]
         cells = (item * size**2 + self._cells).ravel()
