@@ -74,13 +74,14 @@ def _loose(fitted: Fitted) -> dict[int, str]:
     position = fitted.solution.position_m - fitted.solution.position_m.mean(axis=0)
     axes = 2 if levels(fitted.measured) else 3
     extent = np.linalg.svd(position[:, :axes], compute_uv=False)
+    play = f"its ranges leave more than {determination.most_std_m(fitted.problem):.2f} m of play"
     if (not fitted.core.any() and len(extent) and extent[-1] < _FLAT * extent[0]) or len(extent) < axes:
         shape = "on one line" if axes == 2 or extent[1] < _FLAT * extent[0] else "nearly in one plane"
         why = f"all anchors are {shape}, and nothing holds them across it"
     elif levels(fitted.measured) and fitted.measured.facts.dimensions == 2:
-        why = f"its ranges leave more than {determination.MOST_STD_M} m of play"
+        why = play
     else:
-        why = f"its ranges leave more than {determination.MOST_STD_M} m of play; heights may be what is missing"
+        why = f"{play}; heights may be what is missing"
     return dict.fromkeys(anchors, why)
 
 
@@ -153,10 +154,11 @@ def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
         return ()
     position, covariance = _least_held(fitted, surveyed)
     stds = determination.position_stds_m(surveyed, covariance)
-    if not np.any(fitted.core & (stds > determination.MOST_STD_M)):
+    least_m = determination.most_std_m(surveyed)
+    if not np.any(fitted.core & (stds > least_m)):
         return ()
     most = 3 * len(position)
-    directions = determination.weak_directions(surveyed, covariance, fitted.core, determination.MOST_STD_M, most)
+    directions = determination.weak_directions(surveyed, covariance, fitted.core, least_m, most)
     if not directions:
         return ()
     delays = np.sqrt(sum((direction.delay_m * direction.std_m) ** 2 for direction in directions))

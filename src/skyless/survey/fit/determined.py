@@ -1,7 +1,7 @@
 """What the measurements determine: information, covariance after the best rigid alignment, and what has none.
 
 A survey knows positions up to a rigid motion, so a covariance needs a set of anchors, the core, over which results are
-aligned. An anchor whose standard deviation remains above ``MOST_STD_M`` leaves the core; it is not determined.
+aligned. An anchor whose standard deviation remains above ``most_std_m`` leaves the core; it is not determined.
 """
 
 from typing import Final
@@ -12,8 +12,9 @@ from msgspec import Struct, structs
 from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.survey.fit.problem import Problem, delay_weights, residuals_m, solve_least_squares
 
-MOST_STD_M: Final = 0.25
-"""Standard deviation per axis above which an anchor is not determined."""
+_MOST_STD_M: Final = 0.25
+_MOST_RANGE_STDS: Final = 4.0
+"""Standard deviation per axis above which an anchor is not determined, in metres and in those of a range."""
 
 TOUCHED: Final = 0.3
 """Part of a direction's largest component from which on it touches an anchor."""
@@ -31,6 +32,17 @@ _NEARLY_FLAT: Final = 0.3
 
 _FLAT_BARRIER: Final = 11.0
 """Increase of the cost (3.3 σ) by which a flat shape must fit worse for the extent across to be real."""
+
+
+def most_std_m(problem: Problem) -> float:
+    """Standard deviation per axis above which an anchor is not determined.
+
+    Where ranges are poor, so are positions, and poor ones with an honest error are of use: what counts there is that
+    the ranges hold an anchor from all sides, and that not a few ranges' errors add up along one direction.
+    """
+    if not len(problem.variance_m2):
+        return _MOST_STD_M
+    return max(_MOST_STD_M, _MOST_RANGE_STDS * float(np.sqrt(np.median(problem.variance_m2))))
 
 
 class Direction(Struct, frozen=True, eq=False):
@@ -135,20 +147,20 @@ def position_stds_m(problem: Problem, covariance_m2: Array) -> Array:
 
 
 def determined_core(problem: Problem, rows: Array, position_m: Array, least: int) -> Mask:
-    """Anchors that have a standard deviation of at most ``MOST_STD_M`` when aligned over themselves, shape (n,).
+    """Anchors that have a standard deviation of at most ``most_std_m`` when aligned over themselves, shape (n,).
 
     None, where fewer than ``least`` remain.
     """
-    core = np.ones(len(position_m), bool)
+    core, most_m = np.ones(len(position_m), bool), most_std_m(problem)
     while core.sum() >= least:
         std = position_stds_m(problem, aligned_covariance(problem, rows, position_m, core))
         worst = float(std[core].max())
-        if worst <= MOST_STD_M:
-            joins = ~core & (std <= MOST_STD_M)
+        if worst <= most_m:
+            joins = ~core & (std <= most_m)
             if joins.any():
                 core = core | joins
                 std = position_stds_m(problem, aligned_covariance(problem, rows, position_m, core))
-                core = core & (std <= MOST_STD_M)
+                core = core & (std <= most_m)
             return core
         # All that are equally uncertain leave at once, so that no order of anchors decides.
         core &= std < worst * (1.0 - 1e-6)
@@ -178,10 +190,10 @@ def weak_directions(
 
 
 def folds(problem: Problem, position_m: Array, delay_m: Array, weight: Array, direction: Direction) -> bool:
-    """Whether the shape can be moved by 2 × ``MOST_STD_M`` along a direction without ranges that contradict."""
+    """Whether the shape can be moved by twice ``most_std_m`` along a direction without ranges that contradict."""
     start = cost(problem, position_m, delay_m, weight)
     for sign in (1.0, -1.0):
-        for step in np.arange(0.05, 2.0 * MOST_STD_M + 0.01, 0.05):
+        for step in np.arange(0.05, 2.0 * most_std_m(problem) + 0.01, 0.05):
             moved = position_m + sign * step * direction.shift_m
             if cost(problem, moved, delay_m + sign * step * direction.delay_m, weight) > start + _BARRIER:
                 break
