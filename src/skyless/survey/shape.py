@@ -25,6 +25,10 @@ _FALSE_ALARM: Final = 0.01
 
 _MOST_ROUNDS: Final = 4
 
+_BENDS_M: Final = 0.03
+_BENT_SIGMAS: Final = (-1.0, -0.5, 0.5, 1.0)
+"""Least standard deviation of a shape that is looked at when bent, and how far it is bent."""
+
 
 class Fitted(Struct, frozen=True, eq=False):
     """The fit of the anchors that have enough ranges, and what it is worth. ``k`` anchors."""
@@ -119,9 +123,26 @@ def _worth(
     if core.sum() < least or flat:
         core = np.zeros(len(kept), bool)
     if core.any():
-        full = determination.jacobian(problem, solution.position_m, weight)
-        covariance = determination.aligned_covariance(problem, full, solution.position_m, core)
+        covariance = _largest_nearby(problem, solution.position_m, weight, core)
     return core, covariance
+
+
+def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Mask) -> Array:
+    """The covariance, aligned over the core, of the shape or of one within 1 σ along its least certain direction.
+
+    Errors bend a shape that only expected delays hold, and a bent one seems to be held by its ranges.
+    """
+
+    def covariance_at(at_m: Array) -> Array:
+        rows = determination.jacobian(problem, at_m, weight)
+        return determination.aligned_covariance(problem, rows, at_m, core)
+
+    covariance = covariance_at(position_m)
+    found = [covariance]
+    for direction in determination.weak_directions(problem, covariance, core, _BENDS_M, 1):
+        steps = (sigma * direction.std_m * direction.shift_m for sigma in _BENT_SIGMAS)
+        found += [covariance_at(position_m + step) for step in steps]
+    return max(found, key=lambda one: float(np.trace(one[: 3 * len(core), : 3 * len(core)])))
 
 
 def with_tag(fitted: Fitted, rows: MoreRows, solution: Solution, used: Mask) -> Fitted:

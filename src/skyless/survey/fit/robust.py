@@ -52,8 +52,8 @@ _WIDEST: Final = 2.0
 """Weighted squares of one range too many in 99 % of sites, and the part by which standard deviations may be too small
 before a range must be late even so."""
 
-_EXCESS_WEIGHT: Final = 10.0
-_LEAST_EVIDENCE: Final = 25.0
+_EXCESS_WEIGHT: Final = 15.0
+_LEAST_EVIDENCE: Final = 20.0
 """For a larger error: twice the logarithm of likelihoods, and these standard deviations times a weight. Late ranges
 that were left out say nothing of the error of the others; so likelihoods alone mistake many late ranges for it."""
 
