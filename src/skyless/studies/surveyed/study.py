@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from msgspec import Struct
-from msgspec.structs import replace
 
 from skyless.evaluation.scenarios import wanderers
 from skyless.evaluation.surveys.layouts import survey_layouts
@@ -181,5 +180,5 @@ def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
             limits = () if plan.quick else limits_of(group, file)
             case = Case(f"{group.name}, {file}", group.name, None, (), of=None if file == TRUTH else TRUTH)
             row = case_row("survey-room", plan, case, own, None if file == TRUTH else truth)
-            found.append(with_limits(replace(with_levels(row, own), passed=None), limits))
+            found.append(with_limits(with_levels(row, own), limits))
     return found
