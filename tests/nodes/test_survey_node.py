@@ -22,6 +22,7 @@ from skyless.mqtt.messages import (
     SurveyFactsMessage,
     SurveyMessage,
     SurveySaveMessage,
+    WatchFinding,
     WatchMessage,
 )
 from skyless.nodes import survey as survey_module
@@ -398,3 +399,25 @@ def test_one_that_gathers_computes_and_publishes_nothing_but_its_request(monkeyp
         assert {type(message) for _, message, _ in stage.link.published} <= {RequestMessage}
 
     asyncio.run(main())
+
+
+def test_a_finding_is_logged_once_although_its_size_wavers():
+    said, again = [], []
+    node = SurveyNode(SurveySettings(1), lambda _: Facts(), None, None, said.append)
+    found = []
+    node.live = SimpleNamespace(
+        state=lambda _: "no data",
+        watch_message=lambda *_: WatchMessage(0.0, "watching", tuple(found), 15),
+        restart_ranges=lambda: again.append(None),
+    )
+    for size_m in (0.31, 0.32, 0.31, 0.32, 0.9):
+        found[:] = [WatchFinding("moved", (4,), size_m, 0.01, 0.0, f"anchor 4 has moved by about {size_m:g} m")]
+        node.update()
+    found.clear()
+    node.update()
+    assert said == [
+        "watch: anchor 4 has moved by about 0.31 m",
+        "watch: anchor 4 has moved by about 0.9 m",
+        "watch: over: anchor 4 has moved by about 0.9 m",
+    ]
+    assert len(again) == 1

@@ -21,6 +21,7 @@ from skyless.mqtt.messages import (
     StampsMessage,
     SurveyFactsMessage,
     SurveySaveMessage,
+    WatchFinding,
     WatchMessage,
 )
 from skyless.mqtt.topics import (
@@ -69,6 +70,9 @@ _COST: Final = 5.0
 _SETTLED_S: Final = 60.0
 _SETTLED_UPDATE_S: Final = 5.0
 """After a minute of data results change little, and are made less often."""
+
+_SAME_SIZE: Final = 0.25
+"""A finding is logged again when its size has changed by more than this share."""
 
 _EARLIER_KEPT: Final = 32
 """Sites before the present one that a placement names."""
@@ -123,8 +127,8 @@ class SurveyNode:
         self._next_solve_s = 0.0
         self._next_publish_s = 0.0
         self._watch_published: tuple[WatchMessage, float] | None = None
-        self._findings: frozenset[str] = frozenset()
-        self._moved: frozenset[str] = frozenset()
+        self._findings: dict[tuple[object, tuple[int, ...]], WatchFinding] = {}
+        """Those that are logged."""
         self._said_state = ""
         self._name = NAME if settings.serves else f"{NAME}-{secrets.token_hex(4)}"
         self.link = None if address is None else Link(address, self._name, site=settings.site_id, kind=NAME)
@@ -328,18 +332,25 @@ class SurveyNode:
             self._said_state = state
 
     def _log_findings(self, live: LiveSurvey, watch: WatchMessage) -> None:
-        """Log what is new; an anchor that has moved makes the ranges of before useless for another survey."""
-        present = frozenset(one.sentence for one in watch.findings)
-        kinds = {(one.kind, one.anchors) for one in watch.findings}
-        for one in watch.findings:
-            if one.sentence not in self._findings:
+        """Log what is new; an anchor that has moved makes the ranges of before useless for another survey.
+
+        A finding whose size changes a little is the same one.
+        """
+        present: dict[tuple[object, tuple[int, ...]], WatchFinding] = {
+            (one.kind, one.anchors): one for one in watch.findings
+        }
+        for key, one in present.items():
+            logged = self._findings.get(key)
+            if logged is not None and abs(one.size_m - logged.size_m) < _SAME_SIZE * abs(logged.size_m):
+                present[key] = logged
+            elif logged is None or one.sentence != logged.sentence:
                 self._log(f"watch: {one.sentence}")
-        for sentence in sorted(self._findings - present):
-            self._log(f"watch: over: {sentence}")
-        moved = frozenset(f"{kind} {anchors}" for kind, anchors in kinds if kind in ("moved", "delay"))
-        if moved - self._moved:
+        for key, one in self._findings.items():
+            if key not in present:
+                self._log(f"watch: over: {one.sentence}")
+        if any(kind in ("moved", "delay") for kind, _ in present.keys() - self._findings.keys()):
             live.restart_ranges()
-        self._findings, self._moved = present, moved
+        self._findings = present
 
     # Saving
 
