@@ -421,3 +421,13 @@ def test_a_finding_is_logged_once_although_its_size_wavers():
         "watch: over: anchor 4 has moved by about 0.9 m",
     ]
     assert len(again) == 1
+
+
+def test_ranges_count_from_the_delays_of_the_file_although_the_anchors_run_with_others():
+    node = SurveyNode(SurveySettings(1, FRESH), lambda _: Facts(), None, None, lambda _: None)
+    node.live = live_after(3.0)
+    before = {(pair.a, pair.b): pair.range_m for pair in node.final_ranges().pairs}
+    more = replace(FRESH, unplaced=tuple(replace(one, tx_antenna_delay_ticks=16536) for one in FRESH.unplaced))
+    node._on_site(SiteMessage(more, simulated=True, unix_s=0.0))
+    for pair in node.final_ranges().pairs:  # with smaller delays they are longer, by 50 ticks of each anchor
+        assert pair.range_m - before[pair.a, pair.b] == pytest.approx(100 * 0.00469176, abs=1e-5)

@@ -49,6 +49,7 @@ from skyless.survey.ranges import PairRanges
 from skyless.survey.record import SurveyRecord, read_record, record_path
 from skyless.survey.result import Survey
 from skyless.survey.stamps.legs import LegCollector
+from skyless.survey.surveyed_site import with_delays_of
 
 NAME: Final = "survey"
 """On MQTT: one site has one survey program."""
@@ -263,6 +264,16 @@ class SurveyNode:
         self._next_solve_s = 0.0
 
     # Results
+
+    def final_ranges(self) -> PairRanges:
+        """All ranges when nothing more comes, as the antenna delays of the site to be surveyed would give them.
+
+        The anchors may run with others. Only once the site is known.
+        """
+        assert self.live is not None
+        self.live.finish()
+        ranges = self.live.ranges()
+        return ranges if self._running is None else with_delays_of(ranges, self._running, self.live.site)
 
     def update(self) -> None:
         """Begin another result if it is time, and publish what is due."""
