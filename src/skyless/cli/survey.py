@@ -76,7 +76,7 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
         return 0
     given = _inputs(recording, asked)
     site, ranges = given.site, _with_all_anchors(given.ranges, given.site)
-    facts, warnings = facts_of(asked.known, ranges.anchors, site)
+    facts, warnings = facts_of(asked.known, ranges.anchors, site, is_foreign=given.is_foreign)
     facts = replace(facts, tags=_walks(recording, asked, site))
     from skyless.survey.count import count
 
@@ -140,6 +140,8 @@ class _Inputs(Struct, frozen=True):
     ranges: "PairRanges"
     drops: tuple[str, ...] = ()
     """What of a recording could not be used."""
+    is_foreign: bool = False
+    """Whether it is a recording of another system."""
 
 
 def _inputs(recording: Path | None, asked: SurveyOptions) -> _Inputs:
@@ -162,7 +164,7 @@ def _inputs(recording: Path | None, asked: SurveyOptions) -> _Inputs:
         found = ranges_of(recording, asked.format, identifier=None if site is None else site.id)
     warnings = tuple(f"left out: {number} × {reason}" for reason, number in found.drops.items())
     if site is None or found.site is None:
-        return _Inputs(site or found.site, found.ranges, warnings)
+        return _Inputs(site or found.site, found.ranges, warnings, found.site is None)
     return _Inputs(site, with_delays_of(found.ranges, found.site, site), warnings)
 
 

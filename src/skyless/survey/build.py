@@ -12,6 +12,12 @@ from skyless.survey.fit.problem import Problem
 from skyless.survey.ranges import PairRange, PairRanges
 
 LEAST_RANGE_STD_M: Final = 1e-5
+_NO_STD_M: Final = 1e3
+"""As good as unknown."""
+
+_OFTEN_LATE_STD_M: Final = 0.15
+"""Times the share of a pair's ranges that came late: something stands near its path, and the earliest ones have passed
+by it, too."""
 
 
 class Measured(Struct, frozen=True, eq=False):
@@ -32,7 +38,8 @@ def usable(ranges: PairRanges, facts: Facts) -> Measured:
     best: dict[tuple[int, int], PairRange] = {}
     for pair in ranges.pairs:
         ends = (min(pair.a, pair.b), max(pair.a, pair.b))
-        if not (math.isfinite(pair.range_m) and math.isfinite(pair.std_m) and pair.std_m >= 0.0):
+        figures = (pair.range_m, pair.std_m, pair.late_share)
+        if not (all(math.isfinite(figure) for figure in figures) and pair.std_m >= 0.0):
             notes.append(f"the range of anchors {ends[0]} and {ends[1]} is no finite number: not used")
         elif pair.a == pair.b or not known.issuperset(ends) or ends in best:
             notes.append(f"the range of anchors {pair.a} and {pair.b} is of no pair of this site: not used")
@@ -116,18 +123,21 @@ def build_problem(
         coordinate[:, 2], variance[:, 2] = fixed_heights_m(measured)[kept], np.inf
     delay = np.zeros(n)
     delay_variance = np.full(n, facts.delay_std_m**2, np.float64)
+    common = np.full(n, facts.common_delay_std_m if facts.delay_std_m > 0.0 else 0.0, np.float64)
     for item in facts.delays:
         if item.anchor in index:
             delay[index[item.anchor]], delay_variance[index[item.anchor]] = item.delay_m, item.std_m**2
+            common[index[item.anchor]] = 0.0
     delay_variance += np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in index]).reshape(n)
     problem = Problem(
         is_free=is_free,
         first=np.array([index[pair.a] for pair in pairs], np.int64),
         second=np.array([index[pair.b] for pair in pairs], np.int64),
         range_m=np.array([pair.range_m for pair in pairs], np.float64),
-        variance_m2=np.array([pair.std_m**2 + pair_std_m**2 + LEAST_RANGE_STD_M**2 for pair in pairs], np.float64),
+        variance_m2=np.array([own_variance_m2(pair) + pair_std_m**2 for pair in pairs], np.float64),
         delay_m=delay,
         delay_variance_m2=delay_variance,
+        common_delay_m=common if common.any() else None,
         coordinate_m=coordinate,
         coordinate_variance_m2=variance,
         tape_first=np.array([index[tape.a] for tape in tapes], np.int64),
@@ -138,28 +148,41 @@ def build_problem(
     return problem, pairs
 
 
+def own_variance_m2(pair: PairRange) -> float:
+    """Of a range, but for the constant error that any pair has."""
+    return pair.std_m**2 + (_OFTEN_LATE_STD_M * pair.late_share) ** 2 + LEAST_RANGE_STD_M**2
+
+
 def with_free_delays(problem: Problem) -> tuple[Problem, Mask]:
     """Without the expected delays that are coarser than a range: what the measurements alone determine.
 
     Also which delays, shape (n,), are unknown in this sense.
     """
     typical = float(np.median(problem.variance_m2)) if len(problem.variance_m2) else 0.0
-    unknown = problem.delay_variance_m2 > typical
-    return structs.replace(problem, delay_variance_m2=np.where(unknown, np.inf, problem.delay_variance_m2)), unknown
+    own, common = problem.delay_variance_m2, problem.common_delay_m
+    free = structs.replace(problem, delay_variance_m2=np.where(own > typical, np.inf, own))
+    if common is None:
+        return free, np.asarray(own > typical)
+    shared = common**2 > typical
+    free = structs.replace(free, common_delay_m=np.where(shared, _NO_STD_M, common))
+    return free, np.asarray((own > typical) | shared)
 
 
 def own_delays(
-    measured: Measured, anchors: tuple[int, ...], problem: Problem, delay_m: Array, variance_m2: Array
+    measured: Measured, anchors: tuple[int, ...], problem: Problem, delay_m: Array, covariance_m2: Array
 ) -> tuple[Array, Array]:
     """Delays less the error of TX stamps that all ranges of an anchor share, and standard deviations, shape (k,).
 
-    ``delay_m``, ``variance_m2``: of both together, as fitted. What is known of their shares is in the expected delays.
+    ``delay_m``, ``covariance_m2``: of both together, as fitted. What is known of their shares is in the expected delays.
     """
     shared = np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in anchors])
-    own = np.maximum(problem.delay_variance_m2 - shared, 0.0)
-    part = own / np.maximum(problem.delay_variance_m2, 1e-10)
-    own_m = problem.delay_m + part * (delay_m - problem.delay_m)
-    return np.asarray(own_m), np.asarray(np.sqrt(np.maximum(part**2 * variance_m2 + part * shared, 0.0)))
+    common = np.zeros(len(anchors)) if problem.common_delay_m is None else problem.common_delay_m
+    own = np.diag(np.maximum(problem.delay_variance_m2 - shared, 0.0)) + np.outer(common, common)
+    whole = np.diag(np.maximum(problem.delay_variance_m2, 1e-10)) + np.outer(common, common)
+    part = own @ np.linalg.inv(whole)
+    own_m = problem.delay_m + part @ (delay_m - problem.delay_m)
+    variance = np.diag(part @ covariance_m2 @ part.T + own - part @ own)
+    return np.asarray(own_m), np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _heights(measured: Measured, kept: Integers) -> Array:

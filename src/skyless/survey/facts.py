@@ -52,7 +52,9 @@ class Facts(Struct, frozen=True):
     keep_positions: bool = False
     """Only delays are wanted: the positions of ``sketch_m`` stay, and are as good as ``sketch_std_m``."""
     delay_std_m: float = 0.07
-    """What delays h are expected to be off; 0 where they are known."""
+    """What delays h are expected to be off, each for itself; 0 where they are known."""
+    common_delay_std_m: float = 0.1
+    """What all of them are expected to be off together, more than that; nothing where delays are known."""
     pair_std_m: float = 0.03
     """Constant error of each pair's range, which no averaging removes."""
     delays: tuple[KnownDelay, ...] = ()

@@ -1,5 +1,6 @@
 """What a survey does not determine, why, and which tapes would mend it: sentences."""
 
+import math
 import re
 from typing import Final
 
@@ -9,7 +10,7 @@ from skyless.kernels.arrays import Array, Mask
 from skyless.survey.build import Measured, levels, with_free_delays
 from skyless.survey.fit import determined as determination
 from skyless.survey.fit.links import Links
-from skyless.survey.fit.problem import Problem
+from skyless.survey.fit.problem import Problem, delay_weights
 from skyless.survey.fit.tapes import TapeChoice, best_tapes, mending_tapes
 from skyless.survey.frame import Framed
 from skyless.survey.result import TapeAdvice
@@ -73,13 +74,14 @@ def _loose(fitted: Fitted) -> dict[int, str]:
     position = fitted.solution.position_m - fitted.solution.position_m.mean(axis=0)
     axes = 2 if levels(fitted.measured) else 3
     extent = np.linalg.svd(position[:, :axes], compute_uv=False)
+    play = f"its ranges leave more than {determination.most_std_m(fitted.problem):.2f} m of play"
     if (not fitted.core.any() and len(extent) and extent[-1] < _FLAT * extent[0]) or len(extent) < axes:
         shape = "on one line" if axes == 2 or extent[1] < _FLAT * extent[0] else "nearly in one plane"
         why = f"all anchors are {shape}, and nothing holds them across it"
     elif levels(fitted.measured) and fitted.measured.facts.dimensions == 2:
-        why = f"its ranges leave more than {determination.MOST_STD_M} m of play"
+        why = play
     else:
-        why = f"its ranges leave more than {determination.MOST_STD_M} m of play; heights may be what is missing"
+        why = f"{play}; heights may be what is missing"
     return dict.fromkeys(anchors, why)
 
 
@@ -152,23 +154,32 @@ def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
         return ()
     position, covariance = _least_held(fitted, surveyed)
     stds = determination.position_stds_m(surveyed, covariance)
-    if not np.any(fitted.core & (stds > determination.MOST_STD_M)):
+    least_m = determination.most_std_m(surveyed)
+    if not np.any(fitted.core & (stds > least_m)):
         return ()
     most = 3 * len(position)
-    directions = determination.weak_directions(surveyed, covariance, fitted.core, determination.MOST_STD_M, most)
+    directions = determination.weak_directions(surveyed, covariance, fitted.core, least_m, most)
     if not directions:
         return ()
     delays = np.sqrt(sum((direction.delay_m * direction.std_m) ** 2 for direction in directions))
     chosen = _touched(np.asarray(delays), unknown & fitted.core)
     anchors = [anchor for anchor, is_one in zip(fitted.anchors, chosen, strict=True) if is_one]
     against = _axis(fitted, framed, directions)
-    expected = float(np.sqrt(np.median(surveyed_problem(fitted).delay_variance_m2[unknown])))
+    expected = max(_expected_m(fitted.problem, direction.delay_m) for direction in directions)
     mending = mending_tapes(surveyed, position, covariance, fitted.core)
     pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in mending]
     return (
         f"delays of {anchors_named(anchors)} against {against} are not determined by the ranges: only the expected "
         f"delays (±{expected:.2f} m) hold them" + (f"; {_would(pairs)}" if pairs else ""),
     )
+
+
+def _expected_m(problem: Problem, delay_m: Array) -> float:
+    """How much one delay is expected to be off in such a change of delays."""
+    along = float(np.sum((delay_weights(problem) @ delay_m) ** 2))
+    common = 0.0 if problem.common_delay_m is None else float(np.median(problem.common_delay_m))
+    one = math.sqrt(float(np.median(problem.delay_variance_m2)) + common**2)
+    return min(one, math.sqrt(float(np.sum(delay_m**2)) / max(along, 1e-12)))
 
 
 def _least_held(fitted: Fitted, surveyed: Problem) -> tuple[Array, Array]:

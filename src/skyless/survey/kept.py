@@ -12,7 +12,7 @@ from msgspec import structs
 
 from skyless.kernels.arrays import Array
 from skyless.survey.build import Measured, as_array, build_problem, fixed_heights_m, own_delays
-from skyless.survey.fit.problem import Problem
+from skyless.survey.fit.problem import Problem, delay_weights
 from skyless.survey.fit.robust import RobustFit, fit_robustly
 from skyless.survey.ranges import PairRange
 from skyless.survey.result import Survey, SurveyedAnchor, SurveyedPair
@@ -45,8 +45,8 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
     if pairs:
         fit = fit_robustly(problem, [position], math.hypot(facts.pair_std_m, math.sqrt(2.0) * facts.sketch_std_m))
         fit, tag_information, notes = _with_tags(fit, measured, ids, position)
-        variance = np.diag(_delay_covariance(fit, position, facts.sketch_std_m, facts.dimensions, tag_information))
-        own, std = own_delays(measured, ids, fit.problem, fit.solution.delay_m, variance)
+        covariance = _delay_covariance(fit, position, facts.sketch_std_m, facts.dimensions, tag_information)
+        own, std = own_delays(measured, ids, fit.problem, fit.solution.delay_m, covariance)
         delays = {anchor: (float(own[k]), float(std[k])) for k, anchor in enumerate(ids) if anchor in linked}
         for index, pair in enumerate(pairs):
             residuals[pair.a, pair.b] = float(fit.solution.residual_m[index]), not fit.used[index]
@@ -98,9 +98,9 @@ def _delay_covariance(
     problem, k = fit.problem, len(position_m)
     weight = fit.used / problem.variance_m2
     incidence = _incidence(problem)
-    prior = 1.0 / np.maximum(problem.delay_variance_m2, 1e-10)
+    prior = delay_weights(problem).T @ delay_weights(problem)
     of_tags = tag_information[3 * k :, 3 * k :]
-    inverse = np.linalg.inv(incidence.T @ (weight[:, None] * incidence) + np.diag(prior) + of_tags)
+    inverse = np.linalg.inv(incidence.T @ (weight[:, None] * incidence) + prior + of_tags)
     gain = inverse @ (incidence.T * weight)
     apart = position_m[problem.first] - position_m[problem.second]
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None]
@@ -112,7 +112,7 @@ def _delay_covariance(
     moved = gain @ shift.reshape(len(number), -1) + inverse @ by_tags.reshape(k, -1)
     noise = np.maximum(problem.variance_m2 - 2.0 * position_std_m**2, 0.0)
     return np.asarray(
-        (gain * noise) @ gain.T + position_std_m**2 * moved @ moved.T + inverse @ (np.diag(prior) + of_tags) @ inverse
+        (gain * noise) @ gain.T + position_std_m**2 * moved @ moved.T + inverse @ (prior + of_tags) @ inverse
     )
 
 

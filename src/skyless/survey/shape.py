@@ -8,7 +8,7 @@ from msgspec import Struct, structs
 from scipy.special import chdtri
 
 from skyless.kernels.arrays import Array, Integers, Mask
-from skyless.survey.build import Measured, as_array, build_problem, levels, with_free_delays
+from skyless.survey.build import Measured, as_array, build_problem, levels, own_variance_m2, with_free_delays
 from skyless.survey.fit import determined as determination
 from skyless.survey.fit.gauge import Motion, align, fitting_points
 from skyless.survey.fit.problem import MoreRows, Problem, Solution, solve_least_squares
@@ -24,6 +24,10 @@ _FALSE_ALARM: Final = 0.01
 """Share of sites with ranges as good as stated whose residuals nevertheless seem to contradict that."""
 
 _MOST_ROUNDS: Final = 4
+
+_BENDS_M: Final = 0.03
+_BENT_SIGMAS: Final = (-1.0, -0.5, 0.5, 1.0)
+"""Least standard deviation of a shape that is looked at when bent, and how far it is bent."""
 
 
 class Fitted(Struct, frozen=True, eq=False):
@@ -119,9 +123,26 @@ def _worth(
     if core.sum() < least or flat:
         core = np.zeros(len(kept), bool)
     if core.any():
-        full = determination.jacobian(problem, solution.position_m, weight)
-        covariance = determination.aligned_covariance(problem, full, solution.position_m, core)
+        covariance = _largest_nearby(problem, solution.position_m, weight, core)
     return core, covariance
+
+
+def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Mask) -> Array:
+    """The covariance, aligned over the core, of the shape or of one within 1 σ along its least certain direction.
+
+    Errors bend a shape that only expected delays hold, and a bent one seems to be held by its ranges.
+    """
+
+    def covariance_at(at_m: Array) -> Array:
+        rows = determination.jacobian(problem, at_m, weight)
+        return determination.aligned_covariance(problem, rows, at_m, core)
+
+    covariance = covariance_at(position_m)
+    found = [covariance]
+    for direction in determination.weak_directions(problem, covariance, core, _BENDS_M, 1):
+        steps = (sigma * direction.std_m * direction.shift_m for sigma in _BENT_SIGMAS)
+        found += [covariance_at(position_m + step) for step in steps]
+    return max(found, key=lambda one: float(np.trace(one[: 3 * len(core), : 3 * len(core)])))
 
 
 def with_tag(fitted: Fitted, rows: MoreRows, solution: Solution, used: Mask) -> Fitted:
@@ -203,7 +224,7 @@ def _shown_std_m(fitted: Fitted) -> float:
     rows = full[: len(used)]
     freedom = float(used.sum()) - float(np.einsum("ij,jk,ik->", rows, covariance, rows, optimize=True))
     squares = fitted.solution.residual_m[used] ** 2
-    noise = np.array([pair.std_m for pair in fitted.pairs])[used] ** 2 + 1e-10
+    noise = np.array([own_variance_m2(pair) for pair in fitted.pairs])[used]
     if redundancy(fitted) < _LEAST_REDUNDANCY or freedom < 1.0:
         return 0.0
     if float(np.sum(squares / problem.variance_m2[used])) <= chdtri(freedom, _FALSE_ALARM):

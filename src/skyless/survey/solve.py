@@ -89,8 +89,10 @@ def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -
     reasons = anchor_reasons(measured, links, fitted)
     number = {anchor: k for k, anchor in enumerate(fitted.anchors)}
     stds = position_stds_m(fitted.problem, fitted.covariance_m2)
-    variance = np.diag(fitted.covariance_m2)[3 * len(number) :]
-    delays, delay_stds = own_delays(measured, fitted.anchors, fitted.problem, fitted.solution.delay_m, variance)
+    covariance_of_delays = fitted.covariance_m2[3 * len(number) :, 3 * len(number) :]
+    delays, delay_stds = own_delays(
+        measured, fitted.anchors, fitted.problem, fitted.solution.delay_m, covariance_of_delays
+    )
     found = []
     for anchor in measured.anchors:
         k = number.get(anchor)

@@ -6,6 +6,8 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Final, Literal
 
+from msgspec.structs import replace
+
 from skyless.cli.common.options import NotNegative, Positive, finite_numbers, options
 from skyless.errors import SkylessError
 
@@ -14,6 +16,10 @@ if TYPE_CHECKING:
     from skyless.survey.facts import Facts, Gauge, Point, Tape
 
 _SKETCH_STD_M: Final = 0.3
+_FOREIGN_DELAY_STD_M: Final = 0.03
+_FOREIGN_COMMON_DELAY_STD_M: Final = 1.0
+"""Of recordings of other systems: boards of one kind without calibration are nearly alike, but nothing is known of
+what they share."""
 _TAPE: Final = re.compile(r"(?P<a>\w+)-(?P<b>\w+)=(?P<distance>[^±+]+)((±|\+-)(?P<std>.+))?")
 
 
@@ -47,8 +53,11 @@ class FactOptions:
     delays_known: bool = False
     """The antenna delays are right; do not estimate them."""
     delay_std: Positive | None = None
-    """How much antenna delays are expected to be off, metres; 0.07 by default, 0.15 for boards that were never
-    calibrated."""
+    """How much antenna delays are expected to be off, each for itself, metres; 0.07 by default, 0.15 for boards that
+    were never calibrated, 0.03 for recordings of other systems."""
+    common_delay_std: NotNegative | None = None
+    """How much all of them are expected to be off together, more than that; 0.1 by default, 1 for recordings of other
+    systems, whose stamps may lack any correction."""
     pair_std: NotNegative | None = None
     """Constant error expected of each pair's range, metres; 0.03 by default."""
     origin: int | None = None
@@ -59,8 +68,13 @@ class FactOptions:
     """An anchor on the left of the x axis (y > 0)."""
 
 
-def facts_of(asked: FactOptions, anchors: Iterable[int], site: "Site | None") -> "tuple[Facts, list[str]]":
-    """The facts, and warnings about them; ``site``: of --site or of the recording. Raises SkylessError."""
+def facts_of(
+    asked: FactOptions, anchors: Iterable[int], site: "Site | None", *, is_foreign: bool = False
+) -> "tuple[Facts, list[str]]":
+    """The facts, and warnings about them; ``site``: of --site or of the recording. Raises SkylessError.
+
+    ``is_foreign``: of a recording of another system.
+    """
     from skyless.survey.facts import Facts
 
     known = set(anchors)
@@ -74,6 +88,8 @@ def facts_of(asked: FactOptions, anchors: Iterable[int], site: "Site | None") ->
         from_file = {} if site is None else {anchor.id: anchor.z_m for anchor in site.anchors}
         given = _completed(from_file | given, known, warnings)
     usual = Facts()
+    if is_foreign:
+        usual = replace(usual, delay_std_m=_FOREIGN_DELAY_STD_M, common_delay_std_m=_FOREIGN_COMMON_DELAY_STD_M)
     facts = Facts(
         dimensions=dimensions,
         heights_m=given,
@@ -85,6 +101,7 @@ def facts_of(asked: FactOptions, anchors: Iterable[int], site: "Site | None") ->
         sketch_std_m=asked.sketch_std or _sketch_std(asked, site),
         keep_positions=asked.keep_positions,
         delay_std_m=0.0 if asked.delays_known else asked.delay_std or usual.delay_std_m,
+        common_delay_std_m=usual.common_delay_std_m if asked.common_delay_std is None else asked.common_delay_std,
         pair_std_m=usual.pair_std_m if asked.pair_std is None else asked.pair_std,
         gauge=_gauge(asked, known),
     )
@@ -95,6 +112,10 @@ def _check(asked: FactOptions, site: "Site | None") -> None:
     """See that the options fit one another. Raises SkylessError."""
     if asked.delays_known and asked.delay_std is not None:
         raise SkylessError(f"--delay-std is {asked.delay_std:g}; it should be left out with --delays-known")
+    if asked.delays_known and asked.common_delay_std is not None:
+        raise SkylessError(
+            f"--common-delay-std is {asked.common_delay_std:g}; it should be left out with --delays-known"
+        )
     if asked.height_std is not None and asked.dimensions != 3:
         raise SkylessError(f"--height-std is {asked.height_std:g}; it is for --dimensions 3, else heights are exact")
     if asked.keep_positions and asked.no_sketch:

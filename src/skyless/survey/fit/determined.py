@@ -1,7 +1,7 @@
 """What the measurements determine: information, covariance after the best rigid alignment, and what has none.
 
 A survey knows positions up to a rigid motion, so a covariance needs a set of anchors, the core, over which results are
-aligned. An anchor whose standard deviation remains above ``MOST_STD_M`` leaves the core; it is not determined.
+aligned. An anchor whose standard deviation remains above ``most_std_m`` leaves the core; it is not determined.
 """
 
 from typing import Final
@@ -10,10 +10,11 @@ import numpy as np
 from msgspec import Struct, structs
 
 from skyless.kernels.arrays import Array, Integers, Mask
-from skyless.survey.fit.problem import Problem, residuals_m, solve_least_squares
+from skyless.survey.fit.problem import Problem, delay_weights, residuals_m, solve_least_squares
 
-MOST_STD_M: Final = 0.25
-"""Standard deviation per axis above which an anchor is not determined."""
+_MOST_STD_M: Final = 0.25
+_MOST_RANGE_STDS: Final = 4.0
+"""Standard deviation per axis above which an anchor is not determined, in metres and in those of a range."""
 
 TOUCHED: Final = 0.3
 """Part of a direction's largest component from which on it touches an anchor."""
@@ -31,6 +32,17 @@ _NEARLY_FLAT: Final = 0.3
 
 _FLAT_BARRIER: Final = 11.0
 """Increase of the cost (3.3 σ) by which a flat shape must fit worse for the extent across to be real."""
+
+
+def most_std_m(problem: Problem) -> float:
+    """Standard deviation per axis above which an anchor is not determined.
+
+    Where ranges are poor, so are positions, and poor ones with an honest error are of use: what counts there is that
+    the ranges hold an anchor from all sides, and that not a few ranges' errors add up along one direction.
+    """
+    if not len(problem.variance_m2):
+        return _MOST_STD_M
+    return max(_MOST_STD_M, _MOST_RANGE_STDS * float(np.sqrt(np.median(problem.variance_m2))))
 
 
 class Direction(Struct, frozen=True, eq=False):
@@ -65,7 +77,6 @@ def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -
     n, m, t = len(position_m), len(problem.range_m), len(problem.tape_m)
     of_range = np.sqrt((1.0 if weight is None else weight) / problem.variance_m2)
     of_tape = 1.0 / np.sqrt(np.maximum(problem.tape_variance_m2, _LEAST_STD_M**2))
-    of_delay = 1.0 / np.sqrt(np.maximum(problem.delay_variance_m2, _LEAST_STD_M**2))
     of_coordinate = 1.0 / np.sqrt(np.maximum(problem.coordinate_variance_m2, _LEAST_STD_M**2)).ravel()
     known = np.flatnonzero((of_coordinate > 0.0) & problem.is_free.ravel())
     rows = np.zeros((m + t + n + len(known), 4 * n))
@@ -80,7 +91,7 @@ def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -
         rows[number, 3 * second + axis] = -factor * unit[:, axis]
     rows[number[:m], 3 * n + problem.first] = of_range
     rows[number[:m], 3 * n + problem.second] = of_range
-    rows[m + t + np.arange(n), 3 * n + np.arange(n)] = of_delay
+    rows[m + t : m + t + n, 3 * n :] = delay_weights(problem)
     rows[m + t + n + np.arange(len(known)), known] = of_coordinate[known]
     rows = np.vstack([rows, *(more.rows(position_m, problem.delay_m)[0] for more in problem.more)])
     rows[:, : 3 * n] *= problem.is_free.ravel()
@@ -136,20 +147,20 @@ def position_stds_m(problem: Problem, covariance_m2: Array) -> Array:
 
 
 def determined_core(problem: Problem, rows: Array, position_m: Array, least: int) -> Mask:
-    """Anchors that have a standard deviation of at most ``MOST_STD_M`` when aligned over themselves, shape (n,).
+    """Anchors that have a standard deviation of at most ``most_std_m`` when aligned over themselves, shape (n,).
 
     None, where fewer than ``least`` remain.
     """
-    core = np.ones(len(position_m), bool)
+    core, most_m = np.ones(len(position_m), bool), most_std_m(problem)
     while core.sum() >= least:
         std = position_stds_m(problem, aligned_covariance(problem, rows, position_m, core))
         worst = float(std[core].max())
-        if worst <= MOST_STD_M:
-            joins = ~core & (std <= MOST_STD_M)
+        if worst <= most_m:
+            joins = ~core & (std <= most_m)
             if joins.any():
                 core = core | joins
                 std = position_stds_m(problem, aligned_covariance(problem, rows, position_m, core))
-                core = core & (std <= MOST_STD_M)
+                core = core & (std <= most_m)
             return core
         # All that are equally uncertain leave at once, so that no order of anchors decides.
         core &= std < worst * (1.0 - 1e-6)
@@ -179,10 +190,10 @@ def weak_directions(
 
 
 def folds(problem: Problem, position_m: Array, delay_m: Array, weight: Array, direction: Direction) -> bool:
-    """Whether the shape can be moved by 2 × ``MOST_STD_M`` along a direction without ranges that contradict."""
+    """Whether the shape can be moved by twice ``most_std_m`` along a direction without ranges that contradict."""
     start = cost(problem, position_m, delay_m, weight)
     for sign in (1.0, -1.0):
-        for step in np.arange(0.05, 2.0 * MOST_STD_M + 0.01, 0.05):
+        for step in np.arange(0.05, 2.0 * most_std_m(problem) + 0.01, 0.05):
             moved = position_m + sign * step * direction.shift_m
             if cost(problem, moved, delay_m + sign * step * direction.delay_m, weight) > start + _BARRIER:
                 break
@@ -220,7 +231,7 @@ def cost(problem: Problem, position_m: Array, delay_m: Array, weight: Array) -> 
     ranges = residuals_m(problem, position_m, delay_m) ** 2 * weight / problem.variance_m2
     apart = np.linalg.norm(position_m[problem.tape_first] - position_m[problem.tape_second], axis=1)
     tapes = (problem.tape_m - apart) ** 2 / np.maximum(problem.tape_variance_m2, _LEAST_STD_M**2)
-    delays = (problem.delay_m - delay_m) ** 2 / np.maximum(problem.delay_variance_m2, _LEAST_STD_M**2)
+    delays = (delay_weights(problem) @ (problem.delay_m - delay_m)) ** 2
     known = np.isfinite(problem.coordinate_variance_m2) & problem.is_free
     coordinates = (problem.coordinate_m - position_m)[known] ** 2
     coordinates = coordinates / np.maximum(problem.coordinate_variance_m2[known], _LEAST_STD_M**2)

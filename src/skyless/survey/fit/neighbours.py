@@ -36,7 +36,7 @@ _LEAST_MOTION_M: Final = 0.03
 _UNCONTROLLED: Final = 0.02
 """A share of redundancy below which ranges are not checked by others."""
 
-_LEAST_REFITS: Final = 20
+_LEAST_REFITS: Final = 10
 _MOST_REFITS: Final = 600
 _REFIT_WORK: Final = 6e5
 """Refits times squared unknowns."""

@@ -45,7 +45,7 @@ class Problem(Struct, frozen=True, eq=False):
     """Shape (m,): of each range, noise and constant error of the pair together."""
     delay_m: Array
     delay_variance_m2: Array
-    """Shape (n,): expected delays h."""
+    """Shape (n,): expected delays h, and of their own part, which no other anchor shares."""
     coordinate_m: Array
     coordinate_variance_m2: Array
     """Shape (n, 3): known coordinates; infinite variance for none."""
@@ -54,6 +54,9 @@ class Problem(Struct, frozen=True, eq=False):
     tape_m: Array
     tape_variance_m2: Array
     """Shape (t,)."""
+    common_delay_m: Array | None = None
+    """Shape (n,): standard deviation of the part of its delay that an anchor shares with all others, 0 for one that
+    shares none; None where nobody does."""
     more: tuple[MoreRows, ...] = ()
     """Costly: for a last fit, not for searches."""
 
@@ -139,6 +142,18 @@ def solve_many(
     return Solutions(position_m, delay_m, residuals_m(problem, position_m, delay_m), cost)
 
 
+def delay_weights(problem: Problem) -> Array:
+    """The root of the information that is expected of delays, shape (n, n): weights of what they differ."""
+    own = 1.0 / np.sqrt(np.maximum(problem.delay_variance_m2, _LEAST_STD_M**2))
+    if problem.common_delay_m is None:
+        return np.diag(own)
+    # The covariance is own² + common·commonᵀ; the root of its inverse has a closed form.
+    common = own * problem.common_delay_m
+    square = float(common @ common)
+    share = (1.0 - 1.0 / np.sqrt(1.0 + square)) / max(square, 1e-30)
+    return np.asarray((np.eye(len(own)) - share * np.outer(common, common)) * own)
+
+
 def residuals_m(problem: Problem, position_m: Array, delay_m: Array) -> Array:
     """Ranges less distances and delays, shape (..., m), of positions (..., n, 3) and delays (..., n)."""
     apart = position_m[..., problem.first, :] - position_m[..., problem.second, :]
@@ -172,7 +187,7 @@ class _Equations:
         self._cells = (self._row_columns[:, :, None] * size + self._row_columns[:, None, :]).ravel()
         self._of_range = 1.0 / problem.variance_m2
         self._of_tape = 1.0 / np.maximum(problem.tape_variance_m2, _LEAST_STD_M**2)
-        self._of_delay = 1.0 / np.maximum(problem.delay_variance_m2, _LEAST_STD_M**2)
+        self._of_delay = delay_weights(problem)
         of_coordinate = 1.0 / np.maximum(problem.coordinate_variance_m2, _LEAST_STD_M**2)
         self._of_coordinate = np.where(problem.is_free, of_coordinate, 0.0)
         self._coordinate_m = np.where(self._of_coordinate > 0.0, problem.coordinate_m, 0.0)
@@ -184,7 +199,8 @@ class _Equations:
         weights = self._weights(weight)
         unit = (apart / np.maximum(distance, 1e-9)[:, :, None])[:, :, self._axes]
         delays = np.broadcast_to(self._has_delay[None, :, None], (*distance.shape, 1))
-        derivative = np.concatenate([unit, delays, -unit, delays], axis=2)
+        # In this order in memory: products of another one would have to be copied.
+        derivative = np.ascontiguousarray(np.concatenate([unit, delays, -unit, delays], axis=2))
         weighted = weights[:, :, None] * derivative
         item = np.arange(b)[:, None]
         cells = (item * size**2 + self._cells).ravel()
@@ -193,9 +209,11 @@ class _Equations:
         columns = (item * size + self._row_columns.ravel()).ravel()
         gradient = np.bincount(columns, (weighted * residual[:, :, None]).ravel(), b * size).reshape(b, size)[:, :-1]
         from_coordinates = self._of_coordinate * (self._coordinate_m - position_m)
-        priors = np.concatenate([self._of_coordinate.ravel()[self._free], self._of_delay])
-        np.einsum("bii->bi", information)[:] += priors
-        from_delays = self._of_delay * (self._problem.delay_m - delay_m)
+        of_delay = self._of_delay.T @ self._of_delay
+        coordinates = len(self._free)
+        np.einsum("bii->bi", information)[:, :coordinates] += self._of_coordinate.ravel()[self._free]
+        information[:, coordinates:, coordinates:] += of_delay
+        from_delays = (self._problem.delay_m - delay_m) @ of_delay
         from_coordinates = from_coordinates.reshape(b, self._problem.is_free.size)[:, self._free]
         gradient = gradient + np.concatenate([from_coordinates, from_delays], axis=1)
         for one, more in product(range(b), self._problem.more):
@@ -209,7 +227,7 @@ class _Equations:
         """Sum of all weighted squares, shape (b,)."""
         _, _, residual = self._rows(position_m, delay_m)
         squares = np.sum(self._weights(weight) * residual**2, axis=1)
-        of_delays = np.sum(self._of_delay * (self._problem.delay_m - delay_m) ** 2, axis=1)
+        of_delays = np.sum(((self._problem.delay_m - delay_m) @ self._of_delay.T) ** 2, axis=1)
         of_coordinates = np.sum(self._of_coordinate * (self._coordinate_m - position_m) ** 2, axis=(1, 2))
         whole = np.asarray(squares + of_delays + of_coordinates)
         for one, more in product(range(len(whole)), self._problem.more):

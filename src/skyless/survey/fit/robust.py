@@ -27,6 +27,12 @@ _EARLY_BEND: Final = 3.0
 _HUBER_ROUNDS: Final = 12
 _STEPS_A_ROUND: Final = 2
 _GROWTH: Final = 1.4
+_FAST_GROWTH: Final = 2.0
+_MANY_UNKNOWNS: Final = 100
+_AGREEING_STARTS: Final = 3
+"""Large sites have ranges to spare: larger steps lead to the same minimum, and where the first starts agree the others
+are left out."""
+
 _LAST_CONTROL: Final = 30.0
 """Where the graduated cost is as good as cut off."""
 
@@ -37,8 +43,17 @@ _LEAST_CHECKS: Final = 4.0
 _SIGNIFICANT: Final = 2.6
 """Standard deviations by which squares of residuals must exceed what is expected if no range was left out."""
 
-_EXCESS_WEIGHT: Final = 10.0
-_LEAST_EVIDENCE: Final = 25.0
+_LEAST_LEFT: Final = 1.0
+"""Ranges more than unknowns that must remain after some were left out: with less, any range can be left out, and what
+remains fits exactly, be it folded."""
+
+_LARGEST_SQUARES: Final = 6.6
+_WIDEST: Final = 2.0
+"""Weighted squares of one range too many in 99 % of sites, and the part by which standard deviations may be too small
+before a range must be late even so."""
+
+_EXCESS_WEIGHT: Final = 15.0
+_LEAST_EVIDENCE: Final = 20.0
 """For a larger error: twice the logarithm of likelihoods, and these standard deviations times a weight. Late ranges
 that were left out say nothing of the error of the others; so likelihoods alone mistake many late ranges for it."""
 
@@ -97,6 +112,9 @@ def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0)
     """
     start_m = np.stack(starts)
     narrow = _best_near(problem, _from_starts(problem, start_m), pair_std_m)
+    whole = None if narrow.used.all() else _with_all_ranges(narrow, start_m)
+    if whole is not None:
+        return whole
     checks = redundancy(problem, narrow.solution, narrow.used)
     excess = _excess(_squares(problem, narrow.solution, narrow.used), checks)
     if checks < _LEAST_CHECKS or (narrow.used.all() and excess < _SIGNIFICANT):
@@ -111,6 +129,27 @@ def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0)
     width = np.mean(np.log(wider.variance_m2 / problem.variance_m2)[in_use])
     likelier = narrow.cost - wide.cost - redundancy(wider, wide.solution, in_use) * width
     return _softened(wide) if likelier + _EXCESS_WEIGHT * excess > _LEAST_EVIDENCE else narrow
+
+
+def _with_all_ranges(fit: RobustFit, start_m: Array) -> RobustFit | None:
+    """The fit with all ranges, if nothing checks that some of them are late and all agree within larger errors."""
+    if redundancy(fit.problem, fit.solution, fit.used) >= _LEAST_LEFT:
+        return None
+    everything = np.ones(len(fit.used), dtype=np.bool_)
+    plain = _plain(fit.problem, start_m)
+    position_m, delay_m = plain.position_m[0], plain.delay_m[0]
+    solution = solve_least_squares(fit.problem, position_m)
+    checks = redundancy(fit.problem, solution, everything)
+    ratio = float(np.sqrt(_squares(fit.problem, solution, everything) / (_LARGEST_SQUARES * max(checks, 1.0))))
+    if ratio > _WIDEST:
+        return None
+    std_m = max(ratio, 1.0) * fit.range_std_m
+    wider = replace(fit.problem, variance_m2=fit.problem.variance_m2 - fit.range_std_m**2 + std_m**2)
+    minima = cut_off(wider, position_m[None], delay_m[None], everything[None])
+    solution = solve_least_squares(wider, position_m)
+    return RobustFit(
+        wider, solution, everything.astype(np.float64), everything, solution.cost, std_m, _joined(minima, fit.others)
+    )
 
 
 def _softened(fit: RobustFit) -> RobustFit:
@@ -216,14 +255,25 @@ def redundancy(problem: Problem, solution: Solution, used: Mask) -> float:
 
 def _from_starts(problem: Problem, start_m: Array) -> Minima:
     """Minima that plain and one-sided least squares and graduated non-convexity reach."""
-    everything = np.ones((len(start_m), len(problem.range_m)))
-    plain = _distinct(solve_many(problem, start_m, everything, most_steps=15))
+    plain = _plain(problem, start_m[:_AGREEING_STARTS] if _is_large(problem) else start_m)
+    if _is_large(problem) and len(plain.cost) > 1:
+        plain = _plain(problem, start_m)
     bent = _distinct(_huber(problem, plain))
     position_m = np.concatenate([plain.position_m, bent.position_m, bent.position_m])
     delay_m = np.concatenate([plain.delay_m, bent.delay_m, bent.delay_m])
     # A bent start comes twice: from the convex cost, and from one that trusts it.
     nearly_cut = np.arange(len(position_m)) >= len(plain.position_m) + len(bent.position_m)
     return graduated(problem, position_m, delay_m, np.where(nearly_cut, 0.3, 0.0))
+
+
+def _plain(problem: Problem, start_m: Array) -> Solutions:
+    """Minima of plain least squares."""
+    everything = np.ones((len(start_m), len(problem.range_m)))
+    return _distinct(solve_many(problem, start_m, everything, most_steps=15))
+
+
+def _is_large(problem: Problem) -> bool:
+    return int(np.count_nonzero(problem.is_free)) + len(problem.delay_m) > _MANY_UNKNOWNS
 
 
 def _huber(problem: Problem, start: Solutions) -> Solutions:
@@ -247,6 +297,7 @@ def graduated(problem: Problem, position_m: Array, delay_m: Array, least_control
     scaled = _in_cutoffs(problem, residuals_m(problem, position_m, delay_m))
     convex = 1.0 / np.maximum(2.0 * np.max(scaled, axis=1, initial=0.0) - 1.0, 1.0 / _LAST_CONTROL)
     control = np.maximum(convex, least_control)
+    growth = _FAST_GROWTH if _is_large(problem) else _GROWTH
     while np.any(control < _LAST_CONTROL):
         mu = control[:, None]
         weight = np.sqrt(mu * (mu + 1.0) / np.maximum(scaled, 1e-12)) - mu
@@ -254,7 +305,7 @@ def graduated(problem: Problem, position_m: Array, delay_m: Array, least_control
         fit = solve_many(problem, position_m, weight, delay_m, _STEPS_A_ROUND)
         position_m, delay_m = fit.position_m, fit.delay_m
         scaled = _in_cutoffs(problem, fit.residual_m)
-        control = control * _GROWTH
+        control = control * growth
     return cut_off(problem, position_m, delay_m)
 
 

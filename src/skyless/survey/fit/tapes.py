@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.kernels.arrays import Array, Mask
-from skyless.survey.fit.determined import MOST_STD_M, position_stds_m
+from skyless.survey.fit.determined import most_std_m, position_stds_m
 from skyless.survey.fit.problem import Problem
 
 TAPE_STD_M: Final = 0.005
@@ -88,8 +88,9 @@ def best_tapes(
 
 def mending_tapes(problem: Problem, position_m: Array, covariance_m2: Array, core: Mask) -> list[TapeChoice]:
     """The distances after which every anchor of the core is determined; empty where a few do not suffice."""
-    chosen = best_tapes(problem, position_m, covariance_m2, core, most=6, until_m=MOST_STD_M)
-    return chosen if chosen and chosen[-1].worst_after_m <= MOST_STD_M else []
+    most_m = most_std_m(problem)
+    chosen = best_tapes(problem, position_m, covariance_m2, core, most=6, until_m=most_m)
+    return chosen if chosen and chosen[-1].worst_after_m <= most_m else []
 
 
 def _rms(stds_m: Array) -> float:
