@@ -42,7 +42,7 @@ from skyless.positioning.methods.selection import (
 from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
 from skyless.positioning.observation import Observation
 from skyless.site.almanac_pages import AlmanacAssembly, AlmanacState
-from skyless.site.local_almanac import LEAST_ANCHORS, LocalAlmanac, LocalAlmanacState
+from skyless.site.local_almanac import LEAST_ANCHORS, PRESENT_TICKS, LocalAlmanac, LocalAlmanacState
 from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
 
@@ -50,10 +50,11 @@ MOST_WAITING: Final = 128
 """Beacons that are kept while the site's pages are not complete (protocol 2)."""
 
 MOVED_HOLD_TICKS: Final = from_seconds(0.3)
-LONGEST_MOVED_HOLD_TICKS: Final = from_seconds(2.0)
-"""An anchor that states another position joins again when none has done so for the former time, and after the latter in
-any case: a survey moves all anchors of a site, one a little after the other, and positions from before and after it
-must not be mixed."""
+MOVE_TICKS: Final = from_seconds(10.0)
+"""A survey moves all anchors of a site, some of them seconds after the others, and positions from before and after it
+must not be mixed. So a tag uses either the anchors that have stated another position or those that have not, until none
+has done so for the latter time. It goes over to those that have when they are the more, and none has for the former
+time."""
 
 NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
 """Counters of a receiver that do not count dropped frames."""
@@ -84,6 +85,7 @@ class ReceiverState(Struct, frozen=True):
     selection: AnchorSelectionState
     waiting: tuple[Observation, ...]
     moved_ticks: dict[int, int]
+    uses_moved: bool = False
 
 
 class Receiver:
@@ -131,7 +133,9 @@ class Receiver:
         self._selection = AnchorSelection()
         self._waiting: list[Observation] = []
         self._moved_ticks: dict[int, int] = {}
-        """When anchors of protocol 2 stated another position than before, until they join again."""
+        """When anchors of protocol 2 stated another position than before, until all are used together again."""
+        self._uses_moved = False
+        """Whether they are in use, and not the others."""
 
     def state(self) -> ReceiverState:
         """All that it keeps, as it is now."""
@@ -154,6 +158,7 @@ class Receiver:
             selection=self._selection.state(),
             waiting=tuple(self._waiting),
             moved_ticks=dict(self._moved_ticks),
+            uses_moved=self._uses_moved,
         )
 
     @classmethod
@@ -169,7 +174,7 @@ class Receiver:
         made.local_almanac.restore(state.local_almanac)
         made._selection.restore(state.selection)
         made._waiting = list(state.waiting)
-        made._moved_ticks = dict(state.moved_ticks)
+        made._moved_ticks, made._uses_moved = dict(state.moved_ticks), state.uses_moved
         made.counters.update(state.counters)
         made.reason = state.reason
         made._time, made._own_ticks, made._followed = state.time, state.own_ticks, state.followed
@@ -285,6 +290,8 @@ class Receiver:
 
     def _separate_moved(self, anchor: int, rx_ticks: int) -> None:
         """An anchor states another position: it leaves, and where too few are left that have not, all begin again."""
+        if self._uses_moved and anchor in self._moved_ticks:  # those in use move a second time
+            self._moved_ticks, self._uses_moved = {}, False
         self._moved_ticks[anchor] = rx_ticks
         self._waiting = [one for one in self._waiting if one.anchor != anchor]
         method = self._method
@@ -294,21 +301,21 @@ class Receiver:
                 self._renew_method()
 
     def _is_kept_apart(self, anchor: int, rx_ticks: int) -> bool:
-        """Whether an anchor has moved too recently to be mixed with others.
-
-        When it joins again, and more have moved than have not, the position begins again with those that have.
-        """
-        since_ticks = self._moved_ticks.get(anchor)
-        if since_ticks is None:
+        """Whether an anchor states its position of before a move while those in use have moved, or the reverse."""
+        moved = self._moved_ticks
+        if not moved:
             return False
-        method, moved = self._method, self._moved_ticks
-        calm_ticks, own_ticks = rx_ticks - max(moved.values()), rx_ticks - since_ticks
-        if calm_ticks < MOVED_HOLD_TICKS and own_ticks < LONGEST_MOVED_HOLD_TICKS:
-            return True
-        if isinstance(method, Estimation) and not method.is_starting and len(moved) > len(method.estimator.anchors):
-            self._renew_method()
-        del moved[anchor]
-        return False
+        calm_ticks = rx_ticks - max(moved.values())
+        if calm_ticks >= MOVE_TICKS:
+            self._moved_ticks, self._uses_moved = {}, False
+            return False
+        if not self._uses_moved and anchor in moved and calm_ticks >= MOVED_HOLD_TICKS:
+            present = self.local_almanac.placed_since(rx_ticks - PRESENT_TICKS)
+            if 2 * len(present & moved.keys()) > len(present):
+                self._uses_moved = True
+                self._waiting = [one for one in self._waiting if one.anchor in moved]
+                self._renew_method()
+        return (anchor in moved) is not self._uses_moved
 
     def _renew_method(self) -> None:
         """Begin again with the same pages."""
@@ -436,7 +443,7 @@ class Receiver:
         self.local_almanac.forget_times()
         self._selection.forget_times()
         self._waiting = []
-        self._moved_ticks = {}
+        self._moved_ticks, self._uses_moved = {}, False
         self._method = self._method_key = None
         if self.local_almanac.pages is not None:
             self._choose_method_2()

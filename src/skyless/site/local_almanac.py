@@ -156,6 +156,14 @@ class LocalAlmanac:
         assert stated is not None
         return stated.std_m
 
+    def placed_since(self, rx_ticks: int) -> set[int]:
+        """Anchors with a position that were received later than this, and by other anchors, too."""
+        return {
+            anchor
+            for anchor, one in self._anchors.items()
+            if one.position is not None and one.is_confirmed and one.rx_ticks > rx_ticks
+        }
+
     def forget_times(self) -> None:
         """The tag's counter has restarted: who was received when is not known any more."""
         self._first_ticks = None

@@ -24,6 +24,7 @@ from skyless.studies import (
 from skyless.studies.picture import Look, draw
 from skyless.studies.plan import Cell, Plan, Row, Study
 from skyless.studies.summary import Case, world_cells, world_rows
+from skyless.studies.surveyed import study as survey_room
 
 
 def _of_worlds(name: str, title: str, cases: Callable[[Plan], list[Case]], look: Look) -> Study:
@@ -90,6 +91,13 @@ STUDIES: Final = {
             survey.cells,
             survey.rows,
             partial(draw, Look("Anchors that survey themselves", ("rmse", "nees"))),
+        ),
+        Study(
+            "survey-room",
+            "tags by surveyed anchors",
+            survey_room.cells,
+            survey_room.rows,
+            partial(draw, Look("Tags by surveyed anchors", ("rmse", "nees"))),
         ),
         Study(
             "watch",

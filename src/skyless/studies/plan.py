@@ -44,6 +44,7 @@ _USUAL: Final = {
     "large": Plan(worlds=24, seconds=30.0),
     "claims": Plan(worlds=3),
     "survey": Plan(worlds=200, seconds=10.0),
+    "survey-room": Plan(worlds=8, seconds=15.0, tags=8),
     "watch": Plan(worlds=20),
 }
 """Of studies that do not take the usual amounts; those of ``room`` are the room's own, its other cases have fewer."""

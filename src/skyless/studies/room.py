@@ -259,11 +259,11 @@ def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
     for case, row in zip(each, world_rows("room", plan, each, results[:count]), strict=True):
         own: list[RunResult] = [next(ran) for _ in case.runs]
         bounded = row if case.biases is None else with_bound(row, own, [next(bounds) for _ in case.runs])
-        found.append(with_limits(_with_levels(bounded, own), case.limits))
+        found.append(with_limits(with_levels(bounded, own), case.limits))
     return found
 
 
-def _with_levels(row: Row, own: Sequence[RunResult]) -> Row:
+def with_levels(row: Row, own: Sequence[RunResult]) -> Row:
     """The row with its protection levels, tags as units; unchanged where the method gives none."""
     counts = [world.levels for world in own if world.levels is not None]
     if not counts:

@@ -58,12 +58,13 @@ def world_rows(study: str, plan: Plan, cases: Sequence[Case], results: Sequence[
     rest = iter(results)
     worlds = {case.name: [next(rest) for _ in case.runs] for case in cases}
     return [
-        _row(study, plan, case, worlds[case.name], worlds[case.of][: len(case.runs)] if case.of else None)
+        case_row(study, plan, case, worlds[case.name], worlds[case.of][: len(case.runs)] if case.of else None)
         for case in cases
     ]
 
 
-def _row(study: str, plan: Plan, case: Case, worlds: list[RunResult], reference: list[RunResult] | None) -> Row:
+def case_row(study: str, plan: Plan, case: Case, worlds: list[RunResult], reference: list[RunResult] | None) -> Row:
+    """The row of a case's worlds; ``reference``: those of the case over whose RMSE its ratio is."""
     cpu_s = sum(world.cpu_s for world in worlds)
     fixes = sum(world.fixes for world in worlds)
     row = Row(

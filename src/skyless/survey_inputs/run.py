@@ -41,7 +41,7 @@ from skyless.survey_inputs.samples import (
     site_tdoas,
     tdoas_of,
 )
-from skyless.survey_inputs.walk import at_positions, walk_of
+from skyless.survey_inputs.walk import at_positions, relayed_tdoas, walk_of
 
 _TAG_STD_M: Final = 0.02
 """Of a tag's known position, per axis."""
@@ -122,22 +122,24 @@ def calibrate_capture(request: CalibrationRequest) -> Calibrated:
 def calibrate_site(request: CalibrationRequest, identifier: int | None) -> Calibrated:
     """Calibrate the anchors of a site from a recording of ``skyless record``.
 
-    The constants of the estimate are what the tag alone shows, against the master; the survey's delays are absolute.
+    The constants of the estimate are what the tag alone shows, against the master or, where there is none, against
+    their mean; the survey's delays are absolute.
 
     Raises:
         SkylessError: the recording cannot be used, is of another site than ``identifier``, or holds nothing at a
             known position.
     """
+    ranges = ranges_of(request.path, identifier=identifier).ranges
+    ranges_m = {(pair.a, pair.b): pair.range_m for pair in ranges.pairs}
     with McapRecording(request.path) as recording:
         site = recorded_site(recording, identifier)
         tags = _tags(recording, request)
-        samples = joined([_of_tag(recording, site, tag, request) for tag in tags])
+        samples = joined([_of_tag(recording, site, tag, request, ranges_m) for tag in tags])
         _require_some(samples)
         end_s = float(samples.differences.t_s[-1])
         epochs = tuple(_at_known_positions(recording, site, tag, request, end_s) for tag in tags)
-    master = int(samples.differences.anchor_a[0])
-    found = estimate(samples.differences, zero=master, slope=False)
-    ranges = ranges_of(request.path, identifier=identifier).ranges
+    zero = int(samples.differences.anchor_a[0]) if site.schedule.needs_master else None
+    found = estimate(samples.differences, zero=zero, slope=False)
     facts = Facts(
         dimensions=3,
         sketch_m={anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors},
@@ -175,14 +177,23 @@ def _tags(recording: McapRecording, request: CalibrationRequest) -> tuple[str, .
     return raw
 
 
-def _of_tag(recording: McapRecording, site: Site, tag: str, request: CalibrationRequest) -> Samples:
+def _of_tag(
+    recording: McapRecording,
+    site: Site,
+    tag: str,
+    request: CalibrationRequest,
+    ranges_m: dict[tuple[int, int], float],
+) -> Samples:
     anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
     truth = recorded_truth(recording).get(tag) if request.truth is None else request.truth
     at_rest = CalibrationRequest(
         request.path, request.stays, truth, request.above_m, height_m=site.tags.height_m, tag=tag
     )
     drops: Counter[str] = Counter()
-    tdoas = site_tdoas(recording, (tag,), site.id, drops)
+    if site.schedule.needs_master:
+        tdoas = site_tdoas(recording, (tag,), site.id, drops)
+    else:
+        tdoas = relayed_tdoas(recording, tag, site.id, ranges_m)
     samples = gather(tdoas, anchors_m, partial(_position_from, at_rest, truth), request.first)
     return Samples(samples.differences, samples.anchors_m, samples.seen, samples.drops | drops)
 

@@ -1,16 +1,18 @@
 """A tag that was carried around, or stood at known positions, out of a recording of ``skyless record``."""
 
+from collections.abc import Iterator, Mapping
 from math import inf
 from typing import cast
 
 import numpy as np
 from msgspec.structs import replace
 
+from skyless.air.masterless_packets import PairTdoa
 from skyless.errors import ConfigurationError, SkylessError
 from skyless.mqtt.messages import ReceptionsMessage
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.survey.tags.epochs import EpochCollector, TagEpochs
-from skyless.survey.tags.relayed import RelayedDifferences
+from skyless.survey.tags.relayed import RelayedDifference, RelayedDifferences
 from skyless.survey_inputs.samples import NewReceptions, PositionAt
 
 
@@ -29,6 +31,31 @@ def walk_of(
         wanted = f"one of {', '.join(names)}" if names else "of a tag whose receptions were recorded"
         raise ConfigurationError("--walk", "tag", tag, wanted)
     collector = EpochCollector(relayed=True)
+    for t_s, one in _differences(recording, site, tag, span):
+        collector.add(t_s, one.first, one.second, one.difference_m)
+    epochs = collector.epochs()
+    if not len(epochs.t_s):
+        raise SkylessError(f"the receptions of {tag} give no differences between anchors in {span[0]:g}:{span[1]:g} s")
+    return epochs if height_m is None else at_height(epochs, height_m)
+
+
+def relayed_tdoas(
+    recording: McapRecording, tag: str, site: int, ranges_m: Mapping[tuple[int, int], float]
+) -> Iterator[PairTdoa]:
+    """A tag's time differences where there is no site time: the ranges of pairs, as measured, are taken off.
+
+    ``ranges_m``: of anchors (a, b), a < b; of other pairs nothing is used. Times are Unix seconds.
+    """
+    for t_s, one in _differences(recording, site, tag, (0.0, inf)):
+        range_m = ranges_m.get((min(one.first, one.second), max(one.first, one.second)))
+        if range_m is not None:
+            yield PairTdoa(t_s, one.first, one.second, one.difference_m - range_m)
+
+
+def _differences(
+    recording: McapRecording, site: int, tag: str, span: tuple[float, float]
+) -> Iterator[tuple[float, RelayedDifference]]:
+    """With Unix times, within a span of seconds since the tag's first reception."""
     receptions, differences = NewReceptions(), RelayedDifferences(site)
     begin_s: float | None = None
     for found in recording.messages({"receptions"}):
@@ -39,14 +66,9 @@ def walk_of(
             differences = RelayedDifferences(site)
         for reception, unix_s in receptions.read(message):
             begin_s = unix_s if begin_s is None else begin_s
-            if not span[0] <= unix_s - begin_s <= span[1]:
-                continue
-            for one in differences.add(reception):
-                collector.add(unix_s - one.age_s, one.first, one.second, one.difference_m)
-    epochs = collector.epochs()
-    if not len(epochs.t_s):
-        raise SkylessError(f"the receptions of {tag} give no differences between anchors in {span[0]:g}:{span[1]:g} s")
-    return epochs if height_m is None else at_height(epochs, height_m)
+            if span[0] <= unix_s - begin_s <= span[1]:
+                for one in differences.add(reception):
+                    yield unix_s - one.age_s, one
 
 
 def at_height(epochs: TagEpochs, height_m: float, std_m: float = 0.1) -> TagEpochs:

@@ -73,5 +73,5 @@ def status(description: str) -> Iterator[None]:
 @contextmanager
 def loading_kernels() -> Iterator[None]:
     """A spinner while the compiled kernels are loaded, which are compiled where they have not been yet."""
-    with status("loading the kernels; the first start compiles them, which takes some ten seconds"):
+    with status("loading the kernels; the first start compiles them, which takes up to a minute"):
         yield

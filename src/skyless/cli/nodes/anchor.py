@@ -6,6 +6,7 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
+from skyless.cli.common.progress import loading_kernels
 from skyless.cli.nodes.options import MqttOptions, log, site_named
 from skyless.errors import SkylessError
 from skyless.nodes.open_radio import DEFAULT_RADIO
@@ -53,7 +54,8 @@ def anchor(
     delays = [AntennaDelays(nodes[i].tx_antenna_delay_ticks, nodes[i].rx_antenna_delay_ticks) for i in ids]
     radios = open_radios(radio, "anchor", tuple(map(str, ids)), delays)
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
-    compile_kernels()
+    with loading_kernels():
+        compile_kernels()
     with contextlib.suppress(KeyboardInterrupt):
         anchors = Anchors(plan, radios, address, log, simulated=lambda: is_simulated(radio), floor_plan=image)
         run(anchors.run(), punctual=True)

@@ -1,16 +1,24 @@
 """``skyless ether``: the emulated air."""
 
 import contextlib
-from typing import Annotated
+from collections.abc import Iterable
+from functools import partial
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
+from msgspec.structs import replace
 
-from skyless.cli.common.options import Picoseconds, Seed, options
+from skyless.cli.common.options import Picoseconds, Seed, finite_numbers, options
+from skyless.cli.common.progress import loading_kernels
 from skyless.cli.common.simulated_site import check_live
 from skyless.cli.nodes.options import MqttOptions, WalkingSpeed, listen_address, log, site_named
 from skyless.errors import SkylessError
 from skyless.radios.ether_wire import DEFAULT_PORT
+from skyless.ticks import from_seconds
+
+if TYPE_CHECKING:
+    from skyless.simulation.impairments import AnchorDisplacement
 
 _Share = Annotated[float, Parameter(validator=Number(gte=0, lte=1))]
 
@@ -33,6 +41,9 @@ class EtherOptions:
     """Share of receptions that are lost."""
     nlos: _Share = 0.0
     """Share of receptions that an obstacle delays."""
+    move: list[str] | None = None
+    """Move an anchor while the air runs, from its position in the site file, as if somebody had hung it elsewhere:
+    4=0.3,0@60 by 0.3 m along x after 60 s; a third number is a height. Several times for several moves."""
     seed: Seed = 1
     """Same seed, same crystals and noise; what processes do in real time is never the same."""
     listen: str = f"127.0.0.1:{DEFAULT_PORT}"
@@ -59,11 +70,34 @@ def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOpt
     check_live(site)
     host, port = listen_address(asked.listen, DEFAULT_PORT)
     request = Request(site, noise_ps=asked.noise_ps, loss=asked.loss, nlos=asked.nlos, seed=asked.seed)
-    compile_kernels()
+    moves = tuple(_move(text, [anchor.id for anchor in site.anchors]) for text in asked.move or ())
+    with loading_kernels():
+        compile_kernels()
     bodies = {f"tag{number}": path for number, path in enumerate(patrols(site, asked.tags, asked.speed), start=1)}
-    emulated = Ether(site, bodies, impairments_of(request, site), asked.seed)
+    emulated = Ether(site, bodies, replace(impairments_of(request, site), anchor_displacements=moves), asked.seed)
+    for one in moves:
+        say = partial(log, f"anchor {one.anchor} is moved by {one.x_m:g}, {one.y_m:g}, {one.z_m:g} m")
+        emulated.medium.timeline.at(from_seconds(one.from_s), say)
     try:
         with contextlib.suppress(KeyboardInterrupt):
             run(EtherNode(emulated, host, DEFAULT_PORT if port is None else port, address, log).run(), punctual=True)
     except OSError as error:
         raise SkylessError(f"--listen is {asked.listen!r}, which cannot be used: {error.strerror or error}") from None
+
+
+def _move(text: str, anchors: Iterable[int]) -> "AnchorDisplacement":
+    """An anchor, by how much it is moved, and when. Raises SkylessError."""
+    from skyless.simulation.impairments import AnchorDisplacement
+
+    name, is_named, rest = text.partition("=")
+    shift, is_timed, after = rest.partition("@")
+    if not (is_named and is_timed):
+        raise SkylessError(f"--move is {text!r}; it should be ANCHOR=DX,DY@SECONDS or ANCHOR=DX,DY,DZ@SECONDS")
+    known = {str(anchor): anchor for anchor in anchors}
+    if name not in known:
+        raise SkylessError(f"--move is {text!r}; its anchor should be one of the site's: {', '.join(known)}")
+    x_m, y_m, z_m = (*finite_numbers("move", shift, (2, 3)), 0.0)[:3]
+    (from_s,) = finite_numbers("move", after, (1,))
+    if not from_s > 0.0:
+        raise SkylessError(f"--move is {text!r}; the time after @ should be more than 0 s")
+    return AnchorDisplacement(known[name], x_m, y_m, z_m, from_s)

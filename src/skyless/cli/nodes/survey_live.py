@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 _USUAL_S = 30.0
 _STATUS_S = 0.5
+_ERASED = "\r\x1b[2K"
+"""Erases a terminal's line."""
 
 
 @options
@@ -95,13 +97,7 @@ def serve_live(asked: LiveOptions, known: FactOptions) -> None:
 
 
 async def _serve(asked: LiveOptions, known: FactOptions) -> None:
-    node = await _node(asked, known, serves=True)
-    screen = asyncio.ensure_future(_status(node, None)) if sys.stderr.isatty() else None
-    try:
-        await node.run()
-    finally:
-        if screen is not None:
-            screen.cancel()
+    await _run(await _node(asked, known, serves=True), None)
 
 
 async def _gather(asked: LiveOptions, known: FactOptions, found: "list[SurveyNode]") -> None:
@@ -110,13 +106,18 @@ async def _gather(asked: LiveOptions, known: FactOptions, found: "list[SurveyNod
         async with asyncio.timeout(seconds + 1.0):  # a moment for the broker and the anchors to answer
             node = await _node(asked, known, serves=False)
             found.append(node)
-            screen = asyncio.ensure_future(_status(node, seconds)) if sys.stderr.isatty() else None
-            try:
-                await node.run()
-            finally:
-                if screen is not None:
-                    screen.cancel()
-                    print(file=sys.stderr)
+            await _run(node, seconds)
+
+
+async def _run(node: "SurveyNode", seconds: float | None) -> None:
+    """Run it, on a terminal with a status line."""
+    screen = asyncio.ensure_future(_status(node, seconds)) if sys.stderr.isatty() else None
+    try:
+        await node.run()
+    finally:
+        if screen is not None:
+            screen.cancel()
+            print(file=sys.stderr)
 
 
 async def _node(asked: LiveOptions, known: FactOptions, *, serves: bool) -> "SurveyNode":
@@ -140,21 +141,28 @@ async def _node(asked: LiveOptions, known: FactOptions, *, serves: bool) -> "Sur
         site_id = await find_site(address, lambda _: None)
     radio: Radio | None = None if asked.radio is None else open_radios(asked.radio, "tag", (asked.listener,))[0]
     settings = SurveySettings(site_id, site, known.site, not asked.no_watch, serves)
-    return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, log, radio)
+    return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, _log, radio)
 
 
 def _facts(known: FactOptions, site: "Site") -> "Facts":
     facts, warnings = facts_of(known, (anchor.id for anchor in site.all_anchors), site)
     for warning in warnings:
-        log(f"survey: {warning}")
+        _log(f"survey: {warning}")
     return facts
+
+
+def _log(line: str) -> None:
+    """Show a line in place of the status line, which follows again below it."""
+    if sys.stderr.isatty():
+        print(_ERASED, end="", file=sys.stderr)
+    log(line)
 
 
 async def _status(node: "SurveyNode", seconds: float | None) -> None:
     """One line on a terminal, kept up to date."""
     while True:
         await asyncio.sleep(_STATUS_S)
-        print(f"\r\x1b[2K{_line(node, seconds)}", end="", file=sys.stderr, flush=True)
+        print(f"{_ERASED}{_line(node, seconds)}", end="", file=sys.stderr, flush=True)
 
 
 def _line(node: "SurveyNode", seconds: float | None) -> str:

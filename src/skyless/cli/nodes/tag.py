@@ -18,6 +18,7 @@ from skyless.cli.common.options import (
     height_number,
     options,
 )
+from skyless.cli.common.progress import loading_kernels
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
@@ -108,7 +109,8 @@ def _on_radios(names: tuple[str, ...], asked: TagOptions, address: "MqttAddress 
     required = asked.protection.requirement(asked.method, asked.height_std)
     settings = TagSettings(asked.method, asked.qa, asked.site_id, integrity=required, publish_hz=asked.publish_hz)
     radios = open_radios(asked.radio, "tag", names)
-    compile_kernels(asked.method)
+    with loading_kernels():
+        compile_kernels(asked.method)
     return Tags(settings, radios, address, log).run()
 
 
@@ -121,7 +123,8 @@ def _on_sniffers(
 
     settings = _system(asked)
     radios = open_sniffers(asked.radio, names)
-    compile_packet_kernels()
+    with loading_kernels():
+        compile_packet_kernels()
     return PacketTags(settings, radios, address, log, simulated=lambda: is_simulated(asked.radio)).run()
 
 
