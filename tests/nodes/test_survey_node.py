@@ -2,7 +2,9 @@
 
 import asyncio
 import json
+from errno import ENOSPC
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -28,6 +30,7 @@ from skyless.nodes import survey as survey_module
 from skyless.nodes.live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey, is_record_of
 from skyless.nodes.stamp_log import StampLog
 from skyless.nodes.survey import SurveyNode, SurveySettings
+from skyless.nodes.survey_files import save_survey
 from skyless.simulation.impairments import DelayError, lab_impairments
 from skyless.simulation.world import World
 from skyless.site.digest import site_digest
@@ -36,6 +39,7 @@ from skyless.site.lab import lab_site
 from skyless.site.load import load_site
 from skyless.site.model import FloorPlanSite, ScheduleSite, UnplacedAnchor
 from skyless.survey.facts import Facts, Gauge, Tape
+from skyless.survey.ranges import PairRanges
 from skyless.survey.record import read_record, record_path
 from skyless.survey.result import Survey, SurveyedAnchor
 
@@ -494,3 +498,23 @@ def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_has_end
         assert sum("another survey program" in line for line in stage.said) == 1
 
     asyncio.run(main())
+
+
+def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch):
+    file = tmp_path / "lab.toml"
+    file.write_text(TEXT, encoding="utf-8")
+    written = []
+    write_bytes = Path.write_bytes
+
+    def until_the_disk_is_full(path, data):
+        written.append(path)
+        if len(written) == 3:
+            raise OSError(ENOSPC, "No space left on device", str(path))
+        return write_bytes(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", until_the_disk_is_full)
+    with pytest.raises(SkylessError, match="No space left"):
+        save_survey(file, true_survey(), PairRanges((), tuple(POSITIONS_M)), 0.0)
+    assert len(written) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["lab.toml"]
+    assert file.read_text(encoding="utf-8") == TEXT

@@ -173,7 +173,8 @@ def own_delays(
 ) -> tuple[Array, Array]:
     """Delays less the error of TX stamps that all ranges of an anchor share, and standard deviations, shape (k,).
 
-    ``delay_m``, ``covariance_m2``: of both together, as fitted. What is known of their shares is in the expected delays.
+    ``delay_m``, ``covariance_m2``: of both together, as fitted. What is known of their shares is in the expected
+    delays.
     """
     shared = np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in anchors])
     common = np.zeros(len(anchors)) if problem.common_delay_m is None else problem.common_delay_m
