@@ -71,5 +71,5 @@ def _limited(message: SurveyFactsMessage) -> Iterator[tuple[str, float, Limits]]
 def _stds(facts: Facts) -> Iterator[tuple[str, float, Limits]]:
     for name in ("height_std_m", "point_std_m", "sketch_std_m"):
         yield f"facts.{name}", getattr(facts, name), _POSITIVE_STD
-    for name in ("delay_std_m", "pair_std_m"):
+    for name in ("delay_std_m", "common_delay_std_m", "pair_std_m"):
         yield f"facts.{name}", getattr(facts, name), _STD
