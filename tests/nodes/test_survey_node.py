@@ -509,12 +509,18 @@ def test_a_finding_is_logged_once_although_its_size_wavers():
         state=lambda _: "no data",
         watch_message=lambda *_: WatchMessage(0.0, "watching", tuple(found), 15),
         restart_ranges=lambda: again.append(None),
+        advance_watch=lambda *_: None,
     )
+
+    async def update():
+        node.update()
+        await node._watching
+
     for size_m in (0.31, 0.32, 0.31, 0.32, 0.9):
         found[:] = [WatchFinding("moved", (4,), size_m, 0.01, 0.0, f"anchor 4 has moved by about {size_m:g} m")]
-        node.update()
+        asyncio.run(update())
     found.clear()
-    node.update()
+    asyncio.run(update())
     assert said == [
         "watch: anchor 4 has moved by about 0.31 m",
         "watch: anchor 4 has moved by about 0.9 m",
