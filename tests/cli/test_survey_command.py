@@ -253,6 +253,7 @@ def test_delays_from_a_recording_and_twice_is_once(capsys, tmp_path):
         (("--site", "{hall}/site.toml", "--keep-positions", "--delays-known"), "give either"),
         (("--sketch-std", "0.2"), "it needs the positions of --site"),
         (("--delays-known", "--delay-std", "0.1"), "--delay-std is 0.1"),
+        (("--delays-known", "--common-delay-std", "0.1"), "--common-delay-std is 0.1"),
         (("--height-std", "0.1"), "it is for --dimensions 3"),
         (("--height", "tall"), "--height is 'tall'"),
         (("--height", "77=2"), "there is no anchor 77; there are 1, 2"),

@@ -13,10 +13,10 @@ def fitted(problem, sketch_m=None):
 
 
 def test_clean_sites_are_not_ambiguous():
-    """At most 1 % are flagged: two of 30 would come once in 28 runs of this test if 1 % were."""
+    """At most 1 % are flagged: two of 18 would come once in 70 runs of this test if 1 % were."""
     flagged = 0
     for layout, dimensions, delay_std_m in ((LAB, 2, 0.0), (ROOM_J, 3, 0.0), (HALL_J, 2, 0.07)):
-        for seed in range(10):
+        for seed in range(6):
             drawn = draw(layout, seed, dimensions=dimensions, delay_std_m=delay_std_m)
             fit = fitted(drawn.problem)
             flagged += bool(find_ambiguities(drawn.problem, fit) or unchecked_reason(drawn.problem, fit))
@@ -56,14 +56,14 @@ def test_two_anchors_that_hang_on_two_others_have_a_mirror_image():
 def test_wrong_results_are_flagged():
     """Of runs beyond 10 cm and 4 stated standard deviations 90 % are: not fewer than 2 σ below."""
     wrong, flagged = 0, 0
-    for seed in range(20):
+    for seed in range(12):
         drawn = draw(LAB, seed, late=0.3)
         fit = fitted(drawn.problem)
         error_m = rms(aligned_error_m(fit.solution.position_m, LAB))
         if error_m > 0.1 and error_m > 4.0 * rms(aligned_std_m(fit.problem, fit)):
             wrong += 1
             flagged += bool(find_ambiguities(drawn.problem, fit) or unchecked_reason(drawn.problem, fit))
-    assert wrong > 5
+    assert wrong > 3
     assert flagged >= 0.9 * wrong - 2.0 * np.sqrt(0.09 * wrong)
 
 

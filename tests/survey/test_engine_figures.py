@@ -156,6 +156,20 @@ def test_delays_of_kept_positions(name, most_cm):
     assert abs(np.mean(squares) - 1.0) < 4.0 * np.std(squares) / math.sqrt(len(squares))
 
 
+def test_what_all_delays_share_needs_no_tape_where_ranges_suffice():
+    """With 1 m in all delays, as uncorrected stamps have."""
+    layout = LAYOUTS["hall"]
+    ranges, facts, _ = drawn(layout, 1, delay_std_m=0.07, pair_std_m=0.02)
+    expected = run_survey(ranges, facts)
+    late = structs.replace(
+        ranges, pairs=tuple(structs.replace(pair, range_m=pair.range_m + 2.0) for pair in ranges.pairs)
+    )
+    found = run_survey(late, structs.replace(facts, common_delay_std_m=1.0))
+    for one, other in zip(found.anchors, expected.anchors, strict=True):
+        assert one.delay_m == pytest.approx(other.delay_m + 1.0, abs=0.01)
+        assert math.dist((one.x_m, one.y_m), (other.x_m, other.y_m)) < 0.02
+
+
 def test_a_lab_without_a_tape_names_what_is_missing():
     """Figure 2: all anchors stand on two lines, and delays change the lines' lengths."""
     ranges, facts, _ = drawn(LAYOUTS["lab"], 0, delay_std_m=0.15, pair_std_m=0.0)

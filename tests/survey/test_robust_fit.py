@@ -1,5 +1,7 @@
 """Starts and the robust fit of a survey: late ranges are left out, sparse sites unfold, poor ones raise nothing."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,10 +9,13 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from random_sites import HALL_J, LAB, ROOM_J, aligned_error_m, draw, draw_plant, problem_of, rms
 
+from skyless.survey.facts import Facts
 from skyless.survey.fit.ambiguity import aligned_std_m, find_ambiguities, unchecked_reason
-from skyless.survey.fit.problem import residuals_m, solve_least_squares, solve_many
+from skyless.survey.fit.problem import delay_weights, residuals_m, solve_least_squares, solve_many
 from skyless.survey.fit.robust import fit_robustly
 from skyless.survey.fit.start import start_positions
+from skyless.survey.ranges import PairRange, PairRanges
+from skyless.survey.solve import run_survey
 
 
 def fitted(drawn, pair_std_m=0.03):
@@ -27,9 +32,9 @@ def test_exact_ranges_give_exact_positions(layout, dimensions):
 
 @pytest.mark.parametrize(("layout", "dimensions"), [(LAB, 2), (ROOM_J, 3)])
 def test_errors_are_those_of_the_stated_covariance(layout, dimensions):
-    """Mean square error over stated variance: within 4 standard deviations of 1 over 20 runs."""
+    """Mean square error over stated variance: within 4 standard deviations of 1 over 10 runs."""
     ratios = []
-    for seed in range(20):
+    for seed in range(10):
         drawn = draw(layout, seed, dimensions=dimensions)
         solution = solve_least_squares(drawn.problem, layout)
         fit = fitted(drawn)
@@ -41,10 +46,10 @@ def test_errors_are_those_of_the_stated_covariance(layout, dimensions):
 
 
 def test_late_ranges_of_the_lab_are_left_out():
-    """80 % of runs below 10 cm are asked for; fewer than 13 of 24 would come once in 400 then."""
-    runs = [draw(LAB, 500 + seed, late=0.1) for seed in range(24)]
+    """80 % of runs below 10 cm are asked for; fewer than 6 of 12 would come once in 250 then."""
+    runs = [draw(LAB, 500 + seed, late=0.1) for seed in range(12)]
     good = [rms(aligned_error_m(fitted(drawn).solution.position_m, LAB)) < 0.1 for drawn in runs]
-    assert sum(good) >= 13
+    assert sum(good) >= 6
 
 
 def test_late_ranges_of_a_hall_with_unknown_delays():
@@ -72,11 +77,52 @@ def worse(seed):
     return drawn._replace(problem=replace(drawn.problem, variance_m2=np.full(len(drawn.problem.range_m), 0.03**2)))
 
 
-def test_a_sparse_plant_unfolds_and_shows_its_error():
+def test_a_sparse_plant_unfolds_and_most_of_its_anchors_are_determined():
+    """Its ranges are off by 16 cm (rms) where 3 cm are expected; its positions are no better, and say so."""
     drawn = draw_plant(7)
-    fit = fitted(drawn)
-    assert rms(aligned_error_m(fit.solution.position_m, drawn.position_m)) < 0.5
-    assert 0.08 < fit.range_std_m < 0.3
+    problem, noise = drawn.problem, np.sqrt(np.maximum(drawn.problem.variance_m2 - 0.03**2, 0.0))
+    columns = (problem.first, problem.second, problem.range_m, noise)
+    pairs = tuple(PairRange(*row, 10) for row in zip(*(column.tolist() for column in columns), strict=True))
+    heights = dict(enumerate(drawn.position_m[:, 2].tolist()))
+    survey = run_survey(PairRanges(pairs, tuple(heights)), Facts(heights_m=heights))
+    found = [anchor for anchor in survey.anchors if anchor.determined]
+    assert len(found) >= 24
+    assert 0.08 < survey.range_std_m < 0.3
+    position_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in found])
+    error_m = rms(aligned_error_m(position_m, drawn.position_m[[anchor.id for anchor in found]]))
+    # Late ranges are not normal; neither are errors, but of the stated size.
+    assert error_m < 2.0 * math.sqrt(2.0) * rms([anchor.std_m for anchor in found])
+
+
+def test_nothing_is_left_out_where_nothing_would_check_the_rest():
+    """A square with a diagonal by tape and delays that share an unknown part: one range too many.
+
+    Without the other diagonal the square fits exactly, also folded over.
+    """
+    position_m = np.array([[0, 0, 0], [4.5, 0, 0], [0, 4.5, 0], [4.5, 4.5, 0.0]])
+    first, second = np.triu_indices(4, 1)
+    range_m = np.linalg.norm(position_m[first] - position_m[second], axis=1) - 0.15
+    range_m[first + second == 3] += [0.0, -0.11]
+    problem = problem_of(position_m, first, second, range_m, dimensions=2, delay_std_m=0.02, std_m=0.03)
+    taped = {"tape_first": [0], "tape_second": [3], "tape_m": [math.sqrt(40.5)], "tape_variance_m2": [0.005**2]}
+    problem = replace(problem, **{name: np.array(value) for name, value in taped.items()}, common_delay_m=np.ones(4))
+    fit = fit_robustly(problem, start_positions(problem), 0.03)
+    assert fit.used.all()
+    assert 0.03 <= fit.range_std_m <= 0.06
+    assert rms(aligned_error_m(fit.solution.position_m, position_m)) < 0.08
+    assert find_ambiguities(problem, fit) == ()
+    late = replace(problem, range_m=problem.range_m + np.where(first + second == 3, [0, 0, 0.6, 0, 0, 0], 0.0))
+    assert not fit_robustly(late, start_positions(late), 0.03).used.all()
+
+
+@pytest.mark.parametrize("common_m", [0.0, 0.1, 1e3])
+def test_weights_of_delays_are_the_root_of_their_information(common_m):
+    problem = draw(LAB, 1, delay_std_m=0.07).problem
+    common = np.array([common_m] * 5 + [0.0])
+    problem = replace(problem, common_delay_m=common)
+    weights = delay_weights(problem)
+    covariance = np.diag(problem.delay_variance_m2) + np.outer(common, common)
+    assert np.allclose(weights.T @ weights @ covariance, np.eye(6), atol=1e-6)
 
 
 def test_equal_data_have_equal_starts():
@@ -92,7 +138,7 @@ def test_a_sketch_is_the_first_start_and_turns_the_others():
     assert np.linalg.norm(starts[1] - HALL_J, axis=1).max() < 1.5
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 7), st.data())
 def test_few_or_missing_pairs_raise_nothing(n, data):
     """Also unconnected anchors, and none with a pair at all."""

@@ -23,6 +23,7 @@ from skyless.mqtt.messages import (
     SurveyFactsMessage,
     SurveyMessage,
     SurveySaveMessage,
+    WatchFinding,
     WatchMessage,
 )
 from skyless.mqtt.survey_facts import BadFactsError, check_facts
@@ -51,6 +52,7 @@ from skyless.survey.ranges import PairRanges
 from skyless.survey.record import SurveyRecord, read_record, record_path
 from skyless.survey.result import Survey
 from skyless.survey.stamps.legs import LegCollector
+from skyless.survey.surveyed_site import with_delays_of
 
 NAME: Final = "survey"
 """On MQTT: one site has one survey program."""
@@ -72,6 +74,9 @@ _COST: Final = 5.0
 _SETTLED_S: Final = 60.0
 _SETTLED_UPDATE_S: Final = 5.0
 """After a minute of data results change little, and are made less often."""
+
+_SAME_SIZE: Final = 0.25
+"""A finding is logged again when its size has changed by more than this share."""
 
 _EARLIER_KEPT: Final = 32
 """Sites before the present one that a placement names."""
@@ -132,8 +137,8 @@ class SurveyNode:
         self._next_solve_s = 0.0
         self._next_publish_s = 0.0
         self._watch_published: tuple[WatchMessage, float] | None = None
-        self._findings: frozenset[str] = frozenset()
-        self._moved: frozenset[str] = frozenset()
+        self._findings: dict[tuple[object, tuple[int, ...]], WatchFinding] = {}
+        """Those that are logged."""
         self._said_state = ""
         self._logged: set[str] = set()
         """Lines that are logged once."""
@@ -311,6 +316,16 @@ class SurveyNode:
 
     # Results
 
+    def final_ranges(self) -> PairRanges:
+        """All ranges when nothing more comes, as the antenna delays of the site to be surveyed would give them.
+
+        The anchors may run with others. Only once the site is known.
+        """
+        assert self.live is not None
+        self.live.finish()
+        ranges = self.live.ranges()
+        return ranges if self._running is None else with_delays_of(ranges, self._running, self.live.site)
+
     def update(self) -> None:
         """Begin another result if it is time, and publish what is due."""
         live, now_s, unix_s = self.live, time.monotonic(), time.time()
@@ -388,18 +403,25 @@ class SurveyNode:
             self._said_state = state
 
     def _log_findings(self, live: LiveSurvey, watch: WatchMessage) -> None:
-        """Log what is new; an anchor that has moved makes the ranges of before useless for another survey."""
-        present = frozenset(one.sentence for one in watch.findings)
-        kinds = {(one.kind, one.anchors) for one in watch.findings}
-        for one in watch.findings:
-            if one.sentence not in self._findings:
+        """Log what is new; an anchor that has moved makes the ranges of before useless for another survey.
+
+        A finding whose size changes a little is the same one.
+        """
+        present: dict[tuple[object, tuple[int, ...]], WatchFinding] = {
+            (one.kind, one.anchors): one for one in watch.findings
+        }
+        for key, one in present.items():
+            logged = self._findings.get(key)
+            if logged is not None and abs(one.size_m - logged.size_m) < _SAME_SIZE * abs(logged.size_m):
+                present[key] = logged
+            elif logged is None or one.sentence != logged.sentence:
                 self._log(f"watch: {one.sentence}")
-        for sentence in sorted(self._findings - present):
-            self._log(f"watch: over: {sentence}")
-        moved = frozenset(f"{kind} {anchors}" for kind, anchors in kinds if kind in ("moved", "delay"))
-        if moved - self._moved:
+        for key, one in self._findings.items():
+            if key not in present:
+                self._log(f"watch: over: {one.sentence}")
+        if any(kind in ("moved", "delay") for kind, _ in present.keys() - self._findings.keys()):
             live.restart_ranges()
-        self._findings, self._moved = present, moved
+        self._findings = present
 
     def _log_once(self, line: str) -> None:
         if line not in self._logged and len(self._logged) < _MOST_LOGGED:

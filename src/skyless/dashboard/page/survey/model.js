@@ -24,6 +24,7 @@ const NO_FACTS = {
   sketch_std_m: 0.3,
   keep_positions: false,
   delay_std_m: 0.07,
+  common_delay_std_m: 0.1,
   pair_std_m: 0.03,
   delays: [],
   gauge: null,
