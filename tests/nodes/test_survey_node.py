@@ -501,44 +501,6 @@ def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_has_end
     asyncio.run(main())
 
 
-def test_a_finding_is_logged_once_although_its_size_wavers():
-    said, again = [], []
-    node = SurveyNode(SurveySettings(1), lambda _: Facts(), None, None, said.append)
-    found = []
-    node.live = SimpleNamespace(
-        state=lambda _: "no data",
-        watch_message=lambda *_: WatchMessage(0.0, "watching", tuple(found), 15),
-        restart_ranges=lambda: again.append(None),
-        advance_watch=lambda *_: None,
-    )
-
-    async def update():
-        node.update()
-        await node._watching
-
-    for size_m in (0.31, 0.32, 0.31, 0.32, 0.9):
-        found[:] = [WatchFinding("moved", (4,), size_m, 0.01, 0.0, f"anchor 4 has moved by about {size_m:g} m")]
-        asyncio.run(update())
-    found.clear()
-    asyncio.run(update())
-    assert said == [
-        "watch: anchor 4 has moved by about 0.31 m",
-        "watch: anchor 4 has moved by about 0.9 m",
-        "watch: over: anchor 4 has moved by about 0.9 m",
-    ]
-    assert len(again) == 1
-
-
-def test_ranges_count_from_the_delays_of_the_file_although_the_anchors_run_with_others():
-    node = SurveyNode(SurveySettings(1, FRESH), lambda _: Facts(), None, None, lambda _: None)
-    node.live = live_after(3.0)
-    before = {(pair.a, pair.b): pair.range_m for pair in node.final_ranges().pairs}
-    more = replace(FRESH, unplaced=tuple(replace(one, tx_antenna_delay_ticks=16536) for one in FRESH.unplaced))
-    node._on_site(SiteMessage(more, simulated=True, unix_s=0.0))
-    for pair in node.final_ranges().pairs:  # with smaller delays they are longer, by 50 ticks of each anchor
-        assert pair.range_m - before[pair.a, pair.b] == pytest.approx(100 * 0.00469176, abs=1e-5)
-
-
 def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch):
     file = tmp_path / "lab.toml"
     file.write_text(TEXT, encoding="utf-8")
@@ -557,3 +519,40 @@ def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch):
     assert len(written) == 3
     assert [path.name for path in tmp_path.iterdir()] == ["lab.toml"]
     assert file.read_text(encoding="utf-8") == TEXT
+
+
+def test_a_finding_is_logged_once_although_its_size_wavers():
+    said, again = [], []
+    node = SurveyNode(SurveySettings(1), lambda _: Facts(), None, None, said.append)
+    found = []
+    node.live = SimpleNamespace(
+        state=lambda _: "no data",
+        watch_message=lambda *_: WatchMessage(0.0, "watching", tuple(found), 15),
+        restart_ranges=lambda: again.append(None),
+        advance_watch=lambda _: None,
+    )
+
+    async def main():
+        for size_m in (0.31, 0.32, 0.31, 0.32, 0.9):
+            found[:] = [WatchFinding("moved", (4,), size_m, 0.01, 0.0, f"anchor 4 has moved by about {size_m:g} m")]
+            node.update()
+        found.clear()
+        node.update()
+
+    asyncio.run(main())
+    assert said == [
+        "watch: anchor 4 has moved by about 0.31 m",
+        "watch: anchor 4 has moved by about 0.9 m",
+        "watch: over: anchor 4 has moved by about 0.9 m",
+    ]
+    assert len(again) == 1
+
+
+def test_ranges_count_from_the_delays_of_the_file_although_the_anchors_run_with_others():
+    node = SurveyNode(SurveySettings(1, FRESH), lambda _: Facts(), None, None, lambda _: None)
+    node.live = live_after(3.0)
+    before = {(pair.a, pair.b): pair.range_m for pair in node.final_ranges().pairs}
+    more = replace(FRESH, unplaced=tuple(replace(one, tx_antenna_delay_ticks=16536) for one in FRESH.unplaced))
+    node._on_site(SiteMessage(more, simulated=True, unix_s=0.0))
+    for pair in node.final_ranges().pairs:  # with smaller delays they are longer, by 50 ticks of each anchor
+        assert pair.range_m - before[pair.a, pair.b] == pytest.approx(100 * 0.00469176, abs=1e-5)

@@ -37,6 +37,8 @@ _RESULTS_KEPT: Final = 64
 _MOST_BACKLOG_S: Final = 60.0
 """A message that is later than this against others of its sender shows that a clock was set, not that it waited."""
 
+_SHOWN_PAIRS_PER_S: Final = 200
+
 _LAG_S: Final = 30.0
 """For up to twice this time the quickest message counts: a host's clock that was set back is noticed after it."""
 
@@ -64,6 +66,8 @@ class LiveSurvey:
         self.begun = 0
         """How often ranges have begun again: a result of ranges from before does not count."""
         self._watches = watches
+        self._shown: tuple[PairRanges, float] | None = None
+        """The ranges in messages, and when they were made."""
         self._watch: _Watched | None = None
         self._results: dict[int, tuple[Survey, PairRanges]] = {}
         self._runs: dict[int, str] = {}
@@ -154,7 +158,7 @@ class LiveSurvey:
         """All of it for those who watch."""
         newest, state = self._results.get(self.serial), self.state(now_s)
         present = {anchor for anchor, heard_s in self._heard_s.items() if now_s - heard_s <= PRESENT_S}
-        ranges = self._ranger.ranges()
+        ranges = self._shown_ranges(now_s)
         error = self.error
         if error is None and state == "no data":
             ago = "yet" if self._newest_s is None else f"for {now_s - self._newest_s:.0f} s"
@@ -201,6 +205,12 @@ class LiveSurvey:
 
     # Within
 
+    def _shown_ranges(self, now_s: float) -> PairRanges:
+        """Ranges for a message: those of 1225 pairs take half a second, and are made again every six."""
+        if self._shown is None or not 0.0 <= now_s - self._shown[1] < len(self._shown[0].pairs) / _SHOWN_PAIRS_PER_S:
+            self._shown = self._ranger.ranges(), now_s
+        return self._shown[0]
+
     @property
     def _known(self) -> set[int]:
         return self._identifiers
@@ -232,6 +242,7 @@ class LiveSurvey:
         self.begun += 1
         self._identifiers = {anchor.id for anchor in self.site.all_anchors}
         self._ranger = PairRanger(on_block=self._on_block)
+        self._shown = None
         self._results.clear()
 
     def _begin_watch(self, record: SurveyRecord | None) -> None:
