@@ -25,8 +25,8 @@ from skyless.simulation.impairments import Impairments
 from skyless.simulation.trajectory import Roaming
 from skyless.site.grid import grid_site
 from skyless.site.model import EXACT
-from skyless.studies.plan import Cell
-from skyless.studies.runner import run_cells, run_cells_on_dask
+from skyless.studies.common.plan import Cell
+from skyless.studies.common.runner import run_cells, run_cells_on_dask
 
 SPACING_M = 15.0
 WARM_S = 1.0

@@ -17,9 +17,10 @@ from skyless.dashboard.guard import AccessRules
 from skyless.dashboard.live import LiveSite
 from skyless.dashboard.overlays import NoOverlayError, Overlays, overlay_task
 from skyless.dashboard.playback import Playback
-from skyless.dashboard.site_survey import BadFactsError, SiteSurvey
+from skyless.dashboard.site_survey import SiteSurvey
 from skyless.mqtt import topics
 from skyless.mqtt.messages import SurveyFactsMessage, SurveyMessage, WatchFinding, WatchMessage
+from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.model import FloorPlanSite, UnplacedAnchor
 from skyless.survey.facts import Facts, Gauge, Tape
 from skyless.survey.result import Survey, SurveyedAnchor, TapeAdvice

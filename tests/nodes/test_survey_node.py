@@ -22,6 +22,7 @@ from skyless.mqtt.messages import (
     SurveyFactsMessage,
     SurveyMessage,
     SurveySaveMessage,
+    WatchFinding,
     WatchMessage,
 )
 from skyless.nodes import survey as survey_module
@@ -181,13 +182,16 @@ class FakeLink:
     """A link to no broker: the test calls the handlers, and reads what is published."""
 
     def __init__(self, *_, **__):
-        self.handlers, self.published, self.on_state = {}, [], []
+        self.handlers, self.published, self.forgotten, self.on_state = {}, [], [], []
 
     def subscribe(self, topic, handler, qos=0):
         self.handlers[topic] = handler
 
     def publish(self, topic, message, **options):
         self.published.append((topic, message, options))
+
+    def forget(self, topic):
+        self.forgotten.append(topic)
 
     async def run(self):
         await asyncio.Event().wait()
@@ -235,8 +239,9 @@ class Stage:
     async def step(self):
         """Twice, so that a result that is begun is published, too."""
         self.node.update()
-        if self.node._solving is not None:
-            await self.node._solving
+        for task in (self.node._solving, self.node._watching):
+            if task is not None:
+                await task
         self.now_s += 0.001
 
 
@@ -398,3 +403,127 @@ def test_one_that_gathers_computes_and_publishes_nothing_but_its_request(monkeyp
         assert {type(message) for _, message, _ in stage.link.published} <= {RequestMessage}
 
     asyncio.run(main())
+
+
+def test_a_result_that_was_begun_before_it_was_saved_is_dropped(monkeypatch):
+    """Its delays are those against the site before: with them, every delay would be corrected twice."""
+
+    async def main():
+        stage = Stage(monkeypatch, site=SITE)
+        await stage.play()
+        live, serial = stage.node.live, stage.node.live.serial
+        begun = asyncio.ensure_future(stage.node._make_result(live))
+        await asyncio.sleep(0)
+        stage.node.save()
+        await begun
+        assert live.serial == serial
+        assert live.result(serial) is None
+        with pytest.raises(SkylessError, match="not there"):
+            stage.node.save()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("step_s", [-30.0, -3600.0, 30.0, 3600.0])
+def test_ranges_go_on_when_the_clock_of_an_anchors_host_is_set(step_s):
+    live = LiveSurvey(SITE, Facts())
+    for round_number in range(8):  # the same stamps again and again, 100 s in all
+        for t_s, message in messages():
+            set_s = step_s if message.anchor == 2 and round_number > 0 else 0.0
+            again = replace(message, run=str(round_number), unix_s=message.unix_s + 13.0 * round_number + set_s)
+            live.add_stamps(again, BEGIN_S + 13.0 * round_number + t_s)
+        if round_number == 5:  # a minute after the clock was set
+            before = {(one.a, one.b): one.exchanges for one in live.ranges().pairs}
+    after = {(one.a, one.b): one.exchanges for one in live.ranges().pairs}
+    assert min(after[pair] - before[pair] for pair in after) > 500
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        Facts(tapes=(Tape(1, 2, -3.0),)),
+        Facts(tapes=(Tape(1, 2, 1e300),)),
+        Facts(points={1: (1e200, 0.0, None)}),
+        Facts(pair_std_m=-1.0),
+        Facts(heights_m=dict.fromkeys(range(10_001), 1.0)),
+        Facts(gauge=Gauge(1, 1)),
+    ],
+)
+def test_facts_that_cannot_be_computed_with_are_counted_and_ignored(monkeypatch, facts):
+    async def main():
+        stage = Stage(monkeypatch, site=SITE)
+        stage.link.receive(topics.survey_facts_topic(1), SurveyFactsMessage(facts))
+        await stage.play(0.0, 2.0)
+        assert stage.node.problems == 1
+        assert stage.link.newest(SurveyMessage).facts == Facts()
+
+    asyncio.run(main())
+
+
+def test_numbers_that_are_no_stamps_spoil_nothing(monkeypatch):
+    async def main():
+        stage = Stage(monkeypatch, site=SITE)
+        await stage.play(0.0, 2.0)
+        wrong = [[2, 1 << 64, -5], [2, -(1 << 63), 1 << 40], [1, 5, 5], [77, 5, 5]]
+        for unix_s in (0.0, 1e300, -1e300):
+            body = {"anchor": 1, "run": "run1", "unix_s": unix_s, "stamps": wrong}
+            stage.link.handlers[topics.stamps_topic(1, "+")]("", json.dumps(body).encode())
+        await stage.play(2.0, 8.0)
+        assert len(stage.asked[-1][0].pairs) == 15
+
+    asyncio.run(main())
+
+
+def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_has_ended(monkeypatch):
+    async def main():
+        stage = Stage(monkeypatch, site=SITE)
+        await stage.play(0.0, 2.0)
+        own = stage.link.newest(SurveyMessage)
+        for unix_s in (1.0, 2.0):  # a later one, which waits itself
+            stage.link.receive(topics.survey_topic(1), replace(own, by=own.by + "0", unix_s=unix_s))
+        stage.link.receive(topics.survey_topic(1), replace(own, by="0", unix_s=1.0))  # one that the broker has kept
+        await stage.play(2.0, 3.0)
+        assert not stage.node._waits()
+        stage.link.receive(topics.survey_topic(1), replace(own, by="0", unix_s=2.0))
+        count = len(stage.link.published)
+        await stage.play(3.0, 5.0)
+        stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", stage.node.live.serial))
+        assert len(stage.link.published) == count
+        stage.now_s += 31.0
+        await stage.step()
+        assert isinstance(stage.link.published[-1][1], SurveyMessage | WatchMessage)
+        assert sum("another survey program" in line for line in stage.said) == 1
+
+    asyncio.run(main())
+
+
+def test_a_finding_is_logged_once_although_its_size_wavers():
+    said, again = [], []
+    node = SurveyNode(SurveySettings(1), lambda _: Facts(), None, None, said.append)
+    found = []
+    node.live = SimpleNamespace(
+        state=lambda _: "no data",
+        watch_message=lambda *_: WatchMessage(0.0, "watching", tuple(found), 15),
+        restart_ranges=lambda: again.append(None),
+    )
+    for size_m in (0.31, 0.32, 0.31, 0.32, 0.9):
+        found[:] = [WatchFinding("moved", (4,), size_m, 0.01, 0.0, f"anchor 4 has moved by about {size_m:g} m")]
+        node.update()
+    found.clear()
+    node.update()
+    assert said == [
+        "watch: anchor 4 has moved by about 0.31 m",
+        "watch: anchor 4 has moved by about 0.9 m",
+        "watch: over: anchor 4 has moved by about 0.9 m",
+    ]
+    assert len(again) == 1
+
+
+def test_ranges_count_from_the_delays_of_the_file_although_the_anchors_run_with_others():
+    node = SurveyNode(SurveySettings(1, FRESH), lambda _: Facts(), None, None, lambda _: None)
+    node.live = live_after(3.0)
+    before = {(pair.a, pair.b): pair.range_m for pair in node.final_ranges().pairs}
+    more = replace(FRESH, unplaced=tuple(replace(one, tx_antenna_delay_ticks=16536) for one in FRESH.unplaced))
+    node._on_site(SiteMessage(more, simulated=True, unix_s=0.0))
+    for pair in node.final_ranges().pairs:  # with smaller delays they are longer, by 50 ticks of each anchor
+        assert pair.range_m - before[pair.a, pair.b] == pytest.approx(100 * 0.00469176, abs=1e-5)

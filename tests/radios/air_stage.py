@@ -46,10 +46,10 @@ class Stage:
             self.now_s += seconds / steps
             self.ether.advance()
 
-    def join(self, kind, *names):
+    def join(self, kind, *names, tx_delays_ticks=()):
         """A client, its session (or why it has none), and its counters when it joined."""
         client = Listener()
-        session = self.ether.join(client, Join(kind, names))
+        session = self.ether.join(client, Join(kind, names, tx_delays_ticks))
         return client, session
 
     def ticks(self, client, node, ahead_s):

@@ -5,7 +5,7 @@ from air_stage import LAB, Stage, in_loop
 
 from skyless.air.ieee802154 import after_rmarker_s
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.radios.ether_wire import Arrival, Clocks, Done, Joined
+from skyless.radios.ether_wire import Arrival, Clocks, Done, Joined, Send
 from skyless.ticks import difference
 
 FRAME = b"a frame" * 10
@@ -57,6 +57,35 @@ def test_stamps_are_the_flight_time_apart():
         flight = (round_one * round_two - reply_one * reply_two) / (round_one + round_two + reply_one + reply_two)
         grid_m = 512 * TICK_S * SPEED_OF_LIGHT_MPS  # the radio sends at multiples of 512 ticks
         assert flight * TICK_S * SPEED_OF_LIGHT_MPS == pytest.approx(10.0, abs=grid_m)
+
+    in_loop(play)
+
+
+@pytest.mark.parametrize("wrong_ticks", [-600, -1, 1, 20])
+def test_a_radio_that_is_set_to_another_delay_starts_its_frames_when_it_would_otherwise(wrong_ticks):
+    """Only its stamps are off by the difference; the site of the ether has the delay that the radio really has."""
+    delay_ticks = LAB.anchors[0].tx_antenna_delay_ticks
+
+    def rx_ticks(tx_delays_ticks, wrong_ticks):
+        stage = Stage()
+        sender, session = stage.join("anchor", "1", tx_delays_ticks=tx_delays_ticks)
+        tag, _ = stage.join("tag", "tag1")
+        starts = stage.ticks(sender, 0, 2e-3) // 512 * 512
+        stage.ether.transmit(session, Send(0, starts + delay_ticks + wrong_ticks, FRAME))
+        stage.pass_time(4e-3)
+        assert sender.of(Done) == [Done(0, starts + delay_ticks + wrong_ticks, late=False)]
+        return tag.of(Arrival)[0].rows[0].rx_ticks
+
+    def play():
+        assert rx_ticks((delay_ticks + wrong_ticks,), wrong_ticks) == rx_ticks((), 0)
+
+    in_loop(play)
+
+
+def test_delays_for_other_nodes_than_those_that_join_are_refused():
+    def play():
+        _, session = Stage().join("anchor", "1", tx_delays_ticks=(1, 2))
+        assert session == "tx_delays_ticks should have one value a node"
 
     in_loop(play)
 

@@ -10,7 +10,7 @@ from skyless.slot_claims import MOST_PATIENCE
 from skyless.studies import claims
 from skyless.studies.catalogue import STUDIES
 from skyless.studies.claims import EVENTS, ClaimRun, ClaimSite, run_claims
-from skyless.studies.plan import Plan
+from skyless.studies.common.plan import Plan
 
 SMALL = ClaimSite("small", 180.0, 30.0, 15.0, 22.0, 17, 20, (0.8,), 300)
 

@@ -9,6 +9,8 @@ from skyless.errors import SkylessError
 from skyless.evaluation.figures import picture
 from skyless.site.lab import ideal_lab_site
 from skyless.studies.catalogue import STUDIES
+from skyless.studies.common.plan import plan_of
+from skyless.studies.common.summary import CLUSTER_FIXES, clustered_interval
 from skyless.studies.episodes import Case, draw_episode
 from skyless.studies.integrity import (
     ALL_FAULTS,
@@ -23,8 +25,6 @@ from skyless.studies.integrity import (
     rows,
     run_chunk,
 )
-from skyless.studies.plan import plan_of
-from skyless.studies.summary import CLUSTER_FIXES, clustered_interval
 
 SLOT_S = ideal_lab_site().schedule.slot_s
 PLAN = plan_of("joint", 1, episodes=100)

@@ -5,7 +5,7 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.studies import large
-from skyless.studies.plan import Plan
+from skyless.studies.common.plan import Plan
 
 PLAN = Plan(seed=5, worlds=2, seconds=8.0)
 CASES = {case.name: case for case in large.cases(PLAN)}

@@ -15,10 +15,10 @@ from skyless.simulation.impairments import Body
 from skyless.site.lab import lab_site
 from skyless.studies import room
 from skyless.studies.catalogue import STUDIES
-from skyless.studies.plan import Limit, Row, plan_of, with_limits
+from skyless.studies.common.plan import Limit, Row, plan_of, with_limits
+from skyless.studies.common.summary import clustered_interval
+from skyless.studies.common.worlds import RunResult, box, run_world
 from skyless.studies.room import biases_of, bound_cells
-from skyless.studies.summary import clustered_interval
-from skyless.studies.worlds import RunResult, box, run_world
 from skyless.uncertainty.bounds import Biases
 
 PLAN = plan_of("joint", 1, study="room")

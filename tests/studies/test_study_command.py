@@ -91,8 +91,8 @@ def test_every_study_can_be_drawn(name, tmp_path):
     """From rows as they may be, without simulating: with numbers, without, with a single world."""
     from skyless.evaluation.figures import picture
     from skyless.studies.catalogue import STUDIES
-    from skyless.studies.plan import plan_of
-    from skyless.studies.worlds import RunResult, run_world
+    from skyless.studies.common.plan import plan_of
+    from skyless.studies.common.worlds import RunResult, run_world
 
     plan = plan_of("joint", 1, quick=True, worlds=2)
     study = STUDIES[name]

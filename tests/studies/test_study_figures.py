@@ -11,9 +11,9 @@ from skyless.simulation.world import World
 from skyless.site.check import check_site
 from skyless.site.lab import lab_site
 from skyless.studies import efficiency, loss, motion, nlos, room, scale, sync
-from skyless.studies.plan import Plan, plan_of, seed_of
-from skyless.studies.summary import Case, interval, jackknife, world_cells, world_rows
-from skyless.studies.worlds import RunResult, box, large_lab_site, run_world, walking, without_mesh
+from skyless.studies.common.plan import Plan, plan_of, seed_of
+from skyless.studies.common.summary import Case, interval, jackknife, world_cells, world_rows
+from skyless.studies.common.worlds import RunResult, box, large_lab_site, run_world, walking, without_mesh
 
 SMALL = Plan(method="joint", worlds=2, seconds=1.0, tags=1)
 RANDOM = np.random.default_rng(5)

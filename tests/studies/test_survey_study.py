@@ -9,7 +9,7 @@ from skyless.evaluation.surveys.judge import aligned, tag_error_m
 from skyless.evaluation.surveys.layouts import survey_layouts
 from skyless.studies import survey as study
 from skyless.studies.catalogue import STUDIES
-from skyless.studies.plan import Plan
+from skyless.studies.common.plan import Plan
 from skyless.studies.survey import GROUPS, Group, Variant, limits_of
 
 SMALL = {

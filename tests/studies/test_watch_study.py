@@ -6,7 +6,7 @@ from skyless.evaluation.figures import picture
 from skyless.evaluation.watch.drawn import WatchResult, WatchRun, run_watch
 from skyless.studies import watch
 from skyless.studies.catalogue import STUDIES
-from skyless.studies.plan import Plan
+from skyless.studies.common.plan import Plan
 
 
 @pytest.fixture

@@ -11,8 +11,10 @@ from msgspec.structs import replace
 
 from skyless.constants import TICK_M
 from skyless.errors import ConfigurationError, SkylessError
+from skyless.site.check import check_site
 from skyless.site.lab import lab_site
 from skyless.site.load import load_site
+from skyless.site.local_almanac import site_issue, site_pages_of
 from skyless.site.model import EXACT, ScheduleSite, UnplacedAnchor
 from skyless.site.template import site_template
 from skyless.survey.ranges import PairRange, PairRanges
@@ -113,6 +115,18 @@ def test_delays_accuracy_and_anchors_that_are_not_determined():
     assert new.accuracy == replace(site.accuracy, range_std_m=0.0544)
     assert unchanged_anchors(site, survey) == (b.id, kept.id)
     assert delay_changes_ticks(site, survey) == {a.id: round(-0.4 / TICK_M), 100: round(0.4 / TICK_M)}
+
+
+@pytest.mark.parametrize("range_std_m", [0.0, 0.03, 0.50003, 6.5])
+def test_tags_see_from_the_accuracy_that_delays_have_changed(range_std_m):
+    """Positions that are kept do not change the almanac, and delays are not in it."""
+    site = replace(slots_site(6, 0), accuracy=replace(LAB.accuracy, range_std_m=range_std_m))
+    kept = [found(one.id, one.x_m, one.y_m, one.z_m, one.std_m, 0.0) for one in site.anchors]
+    assert surveyed_site(site, survey_of(*kept, range_std_m=0.0)).accuracy == site.accuracy
+    changed = surveyed_site(site, survey_of(*kept[1:], replace(kept[0], delay_m=0.1), range_std_m=0.0))
+    assert 0.5e-4 < abs(changed.accuracy.range_std_m - range_std_m) < 2e-4
+    assert site_issue(site_pages_of(changed)) != site_issue(site_pages_of(site))
+    check_site(changed, "the site")
 
 
 def test_one_accuracy_for_all_anchors_in_protocol_1():

@@ -21,8 +21,10 @@ from skyless.simulation.trajectory import Waypoints
 from skyless.simulation.world import World
 from skyless.survey.facts import Facts
 from skyless.survey.solve import run_survey
+from skyless.survey.tags.estimate import estimate
 from skyless.survey_inputs.recorded_stamps import ranges_of
-from skyless.survey_inputs.walk import walk_of
+from skyless.survey_inputs.samples import First, gather
+from skyless.survey_inputs.walk import relayed_tdoas, walk_of
 
 HEIGHT_M = 0.0
 WAY = [(1.0, 1.0, HEIGHT_M), (5.0, 7.0, HEIGHT_M), (5.0, 1.0, HEIGHT_M), (1.0, 7.0, HEIGHT_M), (3.0, 4.0, HEIGHT_M)]
@@ -85,6 +87,19 @@ def test_a_part_of_the_walk(walk):
 def test_what_the_recording_lacks(walk, tag, span, words):
     with McapRecording(walk) as recording, pytest.raises(SkylessError, match=words):
         walk_of(recording, LAB.id, tag, span)
+
+
+def test_where_there_is_no_site_time_relays_show_the_delays_but_for_what_all_share(walk):
+    ranges_m = {(pair.a, pair.b): pair.range_m for pair in ranges_of(walk).ranges.pairs}
+    anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in LAB.anchors}
+    way = Waypoints(WAY, 1.0, loop=True, corner_s=0.5)
+    with McapRecording(walk) as recording:
+        tdoas = relayed_tdoas(recording, "a", LAB.id, ranges_m)
+        samples = gather(tdoas, anchors_m, lambda _: lambda t_s: tuple(way.position(t_s - live_site.UNIX_S)), First())
+    found = {one.anchor: one for one in estimate(samples.differences, slope=False).anchors}
+    mean_m = np.mean(list(DELAYS_M.values()))
+    for anchor, delay_m in DELAYS_M.items():
+        assert abs(found[anchor].bias_m - (delay_m - mean_m)) < 5.0 * found[anchor].std_m + 0.002
 
 
 def test_the_command_uses_the_walk(walk, capsys):

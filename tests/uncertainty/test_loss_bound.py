@@ -5,7 +5,7 @@ import pytest
 
 from skyless.site.lab import lab_site
 from skyless.studies import loss
-from skyless.studies.plan import Plan
+from skyless.studies.common.plan import Plan
 from skyless.uncertainty.bounds import Sendings, bound_settings, known_receptions, received_bound, tracking_bound
 
 LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors])

@@ -30,7 +30,7 @@ from skyless.method_names import DEFAULT_METHOD
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from skyless.studies.plan import Plan, Row, Study
+    from skyless.studies.common.plan import Plan, Row, Study
 
 _Name = Literal[
     "efficiency",
@@ -234,7 +234,7 @@ def _check(name: str, asked: StudyOptions) -> None:
 
 def _plan(name: str, asked: StudyOptions) -> "Plan":
     from skyless.positioning.integrity import RISK
-    from skyless.studies.plan import plan_of
+    from skyless.studies.common.plan import plan_of
 
     return plan_of(
         asked.method or DEFAULT_METHOD,
@@ -254,7 +254,7 @@ def _plan(name: str, asked: StudyOptions) -> "Plan":
 
 def _run(chosen: "Study", plan: "Plan", asked: StudyOptions) -> "list[Row]":
     from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.studies.runner import run_cells, run_cells_on_dask
+    from skyless.studies.common.runner import run_cells, run_cells_on_dask
 
     check_method(plan.method)
     cells = chosen.cells(plan)

@@ -69,9 +69,10 @@ def show_report(report: SurveyReport) -> None:
             *(f"ambiguous: {one.sentence}" for one in survey.ambiguities),
             *([] if survey.unchecked is None else [survey.unchecked]),
             *survey.not_determined,
-            *survey.notes,
         ]
     )
+    for note in survey.notes:
+        screen.print(f"note: {note}", markup=False)
     screen.print(_anchors(survey))
     checked = [pair for pair in survey.pairs if pair.residual_m is not None]
     if checked:
@@ -87,6 +88,7 @@ def show_report(report: SurveyReport) -> None:
     if report.unchanged and report.written:
         lines.append(f"unchanged in the file: anchor {', '.join(map(str, report.unchanged))}")
     lines += [f"wrote {file}" for file in report.written]
+    lines += [f"next: start the anchors with {file}" for file in report.written[-2:-1] if file.endswith(".toml")]
     for line in lines:
         screen.print(line, markup=False)
 
@@ -133,7 +135,7 @@ def _tapes(tapes: Sequence["TapeAdvice"]) -> list[str]:
     """What to measure next, and what it would bring."""
     lines = []
     for rank, tape in enumerate(tapes):
-        ask = "most would help a tape between" if rank == 0 else "then between"
+        ask = "the tape that helps most" if rank == 0 else "then"
         gain = f"{cm(tape.std_before_m)} → {cm(tape.std_after_m)}"
-        lines.append(f"{ask} {tape.a} and {tape.b}: {gain} (--distance {tape.a}-{tape.b}=METRES)")
+        lines.append(f"{ask}: between {tape.a} and {tape.b}, {gain} (--distance {tape.a}-{tape.b}=METRES)")
     return lines

@@ -21,8 +21,9 @@ from skyless.dashboard.guard import AccessRules, Guard
 from skyless.dashboard.live import LiveSite, NoBrokerError
 from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
-from skyless.dashboard.site_survey import BadFactsError, NoResultError
+from skyless.dashboard.site_survey import NoResultError
 from skyless.dashboard.zones import BadZonesError, read_zones
+from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.image import image_size
 
 _PAGE: Final = Path(__file__).parent / "page"

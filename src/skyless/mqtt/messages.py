@@ -339,6 +339,8 @@ class SurveyMessage(Struct, frozen=True):
     """The site file that it writes."""
     state: Literal["collecting", "surveyed", "no data"] = "collecting"
     """``no data``: no stamps have come for 5 s, so that ``survey``, if there is one, is of before."""
+    by: str = ""
+    """Names this run of the program: two of them at one site notice each other."""
 
 
 class PlacementMessage(Struct, frozen=True):

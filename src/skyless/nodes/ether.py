@@ -38,9 +38,11 @@ _OVERRUN_BYTES: Final = 1 << 16
 class Session:
     """The nodes of one process that are on the air."""
 
-    def __init__(self, client: "Client", nodes: tuple[int, ...]) -> None:
+    def __init__(self, client: "Client", nodes: tuple[int, ...], wrong_ticks: tuple[int, ...] = ()) -> None:
+        """``wrong_ticks``: by how much each radio's TX antenna delay is set larger than it is."""
         self._client = client
         self.nodes = nodes
+        self.wrong_ticks = wrong_ticks or (0,) * len(nodes)
         self.index = {node: index for index, node in enumerate(nodes)}
 
     def send(self, message: msgspec.Struct) -> bool:
@@ -186,13 +188,23 @@ class Ether:
                 return f"the ether's site has no {message.kind} {name}; it has: {known}"
             if node in self._owners or nodes.count(node) > 1:
                 return f"{message.kind} {name} is on the air already"
+        if message.tx_delays_ticks and len(message.tx_delays_ticks) != len(nodes):
+            return "tx_delays_ticks should have one value a node"
         self.advance()
-        session = Session(client, tuple(node for node in nodes if node is not None))
+        present = tuple(node for node in nodes if node is not None)
+        session = Session(client, present, self._wrong_ticks(present, message.tx_delays_ticks))
         for node in session.nodes:
             self._owners[node] = session
             self.medium.switch_on(node)
         session.send(wire.Joined(self.machine, self.now_host_s, self._counters(session)))
         return session
+
+    def _wrong_ticks(self, nodes: tuple[int, ...], delays_ticks: tuple[int, ...]) -> tuple[int, ...]:
+        anchors = self.site.anchors
+        return tuple(
+            delay_ticks - anchors[node].tx_antenna_delay_ticks if node < len(anchors) else 0
+            for node, delay_ticks in zip(nodes, delays_ticks, strict=False)
+        )
 
     def leave(self, session: Session) -> None:
         """Take a process's nodes off the air."""
@@ -211,9 +223,9 @@ class Ether:
         if node >= len(self.site.anchors) or len(message.frame) > MAX_FRAME_BYTES:
             raise wire.WireError("a transmission by a tag, or of a frame that is too long")
         self.advance()
-        is_planned = node not in self._flying and self.medium.transmit(
-            node, Transmission(message.frame, message.tx_ticks)
-        )
+        # a radio starts its frame on multiples of 512, and the antenna's delay, whatever it is set to, comes on top
+        leaves_ticks = wrap(message.tx_ticks - session.wrong_ticks[message.node])
+        is_planned = node not in self._flying and self.medium.transmit(node, Transmission(message.frame, leaves_ticks))
         if is_planned:
             self._flying[node] = message.tx_ticks
             self._arm()

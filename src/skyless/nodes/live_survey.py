@@ -3,9 +3,11 @@
 No I/O and no clock: times are passed in, ``now_s`` by one clock that does not go back.
 """
 
+from collections import deque
 from collections.abc import Callable
 from typing import Final, Literal
 
+from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.mqtt.messages import StampsMessage, SurveyMessage, SurveyProgress, WatchFinding, WatchMessage
@@ -17,6 +19,7 @@ from skyless.survey.record import SurveyRecord, baseline
 from skyless.survey.result import Survey
 from skyless.survey.stamps.legs import AnchorLeg
 from skyless.survey.stamps.pair_ranger import PairRanger
+from skyless.survey.watch.finding import Finding
 from skyless.survey.watch.monitor import AnchorWatch
 
 NO_DATA_S: Final = 5.0
@@ -33,6 +36,12 @@ _RESULTS_KEPT: Final = 64
 
 _MOST_BACKLOG_S: Final = 60.0
 """A message that is later than this against others of its sender shows that a clock was set, not that it waited."""
+
+_LAG_S: Final = 30.0
+"""For up to twice this time the quickest message counts: a host's clock that was set back is noticed after it."""
+
+_MOST_WAITING_BLOCKS: Final = 100_000
+"""A minute of a site with 50 anchors."""
 
 FactsOf = Callable[[Site], Facts]
 """What is known of a site without a user's help."""
@@ -52,12 +61,14 @@ class LiveSurvey:
         self.saved_serial: int | None = None
         self.missed = 0
         """Stamps that anchors had to drop."""
+        self.begun = 0
+        """How often ranges have begun again: a result of ranges from before does not count."""
         self._watches = watches
-        self._watch: AnchorWatch | None = None
+        self._watch: _Watched | None = None
         self._results: dict[int, tuple[Survey, PairRanges]] = {}
         self._runs: dict[int, str] = {}
         self._heard_s: dict[int, float] = {}
-        self._lags_s: dict[int, float] = {}
+        self._lags: dict[int, _Lag] = {}
         self._newest_s: float | None = None
         self._pause_until_s: float | None = None
         self._begin_ranges()
@@ -111,7 +122,7 @@ class LiveSurvey:
         self._ranger.finish()
 
     def add_result(self, survey: Survey, ranges: PairRanges) -> None:
-        """Keep a result; the oldest of many is dropped."""
+        """Keep a result of the present ranges; the oldest of many is dropped."""
         self.serial += 1
         self._results[self.serial] = (survey, ranges)
         if len(self._results) > _RESULTS_KEPT:
@@ -164,17 +175,25 @@ class LiveSurvey:
         )
 
     def watch_message(self, now_s: float, unix_s: float) -> WatchMessage | None:
-        """What the watch sees; None while there is none, as too few anchors have positions."""
-        watch = self._watch
-        if watch is None:
+        """What the watch saw when it was advanced last; None while there is none, as too few anchors have positions."""
+        watched = self._watch
+        if watched is None:
             return None
-        watch.advance(now_s)
+        state, found, pairs = watched.seen
         findings = tuple(
             WatchFinding(one.kind, one.anchors, one.size_m, one.std_m, one.since_s + unix_s - now_s, one.sentence)
-            for one in watch.findings
+            for one in found
         )
         has_data = self.state(now_s) != "no data"
-        return WatchMessage(unix_s, watch.state if has_data else "no data", findings, watch.pairs)
+        return WatchMessage(unix_s, state if has_data else "no data", findings, pairs)
+
+    def advance_watch(self, now_s: float) -> None:
+        """Let the watch look at the ranges that have come. A striking window of a large site takes it a second.
+
+        It may run in a thread while all else is called, but not twice at once.
+        """
+        if self._watch is not None:
+            self._watch.advance(now_s)
 
     def restart_ranges(self) -> None:
         """Forget all ranges and results: an anchor is where it was not before."""
@@ -201,12 +220,16 @@ class LiveSurvey:
         A message may have waited behind others, and hosts' clocks differ.
         """
         lag_s = now_s - unix_s
-        least_s = self._lags_s.get(anchor)
-        if least_s is None or not 0.0 <= lag_s - least_s < _MOST_BACKLOG_S:
-            self._lags_s[anchor] = least_s = lag_s
-        return unix_s + least_s
+        lag = self._lags.get(anchor)
+        if lag is None or not 0.0 <= lag_s - lag.least_s < _MOST_BACKLOG_S:
+            lag = self._lags[anchor] = _Lag(now_s, lag_s, lag_s)
+        elif now_s - lag.begun_s >= _LAG_S:
+            lag = self._lags[anchor] = _Lag(now_s, lag_s, lag.newest_s)
+        lag.newest_s = min(lag.newest_s, lag_s)
+        return now_s - (lag_s - min(lag.least_s, lag.newest_s))
 
     def _begin_ranges(self) -> None:
+        self.begun += 1
         self._identifiers = {anchor.id for anchor in self.site.all_anchors}
         self._ranger = PairRanger(on_block=self._on_block)
         self._results.clear()
@@ -217,11 +240,38 @@ class LiveSurvey:
         self._watch = None
         if self._watches and len(placed) > 2:
             known = None if record is None else {(one.a, one.b): one.range_m for one in baseline(record).pairs}
-            self._watch = AnchorWatch(placed, self.facts.dimensions, known)
+            self._watch = _Watched(AnchorWatch(placed, self.facts.dimensions, known))
 
     def _on_block(self, block: PairBlock) -> None:
         if self._watch is not None:
-            self._watch.add(block)
+            self._watch.waiting.append(block)
+
+
+class _Lag(Struct):
+    """By how much the times of one sender's messages differ from the own clock, at least; forgotten after a while."""
+
+    begun_s: float
+    newest_s: float
+    """Since then."""
+    least_s: float
+    """In the time before."""
+
+
+class _Watched:
+    """A watch, the ranges that it has not looked at yet, and what it saw last."""
+
+    def __init__(self, watch: AnchorWatch) -> None:
+        self.waiting: deque[PairBlock] = deque(maxlen=_MOST_WAITING_BLOCKS)
+        self.seen: tuple[Literal["learning", "watching", "no data"], tuple[Finding, ...], int] = ("no data", (), 0)
+        self._watch = watch
+
+    def advance(self, now_s: float) -> None:
+        """Look at what is waiting."""
+        watch = self._watch
+        while self.waiting:
+            watch.add(self.waiting.popleft())
+        watch.advance(now_s)
+        self.seen = watch.state, watch.findings, watch.pairs
 
 
 def is_record_of(record: SurveyRecord, site: Site) -> bool:

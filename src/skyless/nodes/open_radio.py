@@ -53,19 +53,20 @@ def open_radios(
 ) -> tuple[Radio, ...]:
     """Radios for the nodes of one process, in the order of their names; nothing is connected yet.
 
-    ``delays`` are the nodes' antenna delays, for hardware radios.
+    ``delays`` are the nodes' antenna delays, which their radios are set to.
 
     Raises:
         SkylessError: there is no such radio; the message says what would be right.
     """
     driver, _, where = spec.partition(":")
+    join = Join(kind, names, tuple(one.tx_ticks for one in delays or ()))
     if driver == "ether":
         host, port = host_and_port(spec, where, DEFAULT_PORT)
-        return EtherConnection(host, port, Join(kind, names)).radios
+        return EtherConnection(host, port, join).radios
     settings = delays or [AntennaDelays()] * len(names)
     if driver == "model":
         host, port = host_and_port(spec, where, DEFAULT_PORT)
-        nodes = EtherConnection(host, port, Join(kind, names)).radios
+        nodes = EtherConnection(host, port, join).radios
         return tuple(
             Dw1000Radio(ModelPort(node, own), node.name, own) for node, own in zip(nodes, settings, strict=True)
         )

@@ -9,6 +9,7 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.air.reception import Reception
 from skyless.errors import SkylessError
@@ -20,9 +21,12 @@ from skyless.mqtt.messages import (
     SiteMessage,
     StampsMessage,
     SurveyFactsMessage,
+    SurveyMessage,
     SurveySaveMessage,
+    WatchFinding,
     WatchMessage,
 )
+from skyless.mqtt.survey_facts import BadFactsError, check_facts
 from skyless.mqtt.topics import (
     EVERY_NODE,
     floor_plan_topic,
@@ -48,6 +52,7 @@ from skyless.survey.ranges import PairRanges
 from skyless.survey.record import SurveyRecord, read_record, record_path
 from skyless.survey.result import Survey
 from skyless.survey.stamps.legs import LegCollector
+from skyless.survey.surveyed_site import with_delays_of
 
 NAME: Final = "survey"
 """On MQTT: one site has one survey program."""
@@ -70,8 +75,16 @@ _SETTLED_S: Final = 60.0
 _SETTLED_UPDATE_S: Final = 5.0
 """After a minute of data results change little, and are made less often."""
 
+_SAME_SIZE: Final = 0.25
+"""A finding is logged again when its size has changed by more than this share."""
+
 _EARLIER_KEPT: Final = 32
 """Sites before the present one that a placement names."""
+
+_OTHER_S: Final = 3.0 * _QUIET_S
+"""After this time without a message an earlier program has ended."""
+
+_MOST_LOGGED: Final = 100
 
 Solve = Callable[[PairRanges, Facts], Survey]
 _M = TypeVar("_M", bound=Struct)
@@ -120,12 +133,21 @@ class SurveyNode:
         self._received = 0
         self._facts_changed = False
         self._solving: asyncio.Task[None] | None = None
+        self._watching: asyncio.Task[None] | None = None
         self._next_solve_s = 0.0
         self._next_publish_s = 0.0
         self._watch_published: tuple[WatchMessage, float] | None = None
-        self._findings: frozenset[str] = frozenset()
-        self._moved: frozenset[str] = frozenset()
+        self._findings: dict[tuple[object, tuple[int, ...]], WatchFinding] = {}
+        """Those that are logged."""
         self._said_state = ""
+        self._logged: set[str] = set()
+        """Lines that are logged once."""
+        self._run = f"{1e3 * time.time():014.0f}-{secrets.token_hex(4)}"
+        """Earlier programs have lesser names."""
+        self._other: tuple[str, float] | None = None
+        """The newest message of an earlier one: its name and time."""
+        self._other_s: float | None = None
+        """When the last one came of which there were others before."""
         self._name = NAME if settings.serves else f"{NAME}-{secrets.token_hex(4)}"
         self.link = None if address is None else Link(address, self._name, site=settings.site_id, kind=NAME)
         if self.link is not None:
@@ -147,8 +169,9 @@ class SurveyNode:
         try:
             await together(*parts)
         finally:
-            if self._solving is not None:
-                self._solving.cancel()
+            for task in (self._solving, self._watching):
+                if task is not None:
+                    task.cancel()
             self._withdraw()
 
     def _withdraw(self) -> None:
@@ -157,7 +180,7 @@ class SurveyNode:
         if link is None:
             return
         link.publish(request_topic(site_id), RequestMessage(self._name, (), 0.0), qos=1)
-        if self._settings.serves:
+        if self._settings.serves and not self._waits():
             for topic in (survey_topic(site_id), watch_topic(site_id)):
                 link.publish(topic, b"", qos=1, retain=True)
 
@@ -174,6 +197,7 @@ class SurveyNode:
                 (survey_facts_topic(site_id), SurveyFactsMessage, self._on_facts),
                 (survey_save_topic(site_id), SurveySaveMessage, self._on_save),
                 (placement_topic(site_id), PlacementMessage, self._on_placement),
+                (survey_topic(site_id), SurveyMessage, self._on_survey),
             ):
                 link.subscribe(topic, self._reader(kind, handle), qos=1)
             link.subscribe(floor_plan_topic(site_id), self._on_image)
@@ -234,17 +258,49 @@ class SurveyNode:
                 self._monitor.on_event(event)
 
     def _on_facts(self, message: SurveyFactsMessage) -> None:
+        try:
+            check_facts(message)
+        except BadFactsError as error:
+            self.problems += 1
+            self._log_once(f"survey: facts are ignored: {error}")
+            return
         self._given = message
         if self.live is not None:
             self.live.set_facts(message.facts)
             self._facts_changed = True
             self._next_solve_s = self._next_publish_s = 0.0
 
+    def _on_survey(self, message: SurveyMessage) -> None:
+        """Another program that serves the same site: the later one waits, else both would save what the page asks."""
+        if message.by == "" or message.by >= self._run:
+            return
+        before, self._other = self._other, (message.by, message.unix_s)
+        if before is None or before[0] != message.by or before == self._other:
+            return  # what the broker has kept may be of one that has ended
+        if not self._waits():
+            self._log(
+                f"survey: another survey program serves site {self._settings.site_id}: this one waits for its end"
+            )
+            self._forget(survey_topic, watch_topic)
+        self._other_s = time.monotonic()
+
+    def _waits(self) -> bool:
+        """Whether another program serves the site: then this one only gathers."""
+        return self._other_s is not None and time.monotonic() - self._other_s < _OTHER_S
+
     def _on_image(self, _topic: str, payload: bytes) -> None:
         self._image = payload or None
 
     def _on_placement(self, message: PlacementMessage) -> None:
+        if message != self._placement:
+            self._forget(placement_topic)
         self._placement = message
+
+    def _forget(self, *topics: Callable[[int], str]) -> None:
+        """Stop repeating what another program publishes now."""
+        if self.link is not None:
+            for topic in topics:
+                self.link.forget(topic(self._settings.site_id))
 
     def _begin(self, site: Site) -> None:
         """Survey a site from now on."""
@@ -260,18 +316,30 @@ class SurveyNode:
 
     # Results
 
+    def final_ranges(self) -> PairRanges:
+        """All ranges when nothing more comes, as the antenna delays of the site to be surveyed would give them.
+
+        The anchors may run with others. Only once the site is known.
+        """
+        assert self.live is not None
+        self.live.finish()
+        ranges = self.live.ranges()
+        return ranges if self._running is None else with_delays_of(ranges, self._running, self.live.site)
+
     def update(self) -> None:
         """Begin another result if it is time, and publish what is due."""
         live, now_s, unix_s = self.live, time.monotonic(), time.time()
         if self._monitor is not None and self._radio is not None:
             self._monitor.check(now_s, self._received, self._legs.counters["legs"], self._legs.counters)
-        if live is None or not self._settings.serves:
+        if live is None or not self._settings.serves or self._waits():
             return
         if (self._solving is None or self._solving.done()) and now_s >= self._next_solve_s:
             has_news = live.state(now_s) != "no data" or self._facts_changed
             if has_news:
                 self._solving = asyncio.ensure_future(self._make_result(live))
         self._log_state(live, now_s)
+        if self._watching is None or self._watching.done():
+            self._watching = asyncio.ensure_future(self._advance_watch(live))
         watch = live.watch_message(now_s, unix_s)
         if watch is not None:
             self._log_findings(live, watch)
@@ -281,7 +349,7 @@ class SurveyNode:
     async def _make_result(self, live: LiveSurvey) -> None:
         """One result, made in a thread so that the loop goes on."""
         self._facts_changed = False
-        ranges, facts = live.ranges(), live.facts
+        ranges, facts, begun = live.ranges(), live.facts, live.begun
         if not ranges.pairs:
             return
         begin_s = time.monotonic()
@@ -299,14 +367,21 @@ class SurveyNode:
             pause_s = _SETTLED_UPDATE_S if ranges.duration_s > _SETTLED_S else _UPDATE_S
             if not self._facts_changed:
                 self._next_solve_s = time.monotonic() + max(pause_s, _COST * took_s) - 0.5 * _UPDATE_S
-        if self.live is live and live.facts is facts:
+        if self.live is live and live.facts is facts and live.begun == begun:
             live.error = None
             live.add_result(survey, ranges)
+
+    async def _advance_watch(self, live: LiveSurvey) -> None:
+        """Let the watch look at new ranges, in a thread so that the loop goes on."""
+        try:
+            await asyncio.to_thread(live.advance_watch, time.monotonic())
+        except Exception as error:  # noqa: BLE001 - whatever it is, the survey goes on
+            self._log_once(f"watch: {error!r}")
 
     def _publish(self, link: Link, live: LiveSurvey, now_s: float, unix_s: float, watch: WatchMessage | None) -> None:
         site_id, file = self._settings.site_id, self._settings.file
         if now_s >= self._next_publish_s:
-            message = live.message(now_s, unix_s, None if file is None else str(file))
+            message = replace(live.message(now_s, unix_s, None if file is None else str(file)), by=self._run)
             link.publish(survey_topic(site_id), message, qos=1, retain=True)
             pause_s = _QUIET_S if message.state == "no data" else max(_UPDATE_S, len(message.pairs) / _PAIRS_PER_S)
             self._next_publish_s = now_s + pause_s - 0.5 * _UPDATE_S
@@ -328,24 +403,36 @@ class SurveyNode:
             self._said_state = state
 
     def _log_findings(self, live: LiveSurvey, watch: WatchMessage) -> None:
-        """Log what is new; an anchor that has moved makes the ranges of before useless for another survey."""
-        present = frozenset(one.sentence for one in watch.findings)
-        kinds = {(one.kind, one.anchors) for one in watch.findings}
-        for one in watch.findings:
-            if one.sentence not in self._findings:
+        """Log what is new; an anchor that has moved makes the ranges of before useless for another survey.
+
+        A finding whose size changes a little is the same one.
+        """
+        present: dict[tuple[object, tuple[int, ...]], WatchFinding] = {
+            (one.kind, one.anchors): one for one in watch.findings
+        }
+        for key, one in present.items():
+            logged = self._findings.get(key)
+            if logged is not None and abs(one.size_m - logged.size_m) < _SAME_SIZE * abs(logged.size_m):
+                present[key] = logged
+            elif logged is None or one.sentence != logged.sentence:
                 self._log(f"watch: {one.sentence}")
-        for sentence in sorted(self._findings - present):
-            self._log(f"watch: over: {sentence}")
-        moved = frozenset(f"{kind} {anchors}" for kind, anchors in kinds if kind in ("moved", "delay"))
-        if moved - self._moved:
+        for key, one in self._findings.items():
+            if key not in present:
+                self._log(f"watch: over: {one.sentence}")
+        if any(kind in ("moved", "delay") for kind, _ in present.keys() - self._findings.keys()):
             live.restart_ranges()
-        self._findings, self._moved = present, moved
+        self._findings = present
+
+    def _log_once(self, line: str) -> None:
+        if line not in self._logged and len(self._logged) < _MOST_LOGGED:
+            self._logged.add(line)
+            self._log(line)
 
     # Saving
 
     def _on_save(self, message: SurveySaveMessage) -> None:
         live = self.live
-        if live is None:
+        if live is None or self._waits():
             return
         try:
             self.save(message.serial)

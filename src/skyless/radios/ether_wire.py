@@ -22,6 +22,8 @@ class Join(Struct, frozen=True, tag="join"):
 
     kind: Literal["anchor", "tag"]
     names: tuple[str, ...]
+    tx_delays_ticks: tuple[int, ...] = ()
+    """TX antenna delays that the process sets in its radios, one a node; empty: those of the ether's site."""
 
 
 class Send(Struct, frozen=True, tag="send", gc=False):

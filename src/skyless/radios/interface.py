@@ -11,7 +11,7 @@ from skyless.constants import DEFAULT_ANTENNA_DELAY_TICKS
 
 
 class AntennaDelays(Struct, frozen=True):
-    """What a hardware radio subtracts from its stamps, in ticks."""
+    """What a radio subtracts from its stamps, in ticks."""
 
     tx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
     rx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS

@@ -1,6 +1,5 @@
-"""Errors of the receiver over many simulated runs, one module for each study.
+"""Errors of the receiver over many simulated runs, one module for each study; ``common/`` is what studies share.
 
-Public: catalogue, episodes, plan, runner.
-Within the package: efficiency, integrity, loss, motion, nlos, picture, room, scale, sitetime, summary, sync, watch,
-worlds.
+Public: catalogue, episodes.
+Within the package: efficiency, integrity, loss, motion, nlos, room, scale, sitetime, survey_room, sync, watch.
 """

@@ -18,13 +18,13 @@ from skyless.studies import (
     scale,
     sitetime,
     survey,
+    survey_room,
     sync,
     watch,
 )
-from skyless.studies.picture import Look, draw
-from skyless.studies.plan import Cell, Plan, Row, Study
-from skyless.studies.summary import Case, world_cells, world_rows
-from skyless.studies.surveyed import study as survey_room
+from skyless.studies.common.picture import Look, draw
+from skyless.studies.common.plan import Cell, Plan, Row, Study
+from skyless.studies.common.summary import Case, world_cells, world_rows
 
 
 def _of_worlds(name: str, title: str, cases: Callable[[Plan], list[Case]], look: Look) -> Study:

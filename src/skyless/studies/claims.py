@@ -21,7 +21,7 @@ from skyless.evaluation.claim_graphs import (
 )
 from skyless.kernels.arrays import Array
 from skyless.slot_claims import SlotClaim
-from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of
+from skyless.studies.common.plan import Cell, Limit, Plan, Row, seed_of
 
 
 class ClaimSite(Struct, frozen=True):

@@ -16,8 +16,8 @@ from skyless.errors import SkylessError
 from skyless.kernels.arrays import Array
 from skyless.positioning.estimator.estimator import Estimator
 from skyless.site.lab import ideal_lab_site
+from skyless.studies.common.plan import Cell, Plan, Row
 from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, Case, Episode, draw_episode, settings_of
-from skyless.studies.plan import Cell, Plan, Row
 from skyless.uncertainty.bounds import bound_settings, tracking_bound
 
 _JUDGED_SUPERFRAMES: Final = 20

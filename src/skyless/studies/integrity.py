@@ -25,6 +25,9 @@ from skyless.positioning.estimator.estimator import ACCEPTED, JOINED, Estimator,
 from skyless.positioning.estimator.levels import LEVELS
 from skyless.positioning.integrity import CONTRADICTED, HPL, VPL
 from skyless.site.lab import ideal_lab_site
+from skyless.studies.common.picture import LEAST_DRAWN_SHARE, centimetres
+from skyless.studies.common.plan import Cell, Plan, Row
+from skyless.studies.common.summary import clustered_interval
 from skyless.studies.episodes import (
     EPISODE_SPEED_STD_MPS,
     EPISODE_SUPERFRAMES,
@@ -33,9 +36,6 @@ from skyless.studies.episodes import (
     draw_episode,
     settings_of,
 )
-from skyless.studies.picture import LEAST_DRAWN_SHARE, centimetres
-from skyless.studies.plan import Cell, Plan, Row
-from skyless.studies.summary import clustered_interval
 
 _ONSETS: Final = (40, 67)
 """Superframes between which the fault begins; the filter has settled long before."""

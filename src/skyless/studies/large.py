@@ -28,8 +28,8 @@ from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Roaming, Trajectory, Waypoints
 from skyless.site.grid import grid_site
 from skyless.site.model import EXACT, AccuracySite, ScheduleMode, Site
-from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.studies.summary import interval, jackknife
+from skyless.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.studies.common.summary import interval, jackknife
 from skyless.uncertainty.bounds import Biases, Sendings, bound_settings, received_bound
 
 _SIDE: Final = 32

@@ -6,9 +6,9 @@ from typing import Any, Final
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.studies.plan import Plan, Row, seed_of
-from skyless.studies.summary import RAW_METHODS, Case, world_rows
-from skyless.studies.worlds import Run, walking
+from skyless.studies.common.plan import Plan, Row, seed_of
+from skyless.studies.common.summary import RAW_METHODS, Case, world_rows
+from skyless.studies.common.worlds import Run, walking
 from skyless.uncertainty.bounds import bound_settings, known_receptions, received_bound
 
 _SHARES: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)

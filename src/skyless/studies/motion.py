@@ -13,9 +13,9 @@ from numpy.random import Generator
 
 from skyless.kernels.arrays import Array
 from skyless.simulation.trajectory import Piece, Static, Trajectory, Waypoints
-from skyless.studies.plan import Plan
-from skyless.studies.summary import Case
-from skyless.studies.worlds import box, large_lab_site, worlds
+from skyless.studies.common.plan import Plan
+from skyless.studies.common.summary import Case
+from skyless.studies.common.worlds import box, large_lab_site, worlds
 
 _ACCELERATION_MPS2: Final = 3.0
 _STILL: Final = "still"

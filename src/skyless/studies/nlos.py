@@ -5,9 +5,9 @@ from typing import Any, Final
 
 from skyless.simulation.impairments import AnchorBias
 from skyless.site.lab import ideal_lab_site
-from skyless.studies.plan import Plan
-from skyless.studies.summary import Case
-from skyless.studies.worlds import anchor_of, walking
+from skyless.studies.common.plan import Plan
+from skyless.studies.common.summary import Case
+from skyless.studies.common.worlds import anchor_of, walking
 
 _MAX_RATIO: Final = 1.3
 _BURST_S: Final = 5.0

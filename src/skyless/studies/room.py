@@ -26,10 +26,10 @@ from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Trajectory, Waypoints
 from skyless.site.lab import lab_site
 from skyless.site.model import AnchorSite, Site, TagsSite, WallSite
+from skyless.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.studies.common.summary import Case, clustered_interval, jackknife, world_cells, world_rows
+from skyless.studies.common.worlds import Run, RunResult, anchor_of, box, worlds
 from skyless.studies.motion import laps
-from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.studies.summary import Case, clustered_interval, jackknife, world_cells, world_rows
-from skyless.studies.worlds import Run, RunResult, anchor_of, box, worlds
 from skyless.uncertainty.bounds import Biases, biased_bound, bound_settings
 
 BASE: Final = "the room"

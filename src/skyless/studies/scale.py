@@ -10,10 +10,10 @@ from msgspec.structs import replace
 from skyless.simulation.trajectory import Trajectory
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, Site
+from skyless.studies.common.plan import Plan
+from skyless.studies.common.summary import Case
+from skyless.studies.common.worlds import box, worlds
 from skyless.studies.motion import still
-from skyless.studies.plan import Plan
-from skyless.studies.summary import Case
-from skyless.studies.worlds import box, worlds
 
 _FLEET_WARMUP_S: Final = 1.0
 _FLEET_S: Final = 0.5

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from skyless.kernels.arrays import Matrix
 from skyless.simulation.oscillator import OscillatorModel
 from skyless.simulation.site_time import Errors, Network, network, simulate
-from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
 
 _SLOT_S: Final = 1e-3
 _SETTLING_S: Final = 5.0

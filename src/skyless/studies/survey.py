@@ -16,7 +16,7 @@ from skyless.evaluation.surveys.air import AirErrors, drawn_errors, free_axes, r
 from skyless.evaluation.surveys.judge import Outcome, judged, survey_bound_m, tag_error_m
 from skyless.evaluation.surveys.layouts import SurveyLayout, survey_layouts
 from skyless.kernels.arrays import Array
-from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.survey.facts import Facts, Point, Tape
 from skyless.survey.solve import run_survey
 

@@ -9,9 +9,9 @@ from skyless.simulation.impairments import AnchorOutage, Impairments, Outage
 from skyless.simulation.oscillator import Temperature
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import Site
-from skyless.studies.plan import Plan
-from skyless.studies.summary import Case
-from skyless.studies.worlds import LAB_WARMUP_S, Run, walking
+from skyless.studies.common.plan import Plan
+from skyless.studies.common.summary import Case
+from skyless.studies.common.worlds import LAB_WARMUP_S, Run, walking
 
 _STEADY: Final = "steady"
 _SUPERFRAMES_MS: Final = (15.0, 30.0, 60.0, 120.0, 300.0, 1000.0)

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from skyless.evaluation.surveys.layouts import survey_layouts
 from skyless.evaluation.watch.air import AirRun, run_air_watch
 from skyless.evaluation.watch.drawn import Event, WatchedLayout, WatchResult, WatchRun, run_watch, striking_windows
-from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of
+from skyless.studies.common.plan import Cell, Limit, Plan, Row, seed_of
 
 _LAYOUTS: Final = ("lab", "room", "hall")
 _EVENTS: Final = 50

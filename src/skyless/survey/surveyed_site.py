@@ -8,6 +8,8 @@ What goes where (``docs/survey.md``, "What is written"):
   for errors of its positions, so that a tag sees less than either alone.
 - ``accuracy.range_std_m`` is raised to the constant error of the ranges between anchors, if that is larger: a tag's
   ranges are not better.
+- Where delays change, something of the accuracy does, by 0.1 mm if nothing else: tags see from it that they have to
+  begin again. What they have learned of ranges holds the former delays, and delays are not on the air.
 """
 
 import math
@@ -27,6 +29,8 @@ from skyless.survey.result import Survey, SurveyedAnchor
 
 _DELAY: Final = SITE_LIMITS[f"anchors.{DELAY_KEY}"]
 _MOST_STATED_M: Final = SITE_LIMITS["anchors.std_m"].high
+_RANGE_STD: Final = SITE_LIMITS["accuracy.range_std_m"]
+_STD_STEPS_PER_M: Final = 1e4
 _POSITION_DIGITS: Final = 4
 _KEYS: Final = ("x_m", "y_m", "z_m", DELAY_KEY, "std_m")
 
@@ -41,11 +45,15 @@ def surveyed_site(site: Site, survey: Survey) -> Site:
     """
     found = {anchor.id: anchor for anchor in survey.anchors if anchor.determined}
     known = [_placed(anchor, found.get(anchor.id), site) for anchor in site.all_anchors]
+    accuracy = _accuracy(site, found, survey.range_std_m)
+    delays = {anchor.id: anchor.tx_antenna_delay_ticks for anchor in site.all_anchors}
+    if accuracy == site.accuracy and any(anchor.tx_antenna_delay_ticks != delays[anchor.id] for anchor in known):
+        accuracy = structs.replace(accuracy, range_std_m=_another_std(accuracy.range_std_m))
     return structs.replace(
         site,
         anchors=tuple(anchor for anchor in known if isinstance(anchor, AnchorSite)),
         unplaced=tuple(anchor for anchor in known if isinstance(anchor, UnplacedAnchor)),
-        accuracy=_accuracy(site, found, survey.range_std_m),
+        accuracy=accuracy,
     )
 
 
@@ -145,12 +153,20 @@ def _accuracy(site: Site, found: dict[int, SurveyedAnchor], range_std_m: float) 
     survey_std_m = old.survey_std_m
     if site.schedule.needs_master:
         each = [old.survey_std_m if one is None else one for one in (_std(found, anchor.id) for anchor in site.anchors)]
-        survey_std_m = _up(math.sqrt(sum(one**2 for one in each) / len(each)), 1e4) if each else old.survey_std_m
+        survey_std_m = (
+            _up(math.sqrt(sum(one**2 for one in each) / len(each)), _STD_STEPS_PER_M) if each else old.survey_std_m
+        )
     return structs.replace(
         old,
         survey_std_m=survey_std_m,
-        range_std_m=_up(range_std_m, 1e4) if range_std_m > old.range_std_m else old.range_std_m,
+        range_std_m=_up(range_std_m, _STD_STEPS_PER_M) if range_std_m > old.range_std_m else old.range_std_m,
     )
+
+
+def _another_std(std_m: float) -> float:
+    """The next step on the air, or the one before where there is none."""
+    more_m = _up(std_m, _STD_STEPS_PER_M) + 1.0 / _STD_STEPS_PER_M
+    return round(more_m if _RANGE_STD.contains(more_m) else more_m - 2.0 / _STD_STEPS_PER_M, 4)
 
 
 def _std(found: dict[int, SurveyedAnchor], identifier: int) -> float | None:

@@ -78,8 +78,7 @@ def gather_live(asked: LiveOptions, known: FactOptions) -> "tuple[Site, PairRang
     live = found[0].live if found else None
     if live is None:
         raise SkylessError(f"no site was found at {asked.mqtt}: its anchors are not there, or have not begun yet")
-    live.finish()
-    ranges = live.ranges()
+    ranges = found[0].final_ranges()
     if not ranges.pairs:
         where = asked.mqtt or asked.radio
         raise SkylessError(

@@ -12,12 +12,7 @@ from msgspec import Struct
 
 from skyless.evaluation.scenarios import wanderers
 from skyless.evaluation.surveys.layouts import survey_layouts
-from skyless.simulation.trajectory import Static, Trajectory
-from skyless.site.model import Site
-from skyless.studies.plan import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.studies.room import with_levels
-from skyless.studies.summary import Case, case_row
-from skyless.studies.surveyed.files import (
+from skyless.evaluation.surveys.rooms import (
     ROOM_RANGES,
     DrawnRoom,
     RoomErrors,
@@ -31,7 +26,12 @@ from skyless.studies.surveyed.files import (
     surveyed_room,
     true_site,
 )
-from skyless.studies.worlds import Run, RunResult, run_world
+from skyless.simulation.trajectory import Static, Trajectory
+from skyless.site.model import Site
+from skyless.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.studies.common.summary import Case, case_row
+from skyless.studies.common.worlds import Run, RunResult, run_world
+from skyless.studies.room import with_levels
 
 TRUTH: Final = "truth"
 SURVEYED: Final = "surveyed"

@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from skyless.evaluation.figures import BLUE, GRID, INK, MUTED, ORANGE, RED, report_style
 from skyless.kernels.arrays import Array
-from skyless.studies.plan import Row
+from skyless.studies.common.plan import Row
 
 _WIDTH_IN: Final = 4.7
 _BAR_IN: Final = 0.24

@@ -5,10 +5,7 @@ import pytest
 
 from skyless.constants import TICK_M
 from skyless.evaluation.surveys.layouts import survey_layouts
-from skyless.studies.catalogue import STUDIES
-from skyless.studies.plan import Plan
-from skyless.studies.surveyed import study
-from skyless.studies.surveyed.files import (
+from skyless.evaluation.surveys.rooms import (
     ROOM_RANGES,
     RoomErrors,
     air_of,
@@ -18,7 +15,10 @@ from skyless.studies.surveyed.files import (
     surveyed_room,
     true_site,
 )
-from skyless.studies.surveyed.study import SURVEYED, TRUTH, Group, groups, limits_of
+from skyless.studies import survey_room as study
+from skyless.studies.catalogue import STUDIES
+from skyless.studies.common.plan import Plan
+from skyless.studies.survey_room import SURVEYED, TRUTH, Group, groups, limits_of
 
 ERRORS = RoomErrors(0.07, 0.02, ROOM_RANGES)
 

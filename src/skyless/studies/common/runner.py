@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from skyless.errors import SkylessError
 from skyless.kernels.compiled import cores
-from skyless.studies.plan import Cell
+from skyless.studies.common.plan import Cell
 
 _POLL_S: Final = 0.2
 _CONNECT_S: Final = 10.0

@@ -29,7 +29,7 @@ from skyless.simulation.streams import stream
 from skyless.simulation.trajectory import Trajectory
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, Site
-from skyless.studies.plan import Plan, seed_of
+from skyless.studies.common.plan import Plan, seed_of
 
 LAB_WARMUP_S: Final = 4.0
 """No fix is judged before; cold starts of the lab take a tenth of a second, those with 90 % loss some seconds."""

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 
 from skyless.kernels.arrays import Array
-from skyless.studies.plan import Cell, Limit, Plan, Row
-from skyless.studies.worlds import Run, RunResult, run_world
+from skyless.studies.common.plan import Cell, Limit, Plan, Row
+from skyless.studies.common.worlds import Run, RunResult, run_world
 from skyless.uncertainty.bounds import Biases
 
 _MESSAGE_S: Final = 40e-6

@@ -1,0 +1,4 @@
+"""What studies share: their plan and rows, simulated worlds, the runner, summaries, pictures.
+
+Public: picture, plan, runner, summary, worlds.
+"""
