@@ -268,6 +268,13 @@ def test_delays_from_a_recording_and_twice_is_once(capsys, tmp_path):
         (("--origin", "1", "--x-axis", "1"), "different anchors"),
         (("--origin", "1", "--x-axis", "77"), "no anchor 77"),
         (("--dimensions", "4"), "dimensions"),
+        (("--delay-std", "1e300"), "--delay-std"),
+        (("--pair-std", "1e308"), "--pair-std"),
+        (("--height", "1=1e300"), "metres, at most"),
+        (("--distance", "1-2=1e308"), "metres, at most"),
+        (("--distance", "1-2=3±1e9"), "metres, at most"),
+        (("--point", "1=1e308,0"), "metres, at most"),
+        (("--point", "1=0,0", "--point", "1=5,5"), "given once"),
     ],
 )
 def test_what_the_user_can_mend_is_named(hall, capsys, arguments, words):

@@ -33,7 +33,7 @@ IMAGE = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 40, 30) + byte
 
 def survey_message(unix_s=1000.0, serial=3, result=True):
     anchors = (SurveyedAnchor(1, True, 0.0, 0.0, 0.0, 0.01), SurveyedAnchor(2, False, reason="it is linked to nobody"))
-    advice = (TapeAdvice(1, 2, None, 0.01),)
+    advice = (TapeAdvice(1, 2, 0.05, 0.01),)
     found = Survey(anchors, (), 0.03, 1, None, ("anchor 2",), (), advice, "anchor 1 is the origin", Gauge(1, 2), ())
     return SurveyMessage(unix_s, serial, (1, 2), (3,), 12.0, (), Facts(), found if result else None, file="site.toml")
 

@@ -2,7 +2,9 @@
 
 import asyncio
 import json
+from errno import ENOSPC
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -29,6 +31,7 @@ from skyless.nodes import survey as survey_module
 from skyless.nodes.live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey, is_record_of
 from skyless.nodes.stamp_log import StampLog
 from skyless.nodes.survey import SurveyNode, SurveySettings
+from skyless.nodes.survey_files import save_survey
 from skyless.simulation.impairments import DelayError, lab_impairments
 from skyless.simulation.world import World
 from skyless.site.digest import site_digest
@@ -37,6 +40,7 @@ from skyless.site.lab import lab_site
 from skyless.site.load import load_site
 from skyless.site.model import FloorPlanSite, ScheduleSite, UnplacedAnchor
 from skyless.survey.facts import Facts, Gauge, Tape
+from skyless.survey.ranges import PairRanges
 from skyless.survey.record import read_record, record_path
 from skyless.survey.result import Survey, SurveyedAnchor
 
@@ -505,12 +509,18 @@ def test_a_finding_is_logged_once_although_its_size_wavers():
         state=lambda _: "no data",
         watch_message=lambda *_: WatchMessage(0.0, "watching", tuple(found), 15),
         restart_ranges=lambda: again.append(None),
+        advance_watch=lambda *_: None,
     )
+
+    async def update():
+        node.update()
+        await node._watching
+
     for size_m in (0.31, 0.32, 0.31, 0.32, 0.9):
         found[:] = [WatchFinding("moved", (4,), size_m, 0.01, 0.0, f"anchor 4 has moved by about {size_m:g} m")]
-        node.update()
+        asyncio.run(update())
     found.clear()
-    node.update()
+    asyncio.run(update())
     assert said == [
         "watch: anchor 4 has moved by about 0.31 m",
         "watch: anchor 4 has moved by about 0.9 m",
@@ -527,3 +537,23 @@ def test_ranges_count_from_the_delays_of_the_file_although_the_anchors_run_with_
     node._on_site(SiteMessage(more, simulated=True, unix_s=0.0))
     for pair in node.final_ranges().pairs:  # with smaller delays they are longer, by 50 ticks of each anchor
         assert pair.range_m - before[pair.a, pair.b] == pytest.approx(100 * 0.00469176, abs=1e-5)
+
+
+def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch):
+    file = tmp_path / "lab.toml"
+    file.write_text(TEXT, encoding="utf-8")
+    written = []
+    write_bytes = Path.write_bytes
+
+    def until_the_disk_is_full(path, data):
+        written.append(path)
+        if len(written) == 3:
+            raise OSError(ENOSPC, "No space left on device", str(path))
+        return write_bytes(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", until_the_disk_is_full)
+    with pytest.raises(SkylessError, match="No space left"):
+        save_survey(file, true_survey(), PairRanges((), tuple(POSITIONS_M)), 0.0)
+    assert len(written) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["lab.toml"]
+    assert file.read_text(encoding="utf-8") == TEXT

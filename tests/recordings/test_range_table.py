@@ -45,6 +45,8 @@ def test_both_directions_are_one_pair_and_other_columns_are_ignored(tmp_path):
         (HEADER + "4,4,3\n", 'line 2, column anchor_b is "4"; it should be another anchor'),
         (HEADER + "1,2,nan\n", 'column range_m is "nan"'),
         (HEADER + "1,2,1e9\n", 'column range_m is "1e9"; it should be metres'),
+        ("anchor_a,anchor_b,range_m,range_m\n1,2,3,4\n", "different names"),
+        ("\0" * ((1 << 20) + 1), "lines of text"),
     ],
 )
 def test_bad_ranges_are_named(tmp_path, text, words):
@@ -62,6 +64,7 @@ def test_heights(tmp_path):
         ("id,z_m\n1,2\n1,3\n", "only once"),
         ("id,z_m\n", "at least one height"),
         ("id,z_m\n1,high\n", "a finite number"),
+        ("id,z_m\n1,1e300\n", "metres, at most"),
         ("id\n1\n", "a header with id,z_m"),
     ):
         with pytest.raises(ConfigurationError, match=words):

@@ -154,7 +154,8 @@ def _inputs(recording: Path | None, asked: SurveyOptions) -> _Inputs:
     if asked.ranges is not None:
         from skyless.recordings.range_table import read_ranges
 
-        return _Inputs(site, read_ranges(asked.ranges))
+        with status("reading ranges"):
+            return _Inputs(site, read_ranges(asked.ranges))
     if recording is None:
         raise SkylessError("a survey needs a recording or --ranges")
     from skyless.survey.surveyed_site import with_delays_of

@@ -76,6 +76,8 @@ class AnchorNode:
         self.stamps = StampLog(anchor_id, secrets.token_hex(4))
         self.refused = Counter[str]()
         """Messages on MQTT that could not be used."""
+        self._fault = ""
+        """Why the last placement was refused."""
         self.monitor = RadioMonitor(f"anchor {anchor_id}", "on the air", log, radio.advice)
         self.started_s = time.monotonic()
         self.late = 0
@@ -113,7 +115,9 @@ class AnchorNode:
                 fault = str(error)
         if fault is not None:
             self.refused["placement-refused"] += 1
-            self._log(f"anchor {self.id}: a survey's positions are ignored: {fault}")
+            if fault != self._fault:
+                self._fault = fault
+                self._log(f"anchor {self.id}: a survey's positions are ignored: {fault}")
             return False
         self.site = message.site
         self.machine.place(message.site)

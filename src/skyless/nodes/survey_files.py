@@ -1,5 +1,6 @@
 """A survey into the files of a site: the site's own, the record next to it, and the image of the floor."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 from zlib import crc32
@@ -70,9 +71,7 @@ def save_survey(
                     "y_m": plan.y_m,
                 }
                 text = with_values(text, {}, {"floor_plan": values}, file, "the floor plan")
-        kept.write_bytes(file.read_bytes())
-        _replace(record_path(file), encode_record(record))
-        _replace(file, text.encode())
+        _replace({kept: file.read_bytes(), record_path(file): encode_record(record), file: text.encode()})
     except OSError as error:
         raise SkylessError(f"{error.filename or file} cannot be written: {error.strerror}") from None
     return Saved(load_site(file), record, (file, record_path(file), kept, *images))
@@ -100,12 +99,18 @@ def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None,
     path = file.with_name(f"{file.stem}.floor{_ENDINGS.get(floor.image[:4], '.jpg')}")
     if path.exists() and path.read_bytes() != floor.image:
         path = path.with_stem(f"{path.stem}-{crc32(floor.image):08x}")
-    _replace(path, floor.image)
+    _replace({path: floor.image})
     return path.name, [path]
 
 
-def _replace(path: Path, data: bytes) -> None:
-    """Write a file so that a reader finds the old one or the whole new one. Raises OSError."""
-    scratch = path.with_name(f".{path.name}.part")
-    scratch.write_bytes(data)
-    scratch.replace(path)
+def _replace(files: Mapping[Path, bytes]) -> None:
+    """Write files so that a reader finds the old one or the whole new one; none where not all fit. Raises OSError."""
+    scratch = {path: path.with_name(f".{path.name}.part") for path in files}
+    try:
+        for path, data in files.items():
+            scratch[path].write_bytes(data)
+        for path in files:
+            scratch[path].replace(path)
+    finally:
+        for one in scratch.values():
+            one.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from os import PathLike
 from typing import Final
 
+from skyless.air.page_codec import MAX_COORDINATE_M
 from skyless.errors import ConfigurationError
 from skyless.recordings.anchor_table import anchor_identifier
 from skyless.recordings.source import finite, read_lines
@@ -54,7 +55,10 @@ def read_heights(path: str | PathLike[str]) -> dict[int, float]:
         anchor = anchor_identifier(row["id"], path, line, "id")
         if anchor in heights_m:
             raise ConfigurationError(path, f"line {line}, column id", row["id"], "an id that occurs only once")
-        heights_m[anchor] = finite(row["z_m"], path, line, "z_m")
+        z_m = heights_m[anchor] = finite(row["z_m"], path, line, "z_m")
+        if abs(z_m) > MAX_COORDINATE_M:
+            expected = f"metres, at most {MAX_COORDINATE_M:g}"
+            raise ConfigurationError(path, f"line {line}, column z_m", row["z_m"], expected)
     if not heights_m:
         raise ConfigurationError(path, "the table", "empty", "at least one height below the header")
     return heights_m
@@ -69,6 +73,8 @@ def _rows(path: str | PathLike[str], columns: tuple[str, ...]) -> Iterator[tuple
     names = [name.strip() for name in header]
     if not set(columns) <= set(names):
         raise ConfigurationError(path, "line 1", ",".join(names), f"a header with {','.join(columns)}")
+    if len(set(names)) < len(names):
+        raise ConfigurationError(path, "line 1", ",".join(names), "a header with different names")
     for line, row in enumerate(table, start=2):
         if not any(field.strip() for field in row):
             continue

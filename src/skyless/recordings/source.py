@@ -18,6 +18,10 @@ HEAD_BYTES: Final = 1 << 14
 
 MAX_LINE_BYTES: Final = 1 << 14
 
+MOST_TEXT_BYTES: Final = 1 << 29
+MOST_HEAD_BYTES: Final = 1 << 20
+"""Of a text file that is read whole, and of its first line: devices do not end, and archives can unpack to far more."""
+
 _GZIP_MAGIC: Final = b"\x1f\x8b"
 
 Drops = Counter[str]
@@ -45,8 +49,12 @@ def read_lines(path: str | PathLike[str]) -> list[str]:
         ConfigurationError: the file cannot be opened or read to its end.
     """
     faults: Drops = Counter()
+    text = bytearray()
     with open_source(path) as stream:
-        text = b"".join(chunks(stream, faults))
+        for chunk in chunks(stream, faults):
+            text += chunk
+            if len(text) > MOST_TEXT_BYTES or (len(text) > MOST_HEAD_BYTES and b"\n" not in text[:MOST_HEAD_BYTES]):
+                raise ConfigurationError(path, "", None, f"lines of text, {MOST_TEXT_BYTES >> 20} MiB at most")
     if faults:
         raise ConfigurationError(path, "the file", next(iter(faults)), "a whole file")
     return text.decode("utf-8-sig", "replace").splitlines()

@@ -4,7 +4,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from skyless.survey.tags.epochs import TagEpochs
+from skyless.survey.tags.received import TagReceived
 
 Point = tuple[float, float, float | None]
 """Site coordinates x, y, z in metres; z None where it is not known."""
@@ -59,5 +59,5 @@ class Facts(Struct, frozen=True):
     """Constant error of each pair's range, which no averaging removes."""
     delays: tuple[KnownDelay, ...] = ()
     gauge: Gauge | None = None
-    tags: tuple[TagEpochs, ...] = ()
+    tags: tuple[TagReceived, ...] = ()
     """Tags that were carried around or stood at known positions."""

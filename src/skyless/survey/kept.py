@@ -17,6 +17,7 @@ from skyless.survey.fit.robust import RobustFit, fit_robustly
 from skyless.survey.ranges import PairRange
 from skyless.survey.result import Survey, SurveyedAnchor, SurveyedPair
 from skyless.survey.sentences import anchors_named, are
+from skyless.survey.tags.epochs import TagEpochs
 from skyless.survey.tags.joint import fit_with_tag
 
 _NO_POSITION = "no position is given for it"
@@ -81,6 +82,7 @@ def _with_tags(
     information = np.zeros((4 * len(ids), 4 * len(ids)))
     sentences: list[str] = []
     for epochs in measured.facts.tags:
+        assert isinstance(epochs, TagEpochs)
         joint = fit_with_tag(fit.problem, ids, [fit.solution], epochs, ranges_m, [fit.used])
         sentences.append(joint.sentence)
         if joint.solution is not None and joint.rows is not None:

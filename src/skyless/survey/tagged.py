@@ -6,6 +6,7 @@ from msgspec import structs
 from skyless.survey.fit.ambiguity import OtherFit
 from skyless.survey.fit.problem import solve_least_squares
 from skyless.survey.shape import Fitted, with_tag
+from skyless.survey.tags.epochs import TagEpochs
 from skyless.survey.tags.joint import fit_with_tag
 
 
@@ -16,6 +17,7 @@ def with_tags(fitted: Fitted, others: tuple[OtherFit, ...]) -> tuple[Fitted, tup
     """
     ranges_m = {(pair.a, pair.b): pair.range_m for pair in fitted.measured.pairs}
     for epochs in fitted.measured.facts.tags:
+        assert isinstance(epochs, TagEpochs)
         used = [fitted.used, *(other.used for other in others)]
         elsewhere = [solve_least_squares(fitted.problem, one.position_m, one.used.astype(np.float64)) for one in others]
         alone = [fitted.solution, *elsewhere]

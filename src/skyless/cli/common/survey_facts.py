@@ -4,16 +4,23 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
+from cyclopts import Parameter
+from cyclopts.validators import Number
 from msgspec.structs import replace
 
-from skyless.cli.common.options import NotNegative, Positive, finite_numbers, options
+from skyless.air.page_codec import MAX_COORDINATE_M
+from skyless.cli.common.options import finite_numbers, options
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
     from skyless.site.model import Site
     from skyless.survey.facts import Facts, Gauge, Point, Tape
+
+_MOST_STD_M: Final = 100.0
+Std = Annotated[float, Parameter(validator=Number(gt=0, lte=_MOST_STD_M))]
+StdOrZero = Annotated[float, Parameter(validator=Number(gte=0, lte=_MOST_STD_M))]
 
 _SKETCH_STD_M: Final = 0.3
 _FOREIGN_DELAY_STD_M: Final = 0.03
@@ -31,7 +38,7 @@ class FactOptions:
     """The present site file: its anchors, heights, and rough positions."""
     no_sketch: bool = False
     """Do not use the positions of --site, only its anchors and heights."""
-    sketch_std: Positive | None = None
+    sketch_std: Std | None = None
     """How well the positions of --site are known, metres per axis; 0.3 by default, with --keep-positions what the file
     states."""
     keep_positions: bool = False
@@ -42,23 +49,23 @@ class FactOptions:
     """Height of all anchors in metres, or of one: 3=2.4. Several times for several anchors."""
     heights: Path | None = None
     """Table of heights: id,z_m."""
-    height_std: Positive | None = None
+    height_std: Std | None = None
     """How well given heights are known, metres (--dimensions 3); 0.02 by default."""
     distance: list[str] | None = None
     """A distance between two anchors by tape or laser: 1-4=7.21, or 1-4=7.21±0.01; ±0.005 by default."""
     point: list[str] | None = None
     """An anchor whose position is known: 3=0,4 or 3=0,4,2.5."""
-    point_std: Positive | None = None
+    point_std: Std | None = None
     """How well such positions are known, metres per axis; 0.005 by default."""
     delays_known: bool = False
     """The antenna delays are right; do not estimate them."""
-    delay_std: Positive | None = None
+    delay_std: Std | None = None
     """How much antenna delays are expected to be off, each for itself, metres; 0.07 by default, 0.15 for boards that
     were never calibrated, 0.03 for recordings of other systems."""
-    common_delay_std: NotNegative | None = None
+    common_delay_std: StdOrZero | None = None
     """How much all of them are expected to be off together, more than that; 0.1 by default, 1 for recordings of other
     systems, whose stamps may lack any correction."""
-    pair_std: NotNegative | None = None
+    pair_std: StdOrZero | None = None
     """Constant error expected of each pair's range, metres; 0.03 by default."""
     origin: int | None = None
     """The anchor at (0, 0)."""
@@ -79,7 +86,12 @@ def facts_of(
 
     known = set(anchors)
     _check(asked, site)
-    points = dict(_point(text, known) for text in asked.point or ())
+    points: dict[int, Point] = {}
+    for text in asked.point or ():
+        anchor, point = _point(text, known)
+        if anchor in points:
+            raise SkylessError(f"--point is {text!r}; the position of anchor {anchor} should be given once")
+        points[anchor] = point
     sketch = _positions(site) if site is not None and not asked.no_sketch else {}
     dimensions = asked.dimensions or 2
     given = _heights(asked, known) | {anchor: point[2] for anchor, point in points.items() if point[2] is not None}
@@ -147,7 +159,7 @@ def _heights(asked: FactOptions, known: set[int]) -> dict[int, float]:
     of_all: dict[int, float] = {}
     for text in asked.height or ():
         name, mark, value = text.rpartition("=")
-        (z_m,) = finite_numbers("height", value, (1,))
+        (z_m,) = _metres("height", text, value, (1,))
         if mark:
             single[_anchor("height", text, name, known)] = z_m
         elif of_all:
@@ -176,17 +188,25 @@ def _tape(text: str, known: set[int]) -> "Tape":
     if match is None:
         raise SkylessError(f"--distance is {text!r}; it should be like 1-4=7.21 or 1-4=7.21±0.01")
     a, b = (_anchor("distance", text, match[name], known) for name in ("a", "b"))
-    (distance_m,) = finite_numbers("distance", match["distance"], (1,))
-    std_m = Tape(a, b, distance_m).std_m if match["std"] is None else finite_numbers("distance", match["std"], (1,))[0]
-    if a == b or distance_m <= 0.0 or std_m < 0.0:
+    (distance_m,) = _metres("distance", text, match["distance"], (1,))
+    std_m = Tape(a, b, distance_m).std_m if match["std"] is None else _metres("distance", text, match["std"], (1,))[0]
+    if a == b or distance_m <= 0.0 or not 0.0 <= std_m <= _MOST_STD_M:
         raise SkylessError(f"--distance is {text!r}; it should be a positive distance between two anchors")
     return Tape(a, b, distance_m, std_m)
 
 
 def _point(text: str, known: set[int]) -> "tuple[int, Point]":
     name, _, position = text.partition("=")
-    x_m, y_m, *z_m = finite_numbers("point", position, (2, 3))
+    x_m, y_m, *z_m = _metres("point", text, position, (2, 3))
     return _anchor("point", text, name, known), (x_m, y_m, z_m[0] if z_m else None)
+
+
+def _metres(option: str, text: str, value: str, counts: tuple[int, ...]) -> tuple[float, ...]:
+    """Coordinates or a length of an option's value. Raises SkylessError."""
+    values = finite_numbers(option, value, counts)
+    if any(abs(one) > MAX_COORDINATE_M for one in values):
+        raise SkylessError(f"--{option} is {text!r}; it should be metres, at most {MAX_COORDINATE_M:g}")
+    return values
 
 
 def _gauge(asked: FactOptions, known: set[int]) -> "Gauge | None":

@@ -3,5 +3,5 @@
 ``estimate`` is the regression at known positions alone. ``relayed`` makes differences of receptions, ``epochs`` means
 of them, ``walk`` makes rows of these, and ``joint`` fits these together with the anchors' ranges.
 
-Public: epochs, estimate, joint, relayed.
+Public: epochs, estimate, joint, received, relayed.
 """

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from msgspec import Struct
 
 from skyless.kernels.arrays import Array, Integers, Vector
+from skyless.survey.tags.received import TagReceived
 
 EPOCH_S: Final = 0.5
 """Reflections change within so short a walk: the errors of two epochs count as independent."""
@@ -31,7 +31,7 @@ _HUBER_M: Final = 0.1
 _ROUNDS: Final = 4
 
 
-class TagEpochs(Struct, frozen=True, eq=False):
+class TagEpochs(TagReceived, frozen=True, eq=False):
     """Differences of one tag, ``r`` means over an epoch and a pair of anchors, in ``k`` epochs; ``n`` anchors.
 
     A difference is the range to ``second`` less that to ``first``, both with their delays h. If it is ``relayed``, the
