@@ -145,3 +145,16 @@ def test_kept_positions_need_ranges_and_a_sketch():
 def test_whole_numbers_are_numbers():
     survey = run_survey(RANGES, Facts(delay_std_m=0, pair_std_m=0, sketch_std_m=1))
     assert all(anchor.determined for anchor in survey.anchors)
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_a_delay_far_beyond_what_is_expected_is_named(keep):
+    layout = survey_layouts()["hall"]
+    rng = np.random.default_rng(31)
+    sketch = {anchor: tuple(row) for anchor, row in zip(layout.anchors, layout.position_m.tolist(), strict=True)}
+    facts = Facts(heights_m=layout.heights_m, sketch_m=sketch, sketch_std_m=0.02, keep_positions=keep)
+    usual = drawn_ranges(layout, 10.0, rng, delays_m={3: 0.1}, pair_std_m=0.02)
+    assert not any("expected" in note for note in run_survey(usual, facts).notes)
+    wrong = drawn_ranges(layout, 10.0, rng, delays_m={3: 0.7}, pair_std_m=0.02)
+    (note,) = [note for note in run_survey(wrong, facts).notes if "expected" in note]
+    assert note.startswith("the delay of anchor 3 is off by ")

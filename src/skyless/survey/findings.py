@@ -2,18 +2,20 @@
 
 import math
 import re
+from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
 
 from skyless.kernels.arrays import Array, Mask
 from skyless.survey.build import Measured, levels, with_free_delays
+from skyless.survey.facts import Facts
 from skyless.survey.fit import determined as determination
 from skyless.survey.fit.links import Links
 from skyless.survey.fit.problem import Problem, delay_weights
 from skyless.survey.fit.tapes import TapeChoice, best_tapes, mending_tapes
 from skyless.survey.frame import Framed
-from skyless.survey.result import TapeAdvice
+from skyless.survey.result import SurveyedAnchor, TapeAdvice
 from skyless.survey.sentences import anchors_named, are, joined, tapes_named
 from skyless.survey.shape import Fitted, redundancy, surveyed_problem
 
@@ -32,6 +34,19 @@ _BENT_SIGMA: Final = 3.0
 
 _AXIS_PART: Final = 0.9
 """Square of the cosine from which on a direction is an axis's."""
+
+_UNLIKELY_SIGMAS: Final = 3.0
+
+
+def unlikely_delays(anchors: Iterable[SurveyedAnchor], facts: Facts) -> tuple[str, ...]:
+    """Sentences about delays far beyond what is expected: a wrong height, tape or point of an anchor looks so."""
+    expected_m = math.hypot(facts.delay_std_m, facts.common_delay_std_m if facts.delay_std_m > 0.0 else 0.0)
+    return tuple(
+        f"the delay of anchor {one.id} is off by {100.0 * one.delay_m:.0f} cm, where ±{100.0 * expected_m:.0f} cm is "
+        "expected: is its height, its position or a distance mistyped?"
+        for one in anchors
+        if one.delay_m is not None and expected_m > 0.0 and abs(one.delay_m) > _UNLIKELY_SIGMAS * expected_m
+    )
 
 
 def anchor_reasons(measured: Measured, links: Links, fitted: Fitted | None) -> dict[int, str]:

@@ -8,6 +8,7 @@ import math
 from typing import Final
 
 import numpy as np
+from msgspec import structs
 
 from skyless.kernels.arrays import Array, Mask
 from skyless.survey.build import Measured, as_array, levels, own_delays, usable
@@ -18,6 +19,7 @@ from skyless.survey.findings import (
     held_by_expected_delays,
     missing_sentences,
     unchecked,
+    unlikely_delays,
 )
 from skyless.survey.fit.ambiguity import OtherFit, find_ambiguities
 from skyless.survey.fit.determined import position_stds_m
@@ -40,8 +42,12 @@ def run_survey(ranges: PairRanges, facts: Facts) -> Survey:
     What is not determined has no figures. Ranges and facts that do not suffice or do not fit raise nothing:
     ``not_determined`` and ``notes`` name them.
     """
-    measured = usable(ranges, facts)
-    if facts.keep_positions:
+    survey = _survey(usable(ranges, facts))
+    return structs.replace(survey, notes=(*survey.notes, *unlikely_delays(survey.anchors, facts)))
+
+
+def _survey(measured: Measured) -> Survey:
+    if measured.facts.keep_positions:
         return survey_of_kept_positions(measured)
     links = _links(measured)
     kept = np.flatnonzero(links.has_enough)
