@@ -3,7 +3,9 @@
 import csv
 import json
 import re
+from errno import ENOSPC
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -113,6 +115,29 @@ def test_the_report_for_people(hall, capsys):
     assert out.index("11 anchors, 54 of 55 pairs, 30 unknowns: 24 ranges check the result") < out.index("anchors ┏")
     assert re.search(r"left out as late: 1–10 \(\+0\.[45]\d m\), 3–6 \(\+0\.[45]\d m\)", out)
     assert "delay / cm" in out
+
+
+def test_a_full_disk_leaves_all_files_as_they_were(hall, capsys, tmp_path, monkeypatch):
+    """A new site file with the record of another survey would give the watch a wrong baseline."""
+    out = tmp_path / "new.toml"
+    out.write_text("what was there")
+    write_bytes, written = Path.write_bytes, []
+
+    def until_the_disk_is_full(path, data):
+        written.append(path)
+        if len(written) == 3:
+            raise OSError(ENOSPC, "No space left on device", str(path))
+        return write_bytes(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", until_the_disk_is_full)
+    command = ("--ranges", hall / "ranges.csv", "--site", hall / "site.toml", "--out", out, "--force")
+    assert main(["survey", *map(str, command)]) == 2
+    said = capsys.readouterr().err
+    assert "cannot be written: No space left on device" in " ".join(said.split())
+    assert "Traceback" not in said
+    assert len(written) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["new.toml"]
+    assert out.read_text() == "what was there"
 
 
 def test_an_anchor_that_nobody_receives_is_not_determined_and_stays(hall, capsys, tmp_path):

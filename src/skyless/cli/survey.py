@@ -10,7 +10,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.cli.common.options import Finite, check_left_out, check_output, check_picture, finite_numbers, options
-from skyless.cli.common.output import console, write_file
+from skyless.cli.common.output import console
 from skyless.cli.common.progress import status
 from skyless.cli.common.recording_inputs import is_mcap
 from skyless.cli.common.survey_facts import FactOptions, facts_of
@@ -201,9 +201,7 @@ def _written(
 ) -> SurveyReport:
     """The report after --out was written. Raises SkylessError."""
     if out.suffix.lower() == ".csv":
-        kept = _keep(out)
-        write_file(out, _table(report.survey).encode())
-        return replace(report, written=(*kept, str(out)))
+        return replace(report, written=_write(out, {out: _table(report.survey).encode()}))
     from skyless.survey.record import SurveyRecord, encode_record, record_path
     from skyless.survey.surveyed_site import delay_changes_ticks, surveyed_text, unchanged_anchors
 
@@ -214,14 +212,12 @@ def _written(
     record = SurveyRecord(site.name, site.id, time.time(), ranges, result, delay_changes_ticks(site, result))
     strangers = [one.id for one in result.anchors if one.determined and one.id not in _identifiers(site)]
     more = [f"anchor {one} is not in {asked.known.site} and was not written" for one in strangers]
-    kept = _keep(out)
-    write_file(out, text.encode())
-    write_file(record_path(out), encode_record(record))
+    written = _write(out, {record_path(out): encode_record(record), out: text.encode()})
     return replace(
         report,
         warnings=(*report.warnings, *more),
         unchanged=unchanged_anchors(site, result),
-        written=(*kept, str(out), str(record_path(out))),
+        written=written,
     )
 
 
@@ -229,15 +225,19 @@ def _identifiers(site: "Site") -> set[int]:
     return {anchor.id for anchor in site.all_anchors}
 
 
-def _keep(out: Path) -> tuple[str, ...]:
-    """Keep what a file holds under a name that is free, ``NAME.before-survey-1.toml``. Raises SkylessError."""
-    if not out.exists():
-        return ()
-    number = 1
-    while (kept := out.with_name(f"{out.stem}.before-survey-{number}{out.suffix}")).exists():
-        number += 1
-    write_file(kept, out.read_bytes())
-    return (str(kept),)
+def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
+    """Write files, and what ``out`` held under another name: all of them or none.
+
+    The last one is named first. Raises SkylessError.
+    """
+    from skyless.nodes.survey_files import kept_path, replace_files
+
+    try:
+        before = {kept_path(out): out.read_bytes()} if out.exists() else {}
+        replace_files(before | files)
+    except OSError as error:
+        raise SkylessError(f"{error.filename or out} cannot be written: {error.strerror}") from None
+    return tuple(map(str, (*before, *reversed(files))))
 
 
 def _table(result: "Survey") -> str:

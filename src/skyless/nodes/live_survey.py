@@ -11,7 +11,6 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.mqtt.messages import StampsMessage, SurveyMessage, SurveyProgress, WatchFinding, WatchMessage
-from skyless.site.digest import site_digest
 from skyless.site.model import Site
 from skyless.survey.facts import Facts
 from skyless.survey.ranges import PairBlock, PairRanges
@@ -298,8 +297,3 @@ def is_record_of(record: SurveyRecord, site: Site) -> bool:
 
 def _is_near(value_m: float, found_m: float | None) -> bool:
     return found_m is not None and abs(value_m - found_m) < 1e-3
-
-
-def is_same_site(one: Site, other: Site) -> bool:
-    """Whether two sites have the same anchors at the same positions with the same delays."""
-    return site_digest(one) == site_digest(other)

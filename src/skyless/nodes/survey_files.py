@@ -56,7 +56,7 @@ def save_survey(
         SkylessError: a file cannot be read or written, or the result is no valid site.
     """
     site = load_site(file)
-    record, kept = _record(site, survey, ranges, unix_s), _free_name(file)
+    record, kept = _record(site, survey, ranges, unix_s), kept_path(file)
     images: list[Path] = []
     try:
         text = surveyed_text(file.read_bytes().decode(), survey, site, file)
@@ -71,7 +71,7 @@ def save_survey(
                     "y_m": plan.y_m,
                 }
                 text = with_values(text, {}, {"floor_plan": values}, file, "the floor plan")
-        _replace({kept: file.read_bytes(), record_path(file): encode_record(record), file: text.encode()})
+        replace_files({kept: file.read_bytes(), record_path(file): encode_record(record), file: text.encode()})
     except OSError as error:
         raise SkylessError(f"{error.filename or file} cannot be written: {error.strerror}") from None
     return Saved(load_site(file), record, (file, record_path(file), kept, *images))
@@ -81,8 +81,8 @@ def _record(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> Su
     return SurveyRecord(site.name, site.id, unix_s, ranges, survey, delay_changes_ticks(site, survey))
 
 
-def _free_name(file: Path) -> Path:
-    """``NAME.before-survey-1.toml``, or the next number that is free."""
+def kept_path(file: Path) -> Path:
+    """Where the file before a survey is kept: ``NAME.before-survey-1.toml``, or the next number that is free."""
     number = 1
     while (kept := file.with_name(f"{file.stem}.before-survey-{number}{file.suffix}")).exists():
         number += 1
@@ -99,11 +99,11 @@ def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None,
     path = file.with_name(f"{file.stem}.floor{_ENDINGS.get(floor.image[:4], '.jpg')}")
     if path.exists() and path.read_bytes() != floor.image:
         path = path.with_stem(f"{path.stem}-{crc32(floor.image):08x}")
-    _replace({path: floor.image})
+    replace_files({path: floor.image})
     return path.name, [path]
 
 
-def _replace(files: Mapping[Path, bytes]) -> None:
+def replace_files(files: Mapping[Path, bytes]) -> None:
     """Write files so that a reader finds the old one or the whole new one; none where not all fit. Raises OSError."""
     scratch = {path: path.with_name(f".{path.name}.part") for path in files}
     try:

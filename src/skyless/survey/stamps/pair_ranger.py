@@ -188,7 +188,7 @@ class PairRanger:
         mean_m = np.bincount(pair, range_m, minlength=count) / np.maximum(n, 1)
         residual_m = range_m - mean_m[pair]
         squares_m2 = np.bincount(pair, residual_m**2, minlength=count)
-        # A flight is half of one leg and of the two legs beside it, with weights 1 - part and part.
+        # A flight is half of one leg and of the legs before and after it, with weights 1 - part and part.
         flight_weight = np.bincount(pair, 1.0 + part**2 + (1.0 - part) ** 2, minlength=count)
         freedom = flight_weight - n * one_each
         self._share(legs, leg, residual_m, n)

@@ -31,7 +31,7 @@ _FARTHEST_M: Final = 1e5
 """Of ranges, delays included."""
 
 _MEDIAN_BLOCKS: Final = 3
-"""From so many blocks on their median counts, which short obstacles do not change."""
+"""Blocks from which on their median counts, which short obstacles do not change."""
 _MEDIAN_VARIANCE: Final = math.pi / 2.0
 
 _JUMP_WINDOWS: Final = 1000
