@@ -27,11 +27,11 @@ from skyless.mqtt.messages import (
     WatchFinding,
     WatchMessage,
 )
-from skyless.nodes import survey as survey_module
-from skyless.nodes.live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey, is_record_of
 from skyless.nodes.stamp_log import StampLog
-from skyless.nodes.survey import SurveyNode, SurveySettings
-from skyless.nodes.survey_files import save_survey
+from skyless.nodes.survey import program as program_module
+from skyless.nodes.survey.files import FloorImage, is_record_of, save_survey
+from skyless.nodes.survey.live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey
+from skyless.nodes.survey.program import SurveyNode, SurveySettings
 from skyless.simulation.impairments import DelayError, lab_impairments
 from skyless.simulation.world import World
 from skyless.site.digest import site_digest
@@ -215,8 +215,8 @@ class Stage:
 
     def __init__(self, monkeypatch, **settings):
         self.now_s, self.said, self.asked = BEGIN_S, [], []
-        monkeypatch.setattr(survey_module, "Link", FakeLink)
-        monkeypatch.setattr(survey_module, "time", SimpleNamespace(monotonic=lambda: self.now_s, time=lambda: 1e9))
+        monkeypatch.setattr(program_module, "Link", FakeLink)
+        monkeypatch.setattr(program_module, "time", SimpleNamespace(monotonic=lambda: self.now_s, time=lambda: 1e9))
         self.found = true_survey()
         self.node = SurveyNode(
             SurveySettings(1, **settings), lambda _: Facts(), self.solve, MqttAddress("127.0.0.1", 1), self.said.append
@@ -501,7 +501,9 @@ def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_has_end
     asyncio.run(main())
 
 
-def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch):
+@pytest.mark.parametrize("failing", [1, 2, 3, 4])
+def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch, failing):
+    """The image of the floor, the site's file before, the survey's record, and the site's file."""
     file = tmp_path / "lab.toml"
     file.write_text(TEXT, encoding="utf-8")
     written = []
@@ -509,14 +511,15 @@ def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch):
 
     def until_the_disk_is_full(path, data):
         written.append(path)
-        if len(written) == 3:
+        if len(written) == failing:
             raise OSError(ENOSPC, "No space left on device", str(path))
         return write_bytes(path, data)
 
     monkeypatch.setattr(Path, "write_bytes", until_the_disk_is_full)
+    floor = FloorImage(FloorPlanSite("floor.png", 12.0, -1.0, -2.0), PNG)
     with pytest.raises(SkylessError, match="No space left"):
-        save_survey(file, true_survey(), PairRanges((), tuple(POSITIONS_M)), 0.0)
-    assert len(written) == 3
+        save_survey(file, true_survey(), PairRanges((), tuple(POSITIONS_M)), 0.0, floor)
+    assert len(written) == failing
     assert [path.name for path in tmp_path.iterdir()] == ["lab.toml"]
     assert file.read_text(encoding="utf-8") == TEXT
 

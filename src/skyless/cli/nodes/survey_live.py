@@ -12,7 +12,7 @@ from skyless.cli.nodes.options import MqttCa, SiteId, log
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.nodes.survey import SurveyNode
+    from skyless.nodes.survey.program import SurveyNode
     from skyless.radios.interface import Radio
     from skyless.site.model import Site
     from skyless.survey.facts import Facts
@@ -124,7 +124,7 @@ async def _node(asked: LiveOptions, known: FactOptions, *, serves: bool) -> "Sur
     from skyless.mqtt.address import mqtt_address
     from skyless.nodes.find_site import find_site
     from skyless.nodes.open_radio import open_radios
-    from skyless.nodes.survey import SurveyNode, SurveySettings
+    from skyless.nodes.survey.program import SurveyNode, SurveySettings
     from skyless.site.load import load_site
     from skyless.survey.solve import run_survey
 

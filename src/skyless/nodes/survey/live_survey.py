@@ -282,18 +282,3 @@ class _Watched:
             watch.add(self.waiting.popleft())
         watch.advance(now_s)
         self.seen = watch.state, watch.findings, watch.pairs
-
-
-def is_record_of(record: SurveyRecord, site: Site) -> bool:
-    """Whether a site still has the positions that a survey gave it."""
-    found = {one.id: one for one in record.survey.anchors if one.determined}
-    placed = {anchor.id: anchor for anchor in site.anchors}
-    return record.site_id == site.id and all(
-        anchor in placed and _is_near(placed[anchor].x_m, one.x_m) and _is_near(placed[anchor].y_m, one.y_m)
-        for anchor, one in found.items()
-        if anchor in {known.id for known in site.all_anchors}
-    )
-
-
-def _is_near(value_m: float, found_m: float | None) -> bool:
-    return found_m is not None and abs(value_m - found_m) < 1e-3

@@ -23,7 +23,6 @@ from skyless.mqtt.messages import (
     SurveyFactsMessage,
     SurveyMessage,
     SurveySaveMessage,
-    WatchFinding,
     WatchMessage,
 )
 from skyless.mqtt.survey_facts import BadFactsError, check_facts
@@ -39,17 +38,18 @@ from skyless.mqtt.topics import (
     survey_topic,
     watch_topic,
 )
-from skyless.nodes.live_survey import FactsOf, LiveSurvey, is_record_of
 from skyless.nodes.process import Log, every, keep, outlasting, together
 from skyless.nodes.radio_monitor import RadioMonitor
-from skyless.nodes.survey_files import FloorImage, Saved, save_survey, saved_without_file
+from skyless.nodes.survey.files import FloorImage, Saved, record_of, save_survey, saved_without_file
+from skyless.nodes.survey.findings_log import FindingsLog
+from skyless.nodes.survey.live_survey import FactsOf, LiveSurvey
+from skyless.nodes.survey.precedence import QUIET_S, Precedence
 from skyless.radios.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.site.digest import is_same_but_placed, site_digest
 from skyless.site.load import load_site
 from skyless.site.model import Site
 from skyless.survey.facts import Facts
 from skyless.survey.ranges import PairRanges
-from skyless.survey.record import SurveyRecord, read_record, record_path
 from skyless.survey.result import Survey
 from skyless.survey.stamps.legs import LegCollector
 from skyless.survey.surveyed_site import with_delays_of
@@ -62,9 +62,6 @@ _REQUEST_S: Final = 5.0
 """Each request for stamps is repeated at this interval, before its lease ends."""
 
 _UPDATE_S: Final = 1.0
-_QUIET_S: Final = 10.0
-"""The watch and a survey without stamps are published at least so often."""
-
 _PAIRS_PER_S: Final = 400
 """Pairs that are published a second: larger sites publish less often."""
 
@@ -75,14 +72,8 @@ _SETTLED_S: Final = 60.0
 _SETTLED_UPDATE_S: Final = 5.0
 """After a minute of data results change little, and are made less often."""
 
-_SAME_SIZE: Final = 0.25
-"""A finding is logged again when its size has changed by more than this share."""
-
 _EARLIER_KEPT: Final = 32
 """Sites before the present one that a placement names."""
-
-_OTHER_S: Final = 3.0 * _QUIET_S
-"""After this time without a message an earlier program has ended."""
 
 _MOST_LOGGED: Final = 100
 
@@ -137,17 +128,11 @@ class SurveyNode:
         self._next_solve_s = 0.0
         self._next_publish_s = 0.0
         self._watch_published: tuple[WatchMessage, float] | None = None
-        self._findings: dict[tuple[object, tuple[int, ...]], WatchFinding] = {}
-        """Those that are logged."""
+        self._findings_log = FindingsLog()
         self._said_state = ""
         self._logged: set[str] = set()
         """Lines that are logged once."""
-        self._run = f"{1e3 * time.time():014.0f}-{secrets.token_hex(4)}"
-        """Earlier programs have lesser names."""
-        self._other: tuple[str, float] | None = None
-        """The newest message of an earlier one: its name and time."""
-        self._other_s: float | None = None
-        """When the last one came of which there were others before."""
+        self._precedence = Precedence(time.time())
         self._name = NAME if settings.serves else f"{NAME}-{secrets.token_hex(4)}"
         self.link = None if address is None else Link(address, self._name, site=settings.site_id, kind=NAME)
         if self.link is not None:
@@ -271,22 +256,14 @@ class SurveyNode:
             self._next_solve_s = self._next_publish_s = 0.0
 
     def _on_survey(self, message: SurveyMessage) -> None:
-        """Another program that serves the same site: the later one waits, else both would save what the page asks."""
-        if message.by == "" or message.by >= self._run:
-            return
-        before, self._other = self._other, (message.by, message.unix_s)
-        if before is None or before[0] != message.by or before == self._other:
-            return  # what the broker has kept may be of one that has ended
-        if not self._waits():
-            self._log(
-                f"survey: another survey program serves site {self._settings.site_id}: this one waits for its end"
-            )
+        if self._precedence.add(message, time.monotonic()):
+            site_id = self._settings.site_id
+            self._log(f"survey: another survey program serves site {site_id}: this one waits for its end")
             self._forget(survey_topic, watch_topic)
-        self._other_s = time.monotonic()
 
     def _waits(self) -> bool:
         """Whether another program serves the site: then this one only gathers."""
-        return self._other_s is not None and time.monotonic() - self._other_s < _OTHER_S
+        return self._precedence.waits(time.monotonic())
 
     def _on_image(self, _topic: str, payload: bytes) -> None:
         self._image = payload or None
@@ -304,7 +281,7 @@ class SurveyNode:
 
     def _begin(self, site: Site) -> None:
         """Survey a site from now on."""
-        record = _record_of(self._settings.file, site, self._log)
+        record = record_of(self._settings.file, site, self._log)
         try:
             facts = self._facts_of(site) if self._given is None else self._given.facts
         except SkylessError as error:  # options name anchors that the site on MQTT has not
@@ -381,14 +358,15 @@ class SurveyNode:
     def _publish(self, link: Link, live: LiveSurvey, now_s: float, unix_s: float, watch: WatchMessage | None) -> None:
         site_id, file = self._settings.site_id, self._settings.file
         if now_s >= self._next_publish_s:
-            message = replace(live.message(now_s, unix_s, None if file is None else str(file)), by=self._run)
+            found = live.message(now_s, unix_s, None if file is None else str(file))
+            message = replace(found, by=self._precedence.name)
             link.publish(survey_topic(site_id), message, qos=1, retain=True)
-            pause_s = _QUIET_S if message.state == "no data" else max(_UPDATE_S, len(message.pairs) / _PAIRS_PER_S)
+            pause_s = QUIET_S if message.state == "no data" else max(_UPDATE_S, len(message.pairs) / _PAIRS_PER_S)
             self._next_publish_s = now_s + pause_s - 0.5 * _UPDATE_S
         if watch is not None:
             published = self._watch_published
             is_news = published is None or _without_time(watch) != _without_time(published[0])
-            if is_news or published is None or now_s - published[1] >= _QUIET_S:
+            if is_news or published is None or now_s - published[1] >= QUIET_S:
                 self._watch_published = watch, now_s
                 link.publish(watch_topic(site_id), watch, qos=1, retain=True)
 
@@ -403,25 +381,12 @@ class SurveyNode:
             self._said_state = state
 
     def _log_findings(self, live: LiveSurvey, watch: WatchMessage) -> None:
-        """Log what is new; an anchor that has moved makes the ranges of before useless for another survey.
-
-        A finding whose size changes a little is the same one.
-        """
-        present: dict[tuple[object, tuple[int, ...]], WatchFinding] = {
-            (one.kind, one.anchors): one for one in watch.findings
-        }
-        for key, one in present.items():
-            logged = self._findings.get(key)
-            if logged is not None and abs(one.size_m - logged.size_m) < _SAME_SIZE * abs(logged.size_m):
-                present[key] = logged
-            elif logged is None or one.sentence != logged.sentence:
-                self._log(f"watch: {one.sentence}")
-        for key, one in self._findings.items():
-            if key not in present:
-                self._log(f"watch: over: {one.sentence}")
-        if any(kind in ("moved", "delay") for kind, _ in present.keys() - self._findings.keys()):
+        """Log what is new; an anchor that has moved makes the ranges of before useless for another survey."""
+        lines, has_moved = self._findings_log.update(watch.findings)
+        for line in lines:
+            self._log(f"watch: {line}")
+        if has_moved:
             live.restart_ranges()
-        self._findings = present
 
     def _log_once(self, line: str) -> None:
         if line not in self._logged and len(self._logged) < _MOST_LOGGED:
@@ -490,21 +455,6 @@ class SurveyNode:
     def _floor(self) -> FloorImage | None:
         plan = None if self._given is None else self._given.floor_plan
         return None if plan is None else FloorImage(plan, self._image)
-
-
-def _record_of(file: Path | None, site: Site, log: Log) -> SurveyRecord | None:
-    """The record of the survey that a site file comes from; without one the watch learns what is usual."""
-    if file is None or not record_path(file).exists():
-        return None
-    try:
-        record = read_record(record_path(file))
-    except SkylessError as error:
-        log(f"not used: {error}")
-        return None
-    if is_record_of(record, site):
-        return record
-    log(f"not used: {record_path(file)} is of other positions than those in {file}")
-    return None
 
 
 def _without_time(message: WatchMessage) -> object:

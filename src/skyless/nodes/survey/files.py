@@ -8,13 +8,14 @@ from zlib import crc32
 from msgspec import Struct
 
 from skyless.errors import SkylessError
+from skyless.nodes.process import Log
 from skyless.site.check import check_site
 from skyless.site.image import image_size
 from skyless.site.load import load_site
 from skyless.site.model import FloorPlanSite, Site
 from skyless.site.rewrite import with_values
 from skyless.survey.ranges import PairRanges
-from skyless.survey.record import SurveyRecord, encode_record, record_path
+from skyless.survey.record import SurveyRecord, encode_record, read_record, record_path
 from skyless.survey.result import Survey
 from skyless.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text
 
@@ -47,6 +48,36 @@ def saved_without_file(site: Site, survey: Survey, ranges: PairRanges, unix_s: f
     return Saved(placed, _record(site, survey, ranges, unix_s))
 
 
+def record_of(file: Path | None, site: Site, log: Log) -> SurveyRecord | None:
+    """The record of the survey that a site file comes from; without one the watch learns what is usual."""
+    if file is None or not record_path(file).exists():
+        return None
+    try:
+        record = read_record(record_path(file))
+    except SkylessError as error:
+        log(f"not used: {error}")
+        return None
+    if is_record_of(record, site):
+        return record
+    log(f"not used: {record_path(file)} is of other positions than those in {file}")
+    return None
+
+
+def is_record_of(record: SurveyRecord, site: Site) -> bool:
+    """Whether a site still has the positions that a survey gave it."""
+    found = {one.id: one for one in record.survey.anchors if one.determined}
+    placed = {anchor.id: anchor for anchor in site.anchors}
+    return record.site_id == site.id and all(
+        anchor in placed and _is_near(placed[anchor].x_m, one.x_m) and _is_near(placed[anchor].y_m, one.y_m)
+        for anchor, one in found.items()
+        if anchor in {known.id for known in site.all_anchors}
+    )
+
+
+def _is_near(value_m: float, found_m: float | None) -> bool:
+    return found_m is not None and abs(value_m - found_m) < 1e-3
+
+
 def save_survey(
     file: Path, survey: Survey, ranges: PairRanges, unix_s: float, floor: FloorImage | None = None
 ) -> Saved:
@@ -57,11 +88,11 @@ def save_survey(
     """
     site = load_site(file)
     record, kept = _record(site, survey, ranges, unix_s), kept_path(file)
-    images: list[Path] = []
+    image: dict[Path, bytes] = {}
     try:
         text = surveyed_text(file.read_bytes().decode(), survey, site, file)
         if floor is not None:
-            image_name, images = _floor_image(file, site, floor)
+            image_name, image = _floor_image(file, site, floor)
             if image_name is not None:
                 plan = floor.plan
                 values: dict[str, float | str] = {
@@ -71,10 +102,11 @@ def save_survey(
                     "y_m": plan.y_m,
                 }
                 text = with_values(text, {}, {"floor_plan": values}, file, "the floor plan")
-        replace_files({kept: file.read_bytes(), record_path(file): encode_record(record), file: text.encode()})
+        files = {kept: file.read_bytes(), record_path(file): encode_record(record), file: text.encode()}
+        replace_files(image | files)
     except OSError as error:
         raise SkylessError(f"{error.filename or file} cannot be written: {error.strerror}") from None
-    return Saved(load_site(file), record, (file, record_path(file), kept, *images))
+    return Saved(load_site(file), record, (file, record_path(file), kept, *image))
 
 
 def _record(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> SurveyRecord:
@@ -89,18 +121,17 @@ def kept_path(file: Path) -> Path:
     return kept
 
 
-def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None, list[Path]]:
-    """Name of the image in the site file, and what was written for it; None where there is no image."""
+def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None, dict[Path, bytes]]:
+    """Name of the image in the site file, None where there is no image; and the file to write, if it is a new one."""
     present = None if site.floor_plan is None else site.floor_plan.image
     if floor.image is None or image_size(floor.image) is None:
-        return present, []
+        return present, {}
     if present is not None and (file.parent / present).read_bytes() == floor.image:
-        return present, []
+        return present, {}
     path = file.with_name(f"{file.stem}.floor{_ENDINGS.get(floor.image[:4], '.jpg')}")
     if path.exists() and path.read_bytes() != floor.image:
         path = path.with_stem(f"{path.stem}-{crc32(floor.image):08x}")
-    replace_files({path: floor.image})
-    return path.name, [path]
+    return path.name, {path: floor.image}
 
 
 def replace_files(files: Mapping[Path, bytes]) -> None:
