@@ -2,14 +2,13 @@
 
 import csv
 import json
-from functools import partial
 from math import dist
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from machines.bench import LAB, Heard, Stage
+from machines.bench import LAB
 from recordings import live_site
 from skyless.cli.main import main
 from skyless.constants import TICK_M
@@ -22,24 +21,13 @@ OFF = {2: (40.0, 0.0), 3: (0.0, -50.0), 4: (30.0, 30.0), 5: (-64.0, 20.0), 1: (0
 """True minus configured TX and RX delays, ticks."""
 
 
-def faulty_tape(site, seconds, seed, position, errors):
-    stage = Stage(site, seed, (position,), delay_errors=errors)
-    return tuple(
-        Heard(broadcast.anchor, reception.frame, reception.rx_ticks, reception.host_s, truth_m)
-        for broadcast in stage.world.run(seconds)
-        for _, reception, truth_m in broadcast.receptions()
-    )
-
-
 @pytest.fixture(scope="module")
 def site_recording(tmp_path_factory):
     """A recording of the lab with wrong delays, one standing tag, and the site's file as it was."""
     folder = tmp_path_factory.mktemp("faulty")
     ids = sorted(anchor.id for anchor in LAB.anchors)
     errors = tuple(DelayError(id_, *OFF[k + 1]) for k, id_ in enumerate(ids))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(live_site, "tape", partial(faulty_tape, errors=errors))
-        live_site.record(folder / "stay.mcap", live_site.messages(8.0, ("a",), join_s=0.0))
+    live_site.record(folder / "stay.mcap", live_site.messages(8.0, join_s=0.0, delay_errors=errors))
     (folder / "site.toml").write_text(site_template(LAB))
     return folder, {error.anchor: error for error in errors}
 

@@ -4,13 +4,12 @@ import csv
 import json
 import re
 from errno import ENOSPC
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from machines.bench import LAB, Heard, Stage
+from machines.bench import LAB
 from recordings import live_site
 from skyless.cli.common.survey_facts import FactOptions, facts_of
 from skyless.cli.main import main
@@ -222,22 +221,11 @@ OFF_TICKS = {2: (40.0, 0.0), 3: (0.0, -50.0), 4: (30.0, 30.0), 5: (-64.0, 20.0),
 """True minus configured TX and RX delays of the lab's anchors, in their order."""
 
 
-def faulty_tape(site, seconds, seed, position, errors):
-    stage = Stage(site, seed, (position,), delay_errors=errors)
-    return tuple(
-        Heard(broadcast.anchor, reception.frame, reception.rx_ticks, reception.host_s, truth_m)
-        for broadcast in stage.world.run(seconds)
-        for _, reception, truth_m in broadcast.receptions()
-    )
-
-
 def test_delays_from_a_recording_and_twice_is_once(capsys, tmp_path):
     """A tag's receptions suffice; delays count from those of the recording and not from those of the file."""
     ids = sorted(anchor.id for anchor in LAB.anchors)
     errors = tuple(DelayError(anchor, *OFF_TICKS[number]) for number, anchor in enumerate(ids, start=1))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(live_site, "tape", partial(faulty_tape, errors=errors))
-        live_site.record(tmp_path / "stay.mcap", live_site.messages(5.0, ("a",), join_s=0.0))
+    live_site.record(tmp_path / "stay.mcap", live_site.messages(5.0, join_s=0.0, delay_errors=errors))
     (tmp_path / "site.toml").write_text(site_template(LAB))
     exact = ("--keep-positions", "--sketch-std", "0.0005", "--delay-std", "0.5", "--pair-std", "0")
     first, second = tmp_path / "first.toml", tmp_path / "second.toml"
