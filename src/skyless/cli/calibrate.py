@@ -5,7 +5,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 from cyclopts import App
 
-from skyless.cli.common.options import Finite, check_left_out, check_output, finite_numbers, options
+from skyless.cli.common.options import (
+    Finite,
+    check_folder,
+    check_left_out,
+    check_output,
+    finite_numbers,
+    metres,
+    options,
+)
 from skyless.cli.common.output import console, number, print_json, write_file
 from skyless.cli.common.progress import status
 from skyless.cli.common.recording_inputs import flight_height, is_mcap, known_anchors, known_truth
@@ -63,7 +71,7 @@ class CalibrateOptions:
 
 @app.default
 def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) -> None:
-    """Estimate what each anchor's signals seem late by, from a tag whose position was known, and write it back.
+    """Estimate by how much each anchor's signals seem late, from a tag at known positions, and write a corrected file.
 
     Takes what skyless replay takes. Of a recording of skyless record the antenna delays of the site file are corrected;
     of any other the table of anchors gets a column bias_m, which skyless replay then takes off.
@@ -114,6 +122,7 @@ def _check_out(asked: CalibrateOptions, *, own: bool) -> None:
     out = asked.out
     if out is None:
         return
+    check_folder("out", out)
     if own and (out.suffix.lower() != ".toml" or asked.site is None):
         raise SkylessError(
             f"--out is {str(out)!r}; of a recording of skyless record the site file is corrected: --out should be a "
@@ -139,10 +148,10 @@ def _stay(text: str) -> "Stay":
     from skyless.survey_inputs.samples import Stay
 
     position, mark, span = text.partition("@")
-    x_m, y_m, *z_m = finite_numbers("at", position, (2, 3))
+    x_m, y_m, *z_m = metres("at", text, (2, 3), part=position)
     if not mark:
         return Stay(x_m, y_m, *z_m)
-    from_s, to_s = finite_numbers("at", span, (2,), ":")
+    from_s, to_s = finite_numbers("at", text, (2,), ":", part=span)
     if not 0.0 <= from_s < to_s:
         raise SkylessError(f"--at is {text!r}; what follows @ should be two times in seconds, the later one last")
     return Stay(x_m, y_m, z_m[0] if z_m else None, from_s, to_s)

@@ -35,7 +35,7 @@ _MOST_SEEN: Final = 1 << 16
 
 
 class RecordedRanges(Struct, frozen=True):
-    """What came of a recording."""
+    """Ranges out of a recording, and what could not be used."""
 
     ranges: PairRanges
     format: str
@@ -43,6 +43,8 @@ class RecordedRanges(Struct, frozen=True):
     """As recorded; None for recordings of other systems."""
     drops: dict[str, int]
     """What could not be used, by reason."""
+    damage: dict[str, int] = {}
+    """Those of the drops that are damage of the file, which other readers of it meet as well."""
 
 
 def ranges_of(
@@ -148,10 +150,19 @@ def _of_site(path: str | PathLike[str], identifier: int | None, part: _Part) -> 
                     part.add(leg)
                 else:
                     drops["unknown-anchor"] += 1
-        drops += recording.drops
+        damage = _damage(recording)
     for collector in collectors.values():
         drops += _drops(collector.counters)
-    return RecordedRanges(part.finish(), SITE_FORMAT, site, dict(drops + part.drops()))
+    return RecordedRanges(part.finish(), SITE_FORMAT, site, dict(damage + drops + part.drops()), dict(damage))
+
+
+def _damage(recording: McapRecording) -> Counter[str]:
+    """What could not be read of the file, after it was read."""
+    summary = recording.summary()
+    damage = Counter(summary.drops)
+    if summary.unread_bytes:
+        damage["unfinished-record"] += 1
+    return damage
 
 
 def _of_anchor(message: StampsMessage, ranger: PairRanger, runs: dict[int, str]) -> list[AnchorLeg]:

@@ -73,7 +73,7 @@ class CalibrationRequest(Struct, frozen=True):
 
 
 class Calibrated(Struct, frozen=True):
-    """What came of it."""
+    """The result of a calibration."""
 
     format: str
     estimate: CalibrationEstimate
@@ -129,12 +129,14 @@ def calibrate_site(request: CalibrationRequest, identifier: int | None) -> Calib
         SkylessError: the recording cannot be used, is of another site than ``identifier``, or holds nothing at a
             known position.
     """
-    ranges = ranges_of(request.path, identifier=identifier).ranges
+    recorded = ranges_of(request.path, identifier=identifier)
+    ranges = recorded.ranges
     ranges_m = {(pair.a, pair.b): pair.range_m for pair in ranges.pairs}
     with McapRecording(request.path) as recording:
         site = recorded_site(recording, identifier)
         tags = _tags(recording, request)
         samples = joined([_of_tag(recording, site, tag, request, ranges_m) for tag in tags])
+        samples = replace(samples, drops=recorded.damage | samples.drops)
         _require_some(samples)
         end_s = float(samples.differences.t_s[-1])
         epochs = tuple(_at_known_positions(recording, site, tag, request, end_s) for tag in tags)
