@@ -1,6 +1,7 @@
 """``skyless calibrate`` as its user meets it: simulated sites with known wrong delays, tables, and what goes wrong."""
 
 import csv
+import gzip
 import json
 import os
 from math import dist
@@ -95,6 +96,15 @@ def test_mending_twice_is_mending_once(site_recording, capsys, tmp_path):
     assert first.read_text() == second.read_text()
 
 
+def test_a_compressed_recording_is_named(site_recording, capsys, tmp_path):
+    folder, _ = site_recording
+    packed = tmp_path / "stay.mcap.gz"
+    packed.write_bytes(gzip.compress((folder / "stay.mcap").read_bytes()))
+    for command in ("calibrate", "survey"):
+        assert main([command, str(packed)]) == 2
+        assert 'the file is "a compressed MCAP"; it should be unpacked first' in capsys.readouterr().err
+
+
 def test_a_recording_that_was_cut_off_serves_and_is_reported(site_recording, capsys, tmp_path):
     folder, _ = site_recording
     whole = (folder / "stay.mcap").read_bytes()
@@ -181,6 +191,8 @@ def test_a_wrong_place_is_noticed(stay, capsys):
         ),
         (("--truth", "{folder}/pipe"), "a pipe"),
         (("--at", "1,2,3@9:4"), "later one last"),
+        (("--at", "1,2,3", "--at", "4,5,6@0:9"), "--at is '1,2,3'; before another --at it should have its times"),
+        (("--at", "1,2,3", "--force"), "nothing is written without --out"),
         (("--at", "1,2,3@90:99"), "place-unknown"),
         (("--at", "1,2,3", "--first", "0"), "--first is '0'"),
         (("--at", "1,2,3", "--first", "120%"), "--first is"),

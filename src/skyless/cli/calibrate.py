@@ -1,5 +1,7 @@
 """``skyless calibrate``: the anchors' antenna delays from a recording during which it was known where the tag was."""
 
+from collections.abc import Sequence
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -88,7 +90,7 @@ def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) ->
     _check_out(asked, own=own)
     if asked.at and (asked.truth is not None or asked.lever_arm is not None):
         raise SkylessError("--at says where the antenna was; it should be given without --truth and --lever-arm")
-    stays, beginning = tuple(map(_stay, asked.at or ())), _first(asked.first)
+    stays, beginning = _stays(asked.at or ()), _first(asked.first)
     if own:
         useless = {"anchors": asked.anchors, "format": asked.format, "listener": asked.listener}
         check_left_out(useless, "a recording of skyless record brings its own")
@@ -121,6 +123,7 @@ def _check_out(asked: CalibrateOptions, *, own: bool) -> None:
     """See that --out can be written, before the long work instead of after it. Raises SkylessError."""
     out = asked.out
     if out is None:
+        check_left_out({"force": asked.force or None}, "nothing is written without --out")
         return
     check_folder("out", out)
     if own and (out.suffix.lower() != ".toml" or asked.site is None):
@@ -141,6 +144,15 @@ def _identifier_of(site: Path | None) -> int | None:
     from skyless.site.load import load_site
 
     return None if site is None else load_site(site).id
+
+
+def _stays(texts: Sequence[str]) -> "tuple[Stay, ...]":
+    """The positions of --at. Raises SkylessError."""
+    stays = tuple(map(_stay, texts))
+    for text, stay in zip(texts[:-1], stays, strict=False):
+        if stay.to_s == inf:
+            raise SkylessError(f"--at is {text!r}; before another --at it should have its times, @FROM:TO")
+    return stays
 
 
 def _stay(text: str) -> "Stay":
