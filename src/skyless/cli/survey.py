@@ -203,8 +203,8 @@ def _walks(recording: Path | None, asked: SurveyOptions, site: "Site | None") ->
 
 def _with_all_anchors(ranges: "PairRanges", site: "Site | None") -> "PairRanges":
     """The same ranges, with those anchors of the site added that have none: the survey reports them, too."""
-    everybody = set(ranges.anchors) | ({anchor.id for anchor in site.all_anchors} if site is not None else set())
-    return replace(ranges, anchors=tuple(sorted(everybody)))
+    of_site = set() if site is None else _identifiers(site)
+    return replace(ranges, anchors=tuple(sorted({*ranges.anchors, *of_site})))
 
 
 def _written(
@@ -257,10 +257,11 @@ def _table(result: "Survey") -> str:
     from skyless.recordings.anchor_table import new_table
 
     found = [one for one in result.anchors if one.determined]
-    positions_m = {one.id: (one.x_m or 0.0, one.y_m or 0.0, one.z_m or 0.0) for one in found}
+    positions_m = {
+        one.id: (round(one.x_m or 0.0, 4), round(one.y_m or 0.0, 4), round(one.z_m or 0.0, 4)) for one in found
+    }
     delays = {one.id: AnchorCalibration(one.delay_m, 0.0, None) for one in found if one.delay_m is not None}
-    rounded = {anchor: tuple(round(value, 4) for value in position) for anchor, position in positions_m.items()}
-    return new_table({anchor: (x, y, z) for anchor, (x, y, z) in rounded.items()}, DifferenceCalibration(delays))
+    return new_table(positions_m, DifferenceCalibration(delays))
 
 
 def _draw(path: Path, result: "Survey") -> None:

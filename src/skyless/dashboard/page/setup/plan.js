@@ -13,7 +13,7 @@ import { COORDINATE, DISTANCE, lengthField } from "./fields.js";
 
 export const title = "Floor plan";
 
-/** The user is told that the plan is turned when its two points are turned by more than this. */
+/** A notice says that the plan is turned when its two points are turned by more than this. */
 const TURNED_DEG = 3;
 /** Two points of the image must be apart, or clicking them accurately is not possible. */
 const LEAST_M = 0.05;
