@@ -47,7 +47,7 @@ _COMMANDS = (
 
 _INTERRUPTED = 130
 _BROKEN_PIPE = 1
-_FULL = (ENOSPC, EDQUOT, EFBIG, EIO)
+_CANNOT_WRITE = (ENOSPC, EDQUOT, EFBIG, EIO)
 _USER_ERROR = 2
 
 
@@ -103,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _drop_output()
         return _BROKEN_PIPE
     except OSError as error:
-        if error.filename is not None or error.errno not in _FULL:
+        if error.filename is not None or error.errno not in _CANNOT_WRITE:
             raise
         _drop_output()
         print(f"skyless: standard output cannot be written: {error.strerror}", file=sys.stderr)
