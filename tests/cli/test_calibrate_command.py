@@ -1,15 +1,16 @@
 """``skyless calibrate`` as its user meets it: simulated sites with known wrong delays, tables, and what goes wrong."""
 
 import csv
+import gzip
 import json
-from functools import partial
+import os
 from math import dist
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from machines.bench import LAB, Heard, Stage
+from machines.bench import LAB
 from recordings import live_site
 from skyless.cli.main import main
 from skyless.constants import TICK_M
@@ -22,24 +23,13 @@ OFF = {2: (40.0, 0.0), 3: (0.0, -50.0), 4: (30.0, 30.0), 5: (-64.0, 20.0), 1: (0
 """True minus configured TX and RX delays, ticks."""
 
 
-def faulty_tape(site, seconds, seed, position, errors):
-    stage = Stage(site, seed, (position,), delay_errors=errors)
-    return tuple(
-        Heard(broadcast.anchor, reception.frame, reception.rx_ticks, reception.host_s, truth_m)
-        for broadcast in stage.world.run(seconds)
-        for _, reception, truth_m in broadcast.receptions()
-    )
-
-
 @pytest.fixture(scope="module")
 def site_recording(tmp_path_factory):
     """A recording of the lab with wrong delays, one standing tag, and the site's file as it was."""
     folder = tmp_path_factory.mktemp("faulty")
     ids = sorted(anchor.id for anchor in LAB.anchors)
     errors = tuple(DelayError(id_, *OFF[k + 1]) for k, id_ in enumerate(ids))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(live_site, "tape", partial(faulty_tape, errors=errors))
-        live_site.record(folder / "stay.mcap", live_site.messages(8.0, ("a",), join_s=0.0))
+    live_site.record(folder / "stay.mcap", live_site.messages(8.0, join_s=0.0, delay_errors=errors))
     (folder / "site.toml").write_text(site_template(LAB))
     return folder, {error.anchor: error for error in errors}
 
@@ -106,6 +96,24 @@ def test_mending_twice_is_mending_once(site_recording, capsys, tmp_path):
     assert first.read_text() == second.read_text()
 
 
+def test_a_compressed_recording_is_named(site_recording, capsys, tmp_path):
+    folder, _ = site_recording
+    packed = tmp_path / "stay.mcap.gz"
+    packed.write_bytes(gzip.compress((folder / "stay.mcap").read_bytes()))
+    for command in ("calibrate", "survey"):
+        assert main([command, str(packed)]) == 2
+        assert 'the file is "a compressed MCAP"; it should be unpacked first' in capsys.readouterr().err
+
+
+def test_a_recording_that_was_cut_off_serves_and_is_reported(site_recording, capsys, tmp_path):
+    folder, _ = site_recording
+    whole = (folder / "stay.mcap").read_bytes()
+    (tmp_path / "half.mcap").write_bytes(whole[: len(whole) // 2])
+    report = run(capsys, tmp_path / "half.mcap", "--at", "3,4")
+    assert report["drops"]["unfinished-record"] == 1
+    assert report["used"] > 100
+
+
 @pytest.fixture
 def stay(tmp_path):
     """A tag at two known places before anchors that are off, as tables."""
@@ -122,6 +130,10 @@ def stay(tmp_path):
             writer.writerow((100.0 + 0.01 * k, a, b, tdoa_m))
     anchors = "\n".join(f"{k},{x},{y},{z}" for k, (x, y, z) in places.items())
     (tmp_path / "anchors.csv").write_text(f"id,x_m,y_m,z_m\n{anchors}\n")
+    (tmp_path / "far.csv").write_text("t_s,x_m,y_m,z_m\n0,1e300,0,0\n")
+    (tmp_path / "near.csv").write_text("t_s,x_m,y_m,z_m\n0,2,3,1\n")
+    (tmp_path / "full.csv").symlink_to("/dev/full")
+    os.mkfifo(tmp_path / "pipe")
     return tmp_path, bias
 
 
@@ -170,7 +182,17 @@ def test_a_wrong_place_is_noticed(stay, capsys):
     [
         (("--at", "1,2"), "lacks its height"),
         (("--at", "1,2,x"), "--at is"),
+        (("--at", "1,2,x@0:9"), "--at is '1,2,x@0:9'; '1,2,x' should be 2 or 3 numbers"),
+        (("--at", "1,2,1e300"), "metres, at most 1e+06"),
+        (("--truth", "{folder}/far.csv"), "line 2, column x_m is 1e+300; it should be metres, at most"),
+        (
+            ("--truth", "{folder}/near.csv", "--lever-arm", "1e300,0,0"),
+            "--lever-arm is '1e300,0,0'; it should be",
+        ),
+        (("--truth", "{folder}/pipe"), "a pipe"),
         (("--at", "1,2,3@9:4"), "later one last"),
+        (("--at", "1,2,3", "--at", "4,5,6@0:9"), "--at is '1,2,3'; before another --at it should have its times"),
+        (("--at", "1,2,3", "--force"), "nothing is written without --out"),
         (("--at", "1,2,3@90:99"), "place-unknown"),
         (("--at", "1,2,3", "--first", "0"), "--first is '0'"),
         (("--at", "1,2,3", "--first", "120%"), "--first is"),
@@ -180,7 +202,9 @@ def test_a_wrong_place_is_noticed(stay, capsys):
         (("--at", "1,2,3", "--out", "x.toml"), "a table, .csv"),
         (("--at", "1,2,3", "--out", "{folder}/anchors.csv"), "--force overwrites it"),
         (("--at", "1,2,3", "--force", "--out", "{folder}/stay.csv"), "would destroy it"),
-        (("--at", "1,2,3", "--out", "{folder}/no/such.csv"), "cannot be written"),
+        (("--at", "1,2,3", "--out", "{folder}/no/such.csv"), "a folder that exists"),
+        (("--at", "1,2,3", "--force", "--out", "{folder}"), "should be a file in a folder"),
+        (("--at", "2,3,1", "--force", "--out", "{folder}/full.csv"), "full.csv cannot be written: No space left"),
     ],
 )
 def test_what_the_user_can_mend_is_said(stay, capsys, arguments, words):
@@ -189,6 +213,7 @@ def test_what_the_user_can_mend_is_said(stay, capsys, arguments, words):
     given = (one.format(folder=folder) for one in arguments)
     assert words in complaint(capsys, folder / "stay.csv", "--anchors", folder / "anchors.csv", *given)
     assert (folder / "anchors.csv").read_text() == before
+    assert (folder / "full.csv").is_char_device()
 
 
 def test_a_table_may_be_calibrated_in_its_place_when_asked(stay, capsys):

@@ -49,7 +49,7 @@ from skyless.nodes.ports import hold_any
         ("ether --listen 70000", "--listen is '70000'"),
         ("ether --move 4", "--move is '4'; it should be ANCHOR=DX,DY@SECONDS"),
         ("ether --move 9=1,0@5", "--move is '9=1,0@5'; its anchor should be one of the site's: 1, 2, 3, 4, 5, 6"),
-        ("ether --move 4=1@5", "--move is '1'; it should be 2 or 3 number(s)"),
+        ("ether --move 4=1@5", "--move is '1'; it should be 2 or 3 numbers"),
         ("ether --move 4=1,0@0", "the time after @ should be more than 0 s"),
         ("demo --mqtt none", "the demo needs a broker"),
         ("record --mqtt none", "it should be the broker of the site to record"),

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 
@@ -102,6 +103,14 @@ def test_a_reader_that_goes_away(lab):
         done = subprocess.run([*SKYLESS, *map(str, arguments)], stdout=writer, stderr=subprocess.PIPE, check=False)
         os.close(writer)
         assert (done.returncode, done.stderr) == (1, b"")
+
+
+def test_a_full_disk_behind_standard_output(lab):
+    for arguments in (["site", "check", lab], ["site", "check", lab, "--json"], ["--help"]):
+        with Path("/dev/full").open("wb") as full:
+            done = subprocess.run([*SKYLESS, *map(str, arguments)], stdout=full, stderr=subprocess.PIPE, check=False)
+        assert (done.returncode, done.stderr.count(b"\n")) == (2, 1)
+        assert done.stderr.startswith(b"skyless: standard output cannot be written: No space left")
 
 
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])

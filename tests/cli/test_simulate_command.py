@@ -244,7 +244,7 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--outage", "2:-3"], ["--outage", "2:-3", "0 s or later"]),
         (["--outage", "2:1e300"], ["--outage", "1e300", "at most"]),
         (["--delay-error", "99:1:1"], ["99", "1, 2, 3, 4, 5, 6"]),
-        (["--delay-error", "2:1"], ["--delay-error", "2:1", "3 number(s)"]),
+        (["--delay-error", "2:1"], ["--delay-error", "2:1", "3 numbers"]),
         (["--delay-error", "2.5:1:1"], ["--delay-error", "2.5:1:1", "whole number"]),
         (["--delay-error", "2:1:1e4"], ["--delay-error", "2:1:1e4", "within 1000 ns"]),
         (["--delay-error", "2:1:1", "--delay-error", "2:0:1"], ["--delay-error", "2:0:1", "already"]),

@@ -2,15 +2,15 @@
 
 import csv
 import json
+import os
 import re
 from errno import ENOSPC
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from machines.bench import LAB, Heard, Stage
+from machines.bench import LAB
 from recordings import live_site
 from skyless.cli.common.survey_facts import FactOptions, facts_of
 from skyless.cli.main import main
@@ -66,6 +66,9 @@ def hall(tmp_path_factory):
     anchors = tuple(AnchorSite(k + 1, *np.round(rough_m[k], 3).tolist(), slot=k) for k in range(12))
     site = Site("hall", 3, 1, anchors, ScheduleSite(mode="slots", slots=12, slot_s=2.5e-3))
     (folder / "site.toml").write_text(site_template(site))
+    (folder / "elsewhere.csv").write_text("id,z_m\n77,2\n78,2\n")
+    (folder / "folder.csv").mkdir()
+    os.mkfifo(folder / "pipe")
     assert main(["site", "new", str(folder / "blank.toml"), "--unplaced", "12"]) == 0
     return folder
 
@@ -222,22 +225,11 @@ OFF_TICKS = {2: (40.0, 0.0), 3: (0.0, -50.0), 4: (30.0, 30.0), 5: (-64.0, 20.0),
 """True minus configured TX and RX delays of the lab's anchors, in their order."""
 
 
-def faulty_tape(site, seconds, seed, position, errors):
-    stage = Stage(site, seed, (position,), delay_errors=errors)
-    return tuple(
-        Heard(broadcast.anchor, reception.frame, reception.rx_ticks, reception.host_s, truth_m)
-        for broadcast in stage.world.run(seconds)
-        for _, reception, truth_m in broadcast.receptions()
-    )
-
-
 def test_delays_from_a_recording_and_twice_is_once(capsys, tmp_path):
     """A tag's receptions suffice; delays count from those of the recording and not from those of the file."""
     ids = sorted(anchor.id for anchor in LAB.anchors)
     errors = tuple(DelayError(anchor, *OFF_TICKS[number]) for number, anchor in enumerate(ids, start=1))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(live_site, "tape", partial(faulty_tape, errors=errors))
-        live_site.record(tmp_path / "stay.mcap", live_site.messages(5.0, ("a",), join_s=0.0))
+    live_site.record(tmp_path / "stay.mcap", live_site.messages(5.0, join_s=0.0, delay_errors=errors))
     (tmp_path / "site.toml").write_text(site_template(LAB))
     exact = ("--keep-positions", "--sketch-std", "0.0005", "--delay-std", "0.5", "--pair-std", "0")
     first, second = tmp_path / "first.toml", tmp_path / "second.toml"
@@ -255,19 +247,51 @@ def test_delays_from_a_recording_and_twice_is_once(capsys, tmp_path):
     assert all(abs(again[anchor] - after[anchor]) <= 1 for anchor in after)
     whole = run(capsys, tmp_path / "stay.mcap", "--delays-known", "--pair-std", "0.1")
     assert len(whole["anchors"]) == len(LAB.anchors)
+    assert whole["drops"] == []
+
+
+def test_damage_of_a_recording_is_reported(capsys, tmp_path):
+    stay = tmp_path / "stay.mcap"
+    live_site.record(stay, live_site.messages(5.0, join_s=0.0))
+    whole = bytearray(stay.read_bytes())
+    stay.write_bytes(whole[: len(whole) // 2])
+    report = run(capsys, stay)
+    assert report["drops"] == ["left out: 1 × unfinished-record"]
+    whole[len(whole) // 2] ^= 0xFF
+    stay.write_bytes(whole)
+    report = run(capsys, stay)
+    assert "left out: 1 × damaged-chunk" in report["drops"]
+    assert len(report["anchors"]) == len(LAB.anchors)
+
+
+@pytest.mark.parametrize(
+    ("walks", "words"),
+    [
+        (("a", "a@1:2"), "--walk is 'a@1:2'; a walk of a given before covers the same time"),
+        (("a@2:1",), "the later one last"),
+        (("a@x",), "--walk is 'a@x'; 'x' should be 2 numbers separated by ':'"),
+        (("nobody",), "one of a"),
+    ],
+)
+def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
+    stay = tmp_path / "stay.mcap"
+    live_site.record(stay, live_site.messages(2.0, join_s=0.0))
+    assert words in complaint(capsys, stay, *(part for walk in walks for part in ("--walk", walk)))
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ((), "needs a recording"),
-        (("{hall}/ranges.csv",), "it should be that of one of the formats"),
+        (("{hall}/ranges.csv",), "it should be that of a recording of skyless record, or of one of the formats"),
         (("{hall}/none.mcap",), "a file that can be read"),
+        (("{hall}/pipe",), "a pipe"),
         (("--ranges", "{hall}/heights.csv"), "a header with anchor_a,anchor_b,range_m"),
         (("--ranges", "{hall}/ranges.csv", "--heights", "{hall}/ranges.csv"), "a header with id,z_m"),
         (("--out", "a.toml"), "a site file needs --site"),
         (("--out", "a.txt"), "its ending should be .toml"),
         (("--out", "no/such/a.csv"), "a folder that exists"),
+        (("--out", "{hall}/folder.csv", "--force"), "should be a file in a folder"),
         (("--out", "{hall}/ranges.csv", "--force"), "would destroy it"),
         (("--format", "avalue"), "it is for recordings"),
         (("--force",), "nothing is written without --out"),
@@ -282,12 +306,19 @@ def test_delays_from_a_recording_and_twice_is_once(capsys, tmp_path):
         (("--height-std", "0.1"), "it is for --dimensions 3"),
         (("--height", "tall"), "--height is 'tall'"),
         (("--height", "77=2"), "there is no anchor 77; there are 1, 2"),
+        (("--height", "1=nan"), "--height is '1=nan'; 'nan' should be a number"),
         (("--height", "2", "--height", "3"), "given once"),
+        (("--height", "1=2", "--height", "1=3"), "the height of anchor 1 should be given once"),
+        (("--heights", "{hall}/elsewhere.csv"), 'column id is "77, 78"; it should be anchors among 1, 2'),
+        (("--heights", "{hall}/pipe"), "a pipe"),
+        (("--site", "/dev/zero"), "16 MiB at most"),
         (("--distance", "1-2"), "--distance is '1-2'; it should be like"),
         (("--distance", "1-1=3"), "between two anchors"),
         (("--distance", "1-2=-3"), "a positive distance"),
         (("--distance", "1-77=3"), "no anchor 77"),
-        (("--point", "1=3"), "2 or 3 number(s)"),
+        (("--distance", "1-2=7,21"), "'7,21' should be a number"),
+        (("--distance", "1-2=3", "--distance", "2-1=4"), "that between 2 and 1 should be given once"),
+        (("--point", "1=3"), "2 or 3 numbers"),
         (("--point", "x=3,4"), "'x' should be the identifier of an anchor"),
         (("--origin", "1"), "--origin and --x-axis"),
         (("--origin", "1", "--x-axis", "1"), "different anchors"),

@@ -1,11 +1,32 @@
-"""What the page's tests share: one browser, servers of a made-up site, and visits that nothing may go wrong in."""
+"""What the dashboard's tests share: a live site, one browser, servers of a made-up site, visits nothing may fail in."""
 
 import contextlib
 from pathlib import Path
 
 import pytest
+from dashboard_builders import SITE_ID, Times, Wire
 from page_browser import CHROMIUM, FLAGS, Visit
 from page_fake_server import FakeServer
+
+from skyless.dashboard.live import LiveSite
+
+
+@pytest.fixture
+def times():
+    return Times()
+
+
+@pytest.fixture
+def wire():
+    return Wire()
+
+
+@pytest.fixture
+def live(times, wire):
+    """Of a broker that is not connected yet."""
+    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
+    live.attach(wire, SITE_ID)
+    return live
 
 
 @pytest.fixture(scope="module")  # while it lives its event loop runs, and no other module's test may run its own

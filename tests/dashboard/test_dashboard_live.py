@@ -4,7 +4,7 @@ import asyncio
 import json
 
 import pytest
-from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, fix, status, truth
+from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status, truth
 from msgspec.structs import replace
 
 from skyless.dashboard.live import LiveSite
@@ -15,23 +15,6 @@ from skyless.mqtt.messages import ZoneEvent, ZonesMessage
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)
 EVENT = topics.zone_event_topic(SITE_ID, "desk")
-
-
-@pytest.fixture
-def times():
-    return Times()
-
-
-@pytest.fixture
-def wire():
-    return Wire()
-
-
-@pytest.fixture
-def live(times, wire):
-    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
-    live.attach(wire, SITE_ID)
-    return live
 
 
 def drained(live, page):

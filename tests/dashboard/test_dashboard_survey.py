@@ -6,7 +6,7 @@ import struct
 
 import msgspec
 import pytest
-from dashboard_builders import SITE, SITE_ID, Times, Wire
+from dashboard_builders import SITE, SITE_ID
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -14,7 +14,6 @@ from starlette.testclient import TestClient
 
 from skyless.dashboard.app import MAX_FLOOR_PLAN_BYTES, Services, make_app
 from skyless.dashboard.guard import AccessRules
-from skyless.dashboard.live import LiveSite
 from skyless.dashboard.overlays import NoOverlayError, Overlays, overlay_task
 from skyless.dashboard.playback import Playback
 from skyless.dashboard.site_survey import SiteSurvey
@@ -44,19 +43,7 @@ def watch_message(unix_s=1000.0):
 
 
 @pytest.fixture
-def times():
-    return Times()
-
-
-@pytest.fixture
-def wire():
-    return Wire()
-
-
-@pytest.fixture
-def live(times, wire):
-    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
-    live.attach(wire, SITE_ID)
+def live(live):
     live.on_connection(True)
     return live
 

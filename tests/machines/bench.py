@@ -64,9 +64,9 @@ class Heard:
 
 
 @lru_cache(maxsize=32)
-def tape(site=LAB, seconds=2.0, seed=1, position=(3.0, 4.0, 0.0)) -> tuple[Heard, ...]:
-    """All that one tag hears of a site that is switched on."""
-    stage = Stage(site, seed, (position,))
+def tape(site=LAB, seconds=2.0, seed=1, position=(3.0, 4.0, 0.0), **faults) -> tuple[Heard, ...]:
+    """All that one tag hears of a site that is switched on; ``faults`` as of a ``Stage``."""
+    stage = Stage(site, seed, (position,), **faults)
     return tuple(
         Heard(broadcast.anchor, reception.frame, reception.rx_ticks, reception.host_s, truth_m)
         for broadcast in stage.world.run(seconds)

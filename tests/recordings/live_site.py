@@ -19,21 +19,24 @@ USUAL = IntegrityRequirement()
 PLACES = {"a": (3.0, 4.0, 0.0), "b": (2.0, 2.0, 0.0), "c": (5.0, 3.0, 0.0)}
 
 
-def messages(seconds=2.0, tags=("a",), method="joint", join_s=0.5, publish_every=1, integrity=USUAL):
-    """(unix_s, topic, payload) of a site; somebody asks for receptions from ``join_s`` on."""
+def messages(seconds=2.0, tags=("a",), method="joint", join_s=0.5, publish_every=1, integrity=USUAL, **faults):
+    """(unix_s, topic, payload) of a site; somebody asks for receptions from ``join_s`` on.
+
+    ``faults``: as of ``machines.bench.Stage``.
+    """
     said = [(UNIX_S, topics.site_topic(SITE.id), SiteMessage(SITE, True, UNIX_S))]
     for tag in tags:
-        said += list(_of_tag(tag, seconds, method, join_s, publish_every, integrity))
+        said += list(_of_tag(tag, seconds, method, join_s, publish_every, integrity, faults))
     moments = (0.1 * k for k in range(int(10 * seconds)))
     motion = {tag: TrueMotion(PLACES[tag], (0.0, 0.0, 0.0)) for tag in tags}
     said += [(UNIX_S + s, topics.truth_topic(SITE.id), TruthMessage(UNIX_S + s, motion)) for s in moments]
     return [(s, topic, msgspec.json.encode(message)) for s, topic, message in sorted(said, key=lambda one: one[0])]
 
 
-def _of_tag(tag, seconds, method, join_s, publish_every, integrity):
+def _of_tag(tag, seconds, method, join_s, publish_every, integrity, faults):
     log = ReceptionLog(tag, receiver_settings(method, integrity=integrity), "run")
     receiver, serial = Receiver(method, integrity=integrity), 0
-    for one in tape(LAB, seconds, 1, PLACES[tag]):
+    for one in tape(LAB, seconds, 1, PLACES[tag], **faults):
         host_s = one.host_s
         if host_s >= join_s:
             log.request(RequestMessage("test", ("*",), 10.0), host_s)

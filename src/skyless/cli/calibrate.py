@@ -1,11 +1,21 @@
 """``skyless calibrate``: the anchors' antenna delays from a recording during which it was known where the tag was."""
 
+from collections.abc import Sequence
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from cyclopts import App
 
-from skyless.cli.common.options import Finite, check_left_out, check_output, finite_numbers, options
+from skyless.cli.common.options import (
+    Finite,
+    check_folder,
+    check_left_out,
+    check_output,
+    finite_numbers,
+    metres,
+    options,
+)
 from skyless.cli.common.output import console, number, print_json, write_file
 from skyless.cli.common.progress import status
 from skyless.cli.common.recording_inputs import flight_height, is_mcap, known_anchors, known_truth
@@ -63,7 +73,7 @@ class CalibrateOptions:
 
 @app.default
 def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) -> None:
-    """Estimate what each anchor's signals seem late by, from a tag whose position was known, and write it back.
+    """Estimate by how much each anchor's signals seem late, from a tag at known positions, and write a corrected file.
 
     Takes what skyless replay takes. Of a recording of skyless record the antenna delays of the site file are corrected;
     of any other the table of anchors gets a column bias_m, which skyless replay then takes off.
@@ -80,7 +90,7 @@ def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) ->
     _check_out(asked, own=own)
     if asked.at and (asked.truth is not None or asked.lever_arm is not None):
         raise SkylessError("--at says where the antenna was; it should be given without --truth and --lever-arm")
-    stays, beginning = tuple(map(_stay, asked.at or ())), _first(asked.first)
+    stays, beginning = _stays(asked.at or ()), _first(asked.first)
     if own:
         useless = {"anchors": asked.anchors, "format": asked.format, "listener": asked.listener}
         check_left_out(useless, "a recording of skyless record brings its own")
@@ -113,7 +123,9 @@ def _check_out(asked: CalibrateOptions, *, own: bool) -> None:
     """See that --out can be written, before the long work instead of after it. Raises SkylessError."""
     out = asked.out
     if out is None:
+        check_left_out({"force": asked.force or None}, "nothing is written without --out")
         return
+    check_folder("out", out)
     if own and (out.suffix.lower() != ".toml" or asked.site is None):
         raise SkylessError(
             f"--out is {str(out)!r}; of a recording of skyless record the site file is corrected: --out should be a "
@@ -134,15 +146,24 @@ def _identifier_of(site: Path | None) -> int | None:
     return None if site is None else load_site(site).id
 
 
+def _stays(texts: Sequence[str]) -> "tuple[Stay, ...]":
+    """The positions of --at. Raises SkylessError."""
+    stays = tuple(map(_stay, texts))
+    for text, stay in zip(texts[:-1], stays, strict=False):
+        if stay.to_s == inf:
+            raise SkylessError(f"--at is {text!r}; before another --at it should have its times, @FROM:TO")
+    return stays
+
+
 def _stay(text: str) -> "Stay":
     """Position of a tag at rest: x,y[,z][@FROM:TO]. Raises SkylessError."""
     from skyless.survey_inputs.samples import Stay
 
     position, mark, span = text.partition("@")
-    x_m, y_m, *z_m = finite_numbers("at", position, (2, 3))
+    x_m, y_m, *z_m = metres("at", text, (2, 3), part=position)
     if not mark:
         return Stay(x_m, y_m, *z_m)
-    from_s, to_s = finite_numbers("at", span, (2,), ":")
+    from_s, to_s = finite_numbers("at", text, (2,), ":", part=span)
     if not 0.0 <= from_s < to_s:
         raise SkylessError(f"--at is {text!r}; what follows @ should be two times in seconds, the later one last")
     return Stay(x_m, y_m, z_m[0] if z_m else None, from_s, to_s)

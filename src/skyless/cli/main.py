@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Sequence
+from errno import EDQUOT, EFBIG, EIO, ENOSPC
 from io import TextIOWrapper
 from typing import TYPE_CHECKING
 
@@ -46,6 +47,7 @@ _COMMANDS = (
 
 _INTERRUPTED = 130
 _BROKEN_PIPE = 1
+_CANNOT_WRITE = (ENOSPC, EDQUOT, EFBIG, EIO)
 _USER_ERROR = 2
 
 
@@ -100,6 +102,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         _drop_output()
         return _BROKEN_PIPE
+    except OSError as error:
+        if error.filename is not None or error.errno not in _CANNOT_WRITE:
+            raise
+        _drop_output()
+        print(f"skyless: standard output cannot be written: {error.strerror}", file=sys.stderr)
+        return _USER_ERROR
     return result if isinstance(result, int) else 0
 
 
@@ -117,7 +125,7 @@ def _write_any_character() -> None:
 
 
 def _drop_output() -> None:
-    """Whoever read the output has gone; the interpreter must not complain when it flushes the rest at exit."""
+    """Standard output takes no more; the interpreter must not complain when it flushes the rest at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -9,7 +9,15 @@ from cyclopts import App
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.cli.common.options import Finite, check_left_out, check_output, check_picture, finite_numbers, options
+from skyless.cli.common.options import (
+    Coordinate,
+    check_folder,
+    check_left_out,
+    check_output,
+    check_picture,
+    finite_numbers,
+    options,
+)
 from skyless.cli.common.output import console
 from skyless.cli.common.progress import status
 from skyless.cli.common.recording_inputs import is_mcap
@@ -44,7 +52,7 @@ class SurveyOptions:
     walk: list[str] | None = None
     """A tag of the recording that was carried around, and when in seconds since its first reception: tag1,
     tag1@60:120. Several times for several tags. Used only where it fits the ranges."""
-    walk_height: Finite | None = None
+    walk_height: Coordinate | None = None
     """Height at which it was carried, metres, within some 0.1 m; by default it is free."""
     live: LiveOptions = LiveOptions()
     known: FactOptions = FactOptions()
@@ -60,7 +68,7 @@ class SurveyOptions:
 
 @app.default
 def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOptions()) -> int:
-    """Find where anchors hang and what their antenna delays are off, and say what cannot be known.
+    """Find the anchors' positions and the errors of their antenna delays, and what the ranges cannot determine.
 
     Ends with exit code 1 if no anchor is determined.
 
@@ -101,7 +109,7 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
 
 
 def _check(recording: Path | None, asked: SurveyOptions) -> None:
-    """See that the inputs are clear and the outputs can be written, before the work. Raises SkylessError."""
+    """See that inputs and options fit one another and outputs can be written, before the work. Raises SkylessError."""
     inputs = (recording, asked.ranges, asked.known.heights)
     asked.live.check(asked.known)
     if (recording is not None) + (asked.ranges is not None) + asked.live.given != 1:
@@ -126,8 +134,7 @@ def _check(recording: Path | None, asked: SurveyOptions) -> None:
         raise SkylessError(
             f"--out is {str(out)!r}; a site file needs --site to start from (skyless site new --unplaced makes one)"
         )
-    if not out.parent.is_dir():
-        raise SkylessError(f"--out is {str(out)!r}; it should be in a folder that exists")
+    check_folder("out", out)
     if out.exists() and not asked.force:
         raise SkylessError(f"{out} exists; --force overwrites it")
 
@@ -136,10 +143,10 @@ class _Inputs(Struct, frozen=True):
     """What a survey starts from."""
 
     site: "Site | None"
-    """Of --site, else of the recording."""
+    """The site of --site, else that of the recording."""
     ranges: "PairRanges"
     drops: tuple[str, ...] = ()
-    """What of a recording could not be used."""
+    """What could not be used of a recording, by reason."""
     is_foreign: bool = False
     """Whether it is a recording of another system."""
 
@@ -170,7 +177,7 @@ def _inputs(recording: Path | None, asked: SurveyOptions) -> _Inputs:
 
 
 def _walks(recording: Path | None, asked: SurveyOptions, site: "Site | None") -> "tuple[TagEpochs, ...]":
-    """What tags received that were carried around. Raises SkylessError."""
+    """What the tags of --walk received while they were carried around. Raises SkylessError."""
     if recording is None or not asked.walk:
         return ()
     if site is None or not is_mcap(recording):
@@ -178,22 +185,26 @@ def _walks(recording: Path | None, asked: SurveyOptions, site: "Site | None") ->
     from skyless.recordings.mcap.recording import McapRecording
     from skyless.survey_inputs.walk import walk_of
 
-    walks = []
+    walks: list[TagEpochs] = []
+    spans: list[tuple[str, float, float]] = []
     with McapRecording(recording) as opened, status("reading the walk"):
         for text in asked.walk:
             tag, mark, span = text.partition("@")
-            from_s, to_s = finite_numbers("walk", span, (2,), ":") if mark else (0.0, inf)
+            from_s, to_s = finite_numbers("walk", text, (2,), ":", part=span) if mark else (0.0, inf)
             if not 0.0 <= from_s < to_s:
                 raise SkylessError(f"--walk is {text!r}; what follows @ should be two times, the later one last")
+            if any(tag == other and from_s < end_s and begin_s < to_s for other, begin_s, end_s in spans):
+                raise SkylessError(f"--walk is {text!r}; a walk of {tag} given before covers the same time")
+            spans.append((tag, from_s, to_s))
             epochs = walk_of(opened, site.id, tag, (from_s, to_s), asked.walk_height)
             walks.append(replace(epochs, name=f"the walk of {tag}"))
     return tuple(walks)
 
 
 def _with_all_anchors(ranges: "PairRanges", site: "Site | None") -> "PairRanges":
-    """Anchors of the site of which nothing was received belong to the survey, too."""
-    everybody = set(ranges.anchors) | ({anchor.id for anchor in site.all_anchors} if site is not None else set())
-    return replace(ranges, anchors=tuple(sorted(everybody)))
+    """The same ranges, with those anchors of the site added that have none: the survey reports them, too."""
+    of_site = set() if site is None else _identifiers(site)
+    return replace(ranges, anchors=tuple(sorted({*ranges.anchors, *of_site})))
 
 
 def _written(
@@ -246,10 +257,11 @@ def _table(result: "Survey") -> str:
     from skyless.recordings.anchor_table import new_table
 
     found = [one for one in result.anchors if one.determined]
-    positions_m = {one.id: (one.x_m or 0.0, one.y_m or 0.0, one.z_m or 0.0) for one in found}
+    positions_m = {
+        one.id: (round(one.x_m or 0.0, 4), round(one.y_m or 0.0, 4), round(one.z_m or 0.0, 4)) for one in found
+    }
     delays = {one.id: AnchorCalibration(one.delay_m, 0.0, None) for one in found if one.delay_m is not None}
-    rounded = {anchor: tuple(round(value, 4) for value in position) for anchor, position in positions_m.items()}
-    return new_table({anchor: (x, y, z) for anchor, (x, y, z) in rounded.items()}, DifferenceCalibration(delays))
+    return new_table(positions_m, DifferenceCalibration(delays))
 
 
 def _draw(path: Path, result: "Survey") -> None:

@@ -1,4 +1,4 @@
-"""The picture of a survey, from above: anchors with their ellipses, ranges, what is left out and what is ambiguous."""
+"""The picture of a survey, from above: anchors with their ellipses, ranges, those left out, and other solutions."""
 
 from pathlib import Path
 from typing import Final
@@ -75,7 +75,7 @@ def _legend(survey: Survey, at_m: dict[int, tuple[float, float]], scale: float) 
     if any(pair.excluded for pair in survey.pairs):
         parts.append("red: left out as late")
     if survey.ambiguities:
-        parts.append("orange: or there")
+        parts.append("orange: another solution")
     missing = ", ".join(str(one.id) for one in survey.anchors if one.id not in at_m)
     if missing:
         parts.append(f"not determined: {missing}")

@@ -1,4 +1,4 @@
-"""A survey's report: first what it is not sure of, then tables; or one JSON object."""
+"""A survey's report: first warnings about what is uncertain, then tables; or one JSON object."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
@@ -23,13 +23,13 @@ class SurveyReport(Struct, frozen=True):
     survey: "Survey"
     count: "Count"
     warnings: tuple[str, ...]
-    """About inputs and facts."""
+    """About the inputs and the facts that were stated."""
     drops: tuple[str, ...] = ()
-    """What of the recording could not be used."""
+    """What could not be used of the recording, by reason."""
     unchanged: tuple[int, ...] = ()
     """Anchors of the site file that stay as they are."""
     written: tuple[str, ...] = ()
-    """Files."""
+    """Files that were written."""
 
     @property
     def usable(self) -> bool:
@@ -39,7 +39,7 @@ class SurveyReport(Struct, frozen=True):
 
 
 def print_report(report: SurveyReport) -> None:
-    """Write it as one line of JSON."""
+    """Write the report as one line of JSON."""
     print_json(report_object(report))
 
 
@@ -61,7 +61,7 @@ def report_object(report: SurveyReport) -> dict[str, Any]:
 
 
 def show_report(report: SurveyReport) -> None:
-    """Show it to people."""
+    """Show the report as warnings, tables and lines of text."""
     survey, screen = report.survey, console()
     print_warnings(
         [
@@ -128,11 +128,13 @@ def _late(pair: "SurveyedPair") -> str:
 
 
 def _checks(redundancy: int) -> str:
-    return f"{redundancy} ranges check the result" if redundancy > 0 else "no range checks the result"
+    if redundancy <= 0:
+        return "no range checks the result"
+    return "1 range checks the result" if redundancy == 1 else f"{redundancy} ranges check the result"
 
 
 def _tapes(tapes: Sequence["TapeAdvice"]) -> list[str]:
-    """What to measure next, and what it would bring."""
+    """Which distances to measure next, and how accurate the positions would be then."""
     lines = []
     for rank, tape in enumerate(tapes):
         ask = "the tape that helps most" if rank == 0 else "then"

@@ -78,9 +78,9 @@ class RecordedAnchor:
             self._on_leg(beacon.anchor, self.id, beacon.tx_ticks, reception.rx_ticks, t_s)
 
     def next_transmission_ticks(self, now_ticks: int) -> int | None:
-        """As the machine says."""
+        """That of the wrapped machine."""
         return self._machine.next_transmission_ticks(now_ticks)
 
     def transmission(self, tx_ticks: int) -> Transmission:
-        """As the machine says."""
+        """That of the wrapped machine."""
         return self._machine.transmission(tx_ticks)

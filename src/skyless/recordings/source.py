@@ -31,9 +31,11 @@ def open_source(path: str | PathLike[str]) -> BufferedIOBase:
     """Open a file for reading, through gzip if its first bytes are gzip's.
 
     Raises:
-        ConfigurationError: the file cannot be opened.
+        ConfigurationError: the file cannot be opened, or not read a second time, as a pipe.
     """
     try:
+        if Path(path).is_fifo():
+            raise ConfigurationError(path, "the file", "a pipe", "a file that can be read from its beginning again")
         with Path(path).open("rb") as stream:
             compressed = stream.read(len(_GZIP_MAGIC)) == _GZIP_MAGIC
         return gzip.open(path, "rb") if compressed else Path(path).open("rb")

@@ -17,6 +17,9 @@ POSITION_COLUMNS: Final = ("t_s", "x_m", "y_m", "z_m")
 LISTENER_COLUMNS: Final = ("t_s", "gt_L_x_m", "gt_L_y_m", "gt_L_z_m")
 QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
 
+_FARTHEST_M: Final = 1e8
+"""Coordinates of any frame on Earth are smaller."""
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -82,10 +85,12 @@ def _values(
             listener = listener or fields[chosen]
             if fields[chosen] != listener:
                 continue
-        values.append(
-            [
-                finite(fields[position], path, number, column)
-                for position, column in zip(positions, columns, strict=True)
-            ]
-        )
+        row = [
+            finite(fields[position], path, number, column) for position, column in zip(positions, columns, strict=True)
+        ]
+        for column, value in zip(columns[1:4], row[1:4], strict=True):
+            if abs(value) > _FARTHEST_M:
+                expected = f"metres, at most {_FARTHEST_M:g}"
+                raise ConfigurationError(path, f"line {number}, column {column}", value, expected)
+        values.append(row)
     return np.array(values, dtype=np.float64).reshape(-1, len(columns))

@@ -24,6 +24,9 @@ from skyless.site.model import (
     WallSite,
 )
 
+_MOST_BYTES: Final = 1 << 24
+"""Of a site file: devices do not end."""
+
 _TABLES: Final[dict[str, type[Struct]]] = {
     "schedule": ScheduleSite,
     "noise": NoiseSite,
@@ -124,7 +127,11 @@ def _in_file(text: str, rows: _Rows | None) -> str:
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            text = file.read(_MOST_BYTES + 1)
+        if len(text) > _MOST_BYTES:
+            raise ConfigurationError(path, "", None, f"a site file, {_MOST_BYTES >> 20} MiB at most")
+        return tomllib.loads(text.decode())
     except OSError as error:
         raise ConfigurationError(path, "", None, f"a readable site file ({error.strerror})") from None
     except UnicodeDecodeError as error:

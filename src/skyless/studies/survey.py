@@ -15,23 +15,18 @@ from msgspec import Struct
 from skyless.evaluation.surveys.air import AirErrors, drawn_errors, free_axes, ranges_in_air
 from skyless.evaluation.surveys.judge import Outcome, judged, survey_bound_m, tag_error_m
 from skyless.evaluation.surveys.layouts import SurveyLayout, survey_layouts
+from skyless.evaluation.surveys.rooms import HAND_STD_M, SKETCH_STD_M, TAPE_STD_M
 from skyless.kernels.arrays import Array
 from skyless.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.survey.facts import Facts, Point, Tape
 from skyless.survey.solve import run_survey
 
-HAND_STD_M: Final = 0.02
-"""Of positions measured by hand, per axis."""
-TAPE_STD_M: Final = 0.005
 NEAR_M: Final = 0.1
 """A result whose anchors are farther off (rms) is wrong."""
 _WRONG_SIGMAS: Final = 4.0
 """It should say so, if it is also farther off than this many of its own standard deviations."""
 
 _RUNS_IN_A_CELL: Final = 5
-_SKETCH_STD_M: Final = 0.3
-
-
 _LATE_S: Final = 2.0
 """Length of runs with late pairs, whose errors do not average out."""
 
@@ -176,7 +171,7 @@ def _run(runs: SurveyRuns, layout: SurveyLayout, seed: int) -> tuple[Outcome, ..
     drawn = drawn_errors(runs.group.errors, layout, draw)
     ranges = ranges_in_air(layout, drawn, runs.seconds, runs.noise_ps, int(draw.integers(1 << 60)))
     hand_m = draw.normal(0.0, HAND_STD_M, layout.position_m.shape) * free_axes(layout)
-    sketch_m = draw.normal(0.0, _SKETCH_STD_M, layout.position_m.shape) * free_axes(layout)
+    sketch_m = draw.normal(0.0, SKETCH_STD_M, layout.position_m.shape) * free_axes(layout)
     tape_m = draw.normal(0.0, TAPE_STD_M, 3)
     hand_tag_m = tag_error_m(layout, layout.position_m + hand_m, np.zeros(len(hand_m)), drawn.delay_m)
     outcomes, asked_for = [], tuple[tuple[int, int], ...]()
@@ -212,7 +207,7 @@ def _facts(
             for (a, b), error_m in zip(tapes, tape_m, strict=False)
         ),
         sketch_m=sketch,
-        sketch_std_m=HAND_STD_M if variant.keeps else _SKETCH_STD_M,
+        sketch_std_m=HAND_STD_M if variant.keeps else SKETCH_STD_M,
         keep_positions=variant.keeps,
         delay_std_m=variant.delay_std_m,
         pair_std_m=group.errors.pair_std_m,

@@ -4,6 +4,7 @@ import math
 import os
 from collections import Counter, OrderedDict
 from collections.abc import Callable
+from gzip import GzipFile
 from os import PathLike
 from pathlib import Path
 from typing import Final, cast
@@ -19,7 +20,7 @@ from skyless.mqtt.messages import ReceptionsMessage, StampsMessage
 from skyless.recordings.foreign import avalue
 from skyless.recordings.foreign.formats import FORMATS, format_of, open_recording
 from skyless.recordings.mcap.recording import MAGIC, McapRecording, Recorded
-from skyless.recordings.source import Drops, open_source, read_head
+from skyless.recordings.source import Drops, open_source
 from skyless.replay.site import SITE_FORMAT, recorded_site
 from skyless.site.model import Site
 from skyless.survey.ranges import PairBlock, PairRanges
@@ -35,7 +36,7 @@ _MOST_SEEN: Final = 1 << 16
 
 
 class RecordedRanges(Struct, frozen=True):
-    """What came of a recording."""
+    """Ranges out of a recording, and what could not be used."""
 
     ranges: PairRanges
     format: str
@@ -43,6 +44,8 @@ class RecordedRanges(Struct, frozen=True):
     """As recorded; None for recordings of other systems."""
     drops: dict[str, int]
     """What could not be used, by reason."""
+    damage: dict[str, int] = {}
+    """Those of the drops that are damage of the file, which other readers of it meet as well."""
 
 
 def ranges_of(
@@ -65,7 +68,7 @@ def ranges_of(
     Raises:
         ConfigurationError: the file cannot be read, or its format has no stamps of anchors.
     """
-    if format_name == SITE_FORMAT or (format_name is None and read_head(path).startswith(MAGIC)):
+    if format_name == SITE_FORMAT or (format_name is None and _is_mcap(path)):
         part = _Part(PairRanger(TICK_BITS, block_s, on_block=on_block), from_s, to_s, on_progress)
         return _of_site(path, identifier, part)
     known = format_of(path, format_name)
@@ -75,6 +78,12 @@ def ranges_of(
     part = _Part(PairRanger(known.tx_bits, block_s, on_block=on_block), from_s, to_s, on_progress)
     drops = _add_receptions(path, part) if known.name == "avalue" else _add_packets(path, known.name, part)
     return RecordedRanges(part.finish(), known.name, None, dict(drops + part.drops()))
+
+
+def _is_mcap(path: str | PathLike[str]) -> bool:
+    """Whether a file is an MCAP as it is, not compressed. Raises ConfigurationError."""
+    with open_source(path) as stream:
+        return not isinstance(stream, GzipFile) and stream.read(len(MAGIC)) == MAGIC
 
 
 class _Part:
@@ -148,10 +157,19 @@ def _of_site(path: str | PathLike[str], identifier: int | None, part: _Part) -> 
                     part.add(leg)
                 else:
                     drops["unknown-anchor"] += 1
-        drops += recording.drops
+        damage = _damage(recording)
     for collector in collectors.values():
         drops += _drops(collector.counters)
-    return RecordedRanges(part.finish(), SITE_FORMAT, site, dict(drops + part.drops()))
+    return RecordedRanges(part.finish(), SITE_FORMAT, site, dict(damage + drops + part.drops()), dict(damage))
+
+
+def _damage(recording: McapRecording) -> Counter[str]:
+    """What could not be read of the file, after it was read."""
+    summary = recording.summary()
+    damage = Counter(summary.drops)
+    if summary.unread_bytes:
+        damage["unfinished-record"] += 1
+    return damage
 
 
 def _of_anchor(message: StampsMessage, ranger: PairRanger, runs: dict[int, str]) -> list[AnchorLeg]:

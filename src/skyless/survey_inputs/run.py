@@ -5,6 +5,7 @@ the ranges between the anchors, which its receptions hold as well.
 """
 
 from collections import Counter
+from collections.abc import Callable
 from functools import partial
 from os import PathLike
 from typing import Final
@@ -73,7 +74,7 @@ class CalibrationRequest(Struct, frozen=True):
 
 
 class Calibrated(Struct, frozen=True):
-    """What came of it."""
+    """The result of a calibration."""
 
     format: str
     estimate: CalibrationEstimate
@@ -129,12 +130,14 @@ def calibrate_site(request: CalibrationRequest, identifier: int | None) -> Calib
         SkylessError: the recording cannot be used, is of another site than ``identifier``, or holds nothing at a
             known position.
     """
-    ranges = ranges_of(request.path, identifier=identifier).ranges
+    recorded = ranges_of(request.path, identifier=identifier)
+    ranges = recorded.ranges
     ranges_m = {(pair.a, pair.b): pair.range_m for pair in ranges.pairs}
     with McapRecording(request.path) as recording:
         site = recorded_site(recording, identifier)
         tags = _tags(recording, request)
         samples = joined([_of_tag(recording, site, tag, request, ranges_m) for tag in tags])
+        samples = replace(samples, drops=recorded.damage | samples.drops)
         _require_some(samples)
         end_s = float(samples.differences.t_s[-1])
         epochs = tuple(_at_known_positions(recording, site, tag, request, end_s) for tag in tags)
@@ -155,10 +158,8 @@ def _at_known_positions(
     recording: McapRecording, site: Site, tag: str, request: CalibrationRequest, end_s: float
 ) -> TagEpochs:
     """What a tag received while its position was known, until a Unix time."""
-    truth = recorded_truth(recording).get(tag) if request.truth is None else request.truth
     epochs = walk_of(recording, site.id, tag)
-    at_rest = replace(request, height_m=site.tags.height_m)
-    known = _position_from(at_rest, truth, float(epochs.t_s[0]) - EPOCH_S / 2.0)
+    known = _known_positions(recording, site, tag, request)(float(epochs.t_s[0]) - EPOCH_S / 2.0)
     in_use = at_positions(epochs, lambda time_s: known(time_s) if time_s <= end_s else None, _TAG_STD_M, _OFFSET_STD_M)
     return replace(in_use, name=f"{tag} at known positions")
 
@@ -185,17 +186,21 @@ def _of_tag(
     ranges_m: dict[tuple[int, int], float],
 ) -> Samples:
     anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
-    truth = recorded_truth(recording).get(tag) if request.truth is None else request.truth
-    at_rest = CalibrationRequest(
-        request.path, request.stays, truth, request.above_m, height_m=site.tags.height_m, tag=tag
-    )
     drops: Counter[str] = Counter()
     if site.schedule.needs_master:
         tdoas = site_tdoas(recording, (tag,), site.id, drops)
     else:
         tdoas = relayed_tdoas(recording, tag, site.id, ranges_m)
-    samples = gather(tdoas, anchors_m, partial(_position_from, at_rest, truth), request.first)
+    samples = gather(tdoas, anchors_m, _known_positions(recording, site, tag, request), request.first)
     return Samples(samples.differences, samples.anchors_m, samples.seen, samples.drops | drops)
+
+
+def _known_positions(
+    recording: McapRecording, site: Site, tag: str, request: CalibrationRequest
+) -> Callable[[float], PositionAt]:
+    """Where a tag of a site was, as a function of the time of its first difference."""
+    truth = recorded_truth(recording).get(tag) if request.truth is None else request.truth
+    return partial(_position_from, replace(request, height_m=site.tags.height_m), truth)
 
 
 def _position_from(request: CalibrationRequest, truth: Truth | None, begin_s: float) -> PositionAt:

@@ -175,7 +175,7 @@ class First(Struct, frozen=True):
 
 
 class Samples(Struct, frozen=True):
-    """What was gathered."""
+    """Time differences at known positions, out of a recording."""
 
     differences: Differences
     anchors_m: dict[int, Point]

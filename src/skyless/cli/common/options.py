@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar, dataclass_transform
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from skyless.air.page_codec import MAX_COORDINATE_M
 from skyless.errors import SkylessError
 from skyless.method_names import METHODS, PROTECTED
 
@@ -24,6 +25,7 @@ _T = TypeVar("_T")
 Positive = Annotated[float, Parameter(validator=Number(gt=0, lt=math.inf))]
 NotNegative = Annotated[float, Parameter(validator=Number(gte=0, lt=math.inf))]
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
+Coordinate = Annotated[float, Parameter(validator=Number(gte=-MAX_COORDINATE_M, lte=MAX_COORDINATE_M))]
 Seed = Annotated[int, Parameter(validator=Number(gte=0))]
 Picoseconds = Annotated[float, Parameter(validator=Number(gt=0, lte=1e6))]
 """Noise of a stamp, in the range that a site file and the almanac can hold."""
@@ -95,19 +97,30 @@ def check_height_std(height_std_m: float | None, height_m: float | None) -> None
         raise SkylessError(f"--height-std is {height_std_m:g}; it should be left out: the height is estimated")
 
 
-def finite_numbers(option: str, text: str, counts: tuple[int, ...], separator: str = ",") -> tuple[float, ...]:
-    """Numbers of an option's value; how many is one of ``counts``.
+def finite_numbers(
+    option: str, text: str, counts: tuple[int, ...], separator: str = ",", *, part: str | None = None
+) -> tuple[float, ...]:
+    """Numbers of an option's value, or of a part of it; how many is one of ``counts``.
 
     Raises:
         SkylessError: naming the option, its value and what it should be.
     """
     try:
-        values = tuple(float(part) for part in text.split(separator))
+        values = tuple(float(one) for one in (text if part is None else part).split(separator))
     except ValueError:
         values = ()
     if len(values) not in counts or not all(math.isfinite(value) for value in values):
-        wanted = " or ".join(str(count) for count in counts)
-        raise SkylessError(f"--{option} is {text!r}; it should be {wanted} number(s) separated by {separator!r}")
+        wanted = f"{' or '.join(str(count) for count in counts)} numbers separated by {separator!r}"
+        subject = "it" if part is None else repr(part)
+        raise SkylessError(f"--{option} is {text!r}; {subject} should be {'a number' if counts == (1,) else wanted}")
+    return values
+
+
+def metres(option: str, text: str, counts: tuple[int, ...], *, part: str | None = None) -> tuple[float, ...]:
+    """Coordinates or lengths as ``finite_numbers``, within the range of the almanac. Raises SkylessError."""
+    values = finite_numbers(option, text, counts, part=part)
+    if any(abs(one) > MAX_COORDINATE_M for one in values):
+        raise SkylessError(f"--{option} is {text!r}; it should be metres, at most {MAX_COORDINATE_M:g}")
     return values
 
 
@@ -132,6 +145,12 @@ def check_output(option: str, output: Path | None, *inputs: Path | None) -> None
             raise SkylessError(f"--{option} is {str(output)!r}, another file of this command; writing would destroy it")
 
 
+def check_folder(option: str, output: Path) -> None:
+    """See that an output is no folder itself, and in one that exists. Raises SkylessError."""
+    if output.is_dir() or not output.parent.is_dir():
+        raise SkylessError(f"--{option} is {str(output)!r}; it should be a file in a folder that exists")
+
+
 def _same(a: Path, b: Path) -> bool:
     """Whether two paths lead to one file, through links of either kind, existing or not."""
     try:
@@ -147,5 +166,4 @@ def check_picture(plot: Path | None) -> None:
     endings = (".png", ".svg", ".pdf")
     if plot.suffix.lower() not in endings:
         raise SkylessError(f"--plot is {str(plot)!r}; its ending should be one of {', '.join(endings)}")
-    if plot.is_dir() or not plot.parent.is_dir():
-        raise SkylessError(f"--plot is {str(plot)!r}; it should be a file in a folder that exists")
+    check_folder("plot", plot)

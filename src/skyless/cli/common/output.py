@@ -97,7 +97,10 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that a reader finds the old one or the whole new one, never a part."""
+    """Write a file so that a reader finds the old one or the whole new one, never a part; devices are written to."""
+    if path.exists() and not path.is_file():
+        path.write_bytes(data)
+        return
     handle, scratch = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:

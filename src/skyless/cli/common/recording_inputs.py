@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skyless.cli.common.options import finite_numbers, height_number
+from skyless.cli.common.options import height_number, metres
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -12,10 +12,12 @@ if TYPE_CHECKING:
 
 
 def is_mcap(file: Path) -> bool:
-    """Whether a file's content is an MCAP; one that cannot be opened is none."""
+    """Whether a file's content is an MCAP; one that cannot be opened, or would lose what is read here, is none."""
     from skyless.recordings.mcap.recording import MAGIC
 
     try:
+        if file.is_fifo():
+            return False
         with file.open("rb") as stream:
             return stream.read(len(MAGIC)) == MAGIC
     except OSError:
@@ -54,7 +56,7 @@ def known_truth(
     truth = read_truth(table, listener)
     if arm is None:
         return truth
-    x, y, z = finite_numbers("lever-arm", arm, (3,))
+    x, y, z = metres("lever-arm", arm, (3,))
     return antenna_truth(truth, (x, y, z))
 
 

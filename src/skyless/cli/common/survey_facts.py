@@ -10,9 +10,8 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 from msgspec.structs import replace
 
-from skyless.air.page_codec import MAX_COORDINATE_M
-from skyless.cli.common.options import finite_numbers, options
-from skyless.errors import SkylessError
+from skyless.cli.common.options import metres, options
+from skyless.errors import ConfigurationError, SkylessError
 
 if TYPE_CHECKING:
     from skyless.site.model import Site
@@ -32,7 +31,7 @@ _TAPE: Final = re.compile(r"(?P<a>\w+)-(?P<b>\w+)=(?P<distance>[^±+]+)((±|\+-)
 
 @options
 class FactOptions:
-    """What is known of a site."""
+    """What the user knows of a site."""
 
     site: Path | None = None
     """The present site file: its anchors, heights, and rough positions."""
@@ -106,7 +105,7 @@ def facts_of(
         dimensions=dimensions,
         heights_m=given,
         height_std_m=asked.height_std or usual.height_std_m,
-        tapes=tuple(_tape(text, known) for text in asked.distance or ()),
+        tapes=_tapes(asked.distance or (), known),
         points=points,
         point_std_m=asked.point_std or usual.point_std_m,
         sketch_m=sketch,
@@ -159,14 +158,21 @@ def _heights(asked: FactOptions, known: set[int]) -> dict[int, float]:
     of_all: dict[int, float] = {}
     for text in asked.height or ():
         name, mark, value = text.rpartition("=")
-        (z_m,) = _metres("height", text, value, (1,))
+        (z_m,) = metres("height", text, (1,), part=value if mark else None)
         if mark:
-            single[_anchor("height", text, name, known)] = z_m
+            anchor = _anchor("height", text, name, known)
+            if anchor in single:
+                raise SkylessError(f"--height is {text!r}; the height of anchor {anchor} should be given once")
+            single[anchor] = z_m
         elif of_all:
             raise SkylessError(f"--height is {text!r}; the height of all anchors should be given once")
         else:
             of_all = dict.fromkeys(known, z_m)
-    table = {} if asked.heights is None else read_heights(asked.heights)
+    table: dict[int, float] = {}
+    if asked.heights is not None:
+        table = read_heights(asked.heights)
+        if known.isdisjoint(table):
+            raise ConfigurationError(asked.heights, "column id", _names(table), f"anchors among {_names(known)}")
     return of_all | {anchor: z_m for anchor, z_m in table.items() if anchor in known} | single
 
 
@@ -181,6 +187,17 @@ def _completed(heights_m: dict[int, float], known: set[int], warnings: list[str]
     return heights_m | dict.fromkeys(missing, middle_m)
 
 
+def _tapes(texts: Iterable[str], known: set[int]) -> "tuple[Tape, ...]":
+    tapes: dict[frozenset[int], Tape] = {}
+    for text in texts:
+        tape = _tape(text, known)
+        pair = frozenset((tape.a, tape.b))
+        if pair in tapes:
+            raise SkylessError(f"--distance is {text!r}; that between {tape.a} and {tape.b} should be given once")
+        tapes[pair] = tape
+    return tuple(tapes.values())
+
+
 def _tape(text: str, known: set[int]) -> "Tape":
     from skyless.survey.facts import Tape
 
@@ -188,8 +205,11 @@ def _tape(text: str, known: set[int]) -> "Tape":
     if match is None:
         raise SkylessError(f"--distance is {text!r}; it should be like 1-4=7.21 or 1-4=7.21±0.01")
     a, b = (_anchor("distance", text, match[name], known) for name in ("a", "b"))
-    (distance_m,) = _metres("distance", text, match["distance"], (1,))
-    std_m = Tape(a, b, distance_m).std_m if match["std"] is None else _metres("distance", text, match["std"], (1,))[0]
+    (distance_m,) = metres("distance", text, (1,), part=match["distance"])
+    if match["std"] is None:
+        std_m = Tape(a, b, distance_m).std_m
+    else:
+        (std_m,) = metres("distance", text, (1,), part=match["std"])
     if a == b or distance_m <= 0.0 or not 0.0 <= std_m <= _MOST_STD_M:
         raise SkylessError(f"--distance is {text!r}; it should be a positive distance between two anchors")
     return Tape(a, b, distance_m, std_m)
@@ -197,16 +217,8 @@ def _tape(text: str, known: set[int]) -> "Tape":
 
 def _point(text: str, known: set[int]) -> "tuple[int, Point]":
     name, _, position = text.partition("=")
-    x_m, y_m, *z_m = _metres("point", text, position, (2, 3))
+    x_m, y_m, *z_m = metres("point", text, (2, 3), part=position)
     return _anchor("point", text, name, known), (x_m, y_m, z_m[0] if z_m else None)
-
-
-def _metres(option: str, text: str, value: str, counts: tuple[int, ...]) -> tuple[float, ...]:
-    """Coordinates or a length of an option's value. Raises SkylessError."""
-    values = finite_numbers(option, value, counts)
-    if any(abs(one) > MAX_COORDINATE_M for one in values):
-        raise SkylessError(f"--{option} is {text!r}; it should be metres, at most {MAX_COORDINATE_M:g}")
-    return values
 
 
 def _gauge(asked: FactOptions, known: set[int]) -> "Gauge | None":
@@ -238,5 +250,8 @@ def _anchor(option: str, text: str, name: str, known: set[int]) -> int:
 
 def _require_known(option: str, text: str, anchor: int, known: set[int]) -> None:
     if anchor not in known:
-        names = ", ".join(map(str, sorted(known)))
-        raise SkylessError(f"--{option} is {text!r}, and there is no anchor {anchor}; there are {names}")
+        raise SkylessError(f"--{option} is {text!r}, and there is no anchor {anchor}; there are {_names(known)}")
+
+
+def _names(anchors: Iterable[int]) -> str:
+    return ", ".join(map(str, sorted(anchors)))

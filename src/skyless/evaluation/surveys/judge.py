@@ -127,18 +127,21 @@ def aligned(true_m: Array, found_m: Array, axes: int) -> Array:
     """True positions, shape (n, 3), turned, mirrored and shifted to fit the found ones best; in 2-D on the floor."""
     moved = true_m.copy()
     own, other = true_m[:, :axes], found_m[:, :axes]
-    u, _, vt = np.linalg.svd((own - own.mean(axis=0)).T @ (other - other.mean(axis=0)))
-    moved[:, :axes] = (own - own.mean(axis=0)) @ (u @ vt) + other.mean(axis=0)
+    moved[:, :axes] = (own - own.mean(axis=0)) @ _rotation(own, other) + other.mean(axis=0)
     return moved
+
+
+def _rotation(own: Array, other: Array) -> Array:
+    """The rotation, or rotation and reflection, that fits the own points to the others best; for row vectors."""
+    u, _, vt = np.linalg.svd((own - own.mean(axis=0)).T @ (other - other.mean(axis=0)))
+    return np.asarray(u @ vt)
 
 
 def _turned_back(error_m: Array, true_m: Array, layout: SurveyLayout) -> Array:
     """Errors in the frame of the layout."""
     k = layout.dimensions
-    own, other = true_m[:, :k], layout.position_m[:, :k]
-    u, _, vt = np.linalg.svd((own - own.mean(axis=0)).T @ (other - other.mean(axis=0)))
     back = np.zeros_like(error_m)
-    back[:, :k] = error_m[:, :k] @ (u @ vt)
+    back[:, :k] = error_m[:, :k] @ _rotation(true_m[:, :k], layout.position_m[:, :k])
     return back
 
 

@@ -35,7 +35,7 @@ HAND_STD_M: Final = 0.02
 SKETCH_STD_M: Final = 0.3
 ROOM_RANGES: Final = Room().ranges
 """Errors of ranges at tags in the scenario ``room``."""
-_TAPE_STD_M: Final = 0.005
+TAPE_STD_M: Final = 0.005
 
 
 class RoomErrors(Struct, frozen=True):
@@ -85,7 +85,7 @@ def drawn_room(layout: SurveyLayout, errors: RoomErrors, noise_ps: float, seed: 
         ranges=errors.ranges,
         hand_m=HAND_STD_M * draw.standard_normal((n, 3)) * free_axes(layout),
         sketch_m=SKETCH_STD_M * draw.standard_normal((n, 3)) * free_axes(layout),
-        tape_m=float(_TAPE_STD_M * draw.standard_normal()),
+        tape_m=float(TAPE_STD_M * draw.standard_normal()),
         noise_ps=noise_ps,
         seed=int(draw.integers(1 << 60)),
     )
@@ -173,7 +173,7 @@ def surveyed_room(room: DrawnRoom, ranges: PairRanges, *, with_tape: bool = Fals
         a, b = survey.tapes[0].a, survey.tapes[0].b
         at_m = dict(zip(room.layout.anchors, room.layout.position_m, strict=True))
         measured_m = float(np.linalg.norm(at_m[a] - at_m[b])) + room.tape_m
-        survey = run_survey(ranges, replace(facts, tapes=(Tape(a, b, measured_m, _TAPE_STD_M),)))
+        survey = run_survey(ranges, replace(facts, tapes=(Tape(a, b, measured_m, TAPE_STD_M),)))
     return _aligned(room, _written(room, rough_m, survey, EXACT if is_exact else AccuracySite()))
 
 

@@ -37,7 +37,7 @@ class _Move(Struct, frozen=True):
 
 
 def run_air_watch(run: AirRun) -> WatchResult:
-    """Let it happen, and count what has been found after 0.15 s."""
+    """Run the site with its moves, and count what the watch finds within 0.15 s of each."""
     draw = np.random.default_rng(run.seed)
     site = lab_site()
     moves, displacements = _moves(run, [anchor.id for anchor in site.anchors], draw)

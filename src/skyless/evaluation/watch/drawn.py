@@ -1,4 +1,4 @@
-"""Ranges of a site's anchors as drift and noise make them, with things that happen, in front of the watch."""
+"""Ranges of a site's anchors drawn with drift and noise, and events that change them, as input of the watch."""
 
 import math
 from typing import Final, Literal
@@ -66,7 +66,7 @@ class WatchRun(Struct, frozen=True):
 
 
 class WatchResult(Struct, frozen=True):
-    """What the watch has made of a run."""
+    """How many events of a run the watch found, and what else it reported."""
 
     tries: int
     found: int
@@ -141,7 +141,7 @@ class _Site:
 
 
 def run_watch(run: WatchRun) -> WatchResult:
-    """Let it happen, and count."""
+    """Run the events one after another, and count what the watch finds."""
     draw = np.random.default_rng(run.seed)
     site = _Site(run, draw)
     steps = site.settings.steps

@@ -130,6 +130,9 @@ def open_recording(path: str | PathLike[str], format_name: str | None = None, li
     return Recording(chosen, fspath(path), read(stream, drops), stream, drops)
 
 
+_MCAP: Final = b"\x89MCAP0"
+
+
 def format_of(path: str | PathLike[str], name: str | None = None) -> Format:
     """Format of that name, or the one that the file's first bytes show.
 
@@ -152,12 +155,14 @@ def _recognised(path: str | PathLike[str]) -> Format:
         if known.recognise(head):
             return known
     if not head:
-        raise ConfigurationError(path, "the file", "empty", f"a recording of one of the formats {_names()}")
+        raise ConfigurationError(path, "the file", "empty", f"a recording {_readable()}")
+    if head.startswith(_MCAP):
+        raise ConfigurationError(path, "the file", "a compressed MCAP", "unpacked first, as by gunzip")
     if avalue.recognise_blinks(head):
         expected = "ccp.csv of the same system: what tags send up to anchors cannot be replayed as a tag's receptions"
         raise ConfigurationError(path, "the format", "tag blinks", expected)
     start = head[:24].decode("ascii", "backslashreplace")
-    raise ConfigurationError(path, "the beginning", start, f"that of one of the formats {_names()}")
+    raise ConfigurationError(path, "the beginning", start, f"that of a recording {_readable()}")
 
 
 def _listening(
@@ -174,6 +179,10 @@ def _listening(
         kind = "hexadecimal" if chosen.hexadecimal else "decimal"
         raise ConfigurationError(path, "listener", listener, f"a {kind} identifier") from error
     return partial(chosen.read, listener=listener)
+
+
+def _readable() -> str:
+    return f"of skyless record, or of one of the formats {_names()}"
 
 
 def _names() -> str:

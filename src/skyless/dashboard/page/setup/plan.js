@@ -13,7 +13,7 @@ import { COORDINATE, DISTANCE, lengthField } from "./fields.js";
 
 export const title = "Floor plan";
 
-/** The plan is said to be turned when its two points are by more than this. */
+/** A notice says that the plan is turned when its two points are turned by more than this. */
 const TURNED_DEG = 3;
 /** Two points of the image must be apart, or clicking them accurately is not possible. */
 const LEAST_M = 0.05;
@@ -90,17 +90,13 @@ async function open(file) {
   file.value = ""; // the same file may be chosen again
 }
 
-/** The box that the survey's picture covers, or what the map shows. */
+/** The box around the survey's picture, or else around the anchors of the site file: left, lower, right, upper edge. */
 function box() {
   const corners = surveyCorners();
-  if (corners.length > 1) {
-    const xs = corners.map(([x]) => x);
-    const ys = corners.map(([, y]) => y);
-    return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
-  }
-  const anchors = state.site?.anchors ?? [];
-  if (!anchors.length) return [0, 0, 10, 10];
-  const [xs, ys] = [anchors.map((one) => one.x_m), anchors.map((one) => one.y_m)];
+  const anchors = (state.site?.anchors ?? []).map(({ x_m, y_m }) => [x_m, y_m]);
+  const covered = corners.length > 1 ? corners : anchors;
+  if (!covered.length) return [0, 0, 10, 10];
+  const [xs, ys] = [0, 1].map((axis) => covered.map((point) => point[axis]));
   return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
 }
 
