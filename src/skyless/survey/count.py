@@ -7,8 +7,8 @@ from msgspec import Struct
 from skyless.survey.facts import Facts
 from skyless.survey.ranges import PairRanges
 
-_FEW: Final = 3
-"""Ranges to spare below which a late one cannot be found."""
+LEAST_CHECKS: Final = 3
+"""Ranges more than unknowns below which a late range cannot be found."""
 _RIGID: Final = {2: 3, 3: 6}
 """Unknowns of where the whole site lies, by dimensions; no range depends on them."""
 
@@ -36,7 +36,7 @@ class Count(Struct, frozen=True):
     @property
     def warning(self) -> str | None:
         """What to do before a survey that nothing checks; None if enough does."""
-        if self.spare >= _FEW:
+        if self.spare >= LEAST_CHECKS:
             return None
         return (
             "too few ranges check this survey, so a range that comes late would not be noticed: more links, taped "

@@ -9,6 +9,7 @@ import numpy as np
 
 from skyless.kernels.arrays import Array, Mask
 from skyless.survey.build import Measured, levels, with_free_delays
+from skyless.survey.count import LEAST_CHECKS
 from skyless.survey.facts import Facts
 from skyless.survey.fit import determined as determination
 from skyless.survey.fit.links import Links
@@ -18,9 +19,6 @@ from skyless.survey.frame import Framed
 from skyless.survey.result import SurveyedAnchor, TapeAdvice
 from skyless.survey.sentences import anchors_named, are, joined, tapes_named
 from skyless.survey.shape import Fitted, redundancy, surveyed_problem
-
-LEAST_CHECKS: Final = 3
-"""Ranges more than unknowns below which nothing checks a result."""
 
 _FLAT: Final = 0.3
 """Extent of a site across, as a part of its extent along, below which it is flat."""

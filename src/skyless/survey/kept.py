@@ -12,6 +12,7 @@ from msgspec import structs
 
 from skyless.kernels.arrays import Array
 from skyless.survey.build import Measured, as_array, build_problem, fixed_heights_m, own_delays
+from skyless.survey.count import LEAST_CHECKS
 from skyless.survey.fit.problem import Problem, delay_weights
 from skyless.survey.fit.robust import RobustFit, fit_robustly
 from skyless.survey.ranges import PairRange
@@ -64,7 +65,7 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
         pairs=tuple(_pair(measured, pair, residuals.get((pair.a, pair.b))) for pair in measured.pairs),
         range_std_m=range_std_m,
         redundancy=redundancy,
-        unchecked=None if redundancy >= 3 else "hardly anything checks these delays: there are too few ranges",
+        unchecked=None if redundancy >= LEAST_CHECKS else "too few ranges check these delays",
         not_determined=tuple(sentences),
         ambiguities=(),
         tapes=(),

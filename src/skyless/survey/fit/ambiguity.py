@@ -1,4 +1,4 @@
-"""Whether another result would fit the ranges as well, and whether anything would show a wrong one."""
+"""Other results that fit the ranges as well as the best one."""
 
 from typing import Final
 
@@ -8,7 +8,7 @@ from msgspec import Struct
 from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.survey.fit.neighbours import mirrored
 from skyless.survey.fit.problem import Problem, solve_least_squares
-from skyless.survey.fit.robust import RobustFit, cut_off, redundancy
+from skyless.survey.fit.robust import RobustFit, cut_off
 
 _MIRROR_AS_GOOD: Final = 16.0
 """Weighted squares by which a result that uses the same ranges may fit worse."""
@@ -22,9 +22,6 @@ _LATE_GAIN: Final = 16.0
 _MOVED_STDS: Final = 3.0
 _MOVED_M: Final = 0.1
 """Motion of an anchor that makes two results different."""
-
-_LEAST_CHECKS: Final = 3.0
-_LARGEST_SHARE_OUT: Final = 0.5
 
 _NO_MOTION: Final = 1e-9
 """Of a site, such as a line's around itself."""
@@ -45,16 +42,13 @@ class OtherFit(Struct, frozen=True, eq=False):
     reason: str
 
 
-def find_ambiguities(problem: Problem, fit: RobustFit) -> tuple[OtherFit, ...]:
-    """Results that fit nearly as well and have anchors elsewhere, the best first.
-
-    ``problem``: as given to the fit; the fit's own variances are used.
-    """
+def find_ambiguities(fit: RobustFit) -> tuple[OtherFit, ...]:
+    """Results that fit nearly as well and have anchors elsewhere, the best first."""
     problem = fit.problem
     starts = mirrored(problem, fit.solution.position_m)
     delay_m = np.tile(fit.solution.delay_m, (len(starts), 1))
     by_mirror = cut_off(problem, starts, delay_m)
-    std_m = aligned_std_m(problem, fit)
+    std_m = aligned_std_m(fit)
     is_late = solve_least_squares(problem, fit.solution.position_m).cost > fit.cost + _LATE_GAIN
     others: list[tuple[float, OtherFit]] = []
     for minima in (by_mirror, fit.others):
@@ -77,22 +71,6 @@ def find_ambiguities(problem: Problem, fit: RobustFit) -> tuple[OtherFit, ...]:
         if len(kept) < _MOST_OTHERS and min(apart, default=np.inf) > _MOVED_M:
             kept.append(other)
     return tuple(kept)
-
-
-def unchecked_reason(problem: Problem, fit: RobustFit) -> str | None:
-    """A sentence where a wrong range would not show, None where enough ranges check the result.
-
-    ``problem``: as given to the fit; the fit's own variances are used.
-    """
-    problem = fit.problem
-    checks = redundancy(problem, fit.solution, fit.used)
-    out = int(np.count_nonzero(~fit.used))
-    if checks < _LEAST_CHECKS:
-        used = np.count_nonzero(fit.used)
-        return f"Nothing checks this survey: of {used} ranges in use, all but {checks:.1f} are needed."
-    if out > _LARGEST_SHARE_OUT * (checks + out):
-        return f"{out} late ranges were left out; only {checks:.1f} of the rest check the result."
-    return None
 
 
 def _reason(problem: Problem, used: Mask, other: Mask) -> str:
@@ -126,8 +104,9 @@ def _aligned(position_m: Array, target_m: Array, weight: Array, axes: Integers) 
     return np.asarray(moved_m)
 
 
-def aligned_std_m(problem: Problem, fit: RobustFit) -> Array:
+def aligned_std_m(fit: RobustFit) -> Array:
     """Of each anchor's distance from the truth, after the best rigid alignment, shape (n,)."""
+    problem = fit.problem
     free = np.flatnonzero(problem.is_free.ravel())
     motions = _rigid_motions(problem, fit.solution.position_m)[free]
     direction, length, _ = np.linalg.svd(motions, full_matrices=False)

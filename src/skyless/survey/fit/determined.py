@@ -61,12 +61,6 @@ class Direction(Struct, frozen=True, eq=False):
         length = np.linalg.norm(self.shift_m, axis=1)
         return np.asarray(length > TOUCHED * length.max(initial=0.0))
 
-    @property
-    def delayed(self) -> Mask:
-        """Shape (n,): those whose delays it touches."""
-        size = np.abs(self.delay_m)
-        return np.asarray((size > TOUCHED * size.max(initial=0.0)) & (size > 0.05))
-
 
 def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -> Array:
     """Weighted derivatives of ranges, tapes, delay priors and coordinate priors, shape (rows, 4 n).

@@ -38,7 +38,7 @@ class Alignment(Struct, frozen=True, eq=False):
     """Whether the mirror image fits worse."""
 
 
-def align(position_m: Array, other_m: Array, std_m: float, axes: int, *, may_mirror: bool = True) -> Alignment:
+def align(position_m: Array, other_m: Array, std_m: float, axes: int) -> Alignment:
     """Least squares without scale, positions of shape (k, 3); ``axes`` 2: about the vertical, z stays as it is.
 
     ``std_m``: of both sets' difference per axis, shape (k,) or one for all; decides about mirror images only.
@@ -56,11 +56,12 @@ def align(position_m: Array, other_m: Array, std_m: float, axes: int, *, may_mir
         rotation[:axes, :axes] = turn.T
         shift = np.zeros(3)
         shift[:axes] = goal - turn.T @ centre
-        found.append((float(np.sum(residual**2)) / std_m**2, float(np.linalg.det(turn)), Motion(rotation, shift)))
+        cost = float(np.sum(residual**2)) / max(std_m, 1e-9) ** 2
+        found.append((cost, float(np.linalg.det(turn)), Motion(rotation, shift)))
     plain = next(item for item in found if item[1] > 0.0)
     mirrored = next(item for item in found if item[1] < 0.0)
     decided = abs(plain[0] - mirrored[0]) > _DECIDED
-    best = mirrored if may_mirror and decided and mirrored[0] < plain[0] else plain
+    best = mirrored if decided and mirrored[0] < plain[0] else plain
     return Alignment(best[2], decided)
 
 

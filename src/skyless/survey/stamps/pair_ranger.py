@@ -22,6 +22,9 @@ from skyless.ticks import Unwrapper
 _KEPT_S: Final = 5.0
 """Legs wait so long for the other direction, which another anchor may publish later."""
 
+_LARGEST_TICKS: Final = 1 << 62
+"""Stamps are computed with 64 bits."""
+
 _MOST_BLOCKS: Final = 256
 _MOST_PAIRS: Final = 1 << 16
 _MOST_OPEN_LEGS: Final = 1 << 18
@@ -45,7 +48,8 @@ class PairRanger:
     """Gathers directed legs between anchors; memory does not grow with time.
 
     ``counters``: ``legs``, and what was dropped: ``impossible`` (brackets that cannot be of one pair of counters),
-    ``unusable`` (legs from an anchor to itself, or without a finite time), ``too-many-pairs``.
+    ``unusable`` (legs from an anchor to itself, without a finite time, or with stamps that no counter has),
+    ``too-many-pairs``.
     """
 
     def __init__(
@@ -81,7 +85,7 @@ class PairRanger:
 
         Order matters little: directions of a pair may come one after the other, seconds late.
         """
-        if sender == receiver or not math.isfinite(t_s):
+        if sender == receiver or not math.isfinite(t_s) or max(abs(tx_ticks), abs(rx_ticks)) > _LARGEST_TICKS:
             self.counters["unusable"] += 1
             return
         pair = (sender, receiver) if sender < receiver else (receiver, sender)
