@@ -1,4 +1,4 @@
-"""How many ranges check a survey, counted before it is made: pairs and facts less what is unknown."""
+"""How many ranges check a survey, counted before it is made: measurements less unknowns."""
 
 from typing import Final
 
@@ -10,24 +10,24 @@ from skyless.survey.ranges import PairRanges
 LEAST_CHECKS: Final = 3
 """Ranges more than unknowns below which a late range cannot be found."""
 _RIGID: Final = {2: 3, 3: 6}
-"""Unknowns of where the whole site lies, by dimensions; no range depends on them."""
+"""Rigid motions of the whole site, by dimensions; no range depends on them."""
 
 
 class Count(Struct, frozen=True):
-    """What there is, and what is asked."""
+    """Numbers of measurements and unknowns of a survey."""
 
     anchors: int
     """With at least one range."""
     pairs: int
     possible: int
     unknowns: int
-    """Coordinates and delays, but for where the whole site lies."""
+    """Coordinates and delays, less the rigid motions of the whole site."""
     spare: int
     """Ranges and facts less unknowns."""
 
     @property
     def sentence(self) -> str:
-        """What is counted, in words."""
+        """These numbers in words."""
         many = f"{self.anchors} anchors, {self.pairs} of {self.possible} pairs, {self.unknowns} unknowns"
         if self.spare < 0:
             return f"{many}: {-self.spare} ranges or facts too few, so expected delays decide what is left open"
@@ -39,8 +39,8 @@ class Count(Struct, frozen=True):
         if self.spare >= LEAST_CHECKS:
             return None
         return (
-            "too few ranges check this survey, so a range that comes late would not be noticed: more links, taped "
-            "distances (--distance), known points (--point) or known delays (--delays-known) would"
+            "too few ranges check this survey, so a range that comes late would not be noticed: add links, measured "
+            "distances (--distance), known points (--point) or known delays (--delays-known)"
         )
 
 

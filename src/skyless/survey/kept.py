@@ -13,7 +13,7 @@ from msgspec import structs
 from skyless.kernels.arrays import Array
 from skyless.survey.build import Measured, as_array, build_problem, fixed_heights_m, own_delays
 from skyless.survey.count import LEAST_CHECKS
-from skyless.survey.fit.problem import Problem, delay_weights
+from skyless.survey.fit.problem import Problem, delay_weights, unit_vectors
 from skyless.survey.fit.robust import RobustFit, fit_robustly
 from skyless.survey.ranges import PairRange
 from skyless.survey.result import Survey, SurveyedAnchor, SurveyedPair
@@ -105,8 +105,7 @@ def _delay_covariance(
     of_tags = tag_information[3 * k :, 3 * k :]
     inverse = np.linalg.inv(incidence.T @ (weight[:, None] * incidence) + prior + of_tags)
     gain = inverse @ (incidence.T * weight)
-    apart = position_m[problem.first] - position_m[problem.second]
-    unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None]
+    unit = unit_vectors(position_m, problem.first, problem.second)
     shift = np.zeros((len(problem.first), k, dimensions))
     number = np.arange(len(problem.first))
     shift[number, problem.first] = unit[:, :dimensions]

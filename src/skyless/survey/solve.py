@@ -88,7 +88,7 @@ def _links(measured: Measured) -> Links:
         np.isfinite(as_array(facts.points, measured.anchors)[:, : facts.dimensions]).all(axis=1)
     )
     least = 3 if levels(measured) else 4
-    return count_links(adjacency(len(index), [(both[:, 0], both[:, 1])]), unknown, is_known, least)
+    return count_links(adjacency(len(index), both[:, 0], both[:, 1]), unknown, is_known, least)
 
 
 def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -> tuple[SurveyedAnchor, ...]:

@@ -5,7 +5,8 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.kernels.arrays import Array, Mask
+from skyless.survey.fit.gauge import superimposed
 from skyless.survey.fit.neighbours import mirrored
 from skyless.survey.fit.problem import Problem, solve_least_squares
 from skyless.survey.fit.robust import RobustFit, cut_off
@@ -87,21 +88,11 @@ def aligned_to(problem: Problem, position_m: Array, target_m: Array) -> Array:
     """
     axes = np.flatnonzero(problem.is_free.any(axis=0))
     weight = np.ones(len(position_m))
-    moved_m = position_m
+    moved_m = position_m.copy()
     for _ in range(5):
-        moved_m = _aligned(position_m, target_m, weight, axes)
+        moved_m[:, axes] = superimposed(position_m[:, axes], target_m[:, axes], weight)
         weight = 1.0 / np.maximum(np.linalg.norm(moved_m - target_m, axis=1), 0.01)
     return moved_m
-
-
-def _aligned(position_m: Array, target_m: Array, weight: Array, axes: Integers) -> Array:
-    own, other = position_m[:, axes], target_m[:, axes]
-    share = (weight / weight.sum())[:, None]
-    own_centre, other_centre = np.sum(share * own, axis=0), np.sum(share * other, axis=0)
-    u, _, v = np.linalg.svd((share * (own - own_centre)).T @ (other - other_centre))
-    moved_m = position_m.copy()
-    moved_m[:, axes] = (own - own_centre) @ (u @ v) + other_centre
-    return np.asarray(moved_m)
 
 
 def aligned_std_m(fit: RobustFit) -> Array:

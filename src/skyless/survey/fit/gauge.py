@@ -38,6 +38,17 @@ class Alignment(Struct, frozen=True, eq=False):
     """Whether the mirror image fits worse."""
 
 
+def superimposed(position_m: Array, target_m: Array, weight: Array) -> Array:
+    """Positions rotated, shifted and perhaps reflected to fit a target best (the weighted Procrustes problem).
+
+    ``position_m``, ``target_m``: shape (n, d). ``weight``: of each anchor's squared distance, shape (n,), not all 0.
+    """
+    centre = np.average(position_m, axis=0, weights=weight)
+    goal = np.average(target_m, axis=0, weights=weight)
+    left, _, right = np.linalg.svd((weight[:, None] * (position_m - centre)).T @ (target_m - goal))
+    return np.asarray((position_m - centre) @ (left @ right) + goal)
+
+
 def align(position_m: Array, other_m: Array, std_m: float, axes: int) -> Alignment:
     """Least squares without scale, positions of shape (k, 3); ``axes`` 2: about the vertical, z stays as it is.
 

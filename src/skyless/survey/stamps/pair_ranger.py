@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import astuple
 
 from skyless.constants import TICK_BITS, TICK_M, TICK_RATE_HZ
 from skyless.kernels.arrays import Array, Integers, Mask
@@ -348,11 +349,4 @@ def _legs_of(rows: list[tuple[int, int, int, bool, float]]) -> Legs:
 
 def _joined(one: Legs, other: Legs) -> Legs:
     """The rows of both, the first one's first."""
-    return Legs(
-        np.concatenate([one.pair, other.pair]),
-        np.concatenate([one.a_ticks, other.a_ticks]),
-        np.concatenate([one.b_ticks, other.b_ticks]),
-        np.concatenate([one.is_back, other.is_back]),
-        np.concatenate([one.is_used, other.is_used]),
-        np.concatenate([one.t_s, other.t_s]),
-    )
+    return Legs(*map(np.concatenate, zip(astuple(one), astuple(other), strict=True)))

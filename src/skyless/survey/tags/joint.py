@@ -9,6 +9,7 @@ from msgspec.structs import replace
 from scipy.special import chdtri
 
 from skyless.kernels.arrays import Array, Mask
+from skyless.survey.fit.links import distances_m
 from skyless.survey.fit.problem import Problem, Solution, solve_least_squares
 from skyless.survey.fit.robust import LATE_CUTOFF
 from skyless.survey.tags.epochs import EPOCH_S, TagEpochs, tag_ranges
@@ -116,7 +117,7 @@ def _unfit(problem: Problem, alone: Solution, trial: _Trial) -> str | None:
     """Why ranges and walk are not to be used together."""
     rows, solution = trial.rows, trial.solution
     if rows.epochs < _FEWEST_EPOCHS:
-        return f"only {rows.epochs} epochs of half a second have enough anchors; it takes {_FEWEST_EPOCHS}"
+        return f"only {rows.epochs} epochs of half a second have enough anchors; {_FEWEST_EPOCHS} are needed"
     if rows.excluded_share > _MOST_EXCLUDED:
         return f"{rows.excluded_share:.0%} of its ranges do not fit, as where anchors are not in sight"
     jacobian, _ = rows.rows(solution.position_m, solution.delay_m)
@@ -141,5 +142,4 @@ def _unfit(problem: Problem, alone: Solution, trial: _Trial) -> str | None:
 
 def _same(one: Solution, other: Solution) -> bool:
     """Whether two results have the same distances, within 2 cm."""
-    apart = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in (one.position_m, other.position_m)]
-    return bool(np.abs(apart[0] - apart[1]).max() < 0.02)
+    return bool(np.abs(distances_m(one.position_m) - distances_m(other.position_m)).max() < 0.02)
