@@ -7,6 +7,7 @@ from msgspec.structs import replace
 
 from skyless.site.lab import lab_site
 from skyless.survey.fit.problem import Problem
+from skyless.survey.fit.robust import redundancy
 
 GRID = [[x, y, 6.0] for x in (0.0, 12.0, 24.0, 36.0) for y in (0.0, 12.0, 24.0)]
 CORNERS = [[0, 0, 0.4], [8, 0, 2.6], [8, 6, 0.4], [0, 6, 2.6], [4, 0, 2.6], [8, 3, 0.4], [4, 6, 2.6], [0, 3, 0.4]]
@@ -109,6 +110,13 @@ def aligned_error_m(position_m, truth_m, dimensions=2):
     b = truth_m[:, :dimensions] - truth_m[:, :dimensions].mean(axis=0)
     u, _, v = np.linalg.svd(a.T @ b)
     return np.linalg.norm(a @ u @ v - b, axis=1)
+
+
+def is_unchecked(fit):
+    """Whether too few ranges check a robust fit: fewer than three, or fewer than it has left out as late."""
+    checks = redundancy(fit.problem, fit.solution, fit.used)
+    out = np.count_nonzero(~fit.used)
+    return checks < 3.0 or out > 0.5 * (checks + out)
 
 
 def rms(values):

@@ -24,7 +24,7 @@ def aligned_error_m(layout, position_m):
     errors = []
     for sign in (1.0, -1.0):
         mirrored = position_m * [1.0, sign, 1.0]
-        motion = align(mirrored, layout.position_m, 1.0, layout.dimensions, may_mirror=False).motion
+        motion = align(mirrored, layout.position_m, 1.0, layout.dimensions).motion
         errors.append(motion.moved(mirrored) - layout.position_m)
     return min(errors, key=lambda error: float(np.sum(error**2)))
 
@@ -177,7 +177,7 @@ def test_a_lab_without_a_tape_names_what_is_missing():
     (sentence,) = survey.not_determined
     assert sentence.startswith("delays of anchors 1, 2, 4 and 5 against ")
     assert "not determined by the ranges" in sentence
-    assert sentence.endswith("a tape between 1 and 5 would mend it")
+    assert sentence.endswith("measure the distance between 1 and 5")
     assert survey.unchecked is not None
     assert [(tape.a, tape.b) for tape in survey.tapes] == [(1, 5), (1, 4), (2, 4)]
     best = survey.tapes[0]

@@ -43,7 +43,7 @@ def test_named_axes():
 def test_a_near_anchor_names_the_x_axis_badly():
     survey = run_survey(RANGES, structs.replace(KNOWN, gauge=Gauge(1, 6)))
     (note,) = survey.notes
-    assert "anchor 4, 10.0 m away, would name it better" in note
+    assert "choose anchor 4, 10.0 m away" in note
     assert "mirror image" in survey.frame
 
 
@@ -51,7 +51,7 @@ def test_a_frame_needs_anchors_that_are_determined():
     for gauge in (Gauge(1, 99, 2), Gauge(1, 1, 2)):
         survey = run_survey(RANGES, structs.replace(KNOWN, gauge=gauge))
         assert survey.gauge == Gauge(1, 4, 2)
-        assert "the frame cannot follow" in survey.notes[0]
+        assert "the frame cannot be defined by" in survey.notes[0]
 
 
 def test_without_a_frame_the_first_and_the_farthest_anchor_name_it():
@@ -72,8 +72,8 @@ def test_points_name_the_frame_and_a_wrong_one_bends_nothing():
     survey = run_survey(RANGES, structs.replace(KNOWN, points=wrong))
     assert_near(positions(survey), TRUTH, 0.005)
     (note,) = survey.notes
-    assert note.startswith("point of anchor 3 does not fit by 0.4")
-    assert note.endswith("m: moved or mistyped?")
+    assert note.startswith("the point of anchor 3 does not fit the ranges by 0.4")
+    assert note.endswith("has the anchor moved, or is the point mistyped?")
 
 
 def test_two_points_leave_the_mirror_image_and_a_sketch_decides():
@@ -90,7 +90,7 @@ def test_two_points_leave_the_mirror_image_and_a_sketch_decides():
 
 def test_two_points_that_contradict_each_other():
     survey = run_survey(RANGES, structs.replace(KNOWN, points={1: TRUTH[1], 4: (6.3, 8.4, 0.0)}))
-    assert "anchors 1 and 4 are 10.50 m apart, 10.00 m by the ranges" in survey.notes[0]
+    assert "anchors 1 and 4 are 10.50 m apart, but 10.00 m by the ranges" in survey.notes[0]
 
 
 def test_a_sketch_is_fitted_not_followed():

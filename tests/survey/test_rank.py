@@ -73,15 +73,17 @@ def test_three_on_a_line_stay_undetermined_whatever_the_noise(dimensions):
         assert not any(anchor.determined for anchor in survey.anchors)
 
 
-def test_why_and_what_would_mend_it():
+def test_why_and_what_to_measure():
     def sentence(name):
         return run_survey(CASES[name][0], Facts(delay_std_m=0.0)).not_determined
 
     assert sentence("an anchor with one range") == (
-        "anchor 6 is not determined: only one range, to 1; it needs 3; tapes 6–2 and 6–5 would mend it",
+        "anchor 6 is not determined: only one range, to 1; it needs 3; measure the distances 6–2 and 6–5",
     )
     (found,) = sentence("an anchor with two ranges")
-    assert found.startswith("anchor 6 is not determined: only 2 ranges, to 1 and 2; it needs 3; a tape between 6 and ")
+    assert found.startswith(
+        "anchor 6 is not determined: only 2 ranges, to 1 and 2; it needs 3; measure the distance between 6 and "
+    )
     assert sentence("two halves") == (
         "anchors 1, 2 and 3 are not determined: the group of anchors 1, 2 and 3 has too few ranges to "
         "anchors 4, 5 and 6",

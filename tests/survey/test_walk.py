@@ -185,7 +185,7 @@ def test_a_walk_chooses_between_results_that_the_ranges_cannot_tell_apart():
 
 @pytest.mark.parametrize(
     ("fault", "words"),
-    [("noise", "not used"), ("moved", "not used"), ("short", "it takes 10"), ("relayed", "it takes 10")],
+    [("noise", "not used"), ("moved", "not used"), ("short", "10 are needed"), ("relayed", "10 are needed")],
 )
 def test_a_walk_that_does_not_fit_is_not_used(fault, words):
     rng = np.random.default_rng(4)

@@ -6,18 +6,27 @@ from typing import Final
 import numpy as np
 from msgspec import Struct, structs
 
+from skyless.errors import SkylessError
 from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.survey.facts import Facts, Point, Tape
 from skyless.survey.fit.problem import Problem
 from skyless.survey.ranges import PairRange, PairRanges
 
 LEAST_RANGE_STD_M: Final = 1e-5
-_NO_STD_M: Final = 1e3
-"""As good as unknown."""
+_UNKNOWN_DELAY_STD_M: Final = 1e3
+"""Standard deviation of a delay about which nothing is known."""
+
+_LARGEST_M: Final = 1e5
+"""No range, distance or standard deviation of a site is larger; with far larger ones the fit would not end."""
+
+_STDS: Final = (
+    "height_std_m", "point_std_m", "sketch_std_m", "delay_std_m", "common_delay_std_m", "pair_std_m",
+)  # fmt: skip
+"""Standard deviations among the facts."""
 
 _OFTEN_LATE_STD_M: Final = 0.15
-"""Times the share of a pair's ranges that came late: something stands near its path, and the earliest ones have passed
-by it, too."""
+"""Further standard deviation of a pair's range, times the share of its ranges that came late: an object near the path
+may have delayed the earliest ones, too."""
 
 
 class Measured(Struct, frozen=True, eq=False):
@@ -32,37 +41,64 @@ class Measured(Struct, frozen=True, eq=False):
 
 
 def usable(ranges: PairRanges, facts: Facts) -> Measured:
-    """Leave out what is not finite or names anchors that are not there."""
+    """Leave out ranges and facts that are not finite, or that name anchors without ranges, with a sentence about each.
+
+    Raises:
+        SkylessError: a standard deviation of the facts is not finite, or is negative.
+    """
+    for name in _STDS:
+        if not _is_std(getattr(facts, name)):
+            raise SkylessError(f"{name} is {getattr(facts, name)}; it should be a standard deviation in metres")
     notes = []
-    known = set(ranges.anchors)
+    anchors = tuple(dict.fromkeys(ranges.anchors))
+    known = set(anchors)
     best: dict[tuple[int, int], PairRange] = {}
     for pair in ranges.pairs:
         ends = (min(pair.a, pair.b), max(pair.a, pair.b))
-        figures = (pair.range_m, pair.std_m, pair.late_share)
-        if not (all(math.isfinite(figure) for figure in figures) and pair.std_m >= 0.0):
-            notes.append(f"the range of anchors {ends[0]} and {ends[1]} is no finite number: not used")
+        if not (abs(pair.range_m) < _LARGEST_M and _is_std(pair.std_m) and 0.0 <= pair.late_share <= 1.0):
+            notes.append(f"the range of anchors {ends[0]} and {ends[1]} is not a possible figure: not used")
         elif pair.a == pair.b or not known.issuperset(ends) or ends in best:
-            notes.append(f"the range of anchors {pair.a} and {pair.b} is of no pair of this site: not used")
+            notes.append(
+                f"the range of anchors {pair.a} and {pair.b} is not of a pair of this site, or is there twice: not used"
+            )
         else:
             best[ends] = structs.replace(pair, a=ends[0], b=ends[1])
     tapes = []
     for tape in facts.tapes:
-        if tape.a != tape.b and {tape.a, tape.b} <= known and 0.0 < tape.distance_m < math.inf:
+        is_possible = 0.0 < tape.distance_m < _LARGEST_M and _is_std(tape.std_m)
+        if is_possible and tape.a != tape.b and {tape.a, tape.b} <= known:
             tapes.append(tape)
         else:
-            notes.append(f"the measured distance of anchors {tape.a} and {tape.b} fits no pair of this site: not used")
-    for kind, values in (("point", facts.points), ("height", facts.heights_m)):
-        unknown = sorted(set(values) - known)
-        notes += [f"a {kind} is given for anchor {anchor}, which has no ranges: not used" for anchor in unknown]
+            why = "fits no pair of this site" if is_possible else "is not a possible figure"
+            notes.append(f"the measured distance of anchors {tape.a} and {tape.b} {why}: not used")
+    points = _finite(facts.points)
+    heights_m = {anchor: z for anchor, z in facts.heights_m.items() if math.isfinite(z)}
+    delays = [item for item in facts.delays if abs(item.delay_m) < _LARGEST_M and _is_std(item.std_m)]
+    for kind, given, finite in (
+        ("point", set(facts.points), set(points)),
+        ("height", set(facts.heights_m), set(heights_m)),
+        ("delay", {item.anchor for item in facts.delays}, {item.anchor for item in delays}),
+    ):
+        notes += [
+            f"a {kind} is given for anchor {anchor}, which has no ranges: not used" for anchor in sorted(given - known)
+        ]
+        notes += [
+            f"the {kind} of anchor {anchor} is not a possible figure: not used"
+            for anchor in sorted(given & known - finite)
+        ]
     kept = structs.replace(
         facts,
-        points=_finite({anchor: point for anchor, point in facts.points.items() if anchor in known}),
-        heights_m={anchor: z for anchor, z in facts.heights_m.items() if anchor in known and math.isfinite(z)},
+        points={anchor: point for anchor, point in points.items() if anchor in known},
+        heights_m={anchor: z for anchor, z in heights_m.items() if anchor in known},
         sketch_m=_finite({anchor: point for anchor, point in facts.sketch_m.items() if anchor in known}),
-        delays=tuple(item for item in facts.delays if item.anchor in known and math.isfinite(item.delay_m)),
+        delays=tuple(item for item in delays if item.anchor in known),
     )
-    tx_std_m = {anchor: std for anchor, std in ranges.tx_std_m.items() if math.isfinite(std)}
-    return Measured(tuple(ranges.anchors), tuple(best.values()), tuple(tapes), tx_std_m, kept, tuple(notes))
+    tx_std_m = {anchor: std for anchor, std in ranges.tx_std_m.items() if _is_std(std)}
+    return Measured(anchors, tuple(best.values()), tuple(tapes), tx_std_m, kept, tuple(notes))
+
+
+def _is_std(value_m: float) -> bool:
+    return 0.0 <= value_m < _LARGEST_M
 
 
 def _finite(points: dict[int, Point]) -> dict[int, Point]:
@@ -164,7 +200,7 @@ def with_free_delays(problem: Problem) -> tuple[Problem, Mask]:
     if common is None:
         return free, np.asarray(own > typical)
     shared = common**2 > typical
-    free = structs.replace(free, common_delay_m=np.where(shared, _NO_STD_M, common))
+    free = structs.replace(free, common_delay_m=np.where(shared, _UNKNOWN_DELAY_STD_M, common))
     return free, np.asarray((own > typical) | shared)
 
 

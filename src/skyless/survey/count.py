@@ -1,4 +1,4 @@
-"""How many ranges check a survey, counted before it is made: pairs and facts less what is unknown."""
+"""How many ranges check a survey, counted before it is made: measurements less unknowns."""
 
 from typing import Final
 
@@ -7,27 +7,27 @@ from msgspec import Struct
 from skyless.survey.facts import Facts
 from skyless.survey.ranges import PairRanges
 
-_FEW: Final = 3
-"""Ranges to spare below which a late one cannot be found."""
+LEAST_CHECKS: Final = 3
+"""Ranges more than unknowns below which a late range cannot be found."""
 _RIGID: Final = {2: 3, 3: 6}
-"""Unknowns of where the whole site lies, by dimensions; no range depends on them."""
+"""Rigid motions of the whole site, by dimensions; no range depends on them."""
 
 
 class Count(Struct, frozen=True):
-    """What there is, and what is asked."""
+    """Numbers of measurements and unknowns of a survey."""
 
     anchors: int
     """With at least one range."""
     pairs: int
     possible: int
     unknowns: int
-    """Coordinates and delays, but for where the whole site lies."""
+    """Coordinates and delays, less the rigid motions of the whole site."""
     spare: int
     """Ranges and facts less unknowns."""
 
     @property
     def sentence(self) -> str:
-        """What is counted, in words."""
+        """These numbers in words."""
         many = f"{self.anchors} anchors, {self.pairs} of {self.possible} pairs, {self.unknowns} unknowns"
         if self.spare < 0:
             return f"{many}: {-self.spare} ranges or facts too few, so expected delays decide what is left open"
@@ -36,11 +36,11 @@ class Count(Struct, frozen=True):
     @property
     def warning(self) -> str | None:
         """What to do before a survey that nothing checks; None if enough does."""
-        if self.spare >= _FEW:
+        if self.spare >= LEAST_CHECKS:
             return None
         return (
-            "too few ranges check this survey, so a range that comes late would not be noticed: more links, taped "
-            "distances (--distance), known points (--point) or known delays (--delays-known) would"
+            "too few ranges check this survey, so a range that comes late would not be noticed: add links, measured "
+            "distances (--distance), known points (--point) or known delays (--delays-known)"
         )
 
 

@@ -1,4 +1,4 @@
-"""What a user knows of a site besides the ranges between its anchors."""
+"""What a user states about a site besides the ranges between its anchors."""
 
 from typing import Literal
 
@@ -20,7 +20,7 @@ class Tape(Struct, frozen=True):
 
 
 class KnownDelay(Struct, frozen=True):
-    """The delay ``h`` of an anchor, half of what its TX and RX antenna delays together are off, from a tag."""
+    """The delay ``h`` of an anchor, half the error of its TX and RX antenna delays together, found by a tag."""
 
     anchor: int
     delay_m: float
@@ -28,7 +28,7 @@ class KnownDelay(Struct, frozen=True):
 
 
 class Gauge(Struct, frozen=True):
-    """What names the axes: an anchor at the origin, one on the positive x axis, and one on its left (y > 0)."""
+    """The anchors that define the frame: one at the origin, one on the positive x axis, and one on its left (y > 0)."""
 
     origin: int
     x_axis: int
@@ -52,9 +52,9 @@ class Facts(Struct, frozen=True):
     keep_positions: bool = False
     """Only delays are wanted: the positions of ``sketch_m`` stay, and are as good as ``sketch_std_m``."""
     delay_std_m: float = 0.07
-    """What delays h are expected to be off, each for itself; 0 where they are known."""
+    """Standard deviation of each delay h, apart from the part that all share; 0 if delays are known."""
     common_delay_std_m: float = 0.1
-    """What all of them are expected to be off together, more than that; nothing where delays are known."""
+    """Standard deviation of the part of the delays that all anchors share; not used if delays are known."""
     pair_std_m: float = 0.03
     """Constant error of each pair's range, which no averaging removes."""
     delays: tuple[KnownDelay, ...] = ()

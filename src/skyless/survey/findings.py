@@ -1,4 +1,4 @@
-"""What a survey does not determine, why, and which tapes would mend it: sentences."""
+"""Sentences: what a survey does not determine, why, and which distances to measure."""
 
 import math
 import re
@@ -9,6 +9,7 @@ import numpy as np
 
 from skyless.kernels.arrays import Array, Mask
 from skyless.survey.build import Measured, levels, with_free_delays
+from skyless.survey.count import LEAST_CHECKS
 from skyless.survey.facts import Facts
 from skyless.survey.fit import determined as determination
 from skyless.survey.fit.links import Links
@@ -16,24 +17,21 @@ from skyless.survey.fit.problem import Problem, delay_weights
 from skyless.survey.fit.tapes import TapeChoice, best_tapes, mending_tapes
 from skyless.survey.frame import Framed
 from skyless.survey.result import SurveyedAnchor, TapeAdvice
-from skyless.survey.sentences import anchors_named, are, joined, tapes_named
+from skyless.survey.sentences import anchors_named, are, distances_named, joined
 from skyless.survey.shape import Fitted, redundancy, surveyed_problem
 
-LEAST_CHECKS: Final = 3
-"""Ranges more than unknowns below which nothing checks a result."""
-
 _FLAT: Final = 0.3
-"""Extent of a site across, as a part of its extent along, below which it is flat."""
+"""A site is flat if its smallest extent is a smaller part of its largest one."""
 
 _ONE_AXIS: Final = 0.7
-"""Part of all squares along one direction from which on positions change along it."""
+"""Positions change along one direction if at least this part of their squared changes is along it."""
 
 _BENDS_M: Final = 0.01
 _BENT_SIGMA: Final = 3.0
-"""Least standard deviation of a shape that is looked at when bent, and how far it is bent."""
+"""A shape with at least this standard deviation is also examined when bent, by up to this multiple of it."""
 
 _AXIS_PART: Final = 0.9
-"""Square of the cosine from which on a direction is an axis's."""
+"""A direction is that of an axis if the square of the cosine between both is larger."""
 
 _UNLIKELY_SIGMAS: Final = 3.0
 
@@ -89,19 +87,19 @@ def _loose(fitted: Fitted) -> dict[int, str]:
     position = fitted.solution.position_m - fitted.solution.position_m.mean(axis=0)
     axes = 2 if levels(fitted.measured) else 3
     extent = np.linalg.svd(position[:, :axes], compute_uv=False)
-    play = f"its ranges leave more than {determination.most_std_m(fitted.problem):.2f} m of play"
+    vague = f"its ranges give a standard deviation above {determination.most_std_m(fitted.problem):.2f} m"
     if (not fitted.core.any() and len(extent) and extent[-1] < _FLAT * extent[0]) or len(extent) < axes:
         shape = "on one line" if axes == 2 or extent[1] < _FLAT * extent[0] else "nearly in one plane"
-        why = f"all anchors are {shape}, and nothing holds them across it"
+        why = f"all anchors are {shape}, and no measurement determines their positions across it"
     elif levels(fitted.measured) and fitted.measured.facts.dimensions == 2:
-        why = play
+        why = vague
     else:
-        why = f"{play}; heights may be what is missing"
+        why = f"{vague}; give heights of anchors, if they are known"
     return dict.fromkeys(anchors, why)
 
 
 def missing_sentences(measured: Measured, links: Links, fitted: Fitted | None) -> tuple[str, ...]:
-    """One for each reason: which anchors, why, and what would mend it."""
+    """One for each reason: which anchors, why, and which distances to measure."""
     if not measured.anchors:
         return ("no anchor is determined: there are no anchors",)
     reasons = anchor_reasons(measured, links, fitted)
@@ -113,7 +111,7 @@ def missing_sentences(measured: Measured, links: Links, fitted: Fitted | None) -
     sentences = []
     for reason, anchors in by_reason.items():
         named = f"{anchors_named(anchors)} {are(anchors)} not determined: {_plural(reason, anchors)}"
-        sentences.append(named + _mending(measured, links, fitted, anchors))
+        sentences.append(named + _distances_to_measure(measured, links, fitted, anchors))
     return tuple(sentences)
 
 
@@ -123,15 +121,15 @@ def _plural(reason: str, anchors: list[int]) -> str:
     )
 
 
-def _mending(measured: Measured, links: Links, fitted: Fitted | None, anchors: list[int]) -> str:
-    """Which distances would suffice."""
+def _distances_to_measure(measured: Measured, links: Links, fitted: Fitted | None, anchors: list[int]) -> str:
+    """Which measured distances would determine these anchors."""
     if fitted is None or len(fitted.anchors) < 3:
         return ""
     placed = [index for index, fixed in zip(fitted.kept.tolist(), fitted.core, strict=True) if fixed]
     if not placed:
         chosen = mending_tapes(surveyed_problem(fitted), fitted.solution.position_m, fitted.covariance_m2, ~fitted.core)
         pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in chosen]
-        return f"; {_would(pairs)}" if pairs else ""
+        return f"; {_advised(pairs)}" if pairs else ""
     pairs = []
     for anchor in anchors:
         index = measured.anchors.index(anchor)
@@ -140,7 +138,7 @@ def _mending(measured: Measured, links: Links, fitted: Fitted | None, anchors: l
         if index in fitted.kept or lacking > len(near):
             return ""
         pairs += [(anchor, measured.anchors[other]) for other in _far_apart(near, placed, fitted, lacking)]
-    return f"; {_would(pairs)}" if pairs else ""
+    return f"; {_advised(pairs)}" if pairs else ""
 
 
 def _far_apart(near: list[int], placed: list[int], fitted: Fitted, count: int) -> list[int]:
@@ -158,8 +156,8 @@ def _far_apart(near: list[int], placed: list[int], fitted: Fitted, count: int) -
     return sorted(chosen)
 
 
-def _would(pairs: list[tuple[int, int]]) -> str:
-    return f"{tapes_named(pairs)} would mend it"
+def _advised(pairs: list[tuple[int, int]]) -> str:
+    return f"measure {distances_named(pairs)}"
 
 
 def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
@@ -185,7 +183,7 @@ def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
     pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in mending]
     return (
         f"delays of {anchors_named(anchors)} against {against} are not determined by the ranges: only the expected "
-        f"delays (±{expected:.2f} m) hold them" + (f"; {_would(pairs)}" if pairs else ""),
+        f"delays (±{expected:.2f} m) limit them" + (f"; {_advised(pairs)}" if pairs else ""),
     )
 
 
@@ -252,7 +250,7 @@ def unchecked(fitted: Fitted) -> str | None:
     if checks <= 0:
         return "nothing checks this survey: there are as many unknowns as ranges"
     if checks < LEAST_CHECKS:
-        return f"hardly anything checks this survey: {checks} range{'s' if checks > 1 else ''} more than unknowns"
+        return f"too little checks this survey: only {checks} range{'s' if checks > 1 else ''} more than unknowns"
     if excluded > checks:
         return (
             f"{excluded} ranges were left out as late, more than half of the {checks + excluded} that could check "

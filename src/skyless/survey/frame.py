@@ -61,8 +61,9 @@ def _motion(
         if not missing and len(set(named)) == len(named):
             chosen = [index[anchor] for anchor in named]
             return _by_gauge(anchors, position_m, core, axes, chosen, by_points or by_sketch, decided, notes)
-        why = f"{anchors_named(missing)} has no position" if missing else "it names one anchor twice"
-        notes.append(f"the frame cannot follow origin {joined(named)}: {why}")
+        has = "has" if len(missing) == 1 else "have"
+        why = f"{anchors_named(missing)} {has} no position" if missing else "one anchor is named twice"
+        notes.append(f"the frame cannot be defined by anchors {joined(named)}: {why}")
     mirror = "" if decided else "; the ranges do not show whether this is a mirror image: name an anchor on the left"
     if by_points is not None:
         motion = still if points_used else by_points
@@ -78,7 +79,7 @@ def _motion(
     return found.motion, f"{_sentence(anchors, found, axes)}; {_MIRROR}", _gauge_of(found, anchors), notes
 
 
-_MIRROR = "nobody has named origin and axes, and the picture may be a mirror image"
+_MIRROR = "no anchors are named for the origin and the axes, and the result may be a mirror image"
 
 
 def _by_gauge(
@@ -99,20 +100,20 @@ def _by_gauge(
     far = int(np.argmax(np.where(core, length, 0.0)))
     if length[x_axis] < _NEAR * length[far]:
         notes.append(
-            f"anchor {anchors[x_axis]} names the x axis from {length[x_axis]:.1f} m away; "
-            f"anchor {anchors[far]}, {length[far]:.1f} m away, would name it better"
+            f"anchor {anchors[x_axis]} defines the x axis from only {length[x_axis]:.1f} m away; "
+            f"choose anchor {anchors[far]}, {length[far]:.1f} m away"
         )
     found = axes_through(position_m, core, axes, origin, x_axis, chosen[2] if len(chosen) > 2 else None)
     mirror = ""
     if len(chosen) > 2 and not found.side_decided:
-        notes.append(f"anchor {anchors[chosen[2]]} stands on the x axis and cannot name the left")
+        notes.append(f"anchor {anchors[chosen[2]]} stands on the x axis, so it cannot show which side is left")
     if len(chosen) < 3 and known is not None and decided and axes == 2:
         motion = found.motion
         if np.linalg.det(motion.rotation) < 0.0:
             motion = Motion(motion.rotation * [[1.0], [-1.0], [1.0]], motion.shift_m * [1.0, -1.0, 1.0])
         found = Axes(motion, found.origin, found.x_axis, None, True)
     elif len(chosen) < 3 or not found.side_decided:
-        mirror = "; nobody has named an anchor on the left, and the picture may be a mirror image"
+        mirror = "; no anchor on the left is named, so the result may be a mirror image"
     sentence = _sentence(anchors, found, axes) + mirror
     if known is not None:
         whole = Motion(found.motion.rotation @ known.rotation, found.motion.moved(known.shift_m))
@@ -168,7 +169,7 @@ def _sentence(anchors: Integers, found: Axes, axes: int) -> str:
 def _level_notes(measured: Measured) -> list[str]:
     if levels(measured):
         return []
-    return ["nothing levels the site: heights of three anchors that are not on one line would"]
+    return ["the site may be tilted: give the heights of three anchors that are not on one line"]
 
 
 def _gauge_of(axes: Axes, anchors: Integers) -> Gauge:

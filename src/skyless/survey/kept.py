@@ -12,7 +12,8 @@ from msgspec import structs
 
 from skyless.kernels.arrays import Array
 from skyless.survey.build import Measured, as_array, build_problem, fixed_heights_m, own_delays
-from skyless.survey.fit.problem import Problem, delay_weights
+from skyless.survey.count import LEAST_CHECKS
+from skyless.survey.fit.problem import Problem, delay_weights, unit_vectors
 from skyless.survey.fit.robust import RobustFit, fit_robustly
 from skyless.survey.ranges import PairRange
 from skyless.survey.result import Survey, SurveyedAnchor, SurveyedPair
@@ -64,7 +65,7 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
         pairs=tuple(_pair(measured, pair, residuals.get((pair.a, pair.b))) for pair in measured.pairs),
         range_std_m=range_std_m,
         redundancy=redundancy,
-        unchecked=None if redundancy >= 3 else "hardly anything checks these delays: there are too few ranges",
+        unchecked=None if redundancy >= LEAST_CHECKS else "too few ranges check these delays",
         not_determined=tuple(sentences),
         ambiguities=(),
         tapes=(),
@@ -104,8 +105,7 @@ def _delay_covariance(
     of_tags = tag_information[3 * k :, 3 * k :]
     inverse = np.linalg.inv(incidence.T @ (weight[:, None] * incidence) + prior + of_tags)
     gain = inverse @ (incidence.T * weight)
-    apart = position_m[problem.first] - position_m[problem.second]
-    unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None]
+    unit = unit_vectors(position_m, problem.first, problem.second)
     shift = np.zeros((len(problem.first), k, dimensions))
     number = np.arange(len(problem.first))
     shift[number, problem.first] = unit[:, :dimensions]

@@ -42,7 +42,7 @@ def read_record(path: str | PathLike[str]) -> SurveyRecord:
     """The record in a file.
 
     Raises:
-        ConfigurationError: it cannot be read or is no such record.
+        ConfigurationError: it cannot be read, or is not the record of a survey.
     """
     try:
         return msgspec.json.decode(Path(path).read_bytes(), type=SurveyRecord)

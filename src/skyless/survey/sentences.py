@@ -19,8 +19,8 @@ def are(anchors: Sequence[int]) -> str:
     return "is" if len(anchors) == 1 else "are"
 
 
-def tapes_named(pairs: Sequence[tuple[int, int]]) -> str:
-    """``a tape between 1 and 5``, ``tapes 1–5 and 2–4``."""
+def distances_named(pairs: Sequence[tuple[int, int]]) -> str:
+    """``the distance between 1 and 5``, ``the distances 1–5 and 2–4``."""
     if len(pairs) == 1:
-        return f"a tape between {pairs[0][0]} and {pairs[0][1]}"
-    return f"tapes {joined(f'{a}–{b}' for a, b in pairs)}"
+        return f"the distance between {pairs[0][0]} and {pairs[0][1]}"
+    return f"the distances {joined(f'{a}–{b}' for a, b in pairs)}"

@@ -27,11 +27,11 @@ _MOST_ROUNDS: Final = 4
 
 _BENDS_M: Final = 0.03
 _BENT_SIGMAS: Final = (-1.0, -0.5, 0.5, 1.0)
-"""Least standard deviation of a shape that is looked at when bent, and how far it is bent."""
+"""A shape with at least this standard deviation is also examined when bent by these multiples of it."""
 
 
 class Fitted(Struct, frozen=True, eq=False):
-    """The fit of the anchors that have enough ranges, and what it is worth. ``k`` anchors."""
+    """The fit of the ``k`` anchors that have enough ranges, and its covariance."""
 
     measured: Measured
     kept: Integers
@@ -95,15 +95,15 @@ def _round(
     robust = fit_robustly(problem, [*start_positions(problem, sketch), *extra], range_std_m)
     problem, solution, used = robust.problem, robust.solution, robust.used
     if sketch is not None:
-        solution = _settled(problem, solution, robust.weight, sketch)
+        solution = _in_sketch_frame(problem, solution, robust.weight, sketch)
         robust = structs.replace(robust, solution=solution)
-    core, covariance = _worth(measured, kept, problem, solution, used, point)
+    core, covariance = _determined(measured, kept, problem, solution, used, point)
     return Fitted(
         measured, kept, robust, problem, tuple(pairs), solution, used, robust.range_std_m, core, covariance, (), ()
     )
 
 
-def _worth(
+def _determined(
     measured: Measured, kept: Integers, problem: Problem, solution: Solution, used: Mask, point: Array | None
 ) -> tuple[Mask, Array]:
     """Which anchors are determined, and the covariance aligned over them."""
@@ -148,11 +148,11 @@ def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Ma
 def with_tag(fitted: Fitted, rows: MoreRows, solution: Solution, used: Mask) -> Fitted:
     """The shape with what a tag received, where that is in the solution."""
     problem = structs.replace(fitted.problem, more=(*fitted.problem.more, rows))
-    core, covariance = _worth(fitted.measured, fitted.kept, problem, solution, used, _points(fitted))
+    core, covariance = _determined(fitted.measured, fitted.kept, problem, solution, used, _points(fitted))
     return structs.replace(fitted, problem=problem, solution=solution, used=used, core=core, covariance_m2=covariance)
 
 
-def _settled(problem: Problem, solution: Solution, weight: Array, sketch: Array) -> Solution:
+def _in_sketch_frame(problem: Problem, solution: Solution, weight: Array, sketch: Array) -> Solution:
     """The solution in the sketch's frame."""
     known = np.isfinite(sketch[:, :2]).all(axis=1)
     if known.sum() < 2:
@@ -196,13 +196,16 @@ def _held_by_points(
         by_points, by_ranges = (float(np.linalg.norm(np.diff(item[:2], axis=0))) for item in (there, moved[tested]))
         names = joined(anchors[index] for index in good)
         notes.append(
-            f"points of anchors {names} are {by_points:.2f} m apart, {by_ranges:.2f} m by the ranges: "
-            "one has moved or is mistyped?"
+            f"the points of anchors {names} are {by_points:.2f} m apart, but {by_ranges:.2f} m by the ranges: "
+            "has one of them moved, or is one mistyped?"
         )
         return np.zeros(len(point), bool), moved, _moved_sketch(sketch, motion), notes
     for index, chosen, distance in zip(tested, fits, error, strict=True):
         if not chosen:
-            notes.append(f"point of anchor {anchors[index]} does not fit by {distance:.2f} m: moved or mistyped?")
+            notes.append(
+                f"the point of anchor {anchors[index]} does not fit the ranges by {distance:.2f} m: "
+                "has the anchor moved, or is the point mistyped?"
+            )
     held = is_given.copy()
     held[tested[~fits]] = False
     return held, moved, _moved_sketch(sketch, motion), notes

@@ -55,7 +55,7 @@ def _survey(measured: Measured) -> Survey:
     if not any(pair.a in fitted_ids and pair.b in fitted_ids for pair in measured.pairs):
         return _nothing(measured, links, None)
     fitted = fit_shape(measured, kept)
-    fitted, others = with_tags(fitted, find_ambiguities(fitted.problem, fitted.robust))
+    fitted, others = with_tags(fitted, find_ambiguities(fitted.robust))
     if not fitted.core.any():
         return _nothing(measured, links, fitted)
     framed = in_frame(measured, kept, fitted.solution.position_m, fitted.covariance_m2, fitted.core, fitted.points_used)
@@ -88,7 +88,7 @@ def _links(measured: Measured) -> Links:
         np.isfinite(as_array(facts.points, measured.anchors)[:, : facts.dimensions]).all(axis=1)
     )
     least = 3 if levels(measured) else 4
-    return count_links(adjacency(len(index), [(both[:, 0], both[:, 1])]), unknown, is_known, least)
+    return count_links(adjacency(len(index), both[:, 0], both[:, 1]), unknown, is_known, least)
 
 
 def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -> tuple[SurveyedAnchor, ...]:

@@ -10,7 +10,7 @@ from skyless.constants import SPEED_OF_LIGHT_MPS
 from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.survey.ranges import PairBlock
 from skyless.survey.watch.causes import Pairs, weight_of
-from skyless.survey.watch.explain import is_striking
+from skyless.survey.watch.explain import is_significant
 from skyless.survey.watch.finding import Finding, Kind
 from skyless.survey.watch.monitor import FAST_SETTINGS, AnchorWatch, WatchSettings
 
@@ -265,5 +265,5 @@ def striking_windows(layout: WatchedLayout, window_s: float, alarm: float, windo
         count = min(_CHUNK, windows - start)
         of_tx = draw.standard_normal((count, n))
         noise = math.sqrt(0.5) * draw.standard_normal((count, m)) + 0.5 * (of_tx[:, first] + of_tx[:, second])
-        found += int(is_striking(pairs, std_m * noise, alarm).sum())
+        found += int(is_significant(pairs, std_m * noise, alarm).sum())
     return found

@@ -1,14 +1,15 @@
-"""Whether another result would fit the ranges as well, and whether anything would show a wrong one."""
+"""Other results that fit the ranges as well as the best one."""
 
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
 
-from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.kernels.arrays import Array, Mask
+from skyless.survey.fit.gauge import superimposed
 from skyless.survey.fit.neighbours import mirrored
 from skyless.survey.fit.problem import Problem, solve_least_squares
-from skyless.survey.fit.robust import RobustFit, cut_off, redundancy
+from skyless.survey.fit.robust import RobustFit, cut_off
 
 _MIRROR_AS_GOOD: Final = 16.0
 """Weighted squares by which a result that uses the same ranges may fit worse."""
@@ -22,9 +23,6 @@ _LATE_GAIN: Final = 16.0
 _MOVED_STDS: Final = 3.0
 _MOVED_M: Final = 0.1
 """Motion of an anchor that makes two results different."""
-
-_LEAST_CHECKS: Final = 3.0
-_LARGEST_SHARE_OUT: Final = 0.5
 
 _NO_MOTION: Final = 1e-9
 """Of a site, such as a line's around itself."""
@@ -45,16 +43,13 @@ class OtherFit(Struct, frozen=True, eq=False):
     reason: str
 
 
-def find_ambiguities(problem: Problem, fit: RobustFit) -> tuple[OtherFit, ...]:
-    """Results that fit nearly as well and have anchors elsewhere, the best first.
-
-    ``problem``: as given to the fit; the fit's own variances are used.
-    """
+def find_ambiguities(fit: RobustFit) -> tuple[OtherFit, ...]:
+    """Results that fit nearly as well and have anchors elsewhere, the best first."""
     problem = fit.problem
     starts = mirrored(problem, fit.solution.position_m)
     delay_m = np.tile(fit.solution.delay_m, (len(starts), 1))
     by_mirror = cut_off(problem, starts, delay_m)
-    std_m = aligned_std_m(problem, fit)
+    std_m = aligned_std_m(fit)
     is_late = solve_least_squares(problem, fit.solution.position_m).cost > fit.cost + _LATE_GAIN
     others: list[tuple[float, OtherFit]] = []
     for minima in (by_mirror, fit.others):
@@ -79,22 +74,6 @@ def find_ambiguities(problem: Problem, fit: RobustFit) -> tuple[OtherFit, ...]:
     return tuple(kept)
 
 
-def unchecked_reason(problem: Problem, fit: RobustFit) -> str | None:
-    """A sentence where a wrong range would not show, None where enough ranges check the result.
-
-    ``problem``: as given to the fit; the fit's own variances are used.
-    """
-    problem = fit.problem
-    checks = redundancy(problem, fit.solution, fit.used)
-    out = int(np.count_nonzero(~fit.used))
-    if checks < _LEAST_CHECKS:
-        used = np.count_nonzero(fit.used)
-        return f"Nothing checks this survey: of {used} ranges in use, all but {checks:.1f} are needed."
-    if out > _LARGEST_SHARE_OUT * (checks + out):
-        return f"{out} late ranges were left out; only {checks:.1f} of the rest check the result."
-    return None
-
-
 def _reason(problem: Problem, used: Mask, other: Mask) -> str:
     out = np.flatnonzero(used & ~other)
     if not out.size:
@@ -109,25 +88,16 @@ def aligned_to(problem: Problem, position_m: Array, target_m: Array) -> Array:
     """
     axes = np.flatnonzero(problem.is_free.any(axis=0))
     weight = np.ones(len(position_m))
-    moved_m = position_m
+    moved_m = position_m.copy()
     for _ in range(5):
-        moved_m = _aligned(position_m, target_m, weight, axes)
+        moved_m[:, axes] = superimposed(position_m[:, axes], target_m[:, axes], weight)
         weight = 1.0 / np.maximum(np.linalg.norm(moved_m - target_m, axis=1), 0.01)
     return moved_m
 
 
-def _aligned(position_m: Array, target_m: Array, weight: Array, axes: Integers) -> Array:
-    own, other = position_m[:, axes], target_m[:, axes]
-    share = (weight / weight.sum())[:, None]
-    own_centre, other_centre = np.sum(share * own, axis=0), np.sum(share * other, axis=0)
-    u, _, v = np.linalg.svd((share * (own - own_centre)).T @ (other - other_centre))
-    moved_m = position_m.copy()
-    moved_m[:, axes] = (own - own_centre) @ (u @ v) + other_centre
-    return np.asarray(moved_m)
-
-
-def aligned_std_m(problem: Problem, fit: RobustFit) -> Array:
+def aligned_std_m(fit: RobustFit) -> Array:
     """Of each anchor's distance from the truth, after the best rigid alignment, shape (n,)."""
+    problem = fit.problem
     free = np.flatnonzero(problem.is_free.ravel())
     motions = _rigid_motions(problem, fit.solution.position_m)[free]
     direction, length, _ = np.linalg.svd(motions, full_matrices=False)

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct, structs
 
 from skyless.kernels.arrays import Array, Integers, Mask
-from skyless.survey.fit.problem import Problem, delay_weights, residuals_m, solve_least_squares
+from skyless.survey.fit.problem import Problem, delay_weights, residuals_m, solve_least_squares, unit_vectors
 
 _MOST_STD_M: Final = 0.25
 _MOST_RANGE_STDS: Final = 4.0
@@ -61,12 +61,6 @@ class Direction(Struct, frozen=True, eq=False):
         length = np.linalg.norm(self.shift_m, axis=1)
         return np.asarray(length > TOUCHED * length.max(initial=0.0))
 
-    @property
-    def delayed(self) -> Mask:
-        """Shape (n,): those whose delays it touches."""
-        size = np.abs(self.delay_m)
-        return np.asarray((size > TOUCHED * size.max(initial=0.0)) & (size > 0.05))
-
 
 def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -> Array:
     """Weighted derivatives of ranges, tapes, delay priors and coordinate priors, shape (rows, 4 n).
@@ -83,8 +77,7 @@ def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -
     number = np.arange(m + t)
     first = np.concatenate([problem.first, problem.tape_first])
     second = np.concatenate([problem.second, problem.tape_second])
-    apart = position_m[first] - position_m[second]
-    unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None]
+    unit = unit_vectors(position_m, first, second)
     factor = np.concatenate([of_range, of_tape])
     for axis in range(3):
         rows[number, 3 * first + axis] = factor * unit[:, axis]

@@ -38,7 +38,18 @@ class Alignment(Struct, frozen=True, eq=False):
     """Whether the mirror image fits worse."""
 
 
-def align(position_m: Array, other_m: Array, std_m: float, axes: int, *, may_mirror: bool = True) -> Alignment:
+def superimposed(position_m: Array, target_m: Array, weight: Array) -> Array:
+    """Positions rotated, shifted and perhaps reflected to fit a target best (the weighted Procrustes problem).
+
+    ``position_m``, ``target_m``: shape (n, d). ``weight``: of each anchor's squared distance, shape (n,), not all 0.
+    """
+    centre = np.average(position_m, axis=0, weights=weight)
+    goal = np.average(target_m, axis=0, weights=weight)
+    left, _, right = np.linalg.svd((weight[:, None] * (position_m - centre)).T @ (target_m - goal))
+    return np.asarray((position_m - centre) @ (left @ right) + goal)
+
+
+def align(position_m: Array, other_m: Array, std_m: float, axes: int) -> Alignment:
     """Least squares without scale, positions of shape (k, 3); ``axes`` 2: about the vertical, z stays as it is.
 
     ``std_m``: of both sets' difference per axis, shape (k,) or one for all; decides about mirror images only.
@@ -56,11 +67,12 @@ def align(position_m: Array, other_m: Array, std_m: float, axes: int, *, may_mir
         rotation[:axes, :axes] = turn.T
         shift = np.zeros(3)
         shift[:axes] = goal - turn.T @ centre
-        found.append((float(np.sum(residual**2)) / std_m**2, float(np.linalg.det(turn)), Motion(rotation, shift)))
+        cost = float(np.sum(residual**2)) / max(std_m, 1e-9) ** 2
+        found.append((cost, float(np.linalg.det(turn)), Motion(rotation, shift)))
     plain = next(item for item in found if item[1] > 0.0)
     mirrored = next(item for item in found if item[1] < 0.0)
     decided = abs(plain[0] - mirrored[0]) > _DECIDED
-    best = mirrored if may_mirror and decided and mirrored[0] < plain[0] else plain
+    best = mirrored if decided and mirrored[0] < plain[0] else plain
     return Alignment(best[2], decided)
 
 

@@ -6,6 +6,7 @@ two positions fit. Groups of anchors between which there are too few distances c
 
 import numpy as np
 from msgspec import Struct
+from scipy.sparse.csgraph import connected_components
 
 from skyless.kernels.arrays import Array, Integers, Mask
 
@@ -55,27 +56,18 @@ def count_links(adjacent: Mask, unknown: Integers, is_known: Mask, least: int) -
 
 def _groups(joined: Mask, active: Mask) -> list[Integers]:
     """Connected parts of the anchors that are active."""
-    found = []
-    left = active.copy()
-    while left.any():
-        inside = np.zeros_like(left)
-        inside[np.flatnonzero(left)[0]] = True
-        while True:
-            wider = inside | (joined[inside].any(axis=0) & active)
-            if (wider == inside).all():
-                break
-            inside = wider
-        found.append(np.flatnonzero(inside))
-        left &= ~inside
-    return found
+    members = np.flatnonzero(active)
+    if not members.size:
+        return []
+    count, part = connected_components(joined[np.ix_(members, members)], directed=False)
+    return [members[part == number] for number in range(count)]
 
 
-def adjacency(n: int, pairs: list[tuple[Integers, Integers]]) -> Mask:
-    """Shape (n, n), symmetric."""
+def adjacency(n: int, first: Integers, second: Integers) -> Mask:
+    """Which of n anchors these pairs join, shape (n, n), symmetric."""
     adjacent = np.zeros((n, n), bool)
-    for first, second in pairs:
-        adjacent[first, second] = True
-    return adjacent | adjacent.T
+    adjacent[first, second] = adjacent[second, first] = True
+    return adjacent
 
 
 def distances_m(position_m: Array) -> Array:

@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 
 from skyless.kernels.arrays import Array, Integers, Mask
-from skyless.survey.fit.problem import Problem, Solution
+from skyless.survey.fit.links import adjacency
+from skyless.survey.fit.problem import Problem, Solution, unit_vectors
 
 _MOST_NEIGHBOURS: Final = 12
 """Whose ranges give an anchor's other positions."""
@@ -159,8 +160,7 @@ def derivatives(problem: Problem, solution: Solution, ranges: Integers) -> Array
     """Of modelled ranges by the unknowns, shape (ranges, u)."""
     n = len(problem.delay_m)
     first, second, row = problem.first[ranges], problem.second[ranges], np.arange(len(ranges))
-    apart = solution.position_m[first] - solution.position_m[second]
-    unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None]
+    unit = unit_vectors(solution.position_m, first, second)
     whole = np.zeros((len(ranges), n, 4))
     whole[row, first, :3] = unit
     whole[row, second, :3] = -unit
@@ -182,9 +182,7 @@ def mirrored(problem: Problem, position_m: Array) -> Array:
     """
     axes = np.flatnonzero(problem.is_free.all(axis=0))
     n = len(position_m)
-    joined = np.zeros((n, n), dtype=np.bool_)
-    joined[problem.first, problem.second] = joined[problem.second, problem.first] = True
-    joined[problem.tape_first, problem.tape_second] = joined[problem.tape_second, problem.tape_first] = True
+    joined = adjacency(n, problem.first, problem.second) | adjacency(n, problem.tape_first, problem.tape_second)
     starts = []
     for part in _hanging_parts(joined, len(axes)):
         hinge = joined[part].any(axis=0) & ~part

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from skyless.kernels.arrays import Array
+from skyless.survey.fit.links import adjacency
 from skyless.survey.fit.problem import Problem
 
 _STEPS: Final = 12
@@ -28,9 +29,7 @@ class Presence:
         """``position_m``: shape (n, 3)."""
         n = len(position_m)
         self._first, self._second = np.triu_indices(n, 1)
-        joined = np.zeros((n, n), dtype=np.bool_)
-        joined[problem.first, problem.second] = joined[problem.second, problem.first] = True
-        self._is_present = joined[self._first, self._second]
+        self._is_present = adjacency(n, problem.first, problem.second)[self._first, self._second]
         share = float(np.mean(self._is_present)) if self._is_present.size else 1.0
         self._curve: Array | None = None
         if not 0.0 < share < 1.0:

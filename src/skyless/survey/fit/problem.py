@@ -161,6 +161,12 @@ def residuals_m(problem: Problem, position_m: Array, delay_m: Array) -> Array:
     return np.asarray(problem.range_m - distance - delay_m[..., problem.first] - delay_m[..., problem.second])
 
 
+def unit_vectors(position_m: Array, first: Integers, second: Integers) -> Array:
+    """Directions from the second to the first anchor of each pair, shape (pairs, 3); 0 where both are at one place."""
+    apart = position_m[first] - position_m[second]
+    return np.asarray(apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None])
+
+
 class _Equations:
     """Normal equations of a problem; rows are ranges, then tapes."""
 

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import replace
+from msgspec.structs import astuple, replace
 
 from skyless.kernels.arrays import Array, Mask
 from skyless.survey.fit.neighbours import derivatives, regular, relocated, without_ranges
@@ -236,13 +236,9 @@ def _near(problem: Problem, solution: Solution, used: Mask) -> Minima:
 
 def _joined(some: Minima, more: Minima) -> Minima:
     """All of them, the best first."""
-    both = [np.concatenate(parts) for parts in zip(_fields(some), _fields(more), strict=True)]
+    both = [np.concatenate(parts) for parts in zip(astuple(some), astuple(more), strict=True)]
     order = np.argsort(both[3], kind="stable")
     return Minima(*(part[order] for part in both))
-
-
-def _fields(minima: Minima) -> tuple[Array, Array, Mask, Array]:
-    return minima.position_m, minima.delay_m, minima.used, minima.cost
 
 
 def redundancy(problem: Problem, solution: Solution, used: Mask) -> float:

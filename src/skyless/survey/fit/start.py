@@ -8,8 +8,10 @@ import zlib
 from typing import Final
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
-from skyless.kernels.arrays import Array, Integers
+from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.survey.fit.gauge import superimposed
 from skyless.survey.fit.problem import Problem
 
 _PERTURBED: Final = 6
@@ -36,7 +38,8 @@ def start_positions(problem: Problem, sketch_m: Array | None = None) -> list[Arr
     for _ in range(_PERTURBED):
         kept = np.triu(rng.random(distance_m.shape) < _KEPT_SHARE, 1)
         fewer_m = np.where(kept | kept.T, distance_m, np.inf)
-        position_m = _layout(_completed(np.where(_connects(fewer_m), fewer_m, distance_m)), len(axes))
+        parts, _ = connected_components(np.isfinite(fewer_m), directed=False)
+        position_m = _layout(_completed(fewer_m if parts == 1 else distance_m), len(axes))
         moved_m = _MOVED_SHARE * max(float(position_m.std()), 0.1)
         laid_out.append(position_m + rng.normal(0.0, moved_m, position_m.shape))
     starts = []
@@ -75,14 +78,6 @@ def _completed(distance_m: Array) -> Array:
     return np.asarray(np.where(finite, path_m, path_m[finite].max(initial=1.0)))
 
 
-def _connects(distance_m: Array) -> bool:
-    """Whether paths lead from the first anchor to all others."""
-    reached = np.arange(len(distance_m)) == 0
-    for _ in range(len(distance_m)):
-        reached = reached | np.isfinite(distance_m[reached]).any(axis=0) if reached.any() else reached
-    return bool(reached.all())
-
-
 def _layout(distance_m: Array, dimensions: int) -> Array:
     """Classical multidimensional scaling, shape (n, dimensions)."""
     squared = distance_m**2
@@ -119,11 +114,9 @@ def _levelled(position_m: Array, height_m: Array) -> Array:
 
 def _aligned(position_m: Array, known_m: Array, axes: Integers) -> Array:
     """Moved rigidly, or reflected, along some axes to anchors known in all of these."""
-    known = np.isfinite(known_m[:, axes]).all(axis=1)
+    known: Mask = np.asarray(np.isfinite(known_m[:, axes]).all(axis=1))
     if not known.any():
         return position_m
-    own, other = position_m[np.ix_(known, axes)], known_m[np.ix_(known, axes)]
-    u, _, v = np.linalg.svd((own - own.mean(axis=0)).T @ (other - other.mean(axis=0)))
     moved_m = position_m.copy()
-    moved_m[:, axes] = (position_m[:, axes] - own.mean(axis=0)) @ (u @ v) + other.mean(axis=0)
+    moved_m[:, axes] = superimposed(position_m[:, axes], np.nan_to_num(known_m[:, axes]), known.astype(np.float64))
     return moved_m

@@ -10,7 +10,8 @@ from msgspec import Struct
 
 from skyless.kernels.arrays import Array, Mask
 from skyless.survey.fit.determined import most_std_m, position_stds_m
-from skyless.survey.fit.problem import Problem
+from skyless.survey.fit.links import adjacency
+from skyless.survey.fit.problem import Problem, unit_vectors
 
 TAPE_STD_M: Final = 0.005
 """Of a distance that has not been measured yet."""
@@ -48,13 +49,10 @@ def best_tapes(
     """
     n = len(position_m)
     first, second = np.triu_indices(n, 1)
-    has_tape = np.zeros((n, n), bool)
-    has_tape[problem.tape_first, problem.tape_second] = True
-    has_tape |= has_tape.T
+    has_tape = adjacency(n, problem.tape_first, problem.tape_second)
     usable = core[first] & core[second] & ~has_tape[first, second]
     first, second = first[usable], second[usable]
-    apart = position_m[first] - position_m[second]
-    unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None]
+    unit = unit_vectors(position_m, first, second)
     inside = np.repeat(core, 3)
     covariance = covariance_m2.copy()
     chosen: list[TapeChoice] = []

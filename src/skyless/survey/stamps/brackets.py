@@ -6,6 +6,7 @@ counter by the legs from a to b before and after it; one from a to b likewise on
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import astuple, replace
 
 from skyless.clocks.two_way import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS
 from skyless.kernels.arrays import Array, Integers, Mask
@@ -27,10 +28,7 @@ class Legs(Struct, frozen=True, eq=False):
 
     def part(self, index: Integers | Mask) -> "Legs":
         """Some of the rows."""
-        return Legs(
-            self.pair[index], self.a_ticks[index], self.b_ticks[index], self.is_back[index], self.is_used[index],
-            self.t_s[index],
-        )  # fmt: skip
+        return Legs(*(column[index] for column in astuple(self)))
 
 
 class Flights(Struct, frozen=True, eq=False):
@@ -54,13 +52,9 @@ def flights_of(legs: Legs, longest_ticks: int) -> tuple[Flights, Legs, int]:
     used = legs.is_used.copy()
     used[legs_a.seen] = True
     used[legs_b.seen] = True
-    flights = Flights(
-        np.concatenate([legs_a.flights.leg, legs_b.flights.leg]),
-        np.concatenate([legs_a.flights.ticks, legs_b.flights.ticks]),
-        np.concatenate([legs_a.flights.part, legs_b.flights.part]),
-    )
+    flights = Flights(*map(np.concatenate, zip(astuple(legs_a.flights), astuple(legs_b.flights), strict=True)))
     needed = legs_a.is_needed | legs_b.is_needed
-    kept = Legs(legs.pair, legs.a_ticks, legs.b_ticks, legs.is_back, used, legs.t_s).part(needed)
+    kept = replace(legs, is_used=used).part(needed)
     return flights, kept, legs_a.impossible + legs_b.impossible
 
 

@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import astuple
 
 from skyless.constants import TICK_BITS, TICK_M, TICK_RATE_HZ
 from skyless.kernels.arrays import Array, Integers, Mask
@@ -21,6 +22,9 @@ from skyless.ticks import Unwrapper
 
 _KEPT_S: Final = 5.0
 """Legs wait so long for the other direction, which another anchor may publish later."""
+
+_LARGEST_TICKS: Final = 1 << 62
+"""Stamps are computed with 64 bits."""
 
 _MOST_BLOCKS: Final = 256
 _MOST_PAIRS: Final = 1 << 16
@@ -45,7 +49,8 @@ class PairRanger:
     """Gathers directed legs between anchors; memory does not grow with time.
 
     ``counters``: ``legs``, and what was dropped: ``impossible`` (brackets that cannot be of one pair of counters),
-    ``unusable`` (legs from an anchor to itself, or without a finite time), ``too-many-pairs``.
+    ``unusable`` (legs from an anchor to itself, without a finite time, or with stamps that no counter has),
+    ``too-many-pairs``.
     """
 
     def __init__(
@@ -81,7 +86,7 @@ class PairRanger:
 
         Order matters little: directions of a pair may come one after the other, seconds late.
         """
-        if sender == receiver or not math.isfinite(t_s):
+        if sender == receiver or not math.isfinite(t_s) or max(abs(tx_ticks), abs(rx_ticks)) > _LARGEST_TICKS:
             self.counters["unusable"] += 1
             return
         pair = (sender, receiver) if sender < receiver else (receiver, sender)
@@ -344,11 +349,4 @@ def _legs_of(rows: list[tuple[int, int, int, bool, float]]) -> Legs:
 
 def _joined(one: Legs, other: Legs) -> Legs:
     """The rows of both, the first one's first."""
-    return Legs(
-        np.concatenate([one.pair, other.pair]),
-        np.concatenate([one.a_ticks, other.a_ticks]),
-        np.concatenate([one.b_ticks, other.b_ticks]),
-        np.concatenate([one.is_back, other.is_back]),
-        np.concatenate([one.is_used, other.is_used]),
-        np.concatenate([one.t_s, other.t_s]),
-    )
+    return Legs(*map(np.concatenate, zip(astuple(one), astuple(other), strict=True)))

@@ -27,9 +27,13 @@ _UNKNOWN_NOISE_M: Final = 0.05
 
 
 def mean_ranges(ranges_m: Mapping[tuple[int, int], Sequence[float]], anchors: Iterable[int] = ()) -> PairRanges:
-    """One range of each pair, by pair ``(a, b)`` with a < b; ``anchors``: further ones, without a range."""
-    noise_m = _noise(ranges_m)
-    pairs = tuple(_mean(a, b, np.sort(np.asarray(values)), noise_m) for (a, b), values in sorted(ranges_m.items()))
+    """One range of each pair, by pair ``(a, b)`` with a < b; ``anchors``: further ones, without a range.
+
+    Ranges that are not finite are left out, and so are pairs without any other.
+    """
+    finite_m = {pair: [value for value in values if math.isfinite(value)] for pair, values in ranges_m.items()}
+    noise_m = _noise(finite_m)
+    pairs = tuple(_mean(a, b, np.sort(values), noise_m) for (a, b), values in sorted(finite_m.items()) if values)
     everybody = {anchor for pair in ranges_m for anchor in pair} | set(anchors)
     return PairRanges(pairs, tuple(sorted(everybody)))
 

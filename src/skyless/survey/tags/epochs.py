@@ -5,12 +5,14 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from skyless.kernels.arrays import Array, Integers, Vector
 from skyless.survey.tags.received import TagReceived
 
 EPOCH_S: Final = 0.5
-"""Reflections change within so short a walk: the errors of two epochs count as independent."""
+"""Reflections change while a tag is carried for half a second: the errors of two epochs count as independent."""
 
 WALK_OFFSET_STD_M: Final = 0.07
 """Constant by which a tag's ranges to an anchor differ from what the anchors' own ranges say of its delay: stamps of
@@ -23,7 +25,7 @@ _LONE_STD_M: Final = 0.07
 """Of a single difference, for its weight against the velocity's prior."""
 
 _FLOOR_COUNT: Final = 20
-"""More samples of a pair in one epoch count no more: what they share is larger then than their noise."""
+"""With more samples of a pair in one epoch the errors that they share exceed their noise: the weight grows no more."""
 
 _SPEED_STD_MPS: Final = 1.5
 _REJECT: Final = 4.0
@@ -162,15 +164,8 @@ def tag_ranges(epochs: TagEpochs, pair_ranges_m: Mapping[tuple[int, int], float]
 
 def _largest_part(first: Integers, second: Integers, k: int, n: int) -> Array:
     """Whether each anchor is in its epoch's largest part that differences tie together, shape (k, n), truth values."""
-    label = np.arange(k * n)
-    while True:
-        least = np.minimum(label[first], label[second])
-        after = label.copy()
-        np.minimum.at(after, first, least)
-        np.minimum.at(after, second, least)
-        if np.array_equal(after, label):
-            break
-        label = after
+    edges = coo_array((np.ones(len(first)), (first, second)), shape=(k * n, k * n))
+    label = connected_components(edges, directed=False)[1]
     size = np.bincount(label, minlength=k * n)
     of_node = size[label].reshape(k, n)
     most = of_node.max(axis=1, initial=0, keepdims=True)

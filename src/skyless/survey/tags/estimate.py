@@ -249,7 +249,7 @@ def estimate(differences: Differences, *, zero: int | None = None, slope: bool =
     chosen = steep if steep is not None and not note else plain
     for anchor, count in zip(chosen.anchors.tolist(), chosen.counts.tolist(), strict=True):
         if count < _FEWEST:
-            reasons[anchor] = f"only {count} differences that can be used; it takes {_FEWEST}"
+            reasons[anchor] = f"only {count} differences that can be used; {_FEWEST} are needed"
     return _estimate(differences, chosen, steep, note or "used", reasons, zero)
 
 
@@ -276,7 +276,7 @@ def _slope_note(found: Fit) -> str:
     if slope_m < _SURE * std_m:
         return "not used: it does not differ from zero"
     if slope_m > _STEEPEST_M:
-        return "not used: no radio has such a slope, so something else is behind it"
+        return "not used: no radio has such a slope, so it has another cause"
     return ""
 
 

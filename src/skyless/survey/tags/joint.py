@@ -6,10 +6,12 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from skyless.kernels.arrays import Array, Mask
+from skyless.survey.fit.links import distances_m
 from skyless.survey.fit.problem import Problem, Solution, solve_least_squares
+from skyless.survey.fit.robust import LATE_CUTOFF
 from skyless.survey.tags.epochs import EPOCH_S, TagEpochs, tag_ranges
 from skyless.survey.tags.walk import WalkRows
 
@@ -17,13 +19,12 @@ _FEWEST_EPOCHS: Final = 10
 _LIMIT: Final = 4.0
 """Standard deviations beyond which a range of the tag is not used."""
 
-_LATE: Final = 3.0
-"""The same for ranges between anchors, as in the robust fit."""
-
 _MOST_EXCLUDED: Final = 0.2
-_CONFIDENCE: Final = 0.9999
-_ALIKE: Final = 4.0
-"""So many neighbouring ranges of a walk count as one in the test of its residuals, for reflections last."""
+_FALSE_ALARM: Final = 1e-4
+"""Probability that the chi-squared tests reject a walk that fits."""
+
+_RANGES_PER_INDEPENDENT: Final = 4.0
+"""The residuals of a walk are tested as if only every fourth range were independent: reflections outlast an epoch."""
 
 _CLEARLY: Final = 16.0
 """A result whose cost is higher by this is not the right one."""
@@ -109,20 +110,20 @@ def _trial(problem: Problem, start_m: Array, epochs: TagEpochs, range_m: Array, 
             break
         solution = solve_least_squares(both, solution.position_m, weight)
     excluded = int(rows.measured.sum() - rows.used.sum())
-    return _Trial(solution, rows, solution.cost + _LIMIT**2 * excluded + _LATE**2 * int((~used).sum()))
+    return _Trial(solution, rows, solution.cost + _LIMIT**2 * excluded + LATE_CUTOFF**2 * int((~used).sum()))
 
 
 def _unfit(problem: Problem, alone: Solution, trial: _Trial) -> str | None:
     """Why ranges and walk are not to be used together."""
     rows, solution = trial.rows, trial.solution
     if rows.epochs < _FEWEST_EPOCHS:
-        return f"only {rows.epochs} epochs of half a second have enough anchors; it takes {_FEWEST_EPOCHS}"
+        return f"only {rows.epochs} epochs of half a second have enough anchors; {_FEWEST_EPOCHS} are needed"
     if rows.excluded_share > _MOST_EXCLUDED:
         return f"{rows.excluded_share:.0%} of its ranges do not fit, as where anchors are not in sight"
     jacobian, _ = rows.rows(solution.position_m, solution.delay_m)
-    independent = rows.freedom / _ALIKE
+    independent = rows.freedom / _RANGES_PER_INDEPENDENT
     excess = rows.cost / max(rows.freedom, 1)
-    if excess > chi2.ppf(_CONFIDENCE, independent) / independent:
+    if excess > chdtri(independent, _FALSE_ALARM) / independent:
         return f"its residuals are {np.sqrt(excess):.1f} times what they should be"
     n = len(solution.delay_m)
     unknown = np.concatenate([np.flatnonzero(problem.is_free.ravel()), 3 * n + np.arange(n)])
@@ -132,14 +133,13 @@ def _unfit(problem: Problem, alone: Solution, trial: _Trial) -> str | None:
         np.trace(np.linalg.pinv(solution.information, rcond=1e-12, hermitian=True) @ of_ranges)
     )
     rise = solution.cost - rows.cost - alone.cost
-    checks = int((alone.residual_m.size) + n - np.linalg.matrix_rank(of_ranges, hermitian=True))
+    checks = int(alone.residual_m.size + n - np.linalg.matrix_rank(of_ranges, hermitian=True))
     usual = max(1.0, alone.cost / checks) if checks > 0 else 1.0
-    if rise > usual * chi2.ppf(_CONFIDENCE, max(taken, 1.0)):
+    if rise > usual * chdtri(max(taken, 1.0), _FALSE_ALARM):
         return "it contradicts the ranges between the anchors"
     return None
 
 
 def _same(one: Solution, other: Solution) -> bool:
     """Whether two results have the same distances, within 2 cm."""
-    apart = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in (one.position_m, other.position_m)]
-    return bool(np.abs(apart[0] - apart[1]).max() < 0.02)
+    return bool(np.abs(distances_m(one.position_m) - distances_m(other.position_m)).max() < 0.02)

@@ -21,7 +21,7 @@ _LEAST_SCALE_M: Final = 0.05
 """Of residuals, where ranges are looked for that do not fit."""
 
 _LEAST_FREE: Final = 0.05
-"""Part of a range's error that shows in its residual, at least."""
+"""Least part of a range's error that is assumed to show in its residual."""
 
 _SLOPE_M: Final = 0.025
 _SLOPE_STD_M: Final = 0.03
@@ -37,7 +37,7 @@ _GRID: Final = 9
 """Positions along each horizontal axis from which an epoch may start."""
 
 _ELSEWHERE_M: Final = 2.0
-"""Anchors that are so far from where they were last are another result: the tag's positions start again."""
+"""If an anchor has moved by more since the last evaluation, it is another result: the tag's positions start again."""
 
 _LEVELS: Final = 5
 """Heights from which a walk may start; all of its epochs start at one."""

@@ -60,22 +60,22 @@ class _Set(Struct, frozen=True, eq=False):
     """Whether no further cause is worth adding."""
 
 
-def is_striking(pairs: Pairs, change_m: Array, alarm: float) -> Array:
-    """Whether any cause has more evidence than chance gives with probability ``alarm``.
+def is_significant(pairs: Pairs, change_m: Array, false_alarm: float) -> Array:
+    """Whether any cause has more evidence than chance gives with probability ``false_alarm``.
 
     ``change_m``: shape (..., m); result of shape (...).
     """
     found, dof = evidence(pairs, pairs.weight, change_m @ pairs.weight)
-    return np.asarray((found > thresholds(dof, alarm)).any(axis=-1))
+    return np.asarray((found > thresholds(dof, false_alarm)).any(axis=-1))
 
 
 def nothing(pairs: Pairs, change_m: Array) -> Explanation:
-    """Of a window in which nothing strikes."""
+    """Of a window that noise and drift explain."""
     return Explanation((), pairs.weight, change_m @ pairs.weight)
 
 
 def explain(pairs: Pairs, change_m: Array) -> Explanation:
-    """Of a window in which something strikes. ``change_m``: shape (m,)."""
+    """Of a window with a significant change. ``change_m``: shape (m,)."""
     sets = _grown(pairs, change_m)
     sets += _blocked(pairs, change_m, max(sets, key=lambda one: one.score))
     best = max(sets, key=lambda one: one.score)

@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.survey.ranges import PairBlock
 from skyless.survey.watch.causes import Pairs, evidence, weight_of
-from skyless.survey.watch.explain import Explanation, Part, explain, is_striking, nothing
+from skyless.survey.watch.explain import Explanation, Part, explain, is_significant, nothing
 from skyless.survey.watch.finding import Finding, sentence_of, silent_link
 from skyless.survey.watch.history import HistorySettings, RangeHistory
 
@@ -21,14 +21,14 @@ _LASTING: Final = 1e-3
 """A finding lasts while what it says has more evidence than chance gives with this probability."""
 
 _SLOW_DRIFT: Final = 2.0
-"""By how much more than a window the usual range drifts from the first one."""
+"""Drift of the usual range from the first one, as a multiple of that of one window from the usual range."""
 
 _REGULAR: Final = 0.8
 """Share of windows in which a pair must have had ranges for their absence to be a finding."""
 _KNOWN_WINDOWS: Final = 12
 
 _FARTHEST_M: Final = 1e5
-"""Of ranges, delays included."""
+"""Longest range, delays included."""
 
 _MEDIAN_BLOCKS: Final = 3
 """Blocks from which on their median counts, which short obstacles do not change."""
@@ -47,8 +47,8 @@ class WatchSettings(Struct, frozen=True):
     needed: int = 2
     of: int = 3
     """Something is found when it is seen in ``needed`` of the last ``of`` windows."""
-    alarm: float = 1e-6
-    """Probability that noise and drift let a window strike."""
+    false_alarm: float = 1e-6
+    """Probability that noise and drift alone make the changes of a window significant."""
     learning_windows: int = 12
     """Windows before the watch begins, for pairs without a given range."""
     silent_windows: int = 3
@@ -63,7 +63,7 @@ FAST_SETTINGS: Final = WatchSettings(
     steps=2,
     needed=1,
     of=1,
-    alarm=1e-7,
+    false_alarm=1e-7,
     learning_windows=200,
     silent_windows=20,
     grace_s=0.0,
@@ -276,7 +276,7 @@ class AnchorWatch:
         white_m = np.sqrt(np.maximum(history.noise_m2[known], 1e-8) / exchanges[known] * reference)
         pairs = self._pairs(known, white_m, drift_m[known] * np.sqrt(reference))
         change_m = range_m[known] - history.usual_m[known]
-        if bool(is_striking(pairs, change_m, self._settings.alarm)):
+        if bool(is_significant(pairs, change_m, self._settings.false_alarm)):
             return explain(pairs, change_m)
         return nothing(pairs, change_m)
 
@@ -290,7 +290,7 @@ class AnchorWatch:
             return ()
         rows = known[is_old]
         pairs = self._pairs(rows, np.full(len(rows), 1e-4), _SLOW_DRIFT * drift_m[rows])
-        if not bool(is_striking(pairs, change_m[is_old], self._settings.alarm)):
+        if not bool(is_significant(pairs, change_m[is_old], self._settings.false_alarm)):
             return ()
         return explain(pairs, change_m[is_old]).parts
 
