@@ -22,6 +22,12 @@ def until(page, expression, arg=None, timeout_s=6.0):
         time.sleep(0.03)
 
 
+THREE_FRAMES = """() => new Promise((done) => {
+  const wait = (left) => (left ? requestAnimationFrame(() => wait(left - 1)) : done());
+  wait(3);
+})"""
+
+
 class Visit:
     """A page that is open, and what went wrong in it."""
 
@@ -34,6 +40,7 @@ class Visit:
         self.page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
         self.page.goto(address)
         until(self.page, "window.skyless?.state.connection.phase === 'open'")
+        self.page.evaluate(THREE_FRAMES)  # the map is fitted to the site in the frame after its message
 
     def _note(self, text):
         self.problems.append(text)
