@@ -21,7 +21,7 @@ LAYERS = (
     {"clocks", "radios.interface"},
     {"positioning"},
     {"master_election", "slot_claims", "survey"},
-    {"anchor", "anchors", "receiver", "mqtt"},
+    {"anchor", "anchors", "receiver", "receiver_state", "mqtt"},
     {"simulation", "recordings"},
     {"radios"},
     {"evaluation"},
