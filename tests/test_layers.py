@@ -25,7 +25,7 @@ LAYERS = (
     {"simulation", "recordings"},
     {"radios"},
     {"evaluation"},
-    {"replay"},
+    {"replays"},
     {"nodes", "paper", "planning"},
     {"studies"},
     {"survey_inputs", "bench", "dashboard"},

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from skyless.evaluation.judge import Judge
     from skyless.positioning.fix import Fix
     from skyless.recordings.truth import Truth
-    from skyless.replay.captures import Replay, ReplayReport
-    from skyless.replay.site import SiteReplay, TagReport
+    from skyless.replays.captures import Replay, ReplayReport
+    from skyless.replays.site import SiteReplay, TagReport
 
 FIXES_COLUMNS: Final = (
     *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
@@ -144,7 +144,7 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
     from skyless.evaluation.judge import Judge
     from skyless.recordings.anchor_table import read_calibration
     from skyless.recordings.foreign.formats import format_of
-    from skyless.replay.captures import MEASUREMENTS, Replay, ReplayRequest
+    from skyless.replays.captures import MEASUREMENTS, Replay, ReplayRequest
 
     protection = asked.protection
     of_sites = {
@@ -229,7 +229,7 @@ def _distances(file: Path, name: str) -> dict[str, float]:
 def _replay_site(file: Path, asked: ReplayOptions) -> None:
     """Replay all tags of a recording of skyless record, or one. Raises SkylessError."""
     from skyless.recordings.mcap.recording import McapRecording
-    from skyless.replay.site import SiteReplay
+    from skyless.replays.site import SiteReplay
     from skyless.site.load import load_site
 
     useless = {
@@ -350,7 +350,7 @@ def _row(fix: "Fix") -> list[str]:
 
 def _draw_track(path: Path, judge: "Judge", report: "ReplayReport") -> None:
     """Draw what --plot asks for. Raises SkylessError."""
-    from skyless.replay.plot import draw
+    from skyless.replays.plot import draw
 
     try:
         draw(path, judge.track.rows, f"{report.format}, {report.fixes} fixes")

@@ -22,7 +22,7 @@ from skyless.positioning.masterless.pair_engine import PairEngine
 from skyless.recordings.foreign.formats import Recording
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.recordings.source import Drops
-from skyless.replay.site import HostClock, reception_of
+from skyless.replays.site import HostClock, reception_of
 from skyless.survey.tags.estimate import Differences
 from skyless.ticks import difference, from_seconds
 

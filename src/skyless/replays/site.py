@@ -24,8 +24,8 @@ from skyless.recordings.mcap.checkpoint import RefusedError, load
 from skyless.recordings.mcap.recording import McapRecording, Recorded
 from skyless.recordings.source import Drops
 from skyless.recordings.truth import Truth
-from skyless.replay.antenna_delays import DelayChange, delay_changes, with_delays
-from skyless.replay.captures import ReplayReport, common_figures
+from skyless.replays.antenna_delays import DelayChange, delay_changes, with_delays
+from skyless.replays.captures import ReplayReport, common_figures
 from skyless.site.model import Site
 from skyless.ticks import WRAP_TICKS, Unwrapper
 
