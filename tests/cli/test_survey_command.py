@@ -171,7 +171,8 @@ def test_an_anchor_that_nobody_receives_is_not_determined_and_stays(hall, capsys
 def test_anchors_without_positions_get_theirs(hall, capsys, tmp_path):
     out = tmp_path / "placed.toml"
     report = run(
-        capsys, "--ranges", hall / "ranges.csv", "--anchor-heights", hall / "heights.csv", "--site", hall / "blank.toml",
+        capsys, "--ranges", hall / "ranges.csv", "--anchor-heights", hall / "heights.csv",
+        "--site", hall / "blank.toml",
         "--origin", 1, "--x-axis", 4, "--left", 9, "--out", out,
     )  # fmt: skip
     site = load_site(out)

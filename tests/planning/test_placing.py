@@ -19,7 +19,6 @@ from skyless.planning.optimise import (
     mean_and_worst,
     one_more,
     site_with,
-    site_with,
     site_with_one_more,
 )
 from skyless.planning.predict import PlanSettings, Predictor

@@ -235,7 +235,8 @@ def _replay_site(file: Path, asked: ReplayOptions) -> None:
     useless = {
         "anchors": asked.anchors, "truth": asked.truth, "lever-arm": asked.lever_arm, "format": asked.format,
         "listener": asked.listener, "qa": asked.qa, "tdoa-std": asked.tdoa_std, "measurements": asked.measurements,
-        "tag-height": None if asked.tag_height == "auto" else asked.tag_height, "uncalibrated": asked.uncalibrated or None,
+        "tag-height": None if asked.tag_height == "auto" else asked.tag_height,
+        "uncalibrated": asked.uncalibrated or None,
     }  # fmt: skip
     check_left_out(useless, "a recording of skyless record brings its own")
     required = None
