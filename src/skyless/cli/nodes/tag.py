@@ -47,7 +47,7 @@ class TagOptions:
     qa: Positive = 0.3
     """Process noise for the tags' motion: spectral density of the acceleration in m²/s³ (joint)."""
     protection: ProtectionOptions = ProtectionOptions()
-    height_std: NotNegative | None = None
+    tag_height_std: NotNegative | None = None
     """Standard deviation of the tags' height from the one that is given, in metres, which fixes and levels then
     count (joint); 0 by default, for sniffers 0.5 where the height is only taken for the anchors'."""
     publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0
@@ -57,7 +57,7 @@ class TagOptions:
     default 0; it should be no other site's."""
     anchors: Path | None = None
     """Sniffers only: table of the system's anchors, id,x_m,y_m,z_m, as skyless replay and calibrate take it."""
-    height: str | None = None
+    tag_height: str | None = None
     """Sniffers only: the tags' height in metres, free (estimated) or auto, the default: estimated unless the anchors
     lie too flat, then theirs."""
 
@@ -93,8 +93,10 @@ def tag(
         if asked.protection.given:
             raise SkylessError("--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers")
         serve = _on_sniffers(names, asked, address)
-    elif asked.anchors is not None or asked.height is not None:
-        raise SkylessError("--anchors and --height are for sniffers; other tags hear from the air where anchors stand")
+    elif asked.anchors is not None or asked.tag_height is not None:
+        raise SkylessError(
+            "--anchors and --tag-height are for sniffers; other tags hear from the air where anchors stand"
+        )
     else:
         serve = _on_radios(names, asked, address)
     with contextlib.suppress(KeyboardInterrupt):
@@ -106,7 +108,7 @@ def _on_radios(names: tuple[str, ...], asked: TagOptions, address: "MqttAddress 
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.nodes.tag import Tags, TagSettings
 
-    required = asked.protection.requirement(asked.method, asked.height_std)
+    required = asked.protection.requirement(asked.method, asked.tag_height_std)
     settings = TagSettings(asked.method, asked.qa, asked.site_id, integrity=required, publish_hz=asked.publish_hz)
     radios = open_radios(asked.radio, "tag", names)
     with loading_kernels():
@@ -137,23 +139,23 @@ def _system(asked: TagOptions) -> "PacketTagSettings":
     if asked.anchors is None:
         raise SkylessError("--anchors is missing; a sniffer needs a table of the system's anchors: id,x_m,y_m,z_m")
     anchors_m, std_m = read_anchors(asked.anchors), 0.0
-    if asked.height in (None, "auto"):
+    if asked.tag_height in (None, "auto"):
         height_m = plane_height_m(anchors_m)
         if height_m is not None:
             std_m = GUESSED_STD_M
             log(
                 "the anchors lie too flat to determine the height; tags are taken to be at theirs: "
-                f"--height {height_m:.2f}"
+                f"--tag-height {height_m:.2f}"
             )
     else:
-        height_m = None if asked.height == "free" else height_number(str(asked.height), "free or auto")
-    check_height_std(asked.height_std, height_m)
+        height_m = None if asked.tag_height == "free" else height_number(str(asked.tag_height), "free or auto")
+    check_height_std(asked.tag_height_std, height_m)
     return PacketTagSettings(
         anchors_m,
         site=TDOA_SITE if asked.site_id is None else asked.site_id,
         qa=asked.qa,
         height_m=height_m,
-        height_std_m=std_m if asked.height_std is None else asked.height_std,
+        height_std_m=std_m if asked.tag_height_std is None else asked.tag_height_std,
         calibration=read_calibration(asked.anchors),
         publish_hz=asked.publish_hz,
     )
