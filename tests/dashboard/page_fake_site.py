@@ -33,8 +33,8 @@ def site_message(unix_s, floor_plan=None, mode="master", placed=True):
 
 
 def names(count):
-    few = ("forklift", "trolley", "robot")
-    return [few[n] if n < 3 and count <= 3 else f"tag-{n + 1:03d}" for n in range(count)]
+    few = ("forklift", "trolley", "robot", "drone")
+    return [few[n] if count <= len(few) else f"tag-{n + 1:03d}" for n in range(count)]
 
 
 def truth(number, time_s):
@@ -57,7 +57,19 @@ def state_row(name, number, time_s, unix_s):
     used = 8 - (1 if math.sin(0.7 * time_s + number) > 0.6 else 0)
     chi2 = used * (0.8 + 0.6 * math.sin(5.3 * time_s + number) ** 2)
     numbers = [x + dx, y + dy, 1.2, vx, vy, xx, xy, yy, math.sqrt(xx + yy), math.hypot(dx, dy), x, y]
-    return [name, *(round(value, 5) for value in numbers), used, round(chi2, 3), unix_s, 0.6 * ease, ALERTS[number % 5]]
+    estimated = name.startswith("drone")
+    if estimated:
+        numbers[2] = 1.5 + math.sin(0.4 * time_s)
+    rest = [
+        used,
+        round(chi2, 3),
+        unix_s,
+        0.6 * ease,
+        ALERTS[number % 5],
+        int(not estimated),
+        0.08 if estimated else None,
+    ]
+    return [name, *(round(value, 5) for value in numbers), *rest]
 
 
 def mqtt():
