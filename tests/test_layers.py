@@ -15,7 +15,7 @@ SOURCE = Path(skyless.__file__).parent
 
 LAYERS = (
     {"constants", "errors", "method_names", "kernels", "firmware"},
-    {"ticks"},
+    {"arguments", "ticks"},
     {"air", "uncertainty"},
     {"site"},
     {"clocks", "radios.interface"},
@@ -29,6 +29,7 @@ LAYERS = (
     {"nodes", "paper", "planning"},
     {"studies"},
     {"survey_inputs", "bench", "dashboard"},
+    {"api"},
     {"cli"},
 )
 LAYER_OF = {name: number for number, names in enumerate(LAYERS) for name in names}

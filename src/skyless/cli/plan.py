@@ -11,14 +11,7 @@ from skyless.cli.common.options import Positive, Seed, check_method, check_outpu
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import progress_bar
 from skyless.cli.plan_output import show, write_files, write_site
-from skyless.cli.plan_slots import (
-    conflicts_of,
-    described,
-    show_slots,
-    slot_report,
-    with_planned_slots,
-    write_slots,
-)
+from skyless.cli.plan_slots import conflicts_of, show_slots, write_slots
 from skyless.errors import ConfigurationError, SkylessError
 from skyless.method_names import DEFAULT_METHOD
 
@@ -165,6 +158,7 @@ def _plan_slots(site: "Site", file: Path, asked: PlanOptions, started_s: float) 
     from skyless.planning.floor import floor_of
     from skyless.planning.links import with_range
     from skyless.planning.slot_plan import rate_map
+    from skyless.planning.slot_report import described_slots, slot_report, with_planned_slots
     from skyless.simulation.channel import ChannelModel
     from skyless.site.check import has_slots
 
@@ -196,7 +190,7 @@ def _plan_slots(site: "Site", file: Path, asked: PlanOptions, started_s: float) 
         how = "--write --force writes" if had_slots else "--write writes"
         result["warnings"].append(f"these slots are not in the site file ({recoloured}); {how} them into it")
     if asked.plot is not None and floor is not None and mapped is not None:
-        _draw_slots(site, floor, mapped, file, described(result), asked.plot)
+        _draw_slots(site, floor, mapped, file, described_slots(result), asked.plot)
     result["wall_s"] = time.perf_counter() - started_s
     if asked.json:
         print_json(result)
