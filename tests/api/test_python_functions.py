@@ -1,4 +1,4 @@
-"""``skyless.simulate``, ``replay``, ``plan``, ``calibrate``, ``study``: the commands' figures, arrays, tables, pictures."""
+"""``skyless.simulate``, ``replay``, ``plan``, ``calibrate``, ``study``: the commands' figures, arrays, tables."""
 
 import json
 import sys
