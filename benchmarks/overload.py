@@ -7,7 +7,7 @@
 The first prints the ages of fixes before, during and after, what was withheld, and how long it took until health
 messages reported the overload and until they no longer did. The age of a fix is the time from the end of its last
 frame to its arrival in this process, which asks for the priority of a radio's program: it is to measure the site, not
-itself. ``own_delay_ms`` is how late this process was at worst all the same.
+itself. All the same ``own_delay_ms`` is how late it was at worst; ``age_less_own_ms`` is without that.
 """
 
 import argparse
@@ -15,6 +15,7 @@ import asyncio
 import contextlib
 import ctypes
 import json
+import math
 import os
 import platform
 import re
@@ -32,6 +33,7 @@ from skyless.mqtt.link import Link
 from skyless.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, TagHealth
 from skyless.mqtt.topics import fix_topic, health_topic
 from skyless.nodes.children import end
+from skyless.nodes.lateness import MOST_AGE_S
 from skyless.nodes.process import end_with_parent
 from skyless.site.lab import lab_site
 
@@ -50,6 +52,7 @@ class Subscriber:
 
     def __init__(self, link):
         self.tags, self.anchors, self.ether = {}, {}, None
+        self._due_s = math.inf
         self.begin()
         for topic, kind, handle in (
             (fix_topic(SITE.id, "+"), FixMessage, self._on_fix),
@@ -61,14 +64,16 @@ class Subscriber:
             link.subscribe(topic, lambda _, payload, decode=decode, handle=handle: handle(decode(payload)))
 
     def begin(self):
-        self.ages_s, self.latencies_s, self.own_s = [], [], [0.0]
+        self.ages_s, self.site_s, self.latencies_s, self.own_s = [], [], [], [0.0]
         self.reports = []
         """Health messages with overload: arrival, and what they report."""
         self.shares = {"air": [0.0], "anchors": [0.0]}
         self.begun = {name: health.counters | {"fixes": health.fixes} for name, health in self.tags.items()}
 
     def _on_fix(self, fix):
+        own_s = max(0.0, time.monotonic() - self._due_s)
         self.ages_s.append(time.time() - fix.unix_s)
+        self.site_s.append(self.ages_s[-1] - own_s)
         self.latencies_s.append(fix.latency_s)
 
     def _on_tag(self, health):
@@ -76,7 +81,7 @@ class Subscriber:
         late = health.late - (before.late if before is not None and before.late <= health.late else 0)
         self.tags[health.tag] = health
         if late:
-            self.reports.append((time.monotonic(), f"late receptions or fixes of {health.tag}"))
+            self.reports.append((time.monotonic(), "late receptions or fixes of tags"))
 
     def _on_anchor(self, health):
         self.anchors[health.anchor] = health
@@ -94,9 +99,9 @@ class Subscriber:
     async def measure_itself(self):
         """How late this process itself is."""
         while True:
-            due_s = time.monotonic() + 0.005
+            self._due_s = time.monotonic() + 0.005
             await asyncio.sleep(0.005)
-            self.own_s.append(time.monotonic() - due_s)
+            self.own_s.append(time.monotonic() - self._due_s)
 
     def figures(self):
         """Ages in ms, and what was counted."""
@@ -111,8 +116,10 @@ class Subscriber:
             "late_receptions": counted["late-reception"],
             "late_fixes": counted["late-fix"],
             "age_ms": quantiles(self.ages_s),
+            "age_less_own_ms": quantiles(self.site_s),
             "latency_ms": quantiles(self.latencies_s),
-            "over_100_ms": sum(age_s > 0.1 for age_s in self.ages_s),
+            "over_100_ms": sum(age_s > MOST_AGE_S for age_s in self.ages_s),
+            "over_100_ms_less_own": sum(age_s > MOST_AGE_S for age_s in self.site_s),
             "missed_share": {
                 where: {"mean": round(sum(shares) / len(shares), 3), "max": round(max(shares), 3)}
                 for where, shares in self.shares.items()

@@ -1,5 +1,6 @@
-"""A tag on a computer that is too slow: nothing old is given, all that is dropped is counted, and it goes on at once."""
+"""A tag on a computer that is too slow: nothing old is given, what is dropped is counted, and it goes on at once."""
 
+import itertools
 import math
 from dataclasses import dataclass, field
 
@@ -142,7 +143,7 @@ def test_a_program_that_is_always_too_slow_goes_from_backlog_to_backlog():
     for reception in HEARD:
         host.receive(reception, 0.0, work_s)
     numbers = [HEARD.index(reception) for reception in host.processed]
-    runs = 1 + sum(after - before > 1 for before, after in zip(numbers, numbers[1:], strict=False))
+    runs = 1 + sum(after - before > 1 for before, after in itertools.pairwise(numbers))
     assert 0.4 < len(numbers) / len(HEARD) < 0.6
     assert len(numbers) / runs > 6  # a superframe and more
     assert max(host.ages_s) < OLDEST_RECEPTION_S + 2.0 * work_s
