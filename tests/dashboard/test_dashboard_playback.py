@@ -113,7 +113,13 @@ def test_a_lower_rate_gives_fewer_states(folder):
 def test_nothing_outside_the_folder_is_read(folder, name):
     record(folder.parent / "secret.mcap", seconds=0.1)
     (folder / "link.mcap").symlink_to(folder.parent / "secret.mcap")
-    for read in (Playback(folder).summary, Playback(folder).floor_plan, Playback(None).summary):
+    opening = (
+        Playback(folder).summary,
+        Playback(folder).floor_plan,
+        Playback(folder).open_file,
+        Playback(None).summary,
+    )
+    for read in opening:
         with pytest.raises(NoRecordingError):
             read(name)
     assert [found.name for found in Playback(folder).recordings()] == ["first.mcap"]
@@ -140,9 +146,11 @@ def test_the_server_gives_recordings(folder):
     app = make_app(Services(live, Overlays(), Playback(folder)), AccessRules())
     browser = TestClient(app, base_url="http://localhost")
     (listed,) = browser.get("/api/recordings").json()
-    assert listed.keys() == {"name", "bytes", "start_unix_s", "duration_s", "complete"}
+    assert listed.keys() == {"name", "bytes", "start_unix_s", "duration_s", "complete", "site", "tags", "fixes"}
+    assert (listed["site"], listed["tags"], listed["fixes"]) == (SITE.site.name, 1, 101)
     summary = browser.get("/api/recordings/first.mcap").json()
-    assert summary.keys() == {"name", "site", "start_unix_s", "end_unix_s", "tags", "zones"}
+    keys = {"name", "site", "start_unix_s", "end_unix_s", "tags", "zones", "fix_spans_unix_s"}
+    assert summary.keys() == keys
     assert summary["site"]["site"]["id"] == SITE_ID
     states = browser.get("/api/recordings/first.mcap/states?from_s=1&to_s=2&rate_hz=20").json()["states"]
     assert [state["type"] for state in states] == ["state"] * 10
@@ -151,3 +159,52 @@ def test_the_server_gives_recordings(folder):
         assert browser.get(f"/api/recordings/first.mcap/states?{query}").status_code == 400
     for name in ("none.mcap", "..%2Fsecret.mcap", "%2e%2e", "%2Fetc%2Fpasswd"):
         assert browser.get(f"/api/recordings/{name}").status_code == 404
+        assert browser.get(f"/api/recordings/{name}/file").status_code == 404
+
+
+def test_a_recording_is_downloaded_with_its_name_as_far_as_it_is_written(folder):
+    record(folder / "old hall (1).mcap", seconds=1.0)
+    app = make_app(Services(LiveSite("here", "mqtt://broker:1"), Overlays(), Playback(folder)), AccessRules())
+    browser = TestClient(app, base_url="http://localhost")
+    answer = browser.get("/api/recordings/old%20hall%20(1).mcap/file")
+    assert answer.content == (folder / "old hall (1).mcap").read_bytes()
+    assert answer.headers["content-disposition"] == "attachment; filename*=utf-8''old%20hall%20%281%29.mcap"
+    assert answer.headers["content-length"] == str(len(answer.content))
+    growing = Playback(folder).open_file("first.mcap")
+    before = (folder / "first.mcap").read_bytes()
+    with (folder / "first.mcap").open("ab") as file:
+        file.write(b"more")
+    assert b"".join(growing.pieces()) == before, "as long as was announced, whatever is added meanwhile"
+
+
+def test_a_download_needs_the_token_as_everything_does(folder):
+    rules = AccessRules("correct-horse-battery", remote=True)
+    app = make_app(Services(LiveSite("here", "mqtt://broker:1"), Overlays(), Playback(folder)), rules)
+    stranger = TestClient(app, base_url="http://192.168.1.5:8080")
+    assert stranger.get("/api/recordings/first.mcap/file").status_code == 401
+    elsewhere = {"origin": "http://evil.example", "authorization": "Bearer correct-horse-battery"}
+    assert stranger.get("/api/recordings/first.mcap/file", headers=elsewhere).status_code == 403
+    mine = stranger.get("/api/recordings/first.mcap/file", params={"token": "correct-horse-battery"})
+    assert mine.status_code == 200
+
+
+def test_the_summary_says_when_there_are_fixes(folder):
+    """Nothing for 3 s, fixes for 2 s, nothing for 5 s, fixes for 1 s; the first is known exactly."""
+    recorder = McapRecorder(McapFile(folder / "gaps.mcap"))
+
+    def take(topic, message, at_s):
+        recorder.add(topic, msgspec.json.encode(message), START_S + at_s)
+        recorder.file.flush()
+
+    for k in range(120):
+        at_s = k / 10
+        take(topics.truth_topic(SITE_ID), truth(START_S + at_s), at_s)
+        if 3.0 <= at_s < 5.0 or at_s >= 10.0:
+            take(topics.fix_topic(SITE_ID, "t1"), fix("t1", START_S + at_s, serial=k), at_s)
+    recorder.file.close()
+    spans = [[s - START_S for s in span] for span in Playback(folder).summary("gaps.mcap").fix_spans_unix_s]
+    assert spans == [pytest.approx([3.0, 4.9]), pytest.approx([10.0, 11.9])]
+    empty = McapRecorder(McapFile(folder / "empty.mcap"))
+    empty.add(topics.truth_topic(SITE_ID), msgspec.json.encode(truth(START_S)), START_S)
+    empty.file.close()
+    assert Playback(folder).summary("empty.mcap").fix_spans_unix_s == ()

@@ -5,8 +5,10 @@ import math
 import os
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 from msgspec import Struct
 
@@ -18,6 +20,10 @@ from skyless.recordings.mcap.recording import McapRecording
 
 _SUFFIX: Final = ".mcap"
 _MAX_OPEN: Final = 8
+_GAP_S: Final = 2.5
+"""Shorter times without fixes are not shown: the recorder closes a chunk once a second."""
+
+_PIECE_BYTES: Final = 1 << 18
 _Version = tuple[int, int, int]
 """A file's inode, size and time of change."""
 
@@ -37,6 +43,9 @@ class ListedRecording(Struct, frozen=True):
     duration_s: float
     complete: bool
     """False while it is being written, and after it was cut off."""
+    site: str | None
+    tags: int
+    fixes: int
 
 
 class PlaybackSummary(Struct, frozen=True):
@@ -48,6 +57,24 @@ class PlaybackSummary(Struct, frozen=True):
     end_unix_s: float
     tags: tuple[str, ...]
     zones: tuple[Zone, ...]
+    fix_spans_unix_s: tuple[tuple[float, float], ...]
+    """When there are fixes, from the first one on, to about a second; empty without any."""
+
+
+class RecordingFile(Struct, frozen=True):
+    """A recording's file, open, to be read up to the size that it had then: it may be growing."""
+
+    name: str
+    size_bytes: int
+    file: BinaryIO
+
+    def pieces(self) -> Iterator[bytes]:
+        """The content, piece by piece; closes the file in the end."""
+        with self.file:
+            left = self.size_bytes
+            while left > 0 and (piece := self.file.read(min(left, _PIECE_BYTES))):
+                left -= len(piece)
+                yield piece
 
 
 class Playback:
@@ -89,7 +116,16 @@ class Playback:
             if found.start_s is None or found.end_s is None:
                 raise NoRecordingError(f"{name!r} holds no messages yet")
             zones = recording.zones.zones if recording.zones is not None else ()
-            return PlaybackSummary(name, recording.site, found.start_s, found.end_s, found.tags, zones)
+            spans = _fix_spans(recording)
+            return PlaybackSummary(name, recording.site, found.start_s, found.end_s, found.tags, zones, spans)
+
+    def open_file(self, name: str) -> RecordingFile:
+        """The file, to be downloaded. Raises NoRecordingError."""
+        try:
+            file = self._path(name).open("rb")
+        except OSError as error:
+            raise NoRecordingError(f"{name!r} cannot be read: {error.strerror}") from None
+        return RecordingFile(name, os.fstat(file.fileno()).st_size, file)
 
     def floor_plan(self, name: str) -> bytes | None:
         """The floor plan's image. Raises NoRecordingError."""
@@ -114,7 +150,9 @@ class Playback:
         if old is None or old[0] != version:
             found = self._recording(file.name).summary()
             duration_s = 0.0 if found.start_s is None or found.end_s is None else found.end_s - found.start_s
-            old = version, ListedRecording(file.name, stat.st_size, found.start_s, duration_s, found.finished)
+            tags, fixes = len(found.tags), found.messages.get("fix", 0)
+            listed = (file.name, stat.st_size, found.start_s, duration_s, found.finished, found.name, tags, fixes)
+            old = version, ListedRecording(*listed)
         self._listed[file.name] = old
 
     def _recording(self, name: str) -> McapRecording:
@@ -142,6 +180,14 @@ class Playback:
             if path.is_file() and path.resolve().parent == self._folder.resolve():
                 return path
         raise NoRecordingError(f"there is no recording {name[:100]!r}")
+
+
+def _fix_spans(recording: McapRecording) -> tuple[tuple[float, float], ...]:
+    spans = recording.spans({"fix"}, _GAP_S)
+    if not spans:
+        return ()
+    first_s = min((found.time_s for found in islice(recording.messages({"fix"}), 1)), default=spans[0][0])
+    return (max(first_s, spans[0][0]), spans[0][1]), *spans[1:]
 
 
 def _states(
