@@ -196,7 +196,8 @@ async def _body(request: Request, most_bytes: int, fault: str) -> bytes:
 async def _put_zones(request: Request) -> Response:
     body = await _body(request, _MAX_BODY_BYTES, "too many zones")
     live = _services(request).live
-    live.store_zones(read_zones(body))
+    message = read_zones(body)
+    live.store_zones(message.zones, message.site)
     return _json({"zones": live.monitor.zones})
 
 

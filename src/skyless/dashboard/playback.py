@@ -13,6 +13,7 @@ from typing import BinaryIO, Final
 from msgspec import Struct
 
 from skyless.dashboard.state import SiteState
+from skyless.dashboard.zones import zones_of
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import FixMessage, SiteMessage, TruthMessage, Zone
 from skyless.mqtt.truth_buffer import REACH_S
@@ -115,7 +116,7 @@ class Playback:
             found = recording.summary()
             if found.start_s is None or found.end_s is None:
                 raise NoRecordingError(f"{name!r} holds no messages yet")
-            zones = recording.zones.zones if recording.zones is not None else ()
+            zones = _zones(recording)
             spans = _fix_spans(recording)
             return PlaybackSummary(name, recording.site, found.start_s, found.end_s, found.tags, zones, spans)
 
@@ -180,6 +181,14 @@ class Playback:
             if path.is_file() and path.resolve().parent == self._folder.resolve():
                 return path
         raise NoRecordingError(f"there is no recording {name[:100]!r}")
+
+
+def _zones(recording: McapRecording) -> tuple[Zone, ...]:
+    """The zones of the recorded site, without those of other sites of its number."""
+    if recording.zones is None:
+        return ()
+    name = "" if recording.site is None else recording.site.site.name
+    return zones_of(recording.zones, name).zones
 
 
 def _fix_spans(recording: McapRecording) -> tuple[tuple[float, float], ...]:
