@@ -19,7 +19,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyless.dashboard.guard import AccessRules, Guard
-from skyless.dashboard.live import LiveSite, NoBrokerError
+from skyless.dashboard.live import LiveSite, NoBrokerError, TooManyPagesError
 from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.dashboard.site_survey import NoResultError
@@ -28,7 +28,6 @@ from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.image import image_size
 
 _PAGE: Final = Path(__file__).parent / "page"
-MAX_PAGES: Final = 50
 PAGE_TIMEOUT_S: Final = 10.0
 """A page that accepts no message for this long is disconnected."""
 
@@ -235,19 +234,25 @@ async def _recorded_states(request: Request) -> Response:
 
 async def _live(socket: WebSocket) -> None:
     live = _services(socket).live
-    if len(live.pages) >= MAX_PAGES:
-        await socket.close(_TRY_LATER, "too many pages are open")
+    await socket.accept()  # a browser does not show a page why its socket was refused, only why it was closed
+    try:
+        page = live.open_page(socket.client.host if socket.client is not None else "")
+    except TooManyPagesError as error:
+        await socket.close(_TRY_LATER, str(error))
         return
-    await socket.accept()
-    page = live.open_page()
-    reading = asyncio.create_task(_read(socket, page.close, lambda: page.replace("pong", b'{"type":"pong"}')))
+
+    def pong() -> None:
+        live.keep_page(page)
+        page.replace("pong", b'{"type":"pong"}')
+
+    reading = asyncio.create_task(_read(socket, page.close, pong))
     try:
         while not page.closed:
             messages = await page.drain(live.state)
             async with asyncio.timeout(PAGE_TIMEOUT_S):
                 for message in messages:
                     await socket.send_text(message)
-        await socket.close(_GOING_AWAY)
+        await socket.close(_GOING_AWAY, page.reason)
     except (WebSocketDisconnect, RuntimeError, TimeoutError):
         pass  # the page was closed meanwhile, or does not respond
     finally:
