@@ -3,6 +3,7 @@
 import json
 
 import msgspec
+import page_fake_site as made_up
 import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, fix, truth
 from starlette.testclient import TestClient
@@ -13,7 +14,7 @@ from skyless.dashboard.live import LiveSite
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.mqtt import topics
-from skyless.mqtt.messages import ZonesMessage
+from skyless.mqtt.messages import WatchFinding, WatchMessage, ZonesMessage
 from skyless.recordings.mcap.recorder import McapFile, McapRecorder
 
 START_S = 1_700_000_000.0
@@ -186,6 +187,42 @@ def test_a_download_needs_the_token_as_everything_does(folder):
     assert stranger.get("/api/recordings/first.mcap/file", headers=elsewhere).status_code == 403
     mine = stranger.get("/api/recordings/first.mcap/file", params={"token": "correct-horse-battery"})
     assert mine.status_code == 200
+
+
+def test_the_events_of_a_recording_are_those_that_a_live_page_would_have_listed(folder):
+    """Anchor 1 leads and is silent from 3 s on, 2 leads from 6 s on; t1 has an alert at 8 s, 2 has moved at 13 s."""
+    recorder = McapRecorder(McapFile(folder / "events.mcap"))
+
+    def take(topic, message, at_s):
+        recorder.add(topic, msgspec.json.encode(message), START_S + at_s)
+
+    for k in range(130):
+        at_s = k / 10
+        alert = "alert-limit-exceeded" if 8.0 <= at_s < 8.5 else "none"
+        take(topics.fix_topic(SITE_ID, "t1"), fix("t1", START_S + at_s, serial=k, hpl_m=0.5, alert=alert), at_s)
+        if k % 10 == 0:
+            for anchor in (1, 2):
+                leads = anchor == 1 if at_s < 3.0 else anchor == 2 and at_s >= 6.0
+                if anchor == 2 or at_s < 3.0:
+                    health = made_up.anchor_health(anchor, at_s, START_S + at_s)
+                    role = {"role": "master" if leads else "anchor", "term": k}
+                    take(topics.health_topic(SITE_ID, "anchor", anchor), health | role, at_s)
+    finding = WatchFinding("moved", (2,), 0.3, 0.01, START_S, "Anchor 2 has moved by 30 cm.")
+    take(topics.watch_topic(SITE_ID), WatchMessage(START_S + 13.0, "watching", (finding,), 3), 13.0)
+    recorder.file.close()
+    playback = Playback(folder)
+    found = playback.events("events.mcap")
+    assert found.complete
+    assert [(event.kind, event.name, round(event.unix_s - START_S)) for event in found.events] == [
+        ("anchor", "anchor/1", 6),
+        ("master", "anchor/2", 6),
+        ("alert", "tag/t1", 8),
+        ("alert", "tag/t1", 10),
+        ("watch", "anchor/2", 13),
+    ]
+    assert playback.events("events.mcap") is found, "it is read once"
+    with pytest.raises(NoRecordingError):
+        playback.events("../events.mcap")
 
 
 def test_the_summary_says_when_there_are_fixes(folder):

@@ -77,6 +77,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/survey/save", _save_survey, methods=["POST"]),
         Route("/api/recordings", _recordings),
         Route("/api/recordings/{name}", _recording),
+        Route("/api/recordings/{name}/events", _recorded_events),
         Route("/api/recordings/{name}/file", _recorded_file),
         Route("/api/recordings/{name}/states", _recorded_states),
         Route("/api/recordings/{name}/floor_plan", _recorded_floor_plan),
@@ -210,6 +211,10 @@ async def _recording(request: Request) -> Response:
 
 async def _recorded_floor_plan(request: Request) -> Response:
     return _image(await asyncio.to_thread(_services(request).playback.floor_plan, request.path_params["name"]))
+
+
+async def _recorded_events(request: Request) -> Response:
+    return _json(await asyncio.to_thread(_services(request).playback.events, request.path_params["name"]))
 
 
 async def _recorded_file(request: Request) -> Response:
