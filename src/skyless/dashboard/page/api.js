@@ -60,6 +60,16 @@ export function recording(name) {
   return fetchJson(`api/recordings/${encodeURIComponent(name)}`);
 }
 
+/** What has happened in a recording: events, the oldest first, and whether these are all. */
+export function recordedEvents(name) {
+  return fetchJson(`api/recordings/${encodeURIComponent(name)}/events`);
+}
+
+/** Address of a recording's file. */
+export function fileOf(name) {
+  return new URL(`api/recordings/${encodeURIComponent(name)}/file`, document.baseURI).href;
+}
+
 /** States of a recording between two times since its start, at most 60 s. */
 export async function recordedStates(name, from_s, to_s, rate_hz) {
   const query = `from_s=${from_s.toFixed(3)}&to_s=${to_s.toFixed(3)}&rate_hz=${rate_hz}`;
