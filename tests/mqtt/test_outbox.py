@@ -24,7 +24,7 @@ class Broker:
         self.number = 0
 
     def take(self):
-        message = self.box.next_message()
+        message = self.box.next_message(0.0)
         if message is None:
             return None
         self.number += 1
@@ -143,4 +143,4 @@ def test_a_topic_that_a_broker_would_not_take_is_dropped(topic):
     box = Outbox(Limits())
     box.add(topic, b"", 1, retain=False)
     assert box.dropped == 1
-    assert box.next_message() is None
+    assert box.next_message(0.0) is None

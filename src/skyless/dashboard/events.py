@@ -140,8 +140,14 @@ class EventLog:
         else:
             words = words or ("started" if online else "ended")
         group: Kind = "anchor" if kind == "anchor" else "tag" if kind == "tag" else "program"
-        subject = {"ether": "emulated air", "dashboard": "page server"}.get(kind, kind)
-        self._add(unix_s, group, level, f"{kind}/{name}", f"{subject} {name} {words}")
+        subject = {"ether": "emulated air", "dashboard": "page server", "survey": "survey program"}.get(kind, kind)
+        self._add(
+            unix_s,
+            group,
+            level,
+            f"{kind}/{name}",
+            f"{subject} {name if name != kind else ''} {words}".replace("  ", " "),
+        )
 
     # Fixes
 

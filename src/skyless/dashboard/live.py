@@ -396,6 +396,7 @@ class LiveSite:
     def open_page(self, address: str = "") -> PageQueue:
         """The queue of a new page of a computer, with what it needs first. Raises TooManyPagesError."""
         self._make_room(address)
+        self._send_logged()
         hello = {
             "version": skyless.__version__,
             "site": self.site,

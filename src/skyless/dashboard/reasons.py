@@ -206,9 +206,12 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
             health = node.health
             if isinstance(health, AnchorHealth) and _is_idle(health):
                 idle.append(name)
-        elif (node is not None and node.online is False) or not evidence.in_grace(now_s, node):
+        elif node is None or node.online is not False:
             on_air = node is not None and now_s - node.used_s < FRESH_S
-            (cut_off if on_air and node is not None and node.online is not False else offline).append(name)
+            if not evidence.in_grace(now_s, node):
+                (cut_off if on_air else offline).append(name)
+        elif node.since_s is not None or not evidence.in_grace(now_s):  # else an old status, kept by the broker
+            offline.append(name)
     if offline:
         level: _Severity = "bad" if len(names) - len(offline) < _MIN_ANCHORS else "warning"
         which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""

@@ -14,6 +14,7 @@ from skyless.constants import TICK_S
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import EtherHealth, TrueMotion, TruthMessage, Vector
 from skyless.mqtt.topics import health_topic, truth_topic
+from skyless.nodes.lateness import OLDEST_RECEPTION_S
 from skyless.nodes.process import HEALTH_S, Log, every, keep, link_of, together
 from skyless.radios import ether_wire as wire
 from skyless.simulation.impairments import Impairments
@@ -22,9 +23,6 @@ from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Trajectory
 from skyless.site.model import Site
 from skyless.ticks import wrap
-
-_STALL_S: Final = 0.1
-"""True time stands still while the ether falls behind by more than this (a process that was stopped)."""
 
 _CLOCKS_S: Final = 0.1
 _TRUTH_S: Final = 0.05
@@ -129,6 +127,10 @@ class Ether:
         self._origin_s = clock()
         self._timer: asyncio.TimerHandle | None = None
         self.stalls = self.overruns = 0
+        self._missed = 0
+        """Transmissions whose time had passed when this process came to them."""
+        self._reported = 0, 0
+        """Sent and missed transmissions at the last health message."""
         self.machine = wire.this_machine()
 
     async def serve(self, host: str, port: int) -> asyncio.Server:
@@ -144,14 +146,25 @@ class Ether:
     # Time
 
     def advance(self) -> None:
-        """Let true time catch up with the host's, and wake again at the next event."""
-        behind_s = self._clock() - self._origin_s - self.medium.now_s
-        if behind_s > _STALL_S:
-            self._origin_s += behind_s
+        """Let true time catch up with the host's, and wake again at the next event.
+
+        Frames that no tag could use any more are not sent: so a slow computer has gaps on the air, and no delay.
+        """
+        now_s = self._clock() - self._origin_s
+        if now_s - self.medium.now_s > OLDEST_RECEPTION_S:
             self.stalls += 1
-        for _ in self.medium.run(self._clock() - self._origin_s):
+            self._miss(now_s)
+        for _ in self.medium.run(now_s):
             pass
         self._arm()
+
+    def _miss(self, until_s: float) -> None:
+        """Send none of the frames whose time has passed; their senders are notified."""
+        for node in self.medium.miss(until_s):
+            self._missed += 1
+            session, tx_ticks = self._owners.get(node), self._flying.pop(node, None)
+            if session is not None and tx_ticks is not None:
+                session.send(wire.Done(session.index[node], tx_ticks, late=True))
 
     def _arm(self) -> None:
         if self._timer is not None:
@@ -265,17 +278,23 @@ class Ether:
         return TruthMessage(unix_s, motions)
 
     def health(self, unix_s: float) -> EtherHealth:
-        """What the air has carried so far."""
+        """What the air has carried so far; to be called once a second."""
         tally = self.medium.tally
+        missed = tally.late_transmissions + self._missed
+        sent_before, missed_before = self._reported
+        self._reported = tally.transmissions, missed
+        new_missed = missed - missed_before
+        planned = tally.transmissions - sent_before + new_missed
         return EtherHealth(
             unix_s,
             self.medium.now_s,
             tally.transmissions,
-            tally.late_transmissions,
+            missed,
             tally.at_anchors,
             tally.at_tags,
             self.stalls,
             self.overruns,
+            missed_share=new_missed / planned if planned else 0.0,
         )
 
 

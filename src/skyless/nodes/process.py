@@ -7,6 +7,7 @@ import fcntl
 import gc
 import os
 import resource
+import select
 import selectors
 import signal
 import sys
@@ -55,8 +56,25 @@ def run(main: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
 
 
 def _new_loop() -> asyncio.AbstractEventLoop:
-    """A loop on select(), whose timers are exact to microseconds; those of epoll() are a millisecond late."""
-    return asyncio.SelectorEventLoop(selectors.SelectSelector())
+    """A loop for any number of connections, whose timers are exact to microseconds."""
+    return asyncio.SelectorEventLoop(PunctualSelector() if hasattr(selectors, "EpollSelector") else None)
+
+
+if hasattr(selectors, "EpollSelector"):
+
+    class PunctualSelector(selectors.EpollSelector):
+        """epoll(), whose own timeouts end up to a millisecond late, woken by select(), which knows of at most 1024 files.
+
+        select() waits for one file only, epoll()'s own, which can be read as soon as one of the others is ready.
+        """
+
+        def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+            """The files that are ready; waits for one at most ``timeout`` s, without limit where it is None."""
+            if timeout is None:
+                return super().select()
+            if timeout > 0.0:
+                select.select([self.fileno()], [], [], timeout)
+            return super().select(0)
 
 
 async def _until_terminated(main: Coroutine[Any, Any, None]) -> None:

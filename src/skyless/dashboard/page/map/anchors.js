@@ -1,7 +1,7 @@
 /** Anchors: their health as a colour and a shape, and their marks on the map. */
 
 import { s } from "../dom.js";
-import { state } from "../store.js";
+import { healthAge_s, state } from "../store.js";
 import { surveyShown } from "../survey/model.js";
 import { palette } from "../theme.js";
 import { px, py } from "./view.js";
@@ -25,9 +25,7 @@ export function condition(id) {
   const status = state.health.nodes.find((node) => node.kind === "anchor" && String(node.name) === String(id));
   if (status && !status.online) return "bad";
   if (!health) return status ? "warn" : "unknown";
-  const newest = Math.max(...[...state.health.anchors.values()].map((one) => one.unix_s));
-  const age_s = (performance.now() - state.health.atMs) / 1e3 + newest - health.unix_s;
-  if (age_s > MAX_AGE_S) return "bad";
+  if (healthAge_s("anchors", id) > MAX_AGE_S) return "bad";
   return health.synchronised || health.role === "master" ? "good" : "warn";
 }
 

@@ -1,6 +1,6 @@
 /** All tags as a list; the selected one in detail, with its last minute as charts. */
 
-import { state } from "../store.js";
+import { healthAge_s, state } from "../store.js";
 import { GONE_S, GREY_S, freshness, shown_s, tracks } from "../clock.js";
 import { Chart } from "../chart.js";
 import { h, text } from "../dom.js";
@@ -25,6 +25,8 @@ const WORDS = {
 /** With more tags than this there is a search field. */
 const SEARCHED = 12;
 const WINDOW_S = 60;
+/** Figures of a tag that has not reported for longer are not of now. */
+const MAX_HEALTH_AGE_S = 3.5;
 const row = new Float64Array(COLUMNS);
 let parts = null;
 
@@ -63,7 +65,8 @@ function describe(name, { track, colour }) {
   const condition = freshness(track);
   const known = condition !== "never" && track.at(shown_s(), row, false);
   const style = condition === "fresh" ? `color: ${colour}` : "";
-  const rate = state.mode === "live" ? state.health.tags.get(name)?.updates_per_s : null;
+  const reports = state.mode === "live" && healthAge_s("tags", name) < MAX_HEALTH_AGE_S;
+  const rate = reports ? state.health.tags.get(name)?.updates_per_s : null;
   const position = known ? [metres(row[X]), metres(row[Y]), length(row[STD]), length(row[ERROR])] : Array(4).fill(DASH);
   return {
     condition,
@@ -127,7 +130,8 @@ function makeDetail() {
   const showDetail = (track) => {
     element.hidden = !track;
     if (!track) return;
-    const health = state.mode === "live" ? state.health.tags.get(track.name) : null;
+    const reports = state.mode === "live" && healthAge_s("tags", track.name) < MAX_HEALTH_AGE_S;
+    const health = reports ? state.health.tags.get(track.name) : null;
     text(heading, track.name);
     reason.hidden = !health?.reason;
     text(reason, health?.reason ? `No fix: ${health.reason.replaceAll("-", " ")}` : "");
