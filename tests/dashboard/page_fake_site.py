@@ -72,6 +72,23 @@ def state_row(name, number, time_s, unix_s):
     return [name, *(round(value, 5) for value in numbers), *rest]
 
 
+def recorded_events(start_unix_s):
+    """Of a recording: anchor 2 is lost at 20 s and 4 takes over, an alert at 50 s, an anchor has moved at 70 s."""
+    events = (
+        (1.0, "program", "note", "recorder/demo", "recorder demo started"),
+        (20.0, "anchor", "bad", "anchor/2", "anchor 2 does not report any more"),
+        (20.4, "master", "warning", "anchor/4", "anchor 4 is the master now, after anchor 2"),
+        (31.0, "anchor", "good", "anchor/2", "anchor 2 reports again"),
+        (50.0, "alert", "warning", "tag/tag-001", "tag tag-001: faulty anchor excluded"),
+        (70.0, "watch", "bad", "anchor/7", "Anchor 7 has moved by 31 cm"),
+    )
+    keys = ("unix_s", "kind", "level", "name", "text")
+    return [
+        dict(zip(keys, (start_unix_s + at_s, *rest), strict=True)) | {"serial": n}
+        for n, (at_s, *rest) in enumerate(events, 1)
+    ]
+
+
 def mqtt():
     return {"published": 12_345, "dropped": 0, "reconnects": 0}
 

@@ -19,9 +19,9 @@ async function fetchJson(path, options = {}) {
   return body;
 }
 
-/** Store all zones; returns them as the server has stored them. */
-export async function putZones(zones) {
-  const body = JSON.stringify({ zones });
+/** Store all zones of the site of a name; returns them as the server has stored them. */
+export async function putZones(zones, site) {
+  const body = JSON.stringify({ zones, site });
   const headers = { "content-type": "application/json" };
   return (await fetchJson("api/zones", { method: "PUT", headers, body })).zones;
 }

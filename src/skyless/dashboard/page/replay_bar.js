@@ -132,7 +132,7 @@ function showSpans(box, player) {
 
 /** A button for every event that deserves attention; those that are close share one. */
 function showMarks(box, player) {
-  const width = box.clientWidth - 16;
+  const width = box.parentElement.clientWidth - 16;
   if (width <= 0) return;
   const groups = [];
   for (const event of markedEvents(player)) {

@@ -24,6 +24,10 @@ export const state = {
   mode: "live",
   /** @type {Array<{id: string, name: string, polygon_m: number[][], colour: string|null}>} */
   zones: [],
+  /** Zones of other sites that have this one's number: kept, not shown. @type {Array<{site: string, zones: any[]}>} */
+  otherZones: [],
+  /** Why the zones that the broker keeps cannot be read. @type {string|null} */
+  zonesFault: null,
   /** @type {any[]} tags that entered or left zones, newest first */
   events: [],
   /** @type {any[]} what has happened at the live site, oldest first; `panels/events.js` lists it */
