@@ -158,7 +158,7 @@ function makeDetail() {
   const chi2 = new Chart("Residuals (χ² of each fix)", [{ name: "χ²", colour: "warn" }], (v) => number(v, 1), 1);
   const element = h(
     "section",
-    { class: "detail", "aria-label": "Selected tag", hidden: true },
+    { class: "detail", "aria-label": "Selected tag", tabindex: "0", hidden: true },
     heading,
     reason,
     list.element,
