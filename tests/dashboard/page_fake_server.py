@@ -45,6 +45,9 @@ class FakeServer:
         self.refuse = False
         self.mute = False
         self.zone_error = None
+        self.condition = made_up.condition()
+        self.log = []
+        self.full = False
         self.started = time.time()
         self.sockets = {}
         self.port = _free_port()
@@ -168,12 +171,15 @@ class FakeServer:
         if self.refuse:
             return await websocket.close()
         await websocket.accept()
+        if self.full:
+            return await websocket.close(1013, "too many pages are open: 100 of this computer, 100 in all")
         lock = asyncio.Lock()
         await _send(websocket, lock, self._hello())
+        await _send(websocket, lock, {"type": "log", "events": self.log})
         self.sockets[websocket] = lock
         jobs = [
             asyncio.create_task(job(websocket, lock))
-            for job in (self._states, self._health, self._surveys, self._pongs)
+            for job in (self._states, self._health, self._conditions, self._surveys, self._pongs)
         ]
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
@@ -204,6 +210,12 @@ class FakeServer:
                 await _send(websocket, lock, self.health(time.time()))
             await asyncio.sleep(1.0)
 
+    async def _conditions(self, websocket, lock):
+        while True:
+            if not self.mute and self.condition:
+                await _send(websocket, lock, self.condition)
+            await asyncio.sleep(0.2)
+
     async def _surveys(self, websocket, lock):
         while True:
             if self.survey and not self.survey.silent and not self.mute:
@@ -222,7 +234,11 @@ class FakeServer:
             tags.append(made_up.tag_health(name, number, since, now, reason))
         ether = {"unix_s": now, "simulated_s": since, "transmissions": int(476 * since), "late": 0, "at_anchors": {},
                  "at_tags": {}, "stalls": 0, "overruns": 0}  # fmt: skip
-        return {"type": "health", "anchors": anchors, "tags": tags, "ether": ether, "nodes": made_up.nodes()}
+        old = self.mode == "master"
+        ages = {"anchors": {str(n): 20.0 if n == 8 and old else 0.1 for n in range(1, 9)}, "ether": {"air": 0.1},
+                "tags": dict.fromkeys(made_up.names(self.tags), 0.1)}  # fmt: skip
+        nodes = made_up.nodes()
+        return {"type": "health", "anchors": anchors, "tags": tags, "ether": ether, "nodes": nodes, "ages": ages}
 
     async def _pongs(self, websocket, lock):
         while True:

@@ -143,6 +143,23 @@ def nodes():
     ]
 
 
+def reason(kind, level, text, advice="See there.", names=()):
+    return {"kind": kind, "level": level, "text": text, "advice": advice, "names": names}
+
+
+def condition(*reasons, level=None, text=""):
+    """The server's judgement: good without reasons."""
+    return {
+        "type": "condition", "level": level or (reasons[0]["level"] if reasons else "good"),
+        "text": text or (reasons[0]["text"] if reasons else ""), "reasons": reasons,
+        "latency_p50_s": 0.0012, "latency_p99_s": 0.0034,
+    }  # fmt: skip
+
+
+def event(serial, unix_s, level, kind, name, text):
+    return {"serial": serial, "unix_s": unix_s, "kind": kind, "level": level, "name": name, "text": text}
+
+
 def overlay(kind, step_m):
     """A smooth bowl, good in the middle; nothing beyond the walls' corners."""
     columns, rows = int(WIDTH_M / step_m) + 1, int(DEPTH_M / step_m) + 1

@@ -16,6 +16,7 @@ const MAX_EVENTS = 50;
 const MAX_LOGGED = 500;
 /** Close code of a server that has too many pages open. */
 const TRY_LATER = 1013;
+const NO_RESPONSE = "the server does not respond";
 
 /** @type {WebSocket|null} */
 let socket = null;
@@ -51,7 +52,7 @@ function connect() {
   mine.onmessage = (event) => mine === socket && process(event.data);
   mine.onclose = ({ code, reason }) => {
     if (code === TRY_LATER) retry_ms = LAST_RETRY_MS;
-    if (mine === socket) lost(reason || "the server does not respond");
+    if (mine === socket) lost(reason || NO_RESPONSE);
   };
 }
 
@@ -60,6 +61,7 @@ function lost(reason) {
   socket = null;
   old?.close();
   if (state.connection.phase !== "lost") state.connection = { phase: "lost", since: performance.now(), reason };
+  else if (reason !== NO_RESPONSE) state.connection.reason = reason;
   retryTimer = setTimeout(connect, retry_ms);
   retry_ms = Math.min(retry_ms * 1.6, LAST_RETRY_MS);
   changed("connection");

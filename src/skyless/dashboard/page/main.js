@@ -31,7 +31,7 @@ banner.start();
 watch.start();
 summary.start();
 on(["site"], () => {
-  text(byId("site-name"), state.site ? `${state.site.name} · ${state.site.id}` : "");
+  text(byId("site-name"), state.site?.name ?? "");
   byId("site-name").title = state.site ? `Site ${state.site.id}, ${state.site.name}` : "";
   byId("simulated").hidden = !state.simulated;
 });

@@ -67,6 +67,7 @@ export function summaryFacts() {
     facts.push(["Protection level", `${length(median(levels))}, largest ${length(Math.max(...levels))}`]);
   }
   if (state.mode === "live") facts.push(...liveFacts(lost));
+  if (state.site) facts.push(["Site", `${state.site.name}, number ${state.site.id}`]);
   return facts;
 }
 
