@@ -1,4 +1,4 @@
-"""Axe, a checker of accessibility, finds nothing serious: in both themes, in every tab, live, in a replay, in the set-up.
+"""Axe, a checker of accessibility, finds nothing serious: both themes, every tab, live, in a replay, in the set-up.
 
 What it cannot find, such as the order of the keyboard's focus, is in ``test_page_look.py``.
 """
