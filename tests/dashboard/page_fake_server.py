@@ -44,6 +44,8 @@ class FakeServer:
         self.refuse = False
         self.mute = False
         self.zone_error = None
+        self.overlay_error = None
+        self.overlay_waits = False
         self.started = time.time()
         self.sockets = {}
         self.port = _free_port()
@@ -109,6 +111,10 @@ class FakeServer:
 
         async def overlay(request):
             query = request.query_params
+            while self.overlay_waits:
+                await asyncio.sleep(0.02)
+            if self.overlay_error:
+                return JSONResponse({"error": self.overlay_error}, status_code=422)
             return JSONResponse(made_up.overlay(query["kind"], float(query["step_m"])))
 
         async def put_zones(request):

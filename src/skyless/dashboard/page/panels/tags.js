@@ -6,7 +6,7 @@ import { Chart } from "../chart.js";
 import { h, text } from "../dom.js";
 import { DASH, bytes, duration, length, metres, number } from "../format.js";
 import { tagHistory } from "../history.js";
-import { tagColour } from "../theme.js";
+import { tagMark, tagStyle } from "../map/marks.js";
 import { ALERT, ALERTS, ANCHORS, CHI2, COLUMNS, ERROR, HPL, STD, TIME, VX, VY, X, Y, Z } from "../tracks.js";
 import { facts, selectionTable, split } from "./parts.js";
 
@@ -51,7 +51,7 @@ export function show() {
   parts.empty.hidden = list.length > 0;
   parts.table.element.hidden = list.length === 0;
   parts.table.element.classList.toggle("no-truth", !state.simulated);
-  const shown = list.map((track, index) => [track.name, { track, colour: tagColour(index, list.length) }]);
+  const shown = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length) }]);
   parts.table.rows.show(shown.filter(([name]) => name.toLowerCase().includes(wanted)));
   const fresh = list.filter((track) => freshness(track) === "fresh").length;
   text(parts.count, list.length ? `${fresh} of ${list.length} with a fix` : "");
@@ -59,17 +59,16 @@ export function show() {
   split(parts.panel, parts.box, !parts.detail.element.hidden);
 }
 
-function describe(name, { track, colour }) {
+function describe(name, { track, style: look }) {
   const condition = freshness(track);
   const known = condition !== "never" && track.at(shown_s(), row, false);
-  const style = condition === "fresh" ? `color: ${colour}` : "";
   const rate = state.mode === "live" ? state.health.tags.get(name)?.updates_per_s : null;
   const position = known ? [metres(row[X]), metres(row[Y]), length(row[STD]), length(row[ERROR])] : Array(4).fill(DASH);
   return {
     condition,
     words: WORDS[condition],
-    key: condition + style,
-    mark: () => h("span", { "aria-hidden": "true", style }, MARKS[condition]),
+    key: `${condition} ${look.colour} ${look.shape}`,
+    mark: () => (condition === "fresh" ? tagMark(look) : h("span", { "aria-hidden": "true" }, MARKS[condition])),
     name,
     figures: [...position, number(rate)],
   };
