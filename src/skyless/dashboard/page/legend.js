@@ -48,7 +48,7 @@ export function start() {
 
 /** An entry for each tag; with very many all have one mark, and the list next to the map has their names. */
 function tags() {
-  const list = h("ul", { class: "marks tag-marks" });
+  const list = h("ul", { class: "tag-marks" });
   const many = h("p", { class: "fine", hidden: true }, `With more than ${DISTINCT} tags all have one mark.`);
   let shown = "";
   const show = () => {

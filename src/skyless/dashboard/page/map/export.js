@@ -147,7 +147,7 @@ function drawScaleOf(context, data, y) {
   context.fillText(`${KINDS[data.kind]}, from ${writeValue(data.least)} to ${writeValue(data.most)}`, EDGE, y);
   context.textAlign = "center";
   for (const tick of data.scale.ticks) {
-    const at = EDGE + 12 + (wide - 24) * fractionOf(tick, data.scale);
+    const at = EDGE + wide * fractionOf(tick, data.scale);
     context.fillText(data.unit === "m" ? length(tick) : String(tick), at, y + 2 * LINE - 8);
   }
   context.textAlign = "left";

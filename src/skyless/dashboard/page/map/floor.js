@@ -5,7 +5,6 @@ import { state } from "../store.js";
 import { metres } from "../format.js";
 import { surveyShown } from "../survey/model.js";
 import { height_m, moving, plan } from "../survey/plan.js";
-import { drawRoom, nameRoom } from "./room.js";
 import { drawInMetres, px, py, roundLength, toSite, toX, toY, view } from "./view.js";
 
 /** @type {{image: HTMLImageElement, x_m: number, y_m: number, width_m: number, height_m: number}|null} */
@@ -56,16 +55,6 @@ function drawPicture(context, picture, x_m, y_m, width_m, height_m) {
   context.scale(1, -1); // pictures count downwards
   context.drawImage(picture, x_m, -(y_m + height_m), width_m, height_m);
   context.restore();
-}
-
-/** Draw the outline of the room. */
-export function drawOutline(context, ground_m) {
-  drawRoom(context, floorCorners(), ground_m);
-}
-
-/** Name the outline of the room. */
-export function nameOutline(context, ground_m) {
-  nameRoom(context, floorCorners(), ground_m);
 }
 
 /** The plan that the set-up lays under the picture, or else the site's. */

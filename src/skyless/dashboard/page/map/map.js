@@ -5,20 +5,11 @@ import { byId } from "../dom.js";
 import { surveyShown } from "../survey/model.js";
 import { drawAnchors } from "./anchors.js";
 import { drawFindings } from "./findings.js";
-import {
-  drawFloor,
-  drawGrid,
-  drawOutline,
-  drawOverlay,
-  drawScale,
-  drawWalls,
-  floorCorners,
-  loadFloor,
-  nameOutline,
-} from "./floor.js";
+import { drawFloor, drawGrid, drawOverlay, drawScale, drawWalls, floorCorners, loadFloor } from "./floor.js";
 import { groundHeight } from "./floors.js";
 import { centre } from "./follow.js";
 import { listen } from "./input.js";
+import { drawRoom, fillRoom } from "./room.js";
 import { drawGround, spaceCorners } from "./space.js";
 import { drawSurvey, surveyCorners, surveyOutOfSight } from "./survey.js";
 import { drawTags, visibleTags } from "./tags.js";
@@ -76,13 +67,13 @@ function drawStill() {
   const context = prepare(byId("still"));
   const ground_m = groundHeight();
   drawFloor(context);
-  drawOutline(context, ground_m);
+  fillRoom(context, floorCorners(), ground_m);
   drawOverlay(context);
   if (view.spatial) drawGround(context, floorCorners());
   else drawGrid(context);
   const flashes = drawZones(context);
   drawWalls(context, ground_m);
-  if (!view.spatial) nameOutline(context, ground_m);
+  drawRoom(context, floorCorners(), ground_m);
   drawAnchors(context);
   drawSurvey(context);
   drawFindings(context);

@@ -4,7 +4,7 @@ import { state } from "../store.js";
 import { faint, palette } from "../theme.js";
 import { label } from "./anchors.js";
 import { surveyShown } from "../survey/model.js";
-import { toX, toY } from "./view.js";
+import { toX, toY, view } from "./view.js";
 
 /** Ends of walls nearer than this are one corner. */
 const SAME_M = 0.05;
@@ -101,36 +101,39 @@ function cross([x0, y0], [x1, y1], [x2, y2]) {
   return (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0);
 }
 
-/** Draw the outline with its floor and its name. */
-export function drawRoom(context, plan, z_m = 0) {
-  if (surveyShown()) return;
-  const outline = roomOutline(plan);
-  if (!outline) return;
-  context.beginPath();
-  for (const [x, y] of outline.corners) context.lineTo(toX(x, y), toY(x, y, z_m));
-  context.closePath();
-  if (outline.kind !== "plan") {
-    context.fillStyle = faint(palette.surface, 0.55);
-    context.fill();
-  }
-  context.strokeStyle = palette.wall;
-  context.lineWidth = outline.kind === "room" ? 2 : 1.25;
-  context.setLineDash(outline.kind === "room" ? [] : [7, 5]);
-  context.stroke();
-  context.setLineDash([]);
+/** Draw the area within the outline, unless a floor plan is drawn there. */
+export function fillRoom(context, plan, ground_m) {
+  const outline = surveyShown() ? null : roomOutline(plan);
+  if (!outline || plan.length) return;
+  trace(context, outline, ground_m);
+  context.fillStyle = faint(palette.surface, 0.55);
+  context.fill();
 }
 
-/** Write what the outline is and its size below it. */
-export function nameRoom(context, plan, z_m = 0) {
+function trace(context, { corners }, ground_m) {
+  context.beginPath();
+  for (const [x, y] of corners) context.lineTo(toX(x, y), toY(x, y, ground_m));
+  context.closePath();
+}
+
+/** Draw the outline; from above, write what it is and its size below it. */
+export function drawRoom(context, plan, ground_m) {
   const outline = surveyShown() ? null : roomOutline(plan);
   if (!outline) return;
+  const walls = outline.kind === "room";
+  trace(context, outline, ground_m);
+  context.strokeStyle = palette.wall;
+  context.lineWidth = walls ? 2 : 1.25;
+  context.setLineDash(walls ? [] : [7, 5]);
+  context.stroke();
+  context.setLineDash([]);
+  if (view.spatial) return;
   const [xs, ys] = [outline.corners.map(([x]) => x), outline.corners.map(([, y]) => y)];
   const size = [xs, ys].map((list) => `${(Math.max(...list) - Math.min(...list)).toFixed(1)} m`);
-  const at = outline.corners.map(([x, y]) => [toX(x, y), toY(x, y, z_m)]);
-  const left = Math.min(...at.map(([x]) => x));
-  const bottom = Math.max(...at.map(([, y]) => y));
+  const below = outline.kind === "anchors" ? 28 : 5; // clear of the names of anchors on it
   context.font = "11px system-ui, sans-serif";
   context.textAlign = "left";
   context.textBaseline = "top";
-  label(context, `${outline.name}, ${size.join(" × ")}`, left, bottom + 5, palette.muted);
+  const [left, bottom] = [toX(Math.min(...xs), Math.min(...ys)), toY(Math.min(...xs), Math.min(...ys))];
+  label(context, `${outline.name}, ${size.join(" × ")}`, left, bottom + below, palette.muted);
 }
