@@ -48,6 +48,8 @@ class FakeServer:
         self.condition = made_up.condition()
         self.log = []
         self.full = False
+        self.overlay_error = None
+        self.overlay_waits = False
         self.started = time.time()
         self.sockets = {}
         self.port = _free_port()
@@ -113,6 +115,10 @@ class FakeServer:
 
         async def overlay(request):
             query = request.query_params
+            while self.overlay_waits:
+                await asyncio.sleep(0.02)
+            if self.overlay_error:
+                return JSONResponse({"error": self.overlay_error}, status_code=422)
             return JSONResponse(made_up.overlay(query["kind"], float(query["step_m"])))
 
         async def put_zones(request):

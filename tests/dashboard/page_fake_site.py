@@ -2,6 +2,8 @@
 
 import math
 
+from skyless.planning.colours import COLOUR_STOPS, scale_of
+
 WIDTH_M, DEPTH_M = 24.0, 14.0
 SLOT_S = 2.1e-3
 SUPERFRAME = 8
@@ -169,8 +171,11 @@ def overlay(kind, step_m):
         for column in range(columns):
             u, v = 2 * column / (columns - 1) - 1, 2 * row / (rows - 1) - 1
             values.append(None if abs(u) + abs(v) > 1.9 else round(scale * (1 + u * u + 0.7 * v * v), 4))
+    known = sorted(value for value in values if value is not None)
+    limits = scale_of(known)
     return {
         "kind": kind, "unit": "m" if kind == "sigma" else "1", "x_m": [0, (columns - 1) * step_m],
         "y_m": [0, (rows - 1) * step_m], "step_m": step_m, "columns": columns, "rows": rows, "values": values,
-        "method": "joint", "levels": {"good": scale, "bad": 2.6 * scale},
+        "method": "joint", "height_m": 1.2, "least": known[0], "most": known[-1],
+        "scale": {"low": limits.low, "high": limits.high, "ticks": limits.ticks, "stops": COLOUR_STOPS},
     }  # fmt: skip

@@ -49,9 +49,9 @@ export const state = {
   /** @type {any} the recording that `player.js` plays */
   player: null,
   selection: { tag: null, anchor: null, zone: null },
-  options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none" },
-  /** @type {{data: any, picture: HTMLCanvasElement|null, error: string}} */
-  overlay: { data: null, picture: null, error: "" },
+  options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none", floor: null },
+  /** @type {{data: any, picture: HTMLCanvasElement|null, error: string, pendingSince: number|null}} pending: computing */
+  overlay: { data: null, picture: null, error: "", pendingSince: null },
 };
 
 /** Call `callback` in the next frame after any of the topics has changed. */

@@ -6,7 +6,7 @@ import { Chart } from "../chart.js";
 import { h, text } from "../dom.js";
 import { DASH, bytes, duration, length, metres, number } from "../format.js";
 import { tagHistory } from "../history.js";
-import { tagColour } from "../theme.js";
+import { tagMark, tagStyle } from "../map/marks.js";
 import {
   ALERT,
   ALERTS,
@@ -83,7 +83,7 @@ export function show() {
   parts.empty.hidden = list.length > 0;
   parts.table.element.hidden = list.length === 0;
   parts.table.element.classList.toggle("no-truth", !state.simulated);
-  const shown = list.map((track, index) => [track.name, { track, colour: tagColour(index, list.length) }]);
+  const shown = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length) }]);
   parts.table.rows.show(shown.filter(([name]) => name.toLowerCase().includes(wanted)));
   const fresh = list.filter((track) => freshness(track) === "fresh").length;
   text(parts.count, list.length ? `${fresh} of ${list.length} with a fix` : "");
@@ -91,10 +91,9 @@ export function show() {
   split(parts.panel, parts.box, !parts.detail.element.hidden);
 }
 
-function describe(name, { track, colour }) {
+function describe(name, { track, style: look }) {
   const condition = freshness(track);
   const known = condition !== "never" && track.at(shown_s(), row, false);
-  const style = condition === "fresh" ? `color: ${colour}` : "";
   const reports = state.mode === "live" && healthAge_s("tags", name) < MAX_HEALTH_AGE_S;
   const health = reports ? state.health.tags.get(name) : null;
   if (!known) row.fill(NaN);
@@ -102,8 +101,8 @@ function describe(name, { track, colour }) {
   return {
     condition: alert?.grade ? `${condition} alert-${alert.grade}` : condition,
     words: WORDS[condition],
-    key: condition + style,
-    mark: () => h("span", { "aria-hidden": "true", style }, MARKS[condition]),
+    key: `${condition} ${look.colour} ${look.shape}`,
+    mark: () => (condition === "fresh" ? tagMark(look) : h("span", { "aria-hidden": "true" }, MARKS[condition])),
     name,
     figures: [
       metres(row[X]),
