@@ -260,10 +260,22 @@ class Zone(Struct, frozen=True):
     colour: str | None = None
 
 
+class SiteZones(Struct, frozen=True):
+    """The zones of one site."""
+
+    site: str
+    """The site's name."""
+    zones: tuple[Zone, ...]
+
+
 class ZonesMessage(Struct, frozen=True):
     """All zones of a site, retained."""
 
     zones: tuple[Zone, ...]
+    site: str = ""
+    """Name of the site that they were drawn at: another site may have the same number. Empty: not known."""
+    others: tuple[SiteZones, ...] = ()
+    """Zones of other sites that had this number before, kept until those return."""
 
 
 class ZoneEvent(Struct, frozen=True):

@@ -158,6 +158,8 @@ const handlers = {
   },
   zones(message) {
     zones = message.zones ?? [];
+    state.otherZones = message.other_zones ?? state.otherZones;
+    if ("zones_fault" in message) state.zonesFault = message.zones_fault;
     if (state.mode !== "live") return;
     state.zones = zones;
     changed("zones");

@@ -24,6 +24,10 @@ export const state = {
   mode: "live",
   /** @type {Array<{id: string, name: string, polygon_m: number[][], colour: string|null}>} */
   zones: [],
+  /** Zones of other sites that have this one's number: kept, not shown. @type {Array<{site: string, zones: any[]}>} */
+  otherZones: [],
+  /** Why the zones that the broker keeps cannot be read. @type {string|null} */
+  zonesFault: null,
   /** @type {any[]} tags that entered or left zones, newest first */
   events: [],
   /** @type {any[]} what has happened at the live site, oldest first; `panels/events.js` lists it */
@@ -45,9 +49,9 @@ export const state = {
   /** @type {any} the recording that `player.js` plays */
   player: null,
   selection: { tag: null, anchor: null, zone: null },
-  options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none" },
-  /** @type {{data: any, picture: HTMLCanvasElement|null, error: string}} */
-  overlay: { data: null, picture: null, error: "" },
+  options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none", floor: null },
+  /** @type {{data: any, picture: HTMLCanvasElement|null, error: string, pendingSince: number|null}} pending: computing */
+  overlay: { data: null, picture: null, error: "", pendingSince: null },
 };
 
 /** Call `callback` in the next frame after any of the topics has changed. */
