@@ -5,11 +5,13 @@ dropped and counted.
 """
 
 import asyncio
+import os
 import queue
+import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TextIO
 
 from skyless.cli.common.options import options
 from skyless.cli.common.output import cm, to_json
@@ -53,6 +55,8 @@ class LineOptions:
             raise SkylessError(f"{' and '.join(f'--{name}' for name in chosen)} exclude each other; give one of them")
         if not chosen:
             return None
+        if sys.stdout is None:
+            raise SkylessError(f"--{chosen[0]} writes on standard output, which is closed")
         line = {"print": line_for_people, "csv": csv_row, "json": to_json}[chosen[0]]
         return FixLines(line, ",".join(CSV_COLUMNS) if self.csv else None, log)
 
@@ -128,8 +132,17 @@ class FixLines:
 
     def _write_all(self, loop: asyncio.AbstractEventLoop) -> None:
         try:
-            while (line := self._waiting.get()) is not None:
-                print(line, flush=True)
+            with _standard_output() as out:
+                while (line := self._waiting.get()) is not None:
+                    out.write(f"{line}\n")
         except OSError as error:
             self._trouble = error
             loop.call_soon_threadsafe(self._ended.set)
+
+
+def _standard_output() -> TextIO:
+    """Standard output, flushed with each line.
+
+    It is apart from ``sys.stdout``, which Python flushes at its end: a reader that takes nothing must not delay that.
+    """
+    return os.fdopen(os.dup(sys.stdout.fileno()), "w", 1, sys.stdout.encoding, "backslashreplace")
