@@ -79,7 +79,7 @@ class PlanOptions:
     """Mode slots: write the slots into the site file; everything else in it stays."""
     force: bool = False
     """With --write: replace slots that the site file has already."""
-    seconds: Positive = 60.0
+    search_seconds: Positive = 60.0
     """Time after which the search for positions ends in any case."""
     verify: Annotated[int, Parameter(validator=Number(gte=1, lte=200))] | None = None
     """Let tags rest at this many random points of the region in the simulated world, and compare."""
@@ -346,7 +346,7 @@ def _optimise(
     if anchors < needed:
         raise SkylessError(f"--optimise is {anchors}; this site's positions need {needed} anchors or more")
     with progress_bar("placing anchors", 1.0) as bar:
-        found = Search(site, settings, floor, mounts, heights_m, anchors, asked.seed, asked.seconds)
+        found = Search(site, settings, floor, mounts, heights_m, anchors, asked.seed, asked.search_seconds)
         return found.run(asked.target_m, bar.reach)
 
 

@@ -152,12 +152,15 @@ def _map_line(result: dict[str, Any]) -> str:
 
 def _one_more(more: "OneMore") -> str:
     x, y, z = more.position_m
-    if more.mean_after_m >= more.mean_before_m and more.worst_after_m >= more.worst_before_m:
-        return "would not help: the superframe grows, and the geometry is good"
-    return (
-        f"helps most at ({x:.2f}, {y:.2f}, {z:.2f}) m: mean {cm(more.mean_before_m)} → {cm(more.mean_after_m)}, "
-        f"worst {cm(more.worst_before_m)} → {cm(more.worst_after_m)}"
-    )
+    mean = _change(more.mean_before_m, more.mean_after_m)
+    worst = _change(more.worst_before_m, more.worst_after_m)
+    if not more.helps:
+        return f"none helps noticeably; with the best one mean {mean}, worst {worst}"
+    return f"helps most at ({x:.2f}, {y:.2f}, {z:.2f}) m: mean {mean}, worst {worst}"
+
+
+def _change(before_m: float, after_m: float) -> str:
+    return f"{cm(before_m)} → {cm(after_m)} ({after_m / before_m - 1.0:+.0%})"
 
 
 def _against_even(found: dict[str, Any]) -> str:

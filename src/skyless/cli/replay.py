@@ -40,7 +40,7 @@ FIXES_COLUMNS: Final = (
     *("anchors", "anchor_ids", "chi2", "residual_rms_m"),
     *("hpl_m", "vpl_m", "integrity_risk", "alert"),
 )
-"""Columns of the file that --fixes writes."""
+"""Columns of the file that --fixes-csv writes."""
 
 app = App(
     name="replay",
@@ -58,7 +58,7 @@ class _OtherProtection(ProtectionOptions):
     alert_limit_m: Positive | None = None
     """Another alert limit than the tag's own, in metres."""
     max_acceleration: NotNegative | None = None
-    """Another largest acceleration than the tag's own, in m/s². With any of these, or --height-std, tags start from
+    """Another largest acceleration than the tag's own, in m/s². With any of these, or --tag-height-std, tags start from
     the beginning, as with another method, and those that are not given are as of a tag of which nothing was asked."""
 
 
@@ -75,9 +75,9 @@ class ReplayOptions:
     """Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns. MILUV ticks bring their own."""
     lever_arm: str | None = None
     """The antenna in the body's frame, x,y,z in metres, added to the truth."""
-    height: str = "auto"
+    tag_height: str = "auto"
     """The tag's height: metres, truth (its median), free (estimated), or auto: free where the anchors determine it."""
-    height_std: NotNegative | None = None
+    tag_height_std: NotNegative | None = None
     """Standard deviation of the tag's height from the one that is given, in metres, which fixes and levels then
     count; by default 0.5 where the height is only taken for the anchors', else 0."""
     format: str | None = None
@@ -103,7 +103,7 @@ class ReplayOptions:
     """What the filter is given of other recordings: packets, as anchors sent them, which is the default for
     Bitcraze's; or differences, which are made of them."""
     protection: _OtherProtection = _OtherProtection()
-    fixes: Path | None = None
+    fixes_csv: Path | None = None
     """Write every fix into this table."""
     plot: Path | None = None
     """Draw track, errors and histograms into this PNG, SVG or PDF."""
@@ -119,16 +119,16 @@ def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> None:
     of time differences, MILUV passive ticks and Avalue receptions; the format is recognised by the content.
 
     A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
-    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --height-std,
-    --settle, --above, --fixes, --plot and --json.
+    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --tag-height-std,
+    --settle, --above, --fixes-csv, --plot and --json.
 
     Parameters
     ----------
     file
         The recording, plain or gzip.
     """
-    check_output("fixes", asked.fixes, file, asked.anchors, asked.site, asked.truth)
-    check_output("plot", asked.plot, file, asked.anchors, asked.site, asked.truth, asked.fixes)
+    check_output("fixes-csv", asked.fixes_csv, file, asked.anchors, asked.site, asked.truth)
+    check_output("plot", asked.plot, file, asked.anchors, asked.site, asked.truth, asked.fixes_csv)
     check_picture(asked.plot)
     if is_mcap(file):
         _replay_site(file, asked)
@@ -157,9 +157,9 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
     anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)
     known = known_truth(file, asked.truth, asked.lever_arm, asked.format, asked.listener)
     format_name = format_of(file, asked.format).name
-    height_m, std_m, note = height_to_hold(asked.height, anchors_m, site_height_m, known, format_name)
+    height_m, std_m, note = height_to_hold(asked.tag_height, anchors_m, site_height_m, known, format_name)
     settle_s = asked.settle if asked.settle is not None else (2.0 if known is None else 3.0)
-    check_height_std(asked.height_std, height_m)
+    check_height_std(asked.tag_height_std, height_m)
     judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=flight_height(asked.above, known))
     request = ReplayRequest(
         path=file,
@@ -167,13 +167,13 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
         format=asked.format,
         listener=asked.listener,
         height_m=height_m,
-        height_std_m=std_m if asked.height_std is None else asked.height_std,
+        height_std_m=std_m if asked.tag_height_std is None else asked.tag_height_std,
         qa=asked.qa,
         tdoa_std_m=asked.tdoa_std,
         calibration=None if asked.anchors is None or asked.uncalibrated else read_calibration(asked.anchors),
         measurements=asked.measurements,
     )
-    report = _run_foreign(Replay(request, judge), file, asked.fixes)
+    report = _run_foreign(Replay(request, judge), file, asked.fixes_csv)
     if asked.listener is not None and report.receptions == 0:
         raise ConfigurationError(file, "listener", asked.listener, "one that the recording names")
     if asked.truth is not None and known is not None:
@@ -235,12 +235,13 @@ def _replay_site(file: Path, asked: ReplayOptions) -> None:
     useless = {
         "anchors": asked.anchors, "truth": asked.truth, "lever-arm": asked.lever_arm, "format": asked.format,
         "listener": asked.listener, "qa": asked.qa, "tdoa-std": asked.tdoa_std, "measurements": asked.measurements,
-        "height": None if asked.height == "auto" else asked.height, "uncalibrated": asked.uncalibrated or None,
+        "tag-height": None if asked.tag_height == "auto" else asked.tag_height,
+        "uncalibrated": asked.uncalibrated or None,
     }  # fmt: skip
     check_left_out(useless, "a recording of skyless record brings its own")
     required = None
-    if asked.protection.given or asked.height_std is not None:
-        required = asked.protection.requirement(asked.method, asked.height_std)
+    if asked.protection.given or asked.tag_height_std is not None:
+        required = asked.protection.requirement(asked.method, asked.tag_height_std)
     if asked.method is not None:
         check_method(asked.method)
     with McapRecording(file) as recording:
@@ -268,7 +269,7 @@ def _run_site(run: "SiteReplay", span_s: float, asked: ReplayOptions) -> "list[T
 
     with loading_kernels():
         compile_kernels(asked.method or DEFAULT_METHOD)
-    with progress_bar("replaying", span_s) as bar, _table_of_fixes(asked.fixes, (*FIXES_COLUMNS, "tag")) as write:
+    with progress_bar("replaying", span_s) as bar, _table_of_fixes(asked.fixes_csv, (*FIXES_COLUMNS, "tag")) as write:
         if write is None:
             return run.run(None, bar.reach)
         return run.run(lambda tag, made: write((f"{made.unix_s:.6f}", *_row(made.fix)[1:], tag)), bar.reach)

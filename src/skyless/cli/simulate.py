@@ -98,7 +98,7 @@ class SimulateOptions:
     """Stop when every tag has this many judged fixes (one per superframe), or has had none for 60 s."""
     duration: Positive | None = None
     """Stop after this many simulated seconds; by default 60 unless --fixes is given."""
-    warmup: NotNegative = 2.0
+    settle: NotNegative = 2.0
     """Simulated seconds before which fixes are not judged; less than the run lasts."""
     seed: Seed = 1
     """Same seed, same bytes and ticks."""
@@ -156,16 +156,16 @@ def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
     """
     request = _request(asked)
     check_simulated(request.site, request.method)
-    if asked.warmup >= asked.until_s:
+    if asked.settle >= asked.until_s:
         raise SkylessError(
-            f"--warmup is {asked.warmup:g}; a run of {asked.until_s:g} s (--duration) ends before any fix is judged"
+            f"--settle is {asked.settle:g}; a run of {asked.until_s:g} s (--duration) ends before any fix is judged"
         )
     result = _run(request, asked)
     if asked.json:
         import msgspec
 
         settings = {
-            "seed": asked.seed, "noise_ps": asked.noise_ps, "warmup_s": asked.warmup, "site": request.site.name
+            "seed": asked.seed, "noise_ps": asked.noise_ps, "warmup_s": asked.settle, "site": request.site.name
         }  # fmt: skip
         print_json({**msgspec.to_builtins(result), **settings})
     else:
@@ -189,7 +189,7 @@ def _request(asked: SimulateOptions) -> "Request":
         speed_mps=asked.speed or 1.0,
         qa=asked.qa,
         integrity=asked.protection.requirement(asked.method),
-        warmup_s=asked.warmup,
+        warmup_s=asked.settle,
         most_fixes=asked.fixes,
         loss=asked.loss,
         nlos=asked.nlos,

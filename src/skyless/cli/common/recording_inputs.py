@@ -72,7 +72,7 @@ def height_to_hold(
         return None, 0.0, "estimated"
     if wish == "truth" or (wish == "auto" and truth is not None and format_name == "miluv"):
         if truth is None:
-            raise SkylessError("--height truth takes the height from the truth, which --truth must give")
+            raise SkylessError("--tag-height truth takes the height from the truth, which --truth must give")
         return float(np.median(truth.position_m[:, 2])), 0.0, "the truth's median"
     if wish != "auto":
         return height_number(wish, "or truth, free or auto"), 0.0, "given"
@@ -81,7 +81,7 @@ def height_to_hold(
     plane_m = plane_height_m(anchors_m)
     if plane_m is None:
         return None, 0.0, "estimated"
-    note = "the anchors' mean: they lie too flat to determine the height (--height free estimates it all the same)"
+    note = "the anchors' mean: they lie too flat to determine the height (--tag-height free estimates it all the same)"
     return plane_m, GUESSED_STD_M, note
 
 
