@@ -110,6 +110,7 @@ const handlers = {
     state.mqtt = { connected: message.mqtt !== false, broker: state.mqtt?.broker ?? "" };
     state.events = [...(message.events ?? [])].sort((a, b) => b.unix_s - a.unix_s);
     changed("connection", "events");
+    handlers.preparation({ preparation: null });
     handlers.zones(message);
     if (message.site) handlers.site(message);
   },
@@ -146,6 +147,10 @@ const handlers = {
   },
   watch(message) {
     receiveWatch(message.watch, message.age_s);
+  },
+  preparation(message) {
+    state.preparation = message.preparation;
+    changed("preparation");
   },
   floor_plan(message) {
     state.floorDigest = message.digest;

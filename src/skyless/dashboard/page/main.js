@@ -5,6 +5,7 @@ import * as banner from "./banner.js";
 import * as legend from "./legend.js";
 import * as live from "./live.js";
 import * as map from "./map/map.js";
+import * as preparation from "./preparation.js";
 import * as replay from "./replay_bar.js";
 import * as tabs from "./tabs.js";
 import * as theme from "./theme.js";
@@ -27,6 +28,7 @@ legend.start();
 tabs.start();
 replay.start();
 banner.start();
+preparation.start();
 watch.start();
 on(["site"], () => {
   text(byId("site-name"), state.site?.name ?? "");
