@@ -42,6 +42,7 @@ _COMMANDS = (
     ("tag", "nodes.tag", "Run listening tags."),
     ("dashboard", "dashboard", "Show a site live in the browser."),
     ("record", "nodes.record", "Record a running site into a file."),
+    ("warm", "warm", "Compile all kernels ahead, so that no later start has to."),
     ("bench", "bench", "Measure how fast Monte Carlo draws run on this machine."),
 )
 

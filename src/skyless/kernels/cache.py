@@ -25,6 +25,13 @@ from typing import Final
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 from msgspec import Struct
 
+ONLY_VARIABLE: Final = "SKYLESS_COMPILE_ONLY"
+"""Environment variable: packages, with commas, whose kernels this program compiles; others run as plain Python.
+
+Those with a minus are left out. So several programs compile parts of what one computation needs
+(``skyless.preparation``).
+"""
+
 _PACKAGE: Final = Path(__file__).parents[1]
 _KEPT_S: Final = 86_400.0
 """Kernels of older sources are kept for a day: a program that was started with them may still be compiling."""

@@ -14,18 +14,11 @@ from numba import njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
 from numba.extending import register_jitable
 
-from skyless.kernels.cache import kernel_folder
+from skyless.kernels.cache import ONLY_VARIABLE, kernel_folder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _CONFIG: Any = numba.config
-
-ONLY_VARIABLE: Final = "SKYLESS_COMPILE_ONLY"
-"""Environment variable: packages, with commas, whose kernels this program compiles; others run as plain Python.
-Those with a minus are left out of it.
-
-So that several programs can compile parts of what one computation needs (``skyless.preparation``).
-"""
 
 _NAMES: Final = os.environ.get(ONLY_VARIABLE, "").replace(",", " ").split()
 _ONLY: Final = tuple(name for name in _NAMES if not name.startswith("-"))

@@ -12,7 +12,7 @@ from typing import IO, Final
 import msgspec
 from msgspec import Struct
 
-from skyless.kernels.cache import KernelFolder, kernel_folder
+from skyless.kernels.cache import ONLY_VARIABLE, KernelFolder, kernel_folder
 from skyless.kernels.processors import cores
 from skyless.preparation.parts import Part
 
@@ -40,8 +40,8 @@ class CompilationError(Exception):
 
 def missing(parts: Iterable[Part]) -> tuple[Part, ...]:
     """Parts that have not been compiled for these sources and this processor."""
-    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}:
-        return ()
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"} or ONLY_VARIABLE in os.environ:
+        return ()  # nothing is compiled, or this is the process that compiles
     folder = kernel_folder()
     return tuple(part for part in parts if not folder.is_ready(part.name))
 
@@ -66,9 +66,9 @@ class _Progress(Struct):
     """Of one part."""
 
     typical_s: float
+    timeline: tuple[float, ...]
     done: int = 0
     total: int = 0
-    share: float = 0.0
     begun_s: float | None = None
     ended: bool = False
 
@@ -76,9 +76,19 @@ class _Progress(Struct):
         if self.ended:
             return 0.0
         spent_s = 0.0 if self.begun_s is None else now_s - self.begun_s
-        if self.share < _SURE_SHARE:
-            return max(self.typical_s - spent_s, 1.0)
-        return spent_s * (1.0 - self.share) / self.share
+        share = self._share()
+        if share < _SURE_SHARE:
+            return max(self.typical_s - spent_s, 0.5 * self.typical_s)
+        return spent_s * (1.0 - share) / share
+
+    def _share(self) -> float:
+        """Of its time that is over, by its kernels."""
+        if not self.total:
+            return 0.0
+        at = self.done / self.total * (len(self.timeline) - 1)
+        before = min(int(at), len(self.timeline) - 2)
+        begin, end = self.timeline[before : before + 2]
+        return begin + (at - before) * (end - begin)
 
 
 class _Run:
@@ -86,11 +96,12 @@ class _Run:
 
     def __init__(self, parts: tuple[Part, ...], folder: KernelFolder, report: Report, notes: IO[bytes]) -> None:
         self._parts, self._folder, self._report, self._notes = parts, folder, report, notes
-        self._progress = {part.name: _Progress(part.typical_s) for part in parts}
+        self._progress = {part.name: _Progress(part.typical_s, part.timeline) for part in parts}
+        self._ended = {part.name: asyncio.Event() for part in parts}
         self._free = asyncio.Semaphore(cores())
 
     async def run(self) -> None:
-        telling = asyncio.ensure_future(self._report_all())
+        reporting = asyncio.ensure_future(self._report_all())
         try:
             async with asyncio.TaskGroup() as group:
                 for part in sorted(self._parts, key=lambda part: -part.typical_s):
@@ -98,23 +109,25 @@ class _Run:
         except* CompilationError as errors:
             raise errors.exceptions[0] from None
         finally:
-            telling.cancel()
+            reporting.cancel()
 
     async def _compile(self, part: Part) -> None:
+        for name in part.after:
+            if name in self._ended:
+                await self._ended[name].wait()
         async with self._free:
             progress = self._progress[part.name]
             progress.begun_s = time.monotonic()
             async with _worker(part) as process:
                 assert process.stdout is not None
                 async for line in process.stdout:
-                    progress.done, progress.total, progress.share = msgspec.json.decode(
-                        line, type=tuple[int, int, float]
-                    )
+                    progress.done, progress.total = msgspec.json.decode(line, type=tuple[int, int])
                 code = await process.wait()
             if code != 0:
                 raise CompilationError(f"compiling {part.name} ended with exit code {code}")
             progress.done, progress.ended = progress.total, True
             self._folder.mark_ready(part.name)
+            self._ended[part.name].set()
 
     async def _report_all(self) -> None:
         while True:
@@ -147,7 +160,7 @@ async def _worker(part: Part) -> AsyncIterator[asyncio.subprocess.Process]:
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.DEVNULL,
         start_new_session=True,  # Ctrl-C in a terminal is for its parent
-        env={**os.environ, "SKYLESS_COMPILE_ONLY": ",".join(part.only)},
+        env={**os.environ, ONLY_VARIABLE: ",".join(part.only)},
     )
     try:
         yield process
