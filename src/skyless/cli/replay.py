@@ -191,8 +191,9 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
 
 def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
     from skyless.evaluation.compile_ahead import compile_packet_kernels, compile_pair_kernels
+    from skyless.preparation.parts import PACKETS, PAIRS
 
-    with loading_kernels():
+    with loading_kernels(PACKETS if run.measurements == "packets" else PAIRS):
         if run.measurements == "packets":
             compile_packet_kernels()
         else:
@@ -266,9 +267,11 @@ def _replay_site(file: Path, asked: ReplayOptions) -> None:
 def _run_site(run: "SiteReplay", span_s: float, asked: ReplayOptions) -> "list[TagReport]":
     """The table of fixes has the tag's name at the end of each row; its ``t_s`` is Unix time."""
     from skyless.evaluation.compile_ahead import compile_kernels
+    from skyless.preparation.parts import parts_of
 
-    with loading_kernels():
-        compile_kernels(asked.method or DEFAULT_METHOD)
+    method = asked.method or DEFAULT_METHOD
+    with loading_kernels(*parts_of(method)):
+        compile_kernels(method)
     with progress_bar("replaying", span_s) as bar, _table_of_fixes(asked.fixes_csv, (*FIXES_COLUMNS, "tag")) as write:
         if write is None:
             return run.run(None, bar.reach)

@@ -254,12 +254,13 @@ def _plan(name: str, asked: StudyOptions) -> "Plan":
 
 def _run(chosen: "Study", plan: "Plan", asked: StudyOptions) -> "list[Row]":
     from skyless.evaluation.compile_ahead import compile_kernels
+    from skyless.preparation.parts import parts_of
     from skyless.studies.common.runner import run_cells, run_cells_on_dask
 
     check_method(plan.method)
     cells = chosen.cells(plan)
     if chosen.name not in {"claims", "watch"}:  # in which nobody computes positions
-        with loading_kernels():
+        with loading_kernels(*parts_of(plan.method)):
             compile_kernels(plan.method)
     try:
         with progress_bar(f"studying {chosen.title}", 1.0) as bar:
