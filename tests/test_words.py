@@ -12,7 +12,7 @@ SOURCE = Path(skyless.__file__).parent
 ROOT = Path(__file__).parents[1]
 TEXTS = sorted(
     path
-    for pattern in ("src/skyless/**/*.py", "src/skyless/**/*.js", "src/skyless/**/*.html", "docs/*.md", "README.md")
+    for pattern in ("src/skyless/**/*.py", "src/skyless/**/*.js", "src/skyless/**/*.html", "docs/**/*.md", "README.md", "SECURITY.md")
     for path in ROOT.glob(pattern)
     if "vendor" not in path.parts and path.name != "glossary.md"
 )
