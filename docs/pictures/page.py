@@ -68,7 +68,7 @@ def _frames_of(address: str) -> dict[str, list[Image.Image]]:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         visits = {theme: Visit(browser, address, viewport=SIZE, color_scheme=theme) for theme in frames}
         for visit in visits.values():
-            until(visit.page, f"[...skyless.tracks.all.values()].length >= {TAGS}", timeout_s=START_S)
+            until(visit.page, f"skyless.live.all.size >= {TAGS}", timeout_s=START_S)
         time.sleep(WALKED_S)
         begin_s = time.monotonic()
         for number in range(FRAMES):
