@@ -17,7 +17,7 @@ from sphinx.writers.html5 import HTML5Translator
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import reference  # noqa: E402 (a file of this folder)
+import reference
 
 NAVIGATION = {
     "Tutorials": ["docs/tutorials/first_site", "docs/tutorials/first_replay", "docs/tutorials/own_radio"],
@@ -74,7 +74,7 @@ html_title = "Skyless"
 root_doc = "README"
 include_patterns = ["README.md", *(f"{page}.md" for pages in NAVIGATION.values() for page in pages)]
 exclude_patterns = [".*", "build", "dist", "out", "src", "tests", "benchmarks", "scripts"]
-extensions = ["myst_parser", "sphinx.ext.autodoc"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 myst_enable_extensions = ["attrs_inline", "dollarmath"]

@@ -1,6 +1,7 @@
 """The pages of the reference that are made from the code: all commands with their options, and the Python interface."""
 
 import inspect
+import re
 from collections.abc import Callable
 
 import skyless
@@ -8,8 +9,10 @@ from skyless.cli.main import program
 
 
 def commands() -> str:
-    """Markdown: every command with its usage, options and example, as ``--help`` shows them."""
-    return "\n" + program().generate_docs(output_format="markdown", heading_level=2).split("\n", 1)[1]
+    """Markdown: every command with its usage and options, as ``--help`` shows them."""
+    made = program().generate_docs(output_format="markdown", heading_level=1)
+    body = re.sub(r"^## Table of Contents\n.*?(?=^\*\*)", "", made.split("\n", 1)[1], flags=re.DOTALL | re.MULTILINE)
+    return f"\n{body}"
 
 
 def python() -> str:
@@ -21,9 +24,8 @@ def python() -> str:
 def _directive(name: str) -> str:
     value = getattr(skyless, name)
     kind = "autoclass" if inspect.isclass(value) else "autofunction" if inspect.isroutine(value) else "autodata"
-    target = f"{value.__module__}.{value.__qualname__}" if kind != "autodata" else f"skyless.{name}"
     members = "   :members:\n" if kind == "autoclass" else ""
-    return f".. {kind}:: {target}\n{members}"
+    return f".. {kind}:: skyless.{name}\n{members}"
 
 
 PAGES: dict[str, Callable[[], str]] = {"docs/reference/commands": commands, "docs/reference/python": python}

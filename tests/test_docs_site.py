@@ -19,7 +19,16 @@ PAGES = [
 CURRENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
 """Those that describe the code as it is."""
 SOURCES = ("src", "tests", "benchmarks", "scripts", "firmware", "docs", "examples", "packaging")
-OTHER_PROGRAMS = {"--nthreads", "--nworkers", "--eraseall", "--no-dev", "--compile-bytecode", "--help", "--user"}
+OTHER_PROGRAMS = {
+    "--nthreads",
+    "--nworkers",
+    "--eraseall",
+    "--no-dev",
+    "--compile-bytecode",
+    "--help",
+    "--user",
+    "--no-cache-dir",
+}
 GENERATOR = ("sphinx", "myst_parser", "furo", "latex2mathml")
 
 pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -175,4 +184,4 @@ def test_the_site_builds_without_a_warning_and_needs_no_network(tmp_path):
     start = (site / "README.html").read_text(encoding="utf-8")
     assert re.search(r"class=\"[^\"]*only-dark[^\"]*\"[^>]*src=\"_images/page_dark.webp\"", start)
     assert "skyless-site-check" in (site / "docs" / "reference" / "commands.html").read_text(encoding="utf-8")
-    assert "skyless.receiver.Receiver" in (site / "docs" / "reference" / "python.html").read_text(encoding="utf-8")
+    assert "skyless.Receiver" in (site / "docs" / "reference" / "python.html").read_text(encoding="utf-8")

@@ -42,6 +42,8 @@ SHORTER = {
 DEMO = "tests/cli/test_demo_command.py::"
 SITE = "tests/nodes/test_running_site.py::test_a_site_rides_through_the_death_and_the_freezing_of_every_process"
 BOARD = "tests/nodes/test_boards_live.py::"
+BROKER = "tests/nodes/test_broker.py::"
+MQTT = "tests/cli/test_node_commands.py::test_the_demo_tells_how_to_watch_its_broker"
 PLAN = "tests/cli/test_plan_command.py::"
 REPLAY = "tests/cli/test_replay_command.py::"
 ELSEWHERE = {
@@ -52,8 +54,12 @@ ELSEWHERE = {
     "skyless demo --duration 20 --record walk.mcap": (
         DEMO + "test_json_also_where_ports_are_taken_and_nothing_can_be_written_at_home"
     ),
-    "skyless demo --site hall.toml --tags 3": DEMO + "test_programs_that_die_are_started_again_and_ctrl_c_ends_all_with_a_summary",
-    "skyless broker": "tests/nodes/test_broker.py::test_it_leaves_no_orphan_however_it_ends",
+    "skyless demo --site hall.toml --tags 3": DEMO
+    + "test_programs_that_die_are_started_again_and_ctrl_c_ends_all_with_a_summary",
+    "skyless anchor 3 --site /etc/skyless/site.toml --radio serial:/dev/ttyACM0 --mqtt mqtt://hall.local": (
+        BOARD + "test_anchors_and_tags_on_boards_make_the_fixes_of_those_on_the_air_and_survive_pulled_plugs"
+    ),
+    "skyless broker": BROKER + "test_it_leaves_no_orphan_however_it_ends",
     "skyless ether --site hall.toml --tags 2": SITE,
     "skyless anchor 1 2 3 4 5 6 --site hall.toml": SITE,
     "skyless tag tag1 tag2": SITE,
@@ -67,11 +73,11 @@ ELSEWHERE = {
     "skyless tag tag1 --radio serial:/tmp/tag1": (
         BOARD + "test_anchors_and_tags_on_boards_make_the_fixes_of_those_on_the_air_and_survive_pulled_plugs"
     ),
-    "mosquitto_sub -t 'skyless/#' -v": "tests/cli/test_node_commands.py::test_the_demo_tells_how_to_watch_its_broker",
-    "mosquitto_sub -t 'skyless/v1/+/tag/+/fix'": "tests/cli/test_node_commands.py::test_the_demo_tells_how_to_watch_its_broker",
-    "export SKYLESS_MQTT_PASSWORD=choose-one": "tests/nodes/test_broker.py::test_wrong_options_are_reported_with_what_would_be_right",
+    "mosquitto_sub -t 'skyless/#' -v": MQTT,
+    "mosquitto_sub -t 'skyless/v1/+/tag/+/fix'": MQTT,
+    "export SKYLESS_MQTT_PASSWORD=choose-one": BROKER + "test_wrong_options_are_reported_with_what_would_be_right",
     "skyless broker --listen 0.0.0.0 --user hall": (
-        "tests/nodes/test_broker.py::test_wrong_options_are_reported_with_what_would_be_right"
+        BROKER + "test_wrong_options_are_reported_with_what_would_be_right"
     ),
     "skyless dashboard --listen 0.0.0.0:8080 --mqtt mqtt://hall@127.0.0.1": (
         "tests/dashboard/test_dashboard_end_to_end.py::test_other_machines_need_the_token_that_is_printed"
@@ -107,9 +113,29 @@ ELSEWHERE = {
     "skyless paper --out quick-report --quick": (
         "tests/paper/test_paper_report.py::test_every_picture_is_there_twice_and_nothing_is_left_over"
     ),
-    "python examples/own_radio.py": "tests/examples/test_examples.py",
+    **dict.fromkeys(
+        [
+            "sudo apt install python3-venv",
+            ".venv-uv/uv sync --extra pi",
+            "sudo usermod --append --groups spi,gpio,dialout $USER",
+            "sudo systemctl enable --now skyless-anchor",
+            "journalctl --unit skyless-anchor --follow",
+        ],
+        "never run: these need a Raspberry Pi",
+    ),
+    **dict.fromkeys(
+        [
+            "docker build --tag skyless .",
+            "docker run --rm --init --network host skyless demo",
+        ],
+        "never run: these need Docker",
+    ),
+    "python examples/own_radio.py": "tests/examples/test_examples.py::test_own_radio",
 }
-"""Lines that run until Ctrl-C, take long or need what is not here, and the tests that run such a command."""
+"""Lines that run until Ctrl-C, take long or need what is not here, and the tests that run such a command.
+
+Those that no test can run say so here, and their pages say that they have never run.
+"""
 
 UNTIL_CTRL_C = {"anchor", "board", "broker", "dashboard", "demo", "ether", "record", "tag"}
 
@@ -180,7 +206,13 @@ def test_every_entry_is_of_a_line_and_names_a_test():
 @pages
 def test_no_command_stands_outside_a_shell_block(page):
     text = page.read_text(encoding="utf-8")
-    assert set(re.findall(r"^```(\w*)\n(?:.*?)^```", text, re.DOTALL | re.MULTILINE)) <= {"sh", "python", "text"}
+    assert set(re.findall(r"^```(\w*)\n(?:.*?)^```", text, re.DOTALL | re.MULTILINE)) <= {
+        "sh",
+        "python",
+        "text",
+        "ini",
+        "dockerfile",
+    }
     prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     assert not re.findall(r"^ {4}(?:skyless|scripts|python|sudo|docker) .*", prose, re.MULTILINE)
 

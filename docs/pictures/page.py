@@ -38,7 +38,7 @@ def record() -> None:
     with tempfile.TemporaryDirectory() as folder:
         arguments = ["demo", "--tags", str(TAGS), "--seed", "4", "--record", "none"]
         environment = {**os.environ, "XDG_DATA_HOME": folder, "PYTHONUNBUFFERED": "1"}
-        demo = subprocess.Popen(  # noqa: S603 (this repository's own program)
+        demo = subprocess.Popen(
             [sys.executable, "-m", "skyless.cli.main", *arguments],
             cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
@@ -87,7 +87,13 @@ def _write(path: Path, frames: list[Image.Image]) -> None:
     """An endless animation of no more than ``LIMIT_BYTES``, as sharp as that allows."""
     for quality in (80, 60, 45, 30):
         frames[0].save(
-            path, save_all=True, append_images=frames[1:], duration=round(1e3 * FRAME_S), loop=0, quality=quality, method=6
+            path,
+            save_all=True,
+            append_images=frames[1:],
+            duration=round(1e3 * FRAME_S),
+            loop=0,
+            quality=quality,
+            method=6,
         )
         if path.stat().st_size <= LIMIT_BYTES:
             return
