@@ -18,6 +18,7 @@ NAVIGATION = {
     "Run a site": [
         "docs/setup",
         "docs/sites",
+        "docs/page",
         "docs/mqtt",
         "docs/planning",
         "docs/survey",
