@@ -54,7 +54,7 @@ class TagNode:
         before: Callable[[Receiver, Reception, int], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``before`` is called with receiver, reception and the number of fixes so far before each reception that counts.
+        """``before`` is called before each reception that is processed: with receiver, reception and number of fixes.
 
         ``clock`` gives the host's monotonic time in s, as ``host_s`` of the receptions.
         """
