@@ -10,7 +10,7 @@ from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
 ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y")
-FIELDS = (*POSITION, *ERRORS, "anchors_used", "chi2", "fix_unix_s", "hpl_m", "alert")
+FIELDS = (*POSITION, *ERRORS, "anchors_used", "chi2", "fix_unix_s", "hpl_m", "alert", "height_given", "std_z_m")
 
 
 def rows(state, since=0):
@@ -25,7 +25,28 @@ def test_a_row_has_the_fields_in_order():
     message = json.loads(state.state_since(0))
     assert message["type"] == "state"
     assert message["unix_s"] == pytest.approx(1000.0625, abs=1e-3)
-    expected = ("t1", 1.25, 2.5, 0.75, 0.5, -0.25, 4e-4, 1e-4, 2e-4, 0.01, None, None, None, 4, 2.5, 1000.0, None, None)
+    expected = (
+        "t1",
+        1.25,
+        2.5,
+        0.75,
+        0.5,
+        -0.25,
+        4e-4,
+        1e-4,
+        2e-4,
+        0.01,
+        None,
+        None,
+        None,
+        4,
+        2.5,
+        1000.0,
+        None,
+        None,
+        1,
+        None,
+    )
     assert message["tags"] == [list(expected)]
     state.add_fix(fix(velocity_mps=None), 0.0)
     assert rows(state)[0]["vx"] is None
@@ -36,6 +57,14 @@ def test_rows_hold_levels_and_alerts():
     for alert in ("none", "detected-excluded", None):
         state.add_fix(fix(hpl_m=0.123456, alert=alert), 0.0)
         assert (rows(state)[0]["hpl_m"], rows(state)[0]["alert"]) == (0.1235, alert)
+
+
+def test_rows_say_whether_the_height_was_given():
+    state = SiteState()
+    covariance = (4e-4, 0.0, 0.0, 0.0, 4e-4, 0.0, 0.0, 0.0, 9e-4)
+    for known, std_z_m in ((True, None), (False, 0.03)):
+        state.add_fix(fix(covariance_m2=covariance, height_known=known), 0.0)
+        assert (rows(state)[0]["height_given"], rows(state)[0]["std_z_m"]) == (int(known), std_z_m)
 
 
 def test_only_tags_with_a_newer_fix_are_sent_and_only_their_last():

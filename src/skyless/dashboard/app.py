@@ -5,6 +5,7 @@ import mimetypes
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
+from urllib.parse import quote
 
 import msgspec
 from msgspec import Struct
@@ -12,7 +13,7 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -76,6 +77,8 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/survey/save", _save_survey, methods=["POST"]),
         Route("/api/recordings", _recordings),
         Route("/api/recordings/{name}", _recording),
+        Route("/api/recordings/{name}/events", _recorded_events),
+        Route("/api/recordings/{name}/file", _recorded_file),
         Route("/api/recordings/{name}/states", _recorded_states),
         Route("/api/recordings/{name}/floor_plan", _recorded_floor_plan),
         WebSocketRoute("/live", _live),
@@ -193,7 +196,8 @@ async def _body(request: Request, most_bytes: int, fault: str) -> bytes:
 async def _put_zones(request: Request) -> Response:
     body = await _body(request, _MAX_BODY_BYTES, "too many zones")
     live = _services(request).live
-    live.store_zones(read_zones(body))
+    message = read_zones(body)
+    live.store_zones(message.zones, message.site)
     return _json({"zones": live.monitor.zones})
 
 
@@ -207,6 +211,19 @@ async def _recording(request: Request) -> Response:
 
 async def _recorded_floor_plan(request: Request) -> Response:
     return _image(await asyncio.to_thread(_services(request).playback.floor_plan, request.path_params["name"]))
+
+
+async def _recorded_events(request: Request) -> Response:
+    return _json(await asyncio.to_thread(_services(request).playback.events, request.path_params["name"]))
+
+
+async def _recorded_file(request: Request) -> Response:
+    found = await asyncio.to_thread(_services(request).playback.open_file, request.path_params["name"])
+    headers = {
+        "Content-Disposition": f"attachment; filename*=utf-8''{quote(found.name, safe='')}",
+        "Content-Length": str(found.size_bytes),
+    }
+    return StreamingResponse(found.pieces(), media_type="application/octet-stream", headers=headers)
 
 
 async def _recorded_states(request: Request) -> Response:

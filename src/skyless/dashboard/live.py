@@ -32,6 +32,7 @@ from skyless.dashboard.zones import (
     check_zones,
     publisher_rank,
     read_zones,
+    zones_of,
 )
 from skyless.errors import ConfigurationError
 from skyless.mqtt import topics
@@ -39,6 +40,7 @@ from skyless.mqtt.messages import (
     AnchorHealth,
     EtherHealth,
     FixMessage,
+    PreparationMessage,
     SiteMessage,
     StatusMessage,
     SurveyFactsMessage,
@@ -53,6 +55,8 @@ from skyless.site.check import check_site
 
 _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0
+_PREPARATION_EXPIRY_S: Final = 5.0
+"""A preparation of which nothing has come for this time has ended without saying so."""
 
 _HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
 _log = logging.getLogger("skyless.dashboard")
@@ -160,6 +164,8 @@ class LiveSite:
         self.name, self.broker = name, broker
         self.site = site
         self.floor_plan: bytes | None = None
+        self.preparation: PreparationMessage | None = None
+        """How far the kernels of a site that starts for the first time are compiled."""
         self.connected = False
         self.state = SiteState()
         self.monitor = ZoneMonitor()
@@ -171,8 +177,12 @@ class LiveSite:
         self._clock, self._wall_clock = clock, wall_clock
         self._link: MqttLink | None = None
         self._site_id: int | None = None
+        self._zones = ZonesMessage(())
+        """As the broker keeps them, or as they were stored here last; with those of other sites of this number."""
         self._drawn: ZonesMessage | None = None
         """Zones stored here that have not come back from the broker."""
+        self._zones_fault: str | None = None
+        """Why the zones that the broker keeps cannot be read."""
         self._sent_serial = 0
         self._health_due_s = self._condition_due_s = 0.0
         self.evidence = Evidence(host, clock())
@@ -183,6 +193,7 @@ class LiveSite:
         self.condition: Condition = self._condition_monitor.evaluate(clock())
         self._logged_serial = 0
         self._lag_s = 0.0
+        self._preparation_s = 0.0
 
     # MQTT
 
@@ -196,6 +207,7 @@ class LiveSite:
             topics.status_topic(site_id, "+", "+"): self._on_status,
             topics.health_topic(site_id, "+", "+"): self._on_health,
             topics.truth_topic(site_id): self._on_truth,
+            topics.preparation_topic(site_id): self._on_preparation,
             topics.zones_topic(site_id): self._on_zones,
             topics.zone_event_topic(site_id, "+"): self._on_zone_event,
             **self.survey.handlers(site_id),
@@ -233,6 +245,7 @@ class LiveSite:
         self.site = message
         self.evidence.set_site(message.site, self._clock())
         self._broadcast("site", encode("site", {"site": message}))
+        self._assign_zones()
 
     def _on_floor_plan(self, topic: str, payload: bytes) -> None:
         image = payload or None
@@ -280,18 +293,40 @@ class LiveSite:
             self.evidence.add_health(kind, name, health, now_s, unix_s)
             self.log.on_health(kind, name, health, unix_s)
 
+    def _on_preparation(self, _topic: str, payload: bytes) -> None:
+        now = read_message(payload, PreparationMessage) if payload else None
+        self._preparation_s = self._clock()
+        self._show_preparation(now)
+
+    def _show_preparation(self, now: PreparationMessage | None) -> None:
+        if now is not None or self.preparation is not None:
+            self.preparation = now
+            self._broadcast("preparation", self._preparation_message())
+
+    def _preparation_message(self) -> bytes:
+        return encode("preparation", {"preparation": self.preparation})
+
     def _on_truth(self, _topic: str, payload: bytes) -> None:
         self.state.add_truth(read_message(payload, TruthMessage))
 
     def _on_zones(self, topic: str, payload: bytes) -> None:
-        zones = read_zones(payload) if payload else ()
+        try:
+            message = read_zones(payload) if payload else ZonesMessage(())
+        except BadZonesError as error:
+            self._zones_fault = f"the zones that the broker keeps at {topic} cannot be read: {error}"
+            self._broadcast("zones", self._zones_message())
+            raise
+        if payload and not message.site and not message.others:  # of an older program, which knows of no other sites
+            message = ZonesMessage(message.zones, "", self._zones.others)
         if self._drawn is not None:
-            if zones != self._drawn.zones:
+            if message != self._drawn:
                 return  # older than the zones stored here, which are on their way
             self._drawn = None
-        elif zones != self.monitor.zones and self._link is not None:
+        elif message != self._zones and self._link is not None:
             self._link.forget(topic)
-        self._set_zones(zones)
+        fault, self._zones_fault = self._zones_fault, None
+        self._zones = message
+        self._assign_zones(changed=fault is not None)
 
     def _on_zone_event(self, topic: str, payload: bytes) -> None:
         event = read_message(payload, ZoneEvent)
@@ -301,18 +336,51 @@ class LiveSite:
 
     # Zones
 
-    def store_zones(self, zones: tuple[Zone, ...]) -> None:
-        """Store the zones that a page has drawn. Raises BadZonesError."""
-        check_zones(zones)
-        self._drawn = ZonesMessage(zones)
-        self._set_zones(zones)
-        if self._link is not None and self._site_id is not None:
-            self._link.publish(topics.zones_topic(self._site_id), self._drawn, qos=1, retain=True)
+    def store_zones(self, zones: tuple[Zone, ...], site: str = "") -> None:
+        """Store the zones that a page has drawn at the site of a name; empty: at the one that is shown.
 
-    def _set_zones(self, zones: tuple[Zone, ...]) -> None:
+        Raises BadZonesError; also where the broker keeps zones that cannot be read, which are not overwritten.
+        """
+        check_zones(zones)
+        shown = self._site_name
+        if site and site != shown:
+            raise BadZonesError(f"they are of the site {site[:100]!r}, but {shown[:100]!r} is shown now")
+        if self._zones_fault is not None:
+            raise BadZonesError(f"{self._zones_fault}; nothing was overwritten. Clear that topic to begin again")
+        self._store(ZonesMessage(zones, shown, zones_of(self._zones, shown).others))
+        self._assign_zones()
+
+    @property
+    def _site_name(self) -> str:
+        return "" if self.site is None else self.site.site.name
+
+    def _store(self, message: ZonesMessage) -> None:
+        self._zones = self._drawn = message
+        if self._link is not None and self._site_id is not None:
+            self._link.publish(topics.zones_topic(self._site_id), message, qos=1, retain=True)
+
+    def _assign_zones(self, *, changed: bool = False) -> None:
+        """Show the zones of the present site; those of which no site is known become its own, for good."""
+        name = self._site_name
+        if name and not self._zones.site and self._zones.zones:
+            self._store(zones_of(self._zones, name))
+        if not name and self._zones.site:
+            zones: tuple[Zone, ...] = ()  # whose they are is known, but not whether that site is shown
+        else:
+            zones = zones_of(self._zones, name).zones
         if zones != self.monitor.zones:
             self._schedule(self.monitor.set_zones(zones, self._wall_clock()))
-            self._broadcast("zones", encode("zones", {"zones": zones}))
+            changed = True
+        if changed:
+            self._broadcast("zones", self._zones_message())
+
+    def _zones_message(self) -> bytes:
+        return encode("zones", self._zone_fields())
+
+    def _zone_fields(self) -> dict[str, object]:
+        """The zones of the present site, those of others that have its number, and why they cannot be read."""
+        others = zones_of(self._zones, self._site_name).others
+        return {"zones": self.monitor.zones, "other_zones": others, "zones_fault": self._zones_fault}
 
     def _schedule(self, events: list[ZoneEvent]) -> None:
         if events:
@@ -352,7 +420,7 @@ class LiveSite:
         hello = {
             "version": skyless.__version__,
             "site": self.site,
-            "zones": self.monitor.zones,
+            **self._zone_fields(),
             "events": list(self.events.recent),
             "mqtt": self.connected,
         }
@@ -361,6 +429,8 @@ class LiveSite:
         page.replace("health", self.state.health_message(self.dropped, self._clock()))
         page.replace("condition", encode("condition", msgspec.structs.asdict(self.condition)))
         page.replace("log", encode("log", {"events": self.log.since()}))
+        if self.preparation is not None:
+            page.replace("preparation", self._preparation_message())
         if self.floor_plan is not None:
             page.replace("floor_plan", self._floor_plan_message())
         for kind, message in self.survey.messages().items():
@@ -402,6 +472,8 @@ class LiveSite:
             self._sent_serial = self.state.serial
             for page in self.pages:
                 page.request_state()
+        if now_s > self._preparation_s + _PREPARATION_EXPIRY_S:
+            self._show_preparation(None)
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_PERIOD_S
             self.state.expire(now_s)

@@ -160,4 +160,6 @@ def _row(fix: FixMessage, true_m: Vector | None) -> list[Any]:
         round(fix.unix_s, 4),
         None if fix.hpl_m is None else round(fix.hpl_m, 4),
         fix.alert,
+        int(fix.height_known),
+        None if fix.height_known else round(math.sqrt(max(fix.covariance_m2[8], 0.0)), 5),
     ]

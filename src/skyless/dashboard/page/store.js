@@ -2,7 +2,7 @@
  * The one state of the page. Modules change it and notify the topics; callbacks run at most once a frame.
  *
  * Topics: connection, site, zones, events, health, tags, mode, player, recordings, selection, options, overlay, editor,
- * theme, survey, watch, setup, picking, plan, condition, log, read.
+ * theme, survey, watch, setup, picking, plan, condition, log, read, preparation.
  */
 
 /** @type {Map<string, Set<() => void>>} */
@@ -20,10 +20,16 @@ export const state = {
   /** @type {any} the site message's `site` */
   site: null,
   simulated: false,
+  /** @type {{done: number, total: number, left_s: number|null}|null} while kernels are compiled */
+  preparation: null,
   /** @type {"live"|"replay"} */
   mode: "live",
   /** @type {Array<{id: string, name: string, polygon_m: number[][], colour: string|null}>} */
   zones: [],
+  /** Zones of other sites that have this one's number: kept, not shown. @type {Array<{site: string, zones: any[]}>} */
+  otherZones: [],
+  /** Why the zones that the broker keeps cannot be read. @type {string|null} */
+  zonesFault: null,
   /** @type {any[]} tags that entered or left zones, newest first */
   events: [],
   /** @type {any[]} what has happened at the live site, oldest first; `panels/events.js` lists it */
@@ -45,9 +51,9 @@ export const state = {
   /** @type {any} the recording that `player.js` plays */
   player: null,
   selection: { tag: null, anchor: null, zone: null },
-  options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none" },
-  /** @type {{data: any, picture: HTMLCanvasElement|null, error: string}} */
-  overlay: { data: null, picture: null, error: "" },
+  options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none", floor: null },
+  /** @type {{data: any, picture: HTMLCanvasElement|null, error: string, pendingSince: number|null}} pending: computing */
+  overlay: { data: null, picture: null, error: "", pendingSince: null },
 };
 
 /** Call `callback` in the next frame after any of the topics has changed. */

@@ -109,7 +109,7 @@ function makeDetail() {
   const rates = new Chart("Clock rate relative to the site's (ppm)", [rate], thousandths, 0.01, around);
   const sigmas = new Chart("σ of the clock offset (mm)", [{ name: "σ", colour: "good" }], tenths, 1);
   const charts = h("div", {}, offsets.element, rates.element, sigmas.element);
-  const attributes = { class: "detail", "aria-label": "Selected anchor", hidden: true };
+  const attributes = { class: "detail", "aria-label": "Selected anchor", tabindex: "0", hidden: true };
   const element = h("section", attributes, heading, list.element, charts);
   const showDetail = (id) => {
     const health = healthOf(id);
