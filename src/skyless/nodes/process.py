@@ -31,6 +31,9 @@ Log = Callable[[str], None]
 
 _PR_SET_PDEATHSIG: Final = 1
 
+_MOST_FILES: Final = 65_536
+"""More are not asked for: some systems allow billions, and some libraries go through all that could be open."""
+
 _RADIO_NICE: Final = -10
 """Priority of programs that serve a radio, where the system allows it (root, or a limit in limits.conf)."""
 
@@ -63,9 +66,10 @@ def _new_loop() -> asyncio.AbstractEventLoop:
 if hasattr(selectors, "EpollSelector"):
 
     class PunctualSelector(selectors.EpollSelector):
-        """epoll(), whose own timeouts end up to a millisecond late, woken by select(), which knows of at most 1024 files.
+        """epoll(), whose own timeouts end up to a millisecond late, woken by select(), which is exact.
 
-        select() waits for one file only, epoll()'s own, which can be read as soon as one of the others is ready.
+        select() takes no file beyond number 1023. So it waits for one file alone, epoll()'s own, which can be read as
+        soon as any of the others is ready.
         """
 
         def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
@@ -236,6 +240,17 @@ def locked(file: Path) -> IO[str]:
 
 
 # Use of the machine
+
+
+def most_files() -> int:
+    """How many files and connections this process may have open: as many as the system lets it have, from now on."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == hard:
+        return soft
+    most = min(hard, _MOST_FILES) if hard != resource.RLIM_INFINITY else _MOST_FILES
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(most, soft), hard))
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
 
 
 class Usage:

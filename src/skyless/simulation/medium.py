@@ -317,7 +317,7 @@ class Medium(MediumBase[Result]):
         return True
 
     def miss(self, until_s: float) -> tuple[int, ...]:
-        """Withdraw all frames whose RMARKER would leave before ``until_s``: whoever lets time pass came too late for them.
+        """Withdraw all frames whose RMARKER would leave before ``until_s``: whoever lets time pass came too late.
 
         Returns the nodes that planned them.
         """
