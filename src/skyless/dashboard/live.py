@@ -40,6 +40,7 @@ from skyless.mqtt.messages import (
     AnchorHealth,
     EtherHealth,
     FixMessage,
+    PreparationMessage,
     SiteMessage,
     StatusMessage,
     SurveyFactsMessage,
@@ -54,6 +55,8 @@ from skyless.site.check import check_site
 
 _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0
+_PREPARATION_EXPIRY_S: Final = 5.0
+"""A preparation of which nothing has come for this time has ended without saying so."""
 
 _HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
 _log = logging.getLogger("skyless.dashboard")
@@ -161,6 +164,8 @@ class LiveSite:
         self.name, self.broker = name, broker
         self.site = site
         self.floor_plan: bytes | None = None
+        self.preparation: PreparationMessage | None = None
+        """How far the kernels of a site that starts for the first time are compiled."""
         self.connected = False
         self.state = SiteState()
         self.monitor = ZoneMonitor()
@@ -188,6 +193,7 @@ class LiveSite:
         self.condition: Condition = self._condition_monitor.evaluate(clock())
         self._logged_serial = 0
         self._lag_s = 0.0
+        self._preparation_s = 0.0
 
     # MQTT
 
@@ -201,6 +207,7 @@ class LiveSite:
             topics.status_topic(site_id, "+", "+"): self._on_status,
             topics.health_topic(site_id, "+", "+"): self._on_health,
             topics.truth_topic(site_id): self._on_truth,
+            topics.preparation_topic(site_id): self._on_preparation,
             topics.zones_topic(site_id): self._on_zones,
             topics.zone_event_topic(site_id, "+"): self._on_zone_event,
             **self.survey.handlers(site_id),
@@ -285,6 +292,19 @@ class LiveSite:
             self.state.add_health(name, health, now_s)
             self.evidence.add_health(kind, name, health, now_s, unix_s)
             self.log.on_health(kind, name, health, unix_s)
+
+    def _on_preparation(self, _topic: str, payload: bytes) -> None:
+        now = read_message(payload, PreparationMessage) if payload else None
+        self._preparation_s = self._clock()
+        self._show_preparation(now)
+
+    def _show_preparation(self, now: PreparationMessage | None) -> None:
+        if now is not None or self.preparation is not None:
+            self.preparation = now
+            self._broadcast("preparation", self._preparation_message())
+
+    def _preparation_message(self) -> bytes:
+        return encode("preparation", {"preparation": self.preparation})
 
     def _on_truth(self, _topic: str, payload: bytes) -> None:
         self.state.add_truth(read_message(payload, TruthMessage))
@@ -409,6 +429,8 @@ class LiveSite:
         page.replace("health", self.state.health_message(self.dropped, self._clock()))
         page.replace("condition", encode("condition", msgspec.structs.asdict(self.condition)))
         page.replace("log", encode("log", {"events": self.log.since()}))
+        if self.preparation is not None:
+            page.replace("preparation", self._preparation_message())
         if self.floor_plan is not None:
             page.replace("floor_plan", self._floor_plan_message())
         for kind, message in self.survey.messages().items():
@@ -450,6 +472,8 @@ class LiveSite:
             self._sent_serial = self.state.serial
             for page in self.pages:
                 page.request_state()
+        if now_s > self._preparation_s + _PREPARATION_EXPIRY_S:
+            self._show_preparation(None)
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_PERIOD_S
             self.state.expire(now_s)

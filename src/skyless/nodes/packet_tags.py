@@ -128,9 +128,13 @@ class PacketTags:
         log: Log,
         *,
         simulated: Callable[[], bool],
+        on_fix: FixListener | None = None,
     ) -> None:
-        """``simulated`` is asked again when a sniffer has restarted: its port may lead to another device."""
-        self._settings, self._log = settings, log
+        """``simulated`` is asked again when a sniffer has restarted: its port may lead to another device.
+
+        ``on_fix`` is called with every fix that is to be published, with or without a broker.
+        """
+        self._settings, self._log, self._on_fix = settings, log, on_fix
         self._links = tuple(link_of(address, radio.name, site=settings.site, kind="tag") for radio in radios)
         self.nodes = tuple(
             PacketTagNode(settings, radio, self._publisher(index), log) for index, radio in enumerate(radios)
@@ -147,6 +151,8 @@ class PacketTags:
 
     def _publisher(self, index: int) -> FixListener:
         def publish(message: FixMessage) -> None:
+            if self._on_fix is not None:
+                self._on_fix(message)
             link = self._links[index]
             if link is not None:
                 ended_s = message.unix_s - self.nodes[index].fix_log.unix_less_host_s

@@ -114,8 +114,16 @@ class TagNode:
 class Tag:
     """A tag and its link, which is made once the tag's site is known, and again in another site."""
 
-    def __init__(self, settings: TagSettings, radio: Radio, address: MqttAddress | None, log: Log) -> None:
-        self._address, self._log = address, log
+    def __init__(
+        self,
+        settings: TagSettings,
+        radio: Radio,
+        address: MqttAddress | None,
+        log: Log,
+        on_fix: FixListener | None = None,
+    ) -> None:
+        """``on_fix`` is called with every fix that is to be published, with or without a broker."""
+        self._address, self._log, self._on_fix = address, log, on_fix
         self.link: Link | None = None
         self._site: int | None = None
         self._late_before = 0
@@ -136,6 +144,8 @@ class Tag:
             await asyncio.gather(*self._link_tasks, return_exceptions=True)
 
     def _publish(self, message: FixMessage) -> None:
+        if self._on_fix is not None:
+            self._on_fix(message)
         self._connect()
         if self.link is not None:
             ended_s = message.unix_s - self.node.fix_log.unix_less_host_s
@@ -199,8 +209,16 @@ class Tag:
 class Tags:
     """The tags of one process."""
 
-    def __init__(self, settings: TagSettings, radios: Sequence[Radio], address: MqttAddress | None, log: Log) -> None:
-        self.tags = tuple(Tag(settings, radio, address, log) for radio in radios)
+    def __init__(
+        self,
+        settings: TagSettings,
+        radios: Sequence[Radio],
+        address: MqttAddress | None,
+        log: Log,
+        on_fix: FixListener | None = None,
+    ) -> None:
+        """``on_fix`` as in ``Tag``."""
+        self.tags = tuple(Tag(settings, radio, address, log, on_fix) for radio in radios)
         self._usage = Usage()
 
     async def run(self) -> None:

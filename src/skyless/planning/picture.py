@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from skyless.kernels.arrays import Array
 from skyless.planning.colours import COLOUR_STOPS, round_values, scale_of
-from skyless.planning.columns import ANCHORS_IN_VIEW, BIAS, FIX_SHARE, HDOP, PDOP, RMSE, SIGMA, VDOP
+from skyless.planning.columns import ANCHORS_IN_VIEW, FIX_SHARE, HDOP, PDOP, RMSE, SIGMA, VDOP
 from skyless.planning.floor import Box, Floor, floor_plan_box
 from skyless.planning.maps import Grid, PlanMap
 from skyless.site.model import Site
@@ -80,11 +80,15 @@ class Background(Struct, frozen=True):
     """Method, noise and schedule, in words."""
 
 
+def main_layer(plan: PlanMap) -> Layer:
+    """The predicted error: with the walls' delays where there are any."""
+    return RMSE_LAYER if plan.has_bias else SIGMA_LAYER
+
+
 def layers_for(plan: PlanMap) -> tuple[Layer, ...]:
     """The layers worth showing: RMSE only where walls bias positions, VDOP and PDOP only in 3-D."""
-    bias = plan.column(BIAS)
     layers = list(_LAYERS)
-    if np.nanmax(np.where(np.isfinite(bias), bias, 0.0)) > 1e-4:
+    if plan.has_bias:
         layers.insert(1, RMSE_LAYER)
     if np.nanmax(plan.column(VDOP)) > 0.0:
         layers.insert(-1, Layer(VDOP, "vertical dilution of precision (VDOP)", ""))

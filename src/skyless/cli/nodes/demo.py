@@ -22,7 +22,7 @@ from skyless.cli.common.options import (
     options,
 )
 from skyless.cli.common.output import console, number, print_json
-from skyless.cli.common.progress import loading_kernels
+from skyless.cli.common.progress import CountLine, count_text, say_where_kernels_are_kept
 from skyless.cli.common.simulated_site import check_live
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, log, site_named
 from skyless.errors import SkylessError
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from skyless.mqtt.messages import FixMessage
     from skyless.nodes.demo import SiteRun, WholeSite
     from skyless.nodes.watch import Watch, WatchedTag
+    from skyless.preparation.processes import Preparation
 
 _LONGEST_START_S: Final = 60.0
 """Programs that have not made a fix for every tag by then will not."""
@@ -101,15 +102,17 @@ def demo(*, asked: DemoOptions = DemoOptions()) -> None:
     Anchors, tags, broker, page and recorder are the real programs, each a process; radios, clocks and motion are
     simulated. Watch it on the page, or with: mosquitto_sub -t 'skyless/#' -v
     """
-    from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.nodes.demo import WholeSite
     from skyless.nodes.process import run
+    from skyless.preparation.parts import parts_of
+    from skyless.preparation.processes import missing
 
     settings = _settings(asked)
-    with loading_kernels():
-        compile_kernels(asked.method)
+    if missing(parts_of(asked.method)):
+        say_where_kernels_are_kept()
     whole = WholeSite(settings, log)
     screen = Screen(whole, show=not asked.json and sys.stdout.isatty())
+    whole.on_preparation = screen.show_preparation
     with screen, contextlib.suppress(KeyboardInterrupt):
         run(_run(whole, settings, screen, asked))
     _report(screen, json=asked.json)
@@ -164,6 +167,7 @@ async def _run(whole: "WholeSite", settings: "SiteRun", screen: "Screen", asked:
     try:
         await _either(site, whole.ready.wait())
         screen.print_addresses(settings, json=asked.json)
+        await _either(site, whole.prepared.wait())
         await _either(site, _until_all_fix(whole, asked.tags))
         screen.begin()
         await _either(site, _watch(screen, asked.duration))
@@ -222,6 +226,7 @@ class Screen:
         self.stopped_early = True
         self._whole, self._show = whole, show
         self._live: Live | None = None
+        self._count = CountLine()
         self._begun_s: float | None = None
         self._took_s = 0.0
 
@@ -253,12 +258,21 @@ class Screen:
         else:
             print("\n".join(lines), file=sys.stderr if json else sys.stdout, flush=True)
 
+    def show_preparation(self, now: "Preparation") -> None:
+        """Show how far the kernels are compiled."""
+        if self._live is None:
+            self._count.show(now)
+        else:
+            self._live.update(count_text(now), refresh=True)
+
     def begin(self) -> None:
         """All tags have a fix."""
+        self._count.clear()
         self._begun_s = time.monotonic()
 
     def end(self) -> None:
         """The programs are about to be ended."""
+        self._count.clear()
         if self._begun_s is not None:
             self._took_s = time.monotonic() - self._begun_s
 

@@ -120,6 +120,7 @@ const handlers = {
     state.log = [];
     state.condition = null;
     changed("connection", "events", "log", "condition");
+    handlers.preparation({ preparation: null });
     handlers.zones(message);
     if (message.site) handlers.site(message);
   },
@@ -169,6 +170,10 @@ const handlers = {
   },
   watch(message) {
     receiveWatch(message.watch, message.age_s);
+  },
+  preparation(message) {
+    state.preparation = message.preparation;
+    changed("preparation");
   },
   floor_plan(message) {
     state.floorDigest = message.digest;
