@@ -14,7 +14,7 @@ import pytest
 
 from skyless.kernels.cache import KernelFolder
 from skyless.preparation import processes
-from skyless.preparation.parts import AIR, LAB, Part, parts_of
+from skyless.preparation.parts import LAB, SIMULATED, Part, parts_of
 from skyless.preparation.processes import CompilationError, Preparation, compile_parts, missing
 
 TINY = """
@@ -119,7 +119,7 @@ def test_a_folder_that_cannot_be_written_is_left_alone(folder, monkeypatch):
 
 
 def test_snapshots_need_no_estimator():
-    assert parts_of("weighted") == (AIR,)
+    assert parts_of("weighted") == (SIMULATED,)
     assert parts_of("joint") == LAB
 
 
