@@ -87,12 +87,12 @@ def simulated(method, condition, seed):
 
 
 def replayed(name):
-    """Hash and number of fixes of one recording, from the table that ``skyless replay --fixes`` writes."""
+    """Hash and number of fixes of one recording, from the table that ``skyless replay --fixes-csv`` writes."""
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "fixes.csv"
         places = [str(DATA / part) if "/" in part else part for part in REPLAYS[name]]
         sys.stdout.flush()
-        code = skyless(["replay", *places, "--fixes", str(table), "--json"])
+        code = skyless(["replay", *places, "--fixes-csv", str(table), "--json"])
         content = table.read_bytes() if code == 0 else b""
     return {"sha256": hashlib.sha256(content).hexdigest(), "fixes": max(content.count(b"\n") - 1, 0)}
 

@@ -47,7 +47,14 @@ def replayed(folder, tmp_path, capsys):
     flight = folder / "util_flights" / "const1" / "const1-trial1-tdoa2"
     fixes = tmp_path / "fixes.csv"
     options = ["--anchors", folder / "util_flights" / "anchors_const1.csv", "--truth", f"{flight}_pose.csv.gz"]
-    arguments = ["replay", f"{flight}_tdoa.csv.gz", *options, "--lever-arm=-0.01245,0.00127,0.0908", "--fixes", fixes]
+    arguments = [
+        "replay",
+        f"{flight}_tdoa.csv.gz",
+        *options,
+        "--lever-arm=-0.01245,0.00127,0.0908",
+        "--fixes-csv",
+        fixes,
+    ]
     assert main([*map(str, arguments), "--json"]) == 0
     with fixes.open() as file:
         rows = [row for row in csv.DictReader(file) if float(row["t_s"]) >= SETTLE_S]

@@ -6,7 +6,7 @@ from skyless.cli.main import main
 
 
 def test_it_measures_everything_next_to_its_baselines(capsys):
-    assert main(["bench", "--quick", "--draws", "5000", "--anchors", "3", "--json"]) == 0
+    assert main(["bench", "--quick", "--draws", "5000", "--anchor-count", "3", "--json"]) == 0
     everything = json.loads(capsys.readouterr().out.splitlines()[-1])
     told = everything["monte_carlo"]
     assert told["anchors"] == 3

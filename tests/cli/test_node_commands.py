@@ -27,7 +27,7 @@ from skyless.nodes.ports import hold_any
         ("tag t --method magic", "it should be one of literal"),
         ("tag t --radio serial:", "it should name one port, as serial:/dev/ttyACM0"),
         ("tag t --radio sniffer:/dev/ttyACM0", "--anchors is missing; a sniffer needs a table"),
-        ("tag t --anchors a.csv", "--anchors and --height are for sniffers"),
+        ("tag t --anchors a.csv", "--anchors and --tag-height are for sniffers"),
         ("tag t --radio wifi:x", "it should be ether:HOST[:PORT], serial:PATH[@BAUD]"),
         ("anchor 1 2 --radio serial:/dev/ttyACM0", "it should name 2 ports, one for each node, with commas"),
         ("anchor 1 --radio listener:/dev/ttyACM0", "it should be one that can transmit: a listener only listens"),
@@ -64,9 +64,9 @@ def test_wrong_input_is_told_with_what_would_be_right(command, right, capsys):
 def test_a_sniffer_s_height_is_metres_or_a_word(height, tmp_path, capsys):
     table = tmp_path / "anchors.csv"
     table.write_text("id,x_m,y_m,z_m\n1,0,0,0\n2,5,0,0\n3,0,5,0\n")
-    command = ["tag", "t", "--radio", "sniffer:/dev/x", "--anchors", str(table), "--height", height]
+    command = ["tag", "t", "--radio", "sniffer:/dev/x", "--anchors", str(table), "--tag-height", height]
     assert main(command) == 2
-    assert f"--height is '{height}'; it should be metres, free or auto" in capsys.readouterr().err
+    assert f"--tag-height is '{height}'; it should be metres, free or auto" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_a_program_that_is_asked_to_end_does_so_as_planned(number):
 
 @pytest.mark.parametrize("speaks", ["listener", "sniffer", "sniffer-text"])
 def test_an_anchor_has_no_board_that_only_listens(speaks, capsys):
-    assert main(["board", "6", "--format", speaks]) == 2
+    assert main(["board", "6", "--wire", speaks]) == 2
     assert "it should be link for an anchor" in capsys.readouterr().err
 
 

@@ -21,13 +21,13 @@ def files(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "outputs",
     [
-        ["--fixes", "recording.csv"],
-        ["--fixes", "./recording.csv"],
-        ["--fixes", "soft.csv"],
-        ["--fixes", "hard.csv"],
-        ["--fixes", "anchors.csv"],
+        ["--fixes-csv", "recording.csv"],
+        ["--fixes-csv", "./recording.csv"],
+        ["--fixes-csv", "soft.csv"],
+        ["--fixes-csv", "hard.csv"],
+        ["--fixes-csv", "anchors.csv"],
         ["--plot", "recording.csv"],
-        ["--fixes", "new.svg", "--plot", "new.svg"],
+        ["--fixes-csv", "new.svg", "--plot", "new.svg"],
     ],
 )
 def test_replay_spares_what_it_reads(files, capsys, outputs):

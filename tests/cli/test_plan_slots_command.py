@@ -1,4 +1,4 @@
-"""``skyless site new --grid``, ``site check`` and ``skyless plan`` at sites of protocol 2."""
+"""``skyless site new --spacing``, ``site check`` and ``skyless plan`` at sites of protocol 2."""
 
 import json
 
@@ -8,7 +8,7 @@ from matplotlib.image import imread
 from skyless.cli.main import main
 from skyless.site.load import load_site
 
-GRID = ["--width", "120", "--depth", "90", "--grid", "15"]
+GRID = ["--width", "120", "--depth", "90", "--spacing", "15"]
 HALL = """\
 name = "hall"   # ours
 id = 7
@@ -65,11 +65,11 @@ def test_a_new_grid(tmp_path, capsys, free):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--grid", "5"], "a grid needs"),
+        (["--spacing", "5"], "a grid needs"),
         (["--free", "--width", "9", "--depth", "9"], "a grid needs"),
-        ([*GRID, "--anchors", "5"], "a grid needs"),
-        (["--width", "10000", "--depth", "10000", "--grid", "15"], "444889 anchors are too many"),
-        (["--width", "100", "--depth", "100", "--grid", "3"], "at most 255"),
+        ([*GRID, "--anchor-count", "5"], "a grid needs"),
+        (["--width", "10000", "--depth", "10000", "--spacing", "15"], "444889 anchors are too many"),
+        (["--width", "100", "--depth", "100", "--spacing", "3"], "at most 255"),
     ],
 )
 def test_grids_that_cannot_be(tmp_path, capsys, options, said):

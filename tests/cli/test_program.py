@@ -41,6 +41,17 @@ def test_help_imports_nothing_heavy():
     assert "Usage: skyless COMMAND" in done.stdout
 
 
+def test_the_commands_stand_in_groups_of_what_they_are_for():
+    for arguments in ((), ("--help",)):
+        done = skyless(*arguments)
+        groups = ("Start here", "Set up and check a site", "Run a site", "Record and replay", "Emulate", "Research")
+        found = [done.stdout.index(f"─ {name}") for name in (*groups, "Options")]
+        assert (done.returncode, done.stderr) == (0, "")
+        assert found == sorted(found)
+        assert done.stdout.index("│ demo") < found[1]
+        assert "Example: skyless demo" in done.stdout
+
+
 def test_version():
     done = skyless("--version")
     assert (done.returncode, done.stdout.strip()) == (0, version("skyless"))
@@ -58,7 +69,7 @@ def test_every_command_has_help_with_an_example():
     ("arguments", "said"),
     [
         (["sit"], 'Did you mean "site"?'),
-        (["sit"], "Available commands: demo, simulate, replay, "),
+        (["sit"], "Available commands: demo, simulate, site, "),
         (["site", "check", "--jso"], "Did you mean --json?"),
         (["site", "check"], "requires an argument"),
         (["site", "new", "x.toml", "--width", "wide", "--depth", "3"], "--width"),

@@ -71,7 +71,7 @@ def test_every_format_gives_fixes_at_the_truth(run, name):
 
 def test_fixes_file_and_report_agree(run, room, tmp_path):
     path = tmp_path / "fixes.csv"
-    told = report(run("tdoa-table", "--anchors", "anchors.csv", "--fixes", path, "--settle", "0", "--json"))
+    told = report(run("tdoa-table", "--anchors", "anchors.csv", "--fixes-csv", path, "--settle", "0", "--json"))
     with path.open(newline="") as file:
         table = list(csv.DictReader(file))
     assert tuple(table[0]) == FIXES_COLUMNS
@@ -91,7 +91,7 @@ def test_fixes_file_and_report_agree(run, room, tmp_path):
 
 def test_a_fixes_file_of_a_tag_at_known_height_has_that_height(run, tmp_path):
     path = tmp_path / "fixes.csv"
-    told = report(run("tdoa-table", "--anchors", "anchors.csv", "--fixes", path, "--height", "1.2", "--json"))
+    told = report(run("tdoa-table", "--anchors", "anchors.csv", "--fixes-csv", path, "--tag-height", "1.2", "--json"))
     assert (told["height_m"], told["height_note"], told["rmse_3d_m"]) == (1.2, "given", None)
     with path.open(newline="") as file:
         assert {row["z_m"] for row in csv.DictReader(file)} == {"1.20000"}
@@ -100,8 +100,8 @@ def test_a_fixes_file_of_a_tag_at_known_height_has_that_height(run, tmp_path):
 def test_heights(run):
     arguments = ["tdoa-table", "--anchors", "anchors.csv", "--json"]
     assert report(run(*arguments))["height_m"] is None  # these anchors tell it
-    assert report(run(*arguments, "--height", "free"))["height_note"] == "estimated"
-    told = report(run(*arguments, "--height", "truth", "--truth", "truth.csv"))
+    assert report(run(*arguments, "--tag-height", "free"))["height_note"] == "estimated"
+    told = report(run(*arguments, "--tag-height", "truth", "--truth", "truth.csv"))
     assert (told["height_m"], told["height_note"]) == (1.2, "the truth's median")
 
 
@@ -208,10 +208,10 @@ A, T = ["--anchors", "anchors.csv"], ["--truth", "truth.csv"]
         (["tdoa-table", *A, "--lever-arm", "1,2,3"], ["--lever-arm", "--truth"]),
         (["tdoa-table", *A, *T, "--lever-arm", "1,2"], ["--lever-arm", "1,2", "3 number"]),
         (["tdoa-table", *A, *T, "--lever-arm", "1,2,nan"], ["--lever-arm", "nan"]),
-        (["tdoa-table", *A, "--height", "tall"], ["--height", "tall", "metres"]),
-        (["tdoa-table", *A, "--height", "truth"], ["--height", "--truth"]),
-        (["tdoa-table", *A, "--fixes", "no/fixes.csv"], ["no/fixes.csv", "cannot be written"]),
-        (["tdoa-table", *A, "--fixes", "."], ["cannot be written", "Is a directory"]),
+        (["tdoa-table", *A, "--tag-height", "tall"], ["--tag-height", "tall", "metres"]),
+        (["tdoa-table", *A, "--tag-height", "truth"], ["--tag-height", "--truth"]),
+        (["tdoa-table", *A, "--fixes-csv", "no/fixes.csv"], ["no/fixes.csv", "cannot be written"]),
+        (["tdoa-table", *A, "--fixes-csv", "."], ["cannot be written", "Is a directory"]),
         (["tdoa-table", *A, "--plot", "no/plot.png"], ["--plot", "no/plot.png", "folder that exists"]),
         (["tdoa-table", *A, "--plot", "plot.xyz"], ["--plot", "plot.xyz", ".png, .svg, .pdf"]),
         (["tdoa-table", *A, "--plot", "plot"], ["--plot", "ending"]),
@@ -252,7 +252,7 @@ def test_a_named_format_holds_where_the_content_does_not_show_it(run, room, tmp_
 def test_a_file_that_may_not_be_written(run, tmp_path):
     path = tmp_path / "fixes.csv"
     path.touch(mode=0o400)
-    code, _, err = run("tdoa-table", *A, "--fixes", path)
+    code, _, err = run("tdoa-table", *A, "--fixes-csv", path)
     assert code == 2
     assert "Permission denied" in err
 
@@ -261,7 +261,7 @@ def test_interrupted_replay_keeps_what_it_has_written(room, tmp_path):
     long = synthetic.write(tmp_path / "long", "bitcraze-binary", 100_000)
     path = tmp_path / "fixes.csv"
     process = subprocess.Popen(
-        [*COMMAND, long, "--anchors", room / "anchors.csv", "--fixes", path, "--json"],
+        [*COMMAND, long, "--anchors", room / "anchors.csv", "--fixes-csv", path, "--json"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )

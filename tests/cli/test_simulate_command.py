@@ -92,13 +92,13 @@ def test_the_same_seed_gives_the_same_run(run):
 
 @pytest.mark.parametrize("method", ["literal", "literal-delayed", "weighted", "bracketed", "joint"])
 def test_it_stops_at_the_wanted_number_of_fixes(run, method):
-    told = report(run("--method", method, "--position", "3,4", "--fixes", "40", "--warmup", "1", "--json"))
+    told = report(run("--method", method, "--position", "3,4", "--fixes", "40", "--settle", "1", "--json"))
     assert told["method"] == method
     assert 40 <= told["fixes"] <= 40 + math.ceil(0.25 / 0.015)
 
 
 def test_fixes_file_and_report_agree(run, tmp_path):
-    told = report(run("--position", "3,4", "--duration", "3", "--warmup", "0", "--fixes-csv", "fixes.csv", "--json"))
+    told = report(run("--position", "3,4", "--duration", "3", "--settle", "0", "--fixes-csv", "fixes.csv", "--json"))
     with (tmp_path / "fixes.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     assert tuple(table[0]) == FIXES_CSV_COLUMNS
@@ -222,15 +222,15 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--position", "1,2,3,4"], ["--position", "1,2,3,4"]),
         (["--duration", "-1"], ["--duration", "-1"]),
         (["--duration", "0"], ["--duration", "0"]),
-        (["--duration", "1"], ["--warmup is 2", "1 s", "--duration", "before any fix is judged"]),
-        (["--duration", "2", "--fixes", "5"], ["--warmup is 2", "2 s", "before any fix is judged"]),
-        (["--warmup", "60", "--duration", "60"], ["--warmup is 60", "60 s", "before any fix is judged"]),
+        (["--duration", "1"], ["--settle is 2", "1 s", "--duration", "before any fix is judged"]),
+        (["--duration", "2", "--fixes", "5"], ["--settle is 2", "2 s", "before any fix is judged"]),
+        (["--settle", "60", "--duration", "60"], ["--settle is 60", "60 s", "before any fix is judged"]),
         (["--duration", "inf"], ["--duration", "inf"]),
         (["--fixes", "0"], ["--fixes", "0"]),
         (["--noise-ps", "1e7"], ["--noise-ps", "10000000"]),
         (["--noise-ps", "inf"], ["--noise-ps", "inf"]),
         (["--noise-ps", "nan"], ["--noise-ps", "nan"]),
-        (["--warmup", "-1"], ["--warmup", "-1"]),
+        (["--settle", "-1"], ["--settle", "-1"]),
         (["--tags", "0"], ["--tags", "0"]),
         (["--seed", "-1"], ["--seed", "-1"]),
         (["--loss", "1"], ["--loss", "1"]),

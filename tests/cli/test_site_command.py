@@ -1,5 +1,6 @@
 """``skyless site new`` and ``skyless site check``, called as the program calls them."""
 
+import json
 import os
 
 import pytest
@@ -11,7 +12,7 @@ from skyless.site.load import load_site
 
 def test_new_writes_the_lab(tmp_path):
     path = tmp_path / "lab.toml"
-    assert main(["site", "new", str(path)]) == 0
+    assert main(["site", "new", str(path), "--site-id", "1"]) == 0
     assert load_site(path) == lab_site()
     assert list(tmp_path.iterdir()) == [path]  # nothing left beside it
     umask = os.umask(0)
@@ -21,11 +22,45 @@ def test_new_writes_the_lab(tmp_path):
 
 def test_new_writes_a_room(tmp_path):
     path = tmp_path / "hall.toml"
-    size = ["--width", "30", "--depth", "20", "--anchors", "8", "--height", "4.5", "--name", "Hall 3"]
+    size = ["--width", "30", "--depth", "20", "--anchor-count", "8", "--height", "4.5", "--name", "Hall 3"]
     assert main(["site", "new", str(path), *size]) == 0
     site = load_site(path)
     assert (site.name, len(site.anchors), site.tags.height_m) == ("Hall 3", 8, None)
     assert {anchor.z_m for anchor in site.anchors} == {0.5, 4.0}
+
+
+def test_two_new_sites_have_different_numbers(tmp_path):
+    paths = [tmp_path / f"{number}.toml" for number in range(4)]
+    for path in paths:
+        assert main(["site", "new", str(path)]) == 0
+    assert len({load_site(path).id for path in paths}) > 1  # four equal ones: once in 10¹⁴
+
+
+def test_a_new_hall_has_the_master_that_a_plan_asks_for(tmp_path, capsys):
+    """The hall of the README: from its corner one anchor received 9 % of the master."""
+    path = tmp_path / "hall.toml"
+    hall = ["--width", "30", "--depth", "20", "--anchor-count", "8", "--height", "4"]
+    assert main(["site", "new", str(path), *hall]) == 0
+    assert load_site(path).master == 2
+    capsys.readouterr()
+    assert main(["site", "check", str(path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert min(anchor["hears_master"] for anchor in report["anchors"]) > 0.9
+    assert report["warnings"] == []
+    path.write_text(path.read_text().replace("\nmaster = 2", "\nmaster = 1"))
+    assert main(["site", "check", str(path)]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "anchors 5 (9%), 4 (58%)" in shown
+    assert "with anchor 2 as the master all would receive 90% or more" in shown
+    assert "the site file is valid, with warnings" in shown
+
+
+def test_tags_of_a_grid_may_have_any_height(tmp_path):
+    path = tmp_path / "grid.toml"
+    grid = ["site", "new", str(path), "--width", "60", "--depth", "60", "--spacing", "15", "--force"]
+    for given, height_m in (([], 1.2), (["--tag-height", "2.5"], 2.5), (["--tag-height", "free"], None)):
+        assert main([*grid, *given]) == 0
+        assert load_site(path).tags.height_m == height_m
 
 
 def test_new_overwrites_only_by_force(tmp_path, capsys):
@@ -42,10 +77,13 @@ def test_new_overwrites_only_by_force(tmp_path, capsys):
     ("options", "said"),
     [
         (["--width", "3"], "both --width and --depth"),
-        (["--anchors", "8"], "both --width and --depth"),
+        (["--anchor-count", "8"], "both --width and --depth"),
         (["--tag-height", "0"], "both --width and --depth"),
-        (["--width", "3", "--depth", "3", "--tag-height", "nan"], "tags.height_m"),
-        (["--width", "0.001", "--depth", "0.001", "--anchors", "20"], "elsewhere"),
+        (
+            ["--width", "3", "--depth", "3", "--tag-height", "nan"],
+            "--tag-height is 'nan'; it should be metres, or free",
+        ),
+        (["--width", "0.001", "--depth", "0.001", "--anchor-count", "20"], "elsewhere"),
     ],
 )
 def test_new_refuses(tmp_path, capsys, options, said):
@@ -54,7 +92,9 @@ def test_new_refuses(tmp_path, capsys, options, said):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("option", [["--width", "0"], ["--width", "nan"], ["--anchors", "0"], ["--anchors", "256"]])
+@pytest.mark.parametrize(
+    "option", [["--width", "0"], ["--width", "nan"], ["--anchor-count", "0"], ["--anchor-count", "256"]]
+)
 def test_new_refuses_numbers_out_of_range(tmp_path, option):
     assert main(["site", "new", str(tmp_path / "x.toml"), "--width", "3", "--depth", "3", *option]) == 2
 

@@ -99,7 +99,7 @@ def aligned_rmse_m(report):
 
 
 def test_a_table_of_ranges_and_heights_with_default_options(hall, capsys):
-    report = run(capsys, "--ranges", hall / "ranges.csv", "--heights", hall / "heights.csv")
+    report = run(capsys, "--ranges", hall / "ranges.csv", "--anchor-heights", hall / "heights.csv")
     assert {"id", "x_m", "y_m", "z_m", "std_m", "determined"} <= report["anchors"][0].keys()
     assert [one["id"] for one in report["anchors"]] == list(range(1, 12))
     assert all(one["determined"] for one in report["anchors"])
@@ -113,7 +113,7 @@ def test_a_table_of_ranges_and_heights_with_default_options(hall, capsys):
 
 
 def test_the_report_for_people(hall, capsys):
-    assert main(["survey", "--ranges", str(hall / "ranges.csv"), "--heights", str(hall / "heights.csv")]) == 0
+    assert main(["survey", "--ranges", str(hall / "ranges.csv"), "--anchor-heights", str(hall / "heights.csv")]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert out.index("11 anchors, 54 of 55 pairs, 30 unknowns: 24 ranges check the result") < out.index("anchors ┏")
     assert re.search(r"left out as late: 1–10 \(\+0\.[45]\d m\), 3–6 \(\+0\.[45]\d m\)", out)
@@ -171,7 +171,8 @@ def test_an_anchor_that_nobody_receives_is_not_determined_and_stays(hall, capsys
 def test_anchors_without_positions_get_theirs(hall, capsys, tmp_path):
     out = tmp_path / "placed.toml"
     report = run(
-        capsys, "--ranges", hall / "ranges.csv", "--heights", hall / "heights.csv", "--site", hall / "blank.toml",
+        capsys, "--ranges", hall / "ranges.csv", "--anchor-heights", hall / "heights.csv",
+        "--site", hall / "blank.toml",
         "--origin", 1, "--x-axis", 4, "--left", 9, "--out", out,
     )  # fmt: skip
     site = load_site(out)
@@ -203,7 +204,7 @@ def test_only_delays_with_positions_kept(hall, capsys, tmp_path):
 def test_a_table_of_anchors_with_their_delays(hall, capsys, tmp_path):
     out = tmp_path / "anchors.csv"
     report = run(
-        capsys, "--ranges", hall / "ranges.csv", "--heights", hall / "heights.csv", "--out", out,
+        capsys, "--ranges", hall / "ranges.csv", "--anchor-heights", hall / "heights.csv", "--out", out,
         "--plot", tmp_path / "hall.png",
     )  # fmt: skip
     assert read_anchors(out)[3][:2] == pytest.approx([report["anchors"][2][axis] for axis in ("x_m", "y_m")], abs=1e-4)
@@ -287,7 +288,7 @@ def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
         (("{hall}/none.mcap",), "a file that can be read"),
         (("{hall}/pipe",), "a pipe"),
         (("--ranges", "{hall}/heights.csv"), "a header with anchor_a,anchor_b,range_m"),
-        (("--ranges", "{hall}/ranges.csv", "--heights", "{hall}/ranges.csv"), "a header with id,z_m"),
+        (("--ranges", "{hall}/ranges.csv", "--anchor-heights", "{hall}/ranges.csv"), "a header with id,z_m"),
         (("--out", "a.toml"), "a site file needs --site"),
         (("--out", "a.txt"), "its ending should be .toml"),
         (("--out", "no/such/a.csv"), "a folder that exists"),
@@ -303,14 +304,14 @@ def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
         (("--sketch-std", "0.2"), "it needs the positions of --site"),
         (("--delays-known", "--delay-std", "0.1"), "--delay-std is 0.1"),
         (("--delays-known", "--common-delay-std", "0.1"), "--common-delay-std is 0.1"),
-        (("--height-std", "0.1"), "it is for --dimensions 3"),
-        (("--height", "tall"), "--height is 'tall'"),
-        (("--height", "77=2"), "there is no anchor 77; there are 1, 2"),
-        (("--height", "1=nan"), "--height is '1=nan'; 'nan' should be a number"),
-        (("--height", "2", "--height", "3"), "given once"),
-        (("--height", "1=2", "--height", "1=3"), "the height of anchor 1 should be given once"),
-        (("--heights", "{hall}/elsewhere.csv"), 'column id is "77, 78"; it should be anchors among 1, 2'),
-        (("--heights", "{hall}/pipe"), "a pipe"),
+        (("--anchor-height-std", "0.1"), "it is for --dimensions 3"),
+        (("--anchor-height", "tall"), "--anchor-height is 'tall'"),
+        (("--anchor-height", "77=2"), "there is no anchor 77; there are 1, 2"),
+        (("--anchor-height", "1=nan"), "--anchor-height is '1=nan'; 'nan' should be a number"),
+        (("--anchor-height", "2", "--anchor-height", "3"), "given once"),
+        (("--anchor-height", "1=2", "--anchor-height", "1=3"), "the height of anchor 1 should be given once"),
+        (("--anchor-heights", "{hall}/elsewhere.csv"), 'column id is "77, 78"; it should be anchors among 1, 2'),
+        (("--anchor-heights", "{hall}/pipe"), "a pipe"),
         (("--site", "/dev/zero"), "16 MiB at most"),
         (("--distance", "1-2"), "--distance is '1-2'; it should be like"),
         (("--distance", "1-1=3"), "between two anchors"),
@@ -326,7 +327,7 @@ def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
         (("--dimensions", "4"), "dimensions"),
         (("--delay-std", "1e300"), "--delay-std"),
         (("--pair-std", "1e308"), "--pair-std"),
-        (("--height", "1=1e300"), "metres, at most"),
+        (("--anchor-height", "1=1e300"), "metres, at most"),
         (("--distance", "1-2=1e308"), "metres, at most"),
         (("--distance", "1-2=3±1e9"), "metres, at most"),
         (("--point", "1=1e308,0"), "metres, at most"),

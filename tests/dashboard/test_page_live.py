@@ -206,14 +206,3 @@ def test_a_floor_plan_lies_where_the_site_says(serve, visit):
     assert page.evaluate(reddish, [23.37, 13.71])
     assert not page.evaluate(reddish, [1.37, -1.31])
     shown.problems.clear()  # a hint that pixels are read slowly
-
-
-def test_an_overlay_is_shown_with_its_scale(hall):
-    page = hall[1].page
-    page.click("#legend summary")
-    page.select_option("#overlay", "sigma")
-    page.wait_for_selector("#ramp-box")
-    assert page.locator("#ramp-good").inner_text() == "2.0 cm good"
-    assert page.locator("#ramp-bad").inner_text() == "5.2 cm bad"
-    page.select_option("#overlay", "none")
-    page.locator("#ramp-box").wait_for(state="hidden")

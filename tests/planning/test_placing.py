@@ -113,8 +113,18 @@ def test_one_more_anchor_helps_where_one_is_missing():
     assert more.position_m[1] > 6.0
     assert more.mean_after_m < 0.9 * more.mean_before_m
     assert more.worst_after_m < 0.7 * more.worst_before_m
+    assert more.helps
     grown = site_with_one_more(site, np.array(more.position_m))
     assert [a.id for a in grown.anchors] == [1, 2, 5, 6, 7]
+
+
+def test_one_more_anchor_helps_nobody_where_it_only_lengthens_the_superframe():
+    ring = Mounts(sides(np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float)), (0.0,))
+    site = site_with(lab_site(), ring.at(even_layout(ring, 16).along_m, np.zeros(16, np.int64)), 1)
+    floor = floor_of(site, FILE, None, (2.0, 2.0, 4.0, 6.0))
+    more = one_more(site, BRACKETED, floor, ring, (0.0,))
+    assert not more.helps
+    assert more.mean_after_m > 0.95 * more.mean_before_m
 
 
 def test_warnings_name_what_is_wrong():
@@ -123,7 +133,10 @@ def test_warnings_name_what_is_wrong():
     floor = floor_of(site, FILE, None, None)
     predictor = Predictor(site, BRACKETED)
     text = "\n".join(plan_warnings(predictor, floor, plan_map(predictor, grid_of(floor, (0.0,), 0.5))))
-    assert "anchor(s) 2, 3, 4, 6 m or more from the master, hear 0% of its frames at most and stay silent" in text
+    assert (
+        "anchors 2 (0%), 3 (0%), 4 (0%), 6 m or more from the master, receive this share of its frames and stay silent"
+        in text
+    )
     assert "anchor 6: sends before the master in a round" in text
     assert "has no fix most of the time" in text
 

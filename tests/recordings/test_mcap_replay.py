@@ -14,7 +14,7 @@ from skyless.method_names import METHODS
 from skyless.mqtt.messages import ReceptionsMessage
 from skyless.positioning.integrity import Alert, IntegrityRequirement
 from skyless.recordings.mcap.recording import McapRecording
-from skyless.replay.site import SiteReplay
+from skyless.replays.site import SiteReplay
 
 
 def replayed(path, **options):
@@ -234,7 +234,7 @@ def test_another_method_begins_cold_and_is_compared_with_nothing(tmp_path):
 def test_the_command_tells_one_tag_as_other_replays_and_all_in_sums(tmp_path, capsys):
     path, table, plot = tmp_path / "live.mcap", tmp_path / "fixes.csv", tmp_path / "plot.png"
     record(path, messages(2.0, ("a", "b"), publish_every=8))
-    assert main(["replay", str(path), "--json", "--fixes", str(table)]) == 0
+    assert main(["replay", str(path), "--json", "--fixes-csv", str(table)]) == 0
     both = json.loads(capsys.readouterr().out)
     assert both["identical"]["different"] == 0
     assert both["identical"]["compared"] > 100

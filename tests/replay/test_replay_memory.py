@@ -33,7 +33,7 @@ def test_ten_times_the_recording_takes_the_same_memory(tmp_path, name):
     files = [synthetic.write(tmp_path / str(rows), name, rows) for rows in counts]
     options = ["--anchors", tmp_path / "anchors.csv", *synthetic.LISTENER.get(name, [])]
     if name == "bitcraze-binary":
-        options += ["--fixes", tmp_path / "fixes.csv"]
+        options += ["--fixes-csv", tmp_path / "fixes.csv"]
     command = [sys.executable, "-c", PEAKS, *map(str, [*files, *options])]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     _, short, long = map(int, done.stderr.split())

@@ -18,7 +18,7 @@ app = App(name="bench", help_epilogue="Example: skyless bench --json")
 def bench(
     *,
     draws: Annotated[int, Parameter(validator=Number(gte=100, lte=10**9))] = 1_000_000,
-    anchors: Annotated[int, Parameter(validator=Number(gte=1, lte=1000))] = 10,
+    anchor_count: Annotated[int, Parameter(validator=Number(gte=1, lte=1000))] = 10,
     quick: bool = False,
     json: bool = False,
 ) -> None:
@@ -30,7 +30,7 @@ def bench(
     ----------
     draws
         Draws of the paper's chain, compiled; the NumPy loop makes a hundredth of them.
-    anchors
+    anchor_count
         Anchors in each draw.
     quick
         A few seconds only, with fewer and shorter runs and at most a tenth of a million draws.
@@ -45,8 +45,8 @@ def bench(
     draws = min(draws, _QUICK_DRAWS) if quick else draws
     with status("filters"):
         speed = measure_all(QUICK_EFFORT if quick else FULL_EFFORT)
-    with status(f"{draws:,} draws of {anchors} anchors"):
-        chain = measure(draws, anchors)
+    with status(f"{draws:,} draws of {anchor_count} anchors"):
+        chain = measure(draws, anchor_count)
     if json:
         from msgspec.structs import asdict
 

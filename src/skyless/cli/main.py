@@ -5,9 +5,9 @@ import sys
 from collections.abc import Sequence
 from errno import EDQUOT, EFBIG, EIO, ENOSPC
 from io import TextIOWrapper
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, Group, Parameter, UnknownOptionError
 from cyclopts.help import DefaultFormatter
 
 from skyless.errors import SkylessError
@@ -16,35 +16,64 @@ if TYPE_CHECKING:
     from cyclopts.help import HelpPanel
     from rich.console import Console, ConsoleOptions
 
-_COMMANDS = (
-    # name, module below skyless.cli (imported only when it is called), what it does
-    ("demo", "nodes.demo", "Show a site and walking tags in real time."),
-    ("simulate", "simulate", "Run a site in the simulated world and judge it against the truth."),
-    ("replay", "replay", "Turn a recording into fixes and judge them against the truth."),
-    ("survey", "survey", "Find where anchors hang and their antenna delays, from what they receive of one another."),
-    ("calibrate", "calibrate", "Find wrong antenna delays from a tag whose position is known."),
-    ("paper", "paper", "Reproduce the paper's figures and claims in one report."),
-    ("study", "study", "Measure the receiver's errors over many simulated runs."),
-    ("plan", "plan", "Predict a site's errors before it is mounted, and place its anchors."),
-    ("site", "site", "Write and check site files."),
-    ("broker", "nodes.broker", "Run the MQTT broker that comes with Skyless."),
-    (
-        "ether",
-        "nodes.ether",
-        "Emulate a site's air in real time, for the programs of anchors and tags.",
+_GROUPS: Final = {
+    "Start here": (
+        # name, module below skyless.cli (imported only when it is called), what it does
+        ("demo", "nodes.demo", "Show a site and walking tags in real time: nothing to connect, nothing to write."),
+        ("simulate", "simulate", "Run a site in the simulated world and judge it against the truth."),
     ),
-    (
-        "board",
-        "nodes.board",
-        "Emulate a board with a radio on a serial port, to try programs without one.",
+    "Set up and check a site": (
+        ("site", "site", "Write and check site files."),
+        ("plan", "plan", "Predict a site's errors before it is mounted, and place its anchors."),
+        (
+            "survey",
+            "survey",
+            "Find where anchors hang and their antenna delays, from what they receive of others.",
+        ),
+        ("calibrate", "calibrate", "Find wrong antenna delays from a tag whose position is known."),
     ),
-    ("anchor", "nodes.anchor", "Run anchors of a site."),
-    ("tag", "nodes.tag", "Run listening tags."),
-    ("dashboard", "dashboard", "Show a site live in the browser."),
-    ("record", "nodes.record", "Record a running site into a file."),
-    ("warm", "warm", "Compile all kernels ahead, so that no later start has to."),
-    ("bench", "bench", "Measure how fast Monte Carlo draws run on this machine."),
-)
+    "Run a site": (
+        ("broker", "nodes.broker", "Run the MQTT broker that comes with Skyless."),
+        ("anchor", "nodes.anchor", "Run anchors of a site."),
+        ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
+        ("dashboard", "dashboard", "Show a site live in the browser."),
+        ("warm", "warm", "Compile all kernels ahead, so that no later start has to."),
+    ),
+    "Record and replay": (
+        ("record", "nodes.record", "Record a running site into a file."),
+        ("replay", "replay", "Turn a recording into fixes and judge them against the truth."),
+    ),
+    "Emulate what is not there": (
+        ("ether", "nodes.ether", "Emulate a site's air in real time, for the programs of anchors and tags."),
+        ("board", "nodes.board", "Emulate a board with a radio on a serial port, to try programs without one."),
+    ),
+    "Research": (
+        ("study", "study", "Measure the receiver's errors over many simulated runs."),
+        ("paper", "paper", "Reproduce the paper's figures and claims in one report."),
+        ("bench", "bench", "Measure how fast filters and Monte Carlo draws run on this machine."),
+    ),
+}
+"""The commands, in the groups and in the order of the help."""
+
+_RENAMED: Final = {
+    "--fixes": ("--fixes-csv", ("replay",)),
+    "--anchors": ("--anchor-count", ("site new", "bench")),
+    "--height": ("--tag-height", ("replay", "tag")),
+    "--height-std": ("--tag-height-std", ("replay", "tag")),
+    "--grid": ("--spacing", ("site new",)),
+    "--format": ("--wire", ("board",)),
+    "--warmup": ("--settle", ("simulate",)),
+    "--seconds": ("--search-seconds", ("plan",)),
+}
+"""Options of version 0.1 that have another name in some commands, so that each name has one meaning."""
+
+_RENAMED_IN_SURVEY: Final = {
+    "--height": "--anchor-height",
+    "--height-std": "--anchor-height-std",
+    "--heights": "--anchor-heights",
+    "--listener": "--radio-name",
+    "--seconds": "--duration",
+}
 
 _INTERRUPTED = 130
 _BROKEN_PIPE = 1
@@ -70,7 +99,10 @@ def program() -> App:
     app = App(
         name="skyless",
         help="GPS without a sky: fixed UWB anchors broadcast, tags only listen and compute their own position.",
-        help_epilogue="Example: skyless site new site.toml && skyless site check site.toml",
+        help_epilogue=(
+            "Every command has its own help: skyless COMMAND --help. Example: skyless demo, which shows a page in "
+            "the browser until Ctrl-C; then: skyless site new site.toml && skyless site check site.toml"
+        ),
         help_format="plaintext",
         help_formatter=_Help(),
         version=_version,
@@ -79,8 +111,13 @@ def program() -> App:
         result_action="return_value",
         default_parameter=Parameter(negative=()),
     )
-    for name, module, summary in _COMMANDS:
-        app.command(f"skyless.cli.{module}:app", name=name, help=summary)
+    for number, (title, commands) in enumerate(_GROUPS.items()):
+        group = Group(title, sort_key=number)
+        for place, (name, module, summary) in enumerate(commands):
+            app.command(f"skyless.cli.{module}:app", name=name, help=summary, group=group, sort_key=place)
+    options = Group("Options", sort_key=len(_GROUPS))
+    for option in ("--help", "--version"):
+        app[option].group = (options,)
     return app
 
 
@@ -94,9 +131,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         result = program()(arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
-    except (SkylessError, CycloptsError) as error:
-        message = " ".join(str(error).split()) if isinstance(error, CycloptsError) else error
-        print(f"skyless: {message}", file=sys.stderr)
+    except SkylessError as error:
+        print(f"skyless: {error}", file=sys.stderr)
+        return _USER_ERROR
+    except CycloptsError as error:
+        print(f"skyless: {_renamed(error) or ' '.join(str(error).split())}", file=sys.stderr)
         return _USER_ERROR
     except KeyboardInterrupt:
         return _INTERRUPTED
@@ -110,6 +149,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"skyless: standard output cannot be written: {error.strerror}", file=sys.stderr)
         return _USER_ERROR
     return result if isinstance(result, int) else 0
+
+
+def _renamed(error: CycloptsError) -> str | None:
+    """The message where an option's former name is given."""
+    if not isinstance(error, UnknownOptionError):
+        return None
+    command = " ".join(error.command_chain or ())
+    option = (error.token.keyword or error.token.value).partition("=")[0]
+    new, commands = _RENAMED.get(option, ("", ()))
+    if command == "survey":
+        new, commands = _RENAMED_IN_SURVEY.get(option, ""), (command,)
+    return f"{option} of skyless {command} is called {new} now" if new and command in commands else None
 
 
 def _version() -> str:

@@ -14,7 +14,6 @@ from skyless.cli.common.options import (
     NotNegative,
     Positive,
     ProtectionOptions,
-    check_height_std,
     check_left_out,
     check_method,
     check_output,
@@ -23,16 +22,15 @@ from skyless.cli.common.options import (
 )
 from skyless.cli.common.output import number, open_for_writing, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
-from skyless.cli.common.recording_inputs import flight_height, height_to_hold, is_mcap, known_anchors, known_truth
-from skyless.errors import ConfigurationError, SkylessError
+from skyless.cli.common.recording_inputs import is_mcap, lever_arm, wished_height
+from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.evaluation.judge import Judge
     from skyless.positioning.fix import Fix
-    from skyless.recordings.truth import Truth
-    from skyless.replay.captures import Replay, ReplayReport
-    from skyless.replay.site import SiteReplay, TagReport
+    from skyless.replays.captures import Replay, ReplayReport
+    from skyless.replays.site import SiteReplay, TagReport
 
 FIXES_COLUMNS: Final = (
     *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
@@ -40,7 +38,7 @@ FIXES_COLUMNS: Final = (
     *("anchors", "anchor_ids", "chi2", "residual_rms_m"),
     *("hpl_m", "vpl_m", "integrity_risk", "alert"),
 )
-"""Columns of the file that --fixes writes."""
+"""Columns of the file that --fixes-csv writes."""
 
 app = App(
     name="replay",
@@ -58,7 +56,7 @@ class _OtherProtection(ProtectionOptions):
     alert_limit_m: Positive | None = None
     """Another alert limit than the tag's own, in metres."""
     max_acceleration: NotNegative | None = None
-    """Another largest acceleration than the tag's own, in m/s². With any of these, or --height-std, tags start from
+    """Another largest acceleration than the tag's own, in m/s². With any of these, or --tag-height-std, tags start from
     the beginning, as with another method, and those that are not given are as of a tag of which nothing was asked."""
 
 
@@ -75,9 +73,9 @@ class ReplayOptions:
     """Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns. MILUV ticks bring their own."""
     lever_arm: str | None = None
     """The antenna in the body's frame, x,y,z in metres, added to the truth."""
-    height: str = "auto"
+    tag_height: str = "auto"
     """The tag's height: metres, truth (its median), free (estimated), or auto: free where the anchors determine it."""
-    height_std: NotNegative | None = None
+    tag_height_std: NotNegative | None = None
     """Standard deviation of the tag's height from the one that is given, in metres, which fixes and levels then
     count; by default 0.5 where the height is only taken for the anchors', else 0."""
     format: str | None = None
@@ -103,7 +101,7 @@ class ReplayOptions:
     """What the filter is given of other recordings: packets, as anchors sent them, which is the default for
     Bitcraze's; or differences, which are made of them."""
     protection: _OtherProtection = _OtherProtection()
-    fixes: Path | None = None
+    fixes_csv: Path | None = None
     """Write every fix into this table."""
     plot: Path | None = None
     """Draw track, errors and histograms into this PNG, SVG or PDF."""
@@ -119,16 +117,16 @@ def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> None:
     of time differences, MILUV passive ticks and Avalue receptions; the format is recognised by the content.
 
     A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
-    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --height-std,
-    --settle, --above, --fixes, --plot and --json.
+    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --tag-height-std,
+    --settle, --above, --fixes-csv, --plot and --json.
 
     Parameters
     ----------
     file
         The recording, plain or gzip.
     """
-    check_output("fixes", asked.fixes, file, asked.anchors, asked.site, asked.truth)
-    check_output("plot", asked.plot, file, asked.anchors, asked.site, asked.truth, asked.fixes)
+    check_output("fixes-csv", asked.fixes_csv, file, asked.anchors, asked.site, asked.truth)
+    check_output("plot", asked.plot, file, asked.anchors, asked.site, asked.truth, asked.fixes_csv)
     check_picture(asked.plot)
     if is_mcap(file):
         _replay_site(file, asked)
@@ -141,10 +139,9 @@ def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> None:
 
 def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
     """Replay a recording that another program made. Raises SkylessError."""
-    from skyless.evaluation.judge import Judge
     from skyless.recordings.anchor_table import read_calibration
-    from skyless.recordings.foreign.formats import format_of
-    from skyless.replay.captures import MEASUREMENTS, Replay, ReplayRequest
+    from skyless.replays.capture_run import CaptureRequest, CaptureRun
+    from skyless.replays.inputs import known_anchors, known_truth
 
     protection = asked.protection
     of_sites = {
@@ -152,41 +149,34 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
         "alert-limit-m": protection.alert_limit_m, "max-acceleration": protection.max_acceleration,
     }  # fmt: skip
     check_left_out(of_sites, "it is for recordings of skyless record")
-    if asked.measurements not in {None, *MEASUREMENTS}:
-        raise SkylessError(f"--measurements is {asked.measurements!r}; it should be one of {', '.join(MEASUREMENTS)}")
     anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)
-    known = known_truth(file, asked.truth, asked.lever_arm, asked.format, asked.listener)
-    format_name = format_of(file, asked.format).name
-    height_m, std_m, note = height_to_hold(asked.height, anchors_m, site_height_m, known, format_name)
-    settle_s = asked.settle if asked.settle is not None else (2.0 if known is None else 3.0)
-    check_height_std(asked.height_std, height_m)
-    judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=flight_height(asked.above, known))
-    request = ReplayRequest(
-        path=file,
-        anchors_m=anchors_m,
-        format=asked.format,
-        listener=asked.listener,
-        height_m=height_m,
-        height_std_m=std_m if asked.height_std is None else asked.height_std,
-        qa=asked.qa,
-        tdoa_std_m=asked.tdoa_std,
-        calibration=None if asked.anchors is None or asked.uncalibrated else read_calibration(asked.anchors),
-        measurements=asked.measurements,
+    run = CaptureRun(
+        CaptureRequest(
+            path=file,
+            anchors_m=anchors_m,
+            site_height_m=site_height_m,
+            truth=known_truth(file, asked.truth, lever_arm(asked.lever_arm), asked.format, asked.listener),
+            tag_height=wished_height(asked.tag_height),
+            tag_height_std_m=asked.tag_height_std,
+            settle_s=asked.settle,
+            above_m=asked.above,
+            qa=asked.qa,
+            tdoa_std_m=asked.tdoa_std,
+            calibration=None if asked.anchors is None or asked.uncalibrated else read_calibration(asked.anchors),
+            measurements=asked.measurements,
+            format=asked.format,
+            listener=asked.listener,
+        )
     )
-    report = _run_foreign(Replay(request, judge), file, asked.fixes)
-    if asked.listener is not None and report.receptions == 0:
-        raise ConfigurationError(file, "listener", asked.listener, "one that the recording names")
-    if asked.truth is not None and known is not None:
-        _check_times(asked.truth, known, judge)
-    distances = _distances(file, report.format)
+    report = _run_foreign(run.replay, file, asked.fixes_csv)
+    run.check(report, asked.truth)
+    summary = run.summary(report)
     if asked.plot is not None:
-        _draw_track(asked.plot, judge, report)
+        _draw_track(asked.plot, run.judge, report)
     if asked.json:
-        import msgspec
-
-        print_json({**msgspec.to_builtins(report), "height_note": note, "anchor_distances_m": distances})
+        print_json(summary)
     else:
-        _show(report, note, distances)
+        _show(report, run.height_note, summary["anchor_distances_m"])
 
 
 def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
@@ -202,46 +192,25 @@ def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport
         return run.run(None if write is None else lambda fix: write(_row(fix)), bar.reach)
 
 
-def _check_times(table: Path, truth: "Truth", judge: "Judge") -> None:
-    """Fixes without any truth mean that the table belongs to another recording, or to another clock."""
-    import numpy as np
-
-    times_s, true_x_m = judge.track.rows[:, 0], judge.track.rows[:, 4]
-    if len(times_s) and np.isnan(true_x_m).all():
-        span = f"{truth.t_s[0]:.3f} to {truth.t_s[-1]:.3f}"
-        expected = f"in the time of the recording, whose fixes are from {times_s.min():.3f} to {times_s.max():.3f}"
-        raise ConfigurationError(table, "column t_s", span, expected)
-
-
-def _distances(file: Path, name: str) -> dict[str, float]:
-    """Distances of the anchors, where the recording itself measures them."""
-    if name != "avalue":
-        return {}
-    from collections import Counter
-
-    from skyless.recordings.foreign.avalue import anchor_distances_m
-
-    return {f"{a:X}-{b:X}": metres for (a, b), metres in sorted(anchor_distances_m(file, Counter()).items())}
-
-
 # Recordings of skyless record
 
 
 def _replay_site(file: Path, asked: ReplayOptions) -> None:
     """Replay all tags of a recording of skyless record, or one. Raises SkylessError."""
     from skyless.recordings.mcap.recording import McapRecording
-    from skyless.replay.site import SiteReplay
+    from skyless.replays.site import SiteReplay, summary_of
     from skyless.site.load import load_site
 
     useless = {
         "anchors": asked.anchors, "truth": asked.truth, "lever-arm": asked.lever_arm, "format": asked.format,
         "listener": asked.listener, "qa": asked.qa, "tdoa-std": asked.tdoa_std, "measurements": asked.measurements,
-        "height": None if asked.height == "auto" else asked.height, "uncalibrated": asked.uncalibrated or None,
+        "tag-height": None if asked.tag_height == "auto" else asked.tag_height,
+        "uncalibrated": asked.uncalibrated or None,
     }  # fmt: skip
     check_left_out(useless, "a recording of skyless record brings its own")
     required = None
-    if asked.protection.given or asked.height_std is not None:
-        required = asked.protection.requirement(asked.method, asked.height_std)
+    if asked.protection.given or asked.tag_height_std is not None:
+        required = asked.protection.requirement(asked.method, asked.tag_height_std)
     if asked.method is not None:
         check_method(asked.method)
     with McapRecording(file) as recording:
@@ -257,7 +226,7 @@ def _replay_site(file: Path, asked: ReplayOptions) -> None:
     if asked.plot is not None:
         _draw_track(asked.plot, run.judges[reports[0].tag], reports[0])
     if asked.json:
-        print_json(_site_json(reports))
+        print_json(summary_of(reports))
     else:
         for report in reports:
             _show(report, "from the site", {}, _site_facts(report))
@@ -271,32 +240,10 @@ def _run_site(run: "SiteReplay", span_s: float, asked: ReplayOptions) -> "list[T
     method = asked.method or DEFAULT_METHOD
     with loading_kernels(*parts_of(method)):
         compile_kernels(method)
-    with progress_bar("replaying", span_s) as bar, _table_of_fixes(asked.fixes, (*FIXES_COLUMNS, "tag")) as write:
+    with progress_bar("replaying", span_s) as bar, _table_of_fixes(asked.fixes_csv, (*FIXES_COLUMNS, "tag")) as write:
         if write is None:
             return run.run(None, bar.reach)
         return run.run(lambda tag, made: write((f"{made.unix_s:.6f}", *_row(made.fix)[1:], tag)), bar.reach)
-
-
-def _site_json(reports: "Sequence[TagReport]") -> dict[str, object]:
-    """One tag's report as that of any other recording; of several, their sums and the reports by tag."""
-    import msgspec
-
-    if len(reports) == 1:
-        return {**msgspec.to_builtins(reports[0]), "height_note": "from the site"}
-    compared = [report.identical for report in reports if report.identical is not None]
-    identical = {
-        "compared": sum(one.compared for one in compared),
-        "different": sum(one.different for one in compared),
-    }
-    return {
-        "format": reports[0].format,
-        "receptions": sum(report.receptions for report in reports),
-        "fixes": sum(report.fixes for report in reports),
-        "dropped": sum(report.dropped for report in reports),
-        "identical": identical if compared else None,
-        "wall_s": reports[0].wall_s,
-        "tags": {report.tag: msgspec.to_builtins(report) for report in reports},
-    }
 
 
 def _site_facts(report: "TagReport") -> list[tuple[str, str]]:
@@ -353,7 +300,7 @@ def _row(fix: "Fix") -> list[str]:
 
 def _draw_track(path: Path, judge: "Judge", report: "ReplayReport") -> None:
     """Draw what --plot asks for. Raises SkylessError."""
-    from skyless.replay.plot import draw
+    from skyless.replays.plot import draw
 
     try:
         draw(path, judge.track.rows, f"{report.format}, {report.fixes} fixes")

@@ -1,7 +1,6 @@
 """``skyless simulate``: a site in the simulated world, judged against the truth."""
 
 import csv
-import math
 import time
 from collections.abc import Sequence
 from itertools import pairwise
@@ -37,12 +36,6 @@ if TYPE_CHECKING:
 _Share = Annotated[float, Parameter(validator=Number(gte=0, lt=1))]
 
 _ROOM: Final = "room"
-
-_USUAL_S: Final = 60.0
-"""Duration of a run without a goal."""
-
-_LONGEST_WAIT_S: Final = 60.0
-"""Simulated time for which a run whose goal is fixes waits for one."""
 
 _LATEST_S: Final = 1e8
 """Three years: the 64 bits of unwrapped ticks last four and a half."""
@@ -98,7 +91,7 @@ class SimulateOptions:
     """Stop when every tag has this many judged fixes (one per superframe), or has had none for 60 s."""
     duration: Positive | None = None
     """Stop after this many simulated seconds; by default 60 unless --fixes is given."""
-    warmup: NotNegative = 2.0
+    settle: NotNegative = 2.0
     """Simulated seconds before which fixes are not judged; less than the run lasts."""
     seed: Seed = 1
     """Same seed, same bytes and ticks."""
@@ -145,7 +138,9 @@ class SimulateOptions:
     @property
     def until_s(self) -> float:
         """When the run ends, unless it reaches its goal before."""
-        return self.duration or (_USUAL_S if self.fixes is None else math.inf)
+        from skyless.evaluation.fleet_run import end_s
+
+        return end_s(self.duration, self.fixes)
 
 
 @app.default
@@ -156,16 +151,16 @@ def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
     """
     request = _request(asked)
     check_simulated(request.site, request.method)
-    if asked.warmup >= asked.until_s:
+    if asked.settle >= asked.until_s:
         raise SkylessError(
-            f"--warmup is {asked.warmup:g}; a run of {asked.until_s:g} s (--duration) ends before any fix is judged"
+            f"--settle is {asked.settle:g}; a run of {asked.until_s:g} s (--duration) ends before any fix is judged"
         )
     result = _run(request, asked)
     if asked.json:
         import msgspec
 
         settings = {
-            "seed": asked.seed, "noise_ps": asked.noise_ps, "warmup_s": asked.warmup, "site": request.site.name
+            "seed": asked.seed, "noise_ps": asked.noise_ps, "warmup_s": asked.settle, "site": request.site.name
         }  # fmt: skip
         print_json({**msgspec.to_builtins(result), **settings})
     else:
@@ -189,7 +184,7 @@ def _request(asked: SimulateOptions) -> "Request":
         speed_mps=asked.speed or 1.0,
         qa=asked.qa,
         integrity=asked.protection.requirement(asked.method),
-        warmup_s=asked.warmup,
+        warmup_s=asked.settle,
         most_fixes=asked.fixes,
         loss=asked.loss,
         nlos=asked.nlos,
@@ -321,30 +316,15 @@ def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
 
 
 def _advance(fleet: "TagFleet", request: "Request", until_s: float, file: TextIO | None) -> None:
-    """Run the world in steps, so that the bar moves and the goal is noticed."""
-    writer = None if file is None else csv.writer(file)
-    if writer is not None:
-        writer.writerow(FIXES_CSV_COLUMNS)
-    fixes = request.most_fixes
-    with progress_bar("simulating", fixes if fixes is not None else until_s) as bar:
-        now_s = 0.0
-        while now_s < until_s and not _enough(fleet, request, now_s):
-            now_s = min(now_s + fleet.step_s, until_s)
-            for judged in fleet.run(now_s):
-                if writer is not None:
-                    writer.writerow(_row(judged))
-            bar.reach(fleet.errors.count / len(fleet.records) if fixes is not None else now_s)
+    """Run to the end, with a bar; every fix becomes a row of the file."""
+    from skyless.evaluation.fleet_run import run_fleet
 
-
-def _enough(fleet: "TagFleet", request: "Request", now_s: float) -> bool:
-    """Whether all tags have their fixes, or those that have not wait too long, with nothing planned to come back."""
-    fixes = request.most_fixes
-    if fixes is None:
-        return False
-    returns_s = [planned.outage.on_s for planned in request.outages] + [silence.on_s for silence in request.silences]
-    planned_s = max(filter(math.isfinite, returns_s), default=0.0)
-    last_s = (0.0 if tag.last is None else tag.last.time_s for tag in fleet.records if tag.judged < fixes)
-    return all(now_s - max(tag_s, planned_s) > _LONGEST_WAIT_S for tag_s in last_s)
+    write = None if file is None else csv.writer(file).writerow
+    if write is not None:
+        write(FIXES_CSV_COLUMNS)
+    on_fix = None if write is None else lambda judged: write(_row(judged))
+    with progress_bar("simulating", 1.0) as bar:
+        run_fleet(fleet, request, until_s, on_fix, bar.reach)
 
 
 def _row(judged: "JudgedFix") -> tuple[object, ...]:

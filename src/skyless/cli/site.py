@@ -1,5 +1,6 @@
 """``skyless site``: write and check site files."""
 
+import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -7,7 +8,9 @@ import msgspec
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from skyless.cli.common.options import height_number
 from skyless.cli.common.output import console, print_json, print_warnings, write_file
+from skyless.cli.nodes.options import SiteId
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -26,7 +29,7 @@ _Count = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
 app = App(name="site", help_epilogue="Example: skyless site check site.toml")
 
 
-@app.command(help_epilogue="Example: skyless site new hall.toml --width 30 --depth 20 --anchors 8 --height 4")
+@app.command(help_epilogue="Example: skyless site new hall.toml --width 30 --depth 20 --anchor-count 8 --height 4")
 def new(
     file: Path,
     /,
@@ -34,15 +37,16 @@ def new(
     name: str | None = None,
     width: _Metres | None = None,
     depth: _Metres | None = None,
-    anchors: _Count | None = None,
+    anchor_count: _Count | None = None,
     height: _Metres | None = None,
-    grid: _Metres | None = None,
+    spacing: _Metres | None = None,
     free: bool = False,
     unplaced: _Count | None = None,
-    tag_height: float | None = None,
+    tag_height: str | None = None,
+    site_id: SiteId | None = None,
     force: bool = False,
 ) -> None:
-    """Write a commented site file to start from: the lab, with --width and --depth a room, with --grid a large hall.
+    """Write a commented site file to start from: the lab, with --width and --depth a room, with --spacing a large hall.
 
     With --unplaced the anchors have no positions yet, which skyless survey then finds.
 
@@ -56,44 +60,52 @@ def new(
         The room's width along x in metres.
     depth
         The room's depth along y in metres.
-    anchors
-        How many anchors hang evenly along the room's walls; 6 by default.
+    anchor_count
+        How many anchors hang evenly along the room's walls; 6 by default. Their master is the one that the others
+        receive best.
     height
-        The room's height in metres, 3 by default; the anchors alternate between floor and ceiling. With --grid the
+        The room's height in metres, 3 by default; the anchors alternate between floor and ceiling. With --spacing the
         height of all anchors, 4 by default.
-    grid
+    spacing
         Spacing in metres of a square grid of anchors that needs no master (protocol 2) and may be of any size; they
         get slots, which anchors far apart share.
     free
-        With --grid: anchors send at random instants (mode free) instead of in slots.
+        With --spacing: anchors send at random instants (mode free) instead of in slots.
     unplaced
         How many anchors, 1 to this number, without positions, each with a slot of its own (protocol 2).
     tag_height
-        Height in metres at which all tags move (2-D); by default their height is estimated (3-D), with --grid, whose
-        anchors lie in one plane, it is 1.2.
+        The tags' height: metres, at which all of them move (2-D), or free, the default: estimated (3-D). With
+        --spacing, whose anchors lie in one plane, the default is 1.2.
+    site_id
+        Number of the site on the air, which neighbouring sites must not share; by default a random one.
     force
         Overwrite the file if it exists.
     """
+    from skyless.planning.reception import with_best_master
+    from skyless.simulation.channel import ChannelModel
     from skyless.site.check import check_site
     from skyless.site.lab import lab_site
     from skyless.site.template import rectangular_site, site_template, unplaced_site
 
-    sizes = (width, depth, anchors, height)
+    sizes = (width, depth, anchor_count, height)
+    height_m = _tag_height(tag_height, spacing)
     if unplaced is not None:
-        if sizes != (None,) * 4 or grid is not None or free:
+        if sizes != (None,) * 4 or spacing is not None or free:
             raise SkylessError(f"--unplaced is {unplaced}; it takes no sizes: anchors without positions fill no room")
-        site = unplaced_site(unplaced, tag_height)
-    elif grid is not None and width is not None and depth is not None and anchors is None:
-        site = _grid(width, depth, grid, height, tag_height, free)
-    elif grid is not None or free:
-        raise SkylessError("a grid needs --grid, --width and --depth; how many --anchors follows from them")
+        site = unplaced_site(unplaced, height_m)
+    elif spacing is not None and width is not None and depth is not None and anchor_count is None:
+        site = _grid(width, depth, spacing, height, height_m, free)
+    elif spacing is not None or free:
+        raise SkylessError("a grid needs --spacing, --width and --depth; how many --anchor-count follows from them")
     elif width is not None and depth is not None:
-        site = rectangular_site(width, depth, anchors or 6, height or 3.0, tag_height)
+        room = rectangular_site(width, depth, anchor_count or 6, height or 3.0, height_m)
+        check_site(room, file)
+        site = with_best_master(room, ChannelModel())
     elif (*sizes, tag_height) == (None,) * 5:
         site = lab_site()
     else:
         raise SkylessError("a room needs both --width and --depth; without them the lab is written")
-    site = msgspec.structs.replace(site, name=name or file.stem)
+    site = msgspec.structs.replace(site, name=name or file.stem, id=_new_id() if site_id is None else site_id)
     check_site(site, file)
     if file.exists() and not force:
         raise SkylessError(f"{file} exists; --force overwrites it")
@@ -101,12 +113,25 @@ def new(
     console().print(f"wrote {file}; next: skyless site check {file}", markup=False)
 
 
+def _new_id() -> int:
+    """An identifier that a neighbouring site hardly has: any on the air but 0."""
+    from skyless.site.check import ANY_ADDRESS
+
+    return 1 + secrets.randbelow(ANY_ADDRESS)
+
+
+def _tag_height(text: str | None, spacing_m: float | None) -> float | None:
+    """The tags' height in metres, None where it is estimated. Raises SkylessError."""
+    if text is None:
+        return None if spacing_m is None else _TAGS_BELOW_A_GRID_M
+    return None if text == "free" else height_number(text, "or free")
+
+
 def _grid(
-    width_m: float, depth_m: float, spacing_m: float, height_m: float | None, tag_height_m: float | None, free: bool
+    width_m: float, depth_m: float, spacing_m: float, height_m: float | None, tags_m: float | None, free: bool
 ) -> "Site":
     from skyless.site.grid import grid_site
 
-    tags_m = _TAGS_BELOW_A_GRID_M if tag_height_m is None else tag_height_m
     try:
         return grid_site(width_m, depth_m, spacing_m, height_m or _GRID_HEIGHT_M, tags_m, "free" if free else "slots")
     except ValueError as error:
@@ -140,6 +165,8 @@ def _report(site: "Site") -> dict[str, Any]:
     """The report on a valid site, SI units."""
     from skyless.air.codec import MAX_FRAME_BYTES
     from skyless.air.ieee802154 import air_time_s
+    from skyless.planning.reception import master_warnings, reception_of
+    from skyless.simulation.channel import ChannelModel
     from skyless.site.advice import warnings_of
     from skyless.site.slots import beacon_period_s
 
@@ -156,11 +183,17 @@ def _report(site: "Site") -> dict[str, Any]:
     }
     if site.schedule.mode != "free":
         report |= _superframe(site)
+    warnings = warnings_of(site)
     if site.schedule.needs_master:
         report["occupancy"] = report["messages_per_s"] * report["longest_frame_s"]
+        received = reception_of(site, ChannelModel()).share.tolist()
+        report["anchors"] = [
+            one | {"hears_master": share} for one, share in zip(report["anchors"], received, strict=True)
+        ]
+        warnings += master_warnings(site, ChannelModel())
     else:
         report |= _in_reach(site)
-    return report | {"warnings": warnings_of(site)}
+    return report | {"warnings": warnings}
 
 
 def _anchors(site: "Site") -> list[dict[str, Any]]:
@@ -232,14 +265,17 @@ def _rows(title: "Text", anchors: list[dict[str, Any]], report: dict[str, Any]) 
     from rich.table import Table
 
     with_slots = report["mode"] != "free"
-    table = Table("anchor", "x / m", "y / m", "z / m", *(["slots"] if with_slots else []), title=title)
+    has_master = report["master"] is not None
+    more = [*(["slots"] if with_slots else []), *(["hears master"] if has_master else [])]
+    table = Table("anchor", "x / m", "y / m", "z / m", *more, title=title)
     for column in table.columns:
         column.justify = "right"
     for anchor in anchors:
         role = " (master)" if anchor["id"] == report["master"] else ""
         position = [f"{anchor[axis]:.3f}" if axis in anchor else "?" for axis in ("x_m", "y_m", "z_m")]
         slots = [" ".join(map(str, anchor["slots"]))] if with_slots else []
-        table.add_row(f"{anchor['id']}{role}", *position, *slots)
+        hears = [f"{anchor['hears_master']:.0%}"] if has_master else []
+        table.add_row(f"{anchor['id']}{role}", *position, *slots, *hears)
     return table
 
 

@@ -110,7 +110,7 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
 
 def _check(recording: Path | None, asked: SurveyOptions) -> None:
     """See that inputs and options fit one another and outputs can be written, before the work. Raises SkylessError."""
-    inputs = (recording, asked.ranges, asked.known.heights)
+    inputs = (recording, asked.ranges, asked.known.anchor_heights)
     asked.live.check(asked.known)
     if (recording is not None) + (asked.ranges is not None) + asked.live.given != 1:
         raise SkylessError(

@@ -2,5 +2,5 @@
 
 Public: anchor, board, broker, demo, ether, find_site, open_radio, packet_tags, process, radio_monitor, record,
 tag, watch.
-Within the package: children, fix_log, ports, stamp_log. The survey program has a folder of its own.
+Within the package: children, fix_log, lateness, ports, stamp_log. The survey program has a folder of its own.
 """

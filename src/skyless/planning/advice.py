@@ -4,25 +4,20 @@ from typing import Final
 
 import numpy as np
 
-from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.kernels.arrays import Array, Mask
 from skyless.method_names import FILTERS
 from skyless.planning.anchor_clocks import stamp_variances
 from skyless.planning.columns import BIAS, FIX_SHARE, SIGMA
 from skyless.planning.floor import Floor, sample_points
-from skyless.planning.links import IN_VIEW, anchor_links, masters_by_links
+from skyless.planning.links import IN_VIEW
 from skyless.planning.maps import PlanMap
 from skyless.planning.predict import Predictor
+from skyless.planning.reception import master_warnings
 from skyless.planning.snapshot_sigma import delays
 from skyless.positioning.fix import NoFixReason
 from skyless.positioning.methods.locate import NoSolution, locate
 from skyless.positioning.methods.snapshots import literal_covariance
 from skyless.site.advice import warnings_of
-
-_RELIABLE: Final = 0.95
-"""An anchor should hear at least this share of the master's frames."""
-
-_MOST_NAMED: Final = 8
-"""Anchors named in one warning."""
 
 _WEAK_RATIO: Final = 2.0
 """A position is weak where the error exceeds this multiple of the median."""
@@ -34,42 +29,13 @@ def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str
     """All that may cost accuracy or the fix, from the site alone and from its map."""
     return [
         *warnings_of(predictor.site),
-        *_master(predictor),
+        *master_warnings(predictor.site, predictor.settings.channel),
         *_order(predictor),
         *_mirrors(predictor, floor, plan),
         *_holes(plan),
         *_weak(plan),
         *_walls(predictor, plan),
     ]
-
-
-def _master(predictor: Predictor) -> list[str]:
-    """Anchors that hear the master badly have a poor clock, or none and stay silent; a better master, if any."""
-    share, sends = predictor.links.share, predictor.clocks.sends
-    found = [
-        _poor_reception(predictor, np.flatnonzero(~sends), "stay silent"),
-        _poor_reception(predictor, np.flatnonzero(sends & (share < _RELIABLE)), "follow its clock badly"),
-    ]
-    warnings = [text for text in found if text]
-    best = int(masters_by_links(predictor.anchors_m, predictor.budget, predictor.walls)[0])
-    best_share = anchor_links(predictor.anchors_m, best, predictor.budget, predictor.walls).share
-    if warnings and (best_share >= _RELIABLE).sum() > (share >= _RELIABLE).sum():
-        number = predictor.site.anchors[best].id
-        warnings[0] += f"; with anchor {number} as the master {(best_share < _RELIABLE).sum()} would hear it that badly"
-    return warnings
-
-
-def _poor_reception(predictor: Predictor, rows: Integers, what: str) -> str:
-    """One sentence for all anchors that do the same."""
-    if len(rows) == 0:
-        return ""
-    numbers = [str(predictor.site.anchors[row].id) for row in rows]
-    more = f" and {len(numbers) - _MOST_NAMED} more" if len(numbers) > _MOST_NAMED else ""
-    listed = ", ".join(numbers[:_MOST_NAMED]) + more
-    distances = np.linalg.norm(predictor.anchors_m[rows] - predictor.anchors_m[predictor.master], axis=1)
-    nearest, share = float(distances.min()), float(predictor.links.share[rows].max())
-    heard = f"hear {share:.0%} of its frames at most"
-    return f"anchor(s) {listed}, {nearest:.0f} m or more from the master, {heard} and {what}"
 
 
 def _order(predictor: Predictor) -> list[str]:

@@ -50,6 +50,9 @@ _PENALTY: Final = 10.0
 
 _CLEARLY_SMALLER: Final = 0.95
 
+_NOTICEABLE: Final = 0.05
+"""Share of an error by which one more anchor should lower it to be worth its mounting."""
+
 
 # Layouts
 
@@ -352,6 +355,8 @@ class OneMore(Struct, frozen=True):
     mean_after_m: float
     worst_before_m: float
     worst_after_m: float
+    helps: bool
+    """Whether it lowers the mean or the worst noticeably, and raises neither by as much."""
 
 
 def one_more(
@@ -379,7 +384,9 @@ def one_more(
         _mean_and_worst(predictor.at(points)[:, SIGMA], weights, lattice.cap_m) for predictor in (before, after)
     )
     x, y, z = position_m.tolist()
-    return OneMore((x, y, z), mean_before, mean_after, worst_before, worst_after)
+    changes = mean_after / mean_before - 1.0, worst_after / worst_before - 1.0
+    helps = min(changes) <= -_NOTICEABLE and max(changes) < _NOTICEABLE
+    return OneMore((x, y, z), mean_before, mean_after, worst_before, worst_after, helps)
 
 
 def _mean_and_worst(sigma: Vector, weights: Vector, cap_m: float) -> tuple[float, float]:

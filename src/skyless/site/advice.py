@@ -1,7 +1,6 @@
 """Soft problems of a valid site: geometry and distances that reduce accuracy or prevent a fix."""
 
 from collections import Counter
-from math import dist
 from typing import Final
 
 import numpy as np
@@ -16,8 +15,6 @@ from skyless.site.near import anchor_positions, pairs_within
 
 _FLATTEST: Final = 0.05
 """Extent across the best plane (or line) over the whole extent, below which anchors count as in it."""
-_REACH_M: Final = 100.0
-"""Range of a DW1000 in the open at 6.8 Mbit/s, at best; walls shorten it."""
 RADIO_REACH_M: Final = 31.0
 """Range in the open that the planner's and the simulation's link budget give; half of the frames arrive there."""
 _MOST_OVERLOAD: Final = 2.0
@@ -33,7 +30,7 @@ def warnings_of(site: Site) -> list[str]:
     """Soft problems of a valid site, each a sentence; empty when there is none."""
     general = [*_count(site), *_geometry(site), *_height(site), *_guard(site), *_accuracy(site), *_without_effect(site)]
     if site.schedule.needs_master:
-        return [*general, *_reach(site)]
+        return general
     return [*general, *_neighbours(site), *(_unplaced(site) if site.schedule.mode == "slots" else _load(site))]
 
 
@@ -105,16 +102,6 @@ def _height(site: Site) -> list[str]:
         return []
     reach = f"{RADIO_REACH_M:.0f} m, the range in the open"
     return [f"tags.height_m is {height_m:g}: no anchor is within {reach}, of that height"]
-
-
-def _reach(site: Site) -> list[str]:
-    points = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
-    distances = {number: dist(point, points[site.master]) for number, point in points.items()}
-    return [
-        f"anchor {number} is {distance:.0f} m from the master, which it must hear: over {_REACH_M:.0f} m may be too far"
-        for number, distance in distances.items()
-        if distance > _REACH_M
-    ]
 
 
 def _without_effect(site: Site) -> list[str]:

@@ -57,7 +57,7 @@ class ProtectionOptions:
         return (self.integrity_risk, self.alert_limit_m, self.max_acceleration) != (None,) * 3
 
     def requirement(self, method: str | None = None, height_std_m: float | None = None) -> "IntegrityRequirement":
-        """Them and --height-std as the filter takes them.
+        """Them and --tag-height-std as the filter takes them.
 
         Raises:
             SkylessError: the method gives no protection levels, so that a limit would have no effect.
@@ -67,7 +67,7 @@ class ProtectionOptions:
         if method in METHODS and method != PROTECTED:
             required = {
                 "integrity-risk": self.integrity_risk, "alert-limit-m": self.alert_limit_m,
-                "max-acceleration": self.max_acceleration, "height-std": height_std_m,
+                "max-acceleration": self.max_acceleration, "tag-height-std": height_std_m,
             }  # fmt: skip
             for option, value in required.items():
                 if value is not None:
@@ -92,9 +92,9 @@ def check_method(method: str, names: Sequence[str] = METHODS) -> None:
 
 
 def check_height_std(height_std_m: float | None, height_m: float | None) -> None:
-    """See that --height-std has a height to be the standard deviation of. Raises SkylessError."""
+    """See that --tag-height-std has a height to be the standard deviation of. Raises SkylessError."""
     if height_std_m is not None and height_m is None:
-        raise SkylessError(f"--height-std is {height_std_m:g}; it should be left out: the height is estimated")
+        raise SkylessError(f"--tag-height-std is {height_std_m:g}; it should be left out: the height is estimated")
 
 
 def finite_numbers(
@@ -125,11 +125,11 @@ def metres(option: str, text: str, counts: tuple[int, ...], *, part: str | None 
 
 
 def height_number(text: str, words: str) -> float:
-    """A height in metres; ``words``: what --height may be instead. Raises SkylessError."""
+    """A height in metres; ``words``: what --tag-height may be instead. Raises SkylessError."""
     try:
-        return finite_numbers("height", text, (1,))[0]
+        return finite_numbers("tag-height", text, (1,))[0]
     except SkylessError:
-        raise SkylessError(f"--height is {text!r}; it should be metres, {words}") from None
+        raise SkylessError(f"--tag-height is {text!r}; it should be metres, {words}") from None
 
 
 def check_output(option: str, output: Path | None, *inputs: Path | None) -> None:

@@ -44,11 +44,11 @@ class FactOptions:
     """Keep the positions of --site and find delays only."""
     dimensions: Literal[2, 3] | None = None
     """2 (default): heights are given; 3: heights are estimated."""
-    height: list[str] | None = None
+    anchor_height: list[str] | None = None
     """Height of all anchors in metres, or of one: 3=2.4. Several times for several anchors."""
-    heights: Path | None = None
+    anchor_heights: Path | None = None
     """Table of heights: id,z_m."""
-    height_std: Std | None = None
+    anchor_height_std: Std | None = None
     """How well given heights are known, metres (--dimensions 3); 0.02 by default."""
     distance: list[str] | None = None
     """A distance between two anchors by tape or laser: 1-4=7.21, or 1-4=7.21±0.01; ±0.005 by default."""
@@ -104,7 +104,7 @@ def facts_of(
     facts = Facts(
         dimensions=dimensions,
         heights_m=given,
-        height_std_m=asked.height_std or usual.height_std_m,
+        height_std_m=asked.anchor_height_std or usual.height_std_m,
         tapes=_tapes(asked.distance or (), known),
         points=points,
         point_std_m=asked.point_std or usual.point_std_m,
@@ -127,8 +127,10 @@ def _check(asked: FactOptions, site: "Site | None") -> None:
         raise SkylessError(
             f"--common-delay-std is {asked.common_delay_std:g}; it should be left out with --delays-known"
         )
-    if asked.height_std is not None and asked.dimensions != 3:
-        raise SkylessError(f"--height-std is {asked.height_std:g}; it is for --dimensions 3, else heights are exact")
+    if asked.anchor_height_std is not None and asked.dimensions != 3:
+        raise SkylessError(
+            f"--anchor-height-std is {asked.anchor_height_std:g}; it is for --dimensions 3, else heights are exact"
+        )
     if asked.keep_positions and asked.no_sketch:
         raise SkylessError("--keep-positions keeps what --no-sketch would leave out; give either")
     if asked.keep_positions and asked.delays_known:
@@ -156,23 +158,23 @@ def _heights(asked: FactOptions, known: set[int]) -> dict[int, float]:
 
     single: dict[int, float] = {}
     of_all: dict[int, float] = {}
-    for text in asked.height or ():
+    for text in asked.anchor_height or ():
         name, mark, value = text.rpartition("=")
-        (z_m,) = metres("height", text, (1,), part=value if mark else None)
+        (z_m,) = metres("anchor-height", text, (1,), part=value if mark else None)
         if mark:
-            anchor = _anchor("height", text, name, known)
+            anchor = _anchor("anchor-height", text, name, known)
             if anchor in single:
-                raise SkylessError(f"--height is {text!r}; the height of anchor {anchor} should be given once")
+                raise SkylessError(f"--anchor-height is {text!r}; the height of anchor {anchor} should be given once")
             single[anchor] = z_m
         elif of_all:
-            raise SkylessError(f"--height is {text!r}; the height of all anchors should be given once")
+            raise SkylessError(f"--anchor-height is {text!r}; the height of all anchors should be given once")
         else:
             of_all = dict.fromkeys(known, z_m)
     table: dict[int, float] = {}
-    if asked.heights is not None:
-        table = read_heights(asked.heights)
+    if asked.anchor_heights is not None:
+        table = read_heights(asked.anchor_heights)
         if known.isdisjoint(table):
-            raise ConfigurationError(asked.heights, "column id", _names(table), f"anchors among {_names(known)}")
+            raise ConfigurationError(asked.anchor_heights, "column id", _names(table), f"anchors among {_names(known)}")
     return of_all | {anchor: z_m for anchor, z_m in table.items() if anchor in known} | single
 
 
@@ -183,7 +185,9 @@ def _completed(heights_m: dict[int, float], known: set[int], warnings: list[str]
         return heights_m
     middle_m = median(heights_m.values())
     names = ", ".join(map(str, missing))
-    warnings.append(f"no height is given for anchor {names}; {middle_m:g} m is assumed, as of the others (--height)")
+    warnings.append(
+        f"no height is given for anchor {names}; {middle_m:g} m is assumed, as of the others (--anchor-height)"
+    )
     return heights_m | dict.fromkeys(missing, middle_m)
 
 

@@ -21,7 +21,7 @@ def board(
     /,
     *,
     radio: str = DEFAULT_RADIO,
-    format: Literal["link", "sniffer", "sniffer-text", "listener"] = "link",  # noqa: A002 - the option's natural name
+    wire: Literal["link", "sniffer", "sniffer-text", "listener"] = "link",
     link: Path | None = None,
     json: bool = False,
 ) -> None:
@@ -36,7 +36,7 @@ def board(
         Which radio it is: an anchor's number, or a tag of the air (tag1).
     radio
         The air: ether:HOST:PORT of skyless ether.
-    format
+    wire
         Format on the serial port: link (Skyless), sniffer or sniffer-text (Bitcraze; beacons become TDoA3 packets),
         listener (uwb-apps, JSON).
     link
@@ -51,18 +51,18 @@ def board(
     if not is_ether(radio):
         raise SkylessError(f"--radio is {radio!r}; it should be the emulated air, ether:HOST[:PORT]")
     kind: Literal["anchor", "tag"] = "anchor" if name.isdecimal() else "tag"
-    if kind == "anchor" and format != "link":
+    if kind == "anchor" and wire != "link":
         raise SkylessError(
-            f"--format is {format!r}; it should be link for an anchor, as boards of other formats only listen"
+            f"--wire is {wire!r}; it should be link for an anchor, as boards of other formats only listen"
         )
-    emulated = Board(open_radios(radio, kind, (name,))[0], kind, format, link, log)
+    emulated = Board(open_radios(radio, kind, (name,))[0], kind, wire, link, log)
     path = emulated.pty.name
     if json:
-        print_json({"board": name, "path": path, "format": format, "radio": f"{RADIO_OF[format]}:{path}"})
+        print_json({"board": name, "path": path, "format": wire, "radio": f"{RADIO_OF[wire]}:{path}"})
         sys.stdout.flush()
     else:
         log(f"board {name}: emulated, at {path}")
-        rest = " --anchors anchors.csv" if RADIO_OF[format] == "sniffer" else ""
-        log(f"next: skyless {kind} {name} --radio {RADIO_OF[format]}:{path}{rest}")
+        rest = " --anchors anchors.csv" if RADIO_OF[wire] == "sniffer" else ""
+        log(f"next: skyless {kind} {name} --radio {RADIO_OF[wire]}:{path}{rest}")
     with contextlib.suppress(KeyboardInterrupt):
         run(emulated.run(), punctual=True)

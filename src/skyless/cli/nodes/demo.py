@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from shlex import quote
 from types import TracebackType
@@ -292,7 +293,16 @@ class Screen:
 
     def _line(self) -> str:
         sent = 0 if self._watch is None or self._watch.ether is None else self._watch.ether.transmissions
-        return f"{sent} beacons on the air; page {self._whole.page}; Ctrl-C stops"
+        late = _late(self._late())
+        return f"{sent} beacons on the air{late and f'; {late}'}; page {self._whole.page}; Ctrl-C stops"
+
+    def _late(self) -> dict[str, int]:
+        """What the tags dropped and withheld because it was too old."""
+        late = Counter[str]()
+        for _, tag in self._tags():
+            if tag.health is not None:
+                late.update({name: tag.health.counters.get(name, 0) for name in ("late-reception", "late-fix")})
+        return {"late_receptions": late["late-reception"], "late_fixes": late["late-fix"]}
 
     def tags(self) -> "RenderableType":
         """The table of tags."""
@@ -387,6 +397,7 @@ class Screen:
             "first_fix_s": firsts[len(firsts) // 2] if firsts else None,
             "alerts": {} if self._watch is None else dict(sorted(self._watch.alerts.items())),
             **self._latencies(),
+            **self._late(),
             "late_transmissions": sum(health.late for health in self._watch.anchors.values()) if self._watch else 0,
             "restarts": sum(max(0, child.starts - 1) for child in self._whole.children),
             "duration_s": self._took_s,
@@ -425,15 +436,25 @@ class Screen:
         found = self.summary()
         if not found["tags"]:
             return "no fix was made"
+        late = f"; {found_late}" if (found_late := _late(found)) else ""
         if found["rmse_m"] is None or found["updates_per_s"] is None:
-            return f"{found['tags']} tags with a fix; too short for errors and updates per second"
+            return f"{found['tags']} tags with a fix; too short for errors and updates per second{late}"
         return (
             f"{found['tags']} tags, {found['messages']} messages in {found['duration_s']:.1f} s: "
             f"RMSE {100 * found['rmse_m']:.1f} cm, largest error {100 * found['max_m']:.1f} cm, "
             f"{found['updates_per_s']:.0f} updates per second and tag, "
             f"99 % of fixes within {1e3 * (found['fix_latency_p99_s'] or 0.0):.1f} ms of the frame"
             + (f"; alerts: {_counts(found['alerts']) or 'none'}" if found["alerts"] else "")
+            + late
         )
+
+
+def _late(found: "Mapping[str, Any]") -> str:
+    """What was too old to be used or given, for a person; empty where there is nothing."""
+    receptions, fixes = found["late_receptions"], found["late_fixes"]
+    if not receptions and not fixes:
+        return ""
+    return f"this computer is too slow: {receptions} receptions dropped and {fixes} fixes withheld as too old"
 
 
 def _counts(alerts: "Mapping[str, int]") -> str:

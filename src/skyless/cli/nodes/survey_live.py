@@ -34,11 +34,11 @@ class LiveOptions:
     """Certificates (PEM) to trust for mqtts."""
     radio: str | None = None
     """Survey with what a listener receives instead, as skyless tag --radio; needs --site."""
-    listener: str = "survey"
+    radio_name: str = "survey"
     """Name of that listener on an ether: that of one of its bodies, such as tag1."""
     site_id: SiteId | None = None
     """Number of the site; by default that of --site, or the first that the broker has."""
-    seconds: Positive | None = None
+    duration: Positive | None = None
     """How long to listen before the survey; 30 by default."""
     serve: bool = False
     """Stay until Ctrl-C: survey all the while, serve the page, save on its request, and watch the anchors."""
@@ -54,7 +54,7 @@ class LiveOptions:
         """Raises SkylessError."""
         if not self.given:
             others = {
-                "seconds": self.seconds,
+                "duration": self.duration,
                 "serve": self.serve or None,
                 "no-watch": self.no_watch or None,
                 "site-id": self.site_id,
@@ -63,8 +63,8 @@ class LiveOptions:
             return
         if self.radio is not None and known.site is None:
             raise SkylessError("--radio needs --site: the listener does not know which anchors there are")
-        if self.serve and self.seconds is not None:
-            raise SkylessError(f"--seconds is {self.seconds:g}; with --serve the survey does not end")
+        if self.serve and self.duration is not None:
+            raise SkylessError(f"--duration is {self.duration:g}; with --serve the survey does not end")
         if self.no_watch and not self.serve:
             raise SkylessError("--no-watch is for --serve: nothing else watches")
 
@@ -100,7 +100,7 @@ async def _serve(asked: LiveOptions, known: FactOptions) -> None:
 
 
 async def _gather(asked: LiveOptions, known: FactOptions, found: "list[SurveyNode]") -> None:
-    seconds = asked.seconds or _USUAL_S
+    seconds = asked.duration or _USUAL_S
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds + 1.0):  # a moment for the broker and the anchors to answer
             node = await _node(asked, known, serves=False)
@@ -138,7 +138,7 @@ async def _node(asked: LiveOptions, known: FactOptions, *, serves: bool) -> "Sur
     if site_id is None:
         assert address is not None  # a radio needs a site file
         site_id = await find_site(address, lambda _: None)
-    radio: Radio | None = None if asked.radio is None else open_radios(asked.radio, "tag", (asked.listener,))[0]
+    radio: Radio | None = None if asked.radio is None else open_radios(asked.radio, "tag", (asked.radio_name,))[0]
     settings = SurveySettings(site_id, site, known.site, not asked.no_watch, serves)
     return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, _log, radio)
 

@@ -19,6 +19,7 @@ from skyless.cli.common.options import (
     options,
 )
 from skyless.cli.common.progress import loading_kernels
+from skyless.cli.nodes.fix_lines import LineOptions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
@@ -26,11 +27,12 @@ from skyless.nodes.open_radio import DEFAULT_RADIO, is_simulated, is_sniffer, op
 
 if TYPE_CHECKING:
     from skyless.mqtt.address import MqttAddress
+    from skyless.nodes.fix_log import FixListener
     from skyless.nodes.packet_tags import PacketTagSettings
 
 _TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
-app = App(name="tag", help_epilogue="Example: skyless tag tag1")
+app = App(name="tag", help_epilogue="Example: skyless tag tag1 --print")
 
 
 @options
@@ -47,17 +49,17 @@ class TagOptions:
     qa: Positive = 0.3
     """Process noise for the tags' motion: spectral density of the acceleration in m²/s³ (joint)."""
     protection: ProtectionOptions = ProtectionOptions()
-    height_std: NotNegative | None = None
+    tag_height_std: NotNegative | None = None
     """Standard deviation of the tags' height from the one that is given, in metres, which fixes and levels then
     count (joint); 0 by default, for sniffers 0.5 where the height is only taken for the anchors'."""
     publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0
-    """Fixes a second and tag on MQTT at most."""
+    """Fixes a second and tag at most, on MQTT and on standard output; all of them count in the tag's health."""
     site_id: SiteId | None = None
     """The only site to listen to; by default the first one heard. For sniffers what topics call the system, by
     default 0; it should be no other site's."""
     anchors: Path | None = None
     """Sniffers only: table of the system's anchors, id,x_m,y_m,z_m, as skyless replay and calibrate take it."""
-    height: str | None = None
+    tag_height: str | None = None
     """Sniffers only: the tags' height in metres, free (estimated) or auto, the default: estimated unless the anchors
     lie too flat, then theirs."""
 
@@ -67,11 +69,13 @@ def tag(
     *names: Annotated[str, Parameter(name="NAMES")],
     asked: TagOptions = TagOptions(),
     broker: MqttOptions = MqttOptions(),
+    shown: LineOptions = LineOptions(),
 ) -> None:
     """Run listening tags until Ctrl-C.
 
     A tag needs no configuration: it learns the site from the beacons that it hears. It computes a fix with every
-    message, with or without a broker, and publishes fixes on MQTT under skyless/v1/SITE/tag/NAME/fix.
+    message, with or without a broker, and publishes fixes on MQTT under skyless/v1/SITE/tag/NAME/fix. With --print,
+    --csv or --json it writes the same fixes on standard output.
 
     Parameters
     ----------
@@ -80,9 +84,10 @@ def tag(
     broker.mqtt
         Broker for fixes and health, or none.
     """
-    from skyless.nodes.process import run
+    from skyless.nodes.process import run, together
 
-    address = broker.address()
+    address, lines = broker.address(), shown.lines(log)
+    on_fix = None if lines is None else lines.on_fix
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
         given = repr(" ".join(names)) if names else "missing"
         raise SkylessError(
@@ -92,31 +97,35 @@ def tag(
     if is_sniffer(asked.radio):
         if asked.protection.given:
             raise SkylessError("--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers")
-        serve = _on_sniffers(names, asked, address)
-    elif asked.anchors is not None or asked.height is not None:
-        raise SkylessError("--anchors and --height are for sniffers; other tags hear from the air where anchors stand")
+        serve = _on_sniffers(names, asked, address, on_fix)
+    elif asked.anchors is not None or asked.tag_height is not None:
+        raise SkylessError(
+            "--anchors and --tag-height are for sniffers; other tags hear from the air where anchors stand"
+        )
     else:
-        serve = _on_radios(names, asked, address)
+        serve = _on_radios(names, asked, address, on_fix)
     with contextlib.suppress(KeyboardInterrupt):
-        run(serve, punctual=True)
+        run(serve if lines is None else together(serve, lines.run()), punctual=True)
 
 
-def _on_radios(names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None") -> "Coroutine[Any, Any, None]":
+def _on_radios(
+    names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None", on_fix: "FixListener | None"
+) -> "Coroutine[Any, Any, None]":
     """Tags that hear beacons."""
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.nodes.tag import Tags, TagSettings
     from skyless.preparation.parts import parts_of
 
-    required = asked.protection.requirement(asked.method, asked.height_std)
+    required = asked.protection.requirement(asked.method, asked.tag_height_std)
     settings = TagSettings(asked.method, asked.qa, asked.site_id, integrity=required, publish_hz=asked.publish_hz)
     radios = open_radios(asked.radio, "tag", names)
     with loading_kernels(*parts_of(asked.method)):
         compile_kernels(asked.method)
-    return Tags(settings, radios, address, log).run()
+    return Tags(settings, radios, address, log, on_fix).run()
 
 
 def _on_sniffers(
-    names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None"
+    names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None", on_fix: "FixListener | None"
 ) -> "Coroutine[Any, Any, None]":
     """Tags that hear the packets of another system."""
     from skyless.evaluation.compile_ahead import compile_packet_kernels
@@ -127,7 +136,8 @@ def _on_sniffers(
     radios = open_sniffers(asked.radio, names)
     with loading_kernels(*SNIFFERS):
         compile_packet_kernels()
-    return PacketTags(settings, radios, address, log, simulated=lambda: is_simulated(asked.radio)).run()
+    tags = PacketTags(settings, radios, address, log, simulated=lambda: is_simulated(asked.radio), on_fix=on_fix)
+    return tags.run()
 
 
 def _system(asked: TagOptions) -> "PacketTagSettings":
@@ -139,23 +149,23 @@ def _system(asked: TagOptions) -> "PacketTagSettings":
     if asked.anchors is None:
         raise SkylessError("--anchors is missing; a sniffer needs a table of the system's anchors: id,x_m,y_m,z_m")
     anchors_m, std_m = read_anchors(asked.anchors), 0.0
-    if asked.height in (None, "auto"):
+    if asked.tag_height in (None, "auto"):
         height_m = plane_height_m(anchors_m)
         if height_m is not None:
             std_m = GUESSED_STD_M
             log(
                 "the anchors lie too flat to determine the height; tags are taken to be at theirs: "
-                f"--height {height_m:.2f}"
+                f"--tag-height {height_m:.2f}"
             )
     else:
-        height_m = None if asked.height == "free" else height_number(str(asked.height), "free or auto")
-    check_height_std(asked.height_std, height_m)
+        height_m = None if asked.tag_height == "free" else height_number(str(asked.tag_height), "free or auto")
+    check_height_std(asked.tag_height_std, height_m)
     return PacketTagSettings(
         anchors_m,
         site=TDOA_SITE if asked.site_id is None else asked.site_id,
         qa=asked.qa,
         height_m=height_m,
-        height_std_m=std_m if asked.height_std is None else asked.height_std,
+        height_std_m=std_m if asked.tag_height_std is None else asked.tag_height_std,
         calibration=read_calibration(asked.anchors),
         publish_hz=asked.publish_hz,
     )
