@@ -241,9 +241,9 @@ def _check_carries_anchors(file: Path, asked: ReplayOptions) -> None:
 
 def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
     from skyless.evaluation.compile_ahead import compile_packet_kernels, compile_pair_kernels
-    from skyless.preparation.parts import PACKETS, PAIRS
+    from skyless.preparation.parts import PAIRS, SNIFFERS
 
-    with loading_kernels(PACKETS if run.measurements == "packets" else PAIRS):
+    with loading_kernels(*(SNIFFERS if run.measurements == "packets" else (PAIRS,))):
         if run.measurements == "packets":
             compile_packet_kernels()
         else:
