@@ -26,6 +26,7 @@ LAYERS = (
     {"radios"},
     {"evaluation"},
     {"replays"},
+    {"preparation"},
     {"nodes", "paper", "planning"},
     {"studies"},
     {"survey_inputs", "bench", "dashboard"},

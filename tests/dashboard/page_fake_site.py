@@ -2,6 +2,8 @@
 
 import math
 
+from skyless.planning.colours import COLOUR_STOPS, scale_of
+
 WIDTH_M, DEPTH_M = 24.0, 14.0
 SLOT_S = 2.1e-3
 SUPERFRAME = 8
@@ -72,6 +74,23 @@ def state_row(name, number, time_s, unix_s):
     return [name, *(round(value, 5) for value in numbers), *rest]
 
 
+def recorded_events(start_unix_s):
+    """Of a recording: anchor 2 is lost at 20 s and 4 takes over, an alert at 50 s, an anchor has moved at 70 s."""
+    events = (
+        (1.0, "program", "note", "recorder/demo", "recorder demo started"),
+        (20.0, "anchor", "bad", "anchor/2", "anchor 2 does not report any more"),
+        (20.4, "master", "warning", "anchor/4", "anchor 4 is the master now, after anchor 2"),
+        (31.0, "anchor", "good", "anchor/2", "anchor 2 reports again"),
+        (50.0, "alert", "warning", "tag/tag-001", "tag tag-001: faulty anchor excluded"),
+        (70.0, "watch", "bad", "anchor/7", "Anchor 7 has moved by 31 cm"),
+    )
+    keys = ("unix_s", "kind", "level", "name", "text")
+    return [
+        dict(zip(keys, (start_unix_s + at_s, *rest), strict=True)) | {"serial": n}
+        for n, (at_s, *rest) in enumerate(events, 1)
+    ]
+
+
 def mqtt():
     return {"published": 12_345, "dropped": 0, "reconnects": 0}
 
@@ -126,6 +145,23 @@ def nodes():
     ]
 
 
+def reason(kind, level, text, advice="See there.", names=()):
+    return {"kind": kind, "level": level, "text": text, "advice": advice, "names": names}
+
+
+def condition(*reasons, level=None, text=""):
+    """The server's judgement: good without reasons."""
+    return {
+        "type": "condition", "level": level or (reasons[0]["level"] if reasons else "good"),
+        "text": text or (reasons[0]["text"] if reasons else ""), "reasons": reasons,
+        "latency_p50_s": 0.0012, "latency_p99_s": 0.0034,
+    }  # fmt: skip
+
+
+def event(serial, unix_s, level, kind, name, text):
+    return {"serial": serial, "unix_s": unix_s, "kind": kind, "level": level, "name": name, "text": text}
+
+
 def overlay(kind, step_m):
     """A smooth bowl, good in the middle; nothing beyond the walls' corners."""
     columns, rows = int(WIDTH_M / step_m) + 1, int(DEPTH_M / step_m) + 1
@@ -135,8 +171,11 @@ def overlay(kind, step_m):
         for column in range(columns):
             u, v = 2 * column / (columns - 1) - 1, 2 * row / (rows - 1) - 1
             values.append(None if abs(u) + abs(v) > 1.9 else round(scale * (1 + u * u + 0.7 * v * v), 4))
+    known = sorted(value for value in values if value is not None)
+    limits = scale_of(known)
     return {
         "kind": kind, "unit": "m" if kind == "sigma" else "1", "x_m": [0, (columns - 1) * step_m],
         "y_m": [0, (rows - 1) * step_m], "step_m": step_m, "columns": columns, "rows": rows, "values": values,
-        "method": "joint", "levels": {"good": scale, "bad": 2.6 * scale},
+        "method": "joint", "height_m": 1.2, "least": known[0], "most": known[-1],
+        "scale": {"low": limits.low, "high": limits.high, "ticks": limits.ticks, "stops": COLOUR_STOPS},
     }  # fmt: skip

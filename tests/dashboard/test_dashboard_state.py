@@ -123,24 +123,26 @@ def anchor_health(anchor):
 
 def test_health_holds_the_newest_of_every_node():
     state = SiteState()
-    assert json.loads(state.health_message({})) == {
+    assert json.loads(state.health_message({}, 1.0)) == {
         "type": "health",
         "anchors": [],
         "tags": [],
         "ether": None,
         "nodes": [],
         "dropped": {},
+        "ages": {"anchors": {}, "tags": {}, "ether": {}},
     }
     state.add_health("2", anchor_health(1), 0.0)
     state.add_health("2", anchor_health(2), 1.0)
     state.add_health("air", EtherHealth(0.0, 1.0, 5, 0, {}, {}, 0, 0), 1.0)
     state.add_status(status())
     state.add_status(status(online=False))
-    message = json.loads(state.health_message({"fix": 3}))
+    message = json.loads(state.health_message({"fix": 3}, 3.5))
     assert [anchor["anchor"] for anchor in message["anchors"]] == [2]
     assert message["ether"]["transmissions"] == 5
     assert [(node["name"], node["online"]) for node in message["nodes"]] == [("t1", False)]
     assert message["dropped"] == {"fix": 3}
+    assert message["ages"] == {"anchors": {"2": 2.5}, "tags": {}, "ether": {"air": 2.5}}
 
 
 def test_old_messages_expire_and_invented_names_do_not_fill_the_memory():
@@ -154,4 +156,4 @@ def test_old_messages_expire_and_invented_names_do_not_fill_the_memory():
     assert len(state.statuses) == MAX_NAMES
     state.expire(EXPIRY_S + 0.5)
     assert "old" not in {row["name"] for row in rows(state)}
-    assert json.loads(state.health_message({}))["anchors"] == []
+    assert json.loads(state.health_message({}, 1.0))["anchors"] == []

@@ -37,6 +37,7 @@ _GROUPS: Final = {
         ("anchor", "nodes.anchor", "Run anchors of a site."),
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
         ("dashboard", "dashboard", "Show a site live in the browser."),
+        ("warm", "warm", "Compile all kernels ahead, so that no later start has to."),
     ),
     "Record and replay": (
         ("record", "nodes.record", "Record a running site into a file."),

@@ -298,12 +298,13 @@ def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.evaluation.fleet import report
     from skyless.evaluation.scenarios import fleet_of_any_size
+    from skyless.preparation.parts import parts_of
 
     try:
         fleet = fleet_of_any_size(request)
     except ValueError as error:
         raise SkylessError(str(error)) from None
-    with loading_kernels():
+    with loading_kernels(*parts_of(request.method)):
         compile_kernels(request.method)
     started_s = time.perf_counter()
     if asked.fixes_csv is None:

@@ -251,11 +251,12 @@ def _plan(name: str, asked: StudyOptions) -> "Plan":
 
 def _run(chosen: "Study", plan: "Plan", asked: StudyOptions) -> "list[Row]":
     from skyless.evaluation.compile_ahead import compile_kernels
+    from skyless.preparation.parts import parts_of
     from skyless.studies.run import WITHOUT_POSITIONS, run_study
 
     check_method(plan.method)
     if chosen.name not in WITHOUT_POSITIONS:
-        with loading_kernels():
+        with loading_kernels(*parts_of(plan.method)):
             compile_kernels(plan.method)
     try:
         with progress_bar(f"studying {chosen.title}", 1.0) as bar:

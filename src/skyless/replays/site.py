@@ -1,6 +1,5 @@
 """Replay of a running site: every tag's receptions once more, judged against the truth and the recorded fixes."""
 
-import math
 import time
 from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -11,7 +10,6 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.air.reception import Diagnostics, Reception
-from skyless.constants import TICK_S
 from skyless.errors import ConfigurationError
 from skyless.evaluation.judge import Judge
 from skyless.method_names import DEFAULT_METHOD, METHODS
@@ -21,13 +19,14 @@ from skyless.positioning.fix import Fix
 from skyless.positioning.integrity import RISK, IntegrityRequirement
 from skyless.receiver import NOT_DROPS, Receiver
 from skyless.recordings.mcap.checkpoint import RefusedError, load
+from skyless.recordings.mcap.host_clock import HostClock
 from skyless.recordings.mcap.recording import McapRecording, Recorded
 from skyless.recordings.source import Drops
 from skyless.recordings.truth import Truth
 from skyless.replays.antenna_delays import DelayChange, delay_changes, with_delays
 from skyless.replays.captures import ReplayReport, common_figures
 from skyless.site.model import Site
-from skyless.ticks import WRAP_TICKS, Unwrapper
+from skyless.ticks import WRAP_TICKS
 
 # Recorded fixes against those of a replay: whether they are the same, bit by bit.
 
@@ -90,8 +89,12 @@ def _keep(waiting: OrderedDict[int, _T], serial: int, value: _T) -> None:
 
 # One tag of a recording once more: its receptions through its receiver, bit by bit as it was.
 
-HOST_DRIFT: Final = 1e-4
-"""By how much a host's clock and a tag's may differ in rate."""
+
+class _MadeFix(Struct, frozen=True):
+    """A fix whose time is not known yet, and its number where that is known."""
+
+    fix: Fix
+    serial: int | None
 
 
 class Replayed(Struct, frozen=True):
@@ -100,24 +103,6 @@ class Replayed(Struct, frozen=True):
     fix: Fix
     unix_s: float
     """The end of its last frame, without the delays of the host."""
-
-
-class HostClock:
-    """Unix time of receptions from the tag's counter: the host sees frames late by changing amounts."""
-
-    def __init__(self) -> None:
-        self._ticks = Unwrapper()
-        self._offset_s = math.inf
-        self._last_s = 0.0
-
-    def unix_s(self, reception: Reception, unix_less_host_s: float) -> float:
-        """Unix time of a reception: by its counter, which the least delayed receptions tie to Unix time."""
-        counter_s = self._ticks.unwrap(reception.rx_ticks, reception.host_s) * TICK_S
-        if reception.host_s is not None:
-            leak_s = HOST_DRIFT * max(counter_s - self._last_s, 0.0)
-            self._offset_s = min(self._offset_s + leak_s, reception.host_s + unix_less_host_s - counter_s)
-        self._last_s = counter_s
-        return counter_s + (0.0 if math.isinf(self._offset_s) else self._offset_s)
 
 
 class TagReplay:
@@ -150,12 +135,16 @@ class TagReplay:
         self._restored = False
         self._segment = ""
         self._next = 0
-        self._clock = HostClock()
+        self._clock: HostClock[_MadeFix | None] = HostClock()
         self._comparison = Comparison(tag)
 
     def process(self, message: ReceptionsMessage) -> Iterator[Replayed]:
-        """Process a run of receptions; the fixes that they make."""
-        for raw in self._unheard(message):
+        """Process a run of receptions; the fixes that they make, or that runs before have made."""
+        clock = self._clock
+        fresh = self._unheard(message)
+        if self._clock is not clock:
+            yield from self._timed(clock.rest())
+        for raw in fresh:
             reception = reception_of(raw)
             if reception is None:
                 self.drops["impossible-reception"] += 1
@@ -163,16 +152,31 @@ class TagReplay:
             self.receptions += 1
             if self._delays is not None:
                 reception = with_delays(reception, self._delays)
-            fix = self._fix(reception)
-            unix_s = self._clock.unix_s(reception, message.unix_less_host_s)
+            made = self._made(reception)
+            yield from self._timed(self._clock.add(reception, message.unix_less_host_s, made))
+
+    def rest(self) -> Iterator[Replayed]:
+        """The last fixes, at the end of the recording."""
+        yield from self._timed(self._clock.rest())
+
+    def _made(self, reception: Reception) -> _MadeFix | None:
+        fix = self._fix(reception)
+        if fix is None:
+            return None
+        self.fixes += 1
+        if self._serial is not None:
+            self._serial += 1
+        return _MadeFix(fix, self._serial)
+
+    def _timed(self, found: list[tuple[_MadeFix | None, float]]) -> Iterator[Replayed]:
+        """Fixes of receptions whose Unix time is known now."""
+        for made, unix_s in found:
             self.begun_s = unix_s if self.begun_s is None else self.begun_s
-            if fix is None:
+            if made is None:
                 continue
-            self.fixes += 1
-            if self._serial is not None:
-                self._serial += 1
-                self._comparison.replayed(self._serial, fix, unix_s)
-            yield Replayed(fix, unix_s)
+            if made.serial is not None:
+                self._comparison.replayed(made.serial, made.fix, unix_s)
+            yield Replayed(made.fix, unix_s)
 
     def compare(self, recorded: FixMessage) -> None:
         """Add a recorded fix."""
@@ -364,20 +368,28 @@ class SiteReplay:
                 self._process(found, on_fix)
             if number % 256 == 0:
                 on_progress(found.time_s - self._begin_s)
+        for replay in self.tags.values():
+            self._add(replay, replay.rest(), on_fix)
         wall_s = time.perf_counter() - begun_s
         return [self._report(tag, wall_s) for tag in self.tags]
 
     def _process(self, found: Recorded, on_fix: Callable[[str, Replayed], None] | None) -> None:
-        tag = found.channel.name
-        replay, judge = self.tags[tag], self.judges[tag]
+        replay = self.tags[found.channel.name]
         if found.channel.kind == "fix":
             replay.compare(cast("FixMessage", found.message))
-            return
-        for made in replay.process(cast("ReceptionsMessage", found.message)):
+        else:
+            self._add(replay, replay.process(cast("ReceptionsMessage", found.message)), on_fix)
+
+    def _add(
+        self, replay: TagReplay, fixes: Iterable[Replayed], on_fix: Callable[[str, Replayed], None] | None
+    ) -> None:
+        """Judge fixes of a tag."""
+        tag = replay.tag
+        for made in fixes:
             first_s, _ = self._spans.get(tag, (made.unix_s, 0.0))
             self._spans[tag] = (first_s, made.unix_s)
             x, y, z = made.fix.position_m.tolist()
-            judge.add(made.unix_s, made.unix_s - (replay.begun_s or 0.0), (x, y, z))
+            self.judges[tag].add(made.unix_s, made.unix_s - (replay.begun_s or 0.0), (x, y, z))
             if on_fix is not None:
                 on_fix(tag, made)
 

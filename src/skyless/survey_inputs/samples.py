@@ -20,9 +20,10 @@ from skyless.evaluation.statistics import EvenSample
 from skyless.mqtt.messages import ReceptionsMessage
 from skyless.positioning.masterless.pair_engine import PairEngine
 from skyless.recordings.foreign.formats import Recording
+from skyless.recordings.mcap.host_clock import HostClock
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.recordings.source import Drops
-from skyless.replays.site import HostClock, reception_of
+from skyless.replays.site import reception_of
 from skyless.survey.tags.estimate import Differences
 from skyless.ticks import difference, from_seconds
 
@@ -51,7 +52,7 @@ class NewReceptions:
     """One tag's receptions, as they come, each once."""
 
     def __init__(self) -> None:
-        self._clock = HostClock()
+        self._clock: HostClock[Reception] = HostClock()
         self._segment = ""
         self._next = 0
 
@@ -63,13 +64,13 @@ class NewReceptions:
         return True
 
     def read(self, message: ReceptionsMessage) -> Iterator[tuple[Reception, float]]:
-        """Receptions of a run, some of which may have come before, with Unix time."""
+        """Receptions, each once, with Unix time: of this run and of runs before, as their times become known."""
         new = message.receptions[max(self._next - message.first, 0) :]
         self._next = max(self._next, message.first + len(message.receptions))
         for raw in new:
             reception = reception_of(raw)
             if reception is not None:
-                yield reception, self._clock.unix_s(reception, message.unix_less_host_s)
+                yield from self._clock.add(reception, message.unix_less_host_s, reception)
 
 
 class SiteListener:

@@ -19,6 +19,7 @@ from skyless.cli.common.options import (
     options,
 )
 from skyless.cli.common.progress import loading_kernels
+from skyless.cli.nodes.fix_lines import LineOptions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
@@ -26,11 +27,12 @@ from skyless.nodes.open_radio import DEFAULT_RADIO, is_simulated, is_sniffer, op
 
 if TYPE_CHECKING:
     from skyless.mqtt.address import MqttAddress
+    from skyless.nodes.fix_log import FixListener
     from skyless.nodes.packet_tags import PacketTagSettings
 
 _TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
-app = App(name="tag", help_epilogue="Example: skyless tag tag1")
+app = App(name="tag", help_epilogue="Example: skyless tag tag1 --print")
 
 
 @options
@@ -51,7 +53,7 @@ class TagOptions:
     """Standard deviation of the tags' height from the one that is given, in metres, which fixes and levels then
     count (joint); 0 by default, for sniffers 0.5 where the height is only taken for the anchors'."""
     publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0
-    """Fixes a second and tag on MQTT at most."""
+    """Fixes a second and tag at most, on MQTT and on standard output; all of them count in the tag's health."""
     site_id: SiteId | None = None
     """The only site to listen to; by default the first one heard. For sniffers what topics call the system, by
     default 0; it should be no other site's."""
@@ -67,11 +69,13 @@ def tag(
     *names: Annotated[str, Parameter(name="NAMES")],
     asked: TagOptions = TagOptions(),
     broker: MqttOptions = MqttOptions(),
+    shown: LineOptions = LineOptions(),
 ) -> None:
     """Run listening tags until Ctrl-C.
 
     A tag needs no configuration: it learns the site from the beacons that it hears. It computes a fix with every
-    message, with or without a broker, and publishes fixes on MQTT under skyless/v1/SITE/tag/NAME/fix.
+    message, with or without a broker, and publishes fixes on MQTT under skyless/v1/SITE/tag/NAME/fix. With --print,
+    --csv or --json it writes the same fixes on standard output.
 
     Parameters
     ----------
@@ -80,9 +84,10 @@ def tag(
     broker.mqtt
         Broker for fixes and health, or none.
     """
-    from skyless.nodes.process import run
+    from skyless.nodes.process import run, together
 
-    address = broker.address()
+    address, lines = broker.address(), shown.lines(log)
+    on_fix = None if lines is None else lines.on_fix
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
         given = repr(" ".join(names)) if names else "missing"
         raise SkylessError(
@@ -92,42 +97,47 @@ def tag(
     if is_sniffer(asked.radio):
         if asked.protection.given:
             raise SkylessError("--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers")
-        serve = _on_sniffers(names, asked, address)
+        serve = _on_sniffers(names, asked, address, on_fix)
     elif asked.anchors is not None or asked.tag_height is not None:
         raise SkylessError(
             "--anchors and --tag-height are for sniffers; other tags hear from the air where anchors stand"
         )
     else:
-        serve = _on_radios(names, asked, address)
+        serve = _on_radios(names, asked, address, on_fix)
     with contextlib.suppress(KeyboardInterrupt):
-        run(serve, punctual=True)
+        run(serve if lines is None else together(serve, lines.run()), punctual=True)
 
 
-def _on_radios(names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None") -> "Coroutine[Any, Any, None]":
+def _on_radios(
+    names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None", on_fix: "FixListener | None"
+) -> "Coroutine[Any, Any, None]":
     """Tags that hear beacons."""
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.nodes.tag import Tags, TagSettings
+    from skyless.preparation.parts import parts_of
 
     required = asked.protection.requirement(asked.method, asked.tag_height_std)
     settings = TagSettings(asked.method, asked.qa, asked.site_id, integrity=required, publish_hz=asked.publish_hz)
     radios = open_radios(asked.radio, "tag", names)
-    with loading_kernels():
+    with loading_kernels(*parts_of(asked.method)):
         compile_kernels(asked.method)
-    return Tags(settings, radios, address, log).run()
+    return Tags(settings, radios, address, log, on_fix).run()
 
 
 def _on_sniffers(
-    names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None"
+    names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None", on_fix: "FixListener | None"
 ) -> "Coroutine[Any, Any, None]":
     """Tags that hear the packets of another system."""
     from skyless.evaluation.compile_ahead import compile_packet_kernels
     from skyless.nodes.packet_tags import PacketTags
+    from skyless.preparation.parts import SNIFFERS
 
     settings = _system(asked)
     radios = open_sniffers(asked.radio, names)
-    with loading_kernels():
+    with loading_kernels(*SNIFFERS):
         compile_packet_kernels()
-    return PacketTags(settings, radios, address, log, simulated=lambda: is_simulated(asked.radio)).run()
+    tags = PacketTags(settings, radios, address, log, simulated=lambda: is_simulated(asked.radio), on_fix=on_fix)
+    return tags.run()
 
 
 def _system(asked: TagOptions) -> "PacketTagSettings":

@@ -36,11 +36,11 @@ export const [
 
 /** Integrity alerts by their names on the wire; a track holds their index. */
 export const ALERTS = {
-  none: { words: "none", grade: "" },
-  "detected-excluded": { words: "faulty anchor excluded", grade: "warn" },
-  "detected-not-excluded": { words: "fault not excluded: no protection level", grade: "bad" },
-  unavailable: { words: "no protection level available", grade: "" },
-  "alert-limit-exceeded": { words: "protection level above the alert limit", grade: "bad" },
+  none: { short: "none", words: "none", grade: "" },
+  "detected-excluded": { short: "excluded", words: "faulty anchor excluded", grade: "warn" },
+  "detected-not-excluded": { short: "not excluded", words: "fault not excluded: no protection level", grade: "bad" },
+  unavailable: { short: "no level", words: "no protection level available", grade: "" },
+  "alert-limit-exceeded": { short: "over limit", words: "protection level above the alert limit", grade: "bad" },
 };
 const ALERT_NAMES = Object.keys(ALERTS);
 
