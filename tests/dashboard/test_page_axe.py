@@ -92,7 +92,9 @@ def test_a_lost_connection(serve, checks):
     lost.page.evaluate("document.getElementById('fit').removeAttribute('title')")
     lost.check("axe finds what is there to be found", "#map")
     assert [fault["id"] for fault in lost.found.popitem()[1]] == ["button-name"]
-    lost.visit.problems.clear()  # the browser's own lines about refused sockets
+    server.refuse = False
+    until(lost.page, "skyless.state.connection.phase === 'open'", timeout_s=15.0)
+    lost.visit.problems.clear()  # the browser's own lines about the refused sockets
 
 
 def test_the_condition_with_its_reasons(serve, checks):

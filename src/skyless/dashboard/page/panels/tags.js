@@ -151,7 +151,7 @@ function makeDetail() {
   const sigma = { name: "σ", colour: "accent" };
   const errors = new Chart("Error and predicted σ", [{ name: "error", colour: "bad" }, sigma], length, 0.02);
   const sigmas = new Chart("Predicted σ", [sigma], length, 0.02);
-  const rates = new Chart("Fixes per second", [{ name: "rate", colour: "good", steps: true }], number, 4);
+  const rates = new Chart("Rate of fixes (Hz)", [{ name: "rate", colour: "good", steps: true }], number, 4);
   const anchors = { name: "anchors", colour: "accent", steps: true };
   const used = new Chart("Anchors used", [anchors], number, 4, { whole: true });
   const chi2 = new Chart("Residuals (χ² of each fix)", [{ name: "χ²", colour: "warn" }], (v) => number(v, 1), 1);
