@@ -1,7 +1,8 @@
 """GPS without a sky: listen-only ultra-wideband positioning indoors.
 
 The names below are the interface for programs and notebooks; they are imported when first used, so that
-``import skyless`` stays light. ``docs/architecture.md`` describes the packages that hold everything else.
+``import skyless`` stays light, and ``from skyless import Receiver`` needs no compiler. ``docs/architecture.md``
+describes the packages that hold everything else.
 """
 
 from importlib import import_module

@@ -86,8 +86,9 @@ class CalibrationResult(Result, frozen=True, eq=False):
         """The constants with their standard errors, one bar an anchor."""
         from skyless.evaluation.figures import BLUE, panel, report_style  # noqa: PLC0415 - Matplotlib, where it draws
 
+        zero = "their mean" if self.zero == "mean" else self.zero
         with report_style():
-            figure, axes = panel(f"{self.path.name}: constants of the anchors, zero is {self.zero}")
+            figure, axes = panel(f"{self.path.name}: constants of the anchors, zero is {zero}")
             at = np.arange(len(self.anchors))
             axes.bar(at, 100.0 * self.bias_m, yerr=100.0 * self.std_m, color=BLUE, capsize=3.0)
             axes.set_xticks(at, [str(anchor) for anchor in self.anchors])

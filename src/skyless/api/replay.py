@@ -82,7 +82,7 @@ class ReplayResult(Result, frozen=True, eq=False):
         return track_figure(self.fixes.track(tag), f"{report.format}, {report.fixes} fixes")
 
     def _title(self) -> str:
-        return f"{self.path.name}: {self.summary['format']}"
+        return f"{self.path.name} ({self.summary['format']})"
 
     def _facts(self) -> Iterator[tuple[str, str]]:
         for tag, report in self.reports.items():

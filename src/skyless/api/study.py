@@ -107,9 +107,9 @@ def study(
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> StudyResult:
-    """Measure errors over many simulated runs, as ``skyless study`` does, in processes of their own.
+    """Measure errors over many simulated runs, as ``skyless study`` does.
 
-    In a script call it below ``if __name__ == "__main__":`` where processes are not forked (macOS, Windows).
+    Several processes import the script that calls this: there it stands below ``if __name__ == "__main__":``.
 
     Args:
         name: ``efficiency``, ``loss``, ``nlos``, ``motion``, ``sync``, ``integrity``, ``room``, ``large``, ``claims``,
@@ -125,7 +125,7 @@ def study(
         alert_limit_m: Fixes whose level exceeds this count as not available (integrity).
         mesh: Whether anchors also relay when they heard anchors that are not the master.
         quick: Simulate a fraction, with more scatter.
-        processes: Processes on this machine; by default one for each core.
+        processes: Processes on this machine, by default one for each core; 1 is the present one.
         scheduler: Address of a Dask scheduler whose workers do the work instead.
         progress: Called now and then with the share done.
 
