@@ -41,6 +41,7 @@ NAVIGATION = {
         "docs/reference/commands",
         "docs/reference/python",
         "docs/sites",
+        "docs/page",
         "docs/mqtt",
         "docs/protocol",
         "docs/protocol2",

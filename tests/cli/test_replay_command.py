@@ -150,13 +150,25 @@ def test_what_is_left_of_a_damaged_recording_is_used(run, room, tmp_path):
     assert told["drops"].items() >= {"not-finite": 2, "malformed-number": 1, "anchor-against-itself": 1}.items()
 
 
-def test_without_anchors_there_is_no_fix_and_a_reason(run):
-    told = report(run("tdoa-table", "--json"))
-    assert (told["fixes"], told["reason"], told["median_m"], told["rate_hz"]) == (0, "no-almanac", None, None)
-    code, out, err = run("tdoa-table")
-    assert (code, err) == (0, "")
+@pytest.mark.parametrize("name", synthetic.MAKERS)
+def test_missing_anchors_are_named_before_the_recording_is_read(run, name, monkeypatch):
+    monkeypatch.setattr("skyless.replay.captures.Replay.run", lambda *_: pytest.fail("it was read"))
+    code, out, err = run(name)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "--anchors is missing" in err
+    assert "id,x_m,y_m,z_m" in err
+
+
+def test_no_fix_at_all_is_exit_code_1_with_the_likely_reason(run, room, tmp_path):
+    others = tmp_path / "others.csv"
+    others.write_text("id,x_m,y_m,z_m\n101,0,0,0\n102,5,0,0\n103,5,5,0\n104,0,5,1\n")
+    code, out, err = run("tdoa-table", "--anchors", others, "--json")
+    told = json.loads(out)
+    assert (code, told["fixes"], told["reason"], told["median_m"], told["rate_hz"]) == (1, 0, "no-almanac", None, None)
+    assert err.startswith("skyless: no fix: no reception is of an anchor in the table of --anchors")
+    code, out, err = run("tdoa-table", "--anchors", others)
+    assert (code, err.count("\n")) == (1, 1)
     assert "none: no-almanac" in out
-    assert "--anchors" in out
 
 
 BAD_FILES = {

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from skyless.dashboard.live import LiveSite
 from skyless.dashboard.zones import MAX_EVENTS, TAG_TIMEOUT_S, BadZonesError
 from skyless.mqtt import topics
-from skyless.mqtt.messages import SiteZones, ZoneEvent, ZonesMessage
+from skyless.mqtt.messages import PreparationMessage, SiteZones, ZoneEvent, ZonesMessage
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)
@@ -53,6 +53,23 @@ def test_pages_are_sent_the_site_and_the_state_of_the_broker(live, wire):
     assert of("site", messages)[0]["site"]["simulated"] is True
     assert of("mqtt", messages)[0]["connected"] is True
     assert drained(live, live.open_page())[0]["site"]["site"]["id"] == SITE_ID
+
+
+def test_pages_are_sent_how_far_kernels_are_compiled_until_nothing_comes(live, wire, times):
+    topic = topics.preparation_topic(SITE_ID)
+    wire.deliver(topic, PreparationMessage(37, 120, 25.0, 1.0))
+    page = live.open_page()
+    assert of("preparation", drained(live, page))[0]["preparation"]["done"] == 37
+    wire.deliver(topic, b"")
+    assert of("preparation", drained(live, page)) == [{"type": "preparation", "preparation": None}]
+    wire.deliver(topic, PreparationMessage(38, 120, None, 1.0))
+    times.move(4.9)
+    live.tick()
+    assert of("preparation", drained(live, page))[0]["preparation"]["done"] == 38
+    times.move(0.2)  # the demo was killed
+    live.tick()
+    assert of("preparation", drained(live, page)) == [{"type": "preparation", "preparation": None}]
+    assert of("preparation", drained(live, live.open_page())) == []
 
 
 def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):

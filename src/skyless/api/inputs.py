@@ -1,9 +1,9 @@
 """What several functions are given: a site as a value or a file, what is required of levels, where progress goes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from skyless.arguments import check_number, existing_file
+from skyless.arguments import check_number, existing_file, wrong
 from skyless.errors import SkylessError
 from skyless.method_names import METHODS, PROTECTED
 from skyless.positioning.integrity import RISK, IntegrityRequirement
@@ -29,6 +29,9 @@ def site_of(site: AnySite, *, slots_given: bool = True) -> tuple[Site, Path]:
     if isinstance(site, Site):
         file = Path("site")
         check_site(site, file, slots_given=slots_given)
+        if site.floor_plan is not None and not Path(site.floor_plan.image).is_file():
+            right = "an image in the working folder; or give the path of the site's file, next to which it lies"
+            raise wrong("site.floor_plan.image", site.floor_plan.image, right)
         return site, file
     file = existing_file("site", site)
     return load_site(file, slots_given=slots_given), file
@@ -69,7 +72,7 @@ def silent(_share: float) -> None:
     """Where progress goes that nobody asked for."""
 
 
-def left_out(given: dict[str, object], reason: str) -> None:
+def left_out(given: Mapping[str, object], reason: str) -> None:
     """See that arguments that have no effect here are not given. Raises SkylessError."""
     for name, value in given.items():
         if value is not None:

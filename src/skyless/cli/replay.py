@@ -1,8 +1,10 @@
 """``skyless replay``: a recording becomes fixes, and is judged against the truth where there is one."""
 
 import csv
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -39,6 +41,15 @@ FIXES_COLUMNS: Final = (
     *("hpl_m", "vpl_m", "integrity_risk", "alert"),
 )
 """Columns of the file that --fixes-csv writes."""
+
+NO_FIX: Final = 1
+"""Exit code of a replay without any fix."""
+
+_MOST_WITHOUT_ANCHORS: Final = 20_000
+"""Records within which a recording that carries its anchors' positions has one of them."""
+
+_MOST_DROPS: Final = 3
+"""Reasons for drops that are named when there is no fix."""
 
 app = App(
     name="replay",
@@ -110,7 +121,7 @@ class ReplayOptions:
 
 
 @app.default
-def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> None:
+def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> int:
     """Turn a recording into fixes; judge them where the truth is known.
 
     Reads recordings of skyless record (MCAP), Bitcraze sniffer captures (YAML, binary, text; TDoA2 and TDoA3), tables
@@ -120,6 +131,8 @@ def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> None:
     below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --tag-height-std,
     --settle, --above, --fixes-csv, --plot and --json.
 
+    Ends with exit code 1 if there is no fix at all, and names the likely reason.
+
     Parameters
     ----------
     file
@@ -128,16 +141,40 @@ def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> None:
     check_output("fixes-csv", asked.fixes_csv, file, asked.anchors, asked.site, asked.truth)
     check_output("plot", asked.plot, file, asked.anchors, asked.site, asked.truth, asked.fixes_csv)
     check_picture(asked.plot)
-    if is_mcap(file):
-        _replay_site(file, asked)
+    reports: Sequence[ReplayReport] = _replay_site(file, asked) if is_mcap(file) else [_replay_foreign(file, asked)]
+    if any(report.fixes for report in reports):
+        return 0
+    print(f"skyless: no fix: {_likely_reason(reports[0], asked)}", file=sys.stderr)
+    return NO_FIX
+
+
+_REASONS: Final = {
+    "no-beacons": "the recording holds no reception that can be used",
+    "no-almanac": "no reception is of an anchor in the table of --anchors; are these the anchors of this recording?",
+    "too-few-anchors": "too few anchors were received at a time: three at a known height, four without",
+    "bad-geometry": "the anchors lie too flat to determine the position; --tag-height gives the height",
+    "mirror-ambiguity": "the anchors leave two positions that fit as well; --tag-height gives the height",
+    "residuals-too-large": "the receptions contradict the anchors' positions; is the table right?",
+    "acquiring": "the recording is too short, or its receptions contradict the anchors' positions; is the table right?",
+}
+"""Why a recording gives no fix, by the reason that the filter gave last."""
+
+
+def _likely_reason(report: "ReplayReport", asked: ReplayOptions) -> str:
+    if report.receptions == 0:
+        found = "the recording holds no reception that can be used"
+    elif asked.anchors is None and report.reason == "no-almanac":
+        found = "no message of the recording says where its anchors are"
     else:
-        _replay_foreign(file, asked)
+        found = _REASONS.get(report.reason or "", report.reason or "unknown")
+    drops = sorted(report.drops.items(), key=lambda item: -item[1])[:_MOST_DROPS]
+    return found + (f" (dropped: {', '.join(f'{count} × {name}' for name, count in drops)})" if drops else "")
 
 
 # Recordings of other systems
 
 
-def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
+def _replay_foreign(file: Path, asked: ReplayOptions) -> "ReplayReport":
     """Replay a recording that another program made. Raises SkylessError."""
     from skyless.recordings.anchor_table import read_calibration
     from skyless.replays.capture_run import CaptureRequest, CaptureRun
@@ -150,6 +187,8 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
     }  # fmt: skip
     check_left_out(of_sites, "it is for recordings of skyless record")
     anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)
+    if not anchors_m:
+        _check_carries_anchors(file, asked)
     run = CaptureRun(
         CaptureRequest(
             path=file,
@@ -177,13 +216,34 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> None:
         print_json(summary)
     else:
         _show(report, run.height_note, summary["anchor_distances_m"])
+    return report
+
+
+def _check_carries_anchors(file: Path, asked: ReplayOptions) -> None:
+    """See that a recording without a table of anchors says itself where they are, before the whole of it is read.
+
+    Raises SkylessError.
+    """
+    from skyless.recordings.foreign.formats import open_recording
+
+    read = 0
+    with open_recording(file, asked.format, asked.listener) as recording:
+        for read, record in enumerate(islice(recording, _MOST_WITHOUT_ANCHORS), start=1):  # noqa: B007 - used below
+            if getattr(record, "position_m", None) is not None:
+                return
+        name = recording.format.name
+    if read:
+        raise SkylessError(
+            f"--anchors is missing: {file} ({name}) does not say where its anchors are; give their table, "
+            "id,x_m,y_m,z_m, or --site"
+        )
 
 
 def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
     from skyless.evaluation.compile_ahead import compile_packet_kernels, compile_pair_kernels
-    from skyless.preparation.parts import PACKETS, PAIRS
+    from skyless.preparation.parts import PAIRS, SNIFFERS
 
-    with loading_kernels(PACKETS if run.measurements == "packets" else PAIRS):
+    with loading_kernels(*(SNIFFERS if run.measurements == "packets" else (PAIRS,))):
         if run.measurements == "packets":
             compile_packet_kernels()
         else:
@@ -195,7 +255,7 @@ def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport
 # Recordings of skyless record
 
 
-def _replay_site(file: Path, asked: ReplayOptions) -> None:
+def _replay_site(file: Path, asked: ReplayOptions) -> "list[TagReport]":
     """Replay all tags of a recording of skyless record, or one. Raises SkylessError."""
     from skyless.recordings.mcap.recording import McapRecording
     from skyless.replays.site import SiteReplay, summary_of
@@ -230,6 +290,7 @@ def _replay_site(file: Path, asked: ReplayOptions) -> None:
     else:
         for report in reports:
             _show(report, "from the site", {}, _site_facts(report))
+    return reports
 
 
 def _run_site(run: "SiteReplay", span_s: float, asked: ReplayOptions) -> "list[TagReport]":
@@ -311,8 +372,6 @@ def _draw_track(path: Path, judge: "Judge", report: "ReplayReport") -> None:
 def _show(report: "ReplayReport", note: str, distances: dict[str, float], more: Sequence[tuple[str, str]] = ()) -> None:
     """Show a replay as a table; ``note`` says where the height is from, ``more`` comes first."""
     fixes = str(report.fixes) if report.reason is None else f"none: {report.reason}"
-    if report.reason == "no-almanac":
-        fixes += " (give a table of the anchors' positions with --anchors, or --site)"
     truth_known = any(pair.against_truth for pair in report.pairs)
     facts = [
         *more,

@@ -8,7 +8,7 @@ from cyclopts import App
 from skyless.cli.common.options import check_method
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import compile_with_counts
-from skyless.cli.common.small_runs import RUNS
+from skyless.cli.small_runs import RUNS
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -56,11 +56,11 @@ def warm(*, method: str | None = None, json: bool = False) -> None:
 
 
 def _parts(method: str | None) -> "tuple[Part, ...]":
-    from skyless.preparation.parts import EVERY_SITE, Part, parts_of
+    from skyless.preparation.parts import EVERY_PART, Part, parts_of
 
     if method is not None:
         check_method(method)
         return parts_of(method)
-    after = tuple(part.name for part in EVERY_SITE)
-    runs = (Part(name, "skyless.cli.common.small_runs:run", (name,), after=after) for name in RUNS)
-    return (*EVERY_SITE, *runs)
+    after = tuple(part.name for part in EVERY_PART)
+    runs = (Part(name, "skyless.cli.small_runs:run", (name,), after=after) for name in RUNS)
+    return (*EVERY_PART, *runs)

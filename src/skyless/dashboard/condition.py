@@ -1,14 +1,15 @@
 """The condition of the live site, in one word and with reasons. No I/O; the time is passed in.
 
-A reason appears with the first evaluation that finds it and disappears when no evaluation has found it for ``HOLD_S``.
-The condition is good only on fresh evidence: the broker is connected, some tag has a fix that has just arrived, and
-nothing speaks against it. Where nothing is known it is "waiting".
+A reason appears with the first evaluation that finds it and disappears when no evaluation has found it for ``HOLD_S``;
+its level, too, falls only after that time. The condition is good only on fresh evidence: the broker is connected, some
+tag has a fix that has just arrived, and nothing speaks against it. Where nothing is known it is "waiting".
 """
 
 from collections.abc import Iterable
 from typing import Final, Literal
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.dashboard.evidence import FRESH_S, Evidence
 from skyless.dashboard.reasons import (
@@ -53,6 +54,8 @@ class ConditionMonitor:
         self.evidence = evidence
         self._held: dict[str, tuple[float, Reason]] = {}
         """By kind: when the reason was last found."""
+        self._bad_s: dict[str, float] = {}
+        """By kind: when it was last found to be bad."""
         self._blind_until_s = float("-inf")
 
     def evaluate(
@@ -68,10 +71,8 @@ class ConditionMonitor:
                 return Condition("waiting", "waiting for the broker", (), None, None)
             reason = broker_reason()
             return Condition(reason.level, reason.text, (reason,), None, None)
-        for reason in self._find(ages, now_s, lag_s):
-            self._held[reason.kind] = now_s, reason
-        for reason in watch_reasons(watch, watch_age_s):
-            self._held[reason.kind] = now_s, reason
+        for reason in (*self._find(ages, now_s, lag_s), *watch_reasons(watch, watch_age_s)):
+            self._hold(reason, now_s)
         self._held = {kind: held for kind, held in self._held.items() if now_s - held[0] < HOLD_S}
         tags = evidence.of("tag")
         for _, tag in tags:
@@ -82,6 +83,13 @@ class ConditionMonitor:
         if any(tag.has_fix(now_s) for _, tag in tags):
             return Condition("good", "", (), *latencies)
         return Condition("waiting", self._awaited(), (), *latencies)
+
+    def _hold(self, reason: Reason, now_s: float) -> None:
+        if reason.level == "bad":
+            self._bad_s[reason.kind] = now_s
+        elif now_s - self._bad_s.get(reason.kind, float("-inf")) < HOLD_S:
+            reason = replace(reason, level="bad")
+        self._held[reason.kind] = now_s, reason
 
     def _find(self, ages: dict[str, tuple[float, float]], now_s: float, lag_s: float) -> Iterable[Reason]:
         evidence = self.evidence

@@ -30,6 +30,8 @@ _KEPT_S: Final = 5.0
 """A first status that was made longer ago is one that the broker kept: nothing has happened now."""
 
 
+_SUBJECTS: Final = {"ether": "the emulated air", "dashboard": "page server", "survey": "survey program"}
+
 Kind = Literal["anchor", "master", "watch", "alert", "tag", "program", "survey", "condition"]
 Severity = Literal["good", "note", "warning", "bad"]
 
@@ -101,7 +103,7 @@ class EventLog:
             self._silent.discard(key)
             happened = status.online  # that it is gone stands in the list already
         if happened:
-            again = before is not None and before.online
+            again = status.online and before is not None and before.online
             self._add_presence(key, status.online, unix_s, "started again" if again else "")
 
     def on_health(self, kind: str, name: str, health: Health, unix_s: float) -> None:
@@ -140,14 +142,9 @@ class EventLog:
         else:
             words = words or ("started" if online else "ended")
         group: Kind = "anchor" if kind == "anchor" else "tag" if kind == "tag" else "program"
-        subject = {"ether": "emulated air", "dashboard": "page server", "survey": "survey program"}.get(kind, kind)
-        self._add(
-            unix_s,
-            group,
-            level,
-            f"{kind}/{name}",
-            f"{subject} {name if name != kind else ''} {words}".replace("  ", " "),
-        )
+        subject = _SUBJECTS.get(kind, kind)
+        subject += "" if kind in {name, "ether"} else f" {name}"
+        self._add(unix_s, group, level, f"{kind}/{name}", f"{subject} {words}")
 
     # Fixes
 
@@ -220,7 +217,8 @@ class EventLog:
         if condition.level == "good":
             self._add(unix_s, "condition", "good", "", "condition good")
         else:
-            self._add(unix_s, "condition", condition.level, "", f"{condition.level}: {condition.text}")
+            word = "fault" if condition.level == "bad" else "warning"
+            self._add(unix_s, "condition", condition.level, "", f"{word}: {condition.text}")
 
     def _add(self, unix_s: float, kind: Kind, level: Severity, name: str, text: str) -> None:
         self.serial += 1

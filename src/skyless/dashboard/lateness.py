@@ -8,7 +8,7 @@ differs; for tags of this computer, whose clock is the server's, their health me
 
 from typing import Final
 
-WINDOW_S: Final = 60.0
+_WINDOW_S: Final = 60.0
 _HEALTH_AGE_S: Final = 2.5
 """The delay of a health message holds for this long."""
 
@@ -42,7 +42,7 @@ class FixAges:
         tag = self._tags.get(name)
         if tag is None:
             tag = self._tags[name] = _Tag(now_s)
-        if now_s - tag.begun_s >= WINDOW_S:
+        if now_s - tag.begun_s >= _WINDOW_S:
             tag.begun_s, tag.before_s, tag.least_s = now_s, tag.least_s, float("inf")
         made_s = max(latency_s, 0.0)
         delay_s = now_s - unix_s - made_s

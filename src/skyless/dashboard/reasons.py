@@ -13,12 +13,15 @@ LATE_S: Final = 0.25
 VERY_LATE_S: Final = 1.0
 """Age of positions on arrival."""
 
-SLOW_SHARE: Final = 0.01
-VERY_SLOW_SHARE: Final = 0.3
+SLOW_SHARE: Final = 0.02
+VERY_SLOW_SHARE: Final = 0.5
 """Of transmissions missed, or of receptions dropped."""
 
 LAG_S: Final = 0.25
 """Delay of the page's server itself that counts as too slow."""
+
+START_S: Final = 20.0
+"""Where no anchor has been online yet, all of them may be offline for this long: the site is being started."""
 
 OFTEN: Final = 3
 OFTEN_S: Final = 60.0
@@ -125,7 +128,7 @@ def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
             shares.setdefault(anchor.host, {})[name] = share
     for host, late in shares.items():
         worst = max(late.values())
-        yield host, worst, f"{_listed('anchor', list(late))} missed up to {worst:.0%} of their transmissions"
+        yield host, worst, f"{_counted('anchor', list(late))} missed up to {worst:.0%} of the transmissions"
 
 
 def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
@@ -142,7 +145,7 @@ def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
     for host, drops in found.items():
         names = [name for name, _, _ in drops]
         count, worst = sum(count for _, count, _ in drops), max(share for _, _, share in drops)
-        yield host, worst, f"{_listed('tag', names)} dropped {count} receptions or fixes that were too old"
+        yield host, worst, f"{_counted('tag', names)} dropped {count} receptions or fixes that were too old"
 
 
 def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
@@ -212,7 +215,8 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
                 (cut_off if on_air else offline).append(name)
         elif node.since_s is not None or not evidence.in_grace(now_s):  # else an old status, kept by the broker
             offline.append(name)
-    if offline:
+    unseen = len(offline) == len(names) and all(node.since_s is None for _, node in evidence.of("anchor"))
+    if offline and not (unseen and now_s - evidence.ready_s < START_S):
         level: _Severity = "bad" if len(names) - len(offline) < _MIN_ANCHORS else "warning"
         which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
         which = which or f"{_listed('anchor', offline)} of {len(names)} {_number(offline, 'is', 'are')}"
@@ -283,6 +287,10 @@ def _listed(kind: str, names: list[str]) -> str:
     if len(names) > _MOST_NAMED:
         return f"{kind}s {', '.join(names[:_MOST_NAMED])} and {len(names) - _MOST_NAMED} more"
     return f"{kind}s {', '.join(names[:-1])} and {names[-1]}"
+
+
+def _counted(kind: str, names: list[str]) -> str:
+    return f"{kind} {names[0]}" if len(names) == 1 else f"{len(names)} {kind}s"
 
 
 def _number(items: list[str] | dict[str, str], one: str, many: str) -> str:

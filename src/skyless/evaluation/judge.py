@@ -71,6 +71,11 @@ class Judge:
             self._errors.add(position_m[0] - truth[0], position_m[1] - truth[1], position_m[2] - truth[2])
 
     @property
+    def judged(self) -> int:
+        """How many positions have been compared with the truth, and count."""
+        return self._errors.count
+
+    @property
     def has_truth(self) -> bool:
         """Whether there is anything to compare with."""
         return len(self._times) > 0

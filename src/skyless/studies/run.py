@@ -6,7 +6,7 @@ from typing import Final
 from skyless.errors import SkylessError
 from skyless.studies.catalogue import STUDIES
 from skyless.studies.common.plan import Plan, Row, Study
-from skyless.studies.common.runner import run_cells, run_cells_on_dask
+from skyless.studies.common.runner import run_cells, run_cells_here, run_cells_on_dask
 
 OF_EPISODES: Final = ("efficiency", "integrity")
 """Studies of the filter ``joint`` itself."""
@@ -50,13 +50,15 @@ def run_study(
     processes: int | None = None,
     scheduler: str | None = None,
 ) -> list[Row]:
-    """The rows of a study; ``on_progress`` gets the share done.
+    """The rows of a study; ``on_progress`` gets the share done. One process is this one.
 
     Raises:
         SkylessError: a process died, or the Dask scheduler cannot be used.
     """
     cells = chosen.cells(plan)
-    if scheduler is None:
+    if scheduler is None and processes == 1:
+        results = run_cells_here(cells, on_progress)
+    elif scheduler is None:
         results = run_cells(cells, on_progress, processes)
     else:
         results = run_cells_on_dask(cells, on_progress, scheduler)

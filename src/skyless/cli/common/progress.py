@@ -94,18 +94,18 @@ def compile_with_counts(parts: "Iterable[Part]") -> None:
 
     from skyless.preparation.processes import CompilationError, compile_parts
 
-    say_where_kernels_are_kept()
+    report_kernel_folder()
     with CountLine() as line, suppress(CompilationError):
         asyncio.run(compile_parts(parts, line.show))
 
 
-def say_where_kernels_are_kept() -> None:
+def report_kernel_folder() -> None:
     """One line where compiled kernels cannot be kept for good."""
     from skyless.kernels.cache import kernel_folder
 
     folder = kernel_folder()
     if folder.temporary:
-        _say(
+        _print_line(
             f"no folder can be written to keep compiled kernels; {_for_how_long(folder)}. "
             "To keep them, let NUMBA_CACHE_DIR name a folder that can be written"
         )
@@ -157,6 +157,6 @@ def count_text(now: "Preparation") -> str:
     return f"compiling kernels, at the first start only{counted}{left}"
 
 
-def _say(text: str) -> None:
+def _print_line(text: str) -> None:
     if sys.stderr is not None:
         print(f"skyless: {text}", file=sys.stderr, flush=True)

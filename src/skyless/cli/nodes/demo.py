@@ -22,7 +22,7 @@ from skyless.cli.common.options import (
     options,
 )
 from skyless.cli.common.output import console, number, print_json
-from skyless.cli.common.progress import CountLine, count_text, say_where_kernels_are_kept
+from skyless.cli.common.progress import CountLine, count_text, report_kernel_folder
 from skyless.cli.common.simulated_site import check_live
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, log, site_named
 from skyless.errors import SkylessError
@@ -109,7 +109,7 @@ def demo(*, asked: DemoOptions = DemoOptions()) -> None:
 
     settings = _settings(asked)
     if missing(parts_of(asked.method)):
-        say_where_kernels_are_kept()
+        report_kernel_folder()
     whole = WholeSite(settings, log)
     screen = Screen(whole, show=not asked.json and sys.stdout.isatty())
     whole.on_preparation = screen.show_preparation

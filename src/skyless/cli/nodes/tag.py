@@ -130,11 +130,11 @@ def _on_sniffers(
     """Tags that hear the packets of another system."""
     from skyless.evaluation.compile_ahead import compile_packet_kernels
     from skyless.nodes.packet_tags import PacketTags
-    from skyless.preparation.parts import PACKETS
+    from skyless.preparation.parts import SNIFFERS
 
     settings = _system(asked)
     radios = open_sniffers(asked.radio, names)
-    with loading_kernels(PACKETS):
+    with loading_kernels(*SNIFFERS):
         compile_packet_kernels()
     tags = PacketTags(settings, radios, address, log, simulated=lambda: is_simulated(asked.radio), on_fix=on_fix)
     return tags.run()

@@ -2,7 +2,7 @@
 
 A host sees frames late, by changing amounts, so the times that it gives them are too coarse to be compared with the
 truth. But now and then the two clocks move against each other: the emulated air stood still, a clock was set, a radio
-was started again. Then the tie is made anew. When receptions suddenly come late, it may also be that the host was busy
+was started again. Then they are tied again. When receptions suddenly come late, it may also be that the host was busy
 and receives what had waited. Which of the two it is shows within a second; until then they are held back.
 """
 

@@ -130,7 +130,7 @@ export function drawRoom(context, plan, ground_m) {
   if (view.spatial) return;
   const [xs, ys] = [outline.corners.map(([x]) => x), outline.corners.map(([, y]) => y)];
   const size = [xs, ys].map((list) => `${(Math.max(...list) - Math.min(...list)).toFixed(1)} m`);
-  const below = outline.kind === "anchors" ? 28 : 5; // clear of the names of anchors on it
+  const below = outline.kind === "anchors" ? 28 : 16; // clear of the names of anchors on it
   context.font = "11px system-ui, sans-serif";
   context.textAlign = "left";
   context.textBaseline = "top";

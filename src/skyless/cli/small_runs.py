@@ -14,7 +14,7 @@ _RUNS: Final = {
         "site new lab.toml",
         "plan lab.toml --step 2 --json",
         "plan lab.toml --step 2 --method weighted --json",
-        "plan lab.toml --step 2 --optimise 6 --seconds 1 --json",
+        "plan lab.toml --step 2 --method weighted --optimise 4 --seconds 1 --json",
     ),
     "halls": (
         _HALL,
