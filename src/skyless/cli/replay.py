@@ -4,7 +4,6 @@ import csv
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -44,9 +43,6 @@ FIXES_COLUMNS: Final = (
 
 NO_FIX: Final = 1
 """Exit code of a replay without any fix."""
-
-_MOST_WITHOUT_ANCHORS: Final = 20_000
-"""Records within which a recording that carries its anchors' positions has one of them."""
 
 _MOST_DROPS: Final = 3
 """Reasons for drops that are named when there is no fix."""
@@ -187,8 +183,6 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> "ReplayReport":
     }  # fmt: skip
     check_left_out(of_sites, "it is for recordings of skyless record")
     anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)
-    if not anchors_m:
-        _check_carries_anchors(file, asked)
     run = CaptureRun(
         CaptureRequest(
             path=file,
@@ -217,26 +211,6 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> "ReplayReport":
     else:
         _show(report, run.height_note, summary["anchor_distances_m"])
     return report
-
-
-def _check_carries_anchors(file: Path, asked: ReplayOptions) -> None:
-    """See that a recording without a table of anchors says itself where they are, before the whole of it is read.
-
-    Raises SkylessError.
-    """
-    from skyless.recordings.foreign.formats import open_recording
-
-    read = 0
-    with open_recording(file, asked.format, asked.listener) as recording:
-        for read, record in enumerate(islice(recording, _MOST_WITHOUT_ANCHORS), start=1):  # noqa: B007 - used below
-            if getattr(record, "position_m", None) is not None:
-                return
-        name = recording.format.name
-    if read:
-        raise SkylessError(
-            f"--anchors is missing: {file} ({name}) does not say where its anchors are; give their table, "
-            "id,x_m,y_m,z_m, or --site"
-        )
 
 
 def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
