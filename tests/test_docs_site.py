@@ -26,6 +26,7 @@ OTHER_PROGRAMS = {
     "--no-dev",
     "--compile-bytecode",
     "--help",
+    "--home-dir",
     "--user",
     "--home-dir",
 }
