@@ -28,7 +28,6 @@ OTHER_PROGRAMS = {
     "--help",
     "--home-dir",
     "--user",
-    "--home-dir",
 }
 GENERATOR = ("sphinx", "myst_parser", "furo", "latex2mathml")
 
