@@ -185,3 +185,10 @@ def test_paths_without_heights_lie_at_the_height_of_the_tags():
     )
     assert flat.position(0.7)[2] == 1.2
     assert slope.position(60.0)[2] == 2.0
+
+
+@pytest.mark.parametrize("point", [(), (3,), (1.0, 2.0, 3.0, 4.0), (1.0, math.nan)])
+def test_a_position_has_two_or_three_coordinates(point):
+    for wrong in ({"positions_m": (point,)}, {"paths_m": (((1.0, 1.0), point),)}):
+        with pytest.raises(ValueError, match=r"a position is \(.*\); it should be \(x, y\) or \(x, y, z\) in metres"):
+            fleet_of(Request(ideal_lab_site(), **wrong))

@@ -63,9 +63,10 @@ def dashboard(
     from skyless.dashboard.overlays import Overlays
     from skyless.dashboard.playback import Playback
     from skyless.dashboard.serve import bind, serve
-    from skyless.mqtt.address import mqtt_address
 
-    address = mqtt_address(broker.mqtt, broker.mqtt_ca)
+    address = broker.address()
+    if address is None:
+        raise SkylessError("--mqtt is 'none'; it should be the broker of the site to show")
     address.tls_context()
     known, image = (None, None) if site is None else _load(site)
     if known is not None and site_id is not None and known.site.id != site_id:

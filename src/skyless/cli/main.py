@@ -142,12 +142,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _drop_output()
         return _BROKEN_PIPE
     except OSError as error:
-        if error.filename is not None or error.errno not in _CANNOT_WRITE:
-            raise
-        _drop_output()
-        print(f"skyless: standard output cannot be written: {error.strerror}", file=sys.stderr)
+        print(f"skyless: {_trouble(error)}", file=sys.stderr)
         return _USER_ERROR
     return result if isinstance(result, int) else 0
+
+
+def _trouble(error: OSError) -> str:
+    """What to say of a file or of standard output that cannot be used; anything else is a fault of the program."""
+    if error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    if error.errno not in _CANNOT_WRITE:
+        raise error
+    _drop_output()
+    return f"standard output cannot be written: {error.strerror}"
 
 
 def _renamed(error: CycloptsError) -> str | None:

@@ -23,7 +23,7 @@ from skyless.cli.common.options import (
     check_picture,
     options,
 )
-from skyless.cli.common.output import number, open_for_writing, print_facts, print_json
+from skyless.cli.common.output import new_table, number, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.cli.common.recording_inputs import flight_height, height_to_hold, is_mcap, known_anchors, known_truth
 from skyless.errors import ConfigurationError, SkylessError
@@ -382,7 +382,7 @@ def _table_of_fixes(path: Path | None, columns: tuple[str, ...]) -> Iterator[Cal
     if path is None:
         yield None
         return
-    with open_for_writing(path) as file:
+    with new_table(path) as file:
         writer = csv.writer(file)
         writer.writerow(columns)
 

@@ -22,7 +22,7 @@ from skyless.cli.common.options import (
     finite_numbers,
     options,
 )
-from skyless.cli.common.output import cm, open_for_writing, print_facts, print_json
+from skyless.cli.common.output import cm, new_table, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.cli.common.simulated_site import check_simulated
 from skyless.errors import SkylessError
@@ -314,7 +314,7 @@ def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
     if asked.fixes_csv is None:
         _advance(fleet, request, asked.until_s, None)
     else:
-        with open_for_writing(asked.fixes_csv) as file:
+        with new_table(asked.fixes_csv) as file:
             _advance(fleet, request, asked.until_s, file)
     return report(fleet, request.method, started_s)
 

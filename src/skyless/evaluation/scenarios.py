@@ -113,7 +113,8 @@ def fleet_of(request: Request) -> Fleet:
     """Make the world and its tags; the anchors are the machines that would run on radios.
 
     Raises:
-        ValueError: the method, or an anchor that is to fail, does not exist; a path has equal neighbouring points.
+        ValueError: the method, or an anchor that is to fail, does not exist; a path has equal neighbouring points; a
+            position has neither two nor three coordinates, or one that is not finite.
     """
     site = request.site
     if request.noise_ps is not None:
@@ -234,6 +235,8 @@ def wanderer(low_m: Array, high_m: Array, seed: int, tag: int) -> Roaming:
 
 
 def _with_height(point: tuple[float, ...], height_m: float) -> tuple[float, float, float]:
+    if len(point) not in (2, 3) or not all(map(math.isfinite, point)):
+        raise ValueError(f"a position is {tuple(point)}; it should be (x, y) or (x, y, z) in metres")
     return point[0], point[1], point[2] if len(point) > 2 else height_m
 
 

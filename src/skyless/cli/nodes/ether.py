@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterable
+from errno import EADDRINUSE
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
@@ -82,6 +83,11 @@ def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOpt
         with contextlib.suppress(KeyboardInterrupt):
             run(EtherNode(emulated, host, DEFAULT_PORT if port is None else port, address, log).run(), punctual=True)
     except OSError as error:
+        if error.errno == EADDRINUSE:
+            raise SkylessError(
+                f"--listen is {asked.listen!r}; another program uses this port, perhaps another ether: end it, or give "
+                f"another port, and the same one to anchors and tags (--radio ether:{host}:PORT)"
+            ) from None
         raise SkylessError(f"--listen is {asked.listen!r}, which cannot be used: {error.strerror or error}") from None
 
 
