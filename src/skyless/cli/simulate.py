@@ -76,9 +76,9 @@ class SimulateOptions:
     """A named site: lab (six anchors on the walls of 6 m × 8 m, 2-D), the default; room (the lab as real rooms are:
     anchors 2 cm off per axis, ranges 5 cm off, and more with the distance, tags with random acceleration)."""
     site: Path | None = None
-    """A site file instead of a named one."""
+    """Site file instead of a named site."""
     method: str = DEFAULT_METHOD
-    """literal, literal-delayed, weighted, bracketed or joint.
+    """How positions are computed: literal, literal-delayed, weighted, bracketed or joint.
     Fixes of all but joint hold at the master's message that they refer to, but are judged when made."""
     position: list[str] | None = None
     """Where a tag lies still, x,y or x,y,z in metres; may be given several times."""
@@ -97,9 +97,9 @@ class SimulateOptions:
     fixes: Annotated[int, Parameter(validator=Number(gte=1))] | None = None
     """Stop when every tag has this many judged fixes (one per superframe), or has had none for 60 s."""
     duration: Positive | None = None
-    """Stop after this many simulated seconds; by default 60 unless --fixes is given."""
+    """Seconds to simulate; by default 60 unless --fixes is given."""
     settle: NotNegative = 2.0
-    """Simulated seconds before which fixes are not judged; less than the run lasts."""
+    """Seconds from the start that are not judged, simulated; less than the run lasts."""
     seed: Seed = 1
     """Same seed, same bytes and ticks."""
     loss: _Share = 0.0

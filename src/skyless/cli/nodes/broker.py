@@ -40,7 +40,7 @@ def broker(
     port
         Port to listen on; by default 1883, or the next port that is free.
     listen
-        Where programs connect, HOST or HOST:PORT; 0.0.0.0 means all addresses of this machine.
+        Where programs connect, HOST:PORT or HOST; 0.0.0.0 means all addresses of this machine.
     data
         Folder for retained messages and sessions; by default skyless/broker in the user's data folder.
     user
@@ -50,7 +50,7 @@ def broker(
     key
         Private key of the certificate in PEM form.
     json
-        Print one JSON object instead of the address.
+        Write one JSON object instead of the address.
     """
     from skyless.mqtt.address import PASSWORD_VARIABLE
     from skyless.nodes.broker import FIRST_PORT, BrokerSettings
