@@ -92,3 +92,18 @@ def test_a_former_name_is_answered_with_the_present_one(options, capsys, command
     assert command not in options.get(former, {})
     assert main([*command.split(), "x", former, "1"]) == 2
     assert capsys.readouterr().err == f"skyless: {former} of skyless {command} is called {present} now\n"
+
+
+def test_a_number_that_is_none_is_refused_by_every_option(options, capsys):
+    """Before the command begins: NaN, and infinities."""
+    numbers = [(name, command) for name, uses in options.items() for command, (one, _) in uses.items() if one is float]
+    assert len(numbers) > 40
+    for name, command in numbers:
+        for value in ("nan", "inf", "-inf"):
+            assert main([*command.split(), f"{name}={value}", *_POSITIONAL.get(command, ())]) == 2, (name, command)
+            err = capsys.readouterr().err
+            assert (err.count("\n"), name in err, "Traceback" in err) == (1, True, False), err
+
+
+_POSITIONAL = dict.fromkeys(("plan", "replay", "calibrate", "site new", "site check", "board"), ("x",))
+_POSITIONAL["study"] = ("loss",)

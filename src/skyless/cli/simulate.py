@@ -18,6 +18,7 @@ from skyless.cli.common.options import (
     Positive,
     ProtectionOptions,
     Seed,
+    check_method,
     check_output,
     finite_numbers,
     options,
@@ -154,6 +155,7 @@ def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
 
     Anchors and tags are the machines that would run on radios; clocks, noise, air and motion are simulated.
     """
+    check_method(asked.method)
     request = _request(asked)
     check_simulated(request.site, request.method)
     if asked.settle >= asked.until_s:
