@@ -32,7 +32,7 @@ from skyless.cli.common.recording_inputs import flight_height, height_to_hold, k
 from skyless.evaluation.judge import Judge
 from skyless.recordings.foreign.avalue import anchor_distances_m
 from skyless.recordings.foreign.formats import format_of, open_recording
-from skyless.replay.captures import Replay, ReplayRequest
+from skyless.replays.captures import Replay, ReplayRequest
 from skyless.survey_inputs.run import CalibrationRequest, calibrate_capture
 
 LEVER_ARM = "-0.01245,0.00127,0.0908"

@@ -8,7 +8,7 @@ from plain_filter import PlainFilter
 
 import synthetic_recordings as synthetic
 from skyless.evaluation.judge import Judge
-from skyless.replay.captures import Replay, ReplayRequest
+from skyless.replays.captures import Replay, ReplayRequest
 
 ROWS = {"tdoa-table": 100_000, "miluv": 20_000, "avalue": 10_000}
 PACKETS = 20_000

@@ -5,6 +5,8 @@ GitHub. Formulas become MathML when the site is made: no script and no network i
 """
 
 import re
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from docutils import nodes
@@ -13,22 +15,57 @@ from pygments.lexers.special import TextLexer
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
+sys.path.insert(0, str(Path(__file__).parent))
+
+import reference
+
 NAVIGATION = {
-    "Start": ["docs/architecture", "docs/glossary", "CHANGELOG", "CONTRIBUTING"],
-    "Run a site": [
+    "Tutorials": ["docs/tutorials/first_site", "docs/tutorials/first_replay", "docs/tutorials/own_radio"],
+    "How to": [
+        "docs/howto/run_a_site",
         "docs/setup",
+        "docs/howto/simulate",
+        "docs/howto/plan",
+        "docs/howto/replay",
+        "docs/howto/survey_and_calibrate",
+        "docs/howto/study",
+        "docs/howto/reproduce_the_paper",
+        "docs/howto/raspberry_pi",
+        "docs/howto/container",
+        "docs/hardware",
+        "firmware/README",
+        "CONTRIBUTING",
+        "SECURITY",
+    ],
+    "Reference": [
+        "docs/reference/commands",
+        "docs/reference/python",
         "docs/sites",
+        "docs/page",
         "docs/mqtt",
+        "docs/protocol",
+        "docs/protocol2",
+        "docs/serial",
+        "docs/glossary",
+        "CHANGELOG",
+    ],
+    "Explanation": [
+        "docs/architecture",
+        "docs/comparison",
+        "docs/maths",
+        "docs/studies",
+        "docs/recordings",
         "docs/planning",
         "docs/survey",
         "docs/calibration",
         "docs/watch",
-        "docs/recordings",
+        "docs/speed",
+        "docs/paper",
+        "docs/errata",
+        "docs/radio",
+        "docs/dw1000",
+        "docs/dependencies",
     ],
-    "How it works": ["docs/protocol", "docs/protocol2", "docs/maths", "docs/studies", "docs/speed"],
-    "The paper": ["docs/paper", "docs/errata"],
-    "Radios and boards": ["docs/radio", "docs/serial", "docs/hardware", "docs/dw1000", "firmware/README"],
-    "Development": ["docs/dependencies"],
 }
 """Pages by the captions of the side bar; the start page is the README."""
 
@@ -38,8 +75,10 @@ html_title = "Skyless"
 root_doc = "README"
 include_patterns = ["README.md", *(f"{page}.md" for pages in NAVIGATION.values() for page in pages)]
 exclude_patterns = [".*", "build", "dist", "out", "src", "tests", "benchmarks", "scripts"]
-extensions = ["myst_parser"]
-myst_enable_extensions = ["dollarmath"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+myst_enable_extensions = ["attrs_inline", "dollarmath"]
 myst_heading_anchors = 4
 html_theme = "furo"
 html_show_copyright = False
@@ -54,6 +93,26 @@ def _add_navigation(_app: Sphinx, page: str, source: list[str]) -> None:
         for caption, pages in NAVIGATION.items():
             entries = "\n".join(f"/{entry}" for entry in pages)
             source[0] += f"\n\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{entries}\n```\n"
+
+
+def _use_the_theme_of_the_site(_app: Sphinx, _page: str, source: list[str]) -> None:
+    """Two pictures of which GitHub shows the one for its own theme become two of which the site's theme shows one."""
+    source[0] = re.sub(
+        r"<picture>\s*<source [^>]*srcset=\"([^\"]+)\">\s*<img src=\"([^\"]+)\" alt=\"([^\"]+)\"[^>]*>\s*</picture>",
+        r"![\3](\2){.only-light}\n![\3](\1){.only-dark}",
+        source[0],
+    )
+
+
+def _generate(_app: Sphinx, page: str, source: list[str]) -> None:
+    """Pages of the reference: what stands in the repository is their beginning, the rest is made from the code."""
+    if page in reference.PAGES:
+        source[0] += reference.PAGES[page]()
+
+
+def _generated_pages(*_: object) -> Sequence[str]:
+    """Pages that are made again by every build, as the code may have changed."""
+    return list(reference.PAGES)
 
 
 def _inline_formula(translator: HTML5Translator, node: nodes.math) -> None:
@@ -87,4 +146,7 @@ def setup(app: Sphinx) -> None:
     app.add_lexer("hex", TextLexer)  # the bytes of protocol.md
     app.add_html_math_renderer("mathml", (_inline_formula, None), (_formula, None))
     app.connect("source-read", _add_navigation)
+    app.connect("source-read", _use_the_theme_of_the_site)
+    app.connect("source-read", _generate)
+    app.connect("env-get-outdated", _generated_pages)
     app.connect("build-finished", _write_index)

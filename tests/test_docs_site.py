@@ -13,13 +13,22 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
-    *sorted(ROOT.glob("docs/*.md")),
-    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "firmware/README.md")),
+    *sorted(ROOT.glob("docs/**/*.md")),
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "firmware/README.md")),
 ]
 CURRENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
 """Those that describe the code as it is."""
-SOURCES = ("src", "tests", "benchmarks", "scripts", "firmware", "docs")
-OTHER_PROGRAMS = {"--nthreads", "--nworkers", "--eraseall", "--no-dev", "--compile-bytecode", "--help", "--user"}
+SOURCES = ("src", "tests", "benchmarks", "scripts", "firmware", "docs", "examples", "packaging")
+OTHER_PROGRAMS = {
+    "--nthreads",
+    "--nworkers",
+    "--eraseall",
+    "--no-dev",
+    "--compile-bytecode",
+    "--help",
+    "--user",
+    "--no-cache-dir",
+}
 GENERATOR = ("sphinx", "myst_parser", "furo", "latex2mathml")
 
 pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -142,8 +151,9 @@ def test_every_page_is_in_the_navigation():
 
 
 def test_every_picture_is_shown():
-    shown = {name for page in PAGES for name in re.findall(r"\((?:docs/)?pictures/(\w+\.svg)\)", prose(page))}
-    assert shown == {path.name for path in (ROOT / "docs" / "pictures").glob("*.svg")}
+    pattern = r"[(\"](?:docs/)?pictures/(\w+\.(?:svg|webp))[)\"]"
+    shown = {name for page in PAGES for name in re.findall(pattern, prose(page))}
+    assert shown == {path.name for path in (ROOT / "docs" / "pictures").iterdir() if path.suffix in {".svg", ".webp"}}
 
 
 def test_pictures_show_what_the_documents_and_the_code_say():
@@ -171,3 +181,7 @@ def test_the_site_builds_without_a_warning_and_needs_no_network(tmp_path):
         assert not re.search(r"<(script|link|img)[^>]*(src|href)=\"https?://", html), page.name
     assert "README.html" in (site / "index.html").read_text(encoding="utf-8")
     assert "<math" in (site / "docs" / "maths.html").read_text(encoding="utf-8")
+    start = (site / "README.html").read_text(encoding="utf-8")
+    assert re.search(r"class=\"[^\"]*only-dark[^\"]*\"[^>]*src=\"_images/page_dark.webp\"", start)
+    assert "skyless-site-check" in (site / "docs" / "reference" / "commands.html").read_text(encoding="utf-8")
+    assert "skyless.Receiver" in (site / "docs" / "reference" / "python.html").read_text(encoding="utf-8")

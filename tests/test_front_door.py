@@ -30,6 +30,13 @@ def test_importing_it_is_light():
     assert subprocess.check_output([sys.executable, "-c", script], text=True).strip() == "set()"
 
 
+def test_the_machines_classes_load_no_compiler():
+    """Numba, and all that is compiled with it, waits for the first receiver that is made."""
+    heavy = "{'numba', 'scipy', 'matplotlib', 'pandas'}"
+    script = f"import sys; from skyless import Anchor, Fix, Receiver, Reception; print({heavy} & set(sys.modules))"
+    assert subprocess.check_output([sys.executable, "-c", script], text=True).strip() == "set()"
+
+
 def test_a_value_loads_no_estimator():
     """Value types and the interface of methods need neither the compiler nor what computes them."""
     modules = "fix, integrity, observation"

@@ -15,20 +15,22 @@ SOURCE = Path(skyless.__file__).parent
 
 LAYERS = (
     {"constants", "errors", "method_names", "kernels", "firmware"},
-    {"ticks"},
+    {"arguments", "ticks"},
     {"air", "uncertainty"},
     {"site"},
     {"clocks", "radios.interface"},
     {"positioning"},
     {"master_election", "slot_claims", "survey"},
-    {"anchor", "anchors", "receiver", "mqtt"},
+    {"anchor", "anchors", "receiver", "receiver_state", "mqtt"},
     {"simulation", "recordings"},
     {"radios"},
     {"evaluation"},
-    {"replay"},
+    {"replays"},
+    {"preparation"},
     {"nodes", "paper", "planning"},
     {"studies"},
     {"survey_inputs", "bench", "dashboard"},
+    {"api"},
     {"cli"},
 )
 LAYER_OF = {name: number for number, names in enumerate(LAYERS) for name in names}

@@ -1,13 +1,209 @@
-"""The README's Python runs as it stands."""
+"""What the README, the tutorials and the how-tos show runs: their Python, and every line of their shell blocks.
 
+A line is run as it stands, or in a shorter form (``SHORTER``), or it names the test that runs it (``ELSEWHERE``). A new
+line that is none of these is run, unless it is of a program that runs until Ctrl-C: then this test asks for its entry.
+"""
+
+import ast
 import re
+import shlex
 from pathlib import Path
 
-README = Path(__file__).parents[1] / "README.md"
+import pytest
+
+from recordings import live_site
+from skyless.cli.main import main, program
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+PAGES = [README, *sorted(ROOT.glob("docs/tutorials/*.md")), *sorted(ROOT.glob("docs/howto/*.md"))]
+
+SHORTER = {
+    "skyless plan hall.toml --plot hall.png --target 5": "skyless plan hall.toml --plot hall.png --target 5 --step 4",
+    "skyless plan hall.toml --plot hall.png --target 10": "skyless plan hall.toml --plot hall.png --target 10 --step 4",
+    "skyless plan flat.toml --plot flat.png --target 10": "skyless plan flat.toml --plot flat.png --target 10 --step 4",
+    "skyless simulate --site hall.toml --tags 3 --duration 20": "skyless simulate --site hall.toml --duration 3",
+    "skyless simulate --site hall.toml --tags 3 --duration 20 --loss 0.1 --outage 3:10": (
+        "skyless simulate --site hall.toml --duration 3 --loss 0.1 --outage 3:1"
+    ),
+    "skyless simulate --scenario lab --noise-ps 100 --position 3,4 --fixes 3000 --seed 7": (
+        "skyless simulate --scenario lab --noise-ps 100 --position 3,4 --fixes 30 --seed 7"
+    ),
+    "skyless simulate --site hall.toml --tags 20 --speed 1.5 --duration 60 --loss 0.1 --nlos 0.05": (
+        "skyless simulate --site hall.toml --tags 2 --speed 1.5 --duration 3 --loss 0.1 --nlos 0.05"
+    ),
+    'skyless simulate --waypoints "1,1;5,1;5,7" --speed 0.5 --outage 1:10:15 --fixes-csv fixes.csv': (
+        'skyless simulate --waypoints "1,1;5,1;5,7" --speed 0.5 --outage 1:2:3 --fixes-csv fixes.csv --duration 4'
+    ),
+    "skyless simulate --scenario room --tags 5": "skyless simulate --scenario room --tags 1 --duration 3",
+}
+"""Lines that take long, and what is run in their stead: less of the same."""
+
+DEMO = "tests/cli/test_demo_command.py::"
+SITE = "tests/nodes/test_running_site.py::test_a_site_rides_through_the_death_and_the_freezing_of_every_process"
+BOARD = "tests/nodes/test_boards_live.py::"
+BROKER = "tests/nodes/test_broker.py::"
+MQTT = "tests/cli/test_node_commands.py::test_the_demo_tells_how_to_watch_its_broker"
+PLAN = "tests/cli/test_plan_command.py::"
+REPLAY = "tests/cli/test_replay_command.py::"
+ELSEWHERE = {
+    "scripts/run": DEMO + "test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated",
+    "scripts/test": "the run that this test is part of",
+    "scripts/run --version": "tests/cli/test_program.py::test_version",
+    'export PATH="$PWD/.venv/bin:$PATH"': "the run that this test is part of",
+    "skyless demo --duration 20 --record walk.mcap": (
+        DEMO + "test_json_also_where_ports_are_taken_and_nothing_can_be_written_at_home"
+    ),
+    "skyless demo --site hall.toml --tags 3": DEMO
+    + "test_programs_that_die_are_started_again_and_ctrl_c_ends_all_with_a_summary",
+    "skyless broker": BROKER + "test_it_leaves_no_orphan_however_it_ends",
+    "skyless ether --site hall.toml --tags 2": SITE,
+    "skyless anchor 1 2 3 4 5 6 --site hall.toml": SITE,
+    "skyless tag tag1 tag2": SITE,
+    "skyless dashboard": "tests/dashboard/test_dashboard_end_to_end.py::test_a_site_is_found_shown_and_watched",
+    "skyless record walk.mcap": (
+        "tests/nodes/test_record_command.py::test_a_recording_replays_bit_by_bit_and_ctrl_c_closes_it"
+    ),
+    "skyless board tag1 --link /tmp/tag1": (
+        "tests/cli/test_node_commands.py::test_a_board_tells_where_it_is_and_takes_its_link_with_it"
+    ),
+    "skyless tag tag1 --radio serial:/tmp/tag1": (
+        BOARD + "test_anchors_and_tags_on_boards_make_the_fixes_of_those_on_the_air_and_survive_pulled_plugs"
+    ),
+    "mosquitto_sub -t 'skyless/#' -v": MQTT,
+    "mosquitto_sub -t 'skyless/v1/+/tag/+/fix'": MQTT,
+    "export SKYLESS_MQTT_PASSWORD=choose-one": BROKER + "test_wrong_options_are_reported_with_what_would_be_right",
+    "skyless broker --listen 0.0.0.0 --user hall": (
+        BROKER + "test_wrong_options_are_reported_with_what_would_be_right"
+    ),
+    "skyless dashboard --listen 0.0.0.0:8080 --mqtt mqtt://hall@127.0.0.1": (
+        "tests/dashboard/test_dashboard_end_to_end.py::test_other_machines_need_the_token_that_is_printed"
+    ),
+    "skyless plan hall.toml --plot hall.png --html hall.html --target 5": PLAN + "test_all_files_at_once",
+    "skyless plan hall.toml --optimise 8 --heights 0.5,3.5 --out better.toml": (
+        PLAN + "test_an_optimised_site_is_a_site"
+    ),
+    "skyless plan hall.toml --verify 20": PLAN + "test_verification_tells_its_points",
+    "skyless replay capture.yaml --anchors anchors.csv": REPLAY + "test_every_format_gives_fixes_at_the_truth",
+    "skyless replay flight_tdoa.csv.gz --anchors anchors.csv --truth flight_pose.csv.gz"
+    " --lever-arm=-0.012,0.001,0.091 --plot flight.png": (
+        "tests/recordings/test_replay_acceptance.py::test_the_lever_arm_brings_the_truth_to_the_antenna"
+    ),
+    "skyless survey --mqtt mqtt://127.0.0.1 --site site.toml --duration 30 --anchor-height 2.6"
+    " --anchor-height 3=0.5 --origin 1 --x-axis 4 --left 6 --out surveyed.toml": (
+        "tests/nodes/test_live_survey.py::test_a_site_without_positions_is_surveyed_and_serves_tags"
+    ),
+    "skyless survey walk.mcap --site hall.toml --walk tag1 --out walked.toml": (
+        "tests/survey_inputs/test_walk_of.py::test_the_command_uses_the_walk"
+    ),
+    "skyless calibrate walk.mcap --at 3,4 --site hall.toml --out calibrated.toml": (
+        "tests/cli/test_calibrate_command.py::test_the_delays_of_a_site_are_found_and_written_back"
+    ),
+    "skyless study nlos --quick --plot nlos.png": (
+        "tests/studies/test_study_command.py::test_a_study_tells_its_rows_and_writes_its_files"
+    ),
+    "skyless study room --plot room.png": (
+        "tests/studies/test_study_command.py::test_the_study_of_the_room_tells_levels_and_what_is_missed"
+    ),
+    "skyless bench": "tests/cli/test_bench_command.py::test_the_table_names_every_way",
+    "skyless paper --out report": "tests/paper/test_paper_report.py::test_verdicts_are_those_of_the_long_report",
+    "skyless paper --out quick-report --quick": (
+        "tests/paper/test_paper_report.py::test_every_picture_is_there_twice_and_nothing_is_left_over"
+    ),
+    "python examples/own_radio.py": "tests/examples/test_examples.py::test_own_radio",
+}
+"""Lines that run until Ctrl-C, take long or need what is not here, and the tests that run such a command."""
+
+NEVER_RUN = ("sudo ", "journalctl ", "echo RADIO=", "docker ", "ANCHOR_1=")
+"""Lines that need a Raspberry Pi, systemd or Docker begin like this; the pages that show them say so."""
+
+UNTIL_CTRL_C = {"anchor", "board", "broker", "dashboard", "demo", "ether", "record", "tag"}
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def commands(page):
+    """The lines of a page's shell blocks in their order, without comments, continued lines joined."""
+    lines = [line for block in blocks(page, "sh") for line in re.sub(r"\s*\\\n\s*", " ", block).splitlines()]
+    return [command for line in lines if (command := re.sub(r"(^|\s+)#\s.*", "", line).strip())]
+
+
+def arguments_of(command):
+    """What follows the program's name; None where it is another program."""
+    words = shlex.split(command)
+    return words[1:] if words[0] in {"skyless", "scripts/run"} else None
+
+
+def name_of(page):
+    return str(page.relative_to(ROOT))
+
+
+pages = pytest.mark.parametrize("page", PAGES, ids=name_of)
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """A recording as ``skyless record`` writes it, of a tag named tag1."""
+    path = tmp_path_factory.mktemp("walk") / "walk.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(live_site.PLACES, "tag1", (3.0, 4.0, 0.0))
+        live_site.record(path, live_site.messages(3.0, tags=("tag1",)))
+    return path.read_bytes()
+
+
+@pages
+def test_the_commands_of_a_page_run(page, walk, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("walk.mcap").write_bytes(walk)
+    if not any(command.startswith("skyless site new hall.toml") for command in commands(page)):
+        assert main(["site", "new", "hall.toml"]) == 0
+    for command in commands(page):
+        arguments = arguments_of(command)
+        if command in ELSEWHERE:
+            if arguments and arguments != ["--version"]:
+                program().parse_args(arguments, print_error=False, exit_on_error=False)
+            continue
+        if command.startswith(NEVER_RUN):
+            assert re.search(
+                r"\*\*.*\bnot been built\b|\*\*Nothing of this page has run", " ".join(page.read_text().split())
+            )
+            continue
+        assert arguments, f"{name_of(page)}: name the test that runs {command!r} in ELSEWHERE"
+        assert arguments[0] not in UNTIL_CTRL_C, f"{name_of(page)}: name the test that runs {command!r} in ELSEWHERE"
+        assert main(arguments_of(SHORTER.get(command, command))) == 0, f"{command}\n{capsys.readouterr().err}"
+    if page != README:
+        for example in blocks(page, "python"):
+            exec(compile(example, name_of(page), "exec"), {})
+
+
+def test_every_entry_is_of_a_line_and_names_a_test():
+    shown = {command for page in PAGES for command in commands(page)}
+    assert not (SHORTER.keys() | ELSEWHERE.keys()) - shown
+    for test in set(ELSEWHERE.values()):
+        file, _, name = test.partition("::")
+        if file.startswith("tests/"):
+            tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+            assert not name or name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, test
+
+
+@pages
+def test_no_command_stands_outside_a_shell_block(page):
+    text = page.read_text(encoding="utf-8")
+    assert set(re.findall(r"^```(\w*)\n(?:.*?)^```", text, re.DOTALL | re.MULTILINE)) <= {
+        "sh",
+        "python",
+        "text",
+        "ini",
+        "dockerfile",
+    }
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    assert not re.findall(r"^ {4}(?:skyless|scripts|python|sudo|docker) .*", prose, re.MULTILINE)
 
 
 def test_the_example_runs(capsys):
-    (example,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    (example,) = blocks(README, "python")
     exec(compile(example, str(README), "exec"), {})
     x, y, z = map(float, re.search(r"\[ *(\S+) +(\S+) +(\S+) *\]", capsys.readouterr().out).groups())
     assert abs(x - 3.0) < 0.15
@@ -16,5 +212,6 @@ def test_the_example_runs(capsys):
 
 
 def test_its_links_lead_somewhere():
-    for link in re.findall(r"\]\(([^)#]+)\)", README.read_text(encoding="utf-8")):
+    text = README.read_text(encoding="utf-8")
+    for link in [*re.findall(r"\]\(([^)#]+)", text), *re.findall(r"(?:src|srcset)=\"([^\"]+)\"", text)]:
         assert (README.parent / link).exists(), link

@@ -10,11 +10,12 @@ import skyless
 
 SOURCE = Path(skyless.__file__).parent
 ROOT = Path(__file__).parents[1]
+PATTERNS = ("src/skyless/**/*.py", "src/skyless/**/*.js", "src/skyless/**/*.html", "docs/**/*.md", "*.md")
 TEXTS = sorted(
     path
-    for pattern in ("src/skyless/**/*.py", "src/skyless/**/*.js", "src/skyless/**/*.html", "docs/*.md", "README.md")
+    for pattern in PATTERNS
     for path in ROOT.glob(pattern)
-    if "vendor" not in path.parts and path.name != "glossary.md"
+    if "vendor" not in path.parts and path.name not in {"glossary.md", "CHANGELOG.md"}
 )
 MODULES = sorted(SOURCE.rglob("*.py"))
 

@@ -2,6 +2,9 @@
 
 Numbers come from the tables of the documents, the layers from ``tests/test_layers.py``, the lab from its site file, so
 that a picture never says something else than the text. The SVGs are part of the repository.
+
+``.venv/bin/python docs/pictures/make.py page`` records the page's animation for the README (``page.py``): the demo in
+Debian's Chromium, for half a minute, on a machine that has nothing else to do.
 """
 
 import ast
@@ -252,9 +255,14 @@ def content_of(figure: Figure) -> str:
 
 
 def main(names: Iterable[str]) -> None:
-    """Write the pictures of these names, or all."""
+    """Write the pictures of these names, or all but the animation ``page``."""
     matplotlib.rcParams.update({"svg.hashsalt": "skyless", "font.family": "DejaVu Sans"})
     for name in names or PICTURES:
+        if name == "page":
+            import page  # noqa: PLC0415 (needs a browser, which the other pictures do not)
+
+            page.record()
+            continue
         figure = PICTURES[name]()
         figure.savefig(FOLDER / f"{name}.svg", metadata={"Date": None, "Description": content_of(figure)})
 

@@ -10,6 +10,13 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from skyless.air.reception import Reception, Transmission
     from skyless.anchor import Anchor
+    from skyless.api.calibrate import CalibrationResult, calibrate
+    from skyless.api.plan import PlanResult, plan
+    from skyless.api.replay import ReplayResult, replay
+    from skyless.api.simulate import SimulationResult, simulate
+    from skyless.api.slot_plan import SlotPlanResult
+    from skyless.api.study import StudyResult, study
+    from skyless.errors import SkylessError
     from skyless.evaluation.fleet import Fleet
     from skyless.evaluation.scenarios import Request, fleet_of
     from skyless.method_names import METHODS
@@ -26,37 +33,61 @@ if TYPE_CHECKING:
 _MODULES: Final = {
     "METHODS": "skyless.method_names",
     "Anchor": "skyless.anchor",
+    "CalibrationResult": "skyless.api.calibrate",
     "Fix": "skyless.positioning.fix",
     "Fleet": "skyless.evaluation.fleet",
     "NoFixReason": "skyless.positioning.fix",
+    "PlanResult": "skyless.api.plan",
     "Receiver": "skyless.receiver",
     "Reception": "skyless.air.reception",
+    "ReplayResult": "skyless.api.replay",
     "Request": "skyless.evaluation.scenarios",
+    "SimulationResult": "skyless.api.simulate",
     "Site": "skyless.site.model",
+    "SkylessError": "skyless.errors",
+    "SlotPlanResult": "skyless.api.slot_plan",
+    "StudyResult": "skyless.api.study",
     "Transmission": "skyless.air.reception",
+    "calibrate": "skyless.api.calibrate",
     "fleet_of": "skyless.evaluation.scenarios",
     "lab_site": "skyless.site.lab",
     "load_site": "skyless.site.load",
     "locate": "skyless.positioning.methods.locate",
     "open_recording": "skyless.recordings.foreign.formats",
+    "plan": "skyless.api.plan",
+    "replay": "skyless.api.replay",
+    "simulate": "skyless.api.simulate",
+    "study": "skyless.api.study",
 }
 
 __all__ = [
     "METHODS",
     "Anchor",
+    "CalibrationResult",
     "Fix",
     "Fleet",
     "NoFixReason",
+    "PlanResult",
     "Receiver",
     "Reception",
+    "ReplayResult",
     "Request",
+    "SimulationResult",
     "Site",
+    "SkylessError",
+    "SlotPlanResult",
+    "StudyResult",
     "Transmission",
+    "calibrate",
     "fleet_of",
     "lab_site",
     "load_site",
     "locate",
     "open_recording",
+    "plan",
+    "replay",
+    "simulate",
+    "study",
 ]
 
 

@@ -5,10 +5,9 @@ It needs nothing but beacons: anchors, schedule and noise figures come from the 
 
 from collections import Counter
 from math import inf, isfinite
-from typing import Final
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
-from msgspec import Struct
 
 from skyless.air.beacon import Beacon, Malformed
 from skyless.air.beacon2 import Beacon2
@@ -22,29 +21,30 @@ from skyless.kernels.arrays import Array
 from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.integrity import IntegrityRequirement
-from skyless.positioning.methods.factory import MethodOptions, new_method, new_method_2
-from skyless.positioning.methods.joint import Estimation, EstimationState
 from skyless.positioning.methods.observations import (
     AnchorStamps,
     FixTime,
     Observer,
-    StampTracks,
     observe_2,
     variance_factor,
 )
 from skyless.positioning.methods.selection import (
     LEAST_FITTING,
     AnchorSelection,
-    AnchorSelectionState,
     fitting_relays,
     is_full,
 )
-from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState
 from skyless.positioning.observation import Observation
-from skyless.site.almanac_pages import AlmanacAssembly, AlmanacState
-from skyless.site.local_almanac import LEAST_ANCHORS, PRESENT_TICKS, LocalAlmanac, LocalAlmanacState
+from skyless.site.almanac_pages import AlmanacAssembly
+from skyless.site.local_almanac import LEAST_ANCHORS, PRESENT_TICKS, LocalAlmanac
 from skyless.site.slots import schedule_from_page
 from skyless.ticks import LAST_TICKS, Unwrapper, from_seconds
+
+if TYPE_CHECKING:
+    # These load Numba and all kernels: only who makes a receiver waits for that, not who imports its class.
+    from skyless.positioning.methods.joint import Estimation
+    from skyless.positioning.methods.snapshots import Snapshots
+    from skyless.receiver_state import ReceiverState
 
 MOST_WAITING: Final = 128
 """Beacons that are kept while the site's pages are not complete (protocol 2)."""
@@ -61,31 +61,6 @@ NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump"
 
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
 """Stamps that go back farther than radios and hosts reorder them mean that the tag's own counter has restarted."""
-
-
-class ReceiverState(Struct, frozen=True):
-    """All that a ``Receiver`` keeps; to be used or encoded before its next frame, as they share some parts."""
-
-    options: MethodOptions
-    choice: SiteChoice
-    counters: dict[str, int]
-    reason: NoFixReason
-    almanac: AlmanacState
-    time: FixTime
-    own_ticks: Unwrapper
-    stamps: StampTracks
-    followed: FollowedMaster
-    master: int | None
-    master_scale: tuple[int, int] | None
-    superframe_ticks: int
-    has_method_key: bool
-    """Whether a method has been looked for since stamps were forgotten."""
-    method: EstimationState | SnapshotsState | None
-    local_almanac: LocalAlmanacState
-    selection: AnchorSelectionState
-    waiting: tuple[Observation, ...]
-    moved_ticks: dict[int, int]
-    uses_moved: bool = False
 
 
 class Receiver:
@@ -109,6 +84,8 @@ class Receiver:
         Raises:
             ValueError: there is no such method.
         """
+        from skyless.positioning.methods.factory import MethodOptions  # noqa: PLC0415 - loads the kernels
+
         if method not in METHODS:
             raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")
         self.counters: Counter[str] = Counter()
@@ -137,8 +114,10 @@ class Receiver:
         self._uses_moved = False
         """Whether they are in use, and not the others."""
 
-    def state(self) -> ReceiverState:
+    def state(self) -> "ReceiverState":
         """All that it keeps, as it is now."""
+        from skyless.receiver_state import ReceiverState  # noqa: PLC0415 - its types load the kernels
+
         return ReceiverState(
             options=self._options,
             choice=self._choice,
@@ -162,12 +141,15 @@ class Receiver:
         )
 
     @classmethod
-    def from_state(cls, state: ReceiverState) -> "Receiver":
+    def from_state(cls, state: "ReceiverState") -> "Receiver":
         """A receiver that continues with the same bits as the one with this state.
 
         Raises:
             ValueError: no receiver has such a state.
         """
+        from skyless.positioning.methods.joint import Estimation, EstimationState  # noqa: PLC0415 - kernels
+        from skyless.positioning.methods.snapshots import Snapshots, SnapshotsState  # noqa: PLC0415 - kernels
+
         options = state.options
         made = cls(options.method, qa=options.qa, z_bounds_m=options.z_bounds_m, integrity=options.integrity)
         made._choice, made._superframe_ticks = state.choice, state.superframe_ticks
@@ -205,9 +187,14 @@ class Receiver:
         return self._choice.only_site if self._choice.key is None else self._choice.key.site
 
     @property
-    def method(self) -> Estimation | Snapshots | None:
+    def method(self) -> "Estimation | Snapshots | None":
         """The positioning method in use, None before the almanac is known."""
         return self._method
+
+    @property
+    def _joint(self) -> "Estimation | None":
+        """The method in use where it is ``joint``, the only one that protocol 2 has."""
+        return cast("Estimation | None", self._method) if self._options.method in FILTERS else None
 
     def hear(self, reception: Reception) -> Fix | None:
         """Process a frame from the air; a fix if it made one, else ``reason`` is set.
@@ -257,7 +244,7 @@ class Receiver:
         anchor, relays = beacon.anchor, packed_relays_2(beacon)
         if diagnostics is not None and diagnostics.rx_power_dbm is not None:
             self._selection.add_power(anchor, diagnostics.rx_power_dbm)
-        was_starting = not isinstance(self._method, Estimation) or self._method.is_starting
+        was_starting = self._joint is None or self._joint.is_starting
         before_m = self.local_almanac.position_m(anchor)
         if self.local_almanac.on_beacon(beacon, rx_ticks, self._confirm(anchor, relays, rx_ticks, tx_ticks)):
             self._choose_method_2()
@@ -273,18 +260,18 @@ class Receiver:
         scale = 1.0 if diagnostics is None else _variance_scale(diagnostics)
         std_m = self.local_almanac.std_m(anchor)
         observation = observe_2(beacon, relays, anchor_m, std_m, rx_ticks, tx_ticks, scale)
-        if self._method is None:
+        method = self._joint
+        if method is None:
             self._waiting = [*self._waiting[1 - MOST_WAITING :], observation]
             return NoFixReason.NO_ALMANAC if self.local_almanac.pages is None else NoFixReason.NO_MASTER
-        assert isinstance(self._method, Estimation)
         for waiting in self._waiting:
             if self._selection.is_confirmed(waiting.anchor, rx_ticks):
-                self._method.update(waiting)
+                method.update(waiting)
         self._waiting = []
-        if not self._may_join(self._method, observation):
+        if not self._may_join(method, observation):
             return NoFixReason.TOO_FEW_ANCHORS
-        result = self._method.update(observation)
-        if was_starting and not self._method.is_starting:
+        result = method.update(observation)
+        if was_starting and not method.is_starting:
             self._selection.forget_times()  # from now on what anchors in use have received counts, and what those have
         return result
 
@@ -294,8 +281,8 @@ class Receiver:
             self._moved_ticks, self._uses_moved = {}, False
         self._moved_ticks[anchor] = rx_ticks
         self._waiting = [one for one in self._waiting if one.anchor != anchor]
-        method = self._method
-        if isinstance(method, Estimation):
+        method = self._joint
+        if method is not None:
             was_starting, remaining = method.is_starting, method.remove_anchor(anchor)
             if not was_starting and remaining < LEAST_ANCHORS:
                 self._renew_method()
@@ -324,9 +311,9 @@ class Receiver:
 
     def _confirm(self, anchor: int, relays: bytes, rx_ticks: int, tx_ticks: int) -> bool:
         """Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender."""
-        method = self._method
-        is_starting = not isinstance(method, Estimation) or method.is_starting
-        in_use = isinstance(method, Estimation) and not is_starting and method.estimator.has_anchor(anchor)
+        method = self._joint
+        is_starting = method is None or method.is_starting
+        in_use = method is not None and not is_starting and method.estimator.has_anchor(anchor)
         by_others = self._selection.is_confirmed_by_others(anchor, rx_ticks, in_use=in_use)
         if by_others or is_starting or self._has_too_few(rx_ticks):
             self._selection.add_relays(relays, rx_ticks)
@@ -337,7 +324,7 @@ class Receiver:
     def _packet_in_use(self, anchor: int) -> tuple[int, int] | None:
         """Sequence number and own RX stamp of the last beacon of an anchor in use."""
         track = self._stamps.tracks.of_anchor.get(anchor)
-        in_use = isinstance(self._method, Estimation) and self._method.estimator.has_anchor(anchor)
+        in_use = self._joint is not None and self._joint.estimator.has_anchor(anchor)
         return (track.sequence, track.rx_ticks_tag) if track is not None and in_use else None
 
     def _has_too_few(self, rx_ticks: int) -> bool:
@@ -345,12 +332,12 @@ class Receiver:
 
         A tag may come to where none of its anchors is received, nor receives the next ones: out of a lift.
         """
-        assert isinstance(self._method, Estimation)
-        state = self._method.estimator.state
+        assert self._joint is not None
+        state = self._joint.estimator.state
         is_present = (rx_ticks - state.anchors["rx_ticks"]) * TICK_S <= state.settings[0]["drop_s"]
         return int(np.count_nonzero(is_present & (state.anchors["packets"] > 0))) < LEAST_ANCHORS
 
-    def _may_join(self, method: Estimation, observation: Observation) -> bool:
+    def _may_join(self, method: "Estimation", observation: Observation) -> bool:
         """Whether an anchor is in use or may be: others have received it, and it is not weaker than 24 in use."""
         estimator, anchor = method.estimator, observation.anchor
         if estimator.has_anchor(anchor) and not method.is_starting:
@@ -387,8 +374,8 @@ class Receiver:
             raise ValueError(
                 f"height_m is {height_m!r} and std_m is {std_m!r}; both should be finite numbers, std_m above 0"
             )
-        method = self._method
-        return isinstance(method, Estimation) and method.update_height(height_m, std_m)
+        method = self._joint
+        return method is not None and method.update_height(height_m, std_m)
 
     def _admit(self, beacon: AnyBeacon, rx_ticks: int) -> int | None:
         """TX stamp, unwrapped, of a beacon of the site, by the present master, and of an anchor that may be there."""
@@ -471,6 +458,8 @@ class Receiver:
 
     def _choose_method(self) -> None:
         """Make the method that almanac and master require, unless it is in use already."""
+        from skyless.positioning.methods.factory import new_method  # noqa: PLC0415 - loads the kernels
+
         almanac, options, master = self.almanac, self._options, self._master
         method_master = None if options.method in FILTERS else master
         schedule_page, noise, accuracy = almanac.schedule, almanac.noise, almanac.accuracy
@@ -488,6 +477,8 @@ class Receiver:
 
         ``superframe_ticks``: that with which the method was made, where it continues from a state.
         """
+        from skyless.positioning.methods.factory import new_method_2  # noqa: PLC0415 - loads the kernels
+
         pages = self.local_almanac.pages
         assert pages is not None
         method_key = (pages.site.tag_height_m, pages.noise, pages.accuracy)

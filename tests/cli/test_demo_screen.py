@@ -140,3 +140,19 @@ def test_updates_per_second_of_a_tag_that_was_restarted(stage):
         )
         watch._on_tag(health)
     assert watch.tags["t1"].updates_per_s == 500.0
+
+
+def late_health(**counters):
+    return TagHealth("t1", 1.0, 1.0, "joint", 0, 9, 9.0, None, 0.1, None, None, counters, Counters(0, 0, 0), 0.0, 0, ())
+
+
+def test_what_was_too_old_is_named_where_there_was_any(stage):
+    screen, watch = stage
+    watch._on_fix(fix("t1", None))
+    watch._on_tag(late_health(malformed=4))
+    assert (screen.summary()["late_receptions"], screen.summary()["late_fixes"]) == (0, 0)
+    assert "too slow" not in screen.closing() + screen._line()
+    watch._on_tag(late_health(**{"late-reception": 250, "late-fix": 3, "malformed": 4}))
+    assert (screen.summary()["late_receptions"], screen.summary()["late_fixes"]) == (250, 3)
+    for text in (screen.closing(), screen._line()):
+        assert "this computer is too slow: 250 receptions dropped and 3 fixes withheld as too old" in text

@@ -24,6 +24,7 @@ import skyless
 
 PAGE = Path(skyless.__file__).parent / "dashboard" / "page"
 RECORDED_S = 90.0
+FIRST_FIX_S = 2.0
 DOCK = {"id": "dock", "name": "Dock", "polygon_m": [[14, 2.5], [21, 2.5], [21, 6], [14, 6]], "colour": "#c2763a"}
 
 
@@ -44,6 +45,11 @@ class FakeServer:
         self.refuse = False
         self.mute = False
         self.zone_error = None
+        self.condition = made_up.condition()
+        self.log = []
+        self.full = False
+        self.overlay_error = None
+        self.overlay_waits = False
         self.started = time.time()
         self.sockets = {}
         self.port = _free_port()
@@ -109,6 +115,10 @@ class FakeServer:
 
         async def overlay(request):
             query = request.query_params
+            while self.overlay_waits:
+                await asyncio.sleep(0.02)
+            if self.overlay_error:
+                return JSONResponse({"error": self.overlay_error}, status_code=422)
             return JSONResponse(made_up.overlay(query["kind"], float(query["step_m"])))
 
         async def put_zones(request):
@@ -121,7 +131,8 @@ class FakeServer:
 
         async def recordings(_request):
             start = {"bytes": 48_300_000, "start_unix_s": 1_780_000_000.0, "complete": True}
-            return JSONResponse([{"name": "walk.mcap", "duration_s": RECORDED_S, **start}])
+            what = {"site": "Hall 7", "tags": 2, "fixes": 1800}
+            return JSONResponse([{"name": "walk.mcap", "duration_s": RECORDED_S, **start, **what}])
 
         async def recording(request):
             start = 1_780_000_000.0
@@ -129,7 +140,15 @@ class FakeServer:
             return JSONResponse({
                 "name": request.path_params["name"], "site": site, "start_unix_s": start,
                 "end_unix_s": start + RECORDED_S, "tags": made_up.names(2), "zones": [DOCK],
+                "fix_spans_unix_s": [[start + FIRST_FIX_S, start + 55.0], [start + 60.0, start + RECORDED_S]],
             })  # fmt: skip
+
+        async def events(_request):
+            return JSONResponse({"events": made_up.recorded_events(1_780_000_000.0), "complete": True})
+
+        async def file(request):
+            headers = {"Content-Disposition": f"attachment; filename={request.path_params['name']}"}
+            return Response(b"recorded", media_type="application/octet-stream", headers=headers)
 
         async def states(request):
             query = request.query_params
@@ -146,6 +165,8 @@ class FakeServer:
                 Route("/api/zones", put_zones, methods=["PUT"]),
                 Route("/api/recordings", recordings),
                 Route("/api/recordings/{name}", recording),
+                Route("/api/recordings/{name}/events", events),
+                Route("/api/recordings/{name}/file", file),
                 Route("/api/recordings/{name}/states", states),
                 WebSocketRoute("/live", self._live),
                 Mount("/page", StaticFiles(directory=PAGE)),
@@ -156,12 +177,15 @@ class FakeServer:
         if self.refuse:
             return await websocket.close()
         await websocket.accept()
+        if self.full:
+            return await websocket.close(1013, "too many pages are open: 100 of this computer, 100 in all")
         lock = asyncio.Lock()
         await _send(websocket, lock, self._hello())
+        await _send(websocket, lock, {"type": "log", "events": self.log})
         self.sockets[websocket] = lock
         jobs = [
             asyncio.create_task(job(websocket, lock))
-            for job in (self._states, self._health, self._surveys, self._pongs)
+            for job in (self._states, self._health, self._conditions, self._surveys, self._pongs)
         ]
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
@@ -192,6 +216,12 @@ class FakeServer:
                 await _send(websocket, lock, self.health(time.time()))
             await asyncio.sleep(1.0)
 
+    async def _conditions(self, websocket, lock):
+        while True:
+            if not self.mute and self.condition:
+                await _send(websocket, lock, self.condition)
+            await asyncio.sleep(0.2)
+
     async def _surveys(self, websocket, lock):
         while True:
             if self.survey and not self.survey.silent and not self.mute:
@@ -210,7 +240,11 @@ class FakeServer:
             tags.append(made_up.tag_health(name, number, since, now, reason))
         ether = {"unix_s": now, "simulated_s": since, "transmissions": int(476 * since), "late": 0, "at_anchors": {},
                  "at_tags": {}, "stalls": 0, "overruns": 0}  # fmt: skip
-        return {"type": "health", "anchors": anchors, "tags": tags, "ether": ether, "nodes": made_up.nodes()}
+        old = self.mode == "master"
+        ages = {"anchors": {str(n): 20.0 if n == 8 and old else 0.1 for n in range(1, 9)}, "ether": {"air": 0.1},
+                "tags": dict.fromkeys(made_up.names(self.tags), 0.1)}  # fmt: skip
+        nodes = made_up.nodes()
+        return {"type": "health", "anchors": anchors, "tags": tags, "ether": ether, "nodes": nodes, "ages": ages}
 
     async def _pongs(self, websocket, lock):
         while True:
@@ -226,7 +260,7 @@ async def _send(websocket, lock, message):
 def _recorded(from_s, to_s, rate_hz):
     start, step = 1_780_000_000.0, 1 / float(rate_hz)
     first, last = int(max(0.0, from_s) / step), int(min(to_s, RECORDED_S) / step)
-    times = [n * step for n in range(first, last + 1)]
+    times = [n * step for n in range(first, last + 1) if n * step >= FIRST_FIX_S]
     named = list(enumerate(made_up.names(2)))
     return [
         {"type": "state", "unix_s": start + t, "tags": [made_up.state_row(name, n, t, start + t) for n, name in named]}

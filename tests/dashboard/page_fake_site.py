@@ -2,6 +2,8 @@
 
 import math
 
+from skyless.planning.colours import COLOUR_STOPS, scale_of
+
 WIDTH_M, DEPTH_M = 24.0, 14.0
 SLOT_S = 2.1e-3
 SUPERFRAME = 8
@@ -33,8 +35,8 @@ def site_message(unix_s, floor_plan=None, mode="master", placed=True):
 
 
 def names(count):
-    few = ("forklift", "trolley", "robot")
-    return [few[n] if n < 3 and count <= 3 else f"tag-{n + 1:03d}" for n in range(count)]
+    few = ("forklift", "trolley", "robot", "drone")
+    return [few[n] if count <= len(few) else f"tag-{n + 1:03d}" for n in range(count)]
 
 
 def truth(number, time_s):
@@ -57,7 +59,36 @@ def state_row(name, number, time_s, unix_s):
     used = 8 - (1 if math.sin(0.7 * time_s + number) > 0.6 else 0)
     chi2 = used * (0.8 + 0.6 * math.sin(5.3 * time_s + number) ** 2)
     numbers = [x + dx, y + dy, 1.2, vx, vy, xx, xy, yy, math.sqrt(xx + yy), math.hypot(dx, dy), x, y]
-    return [name, *(round(value, 5) for value in numbers), used, round(chi2, 3), unix_s, 0.6 * ease, ALERTS[number % 5]]
+    estimated = name.startswith("drone")
+    if estimated:
+        numbers[2] = 1.5 + math.sin(0.4 * time_s)
+    rest = [
+        used,
+        round(chi2, 3),
+        unix_s,
+        0.6 * ease,
+        ALERTS[number % 5],
+        int(not estimated),
+        0.08 if estimated else None,
+    ]
+    return [name, *(round(value, 5) for value in numbers), *rest]
+
+
+def recorded_events(start_unix_s):
+    """Of a recording: anchor 2 is lost at 20 s and 4 takes over, an alert at 50 s, an anchor has moved at 70 s."""
+    events = (
+        (1.0, "program", "note", "recorder/demo", "recorder demo started"),
+        (20.0, "anchor", "bad", "anchor/2", "anchor 2 does not report any more"),
+        (20.4, "master", "warning", "anchor/4", "anchor 4 is the master now, after anchor 2"),
+        (31.0, "anchor", "good", "anchor/2", "anchor 2 reports again"),
+        (50.0, "alert", "warning", "tag/tag-001", "tag tag-001: faulty anchor excluded"),
+        (70.0, "watch", "bad", "anchor/7", "Anchor 7 has moved by 31 cm"),
+    )
+    keys = ("unix_s", "kind", "level", "name", "text")
+    return [
+        dict(zip(keys, (start_unix_s + at_s, *rest), strict=True)) | {"serial": n}
+        for n, (at_s, *rest) in enumerate(events, 1)
+    ]
 
 
 def mqtt():
@@ -114,6 +145,23 @@ def nodes():
     ]
 
 
+def reason(kind, level, text, advice="See there.", names=()):
+    return {"kind": kind, "level": level, "text": text, "advice": advice, "names": names}
+
+
+def condition(*reasons, level=None, text=""):
+    """The server's judgement: good without reasons."""
+    return {
+        "type": "condition", "level": level or (reasons[0]["level"] if reasons else "good"),
+        "text": text or (reasons[0]["text"] if reasons else ""), "reasons": reasons,
+        "latency_p50_s": 0.0012, "latency_p99_s": 0.0034,
+    }  # fmt: skip
+
+
+def event(serial, unix_s, level, kind, name, text):
+    return {"serial": serial, "unix_s": unix_s, "kind": kind, "level": level, "name": name, "text": text}
+
+
 def overlay(kind, step_m):
     """A smooth bowl, good in the middle; nothing beyond the walls' corners."""
     columns, rows = int(WIDTH_M / step_m) + 1, int(DEPTH_M / step_m) + 1
@@ -123,8 +171,11 @@ def overlay(kind, step_m):
         for column in range(columns):
             u, v = 2 * column / (columns - 1) - 1, 2 * row / (rows - 1) - 1
             values.append(None if abs(u) + abs(v) > 1.9 else round(scale * (1 + u * u + 0.7 * v * v), 4))
+    known = sorted(value for value in values if value is not None)
+    limits = scale_of(known)
     return {
         "kind": kind, "unit": "m" if kind == "sigma" else "1", "x_m": [0, (columns - 1) * step_m],
         "y_m": [0, (rows - 1) * step_m], "step_m": step_m, "columns": columns, "rows": rows, "values": values,
-        "method": "joint", "levels": {"good": scale, "bad": 2.6 * scale},
+        "method": "joint", "height_m": 1.2, "least": known[0], "most": known[-1],
+        "scale": {"low": limits.low, "high": limits.high, "ticks": limits.ticks, "stops": COLOUR_STOPS},
     }  # fmt: skip

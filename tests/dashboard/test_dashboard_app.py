@@ -3,15 +3,21 @@
 import asyncio
 
 import pytest
-from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, fix
+from dashboard_builders import SITE, SITE_ID, SQUARE, fix
 from hypothesis import given
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from skyless.dashboard.app import MAX_PAGES, Services, make_app
+from skyless.dashboard.app import Services, make_app
 from skyless.dashboard.guard import AccessRules, Guard
-from skyless.dashboard.live import LiveSite
+from skyless.dashboard.live import (
+    GONE_S,
+    IDLE_S,
+    MAX_PAGES,
+    MAX_PAGES_PER_ADDRESS,
+    TooManyPagesError,
+)
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import Playback
 from skyless.mqtt import topics
@@ -20,13 +26,6 @@ TOKEN = "correct-horse-battery"
 HERE = "http://localhost:8080"
 SOCKET = "ws://localhost:8080/live"
 STRANGE_SOCKET = "ws://192.168.1.5:8080/live"
-
-
-@pytest.fixture
-def live():
-    live = LiveSite("here", "mqtt://broker:1")
-    live.attach(Wire(), SITE_ID)
-    return live
 
 
 @pytest.fixture
@@ -197,12 +196,13 @@ def test_the_live_stream(browser, live):
     with browser, browser.websocket_connect(SOCKET) as socket:
         assert socket.receive_json()["type"] == "hello"
         assert socket.receive_json()["type"] == "mqtt"
-        assert socket.receive_json()["type"] == "health"
+        kinds = [socket.receive_json()["type"] for _ in range(3)]
+        assert kinds == ["health", "condition", "log"]
         socket.send_text("ping")
         assert socket.receive_json() == {"type": "pong"}
         assert len(live.pages) == 1
         browser.portal.call(_fix_and_tick, live)
-        messages = [socket.receive_json() for _ in range(2)]
+        messages = [socket.receive_json() for _ in range(4)]  # health, condition, a line of the list, state
         assert [message["tags"][0][0] for message in messages if message["type"] == "state"] == ["t1"]
 
 
@@ -223,12 +223,46 @@ def test_a_page_that_went_away_is_forgotten(browser, live):
     assert not live.pages
 
 
-def test_there_is_an_end_to_the_number_of_pages(browser, live):
-    for _ in range(MAX_PAGES):
-        live.open_page()
-    with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET):
-        pass
+def test_one_page_too_many_is_closed_with_the_reason(browser, live, times):
+    pages = [live.open_page("testclient") for _ in range(MAX_PAGES_PER_ADDRESS)]
+    with browser.websocket_connect(SOCKET) as socket, pytest.raises(WebSocketDisconnect) as closed:
+        socket.receive_json()
+    assert (closed.value.code, closed.value.reason[:28]) == (1013, "too many pages are open: 100")
+    assert live.pages == set(pages)
+    live.open_page("10.0.0.7")  # another computer is not shut out
+
+
+def test_an_idle_page_makes_room(browser, live, times):
+    pages = [live.open_page("testclient") for _ in range(MAX_PAGES_PER_ADDRESS)]
+    times.move(IDLE_S - 1.0)
+    for page in pages[1:]:
+        live.keep_page(page)
+    times.move(2.0)
+    with browser.websocket_connect(SOCKET) as socket:
+        assert socket.receive_json()["type"] == "hello"
+        assert pages[0].closed
+        assert pages[0] not in live.pages
+        assert not any(page.closed for page in pages[1:])
+
+
+def test_all_computers_together_open_a_limited_number_of_pages(live, times):
+    for k in range(MAX_PAGES):
+        live.open_page(f"10.0.0.{k}")
+    with pytest.raises(TooManyPagesError, match=f"0 of this computer, {MAX_PAGES} in all"):
+        live.open_page("10.0.1.1")
+    times.move(IDLE_S)
+    live.open_page("10.0.1.1")
     assert len(live.pages) == MAX_PAGES
+
+
+def test_a_page_that_sends_nothing_for_minutes_is_closed(live, times):
+    silent, active = live.open_page(), live.open_page()
+    times.move(GONE_S - 1.0)
+    live.keep_page(active)
+    times.move(2.0)
+    live.tick()
+    assert (silent.closed, silent.reason, active.closed) == (True, "this page was idle", False)
+    assert live.pages == {active}
 
 
 def test_hello_holds_the_site(browser, live):

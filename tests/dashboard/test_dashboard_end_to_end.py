@@ -11,9 +11,16 @@ import time
 import httpx2 as httpx
 import msgspec
 import pytest
+import uvicorn
 import websockets
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix, truth
+from websockets.protocol import State
 
+from skyless.dashboard.app import Services, make_app
+from skyless.dashboard.guard import AccessRules
+from skyless.dashboard.live import IDLE_S, MAX_PAGES_PER_ADDRESS
+from skyless.dashboard.overlays import Overlays
+from skyless.dashboard.playback import Playback
 from skyless.mqtt import topics
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import ZonesMessage
@@ -67,8 +74,12 @@ async def walk(link, tags=1, step_s=0.05):
         await asyncio.sleep(step_s)
 
 
-def live(output):
-    return websockets.connect(output["page"].replace("http", "ws") + "live", max_size=None)
+def live_page(output):
+    return connect(output["page"].replace("http", "ws") + "live")
+
+
+def connect(address):
+    return websockets.connect(address, max_size=None)
 
 
 async def next_of(page, kind_of_message, /, **fields):
@@ -98,7 +109,7 @@ async def a_site_is_found_shown_and_watched(tmp_path):
     async with site(broker.address) as link:
         link.subscribe(topics.zone_event_topic(SITE_ID, "+"), lambda _, payload: events.append(json.loads(payload)), 1)
         link.subscribe(topics.zones_topic(SITE_ID), lambda _, payload: zones.append(payload), 1)
-        async with dashboard("--mqtt", str(broker.address)) as (output, process), live(output) as page:
+        async with dashboard("--mqtt", str(broker.address)) as (output, process), live_page(output) as page:
             hello = await next_of(page, "hello")
             shown = hello["site"] or (await next_of(page, "site"))["site"]
             assert shown["site"]["id"] == SITE_ID
@@ -128,7 +139,7 @@ async def a_site_is_found_shown_and_watched(tmp_path):
             assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
         async with (
             dashboard("--mqtt", str(broker.address), "--site-id", str(SITE_ID)) as (output, _),
-            live(output) as page,
+            live_page(output) as page,
         ):
             greeted = (await next_of(page, "hello"))["zones"]
             assert (greeted or (await next_of(page, "zones"))["zones"])[0]["id"] == "desk", "zones survive a restart"
@@ -150,7 +161,7 @@ async def a_page_that_does_not_read_delays_no_other(tmp_path):
         walking = asyncio.create_task(walk(link, tags=100))
         port = int(output["page"].rstrip("/").rsplit(":", 1)[1])
         unread = [await never_read(port) for _ in range(3)]
-        async with live(output) as page:
+        async with live_page(output) as page:
             await next_of(page, "state")
             began_s, count = time.monotonic(), 0
             while time.monotonic() < began_s + 4.0:
@@ -188,13 +199,41 @@ async def never_read(port):
 def test_without_a_broker_the_page_opens_and_shows_it():
     async def check():
         nobody = f"mqtt://127.0.0.1:{free_port()}"
-        async with dashboard("--mqtt", nobody) as (output, _), live(output) as page:
+        async with dashboard("--mqtt", nobody) as (output, _), live_page(output) as page:
             assert output["mqtt"] == nobody
             hello = await next_of(page, "hello")
             assert (hello["mqtt"], hello["site"]) == (False, None)
             assert await next_of(page, "mqtt") == {"type": "mqtt", "connected": False, "broker": nobody}
 
     asyncio.run(check())
+
+
+def test_idle_connections_shut_nobody_out_and_a_page_too_many_gets_the_reason(live, times):
+    async def check():
+        services = Services(live, Overlays(), Playback(None))
+        with socket.socket() as sock:
+            sock.bind(("127.0.0.1", 0))
+            config = uvicorn.Config(make_app(services, AccessRules()), ws="websockets-sansio", log_config=None)
+            server = uvicorn.Server(config)
+            serving = asyncio.create_task(server.serve(sockets=[sock]))
+            address = f"ws://127.0.0.1:{sock.getsockname()[1]}/live"
+            async with contextlib.AsyncExitStack() as stack:
+                await settled(lambda: server.started)
+                idle = [await stack.enter_async_context(connect(address)) for _ in range(MAX_PAGES_PER_ADDRESS)]
+                await settled(lambda: len(live.pages) == MAX_PAGES_PER_ADDRESS)
+                with pytest.raises(websockets.ConnectionClosed) as closed:
+                    async with connect(address) as refused:
+                        await refused.recv()
+                assert (closed.value.rcvd.code, closed.value.rcvd.reason[:28]) == (1013, "too many pages are open: 100")
+                times.move(IDLE_S)
+                newest = await stack.enter_async_context(connect(address))
+                assert (await next_of(newest, "hello"))["mqtt"] is False
+                await settled(lambda: any(page.state is State.CLOSED for page in idle))
+                assert len(live.pages) == MAX_PAGES_PER_ADDRESS
+                server.should_exit = True
+            await serving
+
+    asyncio.run(asyncio.wait_for(check(), 60.0))
 
 
 def test_other_machines_need_the_token_that_is_printed():

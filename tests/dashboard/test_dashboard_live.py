@@ -3,17 +3,19 @@
 import asyncio
 import json
 
+import msgspec
 import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status, truth
 from msgspec.structs import replace
 
 from skyless.dashboard.live import LiveSite
-from skyless.dashboard.zones import MAX_EVENTS, TAG_TIMEOUT_S
+from skyless.dashboard.zones import MAX_EVENTS, TAG_TIMEOUT_S, BadZonesError
 from skyless.mqtt import topics
-from skyless.mqtt.messages import ZoneEvent, ZonesMessage
+from skyless.mqtt.messages import PreparationMessage, SiteZones, ZoneEvent, ZonesMessage
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)
+HELLO = ("type", "version", "site", "events", "mqtt")
 EVENT = topics.zone_event_topic(SITE_ID, "desk")
 
 
@@ -35,7 +37,7 @@ def test_a_page_first_gets_hello(live, wire):
     wire.deliver(FIX, fix())
     messages = drained(live, live.open_page())
     assert messages[0]["type"] == "hello"
-    assert messages[0].keys() == {"type", "version", "site", "zones", "events", "mqtt"}
+    assert messages[0].keys() == {*HELLO, "zones", "other_zones", "zones_fault"}
     assert (messages[0]["site"], messages[0]["zones"], messages[0]["mqtt"]) == (None, [], False)
     assert of("mqtt", messages) == [{"type": "mqtt", "connected": False, "broker": "mqtt://broker:1"}]
     assert of("state", messages)[0]["tags"][0][0] == "t1"
@@ -51,6 +53,23 @@ def test_pages_are_sent_the_site_and_the_state_of_the_broker(live, wire):
     assert of("site", messages)[0]["site"]["simulated"] is True
     assert of("mqtt", messages)[0]["connected"] is True
     assert drained(live, live.open_page())[0]["site"]["site"]["id"] == SITE_ID
+
+
+def test_pages_are_sent_how_far_kernels_are_compiled_until_nothing_comes(live, wire, times):
+    topic = topics.preparation_topic(SITE_ID)
+    wire.deliver(topic, PreparationMessage(37, 120, 25.0, 1.0))
+    page = live.open_page()
+    assert of("preparation", drained(live, page))[0]["preparation"]["done"] == 37
+    wire.deliver(topic, b"")
+    assert of("preparation", drained(live, page)) == [{"type": "preparation", "preparation": None}]
+    wire.deliver(topic, PreparationMessage(38, 120, None, 1.0))
+    times.move(4.9)
+    live.tick()
+    assert of("preparation", drained(live, page))[0]["preparation"]["done"] == 38
+    times.move(0.2)  # the demo was killed
+    live.tick()
+    assert of("preparation", drained(live, page)) == [{"type": "preparation", "preparation": None}]
+    assert of("preparation", drained(live, live.open_page())) == []
 
 
 def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):
@@ -182,6 +201,87 @@ def test_zones_drawn_before_the_site_is_known_are_stored_later(times, wire):
     live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
     live.store_zones((SQUARE,))
     live.attach(wire, SITE_ID)
+    assert wire.topics() == [ZONES]
+
+
+def named(name):
+    return replace(SITE, site=replace(SITE.site, name=name))
+
+
+def kept(wire):
+    """The zones that the broker has now."""
+    return msgspec.json.decode(
+        [payload for topic, payload, *_ in wire.published if topic == ZONES][-1], type=ZonesMessage
+    )
+
+
+def test_a_site_does_not_show_the_zones_of_another_with_its_number(live, wire):
+    wire.deliver(topics.site_topic(SITE_ID), named("Hall"))
+    wire.deliver(ZONES, ZonesMessage((SQUARE,), "Lab"))
+    assert live.monitor.zones == ()
+    assert wire.topics() == [], "nothing is written before somebody draws"
+    page = live.open_page()
+    hello = drained(live, page)[0]
+    assert (hello["zones"], [other["site"] for other in hello["other_zones"]]) == ([], ["Lab"])
+    sofa = replace(SQUARE, id="sofa")
+    live.store_zones((sofa,), "Hall")
+    assert kept(wire) == ZonesMessage((sofa,), "Hall", (SiteZones("Lab", (SQUARE,)),))
+    wire.deliver(topics.site_topic(SITE_ID), named("Lab"))
+    assert live.monitor.zones == (SQUARE,)
+    assert of("zones", drained(live, page))[-1]["zones"][0]["id"] == "desk"
+    live.store_zones(())
+    assert kept(wire) == ZonesMessage((), "Lab", (SiteZones("Hall", (sofa,)),))
+    wire.deliver(topics.site_topic(SITE_ID), named("Hall"))
+    assert live.monitor.zones == (sofa,)
+
+
+def test_a_page_that_shows_another_site_does_not_store_its_zones(live, wire):
+    wire.deliver(topics.site_topic(SITE_ID), named("Hall"))
+    with pytest.raises(BadZonesError, match="'Lab', but 'Hall' is shown now"):
+        live.store_zones((SQUARE,), "Lab")
+    assert wire.topics() == []
+
+
+@pytest.mark.parametrize("site_first", [True, False])
+def test_zones_of_before_become_those_of_the_site_that_is_shown(live, wire, site_first):
+    messages = [(topics.site_topic(SITE_ID), named("Hall")), (ZONES, b'{"zones":[%s]}' % msgspec.json.encode(SQUARE))]
+    for topic, message in messages if site_first else messages[::-1]:
+        wire.deliver(topic, message)
+    assert live.monitor.zones == (SQUARE,)
+    assert kept(wire) == ZonesMessage((SQUARE,), "Hall")
+    wire.deliver(ZONES, kept(wire))
+    wire.deliver(topics.site_topic(SITE_ID), named("Lab"))
+    assert live.monitor.zones == ()
+    assert wire.topics() == [ZONES]
+
+
+def test_an_older_dashboard_does_not_lose_the_zones_of_other_sites(live, wire):
+    wire.deliver(topics.site_topic(SITE_ID), named("Hall"))
+    wire.deliver(ZONES, ZonesMessage((), "Hall", (SiteZones("Lab", (SQUARE,)),)))
+    wire.deliver(ZONES, b'{"zones":[%s]}' % msgspec.json.encode(SQUARE))
+    assert kept(wire) == ZonesMessage((SQUARE,), "Hall", (SiteZones("Lab", (SQUARE,)),))
+
+
+def test_named_zones_wait_for_the_site(live, wire):
+    wire.deliver(ZONES, ZonesMessage((SQUARE,), "Hall"))
+    assert live.monitor.zones == ()
+    wire.deliver(topics.site_topic(SITE_ID), named("Hall"))
+    assert live.monitor.zones == (SQUARE,)
+    assert wire.topics() == []
+
+
+def test_damaged_zones_at_the_broker_are_not_overwritten(live, wire):
+    wire.deliver(topics.site_topic(SITE_ID), named("Hall"))
+    wire.deliver(ZONES, b'{"zones": [{"id": ')
+    fault = drained(live, live.open_page())[0]["zones_fault"]
+    assert ZONES in fault
+    assert "\n" not in fault
+    with pytest.raises(BadZonesError, match="nothing was overwritten"):
+        live.store_zones((SQUARE,))
+    assert wire.topics() == []
+    wire.deliver(ZONES, b"")
+    assert drained(live, live.open_page())[0]["zones_fault"] is None
+    live.store_zones((SQUARE,))
     assert wire.topics() == [ZONES]
 
 

@@ -7,8 +7,9 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.dashboard.overlay_process import overlay_grids
-from skyless.dashboard.overlays import MAX_CELLS, NoOverlayError, Overlays, levels, overlay_task
+from skyless.dashboard.overlays import MAX_CELLS, NoOverlayError, Overlays, overlay_task
 from skyless.method_names import DEFAULT_METHOD, METHODS
+from skyless.planning.colours import COLOUR_STOPS
 from skyless.planning.columns import HDOP, PDOP, SIGMA
 from skyless.planning.predict import PlanSettings, Predictor
 from skyless.site.lab import lab_site
@@ -71,12 +72,6 @@ def test_the_methods_of_tags_are_predicted_each_as_itself():
     assert len({sigma[5] for sigma in sigmas}) == len(METHODS)
 
 
-def test_the_scale_reaches_from_the_best_to_what_is_bad():
-    assert levels([1.0, 1.1, None, 1.2]) == {"good": 1.0, "bad": 2.0}
-    assert levels([0.02, *[0.5] * 97, 100.0]) == {"good": 0.02, "bad": 0.5}
-    assert levels([None])["good"] < levels([None])["bad"]
-
-
 def get(overlays, *args):
     return asyncio.run(overlays.get(*args))
 
@@ -91,7 +86,9 @@ def test_one_process_answers_all_three_kinds():
     assert (sigma["x_m"], sigma["y_m"], sigma["columns"], sigma["rows"]) == ([0.5, 5.5], [0.5, 7.5], 6, 8)
     assert len(sigma["values"]) == 48
     assert sigma["method"] == "weighted"
-    assert sigma["levels"]["good"] < sigma["levels"]["bad"]
+    assert sigma["least"] <= sigma["scale"]["low"] < sigma["scale"]["high"]
+    assert sigma["scale"]["stops"] == COLOUR_STOPS
+    assert sigma["height_m"] == LAB.tags.height_m
     assert sigma["values"] == overlay_grids(overlay_task(LAB, None, "weighted", 1.0)).sigma
 
 

@@ -3,6 +3,7 @@
 import json
 
 import msgspec
+import page_fake_site as made_up
 import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, fix, truth
 from starlette.testclient import TestClient
@@ -13,7 +14,7 @@ from skyless.dashboard.live import LiveSite
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.mqtt import topics
-from skyless.mqtt.messages import ZonesMessage
+from skyless.mqtt.messages import WatchFinding, WatchMessage, ZonesMessage
 from skyless.recordings.mcap.recorder import McapFile, McapRecorder
 
 START_S = 1_700_000_000.0
@@ -113,7 +114,13 @@ def test_a_lower_rate_gives_fewer_states(folder):
 def test_nothing_outside_the_folder_is_read(folder, name):
     record(folder.parent / "secret.mcap", seconds=0.1)
     (folder / "link.mcap").symlink_to(folder.parent / "secret.mcap")
-    for read in (Playback(folder).summary, Playback(folder).floor_plan, Playback(None).summary):
+    opening = (
+        Playback(folder).summary,
+        Playback(folder).floor_plan,
+        Playback(folder).open_file,
+        Playback(None).summary,
+    )
+    for read in opening:
         with pytest.raises(NoRecordingError):
             read(name)
     assert [found.name for found in Playback(folder).recordings()] == ["first.mcap"]
@@ -140,9 +147,11 @@ def test_the_server_gives_recordings(folder):
     app = make_app(Services(live, Overlays(), Playback(folder)), AccessRules())
     browser = TestClient(app, base_url="http://localhost")
     (listed,) = browser.get("/api/recordings").json()
-    assert listed.keys() == {"name", "bytes", "start_unix_s", "duration_s", "complete"}
+    assert listed.keys() == {"name", "bytes", "start_unix_s", "duration_s", "complete", "site", "tags", "fixes"}
+    assert (listed["site"], listed["tags"], listed["fixes"]) == (SITE.site.name, 1, 101)
     summary = browser.get("/api/recordings/first.mcap").json()
-    assert summary.keys() == {"name", "site", "start_unix_s", "end_unix_s", "tags", "zones"}
+    keys = {"name", "site", "start_unix_s", "end_unix_s", "tags", "zones", "fix_spans_unix_s"}
+    assert summary.keys() == keys
     assert summary["site"]["site"]["id"] == SITE_ID
     states = browser.get("/api/recordings/first.mcap/states?from_s=1&to_s=2&rate_hz=20").json()["states"]
     assert [state["type"] for state in states] == ["state"] * 10
@@ -151,3 +160,88 @@ def test_the_server_gives_recordings(folder):
         assert browser.get(f"/api/recordings/first.mcap/states?{query}").status_code == 400
     for name in ("none.mcap", "..%2Fsecret.mcap", "%2e%2e", "%2Fetc%2Fpasswd"):
         assert browser.get(f"/api/recordings/{name}").status_code == 404
+        assert browser.get(f"/api/recordings/{name}/file").status_code == 404
+
+
+def test_a_recording_is_downloaded_with_its_name_as_far_as_it_is_written(folder):
+    record(folder / "old hall (1).mcap", seconds=1.0)
+    app = make_app(Services(LiveSite("here", "mqtt://broker:1"), Overlays(), Playback(folder)), AccessRules())
+    browser = TestClient(app, base_url="http://localhost")
+    answer = browser.get("/api/recordings/old%20hall%20(1).mcap/file")
+    assert answer.content == (folder / "old hall (1).mcap").read_bytes()
+    assert answer.headers["content-disposition"] == "attachment; filename*=utf-8''old%20hall%20%281%29.mcap"
+    assert answer.headers["content-length"] == str(len(answer.content))
+    growing = Playback(folder).open_file("first.mcap")
+    before = (folder / "first.mcap").read_bytes()
+    with (folder / "first.mcap").open("ab") as file:
+        file.write(b"more")
+    assert b"".join(growing.pieces()) == before, "as long as was announced, whatever is added meanwhile"
+
+
+def test_a_download_needs_the_token_as_everything_does(folder):
+    rules = AccessRules("correct-horse-battery", remote=True)
+    app = make_app(Services(LiveSite("here", "mqtt://broker:1"), Overlays(), Playback(folder)), rules)
+    stranger = TestClient(app, base_url="http://192.168.1.5:8080")
+    assert stranger.get("/api/recordings/first.mcap/file").status_code == 401
+    elsewhere = {"origin": "http://evil.example", "authorization": "Bearer correct-horse-battery"}
+    assert stranger.get("/api/recordings/first.mcap/file", headers=elsewhere).status_code == 403
+    mine = stranger.get("/api/recordings/first.mcap/file", params={"token": "correct-horse-battery"})
+    assert mine.status_code == 200
+
+
+def test_the_events_of_a_recording_are_those_that_a_live_page_would_have_listed(folder):
+    """Anchor 1 leads and is silent from 3 s on, 2 leads from 6 s on; t1 has an alert at 8 s, 2 has moved at 13 s."""
+    recorder = McapRecorder(McapFile(folder / "events.mcap"))
+
+    def take(topic, message, at_s):
+        recorder.add(topic, msgspec.json.encode(message), START_S + at_s)
+
+    for k in range(130):
+        at_s = k / 10
+        alert = "alert-limit-exceeded" if 8.0 <= at_s < 8.5 else "none"
+        take(topics.fix_topic(SITE_ID, "t1"), fix("t1", START_S + at_s, serial=k, hpl_m=0.5, alert=alert), at_s)
+        if k % 10 == 0:
+            for anchor in (1, 2):
+                leads = anchor == 1 if at_s < 3.0 else anchor == 2 and at_s >= 6.0
+                if anchor == 2 or at_s < 3.0:
+                    health = made_up.anchor_health(anchor, at_s, START_S + at_s)
+                    role = {"role": "master" if leads else "anchor", "term": k}
+                    take(topics.health_topic(SITE_ID, "anchor", anchor), health | role, at_s)
+    finding = WatchFinding("moved", (2,), 0.3, 0.01, START_S, "Anchor 2 has moved by 30 cm.")
+    take(topics.watch_topic(SITE_ID), WatchMessage(START_S + 13.0, "watching", (finding,), 3), 13.0)
+    recorder.file.close()
+    playback = Playback(folder)
+    found = playback.events("events.mcap")
+    assert found.complete
+    assert [(event.kind, event.name, round(event.unix_s - START_S)) for event in found.events] == [
+        ("anchor", "anchor/1", 6),
+        ("master", "anchor/2", 6),
+        ("alert", "tag/t1", 8),
+        ("alert", "tag/t1", 10),
+        ("watch", "anchor/2", 13),
+    ]
+    assert playback.events("events.mcap") is found, "it is read once"
+    with pytest.raises(NoRecordingError):
+        playback.events("../events.mcap")
+
+
+def test_the_summary_says_when_there_are_fixes(folder):
+    """Nothing for 3 s, fixes for 2 s, nothing for 5 s, fixes for 1 s; the first is known exactly."""
+    recorder = McapRecorder(McapFile(folder / "gaps.mcap"))
+
+    def take(topic, message, at_s):
+        recorder.add(topic, msgspec.json.encode(message), START_S + at_s)
+        recorder.file.flush()
+
+    for k in range(120):
+        at_s = k / 10
+        take(topics.truth_topic(SITE_ID), truth(START_S + at_s), at_s)
+        if 3.0 <= at_s < 5.0 or at_s >= 10.0:
+            take(topics.fix_topic(SITE_ID, "t1"), fix("t1", START_S + at_s, serial=k), at_s)
+    recorder.file.close()
+    spans = [[s - START_S for s in span] for span in Playback(folder).summary("gaps.mcap").fix_spans_unix_s]
+    assert spans == [pytest.approx([3.0, 4.9]), pytest.approx([10.0, 11.9])]
+    empty = McapRecorder(McapFile(folder / "empty.mcap"))
+    empty.add(topics.truth_topic(SITE_ID), msgspec.json.encode(truth(START_S)), START_S)
+    empty.file.close()
+    assert Playback(folder).summary("empty.mcap").fix_spans_unix_s == ()

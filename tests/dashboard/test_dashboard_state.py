@@ -10,7 +10,7 @@ from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
 ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y")
-FIELDS = (*POSITION, *ERRORS, "anchors_used", "chi2", "fix_unix_s", "hpl_m", "alert")
+FIELDS = (*POSITION, *ERRORS, "anchors_used", "chi2", "fix_unix_s", "hpl_m", "alert", "height_given", "std_z_m")
 
 
 def rows(state, since=0):
@@ -25,7 +25,28 @@ def test_a_row_has_the_fields_in_order():
     message = json.loads(state.state_since(0))
     assert message["type"] == "state"
     assert message["unix_s"] == pytest.approx(1000.0625, abs=1e-3)
-    expected = ("t1", 1.25, 2.5, 0.75, 0.5, -0.25, 4e-4, 1e-4, 2e-4, 0.01, None, None, None, 4, 2.5, 1000.0, None, None)
+    expected = (
+        "t1",
+        1.25,
+        2.5,
+        0.75,
+        0.5,
+        -0.25,
+        4e-4,
+        1e-4,
+        2e-4,
+        0.01,
+        None,
+        None,
+        None,
+        4,
+        2.5,
+        1000.0,
+        None,
+        None,
+        1,
+        None,
+    )
     assert message["tags"] == [list(expected)]
     state.add_fix(fix(velocity_mps=None), 0.0)
     assert rows(state)[0]["vx"] is None
@@ -36,6 +57,14 @@ def test_rows_hold_levels_and_alerts():
     for alert in ("none", "detected-excluded", None):
         state.add_fix(fix(hpl_m=0.123456, alert=alert), 0.0)
         assert (rows(state)[0]["hpl_m"], rows(state)[0]["alert"]) == (0.1235, alert)
+
+
+def test_rows_say_whether_the_height_was_given():
+    state = SiteState()
+    covariance = (4e-4, 0.0, 0.0, 0.0, 4e-4, 0.0, 0.0, 0.0, 9e-4)
+    for known, std_z_m in ((True, None), (False, 0.03)):
+        state.add_fix(fix(covariance_m2=covariance, height_known=known), 0.0)
+        assert (rows(state)[0]["height_given"], rows(state)[0]["std_z_m"]) == (int(known), std_z_m)
 
 
 def test_only_tags_with_a_newer_fix_are_sent_and_only_their_last():
@@ -94,24 +123,26 @@ def anchor_health(anchor):
 
 def test_health_holds_the_newest_of_every_node():
     state = SiteState()
-    assert json.loads(state.health_message({})) == {
+    assert json.loads(state.health_message({}, 1.0)) == {
         "type": "health",
         "anchors": [],
         "tags": [],
         "ether": None,
         "nodes": [],
         "dropped": {},
+        "ages": {"anchors": {}, "tags": {}, "ether": {}},
     }
     state.add_health("2", anchor_health(1), 0.0)
     state.add_health("2", anchor_health(2), 1.0)
     state.add_health("air", EtherHealth(0.0, 1.0, 5, 0, {}, {}, 0, 0), 1.0)
     state.add_status(status())
     state.add_status(status(online=False))
-    message = json.loads(state.health_message({"fix": 3}))
+    message = json.loads(state.health_message({"fix": 3}, 3.5))
     assert [anchor["anchor"] for anchor in message["anchors"]] == [2]
     assert message["ether"]["transmissions"] == 5
     assert [(node["name"], node["online"]) for node in message["nodes"]] == [("t1", False)]
     assert message["dropped"] == {"fix": 3}
+    assert message["ages"] == {"anchors": {"2": 2.5}, "tags": {}, "ether": {"air": 2.5}}
 
 
 def test_old_messages_expire_and_invented_names_do_not_fill_the_memory():
@@ -125,4 +156,4 @@ def test_old_messages_expire_and_invented_names_do_not_fill_the_memory():
     assert len(state.statuses) == MAX_NAMES
     state.expire(EXPIRY_S + 0.5)
     assert "old" not in {row["name"] for row in rows(state)}
-    assert json.loads(state.health_message({}))["anchors"] == []
+    assert json.loads(state.health_message({}, 1.0))["anchors"] == []

@@ -20,8 +20,9 @@ from skyless.dashboard.zones import (
     ZoneMonitor,
     publisher_rank,
     read_zones,
+    zones_of,
 )
-from skyless.mqtt.messages import Zone, ZoneEvent
+from skyless.mqtt.messages import Zone, ZoneEvent, ZonesMessage
 
 INSIDE, OUTSIDE = (2.0, 2.0, 1.0), (8.0, 2.0, 1.0)
 
@@ -191,7 +192,7 @@ def test_ids_are_unique_and_zones_not_too_many():
         read_zones(json.dumps({"zones": [GOOD, GOOD]}).encode())
     with pytest.raises(BadZonesError, match="101 zones"):
         read_zones(json.dumps({"zones": [GOOD | {"id": str(k)} for k in range(101)]}).encode())
-    assert read_zones(json.dumps({"zones": [GOOD, GOOD | {"id": "b"}]}).encode())[1].id == "b"
+    assert read_zones(json.dumps({"zones": [GOOD, GOOD | {"id": "b"}]}).encode()).zones[1].id == "b"
 
 
 EVENT = ZoneEvent("desk", "Desk", "t1", "enter", 1000.0, (1.0, 2.0, 3.0))
@@ -239,3 +240,22 @@ def test_the_same_event_twice_counts_once():
     queue = EventQueue()
     assert queue.add_published(EVENT)
     assert not queue.add_published(EVENT)
+
+
+SITES = st.sampled_from(["Hall", "Lab", "Yard"])
+
+
+@given(st.lists(st.tuples(SITES, st.booleans()), min_size=1, max_size=12))
+def test_every_site_of_a_number_keeps_its_zones(steps):
+    """Sites come and go; at some of them a zone is drawn; each finds what was drawn there last."""
+    message, drawn = ZonesMessage(()), {}
+    for count, (site, draws) in enumerate(steps):
+        message = zones_of(message, site)
+        assert message.zones == drawn.get(site, ())
+        if draws:
+            drawn[site] = (replace(SQUARE, id=f"z{count}"),)
+            message = ZonesMessage(drawn[site], site, message.others)
+    assert {message.site: message.zones} | {other.site: other.zones for other in message.others} == {
+        message.site: drawn.get(message.site, ()),
+        **{site: zones for site, zones in drawn.items() if site != message.site},
+    }

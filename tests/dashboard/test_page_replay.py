@@ -1,8 +1,11 @@
 """A recording is replayed: the map shows the time of the slider."""
 
+from pathlib import Path
+
 import page_fake_site as made_up
 import pytest
 from page_browser import until
+from page_fake_server import FIRST_FIX_S
 
 
 @pytest.fixture
@@ -50,7 +53,7 @@ def test_it_plays(replay):
 def test_the_slider_leads_anywhere(replay):
     page = replay.page
     page.click("#play")
-    for at_s in (70.0, 12.5, 13.0, 89.0, 0.0):
+    for at_s in (70.0, 12.5, 13.0, 89.0, 2.5):
         place_slider(page, at_s)
         assert page.evaluate("skyless.state.player.at_s") == at_s
         assert_shown(replay)
@@ -63,6 +66,95 @@ def test_it_goes_on_beyond_what_was_fetched_first_and_stops_at_the_end(replay):
     until(page, "!skyless.state.player.playing", timeout_s=15.0)
     assert page.evaluate("skyless.state.player.at_s") == 90.0
     assert_shown(replay)
+
+
+def paused_at(page, at_s):
+    until(page, "at => Math.abs(skyless.state.player.at_s - at) < 0.01 && !skyless.state.player.playing", arg=at_s)
+
+
+def test_it_begins_at_the_first_fix_and_shows_where_there_are_fixes(serve, visit):
+    shown = visit(serve())
+    page = shown.page
+    page.click("#tab-recordings")
+    page.click(".recording")
+    until(page, "skyless.state.player")
+    assert page.evaluate("skyless.state.player.at_s") == FIRST_FIX_S
+    until(page, "!skyless.state.player.waiting")
+    until(page, "skyless.replayed.all.get('forklift').count > 0")
+    assert shown.position("forklift", "replayed") is not None
+    spans = page.evaluate("""() => {
+      const box = document.querySelector(".spans").getBoundingClientRect();
+      const at = (x) => (90 * (x - box.left - 8)) / (box.width - 16);
+      const spans = [...document.querySelectorAll(".spans i")].map((span) => span.getBoundingClientRect());
+      return spans.map((span) => [at(span.left), at(span.right)]);
+    }""")
+    assert [round(at_s) for span in spans for at_s in span] == [2, 55, 60, 90]
+
+
+def test_a_replay_does_not_look_live(replay):
+    page = replay.page
+    mark = page.locator("#replay-mark")
+    assert mark.inner_text().startswith("Replay · recorded 2026-05-28")
+    assert page.locator("#pill").inner_text() == "Replay"
+    assert page.locator("#banner").is_hidden()
+    page.click("#tab-anchors")
+    assert page.locator("#panel-anchors tr.good").count() == 0, "no anchor is shown as if its health were known"
+    page.click("#back")
+    mark.wait_for(state="hidden")
+
+
+def test_events_have_marks_with_words_that_lead_to_them(replay):
+    """Events that are close share a mark; news of programs, and that an anchor is back, have none."""
+    page = replay.page
+    until(page, "document.querySelectorAll('.event-mark').length === 3")
+    page.keyboard.press("k")
+    names = page.evaluate("[...document.querySelectorAll('.event-mark')].map((mark) => mark.ariaLabel)")
+    assert names == [
+        "0:20.0 anchor 2 does not report any more; 0:20.4 anchor 4 is the master now, after anchor 2",
+        "0:50.0 tag tag-001: faulty anchor excluded",
+        "1:10.0 Anchor 7 has moved by 31 cm",
+    ]
+    page.hover(".event-mark >> nth=1")
+    assert page.locator(".bubble:visible").inner_text() == names[1]
+    page.click(".event-mark >> nth=1")
+    paused_at(page, 49.0)
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("document.activeElement.ariaLabel") == names[2]
+    page.mouse.move(0, 0)
+    assert page.locator(".bubble:visible").inner_text() == names[2]
+    page.keyboard.press("Enter")
+    paused_at(page, 69.0)
+    page.click("#event-back")
+    paused_at(page, 49.0)
+    page.keyboard.press("[")
+    paused_at(page, 19.4)
+    page.click("#event-next")
+    paused_at(page, 49.0)
+
+
+def test_a_recording_is_downloaded_under_its_name(replay):
+    for link in ("#download", "#panel-recordings a"):
+        with replay.page.expect_download() as found:
+            replay.page.click(link)
+        assert found.value.suggested_filename == "walk.mcap"
+        assert Path(found.value.path()).read_bytes() == b"recorded"
+
+
+def test_keys_step_and_change_the_speed(replay):
+    page = replay.page
+    place_slider(page, 30.0)
+    page.keyboard.press(",")
+    until(page, "!skyless.state.player.playing")
+    at_s = page.evaluate("skyless.state.player.at_s")
+    for key in ("5", ".", ".", ","):
+        page.keyboard.press(key)
+    paused_at(page, 45.1)
+    assert at_s < 45.0
+    page.keyboard.press(">")
+    until(page, "document.getElementById('speed').value === '2'")
+    page.keyboard.press("<")
+    page.keyboard.press("<")
+    until(page, "document.getElementById('speed').value === '0.5'")
 
 
 def test_keys_move_the_slider(replay):

@@ -1,6 +1,8 @@
 """Zones are drawn with mouse, finger and keyboard, named, moved, deleted; events are listed."""
 
+import json
 import time
+from pathlib import Path
 
 import pytest
 from page_browser import until
@@ -127,3 +129,48 @@ def test_events_are_listed_the_newest_first(hall):
     lines = visit.page.locator("#events li").all_inner_texts()
     assert "left Dock" in lines[0]
     assert "entered Dock" in lines[1]
+
+
+def test_zones_of_another_site_are_not_shown_but_can_be_copied(hall):
+    server, visit = hall
+    page = visit.page
+    door = {**DOCK, "name": "Door"}
+    server.send({"type": "zones", "zones": [], "other_zones": [{"site": "Lab", "zones": [door]}], "zones_fault": None})
+    page.click("#tab-zones")
+    page.wait_for_selector("text=Site Lab: 1 zone")
+    assert page.evaluate("skyless.state.zones.length") == 0
+    page.click("text=Copy here")
+    assert wait_for_put(server) == [door]
+    assert server.stored[0]["site"] == "Hall 7", "zones are stored for the site that the page shows"
+
+
+def test_zones_that_the_broker_keeps_and_nobody_can_read_are_not_drawn_over(hall):
+    server, visit = hall
+    fault = "the zones that the broker keeps at skyless/v1/7/zones cannot be read: this is no list of zones"
+    server.send({"type": "zones", "zones": [], "other_zones": [], "zones_fault": fault})
+    visit.page.click("#tab-zones")
+    visit.page.wait_for_selector(f"text=T{fault[1:]}.")
+    assert visit.page.locator("#add-zone").is_disabled()
+    server.send({"type": "zones", "zones": [], "other_zones": [], "zones_fault": None})
+    visit.page.wait_for_selector("#add-zone:enabled")
+
+
+def test_zones_are_exported_and_imported(hall, tmp_path):
+    server, visit = hall
+    page = visit.page
+    page.click("#tab-zones")
+    with page.expect_download() as found:
+        page.click("text=Export")
+    assert found.value.suggested_filename == "zones Hall 7.json"
+    file = tmp_path / "zones.json"
+    file.write_bytes(Path(found.value.path()).read_bytes())
+    assert json.loads(file.read_bytes()) == {"zones": [DOCK], "site": "Hall 7"}
+    page.set_input_files("#panel-zones input[type=file]", file)
+    first, second = wait_for_put(server)
+    assert first == DOCK
+    assert second == {**DOCK, "id": second["id"]}
+    assert second["id"] != "dock"
+    file.write_text("no")
+    page.set_input_files("#panel-zones input[type=file]", file)
+    page.wait_for_selector("text=zones.json holds no zones.")
+    assert len(server.stored) == 1

@@ -1,5 +1,6 @@
 """The outbox: bounded whatever happens, nothing of QoS 1 lost within its bounds, and every loss counted."""
 
+import math
 from collections import Counter
 
 import pytest
@@ -24,7 +25,7 @@ class Broker:
         self.number = 0
 
     def take(self):
-        message = self.box.next_message()
+        message = self.box.next_message(0.0)
         if message is None:
             return None
         self.number += 1
@@ -143,4 +144,28 @@ def test_a_topic_that_a_broker_would_not_take_is_dropped(topic):
     box = Outbox(Limits())
     box.add(topic, b"", 1, retain=False)
     assert box.dropped == 1
-    assert box.next_message() is None
+    assert box.next_message(0.0) is None
+
+
+@given(st.lists(st.tuples(st.sampled_from("ab"), st.floats(0.0, 1.0), st.floats(0.0, 1.0)), max_size=30))
+def test_what_has_waited_too_long_is_dropped_and_counted_and_never_sent(steps):
+    """Times pass; a message is put in that is good for some time, or one is taken."""
+    box, now_s, got = Outbox(Limits()), 0.0, 0
+    for topic, pass_s, good_s in steps:
+        box.add(topic, b"", 0, retain=False, until_s=now_s + good_s)
+        now_s += pass_s
+        message = box.next_message(now_s)
+        if message is not None:
+            assert message.until_s >= now_s
+            got += 1
+    assert box.next_message(math.inf) is None  # all have become too old
+    assert len(steps) == got + box.dropped
+    assert box.late <= box.dropped
+
+
+def test_a_message_without_an_end_waits_as_long_as_it_has_to():
+    box = Outbox(Limits())
+    for qos, retain in ((0, False), (1, False), (1, True)):
+        box.add(f"a{qos}{retain}", b"", qos, retain=retain)
+    assert [box.next_message(1e9).qos for _ in range(3)] == [1, 1, 0]
+    assert box.late == 0

@@ -86,6 +86,11 @@ def receptions(seconds, seed=1):
     return receptions_of(LAB.id, seconds, seed=seed)
 
 
+def undated(heard):
+    """Receptions of a radio that does not know when they came, so that none is too old."""
+    return [Reception(reception.frame, reception.rx_ticks, None, reception.diagnostics) for reception in heard]
+
+
 def receptions_of(site_id, seconds, *, later_s=0.0, seed=1):
     """The same of a lab with another identifier on the air, and so much later by the host's clock and the counter."""
     site = replace(LAB, id=site_id)

@@ -10,8 +10,9 @@ from node_stage import LAB, FakeRadio, play, receptions
 from skyless.air.codec import decode
 from skyless.constants import TICK_RATE_HZ
 from skyless.master_election import SILENT_SUPERFRAMES
-from skyless.nodes.anchor import ASK_AGAIN_S, LEAD_S, LOST_ANSWER_S, AnchorNode
+from skyless.nodes.anchor import ASK_AGAIN_S, LEAD_S, LOST_ANSWER_S, AnchorNode, TransmissionCount
 from skyless.radios.interface import Gone, Late, Restarted, Sent
+from skyless.site.slots import superframe_ticks_of
 from skyless.ticks import difference, wrap
 
 SUPERFRAME_S = 6 * 2.5e-3
@@ -157,3 +158,20 @@ def test_nothing_goes_on_after_it_was_stopped():
         assert len(radio.transmissions) == sent
 
     play(main())
+
+
+def test_transmissions_that_were_passed_over_are_missed_too():
+    step = superframe_ticks_of(LAB)
+    count = TransmissionCount(LAB)
+    assert count.drain() == 0.0
+    slots = [0, 1, 2, 5, 6, 7]  # two were passed over
+    for before, after in itertools.pairwise(slots):
+        count.plan(wrap(2**40 - 3 * step + before * step))
+        count.sent += after > 0
+    count.plan(wrap(2**40 - 3 * step + slots[-1] * step + 1000))
+    assert (count.sent, count.missed) == (5, 2)
+    assert count.drain() == 2 / 7
+    assert count.drain() == 0.0
+    count.plan(None)  # it does not know its slots, as at its start
+    count.plan(wrap(100 * step))
+    assert count.drain() == 0.0

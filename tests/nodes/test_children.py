@@ -6,6 +6,7 @@ import re
 import signal
 import sys
 
+import pytest
 from mqtt_brokers import free_port, until
 
 from skyless.nodes import children
@@ -36,7 +37,7 @@ def test_a_program_that_is_killed_is_started_again_and_logged():
         await until(lambda: child.pid is not None and child.pid != first)
         second = child.pid
         assert child.starts == 2
-        assert said == ["air ended (signal 9): no message; started again"]
+        assert said == ["air ended (signal 9); it wrote no message; started again"]
         assert not alive(first)
         assert alive(second)
         await stop(task)
@@ -65,13 +66,38 @@ def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last_lines
                 break
             await sleep(0.01)
         await stop(task)
-        assert all(
-            re.fullmatch(r"air ended \(exit code 2\): skyless: .*/nowhere.toml.*; started again", s) for s in said
-        )
+        expected = r'air ended \(exit code 2\); its last message: "skyless: .*/nowhere.toml.*"; started again'
+        assert all(re.fullmatch(expected, line) for line in said)
 
     asyncio.run(main())
     assert waits[:3] == sorted(set(waits[:3]))
     assert waits[0] >= 0.2
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("print('tag 2: listening', file=sys.stderr)", 'its last message: "tag 2: listening"'),
+        (r"sys.stderr.write('begun\ntag 2: rece')", 'its last message, unfinished: "tag 2: rece"'),
+        (r"sys.stderr.write('tag 2: listening\n\n  ')", 'its last message: "tag 2: listening"'),
+        ("pass", "it wrote no message"),
+    ],
+)
+@pytest.mark.parametrize("is_held", [False, True])
+def test_what_a_killed_program_wrote_last_is_not_taken_for_why_it_ended(monkeypatch, code, message, is_held):
+    """Also where it dies in the middle of a line, or its own child holds its standard error open."""
+
+    async def main():
+        said = []
+        hold = "import subprocess; subprocess.Popen(['sleep', '5'])" if is_held else "pass"
+        end = "sys.stderr.flush(); os.kill(os.getpid(), 9)"
+        monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", f"import os, sys; {hold}; {code}; {end}"))
+        task = asyncio.ensure_future(Child(Program("tag 2", ()), said.append).run())
+        await until(lambda: said, 10)
+        assert said[0] == f"tag 2 ended (signal 9); {message}; started again"
+        await stop(task)
+
+    asyncio.run(main())
 
 
 def test_a_program_whose_own_child_holds_its_pipe_is_still_seen_to_die(monkeypatch):
@@ -84,7 +110,7 @@ def test_a_program_whose_own_child_holds_its_pipe_is_still_seen_to_die(monkeypat
         child = Child(Program("page", ()), said.append)
         task = asyncio.ensure_future(child.run())
         await until(lambda: said, 10)
-        assert said[0] == "page ended (exit code 0): gone; started again"
+        assert said[0] == 'page ended (exit code 0); its last message: "gone"; started again'
         await stop(task)
 
     asyncio.run(main())

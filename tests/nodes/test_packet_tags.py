@@ -1,5 +1,7 @@
 """Tags on sniffers: packets of a simulated TDoA3 system in, fixes and health out."""
 
+import math
+
 import msgspec
 import numpy as np
 import pytest
@@ -26,11 +28,13 @@ def packets():
 def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_again(packets):
     published, said = [], []
     (radio,) = open_sniffers("sniffer:/dev/nothing", ("drone",))
-    node = PacketTagNode(SETTINGS, radio, published.append, said.append)
+    now_s = 100.0
+    node = PacketTagNode(SETTINGS, radio, published.append, said.append, lambda: now_s)
     node.fix_log.unix_less_host_s = 0.0
     node.on_event(Restarted())
     first = node.tracking
     for packet in packets:
+        now_s = packet.host_s
         node.on_event(packet)
     late = [fix for fix in published if fix.unix_s > 102.0]
     assert len(late) > 400
@@ -45,6 +49,7 @@ def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_again(packets
     assert node.tracking is not first
     assert node.drops == drops
     for packet in packets:
+        now_s = packet.host_s
         node.on_event(msgspec.structs.replace(packet, rx_ticks=(packet.rx_ticks + 2**39) % 2**40))
     assert node.fix_log.serial > fixes + 400
     assert said == ["tag drone: listening", "tag drone: pulled out; still looking for it", "tag drone: listening again"]
@@ -56,8 +61,9 @@ class Link:
     def __init__(self):
         self.counters = Counters(1, 2, 3)
         self.told = []
+        self.late = 0
 
-    def publish(self, topic, message, qos=0, retain=False):
+    def publish(self, topic, message, qos=0, retain=False, until_s=math.inf):
         assert retain is isinstance(message, SiteMessage)
         self.told.append((topic, message))
 
@@ -76,9 +82,9 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     )
     one, _ = tags.nodes
     one.radio.counters["malformed-line"] += 3
-    one.on_event(Packet(1.0, 77, 0, 0, 0, ()))
+    one.on_event(Packet(None, 77, 0, 0, 0, ()))
     for packet in packets:
-        one.on_event(packet)
+        one.on_event(msgspec.structs.replace(packet, host_s=None))
     tags._publish_health()
     (fix_topic, fix), *_, (site_topic, told), (health_topic, health) = links[0].told
     assert (site_topic, told.site.id, told.simulated) == ("skyless/v1/7/site", 7, False)

@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 from msgspec.structs import replace
-from node_stage import LAB, FakeRadio, receptions
+from node_stage import LAB, FakeRadio, receptions, undated
 
 import masterless_world as hall
 from skyless.air.masterless_packets import Packet
@@ -15,7 +15,7 @@ from skyless.nodes.tag import TagNode, TagSettings
 from skyless.radios.interface import Gone, Restarted
 from skyless.radios.serial.foreign_radios import ListenerRadio, SnifferRadio
 
-HEARD = receptions(1.0)
+HEARD = undated(receptions(1.0))
 
 
 class Watched:
@@ -166,7 +166,7 @@ def test_a_sniffer_whose_anchors_are_not_in_the_table_logs_it():
     node.on_event(Restarted())
     node.check_reception(999.0)
     for number in range(20):
-        node.on_event(Packet(1000.0 + 0.01 * number, 77, number * 10**9, number, 5, ()))
+        node.on_event(Packet(None, 77, number * 10**9, number, 5, ()))
     looks(node)
     assert "20 frames have come; most counted: unknown-anchor (20)" in logged[1]
 

@@ -23,7 +23,7 @@ from skyless.mqtt.topics import site_topic
 from skyless.nodes.process import end_with_parent
 from skyless.nodes.tag import Tags, TagSettings
 from skyless.recordings.mcap.recording import McapRecording
-from skyless.replay.site import SiteReplay
+from skyless.replays.site import SiteReplay
 
 SECONDS = 30.0
 PLACES = ((3.0, 4.0, 0.0), (2.0, 2.0, 0.0))

@@ -19,11 +19,16 @@ HEARD = receptions(6.0)
 class Bench:
     def __init__(self, **settings):
         self.published, self.said = [], []
-        self.node = TagNode(TagSettings(**settings), FakeRadio("t1"), self.published.append, self.said.append)
+        self.now_s = 0.0
+        self.node = TagNode(
+            TagSettings(**settings), FakeRadio("t1"), self.published.append, self.said.append, clock=lambda: self.now_s
+        )
         self.node.fix_log.unix_less_host_s = 1e9
 
     def hear(self, heard):
+        """Receptions that are processed as soon as they have ended."""
         for reception in heard:
+            self.now_s = self.now_s if reception.host_s is None else reception.host_s
             self.node.on_event(reception)
 
 
@@ -99,7 +104,7 @@ def test_what_is_done_before_a_reception_sees_the_receiver_before_it():
     def before(receiver, reception, serial):
         seen.append((receiver.counters["heard"], reception, serial))
 
-    node = TagNode(TagSettings(), FakeRadio("t1"), lambda fix: None, lambda line: None, before)
+    node = TagNode(TagSettings(), FakeRadio("t1"), lambda fix: None, lambda line: None, before, lambda: 0.0)
     for reception in HEARD[:300]:
         node.on_event(reception)
     assert [reception for _, reception, _ in seen] == HEARD[:300]
@@ -130,6 +135,7 @@ def test_it_listens_until_it_is_cancelled():
         task = asyncio.ensure_future(bench.node.run())
         await asyncio.sleep(0)
         for reception in HEARD[:50]:
+            bench.now_s = reception.host_s
             bench.node.radio.listener(reception)
         task.cancel()
         await asyncio.wait([task])

@@ -3,7 +3,7 @@
 import asyncio
 
 import pytest
-from node_stage import LAB, FakeRadio, receptions_of
+from node_stage import LAB, FakeRadio, receptions_of, undated
 
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import Counters, FixMessage, SiteMessage, TagHealth
@@ -16,6 +16,8 @@ from skyless.radios.interface import Restarted
 class FakeLink:
     made = None
     counters = Counters(0, 0, 0)
+
+    late = 0
 
     def __init__(self, address, name, *, site, kind, **_):
         self.name, self.site, self.kind = name, site, kind
@@ -89,14 +91,14 @@ def test_the_link_comes_with_the_site_and_goes_with_it(links):
         await settled()
         tag.publish_health(0.1, 1)
         assert links == []  # nobody to tell it to
-        for reception in receptions_of(LAB.id, 2.0):
+        for reception in undated(receptions_of(LAB.id, 2.0)):
             tag.node.on_event(reception)
         await settled()
         (first,) = links
         assert (first.name, first.site, first.kind, first.state) == ("t1", 1, "tag", "running")
         assert {topic for topic, _ in first.published} == {"skyless/v1/1/tag/t1/fix"}
         assert all(isinstance(message, FixMessage) for _, message in first.published)
-        for reception in receptions_of(9, 2.0, later_s=10.0):
+        for reception in undated(receptions_of(9, 2.0, later_s=10.0)):
             tag.node.on_event(reception)
         await settled()
         first, second = links
@@ -119,7 +121,7 @@ def test_the_link_comes_with_the_site_and_goes_with_it(links):
 def test_without_a_broker_it_works_and_publishes_nothing(links):
     async def main():
         tag = Tag(TagSettings(), FakeRadio("t1"), None, lambda line: None)
-        for reception in receptions_of(LAB.id, 2.0):
+        for reception in undated(receptions_of(LAB.id, 2.0)):
             tag.node.on_event(reception)
         tag.publish_health(0.1, 1)
         tag.publish_receptions()

@@ -249,22 +249,28 @@ def test_what_a_process_does_not_read_is_counted_and_costs_the_others_nothing():
     in_loop(play)
 
 
-def test_an_ether_that_was_stopped_lets_true_time_stand_still_meanwhile():
+def test_an_ether_that_was_stopped_is_in_the_present_at_once_and_has_missed_what_should_have_been_sent():
     def play():
         stage = Stage()
         sender, session = stage.join("anchor", "1")
         tag, _ = stage.join("tag", "tag1")
         stage.pass_time(1.0)
-        stage.send(sender, session, ahead_s=5e-3)
+        before = stage.send(sender, session, ahead_s=2e-3)
+        stage.pass_time(5e-3)
+        missed = stage.send(sender, session, ahead_s=5e-3)
         stage.now_s += 2.0
         stage.ether.advance()
         health = stage.ether.health(0.0)
         assert health.stalls == 1
-        assert health.simulated_s == pytest.approx(1.0, abs=1e-6)
-        assert tag.of(Arrival) == []
+        assert health.simulated_s == pytest.approx(3.005, abs=1e-6)
+        assert (health.transmissions, health.late, health.missed_share) == (1, 1, 0.5)
+        assert sender.of(Done) == [Done(0, before, late=False), Done(0, missed, late=True)]
+        stage.send(sender, session, ahead_s=2e-3)
         stage.pass_time(10e-3)
-        assert len(tag.of(Arrival)) == 1
-        assert stage.ether.health(0.0).stalls == 1
+        assert len(tag.of(Arrival)) == 2
+        health = stage.ether.health(0.0)
+        assert (health.stalls, health.transmissions, health.missed_share) == (1, 2, 0.0)
+        assert tag.of(Arrival)[-1].host_s == pytest.approx(stage.now_s, abs=10e-3)
 
     in_loop(play)
 

@@ -9,7 +9,7 @@ import pytest
 import synthetic_recordings as synthetic
 from skyless.errors import ConfigurationError
 from skyless.evaluation.judge import Judge
-from skyless.replay.captures import Replay, ReplayRequest
+from skyless.replays.captures import Replay, ReplayRequest
 
 MUTATIONS = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
 PER_FILE = 100

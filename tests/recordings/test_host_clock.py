@@ -13,7 +13,7 @@ from skyless.mqtt import topics
 from skyless.mqtt.messages import FixMessage, ReceptionsMessage, TrueMotion, TruthMessage
 from skyless.recordings.mcap.host_clock import HostClock
 from skyless.recordings.mcap.recording import McapRecording
-from skyless.replay.site import SiteReplay
+from skyless.replays.site import SiteReplay
 
 _STEP_S = 0.02
 

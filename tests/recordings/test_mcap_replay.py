@@ -14,7 +14,7 @@ from skyless.method_names import METHODS
 from skyless.mqtt.messages import ReceptionsMessage
 from skyless.positioning.integrity import Alert, IntegrityRequirement
 from skyless.recordings.mcap.recording import McapRecording
-from skyless.replay.site import SiteReplay
+from skyless.replays.site import SiteReplay
 
 
 def replayed(path, **options):

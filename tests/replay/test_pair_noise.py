@@ -8,7 +8,7 @@ import pytest
 from skyless.air.masterless_packets import PairTdoa
 from skyless.evaluation.judge import Judge
 from skyless.recordings.truth import Truth
-from skyless.replay.captures import MIN_PAIR_DIFFERENCES, MOST_PAIRS, ROWS_PER_PAIR, NoiseByPair
+from skyless.replays.captures import MIN_PAIR_DIFFERENCES, MOST_PAIRS, ROWS_PER_PAIR, NoiseByPair
 
 ANCHORS_M = {1: (0.0, 0.0, 0.0), 2: (8.0, 0.0, 1.0), 3: (0.0, 6.0, 2.0)}
 

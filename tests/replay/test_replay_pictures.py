@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from skyless.replay.plot import draw
+from skyless.replays.plot import draw
 
 
 def rows(count, *, truth):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.kernels.compiled import cores
+from skyless.kernels.processors import cores
 from skyless.site.lab import ideal_lab_site
 from skyless.studies.efficiency import run_chunk, summary
 from skyless.studies.episodes import Case, draw_episode

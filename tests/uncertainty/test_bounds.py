@@ -7,7 +7,7 @@ import pytest
 
 from dense_covariance import position_covariance
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.kernels.compiled import cores
+from skyless.kernels.processors import cores
 from skyless.positioning.methods.snapshots import bracketed_covariance, literal_covariance
 from skyless.site.lab import ideal_lab_site
 from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path

@@ -19,7 +19,7 @@ from skyless.air.reception import Reception
 from skyless.bench.runs import BENCH_ANCHORS_M, BENCH_NODES, JointRuns, Run
 from skyless.evaluation.fleet import world_of
 from skyless.kernels.arrays import Array
-from skyless.kernels.compiled import cores
+from skyless.kernels.processors import cores
 from skyless.positioning.methods.locate import PseudorangeSolution, locate_pseudoranges
 from skyless.receiver import Receiver
 from skyless.simulation.impairments import lab_impairments

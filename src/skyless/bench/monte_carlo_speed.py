@@ -10,7 +10,7 @@ from numpy.random import Generator
 
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Array
-from skyless.kernels.compiled import cores
+from skyless.kernels.processors import cores
 from skyless.paper.monte_carlo import Quantity, draw_moments
 from skyless.uncertainty.chain import Chain
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
 from cyclopts import App
 
@@ -18,17 +18,12 @@ from skyless.cli.common.options import (
 )
 from skyless.cli.common.output import console, number, print_json, write_file
 from skyless.cli.common.progress import status
-from skyless.cli.common.recording_inputs import flight_height, is_mcap, known_anchors, known_truth
+from skyless.cli.common.recording_inputs import is_mcap, lever_arm
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.survey.result import SurveyedAnchor
-    from skyless.survey.tags.estimate import CalibrationEstimate
     from skyless.survey_inputs.run import Calibrated
     from skyless.survey_inputs.samples import First, Stay
-
-_MANY_OUTLIERS: Final = 0.05
-_UNEXPLAINED_SHARE: Final = 0.5
 
 app = App(
     name="calibrate",
@@ -84,6 +79,8 @@ def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) ->
     file
         The recording, plain or gzip.
     """
+    from skyless.replays.inputs import flight_height, known_anchors, known_truth
+    from skyless.survey_inputs.report import calibration_report
     from skyless.survey_inputs.run import CalibrationRequest, calibrate_capture, calibrate_site
 
     check_output("out", asked.out, file, asked.truth)
@@ -99,7 +96,7 @@ def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) ->
         check_left_out({"tag": asked.tag}, "it is for recordings of skyless record")
     known = None
     if not asked.at and not (own and asked.truth is None):
-        known = known_truth(file, asked.truth, asked.lever_arm, asked.format, asked.listener)
+        known = known_truth(file, asked.truth, lever_arm(asked.lever_arm), asked.format, asked.listener)
     with status("calibrating"):
         if own:
             request = CalibrationRequest(file, stays, known, asked.above, beginning, tag=asked.tag)
@@ -115,7 +112,7 @@ def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) ->
     if asked.out is not None:
         _write(done, asked.anchors, asked.site, asked.out)
     if asked.json:
-        print_json(_report(done, asked.out))
+        print_json({**calibration_report(done), "written": asked.out})
     else:
         _show(done, asked.out)
 
@@ -194,37 +191,16 @@ def _first(text: str | None) -> "First":
 
 def _write(done: "Calibrated", anchors: Path | None, site: Path | None, out: Path) -> None:
     """Write the table or site file with the calibration in it. Raises SkylessError."""
-    if site is not None and done.site is not None:
-        from skyless.site.rewrite import with_tx_delays
+    from skyless.survey_inputs.report import corrected_text
 
-        delays_ticks = {anchor: new for anchor, (_, new) in done.tx_delays_ticks().items()}
-        text = with_tx_delays(site.read_bytes().decode(), delays_ticks, site)
-    else:
-        from skyless.recordings.anchor_table import calibrated_table, new_table
-
-        known = done.estimate.calibration()
-        text = new_table(done.samples.anchors_m, known) if anchors is None else calibrated_table(anchors, known)
-    write_file(out, text.encode())
-
-
-def _report(done: "Calibrated", out: Path | None) -> dict[str, Any]:
-    """The report as one object."""
-    import msgspec
-
-    return {
-        "format": done.format,
-        **msgspec.to_builtins(done.estimate),
-        "delays": [] if done.survey is None else [_delay(one) for one in done.survey.anchors],
-        "tx_antenna_delay_ticks": {str(anchor): new for anchor, (_, new) in done.tx_delays_ticks().items()},
-        "drops": done.samples.drops,
-        "notes": _notes(done.estimate) + _survey_notes(done),
-        "written": out,
-    }
+    write_file(out, corrected_text(done, anchors, site).encode())
 
 
 def _show(done: "Calibrated", out: Path | None) -> None:
     """Show the report as a table."""
     from rich.table import Table
+
+    from skyless.survey_inputs.report import calibration_notes
 
     found, delays = done.estimate, done.tx_delays_ticks()
     names = [
@@ -256,35 +232,9 @@ def _show(done: "Calibrated", out: Path | None) -> None:
     if found.slope_m is not None:
         slope = f"{found.slope_m:.3f} ± {number(found.slope_std_m)} m while the range grows by the factor e"
         screen.print(f"range bias (received power): {slope}")
-    for note in _notes(found) + _survey_notes(done):
+    for note in calibration_notes(done):
         screen.print(f"note: {note}", markup=False)
     for reason, count in done.samples.drops.items():
         screen.print(f"left out: {count} × {reason}")
     if out is not None:
         screen.print(f"wrote {out}", markup=False)
-
-
-def _delay(one: "SurveyedAnchor") -> dict[str, Any]:
-    return {"anchor": one.id, "delay_m": one.delay_m, "std_m": one.delay_std_m}
-
-
-def _survey_notes(done: "Calibrated") -> list[str]:
-    """What the survey says about the delays."""
-    found = done.survey
-    if found is None:
-        return []
-    return [*([] if found.unchecked is None else [found.unchecked]), *found.not_determined, *found.notes]
-
-
-def _notes(found: "CalibrationEstimate") -> list[str]:
-    """What the user should know."""
-    notes = [f"anchor {one.anchor} is not determined: {one.reason}" for one in found.anchors if one.reason]
-    if found.rejected > _MANY_OUTLIERS * (found.used + found.rejected):
-        part = found.rejected / (found.used + found.rejected)
-        notes.append(f"{part:.0%} of the differences are outliers: calibrate where every anchor is in sight")
-    if (found.loop_m or 0.0) > _UNEXPLAINED_SHARE * (found.noise_m or 0.0):
-        notes.append(
-            f"pairs of anchors remain {found.loop_m:.3f} m off, which no constants explain: something may stand "
-            "between anchors or in the tag's way"
-        )
-    return notes

@@ -21,6 +21,7 @@ _GROUPS: Final = {
         # name, module below skyless.cli (imported only when it is called), what it does
         ("demo", "nodes.demo", "Show a site and walking tags in real time: nothing to connect, nothing to write."),
         ("simulate", "simulate", "Run a site in the simulated world and judge it against the truth."),
+        ("warm", "warm", "Compile all kernels ahead, so that no later start has to."),
     ),
     "Set up and check a site": (
         ("site", "site", "Write and check site files."),

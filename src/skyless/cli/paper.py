@@ -44,9 +44,10 @@ def paper(
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.paper.plan import plan_of
     from skyless.paper.run import write_report
+    from skyless.preparation.parts import LAB
 
     started_s = time.perf_counter()
-    with loading_kernels():
+    with loading_kernels(*LAB):
         compile_kernels()
     try:
         with progress_bar("simulating the paper", 1.0) as bar:

@@ -10,15 +10,8 @@ from cyclopts.validators import Number
 from skyless.cli.common.options import Positive, Seed, check_method, check_output, finite_numbers, options
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import progress_bar
-from skyless.cli.plan_output import report, show, write_files, write_site
-from skyless.cli.plan_slots import (
-    conflicts_of,
-    described,
-    show_slots,
-    slot_report,
-    with_planned_slots,
-    write_slots,
-)
+from skyless.cli.plan_output import show, write_files, write_site
+from skyless.cli.plan_slots import conflicts_of, show_slots, write_slots
 from skyless.errors import ConfigurationError, SkylessError
 from skyless.method_names import DEFAULT_METHOD
 
@@ -108,9 +101,10 @@ def plan(file: Path, /, *, asked: PlanOptions = PlanOptions()) -> None:
     file
         The site file.
     """
-    from skyless.planning.floor import floor_of
+    from skyless.planning.floor import check_anchor_count, floor_of
     from skyless.planning.maps import summary_of
     from skyless.planning.predict import Predictor
+    from skyless.planning.report import plan_report
 
     started_s = time.perf_counter()
     site = _load(file, asked)
@@ -120,7 +114,7 @@ def plan(file: Path, /, *, asked: PlanOptions = PlanOptions()) -> None:
     _refuse(asked, _FOR_PROTOCOL_2, "mode master, whose anchors share no slots")
     settings = _settings(asked)
     if asked.optimise is None:
-        _check_count(site, file)
+        check_anchor_count(site, file)
         if asked.out is not None:
             raise SkylessError("--out writes an optimised site; --optimise N asks for one")
     floor = floor_of(site, file, _outline(asked.outline), _region(asked.region))
@@ -135,7 +129,7 @@ def plan(file: Path, /, *, asked: PlanOptions = PlanOptions()) -> None:
     predictor = Predictor(site, settings)
     mapped = _map(predictor, floor, tag_heights_m, asked.step)
     checked = None if asked.verify is None else _verify(predictor, mapped, asked.verify, asked)
-    result = report(predictor, floor, mounts, mapped, summary_of(mapped, asked.target_m), optimised, checked)
+    result = plan_report(predictor, floor, mounts, mapped, summary_of(mapped, asked.target_m), optimised, checked)
     write_files(file, predictor.site, floor, mapped, result, asked.plot, asked.grid, asked.html)
     result["wall_s"] = time.perf_counter() - started_s
     if asked.json:
@@ -164,6 +158,7 @@ def _plan_slots(site: "Site", file: Path, asked: PlanOptions, started_s: float) 
     from skyless.planning.floor import floor_of
     from skyless.planning.links import with_range
     from skyless.planning.slot_plan import rate_map
+    from skyless.planning.slot_report import described_slots, slot_report, with_planned_slots
     from skyless.simulation.channel import ChannelModel
     from skyless.site.check import has_slots
 
@@ -195,7 +190,7 @@ def _plan_slots(site: "Site", file: Path, asked: PlanOptions, started_s: float) 
         how = "--write --force writes" if had_slots else "--write writes"
         result["warnings"].append(f"these slots are not in the site file ({recoloured}); {how} them into it")
     if asked.plot is not None and floor is not None and mapped is not None:
-        _draw_slots(site, floor, mapped, file, described(result), asked.plot)
+        _draw_slots(site, floor, mapped, file, described_slots(result), asked.plot)
     result["wall_s"] = time.perf_counter() - started_s
     if asked.json:
         print_json(result)
@@ -260,14 +255,6 @@ def _settings(asked: PlanOptions) -> "PlanSettings":
     return PlanSettings(asked.method, asked.noise_ps, asked.qa, channel)
 
 
-def _check_count(site: "Site", file: Path) -> None:
-    """See that the site has anchors enough for a position. Raises ConfigurationError."""
-    needed, what = (4, "with its height") if site.tags.height_m is None else (3, "at a known height")
-    if len(site.anchors) < needed:
-        right = f"at least {needed}, which a position {what} needs"
-        raise ConfigurationError(file, "anchors", f"a list of {len(site.anchors)}", right)
-
-
 def _outline(text: str | None) -> "Matrix | None":
     """Corners of the floor, shape (n, 2) in metres, None if not asked for. Raises SkylessError."""
     import numpy as np
@@ -291,29 +278,25 @@ def _region(text: str | None) -> "Box | None":
 
 
 def _tag_heights(text: str | None, site: "Site") -> tuple[float, ...]:
-    """Heights of the maps: the known one, or those asked for, or three between the lowest and the highest anchor.
+    """Heights of the maps. Raises SkylessError when heights are asked for at a site that knows its tags' height."""
+    from skyless.planning.floor import usual_tag_heights
 
-    Raises SkylessError when heights are asked for at a site that knows its tags' height.
-    """
+    if text is None:
+        return usual_tag_heights(site)
     if site.tags.height_m is not None:
-        if text is not None:
-            raise SkylessError(f"--slices is {text!r}; this site's tags are all at {site.tags.height_m:g} m")
-        return (site.tags.height_m,)
-    if text is not None:
-        return _numbers("slices", text)
-    low, high = _lowest_and_highest(site)
-    return tuple(round(low + share * (high - low), 2) for share in (1 / 6, 1 / 2, 5 / 6))[: 3 if high > low else 1]
+        raise SkylessError(f"--slices is {text!r}; this site's tags are all at {site.tags.height_m:g} m")
+    return _numbers("slices", text)
 
 
 def _mounts(site: "Site", floor: "Floor", asked: PlanOptions) -> "Mounts":
     """Where anchors may hang: on the walls given, or on the floor's sides. Raises SkylessError."""
     import numpy as np
 
-    from skyless.planning.floor import Mounts, sides
+    from skyless.planning.floor import mounts_of
 
     walls = [finite_numbers("mounts", text, (4,)) for text in asked.mounts or ()]
-    levels = _lowest_and_highest(site) if asked.heights is None else _numbers("heights", asked.heights)
-    mounts = Mounts(np.array(walls) if walls else sides(floor.outline_m), tuple(dict.fromkeys(levels)))
+    heights_m = None if asked.heights is None else _numbers("heights", asked.heights)
+    mounts = mounts_of(site, floor, np.array(walls) if walls else None, heights_m)
     if not mounts.length_m > 0.0:
         raise SkylessError("--mounts has no length; it should be x1,y1,x2,y2 with two different ends")
     return mounts
@@ -321,11 +304,6 @@ def _mounts(site: "Site", floor: "Floor", asked: PlanOptions) -> "Mounts":
 
 def _numbers(option: str, text: str) -> tuple[float, ...]:
     return finite_numbers(option, text, (text.count(",") + 1,))
-
-
-def _lowest_and_highest(site: "Site") -> tuple[float, ...]:
-    levels = [anchor.z_m for anchor in site.anchors]
-    return min(levels), max(levels)
 
 
 # The long work, with progress
@@ -340,9 +318,10 @@ def _optimise(
     anchors: int,
     asked: PlanOptions,
 ) -> "Optimised":
+    from skyless.planning.floor import fewest_anchors
     from skyless.planning.optimise import Search
 
-    needed = 4 if site.tags.height_m is None else 3
+    needed = fewest_anchors(site)
     if anchors < needed:
         raise SkylessError(f"--optimise is {anchors}; this site's positions need {needed} anchors or more")
     with progress_bar("placing anchors", 1.0) as bar:

@@ -1,4 +1,4 @@
-"""What ``skyless plan`` writes: one report for JSON, the terminal and the page; tables, pictures and a site."""
+"""What ``skyless plan`` writes of its report: for the terminal and the page; tables, pictures and a site."""
 
 import os
 from pathlib import Path
@@ -10,11 +10,10 @@ from skyless.cli.common.output import cm, new_table, print_facts, print_warnings
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.planning.floor import Floor, Mounts
-    from skyless.planning.maps import MapSummary, PlanMap
-    from skyless.planning.optimise import OneMore, Optimised, Scored
+    from skyless.planning.floor import Floor
+    from skyless.planning.maps import PlanMap
+    from skyless.planning.optimise import OneMore
     from skyless.planning.picture import Background
-    from skyless.planning.predict import Predictor
     from skyless.planning.verify import Verification
     from skyless.site.model import Site
 
@@ -28,95 +27,6 @@ _NOTES: Final = (
     "joint's figures hold the errors of survey and ranges that the site file states (accuracy); for the other methods "
     "positions of the anchors, antenna delays and ranges are assumed to be right.",
 )
-
-
-def report(
-    predictor: "Predictor",
-    floor: "Floor",
-    mounts: "Mounts",
-    mapped: "PlanMap",
-    summary: "MapSummary",
-    optimised: "Optimised | None",
-    checked: "Verification | None",
-) -> dict[str, Any]:
-    """The whole report, SI units."""
-    import numpy as np
-
-    from skyless.planning.advice import plan_warnings
-    from skyless.planning.columns import BIAS
-    from skyless.planning.links import range_of
-    from skyless.planning.optimise import one_more
-    from skyless.site.slots import schedule_of
-
-    site, settings = predictor.site, predictor.settings
-    heights = tuple(mapped.grid.heights_m.tolist())
-    bias = mapped.column(BIAS)
-    more = one_more(site, settings, floor, mounts, heights) if len(site.anchors) < 200 else None
-    return {
-        "site": site.name,
-        "method": settings.method,
-        "tx_stamp_ps": site.noise.tx_stamp_ps,
-        "rx_stamp_ps": site.noise.rx_stamp_ps,
-        "qa": settings.qa,
-        "range_m": range_of(settings.channel),
-        "superframe_s": 1.0 / schedule_of(site).superframe_rate_hz,
-        "master": site.master,
-        "heights_m": heights,
-        "region_m": floor.region_m,
-        "outline_m": floor.outline_m,
-        "step_m": mapped.grid.step_m,
-        "computed_every_m": mapped.computed_every_m,
-        **msgspec.to_builtins(summary),
-        "walls_bias": bool((bias[np.isfinite(bias)] > 1e-4).any()),
-        "anchors": [
-            {
-                "id": anchor.id,
-                "x_m": anchor.x_m,
-                "y_m": anchor.y_m,
-                "z_m": anchor.z_m,
-                "hears_master": float(predictor.links.share[row]),
-                "sends": bool(predictor.clocks.sends[row]),
-            }
-            for row, anchor in enumerate(site.anchors)
-        ],
-        "warnings": plan_warnings(predictor, floor, mapped),
-        "one_more": more,
-        "optimised": None if optimised is None else _optimised(optimised),
-        "verification": checked,
-    }
-
-
-def _optimised(found: "Optimised") -> dict[str, Any]:
-    return {
-        "best": _scored(found.best),
-        "even": _scored(found.even),
-        "mean_ratio": found.best.mean_sigma_m / found.even.mean_sigma_m,
-        "worst_ratio": found.best.worst_sigma_m / found.even.worst_sigma_m,
-        "target_met": found.target_met,
-        "evaluations": found.evaluations,
-        "finished": found.finished,
-    }
-
-
-def _scored(scored: "Scored") -> dict[str, Any]:
-    return {
-        "mean_sigma_m": scored.mean_sigma_m,
-        "worst_sigma_m": scored.worst_sigma_m,
-        "covered_share": scored.covered_share,
-        "master": scored.site.master,
-        "anchors": [(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in scored.site.anchors],
-    }
-
-
-def _described(result: dict[str, Any]) -> str:
-    """Method, noise and schedule in one line."""
-    tx_ps, rx_ps = result["tx_stamp_ps"], result["rx_stamp_ps"]
-    noise = f"{tx_ps:g} ps" if tx_ps == rx_ps else f"{tx_ps:g} ps (TX) and {rx_ps:g} ps (RX)"
-    process_noise = f" with qa {result['qa']:g} m²/s³" if result["method"] == "joint" else ""
-    return (
-        f"predicted for {result['method']}{process_noise}, stamps of {noise}, "
-        f"superframes of {1e3 * result['superframe_s']:.1f} ms, tags at rest"
-    )
 
 
 def _facts(result: dict[str, Any]) -> dict[str, str]:
@@ -185,7 +95,9 @@ def _verified(checked: "Verification") -> str:
 
 def show(file: Path, result: dict[str, Any]) -> None:
     """Show a plan in the terminal."""
-    print_facts(f"{result['site']} ({file}): {_described(result)}", _facts(result).items())
+    from skyless.planning.report import described
+
+    print_facts(f"{result['site']} ({file}): {described(result)}", _facts(result).items())
     print_warnings(result["warnings"])
 
 
@@ -193,6 +105,7 @@ def _page(result: dict[str, Any], mapped: "PlanMap", background: "Background") -
     """The plan as a page."""
     from skyless.planning.page import page
     from skyless.planning.picture import draw_layer, layers_for
+    from skyless.planning.report import described
 
     sections = [
         (layer.title.capitalize() if layer.title.islower() else layer.title, draw_layer(mapped, layer, background))
@@ -206,7 +119,7 @@ def _page(result: dict[str, Any], mapped: "PlanMap", background: "Background") -
             f"{position}, hears {anchor['hears_master']:.0%} of the master's frames{silent}"
         )
     title = f"Plan of {result['site']}"
-    return page(title, _described(result), facts, result["warnings"], sections, _NOTES)
+    return page(title, described(result), facts, result["warnings"], sections, _NOTES)
 
 
 def write_site(out: Path, site: "Site", source: Path) -> None:
@@ -244,13 +157,13 @@ def write_files(
     if plot is None and html is None:
         return
     from skyless.evaluation.figures import save_figure
-    from skyless.planning.picture import RMSE_LAYER, SIGMA_LAYER, Background, draw_layer
+    from skyless.planning.picture import Background, draw_layer, main_layer
+    from skyless.planning.report import described
 
-    background = Background(site, floor, file, _described(result))
+    background = Background(site, floor, file, described(result))
     if plot is not None:
-        layer = RMSE_LAYER if result["walls_bias"] else SIGMA_LAYER
         try:
-            save_figure(draw_layer(mapped, layer, background), plot)
+            save_figure(draw_layer(mapped, main_layer(mapped), background), plot)
         except (OSError, ValueError) as error:
             raise SkylessError(f"{plot} cannot be written: {error}") from None
     if html is not None:

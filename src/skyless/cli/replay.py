@@ -16,7 +16,6 @@ from skyless.cli.common.options import (
     NotNegative,
     Positive,
     ProtectionOptions,
-    check_height_std,
     check_left_out,
     check_method,
     check_output,
@@ -25,16 +24,15 @@ from skyless.cli.common.options import (
 )
 from skyless.cli.common.output import new_table, number, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
-from skyless.cli.common.recording_inputs import flight_height, height_to_hold, is_mcap, known_anchors, known_truth
-from skyless.errors import ConfigurationError, SkylessError
+from skyless.cli.common.recording_inputs import is_mcap, lever_arm, wished_height
+from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.evaluation.judge import Judge
     from skyless.positioning.fix import Fix
-    from skyless.recordings.truth import Truth
-    from skyless.replay.captures import Replay, ReplayReport
-    from skyless.replay.site import SiteReplay, TagReport
+    from skyless.replays.captures import Replay, ReplayReport
+    from skyless.replays.site import SiteReplay, TagReport
 
 FIXES_COLUMNS: Final = (
     *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
@@ -179,10 +177,9 @@ def _likely_reason(report: "ReplayReport", asked: ReplayOptions) -> str:
 
 def _replay_foreign(file: Path, asked: ReplayOptions) -> "ReplayReport":
     """Replay a recording that another program made. Raises SkylessError."""
-    from skyless.evaluation.judge import Judge
     from skyless.recordings.anchor_table import read_calibration
-    from skyless.recordings.foreign.formats import format_of
-    from skyless.replay.captures import MEASUREMENTS, Replay, ReplayRequest
+    from skyless.replays.capture_run import CaptureRequest, CaptureRun
+    from skyless.replays.inputs import known_anchors, known_truth
 
     protection = asked.protection
     of_sites = {
@@ -190,43 +187,36 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> "ReplayReport":
         "alert-limit-m": protection.alert_limit_m, "max-acceleration": protection.max_acceleration,
     }  # fmt: skip
     check_left_out(of_sites, "it is for recordings of skyless record")
-    if asked.measurements not in {None, *MEASUREMENTS}:
-        raise SkylessError(f"--measurements is {asked.measurements!r}; it should be one of {', '.join(MEASUREMENTS)}")
     anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)
     if not anchors_m:
         _check_carries_anchors(file, asked)
-    known = known_truth(file, asked.truth, asked.lever_arm, asked.format, asked.listener)
-    format_name = format_of(file, asked.format).name
-    height_m, std_m, note = height_to_hold(asked.tag_height, anchors_m, site_height_m, known, format_name)
-    settle_s = asked.settle if asked.settle is not None else (2.0 if known is None else 3.0)
-    check_height_std(asked.tag_height_std, height_m)
-    judge = Judge(known, planar=height_m is not None, settle_s=settle_s, above_m=flight_height(asked.above, known))
-    request = ReplayRequest(
-        path=file,
-        anchors_m=anchors_m,
-        format=asked.format,
-        listener=asked.listener,
-        height_m=height_m,
-        height_std_m=std_m if asked.tag_height_std is None else asked.tag_height_std,
-        qa=asked.qa,
-        tdoa_std_m=asked.tdoa_std,
-        calibration=None if asked.anchors is None or asked.uncalibrated else read_calibration(asked.anchors),
-        measurements=asked.measurements,
+    run = CaptureRun(
+        CaptureRequest(
+            path=file,
+            anchors_m=anchors_m,
+            site_height_m=site_height_m,
+            truth=known_truth(file, asked.truth, lever_arm(asked.lever_arm), asked.format, asked.listener),
+            tag_height=wished_height(asked.tag_height),
+            tag_height_std_m=asked.tag_height_std,
+            settle_s=asked.settle,
+            above_m=asked.above,
+            qa=asked.qa,
+            tdoa_std_m=asked.tdoa_std,
+            calibration=None if asked.anchors is None or asked.uncalibrated else read_calibration(asked.anchors),
+            measurements=asked.measurements,
+            format=asked.format,
+            listener=asked.listener,
+        )
     )
-    report = _run_foreign(Replay(request, judge), file, asked.fixes_csv)
-    if asked.listener is not None and report.receptions == 0:
-        raise ConfigurationError(file, "listener", asked.listener, "one that the recording names")
-    if asked.truth is not None and known is not None:
-        _check_times(asked.truth, known, judge)
-    distances = _distances(file, report.format)
+    report = _run_foreign(run.replay, file, asked.fixes_csv)
+    run.check(report, asked.truth)
+    summary = run.summary(report)
     if asked.plot is not None:
-        _draw_track(asked.plot, judge, report)
+        _draw_track(asked.plot, run.judge, report)
     if asked.json:
-        import msgspec
-
-        print_json({**msgspec.to_builtins(report), "height_note": note, "anchor_distances_m": distances})
+        print_json(summary)
     else:
-        _show(report, note, distances)
+        _show(report, run.height_note, summary["anchor_distances_m"])
     return report
 
 
@@ -252,8 +242,9 @@ def _check_carries_anchors(file: Path, asked: ReplayOptions) -> None:
 
 def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
     from skyless.evaluation.compile_ahead import compile_packet_kernels, compile_pair_kernels
+    from skyless.preparation.parts import PAIRS, SNIFFERS
 
-    with loading_kernels():
+    with loading_kernels(*(SNIFFERS if run.measurements == "packets" else (PAIRS,))):
         if run.measurements == "packets":
             compile_packet_kernels()
         else:
@@ -262,35 +253,13 @@ def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport
         return run.run(None if write is None else lambda fix: write(_row(fix)), bar.reach)
 
 
-def _check_times(table: Path, truth: "Truth", judge: "Judge") -> None:
-    """Fixes without any truth mean that the table belongs to another recording, or to another clock."""
-    import numpy as np
-
-    times_s, true_x_m = judge.track.rows[:, 0], judge.track.rows[:, 4]
-    if len(times_s) and np.isnan(true_x_m).all():
-        span = f"{truth.t_s[0]:.3f} to {truth.t_s[-1]:.3f}"
-        expected = f"in the time of the recording, whose fixes are from {times_s.min():.3f} to {times_s.max():.3f}"
-        raise ConfigurationError(table, "column t_s", span, expected)
-
-
-def _distances(file: Path, name: str) -> dict[str, float]:
-    """Distances of the anchors, where the recording itself measures them."""
-    if name != "avalue":
-        return {}
-    from collections import Counter
-
-    from skyless.recordings.foreign.avalue import anchor_distances_m
-
-    return {f"{a:X}-{b:X}": metres for (a, b), metres in sorted(anchor_distances_m(file, Counter()).items())}
-
-
 # Recordings of skyless record
 
 
 def _replay_site(file: Path, asked: ReplayOptions) -> "list[TagReport]":
     """Replay all tags of a recording of skyless record, or one. Raises SkylessError."""
     from skyless.recordings.mcap.recording import McapRecording
-    from skyless.replay.site import SiteReplay
+    from skyless.replays.site import SiteReplay, summary_of
     from skyless.site.load import load_site
 
     useless = {
@@ -318,7 +287,7 @@ def _replay_site(file: Path, asked: ReplayOptions) -> "list[TagReport]":
     if asked.plot is not None:
         _draw_track(asked.plot, run.judges[reports[0].tag], reports[0])
     if asked.json:
-        print_json(_site_json(reports))
+        print_json(summary_of(reports))
     else:
         for report in reports:
             _show(report, "from the site", {}, _site_facts(report))
@@ -328,35 +297,15 @@ def _replay_site(file: Path, asked: ReplayOptions) -> "list[TagReport]":
 def _run_site(run: "SiteReplay", span_s: float, asked: ReplayOptions) -> "list[TagReport]":
     """The table of fixes has the tag's name at the end of each row; its ``t_s`` is Unix time."""
     from skyless.evaluation.compile_ahead import compile_kernels
+    from skyless.preparation.parts import parts_of
 
-    with loading_kernels():
-        compile_kernels(asked.method or DEFAULT_METHOD)
+    method = asked.method or DEFAULT_METHOD
+    with loading_kernels(*parts_of(method)):
+        compile_kernels(method)
     with progress_bar("replaying", span_s) as bar, _table_of_fixes(asked.fixes_csv, (*FIXES_COLUMNS, "tag")) as write:
         if write is None:
             return run.run(None, bar.reach)
         return run.run(lambda tag, made: write((f"{made.unix_s:.6f}", *_row(made.fix)[1:], tag)), bar.reach)
-
-
-def _site_json(reports: "Sequence[TagReport]") -> dict[str, object]:
-    """One tag's report as that of any other recording; of several, their sums and the reports by tag."""
-    import msgspec
-
-    if len(reports) == 1:
-        return {**msgspec.to_builtins(reports[0]), "height_note": "from the site"}
-    compared = [report.identical for report in reports if report.identical is not None]
-    identical = {
-        "compared": sum(one.compared for one in compared),
-        "different": sum(one.different for one in compared),
-    }
-    return {
-        "format": reports[0].format,
-        "receptions": sum(report.receptions for report in reports),
-        "fixes": sum(report.fixes for report in reports),
-        "dropped": sum(report.dropped for report in reports),
-        "identical": identical if compared else None,
-        "wall_s": reports[0].wall_s,
-        "tags": {report.tag: msgspec.to_builtins(report) for report in reports},
-    }
 
 
 def _site_facts(report: "TagReport") -> list[tuple[str, str]]:
@@ -413,7 +362,7 @@ def _row(fix: "Fix") -> list[str]:
 
 def _draw_track(path: Path, judge: "Judge", report: "ReplayReport") -> None:
     """Draw what --plot asks for. Raises SkylessError."""
-    from skyless.replay.plot import draw
+    from skyless.replays.plot import draw
 
     try:
         draw(path, judge.track.rows, f"{report.format}, {report.fixes} fixes")

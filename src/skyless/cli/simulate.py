@@ -1,7 +1,6 @@
 """``skyless simulate``: a site in the simulated world, judged against the truth."""
 
 import csv
-import math
 import time
 from collections.abc import Sequence
 from itertools import pairwise
@@ -38,12 +37,6 @@ if TYPE_CHECKING:
 _Share = Annotated[float, Parameter(validator=Number(gte=0, lt=1))]
 
 _ROOM: Final = "room"
-
-_USUAL_S: Final = 60.0
-"""Duration of a run without a goal."""
-
-_LONGEST_WAIT_S: Final = 60.0
-"""Simulated time for which a run whose goal is fixes waits for one."""
 
 _LATEST_S: Final = 1e8
 """Three years: the 64 bits of unwrapped ticks last four and a half."""
@@ -146,7 +139,9 @@ class SimulateOptions:
     @property
     def until_s(self) -> float:
         """When the run ends, unless it reaches its goal before."""
-        return self.duration or (_USUAL_S if self.fixes is None else math.inf)
+        from skyless.evaluation.fleet_run import end_s
+
+        return end_s(self.duration, self.fixes)
 
 
 @app.default
@@ -305,12 +300,13 @@ def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.evaluation.fleet import report
     from skyless.evaluation.scenarios import fleet_of_any_size
+    from skyless.preparation.parts import parts_of
 
     try:
         fleet = fleet_of_any_size(request)
     except ValueError as error:
         raise SkylessError(str(error)) from None
-    with loading_kernels():
+    with loading_kernels(*parts_of(request.method)):
         compile_kernels(request.method)
     started_s = time.perf_counter()
     if asked.fixes_csv is None:
@@ -322,30 +318,15 @@ def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
 
 
 def _advance(fleet: "TagFleet", request: "Request", until_s: float, file: TextIO | None) -> None:
-    """Run the world in steps, so that the bar moves and the goal is noticed."""
-    writer = None if file is None else csv.writer(file)
-    if writer is not None:
-        writer.writerow(FIXES_CSV_COLUMNS)
-    fixes = request.most_fixes
-    with progress_bar("simulating", fixes if fixes is not None else until_s) as bar:
-        now_s = 0.0
-        while now_s < until_s and not _enough(fleet, request, now_s):
-            now_s = min(now_s + fleet.step_s, until_s)
-            for judged in fleet.run(now_s):
-                if writer is not None:
-                    writer.writerow(_row(judged))
-            bar.reach(fleet.errors.count / len(fleet.records) if fixes is not None else now_s)
+    """Run to the end, with a bar; every fix becomes a row of the file."""
+    from skyless.evaluation.fleet_run import run_fleet
 
-
-def _enough(fleet: "TagFleet", request: "Request", now_s: float) -> bool:
-    """Whether all tags have their fixes, or those that have not wait too long, with nothing planned to come back."""
-    fixes = request.most_fixes
-    if fixes is None:
-        return False
-    returns_s = [planned.outage.on_s for planned in request.outages] + [silence.on_s for silence in request.silences]
-    planned_s = max(filter(math.isfinite, returns_s), default=0.0)
-    last_s = (0.0 if tag.last is None else tag.last.time_s for tag in fleet.records if tag.judged < fixes)
-    return all(now_s - max(tag_s, planned_s) > _LONGEST_WAIT_S for tag_s in last_s)
+    write = None if file is None else csv.writer(file).writerow
+    if write is not None:
+        write(FIXES_CSV_COLUMNS)
+    on_fix = None if write is None else lambda judged: write(_row(judged))
+    with progress_bar("simulating", 1.0) as bar:
+        run_fleet(fleet, request, until_s, on_fix, bar.reach)
 
 
 def _row(judged: "JudgedFix") -> tuple[object, ...]:

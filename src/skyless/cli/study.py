@@ -49,9 +49,6 @@ _Name = Literal[
     "scale",
 ]
 
-_OF_EPISODES: Final = ("efficiency", "integrity")
-"""Studies of the filter ``joint`` itself."""
-
 _WIDEST: Final = 220
 """Columns of a table that is not shown on a terminal."""
 
@@ -208,18 +205,18 @@ def study(name: _Name, /, *, asked: StudyOptions = StudyOptions()) -> None:
 
 def _check(name: str, asked: StudyOptions) -> None:
     """See that the options fit the study and that its files can be written. Raises SkylessError."""
-    if name != "integrity" and (asked.integrity_risk is not None or asked.alert_limit_m is not None):
-        raise SkylessError("--integrity-risk and --alert-limit-m are for the study integrity")
-    if name not in _OF_EPISODES and asked.episodes is not None:
-        takes = f"{name} takes --worlds and --seconds"
-        raise SkylessError(f"--episodes is for the studies efficiency and integrity; {takes}")
-    others = {"worlds": asked.worlds, "seconds": asked.seconds, "noise-ps": asked.noise_ps, "qa": asked.qa}
-    given = [option for option, value in others.items() if value is not None]
-    unfit = [option for option in given if option in {"worlds", "seconds"}]
-    if name == "integrity" and unfit:
-        raise SkylessError(f"--{unfit[0]} is not for the study integrity; give --episodes")
-    if name == "efficiency" and given:
-        raise SkylessError(f"--{given[0]} is not for the study efficiency, which has cases of its own; give --episodes")
+    from skyless.studies.run import check_amounts
+
+    check_amounts(
+        name,
+        episodes=asked.episodes,
+        worlds=asked.worlds,
+        seconds=asked.seconds,
+        noise_ps=asked.noise_ps,
+        qa=asked.qa,
+        integrity_risk=asked.integrity_risk,
+        alert_limit_m=asked.alert_limit_m,
+    )
     if asked.scheduler is not None and asked.processes is not None:
         raise SkylessError("--processes are on this machine, --scheduler is for others; give either")
     check_picture(asked.plot)
@@ -254,23 +251,19 @@ def _plan(name: str, asked: StudyOptions) -> "Plan":
 
 def _run(chosen: "Study", plan: "Plan", asked: StudyOptions) -> "list[Row]":
     from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.studies.common.runner import run_cells, run_cells_on_dask
+    from skyless.preparation.parts import parts_of
+    from skyless.studies.run import WITHOUT_POSITIONS, run_study
 
     check_method(plan.method)
-    cells = chosen.cells(plan)
-    if chosen.name not in {"claims", "watch"}:  # in which nobody computes positions
-        with loading_kernels():
+    if chosen.name not in WITHOUT_POSITIONS:
+        with loading_kernels(*parts_of(plan.method)):
             compile_kernels(plan.method)
     try:
         with progress_bar(f"studying {chosen.title}", 1.0) as bar:
-            if asked.scheduler is None:
-                results = run_cells(cells, bar.reach, asked.processes)
-            else:
-                results = run_cells_on_dask(cells, bar.reach, asked.scheduler)
+            return run_study(chosen, plan, bar.reach, asked.processes, asked.scheduler)
     except KeyboardInterrupt:
         print("stopped; nothing was written", file=sys.stderr)
         raise
-    return chosen.rows(plan, results)
 
 
 def _write(study: "Study", rows: "Sequence[Row]", plot: Path | None, out: Path | None) -> None:

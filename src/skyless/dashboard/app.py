@@ -5,6 +5,7 @@ import mimetypes
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
+from urllib.parse import quote
 
 import msgspec
 from msgspec import Struct
@@ -12,13 +13,13 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyless.dashboard.guard import AccessRules, Guard
-from skyless.dashboard.live import LiveSite, NoBrokerError
+from skyless.dashboard.live import LiveSite, NoBrokerError, TooManyPagesError
 from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.dashboard.site_survey import NoResultError
@@ -27,7 +28,6 @@ from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.image import image_size
 
 _PAGE: Final = Path(__file__).parent / "page"
-MAX_PAGES: Final = 50
 PAGE_TIMEOUT_S: Final = 10.0
 """A page that accepts no message for this long is disconnected."""
 
@@ -77,6 +77,8 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/survey/save", _save_survey, methods=["POST"]),
         Route("/api/recordings", _recordings),
         Route("/api/recordings/{name}", _recording),
+        Route("/api/recordings/{name}/events", _recorded_events),
+        Route("/api/recordings/{name}/file", _recorded_file),
         Route("/api/recordings/{name}/states", _recorded_states),
         Route("/api/recordings/{name}/floor_plan", _recorded_floor_plan),
         WebSocketRoute("/live", _live),
@@ -194,7 +196,8 @@ async def _body(request: Request, most_bytes: int, fault: str) -> bytes:
 async def _put_zones(request: Request) -> Response:
     body = await _body(request, _MAX_BODY_BYTES, "too many zones")
     live = _services(request).live
-    live.store_zones(read_zones(body))
+    message = read_zones(body)
+    live.store_zones(message.zones, message.site)
     return _json({"zones": live.monitor.zones})
 
 
@@ -210,6 +213,19 @@ async def _recorded_floor_plan(request: Request) -> Response:
     return _image(await asyncio.to_thread(_services(request).playback.floor_plan, request.path_params["name"]))
 
 
+async def _recorded_events(request: Request) -> Response:
+    return _json(await asyncio.to_thread(_services(request).playback.events, request.path_params["name"]))
+
+
+async def _recorded_file(request: Request) -> Response:
+    found = await asyncio.to_thread(_services(request).playback.open_file, request.path_params["name"])
+    headers = {
+        "Content-Disposition": f"attachment; filename*=utf-8''{quote(found.name, safe='')}",
+        "Content-Length": str(found.size_bytes),
+    }
+    return StreamingResponse(found.pieces(), media_type="application/octet-stream", headers=headers)
+
+
 async def _recorded_states(request: Request) -> Response:
     begin_s = _number(request, "from_s", 0.0, 0.0, 1e9)
     end_s = _number(request, "to_s", begin_s + 10.0, 0.0, 1e9)
@@ -223,19 +239,25 @@ async def _recorded_states(request: Request) -> Response:
 
 async def _live(socket: WebSocket) -> None:
     live = _services(socket).live
-    if len(live.pages) >= MAX_PAGES:
-        await socket.close(_TRY_LATER, "too many pages are open")
+    await socket.accept()  # a browser does not show a page why its socket was refused, only why it was closed
+    try:
+        page = live.open_page(socket.client.host if socket.client is not None else "")
+    except TooManyPagesError as error:
+        await socket.close(_TRY_LATER, str(error))
         return
-    await socket.accept()
-    page = live.open_page()
-    reading = asyncio.create_task(_read(socket, page.close, lambda: page.replace("pong", b'{"type":"pong"}')))
+
+    def pong() -> None:
+        live.keep_page(page)
+        page.replace("pong", b'{"type":"pong"}')
+
+    reading = asyncio.create_task(_read(socket, page.close, pong))
     try:
         while not page.closed:
             messages = await page.drain(live.state)
             async with asyncio.timeout(PAGE_TIMEOUT_S):
                 for message in messages:
                     await socket.send_text(message)
-        await socket.close(_GOING_AWAY)
+        await socket.close(_GOING_AWAY, page.reason)
     except (WebSocketDisconnect, RuntimeError, TimeoutError):
         pass  # the page was closed meanwhile, or does not respond
     finally:

@@ -1,10 +1,12 @@
 """The live site: messages from MQTT update its state and its zones; open pages are sent what is new, 20 times a second.
 
-Everything here belongs to one event loop.
+Everything here belongs to one event loop. What is wrong at the site is found in ``condition.py``, what has happened is
+listed in ``events.py``; both get the same messages.
 """
 
 import asyncio
 import logging
+import platform
 import time
 import zlib
 from collections import Counter, deque
@@ -16,6 +18,9 @@ import msgspec
 from msgspec import Struct
 
 import skyless
+from skyless.dashboard.condition import EVALUATION_S, Condition, ConditionMonitor
+from skyless.dashboard.events import MAX_LOGGED, EventLog
+from skyless.dashboard.evidence import Evidence
 from skyless.dashboard.site_survey import SiteSurvey, topic_of
 from skyless.dashboard.state import SiteState, encode
 from skyless.dashboard.wire import WrongMessageError, read_message
@@ -27,6 +32,7 @@ from skyless.dashboard.zones import (
     check_zones,
     publisher_rank,
     read_zones,
+    zones_of,
 )
 from skyless.errors import ConfigurationError
 from skyless.mqtt import topics
@@ -34,6 +40,7 @@ from skyless.mqtt.messages import (
     AnchorHealth,
     EtherHealth,
     FixMessage,
+    PreparationMessage,
     SiteMessage,
     StatusMessage,
     SurveyFactsMessage,
@@ -48,9 +55,19 @@ from skyless.site.check import check_site
 
 _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0
+_PREPARATION_EXPIRY_S: Final = 5.0
+"""A preparation of which nothing has come for this time has ended without saying so."""
 
 _HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
 _log = logging.getLogger("skyless.dashboard")
+
+MAX_PAGES: Final = 400
+MAX_PAGES_PER_ADDRESS: Final = 100
+IDLE_S: Final = 12.0
+"""A page that has sent nothing for this long makes room for another one; a visible page sends a ping every 5 s."""
+
+GONE_S: Final = 180.0
+"""A page that has sent nothing for this long is disconnected; browsers let a hidden one send once a minute."""
 
 
 class MqttLink(Protocol):
@@ -70,13 +87,22 @@ class NoBrokerError(Exception):
     """Nothing can be published now."""
 
 
+class TooManyPagesError(Exception):
+    """No other page can be opened now."""
+
+
 class PageQueue:
     """Messages that wait for one page: the newest of each kind, so that a slow page's queue stays short."""
 
-    def __init__(self, hello: bytes) -> None:
-        self.closed = False
+    def __init__(self, hello: bytes, address: str = "", now_s: float = 0.0) -> None:
+        """``address`` is its computer's."""
+        self.closed, self.reason = False, ""
+        """Whether its connection is to be ended, and why."""
+        self.address, self.active_s = address, now_s
+        """When it last sent something."""
         self._latest: dict[str, bytes] = {"hello": hello}
         self._events: deque[bytes] = deque(maxlen=MAX_EVENTS)
+        self._logged: deque[bytes] = deque(maxlen=MAX_LOGGED)
         self._sent_serial = 0
         self._state_due = True
         self._wake = asyncio.Event()
@@ -92,23 +118,29 @@ class PageQueue:
         self._events.append(message)
         self._wake.set()
 
+    def add_logged(self, message: bytes) -> None:
+        """Add a line of the list of events; the oldest is dropped beyond ``MAX_LOGGED``."""
+        self._logged.append(message)
+        self._wake.set()
+
     def request_state(self) -> None:
         """Send the state with the next messages if there is anything new."""
         self._state_due = True
         self._wake.set()
 
-    def close(self) -> None:
+    def close(self, reason: str = "") -> None:
         """End the page's connection."""
-        self.closed = True
+        self.closed, self.reason = True, reason
         self._wake.set()
 
     async def drain(self, state: SiteState) -> list[str]:
         """Wait for messages and return them all, in the order in which the page needs them."""
         await self._wake.wait()
         self._wake.clear()
-        messages = [*self._latest.values(), *self._events]
+        messages = [*self._latest.values(), *self._events, *self._logged]
         self._latest.clear()
         self._events.clear()
+        self._logged.clear()
         if self._state_due and state.serial > self._sent_serial:
             messages.append(state.state_since(self._sent_serial))
             self._sent_serial = state.serial
@@ -126,11 +158,14 @@ class LiveSite:
         site: SiteMessage | None = None,
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
+        host: str = platform.node(),
     ) -> None:
-        """``name`` is the dashboard's on MQTT; ``broker`` its address without a password."""
+        """``name`` is the dashboard's on MQTT; ``broker`` its address without a password; ``host`` this computer."""
         self.name, self.broker = name, broker
         self.site = site
         self.floor_plan: bytes | None = None
+        self.preparation: PreparationMessage | None = None
+        """How far the kernels of a site that starts for the first time are compiled."""
         self.connected = False
         self.state = SiteState()
         self.monitor = ZoneMonitor()
@@ -142,10 +177,23 @@ class LiveSite:
         self._clock, self._wall_clock = clock, wall_clock
         self._link: MqttLink | None = None
         self._site_id: int | None = None
+        self._zones = ZonesMessage(())
+        """As the broker keeps them, or as they were stored here last; with those of other sites of this number."""
         self._drawn: ZonesMessage | None = None
         """Zones stored here that have not come back from the broker."""
+        self._zones_fault: str | None = None
+        """Why the zones that the broker keeps cannot be read."""
         self._sent_serial = 0
-        self._health_due_s = 0.0
+        self._health_due_s = self._condition_due_s = 0.0
+        self.evidence = Evidence(host, clock())
+        if site is not None:
+            self.evidence.set_site(site.site, clock())
+        self.log = EventLog()
+        self._condition_monitor = ConditionMonitor(self.evidence)
+        self.condition: Condition = self._condition_monitor.evaluate(clock())
+        self._logged_serial = 0
+        self._lag_s = 0.0
+        self._preparation_s = 0.0
 
     # MQTT
 
@@ -159,6 +207,7 @@ class LiveSite:
             topics.status_topic(site_id, "+", "+"): self._on_status,
             topics.health_topic(site_id, "+", "+"): self._on_health,
             topics.truth_topic(site_id): self._on_truth,
+            topics.preparation_topic(site_id): self._on_preparation,
             topics.zones_topic(site_id): self._on_zones,
             topics.zone_event_topic(site_id, "+"): self._on_zone_event,
             **self.survey.handlers(site_id),
@@ -172,6 +221,8 @@ class LiveSite:
         """Update whether the broker is connected."""
         if connected != self.connected:
             self.connected = connected
+            self.evidence.set_connected(connected=connected, now_s=self._clock())
+            self._evaluate(self._clock())
             self.survey.expect_kept()
             self._broadcast("mqtt", self._connection())
 
@@ -192,7 +243,9 @@ class LiveSite:
         if message.site.id != self._site_id:
             raise WrongMessageError(f"it is of site {message.site.id}")
         self.site = message
+        self.evidence.set_site(message.site, self._clock())
         self._broadcast("site", encode("site", {"site": message}))
+        self._assign_zones()
 
     def _on_floor_plan(self, topic: str, payload: bytes) -> None:
         image = payload or None
@@ -216,6 +269,8 @@ class LiveSite:
         _check_name(fix.tag, topic)
         now_s = self._clock()
         self.state.add_fix(fix, now_s)
+        self.evidence.add_fix(fix, now_s)
+        self.log.on_fix(fix, self._wall_clock())
         self._schedule(self.monitor.update(fix, now_s))
 
     def _on_status(self, topic: str, payload: bytes) -> None:
@@ -224,26 +279,54 @@ class LiveSite:
         status = read_message(payload, StatusMessage)
         _check_name(status.name, topic)
         self.state.add_status(status)
+        self.evidence.add_status(status, self._clock())
+        self.log.on_status(status, self._wall_clock())
         if status.kind == "tag" and not status.online:
             self._schedule(self.monitor.remove_tag(status.name, self._wall_clock()))
 
     def _on_health(self, topic: str, payload: bytes) -> None:
         _, kind, name, _ = topic.rsplit("/", 3)
         if kind in _HEALTHS:
-            self.state.add_health(name, read_message(payload, _HEALTHS[kind]), self._clock())  # type: ignore[arg-type]
+            health: TagHealth | AnchorHealth | EtherHealth = read_message(payload, _HEALTHS[kind])  # type: ignore[assignment]
+            now_s, unix_s = self._clock(), self._wall_clock()
+            self.state.add_health(name, health, now_s)
+            self.evidence.add_health(kind, name, health, now_s, unix_s)
+            self.log.on_health(kind, name, health, unix_s)
+
+    def _on_preparation(self, _topic: str, payload: bytes) -> None:
+        now = read_message(payload, PreparationMessage) if payload else None
+        self._preparation_s = self._clock()
+        self._show_preparation(now)
+
+    def _show_preparation(self, now: PreparationMessage | None) -> None:
+        if now is not None or self.preparation is not None:
+            self.preparation = now
+            self._broadcast("preparation", self._preparation_message())
+
+    def _preparation_message(self) -> bytes:
+        return encode("preparation", {"preparation": self.preparation})
 
     def _on_truth(self, _topic: str, payload: bytes) -> None:
         self.state.add_truth(read_message(payload, TruthMessage))
 
     def _on_zones(self, topic: str, payload: bytes) -> None:
-        zones = read_zones(payload) if payload else ()
+        try:
+            message = read_zones(payload) if payload else ZonesMessage(())
+        except BadZonesError as error:
+            self._zones_fault = f"the zones that the broker keeps at {topic} cannot be read: {error}"
+            self._broadcast("zones", self._zones_message())
+            raise
+        if payload and not message.site and not message.others:  # of an older program, which knows of no other sites
+            message = ZonesMessage(message.zones, "", self._zones.others)
         if self._drawn is not None:
-            if zones != self._drawn.zones:
+            if message != self._drawn:
                 return  # older than the zones stored here, which are on their way
             self._drawn = None
-        elif zones != self.monitor.zones and self._link is not None:
+        elif message != self._zones and self._link is not None:
             self._link.forget(topic)
-        self._set_zones(zones)
+        fault, self._zones_fault = self._zones_fault, None
+        self._zones = message
+        self._assign_zones(changed=fault is not None)
 
     def _on_zone_event(self, topic: str, payload: bytes) -> None:
         event = read_message(payload, ZoneEvent)
@@ -253,18 +336,51 @@ class LiveSite:
 
     # Zones
 
-    def store_zones(self, zones: tuple[Zone, ...]) -> None:
-        """Store the zones that a page has drawn. Raises BadZonesError."""
-        check_zones(zones)
-        self._drawn = ZonesMessage(zones)
-        self._set_zones(zones)
-        if self._link is not None and self._site_id is not None:
-            self._link.publish(topics.zones_topic(self._site_id), self._drawn, qos=1, retain=True)
+    def store_zones(self, zones: tuple[Zone, ...], site: str = "") -> None:
+        """Store the zones that a page has drawn at the site of a name; empty: at the one that is shown.
 
-    def _set_zones(self, zones: tuple[Zone, ...]) -> None:
+        Raises BadZonesError; also where the broker keeps zones that cannot be read, which are not overwritten.
+        """
+        check_zones(zones)
+        shown = self._site_name
+        if site and site != shown:
+            raise BadZonesError(f"they are of the site {site[:100]!r}, but {shown[:100]!r} is shown now")
+        if self._zones_fault is not None:
+            raise BadZonesError(f"{self._zones_fault}; nothing was overwritten. Clear that topic to begin again")
+        self._store(ZonesMessage(zones, shown, zones_of(self._zones, shown).others))
+        self._assign_zones()
+
+    @property
+    def _site_name(self) -> str:
+        return "" if self.site is None else self.site.site.name
+
+    def _store(self, message: ZonesMessage) -> None:
+        self._zones = self._drawn = message
+        if self._link is not None and self._site_id is not None:
+            self._link.publish(topics.zones_topic(self._site_id), message, qos=1, retain=True)
+
+    def _assign_zones(self, *, changed: bool = False) -> None:
+        """Show the zones of the present site; those of which no site is known become its own, for good."""
+        name = self._site_name
+        if name and not self._zones.site and self._zones.zones:
+            self._store(zones_of(self._zones, name))
+        if not name and self._zones.site:
+            zones: tuple[Zone, ...] = ()  # whose they are is known, but not whether that site is shown
+        else:
+            zones = zones_of(self._zones, name).zones
         if zones != self.monitor.zones:
             self._schedule(self.monitor.set_zones(zones, self._wall_clock()))
-            self._broadcast("zones", encode("zones", {"zones": zones}))
+            changed = True
+        if changed:
+            self._broadcast("zones", self._zones_message())
+
+    def _zones_message(self) -> bytes:
+        return encode("zones", self._zone_fields())
+
+    def _zone_fields(self) -> dict[str, object]:
+        """The zones of the present site, those of others that have its number, and why they cannot be read."""
+        others = zones_of(self._zones, self._site_name).others
+        return {"zones": self.monitor.zones, "other_zones": others, "zones_fault": self._zones_fault}
 
     def _schedule(self, events: list[ZoneEvent]) -> None:
         if events:
@@ -297,18 +413,24 @@ class LiveSite:
 
     # Pages
 
-    def open_page(self) -> PageQueue:
-        """A new page's queue, with what it needs first."""
+    def open_page(self, address: str = "") -> PageQueue:
+        """The queue of a new page of a computer, with what it needs first. Raises TooManyPagesError."""
+        self._make_room(address)
+        self._send_logged()
         hello = {
             "version": skyless.__version__,
             "site": self.site,
-            "zones": self.monitor.zones,
+            **self._zone_fields(),
             "events": list(self.events.recent),
             "mqtt": self.connected,
         }
-        page = PageQueue(encode("hello", hello))
+        page = PageQueue(encode("hello", hello), address, self._clock())
         page.replace("mqtt", self._connection())
-        page.replace("health", self.state.health_message(self.dropped))
+        page.replace("health", self.state.health_message(self.dropped, self._clock()))
+        page.replace("condition", encode("condition", msgspec.structs.asdict(self.condition)))
+        page.replace("log", encode("log", {"events": self.log.since()}))
+        if self.preparation is not None:
+            page.replace("preparation", self._preparation_message())
         if self.floor_plan is not None:
             page.replace("floor_plan", self._floor_plan_message())
         for kind, message in self.survey.messages().items():
@@ -316,13 +438,32 @@ class LiveSite:
         self.pages.add(page)
         return page
 
+    def _make_room(self, address: str) -> None:
+        """Close the page that is idle for longest where there are too many. Raises TooManyPagesError."""
+        mine = [page for page in self.pages if page.address == address]
+        if len(mine) < MAX_PAGES_PER_ADDRESS and len(self.pages) < MAX_PAGES:
+            return
+        oldest = min(mine if len(mine) >= MAX_PAGES_PER_ADDRESS else self.pages, key=lambda page: page.active_s)
+        if self._clock() - oldest.active_s < IDLE_S:
+            raise TooManyPagesError(f"too many pages are open: {len(mine)} of this computer, {len(self.pages)} in all")
+        self._close_idle(oldest)
+
+    def _close_idle(self, page: PageQueue) -> None:
+        self.pages.discard(page)
+        page.close("this page was idle")
+
+    def keep_page(self, page: PageQueue) -> None:
+        """A page has sent something."""
+        page.active_s = self._clock()
+
     def close(self) -> None:
         """Close all pages."""
         for page in self.pages:
             page.close()
 
-    def tick(self) -> None:
-        """Do what is due; to be called 20 times a second."""
+    def tick(self, lag_s: float = 0.0) -> None:
+        """Do what is due; to be called 20 times a second. ``lag_s`` is by how much this call is late."""
+        self._lag_s = max(self._lag_s, lag_s)
         now_s, unix_s = self._clock(), self._wall_clock()
         self.state.unix_s = unix_s
         self._schedule(self.monitor.expire_tags(now_s, unix_s))
@@ -331,17 +472,44 @@ class LiveSite:
             self._sent_serial = self.state.serial
             for page in self.pages:
                 page.request_state()
+        if now_s > self._preparation_s + _PREPARATION_EXPIRY_S:
+            self._show_preparation(None)
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_PERIOD_S
             self.state.expire(now_s)
             if self.pages:
-                self._broadcast("health", self.state.health_message(self.dropped))
+                self._broadcast("health", self.state.health_message(self.dropped, now_s))
+            for page in [page for page in self.pages if now_s - page.active_s > GONE_S]:
+                self._close_idle(page)
+        if now_s >= self._condition_due_s:
+            self._evaluate(now_s)
+        self._send_logged()
+
+    def _evaluate(self, now_s: float) -> None:
+        self._condition_due_s = now_s + EVALUATION_S
+        unix_s = self._wall_clock()
+        watch = self.survey.watch
+        self.condition = self._condition_monitor.evaluate(now_s, self._lag_s, watch, self.survey.watch_age_s)
+        self._lag_s = 0.0
+        self.log.on_watch(watch, unix_s)
+        self.log.on_survey(self.survey.survey, unix_s)
+        self.log.on_condition(self.condition, unix_s)
+        self.log.tick(unix_s)
+        self._broadcast("condition", encode("condition", msgspec.structs.asdict(self.condition)))
+
+    def _send_logged(self) -> None:
+        events = self.log.since(self._logged_serial)
+        if events:
+            self._logged_serial = self.log.serial
+            message = encode("log", {"events": events})
+            for page in self.pages:
+                page.add_logged(message)
 
     async def run(self) -> None:
         """Tick until cancelled."""
         due_s = self._clock()
         while True:
-            self.tick()
+            self.tick(self._clock() - due_s)
             due_s = max(due_s + _STATE_PERIOD_S, self._clock())
             await asyncio.sleep(due_s - self._clock())
 

@@ -37,7 +37,8 @@ def overlay_grids(task: OverlayTask) -> OverlayGrids:
         return OverlayGrids(error=f"a position needs {needed} anchors or more; this site has {len(task.site.anchors)}")
     settings = PlanSettings(task.method if task.method in METHODS else DEFAULT_METHOD)
     try:
-        table = plan_map(Predictor(task.site, settings), _grid(task)).table[0]
+        grid = _grid(task)
+        table = plan_map(Predictor(task.site, settings), grid).table[0]
     except (SkylessError, ValueError) as error:
         return OverlayGrids(error=str(error))
     covered = table[..., FIX_SHARE] >= _MIN_FIX_SHARE
@@ -45,6 +46,7 @@ def overlay_grids(task: OverlayTask) -> OverlayGrids:
         pdop=_values(table[..., PDOP], 3),
         hdop=_values(table[..., HDOP], 3),
         sigma=_values(np.where(covered, table[..., SIGMA], np.inf), 5),
+        height_m=float(grid.heights_m[0]),
     )
 
 

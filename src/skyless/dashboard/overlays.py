@@ -10,6 +10,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.method_names import DEFAULT_METHOD
+from skyless.planning.colours import COLOUR_STOPS, scale_of
 from skyless.site.image import image_size
 from skyless.site.model import Site
 
@@ -20,12 +21,6 @@ _STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 1
 
 _MAX_CACHED: Final = 8
 _TIMEOUT_S: Final = 120.0
-_BAD_QUANTILE: Final = 0.95
-"""The bad end of the scale; otherwise single extreme cells next to an anchor would use up the colours."""
-
-_MIN_SPAN: Final = 2.0
-"""A scale reaches to at least this multiple of its best value, so that small differences look small."""
-
 Box = tuple[float, float, float, float]
 
 
@@ -51,6 +46,8 @@ class OverlayGrids(Struct, frozen=True):
     pdop: list[float | None] = []
     hdop: list[float | None] = []
     sigma: list[float | None] = []
+    height_m: float | None = None
+    """Height of the tags for which it is predicted."""
     error: str | None = None
 
 
@@ -139,6 +136,11 @@ def _most_common(methods: list[str]) -> str:
 def _answer(task: OverlayTask, kind: Kind, grids: OverlayGrids) -> dict[str, Any]:
     x1, y1, x2, y2 = task.box_m
     half_m = task.step_m / 2
+    values: list[float | None] = getattr(grids, kind)
+    known = sorted(value for value in values if value is not None)
+    scale = scale_of(known)
+    if scale is None:
+        raise NoOverlayError("nowhere at this site is there a fix")
     return {
         "kind": kind,
         "unit": "m" if kind == "sigma" else "1",
@@ -147,16 +149,10 @@ def _answer(task: OverlayTask, kind: Kind, grids: OverlayGrids) -> dict[str, Any
         "step_m": task.step_m,
         "columns": task.columns,
         "rows": task.rows,
-        "values": getattr(grids, kind),
+        "values": values,
         "method": task.method,
-        "levels": levels(getattr(grids, kind)),
+        "height_m": grids.height_m,
+        "least": known[0],
+        "most": known[-1],
+        "scale": {"low": scale.low, "high": scale.high, "ticks": scale.ticks, "stops": COLOUR_STOPS},
     }
-
-
-def levels(values: list[float | None]) -> dict[str, float]:
-    """The ends of the scale of colours."""
-    known = sorted(value for value in values if value is not None)
-    if not known:
-        return {"good": 0.0, "bad": 1.0}
-    bad = known[round(_BAD_QUANTILE * (len(known) - 1))]
-    return {"good": known[0], "bad": max(bad, _MIN_SPAN * known[0])}

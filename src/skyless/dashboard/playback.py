@@ -5,19 +5,39 @@ import math
 import os
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 from msgspec import Struct
 
+from skyless.dashboard.events import Event, EventLog
 from skyless.dashboard.state import SiteState
+from skyless.dashboard.zones import zones_of
 from skyless.errors import SkylessError
-from skyless.mqtt.messages import FixMessage, SiteMessage, TruthMessage, Zone
+from skyless.mqtt.messages import (
+    AnchorHealth,
+    EtherHealth,
+    FixMessage,
+    SiteMessage,
+    StatusMessage,
+    TagHealth,
+    TruthMessage,
+    WatchMessage,
+    Zone,
+)
 from skyless.mqtt.truth_buffer import REACH_S
-from skyless.recordings.mcap.recording import McapRecording
+from skyless.recordings.mcap.recording import McapRecording, Recorded
 
 _SUFFIX: Final = ".mcap"
 _MAX_OPEN: Final = 8
+_GAP_S: Final = 2.5
+"""Shorter times without fixes are not shown: the recorder closes a chunk once a second."""
+
+MAX_RECORDED_EVENTS: Final = 2000
+_TICK_S: Final = 0.5
+_PIECE_BYTES: Final = 1 << 18
 _Version = tuple[int, int, int]
 """A file's inode, size and time of change."""
 
@@ -37,6 +57,9 @@ class ListedRecording(Struct, frozen=True):
     duration_s: float
     complete: bool
     """False while it is being written, and after it was cut off."""
+    site: str | None
+    tags: int
+    fixes: int
 
 
 class PlaybackSummary(Struct, frozen=True):
@@ -48,6 +71,32 @@ class PlaybackSummary(Struct, frozen=True):
     end_unix_s: float
     tags: tuple[str, ...]
     zones: tuple[Zone, ...]
+    fix_spans_unix_s: tuple[tuple[float, float], ...]
+    """When there are fixes, from the first one on, to about a second; empty without any."""
+
+
+class RecordedEvents(Struct, frozen=True):
+    """The events of a recording, the oldest first."""
+
+    events: tuple[Event, ...]
+    complete: bool
+    """False where there are more than ``MAX_RECORDED_EVENTS``."""
+
+
+class RecordingFile(Struct, frozen=True):
+    """A recording's file, open, to be read up to the size that it had then: it may be growing."""
+
+    name: str
+    size_bytes: int
+    file: BinaryIO
+
+    def pieces(self) -> Iterator[bytes]:
+        """The content, piece by piece; closes the file in the end."""
+        with self.file:
+            left = self.size_bytes
+            while left > 0 and (piece := self.file.read(min(left, _PIECE_BYTES))):
+                left -= len(piece)
+                yield piece
 
 
 class Playback:
@@ -60,6 +109,7 @@ class Playback:
         self._stopped = threading.Event()
         self._open: OrderedDict[tuple[str, int], McapRecording] = OrderedDict()
         self._listed: dict[str, tuple[_Version, ListedRecording]] = {}
+        self._events: OrderedDict[str, tuple[_Version, RecordedEvents]] = OrderedDict()
 
     def stop(self) -> None:
         """End running reads soon; their results are incomplete."""
@@ -88,8 +138,35 @@ class Playback:
             found = recording.summary()
             if found.start_s is None or found.end_s is None:
                 raise NoRecordingError(f"{name!r} holds no messages yet")
-            zones = recording.zones.zones if recording.zones is not None else ()
-            return PlaybackSummary(name, recording.site, found.start_s, found.end_s, found.tags, zones)
+            zones = _zones(recording)
+            spans = _fix_spans(recording)
+            return PlaybackSummary(name, recording.site, found.start_s, found.end_s, found.tags, zones, spans)
+
+    def events(self, name: str) -> RecordedEvents:
+        """What has happened in a recording; all of it is read while others are served. Raises NoRecordingError."""
+        path = self._path(name)
+        try:
+            version = _version(path)
+            known = self._events.get(name)
+            if known is None or known[0] != version:
+                with McapRecording(path) as recording:
+                    known = version, _events(recording, self._stopped)
+        except (SkylessError, OSError) as error:
+            raise NoRecordingError(f"{name!r} cannot be read: {error}") from None
+        with self._lock:
+            self._events[name] = known
+            self._events.move_to_end(name)
+            while len(self._events) > _MAX_OPEN:
+                self._events.popitem(last=False)
+        return known[1]
+
+    def open_file(self, name: str) -> RecordingFile:
+        """The file, to be downloaded. Raises NoRecordingError."""
+        try:
+            file = self._path(name).open("rb")
+        except OSError as error:
+            raise NoRecordingError(f"{name!r} cannot be read: {error.strerror}") from None
+        return RecordingFile(name, os.fstat(file.fileno()).st_size, file)
 
     def floor_plan(self, name: str) -> bytes | None:
         """The floor plan's image. Raises NoRecordingError."""
@@ -108,13 +185,14 @@ class Playback:
 
     def _list(self, file: Path, known: dict[str, tuple[_Version, ListedRecording]]) -> None:
         """Add a file to the list; it is read only if it has changed since the last list."""
-        stat = file.stat()
-        version = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
+        version = _version(file)
         old = known.get(file.name)
         if old is None or old[0] != version:
             found = self._recording(file.name).summary()
             duration_s = 0.0 if found.start_s is None or found.end_s is None else found.end_s - found.start_s
-            old = version, ListedRecording(file.name, stat.st_size, found.start_s, duration_s, found.finished)
+            tags, fixes = len(found.tags), found.messages.get("fix", 0)
+            listed = (file.name, version[1], found.start_s, duration_s, found.finished, found.name, tags, fixes)
+            old = version, ListedRecording(*listed)
         self._listed[file.name] = old
 
     def _recording(self, name: str) -> McapRecording:
@@ -142,6 +220,57 @@ class Playback:
             if path.is_file() and path.resolve().parent == self._folder.resolve():
                 return path
         raise NoRecordingError(f"there is no recording {name[:100]!r}")
+
+
+def _version(file: Path) -> _Version:
+    stat = file.stat()
+    return stat.st_ino, stat.st_size, stat.st_mtime_ns
+
+
+def _events(recording: McapRecording, stopped: threading.Event) -> RecordedEvents:
+    """The events of the same log that the live page has, by the recording's times."""
+    log = EventLog()
+    events: list[Event] = []
+    due_s = 0.0
+    for found in recording.messages({"status", "health", "fix", "watch"}):
+        if stopped.is_set() or len(events) >= MAX_RECORDED_EVENTS:
+            break
+        if found.time_s >= due_s:
+            log.tick(found.time_s)
+            due_s = found.time_s + _TICK_S
+        _log_message(log, found)
+        if log.serial > len(events):
+            events += log.since(len(events))
+    return RecordedEvents(tuple(events[:MAX_RECORDED_EVENTS]), len(events) < MAX_RECORDED_EVENTS)
+
+
+def _log_message(log: EventLog, found: Recorded) -> None:
+    message = found.message
+    if isinstance(message, FixMessage):
+        log.on_fix(message, found.time_s)
+    elif isinstance(message, StatusMessage):
+        log.on_status(message, found.time_s)
+    elif isinstance(message, WatchMessage):
+        log.on_watch(message, found.time_s)
+    elif isinstance(message, TagHealth | AnchorHealth | EtherHealth):
+        kind = {TagHealth: "tag", AnchorHealth: "anchor", EtherHealth: "ether"}[type(message)]
+        log.on_health(kind, found.channel.name, message, found.time_s)
+
+
+def _zones(recording: McapRecording) -> tuple[Zone, ...]:
+    """The zones of the recorded site, without those of other sites of its number."""
+    if recording.zones is None:
+        return ()
+    name = "" if recording.site is None else recording.site.site.name
+    return zones_of(recording.zones, name).zones
+
+
+def _fix_spans(recording: McapRecording) -> tuple[tuple[float, float], ...]:
+    spans = recording.spans({"fix"}, _GAP_S)
+    if not spans:
+        return ()
+    first_s = min((found.time_s for found in islice(recording.messages({"fix"}), 1)), default=spans[0][0])
+    return (max(first_s, spans[0][0]), spans[0][1]), *spans[1:]
 
 
 def _states(

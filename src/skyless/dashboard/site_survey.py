@@ -73,6 +73,21 @@ class SiteSurvey:
         """What is to be subscribed to, and who handles it."""
         return {survey_topic(site_id): self._on_survey, watch_topic(site_id): self._on_watch}
 
+    @property
+    def watch(self) -> WatchMessage | None:
+        """What the watch of the anchors has found."""
+        return self._watch.message
+
+    @property
+    def watch_age_s(self) -> float | None:
+        """Seconds since the watch reported; None where it has not."""
+        return self._watch.age_s()
+
+    @property
+    def survey(self) -> SurveyMessage | None:
+        """State of the survey program."""
+        return self._survey.message
+
     def messages(self) -> dict[str, bytes]:
         """The messages that a new page needs, by kind."""
         found = {}

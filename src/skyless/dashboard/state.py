@@ -24,6 +24,7 @@ EXPIRY_S: Final = 600.0
 """Fixes and health messages older than this are dropped."""
 
 _MAX_ENCODED: Final = 16
+_AGES: Final = {"AnchorHealth": "anchors", "TagHealth": "tags", "EtherHealth": "ether"}
 
 
 class _Tag:
@@ -105,9 +106,12 @@ class SiteState:
                 rows.append(tag.row)
         return rows
 
-    def health_message(self, dropped: Mapping[str, int]) -> bytes:
-        """The ``health`` message; ``dropped`` counts wrong messages by kind."""
+    def health_message(self, dropped: Mapping[str, int], now_s: float) -> bytes:
+        """The ``health`` message; ``dropped`` counts wrong messages by kind, and ``ages`` are since each arrived."""
         healths = [health for _, health in self._healths.values()]
+        ages: dict[str, dict[str, float]] = {"anchors": {}, "tags": {}, "ether": {}}
+        for (kind, name), (received_s, _) in self._healths.items():
+            ages[_AGES[kind]][name] = round(now_s - received_s, 2)
         return encode(
             "health",
             {
@@ -116,6 +120,7 @@ class SiteState:
                 "ether": next((health for health in healths if isinstance(health, EtherHealth)), None),
                 "nodes": list(self.statuses.values()),
                 "dropped": dict(dropped),
+                "ages": ages,
             },
         )
 
@@ -155,4 +160,6 @@ def _row(fix: FixMessage, true_m: Vector | None) -> list[Any]:
         round(fix.unix_s, 4),
         None if fix.hpl_m is None else round(fix.hpl_m, 4),
         fix.alert,
+        int(fix.height_known),
+        None if fix.height_known else round(math.sqrt(max(fix.covariance_m2[8], 0.0)), 5),
     ]

@@ -12,7 +12,7 @@ from typing import Final
 import msgspec
 
 from skyless.dashboard.polygon import Polygon, area_m2, depth_m, is_simple, perimeter_m
-from skyless.mqtt.messages import FixMessage, StatusMessage, Vector, Zone, ZoneEvent, ZonesMessage
+from skyless.mqtt.messages import FixMessage, SiteZones, StatusMessage, Vector, Zone, ZoneEvent, ZonesMessage
 
 MIN_MARGIN_M: Final = 0.05
 _MARGIN_SIGMAS: Final = 3.0
@@ -27,6 +27,9 @@ TAG_TIMEOUT_S: Final = 3.0
 _MAX_ZONES: Final = 100
 _MAX_CORNERS: Final = 100
 _MAX_CORNER_M: Final = 1e5
+
+MAX_OTHER_SITES: Final = 20
+"""Sites of one number whose zones are kept besides the present one's; those not seen for longest are dropped."""
 
 MAX_EVENTS: Final = 50
 """Events that are kept for pages."""
@@ -44,14 +47,30 @@ class BadZonesError(ValueError):
     """What is wrong with a list of zones."""
 
 
-def read_zones(payload: bytes) -> tuple[Zone, ...]:
-    """Zones of a ``ZonesMessage`` in JSON. Raises BadZonesError."""
+def read_zones(payload: bytes) -> ZonesMessage:
+    """A ``ZonesMessage`` in JSON, all its zones checked. Raises BadZonesError."""
     try:
-        zones = msgspec.json.decode(payload, type=ZonesMessage).zones
+        message = msgspec.json.decode(payload, type=ZonesMessage)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise BadZonesError(f"this is no list of zones: {error}") from None
-    check_zones(zones)
-    return zones
+    check_zones(message.zones)
+    for other in message.others:
+        check_zones(other.zones)
+    return message
+
+
+def zones_of(message: ZonesMessage, site: str) -> ZonesMessage:
+    """The same for the site of this name: its zones first, those of others kept.
+
+    Zones of which no site is known become this one's; an empty name is a site that is not known yet.
+    """
+    if message.site in ("", site) or not site:
+        return ZonesMessage(message.zones, message.site or site, message.others)
+    mine = next((other.zones for other in message.others if other.site == site), ())
+    others = tuple(other for other in message.others if other.site != site)
+    if message.zones:
+        others = (SiteZones(message.site, message.zones), *others)
+    return ZonesMessage(mine, site, others[:MAX_OTHER_SITES])
 
 
 def check_zones(zones: tuple[Zone, ...]) -> None:

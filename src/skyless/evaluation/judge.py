@@ -56,10 +56,12 @@ class Judge:
         self._places_settled = EvenSample(3)
         self.track = EvenSample(7)
         """Rows of time, position, and true position (NaN where there is none)."""
+        self.newest_truth_m: Triple | None = None
+        """With which the newest position was compared."""
 
     def add(self, time_s: float, since_start_s: float, position_m: Triple) -> None:
         """Take one position; ``time_s`` is in the recording's own time."""
-        truth = self.at(time_s) if self.has_truth else None
+        self.newest_truth_m = truth = self.at(time_s) if self.has_truth else None
         self.track.add((time_s, *position_m, *(truth or (np.nan, np.nan, np.nan))))
         if since_start_s < self._settle_s:
             return
@@ -67,6 +69,11 @@ class Judge:
         self._places_settled.add(position_m)
         if truth is not None and (self._above_m is None or truth[2] > self._above_m):
             self._errors.add(position_m[0] - truth[0], position_m[1] - truth[1], position_m[2] - truth[2])
+
+    @property
+    def judged(self) -> int:
+        """How many positions have been compared with the truth, and count."""
+        return self._errors.count
 
     @property
     def has_truth(self) -> bool:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -9,10 +10,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
+from skyless.air.page_codec import MAX_COORDINATE_M
+from skyless.arguments import check_choice, check_number, check_point, check_whole, wrong
+from skyless.errors import SkylessError
 from skyless.evaluation.cell_fleet import MOST_MACHINES, CellFleet
 from skyless.evaluation.fleet import Fleet, FleetSettings, TagFleet
 from skyless.kernels.arrays import Array
-from skyless.method_names import DEFAULT_METHOD
+from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS, SNAPSHOTS
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.simulation.channel import ChannelModel
 from skyless.simulation.impairments import (
@@ -44,6 +48,14 @@ COMFORT_MPS2: Final = 2.0
 
 ROOM_QA_M2PS3: Final = 0.3
 """Density of the random accelerations of tags in a room."""
+
+MOST_TAGS: Final = 10_000
+FASTEST_MPS: Final = 1000.0
+NOISIEST_PS: Final = 1e6
+"""The range of a site file and of the almanac."""
+
+SHORTEST_LEG_M: Final = 0.01
+"""Of a path, whose corners are rounded."""
 
 _BOX_SIGMAS: Final = 3.0
 """Standard deviations from the middle of the box in which tags wander to its walls."""
@@ -109,13 +121,55 @@ class Request(Struct, frozen=True):
     walls_between_anchors: bool = True
 
 
+def check_request(request: Request) -> None:
+    """See that every value is one that can be simulated. Raises SkylessError naming the field."""
+    check_choice("method", request.method, METHODS)
+    check_whole("seed", request.seed, least=0)
+    check_number("noise_ps", request.noise_ps, least=0.0, most=NOISIEST_PS)
+    check_whole("tags", request.tags, least=1, most=MOST_TAGS)
+    check_number("speed_mps", request.speed_mps, above=0.0, most=FASTEST_MPS)
+    check_number("qa", request.qa, above=0.0)
+    check_number("warmup_s", request.warmup_s, least=0.0)
+    check_whole("most_fixes", request.most_fixes, least=1)
+    check_number("loss", request.loss, least=0.0, below=1.0)
+    check_number("nlos", request.nlos, least=0.0, below=1.0)
+    check_number("nlos_mean_m", request.nlos_mean_m, above=0.0)
+    for number, position_m in enumerate(request.positions_m):
+        check_point(f"positions_m[{number}]", position_m, (2, 3), MAX_COORDINATE_M)
+    for number, path_m in enumerate(request.paths_m):
+        _check_path(f"paths_m[{number}]", path_m)
+
+
+def _check_path(name: str, path_m: Sequence[Sequence[float]]) -> None:
+    if len(path_m) < 2:
+        raise wrong(name, path_m, "two or more points, (x, y) or (x, y, z) in metres")
+    for number, point_m in enumerate(path_m):
+        check_point(f"{name}[{number}]", point_m, (2, 3), MAX_COORDINATE_M)
+    if len({len(point_m) for point_m in path_m}) > 1:
+        raise wrong(name, path_m, "points that all have a height, or none")
+    if any(math.dist(a, b) < SHORTEST_LEG_M for a, b in pairwise(path_m)):
+        raise wrong(name, path_m, f"points that are {SHORTEST_LEG_M:g} m or more from the ones before them")
+
+
+def check_can_be_simulated(site: Site, method: str = DEFAULT_METHOD) -> None:
+    """See that tags of the site can have fixes by the method. Raises SkylessError."""
+    if not site.schedule.needs_master and method in SNAPSHOTS:
+        raise SkylessError(
+            f"--method is {method!r}, which needs a master, and site {site.name!r} has none (mode "
+            f"{site.schedule.mode}); it should be {' or '.join(FILTERS)}"
+        )
+    if not site.anchors:
+        raise SkylessError(f"no anchor of site {site.name!r} has a position, so it cannot be simulated")
+
+
 def fleet_of(request: Request) -> Fleet:
     """Make the world and its tags; the anchors are the machines that would run on radios.
 
     Raises:
-        ValueError: the method, or an anchor that is to fail, does not exist; a path has equal neighbouring points; a
-            position has neither two nor three coordinates, or one that is not finite.
+        SkylessError: a value of the request cannot be simulated.
+        ValueError: an anchor that is to fail does not exist.
     """
+    check_request(request)
     site = request.site
     if request.noise_ps is not None:
         noise = replace(site.noise, tx_stamp_ps=request.noise_ps, rx_stamp_ps=request.noise_ps)
@@ -129,6 +183,7 @@ def fleet_of_any_size(request: Request) -> TagFleet:
     Raises:
         ValueError: as ``fleet_of``, or something is to go wrong that is not modelled at such a site.
     """
+    check_request(request)
     site, room = request.site, request.room
     if site.schedule.needs_master or len(site.anchors) <= MOST_MACHINES:
         return fleet_of(request)
@@ -235,8 +290,6 @@ def wanderer(low_m: Array, high_m: Array, seed: int, tag: int) -> Roaming:
 
 
 def _with_height(point: tuple[float, ...], height_m: float) -> tuple[float, float, float]:
-    if len(point) not in (2, 3) or not all(map(math.isfinite, point)):
-        raise ValueError(f"a position is {tuple(point)}; it should be (x, y) or (x, y, z) in metres")
     return point[0], point[1], point[2] if len(point) > 2 else height_m
 
 

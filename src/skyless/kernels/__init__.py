@@ -1,4 +1,4 @@
 """What estimation computes with: the compiler, array types, small linear algebra.
 
-Public: arrays, compiled, covariance, linear_algebra, two_state.
+Public: arrays, cache, compiled, covariance, linear_algebra, processors, two_state.
 """

@@ -3,58 +3,37 @@
 With ``NUMBA_DISABLE_JIT=1`` every kernel runs as plain Python and gives the same values to rounding.
 """
 
-import hashlib
 import os
-import shutil
-import time
+import pickle
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
 import numba
 from numba import njit
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
 from numba.extending import register_jitable
+
+from skyless.kernels.cache import ONLY_VARIABLE, kernel_folder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _CONFIG: Any = numba.config
-_PACKAGE: Final = Path(__file__).parents[1]
-_KEPT_S: Final = 86_400.0
-"""Kernels of older sources are kept for a day: a program that was started with them may still be compiling."""
+
+_NAMES: Final = os.environ.get(ONLY_VARIABLE, "").replace(",", " ").split()
+_ONLY: Final = tuple(name for name in _NAMES if not name.startswith("-"))
+_WITHOUT: Final = tuple(name[1:] for name in _NAMES if name.startswith("-"))
+_declared: Final[set[str]] = set()
 
 
-def _cache_folder() -> str:
-    """Folder of compiled kernels for exactly these sources.
-
-    Numba notices a change of the kernel's own file but not of the kernels that it calls. So a digest of all files with
-    kernels, and of the constants that they use, stands in the folder's name; older folders are removed when no
-    running program can need them.
-    """
-    digest = hashlib.sha1(usedforsecurity=False)
-    for source in sorted(_PACKAGE.rglob("*.py")):
-        text = source.read_bytes()
-        is_kernel = b"skyless.kernels.compiled" in text or source.parent.name == "kernels"
-        if is_kernel or source.name == "constants.py":
-            digest.update(text)
-    folder = _cache_home() / f"kernels-{digest.hexdigest()[:16]}"
-    if not folder.exists():
-        for old in folder.parent.glob("kernels-*"):
-            with suppress(FileNotFoundError):  # another program may be cleaning up as well
-                if time.time() - old.stat().st_mtime > _KEPT_S:
-                    shutil.rmtree(old, ignore_errors=True)
-        folder.mkdir(parents=True, exist_ok=True)
-    return str(folder)
+def is_compiling() -> bool:
+    """Whether kernels are compiled at all."""
+    return not _CONFIG.DISABLE_JIT
 
 
-def _cache_home() -> Path:
-    beside_sources = _PACKAGE / "__pycache__"
-    if os.access(_PACKAGE, os.W_OK):
-        return beside_sources
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "skyless"
-
-
-_CACHE_FOLDER: Final = os.environ.get("NUMBA_CACHE_DIR") or _cache_folder()
+def declared_kernels() -> frozenset[str]:
+    """Module and name of every function that has been declared here so far and that this program compiles."""
+    return frozenset(_declared)
 
 
 def kernel(function: Function) -> Function:
@@ -63,6 +42,7 @@ def kernel(function: Function) -> Function:
     ``error_model="numpy"`` makes a division by zero an infinity instead of an exception, as in NumPy.
     Fast-math stays off: streaming and batch must give identical bits.
     """
+    _declare(function)
     return _compile(function, {})
 
 
@@ -77,6 +57,7 @@ def part(function: Function) -> Function:
 
 def jitted(function: Function) -> Function:
     """A small function that kernels may call, and that stays plain Python elsewhere."""
+    _declare(function)
     return register_jitable(function)
 
 
@@ -87,23 +68,74 @@ def step(function: Function) -> Function:
     counts up it counts down again, and omits both; with a dozen arrays they take as long as the arithmetic. A kernel
     has none of them where all that it calls are steps.
     """
+    _declare(function)
     return register_jitable(forceinline=True, error_model="numpy")(function)
 
 
 def threaded_kernel(function: Function) -> Function:
     """Compile a long loop that runs without the interpreter's lock, so that threads run it side by side."""
+    _declare(function)
     return _compile(function, {"nogil": True})
 
 
 def _compile(function: Function, options: dict[str, Any]) -> Function:
-    callers_folder = _CONFIG.CACHE_DIR
-    _CONFIG.CACHE_DIR = _CACHE_FOLDER
-    try:
-        return cast("Function", njit(cache=True, error_model="numpy", **options)(function))
-    finally:
-        _CONFIG.CACHE_DIR = callers_folder
+    if not _is_wanted(function):
+        return function
+    compiled = njit(error_model="numpy", **options)(function)
+    if is_compiling():
+        compiled._cache = _KernelCache(function)  # type: ignore[no-untyped-call]
+    return cast("Function", compiled)
 
 
-def cores() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _declare(function: Callable[..., Any]) -> None:
+    if _is_wanted(function):
+        _declared.add(f"{function.__module__}.{function.__qualname__}")
+
+
+def _is_wanted(function: Callable[..., Any]) -> bool:
+    module = function.__module__
+    return (not _ONLY or module.startswith(_ONLY)) and not module.startswith(_WITHOUT)
+
+
+class _Locator(UserProvidedCacheLocator):
+    """Where a kernel is kept: numba's own locators reject a folder that cannot be written, as images have them."""
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._py_file, self._lineno = file, function.__code__.co_firstlineno
+        folder = kernel_folder().path / self.get_suitable_cache_subpath(file)  # type: ignore[no-untyped-call]
+        self._cache_path = str(folder)
+        with suppress(OSError):
+            folder.mkdir(exist_ok=True)
+
+    def get_source_stamp(self) -> str:
+        """The folder's name holds a digest of the sources; times of files change on their way into an image."""
+        return kernel_folder().path.name
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> "_Locator":
+        """See numba."""
+        return cls(function, file)
+
+
+class _Kept(CompileResultCacheImpl):
+    _locator_classes = [_Locator]  # noqa: RUF012 (numba's)
+
+
+class _KernelCache(FunctionCache):
+    """A file that cannot be read or written costs a compilation, and is no error."""
+
+    _impl_class = _Kept
+
+    def load_overload(self, signature: object, context: object) -> object:
+        """See numba; None where there is no usable file."""
+        try:
+            return super().load_overload(signature, context)  # type: ignore[no-untyped-call]
+        except (OSError, EOFError, pickle.UnpicklingError):  # as a loss of power leaves them
+            with suppress(OSError):
+                self.flush()  # type: ignore[no-untyped-call]
+            return None
+
+    def save_overload(self, signature: object, data: object) -> None:
+        """See numba."""
+        with suppress(OSError):
+            super().save_overload(signature, data)  # type: ignore[no-untyped-call]

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 import os
 import platform
 import random
@@ -101,14 +102,30 @@ class Link:
         return Counters(self._outbox.sent, self._outbox.dropped, max(0, self._reconnects))
 
     @property
+    def late(self) -> int:
+        """Messages that were dropped because they could not be sent in time."""
+        return self._outbox.late
+
+    @property
     def unacknowledged(self) -> int:
         """Messages of QoS 1, and retained ones, that the broker does not have for certain."""
         return self._outbox.unacknowledged
 
-    def publish(self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False) -> None:
-        """Hand over a message; returns at once, whatever the broker does. A struct becomes JSON."""
+    def publish(
+        self,
+        topic: str,
+        message: Struct | bytes,
+        *,
+        qos: int = 0,
+        retain: bool = False,
+        until_s: float = math.inf,
+    ) -> None:
+        """Hand over a message; returns at once, whatever the broker does. A struct becomes JSON.
+
+        One of QoS 0 that cannot be sent before ``until_s``, of the host's monotonic clock, is dropped.
+        """
         payload = message if isinstance(message, bytes) else _encode(message)
-        fault = self._outbox.add(topic, payload, qos, retain=retain)
+        fault = self._outbox.add(topic, payload, qos, retain=retain, until_s=until_s)
         if fault is not None:
             self._log_fault(fault)
         self._pump()
@@ -220,7 +237,7 @@ class Link:
     def _pump(self) -> None:
         connection = self._connection
         while connection is not None and connection.writable:
-            message = self._outbox.next_message()
+            message = self._outbox.next_message(time.monotonic())
             if message is None:
                 return
             number = connection.publish(message.topic, message.payload, message.qos, retain=message.retain)

@@ -39,6 +39,17 @@ class StatusMessage(Struct, frozen=True):
     """When it came online; 0 in a last will."""
 
 
+class PreparationMessage(Struct, frozen=True):
+    """How far the compilation of the kernels is, before a site's programs start for the first time; retained."""
+
+    done: int
+    total: int
+    """0 while it is not known yet."""
+    left_s: float | None
+    """Estimated; None where it is not known."""
+    unix_s: float
+
+
 class FixMessage(Struct, frozen=True):
     """One fix of one tag. A tag publishes at its configured rate; ``serial`` counts all fixes that it made."""
 
@@ -125,6 +136,11 @@ class TagHealth(Struct, frozen=True):
     """Resident memory of the process."""
     phases: tuple[Phase, ...]
     """The messages of the last whole superframe."""
+    late: int = 0
+    """Receptions dropped because they were too old at their turn, and fixes not given because they were: ``counters``
+    has them as ``late-reception`` and ``late-fix``."""
+    lateness_s: float = 0.0
+    """Largest age of a reception at its turn, or of a fix when it was made, in the last second."""
 
 
 class AnchorHealth(Struct, frozen=True):
@@ -163,6 +179,8 @@ class AnchorHealth(Struct, frozen=True):
     """Mode slots: links from that anchor; 0 for the root itself."""
     parents: tuple[int, ...] = ()
     """Mode slots: the anchors whose slot time it follows."""
+    missed_share: float = 0.0
+    """Share of its transmissions of the last second that came too late."""
 
 
 class EtherHealth(Struct, frozen=True):
@@ -178,6 +196,8 @@ class EtherHealth(Struct, frozen=True):
     """How often the ether fell behind real time."""
     overruns: int
     """Receptions lost because a process did not read."""
+    missed_share: float = 0.0
+    """Share of the last second's transmissions that were missed because this computer was too slow."""
 
 
 class TrueMotion(Struct, frozen=True, array_like=True):
@@ -251,10 +271,22 @@ class Zone(Struct, frozen=True):
     colour: str | None = None
 
 
+class SiteZones(Struct, frozen=True):
+    """The zones of one site."""
+
+    site: str
+    """The site's name."""
+    zones: tuple[Zone, ...]
+
+
 class ZonesMessage(Struct, frozen=True):
     """All zones of a site, retained."""
 
     zones: tuple[Zone, ...]
+    site: str = ""
+    """Name of the site that they were drawn at: another site may have the same number. Empty: not known."""
+    others: tuple[SiteZones, ...] = ()
+    """Zones of other sites that had this number before, kept until those return."""
 
 
 class ZoneEvent(Struct, frozen=True):

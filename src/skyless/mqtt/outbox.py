@@ -1,5 +1,6 @@
 """What waits to be sent to a broker: bounded, so that a slow or absent one costs memory only up to a limit."""
 
+import math
 import re
 from collections import OrderedDict, deque
 from typing import Final
@@ -32,6 +33,8 @@ class Waiting(Struct, frozen=True, gc=False):
     payload: bytes
     qos: int
     retain: bool
+    until_s: float = math.inf
+    """One of QoS 0 is not sent after this, by the clock of its sender."""
 
 
 class Outbox:
@@ -54,16 +57,21 @@ class Outbox:
         self._retained_bytes = 0
         self._to_retain: dict[str, Waiting] = {}
         self.dropped = 0
+        self.late = 0
+        """Those of the dropped that had waited for too long."""
         self.sent = 0
         """Messages of QoS 0 given to the connection, and messages of QoS 1 acknowledged."""
 
-    def add(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> str | None:
-        """Add a message; returns the fault of one that no broker would accept."""
+    def add(self, topic: str, payload: bytes, qos: int, *, retain: bool, until_s: float = math.inf) -> str | None:
+        """Add a message; returns the fault of one that no broker would accept.
+
+        One of QoS 0 that has not been taken at ``until_s``, by the clock of ``next_message``, is dropped.
+        """
         fault = self._fault(topic, payload)
         if fault is not None:
             self.dropped += 1
             return fault
-        message = Waiting(topic, payload, qos, retain)
+        message = Waiting(topic, payload, qos, retain, until_s)
         if retain:
             self._retain(message)
         elif qos:
@@ -74,7 +82,7 @@ class Outbox:
             self._replace(message)
         return None
 
-    def next_message(self) -> Waiting | None:
+    def next_message(self, now_s: float) -> Waiting | None:
         """The next message to send; None when nothing is left, or the window is full."""
         open_window = len(self._flying) < self._limits.window
         if self._again:
@@ -83,10 +91,13 @@ class Outbox:
             return self._to_retain.pop(next(iter(self._to_retain)))
         if self._queue and open_window:
             return self._queue.popleft()
-        if self._newest:
+        while self._newest:
             message = self._newest.popitem(last=False)[1]
             self._newest_bytes -= len(message.payload)
-            return message
+            if now_s <= message.until_s:
+                return message
+            self.dropped += 1
+            self.late += 1
         return None
 
     def mark_sent(self, message: Waiting, number: int) -> None:

@@ -2,5 +2,5 @@
 
 Public: anchor, board, broker, demo, ether, find_site, fix_log, open_radio, packet_tags, process, radio_monitor, record,
 tag, watch.
-Within the package: children, ports, stamp_log. The survey program has a folder of its own.
+Within the package: children, lateness, ports, stamp_log. The survey program has a folder of its own.
 """

@@ -31,6 +31,7 @@ from skyless.radios.interface import Gone, Late, Radio, RadioEvent, Restarted, S
 from skyless.site.check import check_site
 from skyless.site.digest import is_same_but_placed, site_digest
 from skyless.site.model import Site
+from skyless.site.slots import superframe_ticks_of
 from skyless.slot_claims import SlotRole
 from skyless.ticks import difference
 
@@ -81,6 +82,7 @@ class AnchorNode:
         self.monitor = RadioMonitor(f"anchor {anchor_id}", "on the air", log, radio.advice)
         self.started_s = time.monotonic()
         self.late = 0
+        self.transmissions = TransmissionCount(site)
         self.lead_s = LEAD_S
         """How long before its RMARKER the next frame is made."""
         self.heard_s: dict[int, float] = {}
@@ -146,10 +148,12 @@ class AnchorNode:
             self.machine.hear(event)
             self._note(event)
         elif isinstance(event, Sent):
+            self.transmissions.sent += 1
             self.lead_s = max(self.lead_s * LEAD_LOSS, LEAD_S)
             self._schedule()
         elif isinstance(event, Late):
             self.late += 1
+            self.transmissions.missed += 1
             self.lead_s = min(self.lead_s * LEAD_GAIN, MAX_LEAD_S)
             self._wait(ASK_AGAIN_S, self._schedule)
         else:
@@ -184,6 +188,7 @@ class AnchorNode:
         """Ask the machine for its next transmission."""
         now_ticks = self.radio.now_ticks()
         tx_ticks = None if now_ticks is None else self.machine.next_transmission_ticks(now_ticks)
+        self.transmissions.plan(tx_ticks)
         if now_ticks is None or tx_ticks is None:
             self._wait(ASK_AGAIN_S, self._schedule)
             return
@@ -194,6 +199,30 @@ class AnchorNode:
         """Hand the frame to the radio, and ask again if it never reports the frame's end."""
         self._wait(LOST_ANSWER_S, self._schedule)
         self.radio.transmit(self.machine.transmission(tx_ticks))
+
+
+class TransmissionCount:
+    """Transmissions of an anchor that were sent and that were missed, with those that never came to be handed over."""
+
+    def __init__(self, site: Site) -> None:
+        self.sent = self.missed = 0
+        plan = site.schedule
+        self._interval_ticks = 0.0 if plan.mode == "free" else superframe_ticks_of(site) / plan.frames_per_node
+        """Between two transmissions; 0 where they are at random instants."""
+        self._planned_ticks: int | None = None
+
+    def plan(self, tx_ticks: int | None) -> None:
+        """The next transmission is planned, or may not be planned yet; slots that were passed over are missed."""
+        before, self._planned_ticks = self._planned_ticks, tx_ticks
+        if tx_ticks is not None and before is not None and self._interval_ticks:
+            self.missed += max(0, round(difference(tx_ticks, before) / self._interval_ticks) - 1)
+
+    def drain(self) -> float:
+        """Share of transmissions since the last call that were missed."""
+        planned = self.sent + self.missed
+        share = self.missed / planned if planned else 0.0
+        self.sent = self.missed = 0
+        return share
 
 
 class Anchors:
@@ -270,7 +299,7 @@ def leads(machine: AnyAnchor, *, is_first: bool) -> bool:
 
 
 def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> AnchorHealth:
-    """State of an anchor; ``now_s`` is the host's monotonic clock."""
+    """State of an anchor since the last call; ``now_s`` is the host's monotonic clock."""
     machine = node.machine
     now_ticks = node.radio.now_ticks()
     health = AnchorHealth(
@@ -292,6 +321,7 @@ def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> 
         counters=machine.counters | node.radio.counters | node.refused,
         mqtt=mqtt,
         mode=node.site.schedule.mode,
+        missed_share=node.transmissions.drain(),
     )
     if isinstance(machine, Anchor):
         return _with_master(health, machine, now_ticks)

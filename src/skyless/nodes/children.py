@@ -60,11 +60,11 @@ class Child:
         while True:
             begun_s = asyncio.get_running_loop().time()
             code = await self._run_once()
-            line = self._last_lines[-1] if self._last_lines else "no message"
+            ended = f"{self.program.name} ended ({_how(code)}); {self._last_message()}"
             if self.program.new_file is not None and code >= 0:
-                self._log(f"{self.program.name} ended ({_how(code)}): {line}")
+                self._log(ended)
                 return
-            self._log(f"{self.program.name} ended ({_how(code)}): {line}; started again")
+            self._log(f"{ended}; started again")
             was_good = asyncio.get_running_loop().time() - begun_s > _GOOD_RUN_S
             wait_s = _RESTART_S if was_good else min(2.0 * wait_s, _LONGEST_RESTART_S)
             await asyncio.sleep(wait_s)
@@ -115,8 +115,13 @@ class Child:
                 self._line = self._line[-_LINE_BYTES:]
                 self._last_lines.extend(line.decode(errors="replace").rstrip() for line in lines)
             asyncio.get_running_loop().remove_reader(pipe)
-            if self._line:
-                self._last_lines.append(self._line.decode(errors="replace").rstrip())
+
+    def _last_message(self) -> str:
+        """What it wrote last, which need not be why it ended: a program that is killed cannot say so."""
+        if begun := self._line.decode(errors="replace").strip():
+            return f'its last message, unfinished: "{begun}"'
+        line = next((line for line in reversed(self._last_lines) if line), None)
+        return "it wrote no message" if line is None else f'its last message: "{line}"'
 
 
 async def end(process: asyncio.subprocess.Process) -> None:

@@ -1,6 +1,10 @@
-"""``skyless demo``: a site with broker, ether, anchors, tags, page, survey and recorder as processes, and its watch."""
+"""``skyless demo``: a site with broker, ether, anchors, tags, page, survey and recorder as processes, and its watch.
+
+Broker and page are up first and show how far the kernels are compiled, where they have not been; then the others start.
+"""
 
 import asyncio
+import time
 from pathlib import Path
 from typing import Final
 
@@ -9,12 +13,16 @@ from msgspec.structs import replace
 
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
+from skyless.mqtt.messages import PreparationMessage
+from skyless.mqtt.topics import preparation_topic
 from skyless.nodes.broker import Broker, BrokerSettings, start_broker
 from skyless.nodes.children import Child, Program
 from skyless.nodes.ports import claim_next, hold_any
 from skyless.nodes.process import Log, outlasting, together
 from skyless.nodes.watch import Watch
 from skyless.positioning.integrity import RISK, IntegrityRequirement
+from skyless.preparation.parts import parts_of
+from skyless.preparation.processes import CompilationError, Preparation, Report, compile_parts
 from skyless.site.model import Site
 
 _HOST: Final = "127.0.0.1"
@@ -46,17 +54,21 @@ class SiteRun(Struct, frozen=True):
 
 
 class WholeSite:
-    """Starts everything and keeps it alive; ``ready`` is set when the watch is connected."""
+    """Starts everything and keeps it alive."""
 
     def __init__(self, asked: SiteRun, log: Log) -> None:
         self._asked, self._log = asked, log
+        self.on_preparation: Report | None = None
+        """Called while kernels are compiled, a few times a second."""
         self.ether_port, self._ether_held = hold_any(_HOST)
         self.page_port, self._page_claim = claim_next(_HOST, _PAGE_PORT)
         self.address: MqttAddress | None = asked.broker
         self.watch: Watch | None = None
         self.children: list[Child] = []
         self.ready = asyncio.Event()
-        """The broker is there and the programs are starting."""
+        """The broker is there and the page is starting."""
+        self.prepared = asyncio.Event()
+        """All kernels are compiled and the other programs are starting."""
 
     @property
     def page(self) -> str:
@@ -81,10 +93,30 @@ class WholeSite:
         site = self._asked.site
         link = Link(address, "demo", site=site.id, kind="watch")
         self.watch = Watch(link, site.id, planar=site.tags.height_m is not None)
-        self.children = [Child(program, self._log) for program in self._programs(address)]
+        page = Child(self._page(address), self._log)
+        others = [Child(program, self._log) for program in self._programs(address)]
+        self.children = [*others, page]
         self.ready.set()
-        nodes = together(link.run(), *(child.run() for child in self.children))
+        nodes = together(link.run(), page.run(), self._run_prepared(link, others))
         await (nodes if broker is None else outlasting(self._keep(broker), nodes))  # they publish their end to it
+
+    async def _run_prepared(self, link: Link, children: list[Child]) -> None:
+        """Compile what is missing, and then keep the programs that need it alive."""
+        topic = preparation_topic(self._asked.site.id)
+
+        def report(now: Preparation) -> None:
+            if self.on_preparation is not None:
+                self.on_preparation(now)
+            link.publish(topic, PreparationMessage(now.done, now.total, now.left_s, time.time()), retain=True)
+
+        try:
+            await compile_parts(parts_of(self._asked.method), report)
+        except CompilationError as error:
+            self._log(f"{error}; every program compiles for itself")
+        finally:
+            link.publish(topic, b"", qos=1, retain=True)
+        self.prepared.set()
+        await together(*(child.run() for child in children))
 
     async def _keep(self, broker: Broker) -> None:
         """Start the embedded broker again, on the same port and with the same store, whenever it ends."""
@@ -99,11 +131,14 @@ class WholeSite:
         finally:
             await asyncio.shield(broker.stop())
 
-    def _programs(self, address: MqttAddress) -> list[Program]:
+    def _page(self, address: MqttAddress) -> Program:
         asked = self._asked
-        mqtt: tuple[str, ...] = ("--mqtt", str(replace(address, password=None)))
-        if address.ca is not None:
-            mqtt += ("--mqtt-ca", str(address.ca))
+        page = ("dashboard", *_mqtt(address), "--listen", f"{_HOST}:{self.page_port}")
+        return Program("page", (*page, "--recordings", str(asked.recordings), "--site-id", str(asked.site.id)))
+
+    def _programs(self, address: MqttAddress) -> list[Program]:
+        """All others."""
+        asked, mqtt = self._asked, _mqtt(address)
         radio = ("--radio", f"ether:{_HOST}:{self.ether_port}")
         site = ("--site", asked.site_name)
         ether = ["ether", *site, *mqtt, "--listen", f"{_HOST}:{self.ether_port}", "--tags", str(asked.tags)]
@@ -128,8 +163,6 @@ class WholeSite:
             Program(_named("tag", some), ("tag", *some, *radio, *mqtt, *computing))
             for some in _groups(tags, 1 if asked.apart else _TAGS_PER_PROCESS)
         ]
-        page = ("dashboard", *mqtt, "--listen", f"{_HOST}:{self.page_port}", "--recordings", str(asked.recordings))
-        programs.append(Program("page", (*page, "--site-id", str(asked.site.id))))
         programs.append(Program("survey", ("survey", "--serve", *mqtt, "--site-id", str(asked.site.id))))
         if asked.record is not None:
             limit = ("--limit-mb", str(asked.record_limit_mb))
@@ -137,6 +170,12 @@ class WholeSite:
                 Program("recorder", ("record", str(asked.record), *mqtt, *limit, "--site-id", str(asked.site.id)), 1)
             )
         return programs
+
+
+def _mqtt(address: MqttAddress) -> tuple[str, ...]:
+    """The option of all programs; a password is in their environment."""
+    option = ("--mqtt", str(replace(address, password=None)))
+    return option if address.ca is None else (*option, "--mqtt-ca", str(address.ca))
 
 
 def _groups(names: list[str], size: int) -> list[list[str]]:

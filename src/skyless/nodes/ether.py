@@ -14,17 +14,16 @@ from skyless.constants import TICK_S
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import EtherHealth, TrueMotion, TruthMessage, Vector
 from skyless.mqtt.topics import health_topic, truth_topic
-from skyless.nodes.process import HEALTH_S, Log, every, keep, link_of, together
+from skyless.nodes.lateness import OLDEST_RECEPTION_S
+from skyless.nodes.process import HEALTH_S, Log, every, keep, link_of, most_files, together
 from skyless.radios import ether_wire as wire
+from skyless.radios.interface import ignore
 from skyless.simulation.impairments import Impairments
 from skyless.simulation.medium import Delivery, Medium
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Trajectory
 from skyless.site.model import Site
 from skyless.ticks import wrap
-
-_STALL_S: Final = 0.1
-"""True time stands still while the ether falls behind by more than this (a process that was stopped)."""
 
 _CLOCKS_S: Final = 0.1
 _TRUTH_S: Final = 0.05
@@ -33,6 +32,10 @@ _TRUTH_S: Final = 0.05
 _SEND_BUFFER_BYTES: Final = 1 << 16
 _OVERRUN_BYTES: Final = 1 << 16
 """Frames for a process that does not read are lost beyond this, as from a radio whose host is asleep."""
+
+
+_OTHER_FILES: Final = 192
+"""Files that are no connections of processes: the broker's, the libraries', and connections accepted in one turn."""
 
 
 class Session:
@@ -58,6 +61,7 @@ class Client(asyncio.Protocol):
         self._session: Session | None = None
         self._unpacker = wire.Unpacker()
         self._transport: asyncio.Transport | None = None
+        self._is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Keep the buffers small, so that nothing old piles up in them."""
@@ -66,6 +70,10 @@ class Client(asyncio.Protocol):
         endpoint = transport.get_extra_info("socket")
         endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
         endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        refusal = self._ether.admit()
+        self._is_counted = refusal is None
+        if refusal is not None:
+            self._refuse(refusal)
 
     def send(self, message: msgspec.Struct) -> bool:
         """Send a message; False if it was dropped because too much waits already."""
@@ -105,6 +113,7 @@ class Client(asyncio.Protocol):
         """Take the process's nodes off the air."""
         if self._session is not None:
             self._ether.leave(self._session)
+        self._ether.connections -= self._is_counted
 
 
 class Ether:
@@ -117,7 +126,9 @@ class Ether:
         impairments: Impairments,
         seed: int,
         clock: Callable[[], float] = time.monotonic,
+        most_connections: int | None = None,
     ) -> None:
+        """``most_connections``: None for as many as the system lets this process have."""
         self.site, self._tags, self._clock = site, tags, clock
         specs = [TagSpec(trajectory) for trajectory in tags.values()]
         faults = msgspec.structs.replace(impairments, diagnostics=True)
@@ -127,31 +138,54 @@ class Ether:
         self._owners: dict[int, Session] = {}
         self._flying: dict[int, int] = {}
         self._origin_s = clock()
+        self._most_connections = most_connections
+        self.connections = 0
+        """Of processes, those without nodes on the air among them."""
+        self._is_full = False
+        self._log: Log = ignore
         self._timer: asyncio.TimerHandle | None = None
         self.stalls = self.overruns = 0
+        self._missed = 0
+        """Transmissions whose time had passed when this process came to them."""
+        self._reported = 0, 0
+        """Sent and missed transmissions at the last health message."""
         self.machine = wire.this_machine()
 
-    async def serve(self, host: str, port: int) -> asyncio.Server:
-        """Listen; port 0 takes any free one.
+    async def serve(self, host: str, port: int, log: Log = ignore) -> asyncio.Server:
+        """Listen; port 0 takes any free one. ``log`` gets a line when no further connections are accepted.
 
         Raises:
             OSError: the address cannot be listened to.
         """
         loop = asyncio.get_running_loop()
         self._origin_s = self._clock()
+        self._log = log
+        if self._most_connections is None:
+            self._most_connections = max(1, most_files() - _OTHER_FILES)
         return await loop.create_server(lambda: Client(self), host, port)
 
     # Time
 
     def advance(self) -> None:
-        """Let true time catch up with the host's, and wake again at the next event."""
-        behind_s = self._clock() - self._origin_s - self.medium.now_s
-        if behind_s > _STALL_S:
-            self._origin_s += behind_s
+        """Let true time catch up with the host's, and wake again at the next event.
+
+        Frames that no tag could use any more are not sent: so a slow computer has gaps on the air, and no delay.
+        """
+        now_s = self._clock() - self._origin_s
+        if now_s - self.medium.now_s > OLDEST_RECEPTION_S:
             self.stalls += 1
-        for _ in self.medium.run(self._clock() - self._origin_s):
+            self._miss(now_s)
+        for _ in self.medium.run(now_s):
             pass
         self._arm()
+
+    def _miss(self, until_s: float) -> None:
+        """Send none of the frames whose time has passed; their senders are notified."""
+        for node in self.medium.miss(until_s):
+            self._missed += 1
+            session, tx_ticks = self._owners.get(node), self._flying.pop(node, None)
+            if session is not None and tx_ticks is not None:
+                session.send(wire.Done(session.index[node], tx_ticks, late=True))
 
     def _arm(self) -> None:
         if self._timer is not None:
@@ -178,6 +212,18 @@ class Ether:
         return tuple(wrap(self.medium.read_counter(node)) for node in session.nodes)
 
     # Clients
+
+    def admit(self) -> str | None:
+        """Count another connection; or why there is no room for it."""
+        most = self._most_connections
+        if most is None or self.connections < most:
+            self.connections += 1
+            self._is_full = False
+            return None
+        if not self._is_full:
+            self._is_full = True
+            self._log(f"all {most} connections are in use (limit: ulimit -n); others are refused, these go on")
+        return f"all {most} connections of the ether are in use"
 
     def join(self, client: Client, message: wire.Join) -> Session | str:
         """Put a process's nodes on the air; or why not."""
@@ -265,17 +311,23 @@ class Ether:
         return TruthMessage(unix_s, motions)
 
     def health(self, unix_s: float) -> EtherHealth:
-        """What the air has carried so far."""
+        """What the air has carried so far; to be called once a second."""
         tally = self.medium.tally
+        missed = tally.late_transmissions + self._missed
+        sent_before, missed_before = self._reported
+        self._reported = tally.transmissions, missed
+        new_missed = missed - missed_before
+        planned = tally.transmissions - sent_before + new_missed
         return EtherHealth(
             unix_s,
             self.medium.now_s,
             tally.transmissions,
-            tally.late_transmissions,
+            missed,
             tally.at_anchors,
             tally.at_tags,
             self.stalls,
             self.overruns,
+            missed_share=new_missed / planned if planned else 0.0,
         )
 
 
@@ -298,7 +350,7 @@ class EtherNode:
         Raises:
             OSError: the address cannot be listened to.
         """
-        server = await self._ether.serve(self._host, self._port)
+        server = await self._ether.serve(self._host, self._port, self._log)
         host, port = server.sockets[0].getsockname()[:2]
         self._log(f"ether at {f'[{host}]' if ':' in host else host}:{port}")
         async with server:

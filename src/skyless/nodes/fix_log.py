@@ -1,4 +1,4 @@
-"""What a tag's program keeps of its fixes: numbers, latencies and Unix times; which of them are published."""
+"""What a tag's program keeps of its fixes: numbers, latencies and Unix times; which of them are given."""
 
 import time
 from collections import deque
@@ -10,6 +10,7 @@ from skyless.air.beacon2 import Beacon2
 from skyless.air.frames import decode_any
 from skyless.mqtt.fix_message import fix_message
 from skyless.mqtt.messages import Counters, FixMessage, Phase, TagHealth
+from skyless.nodes.lateness import Lateness
 from skyless.nodes.process import HEALTH_S
 from skyless.positioning.fix import Fix
 
@@ -24,10 +25,15 @@ _LATE_SHARE: Final = 0.5
 class FixLog:
     """Numbers, times and publishes the fixes of one tag, from the first one on, whatever its radio does."""
 
-    def __init__(self, tag: str, publish: FixListener, publish_hz: float) -> None:
-        """``publish`` is called at most ``publish_hz`` times a second; all fixes count."""
-        self.tag = tag
-        self.started_s = time.monotonic()
+    def __init__(
+        self, tag: str, publish: FixListener, publish_hz: float, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """``publish`` is called at most ``publish_hz`` times a second, and not with fixes that are too old; all count.
+
+        ``clock`` gives the host's monotonic time in s.
+        """
+        self.tag, self._clock = tag, clock
+        self.started_s = clock()
         self.unix_less_host_s = 0.0
         self.update_clock_offset()
         self.serial = 0
@@ -37,12 +43,14 @@ class FixLog:
         self.last_fix_s: float | None = None
         """When the last fix was made, by the host's monotonic clock."""
         self.latencies = Latencies()
+        self.lateness = Lateness()
+        """Which receptions and fixes are too old."""
         self._reported_serial = 0
         self._publish, self._rate = publish, _RateLimit(publish_hz)
 
     def update_clock_offset(self) -> None:
         """Measure again how far Unix time is from the host's monotonic clock: it is set now and then."""
-        self.unix_less_host_s = time.time() - time.monotonic()
+        self.unix_less_host_s = time.time() - self._clock()
 
     def add(self, fix: Fix, ended_s: float, done_s: float) -> None:
         """Add a fix: when its last frame ended, and when it was made, by the host's monotonic clock."""
@@ -51,7 +59,7 @@ class FixLog:
         self.latencies.add(done_s - ended_s)
         if self.first_fix_s is None:
             self.first_fix_s = done_s - self.started_s
-        if self._rate.is_due(ended_s):
+        if self.lateness.gives(ended_s, done_s) and self._rate.is_due(ended_s):
             unix_s = ended_s + self.unix_less_host_s
             self._publish(fix_message(self.tag, self.serial, fix, unix_s, done_s - ended_s))
 
@@ -66,12 +74,17 @@ class FixLog:
         cpu: float,
         memory_bytes: int,
         phases: tuple[Phase, ...] = (),
+        late_in_link: int = 0,
     ) -> TagHealth:
-        """The tag's state since the last call; ``reason``: why there is no fix, where there is none."""
-        now_s = time.monotonic()
+        """The tag's state since the last call; ``reason``: why there is no fix, where there is none.
+
+        ``late_in_link``: fixes that became too old while they waited for the broker.
+        """
+        now_s = self._clock()
         median_s, late_s, _ = self.latencies.drain()
         fixes, self._reported_serial = self.serial - self._reported_serial, self.serial
         is_silent = self.last_fix_s is None or now_s - self.last_fix_s > HEALTH_S
+        late_fixes = self.lateness.withheld + late_in_link
         return TagHealth(
             tag=self.tag,
             unix_s=time.time(),
@@ -84,11 +97,13 @@ class FixLog:
             first_fix_s=self.first_fix_s,
             latency_p50_s=median_s,
             latency_p99_s=late_s,
-            counters=dict(counters),
+            counters=dict(counters) | ({"late-fix": late_fixes} if late_fixes else {}),
             mqtt=mqtt,
             cpu=cpu,
             memory_bytes=memory_bytes,
             phases=phases,
+            late=self.lateness.dropped + late_fixes,
+            lateness_s=self.lateness.drain(),
         )
 
 

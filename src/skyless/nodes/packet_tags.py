@@ -14,6 +14,7 @@ from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import Counters, FixMessage
 from skyless.mqtt.topics import fix_topic, health_topic
 from skyless.nodes.fix_log import FixListener, FixLog
+from skyless.nodes.lateness import FIX_LEAVES_S
 from skyless.nodes.process import HEALTH_S, Log, SitePublisher, Usage, every, keep, link_of, together
 from skyless.nodes.radio_monitor import RadioMonitor
 from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
@@ -58,11 +59,19 @@ def site_of(settings: PacketTagSettings) -> Site | None:
 class PacketTagNode:
     """Runs ``PacketTracking`` on a sniffer. ``publish`` is called with the fixes that are to be published."""
 
-    def __init__(self, settings: PacketTagSettings, radio: SnifferRadio, publish: FixListener, log: Log) -> None:
-        self.settings, self.radio = settings, radio
+    def __init__(
+        self,
+        settings: PacketTagSettings,
+        radio: SnifferRadio,
+        publish: FixListener,
+        log: Log,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``clock`` gives the host's monotonic time in s, as ``host_s`` of the packets."""
+        self.settings, self.radio, self._clock = settings, radio, clock
         self.tracking = self._new_tracking()
         self.packets = 0
-        self.fix_log = FixLog(radio.name, publish, settings.publish_hz)
+        self.fix_log = FixLog(radio.name, publish, settings.publish_hz, clock)
         self.monitor = RadioMonitor(f"tag {radio.name}", "listening", log, radio.advice)
         self._drops: Counter[str] = Counter()
         self._known = 0
@@ -77,7 +86,7 @@ class PacketTagNode:
     @property
     def drops(self) -> Counter[str]:
         """What could not be used, by reason."""
-        return self._drops + self.tracking.drops + self.radio.counters
+        return self._drops + self.tracking.drops + self.radio.counters + self.fix_log.lateness.drops
 
     def check_reception(self, now_s: float) -> None:
         """Log where to look if it receives nothing usable; ``now_s`` is the host's monotonic clock."""
@@ -99,10 +108,12 @@ class PacketTagNode:
 
     def _receive(self, packet: Packet) -> None:
         self.packets += 1
+        if packet.host_s is not None and not self.fix_log.lateness.admits(packet.host_s, self._clock()):
+            return
         self._known += packet.anchor in self.settings.anchors_m
         fix = self.tracking.on_packet(packet)
         if fix is not None:
-            done_s = time.monotonic()
+            done_s = self._clock()
             self.fix_log.add(fix, done_s if packet.host_s is None else packet.host_s, done_s)
 
 
@@ -144,7 +155,8 @@ class PacketTags:
                 self._on_fix(message)
             link = self._links[index]
             if link is not None:
-                link.publish(fix_topic(self._settings.site, message.tag), message)
+                ended_s = message.unix_s - self.nodes[index].fix_log.unix_less_host_s
+                link.publish(fix_topic(self._settings.site, message.tag), message, until_s=ended_s + FIX_LEAVES_S)
 
         return publish
 
@@ -162,6 +174,7 @@ class PacketTags:
                 mqtt=Counters(0, 0, 0) if link is None else link.counters,
                 cpu=share / len(self.nodes),
                 memory_bytes=memory_bytes,
+                late_in_link=0 if link is None else link.late,
             )
             if link is not None:
                 if self._site_publisher is not None:

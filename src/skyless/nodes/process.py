@@ -7,6 +7,7 @@ import fcntl
 import gc
 import os
 import resource
+import select
 import selectors
 import signal
 import sys
@@ -29,6 +30,9 @@ Log = Callable[[str], None]
 """Called with one line for a person to read."""
 
 _PR_SET_PDEATHSIG: Final = 1
+
+_MOST_FILES: Final = 65_536
+"""More are not asked for: some systems allow billions, and some libraries go through all that could be open."""
 
 _RADIO_NICE: Final = -10
 """Priority of programs that serve a radio, where the system allows it (root, or a limit in limits.conf)."""
@@ -55,8 +59,26 @@ def run(main: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
 
 
 def _new_loop() -> asyncio.AbstractEventLoop:
-    """A loop on select(), whose timers are exact to microseconds; those of epoll() are a millisecond late."""
-    return asyncio.SelectorEventLoop(selectors.SelectSelector())
+    """A loop for any number of connections, whose timers are exact to microseconds."""
+    return asyncio.SelectorEventLoop(PunctualSelector() if hasattr(selectors, "EpollSelector") else None)
+
+
+if hasattr(selectors, "EpollSelector"):
+
+    class PunctualSelector(selectors.EpollSelector):
+        """epoll(), whose own timeouts end up to a millisecond late, woken by select(), which is exact.
+
+        select() takes no file beyond number 1023. So it waits for one file alone, epoll()'s own, which can be read as
+        soon as any of the others is ready.
+        """
+
+        def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+            """The files that are ready; waits for one at most ``timeout`` s, without limit where it is None."""
+            if timeout is None:
+                return super().select()
+            if timeout > 0.0:
+                select.select([self.fileno()], [], [], timeout)
+            return super().select(0)
 
 
 async def _until_terminated(main: Coroutine[Any, Any, None]) -> None:
@@ -218,6 +240,17 @@ def locked(file: Path) -> IO[str]:
 
 
 # Use of the machine
+
+
+def most_files() -> int:
+    """How many files and connections this process may have open: as many as the system lets it have, from now on."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == hard:
+        return soft
+    most = min(hard, _MOST_FILES) if hard != resource.RLIM_INFINITY else _MOST_FILES
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(most, soft), hard))
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
 
 
 class Usage:

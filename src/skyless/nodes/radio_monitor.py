@@ -26,6 +26,7 @@ _MEANING: Final = {
     "malformed-line": "lines of another format, or another rate",
     "bytes-of-no-record": "bytes of another format, or another rate",
     "garbled-record": "the line loses bytes",
+    "late-reception": "those were too old at their turn: this computer is too slow",
 }
 
 

@@ -17,6 +17,7 @@ from skyless.mqtt.link import Link
 from skyless.mqtt.messages import Counters, FixMessage, RequestMessage
 from skyless.mqtt.topics import fix_topic, health_topic, receptions_topic, request_topic
 from skyless.nodes.fix_log import FixListener, FixLog, PhaseLog
+from skyless.nodes.lateness import FIX_LEAVES_S
 from skyless.nodes.process import HEALTH_S, Log, Usage, every, keep, together
 from skyless.nodes.radio_monitor import RadioMonitor
 from skyless.positioning.integrity import IntegrityRequirement
@@ -51,16 +52,21 @@ class TagNode:
         publish: FixListener,
         log: Log,
         before: Callable[[Receiver, Reception, int], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``before`` is called with receiver, reception and the number of fixes so far before each reception."""
+        """``before`` is called before each reception that is processed: with receiver, reception and number of fixes.
+
+        ``clock`` gives the host's monotonic time in s, as ``host_s`` of the receptions.
+        """
         self.settings, self.radio = settings, radio
         self.name = radio.name
         self.receiver = self.new_receiver()
         self.receptions = 0
-        self.fix_log = FixLog(self.name, publish, settings.publish_hz)
+        """Those that were too old at their turn among them."""
+        self.fix_log = FixLog(self.name, publish, settings.publish_hz, clock)
         self.phases = PhaseLog()
         self.monitor = RadioMonitor(f"tag {self.name}", "listening", log, radio.advice)
-        self._before = before
+        self._before, self._clock = before, clock
 
     def new_receiver(self) -> Receiver:
         """A receiver that has heard nothing yet."""
@@ -71,7 +77,8 @@ class TagNode:
     def drops(self) -> Counter[str]:
         """What could not be used, by reason."""
         counters = self.receiver.counters.items()
-        return Counter({reason: count for reason, count in counters if reason not in NOT_DROPS}) + self.radio.counters
+        dropped = Counter({reason: count for reason, count in counters if reason not in NOT_DROPS})
+        return dropped + self.radio.counters + self.fix_log.lateness.drops
 
     def check_reception(self, now_s: float) -> None:
         """Log where to look if it receives nothing usable; ``now_s`` is the host's monotonic clock."""
@@ -91,11 +98,13 @@ class TagNode:
                 self.receiver = self.new_receiver()
 
     def _receive(self, reception: Reception) -> None:
+        self.receptions += 1
+        if reception.host_s is not None and not self.fix_log.lateness.admits(reception.host_s, self._clock()):
+            return
         if self._before is not None:
             self._before(self.receiver, reception, self.fix_log.serial)
-        self.receptions += 1
         fix = self.receiver.hear(reception)
-        done_s = time.monotonic()
+        done_s = self._clock()
         ended_s = done_s if reception.host_s is None else reception.host_s
         self.phases.add(reception.frame, ended_s, done_s, made_fix=fix is not None)
         if fix is not None:
@@ -117,6 +126,8 @@ class Tag:
         self._address, self._log, self._on_fix = address, log, on_fix
         self.link: Link | None = None
         self._site: int | None = None
+        self._late_before = 0
+        """Fixes that became too old in links to other sites."""
         self._link_tasks: list[asyncio.Task[None]] = []
         self._fix_topic = self._health_topic = self._receptions_topic = ""
         asked = receiver_settings(settings.method, settings.site, settings.qa, integrity=settings.integrity)
@@ -137,7 +148,8 @@ class Tag:
             self._on_fix(message)
         self._connect()
         if self.link is not None:
-            self.link.publish(self._fix_topic, message)
+            ended_s = message.unix_s - self.node.fix_log.unix_less_host_s
+            self.link.publish(self._fix_topic, message, until_s=ended_s + FIX_LEAVES_S)
 
     def _connect(self) -> None:
         """Make the link to the site to which the tag listens."""
@@ -148,6 +160,7 @@ class Tag:
             task.cancel()  # it publishes its end to the site that was left
         self._link_tasks = [task for task in self._link_tasks if not task.done()]
         self._site = site
+        self._late_before += 0 if self.link is None else self.link.late
         self.link = Link(self._address, self.node.name, site=site, kind="tag")
         self._fix_topic = fix_topic(site, self.node.name)
         self._health_topic = health_topic(site, "tag", self.node.name)
@@ -187,6 +200,7 @@ class Tag:
             cpu=cpu,
             memory_bytes=memory_bytes,
             phases=node.phases.last,
+            late_in_link=self._late_before + (0 if self.link is None else self.link.late),
         )
         if self.link is not None:
             self.link.publish(self._health_topic, health)

@@ -21,7 +21,8 @@ from msgspec import Struct
 
 from skyless.constants import TICK_M, TICK_S
 from skyless.kernels.arrays import Array
-from skyless.kernels.compiled import cores, kernel, threaded_kernel
+from skyless.kernels.compiled import kernel, threaded_kernel
+from skyless.kernels.processors import cores
 from skyless.positioning.methods.snapshots import (
     averaged_offset,
     protocol_interval,

@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from skyless.errors import SkylessError
 from skyless.evaluation.figures import picture, report_style
-from skyless.kernels.compiled import cores
+from skyless.kernels.processors import cores
 from skyless.paper import (
     checks,
     claim,

@@ -119,6 +119,42 @@ class Mounts(Struct, frozen=True):
         return rounded
 
 
+def lowest_and_highest(site: Site) -> tuple[float, float]:
+    """Heights of the lowest and of the highest anchor, metres."""
+    levels_m = [anchor.z_m for anchor in site.anchors]
+    return min(levels_m), max(levels_m)
+
+
+def usual_tag_heights(site: Site) -> tuple[float, ...]:
+    """Heights of the maps where none are asked for: the known one, or three between the lowest and highest anchor."""
+    if site.tags.height_m is not None:
+        return (site.tags.height_m,)
+    low, high = lowest_and_highest(site)
+    return tuple(round(low + share * (high - low), 2) for share in (1 / 6, 1 / 2, 5 / 6))[: 3 if high > low else 1]
+
+
+def mounts_of(site: Site, floor: Floor, walls_m: Matrix | None, heights_m: tuple[float, ...] | None) -> Mounts:
+    """Where anchors may hang: on the walls, shape (k, 4), by default the floor's sides; at which heights.
+
+    By default the heights are those of the lowest and highest anchor.
+    """
+    levels_m = lowest_and_highest(site) if heights_m is None else heights_m
+    return Mounts(sides(floor.outline_m) if walls_m is None else walls_m, tuple(dict.fromkeys(levels_m)))
+
+
+def fewest_anchors(site: Site) -> int:
+    """How many anchors a position at this site needs."""
+    return 4 if site.tags.height_m is None else 3
+
+
+def check_anchor_count(site: Site, file: Path) -> None:
+    """See that the site has anchors enough for a position. Raises ConfigurationError."""
+    needed, what = fewest_anchors(site), "with its height" if site.tags.height_m is None else "at a known height"
+    if len(site.anchors) < needed:
+        right = f"at least {needed}, which a position {what} needs"
+        raise ConfigurationError(file, "anchors", f"a list of {len(site.anchors)}", right)
+
+
 def points_along(segments_m: Matrix, along_m: Vector) -> Matrix:
     """Points, shape (m, 2), at distances along segments, shape (k, 4), one after the other and round again."""
     lengths = np.linalg.norm(segments_m[:, 2:] - segments_m[:, :2], axis=1)

@@ -32,6 +32,9 @@ from skyless.site.model import GeoreferenceSite
 
 _MOST_POINTS: Final = 5_000_000
 _NICE_POINTS: Final = 12_000
+LEAST_BIAS_M: Final = 1e-4
+"""Mean errors of positions below this are none."""
+
 _STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 _JOINT_BUDGET: Final = 2.5e5
 """Points of the joint filter times what one costs, the square of the anchors in view and a constant."""
@@ -74,6 +77,12 @@ class PlanMap(Struct, frozen=True):
     def column(self, index: int) -> Array:
         """One column, shape (heights, ny, nx)."""
         return self.table[..., index]
+
+    @property
+    def has_bias(self) -> bool:
+        """Whether walls delay frames so that positions somewhere have a mean error."""
+        bias = self.column(BIAS)
+        return bool((bias[np.isfinite(bias)] > LEAST_BIAS_M).any())
 
 
 class MapSummary(Struct, frozen=True):

@@ -11,7 +11,7 @@ from matplotlib.image import AxesImage
 
 from skyless.kernels.arrays import Array
 from skyless.planning.floor import Floor
-from skyless.planning.picture import cells_box, draw_image, draw_outline_and_walls
+from skyless.planning.picture import cells_box, draw_image, draw_outline_and_walls, value_colours
 from skyless.planning.slot_plan import RateMap
 from skyless.site.model import Site
 from skyless.site.near import anchor_positions
@@ -94,6 +94,6 @@ def _draw_rates(axes: Axes, mapped: RateMap) -> AxesImage:
     several = "the least at heights of" if len(mapped.grid.heights_m) > 1 else "at a height of"
     axes.set_title(f"beacons per second at a tag, {several} {heights} m")
     return axes.imshow(
-        lowest, extent=cells_box(mapped.grid), origin="lower", cmap="viridis", vmin=0.0, interpolation="nearest",
-        zorder=1, alpha=0.85,
+        lowest, extent=cells_box(mapped.grid), origin="lower", cmap=value_colours(reversed_=True), vmin=0.0,
+        interpolation="nearest", zorder=1, alpha=0.85,
     )  # fmt: skip

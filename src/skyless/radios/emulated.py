@@ -1,6 +1,7 @@
 """Emulated radios: the nodes of one process on the air of ``skyless ether``, over one TCP connection."""
 
 import asyncio
+import math
 import os
 import socket
 import time
@@ -16,6 +17,8 @@ from skyless.radios.interface import Gone, Late, Listener, RadioEvent, Restarted
 from skyless.ticks import wrap
 
 _RECONNECT_S: Final = 0.2
+_SHIFT_S: Final = 15.0
+"""The shift to another machine's clock is measured again after this: clocks of computers drift by 0.1 ms a second."""
 _RECEIVE_BUFFER_BYTES: Final = 1 << 16
 """A radio keeps few frames for a host that does not fetch them; so does this one, 0.2 s of them."""
 
@@ -146,6 +149,25 @@ class EtherConnection:
             self._set_clocks(message.host_s + shift_s, message.ticks)
 
 
+class ClockShift:
+    """What to add to another machine's clock to get this one's, from messages with the time when they were sent.
+
+    The quickest message of the last half minute or so decides: the clocks drift apart, and some messages are slow.
+    """
+
+    def __init__(self, shift_s: float) -> None:
+        self.shift_s = shift_s
+        self._least_s = self._least_before_s = shift_s
+        self._begun_s: float | None = None
+
+    def note(self, sent_s: float, now_s: float) -> None:
+        """A message has come that was sent at a time of the other's clock."""
+        if self._begun_s is None or now_s - self._begun_s > _SHIFT_S:
+            self._begun_s, self._least_before_s, self._least_s = now_s, self._least_s, math.inf
+        self._least_s = min(self._least_s, now_s - sent_s)
+        self.shift_s = min(self._least_s, self._least_before_s)
+
+
 class _Stream(asyncio.Protocol):
     """The connection from its beginning until it ends; ``ended`` gives the reason."""
 
@@ -153,7 +175,8 @@ class _Stream(asyncio.Protocol):
         self._connection = connection
         self._unpacker = wire.Unpacker()
         self._transport: asyncio.Transport | None = None
-        self._shift_s = 0.0
+        self._shift: ClockShift | None = None
+        """Only of an ether on another machine."""
         self.ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -174,10 +197,16 @@ class _Stream(asyncio.Protocol):
         elif isinstance(message, wire.Joined):
             assert self._transport is not None
             if message.machine != wire.this_machine():
-                self._shift_s = time.monotonic() - message.host_s
+                self._shift = ClockShift(time.monotonic() - message.host_s)
             self._connection.on_joined(message, self._shift_s, self._transport)
         else:
+            if self._shift is not None and isinstance(message, wire.Clocks):
+                self._shift.note(message.host_s, time.monotonic())
             self._connection.on_message(message, self._shift_s)
+
+    @property
+    def _shift_s(self) -> float:
+        return 0.0 if self._shift is None else self._shift.shift_s
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason makes no difference
         self._end("the ether has gone")

@@ -121,6 +121,10 @@ class OnAir:
         """Remove a frame that will not be sent."""
         self._flights.remove(flight)
 
+    def between(self, from_ticks: int, until_ticks: int) -> list[Flight]:
+        """Frames whose RMARKER leaves after a time and before another."""
+        return [flight for flight in self._flights if from_ticks < flight.marker_ticks < until_ticks]
+
     def others(self, flight: Flight) -> Array:
         """Frames that may overlap this one, shape (n, 3): sending node, begin and end in s from this RMARKER."""
         first, last = flight.begin_ticks - _FARTHEST_TICKS, flight.end_ticks + _FARTHEST_TICKS
@@ -252,6 +256,8 @@ class Medium(MediumBase[Result]):
         self._plan_changes()
         self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
         self._air = OnAir()
+        self._missed_ticks = 0
+        """Frames that should have left before are not sent."""
         self._received = np.zeros(len(keys), dtype=RECEPTION_RECORD)
 
     # Clocks
@@ -310,10 +316,19 @@ class Medium(MediumBase[Result]):
         self.timeline.at(marker, partial(self._radiate, flight))
         return True
 
+    def miss(self, until_s: float) -> tuple[int, ...]:
+        """Withdraw all frames whose RMARKER would leave before ``until_s``: whoever lets time pass came too late.
+
+        Returns the nodes that planned them.
+        """
+        self._missed_ticks = from_seconds(until_s)
+        missed = self._air.between(self.timeline.now_ticks, self._missed_ticks)
+        return tuple(flight.sender for flight in missed if flight.boot == self.boots[flight.sender])
+
     def _radiate(self, flight: Flight) -> None:
         """Let the RMARKER leave, and every node that can receive the frame stamp it."""
         node, streams = flight.sender, self._streams
-        if flight.boot != self.boots[node]:
+        if flight.marker_ticks < self._missed_ticks or flight.boot != self.boots[node]:
             self._air.withdraw(flight)
             return
         normals, cursors = streams.normals, streams.cursors

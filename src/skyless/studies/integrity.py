@@ -27,6 +27,7 @@ from skyless.positioning.integrity import CONTRADICTED, HPL, VPL
 from skyless.site.lab import ideal_lab_site
 from skyless.studies.common.picture import LEAST_DRAWN_SHARE, centimetres
 from skyless.studies.common.plan import Cell, Plan, Row
+from skyless.studies.common.sides import STATED_RISK, Sides, name_sides, shade_sides
 from skyless.studies.common.summary import clustered_interval
 from skyless.studies.episodes import (
     EPISODE_SPEED_STD_MPS,
@@ -75,6 +76,8 @@ _WORDS: Final[dict[Kind, str]] = {
 _WIDTH_IN: Final = 4.4
 _HEIGHT_IN: Final = 3.0
 _COLOURS: Final = (BLUE, ORANGE, GREEN, PURPLE, RED, INK)
+
+_LEVELS: Final = Sides("RMSE near or above the level: too confident", "level far above the RMSE: safe side", "above")
 
 _Values = Callable[[Row], float | None]
 
@@ -338,6 +341,8 @@ def _fill(line: Sequence[Axes], rows: list[Row]) -> None:
     for axes in line:
         axes.set(xlabel="size of the fault in m", xscale="log")
         axes.xaxis.set_major_formatter("{x:g}")
+    name_sides(levels, _LEVELS, along="y")
+    shade_sides(misleading, STATED_RISK, rows[0].risk or LEAST_DRAWN_SHARE, along="y")
 
 
 def _numbers(values: Iterable[float | None]) -> list[float]:

@@ -13,6 +13,7 @@ from skyless.kernels.arrays import Matrix
 from skyless.simulation.oscillator import OscillatorModel
 from skyless.simulation.site_time import Errors, Network, network, simulate
 from skyless.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.studies.common.sides import Sides, shade_sides
 
 _SLOT_S: Final = 1e-3
 _SETTLING_S: Final = 5.0
@@ -22,6 +23,7 @@ _SAMPLE_S: Final = 0.1
 _HOPS: Final = (1, 2, 5, 10, 13, 20, 40, 60, 66)
 
 _HONEST: Final = Limit("ratio", 0.7, 1.5)
+_STATED: Final = Sides("σ smaller than the error: too confident", "σ larger than the error: safe side", "above")
 _NEIGHBOURS_M: Final = 0.025
 """Of the corridor with all beacons received, over eleven hops: single pairs have slots that suit them or not."""
 _SLOTS_M: Final = 15.0
@@ -197,4 +199,5 @@ def draw(rows: Sequence[Row]) -> Figure:
     error.yaxis.set_major_formatter("{x:g}")
     error.yaxis.set_minor_formatter("{x:g}")
     error.legend(fontsize=6)
+    shade_sides(ratio, _STATED, 1.0, along="y")
     return figure

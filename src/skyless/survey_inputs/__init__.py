@@ -2,5 +2,5 @@
 
 ``run`` is all of ``skyless calibrate`` on a recording.
 
-Public: recorded_stamps, run, samples, walk.
+Public: recorded_stamps, report, run, samples, walk.
 """

@@ -21,7 +21,7 @@ from skyless.recordings.foreign import avalue
 from skyless.recordings.foreign.formats import FORMATS, format_of, open_recording
 from skyless.recordings.mcap.recording import MAGIC, McapRecording, Recorded
 from skyless.recordings.source import Drops, open_source
-from skyless.replay.site import SITE_FORMAT, recorded_site
+from skyless.replays.site import SITE_FORMAT, recorded_site
 from skyless.site.model import Site
 from skyless.survey.ranges import PairBlock, PairRanges
 from skyless.survey.stamps.legs import AnchorLeg, LegCollector, Relayed, RelayMatcher

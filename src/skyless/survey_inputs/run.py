@@ -20,7 +20,7 @@ from skyless.evaluation.judge import Judge
 from skyless.recordings.foreign.formats import open_recording
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.recordings.truth import Truth
-from skyless.replay.site import SITE_FORMAT, recorded_site, recorded_truth
+from skyless.replays.site import SITE_FORMAT, recorded_site, recorded_truth
 from skyless.site.check import SITE_LIMITS
 from skyless.site.model import Site
 from skyless.site.rewrite import DELAY_KEY

@@ -23,7 +23,7 @@ from skyless.recordings.foreign.formats import Recording
 from skyless.recordings.mcap.host_clock import HostClock
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.recordings.source import Drops
-from skyless.replay.site import reception_of
+from skyless.replays.site import reception_of
 from skyless.survey.tags.estimate import Differences
 from skyless.ticks import difference, from_seconds
 

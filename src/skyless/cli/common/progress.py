@@ -1,16 +1,23 @@
-"""A progress bar on long work, for people only: never in a pipe, never on short work."""
+"""Progress of long work: a bar for people only, never in a pipe, never on short work; counts of compilation for all."""
 
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Final, Self
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+    from skyless.kernels.cache import KernelFolder
+    from skyless.preparation.parts import Part
+    from skyless.preparation.processes import Preparation
+
 _HIDDEN_S: Final = 1.5
 _REDRAW_S: Final = 0.1
+_COUNT_S: Final = 0.25
+_LINE_S: Final = 4.0
+"""Between two lines where there is no terminal."""
 
 
 class Bar:
@@ -71,7 +78,85 @@ def status(description: str) -> Iterator[None]:
 
 
 @contextmanager
-def loading_kernels() -> Iterator[None]:
-    """A spinner while the compiled kernels are loaded, which are compiled where they have not been yet."""
-    with status("loading the kernels; the first start compiles them, which takes up to a minute"):
+def loading_kernels(*parts: "Part") -> Iterator[None]:
+    """Compile what is missing of the parts, on all cores and with counts; then a spinner while the block loads them."""
+    from skyless.preparation.processes import missing
+
+    if missing(parts):
+        compile_with_counts(parts)
+    with status("loading the kernels"):
         yield
+
+
+def compile_with_counts(parts: "Iterable[Part]") -> None:
+    """Compile what is missing of the parts and say how far it is; a part that cannot be is left to its user."""
+    import asyncio
+
+    from skyless.preparation.processes import CompilationError, compile_parts
+
+    report_kernel_folder()
+    with CountLine() as line, suppress(CompilationError):
+        asyncio.run(compile_parts(parts, line.show))
+
+
+def report_kernel_folder() -> None:
+    """One line where compiled kernels cannot be kept for good."""
+    from skyless.kernels.cache import kernel_folder
+
+    folder = kernel_folder()
+    if folder.temporary:
+        _print_line(
+            f"no folder can be written to keep compiled kernels; {_for_how_long(folder)}. "
+            "To keep them, let NUMBA_CACHE_DIR name a folder that can be written"
+        )
+
+
+def _for_how_long(folder: "KernelFolder") -> str:
+    if folder.writable:
+        return f"they are in {folder.path.parent}, which the system may clear"
+    return "every program compiles them at every start, for a minute or so"
+
+
+class CountLine:
+    """``compiling 37 of 120`` on standard error: one line that changes on a terminal, else a line every few seconds."""
+
+    def __init__(self) -> None:
+        self._on_terminal = sys.stderr is not None and sys.stderr.isatty()
+        self._next_s = 0.0
+        self._width = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.clear()
+
+    def show(self, now: "Preparation") -> None:
+        """Show a count, if the last one has been there for long enough."""
+        if sys.stderr is None or time.monotonic() < self._next_s:
+            return
+        self._next_s = time.monotonic() + (_COUNT_S if self._on_terminal else _LINE_S)
+        text = f"skyless: {count_text(now)}"
+        if not self._on_terminal:
+            print(text, file=sys.stderr, flush=True)
+            return
+        print(f"\r{text:<{self._width}}", end="", file=sys.stderr, flush=True)
+        self._width = len(text)
+
+    def clear(self) -> None:
+        """Remove the line from the terminal."""
+        if self._width:
+            print(f"\r{'':<{self._width}}\r", end="", file=sys.stderr, flush=True)
+            self._width = 0
+
+
+def count_text(now: "Preparation") -> str:
+    """What a person reads while kernels are compiled."""
+    counted = f": {now.done} of {now.total}" if now.total else ""
+    left = "" if now.left_s is None else f", about {max(1, round(now.left_s))} s left"
+    return f"compiling kernels, at the first start only{counted}{left}"
+
+
+def _print_line(text: str) -> None:
+    if sys.stderr is not None:
+        print(f"skyless: {text}", file=sys.stderr, flush=True)

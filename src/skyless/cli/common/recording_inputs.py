@@ -1,94 +1,27 @@
-"""What ``skyless replay`` and ``skyless calibrate`` are given with a recording: anchors, truth and heights."""
+"""What ``skyless replay`` and ``skyless calibrate`` are given with a recording: from texts to values."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from skyless.cli.common.options import height_number, metres
-from skyless.errors import SkylessError
-
-if TYPE_CHECKING:
-    from skyless.air.masterless_packets import Point
-    from skyless.recordings.truth import Truth
 
 
 def is_mcap(file: Path) -> bool:
     """Whether a file's content is an MCAP; one that cannot be opened, or would lose what is read here, is none."""
-    from skyless.recordings.mcap.recording import MAGIC
+    from skyless.replays.inputs import is_mcap
 
-    try:
-        if file.is_fifo():
-            return False
-        with file.open("rb") as stream:
-            return stream.read(len(MAGIC)) == MAGIC
-    except OSError:
-        return False
+    return is_mcap(file)
 
 
-def known_anchors(table: Path | None, site: Path | None) -> "tuple[dict[int, Point], float | None]":
-    """Positions of the anchors, and the tags' height where a site file states it. Raises SkylessError."""
-    from skyless.recordings.anchor_table import read_anchors
-    from skyless.site.load import load_site
-
-    if table is not None and site is not None:
-        raise SkylessError("give either --anchors or --site, not both")
-    if table is not None:
-        return read_anchors(table), None
-    if site is None:
-        return {}, None
-    known = load_site(site)
-    return {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in known.anchors}, known.tags.height_m
-
-
-def known_truth(
-    file: Path, table: Path | None, arm: str | None, name: str | None, listener: str | None
-) -> "Truth | None":
-    """Where the antenna was, by a table or by the recording itself. Raises SkylessError."""
-    from skyless.evaluation.judge import antenna_truth
-    from skyless.recordings.foreign.formats import format_of
-    from skyless.recordings.truth import read_truth
-
-    if table is None and format_of(file, name).name == "miluv":
-        table = file
-    if table is None:
-        if arm is not None:
-            raise SkylessError("--lever-arm moves the truth, which --truth must give")
+def lever_arm(text: str | None) -> tuple[float, float, float] | None:
+    """The antenna in the body's frame in metres, None if it is not given. Raises SkylessError."""
+    if text is None:
         return None
-    truth = read_truth(table, listener)
-    if arm is None:
-        return truth
-    x, y, z = metres("lever-arm", arm, (3,))
-    return antenna_truth(truth, (x, y, z))
+    x_m, y_m, z_m = metres("lever-arm", text, (3,))
+    return x_m, y_m, z_m
 
 
-def height_to_hold(
-    wish: str, anchors_m: "dict[int, Point]", site_m: float | None, truth: "Truth | None", format_name: str
-) -> tuple[float | None, float, str]:
-    """Height to hold (None where it is estimated), its standard deviation, and where it is from."""
-    import numpy as np
+def wished_height(text: str) -> float | str:
+    """The tag's height in metres, or a word instead. Raises SkylessError."""
+    from skyless.replays.inputs import HEIGHT_WORDS
 
-    from skyless.evaluation.observability import GUESSED_STD_M, plane_height_m
-
-    if wish == "free":
-        return None, 0.0, "estimated"
-    if wish == "truth" or (wish == "auto" and truth is not None and format_name == "miluv"):
-        if truth is None:
-            raise SkylessError("--tag-height truth takes the height from the truth, which --truth must give")
-        return float(np.median(truth.position_m[:, 2])), 0.0, "the truth's median"
-    if wish != "auto":
-        return height_number(wish, "or truth, free or auto"), 0.0, "given"
-    if site_m is not None:
-        return site_m, 0.0, "from the site file"
-    plane_m = plane_height_m(anchors_m)
-    if plane_m is None:
-        return None, 0.0, "estimated"
-    note = "the anchors' mean: they lie too flat to determine the height (--tag-height free estimates it all the same)"
-    return plane_m, GUESSED_STD_M, note
-
-
-def flight_height(wish: float | None, truth: "Truth | None") -> float | None:
-    """Height above which fixes are judged: the wish, or where the truth begins on the floor and rises well above it."""
-    if wish is not None or truth is None:
-        return wish
-    from skyless.evaluation.observability import FLIGHT_M, flies
-
-    return FLIGHT_M if flies(truth) else None
+    return text if text in HEIGHT_WORDS else height_number(text, "or truth, free or auto")

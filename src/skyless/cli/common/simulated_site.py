@@ -3,8 +3,7 @@
 import sys
 from typing import TYPE_CHECKING, Final
 
-from skyless.errors import SkylessError
-from skyless.method_names import DEFAULT_METHOD, FILTERS, SNAPSHOTS
+from skyless.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from skyless.site.model import Site
@@ -18,13 +17,9 @@ def check_simulated(site: "Site", method: str = DEFAULT_METHOD) -> None:
 
     Raises SkylessError.
     """
-    if not site.schedule.needs_master and method in SNAPSHOTS:
-        raise SkylessError(
-            f"--method is {method!r}, which needs a master, and site {site.name!r} has none (mode "
-            f"{site.schedule.mode}); it should be {' or '.join(FILTERS)}"
-        )
-    if not site.anchors:
-        raise SkylessError(f"no anchor of site {site.name!r} has a position, so it cannot be simulated")
+    from skyless.evaluation.scenarios import check_can_be_simulated
+
+    check_can_be_simulated(site, method)
     if site.unplaced:
         names = ", ".join(str(anchor.id) for anchor in site.unplaced)
         print(f"not simulated, as the site file has no position: anchor {names}", file=sys.stderr)

@@ -9,6 +9,7 @@ from cyclopts import App, Parameter
 from skyless.cli.common.progress import loading_kernels
 from skyless.cli.nodes.options import MqttOptions, log, site_named
 from skyless.errors import SkylessError
+from skyless.method_names import WEIGHTED
 from skyless.nodes.open_radio import DEFAULT_RADIO
 
 app = App(name="anchor", help_epilogue="Example: skyless anchor 3 --site site.toml")
@@ -42,6 +43,7 @@ def anchor(
     from skyless.nodes.anchor import Anchors
     from skyless.nodes.open_radio import is_simulated, open_radios
     from skyless.nodes.process import run
+    from skyless.preparation.parts import SIMULATED
     from skyless.radios.interface import AntennaDelays
 
     plan, address = site_named(site), broker.address()
@@ -54,8 +56,8 @@ def anchor(
     delays = [AntennaDelays(nodes[i].tx_antenna_delay_ticks, nodes[i].rx_antenna_delay_ticks) for i in ids]
     radios = open_radios(radio, "anchor", tuple(map(str, ids)), delays)
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
-    with loading_kernels():
-        compile_kernels()
+    with loading_kernels(SIMULATED):
+        compile_kernels(WEIGHTED)
     with contextlib.suppress(KeyboardInterrupt):
         anchors = Anchors(plan, radios, address, log, simulated=lambda: is_simulated(radio), floor_plan=image)
         run(anchors.run(), punctual=True)

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from shlex import quote
 from types import TracebackType
@@ -21,7 +22,7 @@ from skyless.cli.common.options import (
     options,
 )
 from skyless.cli.common.output import console, number, print_json
-from skyless.cli.common.progress import loading_kernels
+from skyless.cli.common.progress import CountLine, count_text, report_kernel_folder
 from skyless.cli.common.simulated_site import check_live
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, log, site_named
 from skyless.errors import SkylessError
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from skyless.mqtt.messages import FixMessage
     from skyless.nodes.demo import SiteRun, WholeSite
     from skyless.nodes.watch import Watch, WatchedTag
+    from skyless.preparation.processes import Preparation
 
 _LONGEST_START_S: Final = 60.0
 """Programs that have not made a fix for every tag by then will not."""
@@ -100,15 +102,17 @@ def demo(*, asked: DemoOptions = DemoOptions()) -> None:
     Anchors, tags, broker, page and recorder are the real programs, each a process; radios, clocks and motion are
     simulated. Watch it on the page, or with: mosquitto_sub -t 'skyless/#' -v
     """
-    from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.nodes.demo import WholeSite
     from skyless.nodes.process import run
+    from skyless.preparation.parts import parts_of
+    from skyless.preparation.processes import missing
 
     settings = _settings(asked)
-    with loading_kernels():
-        compile_kernels(asked.method)
+    if missing(parts_of(asked.method)):
+        report_kernel_folder()
     whole = WholeSite(settings, log)
     screen = Screen(whole, show=not asked.json and sys.stdout.isatty())
+    whole.on_preparation = screen.show_preparation
     with screen, contextlib.suppress(KeyboardInterrupt):
         run(_run(whole, settings, screen, asked))
     _report(screen, json=asked.json)
@@ -163,6 +167,7 @@ async def _run(whole: "WholeSite", settings: "SiteRun", screen: "Screen", asked:
     try:
         await _either(site, whole.ready.wait())
         screen.print_addresses(settings, json=asked.json)
+        await _either(site, whole.prepared.wait())
         await _either(site, _until_all_fix(whole, asked.tags))
         screen.begin()
         await _either(site, _watch(screen, asked.duration))
@@ -221,6 +226,7 @@ class Screen:
         self.stopped_early = True
         self._whole, self._show = whole, show
         self._live: Live | None = None
+        self._count = CountLine()
         self._begun_s: float | None = None
         self._took_s = 0.0
 
@@ -252,12 +258,21 @@ class Screen:
         else:
             print("\n".join(lines), file=sys.stderr if json else sys.stdout, flush=True)
 
+    def show_preparation(self, now: "Preparation") -> None:
+        """Show how far the kernels are compiled."""
+        if self._live is None:
+            self._count.show(now)
+        else:
+            self._live.update(count_text(now), refresh=True)
+
     def begin(self) -> None:
         """All tags have a fix."""
+        self._count.clear()
         self._begun_s = time.monotonic()
 
     def end(self) -> None:
         """The programs are about to be ended."""
+        self._count.clear()
         if self._begun_s is not None:
             self._took_s = time.monotonic() - self._begun_s
 
@@ -278,7 +293,16 @@ class Screen:
 
     def _line(self) -> str:
         sent = 0 if self._watch is None or self._watch.ether is None else self._watch.ether.transmissions
-        return f"{sent} beacons on the air; page {self._whole.page}; Ctrl-C stops"
+        late = _late(self._late())
+        return f"{sent} beacons on the air{late and f'; {late}'}; page {self._whole.page}; Ctrl-C stops"
+
+    def _late(self) -> dict[str, int]:
+        """What the tags dropped and withheld because it was too old."""
+        late = Counter[str]()
+        for _, tag in self._tags():
+            if tag.health is not None:
+                late.update({name: tag.health.counters.get(name, 0) for name in ("late-reception", "late-fix")})
+        return {"late_receptions": late["late-reception"], "late_fixes": late["late-fix"]}
 
     def tags(self) -> "RenderableType":
         """The table of tags."""
@@ -373,6 +397,7 @@ class Screen:
             "first_fix_s": firsts[len(firsts) // 2] if firsts else None,
             "alerts": {} if self._watch is None else dict(sorted(self._watch.alerts.items())),
             **self._latencies(),
+            **self._late(),
             "late_transmissions": sum(health.late for health in self._watch.anchors.values()) if self._watch else 0,
             "restarts": sum(max(0, child.starts - 1) for child in self._whole.children),
             "duration_s": self._took_s,
@@ -411,15 +436,25 @@ class Screen:
         found = self.summary()
         if not found["tags"]:
             return "no fix was made"
+        late = f"; {found_late}" if (found_late := _late(found)) else ""
         if found["rmse_m"] is None or found["updates_per_s"] is None:
-            return f"{found['tags']} tags with a fix; too short for errors and updates per second"
+            return f"{found['tags']} tags with a fix; too short for errors and updates per second{late}"
         return (
             f"{found['tags']} tags, {found['messages']} messages in {found['duration_s']:.1f} s: "
             f"RMSE {100 * found['rmse_m']:.1f} cm, largest error {100 * found['max_m']:.1f} cm, "
             f"{found['updates_per_s']:.0f} updates per second and tag, "
             f"99 % of fixes within {1e3 * (found['fix_latency_p99_s'] or 0.0):.1f} ms of the frame"
             + (f"; alerts: {_counts(found['alerts']) or 'none'}" if found["alerts"] else "")
+            + late
         )
+
+
+def _late(found: "Mapping[str, Any]") -> str:
+    """What was too old to be used or given, for a person; empty where there is nothing."""
+    receptions, fixes = found["late_receptions"], found["late_fixes"]
+    if not receptions and not fixes:
+        return ""
+    return f"this computer is too slow: {receptions} receptions dropped and {fixes} fixes withheld as too old"
 
 
 def _counts(alerts: "Mapping[str, int]") -> str:

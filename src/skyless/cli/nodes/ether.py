@@ -15,6 +15,7 @@ from skyless.cli.common.progress import loading_kernels
 from skyless.cli.common.simulated_site import check_live
 from skyless.cli.nodes.options import MqttOptions, WalkingSpeed, listen_address, log, site_named
 from skyless.errors import SkylessError
+from skyless.method_names import WEIGHTED
 from skyless.radios.ether_wire import DEFAULT_PORT
 from skyless.ticks import from_seconds
 
@@ -66,14 +67,15 @@ def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOpt
     from skyless.evaluation.scenarios import Request, impairments_of, patrols
     from skyless.nodes.ether import Ether, EtherNode
     from skyless.nodes.process import run
+    from skyless.preparation.parts import SIMULATED
 
     site, address = site_named(asked.site), broker.address()
     check_live(site)
     host, port = listen_address(asked.listen, DEFAULT_PORT)
     request = Request(site, noise_ps=asked.noise_ps, loss=asked.loss, nlos=asked.nlos, seed=asked.seed)
     moves = tuple(_move(text, [anchor.id for anchor in site.anchors]) for text in asked.move or ())
-    with loading_kernels():
-        compile_kernels()
+    with loading_kernels(SIMULATED):
+        compile_kernels(WEIGHTED)
     bodies = {f"tag{number}": path for number, path in enumerate(patrols(site, asked.tags, asked.speed), start=1)}
     emulated = Ether(site, bodies, replace(impairments_of(request, site), anchor_displacements=moves), asked.seed)
     for one in moves:

@@ -114,11 +114,12 @@ def _on_radios(
     """Tags that hear beacons."""
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.nodes.tag import Tags, TagSettings
+    from skyless.preparation.parts import parts_of
 
     required = asked.protection.requirement(asked.method, asked.tag_height_std)
     settings = TagSettings(asked.method, asked.qa, asked.site_id, integrity=required, publish_hz=asked.publish_hz)
     radios = open_radios(asked.radio, "tag", names)
-    with loading_kernels():
+    with loading_kernels(*parts_of(asked.method)):
         compile_kernels(asked.method)
     return Tags(settings, radios, address, log, on_fix).run()
 
@@ -129,10 +130,11 @@ def _on_sniffers(
     """Tags that hear the packets of another system."""
     from skyless.evaluation.compile_ahead import compile_packet_kernels
     from skyless.nodes.packet_tags import PacketTags
+    from skyless.preparation.parts import SNIFFERS
 
     settings = _system(asked)
     radios = open_sniffers(asked.radio, names)
-    with loading_kernels():
+    with loading_kernels(*SNIFFERS):
         compile_packet_kernels()
     tags = PacketTags(settings, radios, address, log, simulated=lambda: is_simulated(asked.radio), on_fix=on_fix)
     return tags.run()

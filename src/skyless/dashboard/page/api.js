@@ -19,9 +19,9 @@ async function fetchJson(path, options = {}) {
   return body;
 }
 
-/** Store all zones; returns them as the server has stored them. */
-export async function putZones(zones) {
-  const body = JSON.stringify({ zones });
+/** Store all zones of the site of a name; returns them as the server has stored them. */
+export async function putZones(zones, site) {
+  const body = JSON.stringify({ zones, site });
   const headers = { "content-type": "application/json" };
   return (await fetchJson("api/zones", { method: "PUT", headers, body })).zones;
 }
@@ -58,6 +58,16 @@ export function recordings() {
 /** Site, times, tags and zones of a recording. */
 export function recording(name) {
   return fetchJson(`api/recordings/${encodeURIComponent(name)}`);
+}
+
+/** What has happened in a recording: events, the oldest first, and whether these are all. */
+export function recordedEvents(name) {
+  return fetchJson(`api/recordings/${encodeURIComponent(name)}/events`);
+}
+
+/** Address of a recording's file. */
+export function fileOf(name) {
+  return new URL(`api/recordings/${encodeURIComponent(name)}/file`, document.baseURI).href;
 }
 
 /** States of a recording between two times since its start, at most 60 s. */

@@ -1,41 +1,129 @@
-/** Live, replay or lost: shown by words, a shape and a colour; and a button to reconnect. */
+/**
+ * The condition of the site: a pill in the header with the first reason, the list of all reasons behind it, the mark in
+ * the browser's tab; and a banner, with a button to reconnect, where the connection is lost.
+ */
 
-import { on, state } from "./store.js";
-import { byId, text } from "./dom.js";
+import { on, select, state } from "./store.js";
+import { byId, h, text } from "./dom.js";
 import { now_s } from "./clock.js";
-import { timeOfDay } from "./format.js";
+import { LEVELS, shownCondition } from "./condition.js";
+import { sentence, timeOfDay } from "./format.js";
 import { retryNow } from "./live.js";
+import { open as openTab } from "./tabs.js";
+import { summaryFacts } from "./summary.js";
 
-const WORDS = {
-  connecting: "Connecting",
-  open: "Live",
-  lost: "Connection lost",
-  replay: "Replay",
-  broker: "No broker",
-};
+/** Pointer or focus on the pill show the list; a click keeps it. */
+let kept = false;
+let over = false;
+let said = "";
+let listed = "";
 
-/** Fill the banner and keep it up to date. */
+/** Fill the header and the banner, and keep them up to date. */
 export function start() {
-  on(["connection", "mode", "player"], show);
-  setInterval(() => state.connection.phase === "lost" || text(byId("time"), timeOfDay(now_s())), 500);
+  on(["connection", "mode", "player", "condition", "site"], show);
+  setInterval(() => {
+    show();
+    if (state.connection.phase !== "lost") text(byId("time"), timeOfDay(now_s()));
+  }, 500);
   byId("banner-button").addEventListener("click", retryNow);
+  const box = byId("condition");
+  byId("pill").addEventListener("click", () => {
+    kept = !kept;
+    over &&= kept;
+    show();
+  });
+  box.addEventListener("pointerenter", (event) => event.pointerType === "mouse" && hover(true));
+  box.addEventListener("pointerleave", () => hover(false));
+  byId("pill").addEventListener("focus", (event) => event.target.matches(":focus-visible") && hover(true));
+  box.addEventListener("focusout", ({ relatedTarget }) => relatedTarget && !box.contains(relatedTarget) && close());
+  box.addEventListener("keydown", (event) => event.key === "Escape" && close());
+  addEventListener("pointerdown", (event) => box.contains(/** @type {Node} */ (event.target)) || close());
+  show();
+}
+
+function hover(on) {
+  over = on;
+  show();
+}
+
+function close() {
+  kept = over = false;
   show();
 }
 
 function show() {
-  const { phase } = state.connection;
-  const brokerAway = phase === "open" && state.mqtt && !state.mqtt.connected;
-  const kind = phase === "lost" ? "lost" : state.mode === "replay" ? "replay" : brokerAway ? "broker" : phase;
+  const condition = shownCondition();
+  const { word, mark } = LEVELS[condition.level];
+  const words = condition.text ? sentence(condition.text).slice(0, -1) : word;
   const pill = byId("pill");
-  if (pill.className !== `pill ${kind}`) pill.className = `pill ${kind}`;
-  text(pill, WORDS[kind]);
+  if (pill.className !== `pill ${condition.level}`) pill.className = `pill ${condition.level}`;
+  text(pill, words);
+  pill.setAttribute("aria-label", condition.text ? `${word}: ${words}` : words);
+  showList(condition, word);
+  say(condition, `${word}. ${words}`);
+  text(document.head.querySelector("title"), `${mark} ${state.site ? `${state.site.name} · ` : ""}Skyless`);
+  showBanner();
+}
+
+/** Screen readers hear a change of level or of the first reason, not every change of a figure. */
+function say({ level, reasons }, words) {
+  const key = `${level} ${reasons[0]?.kind ?? ""}`;
+  if (key === said) return;
+  said = key;
+  text(byId("condition-said"), words);
+}
+
+function showList({ level, text: first, reasons }, word) {
+  const open = kept || over;
+  const list = byId("condition-list");
+  list.hidden = !open;
+  byId("pill").setAttribute("aria-expanded", String(open));
+  if (!open) return void (listed = "");
+  const facts = summaryFacts();
+  const key = JSON.stringify([level, first, reasons, facts]);
+  if (key === listed) return;
+  listed = key;
+  const focused = list.contains(document.activeElement) ? document.activeElement?.textContent : null;
+  const items = reasons.map((reason) =>
+    h("li", { class: reason.level }, h("p", {}, sentence(reason.text), ...links(reason)), h("p", { class: "fine" }, reason.advice)),
+  );
+  const figures = facts.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value)));
+  const all = h("button", { type: "button", class: "quiet", onclick: () => (close(), openTab("events")) }, "All events");
+  list.replaceChildren(
+    h("h2", {}, headline(level, first, reasons, word)),
+    h("ul", {}, ...items),
+    h("dl", { class: "facts" }, ...figures),
+    all,
+  );
+  if (focused) [...list.querySelectorAll("button")].find((one) => one.textContent === focused)?.focus();
+}
+
+function headline(level, first, reasons, word) {
+  if (level === "good") return "All is well: nothing speaks against the positions shown.";
+  if (level === "replay") return "A recording is shown, not the live site.";
+  if (!reasons.length) return sentence(first || word);
+  return reasons.length === 1 ? "One thing is wrong:" : `${reasons.length} things are wrong:`;
+}
+
+/** Buttons that select the tags or anchors of a reason. */
+function links({ names }) {
+  return names.slice(0, 3).map((name) => {
+    const [kind, id] = [name.slice(0, name.indexOf("/")), name.slice(name.indexOf("/") + 1)];
+    const go = () => select(kind, kind === "anchor" ? Number(id) : id);
+    return h("button", { type: "button", class: "quiet", onclick: go }, `Show ${kind} ${id}`);
+  });
+}
+
+function showBanner() {
+  const { phase, since } = state.connection;
+  const brokerAway = phase === "open" && state.mqtt && !state.mqtt.connected;
   const words = phase === "lost" ? lostWords() : brokerAway ? brokerWords() : "";
   const banner = byId("banner");
   banner.hidden = !words;
   banner.className = phase === "lost" ? "lost" : "broker";
   byId("banner-button").hidden = phase !== "lost";
   text(byId("banner-text"), words);
-  text(byId("banner-age"), phase === "lost" ? age(state.connection.since) : "");
+  text(byId("banner-age"), phase === "lost" ? age(since) : "");
   document.body.classList.toggle("lost", phase === "lost");
 }
 

@@ -10,6 +10,8 @@ import { DASH } from "./format.js";
 const charts = new Set();
 on(["theme"], () => charts.forEach((chart) => chart.rebuild()));
 
+/** A value older than this is not of now. */
+const NOW_S = 3.5;
 const HEIGHT = 96;
 
 export class Chart {
@@ -34,11 +36,12 @@ export class Chart {
     charts.add(this);
   }
 
-  /** Show values against seconds before now (≤ 0). */
+  /** Show values against seconds before now (≤ 0); the last one also as a figure, unless it is old. */
   show(data, window_s) {
     this.data = data;
     this.window = [-window_s, 0];
-    const last = data.slice(1).map((values) => values.findLast((value) => value !== null && !Number.isNaN(value)));
+    const isNow = (value, index) => value !== null && !Number.isNaN(value) && data[0][index] > -NOW_S;
+    const last = data.slice(1).map((values) => values.findLast(isNow));
     const parts = last.map((value) => (value === undefined ? DASH : this.write(value)));
     const words =
       this.series.length > 1 ? parts.map((part, n) => `${this.series[n].name} ${part}`).join("  ") : parts[0];

@@ -27,9 +27,10 @@ export function number(value, digits = 0, unit = "") {
   return written.replace("-", "−").replaceAll(",", "\u202f") + (unit ? `\u00a0${unit}` : "");
 }
 
-/** A time difference. */
-export function duration(value_s) {
+/** A time difference; with `least_s`, shorter ones are written as 0.1 s are. */
+export function duration(value_s, least_s = 0) {
   if (!known(value_s)) return DASH;
+  if (value_s < least_s) return `${value_s.toFixed(1)} s`;
   if (Math.abs(value_s) < 1e-3) return `${(value_s * 1e6).toFixed(0)} µs`;
   if (Math.abs(value_s) < 1) return `${(value_s * 1e3).toFixed(value_s < 0.1 ? 1 : 0)} ms`;
   if (value_s < 60) return `${value_s.toFixed(1)} s`;

@@ -1,12 +1,16 @@
-/** The meaning of the map's marks, and switches for its layers. */
+/** The legend beside the map: marks of tags and anchors, switches for layers, floors, and saving; and the scale of an overlay. */
 
-import { changed, on, saveSetting, savedSetting, state } from "./store.js";
-import { byId, h, options, text } from "./dom.js";
-import { DELAY_S, GONE_S, GREY_S, stillMotion } from "./clock.js";
-import { length, number } from "./format.js";
+import { changed, on, saveSetting, savedSetting, select, state } from "./store.js";
+import { byId, h, options, text, throttle, toast } from "./dom.js";
+import { DELAY_S, GONE_S, GREY_S, stillMotion, tracks } from "./clock.js";
+import { length } from "./format.js";
 import { CONDITIONS, anchorMark, siteMode, wordsOf } from "./map/anchors.js";
-import { KINDS, choose, colourAt } from "./map/overlay.js";
+import { savePicture, savePositions } from "./map/export.js";
+import { chooseFloor, floors, giveHeights, givenHeights } from "./map/floors.js";
+import { tagMark, tagStyle } from "./map/marks.js";
+import { KINDS, choose, colourAt, fractionOf, writeValue } from "./map/overlay.js";
 import { NAMED } from "./map/tags.js";
+import { DISTINCT } from "./theme.js";
 
 const KEY = "skyless-legend";
 const SWITCHES = {
@@ -23,12 +27,48 @@ const LEADERS = {
 
 /** Fill the legend. */
 export function start() {
-  const body = byId("legend-body");
-  body.append(marks(), ...Object.entries(SWITCHES).map(switchFor), trails(), overlays(), note());
-  on(["overlay", "options"], scale);
+  const sections = [
+    ["Tags", tags()],
+    ["Anchors", marks()],
+    ["Layers", ...Object.entries(SWITCHES).map(switchFor), trails(), overlays()],
+    ["Floors", ...floorChoice()],
+    ["Save", saving()],
+  ];
+  for (const [title, ...parts] of sections) {
+    byId("legend-body").append(h("section", {}, h("h2", {}, title), ...parts));
+  }
+  byId("legend-body").append(note());
+  on(["overlay", "options", "theme"], scale);
+  setInterval(() => state.overlay.pendingSince !== null && scale(), 500);
   on(["site"], () => (byId("switch-truth").hidden = !state.simulated));
+  byId("ramp-again").addEventListener("click", () => choose(state.options.overlay));
   byId("legend").open = savedSetting(KEY) === "open";
   byId("legend").addEventListener("toggle", () => saveSetting(KEY, byId("legend").open ? "open" : "shut"));
+}
+
+/** An entry for each tag; with very many all have one mark, and the list next to the map has their names. */
+function tags() {
+  const list = h("ul", { class: "tag-marks" });
+  const many = h("p", { class: "fine", hidden: true }, `With more than ${DISTINCT} tags all have one mark.`);
+  let shown = "";
+  const show = () => {
+    const all = tracks().sorted;
+    const key = JSON.stringify([state.selection.tag, tagStyle(0, all.length), all.map(({ name }) => name)]);
+    if (key === shown) return;
+    shown = key;
+    many.hidden = all.length <= DISTINCT;
+    const rows = all.slice(0, DISTINCT).map(({ name }, index) => {
+      const mark = tagMark(tagStyle(index, all.length));
+      const button = h("button", { type: "button", class: "quiet", onclick: () => select("tag", name) }, mark, name);
+      button.setAttribute("aria-pressed", String(name === state.selection.tag));
+      return h("li", {}, button);
+    });
+    list.replaceChildren(...(all.length > DISTINCT ? [] : rows));
+    if (!all.length) list.replaceChildren(h("li", { class: "fine" }, "No tags yet."));
+  };
+  on(["tags", "health", "selection", "theme", "mode"], throttle(400, show));
+  show();
+  return h("div", {}, list, many);
 }
 
 /** The marks of anchors, with the words of the site's mode. */
@@ -67,20 +107,75 @@ function overlays() {
   return h("label", { class: "choice" }, "Overlay", options({ id: "overlay" }, Object.entries(KINDS), choose));
 }
 
+/** The chosen floor, where the site has several, and the heights that the user gives. */
+function floorChoice() {
+  const list = options({ id: "floor" }, [["", "all"]], (value) => chooseFloor(value === "" ? null : Number(value)));
+  const choice = h("label", { class: "choice" }, "Show", list);
+  const heights = h("input", { type: "text", id: "floor-heights", placeholder: "0, 3.2" });
+  const given = h("label", { class: "choice" }, "Heights of the floors, m", heights);
+  heights.addEventListener("change", () => {
+    try {
+      giveHeights(heights.value);
+    } catch (error) {
+      toast(`Floors: ${error.message}.`, "bad");
+    }
+    fill();
+  });
+  const fill = () => {
+    const found = floors();
+    choice.hidden = found.length < 2;
+    list.replaceChildren(...[["", "all"], ...found.map(({ name }, n) => [n, name])].map(([value, words]) => h("option", { value }, words))); // prettier-ignore
+    list.value = state.options.floor === null ? "" : String(state.options.floor);
+    if (document.activeElement !== heights) heights.value = givenHeights().join(", ");
+  };
+  on(["site", "mode"], () => {
+    if (state.options.floor !== null && !floors()[state.options.floor]) chooseFloor(null);
+    fill();
+  });
+  fill();
+  return [choice, given];
+}
+
+function saving() {
+  return h(
+    "div",
+    { class: "saving" },
+    h("button", { type: "button", id: "save-picture", onclick: savePicture }, "Map as a picture (PNG)"),
+    h("button", { type: "button", id: "save-positions", onclick: savePositions }, "Positions as a table (CSV)"),
+  );
+}
+
+/** The overlay's scale: while it is computed, what it shows, or why there is none. */
 function scale() {
-  const data = state.overlay.data;
-  byId("overlay").value = state.options.overlay;
-  byId("ramp-box").hidden = !data;
-  if (!data) return;
+  const { data, error, pendingSince } = state.overlay;
+  const kind = state.options.overlay;
+  const title = (KINDS[data?.kind ?? kind] ?? kind).split(" (")[0];
+  byId("overlay").value = kind;
+  byId("ramp-box").hidden = !data && !error && pendingSince === null;
+  byId("ramp-box").classList.toggle("pending", pendingSince !== null);
+  byId("ramp-again").hidden = !error;
+  byId("ramp-shown").hidden = !data;
+  text(byId("ramp-seconds"), pendingSince === null ? "" : `${Math.round((performance.now() - pendingSince) / 1e3)} s`);
+  if (!data) {
+    text(byId("ramp-title"), error ? `No overlay: ${error}` : `${title}: computing …`);
+    return;
+  }
+  text(byId("ramp-title"), title + (data.unit === "m" ? " in cm or m" : ", a factor"));
   const context = byId("ramp").getContext("2d");
-  const image = context.createImageData(128, 1);
-  for (let x = 0; x < 128; x++) image.data.set([...colourAt(x / 127), 255], 4 * x);
+  const image = context.createImageData(256, 1);
+  for (let x = 0; x < 256; x++) image.data.set([...colourAt(x / 255, data.scale).map(Math.round), 255], 4 * x);
   context.putImageData(image, 0, 0);
-  text(byId("ramp-title"), (KINDS[data.kind] ?? data.kind).split(" (")[0]);
-  const write = (value) => (data.unit === "m" ? length(value) : number(value, 1));
-  text(byId("ramp-good"), `${write(data.levels.good)} good`);
-  text(byId("ramp-bad"), `${write(data.levels.bad)} bad`);
-  text(byId("ramp-note"), `${data.method ? `Method ${data.method}. ` : ""}No colour: no fix there.`);
+  byId("ramp-ticks").replaceChildren(
+    ...data.scale.ticks.map((tick) => {
+      const mark = h("span", {}, data.unit === "m" ? length(tick).replace(/\.0+(?= )/, "") : String(tick));
+      mark.style.left = `${100 * fractionOf(tick, data.scale)}%`;
+      return mark;
+    }),
+  );
+  text(byId("ramp-good"), `least ${writeValue(data.least, data)}`);
+  text(byId("ramp-bad"), `largest ${writeValue(data.most, data)}`);
+  const height = Number.isFinite(data.height_m) ? ` for tags at ${Number(data.height_m.toFixed(2))} m` : "";
+  text(byId("ramp-note"), `Dark is good. ${data.method ? `Method ${data.method}${height}. ` : ""}No colour: no fix.`);
 }
 
 function note() {

@@ -13,6 +13,10 @@ const PING_MS = 5000;
 const MOVING_TIMEOUT_MS = 3000;
 const IDLE_TIMEOUT_MS = 9000;
 const MAX_EVENTS = 50;
+const MAX_LOGGED = 500;
+/** Close code of a server that has too many pages open. */
+const TRY_LATER = 1013;
+const NO_RESPONSE = "the server does not respond";
 
 /** @type {WebSocket|null} */
 let socket = null;
@@ -46,7 +50,10 @@ function connect() {
   const mine = (socket = new WebSocket(address));
   lastMessage = lastPing = performance.now();
   mine.onmessage = (event) => mine === socket && process(event.data);
-  mine.onclose = () => mine === socket && lost("the server does not respond");
+  mine.onclose = ({ code, reason }) => {
+    if (code === TRY_LATER) retry_ms = LAST_RETRY_MS;
+    if (mine === socket) lost(reason || NO_RESPONSE);
+  };
 }
 
 function lost(reason) {
@@ -54,6 +61,7 @@ function lost(reason) {
   socket = null;
   old?.close();
   if (state.connection.phase !== "lost") state.connection = { phase: "lost", since: performance.now(), reason };
+  else if (reason !== NO_RESPONSE) state.connection.reason = reason;
   retryTimer = setTimeout(connect, retry_ms);
   retry_ms = Math.min(retry_ms * 1.6, LAST_RETRY_MS);
   changed("connection");
@@ -109,7 +117,10 @@ const handlers = {
     checkVersion(message.version ?? "");
     state.mqtt = { connected: message.mqtt !== false, broker: state.mqtt?.broker ?? "" };
     state.events = [...(message.events ?? [])].sort((a, b) => b.unix_s - a.unix_s);
-    changed("connection", "events");
+    state.log = [];
+    state.condition = null;
+    changed("connection", "events", "log", "condition");
+    handlers.preparation({ preparation: null });
     handlers.zones(message);
     if (message.site) handlers.site(message);
   },
@@ -123,12 +134,23 @@ const handlers = {
     live.add(message.tags, message.unix_s);
     if (message.tags.length) changed("tags");
   },
-  health({ anchors = [], tags = [], ether = null, nodes = [] }) {
+  condition(message) {
+    state.condition = message;
+    state.conditionMs = performance.now();
+    changed("condition");
+  },
+  log({ events }) {
+    const last = state.log.at(-1)?.serial ?? 0;
+    state.log = [...state.log, ...events.filter((event) => event.serial > last)].slice(-MAX_LOGGED);
+    changed("log");
+  },
+  health({ anchors = [], tags = [], ether = null, nodes = [], ages = {} }) {
     state.health = {
       anchors: new Map(anchors.map((health) => [health.anchor, health])),
       tags: new Map(tags.map((health) => [health.tag, health])),
       ether,
       nodes,
+      ages,
       atMs: performance.now(),
     };
     live.addNames([...state.health.tags.keys()]);
@@ -137,6 +159,8 @@ const handlers = {
   },
   zones(message) {
     zones = message.zones ?? [];
+    state.otherZones = message.other_zones ?? state.otherZones;
+    if ("zones_fault" in message) state.zonesFault = message.zones_fault;
     if (state.mode !== "live") return;
     state.zones = zones;
     changed("zones");
@@ -146,6 +170,10 @@ const handlers = {
   },
   watch(message) {
     receiveWatch(message.watch, message.age_s);
+  },
+  preparation(message) {
+    state.preparation = message.preparation;
+    changed("preparation");
   },
   floor_plan(message) {
     state.floorDigest = message.digest;

@@ -5,7 +5,9 @@ import * as banner from "./banner.js";
 import * as legend from "./legend.js";
 import * as live from "./live.js";
 import * as map from "./map/map.js";
+import * as preparation from "./preparation.js";
 import * as replay from "./replay_bar.js";
+import * as summary from "./summary.js";
 import * as tabs from "./tabs.js";
 import * as theme from "./theme.js";
 import * as tools from "./map/tools.js";
@@ -27,11 +29,13 @@ legend.start();
 tabs.start();
 replay.start();
 banner.start();
+preparation.start();
 watch.start();
+summary.start();
 on(["site"], () => {
   text(byId("site-name"), state.site?.name ?? "");
+  byId("site-name").title = state.site ? `Site ${state.site.id}, ${state.site.name}` : "";
   byId("simulated").hidden = !state.simulated;
-  document.title = state.site ? `${state.site.name} · Skyless` : "Skyless";
 });
 live.start();
 

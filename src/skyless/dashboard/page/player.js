@@ -1,7 +1,7 @@
 /** Plays a recording: fetches its states ahead of time, and moves the shown moment. */
 
 import { changed, on, select, state } from "./store.js";
-import { recordedStates, recording } from "./api.js";
+import { recordedEvents, recordedStates, recording } from "./api.js";
 import { replayed } from "./clock.js";
 import { backToLive } from "./live.js";
 
@@ -18,14 +18,24 @@ let loaded = { from: 0, to: 0 };
 let lastFrame = 0;
 let seekTimer = 0;
 
-/** Open a recording and play it from its start. */
+/** Events nearer than this to the present moment are passed when the next or the last one is looked for. */
+const AT_EVENT_S = 0.3;
+/** An event is shown from a little before it on. */
+const LEAD_S = 1.0;
+/** A step by the keyboard. */
+export const STEP_S = 0.1;
+/** Levels of events that have a mark on the bar. */
+const MARKED = new Set(["warning", "bad"]);
+
+/** Open a recording and play it from its first fix. */
 export async function open(name) {
   const mine = ++generation;
   const found = await recording(name);
   if (mine !== generation) return;
   const duration_s = Math.max(0, found.end_unix_s - found.start_unix_s);
-  state.player = { name, start_unix_s: found.start_unix_s, duration_s, at_s: 0, playing: true, speed: 1, error: "" };
-  state.player.waiting = true;
+  const fixes = (found.fix_spans_unix_s ?? []).map((span) => span.map((at) => at - found.start_unix_s));
+  const player = { name, start_unix_s: found.start_unix_s, duration_s, fixes, at_s: 0, playing: true, speed: 1 };
+  state.player = { ...player, waiting: true, error: fixes.length ? "" : "There are no fixes in it.", events: null };
   state.mode = "replay";
   state.site = found.site?.site ?? null;
   state.simulated = found.site?.simulated ?? false;
@@ -35,7 +45,62 @@ export async function open(name) {
   replayed.sort();
   select(null);
   changed("mode", "site", "zones", "player", "tags", "selection");
-  await seek(0);
+  loadEvents(state.player);
+  await seek(firstFix_s(state.player));
+}
+
+/** The first moment that shows a tag. */
+function firstFix_s(player) {
+  return player.fixes[0]?.[0] ?? 0;
+}
+
+/** Fetch the events while the recording is played already. */
+async function loadEvents(player) {
+  try {
+    const found = await recordedEvents(player.name);
+    player.events = found.events.map((event) => ({ ...event, at_s: event.unix_s - player.start_unix_s }));
+    player.eventsNote = found.complete ? "" : "The recording has more events than are listed.";
+  } catch (error) {
+    player.events = [];
+    player.eventsNote = `The events cannot be read: ${error.message}`;
+  }
+  if (player === state.player) changed("player", "events");
+}
+
+/** The events that have a mark on the bar. */
+export function markedEvents(player) {
+  return (player.events ?? []).filter((event) => MARKED.has(event.level) && event.kind !== "program");
+}
+
+/** Show the moment of an event. */
+export function seekEvent(event) {
+  return seek(event.at_s - LEAD_S);
+}
+
+/** Seek to the next event with a mark (1) or the one before (-1). */
+export function stepEvent(direction) {
+  const player = state.player;
+  if (!player) return;
+  const now = player.at_s + LEAD_S;
+  const marked = markedEvents(player);
+  const found =
+    direction > 0
+      ? marked.find((event) => event.at_s > now + AT_EVENT_S)
+      : marked.findLast((event) => event.at_s < now - AT_EVENT_S);
+  if (found) seekEvent(found);
+}
+
+/** Pause, and seek by a time in s. */
+export function step(by_s) {
+  if (!state.player) return;
+  state.player.playing = false;
+  seek(state.player.at_s + by_s);
+}
+
+/** The next higher (1) or lower (-1) speed. */
+export function stepSpeed(direction) {
+  const at = SPEEDS.indexOf(state.player?.speed) + direction;
+  if (SPEEDS[at]) setSpeed(SPEEDS[at]);
 }
 
 /** Leave the replay. */
@@ -69,10 +134,10 @@ async function load(restart) {
     const states = await recordedStates(player.name, from, to, player.speed > 2 ? 10 : 20);
     if (mine !== generation || player !== state.player) return;
     if (restart) replayed.clearStates();
-    for (const one of states) replayed.add(one.tags);
+    for (const one of states) replayed.add(one.tags, one.unix_s);
     loaded = { name: player.name, from: restart ? from : Math.max(loaded.from, to - KEPT_S), to };
     player.waiting = false;
-    player.error = "";
+    if (player.fixes.length) player.error = "";
   } catch (error) {
     if (mine !== generation || player !== state.player) return;
     player.error = error.message;
@@ -83,12 +148,12 @@ async function load(restart) {
   changed("player", "tags");
 }
 
-/** Play or pause; at the end, from the start. */
+/** Play or pause; at the end, from the first fix. */
 export function toggle() {
   const player = state.player;
   if (!player) return;
   player.playing = !player.playing;
-  if (player.playing && player.at_s >= player.duration_s) seek(0);
+  if (player.playing && player.at_s >= player.duration_s) seek(firstFix_s(player));
   if (player.playing && player.error) load(true);
   lastFrame = 0;
   changed("player");

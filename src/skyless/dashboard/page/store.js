@@ -2,7 +2,7 @@
  * The one state of the page. Modules change it and notify the topics; callbacks run at most once a frame.
  *
  * Topics: connection, site, zones, events, health, tags, mode, player, recordings, selection, options, overlay, editor,
- * theme, survey, watch, setup, picking, plan.
+ * theme, survey, watch, setup, picking, plan, condition, log, read, preparation.
  */
 
 /** @type {Map<string, Set<() => void>>} */
@@ -20,13 +20,24 @@ export const state = {
   /** @type {any} the site message's `site` */
   site: null,
   simulated: false,
+  /** @type {{done: number, total: number, left_s: number|null}|null} while kernels are compiled */
+  preparation: null,
   /** @type {"live"|"replay"} */
   mode: "live",
   /** @type {Array<{id: string, name: string, polygon_m: number[][], colour: string|null}>} */
   zones: [],
-  /** @type {any[]} newest first */
+  /** Zones of other sites that have this one's number: kept, not shown. @type {Array<{site: string, zones: any[]}>} */
+  otherZones: [],
+  /** Why the zones that the broker keeps cannot be read. @type {string|null} */
+  zonesFault: null,
+  /** @type {any[]} tags that entered or left zones, newest first */
   events: [],
-  health: { anchors: new Map(), tags: new Map(), ether: null, nodes: [], atMs: 0 },
+  /** @type {any[]} what has happened at the live site, oldest first; `panels/events.js` lists it */
+  log: [],
+  /** @type {any} the server's newest judgement of the live site, and when it came; `condition.js` says what it is worth */
+  condition: null,
+  conditionMs: 0,
+  health: { anchors: new Map(), tags: new Map(), ether: null, nodes: [], ages: {}, atMs: 0 },
   /** @type {any} the newest message of the survey program; `survey/model.js` says how old it is */
   survey: null,
   /** @type {any} the newest message of the watch of the anchors */
@@ -40,9 +51,9 @@ export const state = {
   /** @type {any} the recording that `player.js` plays */
   player: null,
   selection: { tag: null, anchor: null, zone: null },
-  options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none" },
-  /** @type {{data: any, picture: HTMLCanvasElement|null, error: string}} */
-  overlay: { data: null, picture: null, error: "" },
+  options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none", floor: null },
+  /** @type {{data: any, picture: HTMLCanvasElement|null, error: string, pendingSince: number|null}} pending: computing */
+  overlay: { data: null, picture: null, error: "", pendingSince: null },
 };
 
 /** Call `callback` in the next frame after any of the topics has changed. */
@@ -67,6 +78,15 @@ function flush() {
   for (const topic of dirty) for (const callback of listeners.get(topic) ?? []) callbacks.add(callback);
   dirty.clear();
   for (const callback of callbacks) callback();
+}
+
+/**
+ * Seconds since the server got the health of a node; Infinity without any.
+ * @param {"anchors"|"tags"|"ether"} kind
+ */
+export function healthAge_s(kind, name) {
+  const age = state.health.ages[kind]?.[name];
+  return age === undefined ? Infinity : age + (performance.now() - state.health.atMs) / 1e3;
 }
 
 /** Select one tag, anchor or zone, or with null none. */

@@ -4,6 +4,7 @@ import { changed, on, state } from "./store.js";
 import { byId, h, throttle } from "./dom.js";
 import { picking } from "./survey/picking.js";
 import * as anchors from "./panels/anchors.js";
+import * as events from "./panels/events.js";
 import * as recordings from "./panels/recordings.js";
 import * as tags from "./panels/tags.js";
 import * as timing from "./panels/timing.js";
@@ -11,7 +12,7 @@ import * as zones from "./panels/zones.js";
 import * as setup from "./setup/panel.js";
 
 /** Each has a title, the topics that it shows, the interval at which it shows changes, `start(panel)` and `show()`. */
-const TABS = { tags, anchors, timing, zones, setup, recordings };
+const TABS = { tags, anchors, events, timing, zones, setup, recordings };
 const KEYS = Object.keys(TABS);
 const SHEET = ["low", "half", "high"];
 
@@ -36,6 +37,7 @@ export function start() {
   document.body.dataset.sheet = "half";
   byId("sheet").addEventListener("click", () => sheet(SHEET[(SHEET.indexOf(document.body.dataset.sheet) + 1) % 3]));
   open("tags");
+  on(["log", "read"], showUnread);
   on(["site"], openWhereNothingIsPlaced);
   on(["picking"], () => picking && matchMedia("(max-width: 760px)").matches && sheet("half"));
   setInterval(() => TABS[current].changesWithTime && show(), 1000);
@@ -53,6 +55,16 @@ function openWhereNothingIsPlaced() {
   if (offered || state.mode !== "live" || !state.site) return;
   offered = true;
   if (!state.site.anchors.length && current === "tags") open("setup");
+}
+
+/** The tab's title has the number of severe events that have not been read. */
+function showUnread() {
+  const count = events.unread();
+  const button = byId("tab-events");
+  const words = h("span", { class: "unseen" }, ` ${count === 1 ? "fault" : "faults"} not read`);
+  if (button.dataset.unread === String(count)) return;
+  button.dataset.unread = String(count);
+  button.replaceChildren(events.title, ...(count ? [" ", h("span", { class: "unread" }, String(count), words)] : []));
 }
 
 /** Bring the open tab up to date, if it is visible. */

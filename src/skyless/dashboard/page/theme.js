@@ -20,6 +20,8 @@ const NAMES = [
   "wall",
 ];
 const TAGS = 8;
+/** With more tags than this all have one colour and one mark; `map/marks.js` has the marks. */
+export const DISTINCT = 56;
 
 /** Colours by their names in tokens.css, and `tags`, a few distinct hues. @type {any} */
 export const palette = { tags: [] };
@@ -56,9 +58,9 @@ function refresh() {
   changed("theme");
 }
 
-/** Colour of a tag: its own hue where there are few tags, else one for all. */
+/** Colour of a tag by its position among all tags in the order of their names; one for all where there are many. */
 export function tagColour(index, count) {
-  return count <= TAGS ? palette.tags[index] : palette.accent;
+  return count <= DISTINCT ? palette.tags[index % TAGS] : palette.accent;
 }
 
 /** The same colour, more transparent. */

@@ -7,18 +7,40 @@ const GAP_S = 1.0;
 /** A tag whose host's clock differs more than this from the server's has a wrong clock, not an old fix. */
 const MAX_CLOCK_ERROR_S = 0.5;
 
-export const COLUMNS = 17;
-/** Columns of a track: the fields of a `state` message's row after the tag's name, in the order of the wire. */
-export const [X, Y, Z, VX, VY, CXX, CXY, CYY, STD, ERROR, TRUE_X, TRUE_Y, ANCHORS, CHI2, TIME, HPL, ALERT] =
-  Array(COLUMNS).keys();
+export const COLUMNS = 19;
+/**
+ * Columns of a track: the fields of a `state` message's row after the tag's name, in the order of the wire.
+ * `HEIGHT_GIVEN` is 1 where z was given and not estimated; `STD_Z` is NaN there.
+ */
+export const [
+  X,
+  Y,
+  Z,
+  VX,
+  VY,
+  CXX,
+  CXY,
+  CYY,
+  STD,
+  ERROR,
+  TRUE_X,
+  TRUE_Y,
+  ANCHORS,
+  CHI2,
+  TIME,
+  HPL,
+  ALERT,
+  HEIGHT_GIVEN,
+  STD_Z,
+] = Array(COLUMNS).keys();
 
 /** Integrity alerts by their names on the wire; a track holds their index. */
 export const ALERTS = {
-  none: { words: "none", grade: "" },
-  "detected-excluded": { words: "faulty anchor excluded", grade: "warn" },
-  "detected-not-excluded": { words: "fault not excluded: no protection level", grade: "bad" },
-  unavailable: { words: "no protection level available", grade: "" },
-  "alert-limit-exceeded": { words: "protection level above the alert limit", grade: "bad" },
+  none: { short: "none", words: "none", grade: "" },
+  "detected-excluded": { short: "excluded", words: "faulty anchor excluded", grade: "warn" },
+  "detected-not-excluded": { short: "not excluded", words: "fault not excluded: no protection level", grade: "bad" },
+  unavailable: { short: "no level", words: "no protection level available", grade: "" },
+  "alert-limit-exceeded": { short: "over limit", words: "protection level above the alert limit", grade: "bad" },
 };
 const ALERT_NAMES = Object.keys(ALERTS);
 

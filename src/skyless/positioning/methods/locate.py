@@ -557,7 +557,8 @@ def descend(
         if next_cost < cost:
             damping, growth = _eased(damping, (cost - next_cost) / max(predicted, 1e-300)), 2.0
             cost, normal, next_normal = next_cost, next_normal, normal
-            state[:] = trial
+            for j in range(dims):  # a whole array at once takes the compiler two seconds more
+                state[j] = trial[j]
         else:
             damping, growth = max(growth * damping, FIRST_DAMPING), 2.0 * growth
         if small:

@@ -36,7 +36,7 @@ Schema = dict[str, Any]
 FLOOR_PLAN: Final = "floor_plan"
 """An image, which has no schema; it is kept as an attachment."""
 
-RETAINED_KINDS: Final = frozenset({"site", "zones", "status", FLOOR_PLAN})
+RETAINED_KINDS: Final = frozenset({"site", "zones", "status", "watch", FLOOR_PLAN})
 """Kinds that are retained: a repetition adds nothing."""
 
 
@@ -45,7 +45,7 @@ class Channel(Struct, frozen=True):
 
     site: str
     kind: str
-    """``fix``, ``receptions``, ``stamps``, ``status``, ``health``, ``event``, ``site``, ``request``, ``zones``, ..."""
+    """``fix``, ``receptions``, ``stamps``, ``status``, ``health``, ``event``, ``site``, ``request``, ``zones``, ``watch``..."""
     name: str = ""
     """Of the tag, anchor or zone."""
     payload: type[Struct] | None = None
@@ -59,6 +59,8 @@ def channel_of(topic: str) -> Channel | None:
     match topic.removeprefix(f"{ROOT}/").split("/"):
         case [site, "floor_plan"]:
             return Channel(site, FLOOR_PLAN)
+        case [site, "survey", "watch"]:
+            return Channel(site, "watch", "", messages.WatchMessage)
         case [site, kind] if kind in _SITE_WIDE:
             return Channel(site, kind, "", _SITE_WIDE[kind])
         case [site, who, name, "health"] if who in _HEALTH:

@@ -12,7 +12,8 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.kernels.arrays import Array
-from skyless.receiver import Receiver, ReceiverState
+from skyless.receiver import Receiver
+from skyless.receiver_state import ReceiverState
 
 _FORMAT: Final = 17
 _MAX_BYTES: Final = 1 << 23

@@ -361,6 +361,27 @@ class McapRecording:
             if chunk.end_ns / NS >= from_s and chunk.start_ns / NS < to_s and self._may_hold(chunk, kinds):
                 yield from self._of(chunk, kinds, from_s, to_s)
 
+    def spans(self, kinds: set[str], gap_s: float) -> list[tuple[float, float]]:
+        """When there are messages of these kinds: begins and ends in Unix time, in order, by the times of chunks.
+
+        Gaps of up to ``gap_s`` are no gaps. Only indexes are read, so a span may begin and end a chunk too wide.
+        """
+        found: list[tuple[float, float]] = []
+        for chunk in self._scan.chunks:
+            if self._holds(chunk, kinds):
+                begin_s, end_s = chunk.start_ns / NS, chunk.end_ns / NS
+                if found and begin_s - found[-1][1] <= gap_s:
+                    found[-1] = (found[-1][0], max(end_s, found[-1][1]))
+                else:
+                    found.append((begin_s, end_s))
+        return found
+
+    def _holds(self, chunk: ChunkIndex, kinds: set[str]) -> bool:
+        """Whether a chunk holds messages of these kinds; one without a whole index is read."""
+        if chunk.indexed:
+            return self._may_hold(chunk, kinds)
+        return any(True for _ in self._of(chunk, kinds, -math.inf, math.inf))
+
     def _of(self, chunk: ChunkIndex, kinds: set[str], from_s: float, to_s: float) -> Iterator[Recorded]:
         for channel_id, log_ns, payload in self._scan.messages(chunk):
             topic = self._scan.topics.get(channel_id, "")

@@ -14,6 +14,7 @@ from msgspec import Struct
 from skyless.evaluation.figures import BLUE, GRID, INK, MUTED, ORANGE, RED, report_style
 from skyless.kernels.arrays import Array
 from skyless.studies.common.plan import Row
+from skyless.studies.common.sides import BOUND, CONFIDENCE, STATED_RISK, Sides, name_sides, shade_sides
 
 _WIDTH_IN: Final = 4.7
 _BAR_IN: Final = 0.24
@@ -44,6 +45,8 @@ class _Panel(Struct, frozen=True):
     figure: str = ""
     """Field of a row whose own limits are drawn, ``scale`` times as large."""
     scale: float = 1.0
+    sides: Sides | None = None
+    """What the two sides of the target mean, or of the stated risk."""
     log: bool | None = None
     """Whether the axis of bars is logarithmic; None for where values lie far apart."""
 
@@ -70,17 +73,26 @@ _PANELS: Final = {
         figure="rmse_m",
         scale=100.0,
     ),
-    "ratio": _Panel("RMSE over bound", lambda row: row.ratio, lambda row: row.ratio_error, 1.0),
-    "nees": _Panel("NEES per dimension", lambda row: row.nees, lambda _: None, 1.0, figure="nees"),
+    "ratio": _Panel("RMSE over bound", lambda row: row.ratio, lambda row: row.ratio_error, 1.0, sides=BOUND),
+    "nees": _Panel("NEES per dimension", lambda row: row.nees, lambda _: None, 1.0, figure="nees", sides=CONFIDENCE),
     "level": _Panel(
         "fixes with a level in %",
         lambda row: None if row.level is None else 100.0 * row.level,
         lambda _: None,
         figure="level",
         scale=100.0,
+        sides=Sides("fewer fixes with a level", "more: better, if they hold", "above"),
         log=False,
     ),
-    "exceeded": _Panel("levels exceeded in 10⁻⁴", _exceeded, lambda _: None, figure="exceeded", scale=1e4, log=True),
+    "exceeded": _Panel(
+        "levels exceeded in 10⁻⁴",
+        _exceeded,
+        lambda _: None,
+        figure="exceeded",
+        scale=1e4,
+        sides=STATED_RISK,
+        log=True,
+    ),
     "superframes": _Panel(
         "superframes, the slowest run",
         lambda row: row.superframes_most,
@@ -94,6 +106,7 @@ _PANELS: Final = {
         lambda _: None,
         figure="found",
         scale=100.0,
+        sides=Sides("events missed: unsafe", "events found: safe side", "above"),
         log=False,
     ),
     "found_s": _Panel("seconds to the finding, 99 %", lambda row: row.found_s, lambda _: None, log=True),
@@ -151,6 +164,19 @@ def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
         _limits(axes, rows)
     if panel.figure and not curve:
         _own_limits(axes, panel, rows)
+    if panel.sides is not None:
+        limit = panel.target or _stated_risk(rows, panel)
+        if limit is None:
+            name_sides(axes, panel.sides, along="y" if curve else "x")
+        else:
+            shade_sides(axes, panel.sides, limit, along="y" if curve else "x")
+
+
+def _stated_risk(rows: list[Row], panel: _Panel) -> float | None:
+    """The probability that all rows state for what the panel shows, on its axis; None where they state none."""
+    risks = {row.risk for row in rows}
+    (risk,) = risks if len(risks) == 1 else (None,)
+    return panel.scale * risk if panel.sides is STATED_RISK and risk else None
 
 
 def _or_nan(value: float | None) -> float:

@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Final
 
 from skyless.errors import SkylessError
-from skyless.kernels.compiled import cores
+from skyless.kernels.processors import cores
 from skyless.studies.common.plan import Cell
 
 _POLL_S: Final = 0.2

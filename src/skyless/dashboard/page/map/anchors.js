@@ -1,14 +1,17 @@
 /** Anchors: their health as a colour and a shape, and their marks on the map. */
 
 import { s } from "../dom.js";
-import { state } from "../store.js";
+import { healthAge_s, state } from "../store.js";
 import { surveyShown } from "../survey/model.js";
 import { palette } from "../theme.js";
-import { px, py } from "./view.js";
+import { groundHeight, otherFloor } from "./floors.js";
+import { toX, toY, view } from "./view.js";
 
 /** An anchor whose health is older than this is offline. */
 const MAX_AGE_S = 3.5;
 const MARK = 7;
+/** Opacity of what is on another floor than the chosen one. */
+export const DIMMED = 0.22;
 
 /** The conditions of anchors: their words, their colours and their shapes, outlines in a square from -1 to 1. */
 export const CONDITIONS = {
@@ -25,9 +28,7 @@ export function condition(id) {
   const status = state.health.nodes.find((node) => node.kind === "anchor" && String(node.name) === String(id));
   if (status && !status.online) return "bad";
   if (!health) return status ? "warn" : "unknown";
-  const newest = Math.max(...[...state.health.anchors.values()].map((one) => one.unix_s));
-  const age_s = (performance.now() - state.health.atMs) / 1e3 + newest - health.unix_s;
-  if (age_s > MAX_AGE_S) return "bad";
+  if (healthAge_s("anchors", id) > MAX_AGE_S) return "bad";
   return health.synchronised || health.role === "master" ? "good" : "warn";
 }
 
@@ -64,15 +65,23 @@ export function anchorMark(kind, leading = false) {
   return mark;
 }
 
+/** The anchors as drawn last, for the pointer and for names that avoid them. @type {Array<{id: number, x: number, y: number}>} */
+export let drawnAnchors = [];
+
 /** Draw all anchors, unless the survey's picture shows them; a master or root has a frame around it, the selected one a ring. */
 export function drawAnchors(context) {
+  drawnAnchors = [];
   if (surveyShown()) return;
+  const other = otherFloor();
   context.font = "600 11px system-ui, sans-serif";
   context.textAlign = "center";
   context.textBaseline = "top";
   for (const anchor of state.site?.anchors ?? []) {
-    const x = px(anchor.x_m);
-    const y = py(anchor.y_m);
+    const x = toX(anchor.x_m, anchor.y_m);
+    const y = toY(anchor.x_m, anchor.y_m, anchor.z_m);
+    drawnAnchors.push({ id: anchor.id, x, y });
+    context.globalAlpha = other(anchor.z_m, anchor.floor ?? 0) ? DIMMED : 1;
+    if (view.spatial) dropLine(context, anchor.x_m, anchor.y_m, y, palette.muted);
     const kind = condition(anchor.id);
     const colour = palette[CONDITIONS[kind].colour];
     mark(context, kind, x, y, colour);
@@ -83,13 +92,27 @@ export function drawAnchors(context) {
       context.strokeRect(x - MARK - 4.5, y - MARK - 4.5, 2 * MARK + 9, 2 * MARK + 9);
     }
     if (anchor.id === state.selection.anchor) ring(context, x, y, MARK + 9);
-    label(
-      context,
-      leading ? `${anchor.id} ${leading}` : String(anchor.id),
-      x,
-      y + MARK + (anchor.id === state.selection.anchor ? 12 : 7),
-    );
+    const words = leading ? `${anchor.id} ${leading}` : String(anchor.id);
+    const height = view.spatial ? ` · ${Number(anchor.z_m.toFixed(2))} m` : "";
+    label(context, words + height, x, y + MARK + (anchor.id === state.selection.anchor ? 12 : 7));
   }
+  context.globalAlpha = 1;
+}
+
+/** In the 3-D view, the line from something straight down to the ground. */
+export function dropLine(context, x_m, y_m, y, colour) {
+  const x = toX(x_m, y_m);
+  const ground = toY(x_m, y_m, groundHeight());
+  context.strokeStyle = colour;
+  context.lineWidth = 1;
+  context.setLineDash([2, 3]);
+  context.beginPath();
+  context.moveTo(x, y);
+  context.lineTo(x, ground);
+  context.stroke();
+  context.setLineDash([]);
+  context.fillStyle = colour;
+  context.fillRect(x - 1.5, ground - 1, 3, 2);
 }
 
 function mark(context, kind, x, y, colour) {

@@ -75,6 +75,13 @@ export async function remove(id) {
   toast(`${zone.name} deleted.`, "note", { name: "Undo", run: bringBack });
 }
 
+/** Add zones of elsewhere, as of a file; one whose identifier is in use gets another. */
+export function add(zones, words) {
+  const taken = new Set(state.zones.map((zone) => zone.id));
+  const added = zones.map((zone) => (taken.has(zone.id) ? { ...zone, id: freshId() } : zone));
+  return store([...state.zones, ...added], words);
+}
+
 /** Move a corner while it is dragged; it is stored when it is released. */
 export function moveCorner(id, index, at) {
   state.zones = state.zones.map((zone) => {
@@ -93,7 +100,7 @@ async function store(zones, words = "", before = state.zones) {
   state.zones = zones;
   changed("zones");
   try {
-    showStored((await putZones(zones)) ?? zones);
+    showStored((await putZones(zones, state.site?.name ?? "")) ?? zones);
     if (words) toast(words);
     return true;
   } catch (error) {

@@ -5,11 +5,13 @@ import { state } from "../store.js";
 import { metres } from "../format.js";
 import { surveyShown } from "../survey/model.js";
 import { height_m, moving, plan } from "../survey/plan.js";
-import { px, py, roundLength, toSite, view } from "./view.js";
+import { drawInMetres, px, py, roundLength, toSite, toX, toY, view } from "./view.js";
 
 /** @type {{image: HTMLImageElement, x_m: number, y_m: number, width_m: number, height_m: number}|null} */
 export let floor = null;
 let floorOf = null;
+/** Over a floor plan an overlay is transparent, as in the planner's pictures; elsewhere its colours are those of its scale. */
+const OVER_PLAN = 0.75;
 
 /** Load the site's floor plan, if it has one, and call `done` when it is loaded. */
 export function loadFloor(done) {
@@ -34,17 +36,25 @@ export function loadFloor(done) {
 export function drawFloor(context) {
   const shown = laid();
   if (!shown) return;
-  const [left, top] = [px(shown.x_m), py(shown.y_m + shown.height_m)];
-  const [width, height] = [shown.width_m * view.scale, shown.height_m * view.scale];
   context.globalAlpha = surveyShown() ? 0.5 : 0.75; // thin lines of the survey's picture lie over it
-  context.drawImage(shown.image, left, top, width, height);
+  drawPicture(context, shown.image, shown.x_m, shown.y_m, shown.width_m, shown.height_m);
   context.globalAlpha = 1;
   if (!moving) return;
+  const [left, top] = [px(shown.x_m), py(shown.y_m + shown.height_m)];
+  const [width, height] = [shown.width_m * view.scale, shown.height_m * view.scale];
   context.setLineDash([6, 4]);
   context.strokeStyle = palette.accent;
   context.lineWidth = 2;
   context.strokeRect(left, top, width, height);
   context.setLineDash([]);
+}
+
+/** Lay a picture on the ground, its lower left corner at a position. */
+function drawPicture(context, picture, x_m, y_m, width_m, height_m) {
+  drawInMetres(context);
+  context.scale(1, -1); // pictures count downwards
+  context.drawImage(picture, x_m, -(y_m + height_m), width_m, height_m);
+  context.restore();
 }
 
 /** The plan that the set-up lays under the picture, or else the site's. */
@@ -67,11 +77,11 @@ export function drawOverlay(context) {
   const { data, picture } = state.overlay;
   if (!data || !picture) return;
   const half = data.step_m / 2;
-  const [left, right] = [px(data.x_m[0] - half), px(data.x_m[1] + half)];
-  const [top, bottom] = [py(data.y_m[1] + half), py(data.y_m[0] - half)];
-  context.globalAlpha = 0.62;
+  const [x1, x2] = [data.x_m[0] - half, data.x_m[1] + half];
+  const [y1, y2] = [data.y_m[0] - half, data.y_m[1] + half];
+  context.globalAlpha = laid() ? OVER_PLAN : 1;
   context.imageSmoothingEnabled = true;
-  context.drawImage(picture, left, top, right - left, bottom - top);
+  drawPicture(context, picture, x1, y1, x2 - x1, y2 - y1);
   context.globalAlpha = 1;
 }
 
@@ -99,14 +109,19 @@ export function drawGrid(context) {
   context.textBaseline = "bottom";
   lines(left, right, (x_m) => {
     const x = px(x_m);
-    if (x > 40 && x < view.width - 20) context.fillText(metres(x_m, digits), x, view.height - 4);
+    if (x > 40 && x < view.width - 62) context.fillText(metres(x_m, digits), x, view.height - 4);
   });
   context.textAlign = "left";
   context.textBaseline = "middle";
   lines(bottom, top, (y_m) => {
     const y = py(y_m);
-    if (y > 16 && y < view.height - 24) context.fillText(metres(y_m, digits), 5, y);
+    if (y > 26 && y < view.height - 24) context.fillText(metres(y_m, digits), 5, y);
   });
+  context.fillStyle = palette.text;
+  context.fillText("y in m", 5, 12);
+  context.textAlign = "right";
+  context.textBaseline = "bottom";
+  context.fillText("x in m", view.width - 16, view.height - 4);
 }
 
 function line(context, x1, y1, x2, y2, colour) {
@@ -118,14 +133,14 @@ function line(context, x1, y1, x2, y2, colour) {
 }
 
 /** Draw the walls. */
-export function drawWalls(context) {
+export function drawWalls(context, ground_m) {
   context.strokeStyle = palette.wall;
   context.lineWidth = 3;
   context.lineCap = "round";
   context.beginPath();
   for (const wall of state.site?.walls ?? []) {
-    context.moveTo(px(wall.x1_m), py(wall.y1_m));
-    context.lineTo(px(wall.x2_m), py(wall.y2_m));
+    context.moveTo(toX(wall.x1_m, wall.y1_m), toY(wall.x1_m, wall.y1_m, ground_m));
+    context.lineTo(toX(wall.x2_m, wall.y2_m), toY(wall.x2_m, wall.y2_m, ground_m));
   }
   context.stroke();
   context.lineCap = "butt";

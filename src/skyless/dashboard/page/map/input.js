@@ -2,15 +2,17 @@
 
 import { changed, select, state } from "../store.js";
 import { byId, text } from "../dom.js";
-import { length, metres, number } from "../format.js";
+import { metres } from "../format.js";
 import { surveyShown } from "../survey/model.js";
 import { picking, stopPicking } from "../survey/picking.js";
 import { move as movePlan, moving as movingPlan } from "../survey/plan.js";
 import { addPoint, begin, cancel, editor, finish, moveCorner, setCursor, storeShown, undoPoint } from "./editor.js";
-import { valueAt } from "./overlay.js";
+import { KINDS, valueAt, writeValue } from "./overlay.js";
+import { endFollow, following, toggleFollow } from "./follow.js";
+import { drawnAnchors } from "./anchors.js";
 import { anchorNear } from "./survey.js";
 import { drawn } from "./tags.js";
-import { pan, px, py, toSite, view, zoom } from "./view.js";
+import { orbit, pan, px, py, toSite, view, zoom } from "./view.js";
 import { inside } from "./zones.js";
 
 /** Distances in pixels: a pointer hits an item, and a press is no drag. */
@@ -22,7 +24,7 @@ let travelled = 0;
 let dragged = null;
 
 /** @param {HTMLElement} target the focusable element over the canvases */
-export function listen(target, redraw, fitAll) {
+export function listen(target, redraw, fitAll, toggleSpatial) {
   const pixel = (event) => {
     const box = target.getBoundingClientRect();
     return { x: event.clientX - box.left, y: event.clientY - box.top };
@@ -45,7 +47,7 @@ export function listen(target, redraw, fitAll) {
     if (pointers.size === 2) pinch(event.pointerId, before, at);
     else if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
     else if (travelled + Math.hypot(at.x - before.x, at.y - before.y) >= MAX_TAP_TRAVEL)
-      drag(at.x - before.x, at.y - before.y);
+      drag(at.x - before.x, at.y - before.y, event.shiftKey);
     travelled += Math.hypot(at.x - before.x, at.y - before.y);
     pointers.set(event.pointerId, at);
     redraw(true);
@@ -72,23 +74,34 @@ export function listen(target, redraw, fitAll) {
   );
   target.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (!(editor.drawing ? drawingKey(event) : mapKey(event, fitAll))) return;
+    if (!(editor.drawing ? drawingKey(event) : mapKey(event, fitAll, toggleSpatial))) return;
     event.preventDefault();
     redraw(true);
   });
 }
 
-/** A drag moves the map, or the floor plan while that is being laid. */
-function drag(dx, dy) {
+/** Angle by which the 3-D view turns for a pixel, and for a key. */
+const TURN = 0.007;
+const KEY_TURN = Math.PI / 24;
+
+/** A drag moves the map, or the floor plan while that is being laid; in 3-D it turns the view, with Shift it moves it. */
+function drag(dx, dy, shift) {
   if (movingPlan && !picking) movePlan(dx / view.scale, -dy / view.scale);
-  else pan(dx, dy);
+  else if (view.spatial && !shift) orbit(-TURN * dx, TURN * dy);
+  else panByHand(dx, dy);
+}
+
+/** Whoever moves the map wants to see something else than the followed tag. */
+function panByHand(dx, dy) {
+  if (following() !== null) endFollow();
+  pan(dx, dy);
 }
 
 function pinch(moved, before, at) {
   const other = [...pointers].find(([id]) => id !== moved)[1];
   const apart = Math.hypot(before.x - other.x, before.y - other.y);
   const middle = { x: (at.x + other.x) / 2, y: (at.y + other.y) / 2 };
-  pan((at.x - before.x) / 2, (at.y - before.y) / 2);
+  if (following() === null) pan((at.x - before.x) / 2, (at.y - before.y) / 2);
   if (apart > 1) zoom(Math.hypot(at.x - other.x, at.y - other.y) / apart, middle.x, middle.y);
   travelled += MAX_TAP_TRAVEL;
 }
@@ -106,7 +119,7 @@ function tap({ x, y }) {
   if (tag) return select("tag", tag.name);
   const anchor = surveyShown()
     ? anchorNear(x, y, HIT)
-    : state.site?.anchors.find((one) => near(px(one.x_m), py(one.y_m), x, y))?.id;
+    : drawnAnchors.find((one) => near(one.x, one.y, x, y))?.id;
   if (anchor !== undefined) return select("anchor", anchor);
   const zone = state.zones.findLast((one) => inside(one.polygon_m, site[0], site[1]));
   return zone ? select("zone", zone.id) : select(null);
@@ -123,7 +136,7 @@ function near(x1, y1, x2, y2) {
 }
 
 function cornerAt({ x, y }) {
-  if (editor.drawing || picking || movingPlan || state.mode !== "live") return null;
+  if (editor.drawing || picking || movingPlan || state.mode !== "live" || view.spatial) return null;
   const zone = state.zones.find((one) => one.id === state.selection.zone);
   const index = zone?.polygon_m.findIndex(([x_m, y_m]) => near(px(x_m), py(y_m), x, y)) ?? -1;
   return index < 0 ? null : { id: zone.id, index };
@@ -134,22 +147,27 @@ function hover({ x, y }, type) {
   if (editor.drawing && type === "mouse") setCursor([x_m, y_m]);
   const value = valueAt(x_m, y_m);
   const { data } = state.overlay;
-  const overlay = value === null ? "" : ` · ${data.unit === "m" ? `σ ${length(value)}` : number(value, 2)}`;
-  text(byId("readout"), `x ${metres(x_m)} m · y ${metres(y_m)} m${overlay}`);
+  const overlay = !data ? "" : ` · ${KINDS[data.kind].split(" (")[0]} ${value === null ? "no fix" : writeValue(value)}`;
+  const where = view.spatial ? " on the ground" : "";
+  text(byId("readout"), `x ${metres(x_m)} m · y ${metres(y_m)} m${where}${overlay}`);
 }
 
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
-function mapKey(event, fitAll) {
+function mapKey(event, fitAll, toggleSpatial) {
   const arrow = ARROWS[event.key];
   const step = event.shiftKey ? 0.02 : 0.2;
   if (event.key === "Escape" && picking) stopPicking();
   else if (arrow && movingPlan) movePlan(step * arrow[0], step * arrow[1]);
-  else if (arrow) pan(-60 * arrow[0], 60 * arrow[1]);
+  else if (arrow && view.spatial && !event.shiftKey) orbit(KEY_TURN * arrow[0], -KEY_TURN * arrow[1]);
+  else if (arrow) panByHand(-60 * arrow[0], 60 * arrow[1]);
   else if (event.key === "+" || event.key === "=") zoom(1.25);
   else if (event.key === "-") zoom(0.8);
   else if (event.key === "0") fitAll();
-  else if (event.key === "z") begin([view.x_m, view.y_m]);
+  else if (event.key === "z" && !view.spatial) begin([view.x_m, view.y_m]);
+  else if (event.key === "3") toggleSpatial();
+  else if (event.key === "f") toggleFollow();
+  else if (event.key === "Escape" && following() !== null) endFollow();
   else if (event.key === "Escape") select(null);
   else return false;
   return true;

@@ -6,11 +6,15 @@ import { surveyShown } from "../survey/model.js";
 import { drawAnchors } from "./anchors.js";
 import { drawFindings } from "./findings.js";
 import { drawFloor, drawGrid, drawOverlay, drawScale, drawWalls, floorCorners, loadFloor } from "./floor.js";
+import { groundHeight } from "./floors.js";
+import { centre } from "./follow.js";
 import { listen } from "./input.js";
+import { drawRoom, fillRoom } from "./room.js";
+import { drawGround, spaceCorners } from "./space.js";
 import { drawSurvey, surveyCorners, surveyOutOfSight } from "./survey.js";
 import { drawTags, visibleTags } from "./tags.js";
 import { drawTrails, due } from "./trails.js";
-import { fit, prepare, view } from "./view.js";
+import { fit, isNarrow, prepare, setSpatial, view } from "./view.js";
 import { drawDraft, drawZones, flash } from "./zones.js";
 
 /** Frames drawn so far, for tests and measurements. */
@@ -34,6 +38,8 @@ export function redraw(still = true) {
 
 function frame() {
   scheduled = false;
+  const now = visibleTags();
+  if (centre(now.seen)) stillDirty = true;
   const still = stillDirty;
   if (stillDirty) {
     stillDirty = false;
@@ -43,7 +49,6 @@ function frame() {
   if (movingDirty) {
     movingDirty = false;
     drawnFrames.moving++;
-    const now = visibleTags();
     if (still || due(performance.now() - trailsDrawn, now.seen.length)) {
       trailsDrawn = performance.now();
       const context = prepare(byId("trails"));
@@ -60,11 +65,15 @@ function frame() {
 
 function drawStill() {
   const context = prepare(byId("still"));
+  const ground_m = groundHeight();
   drawFloor(context);
+  fillRoom(context, floorCorners(), ground_m);
   drawOverlay(context);
-  drawGrid(context);
+  if (view.spatial) drawGround(context, floorCorners());
+  else drawGrid(context);
   const flashes = drawZones(context);
-  drawWalls(context);
+  drawWalls(context, ground_m);
+  drawRoom(context, floorCorners(), ground_m);
   drawAnchors(context);
   drawSurvey(context);
   drawFindings(context);
@@ -75,8 +84,18 @@ function drawStill() {
 
 /** Show the whole site. */
 export function fitAll() {
-  fit(state.site, state.zones, [...floorCorners(), ...surveyCorners()]);
+  const corners = [...floorCorners(), ...surveyCorners()];
+  const further = view.spatial ? [...corners, ...spaceCorners(floorCorners())] : corners;
+  fit(state.site, state.zones, further, state.options.overlay !== "none");
   redraw();
+}
+
+/** Show the site in 3-D, or from above; the survey's picture is seen from above only. */
+export function showSpatial(spatial) {
+  setSpatial(spatial && !surveyShown());
+  byId("spatial").setAttribute("aria-pressed", String(view.spatial));
+  byId("draw").disabled = view.spatial || state.mode === "replay";
+  fitAll();
 }
 
 /** Start drawing. */
@@ -89,7 +108,7 @@ export function start() {
     if (view.touched) redraw();
     else fitAll();
   }).observe(box);
-  listen(byId("canvas"), redraw, fitAll);
+  listen(byId("canvas"), redraw, fitAll, () => showSpatial(!view.spatial));
   let shown = null;
   on(["site", "mode"], () => {
     loadFloor(() => (view.touched ? redraw() : fitAll()));
@@ -97,8 +116,14 @@ export function start() {
     if (key !== shown) fitAll();
     shown = key;
   });
+  let overlay = "none";
+  on(["options"], () => {
+    if (overlay !== state.options.overlay && isNarrow() && !view.touched) fitAll();
+    overlay = state.options.overlay;
+  });
   let surveyed = "";
   on(["survey", "setup"], () => {
+    if (view.spatial && surveyShown()) showSpatial(false);
     const box = surveyCorners().map(([x, y]) => [Math.round(x), Math.round(y)]);
     const key = JSON.stringify([state.setup.open, box]);
     if (key !== surveyed && (!view.touched || surveyOutOfSight())) fitAll();

@@ -4,6 +4,7 @@ import { changed, on, state } from "../store.js";
 import { overlay } from "../api.js";
 import { liveSite } from "../live.js";
 import { toast } from "../dom.js";
+import { length, number } from "../format.js";
 
 export const KINDS = {
   none: "None",
@@ -12,46 +13,53 @@ export const KINDS = {
   sigma: "Predicted σ",
 };
 
-/** Eight colours of viridis (matplotlib's, CC0), perceptually uniform, also for colour-blind readers and in grey. */
-const VIRIDIS = [
-  [68, 1, 84],
-  [70, 50, 127],
-  [54, 92, 141],
-  [39, 127, 142],
-  [31, 161, 135],
-  [74, 194, 109],
-  [159, 218, 58],
-  [253, 231, 37],
-];
 const MAX_POINTS = 10_000;
 let serial = 0;
 
-/** Colour at a fraction of the scale from 0 (good) to 1 (bad). */
-export function colourAt(fraction) {
-  const at = Math.min(Math.max(fraction, 0), 1) * (VIRIDIS.length - 1);
-  const low = Math.min(Math.floor(at), VIRIDIS.length - 2);
-  return VIRIDIS[low].map((value, part) => value + (at - low) * (VIRIDIS[low + 1][part] - value));
+/**
+ * Where a value lies on a scale, 0 (best) to 1 (worst): by the logarithm of its ratio to the lowest value.
+ * The server gives the scale and its colours with each overlay: they are those of `skyless plan`'s pictures.
+ */
+export function fractionOf(value, { low, high }) {
+  return value > low ? Math.min(Math.log(value / low) / Math.log(high / low), 1) : 0;
+}
+
+/** Red, green and blue, 0 to 255, at a position on a scale. */
+export function colourAt(fraction, { stops }) {
+  const at = Math.min(Math.max(fraction, 0), 1) * (stops.length - 1);
+  const index = Math.min(Math.floor(at), stops.length - 2);
+  const [one, other] = [parts(stops[index]), parts(stops[index + 1])];
+  return one.map((value, part) => value + (at - index) * (other[part] - value));
+}
+
+function parts(stop) {
+  return [1, 3, 5].map((at) => parseInt(stop.slice(at, at + 2), 16));
+}
+
+/** A value with its unit. */
+export function writeValue(value, data = state.overlay.data) {
+  return data.unit === "m" ? length(value) : number(value, 2);
 }
 
 /** Show another overlay, or none. */
 export async function choose(kind) {
   const mine = ++serial;
   state.options.overlay = kind;
-  state.overlay = { data: null, picture: null, error: "" };
+  state.overlay = { data: null, picture: null, error: "", pendingSince: null };
   changed("overlay", "options");
   if (kind === "none") return;
   if (state.mode === "replay" && JSON.stringify(liveSite()?.anchors) !== JSON.stringify(state.site?.anchors)) {
     toast("Overlays are computed for the live site; this recording has different anchors.");
     return choose("none");
   }
+  state.overlay.pendingSince = performance.now();
   try {
     const data = await overlay(kind, step());
     if (mine !== serial) return;
-    state.overlay = { data, picture: paint(data), error: "" };
+    state.overlay = { data, picture: paint(data), error: "", pendingSince: null };
   } catch (error) {
     if (mine !== serial) return;
-    state.overlay.error = error.message;
-    toast(`No overlay: ${error.message}`, "bad");
+    state.overlay = { data: null, picture: null, error: error.message, pendingSince: null };
   }
   changed("overlay");
 }
@@ -70,12 +78,11 @@ function paint(data) {
   picture.height = data.rows;
   const context = picture.getContext("2d");
   const image = context.createImageData(data.columns, data.rows);
-  const { good, bad } = data.levels;
   for (let line = 0; line < data.rows; line++) {
     for (let column = 0; column < data.columns; column++) {
       const value = data.values[(data.rows - 1 - line) * data.columns + column];
       if (value === null) continue;
-      const [red, green, blue] = colourAt((value - good) / (bad - good));
+      const [red, green, blue] = colourAt(fractionOf(value, data.scale), data.scale);
       image.data.set([red, green, blue, 255], 4 * (line * data.columns + column));
     }
   }

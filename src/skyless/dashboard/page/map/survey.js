@@ -5,7 +5,7 @@ import { roundStep } from "../format.js";
 import { facts, surveyShown } from "../survey/model.js";
 import { faint, palette } from "../theme.js";
 import { label, ring } from "./anchors.js";
-import { isNarrow, px, py, toSite, view } from "./view.js";
+import { isNarrow, px, py, toSite, toX, toY, view } from "./view.js";
 
 const MARK = 6;
 /** Half axes of an ellipse that holds 95 % of the errors, in standard deviations. */
@@ -30,7 +30,7 @@ export function anchorNear(x, y, hit) {
 export function pixelOf(id) {
   if (surveyShown()) return drawn.find((one) => one.id === id) ?? null;
   const anchor = state.site?.anchors.find((one) => one.id === id);
-  return anchor ? { id, x: px(anchor.x_m), y: py(anchor.y_m) } : null;
+  return anchor ? { id, x: toX(anchor.x_m, anchor.y_m), y: toY(anchor.x_m, anchor.y_m, anchor.z_m) } : null;
 }
 
 /** Positions of the survey's picture in metres: the result's, and rough ones where it has none. */

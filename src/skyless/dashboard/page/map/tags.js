@@ -1,12 +1,15 @@
 /** Tags on the map: ellipses, protection levels, true positions, marks and names. */
 
 import { GONE_S, freshness, now_s, shown_s, stillMotion, tracks } from "../clock.js";
-import { faint, palette, tagColour } from "../theme.js";
+import { faint, palette } from "../theme.js";
 import { state } from "../store.js";
-import { COLUMNS, CXX, CXY, CYY, HPL, TRUE_X, TRUE_Y, X, Y } from "../tracks.js";
-import { label, ring } from "./anchors.js";
+import { COLUMNS, CXX, CXY, CYY, HEIGHT_GIVEN, HPL, TRUE_X, TRUE_Y, X, Y, Z } from "../tracks.js";
+import { DIMMED, drawnAnchors, dropLine, ring } from "./anchors.js";
+import { otherFloor } from "./floors.js";
+import { drawMark, tagStyle } from "./marks.js";
+import { drawNames } from "./names.js";
 import { drawStub } from "./trails.js";
-import { px, py, view } from "./view.js";
+import { foreshortening, seenCovariance, toX, toY, view } from "./view.js";
 
 /** √5.991: half axes of the ellipse of 95 % in standard deviations, in two dimensions. */
 const SIGMAS_95 = 2.4477;
@@ -24,6 +27,7 @@ export function visibleTags() {
   const shown = shown_s();
   const list = tracks().sorted;
   const seen = [];
+  const other = otherFloor();
   let moving = false;
   let ageing = false;
   list.forEach((track, index) => {
@@ -33,8 +37,10 @@ export function visibleTags() {
       moving ||= track.lastTime > shown;
       ageing ||= now - track.lastTime < GONE_S + 1;
     }
-    const colour = fresh === "fresh" ? tagColour(index, list.length) : palette.muted;
-    seen.push({ track, colour, fresh, row: row.slice(), selected: track.name === state.selection.tag });
+    const style = tagStyle(index, list.length);
+    const colour = fresh === "fresh" ? style.colour : palette.muted;
+    const selected = track.name === state.selection.tag;
+    seen.push({ track, colour, shape: style.shape, fresh, row: row.slice(), selected, other: other(row[Z]), x: 0, y: 0 });
   });
   return { seen, shown, moving, ageing };
 }
@@ -43,20 +49,26 @@ export function visibleTags() {
 export function drawTags(context, { seen, shown }) {
   const options = state.options;
   drawn.length = 0;
-  if (options.trails) for (const one of seen) drawStub(context, one, shown);
-  if (options.ellipses) for (const one of seen) ellipse(context, one);
-  if (options.levels) for (const one of seen) if (seen.length <= NAMED || one.selected) level(context, one);
-  if (options.truth && state.simulated) for (const one of seen) truth(context, one);
+  for (const one of seen) {
+    one.x = toX(one.row[X], one.row[Y]);
+    one.y = toY(one.row[X], one.row[Y], one.row[Z]);
+  }
+  const here = seen.filter((one) => !one.other);
+  if (options.trails) for (const one of here) drawStub(context, one, shown);
+  if (view.spatial) for (const one of here) dropLine(context, one.row[X], one.row[Y], one.y, faint(one.colour, 0.7));
+  if (options.ellipses) for (const one of here) ellipse(context, one);
+  if (options.levels) for (const one of here) if (seen.length <= NAMED || one.selected) level(context, one);
+  if (options.truth && state.simulated) for (const one of here) truth(context, one);
   for (const one of seen) mark(context, one);
-  if (options.names) names(context, seen);
+  if (options.names) names(context, here);
 }
 
-function ellipse(context, { row: at, colour, selected }) {
-  const [major, minor, angle] = axes(at[CXX], at[CXY], at[CYY]);
+function ellipse(context, { row: at, colour, selected, x, y }) {
+  const [major, minor, angle] = axes(...seenCovariance(at[CXX], at[CXY], at[CYY]));
   const long = SIGMAS_95 * major * view.scale;
   if (!(long > MARK)) return;
   context.beginPath();
-  context.ellipse(px(at[X]), py(at[Y]), long, SIGMAS_95 * minor * view.scale, -angle, 0, 2 * Math.PI);
+  context.ellipse(x, y, long, SIGMAS_95 * minor * view.scale, -angle, 0, 2 * Math.PI);
   context.fillStyle = faint(colour, 0.14);
   context.fill();
   context.strokeStyle = faint(colour, selected ? 0.95 : 0.6);
@@ -65,11 +77,11 @@ function ellipse(context, { row: at, colour, selected }) {
 }
 
 /** The circle of the protection level. */
-function level(context, { row: at, colour, selected }) {
+function level(context, { row: at, colour, selected, x, y }) {
   const radius = at[HPL] * view.scale;
   if (!(radius > MARK)) return;
   context.beginPath();
-  context.arc(px(at[X]), py(at[Y]), radius, 0, 2 * Math.PI);
+  context.ellipse(x, y, radius, radius * foreshortening().floor, 0, 0, 2 * Math.PI);
   context.setLineDash([3, 3]);
   context.strokeStyle = faint(colour, selected ? 0.95 : 0.6);
   context.lineWidth = 1;
@@ -84,41 +96,42 @@ export function axes(xx, xy, yy) {
   return [Math.sqrt(middle + difference), Math.sqrt(Math.max(middle - difference, 0)), Math.atan2(2 * xy, xx - yy) / 2];
 }
 
-function truth(context, { row: at, colour }) {
+function truth(context, { row: at, colour, x, y }) {
   if (!(at[TRUE_X] === at[TRUE_X])) return;
-  const x = px(at[TRUE_X]);
-  const y = py(at[TRUE_Y]);
+  const true_x = toX(at[TRUE_X], at[TRUE_Y]);
+  const true_y = toY(at[TRUE_X], at[TRUE_Y], at[Z]);
   context.strokeStyle = faint(colour, 0.55);
   context.lineWidth = 1.25;
   context.beginPath();
-  context.arc(x, y, MARK + 4, 0, 2 * Math.PI);
-  context.moveTo(px(at[X]), py(at[Y]));
-  context.lineTo(x, y);
+  context.arc(true_x, true_y, MARK + 4, 0, 2 * Math.PI);
+  context.moveTo(x, y);
+  context.lineTo(true_x, true_y);
   context.stroke();
 }
 
-function mark(context, { track, row: at, colour, fresh, selected }) {
-  const x = px(at[X]);
-  const y = py(at[Y]);
+function mark(context, { track, colour, shape, fresh, selected, other, x, y }) {
   drawn.push({ name: track.name, x, y });
-  context.beginPath();
-  context.arc(x, y, MARK, 0, 2 * Math.PI);
-  context.fillStyle = fresh === "fresh" ? colour : palette.surface;
-  context.fill();
-  context.strokeStyle = fresh === "fresh" ? palette.surface : colour;
-  context.lineWidth = 1.5;
-  context.stroke();
+  if (other) context.globalAlpha = DIMMED;
+  drawMark(context, x, y, colour, shape, fresh !== "fresh");
+  if (other) context.globalAlpha = 1;
   if (selected) ring(context, x, y, MARK + 8);
 }
 
 function names(context, seen) {
-  context.font = "11px system-ui, sans-serif";
-  context.textAlign = "left";
-  context.textBaseline = "bottom";
-  for (const { track, row: at, fresh, selected } of seen) {
+  const wanted = [];
+  for (const { track, row: at, fresh, selected, x, y } of seen) {
     if (seen.length > NAMED && !selected) continue;
     const quiet = fresh === "fresh" || state.connection.phase === "lost";
-    const words = quiet ? track.name : `${track.name} · no fix`;
-    label(context, words, px(at[X]) + 9, py(at[Y]) - 6, fresh === "fresh" ? palette.text : palette.muted);
+    const words = (quiet ? track.name : `${track.name} · no fix`) + (view.spatial ? heightWords(at, selected) : "");
+    wanted.push({ key: track.name, words, x, y, colour: fresh === "fresh" ? palette.text : palette.muted });
   }
+  const anchors = wanted.length ? drawnAnchors.map(({ x, y }) => [x - 8, y - 8, x + 8, y + 20]) : [];
+  drawNames(context, wanted, anchors);
+}
+
+/** The height of a tag, and whether it was given; where all are given, only the selected one repeats it. */
+export function heightWords(at, selected) {
+  const all = Number.isFinite(state.site?.tags?.height_m ?? NaN);
+  if (!Number.isFinite(at[Z]) || (all && at[HEIGHT_GIVEN] && !selected)) return "";
+  return at[HEIGHT_GIVEN] ? ` · height ${Number(at[Z].toFixed(2))} m given` : ` · z ${at[Z].toFixed(2)} m`;
 }

@@ -5,7 +5,8 @@ import { byId, text } from "../dom.js";
 import { picking, stopPicking } from "../survey/picking.js";
 import { moving, setMoving } from "../survey/plan.js";
 import { begin, cancel, editor, finish, undoPoint } from "./editor.js";
-import { fitAll, redraw } from "./map.js";
+import { start as startFollow } from "./follow.js";
+import { fitAll, redraw, showSpatial } from "./map.js";
 import { view, zoom } from "./view.js";
 
 /** Connect the buttons. */
@@ -14,6 +15,8 @@ export function start() {
   click("zoom-in", () => (zoom(1.25), redraw()));
   click("zoom-out", () => (zoom(0.8), redraw()));
   click("fit", fitAll);
+  click("spatial", () => showSpatial(!view.spatial));
+  startFollow();
   click("draw", (event) => startDrawing(event.detail === 0));
   click("drawing-finish", finish);
   click("drawing-undo", undoPoint);
@@ -22,7 +25,7 @@ export function start() {
   on(["editor"], show);
   on(["picking", "plan"], showPicking);
   on(["mode"], () => {
-    byId("draw").disabled = document.body.classList.contains("replaying");
+    byId("draw").disabled = view.spatial || document.body.classList.contains("replaying");
     if (editor.drawing) cancel();
   });
 }

@@ -1,12 +1,23 @@
-/** The transformation from metres of the site to the canvas: y points up, with one scale for both axes. */
+/**
+ * The transformation from metres of the site to the canvas, with one scale for all axes: from above, y points up.
+ *
+ * The 3-D view is the same parallel projection from a direction that the user turns, so all layers are drawn alike.
+ */
 
 import { roundStep } from "../format.js";
 
 /** Limits of the scale, pixels in a metre. */
 const MIN_SCALE = 2;
 const MAX_SCALE = 2000;
+/** Limits of the 3-D view's elevation above the floor, and where it begins. */
+const MIN_ELEVATION = Math.PI / 18;
+const MAX_ELEVATION = Math.PI / 2;
+const FIRST = { azimuth: -Math.PI / 7, elevation: Math.PI / 5.5 };
 
-export const view = { width: 1, height: 1, ratio: 1, x_m: 0, y_m: 0, scale: 50, touched: false };
+export const view = { width: 1, height: 1, ratio: 1, x_m: 0, y_m: 0, scale: 50, touched: false, spatial: false };
+
+/** Direction of the view: of its right edge in x and y, and how much floor and heights are foreshortened. */
+const turned = { azimuth: 0, elevation: Math.PI / 2, cos: 1, sin: 0, floor: 1, height: 0 };
 
 /** Whether the map is as narrow as on a phone. */
 export function isNarrow() {
@@ -14,24 +25,64 @@ export function isNarrow() {
 }
 
 /** Pixels (of CSS) from the left. */
+export function toX(x_m, y_m) {
+  return view.width / 2 + ((x_m - view.x_m) * turned.cos + (y_m - view.y_m) * turned.sin) * view.scale;
+}
+
+/** Pixels (of CSS) from the top. */
+export function toY(x_m, y_m, z_m = 0) {
+  const away_m = (y_m - view.y_m) * turned.cos - (x_m - view.x_m) * turned.sin;
+  return view.height / 2 - (away_m * turned.floor + (z_m || 0) * turned.height) * view.scale;
+}
+
+/** Pixels from the left in the view from above, where x alone counts. */
 export function px(x_m) {
   return view.width / 2 + (x_m - view.x_m) * view.scale;
 }
 
-/** Pixels (of CSS) from the top. */
+/** Pixels from the top in the view from above, where y alone counts. */
 export function py(y_m) {
   return view.height / 2 - (y_m - view.y_m) * view.scale;
 }
 
-/** Site coordinates of a pixel. */
+/** Site coordinates of a pixel, in the 3-D view on the floor at height 0. */
 export function toSite(x, y) {
-  return [view.x_m + (x - view.width / 2) / view.scale, view.y_m - (y - view.height / 2) / view.scale];
+  const right_m = (x - view.width / 2) / view.scale;
+  const away_m = (view.height / 2 - y) / view.scale / turned.floor;
+  return [
+    view.x_m + right_m * turned.cos - away_m * turned.sin,
+    view.y_m + right_m * turned.sin + away_m * turned.cos,
+  ];
+}
+
+/** Let a context draw in metres on the floor; `restore` it afterwards. */
+export function drawInMetres(context) {
+  const { cos, sin, floor } = turned;
+  const k = view.scale;
+  context.save();
+  context.transform(k * cos, k * sin * floor, k * sin, -k * cos * floor, toX(0, 0), toY(0, 0));
+}
+
+/** A covariance on the floor as it is seen, in square metres: xx, xy and yy with y pointing up the screen. */
+export function seenCovariance(xx, xy, yy) {
+  const { cos, sin, floor } = turned;
+  return [
+    xx * cos * cos + 2 * xy * cos * sin + yy * sin * sin,
+    floor * ((yy - xx) * cos * sin + xy * (cos * cos - sin * sin)),
+    floor * floor * (xx * sin * sin - 2 * xy * cos * sin + yy * cos * cos),
+  ];
+}
+
+/** How much a height and lengths on the floor up the screen are foreshortened, 0 to 1. */
+export function foreshortening() {
+  return { height: turned.height, floor: turned.floor };
 }
 
 /** Move the map by pixels. */
 export function pan(dx, dy) {
-  view.x_m -= dx / view.scale;
-  view.y_m += dy / view.scale;
+  const [x_m, y_m] = toSite(view.width / 2 - dx, view.height / 2 - dy);
+  view.x_m = x_m;
+  view.y_m = y_m;
   view.touched = true;
 }
 
@@ -39,28 +90,55 @@ export function pan(dx, dy) {
 export function zoom(factor, x = view.width / 2, y = view.height / 2) {
   const [x_m, y_m] = toSite(x, y);
   view.scale = Math.min(Math.max(view.scale * factor, MIN_SCALE), MAX_SCALE);
-  view.x_m = x_m - (x - view.width / 2) / view.scale;
-  view.y_m = y_m + (y - view.height / 2) / view.scale;
+  const [now_x_m, now_y_m] = toSite(x, y);
+  view.x_m += x_m - now_x_m;
+  view.y_m += y_m - now_y_m;
   view.touched = true;
 }
 
-/** Show the whole site and some further corners, clear of the buttons. */
-export function fit(site, zones, further) {
+/** Turn the 3-D view by angles. */
+export function orbit(azimuth, elevation) {
+  turn(turned.azimuth + azimuth, turned.elevation + elevation);
+}
+
+/** Show the site in 3-D, or from above. */
+export function setSpatial(spatial) {
+  view.spatial = spatial;
+  if (spatial) turn(FIRST.azimuth, FIRST.elevation);
+  else turn(0, Math.PI / 2);
+}
+
+function turn(azimuth, elevation) {
+  turned.azimuth = azimuth;
+  turned.elevation = Math.min(Math.max(elevation, MIN_ELEVATION), MAX_ELEVATION);
+  turned.cos = Math.cos(azimuth);
+  turned.sin = Math.sin(azimuth);
+  turned.floor = Math.sin(turned.elevation);
+  turned.height = view.spatial ? Math.cos(turned.elevation) : 0;
+}
+
+/** Show the whole site and some further corners, [x, y] or [x, y, z], clear of the buttons and of a scale of colours. */
+export function fit(site, zones, further, scaleShown = true) {
   view.touched = false;
   const corners = [...zones.flatMap((zone) => zone.polygon_m), ...further];
-  for (const anchor of site?.anchors ?? []) corners.push([anchor.x_m, anchor.y_m]);
+  for (const anchor of site?.anchors ?? []) corners.push([anchor.x_m, anchor.y_m, anchor.z_m]);
   for (const wall of site?.walls ?? []) corners.push([wall.x1_m, wall.y1_m], [wall.x2_m, wall.y2_m]);
   if (!corners.length) corners.push([-5, -4], [5, 4]);
-  const xs = corners.map(([x]) => x);
-  const ys = corners.map(([, y]) => y);
-  const [left, right] = [Math.min(...xs), Math.max(...xs)];
-  const [bottom, top] = [Math.min(...ys), Math.max(...ys)];
-  const edge = isNarrow() ? { left: 34, right: 22, top: 62, bottom: 104 } : { left: 48, right: 64, top: 32, bottom: 104 };
-  const across = (view.width - edge.left - edge.right) / Math.max(right - left, 1);
-  const up = (view.height - edge.top - edge.bottom) / Math.max(top - bottom, 1);
-  view.scale = Math.min(Math.max(Math.min(across, up), MIN_SCALE), MAX_SCALE);
-  view.x_m = (left + right) / 2 + (edge.right - edge.left) / 2 / view.scale;
-  view.y_m = (bottom + top) / 2 + (edge.top - edge.bottom) / 2 / view.scale;
+  Object.assign(view, { x_m: 0, y_m: 0, scale: 1 });
+  const [middle_x, middle_y] = [view.width / 2, view.height / 2];
+  const across = corners.map(([x, y]) => toX(x, y) - middle_x);
+  const up = corners.map(([x, y, z]) => middle_y - toY(x, y, z));
+  const [left, right] = [Math.min(...across), Math.max(...across)];
+  const [bottom, top] = [Math.min(...up), Math.max(...up)];
+  const edge = isNarrow()
+    ? { left: 34, right: 22, top: 62, bottom: scaleShown ? 116 : 66 }
+    : { left: 48, right: 64, top: 32, bottom: 104 };
+  const wide = (view.width - edge.left - edge.right) / Math.max(right - left, 1);
+  const high = (view.height - edge.top - edge.bottom) / Math.max(top - bottom, 1);
+  view.scale = Math.min(Math.max(Math.min(wide, high), MIN_SCALE), MAX_SCALE);
+  const x = middle_x + ((left + right) / 2) * view.scale + (edge.right - edge.left) / 2;
+  const y = middle_y - ((bottom + top) / 2) * view.scale - (edge.top - edge.bottom) / 2;
+  [view.x_m, view.y_m] = toSite(x, y);
 }
 
 /** A round length of at most as many pixels. */

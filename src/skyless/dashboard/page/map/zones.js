@@ -4,7 +4,8 @@ import { state } from "../store.js";
 import { faint, palette } from "../theme.js";
 import { label } from "./anchors.js";
 import { editor } from "./editor.js";
-import { px, py } from "./view.js";
+import { groundHeight } from "./floors.js";
+import { toX, toY } from "./view.js";
 
 /** A zone's colour; the page's where it has none or one that the browser does not know. */
 export function zoneColour(zone) {
@@ -38,7 +39,7 @@ export function drawZones(context) {
     context.textAlign = "center";
     context.textBaseline = "middle";
     const [x, y] = middle(zone.polygon_m);
-    label(context, zone.name, px(x), py(y));
+    label(context, zone.name, toX(x, y), toY(x, y, groundHeight()));
     if (chosen && state.mode === "live") corners(context, zone.polygon_m, colour);
   }
   return flashing.size > 0;
@@ -57,12 +58,13 @@ export function drawDraft(context) {
   context.stroke();
   context.setLineDash([]);
   corners(context, editor.points, palette.accent);
-  if (editor.cursor) crosshair(context, px(editor.cursor[0]), py(editor.cursor[1]));
+  if (editor.cursor) crosshair(context, toX(...editor.cursor), toY(...editor.cursor));
 }
 
 function outline(context, points, closed) {
   context.beginPath();
-  for (const [x, y] of points) context.lineTo(px(x), py(y));
+  const ground = groundHeight();
+  for (const [x, y] of points) context.lineTo(toX(x, y), toY(x, y, ground));
   if (closed) context.closePath();
 }
 
@@ -72,7 +74,7 @@ function corners(context, points, colour) {
   context.lineWidth = 2;
   for (const [x, y] of points) {
     context.beginPath();
-    context.arc(px(x), py(y), 5, 0, 2 * Math.PI);
+    context.arc(toX(x, y), toY(x, y, groundHeight()), 5, 0, 2 * Math.PI);
     context.fill();
     context.stroke();
   }

@@ -1,6 +1,6 @@
 /** Anchors and their clocks as a list; the selected one in detail; and the other programs of the site. */
 
-import { state } from "../store.js";
+import { healthAge_s, state } from "../store.js";
 import { Chart } from "../chart.js";
 import { Rows, h, text } from "../dom.js";
 import { DASH, duration, length, number } from "../format.js";
@@ -62,6 +62,7 @@ function describe(id) {
   const health = healthOf(id);
   const finding = findingAt(id);
   const words = finding ? `${wordsOf(kind)}; ${markWords(finding)}` : wordsOf(kind);
+  const known = kind === "good" && health;
   return {
     condition: finding ? "bad" : kind,
     words,
@@ -69,10 +70,10 @@ function describe(id) {
     mark: () => anchorMark(kind, leading !== ""),
     name: [id, leading, finding && markWords(finding)].filter(Boolean).join(" "),
     figures: [
-      leading ? "reference" : number(health?.offset_s, 4, "s"),
-      leading ? DASH : number(health?.rate_ppm, 3, "ppm"),
-      leading ? DASH : sigma(health?.offset_std_m),
-      number(health?.late),
+      leading ? "reference" : known ? number(health.offset_s, 4, "s") : DASH,
+      leading || !known ? DASH : number(health.rate_ppm, 3, "ppm"),
+      leading || !known ? DASH : sigma(health.offset_std_m),
+      kind === "bad" ? DASH : number(health?.late),
     ],
   };
 }
@@ -85,6 +86,7 @@ function makeDetail() {
   const heading = h("h2", {});
   const list = facts([
     "State",
+    "Last report",
     "Synchronised to",
     "Slot time led by",
     "Hops",
@@ -107,7 +109,7 @@ function makeDetail() {
   const rates = new Chart("Clock rate relative to the site's (ppm)", [rate], thousandths, 0.01, around);
   const sigmas = new Chart("σ of the clock offset (mm)", [{ name: "σ", colour: "good" }], tenths, 1);
   const charts = h("div", {}, offsets.element, rates.element, sigmas.element);
-  const attributes = { class: "detail", "aria-label": "Selected anchor", hidden: true };
+  const attributes = { class: "detail", "aria-label": "Selected anchor", tabindex: "0", hidden: true };
   const element = h("section", attributes, heading, list.element, charts);
   const showDetail = (id) => {
     const health = healthOf(id);
@@ -115,10 +117,12 @@ function makeDetail() {
     if (!health) return;
     text(heading, `Anchor ${id}`);
     list.show(anchorFacts(id, health));
+    list.grade("State", condition(id) === "good" ? "" : condition(id));
+    list.grade("Last report", "bad");
     charts.hidden = leads(id) !== "";
     const past = anchorHistory.get(id);
     if (!past || charts.hidden) return;
-    const now = past.time.at(-1);
+    const now = past.time.at(-1) + Math.max(0, healthAge_s("anchors", id) - 1);
     const times = past.time.map((time) => time - now);
     for (const [chart, values] of [
       [offsets, past.offset_us],
@@ -132,7 +136,12 @@ function makeDetail() {
   return { element, show: showDetail };
 }
 
+/** What an anchor reports; of one that is offline only what stays true. */
 function anchorFacts(id, health) {
+  if (condition(id) === "bad") {
+    const last = `${duration(healthAge_s("anchors", id))} ago`;
+    return { State: "offline: its figures are not known", "Last report": last, Uptime: null };
+  }
   const ages = Object.entries(health.heard_age_s ?? {}).sort((a, b) => b[1] - a[1]);
   const counted = Object.entries(health.counters).filter(([name, count]) => count && !SHOWN.has(name));
   return {

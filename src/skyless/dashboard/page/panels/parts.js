@@ -15,20 +15,35 @@ export function selectionTable(kind, heads, describe) {
   head.cells[0].append(h("span", { class: "unseen" }, "State"));
   const body = h("tbody", {});
   const element = h("table", { class: `list ${kind}s` }, h("thead", {}, head), body);
+  // Of hundreds of rows only those in view are kept up to date: laying them all out costs more than drawing the map.
+  const inView = new WeakSet();
+  const observer = new IntersectionObserver(
+    (entries) => {
+      for (const { target, isIntersecting } of entries) inView[isIntersecting ? "add" : "delete"](target);
+    },
+    { rootMargin: "120px" },
+  );
   const makeRow = (id) => {
     const cells = Array.from({ length: heads.length + 1 }, () => h("td", {}));
     const button = h("button", { type: "button", class: "name", onclick: () => toggleSelection(kind, id) });
     cells[1].append(button);
     const row = h("tr", { onclick: (event) => event.target === button || toggleSelection(kind, id) }, ...cells);
     let shown = "";
+    observer.observe(row);
     const update = (item) => {
+      const chosen = state.selection[kind] === id;
+      if (row.classList.contains("selected") !== chosen) {
+        row.classList.toggle("selected", chosen);
+        button.setAttribute("aria-pressed", String(chosen));
+      }
+      if (shown && !inView.has(row)) return;
       const { condition, words, key, mark, name, figures } = describe(id, item);
       if (shown !== key) cells[0].replaceChildren(mark(), h("span", { class: "unseen" }, words));
       shown = key;
       cells[0].title = words;
       text(button, name);
-      button.setAttribute("aria-pressed", String(state.selection[kind] === id));
-      row.className = `${condition} ${state.selection[kind] === id ? "selected" : ""}`;
+      button.setAttribute("aria-pressed", String(chosen));
+      row.className = `${condition} ${chosen ? "selected" : ""}`;
       figures.forEach((figure, index) => text(cells[index + 2], figure));
     };
     return { element: row, update };

@@ -1,10 +1,11 @@
 /** The recordings that can be replayed. */
 
 import { changed, state } from "../store.js";
-import { recordings } from "../api.js";
+import { fileOf, recordings } from "../api.js";
 import { Rows, h, text, toast } from "../dom.js";
 import { bytes, dateTime, duration } from "../format.js";
 import { open as play, close } from "../player.js";
+import { KEYS } from "../replay_bar.js";
 
 export const title = "Replay";
 export const topics = ["recordings", "player", "mode"];
@@ -24,6 +25,7 @@ export function start(panel) {
     h("div", { class: "above" }, h("p", { class: "count" }, "Recordings, newest first"), back, refresh),
     empty,
     list,
+    keys(),
   );
 }
 
@@ -37,6 +39,11 @@ export function show() {
   text(parts.empty, error || "No recordings yet. `skyless record` makes one.");
   parts.empty.hidden = state.recordings.length > 0;
   parts.rows.show(state.recordings.map((one) => [one.name, one]));
+}
+
+function keys() {
+  const rows = KEYS.map(([key, words]) => h("div", {}, h("dt", {}, key), h("dd", {}, words)));
+  return h("section", {}, h("h2", {}, "Keys while a recording is replayed"), h("dl", { class: "facts keys" }, ...rows));
 }
 
 async function load() {
@@ -59,10 +66,14 @@ function makeRow(name) {
       toast(`${name} cannot be replayed: ${problem.message}`, "bad");
     }
   });
-  const element = h("li", {}, button);
+  const download = h("a", { class: "button", href: fileOf(name), "aria-label": `Download ${name}` }, "Download");
+  download.setAttribute("download", name);
+  const element = h("li", {}, button, download);
   const update = (one) => {
     const incomplete = one.complete ? "" : " · still being written, or cut off";
-    text(about, `${dateTime(one.start_unix_s)} · ${duration(one.duration_s)} · ${bytes(one.bytes)}${incomplete}`);
+    const tags = one.fixes === 0 ? "no fixes" : `${one.tags} ${one.tags === 1 ? "tag" : "tags"}`;
+    const what = [one.site, dateTime(one.start_unix_s), duration(one.duration_s), tags, bytes(one.bytes)];
+    text(about, what.filter(Boolean).join(" · ") + incomplete);
     element.className = state.player?.name === name ? "selected" : "";
     button.setAttribute("aria-pressed", String(state.player?.name === name));
   };

@@ -1,13 +1,30 @@
 /** All tags as a list; the selected one in detail, with its last minute as charts. */
 
-import { state } from "../store.js";
-import { GONE_S, GREY_S, freshness, shown_s, tracks } from "../clock.js";
+import { healthAge_s, state } from "../store.js";
+import { GONE_S, GREY_S, freshness, now_s, shown_s, tracks } from "../clock.js";
 import { Chart } from "../chart.js";
 import { h, text } from "../dom.js";
 import { DASH, bytes, duration, length, metres, number } from "../format.js";
 import { tagHistory } from "../history.js";
-import { tagColour } from "../theme.js";
-import { ALERT, ALERTS, ANCHORS, CHI2, COLUMNS, ERROR, HPL, STD, TIME, VX, VY, X, Y, Z } from "../tracks.js";
+import { tagMark, tagStyle } from "../map/marks.js";
+import {
+  ALERT,
+  ALERTS,
+  ANCHORS,
+  CHI2,
+  COLUMNS,
+  ERROR,
+  HEIGHT_GIVEN,
+  HPL,
+  STD,
+  STD_Z,
+  TIME,
+  VX,
+  VY,
+  X,
+  Y,
+  Z,
+} from "../tracks.js";
 import { facts, selectionTable, split } from "./parts.js";
 
 export const title = "Tags";
@@ -22,19 +39,34 @@ const WORDS = {
   gone: `no fix for ${GONE_S} s`,
   never: "no fix yet",
 };
+/** The columns after the name, and what they mean. */
+const HEADS = {
+  "x (m)": "Position along x",
+  "y (m)": "Position along y",
+  "z (m)": "Height; in brackets where it was given and not estimated",
+  σ: "Predicted standard deviation of the position",
+  Error: "Distance to the true position, where it is known",
+  "Rate (Hz)": "Fixes in the last second",
+  "Speed (m/s)": "Horizontal speed",
+  Level: "Protection level: the horizontal error is larger with at most the configured probability",
+  Alert: "Integrity alert",
+  Age: "Time since the last fix",
+  Latency: "From the end of a frame to its fix, half of them",
+  Method: "How positions are computed",
+};
 /** With more tags than this there is a search field. */
 const SEARCHED = 12;
 const WINDOW_S = 60;
+/** Figures of a tag that has not reported for longer are not of now. */
+const MAX_HEALTH_AGE_S = 3.5;
 const row = new Float64Array(COLUMNS);
 let parts = null;
 
 /** Build the tab. */
 export function start(panel) {
   const search = h("input", { type: "search", placeholder: "Find a tag", "aria-label": "Find a tag", oninput: show });
-  const table = selectionTable("tag", ["Tag", "x", "y", "σ", "Error", "Rate"], describe);
-  table.head.cells[4].title = "Reported standard deviation of the position";
-  table.head.cells[5].title = "Distance to the true position, where it is known";
-  table.head.cells[6].title = "Fixes in the last second";
+  const table = selectionTable("tag", ["Tag", ...Object.keys(HEADS)], describe);
+  Object.values(HEADS).forEach((words, index) => (table.head.cells[index + 2].title = words));
   const empty = h("p", { class: "empty" }, "No tags yet.");
   const count = h("p", { class: "count" });
   const box = h("div", { class: "scroll-x" }, table.element);
@@ -51,7 +83,7 @@ export function show() {
   parts.empty.hidden = list.length > 0;
   parts.table.element.hidden = list.length === 0;
   parts.table.element.classList.toggle("no-truth", !state.simulated);
-  const shown = list.map((track, index) => [track.name, { track, colour: tagColour(index, list.length) }]);
+  const shown = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length) }]);
   parts.table.rows.show(shown.filter(([name]) => name.toLowerCase().includes(wanted)));
   const fresh = list.filter((track) => freshness(track) === "fresh").length;
   text(parts.count, list.length ? `${fresh} of ${list.length} with a fix` : "");
@@ -59,20 +91,40 @@ export function show() {
   split(parts.panel, parts.box, !parts.detail.element.hidden);
 }
 
-function describe(name, { track, colour }) {
+function describe(name, { track, style: look }) {
   const condition = freshness(track);
   const known = condition !== "never" && track.at(shown_s(), row, false);
-  const style = condition === "fresh" ? `color: ${colour}` : "";
-  const rate = state.mode === "live" ? state.health.tags.get(name)?.updates_per_s : null;
-  const position = known ? [metres(row[X]), metres(row[Y]), length(row[STD]), length(row[ERROR])] : Array(4).fill(DASH);
+  const reports = state.mode === "live" && healthAge_s("tags", name) < MAX_HEALTH_AGE_S;
+  const health = reports ? state.health.tags.get(name) : null;
+  if (!known) row.fill(NaN);
+  const alert = Object.values(ALERTS)[row[ALERT]];
   return {
-    condition,
+    condition: alert?.grade ? `${condition} alert-${alert.grade}` : condition,
     words: WORDS[condition],
-    key: condition + style,
-    mark: () => h("span", { "aria-hidden": "true", style }, MARKS[condition]),
+    key: `${condition} ${look.colour} ${look.shape}`,
+    mark: () => (condition === "fresh" ? tagMark(look) : h("span", { "aria-hidden": "true" }, MARKS[condition])),
     name,
-    figures: [...position, number(rate)],
+    figures: [
+      metres(row[X]),
+      metres(row[Y]),
+      row[HEIGHT_GIVEN] ? `(${metres(row[Z])})` : metres(row[Z]),
+      length(row[STD]),
+      length(row[ERROR]),
+      number(health?.updates_per_s),
+      metres(Math.hypot(row[VX], row[VY])),
+      length(row[HPL]),
+      alert?.short ?? DASH,
+      duration(age_s(track), 1),
+      duration(health?.latency_p50_s),
+      health?.method ?? DASH,
+    ],
   };
+}
+
+/** Time since the last fix at the moment that is shown. */
+function age_s(track) {
+  if (state.mode === "live") return Math.max(now_s() - track.lastTime, 0);
+  return row[TIME] > 0 ? Math.max(shown_s() - row[TIME], 0) : NaN;
 }
 
 function makeDetail() {
@@ -80,7 +132,12 @@ function makeDetail() {
   const reason = h("p", { class: "reason", hidden: true });
   const list = facts([
     "Position",
-    "Speed",
+    "Height",
+    "Velocity",
+    "Predicted σ",
+    "Error",
+    "Age of the fix",
+    "Rate",
     "Protection level",
     "Integrity alert",
     "Anchors used",
@@ -92,15 +149,15 @@ function makeDetail() {
     "Memory",
   ]);
   const sigma = { name: "σ", colour: "accent" };
-  const errors = new Chart("Error and reported σ", [{ name: "error", colour: "bad" }, sigma], length, 0.02);
-  const sigmas = new Chart("Reported σ", [sigma], length, 0.02);
-  const rates = new Chart("Fixes per second", [{ name: "rate", colour: "good", steps: true }], number, 4);
+  const errors = new Chart("Error and predicted σ", [{ name: "error", colour: "bad" }, sigma], length, 0.02);
+  const sigmas = new Chart("Predicted σ", [sigma], length, 0.02);
+  const rates = new Chart("Rate of fixes (Hz)", [{ name: "rate", colour: "good", steps: true }], number, 4);
   const anchors = { name: "anchors", colour: "accent", steps: true };
   const used = new Chart("Anchors used", [anchors], number, 4, { whole: true });
   const chi2 = new Chart("Residuals (χ² of each fix)", [{ name: "χ²", colour: "warn" }], (v) => number(v, 1), 1);
   const element = h(
     "section",
-    { class: "detail", "aria-label": "Selected tag", hidden: true },
+    { class: "detail", "aria-label": "Selected tag", tabindex: "0", hidden: true },
     heading,
     reason,
     list.element,
@@ -127,33 +184,40 @@ function makeDetail() {
   const showDetail = (track) => {
     element.hidden = !track;
     if (!track) return;
-    const health = state.mode === "live" ? state.health.tags.get(track.name) : null;
+    const reports = state.mode === "live" && healthAge_s("tags", track.name) < MAX_HEALTH_AGE_S;
+    const health = reports ? state.health.tags.get(track.name) : null;
     text(heading, track.name);
     reason.hidden = !health?.reason;
     text(reason, health?.reason ? `No fix: ${health.reason.replaceAll("-", " ")}` : "");
     const known = track.at(shown_s(), row, false);
-    list.show({ ...(known ? fixFacts() : {}), ...(health ? healthFacts(health) : {}) });
+    list.show({ ...(known ? fixFacts(track) : {}), ...(health ? healthFacts(health) : {}) });
     list.grade("Integrity alert", (known && Object.values(ALERTS)[row[ALERT]]?.grade) || "");
     showCharts(track);
   };
   return { element, show: showDetail };
 }
 
-/** What `row` holds. */
-function fixFacts() {
+/** What `row` holds, the state of a track. */
+function fixFacts(track) {
   const speed = Math.hypot(row[VX], row[VY]);
+  const height = `${metres(row[Z], 2)} m`;
   return {
-    Position: `${metres(row[X], 3)}, ${metres(row[Y], 3)}, ${metres(row[Z], 3)} m`,
-    Speed: speed >= 0 ? `${speed.toFixed(2)} m/s` : null,
+    Position: `${metres(row[X], 3)}, ${metres(row[Y], 3)} m`,
+    Height: row[HEIGHT_GIVEN] ? `${height} given, not estimated` : `${height}, σ ${length(row[STD_Z])}`,
+    Velocity: speed >= 0 ? `${metres(row[VX])}, ${metres(row[VY])} m/s; speed ${speed.toFixed(2)} m/s` : null,
+    "Predicted σ": length(row[STD]),
+    Error: row[ERROR] >= 0 ? length(row[ERROR]) : null,
+    "Age of the fix": duration(age_s(track), 1),
     "Protection level": row[HPL] >= 0 ? length(row[HPL]) : null,
     "Integrity alert": Object.values(ALERTS)[row[ALERT]]?.words,
     "Anchors used": number(row[ANCHORS]),
   };
 }
 
-function healthFacts({ first_fix_s, latency_p50_s, latency_p99_s, method, counters, cpu, memory_bytes }) {
+function healthFacts({ updates_per_s, first_fix_s, latency_p50_s, latency_p99_s, method, counters, cpu, memory_bytes }) {
   const dropped = Object.entries(counters).filter(([, count]) => count);
   return {
+    Rate: number(updates_per_s, 0, "Hz"),
     "Time to first fix": first_fix_s == null ? null : duration(first_fix_s),
     Latency: latency_p50_s == null ? null : `${duration(latency_p50_s)}, p99 ${duration(latency_p99_s)}`,
     Method: method,

@@ -1,6 +1,6 @@
 /** The superframe, and when each tag processed its messages: the paper's oscilloscope picture, from the tags' health. */
 
-import { state } from "../store.js";
+import { healthAge_s, state } from "../store.js";
 import { byId, h, s, text } from "../dom.js";
 import { duration, number, roundStep } from "../format.js";
 import { siteMode } from "../map/anchors.js";
@@ -9,7 +9,10 @@ import { facts } from "./parts.js";
 export const title = "Timing";
 export const topics = ["health", "selection", "theme", "mode"];
 export const interval_ms = 200;
+export const changesWithTime = true;
 
+/** Phases and figures of a program that has not reported for longer are not of now. */
+const MAX_AGE_S = 3.5;
 /** Limit of the rows in the picture. */
 const MAX_ROWS = 24;
 const ROW_HEIGHT = 30;
@@ -28,7 +31,7 @@ export function start(panel) {
   const picture = h("div", { id: "phases" });
   const empty = h("p", { class: "empty" });
   const caption = h("p", { class: "count" });
-  const ether = facts(["Transmissions", "Late", "Stalls", "Overruns", "Simulated time"]);
+  const ether = facts(["Transmissions", "Missed now", "Late", "Stalls", "Overruns", "Simulated time"]);
   const etherBox = h("section", { hidden: true }, h("h2", {}, "Emulated radio channel"), ether.element);
   parts = { picture, empty, caption, ether, etherBox };
   panel.append(h("h2", {}, "Superframe and positioning phases"), caption, picture, empty, about, etherBox);
@@ -37,8 +40,8 @@ export function start(panel) {
 
 /** Bring the tab up to date. */
 export function show() {
-  const all =
-    state.mode === "live" ? [...state.health.tags.values()].filter(({ phases }) => phases?.length).map(read) : [];
+  const reporting = [...state.health.tags.values()].filter(({ tag }) => healthAge_s("tags", tag) < MAX_AGE_S);
+  const all = state.mode === "live" ? reporting.filter(({ phases }) => phases?.length).map(read) : [];
   all.sort((a, b) => a.tag.localeCompare(b.tag, "en", { numeric: true }));
   const chosen = all.filter((health) => health.tag === state.selection.tag);
   const shown = [...chosen, ...all.filter((health) => health.tag !== state.selection.tag)].slice(0, MAX_ROWS);
@@ -140,11 +143,13 @@ function trace(health, top, at, end_s) {
 }
 
 function showEther() {
-  const ether = state.mode === "live" ? state.health.ether : null;
+  const age = Math.min(...Object.keys(state.health.ages.ether ?? {}).map((name) => healthAge_s("ether", name)));
+  const ether = state.mode === "live" && age < MAX_AGE_S ? state.health.ether : null;
   parts.etherBox.hidden = !ether;
   if (!ether) return;
   parts.ether.show({
     Transmissions: number(ether.transmissions),
+    "Missed now": `${number(100 * (ether.missed_share ?? 0), 1)} %`,
     Late: number(ether.late),
     Stalls: number(ether.stalls),
     Overruns: number(ether.overruns),

@@ -1,9 +1,9 @@
 /** Zones: their names, colours and corners; and the tags that entered and left. */
 
 import { select, state, toggleSelection } from "../store.js";
-import { Rows, h, text } from "../dom.js";
-import { timeOfDay } from "../format.js";
-import { change, editor, remove } from "../map/editor.js";
+import { Rows, h, text, toast } from "../dom.js";
+import { sentence, timeOfDay } from "../format.js";
+import { add as addZones, change, editor, remove } from "../map/editor.js";
 import { startDrawing } from "../map/tools.js";
 import { zoneColour } from "../map/zones.js";
 
@@ -21,21 +21,77 @@ export function start(panel) {
   const events = h("ol", { class: "events", id: "events", role: "log", "aria-label": "Events" });
   const none = h("p", { class: "empty" }, "No zones yet. Draw one on the map with mouse, finger or keyboard.");
   const silent = h("p", { class: "empty" });
-  parts = { add, none, silent, zones: new Rows(zones, makeZone), events: new Rows(events, makeEvent) };
-  panel.append(h("div", { class: "above" }, h("p", { class: "count" }), add), none, zones);
+  const fault = h("p", { class: "reason", role: "alert", hidden: true });
+  const others = h("ul", { class: "given" });
+  const kept = h("section", { hidden: true }, h("h2", {}, "Kept, not shown"), others);
+  const file = fileButtons();
+  parts = { add, none, silent, fault, kept, file, others: new Rows(others, makeOther) };
+  Object.assign(parts, { zones: new Rows(zones, makeZone), events: new Rows(events, makeEvent) });
+  panel.append(h("div", { class: "above" }, h("p", { class: "count" }), add), fault, none, zones, file.element, kept);
   panel.append(h("section", {}, h("h2", {}, "Events"), silent, events));
 }
 
 /** Bring the tab up to date. */
 export function show() {
   const live = state.mode === "live";
-  parts.add.disabled = !live || editor.drawing;
-  parts.none.hidden = state.zones.length > 0;
+  const fault = live ? state.zonesFault : null;
+  parts.fault.hidden = !fault;
+  text(parts.fault, fault ? sentence(fault) : "");
+  parts.add.disabled = !live || editor.drawing || Boolean(fault);
+  parts.none.hidden = state.zones.length > 0 || Boolean(fault);
+  parts.file.show(live && !fault);
+  parts.kept.hidden = !live || !state.otherZones.length;
+  parts.others.show(state.otherZones.map((other) => [JSON.stringify(other), other]));
   parts.zones.show(state.zones.map((zone) => [zone.id, zone]));
   const events = live ? state.events : [];
   text(parts.silent, live ? "No tag has entered or left a zone yet." : "Events are shown on the live site only.");
   parts.silent.hidden = events.length > 0;
   parts.events.show(events.map((event) => [`${event.unix_s} ${event.tag} ${event.zone} ${event.kind}`, event]));
+}
+
+/** Zones of another site with the same number, and a button that copies them to this one. */
+function makeOther(_key, { site, zones }) {
+  const count = `${zones.length} ${zones.length === 1 ? "zone" : "zones"}`;
+  const copy = () => addZones(zones, `${count} of ${site} copied.`);
+  const button = h("button", { type: "button", onclick: copy, "aria-label": `Copy the zones of ${site} here` }, "Copy here");
+  return { element: h("li", {}, h("span", {}, `Site ${site}: ${count}`), button) };
+}
+
+/** Zones to a file and from one, in the form of `skyless/v1/<site>/zones`. */
+function fileButtons() {
+  const save = h("button", { type: "button", onclick: exportZones }, "Export");
+  const pick = h("input", { type: "file", accept: ".json,application/json", hidden: true });
+  const load = h("button", { type: "button", onclick: () => pick.click() }, "Import …");
+  pick.addEventListener("change", () => {
+    if (pick.files[0]) importZones(pick.files[0]);
+    pick.value = "";
+  });
+  const element = h("div", { class: "above files" }, save, load, pick);
+  const show = (live) => {
+    save.disabled = !state.zones.length;
+    load.disabled = !live;
+  };
+  return { element, show };
+}
+
+function exportZones() {
+  const name = state.site?.name ?? "";
+  const file = new Blob([JSON.stringify({ zones: state.zones, site: name }, null, 1)], { type: "application/json" });
+  const link = h("a", { href: URL.createObjectURL(file), download: `zones ${name}.json` });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+/** Add the zones of a file; the server checks them. @param {File} file */
+async function importZones(file) {
+  let zones = null;
+  try {
+    zones = JSON.parse(await file.text()).zones;
+  } catch {
+    // no JSON
+  }
+  if (!Array.isArray(zones) || !zones.length) return toast(`${file.name} holds no zones.`, "bad");
+  await addZones(zones, `${zones.length} ${zones.length === 1 ? "zone" : "zones"} of ${file.name} added.`);
 }
 
 function makeZone(id, zone) {

@@ -11,16 +11,21 @@ from skyless.kernels.arrays import Matrix
 
 
 def draw(path: Path, rows: Matrix, title: str) -> None:
-    """Draw rows of time, position (3) and true position (3, NaN where unknown) into a file; without rows, the title.
+    """Draw rows as ``track_figure`` does into a file.
 
     Raises:
         OSError, ValueError: the file cannot be written, or its ending names no kind of picture.
     """
+    save_figure(track_figure(rows, title), path)
+
+
+def track_figure(rows: Matrix, title: str) -> Figure:
+    """Draw rows of time, position (3) and true position (3, NaN where unknown), shape (n, 7); of none, the title."""
     figure = Figure(figsize=(11, 8), layout="constrained")
     figure.suptitle(title)
     if len(rows):
         _fill(figure, rows)
-    save_figure(figure, path)
+    return figure
 
 
 def _fill(figure: Figure, rows: Matrix) -> None:

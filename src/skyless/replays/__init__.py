@@ -1,5 +1,5 @@
 """Recordings through the filter again, judged against the truth.
 
-Public: captures, plot, site.
+Public: capture_run, captures, inputs, plot, site.
 Within the package: antenna_delays.
 """

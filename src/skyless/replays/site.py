@@ -2,8 +2,8 @@
 
 import time
 from collections import Counter, OrderedDict, defaultdict
-from collections.abc import Callable, Iterable, Iterator
-from typing import Final, TypeVar, cast
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Final, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -23,8 +23,8 @@ from skyless.recordings.mcap.host_clock import HostClock
 from skyless.recordings.mcap.recording import McapRecording, Recorded
 from skyless.recordings.source import Drops
 from skyless.recordings.truth import Truth
-from skyless.replay.antenna_delays import DelayChange, delay_changes, with_delays
-from skyless.replay.captures import ReplayReport, common_figures
+from skyless.replays.antenna_delays import DelayChange, delay_changes, with_delays
+from skyless.replays.captures import ReplayReport, common_figures
 from skyless.site.model import Site
 from skyless.ticks import WRAP_TICKS
 
@@ -409,6 +409,26 @@ class SiteReplay:
             segments=replay.segments,
             cold_starts=replay.cold_starts,
         )
+
+
+def summary_of(reports: Sequence[TagReport]) -> dict[str, Any]:
+    """One tag's report as that of any other recording; of several, their sums and the reports by tag."""
+    if len(reports) == 1:
+        return {**msgspec.to_builtins(reports[0]), "height_note": "from the site"}
+    compared = [report.identical for report in reports if report.identical is not None]
+    identical = {
+        "compared": sum(one.compared for one in compared),
+        "different": sum(one.different for one in compared),
+    }
+    return {
+        "format": reports[0].format,
+        "receptions": sum(report.receptions for report in reports),
+        "fixes": sum(report.fixes for report in reports),
+        "dropped": sum(report.dropped for report in reports),
+        "identical": identical if compared else None,
+        "wall_s": reports[0].wall_s,
+        "tags": {report.tag: msgspec.to_builtins(report) for report in reports},
+    }
 
 
 def recorded_site(recording: McapRecording, identifier: int | None = None) -> Site:

@@ -1,0 +1,100 @@
+"""The animation of the page at the top of the README: ``.venv/bin/python docs/pictures/make.py page``.
+
+Runs the demo, opens its page in Chromium once in each theme, and writes what both show at the same time.
+"""
+
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from playwright.sync_api import sync_playwright
+
+FOLDER = Path(__file__).parent
+ROOT = FOLDER.parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "dashboard"))
+
+from page_browser import CHROMIUM, FLAGS, Visit, until  # noqa: E402 (the tests start the same browser)
+
+SIZE = {"width": 1200, "height": 720}
+TAGS = 4
+FRAMES, FRAME_S = 32, 0.25
+WALKED_S = 12.0
+"""How long tags walk before the first frame, so that they have trails."""
+START_S = 300.0
+"""How long the demo may take to compile and to open its page."""
+LIMIT_BYTES = 600_000
+
+
+def record() -> None:
+    """Write ``page_light.webp`` and ``page_dark.webp``."""
+    with tempfile.TemporaryDirectory() as folder:
+        arguments = ["demo", "--tags", str(TAGS), "--seed", "4", "--record", "none"]
+        environment = {**os.environ, "XDG_DATA_HOME": folder, "PYTHONUNBUFFERED": "1"}
+        demo = subprocess.Popen(
+            [sys.executable, "-m", "skyless.cli.main", *arguments],
+            cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        try:
+            frames = _frames_of(_address_of(demo))
+        finally:
+            demo.send_signal(signal.SIGINT)
+            demo.communicate(timeout=60.0)
+    for theme, pictures in frames.items():
+        _write(FOLDER / f"page_{theme}.webp", pictures)
+
+
+def _address_of(demo: "subprocess.Popen[str]") -> str:
+    assert demo.stdout is not None
+    lines = []
+    for line in demo.stdout:
+        lines.append(line)
+        if found := re.search(r"http://127\.0\.0\.1:\d+", line):
+            return found[0]
+    raise RuntimeError("the demo named no page:\n" + "".join(lines))
+
+
+def _frames_of(address: str) -> dict[str, list[Image.Image]]:
+    """What the page shows in each theme, one frame after the other."""
+    frames: dict[str, list[Image.Image]] = {"light": [], "dark": []}
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        visits = {theme: Visit(browser, address, viewport=SIZE, color_scheme=theme) for theme in frames}
+        for visit in visits.values():
+            until(visit.page, f"skyless.live.all.size >= {TAGS}", timeout_s=START_S)
+        time.sleep(WALKED_S)
+        begin_s = time.monotonic()
+        for number in range(FRAMES):
+            time.sleep(max(0.0, begin_s + number * FRAME_S - time.monotonic()))
+            for theme, visit in visits.items():
+                frames[theme].append(_screenshot(visit.page))
+        browser.close()
+    return frames
+
+
+def _screenshot(page: Any) -> Image.Image:  # noqa: ANN401 (playwright's page)
+    return Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+
+
+def _write(path: Path, frames: list[Image.Image]) -> None:
+    """An endless animation of no more than ``LIMIT_BYTES``, as sharp as that allows."""
+    for quality in (80, 60, 45, 30):
+        frames[0].save(
+            path,
+            save_all=True,
+            append_images=frames[1:],
+            duration=round(1e3 * FRAME_S),
+            loop=0,
+            quality=quality,
+            method=6,
+        )
+        if path.stat().st_size <= LIMIT_BYTES:
+            return
+    raise RuntimeError(f"{path} has more than {LIMIT_BYTES} bytes; take fewer frames")

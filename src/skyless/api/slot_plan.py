@@ -1,0 +1,120 @@
+"""The plan of a site of protocol 2 as a result: who shares a slot, and what reaches tags."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from skyless.api.result import Result, data_frame
+from skyless.errors import SkylessError
+from skyless.kernels.arrays import Array, Matrix, Vector
+from skyless.planning.floor import Box, Floor, floor_of
+from skyless.planning.links import with_range
+from skyless.planning.slot_plan import RateMap, rate_map
+from skyless.planning.slot_report import described_slots, slot_report, with_planned_slots
+from skyless.simulation.channel import ChannelModel
+from skyless.site.model import Site
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+
+class SlotPlanResult(Result, frozen=True, eq=False):
+    """Beacons that reach tags over the floor of a site without a master."""
+
+    site: Site
+    """In mode slots with its slots, those of its file if it has any that fit."""
+    file: Path
+    floor: Floor
+    """Outline and region."""
+    map: RateMap
+    summary: dict[str, Any]
+    """The object that ``skyless plan --json`` writes, in SI units, but for the version."""
+
+    @property
+    def x_m(self) -> Vector:
+        """Shape (nx,): centres of the cells."""
+        return self.map.grid.x_m
+
+    @property
+    def y_m(self) -> Vector:
+        """Shape (ny,)."""
+        return self.map.grid.y_m
+
+    @property
+    def heights_m(self) -> Vector:
+        """Shape (heights,): heights of the tags."""
+        return self.map.grid.heights_m
+
+    @property
+    def beacons_per_s(self) -> Array:
+        """Shape (heights, ny, nx): at one point of each cell; NaN outside the outline."""
+        return self.map.beacons_per_s
+
+    def to_dataframe(self) -> "DataFrame":
+        """One row a cell and height: ``x_m``, ``y_m``, ``z_m``, ``beacons_per_s``.
+
+        Raises:
+            SkylessError: pandas is not installed.
+        """
+        z_m, y_m, x_m = np.meshgrid(self.heights_m, self.y_m, self.x_m, indexing="ij")
+        within = np.isfinite(self.beacons_per_s)
+        return data_frame(
+            {
+                "x_m": x_m[within],
+                "y_m": y_m[within],
+                "z_m": z_m[within],
+                "beacons_per_s": self.beacons_per_s[within],
+            }
+        )
+
+    def plot(self) -> "Figure":
+        """The anchors with their slots over the beacons per second."""
+        from skyless.planning.slot_picture import draw_slots  # noqa: PLC0415 - Matplotlib is loaded where it draws
+
+        return draw_slots(self.site, self.floor, self.map, self.file, described_slots(self.summary))
+
+    def _title(self) -> str:
+        return f"plan of {self.site.name}, {described_slots(self.summary)}"
+
+    def _facts(self) -> Iterator[tuple[str, str]]:
+        found = self.map.reception
+        yield "anchors", f"{len(self.site.all_anchors)}"
+        yield "median beacons/s at a tag", f"{found.beacons_per_s.median:.0f}"
+        yield "beacons/s at the worst 5 %", f"{found.beacons_per_s.worst_5_percent:.0f}"
+        yield "anchors received at the worst 5 %", f"{found.anchors_received.worst_5_percent:.0f}"
+        for warning in self.summary["warnings"]:
+            yield "warning", warning
+
+
+def plan_slots(
+    site: Site,
+    file: Path,
+    outline_m: Matrix | None,
+    region_m: Box | None,
+    heights_m: tuple[float, ...],
+    step_m: float | None,
+    range_m: float | None,
+    exponent: float,
+) -> SlotPlanResult:
+    """Plan a site of protocol 2 without writing its slots anywhere. Raises SkylessError."""
+    started_s = time.perf_counter()
+    if not site.anchors:
+        raise SkylessError("site has no anchor with a position; it should have some, to plan what reaches tags")
+    channel = ChannelModel() if range_m is None else with_range(ChannelModel(), range_m, exponent)
+    recoloured = None
+    if site.schedule.mode == "slots":
+        site, recoloured = with_planned_slots(site, file, [], recolour=False)
+    floor = floor_of(site, file, outline_m, region_m)
+    try:
+        mapped = rate_map(site, floor, heights_m, step_m, channel, exponent)
+    except ValueError as error:
+        raise SkylessError(f"no map: {error}") from None
+    found = slot_report(site, floor, mapped, channel, exponent, recoloured, written=False)
+    if recoloured is not None:
+        found["warnings"].append(f"these slots are not in the site ({recoloured}); result.site has them")
+    found["wall_s"] = time.perf_counter() - started_s
+    return SlotPlanResult(site, file, floor, mapped, found)

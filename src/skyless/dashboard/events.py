@@ -1,0 +1,229 @@
+"""What has happened at a site, as a list of events: from the messages of MQTT or of a recording. No I/O.
+
+``unix_s`` is the time of the list's owner: the page server's clock, or the recording's times.
+"""
+
+from collections import deque
+from typing import Final, Literal
+
+from msgspec import Struct
+
+from skyless.dashboard.condition import Condition
+from skyless.dashboard.evidence import ALERT_WORDS, ALERTS, Health
+from skyless.dashboard.leader import LeaderTracker
+from skyless.dashboard.state import MAX_NAMES
+from skyless.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, SurveyMessage, WatchMessage
+
+MAX_LOGGED: Final = 500
+"""Events that are kept; the oldest are dropped."""
+
+SILENT_S: Final = 3.5
+"""A node that reported once a second and has not for this long is offline, whatever its status says."""
+
+ALERT_END_S: Final = 1.0
+"""An alert has ended when no fix has had it for this long."""
+
+ALERT_INTERVAL_S: Final = 10.0
+"""Alerts of one tag that begin sooner than this after the last one are only counted."""
+
+_KEPT_S: Final = 5.0
+"""A first status that was made longer ago is one that the broker kept: nothing has happened now."""
+
+
+_SUBJECTS: Final = {"ether": "the emulated air", "dashboard": "page server", "survey": "survey program"}
+
+Kind = Literal["anchor", "master", "watch", "alert", "tag", "program", "survey", "condition"]
+Severity = Literal["good", "note", "warning", "bad"]
+
+
+class Event(Struct, frozen=True):
+    """One line of the list."""
+
+    serial: int
+    """Counts the events from 1."""
+    unix_s: float
+    kind: Kind
+    level: Severity
+    name: str
+    """What it is about, such as ``tag/t1``, ``anchor/3`` or ``recorder/demo``; empty for the site."""
+    text: str
+
+
+class _Alert:
+    """The alert of one tag."""
+
+    def __init__(self) -> None:
+        self.seen_unix_s = self.logged_unix_s = float("-inf")
+        self.alert: str | None = None
+        """None where there is none now."""
+        self.logged = False
+        """Whether the beginning of this one is in the list."""
+        self.skipped = 0
+
+
+class EventLog:
+    """Gathers events; readers ask for what is new since a serial."""
+
+    def __init__(self) -> None:
+        self.serial = 0
+        self._events: deque[Event] = deque(maxlen=MAX_LOGGED)
+        self._statuses: dict[tuple[str, str], StatusMessage] = {}
+        self._reported: dict[tuple[str, str], float] = {}
+        """Nodes whose health comes, and when it came last."""
+        self._silent: set[tuple[str, str]] = set()
+        self._leader = LeaderTracker()
+        self._alerts: dict[str, _Alert] = {}
+        self._findings: dict[tuple[str, tuple[int, ...]], str] = {}
+        self._saved: int | None = None
+        self._surveyed_by: str | None = None
+        self._condition: Condition | None = None
+
+    def since(self, serial: int = 0) -> list[Event]:
+        """Events after a serial, the oldest first."""
+        new = self.serial - serial
+        return [] if new <= 0 else list(self._events)[-new:]
+
+    # Nodes
+
+    def on_status(self, status: StatusMessage, unix_s: float) -> None:
+        """A node has come online or gone."""
+        key = status.kind, status.name
+        before = self._statuses.get(key)
+        if before is None and len(self._statuses) >= MAX_NAMES:
+            return
+        self._statuses[key] = status
+        if before is None:
+            happened = status.online and unix_s - status.unix_s < _KEPT_S
+        else:
+            happened = before.online != status.online or (status.online and before.pid != status.pid)
+        if not status.online:
+            self._reported.pop(key, None)
+            self._end_alert(status.name, unix_s) if status.kind == "tag" else None
+        if key in self._silent:
+            self._silent.discard(key)
+            happened = status.online  # that it is gone stands in the list already
+        if happened:
+            again = status.online and before is not None and before.online
+            self._add_presence(key, status.online, unix_s, "started again" if again else "")
+
+    def on_health(self, kind: str, name: str, health: Health, unix_s: float) -> None:
+        """A node reports."""
+        key = kind, name
+        if key in self._silent:
+            self._silent.discard(key)
+            self._add_presence(key, True, unix_s, "reports again")
+        if key in self._reported or len(self._reported) < MAX_NAMES:
+            self._reported[key] = unix_s
+        if isinstance(health, AnchorHealth):
+            before = self._leader.leader
+            leader = self._leader.update(health, unix_s)
+            if leader is not None:
+                word = "master" if health.mode == "master" else "root of the slot time"
+                text = f"anchor {leader} is the {word} now, after anchor {before}"
+                self._add(unix_s, "master", "warning", f"anchor/{leader}", text)
+
+    def tick(self, unix_s: float) -> None:
+        """Look for what has ended; to be called once or twice a second."""
+        for key, reported_unix_s in list(self._reported.items()):
+            if unix_s - reported_unix_s > SILENT_S:
+                del self._reported[key]
+                self._silent.add(key)
+                self._add_presence(key, False, unix_s, "does not report any more")
+        for name, alert in self._alerts.items():
+            if alert.alert is not None and unix_s - alert.seen_unix_s > ALERT_END_S:
+                self._end_alert(name, unix_s)
+
+    def _add_presence(self, key: tuple[str, str], online: bool, unix_s: float, words: str) -> None:
+        kind, name = key
+        level: Severity = "note"
+        if kind in {"anchor", "tag", "ether"}:
+            level = "good" if online else "bad" if kind != "tag" else "warning"
+            words = words or ("is online" if online else "is offline")
+        else:
+            words = words or ("started" if online else "ended")
+        group: Kind = "anchor" if kind == "anchor" else "tag" if kind == "tag" else "program"
+        subject = _SUBJECTS.get(kind, kind)
+        subject += "" if kind in {name, "ether"} else f" {name}"
+        self._add(unix_s, group, level, f"{kind}/{name}", f"{subject} {words}")
+
+    # Fixes
+
+    def on_fix(self, fix: FixMessage, unix_s: float) -> None:
+        """A fix, with or without an integrity alert."""
+        alert = self._alerts.get(fix.tag)
+        if ALERTS.get(fix.alert, 0) == 0:
+            return
+        if alert is None:
+            if len(self._alerts) >= MAX_NAMES:
+                return
+            alert = self._alerts[fix.tag] = _Alert()
+        alert.seen_unix_s = unix_s
+        if alert.alert is not None and ALERTS[fix.alert] <= ALERTS[alert.alert]:
+            return
+        worse = alert.alert is not None
+        alert.alert = fix.alert
+        if unix_s - alert.logged_unix_s < ALERT_INTERVAL_S and not worse:
+            alert.skipped += 1
+            return
+        more = f" ({alert.skipped} more since the last one)" if alert.skipped else ""
+        alert.logged, alert.logged_unix_s, alert.skipped = True, unix_s, 0
+        level: Severity = "bad" if ALERTS[fix.alert] > 1 else "warning"
+        self._add(unix_s, "alert", level, f"tag/{fix.tag}", f"tag {fix.tag}: {ALERT_WORDS[fix.alert or '']}{more}")
+
+    def _end_alert(self, name: str, unix_s: float) -> None:
+        alert = self._alerts.get(name)
+        if alert is None or alert.alert is None:
+            return
+        alert.alert = None
+        if alert.logged:
+            alert.logged = False
+            self._add(unix_s, "alert", "good", f"tag/{name}", f"tag {name}: integrity alert ended")
+
+    # Survey and watch
+
+    def on_watch(self, watch: WatchMessage | None, unix_s: float) -> None:
+        """What the watch of the anchors sees now; None when it has ended."""
+        findings = () if watch is None else watch.findings
+        now = {(str(finding.kind), finding.anchors): finding.sentence.rstrip(".") for finding in findings}
+        before, self._findings = self._findings, now
+        for (kind, anchors), sentence in now.items():
+            if (kind, anchors) not in before:
+                level: Severity = "bad" if kind == "moved" else "warning"
+                self._add(unix_s, "watch", level, f"anchor/{anchors[0]}" if anchors else "", sentence)
+        for kind, anchors in before.keys() - now.keys():
+            if watch is not None:
+                text = f"no longer found: {before[kind, anchors]}"
+                self._add(unix_s, "watch", "good", f"anchor/{anchors[0]}" if anchors else "", text)
+
+    def on_survey(self, survey: SurveyMessage | None, unix_s: float) -> None:
+        """The survey program's state; a saved result is an event."""
+        if survey is None:
+            return
+        same = survey.by == self._surveyed_by
+        if same and survey.saved_serial is not None and survey.saved_serial != self._saved:
+            where = f" to {survey.file}" if survey.file else ""
+            self._add(unix_s, "survey", "note", "", f"survey result {survey.saved_serial} saved{where}")
+        self._surveyed_by, self._saved = survey.by, survey.saved_serial
+
+    # Condition
+
+    def on_condition(self, condition: Condition, unix_s: float) -> None:
+        """The condition of the site; a change of its level, or of its first reason, is an event."""
+        before, self._condition = self._condition, condition
+        if before is not None and _first(before) == _first(condition):
+            return
+        if condition.level == "waiting" or (before is None and condition.level == "good"):
+            return
+        if condition.level == "good":
+            self._add(unix_s, "condition", "good", "", "condition good")
+        else:
+            word = "fault" if condition.level == "bad" else "warning"
+            self._add(unix_s, "condition", condition.level, "", f"{word}: {condition.text}")
+
+    def _add(self, unix_s: float, kind: Kind, level: Severity, name: str, text: str) -> None:
+        self.serial += 1
+        self._events.append(Event(self.serial, unix_s, kind, level, name, text))
+
+
+def _first(condition: Condition) -> tuple[str, str]:
+    return condition.level, condition.reasons[0].kind if condition.reasons else ""

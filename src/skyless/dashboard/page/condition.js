@@ -1,0 +1,48 @@
+/** The condition of the site as this page can vouch for it: never better than what the server has just said. */
+
+import { state } from "./store.js";
+
+/** The server judges twice a second; a judgement older than this is worth nothing. */
+const MAX_AGE_MS = 3000;
+
+/** Words and marks by level; the marks stand in the browser's tab. */
+export const LEVELS = {
+  good: { word: "Live", mark: "●" },
+  warning: { word: "Warning", mark: "▲" },
+  bad: { word: "Fault", mark: "✕" },
+  waiting: { word: "Waiting", mark: "○" },
+  lost: { word: "Connection lost", mark: "✕" },
+  replay: { word: "Replay", mark: "▶" },
+  connecting: { word: "Connecting", mark: "○" },
+};
+
+/**
+ * What the page shows of the site's condition.
+ * @returns {{level: keyof LEVELS, text: string, reasons: any[]}}
+ */
+export function shownCondition() {
+  const { phase, reason } = state.connection;
+  if (phase === "lost") return { level: "lost", text: "", reasons: [lostReason(reason)] };
+  if (state.mode === "replay") return { level: "replay", text: "", reasons: [] };
+  if (phase !== "open") return { level: "connecting", text: "", reasons: [] };
+  const { condition } = state;
+  if (!condition) return { level: "waiting", text: "waiting for the server", reasons: [] };
+  if (performance.now() - state.conditionMs > MAX_AGE_MS) {
+    return { level: "waiting", text: "the server is silent", reasons: [silentReason()] };
+  }
+  if (state.mqtt && !state.mqtt.connected && condition.level !== "bad") {
+    return { level: condition.reasons.length ? "warning" : "waiting", text: "no broker", reasons: condition.reasons };
+  }
+  return condition;
+}
+
+function lostReason(words) {
+  const advice = "The page shows the last known state and connects again by itself.";
+  return { kind: "lost", level: "bad", text: `connection lost: ${words}`, advice, names: [] };
+}
+
+function silentReason() {
+  const age = ((performance.now() - state.conditionMs) / 1e3).toFixed(0);
+  const advice = "Its computer, or the network between it and this browser, is busy.";
+  return { kind: "silent", level: "warning", text: `the page's server has sent nothing for ${age} s`, advice, names: [] };
+}

@@ -1,0 +1,297 @@
+"""What can be wrong with a live site: each function looks for one cause and gives its reason. No I/O."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import Final, Literal
+
+from msgspec import Struct
+
+from skyless.dashboard.evidence import ALERT_WORDS, ALERTS, FRESH_S, GRACE_S, Evidence, Node
+from skyless.mqtt.messages import AnchorHealth, EtherHealth, TagHealth, WatchMessage
+
+LATE_S: Final = 0.25
+VERY_LATE_S: Final = 1.0
+"""Age of positions on arrival."""
+
+SLOW_SHARE: Final = 0.02
+VERY_SLOW_SHARE: Final = 0.5
+"""Of transmissions missed, or of receptions dropped."""
+
+LAG_S: Final = 0.25
+"""Delay of the page's server itself that counts as too slow."""
+
+START_S: Final = 20.0
+"""Where no anchor has been online yet, all of them may be offline for this long: the site is being started."""
+
+OFTEN: Final = 3
+OFTEN_S: Final = 60.0
+"""A master that changes this often within this time changes too often."""
+
+WATCH_AGE_S: Final = 60.0
+"""A watch that has not reported for longer is not running."""
+
+_MIN_ANCHORS: Final = 3
+"""Fewer on the air give no position."""
+_MIN_DROPPED: Final = 3
+_MOST_NAMED: Final = 6
+
+_ADVICE_NO_FIX: Final = {
+    "no-beacons": "It receives no anchor: see whether anchors are on the air and its radio is connected.",
+    "no-almanac": "It does not have the anchors' positions yet; they are sent every few seconds.",
+    "too-few-anchors": "Too few anchors reach it: see which are offline, and what stands in the way.",
+    "bad-geometry": "The anchors that reach it lie almost on one line as seen from it: add one on another side.",
+    "mirror-ambiguity": "Two positions explain what it receives: give its height, or add an anchor off the plane.",
+    "not-converged": "What it receives is contradictory: check the anchors' positions and antenna delays.",
+    "residuals-too-large": "What it receives is contradictory: check the anchors' positions and antenna delays.",
+    "acquiring": "It still looks for its first position.",
+    "no-master": "Its method needs a master, and this site has none: use another method.",
+}
+_Severity = Literal["warning", "bad"]
+
+
+class Reason(Struct, frozen=True):
+    """One thing that is wrong."""
+
+    kind: str
+    """Such as ``late`` or ``anchors``; there is one reason of a kind at a time."""
+    level: Literal["warning", "bad"]
+    text: str
+    """What is wrong, and why."""
+    advice: str
+    """What to do next."""
+    names: tuple[str, ...] = ()
+    """The tags or anchors concerned, as ``tag/t1`` or ``anchor/3``."""
+
+
+def broker_reason() -> Reason:
+    """Nothing else can be known then."""
+    advice = "Start the broker again, or see whether its computer is reachable; the page connects by itself."
+    return Reason("broker", "bad", "the broker is not connected: nothing is updated", advice)
+
+
+def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> Reason | None:
+    """Positions arrive late; ``ages`` as of ``FixAges.least_ages_s``."""
+    late = sorted(name for name, (age_s, _) in ages.items() if age_s > LATE_S)
+    if not late:
+        return None
+    worst = max(late, key=lambda name: ages[name][0])
+    age_s, made_s = ages[worst]
+    whose = "positions" if len(late) == len(ages) else f"positions of {_listed('tag', late)}"
+    host = evidence.nodes["tag", worst].host if ("tag", worst) in evidence.nodes else ""
+    if made_s > 0.5 * age_s:
+        why = f"{evidence.computer(host)} does not keep up with the receptions"
+        advice = "End other programs there, or move tags to another computer."
+    else:
+        why = "the broker or the network delivers late"
+        advice = "See whether the broker's computer or the network is busy."
+        if host not in {"", evidence.host}:
+            advice += (
+                f" Measured against the quickest message from {host} in the last minutes, whatever its clock shows."
+            )
+    level: _Severity = "bad" if age_s > VERY_LATE_S else "warning"
+    return Reason("late", level, f"{whose} are {age_s:.1f} s behind: {why}", advice, _names("tag", late))
+
+
+def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None:
+    """Computers do not keep up; one reason for all signs of it. ``lag_s`` is the delay of the page's server."""
+    signs = [*_lag(evidence, lag_s), *_missed(evidence, now_s), *_dropped(evidence, now_s)]
+    if not signs:
+        return None
+    computers: dict[str, list[str]] = {}
+    for host, _, words in signs:
+        computers.setdefault(evidence.computer(host), []).append(words)
+    text = "; ".join(f"{computer} is too slow: {', '.join(words)}" for computer, words in computers.items())
+    advice = "End other programs there, run fewer tags and anchors, or move some to another computer."
+    worst = max(share for _, share, _ in signs)
+    return Reason("slow", "bad" if worst > VERY_SLOW_SHARE else "warning", text, advice)
+
+
+_Sign = tuple[str, float, str]
+"""Computer, share of what was lost, and words."""
+
+
+def _lag(evidence: Evidence, lag_s: float) -> Iterable[_Sign]:
+    if lag_s > LAG_S:
+        yield evidence.host, 0.0, f"the page's server was delayed by {lag_s:.1f} s"
+
+
+def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
+    """Transmissions of the emulated air, and of anchors."""
+    for _, air in evidence.of("ether"):
+        if air.reports(now_s) and isinstance(air.health, EtherHealth) and air.health.missed_share > SLOW_SHARE:
+            share = air.health.missed_share
+            yield air.host, share, f"the emulated air missed {share:.0%} of the transmissions"
+    shares: dict[str, dict[str, float]] = {}
+    for name, anchor in evidence.of("anchor"):
+        share = anchor.health.missed_share if isinstance(anchor.health, AnchorHealth) else 0.0
+        if anchor.reports(now_s) and share > SLOW_SHARE:
+            shares.setdefault(anchor.host, {})[name] = share
+    for host, late in shares.items():
+        worst = max(late.values())
+        yield host, worst, f"{_counted('anchor', list(late))} missed up to {worst:.0%} of the transmissions"
+
+
+def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
+    """Receptions and fixes that tags dropped between their last two health messages, as they were too old."""
+    found: dict[str, list[tuple[str, int, float]]] = {}
+    for name, tag in evidence.of("tag"):
+        now, before = tag.health, tag.previous
+        if not (tag.reports(now_s) and isinstance(now, TagHealth) and isinstance(before, TagHealth)):
+            continue
+        count = now.late - before.late
+        share = count / max(now.receptions - before.receptions, count, 1)
+        if count >= _MIN_DROPPED and share > SLOW_SHARE:
+            found.setdefault(tag.host, []).append((name, count, share))
+    for host, drops in found.items():
+        names = [name for name, _, _ in drops]
+        count, worst = sum(count for _, count, _ in drops), max(share for _, _, share in drops)
+        yield host, worst, f"{_counted('tag', names)} dropped {count} receptions or fixes that were too old"
+
+
+def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
+    """Tags that are online and have no fix, with what they give as the cause, or without any word."""
+    online = [(name, tag) for name, tag in evidence.of("tag") if tag.online]
+    without = [(n, tag) for n, tag in online if not tag.has_fix(now_s) and not evidence.in_grace(now_s, tag)]
+    if not without:
+        return
+    silent = [name for name, tag in without if not tag.reports(now_s)]
+    causes = {name: _cause(tag) for name, tag in without if tag.reports(now_s)}
+    common = Counter(causes.values()).most_common(1)[0][0] if causes else ""
+    why = f": {common.replace('-', ' ')}" if common else ""
+    advice = _ADVICE_NO_FIX.get(common, "See whether fixes are published, and the log of the tag.")
+    if len(without) == len(online):
+        though = "a tag is online" if len(online) == 1 else f"{len(online)} tags are online"
+        if not causes:
+            why, advice = ": they do not report", "See whether their programs and computers still run."
+        yield Reason(
+            "no-fixes", "bad", f"no positions, although {though}{why}", advice, _names("tag", [n for n, _ in without])
+        )
+        return
+    if causes:
+        text = f"{_listed('tag', list(causes))} {_number(causes, 'has', 'have')} no fix{why}"
+        yield Reason("no-fix", "warning", text, advice, _names("tag", list(causes)))
+    if silent:
+        text = f"{_listed('tag', silent)} {_number(silent, 'does', 'do')} not report any more"
+        advice = "Its program does not respond, or its computer is cut off: see there, and start it again."
+        yield Reason("silent", "warning", text, advice, _names("tag", silent))
+
+
+def _cause(tag: Node) -> str:
+    return (tag.health.reason or "") if isinstance(tag.health, TagHealth) else ""
+
+
+def alert_reasons(evidence: Evidence) -> Iterable[Reason]:
+    """Alerts of integrity in the fixes since the last evaluation."""
+    bad: _Severity = "bad"
+    warning: _Severity = "warning"
+    for kind, grade, level, advice in (
+        ("limit", 2, bad, "Do not rely on the position; see which anchors the tag uses and what blocks them."),
+        ("alert", 1, warning, "The position is still sound; see what blocks an anchor, or whether one has moved."),
+    ):
+        alerts = {name: str(tag.alert) for name, tag in evidence.of("tag") if ALERTS.get(tag.alert, 0) == grade}
+        if alerts:
+            words = ALERT_WORDS[Counter(alerts.values()).most_common(1)[0][0]]
+            yield Reason(kind, level, f"{_listed('tag', list(alerts))}: {words}", advice, _names("tag", list(alerts)))
+
+
+def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
+    """Anchors of the site that are offline, only cut off from the broker, or not synchronised."""
+    if evidence.site is None:
+        return
+    site = evidence.site
+    names = [str(anchor.id) for anchor in site.anchors] + [str(anchor.id) for anchor in site.unplaced]
+    offline: list[str] = []
+    cut_off: list[str] = []
+    idle: list[str] = []
+    for name in names:
+        node = evidence.nodes.get(("anchor", name))
+        if node is not None and node.reports(now_s):
+            health = node.health
+            if isinstance(health, AnchorHealth) and _is_idle(health):
+                idle.append(name)
+        elif node is None or node.online is not False:
+            on_air = node is not None and now_s - node.used_s < FRESH_S
+            if not evidence.in_grace(now_s, node):
+                (cut_off if on_air else offline).append(name)
+        elif node.since_s is not None or not evidence.in_grace(now_s):  # else an old status, kept by the broker
+            offline.append(name)
+    unseen = len(offline) == len(names) and all(node.since_s is None for _, node in evidence.of("anchor"))
+    if offline and not (unseen and now_s - evidence.ready_s < START_S):
+        level: _Severity = "bad" if len(names) - len(offline) < _MIN_ANCHORS else "warning"
+        which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
+        which = which or f"{_listed('anchor', offline)} of {len(names)} {_number(offline, 'is', 'are')}"
+        advice = "See whether power and program run there; positions are less accurate without them."
+        yield Reason("anchors", level, f"{which} offline", advice, _names("anchor", offline))
+    if cut_off:
+        text = f"{_listed('anchor', cut_off)} {_number(cut_off, 'does', 'do')} not report, though on the air"
+        advice = "The program has lost the broker, or the page lost its messages: see its log."
+        yield Reason("silent-anchors", "warning", text, advice, _names("anchor", cut_off))
+    if idle:
+        text = f"{_listed('anchor', idle)} {_number(idle, 'is', 'are')} not synchronised and sends nothing"
+        text = text if len(idle) == 1 else text.replace("sends", "send")
+        advice = "Too few messages of the others arrive there: see what blocks them."
+        yield Reason("not-synchronised", "warning", text, advice, _names("anchor", idle))
+
+
+def _is_idle(health: AnchorHealth) -> bool:
+    return not health.synchronised and health.role not in {"master", "root"} and health.uptime_s > GRACE_S
+
+
+def master_reason(evidence: Evidence, now_s: float) -> Reason | None:
+    """The master, or the root of the slot time, changes often."""
+    count = sum(now_s - time_s < OFTEN_S for time_s in evidence.leader.changes_s)
+    if count < OFTEN:
+        return None
+    slots = evidence.site is not None and evidence.site.schedule.mode != "master"
+    leader = "root of the slot time" if slots else "master"
+    text = f"the {leader} has changed {count} times within a minute; now it is anchor {evidence.leader.leader}"
+    advice = "Anchors lose its messages: a computer is too slow, or something blocks it; move it, or name another."
+    return Reason("master", "warning", text, advice)
+
+
+def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[Reason]:
+    """What the watch of the anchors has found."""
+    ended = (age_s or 0.0) > WATCH_AGE_S
+    findings = () if watch is None else watch.findings
+    moved = [finding for finding in findings if finding.kind == "moved"]
+    other = [finding for finding in findings if finding.kind != "moved"]
+    for kind, chosen in (("moved", moved), ("watch", other)):
+        if not chosen:
+            continue
+        text = chosen[0].sentence.rstrip(".") + (f", and {len(chosen) - 1} more" if len(chosen) > 1 else "")
+        text += " (the watch does not report any more)" if ended else ""
+        advice = "Move it back, or survey again." if kind == "moved" else "See there; survey again where it stays so."
+        names = dict.fromkeys(str(anchor) for finding in chosen for anchor in finding.anchors)
+        yield Reason(
+            kind, "bad" if kind == "moved" and not ended else "warning", text, advice, _names("anchor", list(names))
+        )
+
+
+_ORDER: Final = ("broker", "slow", "late", "no-fixes", "limit", "moved", "anchors", "master", "no-fix", "alert")
+"""Causes before their effects."""
+
+
+def rank(reason: Reason) -> tuple[bool, int]:
+    """The key by which reasons are sorted, the worst first."""
+    return reason.level != "bad", _ORDER.index(reason.kind) if reason.kind in _ORDER else len(_ORDER)
+
+
+def _names(kind: str, names: list[str]) -> tuple[str, ...]:
+    return tuple(f"{kind}/{name}" for name in names[:_MOST_NAMED])
+
+
+def _listed(kind: str, names: list[str]) -> str:
+    """``anchors 3, 5 and 8``; of many only the first."""
+    if len(names) == 1:
+        return f"{kind} {names[0]}"
+    if len(names) > _MOST_NAMED:
+        return f"{kind}s {', '.join(names[:_MOST_NAMED])} and {len(names) - _MOST_NAMED} more"
+    return f"{kind}s {', '.join(names[:-1])} and {names[-1]}"
+
+
+def _counted(kind: str, names: list[str]) -> str:
+    return f"{kind} {names[0]}" if len(names) == 1 else f"{len(names)} {kind}s"
+
+
+def _number(items: list[str] | dict[str, str], one: str, many: str) -> str:
+    return one if len(items) == 1 else many

@@ -1,0 +1,135 @@
+"""Where compiled kernels are kept, and which parts of them are there.
+
+The folder belongs to exactly these sources: the compiler notices a change of the kernel's own file but not of the
+kernels that it calls, so a digest of all files with kernels, and of the constants that they use, stands in its name.
+Folders of other sources are removed when no running program can need them.
+
+The first of these is used that can be written, or that cannot but holds kernels for this processor (an image):
+``NUMBA_CACHE_DIR``, next to the sources, the user's cache, a private folder among the temporary ones.
+"""
+
+import hashlib
+import os
+import shutil
+import stat
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+from msgspec import Struct
+
+ONLY_VARIABLE: Final = "SKYLESS_COMPILE_ONLY"
+"""Environment variable: packages, with commas, whose kernels this program compiles; others run as plain Python.
+
+Those with a minus are left out. So several programs compile parts of what one computation needs
+(``skyless.preparation``).
+"""
+
+_PACKAGE: Final = Path(__file__).parents[1]
+_KEPT_S: Final = 86_400.0
+"""Kernels of older sources are kept for a day: a program that was started with them may still be compiling."""
+
+
+class KernelFolder(Struct, frozen=True):
+    """A folder of compiled kernels."""
+
+    path: Path
+    """Where exactly these sources' kernels are; None of it may exist."""
+    key: str
+    """Names compiler, interpreter and processor: kernels of others are of no use."""
+    writable: bool
+    temporary: bool
+    """Whether the system may remove it at its next start."""
+
+    def is_ready(self, part: str) -> bool:
+        """Whether a part has been compiled for this processor."""
+        return self._mark(part).is_file()
+
+    def mark_ready(self, part: str) -> None:
+        """Note that a part has been compiled."""
+        with suppress(OSError):  # a full disk: it is compiled again next time
+            self._mark(part).touch()
+
+    def _mark(self, part: str) -> Path:
+        return self.path / f"ready-{self.key}-{part}"
+
+
+@cache
+def kernel_folder() -> KernelFolder:
+    """Where this program keeps compiled kernels; a folder that can be written exists."""
+    name = f"kernels-{_digest()}"
+    found = choose_folder(_homes(), name, _key()) or _temporary_folder(name, _key())
+    if found.writable:
+        _remove_older(found.path)
+    return found
+
+
+def choose_folder(homes: Iterable[Path], name: str, key: str) -> KernelFolder | None:
+    """The first home whose folder can be written, or cannot but holds kernels for this key; None if there is none."""
+    for home in homes:
+        path = home / name
+        with suppress(OSError):
+            path.mkdir(parents=True, exist_ok=True)
+        if path.is_dir() and os.access(path, os.W_OK | os.X_OK):
+            return KernelFolder(path, key, writable=True, temporary=False)
+        if any(path.glob(f"ready-{key}-*")):
+            return KernelFolder(path, key, writable=False, temporary=False)
+    return None
+
+
+def _homes() -> Iterable[Path]:
+    if asked := os.environ.get("NUMBA_CACHE_DIR"):
+        yield Path(asked)
+    yield _PACKAGE / "__pycache__"
+    if asked := os.environ.get("XDG_CACHE_HOME"):
+        yield Path(asked) / "skyless"
+    with suppress(RuntimeError):  # a user without a home
+        yield Path.home() / ".cache" / "skyless"
+
+
+def _temporary_folder(name: str, key: str) -> KernelFolder:
+    """One folder for all programs of this user; another user's of that name is not trusted, as kernels are code."""
+    home = Path(tempfile.gettempdir()) / f"skyless-{os.getuid() if hasattr(os, 'getuid') else 'kernels'}"
+    try:
+        home.mkdir(mode=0o700, exist_ok=True)
+        found = home.lstat()
+        if hasattr(os, "getuid") and (found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o022):
+            home = Path(tempfile.mkdtemp(prefix="skyless-"))
+            os.environ["NUMBA_CACHE_DIR"] = str(home)  # for the programs that this one starts
+        (home / name).mkdir(exist_ok=True)
+    except OSError:  # nothing can be written at all: every program compiles for itself
+        return KernelFolder(home / name, key, writable=False, temporary=True)
+    return KernelFolder(home / name, key, writable=True, temporary=True)
+
+
+def _digest() -> str:
+    digest = hashlib.sha1(usedforsecurity=False)
+    for source in sorted(_PACKAGE.rglob("*.py")):
+        text = source.read_bytes()
+        is_kernel = b"skyless.kernels.compiled" in text or source.parent.name == "kernels"
+        if is_kernel or source.name == "constants.py":
+            digest.update(text)
+    return digest.hexdigest()[:16]
+
+
+def _key() -> str:
+    processor = os.environ.get("NUMBA_CPU_NAME") or get_host_cpu_name()
+    features = os.environ.get("NUMBA_CPU_FEATURES")
+    if features is None:
+        features = "" if processor == "generic" else get_host_cpu_features().flatten()
+    words = (version("numba"), version("llvmlite"), sys.version, processor, features)
+    return hashlib.sha1("\n".join(words).encode(), usedforsecurity=False).hexdigest()[:12]
+
+
+def _remove_older(folder: Path) -> None:
+    for old in folder.parent.glob("kernels-*"):
+        with suppress(FileNotFoundError):  # another program may be cleaning up as well
+            if old != folder and time.time() - old.stat().st_mtime > _KEPT_S:
+                shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,193 @@
+"""Compile parts of the kernels on all cores, unless another program is doing so already."""
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import sys
+import time
+from collections.abc import AsyncIterator, Callable, Iterable
+from typing import IO, Final
+
+import msgspec
+from msgspec import Struct
+
+from skyless.kernels.cache import ONLY_VARIABLE, KernelFolder, kernel_folder
+from skyless.kernels.processors import cores
+from skyless.preparation.parts import Part
+
+_WAIT_S: Final = 0.25
+_REPORT_S: Final = 0.25
+_SURE_SHARE: Final = 0.1
+"""From here on the time left follows from the time spent."""
+
+
+class Preparation(Struct, frozen=True):
+    """How far the compilation is."""
+
+    done: int
+    total: int
+    left_s: float | None
+    """Estimated; None where another program compiles and has not reported yet."""
+
+
+Report = Callable[[Preparation], None]
+
+
+class CompilationError(Exception):
+    """A process could not compile its part; what needs the kernels will say why when it compiles them itself."""
+
+
+def missing(parts: Iterable[Part]) -> tuple[Part, ...]:
+    """Parts that have not been compiled for these sources and this processor."""
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"} or ONLY_VARIABLE in os.environ:
+        return ()  # nothing is compiled, or this is the process that compiles
+    folder = kernel_folder()
+    return tuple(part for part in parts if not folder.is_ready(part.name))
+
+
+async def compile_parts(parts: Iterable[Part], report: Report) -> None:
+    """Compile what is missing of these parts; ``report`` is called a few times a second while it lasts.
+
+    Where no folder can be written this does nothing: every program then compiles for itself.
+
+    Raises:
+        CompilationError: a part could not be compiled.
+    """
+    folder = kernel_folder()
+    wanted = missing(parts)
+    if not wanted or not folder.writable:
+        return
+    async with _only_one(folder, report) as notes:
+        await _Run(missing(wanted), folder, report, notes).run()
+
+
+class _Progress(Struct):
+    """Of one part."""
+
+    typical_s: float
+    timeline: tuple[float, ...]
+    done: int = 0
+    total: int = 0
+    begun_s: float | None = None
+    ended: bool = False
+
+    def left_s(self, now_s: float) -> float:
+        if self.ended:
+            return 0.0
+        spent_s = 0.0 if self.begun_s is None else now_s - self.begun_s
+        share = self._share()
+        if share < _SURE_SHARE:
+            return max(self.typical_s - spent_s, 0.5 * self.typical_s)
+        return spent_s * (1.0 - share) / share
+
+    def _share(self) -> float:
+        """Of its time that is over, by its kernels."""
+        if not self.total:
+            return 0.0
+        at = self.done / self.total * (len(self.timeline) - 1)
+        before = min(int(at), len(self.timeline) - 2)
+        begin, end = self.timeline[before : before + 2]
+        return begin + (at - before) * (end - begin)
+
+
+class _Run:
+    """The processes of one compilation."""
+
+    def __init__(self, parts: tuple[Part, ...], folder: KernelFolder, report: Report, notes: IO[bytes]) -> None:
+        self._parts, self._folder, self._report, self._notes = parts, folder, report, notes
+        self._progress = {part.name: _Progress(part.typical_s, part.timeline) for part in parts}
+        self._ended = {part.name: asyncio.Event() for part in parts}
+        self._free = asyncio.Semaphore(cores())
+
+    async def run(self) -> None:
+        reporting = asyncio.ensure_future(self._report_all())
+        try:
+            async with asyncio.TaskGroup() as group:
+                for part in sorted(self._parts, key=lambda part: -part.typical_s):
+                    group.create_task(self._compile(part))
+        except* CompilationError as errors:
+            raise errors.exceptions[0] from None
+        finally:
+            reporting.cancel()
+
+    async def _compile(self, part: Part) -> None:
+        for name in part.after:
+            if name in self._ended:
+                await self._ended[name].wait()
+        async with self._free:
+            progress = self._progress[part.name]
+            progress.begun_s = time.monotonic()
+            async with _worker(part) as process:
+                assert process.stdout is not None
+                async for line in process.stdout:
+                    progress.done, progress.total = msgspec.json.decode(line, type=tuple[int, int])
+                code = await process.wait()
+            if code != 0:
+                raise CompilationError(f"compiling {part.name} ended with exit code {code}")
+            progress.done, progress.ended = progress.total, True
+            self._folder.mark_ready(part.name)
+            self._ended[part.name].set()
+
+    async def _report_all(self) -> None:
+        while True:
+            now = self._now()
+            self._report(now)
+            with contextlib.suppress(OSError):
+                self._notes.truncate(0)
+                self._notes.write(msgspec.json.encode(now))
+                self._notes.flush()
+            await asyncio.sleep(_REPORT_S)
+
+    def _now(self) -> Preparation:
+        now_s = time.monotonic()
+        left = [progress.left_s(now_s) for progress in self._progress.values()]
+        left_s = max(max(left, default=0.0), sum(left) / cores())
+        progress = self._progress.values()
+        return Preparation(sum(one.done for one in progress), sum(one.total for one in progress), left_s)
+
+
+@contextlib.asynccontextmanager
+async def _worker(part: Part) -> AsyncIterator[asyncio.subprocess.Process]:
+    """The process of a part, ended where its owner is cancelled."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-m",
+        "skyless.preparation.worker",
+        part.run,
+        *part.arguments,
+        stdin=asyncio.subprocess.PIPE,  # closed when this program has gone, however that came about
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C in a terminal is for its parent
+        env={**os.environ, ONLY_VARIABLE: ",".join(part.only)},
+    )
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+
+
+@contextlib.asynccontextmanager
+async def _only_one(folder: KernelFolder, report: Report) -> AsyncIterator[IO[bytes]]:
+    """Wait until no other program compiles, reporting what it reports; gives a file for the own reports."""
+    with (folder.path / "compiling").open("ab+") as notes:
+        while not _lock(notes):
+            notes.seek(0)
+            with contextlib.suppress(msgspec.MsgspecError):
+                report(msgspec.json.decode(notes.read(), type=Preparation))
+            await asyncio.sleep(_WAIT_S)
+        yield notes
+
+
+def _lock(file: IO[bytes]) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True

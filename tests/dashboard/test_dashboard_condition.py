@@ -1,0 +1,265 @@
+"""The condition of the site: faults are found in time with their cause, are gone soon after; green has evidence."""
+
+import pytest
+from dashboard_builders import SITE, fix, status
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from skyless.dashboard.condition import EVALUATION_S, HOLD_S, ConditionMonitor
+from skyless.dashboard.evidence import FRESH_S, GRACE_S, Evidence
+from skyless.dashboard.reasons import START_S
+from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth, TagHealth, WatchFinding, WatchMessage
+
+IDS = [anchor.id for anchor in SITE.site.anchors]
+MQTT = Counters(0, 0, 0)
+HOST = "here"
+
+
+def anchor_health(anchor, unix_s, master=1, term=0, **more):
+    role = "master" if anchor == master else "anchor"
+    health = AnchorHealth(*(anchor, unix_s, 60.0, role, master, term, True, 0.1, 0.5, 0.01, 9, 0, 9, 7, {}, {}, MQTT))
+    return replace(health, **more)
+
+
+def tag_health(name, unix_s, **more):
+    health = TagHealth(name, unix_s, 60.0, "joint", 400, 390, 400.0, None, 0.1, 1e-3, 2e-3, {}, MQTT, 0.1, 1, ())
+    return replace(health, **more)
+
+
+class Hall:
+    """A site whose programs report regularly, apart from what a test changes."""
+
+    def __init__(self, tags=("t1", "t2"), connected=True):
+        self.now_s = 100.0
+        self.evidence = Evidence(HOST, self.now_s)
+        self.monitor = ConditionMonitor(self.evidence)
+        self.evidence.set_connected(connected=connected, now_s=self.now_s)
+        self.evidence.set_site(SITE.site, self.now_s)
+        self.silent, self.delay_s, self.latency_s, self.alert = set(), 0.0, 1e-3, None
+        self.anchors, self.tags, self.air, self.lag_s, self.watch = {}, {}, {}, 0.0, (None, None)
+        self.names, self.receptions, self.clock_error_s, self.host = tags, 0, 0.0, HOST
+        self.online, self.used = False, (1, 2, 3, 4)
+        """Whether the programs run, and the anchors that fixes use."""
+
+    def start(self):
+        for anchor in IDS:
+            self.evidence.add_status(status("anchor", str(anchor)), self.now_s)
+        for name in self.names:
+            self.evidence.add_status(replace(status("tag", name), host=self.host), self.now_s)
+        self.online = True
+        return self
+
+    def run(self, seconds, rate_hz=10.0):
+        """Pass time; the last condition."""
+        condition = None
+        for step in range(round(seconds * rate_hz)):
+            self.now_s += 1 / rate_hz
+            if self.online:
+                self._report(step % round(rate_hz) == 0)
+            if step % round(EVALUATION_S * rate_hz) == 0:
+                condition = self.monitor.evaluate(self.now_s, self.lag_s, *self.watch)
+        return condition
+
+    def _report(self, second):
+        unix_s = 1e9 + self.now_s
+        self.receptions += 40
+        for name in self.names:
+            if name in self.silent:
+                continue
+            made = unix_s - self.delay_s - self.clock_error_s - self.latency_s
+            self.evidence.add_fix(
+                fix(name, made, latency_s=self.latency_s, alert=self.alert, anchors=self.used), self.now_s
+            )
+        if second:
+            for anchor in IDS:
+                if anchor not in self.silent:
+                    health = anchor_health(anchor, unix_s, **self.anchors)
+                    self.evidence.add_health("anchor", str(anchor), health, self.now_s, unix_s)
+            for name in self.names:
+                more = {"receptions": self.receptions} | self.tags.get(name, {})
+                sent = unix_s - self.delay_s - self.clock_error_s
+                self.evidence.add_health("tag", name, tag_health(name, sent, **more), self.now_s, unix_s)
+            air = replace(EtherHealth(unix_s, 1.0, 5, 0, {}, {}, 0, 0), **self.air)
+            self.evidence.add_health("ether", "air", air, self.now_s, unix_s)
+
+
+@pytest.fixture
+def hall():
+    hall = Hall().start()
+    assert hall.run(10.0).level == "good"
+    return hall
+
+
+def kinds(condition):
+    return [reason.kind for reason in condition.reasons]
+
+
+def test_a_site_that_starts_is_not_green_before_a_position_has_come():
+    hall = Hall(connected=False)
+    assert (hall.run(1.0).level, hall.run(1.0).text) == ("waiting", "waiting for the broker")
+    hall.evidence.set_connected(connected=True, now_s=hall.now_s)
+    assert (hall.run(3.0).level, hall.run(1.0).text) == ("waiting", "no tag is online")
+    for anchor in IDS:
+        hall.evidence.add_status(status("anchor", str(anchor), online=False), hall.now_s)  # kept of yesterday
+    assert hall.run(GRACE_S).level == "waiting"
+    hall.start()
+    condition = hall.run(1.0)
+    assert (condition.level, condition.text, condition.reasons) == ("good", "", ())
+    assert condition.latency_p50_s == pytest.approx(1e-3, abs=1e-6)
+
+
+def test_anchors_that_never_come_online_are_reported_after_a_while():
+    hall = Hall()
+    assert hall.run(START_S + 1.0).text == f"all {len(IDS)} anchors are offline"
+
+
+def test_without_a_broker_nothing_else_is_judged(hall):
+    hall.evidence.set_connected(connected=False, now_s=hall.now_s)
+    condition = hall.run(0.5)
+    assert (condition.level, kinds(condition)) == ("bad", ["broker"])
+    hall.evidence.set_connected(connected=True, now_s=hall.now_s)
+    assert hall.run(1.0).level == "good"
+
+
+@pytest.mark.parametrize(
+    ("change", "back", "level", "kind", "words"),
+    [
+        ({"latency_s": 2.3}, {"latency_s": 1e-3}, "bad", "late", "positions are 2.3 s behind: this computer does not"),
+        ({"latency_s": 0.4}, {"latency_s": 1e-3}, "warning", "late", "positions are 0.4 s behind"),
+        ({"delay_s": 2.0}, {"delay_s": 0.0}, "bad", "late", "2.0 s behind: the broker or the network delivers late"),
+        ({"air": {"missed_share": 0.12}}, {"air": {}}, "warning", "slow", "the emulated air missed 12% of the"),
+        ({"anchors": {"missed_share": 0.7}}, {"anchors": {}}, "bad", "slow", "this computer is too slow: 6 anchors"),
+        ({"lag_s": 0.6}, {"lag_s": 0.0}, "warning", "slow", "the page's server was delayed by 0.6 s"),
+        ({"alert": "detected-excluded"}, {"alert": None}, "warning", "alert", "tags t1 and t2: a faulty anchor is"),
+        ({"alert": "alert-limit-exceeded"}, {"alert": "none"}, "bad", "limit", "above the alert limit"),
+        (
+            {"silent": {2}},
+            {"silent": set()},
+            "warning",
+            "silent-anchors",
+            "anchor 2 does not report, though on the air",
+        ),
+        ({"silent": {5, 6}}, {"silent": set()}, "warning", "anchors", "anchors 5 and 6 of 6 are offline"),
+        ({"silent": {3, 4, 5, 6}}, {"silent": set()}, "bad", "anchors", "of 6 are offline"),
+        ({"anchors": {"synchronised": False}}, {"anchors": {}}, "warning", "not-synchronised", "5 and 6 are not sync"),
+        ({"silent": {"t1"}}, {"silent": set()}, "warning", "no-fix", "tag t1 has no fix"),
+        ({"silent": {"t1", "t2"}}, {"silent": set()}, "bad", "no-fixes", "no positions, although 2 tags are online"),
+    ],
+)
+def test_a_fault_is_reported_within_3_s_and_gone_within_7(hall, change, back, level, kind, words):
+    for name, value in change.items():
+        setattr(hall, name, value)
+    if kind == "anchors":
+        hall.used = tuple(anchor for anchor in IDS if anchor not in hall.silent)
+    condition = hall.run(3.01)
+    assert condition.level == level
+    found = next(reason for reason in condition.reasons if reason.kind == kind)
+    assert words in found.text
+    assert found.advice
+    for name, value in back.items():
+        setattr(hall, name, value)
+    assert hall.run(7.0).level == "good"
+
+
+def test_the_cause_of_a_missing_fix_is_named(hall):
+    hall.silent, hall.tags = {"t1"}, {"t1": {"reason": "too-few-anchors"}}
+    reason = hall.run(4.0).reasons[0]
+    assert reason.text == "tag t1 has no fix: too few anchors"
+    assert reason.names == ("tag/t1",)
+    assert "offline" in reason.advice
+
+
+def test_tags_that_drop_old_receptions_are_named_with_their_number(hall):
+    for k in range(1, 4):
+        hall.tags = {"t2": {"late": 50 * k}}
+        condition = hall.run(1.0)
+    assert condition.text == "this computer is too slow: tag t2 dropped 50 receptions or fixes that were too old"
+    assert hall.run(HOLD_S + 2.0).level == "good"
+
+
+@pytest.mark.parametrize("error_s", [-7200.0, -3.0, 12.5])
+def test_the_clock_of_another_computer_raises_no_alarm_but_a_growing_delay_does(error_s):
+    hall = Hall()
+    hall.host, hall.clock_error_s = "pi7", error_s
+    assert hall.start().run(10.0).level == "good"
+    hall.delay_s = 1.5
+    reason = hall.run(1.0).reasons[0]
+    assert reason.text.startswith("positions are 1.5 s behind")
+    assert "whatever its clock shows" in reason.advice
+
+
+def test_a_delay_of_this_computer_is_found_even_if_it_was_there_from_the_start():
+    hall = Hall()
+    hall.delay_s = 1.5
+    assert hall.start().run(4.0).text.startswith("positions are 1.5 s behind")
+
+
+def test_a_master_that_changes_often_is_reported(hall):
+    for term in range(1, 4):
+        hall.anchors = {"master": 1 + term, "term": term}
+        condition = hall.run(4.0)
+        assert (condition.level == "warning") == (term == 3)
+    assert condition.text == "the master has changed 3 times within a minute; now it is anchor 4"
+
+
+def test_findings_of_the_watch(hall):
+    moved = WatchFinding("moved", (4,), 0.11, 0.01, 1.0, "anchor 4 has moved by about 11 cm.")
+    hall.watch = WatchMessage(1.0, "watching", (moved, replace(moved, kind="delay", sentence="delay of 4")), 15), 1.0
+    condition = hall.run(0.5)
+    assert [(reason.kind, reason.level) for reason in condition.reasons] == [("moved", "bad"), ("watch", "warning")]
+    hall.watch = hall.watch[0], 300.0
+    hall.run(HOLD_S)
+    assert "does not report any more" in hall.run(1.0).text
+
+
+def test_a_stall_of_the_server_blames_no_anchor(hall):
+    hall.now_s += 8.0  # nothing could be read meanwhile
+    condition = hall.monitor.evaluate(hall.now_s, 8.0)
+    assert kinds(condition) == ["slow"]
+    assert hall.run(HOLD_S + 1.5).level == "good"
+
+
+TIMES = st.floats(0.0, 4.0)
+MESSAGES = st.one_of(
+    st.tuples(st.just("connected"), st.booleans()),
+    st.tuples(st.just("status"), st.sampled_from(["anchor", "tag"]), st.sampled_from(["1", "2", "t1"]), st.booleans()),
+    st.tuples(st.just("fix"), st.sampled_from(["t1", "t2"]), st.floats(0.0, 3.0)),
+    st.tuples(st.just("anchor"), st.sampled_from(IDS), st.booleans()),
+    st.tuples(st.just("tag"), st.sampled_from(["t1", "t2"]), st.integers(0, 900)),
+    st.tuples(st.just("evaluate"), st.floats(0.0, 1.0)),
+)
+
+
+@given(st.lists(st.tuples(TIMES, MESSAGES), max_size=40))
+def test_the_condition_is_never_good_without_fresh_evidence(steps):
+    now_s, last_fix_s, connected = 0.0, float("-inf"), False
+    evidence = Evidence(HOST, now_s)
+    monitor = ConditionMonitor(evidence)
+    evidence.set_site(SITE.site, now_s)
+    for wait_s, (kind, *given_values) in steps:
+        now_s += wait_s
+        if kind == "connected":
+            (connected,) = given_values
+            evidence.set_connected(connected=connected, now_s=now_s)
+        elif kind == "status":
+            node_kind, name, online = given_values
+            evidence.add_status(status(node_kind, name, online), now_s)
+        elif kind == "fix":
+            name, latency_s = given_values
+            last_fix_s = now_s
+            evidence.add_fix(fix(name, now_s - latency_s, latency_s=latency_s), now_s)
+        elif kind == "anchor":
+            anchor, synchronised = given_values
+            health = anchor_health(anchor, now_s, synchronised=synchronised)
+            evidence.add_health("anchor", str(anchor), health, now_s, now_s)
+        elif kind == "tag":
+            name, late = given_values
+            evidence.add_health("tag", name, tag_health(name, now_s, late=late), now_s, now_s)
+        condition = monitor.evaluate(now_s, given_values[0] if kind == "evaluate" else 0.0)
+        assert condition.level in {"waiting", "good", "warning", "bad"}
+        assert (condition.level in {"warning", "bad"}) == bool(condition.reasons)
+        assert condition.level == "good" or condition.text
+        if condition.level == "good":
+            assert connected
+            assert now_s - last_fix_s < FRESH_S

@@ -1,0 +1,128 @@
+"""The list of events: what happens once stands there once, in order; what was there before is no event."""
+
+from dashboard_builders import fix, status
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from test_dashboard_condition import anchor_health, tag_health
+
+from skyless.dashboard.condition import Condition
+from skyless.dashboard.events import ALERT_INTERVAL_S, MAX_LOGGED, SILENT_S, EventLog
+from skyless.dashboard.reasons import Reason
+from skyless.mqtt.messages import SurveyMessage, WatchFinding, WatchMessage
+from skyless.survey.facts import Facts
+
+NOW = 1000.0
+
+
+def texts(log, serial=0):
+    return [event.text for event in log.since(serial)]
+
+
+def test_statuses_that_the_broker_kept_are_no_events_and_changes_are():
+    log = EventLog()
+    log.on_status(status("anchor", "3", unix_s=NOW - 500), NOW)
+    log.on_status(status("anchor", "4", online=False), NOW)
+    assert log.since() == []
+    log.on_status(status("anchor", "3", online=False), NOW + 1)
+    log.on_status(status("anchor", "4", unix_s=NOW + 2), NOW + 2)
+    log.on_status(status("recorder", "demo", unix_s=NOW + 2), NOW + 2)
+    assert texts(log) == ["anchor 3 is offline", "anchor 4 is online", "recorder demo started"]
+    assert [(event.serial, event.kind, event.level, event.name) for event in log.since(1)] == [
+        (2, "anchor", "good", "anchor/4"),
+        (3, "program", "note", "recorder/demo"),
+    ]
+    log.on_status(replace(status("recorder", "demo"), pid=7), NOW + 3)
+    log.on_status(status("recorder", "demo", online=False), NOW + 4)
+    assert texts(log, 3) == ["recorder demo started again", "recorder demo ended"]
+
+
+def test_a_node_that_reports_no_more_is_offline_once_and_comes_back():
+    log = EventLog()
+    log.on_status(status("anchor", "3", unix_s=1.0), NOW)
+    log.on_health("anchor", "3", anchor_health(3, NOW), NOW)
+    log.tick(NOW + SILENT_S)
+    assert log.since() == []
+    log.tick(NOW + SILENT_S + 0.1)
+    log.on_status(status("anchor", "3", online=False), NOW + 15)  # the broker's last will, for the same reason
+    log.tick(NOW + 20)
+    assert texts(log) == ["anchor 3 does not report any more"]
+    log.on_status(status("anchor", "3", unix_s=NOW + 30), NOW + 30)
+    log.on_health("anchor", "3", anchor_health(3, NOW), NOW + 31)
+    log.tick(NOW + 36)
+    log.on_health("anchor", "3", anchor_health(3, NOW), NOW + 37)
+    assert texts(log, 1) == ["anchor 3 is online", "anchor 3 does not report any more", "anchor 3 reports again"]
+
+
+def test_a_takeover_names_both_masters():
+    log = EventLog()
+    for k, master in enumerate((1, 1, 2)):
+        for anchor in (1, 2, 3):
+            log.on_health("anchor", str(anchor), anchor_health(anchor, NOW, master, master), NOW + k)
+    assert texts(log) == ["anchor 2 is the master now, after anchor 1"]
+
+
+def test_alerts_begin_and_end_and_are_not_repeated_often():
+    log = EventLog()
+    for k in range(40):
+        log.on_fix(fix(alert="alert-limit-exceeded" if k % 10 < 2 else "none"), NOW + 0.5 * k)
+        log.tick(NOW + 0.5 * k)
+    assert [(event.level, event.text, event.unix_s - NOW) for event in log.since()] == [
+        ("bad", "tag t1: the protection level is above the alert limit", 0.0),
+        ("good", "tag t1: integrity alert ended", 2.0),
+        ("bad", "tag t1: the protection level is above the alert limit (1 more since the last one)", ALERT_INTERVAL_S),
+        ("good", "tag t1: integrity alert ended", 12.0),
+    ]
+
+
+def test_findings_of_the_watch_begin_and_end():
+    log = EventLog()
+    moved = WatchFinding("moved", (4,), 0.11, 0.01, 1.0, "anchor 4 has moved by about 11 cm.")
+    for k, findings in enumerate(((), (moved,), (replace(moved, size_m=0.12),), ())):
+        log.on_watch(WatchMessage(1.0, "watching", findings, 15), NOW + k)
+    assert texts(log) == ["anchor 4 has moved by about 11 cm", "no longer found: anchor 4 has moved by about 11 cm"]
+
+
+def test_a_saved_survey_is_an_event_once():
+    log = EventLog()
+    survey = SurveyMessage(1.0, 12, (1,), (), 1.0, (), Facts(), None, by="x")
+    for saved in (None, 11, 11, 12):
+        log.on_survey(replace(survey, saved_serial=saved, file="hall.toml"), NOW)
+    log.on_survey(replace(survey, saved_serial=3, by="another"), NOW)
+    assert texts(log) == [f"survey result {serial} saved to hall.toml" for serial in (11, 12)]
+
+
+def test_the_condition_is_an_event_when_its_level_or_first_reason_changes():
+    log = EventLog()
+    late = Reason("late", "warning", "positions are 0.4 s behind", "")
+    for condition in (
+        Condition("waiting", "no tag is online", (), None, None),
+        Condition("good", "", (), None, None),
+        Condition("warning", late.text, (late,), None, None),
+        Condition("warning", "positions are 0.5 s behind", (late,), None, None),
+        Condition("good", "", (), None, None),
+    ):
+        log.on_condition(condition, NOW)
+    assert texts(log) == ["condition good", "warning: positions are 0.4 s behind", "condition good"]
+
+
+@given(st.lists(st.tuples(st.booleans(), st.sampled_from("abc"), st.floats(0.0, 9.0)), max_size=60), st.integers(0, 70))
+def test_readers_get_every_event_once_in_order(steps, serial):
+    log, now = EventLog(), NOW
+    for online, name, wait_s in steps:
+        now += wait_s
+        log.on_status(status("tag", name, online, unix_s=now), now)
+        log.on_health("tag", name, tag_health(name, now), now)
+        log.tick(now)
+    events = log.since()
+    assert [event.serial for event in events] == list(range(1, log.serial + 1))
+    assert [event.unix_s for event in events] == sorted(event.unix_s for event in events)
+    assert log.since(serial) == events[serial:]
+
+
+def test_the_newest_are_kept():
+    log = EventLog()
+    for k in range(2 * MAX_LOGGED):
+        log.on_status(status("tag", "t1", online=bool(k % 2), unix_s=NOW), NOW)
+    assert len(log.since()) == MAX_LOGGED
+    assert log.since()[-1].serial == log.serial

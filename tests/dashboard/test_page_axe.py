@@ -1,0 +1,107 @@
+"""Axe, a checker of accessibility, finds nothing serious: both themes, every tab, live, in a replay, in the set-up.
+
+What it cannot find, such as the order of the keyboard's focus, is in ``test_page_look.py``.
+"""
+
+import pytest
+from page_browser import THREE_FRAMES, until
+from page_fake_survey import FakeSurvey
+
+axe = pytest.importorskip("axe_playwright_python.base")
+
+SERIOUS = {"serious", "critical"}
+RUN = """async (context) => {
+  const found = await axe.run(context ?? document, { resultTypes: ["violations"] });
+  return found.violations.map(({ id, impact, nodes }) => ({
+    id,
+    impact,
+    nodes: nodes.slice(0, 5).map((node) => `${node.target.join(" ")}: ${node.any.map((one) => one.message)}`),
+  }));
+}"""
+
+
+class Checks:
+    """An open page, and what axe has found in it so far."""
+
+    def __init__(self, visit):
+        self.visit, self.page, self.found = visit, visit.page, {}
+        self.page.evaluate(axe.AXE_SCRIPT)
+
+    def check(self, what, context=None):
+        """Note the serious findings in the page, or in a part of it."""
+        self.page.evaluate(THREE_FRAMES)
+        faults = [fault for fault in self.page.evaluate(RUN, context) if fault["impact"] in SERIOUS]
+        if faults:
+            self.found[what] = faults
+
+    def check_tabs(self, what):
+        for tab in self.page.evaluate("[...document.querySelectorAll('#tabs [role=tab]')].map((tab) => tab.id)"):
+            self.page.click(f"#{tab}")
+            self.check(f"{what}, {tab}", "#panel")
+
+
+@pytest.fixture(params=["dark", "light"])
+def checks(request, serve, visit):
+    return lambda server: Checks(visit(server, color_scheme=request.param))
+
+
+def test_the_live_page(serve, checks):
+    live = checks(serve(tags=4))
+    page = live.page
+    page.wait_for_selector("table.tags tr.fresh")
+    page.click("#legend summary")
+    live.check("whole page")
+    live.check_tabs("live")
+    page.click("#tab-tags")
+    page.click("table.tags button >> nth=0")
+    page.wait_for_selector("#panel-tags .detail canvas")
+    live.check("a tag", "#panel")
+    page.click("#tab-anchors")
+    page.click("table.anchors button >> nth=2")
+    page.wait_for_selector("#panel-anchors .detail canvas")
+    live.check("an anchor", "#panel")
+    page.click("#tab-zones")
+    page.click("#panel-zones .zones >> text=Corners")
+    live.check("corners of a zone", "#panel")
+    page.click("#draw")
+    live.check("a zone is drawn", "#map")
+    assert live.found == {}
+
+
+def test_a_replay(serve, checks):
+    replay = checks(serve())
+    page = replay.page
+    page.click("#tab-recordings")
+    page.click(".recording")
+    until(page, "skyless.state.player?.events && !skyless.state.player.waiting")
+    page.focus(".event-mark")
+    replay.check("whole page")
+    replay.check_tabs("replay")
+    assert replay.found == {}
+
+
+def test_a_lost_connection(serve, checks):
+    server = serve()
+    lost = checks(server)
+    server.cut()
+    lost.page.wait_for_selector("#banner.lost")
+    lost.check("whole page")
+    assert lost.found == {}
+    lost.page.evaluate("document.getElementById('fit').removeAttribute('aria-label')")
+    lost.page.evaluate("document.getElementById('fit').removeAttribute('title')")
+    lost.check("axe finds what is there to be found", "#map")
+    assert [fault["id"] for fault in lost.found.popitem()[1]] == ["button-name"]
+    server.refuse = False
+    until(lost.page, "skyless.state.connection.phase === 'open'", timeout_s=15.0)
+    lost.visit.problems.clear()  # the browser's own lines about the refused sockets
+
+
+def test_the_set_up(serve, checks):
+    setup = checks(serve(tags=0, placed=False, survey=FakeSurvey()))
+    page = setup.page
+    page.wait_for_selector("#panel-setup .step")
+    for step in page.query_selector_all("#panel-setup .step > summary"):
+        step.click()
+        setup.check(step.inner_text(), "#panel")
+    setup.check("whole page")
+    assert setup.found == {}

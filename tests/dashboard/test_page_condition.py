@@ -1,0 +1,160 @@
+"""The page shows the condition of the site with its reasons, and is never green without fresh evidence."""
+
+import time
+
+import page_fake_site as made_up
+import pytest
+from page_browser import until
+
+OFFLINE = made_up.reason("anchors", "warning", "anchor 8 of 8 is offline", "See its power.", ["anchor/8"])
+SLOW = made_up.reason("slow", "bad", "this computer is too slow: the emulated air missed 41 % of the transmissions")
+
+
+@pytest.fixture
+def hall(serve, visit):
+    server = serve()
+    return server, visit(server)
+
+
+def pill_is(page, level):
+    until(page, "level => document.getElementById('pill').className === `pill ${level}`", arg=level)
+
+
+def test_the_pill_has_the_level_and_the_first_reason_and_so_has_the_browsers_tab(hall):
+    server, visit = hall
+    page = visit.page
+    pill_is(page, "good")
+    assert (page.locator("#pill").inner_text(), page.title()) == ("Live", "● Hall 7 · Skyless")
+    server.condition = made_up.condition(OFFLINE)
+    pill_is(page, "warning")
+    assert page.locator("#pill").inner_text() == "Anchor 8 of 8 is offline"
+    assert page.title().startswith("▲ ")
+    assert page.locator("#condition-said").inner_text() == "Warning. Anchor 8 of 8 is offline"
+    server.condition = made_up.condition(SLOW, OFFLINE)
+    pill_is(page, "bad")
+    assert page.title().startswith("✕ ")
+    server.condition = made_up.condition(level="waiting", text="no tag is online")
+    pill_is(page, "waiting")
+    assert (page.locator("#pill").inner_text(), page.title()[0]) == ("No tag is online", "○")
+
+
+def test_all_reasons_are_listed_on_a_click_by_the_pointer_and_by_keys(hall):
+    server, visit = hall
+    page = visit.page
+    server.condition = made_up.condition(SLOW, OFFLINE)
+    pill_is(page, "bad")
+    panel = page.locator("#condition-list")
+    assert panel.is_hidden()
+    page.hover("#pill")
+    panel.wait_for()
+    assert panel.locator("li").count() == 2
+    assert "2 things are wrong" in panel.inner_text()
+    assert "See its power." in panel.inner_text()
+    page.mouse.move(400, 400)
+    panel.wait_for(state="hidden")
+    page.click("#pill")
+    page.mouse.move(400, 400)
+    assert page.locator("#pill").get_attribute("aria-expanded") == "true"
+    panel.locator("button:has-text('Show anchor 8')").click()
+    page.wait_for_selector("#panel-anchors tr.selected:has-text('8')")
+    page.keyboard.press("Escape")
+    panel.wait_for(state="hidden")
+    page.mouse.click(400, 400)
+    page.focus("#theme")
+    page.keyboard.press("Shift+Tab")
+    panel.wait_for()
+    page.keyboard.press("Escape")
+    panel.wait_for(state="hidden")
+
+
+def test_without_a_judgement_or_with_an_old_one_the_page_is_not_green(serve, visit):
+    server = serve()
+    server.condition = None
+    page = visit(server).page
+    pill_is(page, "waiting")
+    server.condition = made_up.condition()
+    pill_is(page, "good")
+    server.condition = None  # positions still come
+    pill_is(page, "waiting")
+    assert page.locator("#pill").inner_text() == "The server is silent"
+    assert page.evaluate("skyless.state.connection.phase") == "open"
+
+
+def test_a_lost_broker_or_connection_is_not_green(hall):
+    server, visit = hall
+    page = visit.page
+    pill_is(page, "good")
+    server.send({"type": "mqtt", "connected": False, "broker": "mqtt://hall:1883"})
+    until(page, "!document.getElementById('pill').className.includes('good')")
+    server.send({"type": "mqtt", "connected": True, "broker": "mqtt://hall:1883"})
+    pill_is(page, "good")
+    server.mute = True
+    until(page, "!document.getElementById('pill').className.includes('good')", timeout_s=8.0)
+    pill_is(page, "lost")
+    assert page.locator("#summary").inner_text().count("–") >= 3  # no figures of before
+
+
+def test_a_page_too_many_shows_why(hall):
+    server, visit = hall
+    server.full = True
+    server.cut()
+    server.refuse = False
+    until(visit.page, "document.getElementById('banner').innerText.includes('too many pages are open')", timeout_s=8.0)
+    server.full = False
+    visit.page.locator("#banner").wait_for(state="hidden")
+    visit.problems[:] = [text for text in visit.problems if "WebSocket connection" not in text]
+
+
+def test_the_summary_has_figures(hall):
+    _, visit = hall
+    page = visit.page
+    page.wait_for_selector("#summary dd:text-is('3/3')")
+    shown = page.locator("#summary").inner_text().replace("\n", " ")
+    assert "Anchors 7/8" in shown
+    assert "1.2 ms, p99 3.4 ms" in shown
+    page.click("#pill")
+    shown = page.locator("#condition-list").inner_text()
+    assert "Hall 7, number 7" in shown
+    assert "Protection level" in shown
+
+
+def test_a_dead_anchor_has_no_figures(hall):
+    _, visit = hall
+    page = visit.page
+    page.click("#tab-anchors")
+    dead = page.locator("#panel-anchors tr.bad:has-text('8')")
+    dead.wait_for()
+    assert dead.locator("td").all_inner_texts()[2:] == ["–"] * 4
+    page.click("#panel-anchors button:text-is('8')")
+    page.wait_for_selector("#panel-anchors .detail dd:has-text('its figures are not known')")
+    assert set(page.locator("#panel-anchors .detail output").all_inner_texts()) <= {"–"}
+
+
+def test_events_are_listed_filtered_and_counted(hall):
+    server, visit = hall
+    page = visit.page
+    now = time.time()
+    events = [
+        made_up.event(1, now - 60, "good", "anchor", "anchor/3", "anchor 3 is online"),
+        made_up.event(2, now - 50, "note", "program", "recorder/demo", "recorder demo started"),
+        made_up.event(3, now - 40, "bad", "anchor", "anchor/8", "anchor 8 is offline"),
+        made_up.event(4, now - 30, "bad", "alert", "tag/robot", "tag robot: a fault is not excluded"),
+    ]
+    server.send({"type": "log", "events": events})
+    page.wait_for_selector("#tab-events .unread:has-text('2')")
+    page.click("#tab-events")
+    rows = page.locator("#event-list li")
+    until(page, "document.querySelectorAll('#event-list li').length === 4")
+    assert "robot" in rows.first.inner_text()
+    until(page, "document.querySelector('#tab-events .unread') === null")
+    page.select_option("#event-filter", "severe")
+    until(page, "document.querySelectorAll('#event-list li').length === 2")
+    page.select_option("#event-filter", "programs")
+    until(page, "document.querySelectorAll('#event-list li').length === 1")
+    page.select_option("#event-filter", "all")
+    server.send(
+        {"type": "log", "events": [*events[2:], made_up.event(5, now, "warning", "master", "anchor/2", "anchor 2")]}
+    )
+    until(page, "document.querySelectorAll('#event-list li').length === 5")
+    page.click("#event-list button:has-text('Anchor 8 is offline')")
+    page.wait_for_selector("#panel-anchors tr.selected:has-text('8')")

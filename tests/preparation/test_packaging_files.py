@@ -1,0 +1,69 @@
+"""What is packaged runs commands that exist: compose.yaml, the recipe of its image, systemd's units."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+
+from skyless.cli.main import program
+
+ROOT = Path(__file__).parents[2]
+COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
+UNITS = sorted((ROOT / "packaging" / "systemd").glob("*.service"))
+DOCKERFILE = (ROOT / "packaging" / "Dockerfile").read_text(encoding="utf-8")
+
+
+def commands():
+    """Each command of Skyless with its arguments, by where it stands."""
+    for name, service in COMPOSE["services"].items():
+        yield pytest.param(service["command"], id=f"compose {name}")
+    for unit in UNITS:
+        (line,) = re.findall(
+            r"^ExecStart=/opt/skyless/bin/skyless (.*)$", unit.read_text(encoding="utf-8"), re.MULTILINE
+        )
+        line = re.sub(r"\$\{\w*LIMIT\w*}", "1000", re.sub(r"%i", "1", line))
+        yield pytest.param(shlex.split(line), id=unit.name)
+    yield pytest.param(json.loads(re.findall(r"^CMD (.*)$", DOCKERFILE, re.MULTILINE)[0]), id="image")
+    yield pytest.param(
+        shlex.split(re.findall(r"^RUN skyless (.*?) *\\?$", DOCKERFILE, re.MULTILINE)[0]), id="image, built"
+    )
+
+
+@pytest.mark.parametrize("words", list(commands()))
+def test_it_is_a_command_of_skyless(words):
+    program().parse_args(words, print_error=False, exit_on_error=False)
+
+
+def test_the_demo_starts_without_a_profile_and_the_site_brings_its_own_services():
+    services = COMPOSE["services"]
+    assert [name for name, service in services.items() if "profiles" not in service] == ["demo"]
+    assert set(services["site"]["depends_on"]) == services.keys() - {"demo", "site"}
+    for name, service in services.items():
+        assert service["read_only"], name
+        assert service["cap_drop"] == ["ALL"], name
+
+
+def test_the_image_runs_as_a_user_without_rights_and_holds_only_what_is_copied():
+    assert re.search(r"^USER skyless$", DOCKERFILE, re.MULTILINE)
+    kept = {
+        line.removeprefix("!") for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")
+    }
+    copied = {
+        name for line in re.findall(r"^COPY (?!--from)(.*) \S+$", DOCKERFILE, re.MULTILINE) for name in line.split()
+    }
+    assert copied == kept
+    assert all((ROOT / name).exists() for name in copied)
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
+def test_a_unit_is_hardened_and_waits_only_for_units_that_are_there(unit):
+    text = unit.read_text(encoding="utf-8")
+    lines = text.splitlines()
+    assert {"NoNewPrivileges=true", "ProtectSystem=strict", "User=skyless"} <= set(lines)
+    assert "Restart=" in text or "Type=oneshot" in text
+    assert "MemoryDenyWriteExecute=true" not in lines  # kernels are made while it runs
+    wanted = re.findall(r"skyless-[\w@]+\.service", text)
+    assert set(wanted) <= {other.name for other in UNITS}

@@ -1,0 +1,57 @@
+"""Pictures of studies say which side of a limit is safe."""
+
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from skyless.studies.catalogue import STUDIES
+from skyless.studies.common.plan import Row
+from skyless.studies.common.sides import CONFIDENCE, STATED_RISK, shade_sides
+
+
+def row(study, number, case, series, x=None, **more):
+    given = {
+        "study": study, "method": "joint", "case": case, "series": series, "x": x, "mesh": True, "noise_ps": 100.0,
+        "runs": 10, "fixes": 1000, "rmse_m": 0.03 + 0.01 * number, "nees": 0.7 + 0.25 * number, "ratio": 1.0,
+        "ratio_error": 0.02, "level": 0.9, "exceeded": 1e-4, "found": 0.9, "found_s": 3.0, "hpl_m": 0.1,
+        "available": 0.9, "risk": 1e-4, "hmi": 1e-5 * number, "hmi_interval": (0.0, 1e-4),
+    }  # fmt: skip
+    return Row(**(given | more))
+
+
+def words_of(figure):
+    found = []
+    for axes in figure.axes:
+        found += [text.get_text() for text in axes.texts] + [axes.get_xlabel(), axes.get_ylabel()]
+    return " ".join(found)
+
+
+@pytest.mark.parametrize("name", ["efficiency", "loss", "nlos", "room", "large", "survey", "watch", "sync"])
+def test_every_figure_that_can_mislead_names_its_safe_side(name):
+    for x in (None, 1.0):
+        rows = [row(name, n, f"case {n}", "a series", x and n + x) for n in range(3)]
+        assert "safe side" in words_of(STUDIES[name].draw(rows))
+
+
+def test_levels_and_site_time_name_theirs():
+    faults = [row("integrity", n, f"lab, step {n} m", "lab, step", float(n)) for n in range(1, 4)]
+    words = words_of(STUDIES["integrity"].draw([row("integrity", 0, "lab, clean", "lab, clean", 0.0), *faults]))
+    assert STATED_RISK.above in words
+    assert "too confident" in words
+    hops = [row("sitetime", n, f"chain: hop {n}", "site time", n) for n in (1, 2, 5)]
+    assert "too confident" in words_of(STUDIES["sitetime"].draw(hops))
+
+
+@pytest.mark.parametrize("scale", ["linear", "log"])
+@pytest.mark.parametrize("values", [(0.2, 0.4), (3.0, 5.0), (0.5, 2.0)])
+def test_both_sides_are_in_view_and_meet_at_the_limit(scale, values):
+    axes = Figure().subplots()
+    axes.plot([0.0, 1.0], values)
+    axes.set_yscale(scale)
+    shade_sides(axes, CONFIDENCE, 1.0, along="y")
+    low, high = axes.get_ylim()
+    assert low < 1.0 < high
+    bands = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
+    edges = sorted((patch.get_y(), patch.get_y() + patch.get_height()) for patch in bands)
+    assert edges[0][1] == pytest.approx(1.0)
+    assert edges[1][0] == pytest.approx(1.0)
