@@ -28,7 +28,8 @@ def warm(*, method: str | None = None, json: bool = False) -> None:
     Parameters
     ----------
     method
-        Only what anchors, tags and the simulation need with this positioning method; by default everything.
+        How positions are computed: only what anchors, tags and the simulation need with this method; by default
+        everything.
     json
         Write one JSON object instead of a line.
     """
