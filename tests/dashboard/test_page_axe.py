@@ -43,7 +43,7 @@ class Checks:
 
 @pytest.fixture(params=["dark", "light"])
 def checks(request, serve, visit):
-    return lambda server: Checks(visit(server, color_scheme=request.param))
+    return lambda server: Checks(visit(server, color_scheme=request.param, reduced_motion="reduce"))
 
 
 def test_the_live_page(serve, checks):
