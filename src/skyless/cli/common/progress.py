@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Final, Self
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from skyless.kernels.cache import KernelFolder
     from skyless.preparation.parts import Part
     from skyless.preparation.processes import Preparation
 
@@ -100,21 +99,17 @@ def compile_with_counts(parts: "Iterable[Part]") -> tuple[str, ...]:
 
 
 def report_kernel_folder() -> None:
-    """One line where compiled kernels cannot be kept for good."""
+    """One line where the kernels that have to be compiled now cannot be kept for good."""
     from skyless.kernels.cache import kernel_folder
 
     folder = kernel_folder()
-    if folder.temporary:
-        _print_line(
-            f"no folder can be written to keep compiled kernels; {_for_how_long(folder)}. "
-            "To keep them, let NUMBA_CACHE_DIR name a folder that can be written"
-        )
-
-
-def _for_how_long(folder: "KernelFolder") -> str:
-    if folder.writable:
-        return f"they are in {folder.path.parent}, which the system may clear"
-    return "every program compiles them at every start, for a minute or so"
+    if not folder.writable:
+        where = f"every program compiles them at every start, for a minute or so, as {folder.path} cannot be written"
+    elif folder.temporary:
+        where = f"they are in {folder.path.parent}, which the system may clear"
+    else:
+        return
+    _print_line(f"no folder keeps compiled kernels: {where}. Let NUMBA_CACHE_DIR name a folder that can be written")
 
 
 class CountLine:
