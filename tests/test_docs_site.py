@@ -26,8 +26,8 @@ OTHER_PROGRAMS = {
     "--no-dev",
     "--compile-bytecode",
     "--help",
-    "--user",
     "--home-dir",
+    "--user",
 }
 GENERATOR = ("sphinx", "myst_parser", "furo", "latex2mathml")
 

@@ -4,7 +4,6 @@ import csv
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -22,7 +21,7 @@ from skyless.cli.common.options import (
     check_picture,
     options,
 )
-from skyless.cli.common.output import number, open_for_writing, print_facts, print_json
+from skyless.cli.common.output import new_table, number, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.cli.common.recording_inputs import is_mcap, lever_arm, wished_height
 from skyless.errors import SkylessError
@@ -45,9 +44,6 @@ FIXES_COLUMNS: Final = (
 NO_FIX: Final = 1
 """Exit code of a replay without any fix."""
 
-_MOST_WITHOUT_ANCHORS: Final = 20_000
-"""Records within which a recording that carries its anchors' positions has one of them."""
-
 _MOST_DROPS: Final = 3
 """Reasons for drops that are named when there is no fix."""
 
@@ -62,13 +58,14 @@ class _OtherProtection(ProtectionOptions):
     """What is required of protection levels, instead of what the tag did."""
 
     integrity_risk: IntegrityRisk | None = None
-    """Another probability than the tag's own that an error exceeds its protection level, in recordings of skyless
-    record (joint)."""
+    """Probability, for each fix, that the error exceeds its protection level, in recordings of skyless record (joint);
+    by default the tag's own."""
     alert_limit_m: Positive | None = None
-    """Another alert limit than the tag's own, in metres."""
+    """Fixes whose protection level exceeds this, in metres, carry an alert; by default the tag's own limit holds."""
     max_acceleration: NotNegative | None = None
-    """Another largest acceleration than the tag's own, in m/s². With any of these, or --tag-height-std, tags start from
-    the beginning, as with another method, and those that are not given are as of a tag of which nothing was asked."""
+    """The largest acceleration of the tags in m/s²; by default what the tag assumed. With any of these, or
+    --tag-height-std, tags start from the beginning, as with another method, and those that are not given are as of
+    a tag of which nothing was asked."""
 
 
 @options
@@ -78,14 +75,14 @@ class ReplayOptions:
     anchors: Path | None = None
     """Table of anchors: id,x_m,y_m,z_m, with bias_m where skyless calibrate has been; that is then taken off."""
     site: Path | None = None
-    """A site file instead, for its anchors and its tags' height. With a recording of skyless record: replay as if
-    its anchors had had the antenna delays of this file, as skyless calibrate writes them."""
+    """Site file instead of --anchors, for its anchors and its tags' height. With a recording of skyless record:
+    replay as if its anchors had had the antenna delays of this file, as skyless calibrate writes them."""
     truth: Path | None = None
     """Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns. MILUV ticks bring their own."""
     lever_arm: str | None = None
     """The antenna in the body's frame, x,y,z in metres, added to the truth."""
     tag_height: str = "auto"
-    """The tag's height: metres, truth (its median), free (estimated), or auto: free where the anchors determine it."""
+    """The tags' height: metres, truth (its median), free (estimated), or auto: free where the anchors determine it."""
     tag_height_std: NotNegative | None = None
     """Standard deviation of the tag's height from the one that is given, in metres, which fixes and levels then
     count; by default 0.5 where the height is only taken for the anchors', else 0."""
@@ -107,7 +104,7 @@ class ReplayOptions:
     tag: str | None = None
     """Name of the tag, in recordings of skyless record; by default all."""
     method: str | None = None
-    """Another method than the tag's own, in recordings of skyless record."""
+    """How positions are computed, in recordings of skyless record; by default as the tag did."""
     measurements: str | None = None
     """What the filter is given of other recordings: packets, as anchors sent them, which is the default for
     Bitcraze's; or differences, which are made of them."""
@@ -115,7 +112,7 @@ class ReplayOptions:
     fixes_csv: Path | None = None
     """Write every fix into this table."""
     plot: Path | None = None
-    """Draw track, errors and histograms into this PNG, SVG or PDF."""
+    """Draw the picture into this file (PNG, SVG or PDF): track, errors and histograms."""
     json: bool = False
     """Write one JSON object instead of the table."""
 
@@ -187,8 +184,6 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> "ReplayReport":
     }  # fmt: skip
     check_left_out(of_sites, "it is for recordings of skyless record")
     anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)
-    if not anchors_m:
-        _check_carries_anchors(file, asked)
     run = CaptureRun(
         CaptureRequest(
             path=file,
@@ -217,26 +212,6 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> "ReplayReport":
     else:
         _show(report, run.height_note, summary["anchor_distances_m"])
     return report
-
-
-def _check_carries_anchors(file: Path, asked: ReplayOptions) -> None:
-    """See that a recording without a table of anchors says itself where they are, before the whole of it is read.
-
-    Raises SkylessError.
-    """
-    from skyless.recordings.foreign.formats import open_recording
-
-    read = 0
-    with open_recording(file, asked.format, asked.listener) as recording:
-        for read, record in enumerate(islice(recording, _MOST_WITHOUT_ANCHORS), start=1):  # noqa: B007 - used below
-            if getattr(record, "position_m", None) is not None:
-                return
-        name = recording.format.name
-    if read:
-        raise SkylessError(
-            f"--anchors is missing: {file} ({name}) does not say where its anchors are; give their table, "
-            "id,x_m,y_m,z_m, or --site"
-        )
 
 
 def _run_foreign(run: "Replay", file: Path, fixes: Path | None) -> "ReplayReport":
@@ -331,7 +306,7 @@ def _table_of_fixes(path: Path | None, columns: tuple[str, ...]) -> Iterator[Cal
     if path is None:
         yield None
         return
-    with open_for_writing(path) as file:
+    with new_table(path) as file:
         writer = csv.writer(file)
         writer.writerow(columns)
 

@@ -1,8 +1,9 @@
 """All of ``skyless replay`` on a recording of another system, but for what it writes."""
 
 from collections import Counter
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -13,10 +14,13 @@ from skyless.errors import ConfigurationError, SkylessError
 from skyless.evaluation.judge import Judge
 from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
 from skyless.recordings.foreign.avalue import anchor_distances_m
-from skyless.recordings.foreign.formats import format_of
+from skyless.recordings.foreign.formats import format_of, open_recording
 from skyless.recordings.truth import Truth
 from skyless.replays.captures import MEASUREMENTS, Replay, ReplayReport, ReplayRequest
 from skyless.replays.inputs import flight_height, height_to_hold
+
+_MOST_WITHOUT_ANCHORS: Final = 20_000
+"""Records within which a recording that carries its anchors' positions has one of them."""
 
 
 class CaptureRequest(Struct, frozen=True):
@@ -48,6 +52,8 @@ class CaptureRun:
         if asked.measurements not in {None, *MEASUREMENTS}:
             right = ", ".join(MEASUREMENTS)
             raise SkylessError(f"--measurements is {asked.measurements!r}; it should be one of {right}")
+        if not asked.anchors_m:
+            _check_carries_anchors(asked)
         truth, name = asked.truth, format_of(asked.path, asked.format).name
         height_m, std_m, self.height_note = height_to_hold(
             asked.tag_height, asked.anchors_m, asked.site_height_m, truth, name
@@ -86,6 +92,24 @@ class CaptureRun:
         """The report as one tree of plain values."""
         distances = distances_of(self._asked.path, report.format)
         return {**msgspec.to_builtins(report), "height_note": self.height_note, "anchor_distances_m": distances}
+
+
+def _check_carries_anchors(asked: CaptureRequest) -> None:
+    """See that a recording without a table of anchors says itself where they are, before the whole of it is read.
+
+    Raises SkylessError.
+    """
+    read = 0
+    with open_recording(asked.path, asked.format, asked.listener) as recording:
+        for read, record in enumerate(islice(recording, _MOST_WITHOUT_ANCHORS), start=1):  # noqa: B007 - used below
+            if getattr(record, "position_m", None) is not None:
+                return
+        name = recording.format.name
+    if read:
+        raise SkylessError(
+            f"--anchors is missing: {asked.path} ({name}) does not say where its anchors are; give their table, "
+            "id,x_m,y_m,z_m, or --site"
+        )
 
 
 def _check_times(table: Path, truth: Truth, judge: Judge) -> None:

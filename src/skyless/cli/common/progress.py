@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Self
 
 if TYPE_CHECKING:
@@ -88,15 +88,15 @@ def loading_kernels(*parts: "Part") -> Iterator[None]:
         yield
 
 
-def compile_with_counts(parts: "Iterable[Part]") -> None:
-    """Compile what is missing of the parts and say how far it is; a part that cannot be is left to its user."""
+def compile_with_counts(parts: "Iterable[Part]") -> tuple[str, ...]:
+    """Compile what is missing of the parts, saying how far it is; a sentence for each part that cannot be compiled."""
     import asyncio
 
-    from skyless.preparation.processes import CompilationError, compile_parts
+    from skyless.preparation.processes import compile_parts
 
     report_kernel_folder()
-    with CountLine() as line, suppress(CompilationError):
-        asyncio.run(compile_parts(parts, line.show))
+    with CountLine() as line:
+        return asyncio.run(compile_parts(parts, line.show))
 
 
 def report_kernel_folder() -> None:
