@@ -205,10 +205,7 @@ def plan(
     known, file = site_of(site, slots_given=False)
     check_number("range_m", range_m, above=0.0)
     check_number("step_m", step_m, above=0.0)
-    heights_m = _heights("tag_heights_m", tag_heights_m)
-    if heights_m is not None and known.tags.height_m is not None:
-        raise wrong("tag_heights_m", tag_heights_m, f"left out: this site's tags are all at {known.tags.height_m:g} m")
-    heights_m = heights_m or (usual_tag_heights(known) if known.anchors else (0.0,))
+    heights_m = _tag_heights(tag_heights_m, known)
     outline, region = _outline(outline_m), _region(region_m)
     if not known.schedule.needs_master:
         of_masters = {
@@ -218,7 +215,9 @@ def plan(
         _refuse(of_masters, f"in mode {known.schedule.mode}: errors are predicted for sites with one master only")
         check_number("exponent", exponent, least=1.5, most=6.0)
         with named_as_arguments(_ARGUMENTS):
-            return plan_slots(known, file, outline, region, heights_m, step_m, range_m, exponent or 2.0)
+            slot_plan = plan_slots(known, file, outline, region, heights_m, step_m, range_m, exponent or 2.0)
+        report_progress(1.0)
+        return slot_plan
     _refuse({"exponent": exponent}, "in mode master, whose anchors share no slots")
     check_choice("method", method, METHODS)
     check_number("noise_ps", noise_ps, above=0.0, most=NOISIEST_PS)
@@ -252,6 +251,7 @@ def plan(
         if verify_points is not None:
             points_m = random_points(mapped, verify_points, seed)
             checked = verify(predictor, points_m, verify_rounds, seed, report_progress)
+        report_progress(1.0)
         found = plan_report(predictor, floor, mounts, mapped, summary_of(mapped, target_m), optimised, checked)
     return PlanResult(predictor.site, file, floor, mapped, {**found, "wall_s": time.perf_counter() - started_s})
 
@@ -261,6 +261,13 @@ def _refuse(given: Mapping[str, object], mode: str) -> None:
     for name, value in given.items():
         if value is not None and value is not False:
             raise SkylessError(f"{name} is not for this site, which is {mode}; leave it out")
+
+
+def _tag_heights(values_m: Sequence[float] | None, site: Site) -> tuple[float, ...]:
+    heights_m = _heights("tag_heights_m", values_m)
+    if heights_m is not None and site.tags.height_m is not None:
+        raise wrong("tag_heights_m", values_m, f"left out: this site's tags are all at {site.tags.height_m:g} m")
+    return heights_m or (usual_tag_heights(site) if site.anchors else (0.0,))
 
 
 def _heights(name: str, values_m: Sequence[float] | None) -> tuple[float, ...] | None:

@@ -215,6 +215,7 @@ def _replay_capture(asked: CaptureRequest, truth_table: Path | None, progress: P
 
     size = max(asked.path.stat().st_size, 1)
     report = run.replay.run(on_fix, lambda read: progress(min(read / size, 1.0)))
+    progress(1.0)
     run.check(report, truth_table)
     return ReplayResult(asked.path, {"tag": report}, recorder.fixes(), run.height_note, run.summary(report))
 
@@ -230,6 +231,7 @@ def _replay_site(path: Path, recording: McapRecording, run: SiteReplay, progress
         recorder.add(numbers[name], made.unix_s, made.fix, truth_m, judged=judged)
 
     reports = run.run(on_fix, lambda done_s: progress(min(max(done_s / span_s, 0.0), 1.0)))
+    progress(1.0)
     by_tag: dict[str, ReplayReport] = {report.tag: report for report in reports}
     return ReplayResult(path, by_tag, recorder.fixes(), "from the site", summary_of(reports))
 

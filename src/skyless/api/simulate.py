@@ -204,7 +204,9 @@ def simulate(
         judged_before[made.tag] = judged
 
     started_s = time.perf_counter()
-    run_fleet(fleet, request, until_s, on_fix, progress or silent)
+    report_progress = progress or silent
+    run_fleet(fleet, request, until_s, on_fix, report_progress)
+    report_progress(1.0)
     found = report(fleet, method, started_s)
     return SimulationResult(request.site, seed, settle_s, noise_ps, found, recorder.fixes())
 

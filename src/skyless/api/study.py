@@ -171,5 +171,7 @@ def study(
             integrity_risk=integrity_risk,
             alert_limit_m=alert_limit_m,
         )
-        rows = run_study(chosen, plan, progress or silent, processes, scheduler)
+        report_progress = progress or silent
+        rows = run_study(chosen, plan, report_progress, processes, scheduler)
+        report_progress(1.0)
     return StudyResult(name, plan, tuple(rows), time.perf_counter() - started_s)
