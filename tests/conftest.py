@@ -13,9 +13,10 @@ settings.load_profile("skyless")
 
 @pytest.fixture(scope="session", autouse=True)
 def own_data_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What programs keep for their user (broker, recordings) stays out of the real user's folder."""
+    """What programs keep for their user (broker, recordings) stays out of the real user's folders."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("data")))
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
         yield
 
 

@@ -26,8 +26,8 @@ OTHER_PROGRAMS = {
     "--no-dev",
     "--compile-bytecode",
     "--help",
+    "--home-dir",
     "--user",
-    "--no-cache-dir",
 }
 GENERATOR = ("sphinx", "myst_parser", "furo", "latex2mathml")
 
@@ -76,8 +76,9 @@ def words():
     found = set()
     for name in files():
         path = ROOT / name[1:]
-        if path.suffix in {".py", ".js", ".html", ".toml"} or "/scripts/" in name:
+        if path.suffix in {".py", ".js", ".html", ".toml", ".service", ".env"} or "/scripts/" in name:
             found.update(re.findall(r"\w+", path.read_text(encoding="utf-8")))
+    found.update(re.findall(r"\w+", (ROOT / "compose.yaml").read_text(encoding="utf-8")))
     return frozenset(found)
 
 

@@ -31,5 +31,8 @@ class ConfigurationError(SkylessError):
 
 def _shown(value: object) -> str:
     """Write the value as a configuration file would, shortened."""
-    text = json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else str(value)
+    try:
+        text = json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else str(value)
+    except RecursionError:
+        return "nested too far to be shown"
     return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"

@@ -337,7 +337,10 @@ REPLAY = [
     ({"site": lab_site()}, "give either anchors or site"),
     ({"truth": [[0, 1, 2]]}, r"truth is an array of shape \(1, 3\); it should be an array of shape \(n, 4\)"),
     ({"truth": [[0, 1, 2, float("nan")]]}, "all finite"),
-    ({"truth": [[900.0, 1, 2, 1], [901.0, 1, 2, 1]]}, "truth: column t_s is .900.000 to 901.000.; it should be in the time of the recording"),
+    (
+        {"truth": [[900.0, 1, 2, 1], [901.0, 1, 2, 1]]},
+        "truth: column t_s is .900.000 to 901.000.; it should be in the time of the recording",
+    ),
     ({"lever_arm_m": (1, 2)}, r"lever_arm_m is \(1, 2\); it should be 3 finite numbers"),
     ({"lever_arm_m": (1, 2, 3)}, "lever_arm_m moves the truth, which truth must give"),
     ({"tag_height_m": "high"}, "tag_height_m is 'high'; it should be metres, or truth, free, auto"),

@@ -3,6 +3,7 @@
 What it cannot find, such as the order of the keyboard's focus, is in ``test_page_look.py``.
 """
 
+import page_fake_site as made_up
 import pytest
 from page_browser import THREE_FRAMES, until
 from page_fake_survey import FakeSurvey
@@ -42,7 +43,7 @@ class Checks:
 
 @pytest.fixture(params=["dark", "light"])
 def checks(request, serve, visit):
-    return lambda server: Checks(visit(server, color_scheme=request.param))
+    return lambda server: Checks(visit(server, color_scheme=request.param, reduced_motion="reduce"))
 
 
 def test_the_live_page(serve, checks):
@@ -94,6 +95,20 @@ def test_a_lost_connection(serve, checks):
     server.refuse = False
     until(lost.page, "skyless.state.connection.phase === 'open'", timeout_s=15.0)
     lost.visit.problems.clear()  # the browser's own lines about the refused sockets
+
+
+def test_the_condition_with_its_reasons(serve, checks):
+    server = serve()
+    shown = checks(server)
+    shown.page.click("#pill")
+    for reasons in (
+        [made_up.reason("anchors", "warning", "anchor 8 of 8 is offline", "See its power.", ["anchor/8"])],
+        [made_up.reason("slow", "bad", "this computer is too slow: the emulated air missed 41 %")],
+    ):
+        server.condition = made_up.condition(*reasons)
+        until(shown.page, "level => document.getElementById('pill').classList.contains(level)", arg=reasons[0]["level"])
+        shown.check(reasons[0]["level"], "header")
+    assert shown.found == {}
 
 
 def test_the_set_up(serve, checks):

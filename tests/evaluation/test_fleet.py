@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import asdict, replace
 
+from skyless.errors import SkylessError
 from skyless.evaluation.fleet import report
 from skyless.evaluation.scenarios import Request, fleet_of, trajectories_of
 from skyless.simulation.impairments import AnchorOutage, Outage
@@ -185,3 +186,10 @@ def test_paths_without_heights_lie_at_the_height_of_the_tags():
     )
     assert flat.position(0.7)[2] == 1.2
     assert slope.position(60.0)[2] == 2.0
+
+
+@pytest.mark.parametrize("point", [(), (3,), (1.0, 2.0, 3.0, 4.0), (1.0, math.nan)])
+def test_a_position_has_two_or_three_coordinates(point):
+    for wrong in ({"positions_m": (point,)}, {"paths_m": (((1.0, 1.0), point),)}):
+        with pytest.raises(SkylessError, match=r"(positions|paths)_m\["):
+            fleet_of(Request(ideal_lab_site(), **wrong))

@@ -32,6 +32,7 @@ STRUCTS = {
     topics.survey_save_topic(SITE): messages.SurveySaveMessage,
     topics.placement_topic(SITE): messages.PlacementMessage,
     topics.watch_topic(SITE): messages.WatchMessage,
+    topics.preparation_topic(SITE): messages.PreparationMessage,
 }
 
 

@@ -1,4 +1,4 @@
-"""What is packaged runs commands that exist: compose.yaml, the recipe of its image, systemd's units."""
+"""What is packaged or compiled ahead runs commands that exist: compose.yaml, its image, units of systemd."""
 
 import json
 import re
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from skyless.cli import small_runs
 from skyless.cli.main import program
 
 ROOT = Path(__file__).parents[2]
@@ -26,6 +27,8 @@ def commands():
         )
         line = re.sub(r"\$\{\w*LIMIT\w*}", "1000", re.sub(r"%i", "1", line))
         yield pytest.param(shlex.split(line), id=unit.name)
+    for name, lines in small_runs._RUNS.items():
+        yield from (pytest.param(shlex.split(line), id=f"warm {name}: {line}") for line in lines)
     yield pytest.param(json.loads(re.findall(r"^CMD (.*)$", DOCKERFILE, re.MULTILINE)[0]), id="image")
     yield pytest.param(
         shlex.split(re.findall(r"^RUN skyless (.*?) *\\?$", DOCKERFILE, re.MULTILINE)[0]), id="image, built"

@@ -189,6 +189,9 @@ def test_accuracy_says_which_keys_it_has(refused):
         (HEAD + "id = 2\n", "line 4"),
         ("a = " + "[" * 5_000, "nests or counts too far"),
         ("id = " + "1" * 5_000, "nests or counts too far"),
+        (".".join(["a"] * 100_000) + " = 1", "nests or counts too far"),
+        (f"[{' . '.join(['a'] * 3_000)}]\nb = 1", "nests or counts too far"),
+        ("anchors = " + "[" * 900 + "]" * 900, "should be"),
         (b"name = '\xff'\n", "UTF-8"),
     ],
 )

@@ -31,9 +31,9 @@ def bench(
     draws
         Draws of the paper's chain, compiled; the NumPy loop makes a hundredth of them.
     anchor_count
-        Anchors in each draw.
+        How many anchors each draw has.
     quick
-        A few seconds only, with fewer and shorter runs and at most a tenth of a million draws.
+        Simulate a fraction: a few seconds only, with fewer and shorter runs and at most a tenth of a million draws.
     json
         Write one JSON object instead of a table.
     """

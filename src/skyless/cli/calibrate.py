@@ -38,7 +38,8 @@ class CalibrateOptions:
     anchors: Path | None = None
     """Table of anchors: id,x_m,y_m,z_m."""
     site: Path | None = None
-    """A site file instead. Of a recording of skyless record: the file whose antenna delays are to be corrected."""
+    """Site file instead of --anchors. Of a recording of skyless record: the file whose antenna delays are to be
+    corrected."""
     truth: Path | None = None
     """Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns; t_s in the recording's time, in
     Unix time for a recording of skyless record. MILUV ticks and simulated sites bring their own."""
@@ -50,8 +51,8 @@ class CalibrateOptions:
     first: str | None = None
     """Use the beginning only: a number of differences (30), seconds (60s) or a part of the time (50%)."""
     above: Finite | None = None
-    """Use the truth only while its height exceeds this; by default 0.3 m for a truth that starts below it and later
-    flies."""
+    """Judge only while the true height exceeds this: the truth below it is not used; by default 0.3 m for a truth that
+    starts below it and later flies."""
     format: str | None = None
     """Name of the format, if the content should not decide."""
     listener: str | None = None
@@ -59,9 +60,9 @@ class CalibrateOptions:
     tag: str | None = None
     """Name of the tag, in recordings of skyless record; by default all whose truth is known."""
     out: Path | None = None
-    """Write the calibrated table of anchors (.csv) or site file (.toml) here."""
+    """Write the result here: the calibrated table of anchors (.csv) or site file (.toml)."""
     force: bool = False
-    """Overwrite --out if it exists."""
+    """Overwrite what is there, if --out exists."""
     json: bool = False
     """Write one JSON object instead of the table."""
 

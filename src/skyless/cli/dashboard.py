@@ -40,21 +40,22 @@ def dashboard(
     Parameters
     ----------
     broker.mqtt
-        The broker, mqtt://HOST[:PORT] or mqtts://[USER@]HOST[:PORT]; the password is taken from SKYLESS_MQTT_PASSWORD.
+        Broker to show the site of, mqtt://HOST[:PORT] or mqtts://[USER@]HOST[:PORT]; the password is taken from
+        SKYLESS_MQTT_PASSWORD.
     broker.mqtt_ca
-        Certificates to trust instead of the system's, a PEM file.
+        Certificates (PEM) to trust for mqtts, instead of the system's.
     site
-        The site file, or lab; by default the one that the broker has retained, which comes before this.
+        Site file, or lab; by default the one that the broker has retained, which comes before this.
     site_id
         Number of the site; by default the first that the broker has.
     listen
-        Address of the page, HOST:PORT; by default 127.0.0.1:8080, or the next free port.
+        Where programs connect, here browsers, HOST:PORT; by default 127.0.0.1:8080, or the next free port.
     recordings
         Folder of recordings to replay.
     token
         Token that browsers must give; made and printed where other machines can reach the page and none is given.
     json
-        Write the page's address as one JSON object instead of a table.
+        Write one JSON object with the page's address instead of a table.
     """
     import asyncio
 
@@ -63,9 +64,10 @@ def dashboard(
     from skyless.dashboard.overlays import Overlays
     from skyless.dashboard.playback import Playback
     from skyless.dashboard.serve import bind, serve
-    from skyless.mqtt.address import mqtt_address
 
-    address = mqtt_address(broker.mqtt, broker.mqtt_ca)
+    address = broker.address()
+    if address is None:
+        raise SkylessError("--mqtt is 'none'; it should be the broker of the site to show")
     address.tls_context()
     known, image = (None, None) if site is None else _load(site)
     if known is not None and site_id is not None and known.site.id != site_id:

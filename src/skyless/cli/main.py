@@ -21,6 +21,7 @@ _GROUPS: Final = {
         # name, module below skyless.cli (imported only when it is called), what it does
         ("demo", "nodes.demo", "Show a site and walking tags in real time: nothing to connect, nothing to write."),
         ("simulate", "simulate", "Run a site in the simulated world and judge it against the truth."),
+        ("warm", "warm", "Compile all kernels ahead, so that no later start has to."),
     ),
     "Set up and check a site": (
         ("site", "site", "Write and check site files."),
@@ -37,7 +38,6 @@ _GROUPS: Final = {
         ("anchor", "nodes.anchor", "Run anchors of a site."),
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
         ("dashboard", "dashboard", "Show a site live in the browser."),
-        ("warm", "warm", "Compile all kernels ahead, so that no later start has to."),
     ),
     "Record and replay": (
         ("record", "nodes.record", "Record a running site into a file."),
@@ -143,12 +143,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _drop_output()
         return _BROKEN_PIPE
     except OSError as error:
-        if error.filename is not None or error.errno not in _CANNOT_WRITE:
-            raise
-        _drop_output()
-        print(f"skyless: standard output cannot be written: {error.strerror}", file=sys.stderr)
+        print(f"skyless: {_trouble(error)}", file=sys.stderr)
         return _USER_ERROR
     return result if isinstance(result, int) else 0
+
+
+def _trouble(error: OSError) -> str:
+    """What to say of a file or of standard output that cannot be used; anything else is a fault of the program."""
+    if error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    if error.errno not in _CANNOT_WRITE:
+        raise error
+    _drop_output()
+    return f"standard output cannot be written: {error.strerror}"
 
 
 def _renamed(error: CycloptsError) -> str | None:

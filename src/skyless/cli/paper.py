@@ -33,7 +33,7 @@ def paper(
     Parameters
     ----------
     out
-        Folder for the report; files of the same names are replaced, others stay.
+        Write the result here, into a folder; files of the same names are replaced, others stay.
     seed
         Same seed, same numbers, except for times that are measured.
     quick

@@ -33,7 +33,7 @@ class PlanOptions:
     """Options of ``skyless plan``."""
 
     method: str = DEFAULT_METHOD
-    """literal, literal-delayed, weighted, bracketed or joint."""
+    """How positions are computed: literal, literal-delayed, weighted, bracketed or joint."""
     noise_ps: Positive | None = None
     """Noise of every TX and RX stamp in picoseconds; by default the site's own figures."""
     qa: Positive = 0.3
@@ -51,7 +51,7 @@ class PlanOptions:
     target: Positive | None = None
     """Standard deviation to be met, in centimetres."""
     plot: Path | None = None
-    """Write the map of the predicted error into this PNG, PDF or SVG."""
+    """Draw the picture into this file (PNG, SVG or PDF): the map of the predicted error."""
     grid: Path | None = None
     """Write every point's predictions into this .csv or .geojson file."""
     html: Path | None = None
@@ -59,7 +59,7 @@ class PlanOptions:
     optimise: Annotated[int, Parameter(validator=Number(gte=3, lte=60))] | None = None
     """Replace the site's anchors by this many, placed on the walls where they serve best."""
     out: Path | None = None
-    """Write the optimised site into this file, which must not exist."""
+    """Write the result here: the optimised site, into a file that must not exist."""
     heights: str | None = None
     """Heights at which anchors may hang, h1,h2,... in metres; by default the lowest and highest of the site's."""
     mounts: list[str] | None = None
@@ -71,7 +71,7 @@ class PlanOptions:
     write: bool = False
     """Mode slots: write the slots into the site file; everything else in it stays."""
     force: bool = False
-    """With --write: replace slots that the site file has already."""
+    """Overwrite what is there: with --write the slots that the site file has already."""
     search_seconds: Positive = 60.0
     """Time after which the search for positions ends in any case."""
     verify: Annotated[int, Parameter(validator=Number(gte=1, lte=200))] | None = None

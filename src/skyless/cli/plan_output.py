@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from skyless.cli.common.output import cm, open_for_writing, print_facts, print_warnings, write_file
+from skyless.cli.common.output import cm, new_table, print_facts, print_warnings, write_file
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def write_files(
     if grid is not None:
         from skyless.planning.maps import csv_lines, geojson_lines
 
-        with open_for_writing(grid) as table:
+        with new_table(grid) as table:
             is_csv = grid.suffix.lower() == ".csv"
             table.writelines(csv_lines(mapped) if is_csv else geojson_lines(mapped, site.georeference))
     if plot is None and html is None:

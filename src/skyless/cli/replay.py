@@ -21,7 +21,7 @@ from skyless.cli.common.options import (
     check_picture,
     options,
 )
-from skyless.cli.common.output import number, open_for_writing, print_facts, print_json
+from skyless.cli.common.output import new_table, number, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.cli.common.recording_inputs import is_mcap, lever_arm, wished_height
 from skyless.errors import SkylessError
@@ -58,13 +58,14 @@ class _OtherProtection(ProtectionOptions):
     """What is required of protection levels, instead of what the tag did."""
 
     integrity_risk: IntegrityRisk | None = None
-    """Another probability than the tag's own that an error exceeds its protection level, in recordings of skyless
-    record (joint)."""
+    """Probability, for each fix, that the error exceeds its protection level, in recordings of skyless record (joint);
+    by default the tag's own."""
     alert_limit_m: Positive | None = None
-    """Another alert limit than the tag's own, in metres."""
+    """Fixes whose protection level exceeds this, in metres, carry an alert; by default the tag's own limit holds."""
     max_acceleration: NotNegative | None = None
-    """Another largest acceleration than the tag's own, in m/s². With any of these, or --tag-height-std, tags start from
-    the beginning, as with another method, and those that are not given are as of a tag of which nothing was asked."""
+    """The largest acceleration of the tags in m/s²; by default what the tag assumed. With any of these, or
+    --tag-height-std, tags start from the beginning, as with another method, and those that are not given are as of
+    a tag of which nothing was asked."""
 
 
 @options
@@ -74,14 +75,14 @@ class ReplayOptions:
     anchors: Path | None = None
     """Table of anchors: id,x_m,y_m,z_m, with bias_m where skyless calibrate has been; that is then taken off."""
     site: Path | None = None
-    """A site file instead, for its anchors and its tags' height. With a recording of skyless record: replay as if
-    its anchors had had the antenna delays of this file, as skyless calibrate writes them."""
+    """Site file instead of --anchors, for its anchors and its tags' height. With a recording of skyless record:
+    replay as if its anchors had had the antenna delays of this file, as skyless calibrate writes them."""
     truth: Path | None = None
     """Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns. MILUV ticks bring their own."""
     lever_arm: str | None = None
     """The antenna in the body's frame, x,y,z in metres, added to the truth."""
     tag_height: str = "auto"
-    """The tag's height: metres, truth (its median), free (estimated), or auto: free where the anchors determine it."""
+    """The tags' height: metres, truth (its median), free (estimated), or auto: free where the anchors determine it."""
     tag_height_std: NotNegative | None = None
     """Standard deviation of the tag's height from the one that is given, in metres, which fixes and levels then
     count; by default 0.5 where the height is only taken for the anchors', else 0."""
@@ -103,7 +104,7 @@ class ReplayOptions:
     tag: str | None = None
     """Name of the tag, in recordings of skyless record; by default all."""
     method: str | None = None
-    """Another method than the tag's own, in recordings of skyless record."""
+    """How positions are computed, in recordings of skyless record; by default as the tag did."""
     measurements: str | None = None
     """What the filter is given of other recordings: packets, as anchors sent them, which is the default for
     Bitcraze's; or differences, which are made of them."""
@@ -111,7 +112,7 @@ class ReplayOptions:
     fixes_csv: Path | None = None
     """Write every fix into this table."""
     plot: Path | None = None
-    """Draw track, errors and histograms into this PNG, SVG or PDF."""
+    """Draw the picture into this file (PNG, SVG or PDF): track, errors and histograms."""
     json: bool = False
     """Write one JSON object instead of the table."""
 
@@ -305,7 +306,7 @@ def _table_of_fixes(path: Path | None, columns: tuple[str, ...]) -> Iterator[Cal
     if path is None:
         yield None
         return
-    with open_for_writing(path) as file:
+    with new_table(path) as file:
         writer = csv.writer(file)
         writer.writerow(columns)
 

@@ -17,11 +17,12 @@ from skyless.cli.common.options import (
     Positive,
     ProtectionOptions,
     Seed,
+    check_method,
     check_output,
     finite_numbers,
     options,
 )
-from skyless.cli.common.output import cm, open_for_writing, print_facts, print_json
+from skyless.cli.common.output import cm, new_table, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.cli.common.simulated_site import check_simulated
 from skyless.errors import SkylessError
@@ -69,9 +70,9 @@ class SimulateOptions:
     """A named site: lab (six anchors on the walls of 6 m × 8 m, 2-D), the default; room (the lab as real rooms are:
     anchors 2 cm off per axis, ranges 5 cm off, and more with the distance, tags with random acceleration)."""
     site: Path | None = None
-    """A site file instead of a named one."""
+    """Site file instead of a named site."""
     method: str = DEFAULT_METHOD
-    """literal, literal-delayed, weighted, bracketed or joint.
+    """How positions are computed: literal, literal-delayed, weighted, bracketed or joint.
     Fixes of all but joint hold at the master's message that they refer to, but are judged when made."""
     position: list[str] | None = None
     """Where a tag lies still, x,y or x,y,z in metres; may be given several times."""
@@ -90,9 +91,9 @@ class SimulateOptions:
     fixes: Annotated[int, Parameter(validator=Number(gte=1))] | None = None
     """Stop when every tag has this many judged fixes (one per superframe), or has had none for 60 s."""
     duration: Positive | None = None
-    """Stop after this many simulated seconds; by default 60 unless --fixes is given."""
+    """Seconds to simulate; by default 60 unless --fixes is given."""
     settle: NotNegative = 2.0
-    """Simulated seconds before which fixes are not judged; less than the run lasts."""
+    """Seconds from the start that are not judged, simulated; less than the run lasts."""
     seed: Seed = 1
     """Same seed, same bytes and ticks."""
     loss: _Share = 0.0
@@ -149,6 +150,7 @@ def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
 
     Anchors and tags are the machines that would run on radios; clocks, noise, air and motion are simulated.
     """
+    check_method(asked.method)
     request = _request(asked)
     check_simulated(request.site, request.method)
     if asked.settle >= asked.until_s:
@@ -310,7 +312,7 @@ def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
     if asked.fixes_csv is None:
         _advance(fleet, request, asked.until_s, None)
     else:
-        with open_for_writing(asked.fixes_csv) as file:
+        with new_table(asked.fixes_csv) as file:
             _advance(fleet, request, asked.until_s, file)
     return report(fleet, request.method, started_s)
 

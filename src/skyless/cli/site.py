@@ -79,7 +79,7 @@ def new(
     site_id
         Number of the site on the air, which neighbouring sites must not share; by default a random one.
     force
-        Overwrite the file if it exists.
+        Overwrite what is there, if the file exists.
     """
     from skyless.planning.reception import with_best_master
     from skyless.simulation.channel import ChannelModel

@@ -8,13 +8,13 @@ from typing import Final
 
 from skyless.errors import SkylessError
 
-_HALL: Final = "site new hall.toml --grid 12 --width 48 --depth 36"
+_HALL: Final = "site new hall.toml --spacing 12 --width 48 --depth 36"
 _RUNS: Final = {
     "plan": (
         "site new lab.toml",
         "plan lab.toml --step 2 --json",
         "plan lab.toml --step 2 --method weighted --json",
-        "plan lab.toml --step 2 --method weighted --optimise 4 --seconds 1 --json",
+        "plan lab.toml --step 2 --method weighted --optimise 4 --search-seconds 1 --json",
     ),
     "halls": (
         _HALL,
@@ -26,7 +26,7 @@ _RUNS: Final = {
     ),
     "studies": (
         "study efficiency --episodes 1 --processes 1 --json",
-        "study sitetime --worlds 1 --seconds 1 --processes 1 --quick --json",
+        "study sitetime --worlds 2 --seconds 1 --processes 1 --quick --json",
     ),
     "paper": ("paper --quick --out report --json",),
     "bench": ("bench --quick --json",),

@@ -145,7 +145,7 @@ class StudyOptions:
     """Options of ``skyless study``."""
 
     method: str | None = None
-    """A positioning method, by default the best one."""
+    """How positions are computed; by default the best method."""
     seed: Seed = 1
     """Same seed, same rows, whatever computes them; CPU times apart."""
     episodes: Annotated[int, Parameter(validator=Number(gte=1, lte=10**6))] | None = None
@@ -171,7 +171,7 @@ class StudyOptions:
     plot: Path | None = None
     """Draw the picture into this file."""
     out: Path | None = None
-    """Write the rows as JSON and CSV and the picture as PNG and SVG into this folder."""
+    """Write the result here, into a folder: the rows as JSON and CSV, the picture as PNG and SVG."""
     scheduler: str | None = None
     """Address of a Dask scheduler whose workers do the work, for example tcp://127.0.0.1:8786."""
     processes: Annotated[int, Parameter(validator=Number(gte=1, lte=1024))] | None = None

@@ -57,13 +57,13 @@ class SurveyOptions:
     live: LiveOptions = LiveOptions()
     known: FactOptions = FactOptions()
     out: Path | None = None
-    """Write the site file of --site with the survey in it here (.toml), or a table of anchors (.csv)."""
+    """Write the result here: the site file of --site with the survey in it (.toml), or a table of anchors (.csv)."""
     force: bool = False
-    """Overwrite --out if it exists; what was there is kept under another name."""
+    """Overwrite what is there, if --out exists; what was there is kept under another name."""
     json: bool = False
     """Write one JSON object instead of the tables."""
     plot: Path | None = None
-    """Draw the anchors from above into this file (PNG, SVG or PDF)."""
+    """Draw the picture into this file (PNG, SVG or PDF): the anchors from above."""
 
 
 @app.default

@@ -28,7 +28,8 @@ def warm(*, method: str | None = None, json: bool = False) -> None:
     Parameters
     ----------
     method
-        Only what anchors, tags and the simulation need with this positioning method; by default everything.
+        How positions are computed: only what anchors, tags and the simulation need with this method; by default
+        everything.
     json
         Write one JSON object instead of a line.
     """
@@ -41,11 +42,9 @@ def warm(*, method: str | None = None, json: bool = False) -> None:
     wanted = missing(parts)
     if wanted and not folder.writable:
         raise SkylessError(f"{folder.path.parent} cannot be written; let NUMBA_CACHE_DIR name a folder that can")
-    if wanted:
-        compile_with_counts(parts)
-    failed = [part.name for part in missing(parts)]
-    if failed:
-        raise SkylessError(f"could not compile {', '.join(failed)}; the commands that need them show why")
+    failures = compile_with_counts(parts) if wanted else ()
+    if failures:
+        raise SkylessError("\nskyless: ".join(failures))
     if json:
         where = {"folder": str(folder.path), "temporary": folder.temporary}
         print_json({**where, "compiled": [part.name for part in wanted], "wall_s": time.monotonic() - begun_s})

@@ -74,7 +74,9 @@ def _bind(host: str, port: int) -> socket.socket:
             raise
     except (OSError, UnicodeError) as error:
         if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
-            raise _PortInUseError(f"--listen is {text!r}; another program uses this port") from None
+            raise _PortInUseError(
+                f"--listen is {text!r}; another program uses this port; without --listen a free one is taken"
+            ) from None
         reason = error.strerror if isinstance(error, OSError) else error
         raise SkylessError(f"--listen is {text!r}, where this machine cannot listen: {reason}") from None
     return sock

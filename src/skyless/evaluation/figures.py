@@ -4,6 +4,7 @@ Files are written whole or not at all, and without a screen.
 """
 
 import io
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -112,12 +113,18 @@ def draw_floor_plan(axes: Axes, anchors_m: list[tuple[float, float]], *, labels:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure in the format of the file's ending (PNG where it has none).
+    """Write a figure in the format of the file's ending (PNG where it has none), whole or not at all.
 
     Raises:
         OSError, ValueError: the file cannot be written, or its ending names no kind of picture.
     """
-    path.write_bytes(picture(figure, path.suffix.removeprefix(".") or "png"))
+    data = picture(figure, path.suffix.removeprefix(".") or "png")
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        scratch.write_bytes(data)
+        scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)
 
 
 def picture(figure: Figure, kind: str, dpi: float = 130.0) -> bytes:

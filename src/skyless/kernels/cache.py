@@ -43,7 +43,7 @@ class KernelFolder(Struct, frozen=True):
     path: Path
     """Where exactly these sources' kernels are; None of it may exist."""
     key: str
-    """Names compiler, interpreter and processor: kernels of others are of no use."""
+    """Names compiler, interpreter, processor and where the sources are: kernels of others are of no use."""
     writable: bool
     temporary: bool
     """Whether the system may remove it at its next start."""
@@ -124,7 +124,7 @@ def _key() -> str:
     features = os.environ.get("NUMBA_CPU_FEATURES")
     if features is None:
         features = "" if processor == "generic" else get_host_cpu_features().flatten()
-    words = (version("numba"), version("llvmlite"), sys.version, processor, features)
+    words = (version("numba"), version("llvmlite"), sys.version, processor, features, str(_PACKAGE))
     return hashlib.sha1("\n".join(words).encode(), usedforsecurity=False).hexdigest()[:12]
 
 

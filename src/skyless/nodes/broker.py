@@ -20,6 +20,7 @@ from msgspec import Struct
 from skyless.errors import SkylessError
 from skyless.mqtt.address import PASSWORD_VARIABLE, MqttAddress
 from skyless.mqtt.connection import check_broker
+from skyless.nodes.broker_address import StatedAddress
 from skyless.nodes.children import end
 from skyless.nodes.ports import claim, is_free
 from skyless.nodes.process import data_folder, end_with_parent, locked
@@ -187,6 +188,7 @@ class Broker:
         self._process = process
         self._lock = lock
         self._claim = claim
+        self._stated = None if address.tls else StatedAddress(address)  # its certificate is for other names
 
     @property
     def pid(self) -> int:
@@ -199,6 +201,8 @@ class Broker:
 
     async def stop(self) -> None:
         """End it; its data stay."""
+        if self._stated is not None:
+            self._stated.withdraw()
         await end(self._process)
         self._claim.close()
         _release(self.data, self._lock)
@@ -249,7 +253,10 @@ async def _spawn(
 ) -> asyncio.subprocess.Process:
     """nats-server, when it accepts MQTT."""
     file = data / "nats-server.conf"
-    _write_private(file, _configuration(settings, port, data))
+    try:
+        _write_private(file, _configuration(settings, port, data))
+    except OSError as error:
+        raise SkylessError(f"{file} cannot be written: {error.strerror}") from None
     process = await asyncio.create_subprocess_exec(
         program,
         "--config",

@@ -22,7 +22,7 @@ from skyless.nodes.process import Log, outlasting, together
 from skyless.nodes.watch import Watch
 from skyless.positioning.integrity import RISK, IntegrityRequirement
 from skyless.preparation.parts import parts_of
-from skyless.preparation.processes import CompilationError, Preparation, Report, compile_parts
+from skyless.preparation.processes import Preparation, Report, compile_parts
 from skyless.site.model import Site
 
 _HOST: Final = "127.0.0.1"
@@ -110,9 +110,8 @@ class WholeSite:
             link.publish(topic, PreparationMessage(now.done, now.total, now.left_s, time.time()), retain=True)
 
         try:
-            await compile_parts(parts_of(self._asked.method), report)
-        except CompilationError as error:
-            self._log(f"{error}; every program compiles for itself")
+            for failure in await compile_parts(parts_of(self._asked.method), report):
+                self._log(f"{failure}; every program compiles for itself")
         finally:
             link.publish(topic, b"", qos=1, retain=True)
         self.prepared.set()

@@ -5,6 +5,7 @@ import contextlib
 import fcntl
 import os
 import sys
+import tempfile
 import time
 from collections.abc import AsyncIterator, Callable, Iterable
 from typing import IO, Final
@@ -34,10 +35,6 @@ class Preparation(Struct, frozen=True):
 Report = Callable[[Preparation], None]
 
 
-class CompilationError(Exception):
-    """A process could not compile its part; what needs the kernels will say why when it compiles them itself."""
-
-
 def missing(parts: Iterable[Part]) -> tuple[Part, ...]:
     """Parts that have not been compiled for these sources and this processor."""
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"} or ONLY_VARIABLE in os.environ:
@@ -46,20 +43,18 @@ def missing(parts: Iterable[Part]) -> tuple[Part, ...]:
     return tuple(part for part in parts if not folder.is_ready(part.name))
 
 
-async def compile_parts(parts: Iterable[Part], report: Report) -> None:
+async def compile_parts(parts: Iterable[Part], report: Report) -> tuple[str, ...]:
     """Compile what is missing of these parts; ``report`` is called a few times a second while it lasts.
 
-    Where no folder can be written this does nothing: every program then compiles for itself.
-
-    Raises:
-        CompilationError: a part could not be compiled.
+    Returns a sentence for each part that could not be compiled; what needs its kernels will try again itself. Where no
+    folder can be written this does nothing: every program then compiles for itself.
     """
     folder = kernel_folder()
     wanted = missing(parts)
     if not wanted or not folder.writable:
-        return
+        return ()
     async with _only_one(folder, report) as notes:
-        await _Run(missing(wanted), folder, report, notes).run()
+        return await _Run(missing(wanted), folder, report, notes).run()
 
 
 class _Progress(Struct):
@@ -97,19 +92,19 @@ class _Run:
     def __init__(self, parts: tuple[Part, ...], folder: KernelFolder, report: Report, notes: IO[bytes]) -> None:
         self._parts, self._folder, self._report, self._notes = parts, folder, report, notes
         self._progress = {part.name: _Progress(part.typical_s, part.timeline) for part in parts}
+        self._failures: list[str] = []
         self._ended = {part.name: asyncio.Event() for part in parts}
         self._free = asyncio.Semaphore(cores())
 
-    async def run(self) -> None:
+    async def run(self) -> tuple[str, ...]:
         reporting = asyncio.ensure_future(self._report_all())
         try:
             async with asyncio.TaskGroup() as group:
                 for part in sorted(self._parts, key=lambda part: -part.typical_s):
                     group.create_task(self._compile(part))
-        except* CompilationError as errors:
-            raise errors.exceptions[0] from None
         finally:
             reporting.cancel()
+        return tuple(self._failures)
 
     async def _compile(self, part: Part) -> None:
         for name in part.after:
@@ -118,16 +113,20 @@ class _Run:
         async with self._free:
             progress = self._progress[part.name]
             progress.begun_s = time.monotonic()
-            async with _worker(part) as process:
-                assert process.stdout is not None
-                async for line in process.stdout:
-                    progress.done, progress.total = msgspec.json.decode(line, type=tuple[int, int])
-                code = await process.wait()
-            if code != 0:
-                raise CompilationError(f"compiling {part.name} ended with exit code {code}")
-            progress.done, progress.ended = progress.total, True
+            with tempfile.TemporaryFile(dir=self._folder.path) as errors:
+                async with _worker(part, errors) as process:
+                    assert process.stdout is not None
+                    async for line in process.stdout:
+                        progress.done, progress.total = msgspec.json.decode(line, type=tuple[int, int])
+                    code = await process.wait()
+                errors.seek(0)
+                last = errors.read().decode(errors="replace").strip().rpartition("\n")[2]
+        progress.done, progress.ended = progress.total, True
+        self._ended[part.name].set()
+        if code == 0:
             self._folder.mark_ready(part.name)
-            self._ended[part.name].set()
+        else:
+            self._failures.append(f"the kernels of {part.name} could not be compiled: {last or f'exit code {code}'}")
 
     async def _report_all(self) -> None:
         while True:
@@ -148,7 +147,7 @@ class _Run:
 
 
 @contextlib.asynccontextmanager
-async def _worker(part: Part) -> AsyncIterator[asyncio.subprocess.Process]:
+async def _worker(part: Part, errors: IO[bytes]) -> AsyncIterator[asyncio.subprocess.Process]:
     """The process of a part, ended where its owner is cancelled."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
@@ -158,7 +157,7 @@ async def _worker(part: Part) -> AsyncIterator[asyncio.subprocess.Process]:
         *part.arguments,
         stdin=asyncio.subprocess.PIPE,  # closed when this program has gone, however that came about
         stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.DEVNULL,
+        stderr=errors,
         start_new_session=True,  # Ctrl-C in a terminal is for its parent
         env={**os.environ, ONLY_VARIABLE: ",".join(part.only)},
     )

@@ -27,6 +27,9 @@ from skyless.site.model import (
 _MOST_BYTES: Final = 1 << 24
 """Of a site file: devices do not end."""
 
+_TOO_DEEP: Final = re.compile(rb"(?:[\w-]+[ \t]*\.[ \t]*){64}")
+"""A dotted key of so many parts; a site file has two. The time to read one grows with their square."""
+
 _TABLES: Final[dict[str, type[Struct]]] = {
     "schedule": ScheduleSite,
     "noise": NoiseSite,
@@ -127,10 +130,14 @@ def _in_file(text: str, rows: _Rows | None) -> str:
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ConfigurationError(path, "", None, "a site file, not a pipe or a device")
         with path.open("rb") as file:
             text = file.read(_MOST_BYTES + 1)
         if len(text) > _MOST_BYTES:
             raise ConfigurationError(path, "", None, f"a site file, {_MOST_BYTES >> 20} MiB at most")
+        if _TOO_DEEP.search(text):
+            raise ConfigurationError(path, "", None, "a site file; this one nests or counts too far")
         return tomllib.loads(text.decode())
     except OSError as error:
         raise ConfigurationError(path, "", None, f"a readable site file ({error.strerror})") from None

@@ -3,7 +3,8 @@
 import os
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -76,16 +77,31 @@ def cm(value_m: float | None) -> str:
     return number(value_m, "{:.2f} cm", 100.0)
 
 
-def open_for_writing(path: Path) -> TextIO:
-    """Open a table to be written row by row.
+@contextmanager
+def new_table(path: Path) -> Iterator[TextIO]:
+    """A table to be written row by row, which replaces an old one when the block ends: whole or not at all.
+
+    Ctrl-C ends it, too: what is written by then is kept.
 
     Raises:
         SkylessError: the file cannot be written.
     """
     try:
-        return path.open("w", newline="", encoding="utf-8")
+        if path.exists() and not path.is_file():  # a device
+            with path.open("w", newline="", encoding="utf-8") as file:
+                yield file
+            return
+        with _scratch_beside(path) as handle, os.fdopen(handle, "w", newline="", encoding="utf-8") as file:
+            try:
+                yield file
+            except KeyboardInterrupt as error:
+                interrupt: KeyboardInterrupt | None = error
+            else:
+                interrupt = None
     except OSError as error:
         raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
+    if interrupt is not None:
+        raise interrupt
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -101,14 +117,25 @@ def write_atomically(path: Path, data: bytes) -> None:
     if path.exists() and not path.is_file():
         path.write_bytes(data)
         return
-    handle, scratch = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    with _scratch_beside(path) as handle, os.fdopen(handle, "wb") as file:
+        file.write(data)
+
+
+@contextmanager
+def _scratch_beside(path: Path) -> Iterator[int]:
+    """A file beside another, open for writing: it takes the other's name when the block ends without an error.
+
+    Raises:
+        OSError: it cannot be made, or take the name.
+    """
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    scratch = Path(name)
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        Path(scratch).chmod(0o666 & ~_umask())
-        Path(scratch).replace(path)
+        yield handle
+        scratch.chmod(0o666 & ~_umask())
+        scratch.replace(path)
     except BaseException:
-        Path(scratch).unlink(missing_ok=True)
+        scratch.unlink(missing_ok=True)
         raise
 
 

@@ -3,13 +3,12 @@
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Self
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from skyless.kernels.cache import KernelFolder
     from skyless.preparation.parts import Part
     from skyless.preparation.processes import Preparation
 
@@ -88,33 +87,29 @@ def loading_kernels(*parts: "Part") -> Iterator[None]:
         yield
 
 
-def compile_with_counts(parts: "Iterable[Part]") -> None:
-    """Compile what is missing of the parts and say how far it is; a part that cannot be is left to its user."""
+def compile_with_counts(parts: "Iterable[Part]") -> tuple[str, ...]:
+    """Compile what is missing of the parts, saying how far it is; a sentence for each part that cannot be compiled."""
     import asyncio
 
-    from skyless.preparation.processes import CompilationError, compile_parts
+    from skyless.preparation.processes import compile_parts
 
     report_kernel_folder()
-    with CountLine() as line, suppress(CompilationError):
-        asyncio.run(compile_parts(parts, line.show))
+    with CountLine() as line:
+        return asyncio.run(compile_parts(parts, line.show))
 
 
 def report_kernel_folder() -> None:
-    """One line where compiled kernels cannot be kept for good."""
+    """One line where the kernels that have to be compiled now cannot be kept for good."""
     from skyless.kernels.cache import kernel_folder
 
     folder = kernel_folder()
-    if folder.temporary:
-        _print_line(
-            f"no folder can be written to keep compiled kernels; {_for_how_long(folder)}. "
-            "To keep them, let NUMBA_CACHE_DIR name a folder that can be written"
-        )
-
-
-def _for_how_long(folder: "KernelFolder") -> str:
-    if folder.writable:
-        return f"they are in {folder.path.parent}, which the system may clear"
-    return "every program compiles them at every start, for a minute or so"
+    if not folder.writable:
+        where = f"every program compiles them at every start, for a minute or so, as {folder.path} cannot be written"
+    elif folder.temporary:
+        where = f"they are in {folder.path.parent}, which the system may clear"
+    else:
+        return
+    _print_line(f"no folder keeps compiled kernels: {where}. Let NUMBA_CACHE_DIR name a folder that can be written")
 
 
 class CountLine:

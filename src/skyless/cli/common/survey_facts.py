@@ -34,7 +34,7 @@ class FactOptions:
     """What the user knows of a site."""
 
     site: Path | None = None
-    """The present site file: its anchors, heights, and rough positions."""
+    """Site file of the present: its anchors, heights, and rough positions."""
     no_sketch: bool = False
     """Do not use the positions of --site, only its anchors and heights."""
     sketch_std: Std | None = None

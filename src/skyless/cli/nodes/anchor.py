@@ -34,10 +34,10 @@ def anchor(
     site
         Site file, or lab.
     radio
-        The anchors' radio: ether:HOST:PORT is the emulated air of skyless ether, serial:PATH a board,
+        Radio of the anchors: ether:HOST:PORT is the emulated air of skyless ether, serial:PATH a board,
         spi:BUS.DEVICE,irq=PIN,reset=PIN a DW1000 on this computer's SPI, model:HOST:PORT a model of one on that air.
     broker.mqtt
-        Broker for health and site, or none.
+        Broker to publish health and site to, or none.
     """
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.nodes.anchor import Anchors

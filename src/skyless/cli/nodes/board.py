@@ -35,14 +35,14 @@ def board(
     name
         Which radio it is: an anchor's number, or a tag of the air (tag1).
     radio
-        The air: ether:HOST:PORT of skyless ether.
+        Radio of the board, on the emulated air: ether:HOST:PORT of skyless ether.
     wire
         Format on the serial port: link (Skyless), sniffer or sniffer-text (Bitcraze; beacons become TDoA3 packets),
         listener (uwb-apps, JSON).
     link
         A symbolic link to the pseudo-terminal, which keeps its name when the board is started again.
     json
-        Print path and format as one JSON object before it starts.
+        Write one JSON object with path and format before it starts.
     """
     from skyless.nodes.board import RADIO_OF, Board
     from skyless.nodes.open_radio import is_ether, open_radios

@@ -11,6 +11,7 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.common.output import print_json
+from skyless.cli.nodes.options import listen_address
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ def broker(
     port
         Port to listen on; by default 1883, or the next port that is free.
     listen
-        Address of this machine to listen on; 0.0.0.0 means all of them.
+        Where programs connect, HOST:PORT or HOST; 0.0.0.0 means all addresses of this machine.
     data
         Folder for retained messages and sessions; by default skyless/broker in the user's data folder.
     user
@@ -49,13 +50,16 @@ def broker(
     key
         Private key of the certificate in PEM form.
     json
-        Print one JSON object instead of the address.
+        Write one JSON object instead of the address.
     """
     from skyless.mqtt.address import PASSWORD_VARIABLE
-    from skyless.nodes.broker import BrokerSettings
+    from skyless.nodes.broker import FIRST_PORT, BrokerSettings
 
     password = None if user is None else os.environ.get(PASSWORD_VARIABLE)
-    settings = BrokerSettings(port, listen, data, user, password, certificate, key)
+    host, listen_port = listen_address(listen, FIRST_PORT)
+    if port is not None and listen_port not in (None, port):
+        raise SkylessError(f"--port is {port}, and --listen is {listen!r}; give the port once")
+    settings = BrokerSettings(port or listen_port, host, data, user, password, certificate, key)
     asyncio.run(_serve(settings, json=json))
 
 

@@ -86,7 +86,7 @@ class DemoOptions:
     apart: bool = False
     """Run every anchor and every tag as a process of its own, to kill and to freeze."""
     mqtt: Annotated[str | None, Parameter(env_var="SKYLESS_MQTT")] = None
-    """Another broker than the embedded one."""
+    """Broker to use instead of the embedded one."""
     mqtt_ca: MqttCa = None
     """Certificates (PEM) to trust for mqtts."""
     record: str | None = None

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterable
+from errno import EADDRINUSE
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,16 +40,16 @@ class EtherOptions:
     noise_ps: Picoseconds | None = None
     """Noise of every TX and RX stamp in picoseconds; by default that of the site file."""
     loss: _Share = 0.0
-    """Share of receptions that are lost."""
+    """Probability that a message is lost."""
     nlos: _Share = 0.0
-    """Share of receptions that an obstacle delays."""
+    """Probability that a message reaches a tag late, as an obstacle delays it."""
     move: list[str] | None = None
     """Move an anchor while the air runs, from its position in the site file, as if somebody had hung it elsewhere:
     4=0.3,0@60 by 0.3 m along x after 60 s; a third number is a height. Several times for several moves."""
     seed: Seed = 1
     """Same seed, same crystals and noise; what processes do in real time is never the same."""
     listen: str = f"127.0.0.1:{DEFAULT_PORT}"
-    """Where programs connect."""
+    """Where programs connect, HOST:PORT."""
 
 
 @app.default
@@ -60,7 +61,7 @@ def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOpt
     Parameters
     ----------
     broker.mqtt
-        Broker for the truth about the tags and the air's health, or none.
+        Broker to publish the truth about the tags and the air's health to, or none.
     """
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.evaluation.scenarios import Request, impairments_of, patrols
@@ -84,6 +85,11 @@ def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOpt
         with contextlib.suppress(KeyboardInterrupt):
             run(EtherNode(emulated, host, DEFAULT_PORT if port is None else port, address, log).run(), punctual=True)
     except OSError as error:
+        if error.errno == EADDRINUSE:
+            raise SkylessError(
+                f"--listen is {asked.listen!r}; another program uses this port, perhaps another ether: end it, or give "
+                f"another port, and the same one to anchors and tags (--radio ether:{host}:PORT)"
+            ) from None
         raise SkylessError(f"--listen is {asked.listen!r}, which cannot be used: {error.strerror or error}") from None
 
 

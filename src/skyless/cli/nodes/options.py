@@ -25,14 +25,25 @@ WalkingSpeed = Annotated[float, Parameter(validator=Number(gt=0, lte=10))]
 class MqttOptions:
     """The broker of a running site. What a program uses it for stands in the help of its command."""
 
-    mqtt: Annotated[str, Parameter(env_var="SKYLESS_MQTT")] = _DEFAULT_MQTT
+    mqtt: Annotated[str | None, Parameter(env_var="SKYLESS_MQTT")] = None
     mqtt_ca: MqttCa = None
     """Certificates (PEM) to trust for mqtts."""
 
     def address(self) -> "MqttAddress | None":
-        """The broker's address; None for ``none``. Raises SkylessError."""
-        from skyless.mqtt.address import mqtt_address
+        """The broker's address; None for ``none``. Raises SkylessError.
 
+        By default it is that of the broker that runs on this machine, which is said in one line; else the usual one.
+        """
+        from skyless.mqtt.address import mqtt_address
+        from skyless.nodes.broker_address import running_broker
+
+        if self.mqtt is None and self.mqtt_ca is None:
+            found = running_broker()
+            if found is not None:
+                log(f"broker {found}, which runs on this machine (--mqtt names another)")
+                return found
+        if self.mqtt is None:
+            return mqtt_address(_DEFAULT_MQTT, self.mqtt_ca)
         if self.mqtt == "none":
             if self.mqtt_ca is not None:
                 raise SkylessError("--mqtt is 'none'; give a broker's address together with --mqtt-ca")

@@ -44,11 +44,11 @@ def record(
     file
         The recording, a new MCAP file; by default in this folder, named after the time.
     broker.mqtt
-        The site's broker.
+        Broker to record the site of.
     site_id
         Number of the site; by default the first that the broker has.
     duration
-        Seconds after which the recording ends.
+        Seconds to record; by default until Ctrl-C.
     limit_mb
         Megabytes after which the recording ends.
     json

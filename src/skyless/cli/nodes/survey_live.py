@@ -29,17 +29,17 @@ class LiveOptions:
     """Options of a survey at a running site."""
 
     mqtt: str | None = None
-    """Survey the running site at this broker: its anchors publish their stamps."""
+    """Broker to survey the running site of: its anchors publish their stamps."""
     mqtt_ca: MqttCa = None
     """Certificates (PEM) to trust for mqtts."""
     radio: str | None = None
-    """Survey with what a listener receives instead, as skyless tag --radio; needs --site."""
+    """Radio of a listener, to survey with what it receives instead, as skyless tag --radio; needs --site."""
     radio_name: str = "survey"
     """Name of that listener on an ether: that of one of its bodies, such as tag1."""
     site_id: SiteId | None = None
     """Number of the site; by default that of --site, or the first that the broker has."""
     duration: Positive | None = None
-    """How long to listen before the survey; 30 by default."""
+    """Seconds to listen before the survey; 30 by default."""
     serve: bool = False
     """Stay until Ctrl-C: survey all the while, serve the page, save on its request, and watch the anchors."""
     no_watch: bool = False

@@ -40,7 +40,7 @@ class TagOptions:
     """Options of ``skyless tag``."""
 
     radio: str = DEFAULT_RADIO
-    """The tags' radio. ether:HOST:PORT: the emulated air of skyless ether. serial:PATH: a board of Skyless.
+    """Radio of the tags. ether:HOST:PORT: the emulated air of skyless ether. serial:PATH: a board of Skyless.
     spi:BUS.DEVICE,irq=PIN,reset=PIN: a DW1000 on this computer's SPI. model:HOST:PORT: a model of one on that air.
     listener:PATH: the listener of uwb-apps. sniffer:PATH: a Bitcraze sniffer, for TDoA2 and TDoA3 systems.
     Several tags have several paths, with commas; PATH@BAUD gives another rate."""
@@ -55,12 +55,12 @@ class TagOptions:
     publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0
     """Fixes a second and tag at most, on MQTT and on standard output; all of them count in the tag's health."""
     site_id: SiteId | None = None
-    """The only site to listen to; by default the first one heard. For sniffers what topics call the system, by
-    default 0; it should be no other site's."""
+    """Number of the site, the only one to listen to; by default the first one heard. For sniffers what topics call
+    the system, by default 0; it should be no other site's."""
     anchors: Path | None = None
-    """Sniffers only: table of the system's anchors, id,x_m,y_m,z_m, as skyless replay and calibrate take it."""
+    """Table of anchors of another system (sniffers only): id,x_m,y_m,z_m, as skyless replay and calibrate take it."""
     tag_height: str | None = None
-    """Sniffers only: the tags' height in metres, free (estimated) or auto, the default: estimated unless the anchors
+    """The tags' height (sniffers only): metres, free (estimated) or auto, the default: estimated unless the anchors
     lie too flat, then theirs."""
 
 
@@ -82,7 +82,7 @@ def tag(
     names
         Names of one or more tags: letters, digits, - and _.
     broker.mqtt
-        Broker for fixes and health, or none.
+        Broker to publish fixes and health to, or none.
     """
     from skyless.nodes.process import run, together
 

@@ -18,6 +18,7 @@ _SITE_WIDE: Final[dict[str, type[Struct]]] = {
     "request": messages.RequestMessage,
     "truth": messages.TruthMessage,
     "zones": messages.ZonesMessage,
+    "survey/watch": messages.WatchMessage,
 }
 _HEALTH: Final[dict[str, type[Struct]]] = {
     "tag": messages.TagHealth,
@@ -45,7 +46,7 @@ class Channel(Struct, frozen=True):
 
     site: str
     kind: str
-    """``fix``, ``receptions``, ``stamps``, ``status``, ``health``, ``event``, ``site``, ``request``, ``zones``, ``watch``..."""
+    """``fix``, ``receptions``, ``stamps``, ``status``, ``health``, ``event``, ``site``, ``zones``, ``watch`` ..."""
     name: str = ""
     """Of the tag, anchor or zone."""
     payload: type[Struct] | None = None
@@ -56,16 +57,15 @@ def channel_of(topic: str) -> Channel | None:
     """What a topic means; None for one that is not of version 1."""
     if not topic.startswith(f"{ROOT}/"):
         return None
-    match topic.removeprefix(f"{ROOT}/").split("/"):
-        case [site, "floor_plan"]:
+    site, _, rest = topic.removeprefix(f"{ROOT}/").partition("/")
+    if rest in _SITE_WIDE:
+        return Channel(site, rest.rpartition("/")[2], "", _SITE_WIDE[rest])
+    match rest.split("/"):
+        case ["floor_plan"]:
             return Channel(site, FLOOR_PLAN)
-        case [site, "survey", "watch"]:
-            return Channel(site, "watch", "", messages.WatchMessage)
-        case [site, kind] if kind in _SITE_WIDE:
-            return Channel(site, kind, "", _SITE_WIDE[kind])
-        case [site, who, name, "health"] if who in _HEALTH:
+        case [who, name, "health"] if who in _HEALTH:
             return Channel(site, "health", name, _HEALTH[who])
-        case [site, _, name, kind] if kind in _OF_A_NODE:
+        case [_, name, kind] if kind in _OF_A_NODE:
             return Channel(site, kind, name, _OF_A_NODE[kind])
     return None
 

@@ -56,11 +56,15 @@ const HEADS = {
 };
 /** With more tags than this there is a search field. */
 const SEARCHED = 12;
+/** With more tags than this the table is brought up to date less often: laying it out costs as much as a frame. */
+const MANY = 40;
+const MANY_MS = 900;
 const WINDOW_S = 60;
 /** Figures of a tag that has not reported for longer are not of now. */
 const MAX_HEALTH_AGE_S = 3.5;
 const row = new Float64Array(COLUMNS);
 let parts = null;
+let shown = { key: "", at: -Infinity };
 
 /** Build the tab. */
 export function start(panel) {
@@ -79,12 +83,16 @@ export function start(panel) {
 export function show() {
   const list = tracks().sorted;
   const wanted = parts.search.value.trim().toLowerCase();
+  const key = [state.mode, state.selection.tag, wanted, list.length].join(" ");
+  const now = performance.now();
+  if (list.length > MANY && key === shown.key && now - shown.at < MANY_MS) return;
+  shown = { key, at: now };
   parts.search.hidden = list.length <= SEARCHED;
   parts.empty.hidden = list.length > 0;
   parts.table.element.hidden = list.length === 0;
   parts.table.element.classList.toggle("no-truth", !state.simulated);
-  const shown = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length) }]);
-  parts.table.rows.show(shown.filter(([name]) => name.toLowerCase().includes(wanted)));
+  const items = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length) }]);
+  parts.table.rows.show(items.filter(([name]) => name.toLowerCase().includes(wanted)));
   const fresh = list.filter((track) => freshness(track) === "fresh").length;
   text(parts.count, list.length ? `${fresh} of ${list.length} with a fix` : "");
   parts.detail.show(tracks().all.get(state.selection.tag) ?? null);
