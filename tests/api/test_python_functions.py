@@ -22,6 +22,9 @@ from skyless.site.grid import grid_site
 from skyless.site.lab import lab_site
 from skyless.site.load import load_site
 from skyless.site.template import site_template
+from skyless.studies import motion
+from skyless.studies.catalogue import STUDIES, _of_worlds
+from skyless.studies.common.picture import Look
 from skyless.studies.common.plan import MEASURED
 from skyless.survey_inputs.samples import Stay
 
@@ -41,6 +44,15 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_study():
+    """Of the study ``motion`` two cases only."""
+    cases = _of_worlds("motion", "motion", lambda plan: motion.cases(plan)[:2], Look("Motion", ("rmse", "nees")))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(STUDIES, "motion", cases)
+        yield
+
+
 @pytest.fixture(scope="module")
 def results(folder):
     """A small result of each function."""
@@ -52,7 +64,7 @@ def results(folder):
         plan=skyless.plan(folder / "lab.toml", method="weighted", step_m=1.0, target_m=0.1),
         calibrate=skyless.calibrate(folder / "tdoa-table", anchors=anchors, truth=truth),
         delays=skyless.calibrate(folder / "stay.mcap", site=folder / "lab.toml", at_m=(3.0, 4.0)),
-        study=skyless.study("sync", quick=True, method="weighted", worlds=2, seconds=1.0, processes=1),
+        study=skyless.study("motion", quick=True, method="weighted", worlds=2, seconds=1.0, processes=1),
     )
 
 
@@ -63,7 +75,7 @@ COMMANDS = {
     "plan": "plan lab.toml --method weighted --step 1 --target 10",
     "calibrate": "calibrate tdoa-table --anchors anchors.csv --truth truth.csv",
     "delays": "calibrate stay.mcap --site lab.toml --at 3,4",
-    "study": "study sync --quick --method weighted --worlds 2 --seconds 1 --processes 1",
+    "study": "study motion --quick --method weighted --worlds 2 --seconds 1 --processes 1",
 }
 """What each result is compared with."""
 
