@@ -63,6 +63,7 @@ def dashboard(
     from skyless.dashboard.live import LiveSite
     from skyless.dashboard.overlays import Overlays
     from skyless.dashboard.playback import Playback
+    from skyless.dashboard.processors import ProcessorUse
     from skyless.dashboard.serve import bind, serve
 
     address = broker.address()
@@ -78,7 +79,7 @@ def dashboard(
     sock = bind(listening)
     port = sock.getsockname()[1]
     rules = _rules(sock.getsockname()[0], listening.host, port, token)
-    live = LiveSite(_client_name(port), str(address), known)
+    live = LiveSite(_client_name(port), str(address), known, used_share=ProcessorUse().share)
     live.floor_plan = image
     page = _address(listening.host, port, rules)
     if json:

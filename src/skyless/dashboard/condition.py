@@ -18,6 +18,7 @@ from skyless.dashboard.reasons import (
     alert_reasons,
     anchor_reasons,
     broker_reason,
+    busy_reason,
     fix_reasons,
     late_reason,
     master_reason,
@@ -59,9 +60,18 @@ class ConditionMonitor:
         self._blind_until_s = float("-inf")
 
     def evaluate(
-        self, now_s: float, lag_s: float = 0.0, watch: WatchMessage | None = None, watch_age_s: float | None = None
+        self,
+        now_s: float,
+        lag_s: float = 0.0,
+        watch: WatchMessage | None = None,
+        watch_age_s: float | None = None,
+        used_share: float | None = None,
     ) -> Condition:
-        """The condition now. ``lag_s`` is by how much the server's own work was delayed since the last evaluation."""
+        """The condition now.
+
+        ``lag_s`` is by how much the server's own work was delayed since the last evaluation, ``used_share`` the share
+        of its computer's processors that is in use, None where it is not known.
+        """
         evidence = self.evidence
         ages = evidence.ages.least_ages_s()
         latencies = evidence.ages.percentiles_s()
@@ -71,7 +81,7 @@ class ConditionMonitor:
                 return Condition("waiting", "waiting for the broker", (), None, None)
             reason = broker_reason()
             return Condition(reason.level, reason.text, (reason,), None, None)
-        for reason in (*self._find(ages, now_s, lag_s), *watch_reasons(watch, watch_age_s)):
+        for reason in (*self._find(ages, now_s, lag_s, used_share), *watch_reasons(watch, watch_age_s)):
             self._hold(reason, now_s)
         self._held = {kind: held for kind, held in self._held.items() if now_s - held[0] < HOLD_S}
         tags = evidence.of("tag")
@@ -91,10 +101,13 @@ class ConditionMonitor:
             reason = replace(reason, level="bad")
         self._held[reason.kind] = now_s, reason
 
-    def _find(self, ages: dict[str, tuple[float, float]], now_s: float, lag_s: float) -> Iterable[Reason]:
+    def _find(
+        self, ages: dict[str, tuple[float, float]], now_s: float, lag_s: float, used_share: float | None
+    ) -> Iterable[Reason]:
         evidence = self.evidence
         for reason in (
             slow_reason(evidence, now_s, lag_s),
+            busy_reason(evidence, used_share) if evidence.nodes else None,
             late_reason(evidence, ages),
             master_reason(evidence, now_s),
         ):

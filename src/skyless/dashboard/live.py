@@ -159,8 +159,12 @@ class LiveSite:
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
         host: str = platform.node(),
+        used_share: Callable[[float], float | None] | None = None,
     ) -> None:
-        """``name`` is the dashboard's on MQTT; ``broker`` its address without a password; ``host`` this computer."""
+        """``name`` is the dashboard's on MQTT; ``broker`` its address without a password; ``host`` this computer.
+
+        ``used_share`` gives the share of its processors in use at a time of ``clock``: ``ProcessorUse.share``.
+        """
         self.name, self.broker = name, broker
         self.site = site
         self.floor_plan: bytes | None = None
@@ -193,6 +197,7 @@ class LiveSite:
         self.condition: Condition = self._condition_monitor.evaluate(clock())
         self._logged_serial = 0
         self._lag_s = 0.0
+        self._used_share = used_share
         self._preparation_s = 0.0
 
     # MQTT
@@ -489,7 +494,10 @@ class LiveSite:
         self._condition_due_s = now_s + EVALUATION_S
         unix_s = self._wall_clock()
         watch = self.survey.watch
-        self.condition = self._condition_monitor.evaluate(now_s, self._lag_s, watch, self.survey.watch_age_s)
+        used_share = None if self._used_share is None or self.preparation is not None else self._used_share(now_s)
+        self.condition = self._condition_monitor.evaluate(
+            now_s, self._lag_s, watch, self.survey.watch_age_s, used_share
+        )
         self._lag_s = 0.0
         self.log.on_watch(watch, unix_s)
         self.log.on_survey(self.survey.survey, unix_s)

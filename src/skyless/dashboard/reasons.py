@@ -13,9 +13,17 @@ LATE_S: Final = 0.25
 VERY_LATE_S: Final = 1.0
 """Age of positions on arrival."""
 
-SLOW_SHARE: Final = 0.02
+MISSED_SHARE: Final = 0.1
+"""Of transmissions missed in a second. A computer with little to do misses 1 to 4 % in most seconds."""
+
+DROPPED_SHARE: Final = 0.02
+"""Of receptions dropped by a tag, which an idle computer never does."""
+
 VERY_SLOW_SHARE: Final = 0.5
-"""Of transmissions missed, or of receptions dropped."""
+"""Of either."""
+
+BUSY_SHARE: Final = 0.95
+"""Of the processors in use: then each program waits for others, and positions may come late at any moment."""
 
 LAG_S: Final = 0.25
 """Delay of the page's server itself that counts as too slow."""
@@ -106,6 +114,14 @@ def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None
     return Reason("slow", "bad" if worst > VERY_SLOW_SHARE else "warning", text, advice)
 
 
+def busy_reason(evidence: Evidence, used_share: float | None) -> Reason | None:
+    """All processors of the page's computer are in use, by whatever program."""
+    if used_share is None or used_share < BUSY_SHARE:
+        return None
+    text = f"{evidence.computer(evidence.host)} is fully busy: {used_share:.0%} of its processors are in use"
+    return Reason("busy", "warning", text, "End other programs there, or positions may come late or not at all.")
+
+
 _Sign = tuple[str, float, str]
 """Computer, share of what was lost, and words."""
 
@@ -118,13 +134,13 @@ def _lag(evidence: Evidence, lag_s: float) -> Iterable[_Sign]:
 def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
     """Transmissions of the emulated air, and of anchors."""
     for _, air in evidence.of("ether"):
-        if air.reports(now_s) and isinstance(air.health, EtherHealth) and air.health.missed_share > SLOW_SHARE:
+        if air.reports(now_s) and isinstance(air.health, EtherHealth) and air.health.missed_share > MISSED_SHARE:
             share = air.health.missed_share
             yield air.host, share, f"the emulated air missed {share:.0%} of the transmissions"
     shares: dict[str, dict[str, float]] = {}
     for name, anchor in evidence.of("anchor"):
         share = anchor.health.missed_share if isinstance(anchor.health, AnchorHealth) else 0.0
-        if anchor.reports(now_s) and share > SLOW_SHARE:
+        if anchor.reports(now_s) and share > MISSED_SHARE:
             shares.setdefault(anchor.host, {})[name] = share
     for host, late in shares.items():
         worst = max(late.values())
@@ -140,7 +156,7 @@ def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
             continue
         count = now.late - before.late
         share = count / max(now.receptions - before.receptions, count, 1)
-        if count >= _MIN_DROPPED and share > SLOW_SHARE:
+        if count >= _MIN_DROPPED and share > DROPPED_SHARE:
             found.setdefault(tag.host, []).append((name, count, share))
     for host, drops in found.items():
         names = [name for name, _, _ in drops]
@@ -267,7 +283,7 @@ def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[R
         )
 
 
-_ORDER: Final = ("broker", "slow", "late", "no-fixes", "limit", "moved", "anchors", "master", "no-fix", "alert")
+_ORDER: Final = ("broker", "slow", "busy", "late", "no-fixes", "limit", "moved", "anchors", "master", "no-fix", "alert")
 """Causes before their effects."""
 
 
