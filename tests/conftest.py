@@ -7,8 +7,18 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from skyless.cli.common.progress import compile_with_counts
+from skyless.preparation.parts import EVERY_PART
+from skyless.preparation.processes import missing
+
 settings.register_profile("skyless", deadline=None)  # the first call of a kernel compiles it
 settings.load_profile("skyless")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile all kernels once, before the workers: programs that start in tests then do not report it."""
+    if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
+        compile_with_counts(missing(EVERY_PART))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -312,7 +312,7 @@ def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
         (("--anchor-height", "1=2", "--anchor-height", "1=3"), "the height of anchor 1 should be given once"),
         (("--anchor-heights", "{hall}/elsewhere.csv"), 'column id is "77, 78"; it should be anchors among 1, 2'),
         (("--anchor-heights", "{hall}/pipe"), "a pipe"),
-        (("--site", "/dev/zero"), "16 MiB at most"),
+        (("--site", "/dev/zero"), "not a pipe or a device"),
         (("--distance", "1-2"), "--distance is '1-2'; it should be like"),
         (("--distance", "1-1=3"), "between two anchors"),
         (("--distance", "1-2=-3"), "a positive distance"),
@@ -347,7 +347,8 @@ def test_facts_from_options(hall):
     everybody = tuple(range(1, 13))
     facts, warnings = facts_of(
         FactOptions(
-            height=["2.5", "3=2.4"], distance=["1-4=7.21", "0x1-5=8±0.01", "2-3=4+-0.02"], point=["7=1,-2,3", "8=0,0"],
+            anchor_height=["2.5", "3=2.4"], distance=["1-4=7.21", "0x1-5=8±0.01", "2-3=4+-0.02"],
+            point=["7=1,-2,3", "8=0,0"],
             delay_std=0.15, pair_std=0.0, origin=1, x_axis=4,
         ),
         everybody,
@@ -365,16 +366,18 @@ def test_facts_from_options(hall):
     assert (bare.sketch_m, bare.delay_std_m, bare.heights_m[1]) == ({}, 0.0, site.anchors[0].z_m)
     kept, _ = facts_of(FactOptions(keep_positions=True), everybody, site)
     assert (kept.keep_positions, kept.sketch_std_m) == (True, pytest.approx(site.accuracy.survey_std_m))
-    free, _ = facts_of(FactOptions(dimensions=3, heights=hall / "heights.csv", height_std=0.1), (1, 2, 99), site)
+    free, _ = facts_of(
+        FactOptions(dimensions=3, anchor_heights=hall / "heights.csv", anchor_height_std=0.1), (1, 2, 99), site
+    )
     assert (free.dimensions, sorted(free.heights_m), free.height_std_m) == (3, [1, 2], 0.1)
 
 
 def test_missing_heights_are_those_of_the_others(hall):
-    facts, warnings = facts_of(FactOptions(height=["1=2", "2=3", "3=7"]), (1, 2, 3, 4), None)
+    facts, warnings = facts_of(FactOptions(anchor_height=["1=2", "2=3", "3=7"]), (1, 2, 3, 4), None)
     assert facts.heights_m == {1: 2.0, 2: 3.0, 3: 7.0, 4: 3.0}
     assert "anchor 4; 3 m is assumed" in warnings[0]
     with pytest.raises(SkylessError, match="no anchor 9"):
-        facts_of(FactOptions(height=["9=2"]), (1, 2), None)
+        facts_of(FactOptions(anchor_height=["9=2"]), (1, 2), None)
 
 
 def test_ranges_are_counted_before(hall):
