@@ -20,7 +20,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 import reference
 
 NAVIGATION = {
-    "Tutorials": ["docs/tutorials/first_site", "docs/tutorials/first_replay", "docs/tutorials/own_radio"],
+    "Tutorials": [
+        "docs/tutorials/first_site",
+        "docs/tutorials/first_replay",
+        "docs/tutorials/own_radio",
+        "examples/README",
+    ],
     "How to": [
         "docs/howto/run_a_site",
         "docs/setup",

@@ -14,7 +14,17 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PAGES = [
     *sorted(ROOT.glob("docs/**/*.md")),
-    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "firmware/README.md")),
+    *(
+        ROOT / name
+        for name in (
+            "README.md",
+            "CHANGELOG.md",
+            "CONTRIBUTING.md",
+            "SECURITY.md",
+            "examples/README.md",
+            "firmware/README.md",
+        )
+    ),
 ]
 CURRENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
 """Those that describe the code as it is."""
