@@ -28,14 +28,14 @@ import numpy as np
 from plain_flight_filter import plain_positions
 from scipy.stats import chi2
 
-from skyless.cli.common.recording_inputs import flight_height, height_to_hold, known_anchors, known_truth
 from skyless.evaluation.judge import Judge
 from skyless.recordings.foreign.avalue import anchor_distances_m
 from skyless.recordings.foreign.formats import format_of, open_recording
 from skyless.replays.captures import Replay, ReplayRequest
+from skyless.replays.inputs import flight_height, height_to_hold, known_anchors, known_truth
 from skyless.survey_inputs.run import CalibrationRequest, calibrate_capture
 
-LEVER_ARM = "-0.01245,0.00127,0.0908"
+LEVER_ARM = (-0.01245, 0.00127, 0.0908)
 """Of the antenna in the body of the UTIL drone, metres."""
 
 KUIPMAN_M = (2.0, 3.0)
