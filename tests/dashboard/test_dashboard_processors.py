@@ -2,7 +2,7 @@
 
 import pytest
 
-from skyless.dashboard.processors import WINDOW_S, ProcessorUse
+from skyless.dashboard.processors import USE_WINDOW_S, ProcessorUse
 
 
 def write(counters, *, busy, idle):
@@ -31,10 +31,10 @@ def test_a_system_that_does_not_say_gives_no_share(tmp_path, text):
     if text is not None:
         counters.write_text(text, encoding="ascii")
     use = ProcessorUse(counters)
-    assert [use.share(k * WINDOW_S) for k in range(3)] == [None] * 3
+    assert [use.share(k * USE_WINDOW_S) for k in range(3)] == [None] * 3
 
 
 def test_counters_that_stand_still_give_no_share(tmp_path):
     write(tmp_path / "stat", busy=10, idle=10)
     use = ProcessorUse(tmp_path / "stat")
-    assert [use.share(k * WINDOW_S) for k in range(3)] == [None] * 3
+    assert [use.share(k * USE_WINDOW_S) for k in range(3)] == [None] * 3

@@ -4,7 +4,7 @@ from collections import deque
 from pathlib import Path
 from typing import Final
 
-WINDOW_S: Final = 2.0
+USE_WINDOW_S: Final = 2.0
 """Time over which the use is averaged."""
 
 _IDLE, _IO_WAIT = 3, 4
@@ -20,7 +20,7 @@ class ProcessorUse:
         """Time of the sample, and ticks of all processors together: idle ones and all."""
 
     def share(self, now_s: float) -> float | None:
-        """Share of all processors' time that was in use in the last ``WINDOW_S``.
+        """Share of all processors' time that was in use in the last ``USE_WINDOW_S``.
 
         None at first, and where the system does not say.
         """
@@ -31,10 +31,10 @@ class ProcessorUse:
         except (OSError, ValueError, IndexError):
             self._samples.clear()
             return None
-        while len(self._samples) > 1 and now_s - self._samples[1][0] >= WINDOW_S:
+        while len(self._samples) > 1 and now_s - self._samples[1][0] >= USE_WINDOW_S:
             self._samples.popleft()
         then_s, idle_then, all_then = self._samples[0]
         _, idle, all_ = self._samples[-1]
-        if now_s - then_s < WINDOW_S or all_ <= all_then:
+        if now_s - then_s < USE_WINDOW_S or all_ <= all_then:
             return None
         return min(max(1.0 - (idle - idle_then) / (all_ - all_then), 0.0), 1.0)

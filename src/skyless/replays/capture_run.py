@@ -95,17 +95,17 @@ class CaptureRun:
 
 
 def _check_carries_anchors(asked: CaptureRequest) -> None:
-    """See that a recording without a table of anchors says itself where they are, before the whole of it is read.
+    """See that a recording without a table of anchors says something of them itself, before the whole of it is read.
 
     Raises SkylessError.
     """
     read = 0
     with open_recording(asked.path, asked.format, asked.listener) as recording:
         for read, record in enumerate(islice(recording, _MOST_WITHOUT_ANCHORS), start=1):  # noqa: B007 - used below
-            if getattr(record, "position_m", None) is not None:
+            if any(getattr(record, name, None) is not None for name in ("position_m", "a_m", "b_m")):
                 return
         name = recording.format.name
-    if read:
+    if read and not distances_of(asked.path, name):  # those are worth a replay by themselves
         raise SkylessError(
             f"--anchors is missing: {asked.path} ({name}) does not say where its anchors are; give their table, "
             "id,x_m,y_m,z_m, or --site"
