@@ -163,7 +163,7 @@ def resident_mb(pid):
 
 @contextlib.contextmanager
 def busy(loops):
-    """So many busy loops on every core."""
+    """A number of busy loops on every core."""
     cores = sorted(os.sched_getaffinity(0)) * loops
     code = "import os, sys; os.sched_setaffinity(0, {int(sys.argv[1])})\nwhile True: pass"
     running = [

@@ -28,6 +28,10 @@ TAGS = 4
 FRAMES, FRAME_S = 32, 0.25
 WALKED_S = 12.0
 """How long tags walk before the first frame, so that they have trails."""
+DRAW_SLOWLY = (
+    "period_ms => { window.requestAnimationFrame = draw => setTimeout(() => draw(performance.now()), period_ms); }"
+)
+"""Or a browser without a graphics card takes all processors, and the page says so."""
 START_S = 300.0
 """How long the demo may take to compile and to open its page."""
 LIMIT_BYTES = 600_000
@@ -69,6 +73,9 @@ def _frames_of(address: str) -> dict[str, list[Image.Image]]:
         visits = {theme: Visit(browser, address, viewport=SIZE, color_scheme=theme) for theme in frames}
         for visit in visits.values():
             until(visit.page, f"skyless.live.all.size >= {TAGS}", timeout_s=START_S)
+            visit.page.evaluate(DRAW_SLOWLY, 1e3 * FRAME_S)
+        for visit in visits.values():  # what two browsers at the start delayed lasts a minute
+            until(visit.page, "document.querySelector('#pill').classList.contains('good')", timeout_s=START_S)
         time.sleep(WALKED_S)
         begin_s = time.monotonic()
         for number in range(FRAMES):

@@ -1,6 +1,7 @@
 """While kernels are compiled the empty map says so with a count, in both themes and on a phone; then it goes."""
 
 import pytest
+from page_fake_site import condition
 
 
 def preparation(done, total, left_s=25.0):
@@ -15,8 +16,11 @@ def test_the_empty_map_shows_how_far_the_kernels_are_compiled(serve, visit, view
     page = visit(server, viewport=viewport).page
     page.wait_for_selector("#waiting")
     assert page.locator("#preparation").is_hidden()
+    server.condition = condition(level="waiting", text="waiting for the site's anchors")
+    page.wait_for_selector("#pill:has-text('Waiting for the site')")
     server.send(preparation(0, 0, None))
     page.wait_for_selector("#preparation:has-text('Compiling the kernels')")
+    page.wait_for_selector("#pill:has-text('Compiling')")
     assert page.locator("#waiting").is_hidden()
     server.send(preparation(37, 120))
     page.wait_for_selector("#preparation:has-text('Compiling 37 of 120 kernels')")
@@ -27,3 +31,4 @@ def test_the_empty_map_shows_how_far_the_kernels_are_compiled(serve, visit, view
     server.send({"type": "preparation", "preparation": None})
     page.locator("#preparation").wait_for(state="hidden")
     page.wait_for_selector("#waiting")
+    page.wait_for_selector("#pill:has-text('Waiting for the site')")

@@ -4,5 +4,5 @@ Each function takes keyword arguments with the defaults of its command, computes
 returns a frozen result: figures, NumPy arrays, a table for pandas, a picture.
 
 Public: calibrate, plan, replay, simulate, study.
-Within the package: fixes, inputs, result, slot_plan.
+Within the package: fixes, floor_result, inputs, result, slot_plan.
 """

@@ -2,13 +2,13 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from skyless.api.floor_result import FloorResult
 from skyless.api.inputs import AnySite, Progress, silent, site_of
-from skyless.api.result import Result, cm, data_frame
+from skyless.api.result import cm, data_frame
 from skyless.api.slot_plan import SlotPlanResult, plan_slots
 from skyless.arguments import (
     check_choice,
@@ -21,12 +21,11 @@ from skyless.arguments import (
 )
 from skyless.errors import SkylessError
 from skyless.evaluation.scenarios import NOISIEST_PS
-from skyless.kernels.arrays import Array, Matrix, Vector
+from skyless.kernels.arrays import Array, Matrix
 from skyless.method_names import DEFAULT_METHOD, METHODS
 from skyless.planning.columns import ANCHORS_IN_VIEW, PLAN_COLUMNS, RMSE, SIGMA
 from skyless.planning.floor import (
     Box,
-    Floor,
     check_anchor_count,
     fewest_anchors,
     floor_of,
@@ -49,33 +48,8 @@ if TYPE_CHECKING:
 _ARGUMENTS = {"range": "range_m", "step": "step_m", "outline": "outline_m"}
 
 
-class PlanResult(Result, frozen=True, eq=False):
-    """Predicted errors over the floor of a site with one master."""
-
-    site: Site
-    """As planned: with its anchors where they were placed, if that was asked for."""
-    file: Path
-    floor: Floor
-    """Outline and region."""
-    map: PlanMap
-    """The whole table of predictions, ``map.table`` of shape (heights, ny, nx, columns)."""
-    summary: dict[str, Any]
-    """The object that ``skyless plan --json`` writes, in SI units, but for the version."""
-
-    @property
-    def x_m(self) -> Vector:
-        """Shape (nx,): where the points are."""
-        return self.map.grid.x_m
-
-    @property
-    def y_m(self) -> Vector:
-        """Shape (ny,)."""
-        return self.map.grid.y_m
-
-    @property
-    def heights_m(self) -> Vector:
-        """Shape (heights,): heights of the tags."""
-        return self.map.grid.heights_m
+class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
+    """Predicted errors over the floor of a site with one master; ``map.table`` has all columns."""
 
     @property
     def sigma_m(self) -> Array:

@@ -3,14 +3,15 @@
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from skyless.api.result import Result, data_frame
+from skyless.api.floor_result import FloorResult
+from skyless.api.result import data_frame
 from skyless.errors import SkylessError
-from skyless.kernels.arrays import Array, Matrix, Vector
-from skyless.planning.floor import Box, Floor, floor_of
+from skyless.kernels.arrays import Array, Matrix
+from skyless.planning.floor import Box, floor_of
 from skyless.planning.links import with_range
 from skyless.planning.slot_plan import RateMap, rate_map
 from skyless.planning.slot_report import described_slots, slot_report, with_planned_slots
@@ -22,32 +23,11 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-class SlotPlanResult(Result, frozen=True, eq=False):
-    """Beacons that reach tags over the floor of a site without a master."""
+class SlotPlanResult(FloorResult[RateMap], frozen=True, eq=False):
+    """Beacons that reach tags over the floor of a site without a master.
 
-    site: Site
-    """In mode slots with its slots, those of its file if it has any that fit."""
-    file: Path
-    floor: Floor
-    """Outline and region."""
-    map: RateMap
-    summary: dict[str, Any]
-    """The object that ``skyless plan --json`` writes, in SI units, but for the version."""
-
-    @property
-    def x_m(self) -> Vector:
-        """Shape (nx,): centres of the cells."""
-        return self.map.grid.x_m
-
-    @property
-    def y_m(self) -> Vector:
-        """Shape (ny,)."""
-        return self.map.grid.y_m
-
-    @property
-    def heights_m(self) -> Vector:
-        """Shape (heights,): heights of the tags."""
-        return self.map.grid.heights_m
+    ``site`` has, in mode slots, its slots: those of its file if it has any that fit.
+    """
 
     @property
     def beacons_per_s(self) -> Array:

@@ -113,8 +113,8 @@ def program() -> App:
     )
     for number, (title, commands) in enumerate(_GROUPS.items()):
         group = Group(title, sort_key=number)
-        for place, (name, module, summary) in enumerate(commands):
-            app.command(f"skyless.cli.{module}:app", name=name, help=summary, group=group, sort_key=place)
+        for index, (name, module, summary) in enumerate(commands):
+            app.command(f"skyless.cli.{module}:app", name=name, help=summary, group=group, sort_key=index)
     options = Group("Options", sort_key=len(_GROUPS))
     for option in ("--help", "--version"):
         app[option].group = (options,)

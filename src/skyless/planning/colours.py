@@ -1,7 +1,7 @@
 """The colours of predicted values, the same on the page's map and in the plan's pictures.
 
-A value's colour depends on the logarithm of its ratio to the lowest value of the scale: 2 cm beside 1 cm is as
-different as 2 m beside 1 m. Plain Python, because the dashboard's process does without NumPy.
+A value's colour depends on the logarithm of its ratio to the lowest value of the scale: 1 cm and 2 cm differ
+as much as 1 m and 2 m. Plain Python, because the dashboard's process does without NumPy.
 """
 
 import math

@@ -28,7 +28,7 @@ _MOST_BYTES: Final = 1 << 24
 """Of a site file: devices do not end."""
 
 _TOO_DEEP: Final = re.compile(rb"(?:[\w-]+[ \t]*\.[ \t]*){64}")
-"""A dotted key of so many parts; a site file has two. The time to read one grows with their square."""
+"""A dotted key of more than 64 parts; a site file needs two. The time to read a key grows with their square."""
 
 _TABLES: Final[dict[str, type[Struct]]] = {
     "schedule": ScheduleSite,

@@ -123,7 +123,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 @contextmanager
 def _scratch_beside(path: Path) -> Iterator[int]:
-    """A file beside another, open for writing: it takes the other's name when the block ends without an error.
+    """A scratch file next to a file, open for writing: it takes the file's name if the block ends without an error.
 
     Raises:
         OSError: it cannot be made, or take the name.

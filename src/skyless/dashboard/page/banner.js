@@ -20,7 +20,7 @@ let listed = "";
 
 /** Fill the header and the banner, and keep them up to date. */
 export function start() {
-  on(["connection", "mode", "player", "condition", "site"], show);
+  on(["connection", "mode", "player", "condition", "site", "preparation"], show);
   setInterval(() => {
     show();
     if (state.connection.phase !== "lost") text(byId("time"), timeOfDay(now_s()));

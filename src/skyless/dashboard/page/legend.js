@@ -1,4 +1,4 @@
-/** The legend beside the map: marks of tags and anchors, switches for layers, floors, and saving; and the scale of an overlay. */
+/** The legend next to the map: marks of tags and anchors, switches for layers, floors, and saving; and the scale of an overlay. */
 
 import { changed, on, saveSetting, savedSetting, select, state } from "./store.js";
 import { byId, h, options, text, throttle, toast } from "./dom.js";

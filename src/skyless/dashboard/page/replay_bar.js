@@ -23,7 +23,7 @@ export const KEYS = [
 ];
 /** Marks have at least this distance, in pixels; events that are closer share one. */
 const MARK_PX = 26;
-/** Of events that share a mark, so many are named. */
+/** How many of the events that share a mark are named. */
 const NAMED = 3;
 
 /** Build the bar. */
