@@ -1,11 +1,13 @@
 """Where compiled kernels are kept: folders that cannot be written, files that were damaged, users without a home."""
 
+import ast
 import json
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -111,3 +113,81 @@ def test_a_damaged_file_is_compiled_again(run_twice, tmp_path):
         file.write_bytes(b"")  # as a loss of power leaves it
         assert run_twice(tmp_path / "kept") == [4.0, True, 0, 1]
         assert run_twice(tmp_path / "kept") == [4.0, True, 1, 0]
+
+
+def imported(module, of):
+    """Modules of the package that a module imports, by its syntax tree."""
+    found = set()
+    for node in ast.walk(ast.parse(of[module])):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{name.name}" for name in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+    return found & of.keys()
+
+
+def test_the_folder_is_another_one_after_a_change_of_anything_that_a_kernel_may_use(monkeypatch):
+    """Of the sources as they are: each module that some module with kernels imports, directly or not."""
+    package = Path(cache.__file__).parents[1]
+    read = {file: file.read_bytes() for file in package.rglob("*.py")}
+    of = {cache._module(file, package): text for file, text in read.items()}
+    wanted = {name for name, text in of.items() if b"skyless.kernels.compiled" in text}
+    seen = set()
+    while wanted:
+        name = wanted.pop()
+        seen.add(name)
+        wanted |= imported(name, of) - seen
+    assert {"skyless.clocks.filter", "skyless.positioning.fix", "skyless.ticks", "skyless.constants"} <= seen
+    hashed = []
+    monkeypatch.setattr(cache.hashlib, "sha1", lambda **_: SimpleNamespace(update=hashed.append, hexdigest=str))
+    cache.digest(package)
+    assert {name for name in seen if of[name] not in hashed} == set()
+    assert of["skyless.dashboard.live"] not in hashed
+
+
+@pytest.mark.parametrize("line", ["from skyless.ticks import PER_S", "from skyless import (\n    air,\n    ticks,\n)"])
+def test_a_constant_from_another_module_belongs_to_the_kernels(tmp_path, line):
+    package = tmp_path / "skyless"
+    package.mkdir()
+    (package / "air.py").write_text(f"from skyless.kernels.compiled import kernel\n{line}\n")
+    (package / "other.py").write_text("")
+    (package / "ticks.py").write_text("PER_S = 1\n")
+    first = cache.digest(package)
+    (package / "other.py").write_text("WIDTH = 2\n")
+    assert cache.digest(package) == first
+    (package / "ticks.py").write_text("PER_S = 2\n")
+    assert cache.digest(package) != first
+
+
+def test_a_home_that_may_not_be_searched_is_passed_over(tmp_path, monkeypatch):
+    closed = tmp_path / "closed"
+
+    def refuse(path, *_more, **_options):
+        if closed in path.parents:
+            raise PermissionError(path)
+        return True
+
+    for method in ("mkdir", "is_dir"):
+        monkeypatch.setattr(Path, method, refuse)
+    monkeypatch.setattr(os, "access", lambda *_: True)
+    assert choose_folder((closed, tmp_path / "home"), "kernels-1", KEY).path == tmp_path / "home" / "kernels-1"
+
+
+def test_a_relative_folder_stays_the_same_for_programs_that_work_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "kept")
+    assert cache.kernel_folder.__wrapped__().path.parent == tmp_path / "kept"
+    assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "kept")
+
+
+def test_a_folder_of_other_sources_that_is_used_now_and_then_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    for name in ("kernels-used", "kernels-forgotten"):
+        (tmp_path / name).mkdir()
+        os.utime(tmp_path / name, (0.0, 0.0))
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "digest", lambda _: "used")
+        patch.setattr(cache, "_remove_unused", lambda _: None)
+        cache.kernel_folder.__wrapped__()  # another version starts
+    own = cache.kernel_folder.__wrapped__().path
+    assert {path.name for path in tmp_path.iterdir()} == {"kernels-used", own.name}

@@ -1,8 +1,8 @@
 """Where compiled kernels are kept, and which parts of them are there.
 
-The folder belongs to exactly these sources: the compiler notices a change of the kernel's own file but not of the
-kernels that it calls, so a digest of all files with kernels, and of the constants that they use, stands in its name.
-Folders of other sources are removed when no running program can need them.
+The folder belongs to exactly these sources: the compiler notices a change of the kernel's own file but not of what it
+calls, nor of constants from elsewhere, so a digest of all files with kernels, and of all that these import, stands in
+its name. Folders of other sources are removed when they have not been used for long.
 
 The first of these is used that can be written, or that cannot but holds kernels for this processor (an image):
 ``NUMBA_CACHE_DIR``, next to the sources, the user's cache, a private folder among the temporary ones.
@@ -10,6 +10,7 @@ The first of these is used that can be written, or that cannot but holds kernels
 
 import hashlib
 import os
+import re
 import shutil
 import stat
 import sys
@@ -33,8 +34,9 @@ Those with a minus are left out. So several programs compile parts of what one c
 """
 
 _PACKAGE: Final = Path(__file__).parents[1]
-_KEPT_S: Final = 86_400.0
-"""Kernels of older sources are kept for a day: a program that was started with them may still be compiling."""
+_IMPORT: Final = re.compile(rb"from (skyless[\w.]*) import (\([^)]*\)|.*)")
+_KEPT_S: Final = 7 * 86_400.0
+"""Kernels of other sources are kept for a week after their last use: several versions may share a folder."""
 
 
 class KernelFolder(Struct, frozen=True):
@@ -64,10 +66,15 @@ class KernelFolder(Struct, frozen=True):
 @cache
 def kernel_folder() -> KernelFolder:
     """Where this program keeps compiled kernels; a folder that can be written exists."""
-    name = f"kernels-{_digest()}"
+    if asked := os.environ.get("NUMBA_CACHE_DIR"):
+        # absolute for the programs that this one starts, too: they may change their working folder
+        os.environ["NUMBA_CACHE_DIR"] = str(Path(asked).absolute())
+    name = f"kernels-{digest(_PACKAGE)}"
     found = choose_folder(_homes(), name, _key()) or _temporary_folder(name, _key())
     if found.writable:
-        _remove_older(found.path)
+        with suppress(OSError):
+            os.utime(found.path)  # its time is that of its last use
+            _remove_unused(found.path)
     return found
 
 
@@ -77,10 +84,11 @@ def choose_folder(homes: Iterable[Path], name: str, key: str) -> KernelFolder | 
         path = home / name
         with suppress(OSError):
             path.mkdir(parents=True, exist_ok=True)
-        if path.is_dir() and os.access(path, os.W_OK | os.X_OK):
-            return KernelFolder(path, key, writable=True, temporary=False)
-        if any(path.glob(f"ready-{key}-*")):
-            return KernelFolder(path, key, writable=False, temporary=False)
+        with suppress(OSError):  # a home that may not be searched
+            if path.is_dir() and os.access(path, os.W_OK | os.X_OK):
+                return KernelFolder(path, key, writable=True, temporary=False)
+            if any(path.glob(f"ready-{key}-*")):
+                return KernelFolder(path, key, writable=False, temporary=False)
     return None
 
 
@@ -88,8 +96,9 @@ def _homes() -> Iterable[Path]:
     if asked := os.environ.get("NUMBA_CACHE_DIR"):
         yield Path(asked)
     yield _PACKAGE / "__pycache__"
-    if asked := os.environ.get("XDG_CACHE_HOME"):
-        yield Path(asked) / "skyless"
+    cached = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if cached.is_absolute():  # a relative one is not valid
+        yield cached / "skyless"
     with suppress(RuntimeError):  # a user without a home
         yield Path.home() / ".cache" / "skyless"
 
@@ -109,14 +118,26 @@ def _temporary_folder(name: str, key: str) -> KernelFolder:
     return KernelFolder(home / name, key, writable=True, temporary=True)
 
 
-def _digest() -> str:
-    digest = hashlib.sha1(usedforsecurity=False)
-    for source in sorted(_PACKAGE.rglob("*.py")):
-        text = source.read_bytes()
-        is_kernel = b"skyless.kernels.compiled" in text or source.parent.name == "kernels"
-        if is_kernel or source.name == "constants.py":
-            digest.update(text)
-    return digest.hexdigest()[:16]
+def digest(package: Path) -> str:
+    """Of the files of the package ``skyless`` that hold kernels, and of all that these import."""
+    texts = {_module(file, package): file.read_bytes() for file in sorted(package.rglob("*.py"))}
+    wanted = [name for name, text in texts.items() if b"skyless.kernels.compiled" in text or ".kernels." in name]
+    used: set[str] = set()
+    while wanted:
+        name = wanted.pop()
+        if name in texts and name not in used:
+            used.add(name)
+            for module, names in _IMPORT.findall(texts[name]):
+                origin = module.decode()
+                wanted += [origin, *(f"{origin}.{one}" for one in re.findall(r"\w+", names.decode()))]
+    found = hashlib.sha1(usedforsecurity=False)
+    for name in sorted(used):
+        found.update(texts[name])
+    return found.hexdigest()[:16]
+
+
+def _module(file: Path, package: Path) -> str:
+    return str(file)[len(str(package.parent)) + 1 : -len(".py")].replace(os.sep, ".")
 
 
 def _key() -> str:
@@ -128,7 +149,7 @@ def _key() -> str:
     return hashlib.sha1("\n".join(words).encode(), usedforsecurity=False).hexdigest()[:12]
 
 
-def _remove_older(folder: Path) -> None:
+def _remove_unused(folder: Path) -> None:
     for old in folder.parent.glob("kernels-*"):
         with suppress(FileNotFoundError):  # another program may be cleaning up as well
             if old != folder and time.time() - old.stat().st_mtime > _KEPT_S:
