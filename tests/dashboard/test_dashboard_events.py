@@ -54,6 +54,46 @@ def test_a_node_that_reports_no_more_is_offline_once_and_comes_back():
     assert texts(log, 1) == ["anchor 3 is online", "anchor 3 does not report any more", "anchor 3 reports again"]
 
 
+def test_a_status_that_the_broker_repeats_is_no_start():
+    log = EventLog()
+    log.on_status(status("anchor", "3", unix_s=NOW), NOW)
+    log.on_health("anchor", "3", anchor_health(3, NOW), NOW)
+    log.tick(NOW + 10)
+    log.on_status(status("anchor", "3", unix_s=NOW), NOW + 20)  # after a reconnect
+    assert texts(log, 1) == ["anchor 3 does not report any more"]
+    log.on_status(status("anchor", "3", unix_s=NOW + 30), NOW + 30)  # it has connected again itself
+    log.tick(NOW + 40)
+    log.on_health("anchor", "3", anchor_health(3, NOW), NOW + 40)
+    log.tick(NOW + 50)
+    log.on_status(replace(status("anchor", "3", unix_s=NOW + 51), pid=7), NOW + 60)
+    assert texts(log, 2) == [
+        "anchor 3 reports again", "anchor 3 does not report any more", "anchor 3 started again",
+    ]  # fmt: skip
+
+
+def test_nothing_ends_while_nothing_can_be_received():
+    log = EventLog()
+    log.on_health("tag", "t1", tag_health("t1", NOW), NOW)
+    log.on_fix(fix(alert="alert-limit-exceeded"), NOW)
+    log.pause(NOW + 60)
+    log.tick(NOW + 60.5)
+    assert texts(log) == ["tag t1: the protection level is above the alert limit"]
+    log.tick(NOW + 70)
+    assert texts(log, 1) == ["tag t1 does not report any more", "tag t1: integrity alert ended"]
+
+
+def test_times_for_people_follow_their_clock_and_silence_does_not():
+    log = EventLog(1e9)
+    log.on_status(status("anchor", "3", unix_s=1e9 + NOW), NOW)
+    log.on_health("anchor", "3", anchor_health(3, NOW), NOW)
+    log.unix_offset_s = 2e9  # the clock has been set
+    log.tick(NOW + 1)
+    log.tick(NOW + 4)
+    assert [(event.text, event.unix_s) for event in log.since()] == [
+        ("anchor 3 is online", 1e9 + NOW), ("anchor 3 does not report any more", 2e9 + NOW + 4)
+    ]  # fmt: skip
+
+
 def test_a_takeover_names_both_masters():
     log = EventLog()
     for k, master in enumerate((1, 1, 2)):

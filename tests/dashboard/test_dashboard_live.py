@@ -7,7 +7,9 @@ import msgspec
 import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status, truth
 from msgspec.structs import replace
+from test_dashboard_condition import anchor_health
 
+from skyless.dashboard.events import SILENT_S
 from skyless.dashboard.live import LiveSite
 from skyless.dashboard.zones import MAX_EVENTS, TAG_TIMEOUT_S, BadZonesError
 from skyless.mqtt import topics
@@ -289,3 +291,30 @@ def test_the_truth_reaches_the_rows(live, wire):
     wire.deliver(topics.truth_topic(SITE_ID), truth(position_m=(2.0, 2.03, 1.0)))
     wire.deliver(FIX, fix(position_m=(2.0, 2.0, 1.0)))
     assert live.state.rows_since(0)[0][10] == pytest.approx(0.03)
+
+
+def test_neither_a_clock_that_is_set_nor_an_absent_broker_nor_a_stall_makes_anchors_silent(live, wire, times):
+    def pass_time(seconds, lag_s=0.0):
+        times.move(seconds)
+        live.tick(lag_s)
+
+    def report():
+        wire.deliver(topics.health_topic(SITE_ID, "anchor", "1"), anchor_health(1, times.unix_s))
+
+    live.on_connection(connected=True)
+    report()
+    times.unix_s += 3600.0
+    pass_time(1.0)
+    live.on_connection(connected=False)
+    for _ in range(20):
+        pass_time(0.5)
+    live.on_connection(connected=True)
+    pass_time(0.5)
+    report()
+    pass_time(8.0, lag_s=8.0)
+    pass_time(0.5)
+    pass_time(0.5)
+    assert [event for event in live.log.since() if event.kind == "anchor"] == []
+    pass_time(SILENT_S)
+    (event,) = [event for event in live.log.since() if event.kind == "anchor"]
+    assert (event.text, event.unix_s) == ("anchor 1 does not report any more", times.unix_s)

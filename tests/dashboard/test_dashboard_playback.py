@@ -225,6 +225,17 @@ def test_the_events_of_a_recording_are_those_that_a_live_page_would_have_listed(
         playback.events("../events.mcap")
 
 
+def test_a_recording_with_a_gap_lists_no_outage(folder):
+    recorder = McapRecorder(McapFile(folder / "cut.mcap"))
+    for at_s in (0, 1, 2, 3, 60, 61, 62):
+        health = made_up.anchor_health(1, at_s, START_S + at_s)
+        recorder.add(topics.health_topic(SITE_ID, "anchor", 1), msgspec.json.encode(health), START_S + at_s)
+        health = made_up.anchor_health(2, at_s, START_S + at_s)
+        recorder.add(topics.health_topic(SITE_ID, "anchor", 2), msgspec.json.encode(health), START_S + at_s + 0.1)
+    recorder.file.close()
+    assert Playback(folder).events("cut.mcap").events == ()
+
+
 def test_the_summary_says_when_there_are_fixes(folder):
     """Nothing for 3 s, fixes for 2 s, nothing for 5 s, fixes for 1 s; the first is known exactly."""
     recorder = McapRecorder(McapFile(folder / "gaps.mcap"))

@@ -94,6 +94,10 @@ class ConditionMonitor:
             return Condition("good", "", (), *latencies)
         return Condition("waiting", self._awaited(), (), *latencies)
 
+    def is_blind(self, now_s: float) -> bool:
+        """Whether messages may be missing: the broker is not connected, or the server itself was delayed."""
+        return not self.evidence.connected or now_s < self._blind_until_s
+
     def _hold(self, reason: Reason, now_s: float) -> None:
         if reason.level == "bad":
             self._bad_s[reason.kind] = now_s
@@ -116,7 +120,7 @@ class ConditionMonitor:
         yield from alert_reasons(evidence)
         if lag_s > LAG_S:
             self._blind_until_s = now_s + 2 * EVALUATION_S  # what has arrived meanwhile is still to be read
-        if now_s >= self._blind_until_s:
+        if not self.is_blind(now_s):
             yield from fix_reasons(evidence, now_s)
             yield from anchor_reasons(evidence, now_s)
 

@@ -1,6 +1,7 @@
 """What has happened at a site, as a list of events: from the messages of MQTT or of a recording. No I/O.
 
-``unix_s`` is the time of the list's owner: the page server's clock, or the recording's times.
+``now_s`` is the time of the list's owner: the page server's monotonic clock, so that a clock that is set ends nothing,
+or the recording's times.
 """
 
 from collections import deque
@@ -53,7 +54,7 @@ class _Alert:
     """The alert of one tag."""
 
     def __init__(self) -> None:
-        self.seen_unix_s = self.logged_unix_s = float("-inf")
+        self.seen_s = self.logged_s = float("-inf")
         self.alert: str | None = None
         """None where there is none now."""
         self.logged = False
@@ -64,7 +65,9 @@ class _Alert:
 class EventLog:
     """Gathers events; readers ask for what is new since a serial."""
 
-    def __init__(self) -> None:
+    def __init__(self, unix_offset_s: float = 0.0) -> None:
+        """``unix_offset_s`` is Unix time less the owner's time; it follows a clock that is set."""
+        self.unix_offset_s = unix_offset_s
         self.serial = 0
         self._events: deque[Event] = deque(maxlen=MAX_LOGGED)
         self._statuses: dict[tuple[str, str], StatusMessage] = {}
@@ -85,55 +88,65 @@ class EventLog:
 
     # Nodes
 
-    def on_status(self, status: StatusMessage, unix_s: float) -> None:
+    def on_status(self, status: StatusMessage, now_s: float) -> None:
         """A node has come online or gone."""
         key = status.kind, status.name
         before = self._statuses.get(key)
         if before is None and len(self._statuses) >= MAX_NAMES:
             return
         self._statuses[key] = status
-        if before is None:
-            happened = status.online and unix_s - status.unix_s < _KEPT_S
-        else:
-            happened = before.online != status.online or (status.online and before.pid != status.pid)
+        kept = now_s + self.unix_offset_s - status.unix_s >= _KEPT_S
+        changed = before is not None and (
+            before.online != status.online or (status.online and before.pid != status.pid)
+        )
+        happened = changed or (before is None and status.online and not kept)
         if not status.online:
             self._reported.pop(key, None)
-            self._end_alert(status.name, unix_s) if status.kind == "tag" else None
+            self._end_alert(status.name, now_s) if status.kind == "tag" else None
         if key in self._silent:
+            if status.online and kept and not changed:
+                return  # the broker has repeated it
             self._silent.discard(key)
             happened = status.online  # that it is gone stands in the list already
         if happened:
-            again = status.online and before is not None and before.online
-            self._add_presence(key, status.online, unix_s, "started again" if again else "")
+            was_online = status.online and before is not None and before.online
+            words = "" if not was_online else "started again" if changed else "reports again"
+            self._add_presence(key, status.online, now_s, words)
 
-    def on_health(self, kind: str, name: str, health: Health, unix_s: float) -> None:
+    def on_health(self, kind: str, name: str, health: Health, now_s: float) -> None:
         """A node reports."""
         key = kind, name
         if key in self._silent:
             self._silent.discard(key)
-            self._add_presence(key, True, unix_s, "reports again")
+            self._add_presence(key, True, now_s, "reports again")
         if key in self._reported or len(self._reported) < MAX_NAMES:
-            self._reported[key] = unix_s
+            self._reported[key] = now_s
         if isinstance(health, AnchorHealth):
             before = self._leader.leader
-            leader = self._leader.update(health, unix_s)
+            leader = self._leader.update(health, now_s)
             if leader is not None:
                 word = "master" if health.mode == "master" else "root of the slot time"
                 text = f"anchor {leader} is the {word} now, after anchor {before}"
-                self._add(unix_s, "master", "warning", f"anchor/{leader}", text)
+                self._add(now_s, "master", "warning", f"anchor/{leader}", text)
 
-    def tick(self, unix_s: float) -> None:
+    def tick(self, now_s: float) -> None:
         """Look for what has ended; to be called once or twice a second."""
-        for key, reported_unix_s in list(self._reported.items()):
-            if unix_s - reported_unix_s > SILENT_S:
+        for key, reported_s in list(self._reported.items()):
+            if now_s - reported_s > SILENT_S:
                 del self._reported[key]
                 self._silent.add(key)
-                self._add_presence(key, False, unix_s, "does not report any more")
+                self._add_presence(key, False, now_s, "does not report any more")
         for name, alert in self._alerts.items():
-            if alert.alert is not None and unix_s - alert.seen_unix_s > ALERT_END_S:
-                self._end_alert(name, unix_s)
+            if alert.alert is not None and now_s - alert.seen_s > ALERT_END_S:
+                self._end_alert(name, now_s)
 
-    def _add_presence(self, key: tuple[str, str], online: bool, unix_s: float, words: str) -> None:
+    def pause(self, now_s: float) -> None:
+        """Instead of a tick while messages cannot arrive: silence does not mean that something has ended."""
+        self._reported = dict.fromkeys(self._reported, now_s)
+        for alert in self._alerts.values():
+            alert.seen_s = now_s
+
+    def _add_presence(self, key: tuple[str, str], online: bool, now_s: float, words: str) -> None:
         kind, name = key
         level: Severity = "note"
         if kind in {"anchor", "tag", "ether"}:
@@ -144,11 +157,11 @@ class EventLog:
         group: Kind = "anchor" if kind == "anchor" else "tag" if kind == "tag" else "program"
         subject = _SUBJECTS.get(kind, kind)
         subject += "" if kind in {name, "ether"} else f" {name}"
-        self._add(unix_s, group, level, f"{kind}/{name}", f"{subject} {words}")
+        self._add(now_s, group, level, f"{kind}/{name}", f"{subject} {words}")
 
     # Fixes
 
-    def on_fix(self, fix: FixMessage, unix_s: float) -> None:
+    def on_fix(self, fix: FixMessage, now_s: float) -> None:
         """A fix, with or without an integrity alert."""
         alert = self._alerts.get(fix.tag)
         if ALERTS.get(fix.alert, 0) == 0:
@@ -157,31 +170,31 @@ class EventLog:
             if len(self._alerts) >= MAX_NAMES:
                 return
             alert = self._alerts[fix.tag] = _Alert()
-        alert.seen_unix_s = unix_s
+        alert.seen_s = now_s
         if alert.alert is not None and ALERTS[fix.alert] <= ALERTS[alert.alert]:
             return
         worse = alert.alert is not None
         alert.alert = fix.alert
-        if unix_s - alert.logged_unix_s < ALERT_INTERVAL_S and not worse:
+        if now_s - alert.logged_s < ALERT_INTERVAL_S and not worse:
             alert.skipped += 1
             return
         more = f" ({alert.skipped} more since the last one)" if alert.skipped else ""
-        alert.logged, alert.logged_unix_s, alert.skipped = True, unix_s, 0
+        alert.logged, alert.logged_s, alert.skipped = True, now_s, 0
         level: Severity = "bad" if ALERTS[fix.alert] > 1 else "warning"
-        self._add(unix_s, "alert", level, f"tag/{fix.tag}", f"tag {fix.tag}: {ALERT_WORDS[fix.alert or '']}{more}")
+        self._add(now_s, "alert", level, f"tag/{fix.tag}", f"tag {fix.tag}: {ALERT_WORDS[fix.alert or '']}{more}")
 
-    def _end_alert(self, name: str, unix_s: float) -> None:
+    def _end_alert(self, name: str, now_s: float) -> None:
         alert = self._alerts.get(name)
         if alert is None or alert.alert is None:
             return
         alert.alert = None
         if alert.logged:
             alert.logged = False
-            self._add(unix_s, "alert", "good", f"tag/{name}", f"tag {name}: integrity alert ended")
+            self._add(now_s, "alert", "good", f"tag/{name}", f"tag {name}: integrity alert ended")
 
     # Survey and watch
 
-    def on_watch(self, watch: WatchMessage | None, unix_s: float) -> None:
+    def on_watch(self, watch: WatchMessage | None, now_s: float) -> None:
         """What the watch of the anchors sees now; None when it has ended."""
         findings = () if watch is None else watch.findings
         now = {(str(finding.kind), finding.anchors): finding.sentence.rstrip(".") for finding in findings}
@@ -189,25 +202,25 @@ class EventLog:
         for (kind, anchors), sentence in now.items():
             if (kind, anchors) not in before:
                 level: Severity = "bad" if kind == "moved" else "warning"
-                self._add(unix_s, "watch", level, f"anchor/{anchors[0]}" if anchors else "", sentence)
+                self._add(now_s, "watch", level, f"anchor/{anchors[0]}" if anchors else "", sentence)
         for kind, anchors in before.keys() - now.keys():
             if watch is not None:
                 text = f"no longer found: {before[kind, anchors]}"
-                self._add(unix_s, "watch", "good", f"anchor/{anchors[0]}" if anchors else "", text)
+                self._add(now_s, "watch", "good", f"anchor/{anchors[0]}" if anchors else "", text)
 
-    def on_survey(self, survey: SurveyMessage | None, unix_s: float) -> None:
+    def on_survey(self, survey: SurveyMessage | None, now_s: float) -> None:
         """The survey program's state; a saved result is an event."""
         if survey is None:
             return
         same = survey.by == self._surveyed_by
         if same and survey.saved_serial is not None and survey.saved_serial != self._saved:
             where = f" to {survey.file}" if survey.file else ""
-            self._add(unix_s, "survey", "note", "", f"survey result {survey.saved_serial} saved{where}")
+            self._add(now_s, "survey", "note", "", f"survey result {survey.saved_serial} saved{where}")
         self._surveyed_by, self._saved = survey.by, survey.saved_serial
 
     # Condition
 
-    def on_condition(self, condition: Condition, unix_s: float) -> None:
+    def on_condition(self, condition: Condition, now_s: float) -> None:
         """The condition of the site; a change of its level, or of its first reason, is an event."""
         before, self._condition = self._condition, condition
         if before is not None and _first(before) == _first(condition):
@@ -215,14 +228,14 @@ class EventLog:
         if condition.level == "waiting" or (before is None and condition.level == "good"):
             return
         if condition.level == "good":
-            self._add(unix_s, "condition", "good", "", "condition good")
+            self._add(now_s, "condition", "good", "", "condition good")
         else:
             word = "fault" if condition.level == "bad" else "warning"
-            self._add(unix_s, "condition", condition.level, "", f"{word}: {condition.text}")
+            self._add(now_s, "condition", condition.level, "", f"{word}: {condition.text}")
 
-    def _add(self, unix_s: float, kind: Kind, level: Severity, name: str, text: str) -> None:
+    def _add(self, now_s: float, kind: Kind, level: Severity, name: str, text: str) -> None:
         self.serial += 1
-        self._events.append(Event(self.serial, unix_s, kind, level, name, text))
+        self._events.append(Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text))
 
 
 def _first(condition: Condition) -> tuple[str, str]:

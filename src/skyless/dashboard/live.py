@@ -192,7 +192,7 @@ class LiveSite:
         self.evidence = Evidence(host, clock())
         if site is not None:
             self.evidence.set_site(site.site, clock())
-        self.log = EventLog()
+        self.log = EventLog(wall_clock() - clock())
         self._condition_monitor = ConditionMonitor(self.evidence)
         self.condition: Condition = self._condition_monitor.evaluate(clock())
         self._logged_serial = 0
@@ -275,7 +275,7 @@ class LiveSite:
         now_s = self._clock()
         self.state.add_fix(fix, now_s)
         self.evidence.add_fix(fix, now_s)
-        self.log.on_fix(fix, self._wall_clock())
+        self.log.on_fix(fix, now_s)
         self._schedule(self.monitor.update(fix, now_s))
 
     def _on_status(self, topic: str, payload: bytes) -> None:
@@ -285,7 +285,7 @@ class LiveSite:
         _check_name(status.name, topic)
         self.state.add_status(status)
         self.evidence.add_status(status, self._clock())
-        self.log.on_status(status, self._wall_clock())
+        self.log.on_status(status, self._clock())
         if status.kind == "tag" and not status.online:
             self._schedule(self.monitor.remove_tag(status.name, self._wall_clock()))
 
@@ -296,7 +296,7 @@ class LiveSite:
             now_s, unix_s = self._clock(), self._wall_clock()
             self.state.add_health(name, health, now_s)
             self.evidence.add_health(kind, name, health, now_s, unix_s)
-            self.log.on_health(kind, name, health, unix_s)
+            self.log.on_health(kind, name, health, now_s)
 
     def _on_preparation(self, _topic: str, payload: bytes) -> None:
         now = read_message(payload, PreparationMessage) if payload else None
@@ -471,6 +471,7 @@ class LiveSite:
         self._lag_s = max(self._lag_s, lag_s)
         now_s, unix_s = self._clock(), self._wall_clock()
         self.state.unix_s = unix_s
+        self.log.unix_offset_s = unix_s - now_s
         self._schedule(self.monitor.expire_tags(now_s, unix_s))
         self._publish_events(now_s)
         if self.state.serial != self._sent_serial:
@@ -492,17 +493,16 @@ class LiveSite:
 
     def _evaluate(self, now_s: float) -> None:
         self._condition_due_s = now_s + EVALUATION_S
-        unix_s = self._wall_clock()
         watch = self.survey.watch
         used_share = None if self._used_share is None or self.preparation is not None else self._used_share(now_s)
         self.condition = self._condition_monitor.evaluate(
             now_s, self._lag_s, watch, self.survey.watch_age_s, used_share
         )
         self._lag_s = 0.0
-        self.log.on_watch(watch, unix_s)
-        self.log.on_survey(self.survey.survey, unix_s)
-        self.log.on_condition(self.condition, unix_s)
-        self.log.tick(unix_s)
+        self.log.on_watch(watch, now_s)
+        self.log.on_survey(self.survey.survey, now_s)
+        self.log.on_condition(self.condition, now_s)
+        (self.log.pause if self._condition_monitor.is_blind(now_s) else self.log.tick)(now_s)
         self._broadcast("condition", encode("condition", msgspec.structs.asdict(self.condition)))
 
     def _send_logged(self) -> None:

@@ -231,13 +231,16 @@ def _events(recording: McapRecording, stopped: threading.Event) -> RecordedEvent
     """The events of the same log that the live page has, by the recording's times."""
     log = EventLog()
     events: list[Event] = []
-    due_s = 0.0
+    due_s, last_s = 0.0, float("-inf")
     for found in recording.messages({"status", "health", "fix", "watch"}):
         if stopped.is_set() or len(events) >= MAX_RECORDED_EVENTS:
             break
-        if found.time_s >= due_s:
+        if found.time_s - last_s > _GAP_S:
+            log.pause(found.time_s)  # the recorder was cut off
+        elif found.time_s >= due_s:
             log.tick(found.time_s)
             due_s = found.time_s + _TICK_S
+        last_s = found.time_s
         _log_message(log, found)
         if log.serial > len(events):
             events += log.since(len(events))
