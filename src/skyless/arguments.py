@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,12 +36,12 @@ def check_number(
         raise wrong(name, value, f"a number{_limits(above, least, below, most)}")
 
 
-def check_whole(name: str, value: int | None, *, least: int, most: int | None = None) -> None:
+def check_whole(name: str, value: object, *, least: int, most: int | None = None) -> None:
     """See that a whole number is within its limits; None passes. Raises SkylessError."""
     if value is None:
         return
-    is_whole = _is_number(value) and float(value).is_integer()
-    if not (is_whole and least <= value <= (math.inf if most is None else most)):
+    whole = int(value) if not isinstance(value, bool) and isinstance(value, Integral) else None
+    if whole is None or not least <= whole <= (math.inf if most is None else most):
         raise wrong(
             name, value, f"a whole number{_limits(-math.inf, least, math.inf, math.inf if most is None else most)}"
         )
@@ -68,11 +69,8 @@ def check_kinds(name: str, values: Sequence[object], kind: type) -> None:
 
 def check_point(name: str, value: object, counts: tuple[int, ...], farthest_m: float = math.inf) -> None:
     """See that coordinates are finite, as many as one of ``counts``, and not too far away. Raises SkylessError."""
-    try:
-        numbers = [float(one) for one in value]  # type: ignore[attr-defined]
-    except (TypeError, ValueError):
-        numbers = []
-    if len(numbers) not in counts or not all(math.isfinite(one) and abs(one) <= farthest_m for one in numbers):
+    numbers = tuple(value) if isinstance(value, Iterable) and not isinstance(value, bytes) else ()
+    if len(numbers) not in counts or not all(_is_number(one) and abs(one) <= farthest_m for one in numbers):
         right = f"{' or '.join(map(str, counts))} finite numbers in metres"
         raise wrong(name, value, right + (f", at most {farthest_m:g}" if math.isfinite(farthest_m) else ""))
 
@@ -97,7 +95,7 @@ def named_as_arguments(names: Mapping[str, str]) -> Iterator[None]:
     try:
         yield
     except SkylessError as error:
-        text = re.sub(r"--([a-z][a-z0-9-]*)", lambda found: _argument(found[1], names), str(error))
+        text = re.sub(r"(?<![\w./-])--([a-z][a-z0-9-]*)", lambda found: _argument(found[1], names), str(error))
         if text == str(error):
             raise
         raise SkylessError(text) from None
@@ -112,7 +110,7 @@ def _is_number(value: object) -> bool:
         return False
     try:
         return math.isfinite(value)  # type: ignore[arg-type]
-    except TypeError:
+    except (TypeError, OverflowError):
         return False
 
 

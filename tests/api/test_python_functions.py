@@ -418,6 +418,14 @@ def test_mistakes_of_a_calibration_are_named(folder, arguments, right):
     assert "--" not in str(found.value)
 
 
+def test_a_lever_arm_without_a_truth_to_move_is_refused(folder, capsys):
+    right = "lever_arm_m is .*; it should be left out: a recording of skyless record brings its own"
+    with pytest.raises(skyless.SkylessError, match=right):
+        skyless.calibrate(folder / "stay.mcap", lever_arm_m=(0.0, 0.0, 0.1))
+    assert main(["calibrate", str(folder / "stay.mcap"), "--lever-arm", "0,0,0.1"]) == 2
+    assert "--lever-arm is '0,0,0.1'; it should be left out" in capsys.readouterr().err
+
+
 STUDY = [
     ({"name": "everything"}, "name is 'everything'; it should be one of efficiency"),
     ({"method": "best"}, "method is 'best'"),

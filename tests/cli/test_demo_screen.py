@@ -1,5 +1,6 @@
 """What the demo shows of alerts: a line that is always there for methods that give any, and counts at the end."""
 
+import asyncio
 import time
 from types import SimpleNamespace
 
@@ -7,7 +8,7 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from skyless.cli.nodes.demo import ALERT_SHOWN_S, MOST_ALERTS, Screen
+from skyless.cli.nodes.demo import ALERT_SHOWN_S, MOST_ALERTS, Screen, _either
 from skyless.mqtt.messages import AnchorHealth, Counters, FixMessage, TagHealth
 from skyless.nodes.watch import Watch
 from skyless.positioning.integrity import Alert
@@ -156,3 +157,18 @@ def test_what_was_too_old_is_named_where_there_was_any(stage):
     assert (screen.summary()["late_receptions"], screen.summary()["late_fixes"]) == (250, 3)
     for text in (screen.closing(), screen._line()):
         assert "this computer is too slow: 250 receptions dropped and 3 fixes withheld as too old" in text
+
+
+def test_a_part_of_the_demo_that_fails_ends_it():
+    async def fail():
+        raise RuntimeError("the part")
+
+    async def run():
+        site = asyncio.ensure_future(asyncio.sleep(60.0))
+        try:
+            await _either(site, fail())
+        finally:
+            site.cancel()
+
+    with pytest.raises(RuntimeError, match="the part"):
+        asyncio.run(run())

@@ -6,6 +6,10 @@ import subprocess
 import sys
 import threading
 
+from skyless.cli.common import progress
+from skyless.preparation import processes
+from skyless.preparation.parts import LAB
+
 WORK = """
 from skyless.cli.common import progress
 progress._HIDDEN_S = {patience}
@@ -52,7 +56,7 @@ COUNTS = """
 from skyless.cli.common.progress import CountLine
 from skyless.preparation.processes import Preparation
 with CountLine() as line:
-    line.show(Preparation(0, 0, None))
+    line.show(Preparation(0, 0, 30.0))
     line._next_s = 0.0
     line.show(Preparation(37, 120, 25.2))
     line.show(Preparation(38, 120, 24.9))
@@ -63,13 +67,22 @@ def test_counts_of_compilation_are_lines_in_a_pipe_and_one_line_on_a_terminal():
     done = subprocess.run([sys.executable, "-c", COUNTS], capture_output=True, text=True, check=True)
     assert done.stdout == ""
     assert done.stderr.splitlines() == [
-        "skyless: compiling kernels, at the first start only",
+        "skyless: compiling kernels, at the first start only, about 30 s left",
         "skyless: compiling kernels, at the first start only: 37 of 120, about 25 s left",
     ]
     shown = on_terminal(COUNTS)
     assert "\n" not in shown
     assert shown.rstrip(" \r").endswith("37 of 120, about 25 s left")
     assert shown.endswith("\r")
+
+
+def test_kernels_that_cannot_be_compiled_are_reported(monkeypatch, capsys):
+    monkeypatch.setattr(processes, "missing", lambda parts: parts)
+    monkeypatch.setattr(progress, "compile_with_counts", lambda _: ("the kernels of air could not be compiled: no",))
+    with progress.loading_kernels(*LAB):
+        pass
+    line = "skyless: the kernels of air could not be compiled: no; they are compiled where they are needed\n"
+    assert capsys.readouterr().err == line
 
 
 def test_never_in_a_pipe():

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from skyless.dashboard.condition import EVALUATION_S, HOLD_S, ConditionMonitor
 from skyless.dashboard.evidence import FRESH_S, GRACE_S, Evidence
-from skyless.dashboard.reasons import START_S
+from skyless.dashboard.reasons import START_S, alert_reasons
 from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth, TagHealth, WatchFinding, WatchMessage
 
 IDS = [anchor.id for anchor in SITE.site.anchors]
@@ -170,6 +170,33 @@ def test_the_cause_of_a_missing_fix_is_named(hall):
     assert reason.text == "tag t1 has no fix: too few anchors"
     assert reason.names == ("tag/t1",)
     assert "offline" in reason.advice
+
+
+def test_each_tag_has_the_cause_that_it_gives():
+    """Of some tags, then of all."""
+    hall = Hall(("t1", "t2", "t3", "t4")).start()
+    hall.run(10.0)
+    hall.tags = {"t1": {"reason": "bad-geometry"}, "t2": {"reason": "no-beacons"}, "t3": {"reason": "no-beacons"}}
+    hall.silent = {"t1", "t2", "t3"}
+    reason = hall.run(4.0).reasons[0]
+    assert reason.text == "tags t1, t2 and t3 have no fix: no beacons (tags t2 and t3); bad geometry (tag t1)"
+    assert reason.advice.startswith("For tags t2 and t3: It receives no anchor")
+    hall.silent = {"t1", "t2", "t3", "t4"}
+    text = hall.run(4.0).reasons[0].text
+    assert text == "no positions, although 4 tags are online: no beacons (tags t2 and t3); bad geometry (tag t1)"
+    hall.tags = {name: {"reason": "no-beacons"} for name in hall.silent}
+    assert hall.run(4.0).reasons[0].text == "no positions, although 4 tags are online: no beacons"
+
+
+def test_each_tag_has_its_own_alert():
+    evidence = Evidence(HOST, 0.0)
+    for name, alert in (("t1", "detected-not-excluded"), ("t2", "alert-limit-exceeded"), ("t3", "detected-excluded")):
+        evidence.add_fix(fix(name, alert=alert), 0.0)
+    assert [reason.text for reason in alert_reasons(evidence)] == [
+        "tag t1: a fault is not excluded, so that the position may be wrong; "
+        "tag t2: the protection level is above the alert limit",
+        "tag t3: a faulty anchor is excluded",
+    ]
 
 
 def test_tags_that_drop_old_receptions_are_named_with_their_number(hall):

@@ -59,18 +59,19 @@ def test_pages_are_sent_the_site_and_the_state_of_the_broker(live, wire):
 
 def test_pages_are_sent_how_far_kernels_are_compiled_until_nothing_comes(live, wire, times):
     topic = topics.preparation_topic(SITE_ID)
-    wire.deliver(topic, PreparationMessage(37, 120, 25.0, 1.0))
+    wire.deliver(topic, PreparationMessage(37, 120, 25.0, times.unix_s))
     page = live.open_page()
     assert of("preparation", drained(live, page))[0]["preparation"]["done"] == 37
     wire.deliver(topic, b"")
     assert of("preparation", drained(live, page)) == [{"type": "preparation", "preparation": None}]
-    wire.deliver(topic, PreparationMessage(38, 120, None, 1.0))
+    wire.deliver(topic, PreparationMessage(38, 120, 24.0, times.unix_s))
     times.move(4.9)
     live.tick()
     assert of("preparation", drained(live, page))[0]["preparation"]["done"] == 38
     times.move(0.2)  # the demo was killed
     live.tick()
     assert of("preparation", drained(live, page)) == [{"type": "preparation", "preparation": None}]
+    wire.deliver(topic, PreparationMessage(38, 120, 24.0, times.unix_s - 5.1))  # the broker has kept it
     assert of("preparation", drained(live, live.open_page())) == []
 
 

@@ -4,8 +4,8 @@ import pytest
 from page_fake_site import condition
 
 
-def preparation(done, total, left_s=25.0):
-    return {"type": "preparation", "preparation": {"done": done, "total": total, "left_s": left_s, "unix_s": 0.0}}
+def preparation(done, total):
+    return {"type": "preparation", "preparation": {"done": done, "total": total, "left_s": 25.0, "unix_s": 0.0}}
 
 
 @pytest.mark.parametrize(
@@ -18,7 +18,7 @@ def test_the_empty_map_shows_how_far_the_kernels_are_compiled(serve, visit, view
     assert page.locator("#preparation").is_hidden()
     server.condition = condition(level="waiting", text="waiting for the site's anchors")
     page.wait_for_selector("#pill:has-text('Waiting for the site')")
-    server.send(preparation(0, 0, None))
+    server.send(preparation(0, 0))
     page.wait_for_selector("#preparation:has-text('Compiling the kernels')")
     page.wait_for_selector("#pill:has-text('Compiling')")
     assert page.locator("#waiting").is_hidden()

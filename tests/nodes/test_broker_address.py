@@ -1,11 +1,13 @@
 """Programs without ``--mqtt`` find the broker that runs on this machine, and none that has ended."""
 
+import fcntl
 import os
 
 import pytest
 
 from skyless.cli.nodes.options import MqttOptions
 from skyless.mqtt.address import MqttAddress
+from skyless.nodes import broker_address
 from skyless.nodes.broker_address import StatedAddress, running_broker
 
 FIRST, SECOND = MqttAddress("127.0.0.1", 1891), MqttAddress("127.0.0.1", 1892, user="ann", password="secret")
@@ -35,7 +37,46 @@ def test_a_broker_whose_program_was_killed_is_not_found(tmp_path):
     StatedAddress(FIRST).withdraw()
     (tmp_path / "skyless" / "broker-1891").write_text(str(FIRST))
     assert running_broker() is None
-    assert list((tmp_path / "skyless").iterdir()) == []
+    stated = StatedAddress(FIRST)
+    assert running_broker() == FIRST
+    stated.withdraw()
+
+
+def test_a_broker_that_starts_while_others_look_for_one_is_found(tmp_path, monkeypatch):
+    """One has the file for a moment; another broker's end removes it just before it is locked."""
+    StatedAddress(FIRST).withdraw()
+    file = tmp_path / "skyless" / "broker-1891"
+    file.touch()
+    reader = file.open()
+    fcntl.flock(reader, fcntl.LOCK_SH)
+
+    def sleep(_seconds):
+        if not reader.closed:
+            file.unlink()
+            reader.close()
+
+    monkeypatch.setattr(broker_address.time, "sleep", sleep)
+    locked = broker_address.locked
+    removed = []
+
+    def lock(path):
+        found = locked(path)
+        if not removed:
+            removed.append(path.unlink())
+        return found
+
+    monkeypatch.setattr(broker_address, "locked", lock)
+    stated = StatedAddress(FIRST)
+    assert removed
+    assert running_broker() == FIRST
+    stated.withdraw()
+
+
+def test_one_who_looks_removes_no_file_that_a_broker_is_about_to_lock(tmp_path):
+    (tmp_path / "skyless").mkdir(mode=0o700)
+    (tmp_path / "skyless" / "broker-1891").touch()
+    assert running_broker() is None
+    assert (tmp_path / "skyless" / "broker-1891").exists()
 
 
 @pytest.mark.parametrize("text", [b"", b"\xff\xfe", b"http://127.0.0.1", b"mqtt://"])

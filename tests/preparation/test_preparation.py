@@ -73,6 +73,21 @@ def test_a_part_that_fails_is_reported_and_the_others_are_compiled(folder):
     assert missing(parts) == parts[:1]
 
 
+def test_a_process_that_cannot_be_started_is_reported_too(folder, monkeypatch):
+    start = asyncio.create_subprocess_exec
+
+    async def refuse(*words, **more):
+        if "wrong" in words:
+            raise BlockingIOError("too many processes")
+        return await start(*words, **more)
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", refuse)
+    parts = (tiny("wrong"), tiny("fine", "wrong"))
+    failures = asyncio.run(compile_parts(parts, lambda _: None))
+    assert failures == ("the kernels of wrong could not be compiled: too many processes",)
+    assert missing(parts) == parts[:1]
+
+
 def test_a_second_program_waits_and_shows_what_the_first_reports(folder):
     async def compile_beside_another():
         reports = []

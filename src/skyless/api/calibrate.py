@@ -157,7 +157,10 @@ def calibrate(
         raise SkylessError("at_m and stays say where the antenna was; give them without truth and lever_arm_m")
     own = is_mcap(path)
     if own:
-        useless = {"anchors": anchors, "format": format, "listener": listener}
+        useless = {
+            "anchors": anchors, "format": format, "listener": listener,
+            "lever_arm_m": lever_arm_m if truth is None else None,
+        }  # fmt: skip
         left_out(useless, "a recording of skyless record brings its own")
     else:
         left_out({"tag": tag}, "it is for recordings of skyless record")

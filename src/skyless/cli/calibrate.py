@@ -90,7 +90,10 @@ def calibrate(file: Path, /, *, asked: CalibrateOptions = CalibrateOptions()) ->
         raise SkylessError("--at says where the antenna was; it should be given without --truth and --lever-arm")
     stays, beginning = _stays(asked.at or ()), _first(asked.first)
     if own:
-        useless = {"anchors": asked.anchors, "format": asked.format, "listener": asked.listener}
+        useless = {
+            "anchors": asked.anchors, "format": asked.format, "listener": asked.listener,
+            "lever-arm": asked.lever_arm if asked.truth is None else None,
+        }  # fmt: skip
         check_left_out(useless, "a recording of skyless record brings its own")
     else:
         check_left_out({"tag": asked.tag}, "it is for recordings of skyless record")

@@ -300,6 +300,8 @@ class LiveSite:
 
     def _on_preparation(self, _topic: str, payload: bytes) -> None:
         now = read_message(payload, PreparationMessage) if payload else None
+        if now is not None and self._wall_clock() - now.unix_s > _PREPARATION_EXPIRY_S:
+            return  # the broker has kept it, of a demo that was killed
         self._preparation_s = self._clock()
         self._show_preparation(now)
 

@@ -62,7 +62,7 @@ class Reason(Struct, frozen=True):
 
     kind: str
     """Such as ``late`` or ``anchors``; there is one reason of a kind at a time."""
-    level: Literal["warning", "bad"]
+    level: _Severity
     text: str
     """What is wrong, and why."""
     advice: str
@@ -96,8 +96,8 @@ def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> 
             advice += (
                 f" Measured against the quickest message from {host} in the last minutes, whatever its clock shows."
             )
-    level: _Severity = "bad" if age_s > VERY_LATE_S else "warning"
-    return Reason("late", level, f"{whose} are {age_s:.1f} s behind: {why}", advice, _names("tag", late))
+    text = f"{whose} are {age_s:.1f} s behind: {why}"
+    return Reason("late", "bad" if age_s > VERY_LATE_S else "warning", text, advice, _names("tag", late))
 
 
 def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None:
@@ -172,11 +172,9 @@ def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
         return
     silent = [name for name, tag in without if not tag.reports(now_s)]
     causes = {name: _cause(tag) for name, tag in without if tag.reports(now_s)}
-    common = Counter(causes.values()).most_common(1)[0][0] if causes else ""
-    why = f": {common.replace('-', ' ')}" if common else ""
-    advice = _ADVICE_NO_FIX.get(common, "See whether fixes are published, and the log of the tag.")
     if len(without) == len(online):
         though = "a tag is online" if len(online) == 1 else f"{len(online)} tags are online"
+        why, advice = _causes(causes, len(without))
         if not causes:
             why, advice = ": they do not report", "See whether their programs and computers still run."
         yield Reason(
@@ -184,6 +182,7 @@ def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
         )
         return
     if causes:
+        why, advice = _causes(causes, len(causes))
         text = f"{_listed('tag', list(causes))} {_number(causes, 'has', 'have')} no fix{why}"
         yield Reason("no-fix", "warning", text, advice, _names("tag", list(causes)))
     if silent:
@@ -196,18 +195,40 @@ def _cause(tag: Node) -> str:
     return (tag.health.reason or "") if isinstance(tag.health, TagHealth) else ""
 
 
+def _causes(causes: Mapping[str, str], tags: int) -> tuple[str, str]:
+    """Why ``tags`` tags have no fix, with names where it is not the same for all, and what to do for most of them."""
+    groups = [(cause, names) for cause, names in _alike(causes) if cause]
+    words = [cause.replace("-", " ") for cause, _ in groups]
+    common, most = groups[0] if groups else ("", [])
+    advice = _ADVICE_NO_FIX.get(common, "See whether fixes are published, and the log of the tag.")
+    if groups and len(most) < tags:
+        words = [f"{word} ({_listed('tag', names)})" for word, (_, names) in zip(words, groups, strict=True)]
+        advice = f"For {_listed('tag', most)}: {advice}"
+    return f": {'; '.join(words)}" if words else "", advice
+
+
+def _alike(values: Mapping[str, str]) -> list[tuple[str, list[str]]]:
+    """Each value with the names that have it, the most common first."""
+    return [
+        (value, [name for name, of_name in values.items() if of_name == value])
+        for value, _ in Counter(values.values()).most_common()
+    ]
+
+
+_ALERT_REASONS: Final[tuple[tuple[str, int, _Severity, str], ...]] = (
+    ("limit", 2, "bad", "Do not rely on the position; see which anchors the tag uses and what blocks them."),
+    ("alert", 1, "warning", "The position is still sound; see what blocks an anchor, or whether one has moved."),
+)
+"""Kind of the reason, what the alerts count in ``ALERTS``, level and advice."""
+
+
 def alert_reasons(evidence: Evidence) -> Iterable[Reason]:
     """Alerts of integrity in the fixes since the last evaluation."""
-    bad: _Severity = "bad"
-    warning: _Severity = "warning"
-    for kind, grade, level, advice in (
-        ("limit", 2, bad, "Do not rely on the position; see which anchors the tag uses and what blocks them."),
-        ("alert", 1, warning, "The position is still sound; see what blocks an anchor, or whether one has moved."),
-    ):
+    for kind, grade, level, advice in _ALERT_REASONS:
         alerts = {name: str(tag.alert) for name, tag in evidence.of("tag") if ALERTS.get(tag.alert, 0) == grade}
         if alerts:
-            words = ALERT_WORDS[Counter(alerts.values()).most_common(1)[0][0]]
-            yield Reason(kind, level, f"{_listed('tag', list(alerts))}: {words}", advice, _names("tag", list(alerts)))
+            text = "; ".join(f"{_listed('tag', names)}: {ALERT_WORDS[alert]}" for alert, names in _alike(alerts))
+            yield Reason(kind, level, text, advice, _names("tag", list(alerts)))
 
 
 def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
@@ -233,11 +254,11 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
             offline.append(name)
     unseen = len(offline) == len(names) and all(node.since_s is None for _, node in evidence.of("anchor"))
     if offline and not (unseen and now_s - evidence.ready_s < START_S):
-        level: _Severity = "bad" if len(names) - len(offline) < _MIN_ANCHORS else "warning"
         which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
         which = which or f"{_listed('anchor', offline)} of {len(names)} {_number(offline, 'is', 'are')}"
         advice = "See whether power and program run there; positions are less accurate without them."
-        yield Reason("anchors", level, f"{which} offline", advice, _names("anchor", offline))
+        too_few = len(names) - len(offline) < _MIN_ANCHORS
+        yield Reason("anchors", "bad" if too_few else "warning", f"{which} offline", advice, _names("anchor", offline))
     if cut_off:
         text = f"{_listed('anchor', cut_off)} {_number(cut_off, 'does', 'do')} not report, though on the air"
         advice = "The program has lost the broker, or the page lost its messages: see its log."

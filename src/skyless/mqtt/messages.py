@@ -45,8 +45,8 @@ class PreparationMessage(Struct, frozen=True):
     done: int
     total: int
     """0 while it is not known yet."""
-    left_s: float | None
-    """Estimated; None where it is not known."""
+    left_s: float
+    """Estimated."""
     unix_s: float
 
 

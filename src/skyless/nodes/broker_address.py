@@ -8,12 +8,16 @@ import contextlib
 import fcntl
 import os
 import tempfile
+import time
 from pathlib import Path
-from typing import IO
+from typing import IO, Final
 
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress, mqtt_address
 from skyless.nodes.process import locked
+
+_ATTEMPTS: Final = 20
+_WAIT_S: Final = 0.01
 
 
 class StatedAddress:
@@ -24,7 +28,7 @@ class StatedAddress:
         self._lock: IO[str] | None = None
         with contextlib.suppress(OSError):
             file = _folder() / f"broker-{address.port}"
-            self._lock = locked(file)
+            self._lock = _locked(file)
             self._lock.truncate(0)
             self._lock.write(str(address))
             self._lock.flush()
@@ -36,6 +40,21 @@ class StatedAddress:
             self._file.unlink(missing_ok=True)
         if self._lock is not None:
             self._lock.close()
+
+
+def _locked(file: Path) -> IO[str]:
+    """The file, locked: one who looks for a broker may have it for a moment, and the last broker may remove it.
+
+    Raises:
+        OSError: it cannot be written, or another broker states its address there.
+    """
+    for attempt in range(_ATTEMPTS):
+        time.sleep(_WAIT_S if attempt else 0.0)
+        with contextlib.suppress(BlockingIOError, FileNotFoundError):
+            lock = locked(file)
+            if os.path.samestat(os.fstat(lock.fileno()), file.stat()):
+                return lock
+    return locked(file)
 
 
 def running_broker() -> MqttAddress | None:
@@ -50,14 +69,13 @@ def running_broker() -> MqttAddress | None:
 
 
 def _address_in(file: Path) -> MqttAddress | None:
-    """The address in a file; None, and the file removed, where its broker has ended."""
+    """The address in a file; None where its broker has ended. The file stays: a broker may be about to lock it."""
     try:
         with file.open(encoding="utf-8") as stated:
             try:
                 fcntl.flock(stated, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 return mqtt_address(stated.read())
-            file.unlink(missing_ok=True)
     except (OSError, SkylessError, UnicodeError):  # it has just ended, or begins at this moment
         pass
     return None

@@ -97,7 +97,7 @@ class WholeSite:
         others = [Child(program, self._log) for program in self._programs(address)]
         self.children = [*others, page]
         self.ready.set()
-        nodes = together(link.run(), page.run(), self._run_prepared(link, others))
+        nodes = outlasting(link.run(), together(page.run(), self._run_prepared(link, others)))  # its end is published
         await (nodes if broker is None else outlasting(self._keep(broker), nodes))  # they publish their end to it
 
     async def _run_prepared(self, link: Link, children: list[Child]) -> None:

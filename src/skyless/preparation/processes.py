@@ -28,8 +28,8 @@ class Preparation(Struct, frozen=True):
 
     done: int
     total: int
-    left_s: float | None
-    """Estimated; None where another program compiles and has not reported yet."""
+    left_s: float
+    """Estimated."""
 
 
 Report = Callable[[Preparation], None]
@@ -110,23 +110,31 @@ class _Run:
         for name in part.after:
             if name in self._ended:
                 await self._ended[name].wait()
+        progress = self._progress[part.name]
         async with self._free:
-            progress = self._progress[part.name]
             progress.begun_s = time.monotonic()
-            with tempfile.TemporaryFile(dir=self._folder.path) as errors:
-                async with _worker(part, errors) as process:
-                    assert process.stdout is not None
-                    async for line in process.stdout:
-                        progress.done, progress.total = msgspec.json.decode(line, type=tuple[int, int])
-                    code = await process.wait()
-                errors.seek(0)
-                last = errors.read().decode(errors="replace").strip().rpartition("\n")[2]
+            try:
+                problem = await self._run_worker(part, progress)
+            except OSError as error:  # a full disk, or too many processes
+                problem = str(error)
         progress.done, progress.ended = progress.total, True
         self._ended[part.name].set()
-        if code == 0:
-            self._folder.mark_ready(part.name)
+        if problem:
+            self._failures.append(f"the kernels of {part.name} could not be compiled: {problem}")
         else:
-            self._failures.append(f"the kernels of {part.name} could not be compiled: {last or f'exit code {code}'}")
+            self._folder.mark_ready(part.name)
+
+    async def _run_worker(self, part: Part, progress: _Progress) -> str:
+        """Compile a part; the reason where that fails. Raises OSError."""
+        with tempfile.TemporaryFile(dir=self._folder.path) as errors:
+            async with _worker(part, errors) as process:
+                assert process.stdout is not None
+                async for line in process.stdout:
+                    progress.done, progress.total = msgspec.json.decode(line, type=tuple[int, int])
+                code = await process.wait()
+            errors.seek(0)
+            last = errors.read().decode(errors="replace").strip().rpartition("\n")[2]
+        return "" if code == 0 else last or f"exit code {code}"
 
     async def _report_all(self) -> None:
         while True:

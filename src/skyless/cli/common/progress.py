@@ -82,7 +82,8 @@ def loading_kernels(*parts: "Part") -> Iterator[None]:
     from skyless.preparation.processes import missing
 
     if missing(parts):
-        compile_with_counts(parts)
+        for failure in compile_with_counts(parts):
+            _print_line(f"{failure}; they are compiled where they are needed")
     with status("loading the kernels"):
         yield
 
@@ -148,8 +149,7 @@ class CountLine:
 def count_text(now: "Preparation") -> str:
     """What a person reads while kernels are compiled."""
     counted = f": {now.done} of {now.total}" if now.total else ""
-    left = "" if now.left_s is None else f", about {max(1, round(now.left_s))} s left"
-    return f"compiling kernels, at the first start only{counted}{left}"
+    return f"compiling kernels, at the first start only{counted}, about {max(1, round(now.left_s))} s left"
 
 
 def _print_line(text: str) -> None:

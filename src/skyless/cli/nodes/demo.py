@@ -185,6 +185,8 @@ async def _either(site: "asyncio.Task[None]", part: object) -> None:
         await asyncio.wait((site, waiting), return_when=asyncio.FIRST_COMPLETED)
         if site.done():
             site.result()
+        if waiting.done():
+            waiting.result()
     finally:
         waiting.cancel()
 
