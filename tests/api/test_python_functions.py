@@ -389,6 +389,16 @@ PLAN = [
 ]
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [{"qa": 1.0}, {"search_s": 3.0}, {"verify_rounds": 200}, {"seed": 2}, {"method": "weighted"}, {"optimise": 4}],
+    ids=str,
+)
+def test_what_has_no_effect_on_a_plan_of_slots_is_refused(arguments):
+    with pytest.raises(skyless.SkylessError, match=f"{next(iter(arguments))} is not for this site, which is in mode"):
+        skyless.plan(grid_site(30.0, 20.0, 10.0, 4.0, 1.2), **arguments)
+
+
 @pytest.mark.parametrize(("arguments", "right"), PLAN, ids=[str(sorted(given)) for given, _ in PLAN])
 def test_mistakes_of_a_plan_are_named(arguments, right):
     with pytest.raises(skyless.SkylessError, match=right) as found:

@@ -129,6 +129,7 @@ def test_slots_are_coloured_shown_and_written(hall, tmp_path, capsys):
         (["--method", "weighted"], "--method is not for this site"),
         (["--verify", "5"], "--verify is not for this site"),
         (["--html", "x.html"], "--html is not for this site"),
+        (["--rounds", "200"], "--rounds is not for this site"),
         (["--conflicts", "none.csv"], "cannot be read"),
         (["--exponent", "9"], "exponent"),
         (["--step", "0.001"], "no map"),

@@ -14,7 +14,8 @@ import pytest
 from page_browser import THREE_FRAMES, until
 from PIL import Image
 
-from skyless.planning.colours import COLOUR_STOPS, ValueScale, colour_at, scale_of
+from skyless.planning.colours import COLOUR_STOPS, scale_of
+from value_colours import colour_of
 
 PROTANOPIA = np.array([[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]])
 DEUTERANOPIA = np.array([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])
@@ -218,7 +219,7 @@ def test_the_page_colours_values_as_the_planner_does(hall):
         given,
     )
     for value, colour in zip(given[1], drawn, strict=True):
-        assert colour == pytest.approx(colour_at(scale.fraction(value)), abs=1e-6)
+        assert colour == pytest.approx(colour_of(value, scale.low, scale.high), abs=1e-6)
     page.evaluate("import('/page/map/overlay.js').then((m) => m.choose('sigma'))")
     until(page, "skyless.state.overlay.data !== null")
     page.evaluate(THREE_FRAMES)
@@ -226,7 +227,7 @@ def test_the_page_colours_values_as_the_planner_does(hall):
     shown = pixels(page, "still")[round(y), round(x)]
     value = page.evaluate(modules(["map/overlay"], "return overlay.valueAt(5.6, 4.4);"))
     scale = page.evaluate("skyless.state.overlay.data.scale")
-    expected = colour_at(ValueScale(scale["low"], scale["high"], ()).fraction(value))
+    expected = colour_of(value, scale["low"], scale["high"])
     assert shown[:3] == pytest.approx(expected, abs=6)
     hall[1].problems.clear()  # a hint that pixels are read slowly
 

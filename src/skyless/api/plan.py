@@ -183,8 +183,9 @@ def plan(
     outline, region = _outline(outline_m), _region(region_m)
     if not known.schedule.needs_master:
         of_masters = {
-            "method": method != DEFAULT_METHOD, "noise_ps": noise_ps, "target_m": target_m, "optimise": optimise,
-            "anchor_heights_m": anchor_heights_m, "mounts_m": mounts_m, "verify_points": verify_points,
+            "method": method, "noise_ps": noise_ps, "qa": qa, "target_m": target_m, "optimise": optimise,
+            "anchor_heights_m": anchor_heights_m, "mounts_m": mounts_m, "search_s": search_s,
+            "verify_points": verify_points, "verify_rounds": verify_rounds, "seed": seed,
         }  # fmt: skip
         _refuse(of_masters, f"in mode {known.schedule.mode}: errors are predicted for sites with one master only")
         check_number("exponent", exponent, least=1.5, most=6.0)
@@ -232,8 +233,9 @@ def plan(
 
 def _refuse(given: Mapping[str, object], mode: str) -> None:
     """See that arguments which mean nothing here are not given. Raises SkylessError."""
+    usual = plan.__kwdefaults__ or {}
     for name, value in given.items():
-        if value is not None and value is not False:
+        if value is not None and not (usual[name] is not None and value == usual[name]):
             raise SkylessError(f"{name} is not for this site, which is {mode}; leave it out")
 
 

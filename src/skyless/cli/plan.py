@@ -140,7 +140,8 @@ def plan(file: Path, /, *, asked: PlanOptions = PlanOptions()) -> None:
 
 _FOR_PROTOCOL_2: Final = ("exponent", "conflicts", "write", "force")
 _FOR_ONE_MASTER: Final = (
-    "method", "noise_ps", "qa", "target", "grid", "html", "optimise", "out", "heights", "mounts", "verify",
+    "method", "noise_ps", "qa", "target", "grid", "html", "optimise", "out", "heights", "mounts", "search_seconds",
+    "verify", "rounds", "seed",
 )  # fmt: skip
 
 

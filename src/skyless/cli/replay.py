@@ -175,7 +175,7 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> "ReplayReport":
     """Replay a recording that another program made. Raises SkylessError."""
     from skyless.recordings.anchor_table import read_calibration
     from skyless.replays.capture_run import CaptureRequest, CaptureRun
-    from skyless.replays.inputs import known_anchors, known_truth
+    from skyless.replays.inputs import TOO_FLAT, known_anchors, known_truth
 
     protection = asked.protection
     of_sites = {
@@ -210,7 +210,8 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> "ReplayReport":
     if asked.json:
         print_json(summary)
     else:
-        _show(report, run.height_note, summary["anchor_distances_m"])
+        more = " (--tag-height free estimates it all the same)" if run.height_note == TOO_FLAT else ""
+        _show(report, run.height_note + more, summary["anchor_distances_m"])
     return report
 
 

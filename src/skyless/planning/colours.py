@@ -47,12 +47,6 @@ class ValueScale(Struct, frozen=True):
     ticks: tuple[float, ...]
     """Round values between both."""
 
-    def fraction(self, value: float) -> float:
-        """Position of a value on the scale, from 0 at ``low`` to 1 at ``high``."""
-        if not value > self.low:
-            return 0.0
-        return min(math.log(value / self.low) / math.log(self.high / self.low), 1.0)
-
 
 def scale_of(ordered: Sequence[float]) -> ValueScale | None:
     """The scale of finite values in ascending order; None without any."""
@@ -76,16 +70,3 @@ def round_values(low: float, high: float) -> tuple[float, ...]:
         step = next(factor * decade for factor in (1, 2, 2.5, 5, 10) if factor * decade >= rough * (1.0 - 1e-9))
         values = [number * step for number in range(math.ceil(low / step), math.floor(high / step) + 1)]
     return tuple(float(f"{value:.6g}") for value in values if low <= value <= high)
-
-
-def colour_at(fraction: float) -> tuple[float, float, float]:
-    """Red, green and blue, 0 to 255, at a position on a scale from 0 (best) to 1 (worst)."""
-    at = min(max(fraction, 0.0), 1.0) * (len(COLOUR_STOPS) - 1)
-    index = min(int(at), len(COLOUR_STOPS) - 2)
-    first, second = (_parts(stop) for stop in COLOUR_STOPS[index : index + 2])
-    red, green, blue = (a + (at - index) * (b - a) for a, b in zip(first, second, strict=True))
-    return red, green, blue
-
-
-def _parts(stop: str) -> tuple[int, int, int]:
-    return int(stop[1:3], 16), int(stop[3:5], 16), int(stop[5:7], 16)

@@ -18,6 +18,9 @@ from skyless.site.model import Site
 HEIGHT_WORDS = ("truth", "free", "auto")
 """What a tag's height may be instead of metres: the truth's median, estimated, or whichever suits."""
 
+TOO_FLAT = "the anchors' mean: they lie too flat to determine the height"
+"""Where a height is from that nobody gave."""
+
 
 def is_mcap(file: Path) -> bool:
     """Whether a file's content is an MCAP; one that cannot be opened, or would lose what is read here, is none."""
@@ -78,8 +81,7 @@ def height_to_hold(
     plane_m = plane_height_m(anchors_m)
     if plane_m is None:
         return None, 0.0, "estimated"
-    note = "the anchors' mean: they lie too flat to determine the height (--tag-height free estimates it all the same)"
-    return plane_m, GUESSED_STD_M, note
+    return plane_m, GUESSED_STD_M, TOO_FLAT
 
 
 def flight_height(wish: float | None, truth: Truth | None) -> float | None:
