@@ -14,7 +14,7 @@ import skyless
 SOURCE = Path(skyless.__file__).parent
 
 LAYERS = (
-    {"constants", "errors", "method_names", "kernels", "firmware"},
+    {"constants", "errors", "method_names", "whole_files", "kernels", "firmware"},
     {"arguments", "ticks"},
     {"air", "uncertainty"},
     {"site"},

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from msgspec import Struct
 
 import skyless
-from skyless.cli.common.output import print_json, to_json, write_atomically
+from skyless.cli.common.output import print_json, to_json
 
 
 class Colour(StrEnum):
@@ -70,14 +70,3 @@ def test_what_has_no_form_is_refused():
 def test_print_json(capsys):
     print_json({"rmse_m": math.nan})
     assert capsys.readouterr().out == f'{{"skyless_version":"{skyless.__version__}","rmse_m":null}}\n'
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path):
-    path = tmp_path / "file"
-    write_atomically(path, b"old")
-    with pytest.raises(TypeError):
-        write_atomically(path, "text, not bytes")
-    assert path.read_bytes() == b"old"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
-    write_atomically(path, b"new")
-    assert path.read_bytes() == b"new"

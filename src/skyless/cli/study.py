@@ -22,10 +22,11 @@ from skyless.cli.common.options import (
     check_picture,
     options,
 )
-from skyless.cli.common.output import console, print_json, to_json, write_atomically
+from skyless.cli.common.output import console, print_json, to_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
+from skyless.whole_files import write_whole
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -278,10 +279,10 @@ def _write(study: "Study", rows: "Sequence[Row]", plot: Path | None, out: Path |
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
             files |= {out / f"{study.name}.{kind}": kind for kind in ("png", "svg")}
-            write_atomically(out / f"{study.name}.json", to_json(rows).encode())
-            write_atomically(out / f"{study.name}.csv", _csv(rows).encode())
+            write_whole(out / f"{study.name}.json", to_json(rows).encode())
+            write_whole(out / f"{study.name}.csv", _csv(rows).encode())
         for path, kind in files.items():
-            write_atomically(path, picture(figure, kind))
+            write_whole(path, picture(figure, kind))
     except OSError as error:
         raise SkylessError(f"{error.filename or plot or out} cannot be written: {error.strerror}") from None
 

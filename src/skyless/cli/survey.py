@@ -241,7 +241,8 @@ def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
 
     The last one is named first. Raises SkylessError.
     """
-    from skyless.nodes.survey.files import kept_path, replace_files
+    from skyless.nodes.survey.files import kept_path
+    from skyless.whole_files import replace_files
 
     try:
         before = {kept_path(out): out.read_bytes()} if out.exists() else {}

@@ -4,7 +4,6 @@ Files are written whole or not at all, and without a screen.
 """
 
 import io
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from skyless.whole_files import write_whole
 
 INK: Final = "#1f2933"
 MUTED: Final = "#5f6b7a"
@@ -118,13 +119,7 @@ def save_figure(figure: Figure, path: Path) -> None:
     Raises:
         OSError, ValueError: the file cannot be written, or its ending names no kind of picture.
     """
-    data = picture(figure, path.suffix.removeprefix(".") or "png")
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        scratch.write_bytes(data)
-        scratch.replace(path)
-    finally:
-        scratch.unlink(missing_ok=True)
+    write_whole(path, picture(figure, path.suffix.removeprefix(".") or "png"))
 
 
 def picture(figure: Figure, kind: str, dpi: float = 130.0) -> bytes:

@@ -2,7 +2,6 @@
 
 import os
 import sys
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, TextIO
 import msgspec
 
 from skyless.errors import SkylessError
+from skyless.whole_files import whole_file, write_whole
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -87,11 +87,7 @@ def new_table(path: Path) -> Iterator[TextIO]:
         SkylessError: the file cannot be written.
     """
     try:
-        if path.exists() and not path.is_file():  # a device
-            with path.open("w", newline="", encoding="utf-8") as file:
-                yield file
-            return
-        with _scratch_beside(path) as handle, os.fdopen(handle, "w", newline="", encoding="utf-8") as file:
+        with whole_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
             try:
                 yield file
             except KeyboardInterrupt as error:
@@ -105,41 +101,8 @@ def new_table(path: Path) -> Iterator[TextIO]:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file as ``write_atomically`` does. Raises SkylessError when it cannot be written."""
+    """Write a file whole or not at all. Raises SkylessError when it cannot be written."""
     try:
-        write_atomically(path, data)
+        write_whole(path, data)
     except OSError as error:
         raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that a reader finds the old one or the whole new one, never a part; devices are written to."""
-    if path.exists() and not path.is_file():
-        path.write_bytes(data)
-        return
-    with _scratch_beside(path) as handle, os.fdopen(handle, "wb") as file:
-        file.write(data)
-
-
-@contextmanager
-def _scratch_beside(path: Path) -> Iterator[int]:
-    """A scratch file next to a file, open for writing: it takes the file's name if the block ends without an error.
-
-    Raises:
-        OSError: it cannot be made, or take the name.
-    """
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    scratch = Path(name)
-    try:
-        yield handle
-        scratch.chmod(0o666 & ~_umask())
-        scratch.replace(path)
-    except BaseException:
-        scratch.unlink(missing_ok=True)
-        raise
-
-
-def _umask() -> int:
-    umask = os.umask(0)
-    os.umask(umask)
-    return umask

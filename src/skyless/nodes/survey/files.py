@@ -1,6 +1,5 @@
 """A survey into the files of a site: the site's own, the record next to it, and the image of the floor."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 from zlib import crc32
@@ -18,6 +17,7 @@ from skyless.survey.ranges import PairRanges
 from skyless.survey.record import SurveyRecord, encode_record, read_record, record_path
 from skyless.survey.result import Survey
 from skyless.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text
+from skyless.whole_files import replace_files
 
 _ENDINGS: Final = {b"\x89PNG": ".png"}
 
@@ -132,16 +132,3 @@ def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None,
     if path.exists() and path.read_bytes() != floor.image:
         path = path.with_stem(f"{path.stem}-{crc32(floor.image):08x}")
     return path.name, {path: floor.image}
-
-
-def replace_files(files: Mapping[Path, bytes]) -> None:
-    """Write files so that a reader finds the old one or the whole new one; none where not all fit. Raises OSError."""
-    scratch = {path: path.with_name(f".{path.name}.part") for path in files}
-    try:
-        for path, data in files.items():
-            scratch[path].write_bytes(data)
-        for path in files:
-            scratch[path].replace(path)
-    finally:
-        for one in scratch.values():
-            one.unlink(missing_ok=True)
