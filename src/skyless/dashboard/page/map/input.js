@@ -44,11 +44,12 @@ export function listen(target, redraw, fitAll, toggleSpatial) {
     hover(at, event.pointerType);
     const before = pointers.get(event.pointerId);
     if (!before) return;
-    if (pointers.size === 2) pinch(event.pointerId, before, at);
-    else if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
-    else if (travelled + Math.hypot(at.x - before.x, at.y - before.y) >= MAX_TAP_TRAVEL)
-      drag(at.x - before.x, at.y - before.y, event.shiftKey);
     travelled += Math.hypot(at.x - before.x, at.y - before.y);
+    if (pointers.size === 2) pinch(event.pointerId, before, at);
+    else if (travelled >= MAX_TAP_TRAVEL) {
+      if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
+      else drag(at.x - before.x, at.y - before.y, event.shiftKey);
+    }
     pointers.set(event.pointerId, at);
     redraw(true);
   });
