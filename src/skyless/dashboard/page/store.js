@@ -80,6 +80,9 @@ function flush() {
   for (const callback of callbacks) callback();
 }
 
+/** Health older than this is not of now, and whoever sent it is offline; programs report once a second. */
+export const MAX_AGE_S = 3.5;
+
 /**
  * Seconds since the server got the health of a node; Infinity without any.
  * @param {"anchors"|"tags"|"ether"} kind

@@ -141,6 +141,17 @@ export function fit(site, zones, further, scaleShown = true) {
   [view.x_m, view.y_m] = toSite(x, y);
 }
 
+/** √5.991: half axes of the ellipse of 95 % in standard deviations, in two dimensions. */
+const SIGMAS_95 = 2.4477;
+
+/** Half axes in m of the ellipse that holds 95 % of the errors, and the angle of the long one from x. */
+export function halfAxes(xx, xy, yy) {
+  const middle = (xx + yy) / 2;
+  const difference = Math.hypot((xx - yy) / 2, xy);
+  const half = (variance) => SIGMAS_95 * Math.sqrt(Math.max(variance, 0));
+  return [half(middle + difference), half(middle - difference), Math.atan2(2 * xy, xx - yy) / 2];
+}
+
 /** A round length of at most as many pixels. */
 export function roundLength(pixels) {
   return roundStep(pixels / view.scale);

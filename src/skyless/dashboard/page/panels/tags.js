@@ -1,6 +1,6 @@
 /** All tags as a list; the selected one in detail, with its last minute as charts. */
 
-import { healthAge_s, state } from "../store.js";
+import { MAX_AGE_S, healthAge_s, state } from "../store.js";
 import { GONE_S, GREY_S, freshness, now_s, shown_s, tracks } from "../clock.js";
 import { Chart } from "../chart.js";
 import { h, text } from "../dom.js";
@@ -60,8 +60,6 @@ const SEARCHED = 12;
 const MANY = 40;
 const MANY_MS = 900;
 const WINDOW_S = 60;
-/** Figures of a tag that has not reported for longer are not of now. */
-const MAX_HEALTH_AGE_S = 3.5;
 const row = new Float64Array(COLUMNS);
 let parts = null;
 let shown = { key: "", at: -Infinity };
@@ -102,7 +100,7 @@ export function show() {
 function describe(name, { track, style: look }) {
   const condition = freshness(track);
   const known = condition !== "never" && track.at(shown_s(), row, false);
-  const reports = state.mode === "live" && healthAge_s("tags", name) < MAX_HEALTH_AGE_S;
+  const reports = state.mode === "live" && healthAge_s("tags", name) < MAX_AGE_S;
   const health = reports ? state.health.tags.get(name) : null;
   if (!known) row.fill(NaN);
   const alert = Object.values(ALERTS)[row[ALERT]];
@@ -192,7 +190,7 @@ function makeDetail() {
   const showDetail = (track) => {
     element.hidden = !track;
     if (!track) return;
-    const reports = state.mode === "live" && healthAge_s("tags", track.name) < MAX_HEALTH_AGE_S;
+    const reports = state.mode === "live" && healthAge_s("tags", track.name) < MAX_AGE_S;
     const health = reports ? state.health.tags.get(track.name) : null;
     text(heading, track.name);
     reason.hidden = !health?.reason;
