@@ -44,6 +44,7 @@ class FakeServer:
         self.silent_tags = set()
         self.refuse = False
         self.mute = False
+        self.answers_pings = True
         self.zone_error = None
         self.condition = made_up.condition()
         self.log = []
@@ -248,7 +249,7 @@ class FakeServer:
 
     async def _pongs(self, websocket, lock):
         while True:
-            if await websocket.receive_text() == "ping" and not self.mute:
+            if await websocket.receive_text() == "ping" and self.answers_pings and not self.mute:
                 await _send(websocket, lock, {"type": "pong"})
 
 

@@ -116,6 +116,21 @@ def test_a_cut_connection_is_told_and_comes_back(hall):
     until(page, SHOWN)
     assert "Connection lost" in page.locator("#banner").inner_text()
     assert page.locator("#pill").inner_text() == "Connection lost"
+    sockets = """async () => {
+      const { retryNow } = await import("/page/live.js");
+      const made = [];
+      const Before = window.WebSocket;
+      window.WebSocket = class extends Before {
+        constructor(address) {
+          super(address);
+          made.push(this);
+        }
+      };
+      for (let n = 0; n < 3; n++) retryNow();
+      window.WebSocket = Before;
+      return made.map((one) => one.readyState);
+    }"""
+    assert page.evaluate(sockets) == [3, 3, 0] or page.evaluate(sockets) == [2, 2, 0]
     server.refuse = False
     page.locator("#banner").wait_for(state="hidden")
     before = visit.position("forklift")

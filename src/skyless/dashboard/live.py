@@ -64,7 +64,7 @@ _log = logging.getLogger("skyless.dashboard")
 MAX_PAGES: Final = 400
 MAX_PAGES_PER_ADDRESS: Final = 100
 IDLE_S: Final = 12.0
-"""A page that has sent nothing for this long makes room for another one; a visible page sends a ping every 5 s."""
+"""A page that has sent nothing for this long makes room for another one; a visible page sends a ping every 2 s."""
 
 GONE_S: Final = 180.0
 """A page that has sent nothing for this long is disconnected; browsers let a hidden one send once a minute."""

@@ -8,7 +8,7 @@ import { receiveSurvey, receiveWatch, restart } from "./survey/model.js";
 
 const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 3000;
-const PING_MS = 5000;
+const PING_MS = 2000;
 /** The connection is lost after this time without a message: while tags move, and otherwise (every ping is answered). */
 const MOVING_TIMEOUT_MS = 3000;
 const IDLE_TIMEOUT_MS = 9000;
@@ -47,8 +47,11 @@ export function retryNow() {
 function connect() {
   const address = new URL("live", document.baseURI);
   address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+  const old = socket;
   const mine = (socket = new WebSocket(address));
+  old?.close(); // one that was still connecting
   lastMessage = lastPing = performance.now();
+  state.ping = { sentMs: null, tripMs: 0 };
   mine.onmessage = (event) => mine === socket && process(event.data);
   mine.onclose = ({ code, reason }) => {
     if (code === TRY_LATER) retry_ms = LAST_RETRY_MS;
@@ -90,9 +93,10 @@ function checkConnection() {
   if (silence > (moved || !open ? MOVING_TIMEOUT_MS : IDLE_TIMEOUT_MS)) {
     return lost(`no message for ${(silence / 1e3).toFixed(0)} s`);
   }
-  if (now - lastPing > PING_MS && socket.readyState === WebSocket.OPEN) {
+  // Pongs have no number: only one is under way at a time.
+  if (now - lastPing > PING_MS && state.ping.sentMs === null && socket.readyState === WebSocket.OPEN) {
     socket.send("ping");
-    lastPing = now;
+    lastPing = state.ping.sentMs = now;
   }
 }
 
@@ -133,6 +137,10 @@ const handlers = {
     lastMotion = lastMessage;
     live.add(message.tags, message.unix_s);
     if (message.tags.length) changed("tags");
+  },
+  pong() {
+    const { sentMs } = state.ping;
+    if (sentMs !== null) state.ping = { sentMs: null, tripMs: lastMessage - sentMs };
   },
   condition(message) {
     state.condition = message;

@@ -16,6 +16,8 @@ export const state = {
   connection: { phase: "connecting", since: performance.now(), reason: "" },
   /** @type {{connected: boolean, broker: string}|null} */
   mqtt: null,
+  /** The last ping: when it was sent, null once it is answered; and how long the last answer took. */
+  ping: { sentMs: /** @type {number|null} */ (null), tripMs: 0 },
   version: "",
   /** @type {any} the site message's `site` */
   site: null,
