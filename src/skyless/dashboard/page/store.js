@@ -94,11 +94,10 @@ export function healthAge_s(kind, name) {
   return age === undefined ? Infinity : age + (performance.now() - state.health.atMs) / 1e3;
 }
 
-/** Select one tag, anchor or zone, or with null none. */
+/** Select one tag, anchor or zone, or with null none; its tab opens, also where it is selected already. */
 export function select(kind, id) {
   const next = { tag: null, anchor: null, zone: null };
   if (kind) next[kind] = id;
-  if (Object.entries(next).every(([key, value]) => state.selection[key] === value)) return;
   state.selection = next;
   changed("selection");
 }

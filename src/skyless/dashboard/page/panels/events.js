@@ -84,7 +84,7 @@ function makeEvent(_key, { unix_s, level, name, text: words }) {
     "li",
     { class: level },
     h("time", { class: "when", title: dateTime(unix_s), dateTime: new Date(unix_s * 1e3).toISOString() }, timeOfDay(unix_s)),
-    h("span", { class: "event-mark", "aria-hidden": "true" }, MARKS[level]),
+    h("span", { class: "log-mark", "aria-hidden": "true" }, MARKS[level]),
     h("span", { class: "unseen" }, WORDS[level]),
     subject(name, sentence(words)),
   );
