@@ -376,7 +376,8 @@ def test_a_followed_tag_stays_in_the_middle_until_escape(hall):
 
 
 def test_the_map_is_saved_as_a_picture_with_its_legend(hall):
-    page = hall[1].page
+    server, visit = hall
+    page = visit.page
     until(page, "skyless.live.all.get('robot')?.count > 3")
     page.click("#legend summary")
     with page.expect_download() as download:
@@ -387,7 +388,7 @@ def test_the_map_is_saved_as_a_picture_with_its_legend(hall):
     assert picture.format == "PNG"
     assert picture.width == round(box["width"])
     assert picture.height > box["height"] + 60
-    words = page.evaluate("""async () => {
+    words = """async () => {
       const { mapPicture } = await import("/page/map/export.js");
       const found = [];
       const before = CanvasRenderingContext2D.prototype.fillText;
@@ -398,15 +399,26 @@ def test_the_map_is_saved_as_a_picture_with_its_legend(hall):
       mapPicture();
       CanvasRenderingContext2D.prototype.fillText = before;
       return found;
-    }""")
-    assert {"Hall 7", "forklift", "robot", "trolley", "anchor synchronised"} <= set(words)
-    assert any("live · simulated" in one and "20" in one for one in words)
+    }"""
+    live = page.evaluate(words)
+    assert {"Hall 7", "forklift", "robot", "trolley", "anchor synchronised"} <= set(live)
+    assert any("live · simulated" in one and "20" in one for one in live)
+    server.cut()
+    until(page, "skyless.state.connection.phase === 'lost'")
+    at = page.evaluate(
+        "(skyless.state.connection.since -= 3600e3, new Date(Date.now() - 3600e3).toLocaleTimeString('en-GB'))"
+    )
+    heading = next(one for one in page.evaluate(words) if "simulated" in one)
+    assert "last known state, connection lost" in heading
+    assert f" {at[:2]}:" in heading
+    visit.problems.clear()  # the browser's own lines about the refused sockets
 
 
 def test_positions_are_saved_as_a_table(hall):
     page = hall[1].page
     until(page, "skyless.live.all.get('robot')?.count > 5")
     page.click("#legend summary")
+    assert "2048" in page.locator("#save-positions").get_attribute("title")
     with page.expect_download() as download:
         page.click("#save-positions")
     rows = list(csv.DictReader(Path(download.value.path()).read_text().splitlines()))
