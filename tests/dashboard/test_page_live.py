@@ -130,7 +130,7 @@ def test_a_cut_connection_is_told_and_comes_back(hall):
       window.WebSocket = Before;
       return made.map((one) => one.readyState);
     }"""
-    assert page.evaluate(sockets) == [3, 3, 0] or page.evaluate(sockets) == [2, 2, 0]
+    assert [phase >= 2 for phase in page.evaluate(sockets)] == [True, True, False]  # closing, closing, connecting
     server.refuse = False
     page.locator("#banner").wait_for(state="hidden")
     before = visit.position("forklift")
