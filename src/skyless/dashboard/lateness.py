@@ -12,16 +12,21 @@ _WINDOW_S: Final = 60.0
 _HEALTH_AGE_S: Final = 2.5
 """The delay of a health message holds for this long."""
 
+_SET_BACK_S: Final = 10.0
+"""A delay that is longer than the one before by more than this is no delay: the tag's clock was set back."""
+
 
 class _Tag:
     """Delays of one tag's messages: ``now_s`` of arrival less ``unix_s`` of sending, so with the clocks' difference."""
 
-    __slots__ = ("before_s", "begun_s", "delay_s", "delay_seen_s", "least_age_s", "least_s", "made_s")
+    __slots__ = ("before_s", "begun_s", "delay_s", "delay_seen_s", "last_s", "least_age_s", "least_s", "made_s")
 
     def __init__(self, now_s: float) -> None:
         self.begun_s = now_s
         self.least_s = self.before_s = float("inf")
         """The least in the window that has begun, and in the one before."""
+        self.last_s = float("inf")
+        """Of the last fix."""
         self.delay_s, self.delay_seen_s = 0.0, float("-inf")
         """Of the last health message, where this computer sent it, and when it arrived."""
         self.least_age_s: float | None = None
@@ -37,8 +42,8 @@ class FixAges:
         self._tags: dict[str, _Tag] = {}
         self._all: list[float] = []
 
-    def add_fix(self, name: str, unix_s: float, latency_s: float, now_s: float) -> None:
-        """Add a fix whose last frame ended at ``unix_s`` by the tag's clock, and that arrives now."""
+    def add_fix(self, name: str, unix_s: float, latency_s: float, now_s: float) -> float:
+        """Add a fix whose last frame ended at ``unix_s`` by the tag's clock, and that arrives now; returns its age."""
         tag = self._tags.get(name)
         if tag is None:
             tag = self._tags[name] = _Tag(now_s)
@@ -46,6 +51,9 @@ class FixAges:
             tag.begun_s, tag.before_s, tag.least_s = now_s, tag.least_s, float("inf")
         made_s = max(latency_s, 0.0)
         delay_s = now_s - unix_s - made_s
+        if delay_s - tag.last_s > _SET_BACK_S:
+            tag.least_s = tag.before_s = float("inf")
+        tag.last_s = delay_s
         tag.least_s = min(tag.least_s, delay_s)
         travelled_s = delay_s - min(tag.least_s, tag.before_s)
         if now_s - tag.delay_seen_s < _HEALTH_AGE_S:
@@ -54,6 +62,7 @@ class FixAges:
         if tag.least_age_s is None or age_s < tag.least_age_s:
             tag.least_age_s, tag.made_s = age_s, made_s
         self._all.append(age_s)
+        return age_s
 
     def add_health(self, name: str, delay_s: float, now_s: float) -> None:
         """Add how long a health message of a tag of this computer has travelled."""
