@@ -1,4 +1,4 @@
-"""A radio of your own, in thirty lines: six anchors broadcast, a tag listens, and prints where it is.
+"""A radio of your own: six anchors broadcast, a tag listens, and prints where it is.
 
 `Anchor` and `Receiver` know no hardware. A program that drives any radio hands them the frames it receives with the
 stamps of the radio's own 40-bit counter, and asks an anchor when its next frame is due. `OwnRadio` stands for your

@@ -82,11 +82,11 @@ ELSEWHERE = {
     "skyless dashboard --listen 0.0.0.0:8080 --mqtt mqtt://hall@127.0.0.1": (
         "tests/dashboard/test_dashboard_end_to_end.py::test_other_machines_need_the_token_that_is_printed"
     ),
-    "skyless plan hall.toml --plot hall.png --html hall.html --target 5": PLAN + "test_all_files_at_once",
-    "skyless plan hall.toml --optimise 8 --heights 0.5,3.5 --out better.toml": (
+    "skyless plan big_hall.toml --plot big_hall.png --html big_hall.html --target 5": PLAN + "test_all_files_at_once",
+    "skyless plan big_hall.toml --optimise 8 --heights 0.5,3.5 --out better.toml": (
         PLAN + "test_an_optimised_site_is_a_site"
     ),
-    "skyless plan hall.toml --verify 20": PLAN + "test_verification_tells_its_points",
+    "skyless plan big_hall.toml --verify 20": PLAN + "test_verification_tells_its_points",
     "skyless replay capture.yaml --anchors anchors.csv": REPLAY + "test_every_format_gives_fixes_at_the_truth",
     "skyless replay flight_tdoa.csv.gz --anchors anchors.csv --truth flight_pose.csv.gz"
     " --lever-arm=-0.012,0.001,0.091 --plot flight.png": (

@@ -43,7 +43,7 @@ def data_frame(columns: Mapping[str, Any]) -> "DataFrame":
     try:
         from pandas import DataFrame  # noqa: PLC0415 - optional, and slow to import
     except ImportError:
-        raise SkylessError("to_dataframe needs the package pandas: pip install 'skyless[pandas]'") from None
+        raise SkylessError("to_dataframe needs the package pandas: pip install pandas") from None
     return DataFrame(dict(columns))
 
 

@@ -26,7 +26,7 @@ from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.trajectory import Static
 from skyless.site.lab import ideal_lab_site
 
-_NO_FILTERPY: Final = "filterpy is not installed; pip install 'skyless[bench]' adds it"
+_NO_FILTERPY: Final = "filterpy is not installed; pip install filterpy adds it"
 _WARM_S: Final = 2.0
 """A receiver has its almanac and its first fix by then."""
 _TAGS: Final = (1, 100, 10_000)

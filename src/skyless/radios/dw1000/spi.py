@@ -259,4 +259,4 @@ def _package(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError:
         package = name.partition(".")[0]
-        raise SkylessError(f"a DW1000 on SPI needs the package {package}: pip install 'skyless[pi]'") from None
+        raise SkylessError(f"a DW1000 on SPI needs the package {package}: pip install {package}") from None

@@ -142,7 +142,7 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
     try:
         from distributed import Client  # noqa: PLC0415 - an extra, and slow to import
     except ImportError:
-        raise SkylessError("--scheduler needs the package distributed: pip install 'skyless[dask]'") from None
+        raise SkylessError("--scheduler needs the package distributed: pip install distributed") from None
     logging.disable(logging.ERROR)  # what goes wrong is reported once, by an exception
     try:
         yield from _connected(Client, scheduler)
