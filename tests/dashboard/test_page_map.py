@@ -273,7 +273,7 @@ def test_positions_under_the_pointer_are_right_in_every_direction(hall):
             const errors = [];
             for (let n = 0; n < 40; n++) {
               view.orbit(0.3, Math.sin(n));
-              const [x, y] = view.toSite(view.toX(3, 4), view.toY(3, 4));
+              const [x, y] = view.toSite(view.toX(3, 4), view.toY(3, 4, n / 10), n / 10);
               errors.push(Math.hypot(x - 3, y - 4));
             }
             return errors;""",
@@ -334,6 +334,39 @@ def test_tags_and_anchors_of_other_floors_are_dimmed(hall):
         ["map/floors"], "const other = floors.otherFloor(); return [other(2.8, 0), other(6, 1), other(3.5)];"
     )
     assert page.evaluate(dimmed) == [False, True, True]
+
+
+def test_in_3d_the_overlay_and_clicks_are_on_the_ground_of_the_chosen_floor(hall):
+    server, seen = hall
+    page = seen.page
+    send_site(server, page, name="Two floors", anchors=two_floors())
+    page.click("#legend summary")
+    page.select_option("#floor", "1")
+    page.click("#legend summary")
+    page.click("#spatial")
+    page.evaluate(THREE_FRAMES)
+    x, y, low_y, drawn_y = page.evaluate(
+        modules(
+            ["map/floor", "map/floors", "map/view"],
+            """const box = document.getElementById("canvas").getBoundingClientRect();
+            const [x, y] = [view.toX(14.3, 2.8), view.toY(14.3, 2.8, floors.groundHeight())];
+            const context = document.createElement("canvas").getContext("2d");
+            let drawn = null;
+            context.drawImage = () => (drawn = context.getTransform().transformPoint({ x: 14.3, y: -2.8 }));
+            const data = { x_m: [0, 24], y_m: [0, 14], step_m: 1 };
+            const before = skyless.state.overlay;
+            skyless.state.overlay = { ...before, data, picture: context.canvas };
+            floor.drawOverlay(context);
+            skyless.state.overlay = before;
+            return [box.left + x, box.top + y, box.top + view.toY(14.3, 2.8), box.top + drawn.y];""",
+        )
+    )
+    assert low_y - y > 20
+    assert drawn_y == pytest.approx(y)
+    server.silent_tags = set(made_up.names(3))
+    page.evaluate("skyless.live.clear()")
+    page.mouse.click(x, y)
+    until(page, "skyless.state.selection.zone === 'dock'")
 
 
 def test_floors_can_be_given_as_heights_and_are_kept(hall):

@@ -53,8 +53,8 @@ class FixAges:
         self._recent: deque[tuple[float, float]] = deque(maxlen=_MOST_AGES)
         """When fixes arrived, and their ages."""
 
-    def add_fix(self, name: str, unix_s: float, latency_s: float, now_s: float) -> None:
-        """Add a fix whose last frame ended at ``unix_s`` by the tag's clock, and that arrives now."""
+    def add_fix(self, name: str, unix_s: float, latency_s: float, now_s: float) -> float:
+        """Add a fix whose last frame ended at ``unix_s`` by the tag's clock, and that arrives now; returns its age."""
         tag = self._tags.get(name)
         if tag is None:
             tag = self._tags[name] = _Tag(now_s)
@@ -73,6 +73,7 @@ class FixAges:
         if tag.least_age_s is None or age_s < tag.least_age_s:
             tag.least_age_s, tag.made_s = age_s, made_s
         self._recent.append((now_s, age_s))
+        return age_s
 
     def add_health(self, name: str, delay_s: float, now_s: float) -> None:
         """Add how long a health message of a tag of this computer has travelled."""

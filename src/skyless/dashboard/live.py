@@ -273,9 +273,9 @@ class LiveSite:
         fix = read_message(payload, FixMessage)
         _check_name(fix.tag, topic)
         now_s = self._clock()
-        self.state.add_fix(fix, now_s)
-        self.evidence.add_fix(fix, now_s)
-        self.log.on_fix(fix, self._wall_clock())
+        unix_s = self._wall_clock()
+        self.state.add_fix(fix, now_s, unix_s - self.evidence.add_fix(fix, now_s))
+        self.log.on_fix(fix, unix_s)
         self._schedule(self.monitor.update(fix, now_s))
 
     def _on_status(self, topic: str, payload: bytes) -> None:
@@ -432,7 +432,7 @@ class LiveSite:
         page = PageQueue(encode("hello", hello), address, self._clock())
         page.replace("mqtt", self._connection())
         page.replace("health", self.state.health_message(self.dropped, self._clock()))
-        page.replace("condition", encode("condition", msgspec.structs.asdict(self.condition)))
+        page.replace("condition", self._condition_message())
         page.replace("log", encode("log", {"events": self.log.since()}))
         if self.preparation is not None:
             page.replace("preparation", self._preparation_message())
@@ -503,7 +503,11 @@ class LiveSite:
         self.log.on_survey(self.survey.survey, unix_s)
         self.log.on_condition(self.condition, unix_s)
         self.log.tick(unix_s)
-        self._broadcast("condition", encode("condition", msgspec.structs.asdict(self.condition)))
+        self._broadcast("condition", self._condition_message())
+
+    def _condition_message(self) -> bytes:
+        """Its time gives pages the server's clock where no tag moves."""
+        return encode("condition", {"unix_s": self._wall_clock(), **msgspec.structs.asdict(self.condition)})
 
     def _send_logged(self) -> None:
         events = self.log.since(self._logged_serial)

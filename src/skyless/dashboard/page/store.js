@@ -32,7 +32,7 @@ export const state = {
   otherZones: [],
   /** Why the zones that the broker keeps cannot be read. @type {string|null} */
   zonesFault: null,
-  /** @type {any[]} tags that entered or left zones, newest first */
+  /** @type {any[]} tags that entered or left zones, newest first; with `cameMs` those that came since the page connected */
   events: [],
   /** @type {any[]} what has happened at the live site, oldest first; `panels/events.js` lists it */
   log: [],
@@ -79,7 +79,13 @@ function flush() {
   const callbacks = new Set();
   for (const topic of dirty) for (const callback of listeners.get(topic) ?? []) callbacks.add(callback);
   dirty.clear();
-  for (const callback of callbacks) callback();
+  for (const callback of callbacks) {
+    try {
+      callback();
+    } catch (error) {
+      reportError(error); // the others are still to run
+    }
+  }
 }
 
 /** Health older than this is not of now, and whoever sent it is offline; programs report once a second. */

@@ -8,6 +8,7 @@ import { picking, stopPicking } from "../survey/picking.js";
 import { move as movePlan, moving as movingPlan } from "../survey/plan.js";
 import { addPoint, begin, cancel, editor, finish, moveCorner, setCursor, storeShown, undoPoint } from "./editor.js";
 import { KINDS, valueAt, writeValue } from "./overlay.js";
+import { groundHeight } from "./floors.js";
 import { endFollow, following, toggleFollow } from "./follow.js";
 import { drawnAnchors } from "./anchors.js";
 import { anchorNear } from "./survey.js";
@@ -108,7 +109,7 @@ function pinch(moved, before, at) {
 }
 
 function tap({ x, y }) {
-  const site = toSite(x, y);
+  const site = toSite(x, y, groundHeight());
   if (picking) return pickAt(site, anchorNear(x, y, 1.5 * HIT));
   if (editor.drawing) {
     const [first] = editor.points;
@@ -144,7 +145,7 @@ function cornerAt({ x, y }) {
 }
 
 function hover({ x, y }, type) {
-  const [x_m, y_m] = toSite(x, y);
+  const [x_m, y_m] = toSite(x, y, groundHeight());
   if (editor.drawing && type === "mouse") setCursor([x_m, y_m]);
   const value = valueAt(x_m, y_m);
   const { data } = state.overlay;

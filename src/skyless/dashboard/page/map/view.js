@@ -45,22 +45,22 @@ export function py(y_m) {
   return view.height / 2 - (y_m - view.y_m) * view.scale;
 }
 
-/** Site coordinates of a pixel, in the 3-D view on the floor at height 0. */
-export function toSite(x, y) {
+/** Site coordinates of a pixel, in the 3-D view of its point at a height. */
+export function toSite(x, y, z_m = 0) {
   const right_m = (x - view.width / 2) / view.scale;
-  const away_m = (view.height / 2 - y) / view.scale / turned.floor;
+  const away_m = ((view.height / 2 - y) / view.scale - z_m * turned.height) / turned.floor;
   return [
     view.x_m + right_m * turned.cos - away_m * turned.sin,
     view.y_m + right_m * turned.sin + away_m * turned.cos,
   ];
 }
 
-/** Let a context draw in metres on the floor; `restore` it afterwards. */
-export function drawInMetres(context) {
+/** Let a context draw in metres on the floor at a height; `restore` it afterwards. */
+export function drawInMetres(context, z_m) {
   const { cos, sin, floor } = turned;
   const k = view.scale;
   context.save();
-  context.transform(k * cos, k * sin * floor, k * sin, -k * cos * floor, toX(0, 0), toY(0, 0));
+  context.transform(k * cos, k * sin * floor, k * sin, -k * cos * floor, toX(0, 0), toY(0, 0, z_m));
 }
 
 /** A covariance on the floor as it is seen, in square metres: xx, xy and yy with y pointing up the screen. */

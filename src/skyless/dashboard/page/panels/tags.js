@@ -69,7 +69,7 @@ export function start(panel) {
   const search = h("input", { type: "search", placeholder: "Find a tag", "aria-label": "Find a tag", oninput: show });
   const table = selectionTable("tag", ["Tag", ...Object.keys(HEADS)], describe);
   Object.values(HEADS).forEach((words, index) => (table.head.cells[index + 2].title = words));
-  const empty = h("p", { class: "empty" }, "No tags yet.");
+  const empty = h("p", { class: "empty" });
   const count = h("p", { class: "count" });
   const box = h("div", { class: "scroll-x" }, table.element);
   const detail = makeDetail();
@@ -80,17 +80,20 @@ export function start(panel) {
 /** Bring the tab up to date. */
 export function show() {
   const list = tracks().sorted;
-  const wanted = parts.search.value.trim().toLowerCase();
+  const searched = list.length > SEARCHED;
+  const wanted = searched ? parts.search.value.trim().toLowerCase() : "";
   const key = [state.mode, state.selection.tag, wanted, list.length].join(" ");
   const now = performance.now();
   if (list.length > MANY && key === shown.key && now - shown.at < MANY_MS) return;
   shown = { key, at: now };
-  parts.search.hidden = list.length <= SEARCHED;
-  parts.empty.hidden = list.length > 0;
-  parts.table.element.hidden = list.length === 0;
+  parts.search.hidden = !searched;
   parts.table.element.classList.toggle("no-truth", !state.simulated);
   const items = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length) }]);
-  parts.table.rows.show(items.filter(([name]) => name.toLowerCase().includes(wanted)));
+  const found = items.filter(([name]) => name.toLowerCase().includes(wanted));
+  parts.table.rows.show(found);
+  parts.table.element.hidden = !found.length;
+  parts.empty.hidden = found.length > 0;
+  text(parts.empty, list.length ? "No tag of this name." : "No tags yet.");
   const fresh = list.filter((track) => freshness(track) === "fresh").length;
   text(parts.count, list.length ? `${fresh} of ${list.length} with a fix` : "");
   parts.detail.show(tracks().all.get(state.selection.tag) ?? null);
