@@ -25,6 +25,7 @@ import skyless
 PAGE = Path(skyless.__file__).parent / "dashboard" / "page"
 RECORDED_S = 90.0
 FIRST_FIX_S = 2.0
+PLAN = {"image": "hall.png", "width_m": 24.0, "x_m": 0.0, "y_m": -1.0}
 DOCK = {"id": "dock", "name": "Dock", "polygon_m": [[14, 2.5], [21, 2.5], [21, 6], [14, 6]], "colour": "#c2763a"}
 
 
@@ -44,12 +45,19 @@ class FakeServer:
         self.silent_tags = set()
         self.refuse = False
         self.mute = False
+        self.answers_pings = True
         self.zone_error = None
         self.condition = made_up.condition()
         self.log = []
         self.full = False
         self.overlay_error = None
         self.overlay_waits = False
+        self.recorded_plan = None
+        self.recorded_site = True
+        self.recorded_waits = False
+        self.events_note = False
+        self.site_name = "Hall 7"
+        self.zone_events = []
         self.started = time.time()
         self.sockets = {}
         self.port = _free_port()
@@ -101,6 +109,11 @@ class FakeServer:
         async def floor_plan(_request):
             return Response(self.floor_plan, media_type="image/png")
 
+        async def recorded_plan(_request):
+            if self.recorded_plan is None:
+                return JSONResponse({"error": "no floor plan is known"}, status_code=404)
+            return Response(self.recorded_plan, media_type="image/png")
+
         async def put_floor_plan(request):
             self.survey.image = await request.body()
             return JSONResponse({"bytes": len(self.survey.image)})
@@ -135,8 +148,10 @@ class FakeServer:
             return JSONResponse([{"name": "walk.mcap", "duration_s": RECORDED_S, **start, **what}])
 
         async def recording(request):
+            if request.path_params["name"] != "walk.mcap":
+                return JSONResponse({"error": "there is no such recording"}, status_code=404)
             start = 1_780_000_000.0
-            site = made_up.site_message(start)
+            site = made_up.site_message(start, PLAN if self.recorded_plan else None) if self.recorded_site else None
             return JSONResponse({
                 "name": request.path_params["name"], "site": site, "start_unix_s": start,
                 "end_unix_s": start + RECORDED_S, "tags": made_up.names(2), "zones": [DOCK],
@@ -144,7 +159,10 @@ class FakeServer:
             })  # fmt: skip
 
         async def events(_request):
-            return JSONResponse({"events": made_up.recorded_events(1_780_000_000.0), "complete": True})
+            while self.recorded_waits:
+                await asyncio.sleep(0.02)
+            found = made_up.recorded_events(1_780_000_000.0)
+            return JSONResponse({"events": found, "complete": not self.events_note})
 
         async def file(request):
             headers = {"Content-Disposition": f"attachment; filename={request.path_params['name']}"}
@@ -152,6 +170,8 @@ class FakeServer:
 
         async def states(request):
             query = request.query_params
+            while self.recorded_waits:
+                await asyncio.sleep(0.02)
             return JSONResponse({"states": _recorded(float(query["from_s"]), float(query["to_s"]), query["rate_hz"])})
 
         return Starlette(
@@ -168,6 +188,7 @@ class FakeServer:
                 Route("/api/recordings/{name}/events", events),
                 Route("/api/recordings/{name}/file", file),
                 Route("/api/recordings/{name}/states", states),
+                Route("/api/recordings/{name}/floor_plan", recorded_plan),
                 WebSocketRoute("/live", self._live),
                 Mount("/page", StaticFiles(directory=PAGE)),
             ]
@@ -196,17 +217,20 @@ class FakeServer:
         return None
 
     def _hello(self):
-        plan = {"image": "hall.png", "width_m": 24.0, "x_m": 0.0, "y_m": -1.0} if self.floor_plan else None
+        plan = PLAN if self.floor_plan else None
         site = made_up.site_message(self.started, plan, self.mode, self.placed) if self.site else None
-        return {"type": "hello", "version": "0.1.0", "site": site, "zones": self.zones, "events": [], "mqtt": True}
+        if site:
+            site["site"]["name"] = self.site_name
+        more = {"zones": self.zones, "events": self.zone_events, "mqtt": True}
+        return {"type": "hello", "version": "0.1.0", "site": site, **more}
 
     async def _states(self, websocket, lock):
-        named = list(enumerate(made_up.names(self.tags)))
         while True:
+            named = enumerate(made_up.names(self.tags))
             now = time.time()
             since = now - self.started
             rows = [made_up.state_row(name, n, since, now) for n, name in named if name not in self.silent_tags]
-            if not self.mute:
+            if rows and not self.mute:
                 await _send(websocket, lock, {"type": "state", "unix_s": now, "tags": rows})
             await asyncio.sleep(max(0.0, now + 1 / self.rate_hz - time.time()))
 
@@ -219,7 +243,7 @@ class FakeServer:
     async def _conditions(self, websocket, lock):
         while True:
             if not self.mute and self.condition:
-                await _send(websocket, lock, self.condition)
+                await _send(websocket, lock, self.condition | {"unix_s": time.time()})
             await asyncio.sleep(0.2)
 
     async def _surveys(self, websocket, lock):
@@ -248,7 +272,7 @@ class FakeServer:
 
     async def _pongs(self, websocket, lock):
         while True:
-            if await websocket.receive_text() == "ping" and not self.mute:
+            if await websocket.receive_text() == "ping" and self.answers_pings and not self.mute:
                 await _send(websocket, lock, {"type": "pong"})
 
 

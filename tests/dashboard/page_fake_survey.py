@@ -31,7 +31,8 @@ class FakeSurvey:
         self.error = None
         self.saves = []
         self.refuse_save = None
-        self.saved_serial = None
+        self.ignores_saves = False
+        self.saved_serial = self.saved_unix_s = None
         self.silent = False
         self.state = "surveyed"
         self.serial = 1
@@ -52,8 +53,9 @@ class FakeSurvey:
         self.saves.append(serial)
         if self.refuse_save:
             self.error = self.refuse_save
-        else:
-            self.saved_serial, self.cleared = self.serial, True  # ranges begin again: delays are others
+        elif not self.ignores_saves:
+            self.saved_serial, self.saved_unix_s = self.serial, time.time()
+            self.cleared = True  # ranges begin again: delays are others
 
     def message(self):
         """The message that the server forwards."""
@@ -68,7 +70,8 @@ class FakeSurvey:
             "unix_s": now, "serial": self.serial, "anchors": ids, "missing": list(self.missing),
             "duration_s": now - self.started, "pairs": pairs, "facts": self.facts, "error": self.error,
             "survey": self._result(pairs) if len(ids) > 2 and not self.cleared else None,
-            "saved_serial": self.saved_serial, "file": "/srv/hall/site.toml", "state": self.state,
+            "saved_serial": self.saved_serial, "saved_unix_s": self.saved_unix_s,
+            "file": "/srv/hall/site.toml", "state": self.state,
         }  # fmt: skip
         return {"type": "survey", "survey": survey, "age_s": 0.0}
 

@@ -102,6 +102,33 @@ def test_without_anything_new_there_is_no_state(live, wire, times):
     assert not of("state", messages)
 
 
+@pytest.mark.parametrize("clock_error_s", [0.0, 3600.0, -3600.0])
+def test_a_row_has_the_time_of_its_fix_by_the_servers_clock_however_late_it_comes(live, wire, times, clock_error_s):
+    def time_of_fix(late_s=0.0, error_s=clock_error_s):
+        times.move(0.1)
+        wire.deliver(FIX, fix(unix_s=times.unix_s - late_s + error_s, latency_s=0.0))
+        return json.loads(live.state.state_since(live.state.serial - 1))["tags"][0][15] - times.unix_s
+
+    assert time_of_fix() == pytest.approx(0.0, abs=1e-3)
+    assert time_of_fix(late_s=2.0) == pytest.approx(-2.0, abs=1e-3)
+    assert time_of_fix() == pytest.approx(0.0, abs=1e-3)
+    assert time_of_fix(error_s=clock_error_s - 7200.0) == pytest.approx(0.0, abs=1e-3), "its clock was set back"
+    times.move(500.0)
+    live.tick()
+    page = live.open_page()
+    (state,) = of("state", drained(live, page))
+    assert state["unix_s"] - state["tags"][0][15] == pytest.approx(500.0, abs=1e-2)
+
+
+def test_the_condition_has_the_servers_time(live, times):
+    times.move(77.0)
+    page = live.open_page()
+    assert of("condition", drained(live, page))[0]["unix_s"] == times.unix_s
+    times.move(1.0)
+    live.tick()
+    assert of("condition", drained(live, page))[0]["unix_s"] == times.unix_s
+
+
 @pytest.mark.parametrize(
     ("topic", "payload"),
     [

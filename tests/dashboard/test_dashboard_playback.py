@@ -22,7 +22,7 @@ PLAN = b"\x89PNG\r\n\x1a\nplan"
 DURATION_S = 10.0
 
 
-def record(path, *, begin_s=START_S, seconds=DURATION_S, close=True):
+def record(path, *, begin_s=START_S, seconds=DURATION_S, close=True, clock_error_s=0.0):
     """Ten fixes a second of a tag that walks along x at 1 m/s and whose fixes lie 3 cm off it."""
     recorder = McapRecorder(McapFile(path))
 
@@ -36,7 +36,7 @@ def record(path, *, begin_s=START_S, seconds=DURATION_S, close=True):
         at_s = begin_s + k / 10
         moving = truth(at_s, position_m=(k / 10, 2.0, 1.0), velocity_mps=(1.0, 0.0, 0.0))
         take(topics.truth_topic(SITE_ID), moving, at_s)
-        take(topics.fix_topic(SITE_ID, "t1"), fix("t1", at_s, (k / 10, 2.03, 1.0), serial=k), at_s)
+        take(topics.fix_topic(SITE_ID, "t1"), fix("t1", at_s + clock_error_s, (k / 10, 2.03, 1.0), serial=k), at_s)
         recorder.file.flush()
     if close:
         recorder.file.close()
@@ -98,6 +98,12 @@ def test_windows_one_after_the_other_give_every_fix_once(folder):
     assert [row[10] for row in found] == pytest.approx([0.03] * 101)
     times = [json.loads(state)["unix_s"] for window in windows for state in window]
     assert times == sorted(times)
+
+
+def test_fixes_of_a_tag_with_a_wrong_clock_have_the_times_at_which_they_were_recorded(folder):
+    record(folder / "wrong.mcap", seconds=1.0, clock_error_s=3600.0)
+    found = rows(Playback(folder).states("wrong.mcap", 0.0, 2.0, 20.0))
+    assert [row[15] for row in found] == pytest.approx([START_S + k / 10 for k in range(11)])
 
 
 def test_a_lower_rate_gives_fewer_states(folder):

@@ -21,7 +21,9 @@ def test_a_row_has_the_fields_in_order():
     state = SiteState()
     state.unix_s = 1000.0625
     covariance = (4e-4, 1e-4, 9.0, 1e-4, 2e-4, 9.0, 9.0, 9.0, 9.0)
-    state.add_fix(fix(position_m=(1.25, 2.5, 0.75), velocity_mps=(0.5, -0.25, 0.1), covariance_m2=covariance), 0.0)
+    state.add_fix(
+        fix(position_m=(1.25, 2.5, 0.75), velocity_mps=(0.5, -0.25, 0.1), covariance_m2=covariance), 0.0, 1000.0
+    )
     message = json.loads(state.state_since(0))
     assert message["type"] == "state"
     assert message["unix_s"] == pytest.approx(1000.0625, abs=1e-3)
@@ -48,14 +50,14 @@ def test_a_row_has_the_fields_in_order():
         None,
     )
     assert message["tags"] == [list(expected)]
-    state.add_fix(fix(velocity_mps=None), 0.0)
+    state.add_fix(fix(velocity_mps=None), 0.0, 1000.0)
     assert rows(state)[0]["vx"] is None
 
 
 def test_rows_hold_levels_and_alerts():
     state = SiteState()
     for alert in ("none", "detected-excluded", None):
-        state.add_fix(fix(hpl_m=0.123456, alert=alert), 0.0)
+        state.add_fix(fix(hpl_m=0.123456, alert=alert), 0.0, 1000.0)
         assert (rows(state)[0]["hpl_m"], rows(state)[0]["alert"]) == (0.1235, alert)
 
 
@@ -63,17 +65,25 @@ def test_rows_say_whether_the_height_was_given():
     state = SiteState()
     covariance = (4e-4, 0.0, 0.0, 0.0, 4e-4, 0.0, 0.0, 0.0, 9e-4)
     for known, std_z_m in ((True, None), (False, 0.03)):
-        state.add_fix(fix(covariance_m2=covariance, height_known=known), 0.0)
+        state.add_fix(fix(covariance_m2=covariance, height_known=known), 0.0, 1000.0)
         assert (rows(state)[0]["height_given"], rows(state)[0]["std_z_m"]) == (int(known), std_z_m)
+
+
+@pytest.mark.parametrize(("unix_s", "shown_unix_s"), [(1000.4, 1000.4), (1000.6, 1000.0), (4600.0, 1000.0)])
+def test_the_time_of_a_fix_whose_tag_has_a_wrong_clock_is_the_servers(unix_s, shown_unix_s):
+    state = SiteState()
+    state.add_fix(fix(unix_s=unix_s), 0.0, 1000.0)
+    state.unix_s = 1200.0  # a page that is opened much later gets the same time
+    assert rows(state)[0]["fix_unix_s"] == shown_unix_s
 
 
 def test_only_tags_with_a_newer_fix_are_sent_and_only_their_last():
     state = SiteState()
-    state.add_fix(fix("a"), 0.0)
-    state.add_fix(fix("b"), 0.0)
+    state.add_fix(fix("a"), 0.0, 1000.0)
+    state.add_fix(fix("b"), 0.0, 1000.0)
     seen = state.serial
-    state.add_fix(fix("b", position_m=(5.0, 5.0, 1.0)), 0.1)
-    state.add_fix(fix("b", position_m=(6.0, 5.0, 1.0)), 0.2)
+    state.add_fix(fix("b", position_m=(5.0, 5.0, 1.0)), 0.1, 1000.0)
+    state.add_fix(fix("b", position_m=(6.0, 5.0, 1.0)), 0.2, 1000.0)
     assert [(row["name"], row["x_m"]) for row in rows(state, seen)] == [("b", 6.0)]
     assert {row["name"] for row in rows(state)} == {"a", "b"}
     assert rows(state, state.serial) == []
@@ -81,7 +91,7 @@ def test_only_tags_with_a_newer_fix_are_sent_and_only_their_last():
 
 def test_readers_at_the_same_serial_share_the_bytes():
     state = SiteState()
-    state.add_fix(fix(), 0.0)
+    state.add_fix(fix(), 0.0, 1000.0)
     assert state.state_since(0) is state.state_since(0)
 
 
@@ -90,11 +100,11 @@ def test_the_error_is_against_the_truth_moved_to_the_moment_of_the_fix():
     state.add_truth(truth(unix_s=999.9, position_m=(0.0, 0.0, 1.0), velocity_mps=(2.0, 1.0, 0.0)))
     state.add_truth(truth(unix_s=1000.05, position_m=(9.0, 9.0, 1.0), velocity_mps=(1.0, 0.0, 0.0)))
     state.add_truth(truth(unix_s=1000.2, position_m=(50.0, 50.0, 1.0)))
-    state.add_fix(fix(unix_s=1000.0, position_m=(8.95, 9.04, 7.0)), 0.0)
+    state.add_fix(fix(unix_s=1000.0, position_m=(8.95, 9.04, 7.0)), 0.0, 1000.0)
     row = rows(state)[0]
     assert (row["true_x"], row["true_y"]) == (8.95, 9.0)
     assert row["error_m"] == pytest.approx(0.04)  # horizontal: the height was given
-    state.add_fix(fix(unix_s=1000.0, position_m=(8.95, 9.04, 1.03), height_known=False), 0.0)
+    state.add_fix(fix(unix_s=1000.0, position_m=(8.95, 9.04, 1.03), height_known=False), 0.0, 1000.0)
     assert rows(state)[0]["error_m"] == pytest.approx(0.05)
 
 
@@ -102,7 +112,7 @@ def test_the_error_is_against_the_truth_moved_to_the_moment_of_the_fix():
 def test_a_truth_of_another_time_gives_no_error(late_s):
     state = SiteState()
     state.add_truth(truth(unix_s=1000.0 + late_s))
-    state.add_fix(fix(unix_s=1000.0), 0.0)
+    state.add_fix(fix(unix_s=1000.0), 0.0, 1000.0)
     assert rows(state)[0]["error_m"] is None
     assert rows(state)[0]["true_x"] is None
 
@@ -111,7 +121,7 @@ def test_a_restarted_ether_is_accepted():
     state = SiteState()
     state.add_truth(truth(unix_s=5000.0))
     state.add_truth(truth(unix_s=1000.0, position_m=(2.0, 2.0, 1.0)))
-    state.add_fix(fix(unix_s=1000.0), 0.0)
+    state.add_fix(fix(unix_s=1000.0), 0.0, 1000.0)
     assert rows(state)[0]["error_m"] == 0.0
 
 
@@ -147,10 +157,10 @@ def test_health_holds_the_newest_of_every_node():
 
 def test_old_messages_expire_and_invented_names_do_not_fill_the_memory():
     state = SiteState()
-    state.add_fix(fix("old"), 0.0)
+    state.add_fix(fix("old"), 0.0, 1000.0)
     state.add_health("1", anchor_health(1), 0.0)
     for k in range(MAX_NAMES + 50):
-        state.add_fix(fix(f"t{k}"), 1.0)
+        state.add_fix(fix(f"t{k}"), 1.0, 1000.0)
         state.add_status(status(name=f"t{k}"))
     assert len(rows(state)) == MAX_NAMES
     assert len(state.statuses) == MAX_NAMES

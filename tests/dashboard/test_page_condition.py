@@ -55,7 +55,18 @@ def test_all_reasons_are_listed_on_a_click_by_the_pointer_and_by_keys(hall):
     page.click("#pill")
     page.mouse.move(400, 400)
     assert page.locator("#pill").get_attribute("aria-expanded") == "true"
-    panel.locator("button:has-text('Show anchor 8')").click()
+    show = panel.locator("button:has-text('Show anchor 8')").element_handle()
+    show.focus()
+    server.condition = made_up.condition(SLOW, {**OFFLINE, "text": "anchor 8 of 9 is offline"})
+    panel.locator("li:has-text('8 of 9')").wait_for()
+    assert show.evaluate("button => button === document.activeElement")
+    show.click()
+    page.wait_for_selector("#panel-anchors tr.selected:has-text('8')")
+    page.keyboard.press("Escape")
+    panel.wait_for(state="hidden")
+    page.click("#tab-zones")
+    page.click("#pill")
+    show.click()  # selected already
     page.wait_for_selector("#panel-anchors tr.selected:has-text('8')")
     page.keyboard.press("Escape")
     panel.wait_for(state="hidden")
@@ -78,6 +89,27 @@ def test_without_a_judgement_or_with_an_old_one_the_page_is_not_green(serve, vis
     pill_is(page, "waiting")
     assert page.locator("#pill").inner_text() == "The server is silent"
     assert page.evaluate("skyless.state.connection.phase") == "open"
+
+
+def test_a_page_that_is_behind_is_not_green(hall):
+    server, visit = hall
+    page = visit.page
+    pill_is(page, "good")
+    server.answers_pings = False
+    page.evaluate("skyless.state.ping = { sentMs: performance.now() - 2300, tripMs: 0 }")
+    pill_is(page, "warning")
+    assert page.locator("#pill").inner_text().startswith("This page is ")
+    server.condition = made_up.condition(SLOW)
+    pill_is(page, "bad")
+    page.click("#pill")
+    page.wait_for_selector("#condition-list li:nth-child(2):has-text('s behind.')")
+    server.condition = made_up.condition()
+    server.send({"type": "pong"})
+    until(page, "skyless.state.ping.sentMs === null")
+    assert page.evaluate("skyless.state.ping.tripMs") > 2300
+    pill_is(page, "warning")  # until a later answer has come in time
+    server.answers_pings = True
+    pill_is(page, "good")
 
 
 def test_a_lost_broker_or_connection_is_not_green(hall):
@@ -106,16 +138,19 @@ def test_a_page_too_many_shows_why(hall):
 
 
 def test_the_summary_has_figures(hall):
-    _, visit = hall
+    server, visit = hall
     page = visit.page
     page.wait_for_selector("#summary dd:text-is('3/3')")
     shown = page.locator("#summary").inner_text().replace("\n", " ")
     assert "Anchors 7/8" in shown
+    assert "Hz" in page.evaluate("import('/page/summary.js').then((m) => new Map(m.summaryFacts()).get('Rate'))")
     assert "1.2 ms, p99 3.4 ms" in shown
     page.click("#pill")
     shown = page.locator("#condition-list").inner_text()
     assert "Hall 7, number 7" in shown
     assert "Protection level" in shown
+    server.condition = None
+    until(page, "(skyless.state.conditionMs = -1e4, document.querySelector('#summary .latency dd').innerText === '–')")
 
 
 def test_a_dead_anchor_has_no_figures(hall):
@@ -128,6 +163,14 @@ def test_a_dead_anchor_has_no_figures(hall):
     page.click("#panel-anchors button:text-is('8')")
     page.wait_for_selector("#panel-anchors .detail dd:has-text('its figures are not known')")
     assert set(page.locator("#panel-anchors .detail output").all_inner_texts()) <= {"–"}
+    condition = """async () => {
+      const { condition } = await import("/page/map/anchors.js");
+      const { health } = skyless.state;
+      health.nodes.push({ kind: "anchor", name: "8", online: true });
+      health.anchors.delete(8); // as the server drops what is old
+      return condition(8);
+    }"""
+    assert page.evaluate(condition) == "unknown"
 
 
 def test_events_are_listed_filtered_and_counted(hall):
@@ -146,6 +189,9 @@ def test_events_are_listed_filtered_and_counted(hall):
     rows = page.locator("#event-list li")
     until(page, "document.querySelectorAll('#event-list li').length === 4")
     assert "robot" in rows.first.inner_text()
+    for row in rows.all():
+        line, mark = row.bounding_box(), row.locator("span").first.bounding_box()
+        assert line["y"] <= mark["y"] < line["y"] + line["height"]
     until(page, "document.querySelector('#tab-events .unread') === null")
     page.select_option("#event-filter", "severe")
     until(page, "document.querySelectorAll('#event-list li').length === 2")
@@ -157,4 +203,7 @@ def test_events_are_listed_filtered_and_counted(hall):
     )
     until(page, "document.querySelectorAll('#event-list li').length === 5")
     page.click("#event-list button:has-text('Anchor 8 is offline')")
+    page.wait_for_selector("#panel-anchors tr.selected:has-text('8')")
+    page.click("#tab-events")
+    page.click("#event-list button:has-text('Anchor 8 is offline')")  # selected already
     page.wait_for_selector("#panel-anchors tr.selected:has-text('8')")

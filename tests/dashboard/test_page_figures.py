@@ -1,5 +1,7 @@
 """What the page computes by itself, against NumPy and closed forms."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -46,16 +48,20 @@ def test_a_track_keeps_the_newest_states(page):
     assert kept == [2048, 295.2, 499.9, 2046]
 
 
+SIGMAS_95 = math.sqrt(-2.0 * math.log(0.05))
+
+
 def test_ellipses_have_the_axes_of_the_covariance(page):
     draw = np.random.default_rng(4)
     for factor in draw.normal(size=(20, 2, 2)):
         covariance = factor @ factor.T
         (xx, xy), (_, yy) = covariance.tolist()
         major, minor, angle = page.evaluate(
-            "async (given) => (await import('/page/map/tags.js')).axes(...given)", [xx, xy, yy]
+            "async (given) => (await import('/page/map/view.js')).halfAxes(...given)", [xx, xy, yy]
         )
+        major, minor = major / SIGMAS_95, minor / SIGMAS_95
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        np.testing.assert_allclose(turn @ np.diag([major**2, minor**2]) @ turn.T, covariance, atol=1e-9)
+        np.testing.assert_allclose(turn @ np.diag([major**2, minor**2]) @ turn.T, covariance, rtol=1e-4, atol=1e-4)
 
 
 def test_offsets_continue_over_the_wrap_of_the_counter(page):

@@ -5,7 +5,7 @@ import time
 
 import page_fake_site as made_up
 import pytest
-from page_browser import until
+from page_browser import THREE_FRAMES, until
 from PIL import Image
 
 from skyless.positioning.integrity import Alert
@@ -116,6 +116,21 @@ def test_a_cut_connection_is_told_and_comes_back(hall):
     until(page, SHOWN)
     assert "Connection lost" in page.locator("#banner").inner_text()
     assert page.locator("#pill").inner_text() == "Connection lost"
+    sockets = """async () => {
+      const { retryNow } = await import("/page/live.js");
+      const made = [];
+      const Before = window.WebSocket;
+      window.WebSocket = class extends Before {
+        constructor(address) {
+          super(address);
+          made.push(this);
+        }
+      };
+      for (let n = 0; n < 3; n++) retryNow();
+      window.WebSocket = Before;
+      return made.map((one) => one.readyState);
+    }"""
+    assert [phase >= 2 for phase in page.evaluate(sockets)] == [True, True, False]  # closing, closing, connecting
     server.refuse = False
     page.locator("#banner").wait_for(state="hidden")
     before = visit.position("forklift")
@@ -205,3 +220,110 @@ def test_a_floor_plan_lies_where_the_site_says(serve, visit):
     assert page.evaluate(reddish, [23.37, 13.71])
     assert not page.evaluate(reddish, [6.37, -1.31])
     shown.problems.clear()  # a hint that pixels are read slowly
+
+
+def test_another_site_after_a_reconnect_begins_without_what_was_of_the_first(hall):
+    server, visit = hall
+    page = visit.page
+    until(page, "skyless.live.all.get('robot')?.count > 3")
+    server.send({"type": "floor_plan", "digest": "c0ffee"})
+    until(page, "skyless.state.floorDigest")
+    event = {"kind": "enter", "zone": "dock", "tag": "robot", "unix_s": 1.0}
+    old = """async () => {
+      const { anchorHistory, tagHistory } = await import("/page/history.js");
+      const { drawZones } = await import("/page/map/zones.js");
+      const flashes = drawZones(document.createElement("canvas").getContext("2d"));
+      const kept = [...skyless.live.all.keys(), ...tagHistory.keys()].filter((name) => name === "robot");
+      return [kept.length, Boolean(skyless.state.floorDigest), anchorHistory.get(1).time.length > 1, flashes];
+    }"""
+    page.wait_for_timeout(1100)  # health comes once a second
+    assert page.evaluate(old) == [2, True, True, False]
+    for name in ("Hall 7", "Hall 8"):
+        server.site_name, server.tags, server.zone_events = name, 1, [event]
+        restart(server, page)
+        until(page, "name => skyless.state.site?.name === name", arg=name)
+        until(page, "import('/page/history.js').then(({ anchorHistory }) => anchorHistory.get(1))")
+        page.evaluate(THREE_FRAMES)
+        kept = page.evaluate(old)
+        assert kept[1:] == ([True, True, False] if name == "Hall 7" else [False, False, False])
+        assert kept[0] == (1 if name == "Hall 7" else 0)  # the history goes with the health
+    server.site = False
+    restart(server, page)
+    page.locator("#waiting").wait_for()
+    assert page.locator("#site-name").inner_text() == ""
+
+
+def restart(server, page):
+    """A server that is back before the page connects again."""
+    page.evaluate("skyless.state.site.name = ''")
+    server.cut()
+    server.refuse = False
+    until(page, "skyless.state.connection.phase === 'lost'")
+    until(page, "skyless.state.connection.phase === 'open'")
+
+
+def test_tags_of_another_clock_are_not_fresh_and_long_silent_ones_go(serve, visit):
+    server = serve(tags=0)
+    page = visit(server).page
+    until(page, "/^[0-9:]+$/.test(document.getElementById('time').textContent)")  # without any tag
+    found = page.evaluate("""async () => {
+      const { COLUMNS, TIME, Track, Tracks } = await import("/page/tracks.js");
+      const { freshness } = await import("/page/clock.js");
+      const row = (time, name = "a") => Object.assign(Array(COLUMNS + 1).fill(0), { 0: name, [TIME + 1]: time });
+      const track = new Track("a");
+      const kinds = [freshness(track, 1000, 1000)];
+      track.push(row(1000));
+      for (const now of [1000.1, 998.5, 985, NaN]) kinds.push(freshness(track, now, now - 0.15));
+      const times = [999, 996, 990, 989, 992].map((time) => (track.push(row(time)), track.lastTime));
+      const tracks = new Tracks();
+      tracks.add([row(100, "old"), row(100, "healthy"), row(800, "new")]);
+      tracks.addNames(["named"]);
+      tracks.expire(200, new Map([["healthy", {}]]));
+      return [kinds, times, track.count, tracks.sorted.map(({ name }) => name)];
+    }""")
+    assert found == [
+        ["never", "fresh", "stale", "gone", "gone"],
+        [1000, 1000, 990, 990, 992],
+        2,
+        ["healthy", "new"],
+    ]
+    now = time.time()
+    server.send({"type": "state", "unix_s": now, "tags": [made_up.state_row("forklift", 0, 0.0, now - 300)]})
+    page.wait_for_selector("table.tags tr.gone:has-text('forklift')", timeout=2000)
+
+
+def test_the_search_field_counts_only_where_it_is_shown(serve, visit):
+    server = serve(tags=13)
+    page = visit(server).page
+    rows = page.locator("table.tags tbody tr")
+    page.fill("#panel-tags input[type=search]", "003")
+    until(page, "document.querySelectorAll('table.tags tbody tr').length === 1")
+    page.fill("#panel-tags input[type=search]", "nobody")
+    page.wait_for_selector("#panel-tags :text-is('No tag of this name.')")
+    assert rows.count() == 0
+    server.tags = 3
+    page.evaluate("skyless.live.clear()")
+    until(page, "document.querySelectorAll('table.tags tbody tr').length === 3")
+    assert page.locator("#panel-tags input[type=search]").is_hidden()
+    assert page.locator("#panel-tags .empty").is_hidden()
+
+
+def test_a_part_that_fails_stops_no_other(hall):
+    _, visit = hall
+    visit.page.evaluate("""async () => {
+      const { changed, on } = await import("/page/store.js");
+      on(["a test"], () => { throw new Error("wrong"); });
+      on(["a test"], () => (window.othersRan = true));
+      changed("a test");
+    }""")
+    until(visit.page, "window.othersRan")
+    assert visit.problems == ["wrong"]
+    visit.problems.clear()
+
+
+def test_why_a_connection_is_refused_is_asked_for_without_reading_recordings(hall):
+    server, visit = hall
+    asked = []
+    visit.page.on("request", lambda request: asked.append(request.url))
+    restart(server, visit.page)
+    assert [url.rsplit("/", 1)[1] for url in asked if not url.startswith("ws")] == ["live.js"]

@@ -45,6 +45,27 @@ def test_no_width_scrolls_sideways(server, visit, width):
     assert box["x"] + box["width"] <= width
 
 
+OVERLAPS = """() => {
+  const box = (id) => document.getElementById(id).getBoundingClientRect();
+  const boxes = ["replay-mark", "following", "readout"].map(box);
+  const apart = (a, b) => a.right <= b.left || b.right <= a.left || a.bottom <= b.top || b.bottom <= a.top;
+  return boxes.some((a, n) => boxes.slice(n + 1).some((b) => !apart(a, b)));
+}"""
+
+
+@pytest.mark.parametrize("size", [(390, 844), (1000, 700)])
+def test_words_on_the_map_of_a_replay_keep_apart(server, visit, size):
+    page = visit(server, viewport=dict(zip(("width", "height"), size, strict=True))).page
+    assert page.locator("#summary .latency").is_visible() == (size[0] > 900)
+    page.click("#legend summary")
+    page.evaluate("import('/page/player.js').then(({ open }) => open('walk.mcap'))")
+    page.wait_for_selector("#replay-mark")
+    page.evaluate("import('/page/map/follow.js').then(({ follow }) => follow('forklift'))")
+    page.wait_for_selector("#following-words:has-text('forklift')")
+    page.evaluate("document.getElementById('readout').textContent = 'x 12.34 m · y 5.67 m'")
+    assert page.evaluate(OVERLAPS) is False
+
+
 def test_the_sheet_on_a_phone_grows_and_shrinks(server, visit):
     page = visit(server, viewport={"width": 360, "height": 720}).page
     heights = []
@@ -96,6 +117,11 @@ def test_less_motion_means_no_interpolation_and_no_transitions(server, visit):
     }""")
     assert same
     assert page.evaluate("getComputedStyle(document.getElementById('draw')).transitionDuration") == "0s"
+    spinner = """() => {
+      document.getElementById("ramp-box").classList.add("pending");
+      return getComputedStyle(document.getElementById("ramp-head"), "::before").animationName;
+    }"""
+    assert page.evaluate(spinner) == "none"
     page.click("#legend summary")
     assert "not interpolated" in page.locator("#legend").inner_text()
 

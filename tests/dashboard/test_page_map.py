@@ -274,7 +274,7 @@ def test_positions_under_the_pointer_are_right_in_every_direction(hall):
             const errors = [];
             for (let n = 0; n < 40; n++) {
               view.orbit(0.3, Math.sin(n));
-              const [x, y] = view.toSite(view.toX(3, 4), view.toY(3, 4));
+              const [x, y] = view.toSite(view.toX(3, 4), view.toY(3, 4, n / 10), n / 10);
               errors.push(Math.hypot(x - 3, y - 4));
             }
             return errors;""",
@@ -337,6 +337,39 @@ def test_tags_and_anchors_of_other_floors_are_dimmed(hall):
     assert page.evaluate(dimmed) == [False, True, True]
 
 
+def test_in_3d_the_overlay_and_clicks_are_on_the_ground_of_the_chosen_floor(hall):
+    server, seen = hall
+    page = seen.page
+    send_site(server, page, name="Two floors", anchors=two_floors())
+    page.click("#legend summary")
+    page.select_option("#floor", "1")
+    page.click("#legend summary")
+    page.click("#spatial")
+    page.evaluate(THREE_FRAMES)
+    x, y, low_y, drawn_y = page.evaluate(
+        modules(
+            ["map/floor", "map/floors", "map/view"],
+            """const box = document.getElementById("canvas").getBoundingClientRect();
+            const [x, y] = [view.toX(14.3, 2.8), view.toY(14.3, 2.8, floors.groundHeight())];
+            const context = document.createElement("canvas").getContext("2d");
+            let drawn = null;
+            context.drawImage = () => (drawn = context.getTransform().transformPoint({ x: 14.3, y: -2.8 }));
+            const data = { x_m: [0, 24], y_m: [0, 14], step_m: 1 };
+            const before = skyless.state.overlay;
+            skyless.state.overlay = { ...before, data, picture: context.canvas };
+            floor.drawOverlay(context);
+            skyless.state.overlay = before;
+            return [box.left + x, box.top + y, box.top + view.toY(14.3, 2.8), box.top + drawn.y];""",
+        )
+    )
+    assert low_y - y > 20
+    assert drawn_y == pytest.approx(y)
+    server.silent_tags = set(made_up.names(3))
+    page.evaluate("skyless.live.clear()")
+    page.mouse.click(x, y)
+    until(page, "skyless.state.selection.zone === 'dock'")
+
+
 def test_floors_can_be_given_as_heights_and_are_kept(hall):
     page = hall[1].page
     page.click("#legend summary")
@@ -377,7 +410,8 @@ def test_a_followed_tag_stays_in_the_middle_until_escape(hall):
 
 
 def test_the_map_is_saved_as_a_picture_with_its_legend(hall):
-    page = hall[1].page
+    server, visit = hall
+    page = visit.page
     until(page, "skyless.live.all.get('robot')?.count > 3")
     page.click("#legend summary")
     with page.expect_download() as download:
@@ -388,7 +422,7 @@ def test_the_map_is_saved_as_a_picture_with_its_legend(hall):
     assert picture.format == "PNG"
     assert picture.width == round(box["width"])
     assert picture.height > box["height"] + 60
-    words = page.evaluate("""async () => {
+    words = """async () => {
       const { mapPicture } = await import("/page/map/export.js");
       const found = [];
       const before = CanvasRenderingContext2D.prototype.fillText;
@@ -399,15 +433,26 @@ def test_the_map_is_saved_as_a_picture_with_its_legend(hall):
       mapPicture();
       CanvasRenderingContext2D.prototype.fillText = before;
       return found;
-    }""")
-    assert {"Hall 7", "forklift", "robot", "trolley", "anchor synchronised"} <= set(words)
-    assert any("live · simulated" in one and "20" in one for one in words)
+    }"""
+    live = page.evaluate(words)
+    assert {"Hall 7", "forklift", "robot", "trolley", "anchor synchronised"} <= set(live)
+    assert any("live · simulated" in one and "20" in one for one in live)
+    server.cut()
+    until(page, "skyless.state.connection.phase === 'lost'")
+    at = page.evaluate(
+        "(skyless.state.connection.since -= 3600e3, new Date(Date.now() - 3600e3).toLocaleTimeString('en-GB'))"
+    )
+    heading = next(one for one in page.evaluate(words) if "simulated" in one)
+    assert "last known state, connection lost" in heading
+    assert f" {at[:2]}:" in heading
+    visit.problems.clear()  # the browser's own lines about the refused sockets
 
 
 def test_positions_are_saved_as_a_table(hall):
     page = hall[1].page
     until(page, "skyless.live.all.get('robot')?.count > 5")
     page.click("#legend summary")
+    assert "2048" in page.locator("#save-positions").get_attribute("title")
     with page.expect_download() as download:
         page.click("#save-positions")
     rows = list(csv.DictReader(Path(download.value.path()).read_text().splitlines()))

@@ -1,11 +1,13 @@
 """A recording is replayed: the map shows the time of the slider."""
 
+import io
 from pathlib import Path
 
 import page_fake_site as made_up
 import pytest
-from page_browser import until
+from page_browser import THREE_FRAMES, until
 from page_fake_server import FIRST_FIX_S
+from PIL import Image
 
 
 @pytest.fixture
@@ -175,3 +177,136 @@ def test_live_comes_back(replay):
     assert page.evaluate("skyless.state.mode") == "live"
     until(page, "document.getElementById('pill').textContent === 'Live'")
     assert page.locator("table.tags tbody tr").count() == 0 or replay.position("robot")
+
+
+PICTURE = """async () => {
+  const { floor } = await import("/page/map/floor.js");
+  return floor?.image.naturalWidth ?? null;
+}"""
+FLASHES = """async () => {
+  const { drawZones } = await import("/page/map/zones.js");
+  return drawZones(document.createElement("canvas").getContext("2d"));
+}"""
+
+
+def picture(width):
+    file = io.BytesIO()
+    Image.new("RGB", (width, 30)).save(file, "PNG")
+    return file.getvalue()
+
+
+def begin(page):
+    page.click(".recording")
+    until(page, "skyless.state.mode === 'replay' && !skyless.state.player.waiting")
+
+
+@pytest.fixture
+def recorded(serve, visit):
+    server = serve()
+    shown = visit(server)
+    shown.page.click("#tab-recordings")
+    begin(shown.page)
+    return server, shown
+
+
+def test_a_recording_opens_again_and_one_that_cannot_be_opened_leaves_it_playing(recorded):
+    server, shown = recorded
+    page = shown.page
+    page.click("#back")
+    begin(page)
+    until(page, "skyless.replayed.all.get('forklift').count > 0")
+    server.recorded_waits = True
+    page.evaluate("""async () => {
+      const player = await import("/page/player.js");
+      player.setSpeed(8);
+      player.seek(20);
+    }""")
+    until(page, "skyless.state.player.at_s > 21")  # the states after 22 s are awaited
+    failure = "import('/page/player.js').then(({ open }) => open('broken.mcap')).catch((error) => error.message)"
+    assert page.evaluate(failure) == "there is no such recording"
+    server.recorded_waits = False
+    until(page, "skyless.state.player.at_s > 25")
+    assert page.evaluate("[skyless.state.player.name, skyless.state.player.playing]") == ["walk.mcap", True]
+    assert [text for text in shown.problems if "404" not in text] == []
+    shown.problems.clear()
+
+
+def test_states_of_another_moment_that_come_late_do_not_undo_a_seek(recorded):
+    page = recorded[1].page
+    moments = page.evaluate("""async () => {
+      const { seek } = await import("/page/player.js");
+      const { player } = skyless.state;
+      const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+      const ask = window.fetch;
+      let asked, answer;
+      const waiting = new Promise((done) => (asked = done));
+      window.fetch = async (...given) => {
+        const found = await ask(...given);
+        await new Promise((done) => (asked(), (answer = done)));
+        return found;
+      };
+      await seek(18); // so near to the end of what is loaded that more is asked for
+      await waiting;
+      window.fetch = ask;
+      seek(70);
+      answer();
+      while (player.waiting) await wait(10);
+      const moments = [player.at_s];
+      seek(20);
+      seek(71); // back before anything was asked for
+      await wait(100);
+      return [...moments, player.at_s, player.waiting];
+    }""")
+    assert 70 <= moments[0] < 71
+    assert moments[1] >= 71
+    assert moments[2] is False
+
+
+def test_all_that_is_shown_is_of_the_recording(serve, visit):
+    """Its events and its floor plan; nothing of the live site."""
+    server = serve(floor_plan=picture(40))
+    server.recorded_plan = picture(50)
+    server.events_note = True
+    shown = visit(server)
+    page = shown.page
+    until(page, f"({PICTURE})().then((width) => width === 40)")
+    page.click("#tab-recordings")
+    begin(page)
+    until(page, f"({PICTURE})().then((width) => width === 50)")
+    page.click("#tab-events")
+    page.wait_for_selector("#event-list li:has-text('Anchor 7 has moved by 31 cm')")
+    assert page.locator("#event-list li").count() == 6
+    assert page.locator("#panel-events").inner_text().count("The recording has more events than are listed.") == 1
+    page.click("#tab-anchors")
+    ids = "[...document.querySelectorAll('#panel-anchors tbody tr')].length"
+    page.evaluate("void skyless.state.site.anchors.pop()")
+    until(page, f"{ids} === 7")  # the live site has 8
+    assert page.locator("#panel-anchors h2:text-is('Programs')").is_hidden()
+    event = {"kind": "enter", "zone": "dock", "tag": "robot", "unix_s": 1.0}
+    server.send({"type": "zone_event", **event})
+    until(page, "skyless.state.events.length === 1")
+    page.evaluate(THREE_FRAMES)
+    assert page.evaluate(f"({FLASHES})()") is False
+    page.click("#back")
+    until(page, f"({PICTURE})().then((width) => width === 40)")
+    page.locator("#panel-anchors h2:text-is('Programs')").wait_for()
+    server.send({"type": "zone_event", **event, "unix_s": 2.0})
+    until(page, f"({FLASHES})()")
+
+
+def test_a_recording_without_a_site_or_events_so_far(serve, visit):
+    server = serve()
+    server.recorded_site = False
+    page = visit(server).page
+    page.click("#tab-recordings")
+    begin(page)
+    page.evaluate(THREE_FRAMES)
+    assert page.locator("#waiting").is_hidden()
+    server.recorded_waits = True
+    page.click("#back")
+    page.click(".recording")
+    until(page, "skyless.state.mode === 'replay'")
+    page.click("#tab-events")
+    page.wait_for_selector("#panel-events :text-is('Reading the events …')")
+    server.recorded_waits = False
+    page.wait_for_selector("#event-list li")

@@ -361,6 +361,13 @@ def test_without_a_survey_program_the_page_shows_how_to_start_it(serve, visit):
     page.wait_for_selector("#verdict:has-text('No broker')")
 
 
+SURVEYED = """async () => {
+  const { unix_s } = skyless.state.survey;
+  while (skyless.state.survey.unix_s === unix_s) await new Promise((done) => setTimeout(done, 30));
+  await new Promise((done) => setTimeout(done, 300)); // the tab shows it
+}"""
+
+
 def test_the_survey_is_saved(site):
     survey = FakeSurvey()
     here = site(survey)
@@ -377,6 +384,18 @@ def test_the_survey_is_saved(site):
     page.wait_for_selector("#save-state.good:has-text('/srv/hall/site.toml')")
     assert len(survey.saves) == 1
     assert survey.image == picture()["buffer"]
+    state = page.locator("#save-state")
+    survey.saved_serial, survey.saved_unix_s = survey.serial, 1_780_000_000.0
+    survey.cleared, survey.ignores_saves = False, True
+    until(page, "skyless.state.survey.saved_unix_s === 1780000000 && skyless.state.survey.survey !== null")
+    page.click("#save")  # the same result again; the answer to the first request is no answer to this one
+    until(page, "document.getElementById('save-state').textContent === 'Saving …'")
+    page.evaluate(SURVEYED)
+    assert state.inner_text() == "Saving …"
+    survey.saved_unix_s += 3661
+    page.wait_for_selector("#save-state.good")
+    at = page.evaluate("new Date(1780003661e3).toLocaleTimeString('en-GB')")
+    assert state.inner_text() == f"Saved at {at} in /srv/hall/site.toml, and sent to the anchors."
 
 
 def test_a_weak_result_is_saved_only_on_purpose_and_a_failure_is_shown(site):

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 import pytest
-from page_browser import until
+from page_browser import THREE_FRAMES, until
 from page_fake_server import DOCK
 
 
@@ -84,7 +84,15 @@ def test_a_corner_is_dragged_and_typed(hall):
     page = visit.page
     page.mouse.click(*visit.at(19, 3))
     until(page, "skyless.state.selection.zone === 'dock'")
-    page.mouse.move(*visit.at(21, 6))
+    x, y = visit.at(21, 6)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x - 2, y + 3)  # a click, not a drag
+    page.mouse.up()
+    page.evaluate(THREE_FRAMES)
+    assert page.evaluate("skyless.state.zones") == server.zones == [DOCK]
+    until(page, "skyless.state.selection.zone === 'dock'")
+    page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(*visit.at(22, 7), steps=4)
     page.mouse.up()
@@ -107,6 +115,20 @@ def test_a_zone_is_renamed_deleted_and_brought_back(hall):
     assert wait_for_put(server, 2) == []
     page.click("#toasts >> text=Undo")
     assert wait_for_put(server, 3) == [{**DOCK, "name": "Loading dock"}]
+
+
+def test_a_zone_is_not_brought_back_into_a_replay(hall):
+    server, visit = hall
+    page = visit.page
+    page.click("#tab-zones")
+    page.click("#panel-zones .zones >> text=Delete")
+    assert wait_for_put(server) == []
+    page.evaluate("import('/page/player.js').then(({ open }) => open('walk.mcap'))")
+    until(page, "skyless.state.mode === 'replay'")
+    page.click("#toasts >> text=Undo")
+    page.wait_for_selector("#toasts >> text=on the live site only")
+    assert server.zones == []
+    assert page.evaluate("skyless.state.zones") == [DOCK]
 
 
 def test_zones_that_the_server_refuses_are_taken_back(hall):

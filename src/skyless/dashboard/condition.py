@@ -45,7 +45,7 @@ class Condition(Struct, frozen=True):
     """The worst first."""
     latency_p50_s: float | None
     latency_p99_s: float | None
-    """From a frame's end to the arrival of its fix at the page's server, of all tags since the last evaluation."""
+    """From a frame's end to the arrival of its fix at the page's server, of all tags in the last ten seconds."""
 
 
 class ConditionMonitor:
@@ -74,7 +74,7 @@ class ConditionMonitor:
         """
         evidence = self.evidence
         ages = evidence.ages.least_ages_s()
-        latencies = evidence.ages.percentiles_s()
+        latencies = evidence.ages.percentiles_s(now_s)
         if not evidence.connected:
             self._held.clear()
             if not evidence.nodes and now_s - evidence.ready_s < FRESH_S:

@@ -117,20 +117,20 @@ class Evidence:
         elif isinstance(health, TagHealth) and node.host == self.host:
             self.ages.add_health(name, unix_s - health.unix_s, now_s)
 
-    def add_fix(self, fix: FixMessage, now_s: float) -> None:
-        """A fix of a tag."""
+    def add_fix(self, fix: FixMessage, now_s: float) -> float:
+        """A fix of a tag; returns its age as ``FixAges`` has it, in s."""
         node = self._node("tag", fix.tag)
         if node is None:
-            return
+            return 0.0
         node.begin(now_s)
         node.fix_s = now_s
         if ALERTS.get(fix.alert, 0) > ALERTS.get(node.alert, 0):
             node.alert = fix.alert
-        self.ages.add_fix(fix.tag, fix.unix_s, fix.latency_s, now_s)
         for anchor in fix.anchors:
             used = self._node("anchor", str(anchor))
             if used is not None:
                 used.used_s = now_s
+        return self.ages.add_fix(fix.tag, fix.unix_s, fix.latency_s, now_s)
 
     def of(self, kind: str) -> list[tuple[str, Node]]:
         """Names and nodes of a kind, in their natural order."""

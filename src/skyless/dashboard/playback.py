@@ -292,7 +292,7 @@ def _states(
         if isinstance(found.message, TruthMessage):
             site.add_truth(found.message)
         elif isinstance(found.message, FixMessage) and found.time_s >= begin_s:
-            site.add_fix(found.message, found.time_s)
+            site.add_fix(found.message, found.time_s, found.time_s)
     _append_state(site, sent, min(due_s, end_s), states)
     return states
 

@@ -23,6 +23,9 @@ MAX_NAMES: Final = 2000
 EXPIRY_S: Final = 600.0
 """Fixes and health messages older than this are dropped."""
 
+MAX_CLOCK_ERROR_S: Final = 0.5
+"""The time of a fix by its tag's clock is replaced where it is wrong by more than this."""
+
 _MAX_ENCODED: Final = 16
 _AGES: Final = {"AnchorHealth": "anchors", "TagHealth": "tags", "EtherHealth": "ether"}
 
@@ -30,10 +33,10 @@ _AGES: Final = {"AnchorHealth": "anchors", "TagHealth": "tags", "EtherHealth": "
 class _Tag:
     """The last fix of a tag, and its row once one was requested."""
 
-    __slots__ = ("fix", "received_s", "row", "serial")
+    __slots__ = ("ended_unix_s", "fix", "received_s", "row", "serial")
 
-    def __init__(self, fix: FixMessage, serial: int, received_s: float) -> None:
-        self.fix, self.serial, self.received_s = fix, serial, received_s
+    def __init__(self, fix: FixMessage, serial: int, received_s: float, ended_unix_s: float) -> None:
+        self.fix, self.serial, self.received_s, self.ended_unix_s = fix, serial, received_s, ended_unix_s
         self.row: list[Any] | None = None
 
 
@@ -52,12 +55,15 @@ class SiteState:
         self._healths: dict[tuple[str, str], tuple[float, TagHealth | AnchorHealth | EtherHealth]] = {}
         self._encoded: dict[tuple[int, int], bytes] = {}
 
-    def add_fix(self, fix: FixMessage, now_s: float) -> None:
-        """Add a fix; ``now_s`` is its time of arrival, by the clock of ``expire``."""
+    def add_fix(self, fix: FixMessage, now_s: float, unix_s: float) -> None:
+        """Add a fix; ``now_s`` is its time of arrival, by the clock of ``expire``.
+
+        ``unix_s`` is the time of the fix, the end of its last frame, by the owner's clock of the day.
+        """
         if fix.tag not in self._tags and len(self._tags) >= MAX_NAMES:
             return
         self.serial += 1
-        self._tags[fix.tag] = _Tag(fix, self.serial, now_s)
+        self._tags[fix.tag] = _Tag(fix, self.serial, now_s, unix_s)
 
     def add_truth(self, truth: TruthMessage) -> None:
         """Add true positions of simulated tags."""
@@ -102,7 +108,7 @@ class SiteState:
         for tag in self._tags.values():
             if tag.serial > serial:
                 if tag.row is None:
-                    tag.row = _row(tag.fix, self._truths.at(tag.fix.tag, tag.fix.unix_s))
+                    tag.row = _row(tag.fix, self._truths.at(tag.fix.tag, tag.fix.unix_s), tag.ended_unix_s)
                 rows.append(tag.row)
         return rows
 
@@ -136,8 +142,9 @@ def error_m(fix: FixMessage, true_m: Vector) -> float:
     return math.dist(fix.position_m[:axes], true_m[:axes])
 
 
-def _row(fix: FixMessage, true_m: Vector | None) -> list[Any]:
+def _row(fix: FixMessage, true_m: Vector | None, ended_unix_s: float) -> list[Any]:
     """One tag in a ``state``, rounded to what a page can show, which halves the bytes."""
+    unix_s = fix.unix_s if abs(fix.unix_s - ended_unix_s) <= MAX_CLOCK_ERROR_S else ended_unix_s
     x, y, z = fix.position_m
     xx, xy, _, _, yy = fix.covariance_m2[:5]
     vx, vy, _ = fix.velocity_mps or (None, None, None)
@@ -157,7 +164,7 @@ def _row(fix: FixMessage, true_m: Vector | None) -> list[Any]:
         None if true_m is None else round(true_m[1], 4),
         len(fix.anchors),
         round(fix.chi2, 3),
-        round(fix.unix_s, 4),
+        round(unix_s, 4),
         None if fix.hpl_m is None else round(fix.hpl_m, 4),
         fix.alert,
         int(fix.height_known),

@@ -367,6 +367,9 @@ class SurveyMessage(Struct, frozen=True):
     error: str | None = None
     """A sentence: why there is no result, or why the last one could not be saved."""
     saved_serial: int | None = None
+    """Of the result that was saved last, by this run of the program."""
+    saved_unix_s: float | None = None
+    """When that was."""
     file: str | None = None
     """The site file that it writes."""
     state: Literal["collecting", "surveyed", "no data"] = "collecting"

@@ -70,6 +70,12 @@ export function fileOf(name) {
   return new URL(`api/recordings/${encodeURIComponent(name)}/file`, document.baseURI).href;
 }
 
+/** Address of the floor plan's image: of a recording, or with null of the live site, whose digest differs by image. */
+export function floorPlanOf(name, digest) {
+  const path = name === null ? `api/floor_plan?digest=${digest}` : `api/recordings/${encodeURIComponent(name)}/floor_plan`;
+  return new URL(path, document.baseURI).href;
+}
+
 /** States of a recording between two times since its start, at most 60 s. */
 export async function recordedStates(name, from_s, to_s, rate_hz) {
   const query = `from_s=${from_s.toFixed(3)}&to_s=${to_s.toFixed(3)}&rate_hz=${rate_hz}`;

@@ -4,7 +4,7 @@
  */
 
 import { on, select, state } from "./store.js";
-import { byId, h, text } from "./dom.js";
+import { Rows, byId, h, text } from "./dom.js";
 import { now_s } from "./clock.js";
 import { LEVELS, shownCondition } from "./condition.js";
 import { sentence, timeOfDay } from "./format.js";
@@ -16,7 +16,8 @@ import { summaryFacts } from "./summary.js";
 let kept = false;
 let over = false;
 let said = "";
-let listed = "";
+/** The list behind the pill: its parts stay, so that a figure that changes takes neither a click nor the focus away. */
+let list = null;
 
 /** Fill the header and the banner, and keep them up to date. */
 export function start() {
@@ -27,6 +28,7 @@ export function start() {
   }, 500);
   byId("banner-button").addEventListener("click", retryNow);
   const box = byId("condition");
+  buildList();
   byId("pill").addEventListener("click", () => {
     kept = !kept;
     over &&= kept;
@@ -73,29 +75,50 @@ function say({ level, reasons }, words) {
   text(byId("condition-said"), words);
 }
 
+function buildList() {
+  const heading = h("h2", {});
+  const reasons = h("ul", {});
+  const figures = h("dl", { class: "facts" });
+  const all = h("button", { type: "button", class: "quiet", onclick: () => (close(), openTab("events")) }, "All events");
+  byId("condition-list").append(heading, reasons, figures, all);
+  list = { heading, reasons: new Rows(reasons, makeReason), figures: new Rows(figures, makeFigure) };
+}
+
 function showList({ level, text: first, reasons }, word) {
   const open = kept || over;
-  const list = byId("condition-list");
-  list.hidden = !open;
+  byId("condition-list").hidden = !open;
   byId("pill").setAttribute("aria-expanded", String(open));
-  if (!open) return void (listed = "");
-  const facts = summaryFacts();
-  const key = JSON.stringify([level, first, reasons, facts]);
-  if (key === listed) return;
-  listed = key;
-  const focused = list.contains(document.activeElement) ? document.activeElement?.textContent : null;
-  const items = reasons.map((reason) =>
-    h("li", { class: reason.level }, h("p", {}, sentence(reason.text), ...links(reason)), h("p", { class: "fine" }, reason.advice)),
-  );
-  const figures = facts.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value)));
-  const all = h("button", { type: "button", class: "quiet", onclick: () => (close(), openTab("events")) }, "All events");
-  list.replaceChildren(
-    h("h2", {}, headline(level, first, reasons, word)),
-    h("ul", {}, ...items),
-    h("dl", { class: "facts" }, ...figures),
-    all,
-  );
-  if (focused) [...list.querySelectorAll("button")].find((one) => one.textContent === focused)?.focus();
+  if (!open) return;
+  text(list.heading, headline(level, first, reasons, word));
+  list.reasons.show(reasons.map((reason) => [reason.kind, reason]));
+  list.figures.show(summaryFacts());
+}
+
+function makeReason() {
+  const words = h("span", {});
+  const links = h("span", {});
+  const advice = h("p", { class: "fine" });
+  const element = h("li", {}, h("p", {}, words, links), advice);
+  const rows = new Rows(links, makeLink);
+  const update = (reason) => {
+    if (element.className !== reason.level) element.className = reason.level;
+    text(words, sentence(reason.text));
+    text(advice, reason.advice);
+    rows.show(reason.names.slice(0, 3).map((name) => [name, name]));
+  };
+  return { element, update };
+}
+
+/** A button that selects a tag or anchor of a reason, and opens its tab. */
+function makeLink(name) {
+  const [kind, id] = [name.slice(0, name.indexOf("/")), name.slice(name.indexOf("/") + 1)];
+  const go = () => (openTab(`${kind}s`), select(kind, kind === "anchor" ? Number(id) : id));
+  return { element: h("button", { type: "button", class: "quiet", onclick: go }, `Show ${kind} ${id}`) };
+}
+
+function makeFigure(name) {
+  const value = h("dd", {});
+  return { element: h("div", {}, h("dt", {}, name), value), update: (words) => text(value, words) };
 }
 
 function headline(level, first, reasons, word) {
@@ -103,15 +126,6 @@ function headline(level, first, reasons, word) {
   if (level === "replay") return "A recording is shown, not the live site.";
   if (!reasons.length) return sentence(first || word);
   return reasons.length === 1 ? "One thing is wrong:" : `${reasons.length} things are wrong:`;
-}
-
-/** Buttons that select the tags or anchors of a reason. */
-function links({ names }) {
-  return names.slice(0, 3).map((name) => {
-    const [kind, id] = [name.slice(0, name.indexOf("/")), name.slice(name.indexOf("/") + 1)];
-    const go = () => select(kind, kind === "anchor" ? Number(id) : id);
-    return h("button", { type: "button", class: "quiet", onclick: go }, `Show ${kind} ${id}`);
-  });
 }
 
 function showBanner() {

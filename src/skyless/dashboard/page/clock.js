@@ -47,9 +47,8 @@ export function tracks() {
 
 /** State of a tag: "fresh", "stale" (grey), "gone" (only in the list) or "never". */
 export function freshness(track, now = now_s(), shown = shown_s()) {
-  const index = track.find(shown);
-  if (index < 0) return track.count && state.mode === "live" ? "fresh" : "never";
-  const last = state.mode === "live" ? track.lastTime : track.value(index, TIME);
-  const age = now - last;
+  const index = state.mode === "live" ? track.count - 1 : track.find(shown);
+  if (index < 0) return "never";
+  const age = Math.abs(now - track.value(index, TIME)); // a fix of later than now is of another clock
   return age < GREY_S ? "fresh" : age < GONE_S ? "stale" : "gone";
 }

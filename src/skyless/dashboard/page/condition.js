@@ -4,6 +4,8 @@ import { state } from "./store.js";
 
 /** The server judges twice a second; a judgement older than this is worth nothing. */
 const MAX_AGE_MS = 3000;
+/** A page that gets its messages later than this says so. */
+const MAX_BEHIND_S = 1.0;
 
 /** Words and marks by level; the marks stand in the browser's tab. */
 export const LEVELS = {
@@ -25,9 +27,20 @@ export function shownCondition() {
   if (phase === "lost") return { level: "lost", text: "", reasons: [lostReason(reason)] };
   if (state.mode === "replay") return { level: "replay", text: "", reasons: [] };
   if (phase !== "open") return { level: "connecting", text: "", reasons: [] };
+  const behind = behind_s();
+  return behind > MAX_BEHIND_S ? withDelay(judged(), behind) : judged();
+}
+
+/** The server's judgement while it is fresh, otherwise null. */
+export function freshCondition() {
+  return performance.now() - state.conditionMs > MAX_AGE_MS ? null : state.condition;
+}
+
+/** What the server says, as far as it still holds. */
+function judged() {
   const { condition } = state;
   if (!condition) return { level: "waiting", text: "waiting for the server", reasons: [] };
-  if (performance.now() - state.conditionMs > MAX_AGE_MS) {
+  if (!freshCondition()) {
     return { level: "waiting", text: "the server is silent", reasons: [silentReason()] };
   }
   if (state.mqtt && !state.mqtt.connected && condition.level !== "bad") {
@@ -35,6 +48,21 @@ export function shownCondition() {
   }
   if (condition.level === "waiting" && state.preparation) return { ...condition, text: "compiling, at the first start only" };
   return condition;
+}
+
+/** By how much messages are late, as the answers to pings show; an answer that is missing is late already. */
+function behind_s() {
+  const { sentMs, tripMs } = state.ping;
+  return Math.max(tripMs, sentMs === null ? 0 : performance.now() - sentMs) / 1e3;
+}
+
+/** At least a warning: whatever the server says arrives too late. */
+function withDelay({ level, text, reasons }, behind) {
+  const words = `this page is ${behind.toFixed(1)} s behind`;
+  const advice = "The network or this browser is too slow.";
+  const late = { kind: "behind", level: "warning", text: words, advice, names: [] };
+  if (level === "bad") return { level, text, reasons: [...reasons, late] };
+  return { level: "warning", text: words, reasons: [late, ...reasons] };
 }
 
 function lostReason(words) {

@@ -9,10 +9,22 @@ export const anchorHistory = new Map();
 /** Columns by tag: time, rate. @type {Map<string, any>} */
 export const tagHistory = new Map();
 
-/** Add the health of one second. */
+/** Forget all. */
+export function clearHistory() {
+  anchorHistory.clear();
+  tagHistory.clear();
+}
+
+/** Add the health of one second, of all that the server has a health of; the others lose their history. */
 export function addHealth(anchors, tags) {
   for (const health of anchors) add(anchorHistory, health.anchor, health.unix_s, (past) => clockOf(past, health));
+  keepOnly(anchorHistory, new Set(anchors.map(({ anchor }) => anchor)));
+  keepOnly(tagHistory, new Set(tags.map(({ tag }) => tag)));
   for (const health of tags) add(tagHistory, health.tag, health.unix_s, () => ({ rate: health.updates_per_s }));
+}
+
+function keepOnly(histories, ids) {
+  for (const id of histories.keys()) if (!ids.has(id)) histories.delete(id);
 }
 
 /** Append a point; after a clock was set back, the history starts again. */

@@ -19,6 +19,8 @@ const SWITCHES = {
   levels: "Protection level, a dashed circle: the tag is outside with at most the configured probability",
   truth: "True position, a faint ring (simulated sites)",
 };
+/** How much `tracks.js` and `player.js` keep. */
+const KEPT = "What this page holds: of the live site the last 2048 fixes of each tag, of a recording about 90 s up to now";
 /** Anchors with a frame, by the mode of the site. */
 const LEADERS = {
   master: "master: its clock is the site's time",
@@ -141,7 +143,7 @@ function saving() {
     "div",
     { class: "saving" },
     h("button", { type: "button", id: "save-picture", onclick: savePicture }, "Map as a picture (PNG)"),
-    h("button", { type: "button", id: "save-positions", onclick: savePositions }, "Positions as a table (CSV)"),
+    h("button", { type: "button", id: "save-positions", title: KEPT, onclick: savePositions }, "Positions as a table (CSV)"),
   );
 }
 

@@ -1,17 +1,19 @@
 /** The live connection: reads the server's messages into the state, notices a loss, and reconnects. */
 
 import { changed, state } from "./store.js";
-import { live, resetOffset, updateOffset } from "./clock.js";
+import { live, now_s, resetOffset, updateOffset } from "./clock.js";
 import { toast } from "./dom.js";
-import { addHealth } from "./history.js";
+import { addHealth, clearHistory } from "./history.js";
 import { receiveSurvey, receiveWatch, restart } from "./survey/model.js";
 
 const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 3000;
-const PING_MS = 5000;
+const PING_MS = 2000;
 /** The connection is lost after this time without a message: while tags move, and otherwise (every ping is answered). */
 const MOVING_TIMEOUT_MS = 3000;
 const IDLE_TIMEOUT_MS = 9000;
+/** The server drops a tag, too, that it has received nothing of for so long. */
+const EXPIRY_S = 600;
 const MAX_EVENTS = 50;
 const MAX_LOGGED = 500;
 /** Close code of a server that has too many pages open. */
@@ -28,6 +30,8 @@ let lastPing = 0;
 /** The live site's message and zones, also while a recording is replayed. */
 let site = null;
 let zones = [];
+/** Number and name of the site whose tags and histories are kept. */
+let keptOf = "";
 
 /** Connect, and stay connected. */
 export function start() {
@@ -47,8 +51,11 @@ export function retryNow() {
 function connect() {
   const address = new URL("live", document.baseURI);
   address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+  const old = socket;
   const mine = (socket = new WebSocket(address));
+  old?.close(); // one that was still connecting
   lastMessage = lastPing = performance.now();
+  state.ping = { sentMs: null, tripMs: 0 };
   mine.onmessage = (event) => mine === socket && process(event.data);
   mine.onclose = ({ code, reason }) => {
     if (code === TRY_LATER) retry_ms = LAST_RETRY_MS;
@@ -68,10 +75,10 @@ function lost(reason) {
   explain(state.connection);
 }
 
-/** A browser does not report why a socket is refused; an ordinary request does. */
+/** A browser does not report why a socket is refused; an ordinary request does, here for this very file. */
 async function explain(connection) {
   try {
-    const answer = await fetch(new URL("api/recordings", document.baseURI), { cache: "no-store" });
+    const answer = await fetch(import.meta.url, { cache: "no-store" });
     if (answer.status !== 401 && answer.status !== 403) return;
     connection.reason = "the token is missing or wrong: open the address that the dashboard has printed";
     changed("connection");
@@ -90,9 +97,10 @@ function checkConnection() {
   if (silence > (moved || !open ? MOVING_TIMEOUT_MS : IDLE_TIMEOUT_MS)) {
     return lost(`no message for ${(silence / 1e3).toFixed(0)} s`);
   }
-  if (now - lastPing > PING_MS && socket.readyState === WebSocket.OPEN) {
+  // Pongs have no number: only one is under way at a time.
+  if (now - lastPing > PING_MS && state.ping.sentMs === null && socket.readyState === WebSocket.OPEN) {
     socket.send("ping");
-    lastPing = now;
+    lastPing = state.ping.sentMs = now;
   }
 }
 
@@ -122,19 +130,25 @@ const handlers = {
     changed("connection", "events", "log", "condition");
     handlers.preparation({ preparation: null });
     handlers.zones(message);
-    if (message.site) handlers.site(message);
+    handlers.site(message);
   },
   site(message) {
-    site = message.site;
+    site = message.site ?? null;
+    forgetOtherSite();
     if (state.mode === "live") showSite();
   },
   state(message) {
     updateOffset(message.unix_s);
     lastMotion = lastMessage;
-    live.add(message.tags, message.unix_s);
+    live.add(message.tags);
     if (message.tags.length) changed("tags");
   },
+  pong() {
+    const { sentMs } = state.ping;
+    if (sentMs !== null) state.ping = { sentMs: null, tripMs: lastMessage - sentMs };
+  },
   condition(message) {
+    updateOffset(message.unix_s);
     state.condition = message;
     state.conditionMs = performance.now();
     changed("condition");
@@ -154,6 +168,7 @@ const handlers = {
       atMs: performance.now(),
     };
     live.addNames([...state.health.tags.keys()]);
+    live.expire(now_s() - EXPIRY_S, state.health.tags);
     addHealth(anchors, tags);
     changed("health");
   },
@@ -180,7 +195,7 @@ const handlers = {
     changed("site");
   },
   zone_event(message) {
-    state.events = [message, ...state.events].slice(0, MAX_EVENTS);
+    state.events = [{ ...message, cameMs: performance.now() }, ...state.events].slice(0, MAX_EVENTS);
     changed("events");
   },
   mqtt(message) {
@@ -195,6 +210,19 @@ function checkVersion(version) {
     toast(`The server now runs version ${version}.`, "note", action);
   }
   state.version = version;
+}
+
+/** Tags, histories and the floor plan are those of one site; a server that knows none yet may soon know the same. */
+function forgetOtherSite() {
+  if (!site) return;
+  const now = JSON.stringify([site.site.id, site.site.name]);
+  if (keptOf && now !== keptOf) {
+    live.clear();
+    clearHistory();
+    state.floorDigest = null;
+    changed("tags");
+  }
+  keptOf = now;
 }
 
 function showSite() {

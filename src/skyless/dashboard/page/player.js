@@ -12,6 +12,8 @@ const AFTER_S = 20;
 const KEPT_S = 90;
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 
+/** Count what makes an answer that is awaited useless: another recording is to be opened; another moment is shown. */
+let openings = 0;
 let generation = 0;
 let fetching = false;
 let loaded = { from: 0, to: 0 };
@@ -27,11 +29,13 @@ export const STEP_S = 0.1;
 /** Levels of events that have a mark on the bar. */
 const MARKED = new Set(["warning", "bad"]);
 
-/** Open a recording and play it from its first fix. */
+/** Open a recording and play it from its first fix; where it cannot be opened, what is shown stays. */
 export async function open(name) {
-  const mine = ++generation;
+  const mine = ++openings;
   const found = await recording(name);
-  if (mine !== generation) return;
+  if (mine !== openings) return;
+  abandon();
+  loaded = { from: 0, to: 0 };
   const duration_s = Math.max(0, found.end_unix_s - found.start_unix_s);
   const fixes = (found.fix_spans_unix_s ?? []).map((span) => span.map((at) => at - found.start_unix_s));
   const player = { name, start_unix_s: found.start_unix_s, duration_s, fixes, at_s: 0, playing: true, speed: 1 };
@@ -40,13 +44,19 @@ export async function open(name) {
   state.site = found.site?.site ?? null;
   state.simulated = found.site?.simulated ?? false;
   state.zones = found.zones ?? [];
-  replayed.all.clear();
+  replayed.clear();
   replayed.addNames(found.tags ?? []);
-  replayed.sort();
   select(null);
   changed("mode", "site", "zones", "player", "tags", "selection");
   loadEvents(state.player);
   await seek(firstFix_s(state.player));
+}
+
+/** Wait for no states any more. */
+function abandon() {
+  clearTimeout(seekTimer);
+  generation++;
+  fetching = false;
 }
 
 /** The first moment that shows a tag. */
@@ -105,7 +115,8 @@ export function stepSpeed(direction) {
 
 /** Leave the replay. */
 export function close() {
-  generation++;
+  openings++;
+  abandon();
   state.player = null;
   backToLive();
   changed("player");
@@ -117,10 +128,11 @@ export async function seek(at_s) {
   if (!player) return;
   player.at_s = Math.min(Math.max(at_s, 0), player.duration_s);
   changed("player", "tags");
-  clearTimeout(seekTimer);
-  if (player.at_s >= loaded.from && player.at_s < loaded.to && loaded.name === player.name) return;
-  player.waiting = true;
-  seekTimer = setTimeout(() => load(true), 60);
+  const there = player.at_s >= loaded.from && player.at_s < loaded.to;
+  if (there && !player.waiting) return;
+  abandon(); // states of another moment
+  player.waiting = !there;
+  if (!there) seekTimer = setTimeout(() => load(true), 60);
 }
 
 async function load(restart) {
@@ -134,8 +146,8 @@ async function load(restart) {
     const states = await recordedStates(player.name, from, to, player.speed > 2 ? 10 : 20);
     if (mine !== generation || player !== state.player) return;
     if (restart) replayed.clearStates();
-    for (const one of states) replayed.add(one.tags, one.unix_s);
-    loaded = { name: player.name, from: restart ? from : Math.max(loaded.from, to - KEPT_S), to };
+    for (const one of states) replayed.add(one.tags);
+    loaded = { from: restart ? from : Math.max(loaded.from, to - KEPT_S), to };
     player.waiting = false;
     if (player.fixes.length) player.error = "";
   } catch (error) {

@@ -16,6 +16,8 @@ export const state = {
   connection: { phase: "connecting", since: performance.now(), reason: "" },
   /** @type {{connected: boolean, broker: string}|null} */
   mqtt: null,
+  /** The last ping: when it was sent, null once it is answered; and how long the last answer took. */
+  ping: { sentMs: /** @type {number|null} */ (null), tripMs: 0 },
   version: "",
   /** @type {any} the site message's `site` */
   site: null,
@@ -30,7 +32,7 @@ export const state = {
   otherZones: [],
   /** Why the zones that the broker keeps cannot be read. @type {string|null} */
   zonesFault: null,
-  /** @type {any[]} tags that entered or left zones, newest first */
+  /** @type {any[]} tags that entered or left zones, newest first; with `cameMs` those that came since the page connected */
   events: [],
   /** @type {any[]} what has happened at the live site, oldest first; `panels/events.js` lists it */
   log: [],
@@ -77,8 +79,17 @@ function flush() {
   const callbacks = new Set();
   for (const topic of dirty) for (const callback of listeners.get(topic) ?? []) callbacks.add(callback);
   dirty.clear();
-  for (const callback of callbacks) callback();
+  for (const callback of callbacks) {
+    try {
+      callback();
+    } catch (error) {
+      reportError(error); // the others are still to run
+    }
+  }
 }
+
+/** Health older than this is not of now, and whoever sent it is offline; programs report once a second. */
+export const MAX_AGE_S = 3.5;
 
 /**
  * Seconds since the server got the health of a node; Infinity without any.
@@ -89,11 +100,10 @@ export function healthAge_s(kind, name) {
   return age === undefined ? Infinity : age + (performance.now() - state.health.atMs) / 1e3;
 }
 
-/** Select one tag, anchor or zone, or with null none. */
+/** Select one tag, anchor or zone, or with null none; its tab opens, also where it is selected already. */
 export function select(kind, id) {
   const next = { tag: null, anchor: null, zone: null };
   if (kind) next[kind] = id;
-  if (Object.entries(next).every(([key, value]) => state.selection[key] === value)) return;
   state.selection = next;
   changed("selection");
 }

@@ -1,14 +1,13 @@
 /** The site in a few figures, in the header: what is unknown, or old, is a dash. */
 
-import { state, healthAge_s, on } from "./store.js";
+import { MAX_AGE_S, healthAge_s, on, state } from "./store.js";
 import { byId, h, text } from "./dom.js";
+import { freshCondition } from "./condition.js";
 import { freshness, now_s, shown_s, tracks } from "./clock.js";
 import { DASH, duration, length, number } from "./format.js";
 import { condition } from "./map/anchors.js";
 import { COLUMNS, ERROR, HPL, STD } from "./tracks.js";
 
-/** Health older than this is no figure of now. */
-const MAX_AGE_S = 3;
 /** Figures in the header; the list behind the pill has them all. */
 const IN_HEADER = ["Tags", "σ", "Error", "Latency", "Anchors"];
 const TITLES = {
@@ -16,7 +15,7 @@ const TITLES = {
   σ: "Median of the standard deviations that the tags predict",
   Error: "Median distance to the true positions, known as the site is simulated",
   Rate: "Fixes a second of each tag, the median",
-  Latency: "From the end of a frame to the arrival of its fix at the page's server: half of all, and 99 of 100, are quicker",
+  Latency: "From the end of a frame to the arrival of its fix at the page's server: half of all in the last 10 s, and 99 of 100, are quicker",
   "Protection level": "Median of the horizontal protection levels, and the largest",
   Anchors: "Anchors that are online, of all",
 };
@@ -27,7 +26,7 @@ const boxes = new Map();
 export function start() {
   for (const name of IN_HEADER) {
     const value = h("dd", {});
-    const box = h("div", { title: TITLES[name] }, h("dt", {}, name), value);
+    const box = h("div", { class: name.toLowerCase(), title: TITLES[name] }, h("dt", {}, name), value);
     boxes.set(name, { box, value });
     byId("summary").append(box);
   }
@@ -73,12 +72,12 @@ export function summaryFacts() {
 
 function liveFacts(lost) {
   const healths = lost ? [] : [...state.health.tags.values()].filter(({ tag }) => healthAge_s("tags", tag) < MAX_AGE_S);
-  const { latency_p50_s, latency_p99_s } = (!lost && state.condition) || {};
+  const { latency_p50_s, latency_p99_s } = (!lost && freshCondition()) || {};
   const known = latency_p50_s !== null && latency_p50_s !== undefined;
   const anchors = [...(state.site?.anchors ?? []), ...(state.site?.unplaced ?? [])];
   const online = anchors.filter(({ id }) => ["good", "warn"].includes(condition(id))).length;
   return [
-    ["Rate", number(median(healths.map((health) => health.updates_per_s)), 0, "/s")],
+    ["Rate", number(median(healths.map((health) => health.updates_per_s)), 0, "Hz")],
     ["Latency", known ? `${duration(latency_p50_s)}, p99 ${duration(latency_p99_s)}` : DASH],
     ["Anchors", lost || !anchors.length ? DASH : `${online}/${anchors.length}`],
   ];

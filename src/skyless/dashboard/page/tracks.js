@@ -4,8 +4,8 @@ const FIRST_CAPACITY = 64;
 const MAX_CAPACITY = 2048;
 /** Between states further apart than this nothing is interpolated. */
 const GAP_S = 1.0;
-/** A tag whose host's clock differs more than this from the server's has a wrong clock, not an old fix. */
-const MAX_CLOCK_ERROR_S = 0.5;
+/** A state older than the last by more than this comes after the server's clock was set back. */
+const SET_BACK_S = 5;
 
 export const COLUMNS = 19;
 /**
@@ -54,10 +54,14 @@ export class Track {
     this.count = 0;
   }
 
-  /** Add a row of a state: `[name, x, y, …]`, null for unknown; rows older than the last are ignored. */
+  /**
+   * Add a row of a state: `[name, x, y, …]`, null for unknown. A row older than the last is ignored, or starts the track
+   * again where a clock was set back.
+   */
   push(row) {
     const time = row[TIME + 1];
-    if (!Number.isFinite(time) || (this.count && time <= this.value(this.count - 1, TIME))) return false;
+    if (time < this.lastTime - SET_BACK_S) this.start = this.count = 0;
+    if (!Number.isFinite(time) || time <= this.lastTime) return false;
     if (this.count === this.capacity && this.capacity < MAX_CAPACITY) this.grow();
     if (this.count === this.capacity) this.start = (this.start + 1) % this.capacity;
     else this.count += 1;
@@ -130,16 +134,10 @@ export class Tracks {
     this.sorted = [];
   }
 
-  /**
-   * Add a state message's rows. With `unix_s`, the message's own time, it replaces the time of fixes from hosts whose
-   * clocks are wrong.
-   */
-  add(rows, unix_s = NaN) {
+  /** Add a state message's rows. */
+  add(rows) {
     this.addNames(rows.map(([name]) => name));
-    for (const row of rows) {
-      if (Math.abs(row[TIME + 1] - unix_s) > MAX_CLOCK_ERROR_S) row[TIME + 1] = unix_s;
-      this.all.get(row[0]).push(row);
-    }
+    for (const row of rows) this.all.get(row[0]).push(row);
   }
 
   /** Add tags by name, without a state. */
@@ -147,6 +145,19 @@ export class Tracks {
     const before = this.all.size;
     for (const name of names) if (!this.all.has(name)) this.all.set(name, new Track(name));
     if (this.all.size !== before) this.sort();
+  }
+
+  /** Remove the tags without a state since a time, but for some names. */
+  expire(since, kept) {
+    const before = this.all.size;
+    for (const [name, track] of this.all) if (track.lastTime < since && !kept.has(name)) this.all.delete(name);
+    if (this.all.size !== before) this.sort();
+  }
+
+  /** Remove all tags. */
+  clear() {
+    this.all.clear();
+    this.sort();
   }
 
   /** Remove the states, keep the names. */

@@ -60,6 +60,7 @@ class LiveSurvey:
         """Of the newest result."""
         self.error: str | None = None
         self.saved_serial: int | None = None
+        self.saved_unix_s: float | None = None
         self.missed = 0
         """Stamps that anchors had to drop."""
         self.begun = 0
@@ -135,9 +136,9 @@ class LiveSurvey:
         """A result by its number, with the ranges that it was made of; None if it is no longer kept."""
         return self._results.get(serial)
 
-    def place(self, site: Site, record: SurveyRecord, serial: int, now_s: float) -> None:
+    def place(self, site: Site, record: SurveyRecord, serial: int, now_s: float, unix_s: float) -> None:
         """The site is that of a result from now on: ranges begin again, as antenna delays are others."""
-        self.site, self.saved_serial, self.error = site, serial, None
+        self.site, self.saved_serial, self.saved_unix_s, self.error = site, serial, unix_s, None
         if self.facts.sketch_m:
             sketch = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
             self.facts = replace(self.facts, sketch_m=sketch)
@@ -173,6 +174,7 @@ class LiveSurvey:
             survey=None if newest is None else newest[0],
             error=error,
             saved_serial=self.saved_serial,
+            saved_unix_s=self.saved_unix_s,
             file=file,
             state=state,
         )

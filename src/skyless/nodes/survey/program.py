@@ -443,12 +443,13 @@ class SurveyNode:
         old = self._placement
         if old is not None and site_digest(old.site) == site_digest(before):
             earlier = (old.before, *old.earlier)[:_EARLIER_KEPT]
-        self._placement = PlacementMessage(time.time(), site_digest(before), saved.site, earlier)
+        unix_s = time.time()
+        self._placement = PlacementMessage(unix_s, site_digest(before), saved.site, earlier)
         if self.link is not None:
             self.link.publish(placement_topic(self._settings.site_id), self._placement, qos=1, retain=True)
         self._running = None  # until the anchors publish it
         self.saved = saved
-        live.place(saved.site, saved.record, serial, time.monotonic())
+        live.place(saved.site, saved.record, serial, time.monotonic(), unix_s)
         written = "".join(f", {path} written" for path in saved.written)
         self._log(f"survey: saved{written}")
 

@@ -1,14 +1,12 @@
 /** Anchors: their health as a colour and a shape, and their marks on the map. */
 
 import { s } from "../dom.js";
-import { healthAge_s, state } from "../store.js";
+import { MAX_AGE_S, healthAge_s, state } from "../store.js";
 import { surveyShown } from "../survey/model.js";
 import { palette } from "../theme.js";
 import { groundHeight, otherFloor } from "./floors.js";
 import { toX, toY, view } from "./view.js";
 
-/** An anchor whose health is older than this is offline. */
-const MAX_AGE_S = 3.5;
 const MARK = 7;
 /** Opacity of what is on another floor than the chosen one. */
 export const DIMMED = 0.22;
@@ -27,7 +25,7 @@ export function condition(id) {
   const health = state.health.anchors.get(id);
   const status = state.health.nodes.find((node) => node.kind === "anchor" && String(node.name) === String(id));
   if (status && !status.online) return "bad";
-  if (!health) return status ? "warn" : "unknown";
+  if (!health) return "unknown"; // not yet, or silent for so long that the server has dropped it
   if (healthAge_s("anchors", id) > MAX_AGE_S) return "bad";
   return health.synchronised || health.role === "master" ? "good" : "warn";
 }

@@ -97,6 +97,10 @@ export function storeShown(before) {
 }
 
 async function store(zones, words = "", before = state.zones) {
+  if (state.mode !== "live") {
+    toast("Zones can be changed on the live site only."); // a replay shows those of its recording
+    return false;
+  }
   state.zones = zones;
   changed("zones");
   try {
@@ -104,7 +108,7 @@ async function store(zones, words = "", before = state.zones) {
     if (words) toast(words);
     return true;
   } catch (error) {
-    state.zones = before;
+    if (state.mode === "live") state.zones = before;
     changed("zones");
     toast(`Not stored: ${error.message}`, "bad");
     return false;

@@ -83,8 +83,8 @@ export function mapPicture() {
   const after = EDGE + context.measureText(title).width + 12;
   context.font = "12px system-ui, sans-serif";
   context.fillStyle = palette.muted;
-  const kind = state.mode === "replay" ? `recording ${state.player?.name ?? ""}` : "live";
-  context.fillText(`${dateTime(shown_s())} · ${kind}${state.simulated ? " · simulated" : ""}`, after, HEAD / 2 + 1);
+  const { kind, unix_s } = pictured();
+  context.fillText(`${dateTime(unix_s)} · ${kind}${state.simulated ? " · simulated" : ""}`, after, HEAD / 2 + 1);
 
   let y = HEAD + view.height + EDGE + LINE / 2;
   for (const line of lines) {
@@ -97,6 +97,14 @@ export function mapPicture() {
   }
   if (ramp) drawScaleOf(context, state.overlay.data, y);
   return picture;
+}
+
+/** Of what the picture is, and of when; without a connection it shows the state at the loss. */
+function pictured() {
+  if (state.mode === "replay") return { kind: `recording ${state.player?.name ?? ""}`, unix_s: shown_s() };
+  const { phase, since } = state.connection;
+  if (phase !== "lost") return { kind: "live", unix_s: shown_s() };
+  return { kind: "last known state, connection lost", unix_s: now_s() - (performance.now() - since) / 1e3 };
 }
 
 /** What the picture shows: tags with their marks, and the conditions of anchors. */

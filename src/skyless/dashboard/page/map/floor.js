@@ -1,23 +1,30 @@
 /** The layers below the tags: floor plan, overlay, grid, walls, scale bar. */
 
+import { floorPlanOf } from "../api.js";
 import { faint, palette } from "../theme.js";
 import { state } from "../store.js";
 import { metres } from "../format.js";
 import { surveyShown } from "../survey/model.js";
 import { height_m, moving, plan } from "../survey/plan.js";
+import { groundHeight } from "./floors.js";
 import { drawInMetres, px, py, roundLength, toSite, toX, toY, view } from "./view.js";
 
 /** @type {{image: HTMLImageElement, x_m: number, y_m: number, width_m: number, height_m: number}|null} */
 export let floor = null;
 let floorOf = null;
+/** An image that could not be loaded is asked for again after this time, or earlier with the next site or mode. */
+const RETRY_MS = 60e3;
+let retryTimer = 0;
 /** Over a floor plan an overlay is transparent, as in the planner's pictures; elsewhere its colours are those of its scale. */
 const OVER_PLAN = 0.75;
 
-/** Load the site's floor plan, if it has one, and call `done` when it is loaded. */
+/** Load the floor plan of the live site or of the recording, if it has one, and call `done` when it is loaded. */
 export function loadFloor(done) {
   const stated = state.site?.floor_plan ?? null;
-  const key = JSON.stringify([stated, stated && state.floorDigest]);
+  const address = floorPlanOf(state.player?.name ?? null, state.floorDigest);
+  const key = JSON.stringify([stated, stated && address]);
   if (key === floorOf) return;
+  clearTimeout(retryTimer);
   floorOf = key;
   floor = null;
   if (!stated) return;
@@ -28,8 +35,12 @@ export function loadFloor(done) {
     floor = { image, x_m, y_m, width_m, height_m: height_m({ image, width_m }) };
     done();
   };
-  image.onerror = () => (floorOf = null);
-  image.src = new URL("api/floor_plan", document.baseURI).href;
+  image.onerror = () => {
+    if (key !== floorOf) return;
+    floorOf = null;
+    retryTimer = setTimeout(loadFloor, RETRY_MS, done);
+  };
+  image.src = address;
 }
 
 /** Draw the floor plan's image. */
@@ -49,9 +60,9 @@ export function drawFloor(context) {
   context.setLineDash([]);
 }
 
-/** Lay a picture on the ground, its lower left corner at a position. */
+/** Lay a picture on the ground of the chosen floor, its lower left corner at a position. */
 function drawPicture(context, picture, x_m, y_m, width_m, height_m) {
-  drawInMetres(context);
+  drawInMetres(context, groundHeight());
   context.scale(1, -1); // pictures count downwards
   context.drawImage(picture, x_m, -(y_m + height_m), width_m, height_m);
   context.restore();

@@ -8,6 +8,7 @@ import { picking, stopPicking } from "../survey/picking.js";
 import { move as movePlan, moving as movingPlan } from "../survey/plan.js";
 import { addPoint, begin, cancel, editor, finish, moveCorner, setCursor, storeShown, undoPoint } from "./editor.js";
 import { KINDS, valueAt, writeValue } from "./overlay.js";
+import { groundHeight } from "./floors.js";
 import { endFollow, following, toggleFollow } from "./follow.js";
 import { drawnAnchors } from "./anchors.js";
 import { anchorNear } from "./survey.js";
@@ -44,11 +45,12 @@ export function listen(target, redraw, fitAll, toggleSpatial) {
     hover(at, event.pointerType);
     const before = pointers.get(event.pointerId);
     if (!before) return;
-    if (pointers.size === 2) pinch(event.pointerId, before, at);
-    else if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
-    else if (travelled + Math.hypot(at.x - before.x, at.y - before.y) >= MAX_TAP_TRAVEL)
-      drag(at.x - before.x, at.y - before.y, event.shiftKey);
     travelled += Math.hypot(at.x - before.x, at.y - before.y);
+    if (pointers.size === 2) pinch(event.pointerId, before, at);
+    else if (travelled >= MAX_TAP_TRAVEL) {
+      if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
+      else drag(at.x - before.x, at.y - before.y, event.shiftKey);
+    }
     pointers.set(event.pointerId, at);
     redraw(true);
   });
@@ -107,7 +109,7 @@ function pinch(moved, before, at) {
 }
 
 function tap({ x, y }) {
-  const site = toSite(x, y);
+  const site = toSite(x, y, groundHeight());
   if (picking) return pickAt(site, anchorNear(x, y, 1.5 * HIT));
   if (editor.drawing) {
     const [first] = editor.points;
@@ -143,7 +145,7 @@ function cornerAt({ x, y }) {
 }
 
 function hover({ x, y }, type) {
-  const [x_m, y_m] = toSite(x, y);
+  const [x_m, y_m] = toSite(x, y, groundHeight());
   if (editor.drawing && type === "mouse") setCursor([x_m, y_m]);
   const value = valueAt(x_m, y_m);
   const { data } = state.overlay;

@@ -25,7 +25,7 @@ let movingDirty = true;
 let scheduled = false;
 let trailsDrawn = 0;
 let later = 0;
-let lastEvent = null;
+let flashedMs = 0;
 
 /** Draw in the next frame: everything, or only what moves. */
 export function redraw(still = true) {
@@ -78,7 +78,8 @@ function drawStill() {
   drawSurvey(context);
   drawFindings(context);
   drawScale(context);
-  byId("waiting").hidden = state.site !== null || (surveyShown() && state.survey.anchors.length > 0);
+  const surveyed = surveyShown() && state.survey.anchors.length > 0;
+  byId("waiting").hidden = state.mode === "replay" || state.site !== null || surveyed;
   return flashes;
 }
 
@@ -113,8 +114,9 @@ export function start() {
   on(["site", "mode"], () => {
     loadFloor(() => (view.touched ? redraw() : fitAll()));
     const key = JSON.stringify([state.mode, state.site?.name, state.site?.anchors]);
-    if (key !== shown) fitAll();
+    if (key === shown || (state.mode === "live" && !state.site)) return; // no site yet: after a reconnect the same may come
     shown = key;
+    fitAll();
   });
   let overlay = "none";
   on(["options"], () => {
@@ -130,9 +132,9 @@ export function start() {
     surveyed = key;
   });
   on(["events"], () => {
-    const newest = state.events[0];
-    if (newest && newest !== lastEvent && lastEvent !== null) flash(newest.zone);
-    lastEvent = newest ?? 0;
+    const fresh = state.events.filter(({ cameMs }) => cameMs > flashedMs);
+    if (state.mode === "live") for (const { zone } of fresh) flash(zone);
+    flashedMs = performance.now();
   });
   const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode"];
   on([...still, "survey", "watch", "setup", "plan"], () => redraw(true));

@@ -59,11 +59,10 @@ function paint(colour, shape, hollow, ratio) {
   return sprite;
 }
 
-/** A tag's mark as a small picture for lists; hollow where it has no fix. */
-export function tagMark({ colour, shape }, hollow = false) {
+/** A tag's mark as a small picture for lists. */
+export function tagMark({ colour, shape }) {
   const path = s("path", { d: SHAPES[shape], transform: "translate(9 9) scale(5)" });
   const mark = s("svg", { viewBox: "0 0 18 18", class: "tag-mark", "aria-hidden": "true", "data-shape": shape }, path);
   mark.style.color = colour;
-  if (hollow) mark.classList.add("hollow");
   return mark;
 }

@@ -12,7 +12,7 @@ const STEPS = [
 ];
 
 /** By tag: the candidate of the last frame, which is tried first, so that names do not jump. @type {Map<string, number>} */
-const last = new Map();
+let last = new Map();
 /** Widths of names in the font used, pixels. @type {Map<string, number>} */
 const widths = new Map();
 
@@ -29,8 +29,10 @@ export function drawNames(context, wanted, taken) {
   const boxes = [...taken, ...wanted.map(({ x, y }) => [x - 5, y - 5, x + 5, y + 5])];
   const own = boxes.length - wanted.length;
   const names = [];
+  const now = new Map();
   wanted.forEach(({ key, words, x, y, colour }, index) => {
     const chosen = choose(key, x, y, width(context, words), boxes, own + index);
+    now.set(key, chosen.number);
     boxes.push(chosen.box);
     names.push(chosen.box);
     if (chosen.line) {
@@ -43,6 +45,7 @@ export function drawNames(context, wanted, taken) {
     }
     label(context, words, chosen.box[0] + 1, chosen.box[1], colour);
   });
+  last = now;
   return names;
 }
 
@@ -66,9 +69,8 @@ function choose(key, x, y, wide, boxes, own) {
   );
   const before = last.get(key) ?? 0;
   const order = [before, ...candidates.keys()];
-  const free = order.find((n) => !boxes.some((box, index) => index !== own && overlap(box, candidates[n].box)));
-  last.set(key, free ?? 0);
-  return candidates[free ?? 0];
+  const number = order.find((n) => !boxes.some((box, index) => index !== own && overlap(box, candidates[n].box))) ?? 0;
+  return { ...candidates[number], number };
 }
 
 function overlap(a, b) {

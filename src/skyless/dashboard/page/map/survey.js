@@ -5,11 +5,9 @@ import { roundStep } from "../format.js";
 import { facts, surveyShown } from "../survey/model.js";
 import { faint, palette } from "../theme.js";
 import { label, ring } from "./anchors.js";
-import { isNarrow, px, py, toSite, toX, toY, view } from "./view.js";
+import { halfAxes, isNarrow, px, py, toSite, toX, toY, view } from "./view.js";
 
 const MARK = 6;
-/** Half axes of an ellipse that holds 95 % of the errors, in standard deviations. */
-const SIGMAS_95 = 2.4477;
 /** The largest ellipse is enlarged to about this half axis in pixels. */
 const ELLIPSE = 34;
 /** Anchors without any position stand in rows from here, in pixels; clear of the buttons and of the set-up's bar. */
@@ -64,7 +62,7 @@ export function drawSurvey(context) {
   ghosts(context, positions);
   const factor = ellipseFactor(positions);
   for (const { x_m, y_m, anchor } of positions.values()) {
-    const shape = anchor?.covariance_m2 && halfAxes(anchor.covariance_m2);
+    const shape = anchor?.covariance_m2 && ellipseOf(anchor.covariance_m2);
     if (shape) ellipse(context, px(x_m), py(y_m), shape, factor * view.scale);
   }
   if (factor) caption(context, factor);
@@ -132,17 +130,14 @@ function ghosts(context, positions) {
 export function ellipseFactor(positions = surveyPositions()) {
   let largest_m = 0;
   for (const { anchor } of positions.values()) {
-    if (anchor?.covariance_m2) largest_m = Math.max(largest_m, halfAxes(anchor.covariance_m2)[0]);
+    if (anchor?.covariance_m2) largest_m = Math.max(largest_m, ellipseOf(anchor.covariance_m2)[0]);
   }
   return largest_m > 0 ? Math.max(1, roundStep(ELLIPSE / (largest_m * view.scale))) : 0;
 }
 
-/** Half axes in metres and direction of the ellipse of 95 % of a covariance. */
-function halfAxes([[xx, xy], [, yy]]) {
-  const middle = (xx + yy) / 2;
-  const half = Math.hypot((xx - yy) / 2, xy);
-  const axis = (variance) => SIGMAS_95 * Math.sqrt(Math.max(variance, 0));
-  return [axis(middle + half), axis(middle - half), Math.atan2(2 * xy, xx - yy) / 2];
+/** The ellipse of 95 % of a covariance of three axes, seen from above. */
+function ellipseOf([[xx, xy], [, yy]]) {
+  return halfAxes(xx, xy, yy);
 }
 
 function ellipse(context, x, y, [long_m, short_m, angle], scale) {

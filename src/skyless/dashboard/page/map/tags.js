@@ -9,10 +9,8 @@ import { otherFloor } from "./floors.js";
 import { drawMark, tagStyle } from "./marks.js";
 import { drawNames } from "./names.js";
 import { drawStub } from "./trails.js";
-import { foreshortening, seenCovariance, toX, toY, view } from "./view.js";
+import { foreshortening, halfAxes, seenCovariance, toX, toY, view } from "./view.js";
 
-/** √5.991: half axes of the ellipse of 95 % in standard deviations, in two dimensions. */
-const SIGMAS_95 = 2.4477;
 /** With more tags than this only the selected one is named. */
 export const NAMED = 40;
 const MARK = 5;
@@ -64,11 +62,11 @@ export function drawTags(context, { seen, shown }) {
 }
 
 function ellipse(context, { row: at, colour, selected, x, y }) {
-  const [major, minor, angle] = axes(...seenCovariance(at[CXX], at[CXY], at[CYY]));
-  const long = SIGMAS_95 * major * view.scale;
+  const [major_m, minor_m, angle] = halfAxes(...seenCovariance(at[CXX], at[CXY], at[CYY]));
+  const long = major_m * view.scale;
   if (!(long > MARK)) return;
   context.beginPath();
-  context.ellipse(x, y, long, SIGMAS_95 * minor * view.scale, -angle, 0, 2 * Math.PI);
+  context.ellipse(x, y, long, minor_m * view.scale, -angle, 0, 2 * Math.PI);
   context.fillStyle = faint(colour, 0.14);
   context.fill();
   context.strokeStyle = faint(colour, selected ? 0.95 : 0.6);
@@ -87,13 +85,6 @@ function level(context, { row: at, colour, selected, x, y }) {
   context.lineWidth = 1;
   context.stroke();
   context.setLineDash([]);
-}
-
-/** Half axes of one sigma in m, and the angle of the long one from x, of a 2 × 2 covariance. */
-export function axes(xx, xy, yy) {
-  const middle = (xx + yy) / 2;
-  const difference = Math.hypot((xx - yy) / 2, xy);
-  return [Math.sqrt(middle + difference), Math.sqrt(Math.max(middle - difference, 0)), Math.atan2(2 * xy, xx - yy) / 2];
 }
 
 function truth(context, { row: at, colour, x, y }) {

@@ -45,22 +45,22 @@ export function py(y_m) {
   return view.height / 2 - (y_m - view.y_m) * view.scale;
 }
 
-/** Site coordinates of a pixel, in the 3-D view on the floor at height 0. */
-export function toSite(x, y) {
+/** Site coordinates of a pixel, in the 3-D view of its point at a height. */
+export function toSite(x, y, z_m = 0) {
   const right_m = (x - view.width / 2) / view.scale;
-  const away_m = (view.height / 2 - y) / view.scale / turned.floor;
+  const away_m = ((view.height / 2 - y) / view.scale - z_m * turned.height) / turned.floor;
   return [
     view.x_m + right_m * turned.cos - away_m * turned.sin,
     view.y_m + right_m * turned.sin + away_m * turned.cos,
   ];
 }
 
-/** Let a context draw in metres on the floor; `restore` it afterwards. */
-export function drawInMetres(context) {
+/** Let a context draw in metres on the floor at a height; `restore` it afterwards. */
+export function drawInMetres(context, z_m) {
   const { cos, sin, floor } = turned;
   const k = view.scale;
   context.save();
-  context.transform(k * cos, k * sin * floor, k * sin, -k * cos * floor, toX(0, 0), toY(0, 0));
+  context.transform(k * cos, k * sin * floor, k * sin, -k * cos * floor, toX(0, 0), toY(0, 0, z_m));
 }
 
 /** A covariance on the floor as it is seen, in square metres: xx, xy and yy with y pointing up the screen. */
@@ -139,6 +139,17 @@ export function fit(site, zones, further, scaleShown = true) {
   const x = middle_x + ((left + right) / 2) * view.scale + (edge.right - edge.left) / 2;
   const y = middle_y - ((bottom + top) / 2) * view.scale - (edge.top - edge.bottom) / 2;
   [view.x_m, view.y_m] = toSite(x, y);
+}
+
+/** √5.991: half axes of the ellipse of 95 % in standard deviations, in two dimensions. */
+const SIGMAS_95 = 2.4477;
+
+/** Half axes in m of the ellipse that holds 95 % of the errors, and the angle of the long one from x. */
+export function halfAxes(xx, xy, yy) {
+  const middle = (xx + yy) / 2;
+  const difference = Math.hypot((xx - yy) / 2, xy);
+  const half = (variance) => SIGMAS_95 * Math.sqrt(Math.max(variance, 0));
+  return [half(middle + difference), half(middle - difference), Math.atan2(2 * xy, xx - yy) / 2];
 }
 
 /** A round length of at most as many pixels. */

@@ -24,22 +24,26 @@ export function start(panel) {
   const table = selectionTable("anchor", ["Anchor", "Offset", "Rate", "Sync σ", "Late"], describe);
   table.head.cells[5].title = "Transmissions that were skipped because they were late";
   const nodes = h("ul", { class: "nodes" });
+  const programs = h("section", {}, h("h2", {}, "Programs"), nodes);
   const note = h("p", { class: "empty" }, "Anchor health is shown on the live site only.");
   const box = h("div", { class: "scroll-x" }, table.element);
   const list = h("ul", { class: "reasons findings" });
   const found = new Rows(list, (_key, finding) => ({ element: h("li", { class: "bad" }, findingWords(finding)) }));
-  parts = { panel, note, list, found, box, rows: table.rows, detail: makeDetail(), nodes: new Rows(nodes, makeNode) };
-  panel.append(note, list, box, parts.detail.element, h("section", {}, h("h2", {}, "Programs"), nodes));
+  const rows = table.rows;
+  parts = { panel, note, list, found, box, rows, detail: makeDetail(), programs, nodes: new Rows(nodes, makeNode) };
+  panel.append(note, list, box, parts.detail.element, programs);
 }
 
 /** Bring the tab up to date. */
 export function show() {
-  parts.note.hidden = state.mode === "live";
+  const live = state.mode === "live";
+  parts.note.hidden = live;
+  parts.programs.hidden = !live;
   parts.list.hidden = !findings().length;
   parts.found.show(findings().map((finding) => [JSON.stringify(finding), finding]));
   const ids = new Set((state.site?.anchors ?? []).map((anchor) => anchor.id));
   for (const { id } of state.site?.unplaced ?? []) ids.add(id);
-  for (const id of state.health.anchors.keys()) ids.add(id);
+  if (live) for (const id of state.health.anchors.keys()) ids.add(id);
   parts.rows.show([...ids].map((id) => [id, id]));
   parts.detail.show(state.selection.anchor);
   split(parts.panel, parts.box, !parts.detail.element.hidden);

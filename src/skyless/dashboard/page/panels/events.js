@@ -1,4 +1,4 @@
-/** What has happened at the live site, the newest first; with filters, and a count of the severe ones not yet read. */
+/** What has happened, at the live site or in a recording, the newest first; with filters, and a count of the unread. */
 
 import { changed, savedSetting, saveSetting, select, state } from "../store.js";
 import { Rows, h, text } from "../dom.js";
@@ -39,9 +39,10 @@ export function start(panel) {
   });
   const count = h("p", { class: "count" });
   const none = h("p", { class: "empty" });
+  const note = h("p", { class: "fine", hidden: true });
   const list = h("ol", { class: "log", id: "event-list", "aria-label": "Events of the site" });
-  parts = { count, none, rows: new Rows(list, makeEvent) };
-  panel.append(h("div", { class: "above" }, count, filter), none, list);
+  parts = { count, none, note, rows: new Rows(list, makeEvent) };
+  panel.append(h("div", { class: "above" }, count, filter), note, none, list);
 }
 
 /** Bring the tab up to date; what it shows counts as read. */
@@ -50,10 +51,18 @@ export function show() {
   const events = all.filter((event) => isIn(group, event)).reverse();
   parts.rows.show(events.map((event) => [`${event.serial} ${event.unix_s}`, event]));
   text(parts.count, events.length ? `${events.length} of ${all.length}, the newest first` : "");
-  const nothing = state.mode === "live" ? "Nothing has happened since the server started." : "The recording holds no events.";
-  text(parts.none, all.length ? "No event of this kind." : nothing);
+  text(parts.none, all.length ? "No event of this kind." : nothing());
   parts.none.hidden = events.length > 0;
+  const note = state.player?.eventsNote ?? "";
+  text(parts.note, note);
+  parts.note.hidden = !note || !all.length;
   markRead();
+}
+
+function nothing() {
+  if (state.mode === "live") return "Nothing has happened since the server started.";
+  if (!state.player?.events) return "Reading the events …";
+  return state.player.eventsNote || "The recording holds no events.";
 }
 
 /** Severe events that have not been shown yet. */
@@ -71,7 +80,7 @@ function markRead() {
 
 /** The live site's events, or the recording's. */
 function shownLog() {
-  return state.mode === "live" ? state.log : (state.player?.log ?? []);
+  return state.mode === "live" ? state.log : (state.player?.events ?? []);
 }
 
 function isIn(name, { kind, level }) {
@@ -84,7 +93,7 @@ function makeEvent(_key, { unix_s, level, name, text: words }) {
     "li",
     { class: level },
     h("time", { class: "when", title: dateTime(unix_s), dateTime: new Date(unix_s * 1e3).toISOString() }, timeOfDay(unix_s)),
-    h("span", { class: "event-mark", "aria-hidden": "true" }, MARKS[level]),
+    h("span", { class: "log-mark", "aria-hidden": "true" }, MARKS[level]),
     h("span", { class: "unseen" }, WORDS[level]),
     subject(name, sentence(words)),
   );

@@ -1,6 +1,6 @@
 /** All tags as a list; the selected one in detail, with its last minute as charts. */
 
-import { healthAge_s, state } from "../store.js";
+import { MAX_AGE_S, healthAge_s, state } from "../store.js";
 import { GONE_S, GREY_S, freshness, now_s, shown_s, tracks } from "../clock.js";
 import { Chart } from "../chart.js";
 import { h, text } from "../dom.js";
@@ -60,8 +60,6 @@ const SEARCHED = 12;
 const MANY = 40;
 const MANY_MS = 900;
 const WINDOW_S = 60;
-/** Figures of a tag that has not reported for longer are not of now. */
-const MAX_HEALTH_AGE_S = 3.5;
 const row = new Float64Array(COLUMNS);
 let parts = null;
 let shown = { key: "", at: -Infinity };
@@ -71,7 +69,7 @@ export function start(panel) {
   const search = h("input", { type: "search", placeholder: "Find a tag", "aria-label": "Find a tag", oninput: show });
   const table = selectionTable("tag", ["Tag", ...Object.keys(HEADS)], describe);
   Object.values(HEADS).forEach((words, index) => (table.head.cells[index + 2].title = words));
-  const empty = h("p", { class: "empty" }, "No tags yet.");
+  const empty = h("p", { class: "empty" });
   const count = h("p", { class: "count" });
   const box = h("div", { class: "scroll-x" }, table.element);
   const detail = makeDetail();
@@ -82,17 +80,20 @@ export function start(panel) {
 /** Bring the tab up to date. */
 export function show() {
   const list = tracks().sorted;
-  const wanted = parts.search.value.trim().toLowerCase();
+  const searched = list.length > SEARCHED;
+  const wanted = searched ? parts.search.value.trim().toLowerCase() : "";
   const key = [state.mode, state.selection.tag, wanted, list.length].join(" ");
   const now = performance.now();
   if (list.length > MANY && key === shown.key && now - shown.at < MANY_MS) return;
   shown = { key, at: now };
-  parts.search.hidden = list.length <= SEARCHED;
-  parts.empty.hidden = list.length > 0;
-  parts.table.element.hidden = list.length === 0;
+  parts.search.hidden = !searched;
   parts.table.element.classList.toggle("no-truth", !state.simulated);
   const items = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length) }]);
-  parts.table.rows.show(items.filter(([name]) => name.toLowerCase().includes(wanted)));
+  const found = items.filter(([name]) => name.toLowerCase().includes(wanted));
+  parts.table.rows.show(found);
+  parts.table.element.hidden = !found.length;
+  parts.empty.hidden = found.length > 0;
+  text(parts.empty, list.length ? "No tag of this name." : "No tags yet.");
   const fresh = list.filter((track) => freshness(track) === "fresh").length;
   text(parts.count, list.length ? `${fresh} of ${list.length} with a fix` : "");
   parts.detail.show(tracks().all.get(state.selection.tag) ?? null);
@@ -102,7 +103,7 @@ export function show() {
 function describe(name, { track, style: look }) {
   const condition = freshness(track);
   const known = condition !== "never" && track.at(shown_s(), row, false);
-  const reports = state.mode === "live" && healthAge_s("tags", name) < MAX_HEALTH_AGE_S;
+  const reports = state.mode === "live" && healthAge_s("tags", name) < MAX_AGE_S;
   const health = reports ? state.health.tags.get(name) : null;
   if (!known) row.fill(NaN);
   const alert = Object.values(ALERTS)[row[ALERT]];
@@ -192,7 +193,7 @@ function makeDetail() {
   const showDetail = (track) => {
     element.hidden = !track;
     if (!track) return;
-    const reports = state.mode === "live" && healthAge_s("tags", track.name) < MAX_HEALTH_AGE_S;
+    const reports = state.mode === "live" && healthAge_s("tags", track.name) < MAX_AGE_S;
     const health = reports ? state.health.tags.get(track.name) : null;
     text(heading, track.name);
     reason.hidden = !health?.reason;

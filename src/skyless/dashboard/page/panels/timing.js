@@ -1,6 +1,6 @@
 /** The superframe, and when each tag processed its messages: the paper's oscilloscope picture, from the tags' health. */
 
-import { healthAge_s, state } from "../store.js";
+import { MAX_AGE_S, healthAge_s, state } from "../store.js";
 import { byId, h, s, text } from "../dom.js";
 import { duration, number, roundStep } from "../format.js";
 import { siteMode } from "../map/anchors.js";
@@ -11,8 +11,6 @@ export const topics = ["health", "selection", "theme", "mode"];
 export const interval_ms = 200;
 export const changesWithTime = true;
 
-/** Phases and figures of a program that has not reported for longer are not of now. */
-const MAX_AGE_S = 3.5;
 /** Limit of the rows in the picture. */
 const MAX_ROWS = 24;
 const ROW_HEIGHT = 30;

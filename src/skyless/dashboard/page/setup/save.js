@@ -15,8 +15,12 @@ const ANSWER_MS = 15_000;
 /** An error that the program already had may be in a message that was on its way; after this long it is the answer. */
 const CROSSED_MS = 3000;
 
-/** @type {{phase: "none"|"sending"|"waiting"|"saved"|"failed", serial: number, sinceMs: number, words: string, error: string|null}} */
-let saving = { phase: "none", serial: -1, sinceMs: 0, words: "", error: null };
+/**
+ * `error` and `saved_unix_s` are of the program's last message before the request.
+ * @type {{phase: "none"|"sending"|"waiting"|"saved"|"failed", serial: number, sinceMs: number, words: string,
+ *   error: string|null, saved_unix_s: number|null}}
+ */
+let saving = { phase: "none", serial: -1, sinceMs: 0, words: "", error: null, saved_unix_s: null };
 let parts = null;
 
 /** Build the step. */
@@ -77,8 +81,8 @@ function changes() {
 }
 
 async function save() {
-  const { serial, error } = state.survey;
-  saving = { phase: "sending", serial, sinceMs: performance.now(), words: "Sending …", error };
+  const { serial, error, saved_unix_s } = state.survey;
+  saving = { phase: "sending", serial, sinceMs: performance.now(), words: "Sending …", error, saved_unix_s };
   show();
   try {
     if (plan?.blob) {
@@ -97,9 +101,9 @@ async function save() {
 function follow() {
   if (saving.phase !== "waiting" || !state.survey) return;
   const past = performance.now() - saving.sinceMs;
-  const { saved_serial, error, file, unix_s } = state.survey;
-  if (saved_serial !== null && saved_serial !== undefined && saved_serial >= saving.serial) {
-    const words = `Saved at ${timeOfDay(unix_s)}${file ? ` in ${file}` : ""}. The anchors use it.`;
+  const { saved_serial, saved_unix_s, error, file } = state.survey;
+  if (saved_unix_s && saved_unix_s !== saving.saved_unix_s && saved_serial >= saving.serial) {
+    const words = `Saved at ${timeOfDay(saved_unix_s)}${file ? ` in ${file}` : ""}, and sent to the anchors.`;
     saving = { ...saving, phase: "saved", words };
   } else if (error && (error !== saving.error || past > CROSSED_MS)) {
     saving = { ...saving, phase: "failed", words: `Not saved: ${error}` };
