@@ -105,7 +105,7 @@ def test_without_anything_new_there_is_no_state(live, wire, times):
 @pytest.mark.parametrize("clock_error_s", [0.0, 3600.0, -3600.0])
 def test_a_row_has_the_time_of_its_fix_by_the_servers_clock_however_late_it_comes(live, wire, times, clock_error_s):
     def time_of_fix(late_s=0.0, error_s=clock_error_s):
-        times.move(0.1)
+        times.move(0.1 + late_s)  # a late fix does not overtake the one before it
         wire.deliver(FIX, fix(unix_s=times.unix_s - late_s + error_s, latency_s=0.0))
         return json.loads(live.state.state_since(live.state.serial - 1))["tags"][0][15] - times.unix_s
 
