@@ -172,7 +172,7 @@ def replayed_flights() -> Figure:
         else:
             labels = [f"0425 {part}" for part in label.removeprefix("0425 ").split(", ")] if len(alone) > 1 else [label]
         points += zip(labels, alone, ours, strict=True)
-    assert len(points) == 18, points
+    assert len(points) == 20, points
     figure, axes = axes_of(7.2, 4.6)
     for place, (_, alone_m, ours_m) in enumerate(points):
         axes.plot([100 * alone_m, 100 * ours_m], [-place, -place], color=GRID, lw=3, zorder=1)

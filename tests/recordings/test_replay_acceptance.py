@@ -98,11 +98,17 @@ def test_flights_in_free_space(recordings, replay, trial, system, limit_2d_m, li
 
 @pytest.mark.parametrize(
     ("trial", "limit_2d_m", "limit_3d_m"),
-    # a filter with a gate alone: 0.06 / 0.21, 0.11 / 0.34 and 0.13 / 0.37
-    [(1, 0.05, 0.13), (3, 0.08, 0.18), (5, 0.08, 0.21)],
+    # a filter with a gate alone: 0.06 / 0.21, 0.11 / 0.34, 0.13 / 0.37, 0.13 / 0.43 and 0.11 / 0.24
+    [
+        ("1-tdoa2-traj1", 0.05, 0.13),
+        ("3-tdoa2-traj1", 0.08, 0.18),
+        ("5-tdoa2-traj1", 0.08, 0.21),
+        ("4-tdoa2-traj2", 0.11, 0.33),
+        ("7-tdoa2-manual3", 0.10, 0.19),
+    ],
 )
 def test_flights_among_obstacles(recordings, replay, trial, limit_2d_m, limit_3d_m):
-    name = f"util_flights/const4/const4-trial{trial}-tdoa2-traj1"
+    name = f"util_flights/const4/const4-trial{trial}"
     report = replay(*flight(recordings, "util_flights/anchors_const4.csv", name))
     assert report["rmse_2d_m"] <= limit_2d_m
     assert report["rmse_3d_m"] <= limit_3d_m
