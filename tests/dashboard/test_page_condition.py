@@ -124,6 +124,12 @@ def test_a_lost_broker_or_connection_is_not_green(hall):
     until(page, "!document.getElementById('pill').className.includes('good')", timeout_s=8.0)
     pill_is(page, "lost")
     assert page.locator("#summary").inner_text().count("–") >= 3  # no figures of before
+    page.click("#tab-anchors")
+    page.wait_for_selector("#panel-anchors tr.unknown:has-text('3')")
+    assert page.locator("#panel-anchors tr:is(.good, .warn, .bad)").count() == 0  # nobody says what they are now
+    assert not page.locator("#panel-anchors section:has(.nodes)").is_visible()
+    page.click("#panel-anchors button:text-is('3')")
+    page.wait_for_selector("#panel-anchors .detail dd:has-text('health unknown')")
 
 
 def test_a_page_too_many_shows_why(hall):
@@ -163,6 +169,9 @@ def test_a_dead_anchor_has_no_figures(hall):
     page.click("#panel-anchors button:text-is('8')")
     page.wait_for_selector("#panel-anchors .detail dd:has-text('its figures are not known')")
     assert set(page.locator("#panel-anchors .detail output").all_inner_texts()) <= {"–"}
+    page.click("#panel-anchors button:text-is('5')")
+    page.wait_for_selector("#panel-anchors .detail dd:text-is('not synchronised')")
+    assert "Synchronised to" not in page.locator("#panel-anchors .detail").inner_text()
     condition = """async () => {
       const { condition } = await import("/page/map/anchors.js");
       const { health } = skyless.state;
@@ -207,3 +216,18 @@ def test_events_are_listed_filtered_and_counted(hall):
     page.click("#tab-events")
     page.click("#event-list button:has-text('Anchor 8 is offline')")  # selected already
     page.wait_for_selector("#panel-anchors tr.selected:has-text('8')")
+
+
+def test_on_a_phone_the_pill_has_two_whole_lines_and_the_open_tab_is_in_view(serve, visit):
+    server = serve()
+    server.condition = made_up.condition(SLOW)
+    page = visit(server, viewport={"width": 390, "height": 844}).page
+    pill_is(page, "bad")
+    lines = "getComputedStyle(document.getElementById('pill-words'))"
+    until(page, "document.getElementById('pill-words').getClientRects()[0].height > 20")
+    assert page.evaluate(f"[{lines}.webkitLineClamp, {lines}.overflow]") == ["2", "hidden"]
+    assert page.evaluate("document.querySelector('header').scrollWidth <= innerWidth")
+    page.focus("#tab-tags")
+    page.keyboard.press("End")
+    box = page.locator("#tab-recordings").bounding_box()
+    assert box["x"] + box["width"] <= 391

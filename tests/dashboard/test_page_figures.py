@@ -79,6 +79,33 @@ def test_offsets_continue_over_the_wrap_of_the_counter(page):
     np.testing.assert_allclose(got, 3.0 * np.arange(1200, 1500), atol=1e-3)
 
 
+def test_no_line_of_a_chart_crosses_a_restart_a_silence_or_another_master(page):
+    given = [(1, 10, 1, 0.5), (2, 11, 1, 0.5), (20, 1, 1, 7.0), (21, 2, 1, 7.0), (22, 3, 2, 1.0), (23, 4, 2, 1.1)]
+    offsets, rates = page.evaluate(
+        """async (given) => {
+          const { addHealth, anchorHistory } = await import("/page/history.js");
+          for (const [unix_s, uptime_s, master, offset_s] of given)
+            addHealth([{ anchor: 99, role: "anchor", unix_s, uptime_s, master, offset_s, rate_ppm: 3 }], []);
+          const clock = { anchor: 99, role: "master", master: 99, unix_s: 24, uptime_s: 5, offset_s: 0, rate_ppm: 0 };
+          addHealth([{ ...clock, offset_std_m: 0 }], []);
+          const { offset_us, rate_ppm } = anchorHistory.get(99);
+          return [offset_us, rate_ppm];
+        }""",
+        given,
+    )
+    assert rates == [3, 3, None, 3, 3, 3, 3, None]
+    assert offsets[:5] == [None] * 5
+    np.testing.assert_allclose(offsets[5:7], [0.0, 1e5], atol=1e-6)
+
+
+def test_a_number_that_is_rounded_to_zero_has_no_sign(page):
+    written = """async () => {
+      const { metres, number } = await import("/page/format.js");
+      return [metres(-0.001), metres(-0.01), metres(-0.2, 0), number(-0.00001, 4, "s"), number(-1.5, 1)];
+    }"""
+    assert page.evaluate(written) == ["0.00", "−0.01", "0", "0.0000\u00a0s", "−1.5"]
+
+
 def test_zones_hold_what_a_polygon_holds(page):
     path = pytest.importorskip("matplotlib.path")
     polygon = [[0, 0], [6, 0], [6, 5], [3, 2], [0, 5]]

@@ -337,6 +337,26 @@ def test_tags_and_anchors_of_other_floors_are_dimmed(hall):
     assert page.evaluate(dimmed) == [False, True, True]
 
 
+def test_anchors_above_each_other_have_one_line_of_names(hall):
+    server, seen = hall
+    page = seen.page
+    floor_0 = two_floors()[:4]
+    floor_1 = [one | {"id": one["id"] + 4, "floor": 1, "z_m": 6.0} for one in floor_0]
+    send_site(server, page, name="Two floors", anchors=floor_0 + floor_1)
+    written = modules(
+        ["map/anchors", "map/view"],
+        """const words = [];
+        const context = document.createElement("canvas").getContext("2d");
+        context.fillText = (text) => words.push(text);
+        anchors.drawAnchors(context);
+        return words;""",
+    )
+    lines = {line.replace(" master", "") for line in page.evaluate(written)}
+    assert lines == {f"{one['id']}, {one['id'] + 4}" for one in floor_0}
+    page.evaluate("skyless.state.options.floor = 1")
+    assert set(page.evaluate(written)) == {str(one["id"]) for one in floor_1}
+
+
 def test_in_3d_the_overlay_and_clicks_are_on_the_ground_of_the_chosen_floor(hall):
     server, seen = hall
     page = seen.page

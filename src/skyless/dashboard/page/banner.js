@@ -59,7 +59,7 @@ function show() {
   const words = condition.text ? sentence(condition.text).slice(0, -1) : word;
   const pill = byId("pill");
   if (pill.className !== `pill ${condition.level}`) pill.className = `pill ${condition.level}`;
-  text(pill, words);
+  text(byId("pill-words"), words);
   pill.setAttribute("aria-label", condition.text ? `${word}: ${words}` : words);
   showList(condition, word);
   say(condition, `${word}. ${words}`);
@@ -143,7 +143,7 @@ function showBanner() {
 
 function lostWords() {
   const { reason } = state.connection;
-  const old = state.mode === "live" ? " The map shows the last known state." : "";
+  const old = state.mode === "live" ? " Nothing shown here is current." : "";
   return `Connection lost: ${reason}.${old} Reconnecting.`;
 }
 

@@ -66,7 +66,7 @@ function withDelay({ level, text, reasons }, behind) {
 }
 
 function lostReason(words) {
-  const advice = "The page shows the last known state and connects again by itself.";
+  const advice = "Nothing that the page shows is current. It connects again by itself.";
   return { kind: "lost", level: "bad", text: `connection lost: ${words}`, advice, names: [] };
 }
 

@@ -8,7 +8,7 @@ function known(value) {
 
 /** A coordinate in metres. */
 export function metres(value, digits = 2) {
-  return known(value) ? value.toFixed(digits).replace("-", "−") : DASH;
+  return known(value) ? value.toFixed(digits).replace(/^-(?=0?\.?0*$)/, "").replace("-", "−") : DASH;
 }
 
 /** A length in m or cm. */
@@ -23,7 +23,7 @@ export function length(value_m) {
 /** A plain number with its unit. */
 export function number(value, digits = 0, unit = "") {
   if (!known(value)) return DASH;
-  const written = value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  const written = value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits, signDisplay: "negative" });
   return written.replace("-", "−").replaceAll(",", "\u202f") + (unit ? `\u00a0${unit}` : "");
 }
 

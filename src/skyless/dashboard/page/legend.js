@@ -114,7 +114,7 @@ function floorChoice() {
   const list = options({ id: "floor" }, [["", "all"]], (value) => chooseFloor(value === "" ? null : Number(value)));
   const choice = h("label", { class: "choice" }, "Show", list);
   const heights = h("input", { type: "text", id: "floor-heights", placeholder: "0, 3.2" });
-  const given = h("label", { class: "choice" }, "Heights of the floors, m", heights);
+  const given = h("label", { class: "choice" }, "Floor heights (m)", heights);
   heights.addEventListener("change", () => {
     try {
       giveHeights(heights.value);

@@ -85,6 +85,7 @@ export function open(key) {
     button.tabIndex = name === key ? 0 : -1;
     byId(`panel-${name}`).hidden = name !== key;
   }
+  byId(`tab-${key}`).scrollIntoView({ block: "nearest", inline: "nearest" });
   if (document.body.dataset.sheet === "low") sheet("half");
   else show();
 }

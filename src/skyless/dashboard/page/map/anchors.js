@@ -19,9 +19,9 @@ export const CONDITIONS = {
   unknown: { colour: "muted", words: "health unknown", shape: "M-.86-.86H.86V.86H-.86Z" },
 };
 
-/** Condition of an anchor: good, warn, bad or unknown, as always in a recording. */
+/** Condition of an anchor: good, warn, bad or unknown, as always in a recording and without a connection. */
 export function condition(id) {
-  if (state.mode === "replay") return "unknown";
+  if (state.mode === "replay" || state.connection.phase === "lost") return "unknown";
   const health = state.health.anchors.get(id);
   const status = state.health.nodes.find((node) => node.kind === "anchor" && String(node.name) === String(id));
   if (status && !status.online) return "bad";
@@ -44,7 +44,7 @@ export function wordsOf(kind) {
 export function leads(id) {
   if (siteMode() === "master") return id === masterNow() ? "master" : "";
   const root = state.mode === "live" && state.health.anchors.get(id)?.role === "root";
-  return root && condition(id) !== "bad" ? "root" : "";
+  return root && !["bad", "unknown"].includes(condition(id)) ? "root" : "";
 }
 
 /** The current master: as the anchors report it, or else as in the site file. */
@@ -74,11 +74,13 @@ export function drawAnchors(context) {
   context.font = "600 11px system-ui, sans-serif";
   context.textAlign = "center";
   context.textBaseline = "top";
+  const names = [];
   for (const anchor of state.site?.anchors ?? []) {
     const x = toX(anchor.x_m, anchor.y_m);
     const y = toY(anchor.x_m, anchor.y_m, anchor.z_m);
     drawnAnchors.push({ id: anchor.id, x, y });
-    context.globalAlpha = other(anchor.z_m, anchor.floor ?? 0) ? DIMMED : 1;
+    const alpha = other(anchor.z_m, anchor.floor ?? 0) ? DIMMED : 1;
+    context.globalAlpha = alpha;
     if (view.spatial) dropLine(context, anchor.x_m, anchor.y_m, y, palette.muted);
     const kind = condition(anchor.id);
     const colour = palette[CONDITIONS[kind].colour];
@@ -92,9 +94,27 @@ export function drawAnchors(context) {
     if (anchor.id === state.selection.anchor) ring(context, x, y, MARK + 9);
     const words = leading ? `${anchor.id} ${leading}` : String(anchor.id);
     const height = view.spatial ? ` · ${Number(anchor.z_m.toFixed(2))} m` : "";
-    label(context, words + height, x, y + MARK + (anchor.id === state.selection.anchor ? 12 : 7));
+    names.push({ words: words + height, x, y, alpha, below: anchor.id === state.selection.anchor ? 12 : 7 });
+  }
+  for (const { words, x, y, alpha, below } of joined(names)) {
+    context.globalAlpha = alpha;
+    label(context, words, x, y + MARK + below);
   }
   context.globalAlpha = 1;
+}
+
+/** One line of names for anchors above each other, of the chosen floor where one of them is on it. */
+function joined(names) {
+  const lines = [];
+  for (const name of names.toSorted((a, b) => b.alpha - a.alpha)) {
+    const line = lines.find(({ x, y }) => Math.hypot(x - name.x, y - name.y) < MARK);
+    if (!line) lines.push({ ...name });
+    else if (line.alpha === name.alpha) {
+      line.words += `, ${name.words}`;
+      line.below = Math.max(line.below, name.below);
+    }
+  }
+  return lines;
 }
 
 /** In the 3-D view, the line from something straight down to the ground. */

@@ -14,7 +14,7 @@ import { drawGround, spaceCorners } from "./space.js";
 import { drawSurvey, surveyCorners, surveyOutOfSight } from "./survey.js";
 import { drawTags, visibleTags } from "./tags.js";
 import { drawTrails, due } from "./trails.js";
-import { fit, isNarrow, prepare, setSpatial, view } from "./view.js";
+import { fit, prepare, setSpatial, view } from "./view.js";
 import { drawDraft, drawZones, flash } from "./zones.js";
 
 /** Frames drawn so far, for tests and measurements. */
@@ -87,7 +87,7 @@ function drawStill() {
 export function fitAll() {
   const corners = [...floorCorners(), ...surveyCorners()];
   const further = view.spatial ? [...corners, ...spaceCorners(floorCorners())] : corners;
-  fit(state.site, state.zones, further, state.options.overlay !== "none");
+  fit(state.site, state.zones, further, state.options.overlay !== "none", state.mode === "replay");
   redraw();
 }
 
@@ -120,7 +120,7 @@ export function start() {
   });
   let overlay = "none";
   on(["options"], () => {
-    if (overlay !== state.options.overlay && isNarrow() && !view.touched) fitAll();
+    if (overlay !== state.options.overlay && !view.touched) fitAll();
     overlay = state.options.overlay;
   });
   let surveyed = "";
@@ -136,7 +136,7 @@ export function start() {
     if (state.mode === "live") for (const { zone } of fresh) flash(zone);
     flashedMs = performance.now();
   });
-  const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode"];
+  const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode", "connection"];
   on([...still, "survey", "watch", "setup", "plan"], () => redraw(true));
   on(["tags", "editor", "player"], () => redraw(false));
 }

@@ -8,8 +8,8 @@ import { length, number } from "../format.js";
 
 export const KINDS = {
   none: "None",
-  hdop: "HDOP (dilution in x and y)",
-  pdop: "PDOP (dilution in x, y and z)",
+  hdop: "HDOP (x and y)",
+  pdop: "PDOP (x, y and z)",
   sigma: "Predicted σ",
 };
 

@@ -117,8 +117,8 @@ function turn(azimuth, elevation) {
   turned.height = view.spatial ? Math.cos(turned.elevation) : 0;
 }
 
-/** Show the whole site and some further corners, [x, y] or [x, y, z], clear of the buttons and of a scale of colours. */
-export function fit(site, zones, further, scaleShown = true) {
+/** Show the whole site and some further corners, [x, y] or [x, y, z], clear of the buttons, of a scale of colours and of a replay's mark. */
+export function fit(site, zones, further, scaleShown = true, replayed = false) {
   view.touched = false;
   const corners = [...zones.flatMap((zone) => zone.polygon_m), ...further];
   for (const anchor of site?.anchors ?? []) corners.push([anchor.x_m, anchor.y_m, anchor.z_m]);
@@ -131,8 +131,8 @@ export function fit(site, zones, further, scaleShown = true) {
   const [left, right] = [Math.min(...across), Math.max(...across)];
   const [bottom, top] = [Math.min(...up), Math.max(...up)];
   const edge = isNarrow()
-    ? { left: 34, right: 22, top: 62, bottom: scaleShown ? 116 : 66 }
-    : { left: 48, right: 64, top: 32, bottom: 104 };
+    ? { left: 34, right: 22, top: replayed ? 86 : 62, bottom: scaleShown ? 138 : Math.min(Math.max(0.23 * view.height, 66), 90) }
+    : { left: 48, right: 64, top: replayed ? 54 : 32, bottom: scaleShown ? 156 : 104 };
   const wide = (view.width - edge.left - edge.right) / Math.max(right - left, 1);
   const high = (view.height - edge.top - edge.bottom) / Math.max(top - bottom, 1);
   view.scale = Math.min(Math.max(Math.min(wide, high), MIN_SCALE), MAX_SCALE);

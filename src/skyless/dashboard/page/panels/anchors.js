@@ -38,7 +38,7 @@ export function start(panel) {
 export function show() {
   const live = state.mode === "live";
   parts.note.hidden = live;
-  parts.programs.hidden = !live;
+  parts.programs.hidden = !live || state.connection.phase === "lost"; // without messages none is known to run
   parts.list.hidden = !findings().length;
   parts.found.show(findings().map((finding) => [JSON.stringify(finding), finding]));
   const ids = new Set((state.site?.anchors ?? []).map((anchor) => anchor.id));
@@ -77,7 +77,7 @@ function describe(id) {
       leading ? "reference" : known ? number(health.offset_s, 4, "s") : DASH,
       leading || !known ? DASH : number(health.rate_ppm, 3, "ppm"),
       leading || !known ? DASH : sigma(health.offset_std_m),
-      kind === "bad" ? DASH : number(health?.late),
+      kind === "bad" || kind === "unknown" ? DASH : number(health?.late),
     ],
   };
 }
@@ -142,15 +142,16 @@ function makeDetail() {
 
 /** What an anchor reports; of one that is offline only what stays true. */
 function anchorFacts(id, health) {
-  if (condition(id) === "bad") {
+  const kind = condition(id);
+  if (kind === "bad" || kind === "unknown") {
     const last = `${duration(healthAge_s("anchors", id))} ago`;
-    return { State: "offline: its figures are not known", "Last report": last, Uptime: null };
+    return { State: kind === "bad" ? "offline: its figures are not known" : wordsOf(kind), "Last report": last, Uptime: null };
   }
   const ages = Object.entries(health.heard_age_s ?? {}).sort((a, b) => b[1] - a[1]);
   const counted = Object.entries(health.counters).filter(([name, count]) => count && !SHOWN.has(name));
   return {
-    State: `${wordsOf(condition(id))}, ${health.role}`,
-    "Synchronised to": health.master === null || health.master === id ? null : `anchor ${health.master}`,
+    State: [wordsOf(kind), health.role === "anchor" ? "" : health.role].filter(Boolean).join(", "),
+    "Synchronised to": kind !== "good" || health.master === null || health.master === id ? null : `anchor ${health.master}`,
     "Slot time led by": health.root == null || health.root === id ? null : `anchor ${health.root}`,
     Hops: number(health.hop),
     Parents: health.parents?.length ? health.parents.map((parent) => `anchor ${parent}`).join(", ") : null,

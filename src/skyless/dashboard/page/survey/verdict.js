@@ -48,9 +48,10 @@ function unfinished() {
   }
   const open = survey.anchors.filter((anchor) => !anchor.determined).map((anchor) => anchor.id);
   if (open.length) {
-    return bad("Not determined", `${count(open.length, "anchor is", "anchors are")} not determined: ${list(open)}.`);
+    const words = open.length === 1 ? `Anchor ${open[0]} is not determined.` : `${open.length} anchors are not determined: ${list(open)}.`;
+    return bad("Not determined", words);
   }
-  if (survey.not_determined.length) return bad("Not determined", sentence(survey.not_determined[0]));
+  if (survey.not_determined.length) return bad("Not fully determined", sentence(survey.not_determined[0]));
   return null;
 }
 
