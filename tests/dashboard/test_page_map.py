@@ -142,10 +142,15 @@ def test_each_tag_has_an_entry_in_the_legend_beside_the_map(serve, visit):
     page.reload()
     until(page, "window.skyless?.state.connection.phase === 'open'")
     assert page.locator("#legend-body").is_visible()
+    assert page.locator(".marks .frame").is_visible()  # of the master's mark
 
 
 def test_on_a_phone_the_legend_is_below_the_map(serve, visit):
-    page = visit(serve(), viewport={"width": 390, "height": 844}).page
+    seen = visit(serve(), viewport={"width": 390, "height": 844})
+    page = seen.page
+    _, lowest = seen.at(0.0, 0.0)
+    map_box = page.locator("#map").bounding_box()
+    assert lowest + 30 < map_box["y"] + map_box["height"] - 48  # its name is clear of the bar with the scale
     page.click("#legend summary")
     room, legend = page.locator("#map").bounding_box(), page.locator("#legend").bounding_box()
     assert legend["y"] >= room["y"] + room["height"] - 1
@@ -185,6 +190,8 @@ def test_an_overlay_says_that_it_is_computed_then_shows_its_scale_and_values(hal
     ticks = page.locator("#ramp-ticks span").all_inner_texts()
     assert "3 cm" in ticks
     assert len(ticks) >= 3
+    page.evaluate(THREE_FRAMES)
+    assert seen.at(0.0, 0.0)[1] + 30 < page.locator("#ramp-box").bounding_box()["y"]  # clear of the lowest names
     page.mouse.move(*seen.at(12.0, 7.0))
     assert "Predicted σ 2.0 cm" in page.locator("#readout").inner_text()
     page.mouse.move(*seen.at(0.0, 0.0))

@@ -323,7 +323,7 @@ def test_the_reasons_are_listed_and_the_verdict_is_good_only_where_nothing_speak
         ({"missing": (7,)}, "1 anchor has not been received: 7."),
         ({"unchecked": "Nothing checks this survey."}, "Nothing checks this survey."),
         ({"ambiguous": True}, "1 other result fits"),
-        ({"undetermined": (5,)}, "1 anchor is not determined: 5."),
+        ({"undetermined": (5,)}, "Anchor 5 is not determined."),
         ({"error": "the disk is full"}, "The disk is full."),
         ({"state": "no data"}, "No data."),
     ):

@@ -131,8 +131,8 @@ export function fit(site, zones, further, scaleShown = true, replayed = false) {
   const [left, right] = [Math.min(...across), Math.max(...across)];
   const [bottom, top] = [Math.min(...up), Math.max(...up)];
   const edge = isNarrow()
-    ? { left: 34, right: 22, top: replayed ? 86 : 62, bottom: scaleShown ? 138 : Math.min(Math.max(0.23 * view.height, 66), 90) }
-    : { left: 48, right: 64, top: replayed ? 54 : 32, bottom: scaleShown ? 156 : 104 };
+    ? { left: 34, right: 30, top: replayed ? 86 : 62, bottom: scaleShown ? 150 : Math.min(Math.max(0.23 * view.height, 66), 90) }
+    : { left: 48, right: 64, top: replayed ? 54 : 32, bottom: scaleShown ? 168 : 104 };
   const wide = (view.width - edge.left - edge.right) / Math.max(right - left, 1);
   const high = (view.height - edge.top - edge.bottom) / Math.max(top - bottom, 1);
   view.scale = Math.min(Math.max(Math.min(wide, high), MIN_SCALE), MAX_SCALE);
