@@ -69,6 +69,7 @@ def test_counts_of_compilation_are_lines_in_a_pipe_and_one_line_on_a_terminal():
     assert done.stderr.splitlines() == [
         "skyless: compiling kernels, at the first start only, about 30 s left",
         "skyless: compiling kernels, at the first start only: 37 of 120, about 25 s left",
+        "skyless: compiling has ended",
     ]
     shown = on_terminal(COUNTS)
     assert "\n" not in shown

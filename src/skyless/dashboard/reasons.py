@@ -118,7 +118,7 @@ def busy_reason(evidence: Evidence, used_share: float | None) -> Reason | None:
     """All processors of the page's computer are in use, by whatever program."""
     if used_share is None or used_share < BUSY_SHARE:
         return None
-    text = f"{evidence.computer(evidence.host)} is fully busy: {used_share:.0%} of its processors are in use"
+    text = f"{evidence.computer(evidence.host)} is fully busy: {100.0 * used_share:.0f} % of its processors are in use"
     return Reason("busy", "warning", text, "End other programs there, or positions may come late or not at all.")
 
 
@@ -136,7 +136,7 @@ def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
     for _, air in evidence.of("ether"):
         if air.reports(now_s) and isinstance(air.health, EtherHealth) and air.health.missed_share > MISSED_SHARE:
             share = air.health.missed_share
-            yield air.host, share, f"the emulated air missed {share:.0%} of the transmissions"
+            yield air.host, share, f"the emulated air missed {100.0 * share:.0f} % of the transmissions"
     shares: dict[str, dict[str, float]] = {}
     for name, anchor in evidence.of("anchor"):
         share = anchor.health.missed_share if isinstance(anchor.health, AnchorHealth) else 0.0
@@ -144,7 +144,7 @@ def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
             shares.setdefault(anchor.host, {})[name] = share
     for host, late in shares.items():
         worst = max(late.values())
-        yield host, worst, f"{_counted('anchor', list(late))} missed up to {worst:.0%} of the transmissions"
+        yield host, worst, f"{_counted('anchor', list(late))} missed up to {100.0 * worst:.0f} % of the transmissions"
 
 
 def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:

@@ -120,6 +120,7 @@ class CountLine:
         self._on_terminal = sys.stderr is not None and sys.stderr.isatty()
         self._next_s = 0.0
         self._width = 0
+        self._lines = 0
 
     def __enter__(self) -> Self:
         return self
@@ -135,12 +136,16 @@ class CountLine:
         text = f"skyless: {count_text(now)}"
         if not self._on_terminal:
             print(text, file=sys.stderr, flush=True)
+            self._lines += 1
             return
         print(f"\r{text:<{self._width}}", end="", file=sys.stderr, flush=True)
         self._width = len(text)
 
     def clear(self) -> None:
-        """Remove the line from the terminal."""
+        """Remove the line from the terminal; after lines, a last one says that it is over."""
+        if self._lines:
+            _print_line("compiling has ended")
+            self._lines = 0
         if self._width:
             print(f"\r{'':<{self._width}}\r", end="", file=sys.stderr, flush=True)
             self._width = 0
