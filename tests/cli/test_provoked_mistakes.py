@@ -72,6 +72,7 @@ MISTAKES = {
     "a device instead of a site": (["site", "check", "/dev/zero"], "not a pipe or a device"),
     "a key with a slip": (["site", "check", "typo.toml"], "called slot_s"),
     "a master that is no anchor": (["site", "check", "no-master.toml"], "the id of an anchor: 1, 2"),
+    "a folder for a site": (["site", "new", "."], "is a folder"),
     "a site that exists": (["site", "new", "lab.toml"], "--force overwrites it"),
     "a room without a depth": (["site", "new", "new.toml", "--width", "3"], "both --width and --depth"),
     "too few anchors to plan": (["plan", "one-anchor.toml"], "at least 3"),
