@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Final
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.common.options import Positive, Seed, check_method, check_output, check_picture, finite_numbers, options
+from skyless.cli.common.options import (
+    Positive,
+    Seed,
+    check_method,
+    check_output,
+    check_picture,
+    finite_numbers,
+    options,
+)
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import progress_bar
 from skyless.cli.plan_output import show, write_files, write_site
