@@ -140,7 +140,8 @@ def test_an_image_that_cannot_be_read(lab, tmp_path, capsys, keep):
         (["--grid", "grid.xls"], ".csv or .geojson"),
         (["--step", "0.00001"], "points"),
         (["--mounts", "1,1,1,1"], "--mounts"),
-        (["--plot", "plan.what", "--step", "1"], "cannot be written"),
+        (["--plot", "plan.what"], "its ending should be one of .png, .svg, .pdf"),
+        (["--plot", "missing/plan.png"], "a file in a folder that exists"),
         (["--html", "missing/plan.html", "--step", "1"], "cannot be written"),
     ],
 )

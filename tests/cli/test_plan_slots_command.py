@@ -100,6 +100,7 @@ def test_slots_are_coloured_shown_and_written(hall, tmp_path, capsys):
     assert list(slots.values()).count(slots[99]) == 1
     assert "--write" in result["warnings"][-1]
 
+    hall.write_bytes(b"\xef\xbb\xbf" + hall.read_bytes())  # as an editor of Windows leaves it
     assert "written" in run(capsys, "plan", hall, "--write")
     site = load_site(hall)
     assert {anchor.id: anchor.slot for anchor in site.all_anchors} == slots

@@ -72,6 +72,7 @@ MISTAKES = {
     "a device instead of a site": (["site", "check", "/dev/zero"], "not a pipe or a device"),
     "a key with a slip": (["site", "check", "typo.toml"], "called slot_s"),
     "a master that is no anchor": (["site", "check", "no-master.toml"], "the id of an anchor: 1, 2"),
+    "a folder for a site": (["site", "new", "."], "is a folder"),
     "a site that exists": (["site", "new", "lab.toml"], "--force overwrites it"),
     "a room without a depth": (["site", "new", "new.toml", "--width", "3"], "both --width and --depth"),
     "too few anchors to plan": (["plan", "one-anchor.toml"], "at least 3"),
@@ -144,20 +145,20 @@ def test_a_mistake_is_one_line(room, capsys, mistake):
 @pytest.fixture
 def full_disk(monkeypatch):
     """Files can be made, and hold nothing."""
-    fdopen, write_bytes = os.fdopen, Path.write_bytes
+    plain_open, write_bytes = Path.open, Path.write_bytes
 
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def open_full(handle, mode="r", *arguments, **options):
-        file = fdopen(handle, mode, *arguments, **options)
-        return _Full(file, full) if "w" in mode else file
+    def open_full(path, mode="r", *arguments, **options):
+        file = plain_open(path, mode, *arguments, **options)
+        return _Full(file, full) if mode == "w" else file
 
     def write_full(path, data):
         write_bytes(path, data[:1])
         full()
 
-    monkeypatch.setattr("skyless.cli.common.output.os.fdopen", open_full)
+    monkeypatch.setattr(Path, "open", open_full)
     monkeypatch.setattr(Path, "write_bytes", write_full)
 
 
@@ -197,7 +198,8 @@ def test_a_full_disk_is_one_line_and_leaves_no_file(room, capsys, full_disk, arg
 
 
 def test_an_old_table_outlives_a_full_disk(room, capsys, full_disk):
-    Path("out.csv").write_text("precious")
+    with Path("out.csv").open("x") as file:  # another mode than that of a table
+        file.write("precious")
     assert main(["replay", *F, "--fixes-csv", "out.csv"]) == 2
     assert Path("out.csv").read_text() == "precious"
 

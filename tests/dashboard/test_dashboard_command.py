@@ -10,6 +10,7 @@ from skyless.cli.dashboard import _address, _listening, _rules
 from skyless.cli.main import main
 from skyless.dashboard.serve import PORT, ListenAddress, bind
 from skyless.errors import SkylessError
+from skyless.nodes.ports import claim
 
 
 @pytest.mark.parametrize(
@@ -47,6 +48,17 @@ def test_a_taken_port_is_an_error_when_it_was_asked_for():
 def test_the_next_free_port_is_taken_when_none_was_asked_for():
     with bind(ListenAddress("127.0.0.1", None)) as first, bind(ListenAddress("127.0.0.1", None)) as second:
         assert PORT <= first.getsockname()[1] < second.getsockname()[1]
+
+
+def test_a_port_that_a_demo_has_named_is_left_to_its_page():
+    with bind(ListenAddress("127.0.0.1", None)) as first:
+        port = first.getsockname()[1]
+        claimed = claim("127.0.0.1", port)
+    assert claimed is not None
+    with claimed, bind(ListenAddress("127.0.0.1", None)) as second:
+        assert second.getsockname()[1] != port
+        with bind(ListenAddress("127.0.0.1", port)) as page:
+            assert page.getsockname()[1] == port
 
 
 def test_an_address_of_another_machine_is_refused():

@@ -249,7 +249,12 @@ def test_the_command_tells_one_tag_as_other_replays_and_all_in_sums(tmp_path, ca
     assert {"rmse_2d_m", "p95_m", "median_m", "receptions_per_s", "height_note"} <= one.keys()
     assert plot.stat().st_size > 10_000
     assert main(["replay", str(path), "--tag", "a"]) == 0
-    assert "identical, all" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "identical, all" in shown
+    assert "has no end" not in shown
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 4])
+    assert main(["replay", str(path), "--tag", "a"]) == 0
+    assert "has no end: it was cut off" in " ".join(capsys.readouterr().out.split())
 
 
 def test_mistakes_are_told_in_one_line(tmp_path, capsys):

@@ -48,6 +48,10 @@ def refused(load, tmp_path):
     return refused
 
 
+def test_a_byte_order_mark_does_no_harm(load):
+    assert load(b"\xef\xbb\xbf" + LAB.encode()) == load(LAB)
+
+
 def test_least_file(load):
     site = load(HEAD + THREE)
     assert [a.id for a in site.anchors] == [1, 2, 7]

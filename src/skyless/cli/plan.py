@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Final
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from skyless.cli.common.options import Positive, Seed, check_method, check_output, finite_numbers, options
+from skyless.cli.common.options import (
+    Positive,
+    Seed,
+    check_method,
+    check_output,
+    check_picture,
+    finite_numbers,
+    options,
+)
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import progress_bar
 from skyless.cli.plan_output import show, write_files, write_site
@@ -221,6 +229,7 @@ def _load(file: Path, asked: PlanOptions) -> "Site":
     image = None if site.floor_plan is None else file.parent / site.floor_plan.image
     for name, path in (("plot", asked.plot), ("grid", asked.grid), ("html", asked.html), ("out", asked.out)):
         check_output(name, path, asked.conflicts)
+    check_picture(asked.plot)
     outputs = {"plot": asked.plot, "grid": asked.grid, "html": asked.html, "out": asked.out}
     for name, path in outputs.items():
         check_output(name, path, file, image, *(other for key, other in outputs.items() if key != name))

@@ -42,7 +42,7 @@ def write_slots(site: "Site", file: Path) -> None:
     from skyless.site.rewrite import with_slots_written
 
     slots = {anchor.id: anchor.slot for anchor in site.all_anchors if anchor.slot is not None}
-    text = with_slots_written(file.read_bytes().decode(), slots, site.schedule.slots or 0, file)
+    text = with_slots_written(file.read_bytes().decode("utf-8-sig"), slots, site.schedule.slots or 0, file)
     write_file(file, text.encode())
 
 

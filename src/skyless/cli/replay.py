@@ -21,7 +21,7 @@ from skyless.cli.common.options import (
     check_picture,
     options,
 )
-from skyless.cli.common.output import new_table, number, print_facts, print_json
+from skyless.cli.common.output import new_table, number, print_facts, print_json, print_warnings
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.cli.common.recording_inputs import is_mcap, lever_arm, wished_height
 from skyless.errors import SkylessError
@@ -266,6 +266,8 @@ def _replay_site(file: Path, asked: ReplayOptions) -> "list[TagReport]":
     else:
         for report in reports:
             _show(report, "from the site", {}, _site_facts(report))
+        if not summary.finished:
+            print_warnings([f"{file} has no end: it was cut off, or is still being written; later fixes are missing"])
     return reports
 
 

@@ -87,6 +87,8 @@ def new(
     from skyless.site.lab import lab_site
     from skyless.site.template import rectangular_site, site_template, unplaced_site
 
+    if file.is_dir():
+        raise SkylessError(f"{file} is a folder; it should be the name of a file to write")
     sizes = (width, depth, anchor_count, height)
     height_m = _tag_height(tag_height, spacing)
     if unplaced is not None:

@@ -219,7 +219,7 @@ def _written(
     if site is None or asked.known.site is None:
         raise SkylessError(f"--out is {str(out)!r}, and there is no --site")
     result = report.survey
-    text = surveyed_text(asked.known.site.read_bytes().decode(), result, site, asked.known.site)
+    text = surveyed_text(asked.known.site.read_bytes().decode("utf-8-sig"), result, site, asked.known.site)
     record = SurveyRecord(site.name, site.id, time.time(), ranges, result, delay_changes_ticks(site, result))
     strangers = [one.id for one in result.anchors if one.determined and one.id not in _identifiers(site)]
     more = [f"anchor {one} is not in {asked.known.site} and was not written" for one in strangers]

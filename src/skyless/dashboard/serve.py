@@ -17,6 +17,7 @@ from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
 from skyless.nodes.find_site import find_site
+from skyless.nodes.ports import claim
 from skyless.nodes.process import ending_signals
 
 PORT: Final = 8080
@@ -45,10 +46,11 @@ def bind(listen: ListenAddress) -> socket.socket:
     if listen.port is not None:
         return _bind(listen.host, listen.port)
     for port in range(PORT, PORT + _MORE_PORTS):
-        try:
-            return _bind(listen.host, port)
-        except _PortInUseError:
+        claimed = claim(listen.host, port)
+        if claimed is None:  # a demo that has just started names this port and is about to listen there
             continue
+        with claimed, contextlib.suppress(_PortInUseError):
+            return _bind(listen.host, port)
     return _bind(listen.host, 0)
 
 

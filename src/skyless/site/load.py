@@ -138,7 +138,7 @@ def _parse(path: Path) -> dict[str, Any]:
             raise ConfigurationError(path, "", None, f"a site file, {_MOST_BYTES >> 20} MiB at most")
         if _TOO_DEEP.search(text):
             raise ConfigurationError(path, "", None, "a site file; this one nests or counts too far")
-        return tomllib.loads(text.decode())
+        return tomllib.loads(text.decode("utf-8-sig"))  # editors of Windows put a byte order mark before it
     except OSError as error:
         raise ConfigurationError(path, "", None, f"a readable site file ({error.strerror})") from None
     except UnicodeDecodeError as error:

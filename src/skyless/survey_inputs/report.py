@@ -34,7 +34,7 @@ def corrected_text(done: Calibrated, anchors: Path | None, site: Path | None) ->
     """
     if site is not None and done.site is not None:
         delays_ticks = {anchor: new for anchor, (_, new) in done.tx_delays_ticks().items()}
-        return with_tx_delays(site.read_bytes().decode(), delays_ticks, site)
+        return with_tx_delays(site.read_bytes().decode("utf-8-sig"), delays_ticks, site)
     known = done.estimate.calibration()
     return new_table(done.samples.anchors_m, known) if anchors is None else calibrated_table(anchors, known)
 

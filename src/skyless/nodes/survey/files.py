@@ -90,7 +90,7 @@ def save_survey(
     record, kept = _record(site, survey, ranges, unix_s), kept_path(file)
     image: dict[Path, bytes] = {}
     try:
-        text = surveyed_text(file.read_bytes().decode(), survey, site, file)
+        text = surveyed_text(file.read_bytes().decode("utf-8-sig"), survey, site, file)
         if floor is not None:
             image_name, image = _floor_image(file, site, floor)
             if image_name is not None:
