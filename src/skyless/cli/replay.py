@@ -358,7 +358,7 @@ def _show(report: "ReplayReport", note: str, distances: dict[str, float], more: 
         ("rate", number(report.rate_hz, "{:.1f} Hz")),
         ("height", note if report.height_m is None else f"{report.height_m:.3f} m, {note}"),
         ("median position", _triple(report.median_m)),
-        ("standard deviation", _triple(report.std_m)),
+        ("scatter of the fixes", _triple(report.std_m)),
         # without truth, the tag's own motion is in it
         ("noise of a difference" if truth_known else "scatter of a difference", _metres(report.tdoa_noise_m)),
         ("RMSE 2-D", _metres(report.rmse_2d_m)),
