@@ -31,7 +31,9 @@ WALKED_S = 12.0
 DRAW_SLOWLY = (
     "period_ms => { window.requestAnimationFrame = draw => setTimeout(() => draw(performance.now()), period_ms); }"
 )
-"""Or a browser without a graphics card takes all processors, and the page says so."""
+"""Script: the page draws once for each frame of the animation.
+
+At full speed a browser without a graphics card takes all processors, and the page would say that it is too slow."""
 START_S = 300.0
 """How long the demo may take to compile and to open its page."""
 LIMIT_BYTES = 600_000
@@ -74,7 +76,7 @@ def _frames_of(address: str) -> dict[str, list[Image.Image]]:
         for visit in visits.values():
             until(visit.page, f"skyless.live.all.size >= {TAGS}", timeout_s=START_S)
             visit.page.evaluate(DRAW_SLOWLY, 1e3 * FRAME_S)
-        for visit in visits.values():  # what two browsers at the start delayed lasts a minute
+        for visit in visits.values():  # changes of the master during the start of both browsers count for a minute
             until(visit.page, "document.querySelector('#pill').classList.contains('good')", timeout_s=START_S)
         time.sleep(WALKED_S)
         begin_s = time.monotonic()

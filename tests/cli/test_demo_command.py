@@ -136,22 +136,22 @@ def test_json_also_where_ports_are_taken_and_nothing_can_be_written_at_home(tmp_
     assert demo.process.returncode == 0, demo.said
     assert out.count("\n") == 1
     assert not CONTROL.search(out + demo.said)
-    told = json.loads(out)
-    assert told.keys() >= {"tags", "fixes", "rmse_m", "max_m", "p95_m", "sigma_m", "updates_per_s", "duration_s"}
-    assert told.keys() >= {"fix_latency_p50_s", "fix_latency_p99_s", "subscriber_latency_p99_s", "page", "broker"}
-    assert told["tags"] == 3
-    assert told["restarts"] == 0
-    assert told["duration_s"] >= 3.0
-    assert (
-        0.0 < told["updates_per_s"] <= 410.0
-    )  # one for each message of the schedule; on a busy machine some are skipped
-    assert told["fixes"] <= told["messages"]
-    assert 0.0 < told["rmse_m"] < told["max_m"] < 0.5
-    assert 0.0 < told["fix_latency_p50_s"] < told["subscriber_latency_p99_s"]
-    assert int(told["page"].rpartition(":")[2]) > 8080
-    assert int(told["broker"].rpartition(":")[2]) > 1883
-    assert told["page"] in demo.said
-    assert told["broker"] in demo.said
+    summary = json.loads(out)
+    assert summary.keys() >= {"tags", "fixes", "rmse_m", "max_m", "p95_m", "sigma_m", "updates_per_s", "duration_s"}
+    assert summary.keys() >= {"fix_latency_p50_s", "fix_latency_p99_s", "subscriber_latency_p99_s", "page", "broker"}
+    assert summary["tags"] == 3
+    assert summary["restarts"] == 0
+    assert summary["duration_s"] >= 3.0
+    # at most one for each message of the schedule; how many a busy machine skips is not judged here
+    assert 0.0 < summary["updates_per_s"] <= 410.0
+    assert summary["fixes"] <= summary["messages"]
+    assert 0.0 < summary["rmse_m"] < 0.05
+    assert summary["rmse_m"] < summary["max_m"] < 0.3
+    assert 0.0 < summary["fix_latency_p50_s"] < summary["subscriber_latency_p99_s"]
+    assert int(summary["page"].rpartition(":")[2]) > 8080
+    assert int(summary["broker"].rpartition(":")[2]) > 1883
+    assert summary["page"] in demo.said
+    assert summary["broker"] in demo.said
 
 
 def test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated(tmp_path):
@@ -192,10 +192,10 @@ def test_programs_that_die_are_started_again_and_ctrl_c_ends_all_with_a_summary(
     assert code == 0
     assert "stopped" in demo.said
     assert "Traceback" not in demo.said
-    told = json.loads(out)
-    assert told["restarts"] == 3
-    assert told["tags"] == 3
-    assert told["duration_s"] > lived_s - 0.5
+    summary = json.loads(out)
+    assert summary["restarts"] == 3
+    assert summary["tags"] == 3
+    assert summary["duration_s"] > lived_s - 0.5
 
 
 def test_a_demo_that_is_killed_leaves_no_program_behind(tmp_path):

@@ -32,6 +32,8 @@ class Program(Struct, frozen=True):
     new_file: int | None = None
     """Index among the arguments of a file that must not exist: later starts get another name, and the program is not
     started again when it has ended by itself (a full disk, its limit reached)."""
+    start_after_s: float = 0.0
+    """Its first start is so much later."""
 
     def start(self, number: int) -> tuple[str, ...]:
         """Arguments of its first, second ... start."""
@@ -56,6 +58,8 @@ class Child:
 
     async def run(self) -> None:
         """Keep it alive until cancelled, or until it has ended for good."""
+        if self.program.start_after_s > 0.0:
+            await asyncio.sleep(self.program.start_after_s)
         wait_s = _RESTART_S
         while True:
             begun_s = asyncio.get_running_loop().time()

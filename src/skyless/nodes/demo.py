@@ -29,7 +29,6 @@ _HOST: Final = "127.0.0.1"
 _PAGE_PORT: Final = 8080
 _TAGS_PER_PROCESS: Final = 25
 _BROKER_RESTART_S: Final = 0.2
-_SURVEY: Final = "survey"
 _SURVEY_DELAY_S: Final = 4.0
 """Nothing else waits for the survey; started with the others it would delay the first fix by a second on two cores."""
 
@@ -118,7 +117,7 @@ class WholeSite:
         finally:
             link.publish(topic, b"", qos=1, retain=True)
         self.prepared.set()
-        await together(*(_run_later(child) if child.program.name == _SURVEY else child.run() for child in children))
+        await together(*(child.run() for child in children))
 
     async def _keep(self, broker: Broker) -> None:
         """Start the embedded broker again, on the same port and with the same store, whenever it ends."""
@@ -165,18 +164,14 @@ class WholeSite:
             Program(_named("tag", some), ("tag", *some, *radio, *mqtt, *computing))
             for some in _groups(tags, 1 if asked.apart else _TAGS_PER_PROCESS)
         ]
-        programs.append(Program(_SURVEY, ("survey", "--serve", *mqtt, "--site-id", str(asked.site.id))))
+        survey = ("survey", "--serve", *mqtt, "--site-id", str(asked.site.id))
+        programs.append(Program("survey", survey, start_after_s=_SURVEY_DELAY_S))
         if asked.record is not None:
             limit = ("--limit-mb", str(asked.record_limit_mb))
             programs.append(
                 Program("recorder", ("record", str(asked.record), *mqtt, *limit, "--site-id", str(asked.site.id)), 1)
             )
         return programs
-
-
-async def _run_later(child: Child) -> None:
-    await asyncio.sleep(_SURVEY_DELAY_S)
-    await child.run()
 
 
 def _mqtt(address: MqttAddress) -> tuple[str, ...]:
