@@ -33,6 +33,7 @@ TARGET_KINDS: Final = {
     "nmea+pty": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a pseudo-terminal"),
     "jsonl+tcp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a line, for programs that connect", 7010),
     "jsonl+udp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a datagram", 7010),
+    "ros2": Kind("ros2.target", 50.0, MOST_HZ, "topics of ROS 2, published by DDS without ROS being installed"),
 }
 
 

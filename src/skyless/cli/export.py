@@ -29,8 +29,7 @@ def export(
     bag_version: Literal["9", "8"] = "9",
     json: bool = False,
 ) -> int:
-    """Write a recording of skyless record as a bag of ROS 2 (rosbag2, MCAP), for ros2 bag play, Foxglove, Rerun
-    and PlotJuggler.
+    """Write a recording of skyless record as a bag of ROS 2: MCAP, for ros2 bag play, Foxglove, Rerun, PlotJuggler.
 
     Each tag gets the topics pose, velocity, fix (where the site file has a georeference) and truth (where it is
     simulated) below /skyless/TAG; anchors and health become /skyless/anchors and /diagnostics. Needs the extra ros2.
@@ -40,7 +39,7 @@ def export(
     file
         The recording, an MCAP of skyless record.
     to
-        The bag: a new folder.
+        Where fixes go: the bag, a new folder.
     tag
         Name of the only tag to write; by default all.
     frame

@@ -79,7 +79,7 @@ _MARKER: Final = _struct(
 
 TYPES: Final[dict[str, Any]] = {
     messages.POSE.name: _struct(messages.POSE.name, header=_HEADER, pose=_POSE_WITH_COVARIANCE),
-    messages.VELOCITY.name: _struct(messages.VELOCITY.name, header=_HEADER, twist=_TWIST_WITH_COVARIANCE),
+    messages.TWIST.name: _struct(messages.TWIST.name, header=_HEADER, twist=_TWIST_WITH_COVARIANCE),
     messages.NAV_SAT_FIX.name: _struct(
         messages.NAV_SAT_FIX.name,
         header=_HEADER,

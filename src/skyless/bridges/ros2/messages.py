@@ -50,7 +50,7 @@ POSE: Final = RosType(
 TRUE_POSE: Final = RosType(
     "geometry_msgs/msg/PoseStamped", "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8"
 )
-VELOCITY: Final = RosType(
+TWIST: Final = RosType(
     "geometry_msgs/msg/TwistWithCovarianceStamped",
     "RIHS01_77b67434531e6529b7a0091357b186b6ebdb17fd9ffd3e0c7ce9d3fb11a44563",
 )
@@ -112,7 +112,7 @@ class RosEncoder:
         found = [RosMessage(self._topic(fix.tag, "pose"), POSE, _pose(fix, covariance_m2, frame))]
         velocity = _velocity(fix, frame)
         if velocity is not None:
-            found.append(RosMessage(self._topic(fix.tag, "velocity"), VELOCITY, velocity))
+            found.append(RosMessage(self._topic(fix.tag, "velocity"), TWIST, velocity))
         if self._site is not None and self._site.georeference is not None:
             origin = self._site.georeference
             covariance_enu_m2 = rotated(covariance_m2, origin.heading_deg)
