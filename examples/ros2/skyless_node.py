@@ -163,8 +163,8 @@ class SkylessNode(Node):
     def name(self, tag: str) -> str:
         """A tag's name as ROS allows it; tags whose names become equal are numbered as they come."""
         if tag not in self.names:
-            plain = re.sub(r"_+", "_", re.sub(r"[^A-Za-z0-9]", "_", tag))
-            plain = f"tag_{plain}" if not plain or plain[0].isdigit() else plain
+            plain = re.sub(r"[^A-Za-z0-9]+", "_", tag).strip("_")
+            plain = plain if plain[:1].isalpha() else f"tag_{plain}".strip("_")
             name, number = plain, 2
             while name in self.names.values():
                 name, number = f"{plain}_{number}", number + 1

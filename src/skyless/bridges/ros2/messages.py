@@ -154,9 +154,9 @@ class RosEncoder:
 
 
 def ros_name(text: str) -> str:
-    """Text as one part of a topic's name: letters, digits and single _, not beginning with a digit."""
-    plain = re.sub(r"_+", "_", re.sub(r"[^A-Za-z0-9]", "_", text))
-    return f"tag_{plain}" if not plain or plain[0].isdigit() else plain
+    """Text as one part of a topic's name: letters, digits and single _, a letter first."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")
+    return plain if plain[:1].isalpha() else f"tag_{plain}".strip("_")
 
 
 def stamp_of(unix_s: float) -> tuple[int, int]:
