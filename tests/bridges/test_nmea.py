@@ -145,10 +145,11 @@ def test_a_tag_that_stands_has_no_course():
 
 def test_no_fix_has_a_time_and_no_position():
     received = read(epoch_without_fix(NOON_S))
-    rmc, gga, gsa = received.values()
+    rmc, gga, gbs, gsa = received.values()
     assert (rmc.status, rmc.lat, rmc.lon, rmc.posMode) == ("V", "", "", "N")
     assert datetime.combine(rmc.date, rmc.time, UTC).timestamp() == NOON_S
     assert (gga.quality, gga.lat, gga.alt) == (0, "", "")
+    assert (gbs.time, gbs.errLat) == (rmc.time, "")
     assert gsa.navMode == 1
 
 

@@ -128,7 +128,10 @@ def epoch(fix: FixMessage, origin: GeoreferenceSite, quality: str, geoid_m: floa
 
 
 def epoch_without_fix(unix_s: float) -> bytes | None:
-    """Three sentences that state the time, and that no position is known; None for a time that RMC cannot state."""
+    """Four sentences that state the time, and that no position is known; None for a time that RMC cannot state.
+
+    GBS is empty: it ends the epoch, and gpsd reports an epoch when it sees the sentence that ended the ones before.
+    """
     moment = _moment(unix_s)
     if moment is None:
         return None
@@ -137,6 +140,7 @@ def epoch_without_fix(unix_s: float) -> bytes | None:
         (
             sentence(f"GNRMC,{time},V,,,,,,,{date},,,N"),
             sentence(f"GNGGA,{time},,,,,0,00,,,M,,M,,"),
+            sentence(f"GNGBS,{time},,,,,,,"),
             sentence(f"GNGSA,A,1,{',' * (SLOT_COUNT - 1)},,,"),
         )
     )
