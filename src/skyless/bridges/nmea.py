@@ -31,7 +31,8 @@ COURSE_SIGMAS: Final = 2.0
 _LARGEST_DOP: Final = 99.99
 """As receivers write it."""
 
-_LARGEST_ANCHOR: Final = 65_535
+_LARGEST_ANCHOR: Final = 999
+"""GSA has room for three digits; anchors with larger numbers are only counted, in GGA."""
 
 _FARTHEST_M: Final = 1e5
 """Coordinates, heights and standard deviations beyond it are no measurement; the sentences have no room for them."""
@@ -71,17 +72,16 @@ class NmeaEncoder(Encoder):
         quality = self._quality
         if quality == "auto":
             quality = "simulator" if self._site.simulated else "rtk"
-        return self._kept(epoch(fix, self._site.georeference, quality, self._geoid_m))
+        sentences = epoch(fix, self._site.georeference, quality, self._geoid_m)
+        if sentences is None:
+            self.dropped["out-of-range"] += 1
+            sentences = epoch_without_fix(fix.unix_s)
+        return [] if sentences is None else [sentences]
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:  # noqa: ARG002 (NMEA has no reasons)
         """One epoch that states that there is no position."""
-        return self._kept(epoch_without_fix(unix_s))
-
-    def _kept(self, sentences: bytes | None) -> list[bytes]:
-        if sentences is None:
-            self.dropped["out of range"] += 1
-            return []
-        return [sentences]
+        sentences = epoch_without_fix(unix_s)
+        return [] if sentences is None else [sentences]
 
 
 def make_encoder(url: TargetUrl) -> Encoder:
