@@ -6,15 +6,15 @@ import shutil
 import socket
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime
-from math import cos, hypot, radians, sqrt
+from math import atan2, cos, degrees, hypot, radians, sqrt
 
 import msgspec
+import numpy as np
 import pytest
 
 import skyless
 from skyless.bridges.feed import BridgedSite, floored
 from skyless.bridges.hub import Hub
-from skyless.bridges.nmea import horizontal_ellipse
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
 from skyless.mqtt.messages import FixMessage
@@ -159,7 +159,8 @@ def test_gpsd_reports_every_fix_with_its_covariance(transport, fixes, tmp_path):
         covariance = floored(rotated(fix.covariance_m2, HALL.heading_deg))
         for key, axis in (("epx", 0), ("epy", 4), ("epv", 8)):
             worst_std_m = max(worst_std_m, abs(report[key] - sqrt(covariance[axis])))
-        _, _, azimuth_deg = horizontal_ellipse(covariance)
+        _, axes = np.linalg.eigh(np.array(covariance).reshape(3, 3)[:2, :2])
+        azimuth_deg = degrees(atan2(*axes[:, 1]))
         turned_deg = (gsts[time]["orient"] - azimuth_deg + 90.0) % 180.0 - 90.0
         assert abs(turned_deg) < 0.5
         assert report["mode"] == 3

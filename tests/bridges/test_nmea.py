@@ -1,7 +1,7 @@
 """NMEA 0183 as pynmeagps, a decoder of others, reads it."""
 
 from datetime import UTC, datetime
-from math import cos, hypot, isfinite, radians, sin, sqrt
+from math import cos, hypot, isfinite, radians, sqrt
 
 import msgspec
 import pytest
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pynmeagps import VALCKSUM, NMEAReader
 
 from skyless.bridges.feed import BridgedSite, floored
-from skyless.bridges.nmea import NmeaEncoder, epoch, epoch_without_fix, horizontal_ellipse
+from skyless.bridges.nmea import NmeaEncoder, epoch, epoch_without_fix
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import FixMessage
 from skyless.site.earth import geodetic, rotated
@@ -96,21 +96,6 @@ def test_another_decoder_reads_what_was_sent(fix, origin, quality, geoid_m):
     named = [anchor for anchor in fix.anchors if anchor < 1000][:12]
     assert [getattr(gsa, f"svid_{slot:02d}") for slot in range(1, 13)] == named + [""] * (12 - len(named))
     assert gga.numSV == min(len(fix.anchors), 99)
-
-
-@given(covariance=covariances())
-def test_the_major_axis_points_where_the_variance_is_largest(covariance):
-    major, minor, azimuth_deg = horizontal_ellipse(covariance)
-    assert 0.0 <= azimuth_deg < 180.0
-
-    def std(degrees):
-        x, y = sin(radians(degrees)), cos(radians(degrees))
-        ee, en, nn = covariance[0], covariance[1], covariance[4]
-        return sqrt(max(x * x * ee + 2.0 * x * y * en + y * y * nn, 0.0))
-
-    assert std(azimuth_deg) == pytest.approx(major, rel=1e-6)
-    assert minor**2 + major**2 == pytest.approx(covariance[0] + covariance[4])
-    assert all(std(step) <= major * (1.0 + 1e-9) for step in range(0, 180, 15))
 
 
 def test_a_covariance_turns_with_the_site():

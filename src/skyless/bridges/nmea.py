@@ -14,9 +14,10 @@ from typing import Final
 from skyless.bridges.feed import BridgedSite, floored, require_georeference
 from skyless.bridges.target import Encoder
 from skyless.bridges.target_url import TargetUrl
-from skyless.mqtt.messages import FixMessage, Matrix
+from skyless.mqtt.messages import FixMessage
 from skyless.site.earth import east_north_up, geodetic, rotated
 from skyless.site.model import GeoreferenceSite
+from skyless.uncertainty.ellipse import horizontal_ellipse
 
 KNOT_MPS: Final = 1852.0 / 3600.0
 MINUTE_UNITS: Final = 10_000_000
@@ -104,7 +105,8 @@ def epoch(fix: FixMessage, origin: GeoreferenceSite, quality: str, geoid_m: floa
     time, date = moment
     latitude_deg, longitude_deg, height_m = geodetic(fix.position_m, origin)
     covariance = floored(rotated(fix.covariance_m2, origin.heading_deg))
-    major_m, minor_m, azimuth_deg = horizontal_ellipse(covariance)
+    major_m, minor_m, direction = horizontal_ellipse(covariance)
+    azimuth_deg = (90.0 - degrees(direction)) % 180.0
     east_m, north_m, up_m = (sqrt(covariance[axis]) for axis in (0, 4, 8))
     if not all(abs(value) < _FARTHEST_M for value in (height_m, major_m, east_m, north_m, up_m)):
         return None
@@ -150,17 +152,6 @@ def sentence(body: str) -> bytes:
     """A sentence with its checksum: the exclusive or of all bytes between ``$`` and ``*``."""
     data = body.encode("ascii")
     return b"$%b*%02X\r\n" % (data, reduce(xor, data, 0))
-
-
-def horizontal_ellipse(covariance_m2: Matrix) -> tuple[float, float, float]:
-    """Semi-axes of one standard deviation, the longer first, in m, and the longer one's azimuth in [0°, 180°).
-
-    ``covariance_m2`` is of east, north, up.
-    """
-    east, mixed, north = covariance_m2[0], covariance_m2[1], covariance_m2[4]
-    middle, half = (east + north) / 2.0, hypot((east - north) / 2.0, mixed)
-    azimuth_deg = degrees(atan2(2.0 * mixed, north - east)) / 2.0 % 180.0
-    return sqrt(middle + half), sqrt(max(middle - half, 0.0)), azimuth_deg
 
 
 def _moment(unix_s: float) -> tuple[str, str] | None:
