@@ -22,6 +22,7 @@ LAYERS = (
     {"positioning"},
     {"master_election", "slot_claims", "survey"},
     {"anchor", "anchors", "receiver", "receiver_state", "mqtt"},
+    {"foxglove"},
     {"simulation", "recordings"},
     {"radios"},
     {"evaluation"},

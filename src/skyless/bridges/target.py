@@ -66,6 +66,9 @@ class Encoder:
     one_tag = False
     """As of a ``Target``."""
 
+    dropped: Counter[str]
+    """As of its ``Target``: what it could not encode, by reason."""
+
     def greeting(self) -> list[bytes]:
         """For a reader that has just connected."""
         return []
@@ -107,7 +110,7 @@ class StreamTarget(Target):
         super().__init__(text)
         self._encoder, self._sender = encoder, sender
         self.one_tag = encoder.one_tag
-        self.dropped = sender.dropped
+        self.dropped = encoder.dropped = sender.dropped
 
     def on_site(self, site: BridgedSite) -> None:
         """Let the encoder know it."""

@@ -31,6 +31,8 @@ TARGET_KINDS: Final = {
     "nmea+tcp": Kind("nmea", 10.0, 50.0, "NMEA 0183 for programs that connect: gpsd, QGIS, OpenCPN", 10110),
     "nmea+udp": Kind("nmea", 10.0, 50.0, "NMEA 0183 as datagrams", 10110),
     "nmea+pty": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a pseudo-terminal"),
+    "nmea+serial": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a serial port, as nmea+serial:/dev/ttyUSB0@115200"),
+    "foxglove": Kind("foxglove.target", 20.0, MOST_HZ, "live pages of Foxglove and Lichtblick", 8765),
     "jsonl+tcp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a line, for programs that connect", 7010),
     "jsonl+udp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a datagram", 7010),
 }
