@@ -19,8 +19,8 @@ from skyless.bridges.mavlink.messages import (
     encoded,
 )
 from skyless.bridges.mavlink.profiles import (
+    MAVLINK_PROFILES,
     MOST_SATELLITES,
-    PROFILES,
     Profile,
     global_origin,
     gps_input,
@@ -164,7 +164,7 @@ def make_encoder(url: TargetUrl) -> MavlinkEncoder:
         SkylessError: one of them is not right.
     """
     return MavlinkEncoder(
-        cast(Profile, url.choice("profile", PROFILES, "")),
+        cast(Profile, url.choice("profile", MAVLINK_PROFILES, "")),
         text=url.text,
         system=int(url.number("system", 1, 1, 255)),
         component=int(url.number("component", VISUAL_POSITIONING, 1, 255)),

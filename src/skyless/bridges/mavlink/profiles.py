@@ -25,7 +25,7 @@ from skyless.site.earth import east_north_up, geodetic, rotated
 from skyless.site.model import GeoreferenceSite
 
 Profile = Literal["ardupilot", "px4", "gps"]
-PROFILES: Final = ("ardupilot", "px4", "gps")
+MAVLINK_PROFILES: Final = ("ardupilot", "px4", "gps")
 
 GPS_EPOCH_UNIX_S: Final = 315_964_800
 """6 January 1980, when GPS time began."""
