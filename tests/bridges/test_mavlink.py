@@ -1,6 +1,7 @@
 """MAVLink: pymavlink packs and reads the same bytes; profiles state what autopilots accept, and nothing unknown."""
 
 import math
+import re
 import struct
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from bridged_values import BARE_SITE, BERLIN, SITE, a_fix, fixes, georeferences
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from skyless.bridges.mavlink.encoder import MavlinkEncoder
 from skyless.bridges.mavlink.frames import FrameReader, frame
@@ -24,6 +26,8 @@ from skyless.bridges.mavlink.messages import (
     encoded,
 )
 from skyless.bridges.mavlink.profiles import gps_input, gps_time, no_gps_fix, odometry, vision_position_estimate
+from skyless.bridges.target import BridgeContext
+from skyless.bridges.targets import open_route
 from skyless.errors import SkylessError
 from skyless.site.earth import geodetic
 
@@ -370,6 +374,31 @@ def test_a_site_that_does_not_know_where_it_is_gives_no_origin_and_no_gps():
         MavlinkEncoder("gps", text="mavlink+udpout:").on_site(BARE_SITE)
 
 
+def test_the_heading_of_a_site_that_has_none_can_be_given():
+    made = encoder("ardupilot", BARE_SITE, heading_deg=90.0)
+    (found,) = parse(b"".join(made.on_fix(a_fix(position_m=(1.0, 2.0, 3.0)))))
+    assert (found.x, found.y, found.z) == pytest.approx((-1.0, 2.0, -3.0))
+    with pytest.raises(SkylessError, match="heading=90.*heading_deg = 30"):
+        made.on_site(SITE)
+
+
+@pytest.mark.parametrize(
+    ("address", "expected"),
+    [
+        ("mavlink+udpout://", "profile=; it should be ardupilot, px4 or gps"),
+        ("mavlink+udpout://?profile=betaflight", "ardupilot, px4 or gps"),
+        ("mavlink+udpout://?profile=px4&system=0", "system=0; it should be a number from 1 to 255"),
+        ("mavlink+udpout://?profile=gps&satellites=many", "satellites=many"),
+        ("mavlink+udpout://?profile=px4&heading=north", "heading=north"),
+        ("mavlink+udpout://?profile=px4&yaw=3", "yaw"),
+        ("mavlink+serial:?profile=px4", "PATH@BAUD"),
+    ],
+)
+def test_wrong_addresses_are_named(address, expected):
+    with pytest.raises(SkylessError, match=re.escape(expected)):
+        open_route(address, BridgeContext(print))
+
+
 def test_a_gps_gets_no_origin():
     assert names(encoder("gps").on_second(0.0)) == ["HEARTBEAT"]
 
@@ -383,9 +412,12 @@ def test_the_reset_counter_rises_when_the_receiver_or_the_site_begins_again():
 
     assert [counter(serial) for serial in (0, 5, 9, 1, 2)] == [0, 0, 0, 1, 1]
     made.on_site(SITE)
-    assert counter(3) == 1
-    made.on_site(BARE_SITE)
-    assert counter(4) == 2
+    made.on_site(structs.replace(SITE, anchors_m=SITE.anchors_m | {3: (0.0, 9.0, 2.0)}))
+    assert counter(3) == 1, "a tag that learns of more anchors stays in the same frame"
+    made.on_site(structs.replace(SITE, anchors_m=SITE.anchors_m | {1: (0.0, 9.0, 2.0)}))
+    assert counter(4) == 2, "an anchor was surveyed again"
+    made.on_site(structs.replace(SITE, anchors_m=SITE.anchors_m | {1: (0.0, 9.0, 2.0)}, georeference=None))
+    assert counter(5) == 3
 
 
 def test_questions_for_the_time_are_answered():

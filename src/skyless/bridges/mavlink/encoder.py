@@ -84,10 +84,7 @@ class MavlinkEncoder(Encoder):
                 f"the target {self._text!r} has heading={self._given_heading_deg:g}; site {site.id} ({site.name}) has "
                 f"its own, [georeference] heading_deg = {site.georeference.heading_deg:g}: leave heading out"
             )
-        if self._site is not None and (site.georeference, site.anchors_m) != (
-            self._site.georeference,
-            self._site.anchors_m,
-        ):
+        if self._site is not None and _has_moved(self._site, site):
             self._reset_counter += 1
             self.vehicle_origin = None
         self._site = site
@@ -155,6 +152,13 @@ class MavlinkEncoder(Encoder):
             frames.append(encoded(message, sequence=self._sequence, system=self._system, component=self._component))
             self._sequence = (self._sequence + 1) & 0xFF
         return frames
+
+
+def _has_moved(before: BridgedSite, after: BridgedSite) -> bool:
+    """Whether positions are in another frame than before; a tag may only have learned of more anchors."""
+    return before.georeference != after.georeference or any(
+        after.anchors_m.get(anchor, position_m) != position_m for anchor, position_m in before.anchors_m.items()
+    )
 
 
 def make_encoder(url: TargetUrl) -> MavlinkEncoder:
