@@ -378,7 +378,7 @@ def test_the_heading_of_a_site_that_has_none_can_be_given():
     made = encoder("ardupilot", BARE_SITE, heading_deg=90.0)
     (found,) = parse(b"".join(made.on_fix(a_fix(position_m=(1.0, 2.0, 3.0)))))
     assert (found.x, found.y, found.z) == pytest.approx((-1.0, 2.0, -3.0))
-    with pytest.raises(SkylessError, match="heading=90.*heading_deg = 30"):
+    with pytest.raises(SkylessError, match=r"heading=90.*heading_deg = 30"):
         made.on_site(SITE)
 
 

@@ -125,6 +125,10 @@ def test_a_tag_has_the_number_of_its_name_where_it_is_free():
     assert found == {3: b"tag3", 1: b"singer", 2: b"old3", 4: b"tag99999", 5: b"tag0", 6: b"tag2"}
 
 
+def test_nothing_is_sent_while_there_is_no_tag():
+    assert frames().info_packets(START_UNIX_S) == frames().data_packets(START_UNIX_S) == []
+
+
 def test_a_tag_without_a_fix_has_no_position():
     made = frames([a_fix(), a_fix(tag="tag2")])
     made.on_no_fix("tag1")

@@ -97,7 +97,7 @@ class PsnFrames:
             tracker.position_m = tracker.velocity_mps = None
 
     def data_packets(self, unix_s: float) -> list[bytes]:
-        """One frame: all trackers; those without a fix have status 0 and no position."""
+        """One frame: all trackers; those without a fix have status 0 and no position. Nothing while there is none."""
         trackers = [_chunk(tracker.number, self._data(tracker), holds_chunks=True) for tracker in self._sorted()]
         self._frame = (self._frame + 1) & 0xFF
         return self._packets(DATA_PACKET, b"", DATA_TRACKERS, trackers, unix_s)
@@ -144,6 +144,8 @@ class PsnFrames:
 
     def _packets(self, kind: int, before: bytes, list_number: int, trackers: list[bytes], unix_s: float) -> list[bytes]:
         """Divide the trackers among packets that fit."""
+        if not trackers:
+            return []  # readers stumble over empty lists
         space = MOST_PACKET_BYTES - 3 * _CHUNK_BYTES - _HEADER_BYTES - len(before)
         groups: list[list[bytes]] = [[]]
         for tracker in trackers:
