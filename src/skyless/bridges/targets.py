@@ -35,6 +35,10 @@ TARGET_KINDS: Final = {
     "foxglove": Kind("foxglove.target", 20.0, MOST_HZ, "live pages of Foxglove and Lichtblick", 8765),
     "jsonl+tcp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a line, for programs that connect", 7010),
     "jsonl+udp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a datagram", 7010),
+    "mavlink+udpout": Kind("mavlink.encoder", 30.0, 100.0, "MAVLink 2 for an autopilot, as datagrams", 14550),
+    "mavlink+serial": Kind("mavlink.encoder", 30.0, 100.0, "MAVLink 2 for an autopilot on a serial port"),
+    "osc+udp": Kind("osc", 60.0, MOST_HZ, "Open Sound Control: TouchDesigner, Unreal, Max", 9000),
+    "psn": Kind("psn", 60.0, 200.0, "PosiStageNet: media servers, lighting consoles", 56565),
 }
 
 
@@ -71,4 +75,7 @@ def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext
             sender = SerialSender(url.text, path, int(baud or 115_200), context.log)
         case _:
             sender = UdpSender(url.text, url.host(), url.port(kind.port), context.log)
-    return StreamTarget(url.text, encoder, sender)
+    target = StreamTarget(url.text, encoder, sender)
+    if isinstance(sender, UdpSender | SerialSender):
+        sender.received = target.on_bytes
+    return target
