@@ -22,7 +22,7 @@ LAYERS = (
     {"positioning"},
     {"master_election", "slot_claims", "survey"},
     {"anchor", "anchors", "receiver", "receiver_state", "mqtt"},
-    {"simulation", "recordings"},
+    {"simulation", "recordings", "zones"},
     {"radios"},
     {"evaluation"},
     {"replays"},

@@ -23,9 +23,9 @@ from skyless.dashboard.live import LiveSite, NoBrokerError, TooManyPagesError
 from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.dashboard.site_survey import NoResultError
-from skyless.dashboard.zones import BadZonesError, read_zones
 from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.image import image_size
+from skyless.zones.zone_list import BadZonesError, read_zones
 
 _PAGE: Final = Path(__file__).parent / "page"
 PAGE_TIMEOUT_S: Final = 10.0

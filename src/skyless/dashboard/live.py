@@ -24,16 +24,7 @@ from skyless.dashboard.evidence import Evidence
 from skyless.dashboard.site_survey import SiteSurvey, topic_of
 from skyless.dashboard.state import SiteState, encode
 from skyless.dashboard.wire import WrongMessageError, read_message
-from skyless.dashboard.zones import (
-    MAX_EVENTS,
-    BadZonesError,
-    EventQueue,
-    ZoneMonitor,
-    check_zones,
-    publisher_rank,
-    read_zones,
-    zones_of,
-)
+from skyless.dashboard.zone_events import MAX_EVENTS, EventQueue, publisher_rank
 from skyless.errors import ConfigurationError
 from skyless.mqtt import topics
 from skyless.mqtt.messages import (
@@ -52,6 +43,8 @@ from skyless.mqtt.messages import (
     ZonesMessage,
 )
 from skyless.site.check import check_site
+from skyless.zones.monitor import ZoneMonitor
+from skyless.zones.zone_list import BadZonesError, check_zones, read_zones, zones_of
 
 _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0

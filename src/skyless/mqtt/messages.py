@@ -300,6 +300,22 @@ class ZoneEvent(Struct, frozen=True):
     position_m: Vector
 
 
+class TagZones(Struct, frozen=True):
+    """The zones that a tag is in at present; retained, by what announces tags to Home Assistant."""
+
+    tag: str
+    unix_s: float
+    """Of the fix with which this became so."""
+    usable: bool
+    """Whether the tag has fixes that may be used; without, it is in no zone."""
+    zone: str | None = None
+    """The id of the smallest of them."""
+    name: str | None = None
+    """Its name."""
+    zones: tuple[str, ...] = ()
+    """The ids of all, the smallest first."""
+
+
 class Stamp(Struct, frozen=True, array_like=True):
     """One reception of an anchor by another."""
 

@@ -22,6 +22,11 @@ def fix_topic(site: int | str, tag: str) -> str:
     return f"{ROOT}/{site}/tag/{tag}/fix"
 
 
+def tag_zones_topic(site: int | str, tag: str) -> str:
+    """Retained ``TagZones``."""
+    return f"{ROOT}/{site}/tag/{tag}/zone"
+
+
 def status_topic(site: int | str, kind: str, name: int | str) -> str:
     """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard``, ``recorder`` or ``survey``.
 
