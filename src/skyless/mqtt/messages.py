@@ -314,6 +314,26 @@ class TagZones(Struct, frozen=True):
     """Its name."""
     zones: tuple[str, ...] = ()
     """The ids of all, the smallest first."""
+    by: str = ""
+    """Name of the bridge that says so."""
+
+
+class TagReport(Struct, frozen=True):
+    """Where a tag is, at most once a second and only when that has changed; retained, for programs that keep each."""
+
+    tag: str
+    unix_s: float
+    """Of the fix."""
+    position_m: Vector
+    std_m: float
+    """One-sigma radial error, at least 1 cm in each axis."""
+    horizontal_std_m: float
+    """The same on the floor."""
+    latitude_deg: float | None = None
+    """WGS 84; None where the site does not say where it is."""
+    longitude_deg: float | None = None
+    height_m: float | None = None
+    """Above the ellipsoid."""
 
 
 class Stamp(Struct, frozen=True, array_like=True):
