@@ -42,6 +42,9 @@ NAVIGATION = {
         "CONTRIBUTING",
         "SECURITY",
     ],
+    "In other tools": [
+        "docs/tools/index",
+    ],
     "Reference": [
         "docs/reference/commands",
         "docs/reference/python",

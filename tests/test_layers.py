@@ -26,7 +26,7 @@ LAYERS = (
     {"radios"},
     {"evaluation"},
     {"replays"},
-    {"preparation"},
+    {"preparation", "bridges"},
     {"nodes", "paper", "planning"},
     {"studies"},
     {"survey_inputs", "bench", "dashboard"},

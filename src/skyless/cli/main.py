@@ -38,6 +38,7 @@ _GROUPS: Final = {
         ("anchor", "nodes.anchor", "Run anchors of a site."),
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
         ("dashboard", "dashboard", "Show a site live in the browser."),
+        ("bridge", "nodes.bridge", "Give positions to other tools: gpsd, ROS 2, autopilots, Home Assistant and more."),
     ),
     "Record and replay": (
         ("record", "nodes.record", "Record a running site into a file."),

@@ -11,7 +11,7 @@ from msgspec import Struct, structs
 from skyless.air.masterless_packets import Packet, Point
 from skyless.errors import ConfigurationError
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.messages import Counters, FixMessage
+from skyless.mqtt.messages import Counters, FixMessage, TagHealth
 from skyless.mqtt.topics import fix_topic, health_topic
 from skyless.nodes.fix_log import FixListener, FixLog
 from skyless.nodes.lateness import FIX_LEAVES_S
@@ -129,12 +129,13 @@ class PacketTags:
         *,
         simulated: Callable[[], bool],
         on_fix: FixListener | None = None,
+        on_health: Callable[[TagHealth], None] | None = None,
     ) -> None:
         """``simulated`` is asked again when a sniffer has restarted: its port may lead to another device.
 
-        ``on_fix`` is called with every fix that is to be published, with or without a broker.
+        ``on_fix`` and ``on_health`` are called with all that is to be published, with or without a broker.
         """
-        self._settings, self._log, self._on_fix = settings, log, on_fix
+        self._settings, self._log, self._on_fix, self._on_health = settings, log, on_fix, on_health
         self._links = tuple(link_of(address, radio.name, site=settings.site, kind="tag") for radio in radios)
         self.nodes = tuple(
             PacketTagNode(settings, radio, self._publisher(index), log) for index, radio in enumerate(radios)
@@ -176,6 +177,8 @@ class PacketTags:
                 memory_bytes=memory_bytes,
                 late_in_link=0 if link is None else link.late,
             )
+            if self._on_health is not None:
+                self._on_health(health)
             if link is not None:
                 if self._site_publisher is not None:
                     self._site_publisher.update(sum(each.monitor.restarts for each in self.nodes))
