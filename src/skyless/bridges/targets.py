@@ -31,6 +31,8 @@ TARGET_KINDS: Final = {
     "nmea+tcp": Kind("nmea", 10.0, 50.0, "NMEA 0183 for programs that connect: gpsd, QGIS, OpenCPN", 10110),
     "nmea+udp": Kind("nmea", 10.0, 50.0, "NMEA 0183 as datagrams", 10110),
     "nmea+pty": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a pseudo-terminal"),
+    "homeassistant": Kind("home_assistant.target", 10.0, 50.0, "tags as devices of Home Assistant, with their rooms"),
+    "prometheus": Kind("prometheus.target", 50.0, MOST_HZ, "figures for Prometheus at /metrics", 9464),
     "jsonl+tcp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a line, for programs that connect", 7010),
     "jsonl+udp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a datagram", 7010),
 }

@@ -28,7 +28,7 @@ STALE_S: Final = 5
 
 _MOST_TAGS: Final = 500
 _STD_CHANGE: Final = 1.25
-"""An accuracy that has changed by less than this factor is not sent again."""
+"""An accuracy that has changed by less than this factor counts as the same."""
 
 
 class MqttLink(Protocol):
@@ -156,11 +156,12 @@ class Announcer:
     def _has_changed(self, tag: _Tag, fix: FixMessage) -> bool:
         if tag.report is None or tag.reported_m is None or dist(fix.position_m, tag.reported_m) >= self._move_m:
             return True
-        now, before = _stds_m(fix)[0], tag.report.std_m
-        return max(now, before) > _STD_CHANGE * min(now, before)
+        return not _are_alike(_stds_m(fix)[0], tag.report.std_m)
 
     def _report(self, tag: _Tag, fix: FixMessage) -> None:
         std_m, horizontal_std_m = _stds_m(fix)
+        if tag.report is not None and _are_alike(std_m, tag.report.std_m):
+            std_m, horizontal_std_m = tag.report.std_m, tag.report.horizontal_std_m
         origin = self._site.georeference
         latitude_deg, longitude_deg, height_m = (
             (None, None, None) if origin is None else _rounded(geodetic(fix.position_m, origin))
@@ -217,6 +218,11 @@ class Announcer:
             return
         if kept.usable and kept.by == self._name and TAG_NAME.fullmatch(kept.tag) and len(self._kept) < _MOST_TAGS:
             self._kept[kept.tag] = STALE_S
+
+
+def _are_alike(a: float, b: float) -> bool:
+    """Whether two accuracies count as the same."""
+    return max(a, b) <= _STD_CHANGE * min(a, b)
 
 
 def _stds_m(fix: FixMessage) -> tuple[float, float]:

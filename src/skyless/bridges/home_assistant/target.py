@@ -48,8 +48,8 @@ class HomeAssistant(Target):
             raise SkylessError(f"{self.text} serves site {self._site.id}, not site {site.id}; start the bridge again")
         if site.georeference is None and (self._site is None or self._site.georeference is not None):
             self._context.log(
-                f"{self.text}: rooms without a position on the map: site {site.id} ({site.name}) does not say where it "
-                "is; its site file should have [georeference] with latitude_deg and longitude_deg"
+                f"{self.text} gives rooms, but no position on the map: site {site.id} ({site.name}) does not say where "
+                "it is; its site file should have [georeference] with latitude_deg and longitude_deg"
             )
         self._site = site
         if self._announcer is not None:
