@@ -15,7 +15,7 @@ SOURCE = Path(skyless.__file__).parent
 
 LAYERS = (
     {"constants", "errors", "method_names", "whole_files", "kernels", "firmware"},
-    {"arguments", "ticks"},
+    {"arguments", "rate_limit", "ticks"},
     {"air", "uncertainty"},
     {"site"},
     {"clocks", "radios.interface"},

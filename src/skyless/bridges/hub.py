@@ -12,15 +12,13 @@ from skyless.bridges.feed import BridgedSite, is_usable
 from skyless.bridges.target import Target
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
+from skyless.rate_limit import RateLimit
 
 NO_FIX_S: Final = 1.0
 """A tag has no fix once its last usable one is older."""
 
 _FORGET_S: Final = 3600.0
 """A tag without a fix for so long is not spoken of any more."""
-
-_LATE_SHARE: Final = 0.5
-"""A fix that comes late by up to this share of the interval does not lower the average rate."""
 
 
 class Route(Struct):
@@ -30,8 +28,8 @@ class Route(Struct):
     tag: str | None
     """The only tag; None for all, or for the first where the target carries one."""
     hz: float
-    due_s: dict[str, float] = {}
-    """When the next fix of each tag may go."""
+    rates: dict[str, RateLimit] = {}
+    """Of each tag."""
     others: bool = False
     """Whether it was logged that there are more tags than the target carries."""
     refused: bool = False
@@ -95,7 +93,7 @@ class Hub:
             return
         self.fixes += 1
         for route in self.routes:
-            if self._carries(route, fix.tag) and _is_due(route, fix.tag, now_s):
+            if self._carries(route, fix.tag) and self._is_due(route, fix.tag, now_s):
                 self._guard(route, lambda target: target.on_fix(fix))
 
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
@@ -118,6 +116,8 @@ class Hub:
             age_s = now_s - tag.usable_s
             if age_s > _FORGET_S:
                 del self._tags[name]
+                for route in self.routes:
+                    route.rates.pop(name, None)
             elif age_s >= NO_FIX_S and self.site is not None:
                 self._give_no_fix(name, unix_s, tag.reason)
         for route in self.routes:
@@ -139,6 +139,12 @@ class Hub:
             if route.faults == 1:
                 self._log(f"{route.target.text} failed ({error!r}); it is logged once")
 
+    @staticmethod
+    def _is_due(route: Route, tag: str, now_s: float) -> bool:
+        if tag not in route.rates:
+            route.rates[tag] = RateLimit(route.hz)
+        return route.rates[tag].is_due(now_s)
+
     def _carries(self, route: Route, tag: str) -> bool:
         """Whether a target gets a tag; one that carries a single one keeps to the first."""
         if route.tag is None and route.target.one_tag:
@@ -158,13 +164,3 @@ def open_hub(routes: Sequence[Route], log: Callable[[str], None]) -> Hub:
         if texts.count(text) > 1:
             raise SkylessError(f"the target {text!r} is given twice; give it once")
     return Hub(routes, log)
-
-
-def _is_due(route: Route, tag: str, now_s: float) -> bool:
-    """Whether the target's rate allows a fix of this tag now."""
-    interval_s = 1.0 / route.hz
-    due_s = route.due_s.get(tag, 0.0)
-    if now_s < due_s:
-        return False
-    route.due_s[tag] = max(due_s, now_s - _LATE_SHARE * interval_s) + interval_s
-    return True

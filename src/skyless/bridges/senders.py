@@ -52,7 +52,7 @@ class TcpServer:
         try:
             server = await loop.create_server(lambda: _TcpReader(self._readers, self._greeting), self._host, self.port)
         except OSError as error:
-            reason = error.strerror or error
+            reason = os.strerror(error.errno) if error.errno else error
             raise SkylessError(
                 f"the target {self._text!r} cannot listen on {self._host}:{self.port}: {reason}"
             ) from None

@@ -39,8 +39,6 @@ class BridgeState(Struct, frozen=True):
     """By target and reason: what its readers missed."""
     malformed: int
     """Messages of the broker that could not be read."""
-    trouble: str | None
-    """Why there is no broker; None while there is one."""
 
 
 class BridgeNode:
@@ -79,7 +77,6 @@ class BridgeNode:
             fixes=self.hub.fixes,
             dropped={route.target.text: dict(route.target.dropped) for route in self.hub.routes},
             malformed=sum(self._drops.values()),
-            trouble=self.link.trouble,
         )
 
     def _reader(self, kind: type[_Message], act: Callable[[_Message], None]) -> Handler:
