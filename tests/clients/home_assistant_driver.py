@@ -9,9 +9,14 @@ import signal
 import sys
 
 from homeassistant import bootstrap, runner
-from homeassistant.helpers import device_registry, entity_registry
+from homeassistant.helpers import entity_registry
 
 WATCHED = ("sensor", "binary_sensor", "device_tracker")
+
+
+def show(line):
+    sys.stdout.write(json.dumps(line) + "\n")
+    sys.stdout.flush()
 
 
 def state_of(hass, state):
@@ -35,7 +40,7 @@ async def main(folder, port):
         state = event.data["new_state"]
         if event.data["entity_id"].split(".")[0] in WATCHED:
             line = {"entity": event.data["entity_id"], "state": None} if state is None else state_of(hass, state)
-            print(json.dumps(line), flush=True)
+            show(line)
 
     hass.bus.async_listen("state_changed", changed)
     if not hass.config_entries.async_entries("mqtt"):
@@ -45,8 +50,8 @@ async def main(folder, port):
         )
         assert result["type"] == "create_entry", result
     for state in hass.states.async_all(WATCHED):
-        print(json.dumps(state_of(hass, state)), flush=True)
-    print(json.dumps({"ready": True}), flush=True)
+        show(state_of(hass, state))
+    show({"ready": True})
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, ended.set)

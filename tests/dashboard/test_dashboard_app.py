@@ -6,6 +6,7 @@ import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
@@ -21,6 +22,8 @@ from skyless.dashboard.live import (
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import Playback
 from skyless.mqtt import topics
+from skyless.site.earth import geodetic
+from skyless.site.model import GeoreferenceSite
 
 TOKEN = "correct-horse-battery"
 HERE = "http://localhost:8080"
@@ -315,8 +318,7 @@ def test_maps_get_the_tags_as_geojson(browser, live, wire, times):
     first, second = whole["features"]
     assert (whole["type"], first["type"], first["id"], second["id"]) == ("FeatureCollection", "Feature", "t1", "t3")
     longitude_deg, latitude_deg, height_m = first["geometry"]["coordinates"]
-    back = GeodeticFrame(EARTH).point(latitude_deg, longitude_deg, height_m)
-    assert back == pytest.approx((2.0, 3.0, 1.5), abs=1e-3)
+    assert geodetic((2.0, 3.0, 1.5), EARTH) == pytest.approx((latitude_deg, longitude_deg, height_m), abs=1e-8)
     assert first["properties"]["age_s"] == pytest.approx(2.0, abs=0.01)
     assert first["properties"]["horizontal_std_m"] == pytest.approx(0.02)
     assert second["properties"]["speed_mps"] is None

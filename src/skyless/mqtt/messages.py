@@ -84,7 +84,7 @@ class FixMessage(Struct, frozen=True):
     integrity_risk: float | None = None
     """Probability, for each fix, that the error exceeds its level."""
     alert: str | None = None
-    """A value of ``skyless.positioning.integrity.Alert``."""
+    """A value of ``skyless.positioning.alert.Alert``."""
 
 
 class Counters(Struct, frozen=True):

@@ -205,7 +205,12 @@ class Announcer:
             return
         if not kept:
             del self._tags[name]
-            for topic in (config_topic(self._prefix, self._site.id, name), tag_zones_topic(self._site.id, name)):
+            site = self._site.id
+            for topic in (
+                config_topic(self._prefix, site, name),
+                tag_zones_topic(site, name),
+                tag_report_topic(site, name),
+            ):
                 self._link.forget(topic)
         else:
             self._remove(tag, platforms(kept))

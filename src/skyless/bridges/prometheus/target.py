@@ -12,7 +12,7 @@ from skyless.bridges.target_url import TargetUrl
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
 
-PORT: Final = 9464
+_PORT: Final = 9464
 
 _MOST_CONNECTIONS: Final = 32
 _MOST_REQUEST_BYTES: Final = 8192
@@ -101,4 +101,4 @@ def _response(status: str, text: str, content_type: str = "text/plain; charset=u
 def make_target(url: TargetUrl, _context: BridgeContext) -> Prometheus:
     """``prometheus://[HOST][:PORT]``; with ``position=yes`` it gives where tags are. Raises SkylessError."""
     positions = url.choice("position", ("no", "yes"), "no") == "yes"
-    return Prometheus(url.text, url.host(), url.port(PORT), positions=positions)
+    return Prometheus(url.text, url.host(), url.port(_PORT), positions=positions)
