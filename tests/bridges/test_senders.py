@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import os
 import socket
 import stat
 
@@ -128,11 +127,11 @@ def test_a_pseudo_terminal_that_nobody_reads_holds_only_what_is_new(tmp_path):
     async def work():
         async with running(PtySender("p:", str(link), said.append)) as sender:
             assert str(link) in said[0]
-            assert stat.S_IMODE(os.stat(link).st_mode) == 0o666  # gpsd opens it without any rights
+            assert stat.S_IMODE(link.stat().st_mode) == 0o666  # gpsd opens it without any rights
             for number in range(3000):
                 sender.send(b"%07d\n" % number)
             assert sender.dropped["not-read"] > 0
-            with open(link, "rb", buffering=0) as port:
+            with link.open("rb", buffering=0) as port:
                 data = await asyncio.to_thread(port.read, 1 << 16)
                 assert len(data) <= 4096, "not more than the system itself holds"
                 assert int(data.split(b"\n")[-2]) == 2999 - (sender._pty._waiting != b"")
