@@ -23,7 +23,7 @@ LAYERS = (
     {"master_election", "slot_claims", "survey"},
     {"anchor", "anchors", "receiver", "receiver_state", "mqtt"},
     {"foxglove"},
-    {"simulation", "recordings"},
+    {"simulation", "recordings", "zones"},
     {"radios"},
     {"evaluation"},
     {"replays"},
