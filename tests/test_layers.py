@@ -28,7 +28,7 @@ LAYERS = (
     {"evaluation"},
     {"replays"},
     {"preparation", "bridges"},
-    {"nodes", "paper", "planning"},
+    {"nodes", "paper", "planning", "exports"},
     {"studies"},
     {"survey_inputs", "bench", "dashboard"},
     {"api"},

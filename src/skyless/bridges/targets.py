@@ -41,6 +41,7 @@ TARGET_KINDS: Final = {
     "mavlink+serial": Kind("mavlink.encoder", 30.0, 100.0, "MAVLink 2 for an autopilot on a serial port"),
     "osc+udp": Kind("osc", 60.0, MOST_HZ, "Open Sound Control: TouchDesigner, Unreal, Max", 9000),
     "psn": Kind("psn", 60.0, 200.0, "PosiStageNet: media servers, lighting consoles", 56565),
+    "ros2": Kind("ros2.target", 50.0, MOST_HZ, "topics of ROS 2, published by DDS without ROS being installed"),
 }
 
 
