@@ -44,6 +44,7 @@ NAVIGATION = {
     ],
     "In other tools": [
         "docs/tools/index",
+        "docs/tools/json_lines",
     ],
     "Reference": [
         "docs/reference/commands",

@@ -94,7 +94,7 @@ def heard_site(
     earth = None
     if page is not None:
         earth = GeoreferenceSite(page.latitude_deg, page.longitude_deg, page.height_m, page.heading_deg)
-    return BridgedSite(number, f"site {number}", simulated, dict(anchors_m), earth)
+    return BridgedSite(number, f"site {number}", simulated, dict(sorted(anchors_m.items())), earth)
 
 
 def _point(values: list[float]) -> Point:
