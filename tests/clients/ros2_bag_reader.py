@@ -3,6 +3,7 @@
 import json
 import sys
 from importlib import import_module
+from pathlib import Path
 
 from mcap.reader import make_reader
 from rclpy.serialization import deserialize_message
@@ -21,7 +22,7 @@ def plain(value):
 
 def main():
     found = []
-    with open(sys.argv[1], "rb") as file:
+    with Path(sys.argv[1]).open("rb") as file:
         reader = make_reader(file)
         profile = reader.get_header().profile
         for schema, channel, message in reader.iter_messages():

@@ -1,6 +1,6 @@
 """ROS 2 itself (Kilted, from its wheels) reads what Skyless gives: by DDS, through the one-file node, and in a bag.
 
-The wheels have no command ``ros2``; where one is found, it is asked, too. It is looked for in this environment and in PATH.
+The wheels have no command ``ros2``; where one is found, in this environment or in PATH, it is asked, too.
 """
 
 import asyncio
@@ -145,6 +145,8 @@ def door(request, ros, capfd):
     node = ros.start(ros.python, ROOT / "examples/ros2/skyless_node.py", "--ros-args", "-p", f"port:={port}")
     try:
         with Feed(f"jsonl+tcp://:{port}?hz=1000", print) as feed:
+            while "reading" not in (line := node.stderr.readline()):
+                assert line, "the node has ended"
             yield feed
     finally:
         node.send_signal(signal.SIGINT)
