@@ -7,7 +7,7 @@ from msgspec import Struct
 
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import FixMessage, Matrix, Vector, Zone
-from skyless.positioning.integrity import Alert
+from skyless.positioning.alert import Alert
 from skyless.site.model import GeoreferenceSite, Site, WallSite
 
 MIN_STD_M: Final = 0.01

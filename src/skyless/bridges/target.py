@@ -3,6 +3,7 @@
 A target whose readers get bytes consists of an ``Encoder``, which does no I/O, and a sender (``senders.py``).
 """
 
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Protocol
@@ -89,6 +90,10 @@ class Encoder:
         """As of a ``Target``."""
         return []
 
+    def on_bytes(self, data: bytes, unix_ns: int) -> list[bytes]:  # noqa: ARG002 - see above
+        """What a reader has sent, over UDP or a serial port, and when it came; the result answers it."""
+        return []
+
 
 class Sender(Protocol):
     """What carries bytes to readers."""
@@ -127,6 +132,10 @@ class StreamTarget(Target):
     def on_second(self, unix_s: float) -> None:
         """Send what is due once a second."""
         self._send(self._encoder.on_second(unix_s))
+
+    def on_bytes(self, data: bytes) -> None:
+        """Answer what a reader has just sent."""
+        self._send(self._encoder.on_bytes(data, time.time_ns()))
 
     async def run(self) -> None:
         """Serve until cancelled."""
