@@ -1,4 +1,4 @@
-"""The figures for Prometheus, read by its own Python client and by promtool: counters rise, ages grow, nothing is old."""
+"""The figures for Prometheus, read by its own Python client and by promtool: counters rise, ages grow."""
 
 import asyncio
 import shutil
