@@ -44,6 +44,8 @@ NAVIGATION = {
     ],
     "In other tools": [
         "docs/tools/index",
+        "docs/tools/gpsd",
+        "docs/tools/foxglove",
         "docs/tools/json_lines",
     ],
     "Reference": [

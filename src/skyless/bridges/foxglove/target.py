@@ -20,15 +20,13 @@ from skyless.bridges.foxglove.session import Session
 from skyless.bridges.target import BridgeContext, Target
 from skyless.bridges.target_url import TargetUrl
 from skyless.errors import SkylessError
-from skyless.foxglove.messages import ellipse, frame_transform, location_fix, pose_in_frame, scene
+from skyless.foxglove.messages import SCENE_TOPIC, ellipse, frame_transform, location_fix, pose_in_frame, scene
 from skyless.foxglove.schemas import foxglove_schema, schema_of
 from skyless.mqtt.messages import AnchorHealth, FixMessage, TagHealth
 
-PORT: Final = 8765
+_PORT: Final = 8765
 MOST_CLIENTS: Final = 32
 MOST_CHANNELS: Final = 2000
-
-SCENE_TOPIC: Final = "/site/scene"
 
 _MOST_REQUEST_BYTES: Final = 1 << 16
 _SEND_BUFFER_BYTES: Final = 1 << 16
@@ -51,7 +49,7 @@ class FoxgloveTarget(Target):
         self.port = port
         """The one that is used, where 0 was asked for and the server runs."""
         self._host, self._unix_time = host, unix_time
-        self._session = secrets.token_hex(4)
+        self._run = secrets.token_hex(4)
         self._site: BridgedSite | None = None
         self._channels: dict[int, Channel] = {}
         self._numbers: dict[str, int] = {}
@@ -123,7 +121,7 @@ class FoxgloveTarget(Target):
             socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES
         )
         session = Session(connection)
-        session.send_text(server_info("skyless", self._session))
+        session.send_text(server_info("skyless", self._run))
         if self._channels:
             session.send_text(advertise(tuple(self._channels.values())))
         self._sessions.add(session)
@@ -187,4 +185,4 @@ class FoxgloveTarget(Target):
 
 def make_target(url: TargetUrl, _context: BridgeContext) -> FoxgloveTarget:
     """Of ``foxglove://HOST:PORT``."""
-    return FoxgloveTarget(url.text, url.host(), url.port(PORT))
+    return FoxgloveTarget(url.text, url.host(), url.port(_PORT))
