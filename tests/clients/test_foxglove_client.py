@@ -18,7 +18,7 @@ from skyless.site.model import GeoreferenceSite, WallSite
 
 ROOT = Path(__file__).parents[2]
 CLIENT = Path(__file__).with_name("foxglove_client.cjs")
-PACKAGES = ("@foxglove/ws-protocol@0.8.0", "ws@8.18.3", "ajv@8.17.1")
+PACKAGES = ("@foxglove/ws-protocol@0.8.0", "@foxglove/schemas@2.1.0", "ws@8.18.3", "ajv@8.17.1")
 HALL = GeoreferenceSite(latitude_deg=52.5, longitude_deg=13.4, height_m=40.0, heading_deg=30.0)
 SITE = BridgedSite(
     1, "hall", simulated=True, anchors_m={1: (0.0, 0.0, 2.5), 2: (8.0, 0.0, 2.5), 3: (8.0, 6.0, 2.5)},
@@ -41,7 +41,7 @@ def modules():
     if shutil.which("node") is None or shutil.which("npm") is None:
         pytest.skip("Node.js is not installed: apt-get install nodejs npm")
     folder = ROOT / ".venv-clients" / "foxglove"
-    if not (folder / "node_modules" / "ajv").is_dir():
+    if not all((folder / "node_modules" / package.rpartition("@")[0]).is_dir() for package in PACKAGES):
         folder.mkdir(parents=True, exist_ok=True)
         command = ["npm", "install", "--no-audit", "--no-fund", "--prefix", str(folder), *PACKAGES]
         installed = subprocess.run(command, check=False, capture_output=True, text=True, cwd=folder)
