@@ -68,20 +68,15 @@ class FoxgloveTarget(Target):
             return
         shown = msgspec.structs.replace(fix, covariance_m2=floored(fix.covariance_m2))
         topic = f"/tag/{fix.tag}"
-        try:
-            self._give_fix(f"{topic}/fix", schema_of(FixMessage), fix, msgspec.json.encode)
-            self._give_foxglove("/tf", "foxglove.FrameTransform", fix, frame_transform)
+        self._give_fix(f"{topic}/fix", schema_of(FixMessage), fix, msgspec.json.encode)
+        self._give_foxglove("/tf", "foxglove.FrameTransform", fix, frame_transform)
+        self._give_foxglove(f"{topic}/pose", "foxglove.PoseInFrame", fix, lambda fix: pose_in_frame(fix, facing=False))
+        self._give_foxglove(f"{topic}/ellipse", "foxglove.SceneUpdate", shown, ellipse)
+        origin = site.georeference
+        if origin is not None:
             self._give_foxglove(
-                f"{topic}/pose", "foxglove.PoseInFrame", fix, lambda fix: pose_in_frame(fix, facing=False)
+                f"{topic}/location", "foxglove.LocationFix", shown, lambda fix: location_fix(fix, origin)
             )
-            self._give_foxglove(f"{topic}/ellipse", "foxglove.SceneUpdate", shown, ellipse)
-            origin = site.georeference
-            if origin is not None:
-                self._give_foxglove(
-                    f"{topic}/location", "foxglove.LocationFix", shown, lambda fix: location_fix(fix, origin)
-                )
-        except (ValueError, ArithmeticError):  # figures that no tag publishes
-            self.dropped["out-of-range"] += 1
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
         """Give a tag's state, for its rates and reasons."""
@@ -166,10 +161,13 @@ class FoxgloveTarget(Target):
         wanting = [session for session in self._sessions if session.wants(channel)]
         if not wanting:
             return
-        payload = encode()
-        for session in wanting:
-            if not session.send_data(channel, unix_s, payload):
-                self.dropped["slow-client"] += 1
+        try:
+            payload = encode()
+            for session in wanting:
+                if not session.send_data(channel, unix_s, payload):
+                    self.dropped["slow-client"] += 1
+        except (ValueError, ArithmeticError):  # figures that no tag publishes
+            self.dropped["out-of-range"] += 1
 
     def _advertise(self, topic: str, schema: tuple[str, bytes]) -> None:
         if len(self._channels) >= MOST_CHANNELS:
