@@ -68,7 +68,7 @@ class Encoder:
     """As of a ``Target``."""
 
     dropped: Counter[str]
-    """What could not be encoded, by reason; its target replaces it by the sender's, for one count of all."""
+    """As of its ``Target``: what it could not encode, by reason."""
 
     def greeting(self) -> list[bytes]:
         """For a reader that has just connected."""

@@ -16,9 +16,10 @@ from skyless.bridges.target import Target
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Handler, Link
-from skyless.mqtt.messages import AnchorHealth, FixMessage, SiteMessage, StatusMessage, TagHealth, Zone, ZonesMessage
+from skyless.mqtt.messages import AnchorHealth, FixMessage, SiteMessage, StatusMessage, TagHealth, ZonesMessage
 from skyless.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
 from skyless.nodes.process import HEALTH_S, Log, every, keep, together
+from skyless.zones.zone_list import BadZonesError, check_zones, zones_of
 
 _SILENT_S: Final = 5.0
 """After so long without a fix a line says where to look."""
@@ -51,7 +52,7 @@ class BridgeNode:
         self._last_fix_s = self._started_s
         self._is_silent = False
         self._site: SiteMessage | None = None
-        self._zones: tuple[Zone, ...] = ()
+        self._zones = ZonesMessage(())
         self._drops: Counter[str] = Counter()
         self._refused: asyncio.Future[None] | None = None
         subscribe = self.link.subscribe
@@ -99,14 +100,22 @@ class BridgeNode:
         self._update_site()
 
     def _on_zones(self, message: ZonesMessage) -> None:
-        self._zones = message.zones
-        self._update_site()
+        try:
+            for zones in (message.zones, *(other.zones for other in message.others)):
+                check_zones(zones)
+        except BadZonesError:
+            self._drops["zones"] += 1
+        else:
+            self._zones = message
+            self._update_site()
 
     def _update_site(self) -> None:
         if self._site is None:
             return
+        site = self._site.site
+        zones = zones_of(self._zones, site.name).zones
         try:
-            self.hub.on_site(bridged_site(self._site.site, self._zones, simulated=self._site.simulated))
+            self.hub.on_site(bridged_site(site, zones, simulated=self._site.simulated))
         except SkylessError as error:
             if self._refused is not None and not self._refused.done():
                 self._refused.set_exception(error)
