@@ -45,6 +45,9 @@ NAVIGATION = {
     "In other tools": [
         "docs/tools/index",
         "docs/tools/json_lines",
+        "docs/tools/ardupilot",
+        "docs/tools/px4",
+        "docs/tools/stage",
     ],
     "Reference": [
         "docs/reference/commands",
