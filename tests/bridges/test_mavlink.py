@@ -3,6 +3,7 @@
 import math
 import re
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -447,3 +448,16 @@ def test_the_payload_of_zeros_keeps_one_byte():
     data = encoded(Timesync(0, 0), sequence=0, system=1, component=1)
     assert data[1] == 1
     assert struct.unpack_from("<B", data, 10) == (0,)
+
+
+def test_the_parameters_of_ardupilots_page_are_a_file_that_its_programs_load(tmp_path):
+    """MAVProxy and the others read such files with pymavlink's reader."""
+    from pymavlink.mavparm import MAVParmDict
+
+    page = (Path(__file__).parents[2] / "docs" / "tools" / "ardupilot.md").read_text(encoding="utf-8")
+    file = tmp_path / "skyless.param"
+    file.write_text(re.search(r"^```\n(SERIAL.*?)^```", page, re.DOTALL | re.MULTILINE)[1], encoding="utf-8")
+    parameters = MAVParmDict()
+    assert parameters.load(str(file), use_excludes=False)
+    assert len(parameters) == 14
+    assert (parameters["EK3_SRC1_YAW"], parameters["VISO_TYPE"], parameters["EK3_SRC1_POSXY"]) == (1, 1, 6)
