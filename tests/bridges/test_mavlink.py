@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
+from skyless.bridges.hub import open_hub
 from skyless.bridges.mavlink.encoder import MavlinkEncoder
 from skyless.bridges.mavlink.frames import FrameReader, frame
 from skyless.bridges.mavlink.messages import (
@@ -398,6 +399,19 @@ def test_the_heading_of_a_site_that_has_none_can_be_given():
 def test_wrong_addresses_are_named(address, expected):
     with pytest.raises(SkylessError, match=re.escape(expected)):
         open_route(address, BridgeContext(print))
+
+
+@pytest.mark.parametrize(("key", "lines"), [("&tag=tag2", 0), ("", 1)])
+def test_a_tag_that_the_user_chose_is_not_argued_about(key, lines):
+    said = []
+    hub = open_hub(
+        [open_route(f"mavlink+udpout://127.0.0.1:9?profile=px4{key}", BridgeContext(said.append))], said.append
+    )
+    hub.on_site(SITE)
+    for serial in range(1, 4):
+        hub.on_fix(a_fix(tag="tag2", serial=serial), serial)
+        hub.on_fix(a_fix(tag="tag1", serial=serial), serial)
+    assert len([line for line in said if "carries one tag" in line]) == lines
 
 
 def test_a_gps_gets_no_origin():
