@@ -47,6 +47,9 @@ NAVIGATION = {
         "docs/tools/gpsd",
         "docs/tools/foxglove",
         "docs/tools/json_lines",
+        "docs/tools/ardupilot",
+        "docs/tools/px4",
+        "docs/tools/stage",
     ],
     "Reference": [
         "docs/reference/commands",

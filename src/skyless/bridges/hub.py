@@ -44,7 +44,7 @@ class Route(Struct):
     rates: dict[str, RateLimit] = {}
     """Of each tag."""
     others: bool = False
-    """Whether it was logged that there are more tags than the target carries."""
+    """Whether it needs no line that there are more tags than the target carries: there was one, or the user chose."""
     refused: bool = False
     """Whether the site lacks what the target needs, so that it gets nothing."""
     faults: int = 0
