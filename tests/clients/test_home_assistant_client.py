@@ -62,15 +62,16 @@ def python():
 class HomeAssistant:
     """A running core, and the newest state of each entity by its unique id."""
 
-    def __init__(self, python, folder, port):
+    def __init__(self, python, folder, port, *user):
         environment = {"PATH": "/usr/bin:/bin", "HOME": str(folder)}
-        self._process = Process(python, DRIVER, folder, port, env=environment, cwd=folder)
+        self._process = Process(python, DRIVER, folder, port, *user, env=environment, cwd=folder)
+        self.lines = self._process.lines
         self._process.said('"ready"')
 
     def states(self):
         """By unique id; entities that are gone are left out."""
         states, names = {}, {}
-        for line in self._process.lines:
+        for line in self.lines:
             value = json.loads(line) if line.startswith("{") else {}
             if value.get("state") is not None:
                 names[value["entity"]] = value["unique_id"]
@@ -139,7 +140,7 @@ def test_tags_are_devices_whose_rooms_follow_the_polygons(make_home, tmp_path):
         walk(site, [1.0, 2.0, 2.99, 3.01, 2.99])
         until(lambda: home.state("room", "walker") == "West", 5.0)
         walk(site, [3.5, 4.0, 4.0, 4.0, 4.0, 4.0])
-        rooms = [json.loads(line) for line in home._process.lines if "skyless_1_walker_room" in line]
+        rooms = [json.loads(line) for line in home.lines if "skyless_1_walker_room" in line]
         known = [value["state"] for value in rooms if value["state"] not in {"unavailable", "unknown"}]
         assert known[-1] == "East"
         until(lambda: home.state("room", "walker") == "unavailable")  # it sends no more fixes
