@@ -8,7 +8,7 @@ from msgspec import Struct
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import FixMessage, Matrix, Vector, Zone
 from skyless.positioning.alert import Alert
-from skyless.site.model import GeoreferenceSite, Site
+from skyless.site.model import GeoreferenceSite, Site, WallSite
 
 MIN_STD_M: Final = 0.01
 """Least standard deviation of an axis that leaves: the gates of other programs reject fixes with honest millimetres."""
@@ -28,12 +28,16 @@ class BridgedSite(Struct, frozen=True):
     """Positions of those that are known, in the site's frame."""
     georeference: GeoreferenceSite | None = None
     zones: tuple[Zone, ...] = ()
+    master: int | None = None
+    """The anchor that is the master by the site file; None where there is none, or it is not known."""
+    walls: tuple[WallSite, ...] = ()
+    """A tag by itself knows none."""
 
 
 def bridged_site(site: Site, zones: tuple[Zone, ...] = (), *, simulated: bool) -> BridgedSite:
     """The same of a whole site, as MQTT has it."""
     anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
-    return BridgedSite(site.id, site.name, simulated, anchors_m, site.georeference, zones)
+    return BridgedSite(site.id, site.name, simulated, anchors_m, site.georeference, zones, site.master, site.walls)
 
 
 def is_usable(fix: FixMessage) -> bool:

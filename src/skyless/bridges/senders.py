@@ -5,6 +5,7 @@ one, and what it reads afterwards is new.
 """
 
 import asyncio
+import contextlib
 import os
 import socket
 from collections import Counter
@@ -21,6 +22,8 @@ MOST_READERS: Final = 64
 
 _WAITING_BYTES: Final = 1 << 15
 """Bytes that may wait for one reader in this process, and as many in the system."""
+
+_MOST_DATAGRAM_BYTES: Final = 1 << 16
 
 _STUCK_S: Final = 5.0
 """A TCP reader that has taken nothing for so long is disconnected."""
@@ -112,9 +115,17 @@ class _TcpReader(asyncio.Protocol):
 class UdpSender:
     """Sends datagrams to one address: a host, a broadcast address or a multicast group."""
 
-    def __init__(self, text: str, host: str, port: int, log: Callable[[str], None], hops: int = 1) -> None:
-        """``hops``: networks that multicast may cross. Raises SkylessError: there is no such host."""
+    def __init__(
+        self, text: str, host: str, port: int, log: Callable[[str], None], hops: int = 1, interface: str = ""
+    ) -> None:
+        """``hops``: networks that multicast may cross; ``interface``: address of the network card that it leaves by.
+
+        Raises:
+            SkylessError: there is no such host or interface.
+        """
         self.dropped: Counter[str] = Counter()
+        self.received: Callable[[bytes], None] | None = None
+        """Called with each datagram that comes back, while it runs."""
         self._text, self._log, self._trouble = text, log, ""
         try:
             family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -127,6 +138,14 @@ class UdpSender:
         if family == socket.AF_INET:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
             self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, hops)
+        if interface:
+            try:
+                self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(interface))
+            except OSError:
+                raise SkylessError(
+                    f"the target {text!r} has interface={interface}; it should be the IPv4 address of a network card "
+                    "of this computer"
+                ) from None
 
     def send(self, data: bytes) -> None:
         """Send a datagram; the network may lose it."""
@@ -141,8 +160,18 @@ class UdpSender:
 
     async def run(self) -> None:
         """Keep the socket until cancelled."""
+        loop = asyncio.get_running_loop()
         with self._socket:
-            await asyncio.Event().wait()
+            if self.received is not None:
+                loop.add_reader(self._socket, self._read, self.received)
+            try:
+                await asyncio.Event().wait()
+            finally:
+                loop.remove_reader(self._socket)
+
+    def _read(self, received: Callable[[bytes], None]) -> None:
+        with contextlib.suppress(OSError):  # nothing to read after all, or what was sent found nobody
+            received(self._socket.recv(_MOST_DATAGRAM_BYTES))
 
 
 class PtySender:
@@ -179,6 +208,8 @@ class SerialSender:
 
     def __init__(self, text: str, path: str, baud: int, log: Callable[[str], None]) -> None:
         self.dropped: Counter[str] = Counter()
+        self.received: Callable[[bytes], None] | None = None
+        """Called with what comes."""
         self._port = SerialPort(path, baud, lambda reason: log(f"{text}: {reason}"))
         self._write: Callable[[bytes], None] | None = None
 
@@ -203,7 +234,9 @@ class SerialSender:
         self._port.clear_report()
 
     def on_data(self, data: bytes) -> None:
-        """What comes is not read."""
+        """Bytes have come."""
+        if self.received is not None:
+            self.received(data)
 
     def on_close(self) -> None:
         """The port is closed."""

@@ -3,6 +3,7 @@
 A target whose readers get bytes consists of an ``Encoder``, which does no I/O, and a sender (``senders.py``).
 """
 
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Protocol
@@ -66,6 +67,9 @@ class Encoder:
     one_tag = False
     """As of a ``Target``."""
 
+    dropped: Counter[str]
+    """As of its ``Target``: what it could not encode, by reason."""
+
     def greeting(self) -> list[bytes]:
         """For a reader that has just connected."""
         return []
@@ -84,6 +88,10 @@ class Encoder:
 
     def on_second(self, unix_s: float) -> list[bytes]:  # noqa: ARG002 - see above
         """As of a ``Target``."""
+        return []
+
+    def on_bytes(self, data: bytes, unix_ns: int) -> list[bytes]:  # noqa: ARG002 - see above
+        """What a reader has sent, over UDP or a serial port, and when it came; the result answers it."""
         return []
 
 
@@ -107,7 +115,7 @@ class StreamTarget(Target):
         super().__init__(text)
         self._encoder, self._sender = encoder, sender
         self.one_tag = encoder.one_tag
-        self.dropped = sender.dropped
+        self.dropped = encoder.dropped = sender.dropped
 
     def on_site(self, site: BridgedSite) -> None:
         """Let the encoder know it."""
@@ -124,6 +132,10 @@ class StreamTarget(Target):
     def on_second(self, unix_s: float) -> None:
         """Send what is due once a second."""
         self._send(self._encoder.on_second(unix_s))
+
+    def on_bytes(self, data: bytes) -> None:
+        """Answer what a reader has just sent."""
+        self._send(self._encoder.on_bytes(data, time.time_ns()))
 
     async def run(self) -> None:
         """Serve until cancelled."""

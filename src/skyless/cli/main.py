@@ -43,6 +43,7 @@ _GROUPS: Final = {
     "Record and replay": (
         ("record", "nodes.record", "Record a running site into a file."),
         ("replay", "replay", "Turn a recording into fixes and judge them against the truth."),
+        ("export", "export", "Write a recording as a bag of ROS 2, for its tools, Foxglove, Rerun and PlotJuggler."),
     ),
     "Emulate what is not there": (
         ("ether", "nodes.ether", "Emulate a site's air in real time, for the programs of anchors and tags."),

@@ -62,7 +62,7 @@ class TagOptions:
     anchors: Path | None = None
     """Table of anchors of another system (sniffers only): id,x_m,y_m,z_m, as skyless replay and calibrate take it."""
     to: tuple[str, ...] = ()
-    """A program or device of another kind that gets the fixes as well, without a broker; may be given several times.
+    """Where fixes go as well, without a broker: a program or device of another kind; may be given several times.
     skyless bridge --help lists the targets, as nmea+tcp://:10110."""
     tag_height: str | None = None
     """The tags' height (sniffers only): metres, free (estimated) or auto, the default: estimated unless the anchors
