@@ -24,10 +24,10 @@ _MISSED: Final = 2.5
 _LONGEST_S: Final = 10.0
 """... but than this in any case."""
 
-TICK_S: Final = 0.25
+SILENCE_CHECK_S: Final = 0.25
 """Interval in which ``on_tick`` is to be called."""
 
-_SECOND_S: Final = 1.0 - 0.1 * TICK_S
+_SECOND_S: Final = 1.0 - 0.1 * SILENCE_CHECK_S
 """After so long a second has gone by: ticks come late now and then."""
 
 _FORGET_S: Final = 3600.0
@@ -130,7 +130,7 @@ class Hub:
             self._guard(route, lambda target: target.on_status(status))
 
     def on_tick(self, now_s: float, unix_s: float) -> None:
-        """To be called every ``TICK_S``."""
+        """To be called every ``SILENCE_CHECK_S``."""
         for name, tag in tuple(self._tags.items()):
             age_s = now_s - tag.usable_s
             if age_s > _FORGET_S:

@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.bridges.feed import bridged_site
-from skyless.bridges.hub import TICK_S, Hub
+from skyless.bridges.hub import SILENCE_CHECK_S, Hub
 from skyless.bridges.target import Target
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
@@ -68,7 +68,9 @@ class BridgeNode:
         """Serve until cancelled. Raises SkylessError: a target cannot begin, or the site lacks what they need."""
         self._refused = asyncio.get_running_loop().create_future()
         targets = (run_target(route.target, self._log) for route in self.hub.routes)
-        await together(keep(self.link, self._log), _await(self._refused), *targets, every(TICK_S, self._on_tick))
+        await together(
+            keep(self.link, self._log), _await(self._refused), *targets, every(SILENCE_CHECK_S, self._on_tick)
+        )
 
     def state(self) -> BridgeState:
         """What it has done so far."""

@@ -9,7 +9,7 @@ from msgspec import structs
 from skyless.air.almanac import GeoreferencePage
 from skyless.air.masterless_packets import Point
 from skyless.bridges.feed import BridgedSite
-from skyless.bridges.hub import TICK_S, Hub
+from skyless.bridges.hub import SILENCE_CHECK_S, Hub
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import FixMessage, TagHealth
 from skyless.nodes.bridge.broker_bridge import run_target
@@ -58,7 +58,7 @@ class TagBridge:
     async def run(self) -> None:
         """Serve until cancelled. Raises SkylessError: a target cannot begin."""
         targets = (run_target(route.target, self._log) for route in self._hub.routes)
-        await together(*targets, every(TICK_S, lambda: self._hub.on_tick(time.monotonic(), time.time())))
+        await together(*targets, every(SILENCE_CHECK_S, lambda: self._hub.on_tick(time.monotonic(), time.time())))
 
 
 class _HeardSite:
