@@ -141,7 +141,7 @@ async def tpvs_of(transport, fixes, folder):
                         break
                     except TimeoutError:
                         continue
-            hub.on_tick(now_s + 1.0, fixes[-1].unix_s + 1.0)
+            hub.on_tick(now_s + 3.0, fixes[-1].unix_s + 3.0)
             outage = await client.receive(lambda report: report["class"] == "TPV" and report["mode"] == 1)
     finally:
         running.cancel()
