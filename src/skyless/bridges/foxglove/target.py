@@ -17,9 +17,8 @@ from websockets.typing import Subprotocol
 from skyless.bridges.feed import BridgedSite, floored
 from skyless.bridges.foxglove.protocol import SUBPROTOCOLS, Channel, advertise, server_info
 from skyless.bridges.foxglove.session import Session
-from skyless.bridges.target import BridgeContext, Target
+from skyless.bridges.target import BridgeContext, Target, cannot_listen
 from skyless.bridges.target_url import TargetUrl
-from skyless.errors import SkylessError
 from skyless.foxglove.messages import SCENE_TOPIC, ellipse, frame_transform, location_fix, pose_in_frame, scene
 from skyless.foxglove.schemas import foxglove_schema, schema_of
 from skyless.mqtt.messages import AnchorHealth, FixMessage, TagHealth
@@ -99,10 +98,7 @@ class FoxgloveTarget(Target):
                 logger=_quiet,
             )
         except OSError as error:
-            where = f"{self._host}:{self.port}"
-            raise SkylessError(
-                f"the target {self.text!r} cannot listen on {where}: {error.strerror or error}"
-            ) from None
+            raise cannot_listen(self.text, self._host, self.port, error) from None
         async with server:
             self.port = next(iter(server.sockets)).getsockname()[1]
             await server.serve_forever()
