@@ -1,8 +1,11 @@
-"""The figures for Prometheus, read by its own Python client and by promtool: counters rise, ages grow."""
+"""The figures for Prometheus, read by its own Python client and promtool: counters rise, ages grow, nothing is old."""
 
 import asyncio
+import json
+import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 from bridged_values import SITE, a_fix
@@ -246,3 +249,42 @@ def test_a_port_that_is_taken_is_named():
 
     with pytest.raises(SkylessError, match=r"prometheus://:\d+' cannot listen on 127.0.0.1:\d+: "):
         asyncio.run(twice())
+
+
+DASHBOARD = json.loads((Path(__file__).parents[2] / "docs" / "tools" / "skyless_grafana.json").read_text("utf-8"))
+QUERIES = [target["expr"] for panel in DASHBOARD["panels"] for target in panel["targets"]]
+
+
+def test_the_dashboard_of_grafana_is_one_that_can_be_imported():
+    """The keys that Grafana's import asks for; its own program cannot be had here."""
+    assert [given["name"] for given in DASHBOARD["__inputs"]] == ["DS_PROMETHEUS"]
+    assert {"uid", "title", "schemaVersion", "panels", "templating", "time"} <= DASHBOARD.keys()
+    panels = DASHBOARD["panels"]
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    assert {panel["type"] for panel in panels} == {panel["id"] for panel in DASHBOARD["__requires"][1:]}
+    assert all(panel["datasource"]["uid"] == "${DS_PROMETHEUS}" for panel in panels)
+    cells = [
+        (x, y)
+        for panel in panels
+        for x in range(panel["gridPos"]["x"], panel["gridPos"]["x"] + panel["gridPos"]["w"])
+        for y in range(panel["gridPos"]["y"], panel["gridPos"]["y"] + panel["gridPos"]["h"])
+    ]
+    assert len(set(cells)) == len(cells), "panels overlap"
+    assert max(x for x, _ in cells) < 24
+
+
+@pytest.mark.parametrize("query", QUERIES)
+def test_every_metric_of_the_dashboard_is_served(metrics, query):
+    served = {key[0] for key in read(metrics)}
+    assert set(re.findall(r"skyless_\w+", query)) <= served
+
+
+def test_prometheus_can_parse_every_query_of_the_dashboard(tmp_path):
+    if shutil.which("promtool") is None:
+        pytest.skip("promtool is not installed: apt-get install prometheus")
+    replaced = [query.replace("$__rate_interval", "1m").replace("$tag", ".*") for query in QUERIES]
+    rules = [{"record": f"a:r{k}", "expr": query} for k, query in enumerate(replaced)]
+    file = tmp_path / "rules.yml"
+    file.write_text(json.dumps({"groups": [{"name": "all", "rules": rules}]}), encoding="utf-8")
+    done = subprocess.run(["promtool", "check", "rules", file], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

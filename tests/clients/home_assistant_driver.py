@@ -1,6 +1,7 @@
 """Runs in Home Assistant's own environment: a real core, whose states it prints as lines of JSON.
 
-``home_assistant_driver.py FOLDER BROKER_PORT``. The first start adds the MQTT integration; it ends by SIGTERM.
+``home_assistant_driver.py FOLDER BROKER_PORT [USER]``. The first start adds the MQTT integration; it ends by SIGTERM.
+Where a user is named, it is made, and what a browser needs to be it is printed.
 """
 
 import asyncio
@@ -22,6 +23,7 @@ def show(line):
 def state_of(hass, state):
     entry = entity_registry.async_get(hass).async_get(state.entity_id)
     return {
+        "device": entry.device_id if entry else None,
         "entity": state.entity_id,
         "unique_id": entry.unique_id if entry else None,
         "state": state.state,
@@ -29,7 +31,24 @@ def state_of(hass, state):
     }
 
 
-async def main(folder, port):
+async def access_of(hass, name):
+    """What Home Assistant's page keeps in a browser."""
+    user = await hass.auth.async_create_user(name, group_ids=["system-admin"])
+    client = f"http://127.0.0.1:{hass.http.server_port}/"
+    token = await hass.auth.async_create_refresh_token(user, client)
+    access = {
+        "access_token": hass.auth.async_create_access_token(token),
+        "token_type": "Bearer",
+        "expires_in": 1800,
+        "hassUrl": client.rstrip("/"),
+        "clientId": client,
+        "expires": 4102444800000,
+        "refresh_token": token.token,
+    }
+    return {"access": access}
+
+
+async def main(folder, port, user=None):
     hass = await bootstrap.async_setup_hass(
         runner.RuntimeConfig(config_dir=folder, skip_pip=True, skip_pip_packages=[], recovery_mode=False)
     )
@@ -51,6 +70,8 @@ async def main(folder, port):
         assert result["type"] == "create_entry", result
     for state in hass.states.async_all(WATCHED):
         show(state_of(hass, state))
+    if user is not None:
+        show(await access_of(hass, user))
     show({"ready": True})
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

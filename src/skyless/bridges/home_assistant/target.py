@@ -3,6 +3,7 @@
 import asyncio
 import platform
 import re
+import time
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -75,7 +76,7 @@ class HomeAssistant(Target):
     def on_status(self, status: StatusMessage) -> None:
         """A tag that has gone becomes unavailable at once."""
         if self._announcer is not None and status.kind == "tag" and not status.online:
-            self._announcer.on_no_fix(status.name, status.unix_s)
+            self._announcer.on_no_fix(status.name, time.time())  # a last will has no time
 
     async def run(self) -> None:
         """Keep the link from the first fix until cancelled."""
