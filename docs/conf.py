@@ -44,6 +44,7 @@ NAVIGATION = {
     ],
     "In other tools": [
         "docs/tools/index",
+        "docs/tools/ros2",
         "docs/tools/gpsd",
         "docs/tools/foxglove",
         "docs/tools/json_lines",
