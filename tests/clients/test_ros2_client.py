@@ -276,3 +276,11 @@ def test_ros_reads_the_bag(ros, tmp_path):
         places = [tuple(one["pose"]["pose"]["position"][axis] for axis in "xyz") for one in poses]
         assert places == [fix.position_m for fix in fixes if fix.tag == tag]
     assert len(structs.asdict(fixes[0])["covariance_m2"]) == 9
+
+
+def test_lines_that_nobody_should_send_do_not_end_the_node(ros):
+    """A million: python tests/clients/ros2_garbage.py 1000000 1, with the Python of .venv-clients/ros2."""
+    run = ros.start(ros.python, HERE / "ros2_garbage.py", 5000, random.randrange(10**6))
+    out, said = run.communicate(timeout=4 * PATIENCE_S)
+    assert run.returncode == 0, said
+    assert json.loads(out)["last"] == {"tag1": 1}
