@@ -110,8 +110,9 @@ class SkylessNode(Node):
     def publish(self, line: dict[str, Any]) -> None:
         """Publish one line. Raises many things where it is not as it should be."""
         if line["type"] == "site":
-            self.origin = line["georeference"]
-            self.anchors.publish(anchor_markers(line["anchors_m"], self.frame))
+            markers, origin = anchor_markers(line["anchors_m"], self.frame), origin_of(line["georeference"])
+            self.anchors.publish(markers)
+            self.origin = origin
         elif line["type"] == "fix":
             self.publish_fix(line)
         elif line["type"] == "no_fix":
@@ -263,6 +264,16 @@ def anchor_markers(anchors_m: dict[str, list[float]], frame: str) -> MarkerArray
             marker.text = number if shape == Marker.TEXT_VIEW_FACING else ""
             found.append(marker)
     return MarkerArray(markers=found)
+
+
+def origin_of(georeference: dict[str, Any] | None) -> dict[str, float] | None:
+    """Where the site's origin is on the Earth, if that is known. Raises ValueError, KeyError, TypeError."""
+    if georeference is None:
+        return None
+    origin = {key: float(georeference[key]) for key in ("latitude_deg", "longitude_deg", "height_m", "heading_deg")}
+    if not all(map(math.isfinite, origin.values())):
+        raise ValueError(f"the site is at {georeference}")
+    return origin
 
 
 def towards_east(covariance: list[float], origin: dict[str, float]) -> list[float]:

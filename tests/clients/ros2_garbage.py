@@ -19,7 +19,8 @@ FIX = {
     "velocity_mps": [1.0, 0.0, 0.0],
     "velocity_covariance": [0.01] * 9,
 }
-SITE = {"type": "site", "anchors_m": {"1": [0.0, 1.0, 2.0]}, "georeference": None}
+PLACE = {"latitude_deg": 52.0, "longitude_deg": 13.0, "height_m": 34.0, "heading_deg": 30.0}
+SITE = {"type": "site", "anchors_m": {"1": [0.0, 1.0, 2.0]}, "georeference": PLACE}
 WORDS = [None, True, -1, 1e308, 2**80, "", "x" * 300, "\u0000", [], {}, [[]], "fix", "NaN", -1e-300]
 
 
