@@ -120,6 +120,11 @@ class PacketTracking:
         return self._tracking
 
     @property
+    def anchors_m(self) -> Mapping[int, Point]:
+        """Positions that are known, surveyed or stated by packets."""
+        return self._positions_m
+
+    @property
     def drops(self) -> Counter[str]:
         """What was not used, by reason."""
         self._count_relays()
