@@ -12,6 +12,7 @@ from typing import Final
 from msgspec import Struct, structs
 
 from skyless.air.masterless_packets import Packet, Point
+from skyless.constants import TICK_BITS
 from skyless.errors import ConfigurationError
 from skyless.evaluation.observability import GUESSED_STD_M, plane_height_m
 from skyless.mqtt.address import MqttAddress
@@ -22,9 +23,10 @@ from skyless.nodes.lateness import FIX_LEAVES_S
 from skyless.nodes.process import HEALTH_S, Log, SitePublisher, Usage, every, keep, link_of, together
 from skyless.nodes.radio_monitor import RadioMonitor
 from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
-from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
+from skyless.positioning.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.radios.interface import Gone, Restarted
 from skyless.radios.serial.foreign_radios import SnifferRadio, UciRadio
+from skyless.recordings.foreign.bitcraze import STAMP_BITS
 from skyless.site.check import check_site
 from skyless.site.model import AnchorSite, Site, TagsSite
 
@@ -99,9 +101,15 @@ class PacketTagNode:
 
     def _new_tracking(self) -> PacketTracking:
         asked = self.settings
-        known = {"height_m": self._height_m, "height_std_m": self._height_std_m}
-        filter_settings = structs.replace(MASTERLESS, qa=asked.qa, **known)
-        return PacketTracking(filter_settings, asked.anchors_m, calibration=asked.calibration)
+        known = {"qa": asked.qa, "height_m": self._height_m, "height_std_m": self._height_std_m}
+        is_dl_tdoa = isinstance(self.radio, UciRadio)
+        return PacketTracking(
+            structs.replace(DL_TDOA if is_dl_tdoa else MASTERLESS, **known),
+            asked.anchors_m,
+            TICK_BITS if is_dl_tdoa else STAMP_BITS,
+            calibration=asked.calibration,
+            one_way=structs.replace(DL_TDOA_ONE_WAY, **known) if is_dl_tdoa else None,
+        )
 
     @property
     def drops(self) -> Counter[str]:

@@ -1,13 +1,16 @@
 """An emulated FiRa board: a site's beacons as the rounds of a DL-TDoA session, in notifications of UCI.
 
 Every superframe is a round. The master's beacon is the poll; those of the other anchors are the responses, as each
-holds when its sender received the master's.
+holds when its sender received the master's. Where anchors have two frames in a superframe, the master's second one is
+the final message, which holds when it received the responses; what comes after it belongs to no round.
 """
 
 from collections import Counter
 from collections.abc import Callable
 from math import dist
 from typing import Final, Literal
+
+from msgspec.structs import replace
 
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
@@ -37,20 +40,25 @@ _RELATIVE_2: Final = bytes((1, 1 | 1 << 1))
 
 
 class UciProtocol:
-    """What the board sends; a round as soon as all have been heard that were in the one before, or with the next."""
+    """What the board sends: a round, as soon as it holds all messages that the one before had, or with the next poll.
+
+    What joins a round after that has a notification of its own.
+    """
 
     def __init__(self, send: Callable[[bytes], bool], version: Literal[1, 2]) -> None:
         self._send, self._version = send, version
         self._almanac = AlmanacAssembly()
-        self._round: dict[int, DtMeasurement] = {}
-        self._usual: frozenset[int] = frozenset()
-        self._is_sent = True
+        self._heard: set[tuple[int, DtMessageType]] = set()
+        """Messages of this round."""
+        self._usual: set[tuple[int, DtMessageType]] = set()
+        """Those of the round before."""
+        self._waiting: list[tuple[Beacon, DtMeasurement]] = []
         self._poll: Beacon | None = None
         self._sequence = 0
         self.drops: Counter[str] = Counter()
 
     def on_radio_event(self, event: RadioEvent) -> None:
-        """Add a beacon to its round, and send the round before or the one that it completes."""
+        """Add a beacon to its round."""
         if not isinstance(event, Reception):
             return
         beacon = decode_cached(event.frame)
@@ -58,16 +66,20 @@ class UciProtocol:
             self.drops["not-translated"] += 1
             return
         self._almanac.add_page(beacon.almanac_issue, beacon.page)
-        if beacon.anchor == beacon.master:
-            self._finish()
-            self._usual, self._round, self._is_sent, self._poll = frozenset(self._round), {}, False, beacon
+        poll = self._poll
+        if beacon.anchor == beacon.master and (poll is None or beacon.superframe != poll.superframe):
+            self._notify()
+            self._usual, self._heard, self._poll = self._heard, set(), beacon
         measurement = self._measurement(beacon, event)
         if measurement is None:
             self.drops["not-of-a-round"] += 1
             return
-        self._round[beacon.anchor] = measurement
-        if self._usual and self._usual <= self._round.keys():
-            self._finish()
+        self._heard.add((beacon.anchor, DtMessageType(measurement.message)))
+        if measurement.message == DtMessageType.FINAL:
+            self._waiting = [(sent, _answered(one, sent, beacon)) for sent, one in self._waiting]
+        self._waiting.append((beacon, measurement))
+        if self._usual <= self._heard or len(self._waiting) >= _MOST_MEASUREMENTS:
+            self._notify()
 
     def on_host_data(self, data: bytes) -> None:
         """It takes no commands: its session goes on from the start."""
@@ -75,11 +87,15 @@ class UciProtocol:
     def _measurement(self, beacon: Beacon, reception: Reception) -> DtMeasurement | None:
         """What the board reports of a beacon; None for one that answers no poll of this round."""
         poll, heard = self._poll, beacon.master_heard
-        if poll is None or self._is_sent or len(self._round) >= _MOST_MEASUREMENTS:
+        if poll is None or (poll.anchor, DtMessageType.FINAL) in self._heard:
             return None
         reply = flight = 0
-        is_poll = beacon is poll
-        if not is_poll:
+        if beacon is poll:
+            kind = DtMessageType.POLL
+        elif beacon.anchor == poll.anchor:
+            kind = DtMessageType.FINAL
+        else:
+            kind = DtMessageType.RESPONSE
             if heard is None or (heard.anchor, heard.sequence) != (poll.anchor, poll.sequence):
                 return None
             reply = difference(beacon.tx_ticks, heard.rx_ticks)
@@ -90,7 +106,7 @@ class UciProtocol:
         location = self._location(beacon.anchor)
         return DtMeasurement(
             address=beacon.anchor,
-            message=DtMessageType.POLL if is_poll else DtMessageType.RESPONSE,
+            message=kind,
             block=poll.superframe & 0xFFFF,
             round=0,
             tx_ticks=beacon.tx_ticks,
@@ -124,11 +140,19 @@ class UciProtocol:
     def _position_m(self, anchor: int) -> Point | None:
         return self._almanac.anchors_m.get(anchor)
 
-    def _finish(self) -> None:
-        """Send the round, if it is not sent yet."""
-        if self._is_sent or not self._round:
+    def _notify(self) -> None:
+        if not self._waiting:
             return
-        self._is_sent = True
-        info = SessionInfo(self._sequence, _SESSION, self._version, tuple(self._round.values()))
+        info = SessionInfo(self._sequence, _SESSION, self._version, tuple(one for _, one in self._waiting))
+        self._waiting.clear()
         self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
         self._send(encode_packet(encode_session_info(info)))
+
+
+def _answered(one: DtMeasurement, sent: Beacon, final: Beacon) -> DtMeasurement:
+    """A response with the reply of the final message, where the initiator received it."""
+    heard = next((entry for entry in final.heard if entry.anchor == one.address), None)
+    if one.message != DtMessageType.RESPONSE or heard is None or heard.sequence != sent.sequence:
+        return one
+    reply = difference(final.tx_ticks, heard.rx_ticks)
+    return replace(one, initiator_reply_ticks=reply) if 0 < reply <= _MOST_REPLY_TICKS else one

@@ -69,8 +69,8 @@ class TagOptions:
     """Table of anchors of another system (sniffers and FiRa boards): id,x_m,y_m,z_m, as skyless replay and calibrate
     take it. FiRa boards need none where anchors state their positions."""
     tag_height: str | None = None
-    """The tags' height (sniffers and FiRa boards): metres, free (estimated) or auto, the default: estimated unless the anchors
-    lie too flat, then theirs."""
+    """The tags' height (sniffers and FiRa boards): metres, free (estimated) or auto, the default: estimated unless the
+    anchors lie too flat, then theirs."""
 
 
 @app.default

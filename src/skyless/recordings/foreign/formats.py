@@ -34,8 +34,8 @@ class Format:
     """One recording holds several listeners, one of which is chosen."""
     hexadecimal: bool = False
     """Identifiers are hexadecimal."""
-    states_positions: bool = False
-    """Its packets may state where their senders are."""
+    is_dl_tdoa: bool = False
+    """FiRa's: packets may state where their senders are, and relay only initiators and those that answered them."""
     delays_ticks: int = 0
     """Antenna delays of a sender and a receiver together, where its stamps include them."""
 
@@ -80,7 +80,7 @@ FORMATS: Final = (
         phones.recognise,
         phones.read,
         TICK_BITS,
-        states_positions=True,
+        is_dl_tdoa=True,
     ),
     Format(
         "uci-text",
@@ -88,7 +88,7 @@ FORMATS: Final = (
         fira.recognise_text,
         fira.read_text,
         TICK_BITS,
-        states_positions=True,
+        is_dl_tdoa=True,
     ),
     Format("tdoa-table", "Table t_s,idA,idB,tdoa_m", tdoa_tables.recognise_tdoas, tdoa_tables.read_tdoas, None),
     Format(
@@ -105,7 +105,7 @@ FORMATS: Final = (
         fira.recognise_binary,
         fira.read_binary,
         TICK_BITS,
-        states_positions=True,
+        is_dl_tdoa=True,
     ),
 )
 """In the order in which they are tried: the more particular first."""
