@@ -42,6 +42,15 @@ NAVIGATION = {
         "CONTRIBUTING",
         "SECURITY",
     ],
+    "In other tools": [
+        "docs/tools/index",
+        "docs/tools/gpsd",
+        "docs/tools/foxglove",
+        "docs/tools/json_lines",
+        "docs/tools/ardupilot",
+        "docs/tools/px4",
+        "docs/tools/stage",
+    ],
     "Reference": [
         "docs/reference/commands",
         "docs/reference/python",

@@ -21,6 +21,12 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         compile_with_counts(missing(EVERY_PART))
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Clients that need environments of their own run only when they are asked for: ``scripts/test clients``."""
+    asked = any("clients" in argument for argument in config.args)
+    return True if collection_path.name == "clients" and not asked else None
+
+
 @pytest.fixture(scope="session", autouse=True)
 def own_data_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What programs keep for their user (broker, recordings) stays out of the real user's folders."""

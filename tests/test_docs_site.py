@@ -162,7 +162,7 @@ def test_every_page_is_in_the_navigation():
 
 
 def test_every_picture_is_shown():
-    pattern = r"[(\"](?:docs/)?pictures/(\w+\.(?:svg|webp))[)\"]"
+    pattern = r"[(\"](?:docs/|\.\./)?pictures/(\w+\.(?:svg|webp))[)\"]"
     shown = {name for page in PAGES for name in re.findall(pattern, prose(page))}
     assert shown == {path.name for path in (ROOT / "docs" / "pictures").iterdir() if path.suffix in {".svg", ".webp"}}
 

@@ -15,6 +15,7 @@ WORDS = 2
 
 OF_SEVERAL_TYPES = {
     "--site": "a site file; where a site is emulated or shown also lab",
+    "--to": "a folder; where a site runs, targets",
 }
 """Options whose type differs, and what they mean all the same."""
 

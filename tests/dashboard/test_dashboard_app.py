@@ -6,6 +6,7 @@ import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
@@ -21,6 +22,8 @@ from skyless.dashboard.live import (
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import Playback
 from skyless.mqtt import topics
+from skyless.site.earth import geodetic
+from skyless.site.model import GeoreferenceSite
 
 TOKEN = "correct-horse-battery"
 HERE = "http://localhost:8080"
@@ -297,3 +300,39 @@ def test_without_the_token_every_request_of_a_stranger_is_refused(headers, query
     asyncio.run(Guard(inside, AccessRules(TOKEN, remote=True))(scope, None, send))
     assert sent[0].get("status", 403) in {401, 403, 421}
     assert sent[0]["type"] in {"http.response.start", "websocket.close"}
+
+
+EARTH = GeoreferenceSite(latitude_deg=48.137, longitude_deg=11.576, height_m=520.0, heading_deg=30.0)
+EARTHLY = replace(SITE, site=replace(SITE.site, georeference=EARTH))
+
+
+def test_maps_get_the_tags_as_geojson(browser, live, wire, times):
+    wire.deliver(topics.site_topic(SITE_ID), EARTHLY)
+    wire.deliver(topics.fix_topic(SITE_ID, "t1"), fix(std_m=0.02, position_m=(2.0, 3.0, 1.5)))
+    wire.deliver(topics.fix_topic(SITE_ID, "t2"), fix("t2", alert="alert-limit-exceeded"))
+    times.move(2.0)
+    wire.deliver(topics.fix_topic(SITE_ID, "t3"), fix("t3", velocity_mps=None, unix_s=times.unix_s))
+    answer = browser.get("/fixes.geojson")
+    assert answer.headers["content-type"] == "application/geo+json"
+    whole = answer.json()
+    first, second = whole["features"]
+    assert (whole["type"], first["type"], first["id"], second["id"]) == ("FeatureCollection", "Feature", "t1", "t3")
+    longitude_deg, latitude_deg, height_m = first["geometry"]["coordinates"]
+    assert geodetic((2.0, 3.0, 1.5), EARTH) == pytest.approx((latitude_deg, longitude_deg, height_m), abs=1e-8)
+    assert first["properties"]["age_s"] == pytest.approx(2.0, abs=0.01)
+    assert first["properties"]["horizontal_std_m"] == pytest.approx(0.02)
+    assert second["properties"]["speed_mps"] is None
+    times.move(4.0)
+    assert [feature["id"] for feature in browser.get("/fixes.geojson").json()["features"]] == ["t3"]
+
+
+def test_a_site_that_is_nowhere_on_the_earth_says_what_is_missing(browser, live, wire):
+    assert browser.get("/fixes.geojson").status_code == 404
+    wire.deliver(topics.site_topic(SITE_ID), SITE)
+    answer = browser.get("/fixes.geojson")
+    assert answer.status_code == 409
+    assert "[georeference] with latitude_deg, longitude_deg" in answer.json()["error"]
+
+
+def test_strangers_need_the_token_for_positions(stranger):
+    assert stranger.get("/fixes.geojson").status_code == 401

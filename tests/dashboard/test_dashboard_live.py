@@ -11,9 +11,11 @@ from test_dashboard_condition import anchor_health
 
 from skyless.dashboard.events import SILENT_S
 from skyless.dashboard.live import LiveSite
-from skyless.dashboard.zones import MAX_EVENTS, TAG_TIMEOUT_S, BadZonesError
+from skyless.dashboard.zone_events import MAX_EVENTS
 from skyless.mqtt import topics
 from skyless.mqtt.messages import PreparationMessage, SiteZones, ZoneEvent, ZonesMessage
+from skyless.zones.monitor import TAG_TIMEOUT_S
+from skyless.zones.zone_list import BadZonesError
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)

@@ -10,19 +10,10 @@ from hypothesis import strategies as st
 from matplotlib.path import Path
 from msgspec.structs import replace
 
-from skyless.dashboard.zones import (
-    CROSSING_S,
-    MIN_MARGIN_M,
-    TAG_TIMEOUT_S,
-    TAKEOVER_S,
-    BadZonesError,
-    EventQueue,
-    ZoneMonitor,
-    publisher_rank,
-    read_zones,
-    zones_of,
-)
+from skyless.dashboard.zone_events import TAKEOVER_S, EventQueue, publisher_rank
 from skyless.mqtt.messages import Zone, ZoneEvent, ZonesMessage
+from skyless.zones.monitor import CROSSING_S, MIN_MARGIN_M, TAG_TIMEOUT_S, ZoneMonitor
+from skyless.zones.zone_list import BadZonesError, read_zones, zones_of
 
 INSIDE, OUTSIDE = (2.0, 2.0, 1.0), (8.0, 2.0, 1.0)
 
@@ -127,6 +118,16 @@ def test_a_tag_that_goes_offline_leaves_at_once():
     assert [event.kind for event in monitor.remove_tag("t1", 7.0)] == ["leave"]
     assert monitor.remove_tag("t1", 8.0) == []
     assert monitor.remove_tag("nobody", 8.0) == []
+
+
+def test_of_the_zones_that_a_tag_is_in_the_smallest_comes_first():
+    hall = Zone("hall", "Hall", ((0.0, 0.0), (9.0, 0.0), (9.0, 9.0), (0.0, 9.0)))
+    monitor = monitor_of(hall, SQUARE)
+    assert monitor.zones_with("t1") == []
+    walk(monitor, [2.0])
+    assert monitor.zones_with("t1") == [SQUARE, hall]
+    walk(monitor, [4.0], begin_s=1.0)
+    assert monitor.zones_with("t1") == [hall]
 
 
 def test_tags_in_a_deleted_zone_leave_it():

@@ -26,6 +26,8 @@ STRUCTS = {
     topics.truth_topic(SITE): messages.TruthMessage,
     topics.zones_topic(SITE): messages.ZonesMessage,
     topics.zone_event_topic(SITE, "<zone>"): messages.ZoneEvent,
+    topics.tag_zones_topic(SITE, TAG): messages.TagZones,
+    topics.tag_report_topic(SITE, TAG): messages.TagReport,
     topics.stamps_topic(SITE, "<id>"): messages.StampsMessage,
     topics.survey_topic(SITE): messages.SurveyMessage,
     topics.survey_facts_topic(SITE): messages.SurveyFactsMessage,

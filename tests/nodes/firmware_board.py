@@ -6,10 +6,10 @@ import time
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.firmware import board, dw1000
-from skyless.nodes.board import Pty
 from skyless.nodes.open_radio import open_radios
 from skyless.radios.dw1000.model import ETHER_LEAD_TICKS
 from skyless.radios.interface import AntennaDelays, Gone, Restarted, Sent
+from skyless.radios.serial.pseudo_terminal import Pty
 from skyless.simulation.dw1000.chip import Chip, ModelBus
 from skyless.ticks import difference
 

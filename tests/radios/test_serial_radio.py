@@ -17,10 +17,11 @@ from skyless.anchor import Anchor
 from skyless.errors import SkylessError
 from skyless.evaluation.scenarios import Request, impairments_of
 from skyless.firmware import link
-from skyless.nodes.board import ListenerProtocol, Pty
+from skyless.nodes.board import ListenerProtocol
 from skyless.nodes.open_radio import is_simulated, open_radios, open_sniffers
 from skyless.radios.interface import AntennaDelays, Gone, Late, Restarted, Sent
 from skyless.radios.serial.foreign_radios import ListenerRadio
+from skyless.radios.serial.pseudo_terminal import Pty
 from skyless.radios.serial.serial_radio import SerialRadio
 from skyless.receiver import Receiver
 from skyless.simulation.stations import TagSpec

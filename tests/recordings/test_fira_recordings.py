@@ -7,7 +7,6 @@ import random
 from collections import Counter
 from math import degrees, dist
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,7 +18,7 @@ from skyless.air.uci_location import GeodeticPoint, encode_wgs84
 from skyless.constants import TICK_M, TICK_RATE_HZ
 from skyless.recordings.foreign import fira, phones
 from skyless.recordings.foreign.anchor_frame import east_north_up_m
-from skyless.site.georeference import to_wgs84
+from skyless.site.earth import geodetic
 from skyless.site.model import GeoreferenceSite
 
 LINES = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000")) // 4
@@ -87,7 +86,7 @@ def test_measurements_are_put_into_the_order_of_their_reception():
 
 def test_positions_on_the_earth_are_in_the_frame_of_the_first():
     origin = GeoreferenceSite(latitude_deg=48.1, longitude_deg=11.5, height_m=500.0, heading_deg=0.0)
-    longitude, latitude, height = to_wgs84(np.array([(30.0, -40.0, 2.5)]), origin)[0].tolist()
+    latitude, longitude, height = geodetic((30.0, -40.0, 2.5), origin)
     here = GeodeticPoint(48.1, 11.5, 500.0)
     assert dist(east_north_up_m(GeodeticPoint(latitude, longitude, height), here), (30.0, -40.0, 2.5)) < 1e-3
     tag = fira.DtTag(Counter())

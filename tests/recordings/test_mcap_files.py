@@ -17,10 +17,11 @@ from hypothesis import strategies as st
 from live_site import PLACES, SITE, UNIX_S, messages, record
 
 from skyless.errors import SkylessError
+from skyless.foxglove.messages import ellipse_of
+from skyless.foxglove.schemas import schema_of
 from skyless.mqtt import messages as outputs
 from skyless.mqtt.messages import FixMessage
-from skyless.recordings.mcap.channels import channel_of, schema_of
-from skyless.recordings.mcap.foxglove import ellipse_of
+from skyless.recordings.mcap.channels import channel_of
 from skyless.recordings.mcap.recorder import McapFile
 from skyless.recordings.mcap.recording import McapRecording
 

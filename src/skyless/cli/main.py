@@ -38,10 +38,12 @@ _GROUPS: Final = {
         ("anchor", "nodes.anchor", "Run anchors of a site."),
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
         ("dashboard", "dashboard", "Show a site live in the browser."),
+        ("bridge", "nodes.bridge", "Give positions to other tools: gpsd, ROS 2, autopilots, Home Assistant and more."),
     ),
     "Record and replay": (
         ("record", "nodes.record", "Record a running site into a file."),
         ("replay", "replay", "Turn a recording into fixes and judge them against the truth."),
+        ("export", "export", "Write a recording as a bag of ROS 2, for its tools, Foxglove, Rerun and PlotJuggler."),
     ),
     "Emulate what is not there": (
         ("ether", "nodes.ether", "Emulate a site's air in real time, for the programs of anchors and tags."),

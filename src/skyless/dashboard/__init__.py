@@ -1,5 +1,5 @@
 """The live page: what it shows, and the server that it talks to.
 
 Public: app, guard, live, overlays, playback, processors, serve.
-Within the package: overlay_process, polygon, state, zones.
+Within the package: geojson, overlay_process, state, zone_events.
 """

@@ -18,14 +18,16 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from skyless.dashboard.geojson import MEDIA_TYPE
 from skyless.dashboard.guard import AccessRules, Guard
-from skyless.dashboard.live import LiveSite, NoBrokerError, TooManyPagesError
+from skyless.dashboard.live import LiveSite, NoBrokerError, NoSiteError, TooManyPagesError
 from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.dashboard.site_survey import NoResultError
-from skyless.dashboard.zones import BadZonesError, read_zones
+from skyless.errors import SkylessError
 from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.image import image_size
+from skyless.zones.zone_list import BadZonesError, read_zones
 
 _PAGE: Final = Path(__file__).parent / "page"
 PAGE_TIMEOUT_S: Final = 10.0
@@ -42,6 +44,7 @@ _STATUSES: Final[dict[type[Exception], int]] = {
     BadZonesError: 400,
     BadFactsError: 400,
     NoRecordingError: 404,
+    NoSiteError: 404,
     NoResultError: 409,
     NoOverlayError: 422,
     NoBrokerError: 503,
@@ -69,6 +72,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
 
     routes = [
         Route("/", index),
+        Route("/fixes.geojson", _fixes),
         Route("/api/floor_plan", _floor_plan),
         Route("/api/floor_plan", _put_floor_plan, methods=["PUT"]),
         Route("/api/overlay", _overlay),
@@ -119,6 +123,14 @@ def _json(value: object) -> Response:
 def _services(request: Request | WebSocket) -> Services:
     services: Services = request.app.state.services
     return services
+
+
+async def _fixes(request: Request) -> Response:
+    try:
+        features = _services(request).live.features()
+    except SkylessError as error:
+        raise HTTPException(409, str(error)) from None
+    return Response(features, media_type=MEDIA_TYPE, headers={"Cache-Control": "no-store"})
 
 
 async def _floor_plan(request: Request) -> Response:

@@ -18,22 +18,15 @@ import msgspec
 from msgspec import Struct
 
 import skyless
+from skyless.bridges.feed import bridged_site
 from skyless.dashboard.condition import EVALUATION_S, Condition, ConditionMonitor
 from skyless.dashboard.events import MAX_LOGGED, EventLog
 from skyless.dashboard.evidence import Evidence
+from skyless.dashboard.geojson import OLDEST_S, features
 from skyless.dashboard.site_survey import SiteSurvey, topic_of
 from skyless.dashboard.state import SiteState, encode
 from skyless.dashboard.wire import WrongMessageError, read_message
-from skyless.dashboard.zones import (
-    MAX_EVENTS,
-    BadZonesError,
-    EventQueue,
-    ZoneMonitor,
-    check_zones,
-    publisher_rank,
-    read_zones,
-    zones_of,
-)
+from skyless.dashboard.zone_events import MAX_EVENTS, EventQueue, publisher_rank
 from skyless.errors import ConfigurationError
 from skyless.mqtt import topics
 from skyless.mqtt.messages import (
@@ -52,6 +45,8 @@ from skyless.mqtt.messages import (
     ZonesMessage,
 )
 from skyless.site.check import check_site
+from skyless.zones.monitor import ZoneMonitor
+from skyless.zones.zone_list import BadZonesError, check_zones, read_zones, zones_of
 
 _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0
@@ -85,6 +80,10 @@ class MqttLink(Protocol):
 
 class NoBrokerError(Exception):
     """Nothing can be published now."""
+
+
+class NoSiteError(Exception):
+    """No site is known yet."""
 
 
 class TooManyPagesError(Exception):
@@ -417,6 +416,19 @@ class LiveSite:
         if self._link is None or self._site_id is None or not self.connected:
             raise NoBrokerError(f"the broker {self.broker} is not connected; try again when it is")
         return self._link, self._site_id
+
+    def features(self) -> bytes:
+        """The tags as GeoJSON.
+
+        Raises:
+            NoSiteError: no site is known yet.
+            SkylessError: it is not georeferenced.
+        """
+        if self.site is None:
+            raise NoSiteError("no site is known yet")
+        now_s, unix_s = self._clock(), self._wall_clock()
+        site = bridged_site(self.site.site, simulated=self.site.simulated)
+        return features(site, self.state.fixes_since(now_s, OLDEST_S), unix_s)
 
     # Pages
 

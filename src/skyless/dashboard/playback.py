@@ -14,7 +14,6 @@ from msgspec import Struct
 
 from skyless.dashboard.events import Event, EventLog
 from skyless.dashboard.state import SiteState
-from skyless.dashboard.zones import zones_of
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import (
     AnchorHealth,
@@ -29,6 +28,7 @@ from skyless.mqtt.messages import (
 )
 from skyless.mqtt.truth_buffer import REACH_S
 from skyless.recordings.mcap.recording import McapRecording, Recorded
+from skyless.zones.zone_list import zones_of
 
 _SUFFIX: Final = ".mcap"
 _MAX_OPEN: Final = 8

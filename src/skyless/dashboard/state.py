@@ -89,6 +89,11 @@ class SiteState:
         for key in [key for key, (received_s, _) in self._healths.items() if now_s - received_s > EXPIRY_S]:
             del self._healths[key]
 
+    def fixes_since(self, now_s: float, longest_s: float) -> list[tuple[FixMessage, float]]:
+        """The newest fix of each tag that came within the last ``longest_s``, and when it ended, by ``unix_s``."""
+        found = [tag for tag in self._tags.values() if now_s - tag.received_s <= longest_s]
+        return [(tag.fix, tag.ended_unix_s) for tag in found]
+
     def methods(self) -> list[str]:
         """The positioning method of each tag whose health is known."""
         return [health.method for _, health in self._healths.values() if isinstance(health, TagHealth)]

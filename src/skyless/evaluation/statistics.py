@@ -13,8 +13,8 @@ from msgspec import Struct
 
 from skyless.constants import TICK_RATE_HZ
 from skyless.kernels.arrays import Array
+from skyless.positioning.alert import Alert
 from skyless.positioning.fix import Fix
-from skyless.positioning.integrity import Alert
 from skyless.site.model import Site
 from skyless.site.slots import superframe_ticks_of
 

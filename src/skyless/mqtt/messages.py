@@ -84,7 +84,7 @@ class FixMessage(Struct, frozen=True):
     integrity_risk: float | None = None
     """Probability, for each fix, that the error exceeds its level."""
     alert: str | None = None
-    """A value of ``skyless.positioning.integrity.Alert``."""
+    """A value of ``skyless.positioning.alert.Alert``."""
 
 
 class Counters(Struct, frozen=True):
@@ -298,6 +298,42 @@ class ZoneEvent(Struct, frozen=True):
     kind: Literal["enter", "leave"]
     unix_s: float
     position_m: Vector
+
+
+class TagZones(Struct, frozen=True):
+    """The zones that a tag is in at present; retained, by what announces tags to Home Assistant."""
+
+    tag: str
+    unix_s: float
+    """Of the fix with which this became so."""
+    usable: bool
+    """Whether the tag has fixes that may be used; without, it is in no zone."""
+    zone: str | None = None
+    """The id of the smallest of them."""
+    name: str | None = None
+    """Its name."""
+    zones: tuple[str, ...] = ()
+    """The ids of all, the smallest first."""
+    by: str = ""
+    """Name of the bridge that says so."""
+
+
+class TagReport(Struct, frozen=True):
+    """Where a tag is, at most once a second and only when that has changed; retained, for programs that keep each."""
+
+    tag: str
+    unix_s: float
+    """Of the fix."""
+    position_m: Vector
+    std_m: float
+    """One-sigma radial error, at least 1 cm in each axis."""
+    horizontal_std_m: float
+    """The same on the floor."""
+    latitude_deg: float | None = None
+    """WGS 84; None where the site does not say where it is."""
+    longitude_deg: float | None = None
+    height_m: float | None = None
+    """Above the ellipsoid."""
 
 
 class Stamp(Struct, frozen=True, array_like=True):

@@ -37,7 +37,7 @@ async def find_site(address: MqttAddress, on_state: Callable[[bool], None]) -> i
         if sites:
             if len(sites) > 1:
                 others = ", ".join(str(site) for site in sorted(sites))
-                _log.warning("the broker carries the sites %s: showing the first; --site-id chooses", others)
+                _log.warning("the broker carries the sites %s: the first is used; --site-id chooses", others)
             return min(sites)
         await asyncio.sleep(_RETRY_S)
 

@@ -13,13 +13,12 @@ from skyless.mqtt.messages import Counters, FixMessage, Phase, TagHealth
 from skyless.nodes.lateness import Lateness
 from skyless.nodes.process import HEALTH_S
 from skyless.positioning.fix import Fix
+from skyless.rate_limit import RateLimit
 
 FixListener = Callable[[FixMessage], None]
 
 _MOST_LATENCIES: Final = 4096
 _MOST_PHASES: Final = 64
-_LATE_SHARE: Final = 0.5
-"""A fix that is published late by up to this share of the interval does not lower the average rate."""
 
 
 class FixLog:
@@ -46,7 +45,7 @@ class FixLog:
         self.lateness = Lateness()
         """Which receptions and fixes are too old."""
         self._reported_serial = 0
-        self._publish, self._rate = publish, _RateLimit(publish_hz)
+        self._publish, self._rate = publish, RateLimit(publish_hz)
 
     def update_clock_offset(self) -> None:
         """Measure again how far Unix time is from the host's monotonic clock: it is set now and then."""
@@ -105,21 +104,6 @@ class FixLog:
             late=self.lateness.dropped + late_fixes,
             lateness_s=self.lateness.drain(),
         )
-
-
-class _RateLimit:
-    """Passes at most a given number of events a second."""
-
-    def __init__(self, most_hz: float) -> None:
-        self._interval_s = 1.0 / most_hz
-        self._due_s = 0.0
-
-    def is_due(self, now_s: float) -> bool:
-        """Whether an event at this time passes."""
-        if now_s < self._due_s:
-            return False
-        self._due_s = max(self._due_s, now_s - _LATE_SHARE * self._interval_s) + self._interval_s
-        return True
 
 
 class Latencies:

@@ -16,7 +16,7 @@ from skyless.constants import TICK_BITS
 from skyless.errors import ConfigurationError
 from skyless.evaluation.observability import GUESSED_STD_M, plane_height_m
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.messages import Counters, FixMessage
+from skyless.mqtt.messages import Counters, FixMessage, TagHealth
 from skyless.mqtt.topics import fix_topic, health_topic
 from skyless.nodes.fix_log import FixListener, FixLog
 from skyless.nodes.lateness import FIX_LEAVES_S
@@ -28,7 +28,7 @@ from skyless.radios.interface import Gone, Restarted
 from skyless.radios.serial.foreign_radios import SnifferRadio, UciRadio
 from skyless.recordings.foreign.bitcraze import STAMP_BITS
 from skyless.site.check import check_site
-from skyless.site.model import AnchorSite, Site, TagsSite
+from skyless.site.model import AnchorSite, GeoreferenceSite, Site, TagsSite
 
 TDOA_SITE: Final = 0
 """The site in the topics of a system that has no site identifier."""
@@ -58,17 +58,19 @@ class PacketTagSettings(Struct, frozen=True):
     publish_hz: float = 50.0
 
 
-def site_of(settings: PacketTagSettings, heard_m: Mapping[int, Point] | None = None) -> Site | None:
+def site_of(
+    settings: PacketTagSettings, heard_m: Mapping[int, Point] | None = None, origin: GeoreferenceSite | None = None
+) -> Site | None:
     """The system as a site that a page can draw; None for anchors that no site can have.
 
-    ``heard_m``: their positions, where they are not configured.
+    ``heard_m``: their positions, where they are not configured; ``origin``: where on the Earth these begin.
     """
     positions_m = settings.anchors_m or heard_m or {}
     anchors = tuple(AnchorSite(anchor, *position_m) for anchor, position_m in sorted(positions_m.items()))
     if not anchors:
         return None
     tags = TagsSite(height_m=settings.height_m)
-    site = Site("TDoA system", settings.site, anchors[0].id, anchors, tags=tags)
+    site = Site("TDoA system", settings.site, anchors[0].id, anchors, tags=tags, georeference=origin)
     try:
         check_site(site, Path("the table of anchors"))
     except ConfigurationError:
@@ -173,18 +175,22 @@ class PacketTags:
         *,
         simulated: Callable[[], bool],
         on_fix: FixListener | None = None,
+        on_health: Callable[[TagHealth], None] | None = None,
+        on_anchors: Callable[[Mapping[int, Point], GeoreferenceSite | None], None] | None = None,
     ) -> None:
         """``simulated`` is asked again when a radio has restarted: its port may lead to another device.
 
-        ``on_fix`` is called with every fix that is to be published, with or without a broker.
+        ``on_fix`` and ``on_health`` are called with all that is to be published, with or without a broker;
+        ``on_anchors`` with positions that messages state, and where on the Earth they begin, whenever there are others.
         """
-        self._settings, self._log, self._on_fix = settings, log, on_fix
+        self._settings, self._log, self._on_fix, self._on_health = settings, log, on_fix, on_health
         self._links = tuple(link_of(address, radio.name, site=settings.site, kind="tag") for radio in radios)
         self.nodes = tuple(
             PacketTagNode(settings, radio, self._publisher(index), log) for index, radio in enumerate(radios)
         )
         self._usage = Usage()
-        self._simulated = simulated
+        self._simulated, self._on_anchors = simulated, on_anchors
+        self._heard_m: dict[int, Point] = {}
         site = site_of(settings)
         self._site_publisher = None if site is None else SitePublisher(site, simulated)
 
@@ -223,6 +229,8 @@ class PacketTags:
                 memory_bytes=memory_bytes,
                 late_in_link=0 if link is None else link.late,
             )
+            if self._on_health is not None:
+                self._on_health(health)
             if link is not None:
                 if self._site_publisher is not None:
                     self._site_publisher.update(sum(each.monitor.restarts for each in self.nodes))
@@ -231,10 +239,18 @@ class PacketTags:
 
     def _update_site(self) -> None:
         """The site of the positions that the tags have heard by now."""
-        heard_m: dict[int, Point] = {}
+        heard_m = dict(self._heard_m)
         for node in self.nodes:
             heard_m |= node.tracking.anchors_m
-        site = site_of(self._settings, heard_m)
+        if heard_m == self._heard_m:
+            return
+        self._heard_m = heard_m
+        origins = [node.radio.origin for node in self.nodes if isinstance(node.radio, UciRadio)]
+        known = next((origin for origin in origins if origin is not None), None)
+        origin = None if known is None else GeoreferenceSite(*structs.astuple(known))
+        if self._on_anchors is not None:
+            self._on_anchors(heard_m, origin)
+        site = site_of(self._settings, heard_m, origin)
         if site is not None and self._site_publisher is not None:
             self._site_publisher.place(site)
         elif site is not None:

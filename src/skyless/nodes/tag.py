@@ -14,7 +14,7 @@ from skyless.air.reception import Reception
 from skyless.method_names import DEFAULT_METHOD
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
-from skyless.mqtt.messages import Counters, FixMessage, RequestMessage
+from skyless.mqtt.messages import Counters, FixMessage, RequestMessage, TagHealth
 from skyless.mqtt.topics import fix_topic, health_topic, receptions_topic, request_topic
 from skyless.nodes.fix_log import FixListener, FixLog, PhaseLog
 from skyless.nodes.lateness import FIX_LEAVES_S
@@ -27,6 +27,9 @@ from skyless.recordings.mcap.reception_log import ReceptionLog, receiver_setting
 
 RECEPTIONS_S: Final = 0.05
 """Interval of the messages with raw receptions."""
+HealthListener = Callable[[TagHealth, Receiver], None]
+"""Called with a tag's state, and with its receiver, which knows the site."""
+
 _decode_request: Final = msgspec.json.Decoder(RequestMessage).decode
 
 
@@ -121,9 +124,10 @@ class Tag:
         address: MqttAddress | None,
         log: Log,
         on_fix: FixListener | None = None,
+        on_health: HealthListener | None = None,
     ) -> None:
-        """``on_fix`` is called with every fix that is to be published, with or without a broker."""
-        self._address, self._log, self._on_fix = address, log, on_fix
+        """``on_fix`` and ``on_health`` are called with all that is to be published, with or without a broker."""
+        self._address, self._log, self._on_fix, self._on_health = address, log, on_fix, on_health
         self.link: Link | None = None
         self._site: int | None = None
         self._late_before = 0
@@ -202,6 +206,8 @@ class Tag:
             phases=node.phases.last,
             late_in_link=self._late_before + (0 if self.link is None else self.link.late),
         )
+        if self._on_health is not None:
+            self._on_health(health, node.receiver)
         if self.link is not None:
             self.link.publish(self._health_topic, health)
 
@@ -216,9 +222,10 @@ class Tags:
         address: MqttAddress | None,
         log: Log,
         on_fix: FixListener | None = None,
+        on_health: HealthListener | None = None,
     ) -> None:
-        """``on_fix`` as in ``Tag``."""
-        self.tags = tuple(Tag(settings, radio, address, log, on_fix) for radio in radios)
+        """``on_fix`` and ``on_health`` as in ``Tag``."""
+        self.tags = tuple(Tag(settings, radio, address, log, on_fix, on_health) for radio in radios)
         self._usage = Usage()
 
     async def run(self) -> None:

@@ -14,7 +14,7 @@ from skyless.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, TagHeal
 from skyless.mqtt.topics import EVERY_NODE, fix_topic, health_topic, truth_topic
 from skyless.mqtt.truth_buffer import TruthBuffer
 from skyless.nodes.fix_log import Latencies
-from skyless.positioning.integrity import Alert
+from skyless.positioning.alert import Alert
 
 _WARMUP_S: Final = 1.0
 """Fixes of a tag count for the errors from this time after its first."""

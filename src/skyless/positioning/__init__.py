@@ -1,4 +1,4 @@
 """From receptions to positions: the values that all methods share; methods, estimator and masterless sites below.
 
-Public: fix, integrity, observation.
+Public: alert, fix, integrity, observation.
 """

@@ -9,7 +9,8 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.kernels.arrays import Array
-from skyless.positioning.integrity import Alert, Integrity, IntegrityRequirement, integrity_of
+from skyless.positioning.alert import Alert
+from skyless.positioning.integrity import Integrity, IntegrityRequirement, integrity_of
 
 if TYPE_CHECKING:
     from skyless.uncertainty.dop import Dops

@@ -1,7 +1,6 @@
 """Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8)."""
 
 from collections.abc import Sequence
-from enum import StrEnum
 from statistics import NormalDist
 from typing import Final
 
@@ -9,21 +8,12 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.kernels.arrays import Array
+from skyless.positioning.alert import Alert
 
 RISK: Final = 1e-4
 
 MARGIN: Final = 1.05
 """On all standard deviations, for errors that are not quite Gaussian and figures that are not quite the filter's."""
-
-
-class Alert(StrEnum):
-    """What a fix states of its integrity."""
-
-    NONE = "none"
-    EXCLUDED = "detected-excluded"
-    NOT_EXCLUDED = "detected-not-excluded"
-    UNAVAILABLE = "unavailable"
-    LIMIT = "alert-limit-exceeded"
 
 
 HPL, VPL, STATE = range(3)

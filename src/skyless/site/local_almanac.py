@@ -146,6 +146,11 @@ class LocalAlmanac:
             for anchor in one.anchors:
                 self._collect(anchor, one.issue, page)
 
+    @property
+    def positions_m(self) -> dict[int, Array]:
+        """Position of each anchor that has stated one, each of shape (3,)."""
+        return dict(self._positions_m)
+
     def position_m(self, anchor: int) -> Array | None:
         """Position of an anchor, shape (3,), the same array until it moves; None while it has stated none."""
         return self._positions_m.get(anchor)

@@ -1,4 +1,4 @@
 """How well positions are known: geometry (DOPs), propagated covariances, bounds.
 
-Public: bounds, chain, dop.
+Public: bounds, chain, dop, ellipse.
 """

@@ -28,7 +28,7 @@ from skyless.cli.nodes.options import MqttCa, WalkingSpeed, log, site_named
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
 from skyless.mqtt.address import PASSWORD_VARIABLE
-from skyless.positioning.integrity import Alert
+from skyless.positioning.alert import Alert
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

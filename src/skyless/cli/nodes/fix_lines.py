@@ -18,7 +18,7 @@ from skyless.cli.common.output import cm, to_json
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import FixMessage
 from skyless.nodes.process import Log
-from skyless.positioning.integrity import Alert
+from skyless.positioning.alert import Alert
 
 CSV_COLUMNS: Final = (
     *("unix_s", "tag", "x_m", "y_m", "z_m", "std_m", "vx_mps", "vy_mps", "vz_mps"),

@@ -2,7 +2,7 @@
 
 import contextlib
 import re
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -19,7 +19,7 @@ from skyless.cli.common.options import (
     options,
 )
 from skyless.cli.common.progress import loading_kernels
-from skyless.cli.nodes.fix_lines import LineOptions
+from skyless.cli.nodes.fix_lines import FixLines, LineOptions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
@@ -33,9 +33,13 @@ from skyless.nodes.open_radio import (
 )
 
 if TYPE_CHECKING:
+    from skyless.air.masterless_packets import Point
     from skyless.mqtt.address import MqttAddress
+    from skyless.mqtt.messages import FixMessage
+    from skyless.nodes.bridge.tag_bridge import TagBridge
     from skyless.nodes.fix_log import FixListener
     from skyless.nodes.packet_tags import PacketTagSettings
+    from skyless.site.model import GeoreferenceSite
 
 _TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
@@ -68,6 +72,9 @@ class TagOptions:
     anchors: Path | None = None
     """Table of anchors of another system (sniffers and FiRa boards): id,x_m,y_m,z_m, as skyless replay and calibrate
     take it. FiRa boards need none where anchors state their positions."""
+    to: tuple[str, ...] = ()
+    """Where fixes go as well, without a broker: a program or device of another kind; may be given several times.
+    skyless bridge --help lists the targets, as nmea+tcp://:10110."""
     tag_height: str | None = None
     """The tags' height (sniffers and FiRa boards): metres, free (estimated) or auto, the default: estimated unless the
     anchors lie too flat, then theirs."""
@@ -96,7 +103,6 @@ def tag(
     from skyless.nodes.process import run, together
 
     address, lines = broker.address(), shown.lines(log)
-    on_fix = None if lines is None else lines.on_fix
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
         given = repr(" ".join(names)) if names else "missing"
         raise SkylessError(
@@ -108,20 +114,49 @@ def tag(
             raise SkylessError(
                 "--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers and FiRa boards"
             )
-        serve = _on_sniffers(names, asked, address, on_fix)
+        tags, bridge = _on_sniffers, _bridge(asked, address)
     elif asked.anchors is not None or asked.tag_height is not None:
         raise SkylessError(
             "--anchors and --tag-height are for sniffers and FiRa boards; other tags hear from the air where anchors "
             "stand"
         )
     else:
-        serve = _on_radios(names, asked, address, on_fix)
+        tags, bridge = _on_radios, _bridge(asked, address)
+    serve = tags(names, asked, address, _listener(lines, bridge), bridge)
+    others = [part.run() for part in (lines, bridge) if part is not None]
     with contextlib.suppress(KeyboardInterrupt):
-        run(serve if lines is None else together(serve, lines.run()), punctual=True)
+        run(together(serve, *others), punctual=True)
+
+
+def _bridge(asked: TagOptions, address: "MqttAddress | None") -> "TagBridge | None":
+    """What gives fixes to --to; None where nobody gets them. Raises SkylessError."""
+    from skyless.cli.nodes.bridge import hub_of
+    from skyless.nodes.bridge.tag_bridge import TagBridge
+
+    if not asked.to:
+        return None
+    return TagBridge(hub_of(asked.to, address), lambda: is_simulated(asked.radio), log)
+
+
+def _listener(lines: "FixLines | None", bridge: "TagBridge | None") -> "FixListener | None":
+    """Calls all that want fixes; None where nobody does."""
+    listeners = [part.on_fix for part in (lines, bridge) if part is not None]
+    if len(listeners) < 2:
+        return listeners[0] if listeners else None
+
+    def on_fix(fix: "FixMessage") -> None:
+        for listener in listeners:
+            listener(fix)
+
+    return on_fix
 
 
 def _on_radios(
-    names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None", on_fix: "FixListener | None"
+    names: tuple[str, ...],
+    asked: TagOptions,
+    address: "MqttAddress | None",
+    on_fix: "FixListener | None",
+    bridge: "TagBridge | None",
 ) -> "Coroutine[Any, Any, None]":
     """Tags that hear beacons."""
     from skyless.evaluation.compile_ahead import compile_kernels
@@ -133,14 +168,21 @@ def _on_radios(
     radios = open_radios(asked.radio, "tag", names)
     with loading_kernels(*parts_of(asked.method)):
         compile_kernels(asked.method)
-    return Tags(settings, radios, address, log, on_fix).run()
+    return Tags(settings, radios, address, log, on_fix, None if bridge is None else bridge.on_health).run()
 
 
 def _on_sniffers(
-    names: tuple[str, ...], asked: TagOptions, address: "MqttAddress | None", on_fix: "FixListener | None"
+    names: tuple[str, ...],
+    asked: TagOptions,
+    address: "MqttAddress | None",
+    on_fix: "FixListener | None",
+    bridge: "TagBridge | None",
 ) -> "Coroutine[Any, Any, None]":
     """Tags that hear the packets of another system."""
+    from msgspec import structs
+
     from skyless.evaluation.compile_ahead import compile_packet_kernels
+    from skyless.nodes.bridge.tag_bridge import heard_site
     from skyless.nodes.packet_tags import PacketTags
     from skyless.preparation.parts import SNIFFERS
 
@@ -148,7 +190,24 @@ def _on_sniffers(
     radios = open_sniffers(asked.radio, names, settings.anchors_m)
     with loading_kernels(*SNIFFERS):
         compile_packet_kernels()
-    tags = PacketTags(settings, radios, address, log, simulated=lambda: is_simulated(asked.radio), on_fix=on_fix)
+    if bridge is not None and settings.anchors_m:
+        bridge.on_site(heard_site(settings.site, settings.anchors_m, simulated=is_simulated(asked.radio)))
+
+    def on_anchors(anchors_m: Mapping[int, "Point"], origin: "GeoreferenceSite | None") -> None:
+        if bridge is not None:
+            site = heard_site(settings.site, anchors_m, simulated=is_simulated(asked.radio))
+            bridge.on_site(structs.replace(site, georeference=origin))
+
+    tags = PacketTags(
+        settings,
+        radios,
+        address,
+        log,
+        simulated=lambda: is_simulated(asked.radio),
+        on_fix=on_fix,
+        on_health=None if bridge is None else bridge.on_system_health,
+        on_anchors=on_anchors,
+    )
     return tags.run()
 
 

@@ -13,6 +13,7 @@ from skyless.air.codec import MAX_FRAME_BYTES
 from skyless.air.masterless_packets import Packet, Point
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.air.uci import UciReader
+from skyless.air.uci_location import GeodeticPoint
 from skyless.radios.interface import Gone, Late, RadioEvent, Restarted, ignore
 from skyless.radios.serial.serial_port import BoardClock, SerialPort, line_advice
 from skyless.recordings.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
@@ -155,6 +156,11 @@ class UciRadio(_ListeningBoard[Packet]):
         super().__init__(path, baud, name)
         self._anchors_m = anchors_m
         self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, anchors_m)
+
+    @property
+    def origin(self) -> GeodeticPoint | None:
+        """Where the frame of positions begins that anchors state on the Earth."""
+        return self._tag.origin
 
     def _start(self, send: Callable[[bytes], None]) -> None:  # noqa: ARG002 - it is sent nothing
         self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, self._anchors_m)

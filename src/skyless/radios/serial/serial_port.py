@@ -76,6 +76,10 @@ class SerialPort:
         transport, _ = await serialx.create_serial_connection(loop, protocol, self.path, self.baud)
         return transport, connection
 
+    def waiting_bytes(self) -> int:
+        """What the port has not accepted yet; 0 while it is not open."""
+        return 0 if self._connection is None else self._connection.waiting_bytes()
+
     def reopen(self, reason: str) -> None:
         """Close the port, if it is open, and open it again."""
         if self._connection is not None:
@@ -97,10 +101,12 @@ class _Connection(asyncio.Protocol):
 
     def __init__(self, user: PortUser) -> None:
         self._user = user
+        self.waiting_bytes: Callable[[], int] = int
         self.ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.WriteTransport)
+        self.waiting_bytes = transport.get_write_buffer_size
 
         def send(data: bytes) -> None:
             if not self.ended.done() and not transport.is_closing():

@@ -8,7 +8,7 @@ from math import cos, radians, sin, sqrt
 
 from skyless.air.masterless_packets import Point
 from skyless.air.uci_location import GeodeticPoint
-from skyless.site.georeference import EARTH_A_M, EARTH_E2
+from skyless.site.earth import EARTH_A_M, EARTH_E2
 
 
 class AnchorFrame:

@@ -18,7 +18,7 @@ from skyless.air.uci import (
     UciReader,
     decode_session_info,
 )
-from skyless.air.uci_location import location_of
+from skyless.air.uci_location import GeodeticPoint, location_of
 from skyless.constants import TICK_BITS, TICK_S
 from skyless.recordings.foreign.anchor_frame import AnchorFrame
 from skyless.recordings.source import Drops, chunks, lines
@@ -36,6 +36,11 @@ class DtTag:
         self._drops = drops
         self._rounds = DtRounds(anchors_m)
         self._frame = AnchorFrame()
+
+    @property
+    def origin(self) -> GeodeticPoint | None:
+        """Where the frame of the positions begins, where anchors state theirs on the Earth."""
+        return self._frame.origin
 
     def on_uci(self, packet: UciPacket, host_s: float | None = None) -> list[Packet]:
         """Packets of a notification, in the order in which they were received; ``host_s``: when it came."""

@@ -1,5 +1,5 @@
 """Recordings of a running site, in MCAP.
 
 Public: checkpoint, host_clock, reception_log, recorder, recording.
-Within the package: channels, foxglove.
+Within the package: channels.
 """

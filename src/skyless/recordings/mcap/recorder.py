@@ -14,8 +14,9 @@ from msgspec import Struct
 
 import skyless
 from skyless.errors import ConfigurationError, SkylessError
+from skyless.foxglove.messages import SCENE_TOPIC, ellipse, location_fix, pose_in_frame, scene
+from skyless.foxglove.schemas import foxglove_schema, schema_of
 from skyless.mqtt.messages import FixMessage, SiteMessage
-from skyless.recordings.mcap import foxglove
 from skyless.recordings.mcap.channels import (
     FLOOR_PLAN,
     JSON,
@@ -24,7 +25,6 @@ from skyless.recordings.mcap.channels import (
     RETAINED_KINDS,
     channel_of,
     decoder_of,
-    schema_of,
 )
 from skyless.recordings.mcap.recording import NS
 from skyless.recordings.source import Drops
@@ -184,7 +184,6 @@ class McapFile:
 SHOWN_HZ: Final = 20.0
 """How many poses of a tag are added for Foxglove in a second; the fixes themselves are all kept."""
 
-SCENE_TOPIC: Final = "/site/scene"
 MOST_TOPICS: Final = 10_000
 
 
@@ -238,18 +237,21 @@ class McapRecorder:
                 self.drops["impossible-fix"] += 1
         elif isinstance(message, SiteMessage):
             self._georeference = message.site.georeference
-            self._add(SCENE_TOPIC, "foxglove.SceneUpdate", foxglove.scene(message.site, unix_s), log_ns)
+            site = message.site
+            anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
+            shown = scene(unix_s, anchors_m, site.master, site.walls)
+            self._add(SCENE_TOPIC, "foxglove.SceneUpdate", shown, log_ns)
 
     def _show(self, fix: FixMessage, log_ns: int) -> None:
         """Add what Foxglove shows, not more often than a person sees."""
         if abs(fix.unix_s - self._shown_s.get(fix.tag, -1.0)) < 1.0 / SHOWN_HZ:
             return
         self._shown_s[fix.tag] = fix.unix_s
-        self._add(f"/tag/{fix.tag}/pose", "foxglove.PoseInFrame", foxglove.pose_in_frame(fix), log_ns)
-        self._add(f"/tag/{fix.tag}/ellipse", "foxglove.SceneUpdate", foxglove.ellipse(fix), log_ns)
+        self._add(f"/tag/{fix.tag}/pose", "foxglove.PoseInFrame", pose_in_frame(fix, facing=True), log_ns)
+        self._add(f"/tag/{fix.tag}/ellipse", "foxglove.SceneUpdate", ellipse(fix), log_ns)
         if self._georeference is not None:
-            location = foxglove.location_fix(fix, self._georeference)
+            location = location_fix(fix, self._georeference)
             self._add(f"/tag/{fix.tag}/location", "foxglove.LocationFix", location, log_ns)
 
     def _add(self, topic: str, schema: str, payload: bytes, log_ns: int) -> None:
-        self.file.add(topic, foxglove.foxglove_schema(schema), payload, log_ns)
+        self.file.add(topic, foxglove_schema(schema), payload, log_ns)

@@ -1,0 +1,68 @@
+"""JSON lines: one object to a line over TCP, or to a datagram over UDP; SI units, the site's own frame.
+
+``type`` says which: ``site``, ``fix`` (the fields of a fix on MQTT, ``docs/mqtt.md``) or ``no_fix``.
+"""
+
+from typing import Final
+
+import msgspec
+from msgspec import Struct
+
+from skyless.bridges.feed import BridgedSite
+from skyless.bridges.target import Encoder
+from skyless.bridges.target_url import TargetUrl
+from skyless.mqtt.messages import FixMessage, Vector
+from skyless.site.model import GeoreferenceSite
+
+_encode: Final = msgspec.json.Encoder().encode
+
+
+class SiteLine(Struct, frozen=True, tag="site"):
+    """The site: first for each new reader, and whenever it changes."""
+
+    id: int
+    name: str
+    simulated: bool
+    anchors_m: dict[int, Vector]
+    georeference: GeoreferenceSite | None
+
+
+class NoFixLine(Struct, frozen=True, tag="no_fix"):
+    """A tag that had a fix has none: once a second while that lasts."""
+
+    tag: str
+    unix_s: float
+    reason: str
+
+
+class JsonLines(Encoder):
+    """Encodes all that there is."""
+
+    def __init__(self) -> None:
+        self._site = b""
+
+    def greeting(self) -> list[bytes]:
+        """The site, once it is known."""
+        return [self._site] if self._site else []
+
+    def on_site(self, site: BridgedSite) -> list[bytes]:
+        """The site."""
+        self._site = _line(SiteLine(site.id, site.name, site.simulated, site.anchors_m, site.georeference))
+        return [self._site]
+
+    def on_fix(self, fix: FixMessage) -> list[bytes]:
+        """A fix, with its type first."""
+        return [b'{"type":"fix",' + _line(fix)[1:]]
+
+    def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:
+        """That there is none."""
+        return [_line(NoFixLine(tag, unix_s, reason))]
+
+
+def _line(value: Struct) -> bytes:
+    return _encode(value) + b"\n"
+
+
+def make_encoder(_url: TargetUrl) -> JsonLines:
+    """Lines have no settings."""
+    return JsonLines()

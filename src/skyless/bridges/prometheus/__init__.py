@@ -1,0 +1,4 @@
+"""Figures of a site for Prometheus.
+
+Within the package: exposition, metrics, target.
+"""

@@ -1,0 +1,302 @@
+"""From fixes to messages of ROS 2: names of topics, types, and the bytes of each message.
+
+Definitions of the messages and the meaning of their fields: the packages ``common_interfaces`` and ``geometry2`` of
+ROS 2; names of topics: REP 144 and https://design.ros2.org/articles/topic_and_service_names.html. The bytes are CDR
+(``cdr.py``), the same in DDS and in a bag.
+"""
+
+import re
+from math import floor, isfinite, nan
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.bridges.feed import BridgedSite, floored
+from skyless.bridges.ros2.cdr import CdrWriter
+from skyless.mqtt.messages import AnchorHealth, FixMessage, Matrix, TagHealth, Vector
+from skyless.site.earth import geodetic, rotated
+
+SITE_FRAME: Final = "site"
+NAMESPACE: Final = "skyless"
+
+UNKNOWN_VARIANCE: Final = 1e6
+"""Of an angle in rad² and of its rate: a tag does not know how it is turned."""
+
+_NO_TURN: Final = (0.0, 0.0, 0.0, 1.0)
+_ANGLES: Final = 3
+_STATUS_NO_FIX, _STATUS_FIX = -1, 0
+_SERVICE_UNKNOWN: Final = 0
+"""No satellite system: a figure that ROS gave a name after Humble."""
+
+_COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
+_OK, _WARN, _ERROR = 0, 1, 2
+_CUBE, _TEXT_VIEW_FACING = 1, 9
+_ANCHOR_SIZE_M: Final = 0.15
+
+
+class RosType(Struct, frozen=True):
+    """A type of message."""
+
+    name: str
+    """``package/msg/Name``."""
+    digest: str
+    """What ROS since Iron compares to see that both ends mean the same: REP 2011's hash of the definition."""
+
+
+POSE: Final = RosType(
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
+)
+TRUE_POSE: Final = RosType(
+    "geometry_msgs/msg/PoseStamped", "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8"
+)
+TWIST: Final = RosType(
+    "geometry_msgs/msg/TwistWithCovarianceStamped",
+    "RIHS01_77b67434531e6529b7a0091357b186b6ebdb17fd9ffd3e0c7ce9d3fb11a44563",
+)
+NAV_SAT_FIX: Final = RosType(
+    "sensor_msgs/msg/NavSatFix", "RIHS01_62223ab3fe210a15976021da7afddc9e200dc9ec75231c1b6a557fc598a65404"
+)
+DIAGNOSTICS: Final = RosType(
+    "diagnostic_msgs/msg/DiagnosticArray", "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
+)
+TRANSFORMS: Final = RosType(
+    "tf2_msgs/msg/TFMessage", "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+)
+MARKERS: Final = RosType(
+    "visualization_msgs/msg/MarkerArray", "RIHS01_86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf"
+)
+
+
+class RosMessage(Struct, frozen=True):
+    """One message on its topic."""
+
+    topic: str
+    type: RosType
+    data: bytes
+    """CDR with its header of four bytes."""
+    lasting: bool = False
+    """Whether a subscriber that comes later gets it, too (transient local)."""
+
+
+class RosSettings(Struct, frozen=True):
+    """What a user may choose."""
+
+    frame: str = SITE_FRAME
+    """``frame_id`` of poses and velocities: the site's frame, x, y, z as in the site file."""
+    namespace: str = NAMESPACE
+    transforms: bool = False
+    """Whether ``/tf`` gets a transform from the site's frame to each tag's."""
+
+
+class RosEncoder:
+    """Makes the messages of a site; does no I/O and reads no clock."""
+
+    def __init__(self, settings: RosSettings) -> None:
+        self._settings = settings
+        self._site: BridgedSite | None = None
+        self._names: dict[str, str] = {}
+
+    def on_site(self, site: BridgedSite) -> list[RosMessage]:
+        """The anchors, as RViz draws them; at the stamp 0, which means at any time. Nothing if they are known."""
+        if site == self._site:
+            return []
+        self._site = site
+        topic = f"/{self._settings.namespace}/anchors"
+        return [RosMessage(topic, MARKERS, _markers(site, self._settings.frame), lasting=True)]
+
+    def on_fix(self, fix: FixMessage) -> list[RosMessage]:
+        """Pose, velocity, and position on the Earth, of a usable fix."""
+        frame = self._settings.frame
+        covariance_m2 = floored(fix.covariance_m2)
+        found = [RosMessage(self._topic(fix.tag, "pose"), POSE, _pose(fix, covariance_m2, frame))]
+        velocity = _velocity(fix, frame)
+        if velocity is not None:
+            found.append(RosMessage(self._topic(fix.tag, "velocity"), TWIST, velocity))
+        if self._site is not None and self._site.georeference is not None:
+            origin = self._site.georeference
+            covariance_enu_m2 = rotated(covariance_m2, origin.heading_deg)
+            data = _nav_sat_fix(self._name(fix.tag), fix.unix_s, geodetic(fix.position_m, origin), covariance_enu_m2)
+            found.append(RosMessage(self._topic(fix.tag, "fix"), NAV_SAT_FIX, data))
+        if self._settings.transforms:
+            found.append(RosMessage("/tf", TRANSFORMS, _transform(fix, frame, self._name(fix.tag))))
+        return found
+
+    def on_no_fix(self, tag: str, unix_s: float) -> list[RosMessage]:
+        """That there is none, on the topic whose type can say so."""
+        if self._site is None or self._site.georeference is None:
+            return []
+        return [RosMessage(self._topic(tag, "fix"), NAV_SAT_FIX, _nav_sat_fix(self._name(tag), unix_s, None, None))]
+
+    def on_health(self, health: TagHealth | AnchorHealth) -> list[RosMessage]:
+        """The state of a tag or an anchor."""
+        return [RosMessage("/diagnostics", DIAGNOSTICS, _diagnostics(health))]
+
+    def on_truth(self, tag: str, unix_s: float, position_m: Vector) -> list[RosMessage]:
+        """Where a simulated tag truly was."""
+        writer = _stamped(unix_s, self._settings.frame)
+        writer.add_doubles((*position_m, *_NO_TURN))
+        return [RosMessage(self._topic(tag, "truth"), TRUE_POSE, writer.message())]
+
+    def _topic(self, tag: str, what: str) -> str:
+        return f"/{self._settings.namespace}/{self._name(tag)}/{what}"
+
+    def _name(self, tag: str) -> str:
+        """A tag's name as ROS allows it; tags whose names become equal are numbered as they come."""
+        if tag not in self._names:
+            plain = ros_name(tag)
+            taken, number = set(self._names.values()), 2
+            name = plain
+            while name in taken:
+                name, number = f"{plain}_{number}", number + 1
+            self._names[tag] = name
+        return self._names[tag]
+
+
+def ros_name(text: str) -> str:
+    """Text as one part of a topic's name: letters, digits and single _, a letter first."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")
+    return plain if plain[:1].isalpha() else f"tag_{plain}".strip("_")
+
+
+def stamp_of(unix_s: float) -> tuple[int, int]:
+    """``builtin_interfaces/Time``: whole seconds and nanoseconds, to the nearest; 0 for what it cannot hold."""
+    if not isfinite(unix_s) or not 0.0 <= unix_s < 2**31 - 1:
+        return 0, 0
+    seconds = floor(unix_s)
+    nanoseconds = round((unix_s - seconds) * 1e9)  # the difference is exact
+    return seconds + nanoseconds // 1_000_000_000, nanoseconds % 1_000_000_000
+
+
+def _stamped(unix_s: float, frame: str) -> CdrWriter:
+    """A message that begins with ``std_msgs/Header``."""
+    writer = CdrWriter()
+    _add_header(writer, unix_s, frame)
+    return writer
+
+
+def _add_header(writer: CdrWriter, unix_s: float, frame: str) -> None:
+    seconds, nanoseconds = stamp_of(unix_s)
+    writer.add("i", seconds)
+    writer.add("I", nanoseconds)
+    writer.add_text(frame)
+
+
+def _pose(fix: FixMessage, covariance_m2: Matrix, frame: str) -> bytes:
+    """``geometry_msgs/PoseWithCovarianceStamped``: 36 entries in the order x, y, z and rotations about them."""
+    writer = _stamped(fix.unix_s, frame)
+    writer.add_doubles((*fix.position_m, *_NO_TURN))
+    writer.add_doubles(_with_angles(covariance_m2))
+    return writer.message()
+
+
+def _velocity(fix: FixMessage, frame: str) -> bytes | None:
+    """``geometry_msgs/TwistWithCovarianceStamped`` in the site's frame; None where it is not known."""
+    if fix.velocity_mps is None or fix.velocity_covariance is None:
+        return None
+    if not all(map(isfinite, (*fix.velocity_mps, *fix.velocity_covariance))):
+        return None
+    writer = _stamped(fix.unix_s, frame)
+    writer.add_doubles((*fix.velocity_mps, *(0.0,) * _ANGLES))
+    writer.add_doubles(_with_angles(fix.velocity_covariance))
+    return writer.message()
+
+
+def _with_angles(covariance: Matrix) -> list[float]:
+    """Six by six, row by row: the given three and unknown angles."""
+    rows = [[*covariance[3 * row : 3 * row + 3], *(0.0,) * _ANGLES] for row in range(3)]
+    angles = [[UNKNOWN_VARIANCE * (row == column) for column in range(3, 6)] for row in range(3, 6)]
+    return [value for row in (*rows, *([0.0, 0.0, 0.0, *angle] for angle in angles)) for value in row]
+
+
+def _nav_sat_fix(frame: str, unix_s: float, earth: Vector | None, covariance_m2: Matrix | None) -> bytes:
+    """``sensor_msgs/NavSatFix``: latitude, longitude, height on WGS 84; covariance towards east, north, up.
+
+    Without a position: status no fix, NaN, and a covariance that is not known.
+    """
+    writer = _stamped(unix_s, frame)
+    writer.add("b", _STATUS_NO_FIX if earth is None else _STATUS_FIX)
+    writer.add("H", _SERVICE_UNKNOWN)
+    writer.add_doubles((nan, nan, nan) if earth is None else earth)
+    writer.add_doubles((0.0,) * 9 if covariance_m2 is None else covariance_m2)
+    writer.add("B", _COVARIANCE_UNKNOWN if covariance_m2 is None else _COVARIANCE_KNOWN)
+    return writer.message()
+
+
+def _transform(fix: FixMessage, frame: str, child: str) -> bytes:
+    """``tf2_msgs/TFMessage`` with one transform."""
+    writer = CdrWriter()
+    writer.add_length(1)
+    _add_header(writer, fix.unix_s, frame)
+    writer.add_text(child)
+    writer.add_doubles((*fix.position_m, *_NO_TURN))
+    return writer.message()
+
+
+def _diagnostics(health: TagHealth | AnchorHealth) -> bytes:
+    """``diagnostic_msgs/DiagnosticArray`` with one status."""
+    values: dict[str, object]
+    if isinstance(health, TagHealth):
+        name = f"tag {health.tag}"
+        level = _OK if health.reason is None else _ERROR
+        message = f"{health.updates_per_s:.1f} fixes/s" if health.reason is None else f"no fix: {health.reason}"
+        values = {
+            "method": health.method,
+            "fixes": health.fixes,
+            "updates_per_s": health.updates_per_s,
+            "latency_p50_s": health.latency_p50_s,
+            "latency_p99_s": health.latency_p99_s,
+        }
+    else:
+        name = f"anchor {health.anchor}"
+        level = _OK if health.synchronised else _WARN
+        message = health.role if health.synchronised else "not synchronised"
+        values = {"master": health.master, "offset_std_m": health.offset_std_m, "sent": health.sent}
+    values |= {f"dropped {reason}": count for reason, count in sorted(health.counters.items())}
+    writer = _stamped(health.unix_s, "")
+    writer.add_length(1)
+    writer.add("B", level)
+    for text in (f"skyless: {name}", message, name):
+        writer.add_text(text)
+    writer.add_length(len(values))
+    for key, value in values.items():
+        writer.add_text(key)
+        writer.add_text("" if value is None else str(value))
+    return writer.message()
+
+
+def _markers(site: BridgedSite, frame: str) -> bytes:
+    """``visualization_msgs/MarkerArray``: a cube and its number for each anchor."""
+    writer = CdrWriter()
+    writer.add_length(2 * len(site.anchors_m))
+    for number, (x, y, z) in sorted(site.anchors_m.items()):
+        above = (x, y, z + 2.0 * _ANCHOR_SIZE_M)
+        _add_marker(writer, frame, "anchors", number, _CUBE, (x, y, z), "")
+        _add_marker(writer, frame, "anchor_numbers", number, _TEXT_VIEW_FACING, above, str(number))
+    return writer.message()
+
+
+def _add_marker(
+    writer: CdrWriter, frame: str, kind: str, number: int, shape: int, position_m: Vector, text: str
+) -> None:
+    _add_header(writer, 0.0, frame)
+    writer.add_text(kind)
+    writer.add("i", number, shape, 0)  # action 0: add or change
+    writer.add_doubles((*position_m, *_NO_TURN))
+    writer.add_doubles((_ANCHOR_SIZE_M,) * 3)
+    writer.add("f", 1.0, 0.6, 0.0, 1.0)
+    writer.add("i", 0)  # lifetime: for ever
+    writer.add("I", 0)
+    writer.add("?", True)  # follows its frame
+    writer.add_length(0)  # points
+    writer.add_length(0)  # colours
+    writer.add_text("")  # texture: name, and an image of none
+    _add_header(writer, 0.0, "")
+    writer.add_text("")
+    writer.add_length(0)
+    writer.add_length(0)  # texture coordinates
+    writer.add_text(text)
+    writer.add_text("")  # mesh: name, and a file of none
+    writer.add_text("")
+    writer.add_length(0)
+    writer.add("?", False)

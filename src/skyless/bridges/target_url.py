@@ -1,0 +1,97 @@
+"""The address of a target: ``SCHEME://HOST:PORT?KEY=VALUE`` or ``SCHEME:PATH?KEY=VALUE``."""
+
+import re
+from collections.abc import Sequence
+from math import isfinite
+from typing import Final
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from skyless.errors import SkylessError
+from skyless.mqtt.address import hide_password
+
+TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
+"""Names that tags may have."""
+
+
+class TargetUrl:
+    """One address; each part is checked when it is read, and ``check_all_read`` refuses what nobody reads."""
+
+    def __init__(self, text: str) -> None:
+        """Raises SkylessError."""
+        self.text = hide_password(text)
+        """As it was given, for messages: without a password."""
+        self.given = text
+        scheme, colon, _ = text.partition(":")
+        try:
+            parts = urlsplit(text)
+            self._port = parts.port
+        except ValueError:
+            raise self.wrong("a port between 1 and 65535 after the host") from None
+        if not colon or not scheme:
+            raise self.wrong("SCHEME://HOST:PORT or SCHEME:PATH, as nmea+tcp://:10110")
+        self.scheme = scheme.lower()
+        self.path = unquote(parts.path)
+        """Of a port or a link; empty where there is none."""
+        self._host = parts.hostname or ""
+        if self._port == 0:
+            raise self.wrong("a port between 1 and 65535 after the host")
+        if parts.fragment:
+            raise self.wrong("without #")
+        pairs = parse_qsl(parts.query, keep_blank_values=True)
+        self._options = dict(pairs)
+        if len(self._options) < len(pairs):
+            raise self.wrong("each key once")
+        self._read: set[str] = set()
+
+    def host(self, default: str = "127.0.0.1") -> str:
+        """The host, ``default`` where none is given."""
+        return self._host or default
+
+    def port(self, default: int) -> int:
+        """The port, ``default`` where none is given."""
+        return self._port or default
+
+    def text_option(self, key: str, default: str = "") -> str:
+        """The value of a key, as it is."""
+        self._read.add(key)
+        return self._options.get(key, default)
+
+    def number(self, key: str, default: float, least: float, most: float) -> float:
+        """A number within limits. Raises SkylessError."""
+        text = self.text_option(key)
+        try:
+            value = float(text) if key in self._options else default
+        except ValueError:
+            value = float("nan")
+        if not isfinite(value) or not least <= value <= most:
+            raise self._wrong_value(key, f"a number from {least:g} to {most:g}")
+        return value
+
+    def choice(self, key: str, names: Sequence[str], default: str) -> str:
+        """One of several words. Raises SkylessError."""
+        value = self.text_option(key, default)
+        if value not in names:
+            raise self._wrong_value(key, f"{', '.join(names[:-1])} or {names[-1]}")
+        return value
+
+    def tag(self) -> str | None:
+        """The only tag that is wanted; None for all. Raises SkylessError."""
+        name = self.text_option("tag")
+        if "tag" in self._options and not TAG_NAME.fullmatch(name):
+            raise self._wrong_value("tag", "a tag's name: 1 to 32 letters, digits, - or _")
+        return name or None
+
+    def check_all_read(self) -> None:
+        """Refuse keys that nobody has read. Raises SkylessError."""
+        for key in self._options:
+            if key not in self._read:
+                known = ", ".join(sorted(self._read))
+                raise SkylessError(f"the target {self.text!r} has {key!r}; its keys are {known}")
+
+    def wrong(self, expected: str) -> SkylessError:
+        """What to raise where the address cannot be used."""
+        return SkylessError(f"the target is {self.text!r}; it should be {expected}")
+
+    def _wrong_value(self, key: str, expected: str) -> SkylessError:
+        value = self._options.get(key, "")
+        return SkylessError(f"the target {self.text!r} has {key}={value}; it should be {expected}")

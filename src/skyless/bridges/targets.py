@@ -1,0 +1,84 @@
+"""The table of targets, and how one is opened by its address."""
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Final, cast
+
+from msgspec import Struct
+
+from skyless.bridges.hub import Route
+from skyless.bridges.senders import PtySender, SerialSender, TcpServer, UdpSender
+from skyless.bridges.target import BridgeContext, Encoder, Sender, StreamTarget, Target
+from skyless.bridges.target_url import TargetUrl
+
+MOST_HZ: Final = 1000.0
+
+
+class Kind(Struct, frozen=True):
+    """A scheme of addresses."""
+
+    module: str
+    """Below ``skyless.bridges``; imported when it is used. A stream's has ``make_encoder``, others ``make_target``."""
+    hz: float
+    """Usual rate of fixes for each tag."""
+    most_hz: float
+    summary: str
+    port: int = 0
+    """Usual port."""
+
+
+TARGET_KINDS: Final = {
+    "nmea+tcp": Kind("nmea", 10.0, 50.0, "NMEA 0183 for programs that connect: gpsd, QGIS, OpenCPN", 10110),
+    "nmea+udp": Kind("nmea", 10.0, 50.0, "NMEA 0183 as datagrams", 10110),
+    "nmea+pty": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a pseudo-terminal"),
+    "nmea+serial": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a serial port, as nmea+serial:/dev/ttyUSB0@115200"),
+    "foxglove": Kind("foxglove.target", 20.0, MOST_HZ, "live pages of Foxglove and Lichtblick", 8765),
+    "homeassistant": Kind("home_assistant.target", 10.0, 50.0, "tags as devices of Home Assistant, with their rooms"),
+    "prometheus": Kind("prometheus.target", 50.0, MOST_HZ, "figures for Prometheus at /metrics", 9464),
+    "jsonl+tcp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a line, for programs that connect", 7010),
+    "jsonl+udp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a datagram", 7010),
+    "mavlink+udpout": Kind("mavlink.encoder", 30.0, 100.0, "MAVLink 2 for an autopilot, as datagrams", 14550),
+    "mavlink+serial": Kind("mavlink.encoder", 30.0, 100.0, "MAVLink 2 for an autopilot on a serial port"),
+    "osc+udp": Kind("osc", 60.0, MOST_HZ, "Open Sound Control: TouchDesigner, Unreal, Max", 9000),
+    "psn": Kind("psn", 60.0, 200.0, "PosiStageNet: media servers, lighting consoles", 56565),
+    "ros2": Kind("ros2.target", 50.0, MOST_HZ, "topics of ROS 2, published by DDS without ROS being installed"),
+}
+
+
+def open_route(text: str, context: BridgeContext) -> Route:
+    """The target of an address, with its tag and its rate. Raises SkylessError: there is none."""
+    url = TargetUrl(text)
+    kind = TARGET_KINDS.get(url.scheme)
+    if kind is None:
+        raise url.wrong(f"one of {', '.join(f'{scheme}:' for scheme in TARGET_KINDS)} as skyless bridge --help shows")
+    tag = url.tag()
+    hz = url.number("hz", kind.hz, 0.1, kind.most_hz)
+    module = import_module(f"skyless.bridges.{kind.module}")
+    target = (
+        _stream(url, kind, cast(Callable[[TargetUrl], Encoder], module.make_encoder)(url), context)
+        if "+" in url.scheme
+        else cast(Callable[[TargetUrl, BridgeContext], Target], module.make_target)(url, context)
+    )
+    url.check_all_read()
+    return Route(target, tag, hz, others=tag is not None)
+
+
+def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext) -> StreamTarget:
+    """An encoder and the sender that the scheme names after ``+``."""
+    sender: Sender
+    match url.scheme.partition("+")[2]:
+        case "tcp":
+            sender = TcpServer(url.text, url.host(), url.port(kind.port), encoder.greeting)
+        case "pty":
+            sender = PtySender(url.text, url.path, context.log)
+        case "serial":
+            path, _, baud = url.path.partition("@")
+            if not path or (baud and not (baud.isdecimal() and 300 <= int(baud) <= 10_000_000)):
+                raise url.wrong(f"{url.scheme}:PATH@BAUD, as {url.scheme}:/dev/ttyAMA0@921600")
+            sender = SerialSender(url.text, path, int(baud or 115_200), context.log)
+        case _:
+            sender = UdpSender(url.text, url.host(), url.port(kind.port), context.log)
+    target = StreamTarget(url.text, encoder, sender)
+    if isinstance(sender, UdpSender | SerialSender):
+        sender.received = target.on_bytes
+    return target

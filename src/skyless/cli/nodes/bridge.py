@@ -1,0 +1,100 @@
+"""``skyless bridge``: a running site's fixes for programs and devices of other kinds."""
+
+import contextlib
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from skyless.bridges.hub import Hub, open_hub
+from skyless.bridges.target import BridgeContext
+from skyless.bridges.targets import TARGET_KINDS, open_route
+from skyless.cli.common.output import print_json
+from skyless.cli.nodes.options import MqttOptions, SiteId, log
+from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from skyless.mqtt.address import MqttAddress
+    from skyless.nodes.bridge.broker_bridge import BridgeNode, BridgeState
+
+_EXAMPLE = "Example: skyless bridge nmea+tcp://:10110, and then: gpsd -N -n tcp://127.0.0.1:10110"
+
+
+def _targets() -> str:
+    """The table of schemes for the help."""
+    rows = [f"{scheme}: {kind.summary}." for scheme, kind in TARGET_KINDS.items()]
+    keys = "Every target takes ?tag=NAME, the only tag that it gets, and &hz=RATE, fixes a second and tag at most."
+    return "\n\n".join(["Targets:", *rows, keys, _EXAMPLE])
+
+
+app = App(name="bridge", help_epilogue=_targets())
+
+
+@app.default
+def bridge(
+    *targets: Annotated[str, Parameter(name="TARGETS")],
+    broker: MqttOptions = MqttOptions(),
+    site_id: SiteId | None = None,
+    json: bool = False,
+) -> int:
+    """Give a running site's fixes to programs and devices of other kinds until Ctrl-C.
+
+    A reader that is too slow misses fixes and delays nobody. Where a tag has no fix, readers get to know that, in the
+    way of each; they never get an old position with a new time.
+
+    Parameters
+    ----------
+    targets
+        Addresses of one or more targets, as listed below.
+    broker.mqtt
+        Broker to bridge the site of.
+    site_id
+        Number of the site; by default the first that the broker has.
+    json
+        Write one JSON object at the end instead of text.
+    """
+    from skyless.nodes.process import run
+
+    address = broker.address()
+    if address is None:
+        raise SkylessError("--mqtt is 'none'; it should be the site's broker (skyless tag --to needs none)")
+    address.tls_context()
+    if not targets:
+        raise SkylessError("TARGETS is missing; it should be one or more, as nmea+tcp://:10110 (see --help)")
+    hub = hub_of(targets, address)
+    nodes: list[BridgeNode] = []
+    with contextlib.suppress(KeyboardInterrupt):
+        run(_bridge(hub, address, site_id, nodes))
+    if nodes:
+        _report(nodes[0].state(), json=json)
+    return 0
+
+
+def hub_of(targets: tuple[str, ...], address: "MqttAddress | None") -> Hub:
+    """What gives fixes to targets. Raises SkylessError: one of them is not right."""
+    context = BridgeContext(log, address)
+    return open_hub([open_route(target, context) for target in targets], log)
+
+
+async def _bridge(hub: Hub, address: "MqttAddress", site_id: int | None, nodes: "list[BridgeNode]") -> None:
+    from skyless.nodes.bridge.broker_bridge import BridgeNode
+    from skyless.nodes.find_site import find_site
+
+    site = await find_site(address, lambda _: None) if site_id is None else site_id
+    node = BridgeNode(hub, address, site, log)
+    nodes.append(node)
+    log(f"bridging site {site} of {address} to {', '.join(route.target.text for route in hub.routes)}; Ctrl-C ends")
+    await node.run()
+
+
+def _report(state: "BridgeState", *, json: bool) -> None:
+    import msgspec
+
+    if json:
+        print_json(msgspec.to_builtins(state))
+        return
+    print(f"{state.fixes} fixes in {state.seconds:.1f} s")
+    for target, reasons in state.dropped.items():
+        for reason, number in sorted(reasons.items()):
+            print(f"  {target}: dropped, {reason}: {number}")
+    if state.malformed:
+        print(f"  messages of the broker that could not be read: {state.malformed}")

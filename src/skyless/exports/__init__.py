@@ -1,0 +1,4 @@
+"""Recordings of a running site in the formats of other programs.
+
+Public: rosbag.
+"""

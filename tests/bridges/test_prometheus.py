@@ -1,0 +1,290 @@
+"""The figures for Prometheus, read by its own Python client and promtool: counters rise, ages grow, nothing is old."""
+
+import asyncio
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from bridged_values import SITE, a_fix
+from hypothesis import given
+from hypothesis import strategies as st
+from prometheus_client.parser import text_string_to_metric_families
+
+from skyless.bridges.prometheus.exposition import CONTENT_TYPE, family, histograms
+from skyless.bridges.prometheus.metrics import FRESH_S, LATENCY_BOUNDS_S, Rising, SiteMetrics
+from skyless.bridges.prometheus.target import make_target
+from skyless.bridges.target import BridgeContext
+from skyless.bridges.target_url import TargetUrl
+from skyless.errors import SkylessError
+from skyless.mqtt.messages import AnchorHealth, Counters, StatusMessage, TagHealth
+
+NO_LINK = Counters(0, 0, 0)
+CONTEXT = BridgeContext(print)
+
+
+def tag_health(tag="tag1", uptime_s=10.0, fixes=100, counters=None, mqtt=NO_LINK, **more):
+    values = {
+        "unix_s": 0.0,
+        "method": "joint",
+        "receptions": 2 * fixes,
+        "updates_per_s": 10.0,
+        "reason": None,
+        "first_fix_s": 0.1,
+        "latency_p50_s": 0.001,
+        "latency_p99_s": 0.002,
+        "cpu": 0.05,
+        "memory_bytes": 1000,
+        "phases": (),
+    }
+    return TagHealth(tag=tag, uptime_s=uptime_s, fixes=fixes, counters=counters or {}, mqtt=mqtt, **values | more)
+
+
+def anchor_health(anchor=2, uptime_s=10.0, sent=100, **more):
+    values = {
+        "unix_s": 0.0,
+        "role": "anchor",
+        "master": 1,
+        "term": 0,
+        "synchronised": True,
+        "offset_s": 0.1,
+        "rate_ppm": -3.0,
+        "offset_std_m": 0.012,
+        "late": 1,
+        "heard": 500,
+        "superframe": 7,
+        "heard_age_s": {},
+        "counters": {"malformed": 3},
+        "mqtt": NO_LINK,
+    }
+    return AnchorHealth(anchor=anchor, uptime_s=uptime_s, sent=sent, **values | more)
+
+
+def read(metrics, now_s=100.0):
+    """All samples: by name and labels, as Prometheus's own client reads them."""
+    return {
+        (sample.name, *sorted(sample.labels.items())): sample.value
+        for one in text_string_to_metric_families(metrics.text(now_s))
+        for sample in one.samples
+    }
+
+
+def of_tag(name, tag="tag1", **labels):
+    return (f"skyless_{name}", *sorted({"tag": tag, **labels}.items()))
+
+
+@pytest.fixture
+def metrics():
+    metrics = SiteMetrics(positions=True)
+    metrics.on_site(SITE)
+    metrics.on_fix(a_fix(serial=200, latency_s=0.004, hpl_m=0.3), 100.0)
+    metrics.on_health(tag_health(fixes=190, counters={"foreign": 2}, mqtt=Counters(50, 4, 1)), 100.0)
+    metrics.on_health(anchor_health(), 100.0)
+    metrics.on_status(StatusMessage(online=True, kind="tag", name="tag1"))
+    metrics.on_status(StatusMessage(online=False, kind="anchor", name="2"))
+    metrics.on_status(StatusMessage(online=True, kind="dashboard", name="pi"))
+    return metrics
+
+
+def test_what_is_known_of_a_tag_and_an_anchor(metrics):
+    samples = read(metrics, 101.0)
+    expected = {
+        of_tag("tag_online"): 1,
+        of_tag("tag_fixes_total"): 200,
+        of_tag("tag_receptions_total"): 380,
+        of_tag("tag_dropped_frames_total", reason="foreign"): 2,
+        of_tag("tag_fix_age_seconds"): 1.004,
+        of_tag("tag_error_std_metres"): 0.13,
+        of_tag("tag_anchors"): 6,
+        of_tag("tag_protection_level_metres", axis="horizontal"): 0.3,
+        of_tag("tag_position_metres", axis="y"): 2.0,
+        of_tag("tag_latency_seconds_count"): 1,
+        of_tag("tag_latency_seconds_bucket", le="0.002"): 0,
+        of_tag("tag_latency_seconds_bucket", le="0.005"): 1,
+        ("skyless_anchor_online", ("anchor", "2")): 0,
+        ("skyless_anchor_synchronised", ("anchor", "2")): 1,
+        ("skyless_anchor_offset_std_metres", ("anchor", "2")): 0.012,
+        ("skyless_anchor_sent_total", ("anchor", "2")): 100,
+        ("skyless_anchor_dropped_frames_total", ("anchor", "2"), ("reason", "malformed")): 3,
+        ("skyless_mqtt_dropped_total", ("kind", "tag"), ("name", "tag1")): 4,
+        ("skyless_mqtt_reconnects_total", ("kind", "tag"), ("name", "tag1")): 1,
+    }
+    assert {key: samples[key] for key in expected} == pytest.approx(expected)
+    assert "dashboard" not in str(samples)
+
+
+def test_positions_are_given_on_request_only():
+    metrics = SiteMetrics()
+    metrics.on_fix(a_fix(), 100.0)
+    assert of_tag("tag_position_metres", axis="x") not in read(metrics)
+
+
+def test_the_age_of_a_killed_tag_grows_from_scrape_to_scrape_and_its_gauges_end(metrics):
+    ages = [read(metrics, 100.0 + later_s)[of_tag("tag_fix_age_seconds")] for later_s in (0.0, 1.5, 3600.0)]
+    assert ages == pytest.approx([0.004, 1.504, 3600.004])
+    fresh, old = read(metrics, 100.0 + FRESH_S - 0.1), read(metrics, 100.1 + FRESH_S)
+    gone = {key[0] for key in fresh.keys() - old.keys()}
+    assert of_tag("tag_error_std_metres")[0] in gone
+    assert not any(name.endswith(("_total", "_count", "_online", "age_seconds")) for name in gone)
+
+
+def test_a_restarted_tag_lets_no_counter_fall(metrics):
+    metrics.on_fix(a_fix(serial=3), 110.0)  # it has been started again; its health has not said so yet
+    assert read(metrics)[of_tag("tag_fixes_total")] == 200
+    metrics.on_health(tag_health(uptime_s=1.0, fixes=30, counters={"foreign": 1}, mqtt=Counters(5, 0, 0)), 111.0)
+    samples = read(metrics)
+    assert samples[of_tag("tag_fixes_total")] == 230
+    assert samples[of_tag("tag_dropped_frames_total", reason="foreign")] == 3
+    assert samples[("skyless_mqtt_dropped_total", ("kind", "tag"), ("name", "tag1"))] == 4
+    metrics.on_fix(a_fix(serial=31), 111.1)
+    assert read(metrics)[of_tag("tag_fixes_total")] == 231
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 100)), max_size=30))
+def test_a_counter_only_rises_whatever_comes(steps):
+    counter, before = Rising(), 0
+    for restarted, value in steps:
+        counter.update(value, restarted=restarted)
+        assert counter.total >= before
+        before = counter.total
+
+
+def test_nobody_can_fill_the_memory_with_names():
+    metrics = SiteMetrics()
+    for k in range(3000):
+        metrics.on_fix(a_fix(tag=f"t{k}"), 0.0)
+    metrics.on_health(tag_health("t1", counters={f"reason{k}": 1 for k in range(200)}), 0.0)
+    text = metrics.text(0.0)
+    assert text.count("skyless_tag_fixes_total{") == 2000
+    assert text.count("skyless_tag_dropped_frames_total{") == 50
+
+
+@given(st.dictionaries(st.sampled_from(["tag", "reason"]), st.text(max_size=20)), st.floats(allow_nan=False))
+def test_any_label_and_value_comes_back(labels, value):
+    text = "\n".join([*family("skyless_x", "gauge", "Some text.", [(labels, value)]), ""])
+    (one,) = text_string_to_metric_families(text)
+    (sample,) = one.samples
+    assert (sample.labels, sample.value) == (labels, value)
+
+
+@given(st.lists(st.floats(0.0, 1.0), max_size=30))
+def test_a_histogram_counts_as_prometheus_does(values):
+    metrics = SiteMetrics()
+    for value in values:
+        metrics.on_fix(a_fix(latency_s=value), 1.0)
+    samples = read(metrics)
+    for bound in LATENCY_BOUNDS_S if values else ():
+        assert samples[of_tag("tag_latency_seconds_bucket", le=str(bound))] == sum(v <= bound for v in values)
+    assert samples.get(of_tag("tag_latency_seconds_sum"), 0.0) == pytest.approx(sum(values))
+    assert histograms("x", "y", (1.0,), []) == []
+
+
+def test_promtool_finds_nothing(metrics):
+    if shutil.which("promtool") is None:
+        pytest.skip("promtool is not installed: apt-get install prometheus")
+    done = subprocess.run(
+        ["promtool", "check", "metrics"], input=metrics.text(100.0), capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def exchange(*requests):
+    """Answers of a target that serves; each request on a connection of its own."""
+
+    async def talk():
+        target = make_target(TargetUrl("prometheus://"), CONTEXT)
+        target.port = 0
+        target.on_site(SITE)
+        target.on_fix(a_fix())
+        serving = asyncio.ensure_future(target.run())
+        while not target.port:
+            await asyncio.sleep(0.01)
+        answers = []
+        for request in requests:
+            reader, writer = await asyncio.open_connection("127.0.0.1", target.port)
+            writer.write(request)
+            writer.write_eof()
+            answers.append(await reader.read())
+            writer.close()
+        serving.cancel()
+        await asyncio.wait([serving])
+        return target, answers
+
+    return asyncio.run(talk())
+
+
+def test_it_answers_scrapes_and_nothing_else():
+    _, (whole, head, other, posted) = exchange(
+        b"GET /metrics?x=1 HTTP/1.1\r\nHost: a\r\n\r\n",
+        b"HEAD /metrics HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"POST /metrics HTTP/1.1\r\n\r\n",
+    )
+    first, _, body = whole.partition(b"\r\n\r\n")
+    assert first.startswith(b"HTTP/1.1 200 OK\r\n")
+    assert CONTENT_TYPE.encode() in first
+    assert f"Content-Length: {len(body)}".encode() in first
+    assert b"skyless_tag_fixes_total" in body
+    assert head.startswith(b"HTTP/1.1 200")
+    assert head.endswith(b"\r\n\r\n")
+    assert other.startswith(b"HTTP/1.1 404")
+    assert posted.startswith(b"HTTP/1.1 405")
+
+
+def test_what_is_no_request_is_counted_and_harms_nobody():
+    target, answers = exchange(
+        b"", b"\x00" * 100, b"A" * 20_000, b" \r\n\r\n", b"GET\r\n\r\n", b"GET /metrics HTTP/1.1\r\n\r\n"
+    )
+    assert target.dropped["request"] == 3
+    assert answers[-1].startswith(b"HTTP/1.1 200")
+
+
+def test_a_port_that_is_taken_is_named():
+    async def twice():
+        async with await asyncio.start_server(lambda _r, _w: None, "127.0.0.1", 0) as server:
+            port = server.sockets[0].getsockname()[1]
+            await make_target(TargetUrl(f"prometheus://:{port}"), CONTEXT).run()
+
+    with pytest.raises(SkylessError, match=r"prometheus://:\d+' cannot listen on 127.0.0.1:\d+: "):
+        asyncio.run(twice())
+
+
+DASHBOARD = json.loads((Path(__file__).parents[2] / "docs" / "tools" / "skyless_grafana.json").read_text("utf-8"))
+QUERIES = [target["expr"] for panel in DASHBOARD["panels"] for target in panel["targets"]]
+
+
+def test_the_dashboard_of_grafana_is_one_that_can_be_imported():
+    """The keys that Grafana's import asks for; its own program cannot be had here."""
+    assert [given["name"] for given in DASHBOARD["__inputs"]] == ["DS_PROMETHEUS"]
+    assert {"uid", "title", "schemaVersion", "panels", "templating", "time"} <= DASHBOARD.keys()
+    panels = DASHBOARD["panels"]
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    assert {panel["type"] for panel in panels} == {panel["id"] for panel in DASHBOARD["__requires"][1:]}
+    assert all(panel["datasource"]["uid"] == "${DS_PROMETHEUS}" for panel in panels)
+    cells = [
+        (x, y)
+        for panel in panels
+        for x in range(panel["gridPos"]["x"], panel["gridPos"]["x"] + panel["gridPos"]["w"])
+        for y in range(panel["gridPos"]["y"], panel["gridPos"]["y"] + panel["gridPos"]["h"])
+    ]
+    assert len(set(cells)) == len(cells), "panels overlap"
+    assert max(x for x, _ in cells) < 24
+
+
+@pytest.mark.parametrize("query", QUERIES)
+def test_every_metric_of_the_dashboard_is_served(metrics, query):
+    served = {key[0] for key in read(metrics)}
+    assert set(re.findall(r"skyless_\w+", query)) <= served
+
+
+def test_prometheus_can_parse_every_query_of_the_dashboard(tmp_path):
+    if shutil.which("promtool") is None:
+        pytest.skip("promtool is not installed: apt-get install prometheus")
+    replaced = [query.replace("$__rate_interval", "1m").replace("$tag", ".*") for query in QUERIES]
+    rules = [{"record": f"a:r{k}", "expr": query} for k, query in enumerate(replaced)]
+    file = tmp_path / "rules.yml"
+    file.write_text(json.dumps({"groups": [{"name": "all", "rules": rules}]}), encoding="utf-8")
+    done = subprocess.run(["promtool", "check", "rules", file], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

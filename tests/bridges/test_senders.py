@@ -1,0 +1,177 @@
+"""Senders on the real system: what readers get, and what one that never reads costs."""
+
+import asyncio
+import contextlib
+import socket
+import stat
+
+import pytest
+
+from skyless.bridges.jsonl import JsonLines
+from skyless.bridges.senders import MOST_READERS, PtySender, SerialSender, TcpServer, UdpSender
+from skyless.errors import SkylessError
+from skyless.radios.serial.pseudo_terminal import Pty
+
+
+@contextlib.asynccontextmanager
+async def running(sender):
+    task = asyncio.ensure_future(sender.run())
+    await asyncio.sleep(0)
+    try:
+        yield sender
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def listening(server):
+    while server.port == 0:
+        await asyncio.sleep(0.001)
+    return server.port
+
+
+def test_tcp_readers_get_the_greeting_and_then_everything():
+    async def work():
+        async with running(TcpServer("t:", "127.0.0.1", 0, lambda: [b"hello\n"])) as server:
+            port = await listening(server)
+            one, _ = await asyncio.open_connection("127.0.0.1", port)
+            two, leaving = await asyncio.open_connection("127.0.0.1", port)
+            assert [await one.readline(), await two.readline()] == [b"hello\n"] * 2
+            server.send(b"first\n")
+            assert [await one.readline(), await two.readline()] == [b"first\n"] * 2
+            leaving.close()
+            await leaving.wait_closed()
+            for number in range(100):
+                server.send(b"%d\n" % number)
+            assert [await one.readline() for _ in range(100)] == [b"%d\n" % number for number in range(100)]
+        assert await one.read() == b"", "the end of the server ends its connections"
+
+    asyncio.run(work())
+
+
+def test_a_tcp_reader_that_never_reads_costs_no_other_a_byte_and_is_disconnected():
+    async def work():
+        async with running(TcpServer("t:", "127.0.0.1", 0, list)) as server:
+            port = await listening(server)
+            asleep = socket.create_connection(("127.0.0.1", port))
+            awake, held = await asyncio.open_connection("127.0.0.1", port)
+            while len(server._readers) < 2:
+                await asyncio.sleep(0.001)
+            line = b"x" * 999 + b"\n"
+            for _ in range(3000):  # 3 MB: more than any buffer of the system holds
+                server.send(line)
+                assert await awake.readline() == line
+            assert server.dropped["slow-reader"] > 0
+            assert len(server._readers) == 2
+            loop = asyncio.get_running_loop()
+            now_s = loop.time()
+            loop.time = lambda: now_s + 60.0  # a minute later it still has not read
+            server.send(line)
+            del loop.time
+            while len(server._readers) > 1:
+                await asyncio.sleep(0.001)
+            assert await awake.readline() == line
+            asleep.close()
+            held.close()
+
+    asyncio.run(work())
+
+
+def test_more_connections_than_allowed_are_closed_at_once():
+    async def work():
+        async with running(TcpServer("t:", "127.0.0.1", 0, list)) as server:
+            port = await listening(server)
+            held = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST_READERS)]
+            reader, _ = await asyncio.open_connection("127.0.0.1", port)
+            with contextlib.suppress(ConnectionResetError):
+                assert await reader.read() == b""
+            assert len(server._readers) == MOST_READERS
+            del held
+
+    asyncio.run(work())
+
+
+def test_a_port_in_use_is_named():
+    async def work():
+        with socket.create_server(("127.0.0.1", 0)) as taken:
+            port = taken.getsockname()[1]
+            with pytest.raises(SkylessError, match=f"'t:' cannot listen on 127.0.0.1:{port}: Address already in use"):
+                await TcpServer("t:", "127.0.0.1", port, list).run()
+
+    asyncio.run(work())
+
+
+def test_datagrams_arrive_one_by_one_and_none_is_missed_aloud():
+    async def work():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as inbox:
+            inbox.bind(("127.0.0.1", 0))
+            inbox.settimeout(10)
+            said = []
+            async with running(UdpSender("u:", "127.0.0.1", inbox.getsockname()[1], said.append)) as sender:
+                sender.send(b"one")
+                sender.send(b"two")
+                assert [inbox.recv(99), inbox.recv(99)] == [b"one", b"two"]
+                for _ in range(3):
+                    sender.send(b"x" * 70_000)  # no datagram is so long
+                assert sender.dropped["not-sent"] == 3
+                assert len(said) == 1
+                sender.send(b"three")
+                assert inbox.recv(99) == b"three"
+
+    asyncio.run(work())
+
+
+def test_a_pseudo_terminal_that_nobody_reads_holds_only_what_is_new(tmp_path):
+    link, said = tmp_path / "tag1", []
+
+    async def work():
+        async with running(PtySender("p:", str(link), said.append)) as sender:
+            assert str(link) in said[0]
+            assert stat.S_IMODE(link.stat().st_mode) == 0o666  # gpsd opens it without any rights
+            for number in range(3000):
+                sender.send(b"%07d\n" % number)
+            assert sender.dropped["not-read"] > 0
+            with link.open("rb", buffering=0) as port:
+                data = await asyncio.to_thread(port.read, 1 << 16)
+                assert len(data) <= 4096, "not more than the system itself holds"
+                assert int(data.split(b"\n")[-2]) == 2999 - (sender._pty._waiting != b"")
+                sender.send(b"9999999\n")
+                assert (await asyncio.to_thread(port.read, 1 << 16)).endswith(b"9999999\n")
+        assert not link.exists()
+
+    asyncio.run(work())
+
+
+def test_a_path_in_the_way_of_a_link_is_named(tmp_path):
+    (tmp_path / "file").write_text("keep me")
+    with pytest.raises(SkylessError, match=r"'p:' has the path .*; it should be a free name"):
+        PtySender("p:", str(tmp_path / "file"), print)
+    assert (tmp_path / "file").read_text() == "keep me"
+
+
+def test_a_serial_port_gets_bytes_once_it_is_there(tmp_path):
+    async def work():
+        said = []
+        path = tmp_path / "port"
+        async with running(SerialSender("s:", str(path), 115_200, said.append)) as sender:
+            sender.send(b"lost")
+            assert sender.dropped["no-port"] == 1
+            while not said:
+                await asyncio.sleep(0.001)
+            device = Pty(path)
+            got = bytearray()
+            device.start(got.extend)
+            while sender._write is None:
+                await asyncio.sleep(0.01)
+            sender.send(b"found")
+            while bytes(got) != b"found":
+                await asyncio.sleep(0.001)
+            assert len(said) == 1
+            assert "there is no" in said[0]
+            device.close()
+
+    asyncio.run(asyncio.wait_for(work(), 30))
+
+
+def test_a_stream_of_json_lines_begins_with_the_site():
+    assert JsonLines().greeting() == []

@@ -1,0 +1,310 @@
+"""Targets for vehicles and stages on the real system: MAVSDK, pymavlink, python-osc and pypsn get what was given."""
+
+import asyncio
+import contextlib
+import json
+import math
+import socket
+import struct
+
+import pypsn
+import pytest
+from bridged_values import SITE, a_fix
+from msgspec import structs
+from pythonosc.osc_message import OscMessage
+
+from skyless.bridges.mavlink.profiles import gps_input, odometry, vision_position_estimate
+from skyless.bridges.target import BridgeContext
+from skyless.bridges.targets import open_route
+from skyless.radios.serial.pseudo_terminal import Pty
+
+pymavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
+HEADING_DEG = SITE.georeference.heading_deg
+
+
+@contextlib.asynccontextmanager
+async def serving(address, site=SITE):
+    """A target that runs and knows its site."""
+    said = []
+    target = open_route(address, BridgeContext(said.append)).target
+    task = asyncio.ensure_future(target.run())
+    await asyncio.sleep(0)
+    target.on_site(site)
+    try:
+        yield target
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        assert said == []
+
+
+def within(work):
+    """Run it, but not for ever."""
+    asyncio.run(asyncio.wait_for(work, 60))
+
+
+def bound():
+    """A UDP socket that receives at a port of its own, and that port."""
+    receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    receiver.bind(("127.0.0.1", 0))
+    receiver.setblocking(False)
+    return receiver, receiver.getsockname()[1]
+
+
+# MAVSDK as the vehicle
+
+
+class Vehicle:
+    """MAVSDK, which is system 3 with an autopilot: the target's messages as it decodes them."""
+
+    def __init__(self):
+        mavsdk = pytest.importorskip("mavsdk")
+        self._kind = pytest.importorskip("mavsdk.plugins.mavlink_direct").MavlinkDirect
+        free, self.port = bound()
+        free.close()
+        self._sdk = mavsdk.Mavsdk(mavsdk.Configuration.create_manual(3, 1, True))
+        assert self._sdk.add_any_connection(f"udpin://127.0.0.1:{self.port}") == 0
+        self._direct = None
+        self.messages = {}
+
+    def connect(self):
+        """Once it knows of a system, get its messages."""
+        if self._direct is None and self._sdk.get_systems():
+            self._direct = self._kind(self._sdk.get_systems()[0])
+            self._direct.subscribe_message("", self._on_message)
+
+    def _on_message(self, message, _):
+        sender = {"from": (message.system_id, message.component_id)}
+        self.messages[message.message_name] = json.loads(message.fields_json) | sender
+
+    def close(self):
+        self._sdk.destroy()
+
+
+@pytest.fixture
+def vehicle():
+    made = Vehicle()
+    yield made
+    made.close()
+
+
+NAMES = {"ardupilot": "VISION_POSITION_ESTIMATE", "px4": "ODOMETRY", "gps": "GPS_INPUT"}
+RENAMED = {
+    "time_us": "time_usec",
+    "latitude_1e7": "lat",
+    "longitude_1e7": "lon",
+    "altitude": "alt",
+    "horizontal_accuracy": "horiz_accuracy",
+    "vertical_accuracy": "vert_accuracy",
+    "yaw_cdeg": "yaw",
+}
+SEVERAL = {"position": "xyz", "velocity": ("vx", "vy", "vz"), "rates": ("rollspeed", "pitchspeed", "yawspeed")}
+
+
+def expected_of(profile, fix):
+    """The fields that the vehicle should decode, by MAVLink's names; NaN is None in JSON."""
+    if profile == "ardupilot":
+        message = vision_position_estimate(fix, HEADING_DEG, 0)
+    elif profile == "px4":
+        message = odometry(fix, HEADING_DEG, 0)
+    else:
+        message = gps_input(fix, SITE.georeference)
+    fields = {}
+    for name, value in structs.asdict(message).items():
+        if profile == "gps" and name == "velocity":
+            fields |= dict(zip(("vn", "ve", "vd"), value, strict=True))
+        elif name in SEVERAL:
+            fields |= dict(zip(SEVERAL[name], value, strict=True))
+        else:
+            fields[RENAMED.get(name, name)] = value
+    if profile == "ardupilot":
+        fields["usec"] = fields.pop("time_usec")
+    return fields
+
+
+def as_float32(value):
+    """As it comes out of a 32-bit float and JSON."""
+    if isinstance(value, tuple):
+        return [as_float32(one) for one in value]
+    if isinstance(value, float):
+        return None if math.isnan(value) else struct.unpack("<f", struct.pack("<f", value))[0]
+    return value
+
+
+@pytest.mark.parametrize("profile", NAMES)
+@pytest.mark.parametrize("moving", [True, False])
+def test_mavsdk_decodes_every_field(profile, moving, vehicle):
+    fix = a_fix() if moving else a_fix(velocity_mps=None, velocity_covariance=None, hdop=None, height_known=True)
+
+    async def work():
+        async with serving(f"mavlink+udpout://127.0.0.1:{vehicle.port}?profile={profile}&system=3") as target:
+            serial = 0
+            while not {"HEARTBEAT", NAMES[profile]} <= set(vehicle.messages):
+                serial += 1
+                target.on_second(fix.unix_s)
+                target.on_fix(structs.replace(fix, serial=serial))
+                await asyncio.sleep(0.02)
+                vehicle.connect()
+
+    within(work())
+    fields = vehicle.messages[NAMES[profile]]
+    assert fields.pop("from") == (3, 197)
+    assert fields.pop("message_name") == NAMES[profile]
+    fields.pop("message_id")
+    expected = expected_of(profile, fix)
+    assert set(fields) == set(expected)
+    for name, value in expected.items():
+        assert fields[name] == as_float32(value), name
+    heartbeat = vehicle.messages["HEARTBEAT"]
+    assert (heartbeat["type"], heartbeat["autopilot"]) == (18, 8)
+    if profile == "gps":
+        assert "SET_GPS_GLOBAL_ORIGIN" not in vehicle.messages
+    else:
+        origin = vehicle.messages["SET_GPS_GLOBAL_ORIGIN"]
+        assert (origin["latitude"], origin["longitude"], origin["altitude"]) == (525_123_457, 133_260_000, 34_500)
+        assert origin["target_system"] == 3
+
+
+# A vehicle that pymavlink plays, over UDP and a serial line
+
+
+class Played:
+    """A vehicle's side of a link: what it has received, and what it says."""
+
+    def __init__(self, send):
+        self._send = send
+        self._link = pymavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        self.received = asyncio.Queue()
+
+    def on_data(self, data):
+        for message in self._link.parse_buffer(data) or []:
+            self.received.put_nowait(message)
+
+    def say(self, message):
+        self._send(message.pack(self._link))
+
+    async def next(self, kind):
+        while (message := await self.received.get()).get_type() != kind:
+            pass
+        return message
+
+
+async def converse(vehicle, target):
+    """The vehicle gets fixes, an origin until it has one, and answers when it asks for the time."""
+    target.on_second(1_795_000_000.0)
+    assert (await vehicle.next("SET_GPS_GLOBAL_ORIGIN")).latitude == 525_123_457
+    target.on_fix(a_fix())
+    found = await vehicle.next("VISION_POSITION_ESTIMATE")
+    assert (found.x, found.z) == pytest.approx((1.2320508, -1.5))
+    vehicle.say(pymavlink.MAVLink_timesync_message(0, 4711))
+    answer = await vehicle.next("TIMESYNC")
+    assert answer.ts1 == 4711
+    assert answer.tc1 > 1_700_000_000_000_000_000  # ns since 1970
+    vehicle.say(pymavlink.MAVLink_gps_global_origin_message(525_123_457, 133_260_000, 34_500))
+    vehicle.say(pymavlink.MAVLink_timesync_message(0, 4712))
+    assert (await vehicle.next("TIMESYNC")).ts1 == 4712  # so that it has read the origin as well
+    target.on_second(1_795_000_001.0)
+    target.on_fix(a_fix(serial=2))
+    assert (await vehicle.received.get()).get_type() == "HEARTBEAT"
+    assert (await vehicle.received.get()).get_type() == "VISION_POSITION_ESTIMATE"
+
+
+def test_a_vehicle_on_udp():
+    async def work():
+        receiver, port = bound()
+        with receiver:
+            peers = []
+            vehicle = Played(lambda data: receiver.sendto(data, peers[-1]))
+
+            def read():
+                data, peer = receiver.recvfrom(1 << 16)
+                peers.append(peer)
+                vehicle.on_data(data)
+
+            loop = asyncio.get_running_loop()
+            loop.add_reader(receiver, read)
+            async with serving(f"mavlink+udpout://127.0.0.1:{port}?profile=ardupilot") as target:
+                await converse(vehicle, target)
+            assert target.dropped.total() == 0
+            loop.remove_reader(receiver)
+
+    within(work())
+
+
+def test_a_vehicle_on_a_serial_line():
+    async def work():
+        line = Pty()
+        vehicle = Played(line.send)
+        line.start(vehicle.on_data)
+        async with serving(f"mavlink+serial:{line.path}@57600?profile=ardupilot") as target:
+            while vehicle.received.empty():  # until the port is open
+                target.on_second(0.0)
+                await asyncio.sleep(0.01)
+            await converse(vehicle, target)
+        line.close()
+
+    within(work())
+
+
+# Stages
+
+
+def test_osc_arrives():
+    async def work():
+        receiver, port = bound()
+        with receiver:
+            async with serving(f"osc+udp://127.0.0.1:{port}?up=y") as target:
+                target.on_fix(a_fix())
+                loop = asyncio.get_running_loop()
+                found = [OscMessage(await loop.sock_recv(receiver, 4096)) for _ in range(2)]
+        assert [(one.address, one.params) for one in found] == [
+            ("/skyless/tag1/fix", [1]),
+            ("/skyless/tag1/xyz", [1.0, 1.5, -2.0]),
+        ]
+
+    within(work())
+
+
+def test_psn_is_a_steady_stream_of_frames_with_names_in_between():
+    async def work():
+        receiver, port = bound()
+        with receiver:
+            async with serving(f"psn://127.0.0.1:{port}?hz=100") as target:
+                target.on_fix(a_fix())
+                target.on_second(1_795_000_000.0)
+                packets = []
+                loop = asyncio.get_running_loop()
+                while len(packets) < 20:
+                    packets.append(pypsn.parse_psn_packet(await loop.sock_recv(receiver, 4096)))
+        (info,) = [packet for packet in packets if isinstance(packet, pypsn.psn_info_packet)]
+        assert info.name == b"hall"
+        assert [tracker.tracker_name for tracker in info.trackers] == [b"tag1"]
+        data = [packet for packet in packets if isinstance(packet, pypsn.psn_data_packet)]
+        first = data[0].info.frame_id
+        assert [packet.info.frame_id for packet in data] == list(range(first, first + len(data)))
+        assert all(tuple(packet.trackers[0].pos) == (1.0, 1.5, -2.0) for packet in data)
+        # The same fix, so that its own stamp stays the same while the frames' stamps rise.
+        assert len({packet.trackers[0].timestamp for packet in data}) == 1
+        stamps = [packet.info.timestamp for packet in data]
+        assert stamps == sorted(set(stamps))
+
+    within(work())
+
+
+def test_psn_leaves_by_the_interface_that_is_named():
+    with pytest.raises(Exception, match="interface=nowhere; it should be the IPv4 address of a network card"):
+        open_route("psn://?interface=nowhere", BridgeContext(print))
+    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as receiver:
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        receiver.bind(("236.10.10.10", 56565))
+        membership = socket.inet_aton("236.10.10.10") + socket.inet_aton("127.0.0.1")
+        receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        receiver.setblocking(False)
+
+        async def work():
+            async with serving("psn://?interface=127.0.0.1") as target:
+                target.on_fix(a_fix())
+                packet = await asyncio.get_running_loop().sock_recv(receiver, 4096)
+                assert pypsn.parse_psn_packet(packet).info.version_high == 2
+
+        within(work())

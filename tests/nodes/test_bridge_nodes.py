@@ -1,0 +1,201 @@
+"""Where bridges get fixes from: a broker, and the tags of the same process."""
+
+import asyncio
+import contextlib
+import json
+import signal
+import sys
+
+import pytest
+from mqtt_brokers import Embedded, free_port, until
+from msgspec import structs
+
+from bridges.bridged_values import BERLIN, a_fix
+from machines.bench import LAB, tape
+from skyless.air.reception import Reception
+from skyless.bridges.hub import Hub, Route
+from skyless.bridges.target import Target
+from skyless.errors import SkylessError
+from skyless.mqtt.link import Link
+from skyless.mqtt.messages import Counters, SiteMessage, StatusMessage, TagHealth, Zone, ZonesMessage
+from skyless.mqtt.topics import fix_topic, health_topic, site_topic, status_topic, zones_topic
+from skyless.nodes.bridge.broker_bridge import BridgeNode
+from skyless.nodes.bridge.tag_bridge import TagBridge, heard_site
+from skyless.nodes.process import end_with_parent
+from skyless.receiver import Receiver
+
+ZONE = Zone("dock", "Dock", ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0)))
+
+
+class Recorded(Target):
+    def __init__(self, refuses=False):
+        super().__init__("test:")
+        self.refuses = refuses
+        self.sites, self.fixes, self.health, self.status, self.none = [], [], [], [], []
+
+    def on_site(self, site):
+        if self.refuses:
+            raise SkylessError("test: needs more")
+        self.sites.append(site)
+
+    def on_fix(self, fix):
+        self.fixes.append(fix)
+
+    def on_no_fix(self, tag, unix_s, reason):
+        self.none.append((tag, reason))
+
+    def on_health(self, health):
+        self.health.append(health)
+
+    def on_status(self, status):
+        self.status.append(status)
+
+    async def run(self):
+        await asyncio.Event().wait()
+
+
+def health(tag, reason=None):
+    return TagHealth(
+        tag, 0.0, 1.0, "joint", 1, 1, 1.0, reason, 0.1, None, None, {}, Counters(0, 0, 0), 0.0, 0, ()
+    )  # fmt: skip
+
+
+@contextlib.asynccontextmanager
+async def running(*parts):
+    tasks = [asyncio.ensure_future(part) for part in parts]
+    try:
+        yield tasks
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+@contextlib.asynccontextmanager
+async def brokered(folder):
+    """A broker, and a link that plays the site's programs."""
+    broker = Embedded(folder)
+    await broker.start()
+    programs = Link(broker.address, "tag1", site=LAB.id, kind="tag")
+    try:
+        async with running(programs.run()):
+            await until(lambda: programs.connected)
+            yield broker, programs
+    finally:
+        await broker.stop()
+
+
+def test_all_that_targets_need_comes_from_the_broker_and_nonsense_is_counted(tmp_path):
+    async def main():
+        target, said = Recorded(), []
+        async with brokered(tmp_path) as (broker, programs):
+            programs.publish(zones_topic(LAB.id), ZonesMessage((ZONE,)), retain=True)
+            programs.publish(site_topic(LAB.id), SiteMessage(LAB, True, 0.0), retain=True)
+            hub = Hub([Route(target, None, 50.0)], said.append)
+            node = BridgeNode(hub, broker.address, LAB.id, said.append)
+            async with running(node.run()):
+                await until(lambda: target.sites and target.sites[-1].zones)
+                programs.publish(fix_topic(LAB.id, "tag1"), b"{not json")
+                programs.publish(fix_topic(LAB.id, "tag1"), b'{"tag":"tag1"}')
+                programs.publish(site_topic(LAB.id), b"")
+                programs.publish(status_topic(LAB.id, "tag", "tag9"), StatusMessage(True, "tag", "tag9"))
+                programs.publish(health_topic(LAB.id, "tag", "tag1"), health("tag1"))
+                programs.publish(fix_topic(LAB.id, "tag1"), a_fix())
+                await until(lambda: target.fixes and target.health and target.status)
+                assert target.fixes == [a_fix()]
+                assert target.sites[-1].name == LAB.name
+                assert target.sites[-1].simulated
+                assert "tag9" in {status.name for status in target.status}
+                await until(lambda: target.none)
+                state = node.state()
+                assert (state.fixes, state.malformed, state.dropped) == (1, 2, {"test:": {}})
+
+    asyncio.run(main())
+
+
+def test_a_site_that_lacks_what_the_only_target_needs_ends_the_bridge_with_the_reason(tmp_path):
+    async def main():
+        async with brokered(tmp_path) as (broker, programs):
+            programs.publish(site_topic(LAB.id), SiteMessage(LAB, True, 0.0), retain=True)
+            node = BridgeNode(Hub([Route(Recorded(refuses=True), None, 50.0)], print), broker.address, LAB.id, print)
+            with pytest.raises(SkylessError, match="test: needs more"):
+                await asyncio.wait_for(node.run(), 30)
+
+    asyncio.run(main())
+
+
+def test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did(tmp_path):
+    async def main():
+        port = free_port()
+        async with brokered(tmp_path) as (broker, programs):
+            programs.publish(site_topic(LAB.id), SiteMessage(LAB, True, 0.0), retain=True)
+            command = ("bridge", f"jsonl+tcp://:{port}?tag=tag1", "--mqtt", str(broker.address), "--json")
+            process = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "skyless.cli.main", *command),
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+                preexec_fn=end_with_parent(),
+            )
+            while b"bridging site" not in await asyncio.wait_for(process.stderr.readline(), 60):
+                pass
+            lines, connection = await reader_of(port)
+            site = json.loads(await lines.readline())
+            assert (site["type"], site["id"], site["name"]) == ("site", LAB.id, LAB.name)
+            programs.publish(fix_topic(LAB.id, "tag2"), a_fix(tag="tag2"))
+            programs.publish(fix_topic(LAB.id, "tag1"), a_fix())
+            fix = json.loads(await lines.readline())
+            assert (fix["type"], fix["tag"], fix["position_m"]) == ("fix", "tag1", [1.0, 2.0, 1.5])
+            while True:
+                line = json.loads(await lines.readline())
+                if line["type"] == "no_fix" and line["tag"] == "tag1":
+                    break
+            connection.close()
+            process.send_signal(signal.SIGINT)
+            out, _ = await asyncio.wait_for(process.communicate(), 30)
+            assert process.returncode == 0
+            assert json.loads(out)["fixes"] == 2
+
+    asyncio.run(asyncio.wait_for(main(), 120))
+
+
+async def reader_of(port):
+    """A reader of a server that may still be starting."""
+    while True:
+        try:
+            return await asyncio.open_connection("127.0.0.1", port)
+        except ConnectionRefusedError:
+            await asyncio.sleep(0.01)
+
+
+@pytest.mark.parametrize("georeference", [None, BERLIN])
+def test_a_tag_learns_its_site_from_the_air_with_the_georeference_where_one_is_sent(georeference):
+    site = structs.replace(LAB, georeference=georeference)
+    target, said = Recorded(), []
+    bridge = TagBridge(Hub([Route(target, None, 50.0)], said.append), lambda: True, said.append)
+    receiver = Receiver()
+    for heard in tape(site, 2.0, 1, (3.0, 4.0, 0.0)):
+        receiver.hear(Reception(heard.frame, heard.rx_ticks, heard.host_s))
+    bridge.on_health(health("tag1"), receiver)
+    if georeference is None:
+        assert target.sites == [], "the page may still come"
+        bridge._sites["tag1"]._complete_s -= 10.0
+        bridge.on_health(health("tag1"), receiver)
+    (learned,) = target.sites
+    assert (learned.id, learned.simulated) == (site.id, True)
+    assert learned.anchors_m == {one.id: (one.x_m, one.y_m, one.z_m) for one in site.anchors}
+    if georeference is None:
+        assert learned.georeference is None
+    else:
+        assert learned.georeference.latitude_deg == pytest.approx(BERLIN.latitude_deg, abs=6e-8)
+        assert learned.georeference.heading_deg == pytest.approx(BERLIN.heading_deg, abs=1e-2)
+    bridge.on_fix(a_fix())
+    assert target.fixes == [a_fix()]
+
+
+def test_tags_that_know_different_anchors_of_a_large_site_make_one_site():
+    target = Recorded()
+    bridge = TagBridge(Hub([Route(target, None, 50.0)], print), lambda: False, print)
+    for _ in range(3):
+        bridge.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, simulated=False))
+        bridge.on_site(heard_site(5, {2: (9.0, 0.0, 2.0)}, simulated=False))
+    assert [sorted(site.anchors_m) for site in target.sites] == [[1], [1, 2]]
