@@ -210,7 +210,7 @@ def test_locations_on_the_earth_survive_the_line(latitude, longitude, height):
     point = decode_wgs84(encode_wgs84(GeodeticPoint(latitude, longitude, height)))
     assert point.latitude_deg == pytest.approx(latitude, abs=2**-25)
     assert point.longitude_deg == pytest.approx(longitude, abs=2**-25)
-    assert point.height_m == pytest.approx(height, abs=0.24)
+    assert point.height_m == pytest.approx(height, abs=3e-4)
 
 
 @pytest.mark.parametrize("header", ["01", "0103"])
