@@ -44,6 +44,9 @@ NAVIGATION = {
     ],
     "In other tools": [
         "docs/tools/index",
+        "docs/tools/home_assistant",
+        "docs/tools/prometheus",
+        "docs/tools/geojson",
         "docs/tools/json_lines",
     ],
     "Reference": [

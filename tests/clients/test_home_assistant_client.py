@@ -39,7 +39,7 @@ zone:
 """
 WEST = Zone("z1", "West", ((-9.0, -9.0), (3.0, -9.0), (3.0, 19.0), (-9.0, 19.0)))
 EAST = Zone("z2", "East", ((3.0, -9.0), (19.0, -9.0), (19.0, 19.0), (3.0, 19.0)))
-ZONES, REPORT = "skyless/v1/1/zones", "skyless/v1/1/tag/tag1/report"
+ZONES, POSITION = "skyless/v1/1/zones", "skyless/v1/1/tag/tag1/position"
 
 
 @pytest.fixture(scope="module")
@@ -172,10 +172,10 @@ def test_a_killed_tag_is_unavailable_and_a_restarted_home_assistant_has_all_stat
         until(lambda: home.state("room") in {"West", "East"} and home.state("position") == "Hall")
 
         home.stop()
-        last = site.retained(REPORT)
+        last = site.retained(POSITION)
         home = make_home(site.mqtt_port)
         until(lambda: home.state("room") in {"West", "East"} and home.state("position") == "Hall")
-        assert site.retained(REPORT) == last, "no new fix was needed"
+        assert site.retained(POSITION) == last, "no new fix was needed"
         assert set(home.of_tag()) == before
         assert "unknown" not in home.of_tag().values()
 

@@ -11,7 +11,7 @@ import msgspec
 import skyless
 from skyless.bridges.feed import BridgedSite
 from skyless.mqtt.messages import Zone
-from skyless.mqtt.topics import tag_report_topic, tag_zones_topic
+from skyless.mqtt.topics import tag_position_topic, tag_zones_topic
 
 OUTSIDE: Final = "outside"
 """The room of a tag that is in no zone."""
@@ -74,7 +74,7 @@ def document(site: BridgedSite, tag: str, status_topic: str, removed: Mapping[st
 
 
 def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
-    zones_topic, report_topic = tag_zones_topic(site.id, tag), tag_report_topic(site.id, tag)
+    zones_topic, position_topic = tag_zones_topic(site.id, tag), tag_position_topic(site.id, tag)
     components: dict[str, Component] = {
         "room": {
             "platform": "sensor",
@@ -91,7 +91,7 @@ def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
             "unit_of_measurement": "m",
             "suggested_display_precision": 2,
             "entity_category": "diagnostic",
-            "state_topic": report_topic,
+            "state_topic": position_topic,
             "value_template": "{{ value_json.std_m }}",
         },
     }
@@ -100,7 +100,7 @@ def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
             "platform": "device_tracker",
             "name": "Position",
             "source_type": "gps",
-            "json_attributes_topic": report_topic,
+            "json_attributes_topic": position_topic,
             "json_attributes_template": _ATTRIBUTES,
         }
     return components | {zone_key(zone): _occupancy(zone, zones_topic) for zone in site.zones}
