@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from skyless.bridges.home_assistant.announcer import STALE_S, Announcer
 from skyless.bridges.home_assistant.discovery import document, platforms
-from skyless.bridges.home_assistant.target import make_target
+from skyless.bridges.home_assistant.target import SETTLE_S, make_target
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.target_url import TargetUrl
 from skyless.errors import SkylessError
@@ -30,6 +30,7 @@ CONFIG, ZONE, POSITION = (
     "skyless/v1/7/tag/tag1/zone",
     "skyless/v1/7/tag/tag1/position",
 )
+CONTEXT = BridgeContext(lambda _line: None, MqttAddress("hall.example", 1883))
 COVARIANCE = (0.0004, 0.0, 0.0, 0.0, 0.0004, 0.0, 0.0, 0.0, 0.0004)
 
 
@@ -105,6 +106,25 @@ def test_a_site_that_is_nowhere_has_rooms_and_no_tracker(broker):
     announcer_of(broker, replace(BARE_SITE, zones=(WEST,))).on_fix(at(1.0))
     assert set(broker.components()) == {"room", "accuracy", "zone_z1"}
     assert broker.value(POSITION, TagPosition).latitude_deg is None
+
+
+def test_without_zones_there_is_no_room(broker):
+    announcer = announcer_of(broker, SITE)
+    announcer.on_fix(at(1.0))
+    assert set(broker.components()) == {"accuracy", "position"}
+    announcer.on_site(HALL)
+    assert set(broker.components()) == {"accuracy", "position", "room", "zone_z1", "zone_z2"}
+
+
+def test_tags_are_announced_only_when_the_zones_had_time_to_come():
+    target = make_target(TargetUrl("homeassistant:"), CONTEXT)
+    target.on_site(HALL)
+    for second in range(SETTLE_S):
+        target.on_fix(at(1.0))
+        assert not target._begun.is_set()
+        target.on_second(float(second))
+    target.on_fix(at(1.0))
+    assert target._begun.is_set()
 
 
 def test_the_room_follows_the_polygons_and_noise_at_an_edge_changes_nothing(broker):
@@ -253,9 +273,6 @@ def test_templates_hold_nothing_of_what_users_name(broker):
     components = json.loads(document(replace(HALL, name="{{ 2 }}", zones=(evil,)), "tag1", "s", {}))["components"]
     assert components["zone_z1"]["name"] == "In {{ 1 + 1 }}'"
     assert all("1 + 1" not in part.get("value_template", "") for part in components.values())
-
-
-CONTEXT = BridgeContext(lambda _line: None, MqttAddress("hall.example", 1883))
 
 
 def test_the_broker_is_the_sites_or_the_one_of_the_address(broker):

@@ -46,8 +46,8 @@ def birth_topic(prefix: str) -> str:
 def document(site: BridgedSite, tag: str, status_topic: str, removed: Mapping[str, str]) -> bytes:
     """The document of a tag.
 
-    It has the sensors Room and Accuracy, a binary sensor for each zone, and a tracker where the site is georeferenced.
-    All are unavailable while the bridge is offline or the tag has no usable fix. ``status_topic`` is the bridge's, and
+    It has the sensor Accuracy; where there are zones, the sensor Room and a binary sensor for each of them; a tracker where
+    the site is georeferenced. All are unavailable while the bridge is offline or the tag has no usable fix. ``status_topic`` is the bridge's, and
     ``removed`` has the platforms of components that an earlier document had, by key.
     """
     components = _components(site, tag)
@@ -76,13 +76,6 @@ def document(site: BridgedSite, tag: str, status_topic: str, removed: Mapping[st
 def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
     zones_topic, position_topic = tag_zones_topic(site.id, tag), tag_position_topic(site.id, tag)
     components: dict[str, Component] = {
-        "room": {
-            "platform": "sensor",
-            "name": "Room",
-            "icon": "mdi:floor-plan",
-            "state_topic": zones_topic,
-            "value_template": _ROOM,
-        },
         "accuracy": {
             "platform": "sensor",
             "name": "Accuracy",
@@ -102,6 +95,14 @@ def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
             "source_type": "gps",
             "json_attributes_topic": position_topic,
             "json_attributes_template": _ATTRIBUTES,
+        }
+    if site.zones:
+        components["room"] = {
+            "platform": "sensor",
+            "name": "Room",
+            "icon": "mdi:floor-plan",
+            "state_topic": zones_topic,
+            "value_template": _ROOM,
         }
     return components | {zone_key(zone): _occupancy(zone, zones_topic) for zone in site.zones}
 
