@@ -46,9 +46,9 @@ def birth_topic(prefix: str) -> str:
 def document(site: BridgedSite, tag: str, status_topic: str, removed: Mapping[str, str]) -> bytes:
     """The document of a tag.
 
-    It has the sensor Accuracy; where there are zones, the sensor Room and a binary sensor for each of them; a tracker where
-    the site is georeferenced. All are unavailable while the bridge is offline or the tag has no usable fix. ``status_topic`` is the bridge's, and
-    ``removed`` has the platforms of components that an earlier document had, by key.
+    It has the sensor Accuracy; where there are zones, the sensor Room and a binary sensor for each of them; a tracker
+    where the site is georeferenced. All are unavailable while the bridge is offline or the tag has no usable fix.
+    ``status_topic`` is the bridge's; ``removed`` has the platforms of components that an earlier document had, by key.
     """
     components = _components(site, tag)
     for key, component in components.items():

@@ -22,8 +22,8 @@ _PREFIX: Final = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
 
 
 SETTLE_S: Final = 3
-"""The site is known for so long before tags are announced: its zones come after it, and Home Assistant would forget what
-a user has set for the sensors of zones that are missing from a document."""
+"""The site is known for so long before tags are announced, as its zones come after it: Home Assistant would forget what
+a user has set for sensors of zones that are missing."""
 
 
 class Settings(Struct, frozen=True):
