@@ -44,10 +44,15 @@ NAVIGATION = {
     ],
     "In other tools": [
         "docs/tools/index",
+        "docs/tools/gpsd",
+        "docs/tools/foxglove",
         "docs/tools/home_assistant",
         "docs/tools/prometheus",
         "docs/tools/geojson",
         "docs/tools/json_lines",
+        "docs/tools/ardupilot",
+        "docs/tools/px4",
+        "docs/tools/stage",
     ],
     "Reference": [
         "docs/reference/commands",

@@ -259,7 +259,7 @@ def main(names: Iterable[str]) -> None:
     matplotlib.rcParams.update({"svg.hashsalt": "skyless", "font.family": "DejaVu Sans"})
     for name in names or PICTURES:
         if name == "page":
-            import page  # noqa: PLC0415 (needs a browser, which the other pictures do not)
+            import page
 
             page.record()
             continue

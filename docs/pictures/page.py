@@ -88,7 +88,7 @@ def _frames_of(address: str) -> dict[str, list[Image.Image]]:
     return frames
 
 
-def _screenshot(page: Any) -> Image.Image:  # noqa: ANN401 (playwright's page)
+def _screenshot(page: Any) -> Image.Image:
     return Image.open(io.BytesIO(page.screenshot())).convert("RGB")
 
 

@@ -5,6 +5,7 @@ The pictures of ``docs/tools`` are made so, from what the programs that they sho
 
 import re
 import sys
+from io import StringIO
 from pathlib import Path
 from typing import Final
 
@@ -18,9 +19,7 @@ _MOST_LINES: Final = 40
 
 def terminal_svg(text: str, title: str, width: int = WIDTH) -> str:
     """The text with its colours, if it has any, in a window with a title; the fonts are the reader's own."""
-    console = Console(
-        record=True, width=width, file=Path("/dev/null").open("w", encoding="utf-8"), legacy_windows=False
-    )
+    console = Console(record=True, width=width, file=StringIO(), legacy_windows=False)
     for line in text.rstrip().splitlines()[:_MOST_LINES]:
         console.print(Text.from_ansi(line), soft_wrap=False, overflow="fold")
     svg = console.export_svg(title=title, theme=MONOKAI, unique_id="terminal")

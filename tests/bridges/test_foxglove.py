@@ -187,6 +187,26 @@ def test_what_cannot_be_done_is_answered_with_a_status_and_costs_nothing():
     asyncio.run(run())
 
 
+def test_figures_that_no_tag_publishes_are_dropped():
+    async def run():
+        async with served() as server, client_of(server) as client:
+            server.on_fix(FIX)
+            await client.text(advertised("/tag/tag1/location"))
+            wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in client.channels.values()]
+            await client.ask(op="subscribe", subscriptions=wanted)
+            await client.receive()
+            await until(lambda: all(one.wants(number["id"]) for one in server._sessions for number in wanted))
+            for unix_s in (float("nan"), float("inf"), -1.0, 1e30):
+                server.on_fix(msgspec.structs.replace(FIX, unix_s=unix_s))
+            server.on_fix(msgspec.structs.replace(FIX, position_m=(1e300, 1e300, 1e300), covariance_m2=(1e308,) * 9))
+            server.on_fix(FIX)
+            while (await client.receive())[1] != round(FIX.unix_s * 1e9):
+                pass
+            assert server.dropped["out-of-range"] >= 4 * 5
+
+    asyncio.run(run())
+
+
 def test_a_client_that_never_reads_is_disconnected_and_others_get_every_fix(monkeypatch):
     monkeypatch.setattr(session, "STUCK_S", 0.2)
     fixes = 6000

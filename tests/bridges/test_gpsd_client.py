@@ -72,6 +72,16 @@ class Client:
                 return report
 
 
+async def connected(port):
+    """Reader and writer of a connection, as soon as somebody listens."""
+    async with asyncio.timeout(ANSWER_S):
+        while True:
+            try:
+                return await asyncio.open_connection("127.0.0.1", port)
+            except ConnectionRefusedError:
+                await asyncio.sleep(0.05)
+
+
 @asynccontextmanager
 async def gpsd(device):
     """A gpsd of its own that reads the device, and a client that watches it."""
@@ -81,13 +91,7 @@ async def gpsd(device):
         stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        async with asyncio.timeout(ANSWER_S):
-            while True:
-                try:
-                    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-                    break
-                except ConnectionRefusedError:
-                    await asyncio.sleep(0.05)
+        reader, writer = await connected(port)
         writer.write(b'?WATCH={"enable":true,"json":true}\n')
         yield Client(reader)
         writer.close()
@@ -110,10 +114,11 @@ async def tpvs_of(transport, fixes, folder):
     route = open_route(f"{address}?hz=50", BridgeContext(lambda line: None))
     hub = Hub([route], lambda line: None)
     running = asyncio.create_task(route.target.run())
-    await asyncio.sleep(0)
+    if transport == "tcp":
+        (await connected(port))[1].close()
     hub.on_site(SITE)
     device = path.resolve() if transport == "pty" else f"{transport}://127.0.0.1:{port}"
-    reports, gsts = {}, {}
+    reports, gsts, now_s = {}, {}, 0.0
     try:
         async with gpsd(str(device)) as client:
             await client.receive(lambda report: report["class"] == "WATCH")
@@ -129,13 +134,14 @@ async def tpvs_of(transport, fixes, folder):
                 # Until the device is open, and while gpsd does not know where an epoch ends, nothing may come.
                 wait_s = 0.3 if number < 10 else ANSWER_S
                 for attempt in range(20 if number < 10 else 1):
-                    hub.on_fix(msgspec.structs.replace(fix, serial=attempt), 1000.0 * attempt + number)
+                    now_s += 1.0
+                    hub.on_fix(msgspec.structs.replace(fix, serial=attempt), now_s)
                     try:
                         await asyncio.wait_for(client.receive(is_of), wait_s)
                         break
                     except TimeoutError:
                         continue
-            hub.on_second(len(fixes) + 1.0, fixes[-1].unix_s + 1.0)
+            hub.on_tick(now_s + 3.0, fixes[-1].unix_s + 3.0)
             outage = await client.receive(lambda report: report["class"] == "TPV" and report["mode"] == 1)
     finally:
         running.cancel()

@@ -64,7 +64,7 @@ def test_before_the_site_is_known_nothing_is_given():
     target = Recorded()
     hub = Hub([Route(target, None, 10.0)], print)
     hub.on_fix(a_fix(), 1.0)
-    hub.on_second(9.0, 9.0)
+    hub.on_tick(9.0, 9.0)
     assert (target.fixes, target.none, target.seconds) == ([], [], 1)
 
 
@@ -84,7 +84,7 @@ def test_unusable_fixes_count_as_none_and_are_never_given(changes):
     for step in range(1, 30):
         hub.on_fix(a_fix(serial=step + 1, **changes), 10.0 + 0.1 * step)
         if step % 10 == 0:
-            hub.on_second(10.0 + 0.1 * step, 500.0 + 0.1 * step)
+            hub.on_tick(10.0 + 0.1 * step, 500.0 + 0.1 * step)
     assert len(target.fixes) == 1
     assert [when_s for _, when_s, _ in target.none] == [501.0, 502.0]
     assert {reason for _, _, reason in target.none} == {changes.get("alert") or "position is not finite"}
@@ -99,17 +99,40 @@ def test_a_tag_without_a_fix_is_reported_each_second_until_it_has_one_or_is_forg
     target = Recorded()
     hub = hub_of(target)
     hub.on_fix(a_fix(), 0.0)
-    hub.on_second(0.9, 100.9)
+    hub.on_tick(0.9, 100.9)
     assert target.none == []
     for second in (2, 3):
-        hub.on_second(float(second), 100.0 + second)
+        hub.on_tick(float(second), 100.0 + second)
     assert target.none == [("tag1", 102.0, "no fix"), ("tag1", 103.0, "no fix")]
     hub.on_fix(a_fix(serial=2), 3.5)
-    hub.on_second(4.0, 104.0)
+    hub.on_tick(4.0, 104.0)
     assert len(target.none) == 2
-    hub.on_second(5000.0, 5100.0)
-    hub.on_second(5001.0, 5101.0)
+    hub.on_tick(5000.0, 5100.0)
+    hub.on_tick(5001.0, 5101.0)
     assert len(target.none) == 2, "a tag that left an hour ago is not spoken of"
+
+
+def test_a_tag_whose_fixes_are_rare_has_none_only_when_some_are_missing():
+    target = Recorded()
+    hub = hub_of(target)
+    for step in range(4):  # a fix every two seconds
+        hub.on_fix(a_fix(serial=step + 1), 2.0 * step)
+        for quarter in range(8):
+            hub.on_tick(2.0 * step + 0.25 * quarter, 100.0 + 2.0 * step + 0.25 * quarter)
+    assert (len(target.fixes), target.seconds) == (4, 8)
+    assert [when_s for _, when_s, _ in target.none] == [101.0], "its interval was not known then"
+    target.none.clear()
+    for quarter in range(1, 33):
+        hub.on_tick(8.0 + 0.25 * quarter, 108.0 + 0.25 * quarter)
+    assert [when_s for _, when_s, _ in target.none] == [111.0 + second for second in range(6)]
+
+
+def test_no_fix_of_a_tag_at_the_targets_own_rate_is_missed_because_it_came_early():
+    target = Recorded()
+    hub = hub_of(target, hz=50.0)
+    for step in range(500):
+        hub.on_fix(a_fix(serial=step), 10.0 + 0.02 * step + (0.004 if step % 3 else -0.004))
+    assert len(target.fixes) == 500
 
 
 def test_a_target_for_one_tag_keeps_to_the_first_and_says_so_once():
@@ -119,7 +142,7 @@ def test_a_target_for_one_tag_keeps_to_the_first_and_says_so_once():
     for step in range(3):
         hub.on_fix(a_fix(tag="tag1", serial=step), float(step))
         hub.on_fix(a_fix(tag="tag2", serial=step), float(step))
-    hub.on_second(9.0, 9.0)
+    hub.on_tick(9.0, 9.0)
     assert {fix.tag for fix in target.fixes} == {"tag1"}
     assert {tag for tag, _, _ in target.none} == {"tag1"}
     assert said == ["test: carries one tag, tag1; ?tag=NAME chooses another, as tag2"]
@@ -149,7 +172,7 @@ def test_a_site_without_georeference_is_refused_with_the_keys_to_add():
     hub = Hub([Route(earthly, None, 10.0), Route(other, None, 10.0)], said.append)
     hub.on_site(BARE_SITE)
     hub.on_fix(a_fix(), 1.0)
-    hub.on_second(3.0, 3.0)
+    hub.on_tick(3.0, 3.0)
     assert (len(earthly.fixes), len(other.fixes), len(earthly.none), len(other.none)) == (0, 1, 0, 1)
     assert len(said) == 1
     assert "earthly:" in said[0]

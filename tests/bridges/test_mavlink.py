@@ -3,6 +3,7 @@
 import math
 import re
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
+from skyless.bridges.hub import open_hub
 from skyless.bridges.mavlink.encoder import MavlinkEncoder
 from skyless.bridges.mavlink.frames import FrameReader, frame
 from skyless.bridges.mavlink.messages import (
@@ -150,7 +152,7 @@ def test_a_damaged_frame_is_dropped_and_the_next_is_read(message, data):
 
 @given(st.lists(st.binary(max_size=400), max_size=5))
 def test_no_bytes_raise_or_are_kept(pieces):
-    """``python benchmarks/fuzz_mavlink.py`` does a million."""
+    """``.venv/bin/python benchmarks/mavlink_noise.py`` does a million."""
     finder = FrameReader(CRC_EXTRAS)
     encoder = MavlinkEncoder("px4")
     encoder.on_site(SITE)
@@ -230,11 +232,11 @@ def test_px4_gets_nan_for_what_is_unknown(fix, georeference):
     else:
         np.testing.assert_allclose(found.velocity, ned(heading) @ fix.velocity_mps, atol=1e-9)
         rotation = ned(heading)
-        np.testing.assert_allclose(
-            triangle(found.velocity_covariance)[:3, :3],
-            rotation @ matrix(fix.velocity_covariance) @ rotation.T,
-            atol=1e-12,
-        )
+        expected = rotation @ matrix(fix.velocity_covariance) @ rotation.T
+        if fix.height_known:
+            expected[2, :] = expected[:, 2] = 0.0
+            expected[2, 2] = 100.0**2
+        np.testing.assert_allclose(triangle(found.velocity_covariance)[:3, :3], expected, atol=1e-12)
 
 
 @given(fixes(), georeferences)
@@ -252,7 +254,7 @@ def test_gps_gives_position_accuracy_and_what_is_to_be_ignored(fix, georeference
     assert found.satellites_visible == len(fix.anchors)
     assert bool(found.ignore_flags & 2) == (fix.hdop is None)
     assert bool(found.ignore_flags & 4) == (fix.vdop is None)
-    assert found.ignore_flags & 0x38 == (0x38 if fix.velocity_mps is None else 0)
+    assert found.ignore_flags & 0x38 == (0x38 if fix.velocity_mps is None else 0x10 if fix.height_known else 0)
     assert not found.ignore_flags & 0xC1  # altitude and both accuracies are to be used
     if fix.velocity_mps is not None:
         np.testing.assert_allclose(found.velocity, ned(georeference.heading_deg) @ fix.velocity_mps, atol=1e-9)
@@ -399,6 +401,19 @@ def test_wrong_addresses_are_named(address, expected):
         open_route(address, BridgeContext(print))
 
 
+@pytest.mark.parametrize(("key", "lines"), [("&tag=tag2", 0), ("", 1)])
+def test_a_tag_that_the_user_chose_is_not_argued_about(key, lines):
+    said = []
+    hub = open_hub(
+        [open_route(f"mavlink+udpout://127.0.0.1:9?profile=px4{key}", BridgeContext(said.append))], said.append
+    )
+    hub.on_site(SITE)
+    for serial in range(1, 4):
+        hub.on_fix(a_fix(tag="tag2", serial=serial), serial)
+        hub.on_fix(a_fix(tag="tag1", serial=serial), serial)
+    assert len([line for line in said if "carries one tag" in line]) == lines
+
+
 def test_a_gps_gets_no_origin():
     assert names(encoder("gps").on_second(0.0)) == ["HEARTBEAT"]
 
@@ -447,3 +462,16 @@ def test_the_payload_of_zeros_keeps_one_byte():
     data = encoded(Timesync(0, 0), sequence=0, system=1, component=1)
     assert data[1] == 1
     assert struct.unpack_from("<B", data, 10) == (0,)
+
+
+def test_the_parameters_of_ardupilots_page_are_a_file_that_its_programs_load(tmp_path):
+    """MAVProxy and the others read such files with pymavlink's reader."""
+    from pymavlink.mavparm import MAVParmDict
+
+    page = (Path(__file__).parents[2] / "docs" / "tools" / "ardupilot.md").read_text(encoding="utf-8")
+    file = tmp_path / "skyless.param"
+    file.write_text(re.search(r"^```\n(SERIAL.*?)^```", page, re.DOTALL | re.MULTILINE)[1], encoding="utf-8")
+    parameters = MAVParmDict()
+    assert parameters.load(str(file), use_excludes=False)
+    assert len(parameters) == 14
+    assert (parameters["EK3_SRC1_YAW"], parameters["VISO_TYPE"], parameters["EK3_SRC1_POSXY"]) == (1, 1, 6)

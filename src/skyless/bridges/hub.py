@@ -4,6 +4,7 @@ No I/O, and the time is passed in.
 """
 
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Final
 
 from msgspec import Struct
@@ -15,7 +16,19 @@ from skyless.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHe
 from skyless.rate_limit import RateLimit
 
 NO_FIX_S: Final = 1.0
-"""A tag has no fix once its last usable one is older."""
+"""A tag has no fix once its last usable one is older, ..."""
+
+_MISSED: Final = 2.5
+"""... where its fixes are rarer, once it is older than this number of their intervals, ..."""
+
+_LONGEST_S: Final = 10.0
+"""... but than this in any case."""
+
+SILENCE_CHECK_S: Final = 0.25
+"""Interval in which ``on_tick`` is to be called."""
+
+_SECOND_S: Final = 1.0 - 0.1 * SILENCE_CHECK_S
+"""After so long a second has gone by: ticks come late now and then."""
 
 _FORGET_S: Final = 3600.0
 """A tag without a fix for so long is not spoken of any more."""
@@ -31,7 +44,7 @@ class Route(Struct):
     rates: dict[str, RateLimit] = {}
     """Of each tag."""
     others: bool = False
-    """Whether it was logged that there are more tags than the target carries."""
+    """Whether it needs no line that there are more tags than the target carries: there was one, or the user chose."""
     refused: bool = False
     """Whether the site lacks what the target needs, so that it gets nothing."""
     faults: int = 0
@@ -45,6 +58,10 @@ class _Tag(Struct):
     """When its last usable fix came, or when it was first heard of."""
     reason: str
     """Why there is none."""
+    interval_s: float = 0.0
+    """Between its last two usable fixes."""
+    reported_s: float = -inf
+    """When targets were informed that it has none."""
 
 
 class Hub:
@@ -56,6 +73,8 @@ class Hub:
         self.fixes = 0
         self._log = log
         self._tags: dict[str, _Tag] = {}
+        self._second_s = -inf
+        """When the last second began."""
 
     def on_site(self, site: BridgedSite) -> None:
         """The site is known, or has changed.
@@ -88,7 +107,7 @@ class Hub:
         if not is_usable(fix):
             tag.reason = fix.alert or "position is not finite"
             return
-        tag.usable_s, tag.reason = now_s, "no fix"
+        tag.interval_s, tag.usable_s, tag.reason = now_s - tag.usable_s, now_s, "no fix"
         if self.site is None:
             return
         self.fixes += 1
@@ -110,18 +129,24 @@ class Hub:
         for route in self.routes:
             self._guard(route, lambda target: target.on_status(status))
 
-    def on_second(self, now_s: float, unix_s: float) -> None:
-        """To be called once a second."""
+    def on_tick(self, now_s: float, unix_s: float) -> None:
+        """To be called every ``SILENCE_CHECK_S``."""
         for name, tag in tuple(self._tags.items()):
             age_s = now_s - tag.usable_s
             if age_s > _FORGET_S:
-                del self._tags[name]
-                for route in self.routes:
-                    route.rates.pop(name, None)
-            elif age_s >= NO_FIX_S and self.site is not None:
+                self._forget(name)
+            elif age_s >= _silence_s(tag.interval_s) and now_s - tag.reported_s >= _SECOND_S and self.site is not None:
+                tag.reported_s = now_s
                 self._give_no_fix(name, unix_s, tag.reason)
+        if now_s - self._second_s >= _SECOND_S:
+            self._second_s = now_s
+            for route in self.routes:
+                self._guard(route, lambda target: target.on_second(unix_s))
+
+    def _forget(self, tag: str) -> None:
+        del self._tags[tag]
         for route in self.routes:
-            self._guard(route, lambda target: target.on_second(unix_s))
+            route.rates.pop(tag, None)
 
     def _give_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
         for route in self.routes:
@@ -164,3 +189,8 @@ def open_hub(routes: Sequence[Route], log: Callable[[str], None]) -> Hub:
         if texts.count(text) > 1:
             raise SkylessError(f"the target {text!r} is given twice; give it once")
     return Hub(routes, log)
+
+
+def _silence_s(interval_s: float) -> float:
+    """How long a tag whose fixes come at an interval must be silent to have none."""
+    return min(max(NO_FIX_S, _MISSED * interval_s), _LONGEST_S)

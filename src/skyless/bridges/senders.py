@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from skyless.bridges.target import cannot_listen
 from skyless.errors import SkylessError
 from skyless.radios.serial.pseudo_terminal import Pty
 from skyless.radios.serial.serial_port import SerialPort
@@ -55,10 +56,7 @@ class TcpServer:
         try:
             server = await loop.create_server(lambda: _TcpReader(self._readers, self._greeting), self._host, self.port)
         except OSError as error:
-            reason = os.strerror(error.errno) if error.errno else error
-            raise SkylessError(
-                f"the target {self._text!r} cannot listen on {self._host}:{self.port}: {reason}"
-            ) from None
+            raise cannot_listen(self._text, self._host, self.port, error) from None
         self.port = server.sockets[0].getsockname()[1]
         try:
             await server.serve_forever()

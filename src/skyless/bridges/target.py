@@ -3,6 +3,7 @@
 A target whose readers get bytes consists of an ``Encoder``, which does no I/O, and a sender (``senders.py``).
 """
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -11,6 +12,7 @@ from typing import Protocol
 from msgspec import Struct
 
 from skyless.bridges.feed import BridgedSite
+from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
 
@@ -144,3 +146,9 @@ class StreamTarget(Target):
     def _send(self, messages: Iterable[bytes]) -> None:
         for message in messages:
             self._sender.send(message)
+
+
+def cannot_listen(text: str, host: str, port: int, error: OSError) -> SkylessError:
+    """What a server raises that cannot begin; asyncio's own words are longer and name the same."""
+    reason = os.strerror(error.errno) if error.errno is not None and error.errno > 0 else error
+    return SkylessError(f"the target {text!r} cannot listen on {host}:{port}: {reason}")

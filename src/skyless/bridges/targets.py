@@ -60,7 +60,7 @@ def open_route(text: str, context: BridgeContext) -> Route:
         else cast(Callable[[TargetUrl, BridgeContext], Target], module.make_target)(url, context)
     )
     url.check_all_read()
-    return Route(target, tag, hz)
+    return Route(target, tag, hz, others=tag is not None)
 
 
 def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext) -> StreamTarget:

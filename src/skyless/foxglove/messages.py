@@ -16,6 +16,7 @@ from skyless.site.model import GeoreferenceSite, WallSite
 from skyless.uncertainty.ellipse import horizontal_ellipse
 
 FRAME: Final = "site"
+SCENE_TOPIC: Final = "/site/scene"
 KNOWN_COVARIANCE: Final = 3
 ELLIPSE_SIGMAS: Final = 2.0
 """How many standard deviations an ellipse shows."""

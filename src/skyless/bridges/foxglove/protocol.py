@@ -19,6 +19,8 @@ WARNING: Final = 1
 _MESSAGE_DATA: Final = Format("<BIQ")
 """Operation 1, subscription, time in ns; the payload follows."""
 
+_LAST_NS: Final = 2**64 - 1
+
 _MOST_IDS: Final = 1000
 """Of one request."""
 
@@ -95,8 +97,11 @@ def status(level: int, message: str) -> str:
 
 
 def message_data(subscription: int, unix_s: float, payload: bytes) -> bytes:
-    """A message of a subscribed channel."""
-    return _MESSAGE_DATA.pack(1, subscription, max(round(unix_s * 1e9), 0)) + payload
+    """A message of a subscribed channel. Raises ValueError or OverflowError: the time cannot be stated."""
+    time_ns = round(unix_s * 1e9)
+    if not 0 <= time_ns <= _LAST_NS:
+        raise OverflowError("the time is before 1970, or after what 64 bits can state")
+    return _MESSAGE_DATA.pack(1, subscription, time_ns) + payload
 
 
 def _text(value: dict[str, Any]) -> str:

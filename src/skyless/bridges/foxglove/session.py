@@ -8,7 +8,7 @@ from websockets.asyncio.server import ServerConnection
 
 from skyless.bridges.foxglove.protocol import WARNING, Channel, Subscribe, decode_request, message_data, status
 
-MOST_WAITING: Final = 500
+_MOST_WAITING: Final = 500
 """Messages for one client; beyond it the oldest is dropped."""
 
 STUCK_S: Final = 10.0
@@ -21,12 +21,12 @@ _MOST_TEXTS: Final = 2000
 class Session:
     """One client. Nothing here waits, but ``run``."""
 
-    def __init__(self, connection: ServerConnection, *, most_waiting: int = MOST_WAITING) -> None:
+    def __init__(self, connection: ServerConnection) -> None:
         self._connection = connection
         self._numbers: dict[int, int] = {}
         """The client's numbers of its subscriptions, by channel."""
         self._texts: deque[str] = deque()
-        self._data: deque[bytes] = deque(maxlen=most_waiting)
+        self._data: deque[bytes] = deque(maxlen=_MOST_WAITING)
         self._ready = asyncio.Event()
         self._sent_s = asyncio.get_running_loop().time()
 

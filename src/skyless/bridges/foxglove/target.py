@@ -17,18 +17,15 @@ from websockets.typing import Subprotocol
 from skyless.bridges.feed import BridgedSite, floored
 from skyless.bridges.foxglove.protocol import SUBPROTOCOLS, Channel, advertise, server_info
 from skyless.bridges.foxglove.session import Session
-from skyless.bridges.target import BridgeContext, Target
+from skyless.bridges.target import BridgeContext, Target, cannot_listen
 from skyless.bridges.target_url import TargetUrl
-from skyless.errors import SkylessError
-from skyless.foxglove.messages import ellipse, frame_transform, location_fix, pose_in_frame, scene
+from skyless.foxglove.messages import SCENE_TOPIC, ellipse, frame_transform, location_fix, pose_in_frame, scene
 from skyless.foxglove.schemas import foxglove_schema, schema_of
 from skyless.mqtt.messages import AnchorHealth, FixMessage, TagHealth
 
-PORT: Final = 8765
+_PORT: Final = 8765
 MOST_CLIENTS: Final = 32
 MOST_CHANNELS: Final = 2000
-
-SCENE_TOPIC: Final = "/site/scene"
 
 _MOST_REQUEST_BYTES: Final = 1 << 16
 _SEND_BUFFER_BYTES: Final = 1 << 16
@@ -51,7 +48,7 @@ class FoxgloveTarget(Target):
         self.port = port
         """The one that is used, where 0 was asked for and the server runs."""
         self._host, self._unix_time = host, unix_time
-        self._session = secrets.token_hex(4)
+        self._run = secrets.token_hex(4)
         self._site: BridgedSite | None = None
         self._channels: dict[int, Channel] = {}
         self._numbers: dict[str, int] = {}
@@ -70,20 +67,15 @@ class FoxgloveTarget(Target):
             return
         shown = msgspec.structs.replace(fix, covariance_m2=floored(fix.covariance_m2))
         topic = f"/tag/{fix.tag}"
-        try:
-            self._give_fix(f"{topic}/fix", schema_of(FixMessage), fix, msgspec.json.encode)
-            self._give_foxglove("/tf", "foxglove.FrameTransform", fix, frame_transform)
+        self._give_fix(f"{topic}/fix", schema_of(FixMessage), fix, msgspec.json.encode)
+        self._give_foxglove("/tf", "foxglove.FrameTransform", fix, frame_transform)
+        self._give_foxglove(f"{topic}/pose", "foxglove.PoseInFrame", fix, lambda fix: pose_in_frame(fix, facing=False))
+        self._give_foxglove(f"{topic}/ellipse", "foxglove.SceneUpdate", shown, ellipse)
+        origin = site.georeference
+        if origin is not None:
             self._give_foxglove(
-                f"{topic}/pose", "foxglove.PoseInFrame", fix, lambda fix: pose_in_frame(fix, facing=False)
+                f"{topic}/location", "foxglove.LocationFix", shown, lambda fix: location_fix(fix, origin)
             )
-            self._give_foxglove(f"{topic}/ellipse", "foxglove.SceneUpdate", shown, ellipse)
-            origin = site.georeference
-            if origin is not None:
-                self._give_foxglove(
-                    f"{topic}/location", "foxglove.LocationFix", shown, lambda fix: location_fix(fix, origin)
-                )
-        except (ValueError, ArithmeticError):  # figures that no tag publishes
-            self.dropped["out-of-range"] += 1
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
         """Give a tag's state, for its rates and reasons."""
@@ -106,10 +98,7 @@ class FoxgloveTarget(Target):
                 logger=_quiet,
             )
         except OSError as error:
-            where = f"{self._host}:{self.port}"
-            raise SkylessError(
-                f"the target {self.text!r} cannot listen on {where}: {error.strerror or error}"
-            ) from None
+            raise cannot_listen(self.text, self._host, self.port, error) from None
         async with server:
             self.port = next(iter(server.sockets)).getsockname()[1]
             await server.serve_forever()
@@ -123,7 +112,7 @@ class FoxgloveTarget(Target):
             socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES
         )
         session = Session(connection)
-        session.send_text(server_info("skyless", self._session))
+        session.send_text(server_info("skyless", self._run))
         if self._channels:
             session.send_text(advertise(tuple(self._channels.values())))
         self._sessions.add(session)
@@ -168,10 +157,13 @@ class FoxgloveTarget(Target):
         wanting = [session for session in self._sessions if session.wants(channel)]
         if not wanting:
             return
-        payload = encode()
-        for session in wanting:
-            if not session.send_data(channel, unix_s, payload):
-                self.dropped["slow-client"] += 1
+        try:
+            payload = encode()
+            for session in wanting:
+                if not session.send_data(channel, unix_s, payload):
+                    self.dropped["slow-client"] += 1
+        except (ValueError, ArithmeticError):  # figures that no tag publishes
+            self.dropped["out-of-range"] += 1
 
     def _advertise(self, topic: str, schema: tuple[str, bytes]) -> None:
         if len(self._channels) >= MOST_CHANNELS:
@@ -187,4 +179,4 @@ class FoxgloveTarget(Target):
 
 def make_target(url: TargetUrl, _context: BridgeContext) -> FoxgloveTarget:
     """Of ``foxglove://HOST:PORT``."""
-    return FoxgloveTarget(url.text, url.host(), url.port(PORT))
+    return FoxgloveTarget(url.text, url.host(), url.port(_PORT))

@@ -36,7 +36,8 @@ WEEK_MS: Final = 604_800_000
 UNKNOWN_ANGLE_RAD2: Final = pi**2
 """Variance of an angle of which nothing is known, for ArduPilot, which does not check for NaN."""
 UNKNOWN_HEIGHT_STD_M: Final = 100.0
-"""Of a height that is the site's assumption (``height_known``), and no measurement."""
+UNKNOWN_CLIMB_STD_MPS: Final = 100.0
+"""Of a height that is the site's assumption (``height_known``) and no measurement, and of its change."""
 
 IGNORE_HDOP: Final = 2
 IGNORE_VDOP: Final = 4
@@ -73,15 +74,17 @@ def odometry(fix: FixMessage, heading_deg: float, reset_counter: int) -> Odometr
     """For PX4: attitude, rates and an unknown velocity are NaN; a height that is not measured has a wide variance."""
     covariance_m2 = _covariance_ned(fix.covariance_m2, heading_deg)
     if fix.height_known:
-        nn, ne, _, en, ee, _, _, _, _ = covariance_m2
-        covariance_m2 = (nn, ne, 0.0, en, ee, 0.0, 0.0, 0.0, UNKNOWN_HEIGHT_STD_M**2)
+        covariance_m2 = _flat(covariance_m2, UNKNOWN_HEIGHT_STD_M)
     moving = _velocity(fix)
     if moving is None:
         velocity: Vector = (NAN, NAN, NAN)
         velocity_covariance: tuple[float, ...] = UNKNOWN_21
     else:
         velocity = _ned(moving[0], heading_deg)
-        velocity_covariance = _pose_covariance(_swapped(rotated(moving[1], heading_deg)), NAN, NAN)
+        covariance = _swapped(rotated(moving[1], heading_deg))
+        if fix.height_known:
+            covariance = _flat(covariance, UNKNOWN_CLIMB_STD_MPS)
+        velocity_covariance = _pose_covariance(covariance, NAN, NAN)
     return Odometry(
         time_us=micros(fix.unix_s),
         position=_ned(fix.position_m, heading_deg),
@@ -112,6 +115,8 @@ def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None 
         velocity = _ned(moving[0], origin.heading_deg)
         north, cross, _, _, east, _, _, _, down = _swapped(rotated(moving[1], origin.heading_deg))
         speed_std = sqrt(max(_largest(north, cross, east), down, 0.0))
+        if fix.height_known:
+            ignore |= IGNORE_VERTICAL_VELOCITY
     week, week_ms = gps_time(fix.unix_s)
     count = len(fix.anchors) if satellites is None else satellites
     return GpsInput(
@@ -208,6 +213,12 @@ def _swapped(covariance: Matrix) -> Matrix:
     """From east, north, up to north, east, down."""
     ee, en, eu, ne, nn, nu, ue, un, uu = covariance
     return nn, ne, -nu, en, ee, -eu, -un, -ue, uu
+
+
+def _flat(covariance: Matrix, down_std: float) -> Matrix:
+    """The covariance where nothing is known of the vertical axis."""
+    nn, ne, _, en, ee, _, _, _, _ = covariance
+    return nn, ne, 0.0, en, ee, 0.0, 0.0, 0.0, down_std**2
 
 
 def _pose_covariance(covariance: Matrix, between: float, angle: float) -> tuple[float, ...]:

@@ -7,9 +7,8 @@ from typing import Final
 from skyless.bridges.feed import BridgedSite
 from skyless.bridges.prometheus.exposition import CONTENT_TYPE
 from skyless.bridges.prometheus.metrics import SiteMetrics
-from skyless.bridges.target import BridgeContext, Target
+from skyless.bridges.target import BridgeContext, Target, cannot_listen
 from skyless.bridges.target_url import TargetUrl
-from skyless.errors import SkylessError
 from skyless.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
 
 _PORT: Final = 9464
@@ -52,10 +51,7 @@ class Prometheus(Target):
         try:
             server = await asyncio.start_server(self._serve, self._host, self.port, limit=_MOST_REQUEST_BYTES)
         except OSError as error:
-            reason = error.strerror or error
-            raise SkylessError(
-                f"the target {self.text!r} cannot listen on {self._host}:{self.port}: {reason}"
-            ) from None
+            raise cannot_listen(self.text, self._host, self.port, error) from None
         self.port = server.sockets[0].getsockname()[1]
         async with server:
             await server.serve_forever()

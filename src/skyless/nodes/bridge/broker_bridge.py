@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.bridges.feed import bridged_site
-from skyless.bridges.hub import Hub
+from skyless.bridges.hub import SILENCE_CHECK_S, Hub
 from skyless.bridges.target import Target
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
@@ -68,7 +68,9 @@ class BridgeNode:
         """Serve until cancelled. Raises SkylessError: a target cannot begin, or the site lacks what they need."""
         self._refused = asyncio.get_running_loop().create_future()
         targets = (run_target(route.target, self._log) for route in self.hub.routes)
-        await together(keep(self.link, self._log), _await(self._refused), *targets, every(HEALTH_S, self._on_second))
+        await together(
+            keep(self.link, self._log), _await(self._refused), *targets, every(SILENCE_CHECK_S, self._on_tick)
+        )
 
     def state(self) -> BridgeState:
         """What it has done so far."""
@@ -127,9 +129,9 @@ class BridgeNode:
     def _on_health(self, health: TagHealth | AnchorHealth) -> None:
         self.hub.on_health(health, time.monotonic())
 
-    def _on_second(self) -> None:
+    def _on_tick(self) -> None:
         now_s = time.monotonic()
-        self.hub.on_second(now_s, time.time())
+        self.hub.on_tick(now_s, time.time())
         if self.link.connected and not self._is_silent and now_s - self._last_fix_s > _SILENT_S:
             self._is_silent = True
             known = "no tag publishes fixes" if self._site is not None else "the site itself is not on the broker"

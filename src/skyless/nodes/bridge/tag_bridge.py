@@ -9,11 +9,11 @@ from msgspec import structs
 from skyless.air.almanac import GeoreferencePage
 from skyless.air.masterless_packets import Point
 from skyless.bridges.feed import BridgedSite
-from skyless.bridges.hub import Hub
+from skyless.bridges.hub import SILENCE_CHECK_S, Hub
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import FixMessage, TagHealth
 from skyless.nodes.bridge.broker_bridge import run_target
-from skyless.nodes.process import HEALTH_S, Log, every, together
+from skyless.nodes.process import Log, every, together
 from skyless.receiver import Receiver
 from skyless.site.model import GeoreferenceSite
 
@@ -58,7 +58,7 @@ class TagBridge:
     async def run(self) -> None:
         """Serve until cancelled. Raises SkylessError: a target cannot begin."""
         targets = (run_target(route.target, self._log) for route in self._hub.routes)
-        await together(*targets, every(HEALTH_S, lambda: self._hub.on_second(time.monotonic(), time.time())))
+        await together(*targets, every(SILENCE_CHECK_S, lambda: self._hub.on_tick(time.monotonic(), time.time())))
 
 
 class _HeardSite:

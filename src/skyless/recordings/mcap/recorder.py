@@ -14,7 +14,7 @@ from msgspec import Struct
 
 import skyless
 from skyless.errors import ConfigurationError, SkylessError
-from skyless.foxglove.messages import ellipse, location_fix, pose_in_frame, scene
+from skyless.foxglove.messages import SCENE_TOPIC, ellipse, location_fix, pose_in_frame, scene
 from skyless.foxglove.schemas import foxglove_schema, schema_of
 from skyless.mqtt.messages import FixMessage, SiteMessage
 from skyless.recordings.mcap.channels import (
@@ -184,7 +184,6 @@ class McapFile:
 SHOWN_HZ: Final = 20.0
 """How many poses of a tag are added for Foxglove in a second; the fixes themselves are all kept."""
 
-SCENE_TOPIC: Final = "/site/scene"
 MOST_TOPICS: Final = 10_000
 
 
