@@ -54,6 +54,8 @@ NAVIGATION = {
         "docs/tools/ardupilot",
         "docs/tools/px4",
         "docs/tools/stage",
+        "docs/tools/fira",
+        "docs/tools/phones",
     ],
     "Reference": [
         "docs/reference/commands",
