@@ -7,10 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.air.dl_tdoa import MOST_ROUNDS_AT_ONCE, DtMessage, DtRounds
+from skyless.air.dl_tdoa import MOST_ANCHORS_KEPT, MOST_ROUNDS_AT_ONCE, DtMessage, DtRounds, host_time_s
 from skyless.air.masterless_packets import Packet, Relay
-from skyless.air.uci import DtMessageType
-from skyless.constants import TICK_M
+from skyless.air.uci_measurements import (
+    DtMessageType,
+)
+from skyless.constants import TICK_M, TICK_RATE_HZ
 
 PLACES_M = {1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.0), 3: (6.0, 8.0, 2.0)}
 POLL = DtMessage(None, 1, DtMessageType.POLL, 7, 0, 2**40 - 500, 1000, False)
@@ -31,6 +33,19 @@ def test_a_response_relays_the_poll_and_the_final_message_the_responses():
     assert final.relays == (Relay(2, one.sequence, 2**39 - 5000, 1280.0),)
     assert len({poll.sequence, final.sequence}) == 2
     assert other.sequence == one.sequence == poll.sequence
+
+
+def test_a_response_that_is_reported_twice_is_relayed_once():
+    rounds = DtRounds()
+    for message in (POLL, *[replace(RESPONSE, initiator_reply_ticks=5000)] * 2):
+        rounds.on_message(message)
+    assert len(rounds.on_message(FINAL).relays) == 1
+
+
+def test_a_final_message_without_responses_relays_nothing():
+    rounds = DtRounds()
+    rounds.on_message(POLL)
+    assert rounds.on_message(FINAL).relays == ()
 
 
 @pytest.mark.parametrize("states_positions", [True, False])
@@ -63,6 +78,19 @@ def test_in_the_common_time_the_poll_arrives_one_flight_after_it_left(states_pos
 def test_messages_of_no_use_have_a_reason(messages, reason):
     rounds = DtRounds()
     assert [rounds.on_message(message) for message in messages][-1] == reason
+
+
+def test_addresses_that_change_for_ever_hide_no_newer_position():
+    rounds = DtRounds()
+    for address in range(3 * MOST_ANCHORS_KEPT):
+        rounds.on_message(replace(POLL, address=address, common_time=True, position_m=PLACES_M[1]))
+    response = replace(RESPONSE, address=2**16, common_time=True, position_m=PLACES_M[2])
+    assert isinstance(rounds.on_message(response), Packet)
+
+
+@pytest.mark.parametrize(("stamp", "host_s"), [(2**40 - 1, None), (2**40, 2**40 / TICK_RATE_HZ)])
+def test_a_counter_of_40_bits_given_in_64_is_no_host_s_time(stamp, host_s):
+    assert host_time_s(stamp) == pytest.approx(host_s)
 
 
 stamps = st.integers(0, 2**40 - 1)

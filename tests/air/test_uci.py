@@ -15,20 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.air.uci import (
-    LOCATION_BYTES,
-    NO_LOCATION,
-    RELATIVE_LOCATION,
-    WGS84_LOCATION,
-    DtMeasurement,
-    SessionInfo,
-    UciPacket,
-    UciReader,
-    UciType,
-    decode_session_info,
-    encode_packet,
-    encode_session_info,
-)
+from skyless.air.uci import UciPacket, UciReader, UciType, encode_packet
 from skyless.air.uci_location import (
     GeodeticPoint,
     decode_relative,
@@ -36,6 +23,16 @@ from skyless.air.uci_location import (
     encode_relative,
     encode_wgs84,
     location_of,
+)
+from skyless.air.uci_measurements import (
+    LOCATION_BYTES,
+    NO_LOCATION,
+    RELATIVE_LOCATION,
+    WGS84_LOCATION,
+    DtMeasurement,
+    SessionInfo,
+    decode_session_info,
+    encode_session_info,
 )
 
 INPUTS = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))

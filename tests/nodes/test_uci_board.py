@@ -7,10 +7,13 @@ import pytest
 from skyless.air.beacon import Beacon, Heard
 from skyless.air.codec import encode
 from skyless.air.reception import Diagnostics, Reception
-from skyless.air.uci import UciReader, decode_session_info
+from skyless.air.uci import UciReader
 from skyless.air.uci_location import location_of
+from skyless.air.uci_measurements import (
+    decode_session_info,
+)
 from skyless.anchor import Anchor
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
 from skyless.nodes.uci_board import UciProtocol
 from skyless.radios.interface import Restarted
 from skyless.simulation.impairments import lab_impairments
@@ -89,6 +92,16 @@ def test_the_master_s_second_frame_ends_the_round_and_tells_when_it_heard_the_re
     assert [one.message for one in info.measurements] == [0, 1, 1, 2]
     assert [one.initiator_reply_ticks for one in info.measurements] == [0, 600, 0, 0]  # 3's frame was another one
     assert board.speech.drops == {"not-of-a-round": 2}
+
+
+@pytest.mark.parametrize(("x_m", "ticks"), [(300.0, round(300.0 / TICK_M)), (310.0, 0)])
+def test_a_flight_that_the_line_has_no_bits_for_is_unknown(x_m, ticks):
+    board = Board(1)
+    board.speech._position_m = {1: (0.0, 0.0, 2.0), 2: (x_m, 0.0, 2.0)}.get
+    board.hear(beacon(1, 9, 1000))
+    board.hear(beacon(2, 9, 9000, Heard(1, 7, 8000)))
+    *_, info = board.said()
+    assert info.measurements[-1].flight_ticks == ticks
 
 
 def test_what_belongs_to_no_round_is_counted():

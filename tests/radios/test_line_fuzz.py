@@ -15,11 +15,17 @@ from collections import Counter
 import pytest
 
 from recordings.capture_makers import binary_record, tdoa3, text_line
-from skyless.air.uci import DtMeasurement, SessionInfo, encode_packet, encode_session_info
+from skyless.air.uci import encode_packet
+from skyless.air.uci_measurements import (
+    DtMeasurement,
+    SessionInfo,
+    encode_session_info,
+)
 from skyless.firmware import link
 from skyless.radios.interface import AntennaDelays
 from skyless.radios.serial.foreign_radios import ListenerRadio, SnifferStream, UciRadio
 from skyless.radios.serial.serial_radio import LinkSession
+from skyless.recordings.foreign.anchor_frame import AnchorFrame
 
 BYTES = int(os.environ.get("SKYLESS_FUZZ_BYTES", "300000"))
 ALPHABETS = (
@@ -100,7 +106,7 @@ class UciLine:
 
     def __init__(self):
         self.found = []
-        self.radio = UciRadio("uci", 115_200, "tag", {})
+        self.radio = UciRadio("uci", 115_200, "tag", {}, AnchorFrame())
         self.radio._listener = lambda event: self.found.append(getattr(event, "rx_ticks", None))
         self.radio.on_open(lambda data: None)
         self.counters = self.radio.counters

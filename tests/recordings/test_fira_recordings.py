@@ -7,21 +7,29 @@ import random
 from collections import Counter
 from math import degrees, dist
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import synthetic_recordings as synthetic
 from skyless.air.masterless_packets import Packet
-from skyless.air.uci import DtMeasurement, DtMessageType, SessionInfo
 from skyless.air.uci_location import GeodeticPoint, encode_wgs84
+from skyless.air.uci_measurements import (
+    DtMeasurement,
+    DtMessageType,
+    SessionInfo,
+)
 from skyless.constants import TICK_M, TICK_RATE_HZ
 from skyless.recordings.foreign import fira, phones
-from skyless.recordings.foreign.anchor_frame import east_north_up_m
+from skyless.recordings.foreign.anchor_frame import AnchorFrame, east_north_up_m
+from skyless.recordings.foreign.formats import open_recording
+from skyless.replays.capture_run import CaptureRequest, CaptureRun
 from skyless.site.earth import geodetic
 from skyless.site.model import GeoreferenceSite
 
-LINES = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000")) // 4
+LINES = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
+"""SKYLESS_FUZZ_FRAMES=1000000 for a full run."""
 
 
 def read(module_read, data):
@@ -140,6 +148,11 @@ def test_records_of_ios():
         (b"{}\n", "malformed-record"),
         (b"[1]\n", "malformed-record"),
         (b'{"address": 1}\n', "unknown-message"),
+        (b'{"address": 1, "x": ' + b"[" * 8000 + b"]" * 8000 + b"}\n", "malformed-record"),
+        (b'{"address": 1' + b"0" * 6000 + b"}\n", "malformed-record"),
+        (ios(0, rawReceiveTime=2**64), "stamp-missing"),
+        (ios(0, rawReceiveTime=True), "malformed-record"),
+        (ios(0, rawReceiveTime=float("nan")), "malformed-record"),
         (ios(0, measurementType="ping"), "unknown-message"),
         (ios(0, address="xy"), "impossible-address"),
         (ios(0, address=-1), "impossible-address"),
@@ -185,6 +198,72 @@ def test_random_lines_never_raise(reader):
         found += len(packets)
         assert all(isinstance(packet, Packet) for packet in packets)
     assert found > 0
+
+
+@pytest.mark.parametrize("stated", ["messages", "common time"])
+def test_two_sessions_that_take_turns_are_kept_apart(stated):
+    """Their blocks and rounds have the same numbers."""
+    tag, relays = fira.DtTag(Counter()), []
+    polls = [DtMeasurement(anchor, 0, 5, 0, 100, 1000 + anchor) for anchor in (1, 11)]
+    responses = [
+        DtMeasurement(anchor, 1, 5, 0, 2000, 2000 + anchor, responder_reply_ticks=500, flight_ticks=64)
+        for anchor in (2, 12)
+    ]
+    if stated == "common time":
+        responses = [msgspec.structs.replace(one, common_time=True) for one in responses]
+    for messages in (polls, responses):
+        for session, one in enumerate(messages):
+            (packet,) = tag.on_info(SessionInfo(1, session, 1, (one,)))
+            relays += [relay.anchor for relay in packet.relays]
+    assert relays == [1, 11]
+
+
+def test_one_frame_has_one_kind_of_positions_and_several_tags_share_it():
+    here, there = GeodeticPoint(48.1, 11.5, 500.0), GeodeticPoint(48.1, 11.6, 500.0)
+    frame = AnchorFrame()
+    assert frame.position_m(None) is None
+    assert frame.position_m(here) == (0.0, 0.0, 0.0)
+    assert frame.position_m((1.0, 2.0, 3.0)) is None
+    first, second = fira.DtTag(Counter(), None, frame), fira.DtTag(Counter(), None, frame)
+    one = DtMeasurement(1, 0, 1, 0, 0, 0, location_kind=1, location=encode_wgs84(there))
+    first_m, second_m = (tag.on_info(SessionInfo(1, 1, 1, (one,)))[0].position_m for tag in (first, second))
+    assert first_m == second_m
+    assert first_m[0] > 7000.0
+    relative = AnchorFrame()
+    assert relative.position_m((1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
+    assert relative.position_m(here) is None
+    assert relative.origin is None
+
+
+def test_records_without_positions_are_used_with_a_table_of_anchors(tmp_path):
+    path = tmp_path / "phone.jsonl"
+    path.write_bytes(ios(0, coordinates=None) + ios(1, coordinates=None))
+    for anchors_m, relays in (({}, 0), ({1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.0)}, 1)):
+        with open_recording(path, anchors_m=anchors_m) as recording:
+            assert sum(len(packet.relays) for packet in recording) == relays
+
+
+@pytest.mark.parametrize(
+    ("reader", "maker"), [(fira.read_binary, synthetic.uci_binary), (phones.read, synthetic.phone_records)]
+)
+def test_a_table_of_anchors_replaces_what_messages_state(reader, maker):
+    packets = reader(io.BytesIO(b"".join(maker(9))), Counter(), {1: (0.0, 0.0, 9.0)})
+    assert {packet.position_m for packet in packets} == {None}
+
+
+def test_anchors_that_state_other_positions_later_are_where_they_state(tmp_path):
+    """As of a tag on a board: the second half of the recording is made 100 m farther east."""
+    path = tmp_path / "moved.jsonl"
+    whole = list(synthetic.phone_records(900))
+    moved = [json.loads(line) for line in whole[450:]]
+    for record in moved:
+        record["anchorLocation"]["relativeLocation"]["x"] += 100_000
+    path.write_bytes(b"".join(whole[:450]) + b"".join(json.dumps(record).encode() + b"\n" for record in moved))
+    run = CaptureRun(CaptureRequest(path, {}))
+    found = []
+    run.replay.run(found.append, lambda _: None)
+    assert found[300].position_m[0] < 20.0
+    assert found[-1].position_m[0] > 80.0
 
 
 def test_degrees_of_a_metre():

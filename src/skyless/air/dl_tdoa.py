@@ -16,13 +16,15 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.air.masterless_packets import Packet, Point, Relay
-from skyless.air.uci import DtMessageType
-from skyless.constants import TICK_M
-from skyless.ticks import wrap
+from skyless.air.uci_measurements import (
+    DtMessageType,
+)
+from skyless.constants import TICK_M, TICK_S
+from skyless.ticks import TICK_MASK, wrap
 
 MOST_ROUNDS_AT_ONCE: Final = 256
-MOST_RESPONSES: Final = 256
-"""Bounds of what is kept of rounds that go on."""
+MOST_ANCHORS_KEPT: Final = 256
+"""Bounds of what is kept: of rounds that go on, and of positions and responses by address; the oldest goes first."""
 
 
 class DtMessage(Struct, frozen=True, gc=False):
@@ -34,7 +36,7 @@ class DtMessage(Struct, frozen=True, gc=False):
     kind: DtMessageType
     block: int
     round: int
-    """Which of the rounds that go on at once: its number in the block, or any other that its messages share."""
+    """Which of the rounds that go on at once: any number that its messages share, and those of no other."""
     tx_ticks: int
     """In the sender's clock, or in the initiator's time."""
     rx_ticks_tag: int
@@ -47,6 +49,14 @@ class DtMessage(Struct, frozen=True, gc=False):
     position_m: Point | None = None
 
 
+def host_time_s(stamp_ticks: int) -> float | None:
+    """Time of a stamp that shows more than a 40-bit counter, which bridges silences of any length; None for others.
+
+    A counter of 40 bits may be given in 64; its wraps are no jumps in time.
+    """
+    return stamp_ticks * TICK_S if stamp_ticks > TICK_MASK else None
+
+
 class _Round:
     """A round that goes on: its poll, and the responses to it."""
 
@@ -54,7 +64,8 @@ class _Round:
 
     def __init__(self, poll: DtMessage) -> None:
         self.poll = poll
-        self.responses: list[DtMessage] = []
+        self.responses: dict[int, DtMessage] = {}
+        """By their senders, so that one that is reported twice counts once."""
 
 
 class DtRounds:
@@ -68,9 +79,10 @@ class DtRounds:
 
     def on_message(self, message: DtMessage) -> Packet | str:
         """The packet of a message, or the reason why it is of no use."""
-        if message.position_m is not None and (
-            message.address in self._stated_m or len(self._stated_m) < MOST_RESPONSES
-        ):
+        if message.position_m is not None:
+            self._stated_m.pop(message.address, None)
+            if len(self._stated_m) >= MOST_ANCHORS_KEPT:
+                del self._stated_m[next(iter(self._stated_m))]
             self._stated_m[message.address] = message.position_m
         if message.kind is DtMessageType.POLL:
             self._rounds.pop(message.round, None)
@@ -85,7 +97,7 @@ class DtRounds:
             return self._response(going_on, message)
         if message.address != going_on.poll.address:
             return "final-of-another-anchor"
-        return _packet(message, tuple(_relay_of_response(one, message) for one in going_on.responses))
+        return _packet(message, tuple(_relay_of_response(one, message) for one in going_on.responses.values()))
 
     def _response(self, going_on: _Round, message: DtMessage) -> Packet | str:
         poll = going_on.poll
@@ -101,8 +113,8 @@ class DtRounds:
             rx_ticks = message.tx_ticks - message.responder_reply_ticks
         else:
             return "reply-time-unknown"
-        if message.initiator_reply_ticks > 0 and len(going_on.responses) < MOST_RESPONSES:
-            going_on.responses.append(message)
+        if message.initiator_reply_ticks > 0 and len(going_on.responses) < MOST_ANCHORS_KEPT:
+            going_on.responses[message.address] = message
         return _packet(message, (Relay(poll.address, _sequence(poll), wrap(rx_ticks), flight),))
 
     def _distance_ticks(self, one: int, other: int) -> float | None:

@@ -15,7 +15,11 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.air.masterless_packets import Point
-from skyless.air.uci import RELATIVE_LOCATION, WGS84_LOCATION, DtMeasurement
+from skyless.air.uci_measurements import (
+    RELATIVE_LOCATION,
+    WGS84_LOCATION,
+    DtMeasurement,
+)
 
 
 class GeodeticPoint(Struct, frozen=True, gc=False):

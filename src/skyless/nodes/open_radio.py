@@ -15,6 +15,7 @@ from skyless.radios.interface import AntennaDelays, Radio
 from skyless.radios.serial.foreign_radios import ListenerRadio, SnifferRadio, UciRadio
 from skyless.radios.serial.serial_port import check_path
 from skyless.radios.serial.serial_radio import SerialRadio
+from skyless.recordings.foreign.anchor_frame import AnchorFrame
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
 _SERIAL_BAUD: Final = 1_000_000
@@ -104,7 +105,8 @@ def open_sniffers(
     ports = zip(_ports(spec, where, _SNIFFER_BAUD if driver == "sniffer" else _UCI_BAUD, names), names, strict=True)
     if driver == "sniffer":
         return tuple(SnifferRadio(*port, name) for port, name in ports)
-    return tuple(UciRadio(*port, name, anchors_m or {}) for port, name in ports)
+    frame = AnchorFrame()  # one for all, as their tags are of one site
+    return tuple(UciRadio(*port, name, anchors_m or {}, frame) for port, name in ports)
 
 
 def _ports(spec: str, where: str, usual_baud: int, names: tuple[str, ...]) -> list[tuple[str, int]]:

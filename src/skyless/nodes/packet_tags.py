@@ -133,6 +133,8 @@ class PacketTagNode:
             return
         self.monitor.on_event(event)
         if isinstance(event, Restarted) and self.packets:
+            self._height_m, self._height_std_m = self.settings.height_m, self.settings.height_std_m
+            self._anchors_seen = 0  # the anchors may stand elsewhere now
             self._begin_again()
 
     def _begin_again(self) -> None:
@@ -245,8 +247,8 @@ class PacketTags:
         if heard_m == self._heard_m:
             return
         self._heard_m = heard_m
-        origins = [node.radio.origin for node in self.nodes if isinstance(node.radio, UciRadio)]
-        known = next((origin for origin in origins if origin is not None), None)
+        radio = self.nodes[0].radio
+        known = radio.frame.origin if isinstance(radio, UciRadio) else None
         origin = None if known is None else GeoreferenceSite(*structs.astuple(known))
         if self._on_anchors is not None:
             self._on_anchors(heard_m, origin)

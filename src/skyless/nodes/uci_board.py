@@ -16,17 +16,17 @@ from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.masterless_packets import Point
 from skyless.air.reception import Diagnostics, Reception
-from skyless.air.uci import (
+from skyless.air.uci import encode_packet
+from skyless.air.uci_location import encode_relative
+from skyless.air.uci_measurements import (
     NO_LOCATION,
     RELATIVE_LOCATION,
     DtMeasurement,
     DtMessageType,
     SessionInfo,
-    encode_packet,
     encode_session_info,
 )
-from skyless.air.uci_location import encode_relative
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.constants import TICK_M
 from skyless.radios.interface import RadioEvent
 from skyless.site.almanac_pages import AlmanacAssembly
 from skyless.ticks import difference
@@ -120,11 +120,12 @@ class UciProtocol:
         )
 
     def _flight_ticks(self, one: int, other: int) -> int:
-        """As anchors would have ranged each other; 0 while their positions are not known."""
+        """As anchors would have ranged each other; 0 for more than the line has bits for, or unknown positions."""
         one_m, other_m = self._position_m(one), self._position_m(other)
         if one_m is None or other_m is None:
             return 0
-        return min(round(dist(one_m, other_m) / SPEED_OF_LIGHT_MPS * TICK_RATE_HZ), _MOST_FLIGHT_TICKS)
+        ticks = round(dist(one_m, other_m) / TICK_M)
+        return ticks if ticks <= _MOST_FLIGHT_TICKS else 0
 
     def _location(self, anchor: int) -> bytes:
         position_m = self._position_m(anchor)

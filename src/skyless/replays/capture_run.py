@@ -55,13 +55,13 @@ class CaptureRun:
         if asked.measurements not in {None, *MEASUREMENTS}:
             right = ", ".join(MEASUREMENTS)
             raise SkylessError(f"--measurements is {asked.measurements!r}; it should be one of {right}")
-        anchors_m = asked.anchors_m
-        if not anchors_m:
+        stated_m: dict[int, Point] = {}
+        if not asked.anchors_m:
             _check_carries_anchors(asked)
-            anchors_m = _stated_anchors(asked)
+            stated_m = _stated_anchors(asked)
         truth, name = asked.truth, format_of(asked.path, asked.format).name
         height_m, std_m, self.height_note = height_to_hold(
-            asked.tag_height, anchors_m, asked.site_height_m, truth, name
+            asked.tag_height, asked.anchors_m or stated_m, asked.site_height_m, truth, name
         )
         if asked.tag_height_std_m is not None:
             std_m = asked.tag_height_std_m
@@ -73,7 +73,8 @@ class CaptureRun:
         self.judge = Judge(truth, planar=height_m is not None, settle_s=settle_s, above_m=above_m)
         request = ReplayRequest(
             path=asked.path,
-            anchors_m=anchors_m,
+            anchors_m=asked.anchors_m,
+            stated_m=stated_m,
             format=asked.format,
             listener=asked.listener,
             height_m=height_m,

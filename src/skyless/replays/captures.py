@@ -227,6 +227,8 @@ class ReplayRequest(Struct, frozen=True):
     calibration: DifferenceCalibration | None = None
     measurements: str | None = None
     """One of ``MEASUREMENTS``; None: what suits the format."""
+    stated_m: dict[int, Point] = {}
+    """Positions at the recording's beginning, for time differences; packets carry theirs, which may change."""
 
 
 class ReplayReport(Struct, frozen=True, kw_only=True):
@@ -291,8 +293,9 @@ class Replay:
         self._request = request
         self._judge = judge
         self.measurements = self._measurements()
-        self.recording: Recording = open_recording(request.path, request.format, request.listener)
-        self._noise = NoiseByPair(judge, request.anchors_m)
+        self.recording: Recording = open_recording(request.path, request.format, request.listener, request.anchors_m)
+        self._known_m = request.anchors_m or request.stated_m
+        self._noise = NoiseByPair(judge, self._known_m)
         self._pipeline: ByPairs | ByPackets = self._by_packets() if self.measurements == PACKETS else self._by_pairs()
         self.receptions = 0
         self.fixes = 0
@@ -316,7 +319,7 @@ class Replay:
 
     def _engine(self) -> PairEngine | None:
         bits = self.recording.format.tx_bits
-        return None if bits is None else PairEngine(bits, anchors_m=self._request.anchors_m)
+        return None if bits is None else PairEngine(bits, anchors_m=self._known_m)
 
     def _by_pairs(self) -> ByPairs:
         request = self._request
@@ -324,7 +327,7 @@ class Replay:
         asked["height_std_m"] = request.height_std_m
         known = {key: value for key, value in asked.items() if value is not None}
         settings = structs.replace(PROFILES.get(self.recording.format.name, DIFFERENCES), **known)
-        tracking = DifferenceTracking(settings, request.anchors_m, request.z_bounds_m, request.calibration)
+        tracking = DifferenceTracking(settings, self._known_m, request.z_bounds_m, request.calibration)
         return ByPairs(tracking, self._engine(), self._noise)
 
     def _by_packets(self) -> ByPackets:
@@ -380,7 +383,7 @@ class Replay:
     def _report(self, wall_s: float) -> ReplayReport:
         pairs = self._noise.pairs()
         span_s = self._last_s - (self._first_s or 0.0)
-        reason = self._pipeline.reason if self._request.anchors_m or self.fixes else NoFixReason.NO_ALMANAC
+        reason = self._pipeline.reason if self._known_m or self.fixes else NoFixReason.NO_ALMANAC
         return ReplayReport(
             format=self.recording.format.name,
             **common_figures(self._judge.judgement(), self.receptions, self.fixes, self._drops(), wall_s),

@@ -13,9 +13,9 @@ from skyless.air.codec import MAX_FRAME_BYTES
 from skyless.air.masterless_packets import Packet, Point
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.air.uci import UciReader
-from skyless.air.uci_location import GeodeticPoint
 from skyless.radios.interface import Gone, Late, RadioEvent, Restarted, ignore
 from skyless.radios.serial.serial_port import BoardClock, SerialPort, line_advice
+from skyless.recordings.foreign.anchor_frame import AnchorFrame
 from skyless.recordings.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
 from skyless.recordings.foreign.fira import DtTag
 from skyless.recordings.source import Drops, LineCutter
@@ -151,19 +151,14 @@ class UciRadio(_ListeningBoard[Packet]):
 
     firmware = "FiRa's UCI with a DL-TDoA session that goes on"
 
-    def __init__(self, path: str, baud: int, name: str, anchors_m: Mapping[int, Point]) -> None:
-        """``anchors_m``: positions that are known, where anchors may state none."""
+    def __init__(self, path: str, baud: int, name: str, anchors_m: Mapping[int, Point], frame: AnchorFrame) -> None:
+        """``anchors_m``: positions that replace all that anchors state; ``frame``: of those, which tags share."""
         super().__init__(path, baud, name)
-        self._anchors_m = anchors_m
-        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, anchors_m)
-
-    @property
-    def origin(self) -> GeodeticPoint | None:
-        """Where the frame of positions begins that anchors state on the Earth."""
-        return self._tag.origin
+        self._anchors_m, self.frame = anchors_m, frame
+        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, anchors_m, frame)
 
     def _start(self, send: Callable[[bytes], None]) -> None:  # noqa: ARG002 - it is sent nothing
-        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, self._anchors_m)
+        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, self._anchors_m, self.frame)
 
     def _events(self, data: bytes, host_s: float) -> Iterator[Packet]:
         for packet in self._reader.feed(data):
@@ -243,7 +238,7 @@ def reception_of(line: bytes, host_s: float, drops: Drops) -> Reception | None:
     try:
         found = _decode(line)
         frame = bytes.fromhex(found.d)
-    except (msgspec.MsgspecError, ValueError):
+    except (msgspec.MsgspecError, ValueError, RecursionError):
         drops["malformed-line"] += 1
         return None
     if len(frame) != found.dlen or not 1 <= len(frame) <= MAX_FRAME_BYTES:

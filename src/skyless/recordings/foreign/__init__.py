@@ -1,5 +1,5 @@
 """Recordings of other systems: their formats as streams of packets or time differences.
 
-Public: avalue, bitcraze, fira, formats.
-Within the package: anchor_frame, phones, tdoa_tables.
+Public: anchor_frame, avalue, bitcraze, fira, formats.
+Within the package: phones, tdoa_tables.
 """

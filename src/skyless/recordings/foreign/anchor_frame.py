@@ -1,7 +1,8 @@
 """Positions that anchors of another system state of themselves, in one frame.
 
 Relative positions are in the frame of whoever installed the anchors. Positions on the Earth become east, north and up
-of the first one that is stated, so that the tag's are as well.
+of the first one that is stated, so that the tag's are as well. One frame cannot have both: the first that is stated
+decides.
 """
 
 from math import cos, radians, sin, sqrt
@@ -12,19 +13,24 @@ from skyless.site.earth import EARTH_A_M, EARTH_E2
 
 
 class AnchorFrame:
-    """The frame of one recording or one board."""
+    """The frame of one recording, or of the boards of one process."""
 
     def __init__(self) -> None:
         self.origin: GeodeticPoint | None = None
-        """The first point on the Earth."""
+        """The first point on the Earth, where positions are stated there."""
+        self._is_relative = False
 
     def position_m(self, location: Point | GeodeticPoint | None) -> Point | None:
-        """A location in this frame."""
-        if not isinstance(location, GeodeticPoint):
-            return location
-        if self.origin is None:
-            self.origin = location
-        return east_north_up_m(location, self.origin)
+        """A location in this frame; None for one of the other kind."""
+        if isinstance(location, GeodeticPoint):
+            if self._is_relative:
+                return None
+            self.origin = self.origin or location
+            return east_north_up_m(location, self.origin)
+        if location is None or self.origin is not None:
+            return None
+        self._is_relative = True
+        return location
 
 
 def east_north_up_m(point: GeodeticPoint, origin: GeodeticPoint) -> Point:

@@ -6,20 +6,18 @@ from collections.abc import Iterator, Mapping
 from io import BufferedIOBase
 from typing import Final
 
-from skyless.air.dl_tdoa import DtMessage, DtRounds
+from skyless.air.dl_tdoa import DtMessage, DtRounds, host_time_s
 from skyless.air.masterless_packets import Packet, Point
-from skyless.air.uci import (
-    CONTROL_HEADER_BYTES,
+from skyless.air.uci import CONTROL_HEADER_BYTES, UciPacket, UciReader
+from skyless.air.uci_location import location_of
+from skyless.air.uci_measurements import (
     STATUS_OK,
     DtMeasurement,
     DtMessageType,
     SessionInfo,
-    UciPacket,
-    UciReader,
     decode_session_info,
 )
-from skyless.air.uci_location import GeodeticPoint, location_of
-from skyless.constants import TICK_BITS, TICK_S
+from skyless.constants import TICK_BITS
 from skyless.recordings.foreign.anchor_frame import AnchorFrame
 from skyless.recordings.source import Drops, chunks, lines
 from skyless.ticks import difference, wrap
@@ -31,16 +29,13 @@ _MESSAGES: Final = frozenset(map(int, DtMessageType))
 class DtTag:
     """From a tag's notifications to packets; what is of no use is counted."""
 
-    def __init__(self, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> None:
-        """``anchors_m``: positions that are known, where anchors may state none."""
+    def __init__(
+        self, drops: Drops, anchors_m: Mapping[int, Point] | None = None, frame: AnchorFrame | None = None
+    ) -> None:
+        """``anchors_m``: positions that replace all that anchors state; ``frame``: of those, where tags share it."""
         self._drops = drops
         self._rounds = DtRounds(anchors_m)
-        self._frame = AnchorFrame()
-
-    @property
-    def origin(self) -> GeodeticPoint | None:
-        """Where the frame of the positions begins, where anchors state theirs on the Earth."""
-        return self._frame.origin
+        self._frame = None if anchors_m else frame or AnchorFrame()
 
     def on_uci(self, packet: UciPacket, host_s: float | None = None) -> list[Packet]:
         """Packets of a notification, in the order in which they were received; ``host_s``: when it came."""
@@ -64,29 +59,27 @@ class DtTag:
             usable.sort(key=lambda one: difference(one.rx_ticks_tag, first))
         packets = []
         for one in usable:
-            packet = self._rounds.on_message(self._message(one, host_s))
+            packet = self._rounds.on_message(self._message(one, info.session, host_s))
             if isinstance(packet, Packet):
                 packets.append(packet)
             else:
                 self._drops[packet] += 1
         return packets
 
-    def _message(self, one: DtMeasurement, host_s: float | None) -> DtMessage:
-        if host_s is None and one.rx_bytes > _STAMP_BYTES:
-            host_s = one.rx_ticks_tag * TICK_S  # it has more bits, which bridge silences
+    def _message(self, one: DtMeasurement, session: int, host_s: float | None) -> DtMessage:
         return DtMessage(
-            host_s,
+            host_time_s(one.rx_ticks_tag) if host_s is None else host_s,
             one.address,
             DtMessageType(one.message),
             one.block,
-            one.round,
+            session << 8 | one.round,
             wrap(one.tx_ticks),
             wrap(one.rx_ticks_tag),
             one.common_time,
             one.responder_reply_ticks,
             one.initiator_reply_ticks,
             one.flight_ticks or None,
-            self._frame.position_m(location_of(one)),
+            None if self._frame is None else self._frame.position_m(location_of(one)),
         )
 
 
@@ -121,17 +114,17 @@ def _has_measurements(packets: list[UciPacket]) -> bool:
     return any(isinstance(info, SessionInfo) and info.measurements for info in found)
 
 
-def read_binary(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
-    """Yield the packets of a binary log."""
-    reader, tag = UciReader(drops), DtTag(drops)
+def read_binary(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
+    """Yield the packets of a binary log; ``anchors_m``: positions that replace all that anchors state."""
+    reader, tag = UciReader(drops), DtTag(drops, anchors_m)
     for chunk in chunks(stream, drops):
         for packet in reader.feed(chunk):
             yield from tag.on_uci(packet)
 
 
-def read_text(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
-    """Yield the packets of a log of lines; lines without a packet are counted."""
-    reader, tag = UciReader(drops), DtTag(drops)
+def read_text(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
+    """Yield the packets of a log of lines as of a binary one; lines without a packet are counted."""
+    reader, tag = UciReader(drops), DtTag(drops, anchors_m)
     for line in lines(stream, drops):
         found = _packets_of_line(line)
         if not found and line.strip():

@@ -2,14 +2,14 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from io import BufferedIOBase
 from os import PathLike, fspath
 from typing import Final
 
-from skyless.air.masterless_packets import Packet, PairTdoa
+from skyless.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.constants import TICK_BITS
 from skyless.errors import ConfigurationError
 from skyless.recordings.foreign import avalue, bitcraze, fira, phones, tdoa_tables
@@ -27,7 +27,8 @@ class Format:
     recognise: Callable[[bytes], bool]
     """From the first bytes, decompressed."""
     read: Callable[..., Iterator[Record]]
-    """From an open stream and a counter of drops; with ``listener`` where ``any_listener``."""
+    """From an open stream and a counter of drops; with ``listener`` where ``any_listener``, and ``anchors_m`` where
+    ``is_dl_tdoa``."""
     tx_bits: int | None
     """Width of the anchors' stamps in its packets; None for a format of ready TDoAs."""
     any_listener: bool = False
@@ -141,16 +142,24 @@ class Recording:
         self.stream.close()
 
 
-def open_recording(path: str | PathLike[str], format_name: str | None = None, listener: str | None = None) -> Recording:
+def open_recording(
+    path: str | PathLike[str],
+    format_name: str | None = None,
+    listener: str | None = None,
+    anchors_m: Mapping[int, Point] | None = None,
+) -> Recording:
     """Open a recording of a named format, or of the one that its first bytes show.
 
-    ``listener`` chooses one receiver where a recording holds several; by default that of the first row.
+    ``listener`` chooses one receiver where a recording holds several; by default that of the first row. ``anchors_m``:
+    positions that replace all that the anchors of a recording of DL-TDoA state.
 
     Raises:
         ConfigurationError: the file cannot be opened, its format is not known, or the listener makes no sense.
     """
     chosen = format_of(path, format_name)
     read = _listening(path, chosen, listener)
+    if chosen.is_dl_tdoa:
+        read = partial(chosen.read, anchors_m=anchors_m)
     stream = open_source(path)
     drops: Drops = Counter()
     return Recording(chosen, fspath(path), read(stream, drops), stream, drops)

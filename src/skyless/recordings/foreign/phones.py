@@ -16,7 +16,7 @@ message: Android's documentation names either unit); and ``address``, which the 
 An address is a number or hexadecimal text, with or without colons. Further keys are of no interest.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from io import BufferedIOBase
 from math import isfinite
 from typing import Final
@@ -24,11 +24,13 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
-from skyless.air.dl_tdoa import DtMessage, DtRounds
+from skyless.air.dl_tdoa import DtMessage, DtRounds, host_time_s
 from skyless.air.masterless_packets import Packet, Point
-from skyless.air.uci import DtMessageType
 from skyless.air.uci_location import GeodeticPoint
-from skyless.constants import TICK_BITS, TICK_RATE_HZ, TICK_S
+from skyless.air.uci_measurements import (
+    DtMessageType,
+)
+from skyless.constants import TICK_BITS, TICK_RATE_HZ
 from skyless.recordings.foreign.anchor_frame import AnchorFrame
 from skyless.recordings.source import Drops, lines
 from skyless.ticks import wrap
@@ -93,14 +95,14 @@ def recognise(head: bytes) -> bool:
     first = head.removeprefix(b"\xef\xbb\xbf").partition(b"\n")[0]
     try:
         record = _decode(first)
-    except (msgspec.MsgspecError, ValueError):
+    except (msgspec.MsgspecError, ValueError, RecursionError):
         return False
     return record.measurement_type is not None or record.message_type is not None
 
 
-def read(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
-    """Yield the packets of a file of records."""
-    phone = _Phone()
+def read(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
+    """Yield the packets of a file of records; ``anchors_m``: positions that replace all that anchors state."""
+    phone = _Phone(anchors_m)
     for line in lines(stream, drops):
         if not line.strip():
             continue
@@ -114,9 +116,9 @@ def read(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
 class _Phone:
     """One phone's records, in their order."""
 
-    def __init__(self) -> None:
-        self._rounds = DtRounds()
-        self._frame = AnchorFrame()
+    def __init__(self, anchors_m: Mapping[int, Point] | None) -> None:
+        self._rounds = DtRounds(anchors_m)
+        self._frame = None if anchors_m else AnchorFrame()
         self._polls: dict[int, int] = {}
         """How many each cluster has sent, by its initiator."""
         self._newest_initiator: int | None = None
@@ -125,7 +127,7 @@ class _Phone:
         """The packet of a record, or the reason why it is of no use."""
         try:
             record = _decode(line.removeprefix(b"\xef\xbb\xbf"))
-        except (msgspec.MsgspecError, ValueError):
+        except (msgspec.MsgspecError, ValueError, RecursionError):
             return "malformed-record"
         message = self._android(record) if record.measurement_type is None else self._ios(record)
         return message if isinstance(message, str) else self._rounds.on_message(message)
@@ -147,7 +149,7 @@ class _Phone:
             self._polls[initiator] = self._polls.get(initiator, 0) + 1
             self._newest_initiator = initiator
         return DtMessage(
-            host_s=rx_ticks * TICK_S,
+            host_s=host_time_s(rx_ticks),
             address=address,
             kind=kind,
             block=self._polls.get(initiator, 0),
@@ -155,7 +157,7 @@ class _Phone:
             tx_ticks=wrap(tx_ticks),
             rx_ticks_tag=wrap(rx_ticks),
             common_time=True,
-            position_m=self._frame.position_m(_ios_location(record)),
+            position_m=self._position_m(_ios_location(record)),
         )
 
     def _initiator(self, record: _Record) -> int | None:
@@ -175,7 +177,7 @@ class _Phone:
         if not all(0 <= value <= _MOST_REPLY_TICKS for value in (*replies, *indices)):
             return "impossible-number"
         return DtMessage(
-            None,
+            host_time_s(rx_ticks),
             address,
             kind,
             *indices,
@@ -185,8 +187,11 @@ class _Phone:
             replies[0],
             replies[1],
             float(replies[2]) or None,
-            self._frame.position_m(_android_location(record.anchor_location)),
+            self._position_m(_android_location(record.anchor_location)),
         )
+
+    def _position_m(self, location: Point | GeodeticPoint | None) -> Point | None:
+        return None if self._frame is None else self._frame.position_m(location)
 
 
 def _kind(stated: int | str | None) -> DtMessageType | None:
