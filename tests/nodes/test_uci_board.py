@@ -6,6 +6,7 @@ import pytest
 
 from skyless.air.beacon import Beacon, Heard
 from skyless.air.codec import encode
+from skyless.air.masterless_packets import Packet
 from skyless.air.reception import Diagnostics, Reception
 from skyless.air.uci import UciReader
 from skyless.air.uci_location import location_of
@@ -14,8 +15,12 @@ from skyless.air.uci_measurements import (
 )
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
+from skyless.nodes.open_radio import open_sniffers
+from skyless.nodes.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.nodes.uci_board import UciProtocol
 from skyless.radios.interface import Restarted
+from skyless.radios.serial.foreign_radios import UciRadio
+from skyless.recordings.foreign.anchor_frame import AnchorFrame
 from skyless.simulation.impairments import lab_impairments
 from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Static
@@ -102,6 +107,23 @@ def test_a_flight_that_the_line_has_no_bits_for_is_unknown(x_m, ticks):
     board.hear(beacon(2, 9, 9000, Heard(1, 7, 8000)))
     *_, info = board.said()
     assert info.measurements[-1].flight_ticks == ticks
+
+
+def test_a_board_that_restarts_may_receive_anchors_at_another_height():
+    radio = UciRadio("/dev/ttyACM0", 115_200, "tag1", {}, AnchorFrame())
+    node = PacketTagNode(PacketTagSettings({}, auto_height=True), radio, print, print, lambda: 0.0)
+    corners_m = [(0.0, 0.0), (6.0, 0.0), (6.0, 8.0), (0.0, 8.0)]
+    for height_m in (2.0, 5.0):
+        node.on_event(Restarted())
+        for number, corner_m in enumerate(2 * corners_m):
+            ticks = 1000 * number
+            node.on_event(Packet(None, number % 4, number, ticks, ticks, (), (*corner_m, height_m)))
+        assert node._height_m == pytest.approx(height_m)
+
+
+def test_boards_of_one_process_have_one_frame():
+    one, other = open_sniffers("uci:/dev/null,/dev/zero", ("tag1", "tag2"))
+    assert one.frame is other.frame
 
 
 def test_what_belongs_to_no_round_is_counted():
