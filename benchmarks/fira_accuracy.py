@@ -154,16 +154,32 @@ def main():
     asked.add_argument("--json", action="store_true")
     arguments = asked.parse_args()
     for name, frames in ROUNDS.items():
+        all_found = []
         for number in range(arguments.seeds):
-            found = measure(frames, arguments.worlds, 1 + 1000 * number)
-            if arguments.json:
-                print(json.dumps({"rounds": name, "seed": 1 + 1000 * number, **found._asdict()}))
-            else:
-                print(
-                    f"{name:<10} seed {1 + 1000 * number:>4}: {100 * found.rmse_m:.2f} cm, "
-                    f"plan {100 * found.planned_m:.2f} cm, of rounds {100 * found.round_planned_m:.2f} cm, "
-                    f"ratios {found.ratio:.3f} and {found.round_ratio:.3f} ({found.fixes} fixes)"
-                )
+            all_found.append(measure(frames, arguments.worlds, 1 + 1000 * number))
+            show(name, 1 + 1000 * number, all_found[-1], arguments.json)
+        show(name, "all", together(all_found), arguments.json)
+
+
+def together(found):
+    """All seeds as one."""
+    fixes = sum(one.fixes for one in found)
+    rmse_m = math.sqrt(sum(one.fixes * one.rmse_m**2 for one in found) / fixes)
+    planned_m, round_planned_m = found[0].planned_m, found[0].round_planned_m
+    return Measured(rmse_m, planned_m, round_planned_m, rmse_m / planned_m, rmse_m / round_planned_m, fixes)
+
+
+def show(name, seed, found, as_json):
+    """Print one line of the table."""
+    if as_json:
+        print(json.dumps({"rounds": name, "seed": seed, **found._asdict()}), flush=True)
+        return
+    print(
+        f"{name:<10} seed {seed:>4}: {100 * found.rmse_m:.2f} cm, plan {100 * found.planned_m:.2f} cm, "
+        f"of rounds {100 * found.round_planned_m:.2f} cm, ratios {found.ratio:.3f} and {found.round_ratio:.3f} "
+        f"({found.fixes} fixes)",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":
