@@ -13,10 +13,12 @@ from pythonosc.osc_message import OscMessage
 from skyless.bridges.osc import OscEncoder, make_encoder
 from skyless.bridges.psn import MOST_PACKET_BYTES, PsnFrames
 from skyless.bridges.stage_axes import turned
+from skyless.bridges.target import BridgeContext
 from skyless.bridges.target_url import TargetUrl
 from skyless.errors import SkylessError
 
 START_UNIX_S = 1_795_000_000.0
+CONTEXT = BridgeContext(print)
 names = st.from_regex(r"[A-Za-z0-9_-]{1,32}", fullmatch=True)
 vectors = st.tuples(*[st.floats(-1e30, 1e30)] * 3)
 
@@ -60,6 +62,18 @@ def test_osc_states_that_there_is_no_fix_and_that_there_is_one_again():
     assert [OscMessage(data).address for data in encoder.on_fix(a_fix())] == ["/skyless/tag1/fix", "/skyless/tag1/xyz"]
 
 
+def test_osc_repeats_each_second_which_tags_have_a_fix():
+    """For programs that began later, or lost the datagram that said so."""
+    encoder = OscEncoder()
+    assert encoder.on_second(0.0) == []
+    for tag in ("tag2", "tag1"):
+        encoder.on_fix(a_fix(tag=tag))
+    states = [OscMessage(data) for data in encoder.on_second(0.0)]
+    assert [(one.address, one.params) for one in states] == [("/skyless/tag1/fix", [1]), ("/skyless/tag2/fix", [1])]
+    encoder.on_no_fix("tag1", 0.0, "lost")
+    assert [OscMessage(data).address for data in encoder.on_second(0.0)] == ["/skyless/tag2/fix"]
+
+
 def test_osc_drops_what_no_float_holds():
     encoder = OscEncoder()
     assert encoder.on_fix(a_fix(position_m=(1e39, 0.0, 0.0))) == []
@@ -67,9 +81,9 @@ def test_osc_drops_what_no_float_holds():
 
 
 def test_the_axis_that_is_up_is_checked():
-    assert OscMessage(make_encoder(TargetUrl("osc+udp://?up=y")).on_fix(a_fix())[1]).params == [1.0, 1.5, -2.0]
+    assert OscMessage(make_encoder(TargetUrl("osc+udp://?up=y"), CONTEXT).on_fix(a_fix())[1]).params == [1.0, 1.5, -2.0]
     with pytest.raises(SkylessError, match="y or z"):
-        make_encoder(TargetUrl("osc+udp://?up=x"))
+        make_encoder(TargetUrl("osc+udp://?up=x"), CONTEXT)
 
 
 # PosiStageNet

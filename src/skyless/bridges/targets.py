@@ -55,7 +55,9 @@ def open_route(text: str, context: BridgeContext) -> Route:
     hz = url.number("hz", kind.hz, 0.1, kind.most_hz)
     module = import_module(f"skyless.bridges.{kind.module}")
     target = (
-        _stream(url, kind, cast(Callable[[TargetUrl], Encoder], module.make_encoder)(url), context)
+        _stream(
+            url, kind, cast(Callable[[TargetUrl, BridgeContext], Encoder], module.make_encoder)(url, context), context
+        )
         if "+" in url.scheme
         else cast(Callable[[TargetUrl, BridgeContext], Target], module.make_target)(url, context)
     )
