@@ -8,6 +8,7 @@ import pytest
 from bridged_values import SITE, a_fix
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 from pythonosc.osc_message import OscMessage
 
 from skyless.bridges.osc import OscEncoder, make_encoder
@@ -137,6 +138,13 @@ def test_a_tag_has_the_number_of_its_name_where_it_is_free():
     (info,) = made.info_packets(START_UNIX_S)
     found = {tracker.tracker_id: tracker.tracker_name for tracker in pypsn.parse_psn_packet(info).trackers}
     assert found == {3: b"tag3", 1: b"singer", 2: b"old3", 4: b"tag99999", 5: b"tag0", 6: b"tag2"}
+
+
+def test_a_long_name_of_a_site_is_cut_between_characters():
+    made = frames([a_fix()])
+    made.on_site(structs.replace(SITE, name="x" + 200 * "ä"))
+    (info,) = made.info_packets(START_UNIX_S)
+    assert pypsn.parse_psn_packet(info).name.decode() == "x" + 127 * "ä"
 
 
 def test_nothing_is_sent_while_there_is_no_tag():
