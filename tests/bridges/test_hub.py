@@ -120,11 +120,21 @@ def test_a_tag_whose_fixes_are_rare_has_none_only_when_some_are_missing():
         for quarter in range(8):
             hub.on_tick(2.0 * step + 0.25 * quarter, 100.0 + 2.0 * step + 0.25 * quarter)
     assert (len(target.fixes), target.seconds) == (4, 8)
-    assert [when_s for _, when_s, _ in target.none] == [101.0], "its interval was not known then"
+    assert [when_s for _, when_s, _ in target.none] == [101.0, 103.0], "its interval was not known then"
     target.none.clear()
     for quarter in range(1, 33):
         hub.on_tick(8.0 + 0.25 * quarter, 108.0 + 0.25 * quarter)
     assert [when_s for _, when_s, _ in target.none] == [111.0 + second for second in range(6)]
+
+
+def test_a_single_fix_after_an_outage_does_not_make_a_tag_slow():
+    target = Recorded()
+    hub = hub_of(target)
+    for step in range(50):
+        hub.on_fix(a_fix(serial=step), 0.02 * step)
+    hub.on_fix(a_fix(serial=50), 30.0)
+    hub.on_tick(31.25, 131.25)
+    assert [when_s for _, when_s, _ in target.none] == [131.25]
 
 
 def test_no_fix_of_a_tag_at_the_targets_own_rate_is_missed_because_it_came_early():

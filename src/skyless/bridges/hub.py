@@ -58,8 +58,8 @@ class _Tag(Struct):
     """When its last usable fix came, or when it was first heard of."""
     reason: str
     """Why there is none."""
-    interval_s: float = 0.0
-    """Between its last two usable fixes."""
+    intervals_s: tuple[float, float] = (0.0, 0.0)
+    """Between its last three usable fixes: a single long one is an outage, two are its rate."""
     reported_s: float = -inf
     """When targets were informed that it has none."""
 
@@ -107,7 +107,8 @@ class Hub:
         if not is_usable(fix):
             tag.reason = fix.alert or "position is not finite"
             return
-        tag.interval_s, tag.usable_s, tag.reason = now_s - tag.usable_s, now_s, "no fix"
+        tag.intervals_s = (tag.intervals_s[1], now_s - tag.usable_s)
+        tag.usable_s, tag.reason = now_s, "no fix"
         if self.site is None:
             return
         self.fixes += 1
@@ -135,7 +136,7 @@ class Hub:
             age_s = now_s - tag.usable_s
             if age_s > _FORGET_S:
                 self._forget(name)
-            elif age_s >= _silence_s(tag.interval_s) and now_s - tag.reported_s >= _SECOND_S and self.site is not None:
+            elif age_s >= _silence_s(min(tag.intervals_s)) and now_s - tag.reported_s >= _SECOND_S and self.site is not None:
                 tag.reported_s = now_s
                 self._give_no_fix(name, unix_s, tag.reason)
         if now_s - self._second_s >= _SECOND_S:
