@@ -70,9 +70,7 @@ class TcpServer:
 class _TcpReader(asyncio.Protocol):
     """One connection; what it sends is not read."""
 
-    def __init__(
-        self, readers: "set[_TcpReader]", greeting: Callable[[], list[bytes]], dropped: Counter[str]
-    ) -> None:
+    def __init__(self, readers: "set[_TcpReader]", greeting: Callable[[], list[bytes]], dropped: Counter[str]) -> None:
         self._readers, self._greeting, self._dropped = readers, greeting, dropped
         self._transport: asyncio.Transport | None = None
         self._stuck_since_s: float | None = None
@@ -95,7 +93,7 @@ class _TcpReader(asyncio.Protocol):
         self._readers.discard(self)
 
     def send(self, data: bytes) -> bool:
-        """Whether the connection accepts it, however long it is, if nothing waits; one that accepts nothing is ended."""
+        """Whether the connection accepts it, which it does where nothing waits; one that accepts nothing is ended."""
         if self._transport is None or self._transport.is_closing():
             return False
         waiting = self._transport.get_write_buffer_size()
