@@ -20,7 +20,7 @@ from skyless.bridges.target import Target
 from skyless.errors import SkylessError
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
-from skyless.mqtt.topics import fix_topic, health_topic, site_topic, status_topic, zones_topic
+from skyless.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
 from skyless.nodes.bridge.broker_bridge import BridgeNode, run_route
 from skyless.nodes.bridge.tag_bridge import TagBridge, heard_site
 from skyless.nodes.process import end_with_parent
@@ -268,5 +268,20 @@ def test_a_target_that_has_ended_gets_nothing_more():
         hub.on_fix(a_fix(serial=2), 2.0)
         hub.on_tick(9.0, 9.0)
         assert (len(target.fixes), target.none, said) == (1, [], [])
+
+    asyncio.run(main())
+
+
+def test_a_bridge_that_is_started_again_leaves_no_second_status_on_the_broker(tmp_path):
+    async def main():
+        async with brokered(tmp_path) as (broker, programs):
+            statuses = {}
+            programs.subscribe(status_topic(LAB.id, "bridge", EVERY_NODE), statuses.__setitem__)
+            for _ in range(2):
+                node = BridgeNode(Hub([Route(Recorded(), None, 1.0)], print), broker.address, LAB.id, print)
+                async with running(node.run()):
+                    await until(lambda: any(b'"online":true' in status for status in statuses.values()))
+                await until(lambda: all(b'"online":false' in status for status in statuses.values()))
+            assert len(statuses) == 1
 
     asyncio.run(main())

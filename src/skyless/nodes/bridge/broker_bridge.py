@@ -1,11 +1,13 @@
 """``skyless bridge``: gives a site's fixes, from its broker, to programs and devices of other kinds."""
 
 import asyncio
-import secrets
+import platform
+import re
 import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Final, TypeVar
+from zlib import crc32
 
 import msgspec
 from msgspec import Struct
@@ -45,7 +47,7 @@ class BridgeNode:
 
     def __init__(self, hub: Hub, address: MqttAddress, site: int, log: Log) -> None:
         self.hub = hub
-        self.link = Link(address, f"bridge-{secrets.token_hex(4)}", site=site, kind="bridge")
+        self.link = Link(address, _name(hub), site=site, kind="bridge")
         self._log = log
         self._started_s = time.monotonic()
         self._last_fix_s = self._started_s
@@ -137,6 +139,12 @@ class BridgeNode:
             self._is_silent = True
             known = "no tag publishes fixes" if self._site is not None else "the site itself is not on the broker"
             self._log(f"no fix for {_SILENT_S:g} s: {known}; skyless dashboard shows why")
+
+
+def _name(hub: Hub) -> str:
+    """The bridge's name on MQTT: always the same for its targets, as the broker keeps the status of each name."""
+    targets = " ".join(route.target.text for route in hub.routes).encode()
+    return f"{re.sub(r'[^A-Za-z0-9_-]', '-', platform.node())}-{crc32(targets):08x}"
 
 
 async def run_route(route: Route, log: Log) -> None:
