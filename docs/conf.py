@@ -44,12 +44,18 @@ NAVIGATION = {
     ],
     "In other tools": [
         "docs/tools/index",
+        "docs/tools/ros2",
         "docs/tools/gpsd",
         "docs/tools/foxglove",
+        "docs/tools/home_assistant",
+        "docs/tools/prometheus",
+        "docs/tools/geojson",
         "docs/tools/json_lines",
         "docs/tools/ardupilot",
         "docs/tools/px4",
         "docs/tools/stage",
+        "docs/tools/fira",
+        "docs/tools/phones",
     ],
     "Reference": [
         "docs/reference/commands",

@@ -5,9 +5,11 @@ still. Each clock has its own rate and offset; stamps have 100 ps of Gaussian no
 the formats, not with the code under test, in a stream, so that a file may be of any length.
 """
 
+import json
 from itertools import product
 from math import cos, dist, sin
 from random import Random
+from struct import pack
 
 from recordings.capture_makers import binary_record, tdoa3, text_line, yaml_document
 
@@ -135,6 +137,80 @@ def exchange_stamps(i, r, t, tag_m, random):
     return [*listened, at(i, i, t), at(r, i, t), at(r, r, t2), at(i, r, t2), at(r, r, t3), at(i, r, t3)]
 
 
+def dl_tdoa_rounds(count, seed=1, speed_mps=0.5):
+    """Rounds of FiRa's DL-TDoA, nine messages each, in dicts; anchor 1 is the initiator, and sends the final one."""
+    random = Random(seed)
+    for number in range(-(-count // 9)):
+        sent, replies, messages = 1.0 + number * 9 * PERIOD_S, {}, []
+        final_s = sent + 8 * PERIOD_S
+        tx_poll, tx_final = stamp(1, sent, random), stamp(1, final_s, random)
+        for k, anchor in enumerate([*ANCHORS_M, 1]):
+            t, kind = sent + k * PERIOD_S, 0 if k == 0 else 2 if k == 8 else 1
+            flight_s = dist(ANCHORS_M[anchor], ANCHORS_M[1]) / C_MPS
+            tx = {0: tx_poll, 2: tx_final}.get(kind) or stamp(anchor, t, random)
+            reply = (tx - stamp(anchor, sent + flight_s, random)) % 2**40 if kind == 1 else 0
+            if kind == 1:
+                replies[anchor] = (tx_final - stamp(1, t + flight_s, random)) % 2**40
+            heard_s = t + dist(place_m(t - 1.0, speed_mps), ANCHORS_M[anchor]) / C_MPS
+            flight = round(flight_s * RATE_HZ) if kind == 1 else 0
+            messages.append((anchor, kind, number % 2**16, tx, stamp(TAG, heard_s, random), reply, flight))
+        whole = [(*message, replies.get(message[0], 0) if message[1] == 1 else 0) for message in messages]
+        yield whole[: count - 9 * number]
+
+
+def uci_notification(messages, number):
+    """A round as measurements of version 1, with relative locations, in segments."""
+    body = pack("<IIBIBBB8xB", number, 7, 0, 200, 2, 0, 0, len(messages))
+    for anchor, kind, block, tx, rx, reply, flight, initiator_reply in messages:
+        body += pack("<HBBHHBBhBhBB", anchor, 0, kind, 2 << 5, block, 0, 0, 0, 0, 0, 0, 160)
+        body += tx.to_bytes(5, "little") + rx.to_bytes(5, "little")
+        body += pack("<hhIIH", -32768, -32768, initiator_reply, reply, flight) + location(ANCHORS_M[anchor])
+    parts = [body[at : at + 255] for at in range(0, len(body), 255)]
+    ends = [0x72] * (len(parts) - 1) + [0x62]
+    return [bytes((end, 0, 0, len(part))) + part for end, part in zip(ends, parts, strict=True)]
+
+
+def location(position_m):
+    """x, y of 28 bits and z of 24 bits in millimetres, lowest byte first, one string of bits."""
+    x, y, z = (round(1000 * value) for value in position_m)
+    digits = [f"{value & 255:08b}" for value in (x, x >> 8, x >> 16)] + [f"{x >> 24 & 15:04b}"]
+    digits += [f"{value & 255:08b}" for value in (y, y >> 8, y >> 16)] + [f"{y >> 24 & 15:04b}"]
+    digits += [f"{value & 255:08b}" for value in (z, z >> 8, z >> 16)]
+    return int("".join(digits), 2).to_bytes(10, "big")
+
+
+def uci_binary(count, **options):
+    for number, messages in enumerate(dl_tdoa_rounds(count, **options)):
+        yield b"".join(uci_notification(messages, number))
+
+
+def uci_text(count, **options):
+    for number, messages in enumerate(dl_tdoa_rounds(count, **options)):
+        for segment in uci_notification(messages, number):
+            yield b"11-21 10:00:%06.3f UciHal: RECV %s\n" % (number % 60, segment.hex(" ").encode())
+
+
+def phone_records(count, **options):
+    """As an app on Android could write them."""
+    for messages in dl_tdoa_rounds(count, **options):
+        for anchor, kind, block, tx, rx, reply, flight, initiator_reply in messages:
+            x, y, z = (round(1000 * value) for value in ANCHORS_M[anchor])
+            record = {
+                "address": f"00:{anchor:02x}",
+                "messageType": kind,
+                "messageControl": 0,
+                "blockIndex": block,
+                "roundIndex": 0,
+                "txTimestamp": [byte - 256 if byte > 127 else byte for byte in tx.to_bytes(8, "little")],
+                "rxTimestamp": rx.to_bytes(8, "little").hex(),
+                "responderReplyTime": reply,
+                "initiatorReplyTime": initiator_reply,
+                "initiatorResponderTof": flight,
+                "anchorLocation": {"coordinateType": 1, "relativeLocation": {"x": x, "y": y, "z": z}},
+            }
+            yield json.dumps(record).encode() + b"\n"
+
+
 MAKERS = {
     "tdoa-table": tdoa_table,
     "bitcraze-yaml": yaml_capture,
@@ -142,6 +218,9 @@ MAKERS = {
     "bitcraze-text": text_stream,
     "avalue": avalue_table,
     "miluv": miluv_table,
+    "uci-binary": uci_binary,
+    "uci-text": uci_text,
+    "dl-tdoa-json": phone_records,
 }
 LISTENER = {"avalue": ["--listener", "99"]}
 

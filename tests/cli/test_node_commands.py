@@ -100,7 +100,7 @@ def test_a_program_that_is_asked_to_end_does_so_as_planned(number):
         assert not program.stderr.read()
 
 
-@pytest.mark.parametrize("speaks", ["listener", "sniffer", "sniffer-text"])
+@pytest.mark.parametrize("speaks", ["listener", "sniffer", "sniffer-text", "uci", "uci-2"])
 def test_an_anchor_has_no_board_that_only_listens(speaks, capsys):
     assert main(["board", "6", "--wire", speaks]) == 2
     assert "it should be link for an anchor" in capsys.readouterr().err

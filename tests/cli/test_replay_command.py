@@ -21,6 +21,7 @@ from skyless.site.lab import lab_site
 from skyless.site.template import site_template
 
 ROWS = 1500
+DL_TDOA = ("uci-binary", "uci-text", "dl-tdoa-json")
 TEXTS = {"anchor_ids", "hpl_m", "vpl_m", "integrity_risk", "alert"}
 """Columns that hold no number, or none here: pairs of time differences come without protection levels."""
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256))
@@ -150,7 +151,7 @@ def test_what_is_left_of_a_damaged_recording_is_used(run, room, tmp_path):
     assert told["drops"].items() >= {"not-finite": 2, "malformed-number": 1, "anchor-against-itself": 1}.items()
 
 
-@pytest.mark.parametrize("name", [name for name in synthetic.MAKERS if name not in {"avalue", "miluv"}])
+@pytest.mark.parametrize("name", [name for name in synthetic.MAKERS if name not in {"avalue", "miluv", *DL_TDOA}])
 def test_missing_anchors_are_named_before_the_recording_is_read(run, name, monkeypatch):
     monkeypatch.setattr("skyless.replays.captures.Replay.run", lambda *_: pytest.fail("it was read"))
     code, out, err = run(name)
@@ -166,6 +167,16 @@ def test_recordings_that_say_where_their_anchors_are_need_no_table(run):
     code, out, err = run("avalue", "--json")
     found = json.loads(out)
     assert (code, found["fixes"], len(found["anchor_distances_m"]) > 0, err.count("\n")) == (1, 0, True, 1)
+
+
+@pytest.mark.parametrize("name", DL_TDOA)
+def test_anchors_of_dl_tdoa_state_where_they_are(run, name):
+    told = report(run(name, "--truth", "truth.csv", "--settle", "1", "--json"))
+    assert told["measurements"] == "packets"
+    assert told["fixes"] > 0.98 * ROWS
+    assert told["rmse_2d_m"] < 0.05
+    differences = report(run(name, "--truth", "truth.csv", "--measurements", "differences", "--json"))
+    assert differences["measurements"] == "differences"
 
 
 def test_no_fix_at_all_is_exit_code_1_with_the_likely_reason(run, room, tmp_path):

@@ -66,8 +66,9 @@ class LiveSite:
 
     def tag(self, name, radio):
         fixes = self.published[name] = []
-        if radio.startswith("sniffer"):
-            settings = PacketTagSettings(PLACES, height_m=PLACE_M[2], publish_hz=1000.0)
+        if radio.startswith(("sniffer", "uci")):
+            known = {"auto_height": True} if radio.startswith("uci") else {"height_m": PLACE_M[2]}
+            settings = PacketTagSettings({} if radio.startswith("uci") else PLACES, publish_hz=1000.0, **known)
             node = PacketTagNode(settings, open_sniffers(radio, (name,))[0], fixes.append, self.said.append)
         else:
             node = TagNode(

@@ -72,7 +72,7 @@ def test_a_frame_that_reaches_the_board_too_late_is_skipped_and_the_anchor_makes
     asyncio.run(play())
 
 
-@pytest.mark.parametrize("speaks", ["sniffer", "sniffer-text", "listener"])
+@pytest.mark.parametrize("speaks", ["sniffer", "sniffer-text", "listener", "uci", "uci-2"])
 def test_boards_of_other_formats_give_right_fixes(speaks, tmp_path):
     async def play():
         async with LiveSite(tmp_path) as site:

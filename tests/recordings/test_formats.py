@@ -5,6 +5,7 @@ from capture_makers import binary_record, tdoa3, text_line, yaml_document
 
 from skyless.errors import ConfigurationError
 from skyless.recordings.foreign.formats import FORMATS, open_recording
+from synthetic_recordings import phone_records, uci_binary, uci_text
 
 PACKET = (2, 12345, tdoa3(5, 6, [(1, 2, 3, 33000)]))
 SAMPLES = {
@@ -13,6 +14,9 @@ SAMPLES = {
     "bitcraze-binary": b"boot\xbc\x00" + binary_record(*PACKET),
     "tdoa-table": b"t_s,idA,idB,tdoa_m\n1,2,3,4\n",
     "avalue": b"t_host,order,slave,master,status,tx_ticks_u40,rx_ticks_u40\n1,1,A,B,0,5,6\n",
+    "uci-binary": b"".join(uci_binary(1)),
+    "uci-text": b"".join(uci_text(1)),
+    "dl-tdoa-json": b"".join(phone_records(1)),
     "miluv": (
         b"t_s,listener,initiator,responder,L_rx1,L_rx2,L_rx3,I_tx1,R_rx1,R_tx2,I_rx2,R_tx3,I_rx3,"
         b"gt_I_x_m,gt_I_y_m,gt_I_z_m,gt_R_x_m,gt_R_y_m,gt_R_z_m\n"

@@ -107,7 +107,7 @@ class ReplayOptions:
     """How positions are computed, in recordings of skyless record; by default as the tag did."""
     measurements: str | None = None
     """What the filter is given of other recordings: packets, as anchors sent them, which is the default for
-    Bitcraze's; or differences, which are made of them."""
+    Bitcraze's and FiRa's; or differences, which are made of them."""
     protection: _OtherProtection = _OtherProtection()
     fixes_csv: Path | None = None
     """Write every fix into this table."""
@@ -121,8 +121,9 @@ class ReplayOptions:
 def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> int:
     """Turn a recording into fixes; judge them where the truth is known.
 
-    Reads recordings of skyless record (MCAP), Bitcraze sniffer captures (YAML, binary, text; TDoA2 and TDoA3), tables
-    of time differences, MILUV passive ticks and Avalue receptions; the format is recognised by the content.
+    Reads recordings of skyless record (MCAP), Bitcraze sniffer captures (YAML, binary, text; TDoA2 and TDoA3), FiRa
+    UCI logs (binary, text) and phones' records (JSON) of DL-TDoA, tables of time differences, MILUV passive ticks and
+    Avalue receptions; the format is recognised by the content.
 
     A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
     below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --tag-height-std,

@@ -14,6 +14,7 @@ from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.firmware import link
 from skyless.nodes.process import Log
+from skyless.nodes.uci_board import UciProtocol
 from skyless.radios.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radios.serial.link_records import to_steps
 from skyless.radios.serial.pseudo_terminal import Pty
@@ -26,12 +27,14 @@ _EMULATED_FIRMWARE: Final = (0, 0, 0)
 _LAST_ID: Final = 0xFF
 
 
-BoardFormat = Literal["link", "sniffer", "sniffer-text", "listener"]
+BoardFormat = Literal["link", "sniffer", "sniffer-text", "listener", "uci", "uci-2"]
 RADIO_OF: Final[dict[BoardFormat, str]] = {
     "link": "serial",
     "sniffer": "sniffer",
     "sniffer-text": "sniffer",
     "listener": "listener",
+    "uci": "uci",
+    "uci-2": "uci",
 }
 """The name in ``--radio`` of a board of each format."""
 
@@ -251,6 +254,8 @@ class Board:
             self.protocol = LinkProtocol(radio, self.pty.send, can_transmit=kind == "anchor")
         elif board_format == "listener":
             self.protocol = ListenerProtocol(self.pty.send)
+        elif board_format in ("uci", "uci-2"):
+            self.protocol = UciProtocol(self.pty.send, 1 if board_format == "uci" else 2)
         else:
             self.protocol = SnifferProtocol(self.pty.send, knows_binary=board_format == "sniffer")
 

@@ -1,9 +1,10 @@
 """Radios by their names in ``--radio``."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
+from skyless.air.masterless_packets import Point
 from skyless.errors import SkylessError
 from skyless.radios.dw1000.model import ModelPort
 from skyless.radios.dw1000.radio import Dw1000Radio
@@ -11,7 +12,7 @@ from skyless.radios.dw1000.spi import DEFAULT_CHIP, DEFAULT_FAST_HZ, MAX_FAST_HZ
 from skyless.radios.emulated import EtherConnection
 from skyless.radios.ether_wire import DEFAULT_PORT, Join
 from skyless.radios.interface import AntennaDelays, Radio
-from skyless.radios.serial.foreign_radios import ListenerRadio, SnifferRadio
+from skyless.radios.serial.foreign_radios import ListenerRadio, SnifferRadio, UciRadio
 from skyless.radios.serial.serial_port import check_path
 from skyless.radios.serial.serial_radio import SerialRadio
 
@@ -20,9 +21,10 @@ _SERIAL_BAUD: Final = 1_000_000
 _SNIFFER_BAUD: Final = 115_200
 """Any rate serves on a real sniffer's USB port."""
 _LISTENER_BAUD: Final = 115_200
+_UCI_BAUD: Final = 115_200
 _EXPECTED: Final = (
     "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN], model:HOST[:PORT], "
-    "listener:PATH[@BAUD] or sniffer:PATH[@BAUD]"
+    "listener:PATH[@BAUD], sniffer:PATH[@BAUD] or uci:PATH[@BAUD]"
 )
 
 
@@ -40,9 +42,14 @@ def is_ether(spec: str) -> bool:
     return spec.split(":", 1)[0] == "ether"
 
 
-def is_sniffer(spec: str) -> bool:
+def receives_packets(spec: str) -> bool:
     """Whether a radio of that name receives packets of another system, and not beacons."""
-    return spec.split(":", 1)[0] == "sniffer"
+    return spec.split(":", 1)[0] in ("sniffer", "uci")
+
+
+def hears_positions(spec: str) -> bool:
+    """Whether what a radio of that name receives may state where anchors are."""
+    return spec.split(":", 1)[0] == "uci"
 
 
 def open_radios(
@@ -78,7 +85,7 @@ def open_radios(
         ports = _ports(spec, where, _SERIAL_BAUD, names)
         transmits = kind == "anchor"
         return tuple(SerialRadio(*ports[i], name, settings[i], transmits=transmits) for i, name in enumerate(names))
-    if driver in ("listener", "sniffer") and kind == "anchor":
+    if driver in ("listener", "sniffer", "uci") and kind == "anchor":
         raise SkylessError(f"--radio is {spec!r}; it should be one that can transmit: a {driver} only listens")
     if driver == "listener":
         ports = _ports(spec, where, _LISTENER_BAUD, names)
@@ -86,10 +93,18 @@ def open_radios(
     raise SkylessError(f"--radio is {spec!r}; it should be {_EXPECTED}")
 
 
-def open_sniffers(spec: str, names: tuple[str, ...]) -> tuple[SnifferRadio, ...]:
-    """Sniffers for the tags of one process, in the order of their names. Raises SkylessError."""
-    ports = _ports(spec, spec.partition(":")[2], _SNIFFER_BAUD, names)
-    return tuple(SnifferRadio(*port, name) for port, name in zip(ports, names, strict=True))
+def open_sniffers(
+    spec: str, names: tuple[str, ...], anchors_m: Mapping[int, Point] | None = None
+) -> tuple[SnifferRadio | UciRadio, ...]:
+    """Sniffers or FiRa boards for the tags of one process, in the order of their names.
+
+    ``anchors_m``: positions of the system's anchors, as far as they are known. Raises SkylessError.
+    """
+    driver, _, where = spec.partition(":")
+    ports = zip(_ports(spec, where, _SNIFFER_BAUD if driver == "sniffer" else _UCI_BAUD, names), names, strict=True)
+    if driver == "sniffer":
+        return tuple(SnifferRadio(*port, name) for port, name in ports)
+    return tuple(UciRadio(*port, name, anchors_m or {}) for port, name in ports)
 
 
 def _ports(spec: str, where: str, usual_baud: int, names: tuple[str, ...]) -> list[tuple[str, int]]:

@@ -1,4 +1,7 @@
-"""Tags on sniffers: they receive the packets of a system without a master, whose anchors' positions are configured."""
+"""Tags on sniffers and FiRa boards: they receive the packets of a system without a master.
+
+Its anchors' positions are configured, or a FiRa board's messages state them.
+"""
 
 import time
 from collections import Counter
@@ -9,7 +12,9 @@ from typing import Final
 from msgspec import Struct, structs
 
 from skyless.air.masterless_packets import Packet, Point
+from skyless.constants import TICK_BITS
 from skyless.errors import ConfigurationError
+from skyless.evaluation.observability import GUESSED_STD_M, plane_height_m
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import Counters, FixMessage, TagHealth
 from skyless.mqtt.topics import fix_topic, health_topic
@@ -18,37 +23,54 @@ from skyless.nodes.lateness import FIX_LEAVES_S
 from skyless.nodes.process import HEALTH_S, Log, SitePublisher, Usage, every, keep, link_of, together
 from skyless.nodes.radio_monitor import RadioMonitor
 from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
-from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
+from skyless.positioning.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.radios.interface import Gone, Restarted
-from skyless.radios.serial.foreign_radios import SnifferRadio
+from skyless.radios.serial.foreign_radios import SnifferRadio, UciRadio
+from skyless.recordings.foreign.bitcraze import STAMP_BITS
 from skyless.site.check import check_site
-from skyless.site.model import AnchorSite, Site, TagsSite
+from skyless.site.model import AnchorSite, GeoreferenceSite, Site, TagsSite
 
 TDOA_SITE: Final = 0
 """The site in the topics of a system that has no site identifier."""
 
 _METHOD: Final = "joint"
 
+_NEW_HEIGHT_M: Final = 0.05
+"""A change of the anchors' mean height with which tracking begins again."""
+
+PacketRadio = SnifferRadio | UciRadio
+
 
 class PacketTagSettings(Struct, frozen=True):
     """Configuration of the tags of such a system."""
 
     anchors_m: Mapping[int, Point]
+    """Empty where messages state them."""
     site: int = TDOA_SITE
     qa: float = MASTERLESS.qa
     height_m: float | None = None
     """Height of the tags where it is known; None to estimate it."""
     height_std_m: float = 0.0
     """Of a known one."""
+    auto_height: bool = False
+    """Whether tags take the anchors' height as soon as these turn out to lie too flat to determine it."""
     calibration: DifferenceCalibration | None = None
     publish_hz: float = 50.0
 
 
-def site_of(settings: PacketTagSettings) -> Site | None:
-    """The system as a site that a page can draw; None for a table of anchors that no site can have."""
-    anchors = tuple(AnchorSite(anchor, *position_m) for anchor, position_m in settings.anchors_m.items())
+def site_of(
+    settings: PacketTagSettings, heard_m: Mapping[int, Point] | None = None, origin: GeoreferenceSite | None = None
+) -> Site | None:
+    """The system as a site that a page can draw; None for anchors that no site can have.
+
+    ``heard_m``: their positions, where they are not configured; ``origin``: where on the Earth these begin.
+    """
+    positions_m = settings.anchors_m or heard_m or {}
+    anchors = tuple(AnchorSite(anchor, *position_m) for anchor, position_m in sorted(positions_m.items()))
+    if not anchors:
+        return None
     tags = TagsSite(height_m=settings.height_m)
-    site = Site("TDoA system", settings.site, anchors[0].id, anchors, tags=tags)
+    site = Site("TDoA system", settings.site, anchors[0].id, anchors, tags=tags, georeference=origin)
     try:
         check_site(site, Path("the table of anchors"))
     except ConfigurationError:
@@ -62,26 +84,34 @@ class PacketTagNode:
     def __init__(
         self,
         settings: PacketTagSettings,
-        radio: SnifferRadio,
+        radio: PacketRadio,
         publish: FixListener,
         log: Log,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """``clock`` gives the host's monotonic time in s, as ``host_s`` of the packets."""
         self.settings, self.radio, self._clock = settings, radio, clock
+        self._height_m, self._height_std_m = settings.height_m, settings.height_std_m
+        self._anchors_seen = 0
         self.tracking = self._new_tracking()
         self.packets = 0
         self.fix_log = FixLog(radio.name, publish, settings.publish_hz, clock)
         self.monitor = RadioMonitor(f"tag {radio.name}", "listening", log, radio.advice)
         self._drops: Counter[str] = Counter()
         self._known = 0
-        """Packets of anchors that are in the table."""
+        """Packets of anchors whose positions are known."""
 
     def _new_tracking(self) -> PacketTracking:
         asked = self.settings
-        known = {"height_m": asked.height_m, "height_std_m": asked.height_std_m}
-        filter_settings = structs.replace(MASTERLESS, qa=asked.qa, **known)
-        return PacketTracking(filter_settings, asked.anchors_m, calibration=asked.calibration)
+        known = {"qa": asked.qa, "height_m": self._height_m, "height_std_m": self._height_std_m}
+        is_dl_tdoa = isinstance(self.radio, UciRadio)
+        return PacketTracking(
+            structs.replace(DL_TDOA if is_dl_tdoa else MASTERLESS, **known),
+            asked.anchors_m,
+            TICK_BITS if is_dl_tdoa else STAMP_BITS,
+            calibration=asked.calibration,
+            one_way=structs.replace(DL_TDOA_ONE_WAY, **known) if is_dl_tdoa else None,
+        )
 
     @property
     def drops(self) -> Counter[str]:
@@ -97,43 +127,61 @@ class PacketTagNode:
         await self.radio.run(self.on_event)
 
     def on_event(self, event: Packet | Restarted | Gone) -> None:
-        """Process an event of the sniffer."""
+        """Process an event of the radio."""
         if isinstance(event, Packet):
             self._receive(event)
             return
         self.monitor.on_event(event)
         if isinstance(event, Restarted) and self.packets:
-            self._drops += self.tracking.drops
-            self.tracking = self._new_tracking()
+            self._begin_again()
+
+    def _begin_again(self) -> None:
+        self._drops += self.tracking.drops
+        self.tracking = self._new_tracking()
+
+    def _update_height(self) -> None:
+        """Take the anchors' height, or estimate the tag's again, where another anchor has stated its position."""
+        known_m = self.tracking.anchors_m
+        if not self.settings.auto_height or len(known_m) <= self._anchors_seen:
+            return
+        self._anchors_seen = len(known_m)
+        plane_m, before_m = plane_height_m(known_m), self._height_m
+        is_new = (plane_m is None) is not (before_m is None)
+        if is_new or (plane_m is not None and before_m is not None and abs(plane_m - before_m) > _NEW_HEIGHT_M):
+            self._height_m, self._height_std_m = plane_m, GUESSED_STD_M
+            self._begin_again()
 
     def _receive(self, packet: Packet) -> None:
         self.packets += 1
         if packet.host_s is not None and not self.fix_log.lateness.admits(packet.host_s, self._clock()):
             return
-        self._known += packet.anchor in self.settings.anchors_m
         fix = self.tracking.on_packet(packet)
+        self._known += packet.anchor in self.tracking.anchors_m
+        self._update_height()
         if fix is not None:
             done_s = self._clock()
             self.fix_log.add(fix, done_s if packet.host_s is None else packet.host_s, done_s)
 
 
 class PacketTags:
-    """The tags of one process, each with its sniffer and its MQTT connection."""
+    """The tags of one process, each with its radio and its MQTT connection."""
 
     def __init__(
         self,
         settings: PacketTagSettings,
-        radios: Sequence[SnifferRadio],
+        radios: Sequence[PacketRadio],
         address: MqttAddress | None,
         log: Log,
         *,
         simulated: Callable[[], bool],
         on_fix: FixListener | None = None,
         on_health: Callable[[TagHealth], None] | None = None,
+        on_anchors: Callable[[Mapping[int, Point], GeoreferenceSite | None], None] | None = None,
     ) -> None:
-        """``simulated`` is asked again when a sniffer has restarted: its port may lead to another device.
+        """``simulated`` is asked again when a radio has restarted: its port may lead to another device.
 
-        ``on_fix`` and ``on_health`` are called with all that is to be published, with or without a broker.
+        ``on_fix`` and ``on_health`` are called with all that is to be published, with or without a broker;
+        ``on_anchors`` with positions that messages state, and where on the Earth they begin, whenever there are others.
         """
         self._settings, self._log, self._on_fix, self._on_health = settings, log, on_fix, on_health
         self._links = tuple(link_of(address, radio.name, site=settings.site, kind="tag") for radio in radios)
@@ -141,6 +189,8 @@ class PacketTags:
             PacketTagNode(settings, radio, self._publisher(index), log) for index, radio in enumerate(radios)
         )
         self._usage = Usage()
+        self._simulated, self._on_anchors = simulated, on_anchors
+        self._heard_m: dict[int, Point] = {}
         site = site_of(settings)
         self._site_publisher = None if site is None else SitePublisher(site, simulated)
 
@@ -164,6 +214,8 @@ class PacketTags:
     def _publish_health(self) -> None:
         """Health of all tags, and the site with the anchors' positions."""
         share, memory_bytes = self._usage.sample()
+        if not self._settings.anchors_m:
+            self._update_site()
         for node, link in zip(self.nodes, self._links, strict=True):
             node.fix_log.update_clock_offset()
             node.check_reception(time.monotonic())
@@ -184,3 +236,22 @@ class PacketTags:
                     self._site_publisher.update(sum(each.monitor.restarts for each in self.nodes))
                     self._site_publisher.publish(link)
                 link.publish(health_topic(self._settings.site, "tag", node.radio.name), health)
+
+    def _update_site(self) -> None:
+        """The site of the positions that the tags have heard by now."""
+        heard_m = dict(self._heard_m)
+        for node in self.nodes:
+            heard_m |= node.tracking.anchors_m
+        if heard_m == self._heard_m:
+            return
+        self._heard_m = heard_m
+        origins = [node.radio.origin for node in self.nodes if isinstance(node.radio, UciRadio)]
+        known = next((origin for origin in origins if origin is not None), None)
+        origin = None if known is None else GeoreferenceSite(*structs.astuple(known))
+        if self._on_anchors is not None:
+            self._on_anchors(heard_m, origin)
+        site = site_of(self._settings, heard_m, origin)
+        if site is not None and self._site_publisher is not None:
+            self._site_publisher.place(site)
+        elif site is not None:
+            self._site_publisher = SitePublisher(site, self._simulated)

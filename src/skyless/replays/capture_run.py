@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from skyless.air.masterless_packets import Point
+from skyless.air.masterless_packets import Packet, Point
 from skyless.errors import ConfigurationError, SkylessError
 from skyless.evaluation.judge import Judge
 from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
@@ -21,6 +21,9 @@ from skyless.replays.inputs import flight_height, height_to_hold
 
 _MOST_WITHOUT_ANCHORS: Final = 20_000
 """Records within which a recording that carries its anchors' positions has one of them."""
+
+_MOST_TO_FIND_ANCHORS: Final = 2_000
+"""Records within which every anchor of a recording of DL-TDoA is heard."""
 
 
 class CaptureRequest(Struct, frozen=True):
@@ -52,11 +55,13 @@ class CaptureRun:
         if asked.measurements not in {None, *MEASUREMENTS}:
             right = ", ".join(MEASUREMENTS)
             raise SkylessError(f"--measurements is {asked.measurements!r}; it should be one of {right}")
-        if not asked.anchors_m:
+        anchors_m = asked.anchors_m
+        if not anchors_m:
             _check_carries_anchors(asked)
+            anchors_m = _stated_anchors(asked)
         truth, name = asked.truth, format_of(asked.path, asked.format).name
         height_m, std_m, self.height_note = height_to_hold(
-            asked.tag_height, asked.anchors_m, asked.site_height_m, truth, name
+            asked.tag_height, anchors_m, asked.site_height_m, truth, name
         )
         if asked.tag_height_std_m is not None:
             std_m = asked.tag_height_std_m
@@ -68,7 +73,7 @@ class CaptureRun:
         self.judge = Judge(truth, planar=height_m is not None, settle_s=settle_s, above_m=above_m)
         request = ReplayRequest(
             path=asked.path,
-            anchors_m=asked.anchors_m,
+            anchors_m=anchors_m,
             format=asked.format,
             listener=asked.listener,
             height_m=height_m,
@@ -110,6 +115,15 @@ def _check_carries_anchors(asked: CaptureRequest) -> None:
             f"--anchors is missing: {asked.path} ({name}) does not say where its anchors are; give their table, "
             "id,x_m,y_m,z_m, or --site"
         )
+
+
+def _stated_anchors(asked: CaptureRequest) -> dict[int, Point]:
+    """Where the anchors of a recording of DL-TDoA say that they are."""
+    if not format_of(asked.path, asked.format).is_dl_tdoa:
+        return {}
+    with open_recording(asked.path, asked.format) as recording:
+        packets = [record for record in islice(recording, _MOST_TO_FIND_ANCHORS) if isinstance(record, Packet)]
+    return {packet.anchor: packet.position_m for packet in packets if packet.position_m is not None}
 
 
 def _check_times(table: Path, truth: Truth, judge: Judge) -> None:

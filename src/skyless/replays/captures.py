@@ -20,7 +20,7 @@ from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
 from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
-from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
+from skyless.positioning.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.positioning.masterless.pair_engine import PairEngine
 from skyless.recordings.foreign.formats import Recording, format_of, open_recording
 
@@ -304,7 +304,8 @@ class Replay:
         """The measurements that were asked for, or that suit the recording."""
         request, kind = self._request, format_of(self._request.path, self._request.format)
         if request.measurements is None:
-            suits = kind.name in FORMATS_BY_PACKETS and request.anchors_m and request.tdoa_std_m is None
+            suits = kind.is_dl_tdoa or (kind.name in FORMATS_BY_PACKETS and request.anchors_m)
+            suits = suits and request.tdoa_std_m is None
             return PACKETS if suits else DIFFERENCES_MADE
         if request.measurements == PACKETS and kind.tx_bits is None:
             wanted = f"it should be 'differences': {kind.name} holds no anchors' packets"
@@ -331,9 +332,16 @@ class Replay:
         assert engine is not None
         assert bits is not None
         qa = MASTERLESS.qa if request.qa is None else request.qa
-        known = {"height_m": request.height_m, "height_std_m": request.height_std_m}
-        settings = structs.replace(MASTERLESS, qa=qa, **known)
-        tracking = PacketTracking(settings, request.anchors_m, bits, request.z_bounds_m, request.calibration)
+        known = {"qa": qa, "height_m": request.height_m, "height_std_m": request.height_std_m}
+        is_dl_tdoa = self.recording.format.is_dl_tdoa
+        tracking = PacketTracking(
+            structs.replace(DL_TDOA if is_dl_tdoa else MASTERLESS, **known),
+            request.anchors_m,
+            bits,
+            request.z_bounds_m,
+            request.calibration,
+            structs.replace(DL_TDOA_ONE_WAY, **known) if is_dl_tdoa else None,
+        )
         return ByPackets(tracking, engine, self._noise)
 
     def run(self, on_fix: Callable[[Fix], None] | None, on_progress: Callable[[int], None]) -> ReplayReport:

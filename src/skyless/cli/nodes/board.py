@@ -21,7 +21,7 @@ def board(
     /,
     *,
     radio: str = DEFAULT_RADIO,
-    wire: Literal["link", "sniffer", "sniffer-text", "listener"] = "link",
+    wire: Literal["link", "sniffer", "sniffer-text", "listener", "uci", "uci-2"] = "link",
     link: Path | None = None,
     json: bool = False,
 ) -> None:
@@ -38,7 +38,7 @@ def board(
         Radio of the board, on the emulated air: ether:HOST:PORT of skyless ether.
     wire
         Format on the serial port: link (Skyless), sniffer or sniffer-text (Bitcraze; beacons become TDoA3 packets),
-        listener (uwb-apps, JSON).
+        listener (uwb-apps, JSON), uci or uci-2 (a FiRa board that receives DL-TDoA; measurements of version 1 or 2).
     link
         A symbolic link to the pseudo-terminal, which keeps its name when the board is started again.
     json

@@ -2,7 +2,7 @@
 
 import contextlib
 import re
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -23,14 +23,23 @@ from skyless.cli.nodes.fix_lines import FixLines, LineOptions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.errors import SkylessError
 from skyless.method_names import DEFAULT_METHOD
-from skyless.nodes.open_radio import DEFAULT_RADIO, is_simulated, is_sniffer, open_radios, open_sniffers
+from skyless.nodes.open_radio import (
+    DEFAULT_RADIO,
+    hears_positions,
+    is_simulated,
+    open_radios,
+    open_sniffers,
+    receives_packets,
+)
 
 if TYPE_CHECKING:
+    from skyless.air.masterless_packets import Point
     from skyless.mqtt.address import MqttAddress
     from skyless.mqtt.messages import FixMessage
     from skyless.nodes.bridge.tag_bridge import TagBridge
     from skyless.nodes.fix_log import FixListener
     from skyless.nodes.packet_tags import PacketTagSettings
+    from skyless.site.model import GeoreferenceSite
 
 _TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
@@ -45,28 +54,30 @@ class TagOptions:
     """Radio of the tags. ether:HOST:PORT: the emulated air of skyless ether. serial:PATH: a board of Skyless.
     spi:BUS.DEVICE,irq=PIN,reset=PIN: a DW1000 on this computer's SPI. model:HOST:PORT: a model of one on that air.
     listener:PATH: the listener of uwb-apps. sniffer:PATH: a Bitcraze sniffer, for TDoA2 and TDoA3 systems.
+    uci:PATH: a FiRa board whose DL-TDoA session as a tag goes on.
     Several tags have several paths, with commas; PATH@BAUD gives another rate."""
     method: str = DEFAULT_METHOD
-    """How positions are computed (sniffers: always joint)."""
+    """How positions are computed (sniffers and FiRa boards: always joint)."""
     qa: Positive = 0.3
     """Process noise for the tags' motion: spectral density of the acceleration in m²/s³ (joint)."""
     protection: ProtectionOptions = ProtectionOptions()
     tag_height_std: NotNegative | None = None
     """Standard deviation of the tags' height from the one that is given, in metres, which fixes and levels then
-    count (joint); 0 by default, for sniffers 0.5 where the height is only taken for the anchors'."""
+    count (joint); 0 by default, for sniffers and FiRa boards 0.5 where the height is only taken for the anchors'."""
     publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0
     """Fixes a second and tag at most, on MQTT and on standard output; all of them count in the tag's health."""
     site_id: SiteId | None = None
-    """Number of the site, the only one to listen to; by default the first one heard. For sniffers what topics call
-    the system, by default 0; it should be no other site's."""
+    """Number of the site, the only one to listen to; by default the first one heard. For sniffers and FiRa boards what
+    topics call the system, by default 0; it should be no other site's."""
     anchors: Path | None = None
-    """Table of anchors of another system (sniffers only): id,x_m,y_m,z_m, as skyless replay and calibrate take it."""
+    """Table of anchors of another system (sniffers and FiRa boards): id,x_m,y_m,z_m, as skyless replay and calibrate
+    take it. FiRa boards need none where anchors state their positions."""
     to: tuple[str, ...] = ()
     """Where fixes go as well, without a broker: a program or device of another kind; may be given several times.
     skyless bridge --help lists the targets, as nmea+tcp://:10110."""
     tag_height: str | None = None
-    """The tags' height (sniffers only): metres, free (estimated) or auto, the default: estimated unless the anchors
-    lie too flat, then theirs."""
+    """The tags' height (sniffers and FiRa boards): metres, free (estimated) or auto, the default: estimated unless the
+    anchors lie too flat, then theirs."""
 
 
 @app.default
@@ -98,13 +109,16 @@ def tag(
             f"NAMES is {given}; it should be one or more names, each once, of 1 to 32 letters, digits, - or _"
         )
     check_method(asked.method)
-    if is_sniffer(asked.radio):
+    if receives_packets(asked.radio):
         if asked.protection.given:
-            raise SkylessError("--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers")
+            raise SkylessError(
+                "--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers and FiRa boards"
+            )
         tags = _on_sniffers
     elif asked.anchors is not None or asked.tag_height is not None:
         raise SkylessError(
-            "--anchors and --tag-height are for sniffers; other tags hear from the air where anchors stand"
+            "--anchors and --tag-height are for sniffers and FiRa boards; other tags hear from the air where anchors "
+            "stand"
         )
     else:
         tags = _on_radios
@@ -166,18 +180,25 @@ def _on_sniffers(
     bridge: "TagBridge | None",
 ) -> "Coroutine[Any, Any, None]":
     """Tags that hear the packets of another system."""
+    from msgspec import structs
+
     from skyless.evaluation.compile_ahead import compile_packet_kernels
     from skyless.nodes.bridge.tag_bridge import heard_site
     from skyless.nodes.packet_tags import PacketTags
     from skyless.preparation.parts import SNIFFERS
 
     settings = _system(asked)
-    radios = open_sniffers(asked.radio, names)
+    radios = open_sniffers(asked.radio, names, settings.anchors_m)
     with loading_kernels(*SNIFFERS):
         compile_packet_kernels()
-    simulated = is_simulated(asked.radio)
-    if bridge is not None:
-        bridge.on_site(heard_site(settings.site, settings.anchors_m, simulated=simulated))
+    if bridge is not None and settings.anchors_m:
+        bridge.on_site(heard_site(settings.site, settings.anchors_m, simulated=is_simulated(asked.radio)))
+
+    def on_anchors(anchors_m: Mapping[int, "Point"], origin: "GeoreferenceSite | None") -> None:
+        if bridge is not None:
+            site = heard_site(settings.site, anchors_m, simulated=is_simulated(asked.radio))
+            bridge.on_site(structs.replace(site, georeference=origin))
+
     tags = PacketTags(
         settings,
         radios,
@@ -186,19 +207,20 @@ def _on_sniffers(
         simulated=lambda: is_simulated(asked.radio),
         on_fix=on_fix,
         on_health=None if bridge is None else bridge.on_system_health,
+        on_anchors=on_anchors,
     )
     return tags.run()
 
 
 def _system(asked: TagOptions) -> "PacketTagSettings":
-    """What sniffers cannot hear. Raises SkylessError."""
+    """What sniffers cannot hear, and FiRa boards may not. Raises SkylessError."""
     from skyless.evaluation.observability import GUESSED_STD_M, plane_height_m
     from skyless.nodes.packet_tags import TDOA_SITE, PacketTagSettings
     from skyless.recordings.anchor_table import read_anchors, read_calibration
 
-    if asked.anchors is None:
+    if asked.anchors is None and not hears_positions(asked.radio):
         raise SkylessError("--anchors is missing; a sniffer needs a table of the system's anchors: id,x_m,y_m,z_m")
-    anchors_m, std_m = read_anchors(asked.anchors), 0.0
+    anchors_m, std_m = {} if asked.anchors is None else read_anchors(asked.anchors), 0.0
     if asked.tag_height in (None, "auto"):
         height_m = plane_height_m(anchors_m)
         if height_m is not None:
@@ -216,6 +238,7 @@ def _system(asked: TagOptions) -> "PacketTagSettings":
         qa=asked.qa,
         height_m=height_m,
         height_std_m=std_m if asked.tag_height_std is None else asked.tag_height_std,
-        calibration=read_calibration(asked.anchors),
+        auto_height=asked.anchors is None and asked.tag_height in (None, "auto"),
+        calibration=None if asked.anchors is None else read_calibration(asked.anchors),
         publish_hz=asked.publish_hz,
     )

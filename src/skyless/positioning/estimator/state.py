@@ -34,6 +34,9 @@ from skyless.positioning.integrity import RISK, limits_of
 MAX_CLOCK_RATE: Final = 50e-6
 """Two crystals of ±20 ppm, and margin."""
 
+PAIR_STD_M: Final = 0.05
+"""Of the constant of a pair of anchors besides what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
+
 
 class EstimatorSettings(Struct, frozen=True):
     """What the filter assumes; standard deviations are one sigma."""
@@ -64,6 +67,8 @@ class EstimatorSettings(Struct, frozen=True):
     """Of each coordinate of an anchor."""
     range_std_m: float = 0.03
     """Of the constant error of a tag's ranges to one anchor."""
+    pair_std_m: float = PAIR_STD_M
+    """Of the constant error of the range between two anchors; not used where survey and ranges are exact."""
     slope_std_m: float = 0.05
     """By how much ranges lengthen for each unit of clip((range − 4 m)/4 m, −1, 1)."""
     place_std_m: float = 0.005
@@ -393,9 +398,6 @@ OPEN_RANGE_STD_M: Final = 1.0
 OPEN_SURVEY_STD_M: Final = 0.15
 """What a start expects of ranges and survey that follows one which was contradicted."""
 
-PAIR_STD_M: Final = 0.05
-"""Of the constant of a pair of anchors besides what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
-
 
 def with_anchor(
     s: EstimatorState, table_index: int, position_m: Vector, is_open: bool = False, std_m: float | None = None
@@ -414,7 +416,7 @@ def with_anchor(
     grown.packets[count] = (NEVER, NEVER, NEVER)
     pair_variance = 0.0
     if settings["range_std_m"] > 0.0 or settings["survey_std_m"] > 0.0 or std_m:
-        pair_variance = PAIR_STD_M**2
+        pair_variance = settings["pair_std_m"] ** 2
     for link in (grown.links[count], grown.links[:, count]):
         link["tx_ticks"], link["variance_m2"] = NEVER, pair_variance
     where = layout(dim, count + 1)

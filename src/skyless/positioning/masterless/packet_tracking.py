@@ -6,7 +6,7 @@ what cannot be used is counted. The filter decides which measurements are used.
 
 from collections import Counter
 from collections.abc import Mapping
-from math import dist, log
+from math import dist, log, sqrt
 from typing import Final
 
 import numpy as np
@@ -38,6 +38,18 @@ MASTERLESS: Final = replace(
     slope_std_m=0.05,
 )
 """Ranges err as those of differences do, and in those captures a reception is 4 cm off by itself."""
+
+DL_TDOA: Final = replace(EstimatorSettings(), qa=DIFFERENCES.qa)
+"""For FiRa's radios, of which there are no recordings yet: what is assumed of a site with typical errors, ..."""
+
+DL_TDOA_ONE_WAY: Final = replace(
+    DL_TDOA,
+    pair_std_m=0.0,
+    survey_std_m=0.0,
+    range_std_m=sqrt(DL_TDOA.range_std_m**2 + 3.0 * DL_TDOA.survey_std_m**2),
+)
+"""... and where only one anchor of each pair relays the other: the constant error of their range cannot be separated
+from their clocks then, and with the survey's it counts as one of the tag's range."""
 
 PERIOD_S: Final = 0.15
 """Anchors send 6 to 60 times a second; the filter assumes the slowest."""
@@ -86,11 +98,13 @@ class PacketTracking:
         tx_bits: int = 32,
         z_bounds_m: tuple[float, float] | None = None,
         calibration: DifferenceCalibration | None = None,
+        one_way: EstimatorSettings | None = None,
     ) -> None:
         """``anchors_m``: the anchors' positions; where it has none, those that packets carry are used.
 
         ``tx_bits``: width of the anchors' stamps. ``calibration`` is subtracted from the tag's receptions; without one
-        the anchors' antenna delays are estimated from how they range each other.
+        the anchors' antenna delays are estimated from how they range each other. ``one_way``: settings that hold until
+        two anchors have relayed each other.
         """
         self.reason = NoFixReason.NO_BEACONS
         self.time_s = 0.0
@@ -108,7 +122,10 @@ class PacketTracking:
         self._newest_rx_ticks: int | None = None
         self._back_in_row = 0
         self._time = FixTime()
-        self._settings, self._z_bounds_m = settings, z_bounds_m
+        self._settings, self._z_bounds_m = settings if one_way is None else one_way, z_bounds_m
+        self._both_ways = settings
+        self._pairs: set[tuple[int, int]] | None = None if one_way is None else set()
+        """Listeners and senders of relays, until two have relayed each other."""
         self._tracking = self._new_tracking()
         self._area_m = (0.0, 0.0, 0.0)
         self._drops: Counter[str] = Counter()
@@ -118,6 +135,11 @@ class PacketTracking:
     def tracking(self) -> Estimation:
         """The filter behind."""
         return self._tracking
+
+    @property
+    def anchors_m(self) -> Mapping[int, Point]:
+        """Positions that are known, surveyed or stated by packets."""
+        return self._positions_m
 
     @property
     def drops(self) -> Counter[str]:
@@ -145,6 +167,8 @@ class PacketTracking:
                 self._drops[rx_ticks] += 1
             else:
                 relays.append((relay.anchor, relay.sequence, rx_ticks))
+                if self._pairs is not None:
+                    self._look_both_ways(packet.anchor, relay.anchor)
         rx_ticks = anchor.rx_ticks if self._calibration is None else self._calibrated(packet.anchor, anchor)
         observation = Observation(
             packet.anchor,
@@ -170,6 +194,16 @@ class PacketTracking:
                 if packet.anchor in self._tracking.excluded:
                     fix = self._tracking.coast(observation)
         return self._checked(fix)
+
+    def _look_both_ways(self, listener: int, sender: int) -> None:
+        """Begin again with the settings for pairs that relay each other, once there is one."""
+        assert self._pairs is not None
+        if (sender, listener) in self._pairs:
+            self._settings, self._pairs = self._both_ways, None
+            self._count_relays()
+            self._tracking = self._new_tracking()
+        else:
+            self._pairs.add((listener, sender))
 
     def _new_tracking(self) -> Estimation:
         return Estimation(self._settings, self._z_bounds_m, self._time, PERIOD_S)

@@ -1,20 +1,23 @@
-"""Boards with other firmware, which only listen: the listener of uwb-apps, and the Bitcraze sniffer."""
+"""Boards with other firmware, which only listen: that of uwb-apps, the Bitcraze sniffer, and FiRa boards."""
 
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final, Generic, TypeVar
 
 import msgspec
 from msgspec import structs
 
 from skyless.air.codec import MAX_FRAME_BYTES
-from skyless.air.masterless_packets import Packet
+from skyless.air.masterless_packets import Packet, Point
 from skyless.air.reception import Diagnostics, Reception, Transmission
+from skyless.air.uci import UciReader
+from skyless.air.uci_location import GeodeticPoint
 from skyless.radios.interface import Gone, Late, RadioEvent, Restarted, ignore
 from skyless.radios.serial.serial_port import BoardClock, SerialPort, line_advice
 from skyless.recordings.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
+from skyless.recordings.foreign.fira import DtTag
 from skyless.recordings.source import Drops, LineCutter
 from skyless.ticks import wrap
 
@@ -28,7 +31,7 @@ _Event = TypeVar("_Event")
 
 
 class _ListeningBoard(ABC, Generic[_Event]):
-    """What both have in common: a serial port from which they read events."""
+    """What all have in common: a serial port from which they read events."""
 
     firmware = ""
     """What runs on the board, in messages."""
@@ -137,6 +140,34 @@ class SnifferRadio(_ListeningBoard[Packet]):
     def _events(self, data: bytes, host_s: float) -> Iterator[Packet]:
         for packet in self._stream.feed(data):
             yield structs.replace(packet, host_s=host_s)
+
+
+class UciRadio(_ListeningBoard[Packet]):
+    """A FiRa board whose session as a DT-tag goes on: its notifications of DL-TDoA measurements, as packets.
+
+    Packets carry the host's monotonic time of their arrival. It is sent nothing: whoever has started the session set
+    it up.
+    """
+
+    firmware = "FiRa's UCI with a DL-TDoA session that goes on"
+
+    def __init__(self, path: str, baud: int, name: str, anchors_m: Mapping[int, Point]) -> None:
+        """``anchors_m``: positions that are known, where anchors may state none."""
+        super().__init__(path, baud, name)
+        self._anchors_m = anchors_m
+        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, anchors_m)
+
+    @property
+    def origin(self) -> GeodeticPoint | None:
+        """Where the frame of positions begins that anchors state on the Earth."""
+        return self._tag.origin
+
+    def _start(self, send: Callable[[bytes], None]) -> None:  # noqa: ARG002 - it is sent nothing
+        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, self._anchors_m)
+
+    def _events(self, data: bytes, host_s: float) -> Iterator[Packet]:
+        for packet in self._reader.feed(data):
+            yield from self._tag.on_uci(packet, host_s)
 
 
 class SnifferStream:

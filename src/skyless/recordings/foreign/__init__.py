@@ -1,5 +1,5 @@
 """Recordings of other systems: their formats as streams of packets or time differences.
 
-Public: avalue, bitcraze, formats.
-Within the package: tdoa_tables.
+Public: avalue, bitcraze, fira, formats.
+Within the package: anchor_frame, phones, tdoa_tables.
 """

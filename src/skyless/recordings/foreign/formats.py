@@ -12,7 +12,7 @@ from typing import Final
 from skyless.air.masterless_packets import Packet, PairTdoa
 from skyless.constants import TICK_BITS
 from skyless.errors import ConfigurationError
-from skyless.recordings.foreign import avalue, bitcraze, tdoa_tables
+from skyless.recordings.foreign import avalue, bitcraze, fira, phones, tdoa_tables
 from skyless.recordings.source import Drops, open_source, read_head
 
 Record = Packet | PairTdoa
@@ -34,6 +34,8 @@ class Format:
     """One recording holds several listeners, one of which is chosen."""
     hexadecimal: bool = False
     """Identifiers are hexadecimal."""
+    is_dl_tdoa: bool = False
+    """FiRa's: packets may state where their senders are, and relay only initiators and those that answered them."""
     delays_ticks: int = 0
     """Antenna delays of a sender and a receiver together, where its stamps include them."""
 
@@ -72,6 +74,22 @@ FORMATS: Final = (
         any_listener=True,
         hexadecimal=True,
     ),
+    Format(
+        "dl-tdoa-json",
+        "FiRa DL-TDoA records of phones, lines of JSON (iOS NIDLTDOAMeasurement, Android DlTdoaMeasurement)",
+        phones.recognise,
+        phones.read,
+        TICK_BITS,
+        is_dl_tdoa=True,
+    ),
+    Format(
+        "uci-text",
+        "FiRa UCI log, lines with hexadecimal packets (DL-TDoA measurements, versions 1 and 2)",
+        fira.recognise_text,
+        fira.read_text,
+        TICK_BITS,
+        is_dl_tdoa=True,
+    ),
     Format("tdoa-table", "Table t_s,idA,idB,tdoa_m", tdoa_tables.recognise_tdoas, tdoa_tables.read_tdoas, None),
     Format(
         "bitcraze-binary",
@@ -80,6 +98,14 @@ FORMATS: Final = (
         bitcraze.read_binary,
         bitcraze.STAMP_BITS,
         delays_ticks=bitcraze.ANTENNA_DELAYS_TICKS,
+    ),
+    Format(
+        "uci-binary",
+        "FiRa UCI log, packets as they came over the line (DL-TDoA measurements, versions 1 and 2)",
+        fira.recognise_binary,
+        fira.read_binary,
+        TICK_BITS,
+        is_dl_tdoa=True,
     ),
 )
 """In the order in which they are tried: the more particular first."""

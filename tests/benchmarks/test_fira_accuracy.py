@@ -1,0 +1,10 @@
+"""The emulated FiRa tag beside the plan: within a tenth, where initiator and responders relay each other."""
+
+import fira_accuracy
+
+
+def test_a_tag_on_an_emulated_board_errs_as_planned():
+    found = fira_accuracy.measure(fira_accuracy.ROUNDS["both ways"], worlds=10, seed=1, version=2, until_s=2.5)
+    assert found.fixes > 6_000
+    assert 0.9 < found.round_ratio < 1.1
+    assert found.ratio < 1.15  # half of the anchors' frames belong to no round
