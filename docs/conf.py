@@ -44,8 +44,12 @@ NAVIGATION = {
     ],
     "In other tools": [
         "docs/tools/index",
+        "docs/tools/ros2",
         "docs/tools/gpsd",
         "docs/tools/foxglove",
+        "docs/tools/home_assistant",
+        "docs/tools/prometheus",
+        "docs/tools/geojson",
         "docs/tools/json_lines",
         "docs/tools/ardupilot",
         "docs/tools/px4",

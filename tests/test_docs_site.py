@@ -38,6 +38,8 @@ OTHER_PROGRAMS = {
     "--help",
     "--home-dir",
     "--user",
+    "--ros-args",
+    "--spin-time",
 }
 GENERATOR = ("sphinx", "myst_parser", "furo", "latex2mathml")
 

@@ -102,16 +102,17 @@ class SkylessNode(Node):
             for line in lines:
                 try:
                     self.publish(json.loads(line))
-                except (ValueError, KeyError, TypeError, OverflowError) as error:
+                except Exception as error:  # noqa: BLE001 - a line from the network ends nothing
                     self.get_logger().warning(f"a line was not understood: {error!r}", throttle_duration_sec=10.0)
             if len(waiting) > LONGEST_LINE:
                 waiting = b""
 
     def publish(self, line: dict[str, Any]) -> None:
-        """Publish one line. Raises ValueError, KeyError, TypeError, OverflowError: it is not as it should be."""
+        """Publish one line. Raises many things where it is not as it should be."""
         if line["type"] == "site":
-            self.origin = line["georeference"]
-            self.anchors.publish(anchor_markers(line["anchors_m"], self.frame))
+            markers, origin = anchor_markers(line["anchors_m"], self.frame), origin_of(line["georeference"])
+            self.anchors.publish(markers)
+            self.origin = origin
         elif line["type"] == "fix":
             self.publish_fix(line)
         elif line["type"] == "no_fix":
@@ -263,6 +264,16 @@ def anchor_markers(anchors_m: dict[str, list[float]], frame: str) -> MarkerArray
             marker.text = number if shape == Marker.TEXT_VIEW_FACING else ""
             found.append(marker)
     return MarkerArray(markers=found)
+
+
+def origin_of(georeference: dict[str, Any] | None) -> dict[str, float] | None:
+    """Where the site's origin is on the Earth, if that is known. Raises ValueError, KeyError, TypeError."""
+    if georeference is None:
+        return None
+    origin = {key: float(georeference[key]) for key in ("latitude_deg", "longitude_deg", "height_m", "heading_deg")}
+    if not all(map(math.isfinite, origin.values())):
+        raise ValueError(f"the site is at {georeference}")
+    return origin
 
 
 def towards_east(covariance: list[float], origin: dict[str, float]) -> list[float]:

@@ -69,8 +69,10 @@ def _show(bag: "Bag") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    table = Table("topic", "type", "messages", title=escape(f"{bag.path}, {bag.end_s - bag.start_s:.1f} s"))
-    table.columns[-1].justify = "right"
+    table = Table(title=escape(f"{bag.path}, {bag.end_s - bag.start_s:.1f} s"))
+    table.add_column("topic", no_wrap=True)
+    table.add_column("type", overflow="fold")
+    table.add_column("messages", justify="right")
     for topic, count in bag.topics.items():
         table.add_row(Text(topic), Text(bag.types[topic]), str(count))
     console().print(table)

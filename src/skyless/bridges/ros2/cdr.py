@@ -25,8 +25,8 @@ class CdrWriter:
         self._data += struct.pack(f"<{len(values)}{code}", *values)
 
     def add_text(self, text: str) -> None:
-        """A string: its length with the NUL that ends it, then both."""
-        data = text.encode() + b"\0"
+        """A string: its length with the NUL that ends it, then both; without any other NUL."""
+        data = text.replace("\0", "").encode() + b"\0"
         self.add("I", len(data))
         self._data += data
 

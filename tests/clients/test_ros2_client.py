@@ -1,0 +1,286 @@
+"""ROS 2 itself (Kilted, from its wheels) reads what Skyless gives: by DDS, through the one-file node, and in a bag.
+
+The wheels have no command ``ros2``; where one is found, in this environment or in PATH, it is asked, too.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from msgspec import structs
+
+from bridges.bridged_values import SITE, a_fix
+from recordings import live_site
+from skyless.bridges.feed import floored
+from skyless.bridges.hub import open_hub
+from skyless.bridges.ros2.messages import POSE
+from skyless.bridges.target import BridgeContext
+from skyless.bridges.targets import open_route
+from skyless.cli.main import main
+from skyless.recordings.mcap.recording import McapRecording
+from skyless.site.earth import geodetic, rotated
+
+ROOT = Path(__file__).parents[2]
+HERE = Path(__file__).parent
+FOLDER = ROOT / ".venv-clients" / "ros2"
+MESSAGES = ("diagnostic-msgs", "geometry-msgs", "sensor-msgs", "std-msgs", "visualization-msgs")
+PACKAGES = [
+    "ros-kilted-rclpy==9.1.2",
+    "ros-kilted-rmw-fastrtps-cpp==9.3.3",
+    *(f"ros-kilted-{name}==5.5.1" for name in MESSAGES),
+    "mcap==1.3.0",
+]
+RATE_HZ = 50.0
+PATIENCE_S = 60.0
+"""As long as discovery and a busy machine may take."""
+
+FEW = 100
+
+
+class Ros:
+    """An environment with ROS 2 in a domain of its own."""
+
+    def __init__(self, domain):
+        self.python = FOLDER / "bin" / "python"
+        path = os.pathsep.join([str(FOLDER / "bin"), os.environ.get("PATH", "")])
+        without = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+        self.environment = without | {"ROS_DOMAIN_ID": str(domain), "PATH": path}
+        self.domain = domain
+
+    def start(self, *arguments):
+        pipe = subprocess.PIPE
+        return subprocess.Popen(
+            [str(one) for one in arguments], env=self.environment, stdout=pipe, stderr=pipe, text=True
+        )
+
+    def listener(self, count):
+        """One that listens already."""
+        process = self.start(self.python, HERE / "ros2_listener.py", count, PATIENCE_S)
+        assert "listening" in process.stderr.readline()
+        return process
+
+
+@pytest.fixture(scope="module")
+def ros():
+    """ROS 2 from PyPI, installed once."""
+    if not (FOLDER / "bin" / "python").exists():
+        subprocess.run([sys.executable, "-m", "venv", FOLDER], check=True)
+    for attempt in ("offline", "install"):
+        if attempt == "install":
+            pip = subprocess.run(
+                [FOLDER / "bin" / "python", "-m", "pip", "install", "--quiet", *PACKAGES],
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            if pip.returncode:
+                pytest.skip(f"ROS 2's wheels are not installed (x86-64 Linux only): {pip.stderr.strip()[-200:]}")
+        found = Ros(random.Random().randint(100, 200))
+        probe = "import rclpy, mcap, diagnostic_msgs.msg, geometry_msgs.msg, sensor_msgs.msg, visualization_msgs.msg"
+        done = subprocess.run([found.python, "-c", probe], env=found.environment, capture_output=True, check=False)
+        if done.returncode == 0:
+            return found
+    pytest.skip(f"ROS 2's wheels do not run here: {done.stderr.decode().strip()[-200:]}")
+
+
+class Feed:
+    """A hub in a thread, with fixes at a rate that each say in their position which they are."""
+
+    def __init__(self, target, log):
+        self.sent = {}
+        self.dropped = {}
+        self._target, self._log = target, log
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()))
+
+    async def _run(self):
+        hub = open_hub([open_route(self._target, BridgeContext(self._log))], self._log)
+        target = hub.routes[0].target
+        task = asyncio.create_task(target.run())
+        hub.on_site(SITE)
+        serial = 0
+        while not self._stop.is_set():
+            serial += 1
+            fix = a_fix(serial=serial, unix_s=time.time(), position_m=(serial * 1e-3, 2.0 + 1.0 / serial, 1.5))
+            self.sent[round(fix.position_m[0] * 1e3)] = fix
+            hub.on_fix(fix, time.monotonic())
+            await asyncio.sleep(1.0 / RATE_HZ)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+        self.dropped = dict(target.dropped)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stop.set()
+        self._thread.join()
+
+
+@pytest.fixture(params=["dds", "node"])
+def door(request, ros, capfd):
+    """A feed that comes out in ROS: by ros2://, or by jsonl+tcp:// and the node."""
+    if request.param == "dds":
+        pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheel here")
+        with Feed(f"ros2://?domain={ros.domain}&hz=1000", print) as feed:
+            yield feed
+        return
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    node = ros.start(ros.python, ROOT / "examples/ros2/skyless_node.py", "--ros-args", "-p", f"port:={port}")
+    try:
+        with Feed(f"jsonl+tcp://:{port}?hz=1000", print) as feed:
+            while "reading" not in (line := node.stderr.readline()):
+                assert line, "the node has ended"
+            yield feed
+    finally:
+        node.send_signal(signal.SIGINT)
+        _, said = node.communicate(timeout=PATIENCE_S)
+        assert node.returncode == 0, said
+        assert "Traceback" not in said
+
+
+def exact(unix_s):
+    whole = int(unix_s)
+    return [whole, round((unix_s - whole) * 1e9)]
+
+
+def expect(found, feed):
+    """What came is what was given, in order, without holes."""
+    serials = [round(1e3 * position[0]) for _, _, position, _ in found["pose"]]
+    assert serials == list(range(serials[0], serials[0] + len(serials))), "one is missing, or the order is wrong"
+    for serial, (stamp, frame, position, covariance) in zip(serials, found["pose"], strict=True):
+        fix = feed.sent[serial]
+        assert (stamp, frame) == (exact(fix.unix_s), "site")
+        assert position == pytest.approx(fix.position_m, abs=1e-9)
+        assert len(covariance) == 36
+        assert [covariance[6 * row + column] for row in range(3) for column in range(3)] == list(
+            floored(fix.covariance_m2)
+        )
+        assert [covariance[7 * row] for row in (3, 4, 5)] == [1e6] * 3
+    by_stamp = {tuple(exact(fix.unix_s)): fix for fix in feed.sent.values()}
+    assert found["velocity"]
+    for stamp, linear, covariance in found["velocity"]:
+        fix = by_stamp[tuple(stamp)]
+        assert tuple(linear) == fix.velocity_mps
+        assert covariance[:3] == list(fix.velocity_covariance[:3])
+    for stamp, status, where, covariance in found["fix"]:
+        fix = by_stamp[tuple(stamp)]
+        assert status == 0
+        expected = geodetic(fix.position_m, SITE.georeference)
+        assert where[:2] == pytest.approx(expected[:2], abs=1e-11)  # a micrometre
+        assert where[2] == pytest.approx(expected[2], abs=1e-9)
+        assert covariance == pytest.approx(
+            rotated(floored(fix.covariance_m2), SITE.georeference.heading_deg), abs=1e-12
+        )
+    cubes = {number: (x, y, z) for shape, number, x, y, z in found["anchors"][0] if shape == 1}
+    assert cubes == SITE.anchors_m
+
+
+def test_a_subscriber_reads_the_fixes_and_the_hash_of_their_type(ros, door):
+    listener = ros.listener(FEW)
+    out, said = listener.communicate(timeout=2 * PATIENCE_S)
+    found = json.loads(out)
+    assert len(found["pose"]) >= FEW, said
+    expect(found, door)
+    (publisher,) = found["publishers"]
+    assert publisher["hash"] == POSE.digest
+    assert publisher["type"] == POSE.name
+    assert publisher["reliability"] == "RELIABLE"
+
+
+def test_a_subscriber_that_was_there_before(ros):
+    pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheel here")
+    listener = ros.listener(FEW)
+    with Feed(f"ros2://?domain={ros.domain}&hz=1000", print) as feed:
+        out, said = listener.communicate(timeout=2 * PATIENCE_S)
+    found = json.loads(out)
+    assert len(found["pose"]) >= FEW, said
+    expect(found, feed)
+
+
+def test_a_subscriber_that_is_killed_costs_the_others_nothing(ros, door):
+    victim, other = ros.listener(10_000), ros.listener(6 * FEW)
+    assert "a pose" in victim.stderr.readline()
+    victim.kill()
+    victim.communicate()
+    out, said = other.communicate(timeout=2 * PATIENCE_S)
+    found = json.loads(out)
+    assert len(found["pose"]) >= 6 * FEW, said
+    expect(found, door)
+    assert not door.dropped
+
+
+def ros2_of(ros):
+    """The real command, if it is anywhere."""
+    command = shutil.which("ros2", path=ros.environment["PATH"])
+    if command is None:
+        pytest.skip("the command ros2 is not installed: the wheels have none (apt-get install ros-kilted-ros2topic)")
+    return command
+
+
+def test_the_command_ros2_shows_type_rate_and_position(ros, door):
+    command = ros2_of(ros)
+    pose = "/skyless/tag1/pose"
+
+    def ask(*arguments, seconds=30):
+        """Until it has discovered the topic, for which it waits half a second each time."""
+        asked = ["timeout", "--signal=INT", str(seconds), command, "topic", *arguments]
+        end_s = time.monotonic() + PATIENCE_S
+        while True:
+            said = subprocess.run(asked, env=ros.environment, capture_output=True, text=True, check=False).stdout
+            if (said and "Unknown" not in said and "WARNING" not in said) or time.monotonic() > end_s:
+                return said
+
+    assert POSE.digest in ask("info", "-v", pose)
+    field = ask("echo", "--once", "--field", "pose.pose.position", pose)
+    values = {name: float(value) for name, value in re.findall(r"([xyz]): (\S+)", field)}
+    fix = door.sent[round(values["x"] * 1e3)]
+    assert (values["x"], values["y"], values["z"]) == pytest.approx(fix.position_m, abs=1e-9)
+    rates = re.findall(r"average rate: (\S+)", ask("hz", pose, seconds=15))
+    begun_s, ended_s = (fix.unix_s for fix in (door.sent[1], door.sent[max(door.sent)]))
+    assert float(rates[-1]) == pytest.approx((max(door.sent) - 1) / (ended_s - begun_s), rel=0.1)
+
+
+def test_ros_reads_the_bag(ros, tmp_path):
+    recording = tmp_path / "walk.mcap"
+    live_site.record(recording, live_site.messages(1.0, tags=("a", "b")))
+    assert main(["export", str(recording), "--to", str(tmp_path / "bag")]) == 0
+    reader = ros.start(ros.python, HERE / "ros2_bag_reader.py", tmp_path / "bag" / "bag.mcap")
+    out, said = reader.communicate(timeout=PATIENCE_S)
+    assert reader.returncode == 0, said
+    read = json.loads(out)
+    assert read["profile"] == "ros2"
+    assert {coding for _, coding, _, _ in read["messages"]} == {"cdr/ros2msg"}
+    with McapRecording(recording) as source:
+        fixes = list(source.fixes())
+    for tag in ("a", "b"):
+        poses = [message for topic, _, _, message in read["messages"] if topic == f"/skyless/{tag}/pose"]
+        stamps = [[one["header"]["stamp"][key] for key in ("sec", "nanosec")] for one in poses]
+        assert stamps == [exact(fix.unix_s) for fix in fixes if fix.tag == tag]
+        places = [tuple(one["pose"]["pose"]["position"][axis] for axis in "xyz") for one in poses]
+        assert places == [fix.position_m for fix in fixes if fix.tag == tag]
+    assert len(structs.asdict(fixes[0])["covariance_m2"]) == 9
+
+
+def test_lines_that_nobody_should_send_do_not_end_the_node(ros):
+    """A million: python tests/clients/ros2_garbage.py 1000000 1, with the Python of .venv-clients/ros2."""
+    run = ros.start(ros.python, HERE / "ros2_garbage.py", 5000, random.randrange(10**6))
+    out, said = run.communicate(timeout=4 * PATIENCE_S)
+    assert run.returncode == 0, said
+    assert json.loads(out)["last"] == {"tag1": 1}
