@@ -28,7 +28,7 @@ class SiteLine(Struct, frozen=True, tag="site"):
 
 
 class NoFixLine(Struct, frozen=True, tag="no_fix"):
-    """A tag that had a fix has none: once a second while that lasts."""
+    """A tag that runs, or ran, has no usable fix: once a second while that lasts."""
 
     tag: str
     unix_s: float

@@ -71,9 +71,9 @@ def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext
         case "tcp":
             sender = TcpServer(url.text, url.host(), url.port(kind.port), encoder.greeting)
         case "pty":
-            sender = PtySender(url.text, url.path, context.log)
+            sender = PtySender(url.text, url.path(), context.log)
         case "serial":
-            path, _, baud = url.path.partition("@")
+            path, _, baud = url.path().partition("@")
             if not path or (baud and not (baud.isdecimal() and 300 <= int(baud) <= 10_000_000)):
                 raise url.wrong(f"{url.scheme}:PATH@BAUD, as {url.scheme}:/dev/ttyAMA0@921600")
             sender = SerialSender(url.text, path, int(baud or 115_200), context.log)
