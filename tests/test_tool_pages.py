@@ -45,7 +45,7 @@ def test_targets_can_be_opened(page, tmp_path, monkeypatch):
             continue  # how such an address is made up
         url = TargetUrl(text)
         if url.scheme.endswith("+pty"):  # its folder is not this computer's
-            text = text.replace(url.path, str(tmp_path / "link"))  # noqa: PLW2901
+            text = text.replace(url.path(), str(tmp_path / "link"))  # noqa: PLW2901
         open_route(text, BridgeContext(print))
 
 
