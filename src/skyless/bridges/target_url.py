@@ -82,6 +82,18 @@ class TargetUrl:
             raise self._wrong_value(key, f"a number from {least:g} to {most:g}")
         return value
 
+    def whole_number(self, key: str, default: int, least: int, most: int) -> int:
+        """A number without a fraction, within limits. Raises SkylessError."""
+        value = self.number(key, default, least, most)
+        if value % 1:
+            raise self._wrong_value(key, f"a whole number from {least} to {most}")
+        return int(value)
+
+    def has(self, key: str) -> bool:
+        """Whether a key is given, even without a value."""
+        self._read.add(key)
+        return key in self._options
+
     def choice(self, key: str, names: Sequence[str], default: str) -> str:
         """One of several words. Raises SkylessError."""
         value = self.text_option(key, default)

@@ -54,11 +54,12 @@ def open_route(text: str, context: BridgeContext) -> Route:
     tag = url.tag()
     hz = url.number("hz", kind.hz, 0.1, kind.most_hz)
     module = import_module(f"skyless.bridges.{kind.module}")
-    target = (
-        _stream(url, kind, cast(Callable[[TargetUrl], Encoder], module.make_encoder)(url), context)
-        if "+" in url.scheme
-        else cast(Callable[[TargetUrl, BridgeContext], Target], module.make_target)(url, context)
-    )
+    target: Target
+    if "+" in url.scheme:
+        encoder = cast(Callable[[TargetUrl, BridgeContext], Encoder], module.make_encoder)(url, context)
+        target = _stream(url, kind, encoder, context)
+    else:
+        target = cast(Callable[[TargetUrl, BridgeContext], Target], module.make_target)(url, context)
     url.check_all_read()
     return Route(target, tag, hz, others=tag is not None)
 
