@@ -1,6 +1,8 @@
 """What Home Assistant is sent: each tag announced once, rooms by the polygons, nothing old, nothing too often."""
 
 import json
+import os
+import random
 
 import msgspec
 import pytest
@@ -11,23 +13,25 @@ from msgspec.structs import replace
 
 from skyless.bridges.home_assistant.announcer import STALE_S, Announcer
 from skyless.bridges.home_assistant.discovery import document, platforms
-from skyless.bridges.home_assistant.target import make_target
+from skyless.bridges.home_assistant.target import SETTLE_S, make_target
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.target_url import TargetUrl
+from skyless.bridges.targets import open_route
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.messages import TagReport, TagZones, Zone
+from skyless.mqtt.messages import TagPosition, TagZones, Zone
 from skyless.site.earth import geodetic
 
 WEST = Zone("z1", "West", ((0.0, 0.0), (3.0, 0.0), (3.0, 8.0), (0.0, 8.0)))
 EAST = Zone("z2", "East", ((3.0, 0.0), (6.0, 0.0), (6.0, 8.0), (3.0, 8.0)))
 DESK = Zone("desk", "", ((1.0, 1.0), (2.0, 1.0), (2.0, 2.0), (1.0, 2.0)))
 HALL = replace(SITE, zones=(WEST, EAST))
-CONFIG, ZONE, REPORT = (
+CONFIG, ZONE, POSITION = (
     "homeassistant/device/skyless_7_tag1/config",
     "skyless/v1/7/tag/tag1/zone",
-    "skyless/v1/7/tag/tag1/report",
+    "skyless/v1/7/tag/tag1/position",
 )
+CONTEXT = BridgeContext(lambda _line: None, MqttAddress("hall.example", 1883))
 COVARIANCE = (0.0004, 0.0, 0.0, 0.0, 0.0004, 0.0, 0.0, 0.0, 0.0004)
 
 
@@ -93,16 +97,35 @@ def test_a_tag_is_announced_with_all_that_it_has(broker):
     assert whole["availability_mode"] == "all"
     assert components["room"]["state_topic"] == ZONE
     assert broker.value(ZONE, TagZones).name == "West"
-    report = broker.value(REPORT, TagReport)
-    earth = (report.latitude_deg, report.longitude_deg, report.height_m)
+    position = broker.value(POSITION, TagPosition)
+    earth = (position.latitude_deg, position.longitude_deg, position.height_m)
     assert earth == pytest.approx(geodetic((1.0, 2.0, 1.0), SITE.georeference), abs=1e-3)
-    assert (report.std_m, report.horizontal_std_m) == (0.035, 0.028)
+    assert (position.std_m, position.horizontal_std_m) == (0.035, 0.028)
 
 
 def test_a_site_that_is_nowhere_has_rooms_and_no_tracker(broker):
     announcer_of(broker, replace(BARE_SITE, zones=(WEST,))).on_fix(at(1.0))
     assert set(broker.components()) == {"room", "accuracy", "zone_z1"}
-    assert broker.value(REPORT, TagReport).latitude_deg is None
+    assert broker.value(POSITION, TagPosition).latitude_deg is None
+
+
+def test_without_zones_there_is_no_room(broker):
+    announcer = announcer_of(broker, SITE)
+    announcer.on_fix(at(1.0))
+    assert set(broker.components()) == {"accuracy", "position"}
+    announcer.on_site(HALL)
+    assert set(broker.components()) == {"accuracy", "position", "room", "zone_z1", "zone_z2"}
+
+
+def test_tags_are_announced_only_when_the_zones_had_time_to_come():
+    target = make_target(TargetUrl("homeassistant:"), CONTEXT)
+    target.on_site(HALL)
+    for second in range(SETTLE_S):
+        target.on_fix(at(1.0))
+        assert not target._begun.is_set()
+        target.on_second(float(second))
+    target.on_fix(at(1.0))
+    assert target._begun.is_set()
 
 
 def test_the_room_follows_the_polygons_and_noise_at_an_edge_changes_nothing(broker):
@@ -129,10 +152,10 @@ def test_without_a_fix_a_tag_is_unavailable_until_the_next(broker):
         announcer.on_no_fix("tag1", 101.0 + second)
         announcer.on_second(101.0 + second)
     assert broker.value(ZONE, TagZones) == TagZones("tag1", 101.0, usable=False, by="pi-tag1")
-    assert (broker.sent.count(ZONE), broker.sent.count(REPORT)) == (2, 1)
+    assert (broker.sent.count(ZONE), broker.sent.count(POSITION)) == (2, 1)
     announcer.on_fix(at(4.0, unix_s=110.0))
     assert broker.value(ZONE, TagZones).name == "East"
-    assert broker.value(REPORT, TagReport).unix_s == 110.0
+    assert broker.value(POSITION, TagPosition).unix_s == 110.0
 
 
 def test_a_recorder_gets_little_of_a_tag_that_stands(broker):
@@ -141,14 +164,14 @@ def test_a_recorder_gets_little_of_a_tag_that_stands(broker):
         announcer.on_fix(at(1.0 + 0.02 * (k % 3), unix_s=100.0 + 0.1 * k))
         if k % 10 == 9:
             announcer.on_second(100.0 + 0.1 * k)
-    assert broker.sent.count(REPORT) == broker.sent.count(ZONE) == broker.sent.count(CONFIG) == 1
+    assert broker.sent.count(POSITION) == broker.sent.count(ZONE) == broker.sent.count(CONFIG) == 1
     announcer.on_fix(at(1.5, unix_s=111.0))
     announcer.on_second(111.0)
     announcer.on_second(112.0)
-    assert broker.sent.count(REPORT) == 2
+    assert broker.sent.count(POSITION) == 2
     announcer.on_fix(replace(at(1.5, unix_s=113.0), covariance_m2=tuple(2 * value for value in COVARIANCE)))
     announcer.on_second(113.0)
-    assert broker.value(REPORT, TagReport).std_m == 0.049
+    assert broker.value(POSITION, TagPosition).std_m == 0.049
 
 
 def test_ids_do_not_change_with_names_and_removed_zones_are_removed(broker):
@@ -195,14 +218,14 @@ def test_when_home_assistant_starts_it_gets_everything_again_without_a_new_fix(b
     broker.deliver("homeassistant/status", b"offline")
     assert broker.sent == []
     broker.deliver("homeassistant/status", b"online")
-    assert sorted(broker.sent) == sorted([CONFIG, ZONE, REPORT])
+    assert sorted(broker.sent) == sorted([CONFIG, ZONE, POSITION])
     assert broker.kept == before
 
 
 def test_a_tag_whose_document_is_emptied_is_forgotten(broker):
     announcer_of(broker).on_fix(at(1.0))
     broker.deliver(CONFIG, b"")
-    assert {CONFIG, ZONE, REPORT} == set(broker.forgotten)
+    assert {CONFIG, ZONE, POSITION} == set(broker.forgotten)
     broker.sent.clear()
     broker.deliver("homeassistant/status", b"online")
     assert broker.sent == []
@@ -230,15 +253,27 @@ def test_garbage_from_the_broker_changes_nothing(payload):
     assert broker.kept == before
 
 
+def test_random_documents_raise_nothing():
+    """Half of them are a real document with a few bytes changed; ``SKYLESS_FUZZ_INPUTS=1000000`` for a full run."""
+    draws = random.Random(5)
+    real = document(HALL, "tag1", "status", {"zone_z9": "binary_sensor"})
+    broker = Broker()
+    announcer_of(broker).on_fix(at(1.0))
+    for number in range(int(os.environ.get("SKYLESS_FUZZ_INPUTS", "3000"))):
+        noise = bytearray(real if number % 2 else draws.randbytes(draws.randrange(80)))
+        for _ in range(draws.randrange(4)):
+            if noise:
+                noise[draws.randrange(len(noise))] = draws.randrange(256)
+        assert all(isinstance(name, str) for name in platforms(bytes(noise)).values())
+        broker.handlers["skyless/v1/7/tag/+/zone"](ZONE, bytes(noise))
+
+
 def test_templates_hold_nothing_of_what_users_name(broker):
     """Home Assistant runs templates: a name in one would be a program of whoever draws zones."""
     evil = replace(WEST, name="{{ 1 + 1 }}'")
     components = json.loads(document(replace(HALL, name="{{ 2 }}", zones=(evil,)), "tag1", "s", {}))["components"]
     assert components["zone_z1"]["name"] == "In {{ 1 + 1 }}'"
     assert all("1 + 1" not in part.get("value_template", "") for part in components.values())
-
-
-CONTEXT = BridgeContext(lambda _line: None, MqttAddress("hall.example", 1883))
 
 
 def test_the_broker_is_the_sites_or_the_one_of_the_address(broker):
@@ -264,5 +299,5 @@ def test_the_broker_is_the_sites_or_the_one_of_the_address(broker):
 )
 def test_wrong_addresses_say_what_would_be_right(text, context, expected):
     with pytest.raises(SkylessError, match=expected) as caught:
-        make_target(TargetUrl(text), context)
+        open_route(text, context)
     assert "pw" not in str(caught.value)

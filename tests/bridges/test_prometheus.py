@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import random
 import re
 import shutil
 import subprocess
@@ -14,7 +16,7 @@ from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 
 from skyless.bridges.prometheus.exposition import CONTENT_TYPE, family, histograms
-from skyless.bridges.prometheus.metrics import FRESH_S, LATENCY_BOUNDS_S, Rising, SiteMetrics
+from skyless.bridges.prometheus.metrics import GAUGE_AGE_S, LATENCY_BOUNDS_S, Rising, SiteMetrics
 from skyless.bridges.prometheus.target import make_target
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.target_url import TargetUrl
@@ -124,7 +126,7 @@ def test_positions_are_given_on_request_only():
 def test_the_age_of_a_killed_tag_grows_from_scrape_to_scrape_and_its_gauges_end(metrics):
     ages = [read(metrics, 100.0 + later_s)[of_tag("tag_fix_age_seconds")] for later_s in (0.0, 1.5, 3600.0)]
     assert ages == pytest.approx([0.004, 1.504, 3600.004])
-    fresh, old = read(metrics, 100.0 + FRESH_S - 0.1), read(metrics, 100.1 + FRESH_S)
+    fresh, old = read(metrics, 100.0 + GAUGE_AGE_S - 0.1), read(metrics, 100.1 + GAUGE_AGE_S)
     gone = {key[0] for key in fresh.keys() - old.keys()}
     assert of_tag("tag_error_std_metres")[0] in gone
     assert not any(name.endswith(("_total", "_count", "_online", "age_seconds")) for name in gone)
@@ -239,6 +241,15 @@ def test_what_is_no_request_is_counted_and_harms_nobody():
     )
     assert target.dropped["request"] == 3
     assert answers[-1].startswith(b"HTTP/1.1 200")
+
+
+def test_random_requests_get_an_answer():
+    """Half of them begin as a real one does; ``SKYLESS_FUZZ_INPUTS=1000000`` for a full run."""
+    draws = random.Random(6)
+    target = make_target(TargetUrl("prometheus://"), CONTEXT)
+    for number in range(int(os.environ.get("SKYLESS_FUZZ_INPUTS", "3000"))):
+        noise = b"GET /metr" * (number % 2) + draws.randbytes(draws.randrange(40))
+        assert target._answer(noise).startswith(b"HTTP/1.1 ")
 
 
 def test_a_port_that_is_taken_is_named():

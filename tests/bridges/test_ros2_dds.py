@@ -85,7 +85,7 @@ def test_fixes_arrive_in_order_also_where_the_reader_comes_later(domain):
                     return len(stamps) >= 10
 
                 await until(more)
-                assert stamps == list(range(stamps[0], stamps[0] + len(stamps)))
+                assert stamps == sorted(set(stamps))  # a starved reader may miss some: writers keep the last ten
                 found += stamps
         return found, target.dropped
 

@@ -93,8 +93,7 @@ def until(condition, limit_s=60.0):
 class ClientSite:
     """The lab on the Earth with one walking tag, ``tag1``, at Skyless's own broker."""
 
-    def __init__(self, folder, speed_mps=1.0):
-        self._speed_mps = speed_mps
+    def __init__(self, folder):
         self.mqtt_port, self._air_port, self._folder = free_port(), free_port(), folder
         self._file = folder / "site.toml"
         self._file.write_text(site_text(), encoding="utf-8")
@@ -104,7 +103,7 @@ class ClientSite:
         broker = self.run("broker", "--port", self.mqtt_port, "--data", self._folder / "broker", mqtt=False)
         broker.said("mqtt://")
         site = ("--site", self._file)
-        self.run("ether", *site, "--tags", 1, "--speed", self._speed_mps, "--listen", f"127.0.0.1:{self._air_port}")
+        self.run("ether", *site, "--tags", 1, "--listen", f"127.0.0.1:{self._air_port}")
         self.run("anchor", *range(1, 7), *site, *self._radio).said("on the air")
         self.tag = self.start_tag()
         return self

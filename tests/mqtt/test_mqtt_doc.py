@@ -27,7 +27,7 @@ STRUCTS = {
     topics.zones_topic(SITE): messages.ZonesMessage,
     topics.zone_event_topic(SITE, "<zone>"): messages.ZoneEvent,
     topics.tag_zones_topic(SITE, TAG): messages.TagZones,
-    topics.tag_report_topic(SITE, TAG): messages.TagReport,
+    topics.tag_position_topic(SITE, TAG): messages.TagPosition,
     topics.stamps_topic(SITE, "<id>"): messages.StampsMessage,
     topics.survey_topic(SITE): messages.SurveyMessage,
     topics.survey_facts_topic(SITE): messages.SurveyFactsMessage,

@@ -318,7 +318,7 @@ class TagZones(Struct, frozen=True):
     """Name of the bridge that says so."""
 
 
-class TagReport(Struct, frozen=True):
+class TagPosition(Struct, frozen=True):
     """Where a tag is, at most once a second and only when that has changed; retained, for programs that keep each."""
 
     tag: str

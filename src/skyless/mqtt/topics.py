@@ -27,13 +27,13 @@ def tag_zones_topic(site: int | str, tag: str) -> str:
     return f"{ROOT}/{site}/tag/{tag}/zone"
 
 
-def tag_report_topic(site: int | str, tag: str) -> str:
-    """Retained ``TagReport``."""
-    return f"{ROOT}/{site}/tag/{tag}/report"
+def tag_position_topic(site: int | str, tag: str) -> str:
+    """Retained ``TagPosition``."""
+    return f"{ROOT}/{site}/tag/{tag}/position"
 
 
 def status_topic(site: int | str, kind: str, name: int | str) -> str:
-    """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard``, ``recorder`` or ``survey``.
+    """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard``, ``recorder`` or another kind.
 
     It is the node's last will, too.
     """

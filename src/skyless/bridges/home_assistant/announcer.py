@@ -15,8 +15,8 @@ from msgspec import Struct
 from skyless.bridges.feed import BridgedSite, floored
 from skyless.bridges.home_assistant.discovery import birth_topic, config_topic, document, platforms
 from skyless.bridges.target_url import TAG_NAME
-from skyless.mqtt.messages import FixMessage, TagReport, TagZones, Vector
-from skyless.mqtt.topics import status_topic, tag_report_topic, tag_zones_topic
+from skyless.mqtt.messages import FixMessage, TagPosition, TagZones, Vector
+from skyless.mqtt.topics import status_topic, tag_position_topic, tag_zones_topic
 from skyless.site.earth import geodetic
 from skyless.zones.monitor import ZoneMonitor
 
@@ -54,8 +54,7 @@ class _Tag(Struct):
     zones: TagZones | None = None
     fix: FixMessage | None = None
     """None while it has no usable one."""
-    report: TagReport | None = None
-    reported_m: Vector | None = None
+    position: TagPosition | None = None
 
 
 class Announcer:
@@ -93,22 +92,22 @@ class Announcer:
         self._monitor.update(fix, fix.unix_s)
         tag.fix = fix
         self._send_zones(tag, fix.unix_s)
-        if tag.report is None:
-            self._report(tag, fix)
+        if tag.position is None:
+            self._send_position(tag, fix)
 
     def on_no_fix(self, name: str, unix_s: float) -> None:
         """A tag has no usable fix any more."""
         self._monitor.remove_tag(name, unix_s)
         tag = self._tags.get(name)
         if tag is not None:
-            tag.fix = tag.report = None
+            tag.fix = tag.position = None
             self._send_zones(tag, unix_s)
 
     def on_second(self, unix_s: float) -> None:
         """Send what has changed by much; once a second."""
         for tag in self._tags.values():
             if tag.fix is not None and self._has_changed(tag, tag.fix):
-                self._report(tag, tag.fix)
+                self._send_position(tag, tag.fix)
         for name, left_s in tuple(self._kept.items()):
             self._kept[name] = left_s - 1
             if name in self._tags or left_s == 0:
@@ -154,20 +153,19 @@ class Announcer:
             self._publish(tag_zones_topic(self._site.id, tag.name), message)
 
     def _has_changed(self, tag: _Tag, fix: FixMessage) -> bool:
-        if tag.report is None or tag.reported_m is None or dist(fix.position_m, tag.reported_m) >= self._move_m:
+        if tag.position is None or dist(fix.position_m, tag.position.position_m) >= self._move_m:
             return True
-        return not _are_alike(_stds_m(fix)[0], tag.report.std_m)
+        return not _are_alike(_stds_m(fix)[0], tag.position.std_m)
 
-    def _report(self, tag: _Tag, fix: FixMessage) -> None:
+    def _send_position(self, tag: _Tag, fix: FixMessage) -> None:
         std_m, horizontal_std_m = _stds_m(fix)
-        if tag.report is not None and _are_alike(std_m, tag.report.std_m):
-            std_m, horizontal_std_m = tag.report.std_m, tag.report.horizontal_std_m
+        if tag.position is not None and _are_alike(std_m, tag.position.std_m):
+            std_m, horizontal_std_m = tag.position.std_m, tag.position.horizontal_std_m
         origin = self._site.georeference
         latitude_deg, longitude_deg, height_m = (
             (None, None, None) if origin is None else _rounded(geodetic(fix.position_m, origin))
         )
-        tag.reported_m = fix.position_m
-        tag.report = TagReport(
+        tag.position = TagPosition(
             tag=tag.name,
             unix_s=fix.unix_s,
             position_m=fix.position_m,
@@ -177,7 +175,7 @@ class Announcer:
             longitude_deg=longitude_deg,
             height_m=height_m,
         )
-        self._publish(tag_report_topic(self._site.id, tag.name), tag.report)
+        self._publish(tag_position_topic(self._site.id, tag.name), tag.position)
 
     def _publish(self, topic: str, message: Struct | bytes) -> None:
         self._link.publish(topic, message, qos=1, retain=True)
@@ -193,7 +191,7 @@ class Announcer:
                 self._announce(tag)
                 for topic, message in (
                     (tag_zones_topic(self._site.id, tag.name), tag.zones),
-                    (tag_report_topic(self._site.id, tag.name), tag.report),
+                    (tag_position_topic(self._site.id, tag.name), tag.position),
                 ):
                     if message is not None:
                         self._publish(topic, message)
@@ -209,7 +207,7 @@ class Announcer:
             for topic in (
                 config_topic(self._prefix, site, name),
                 tag_zones_topic(site, name),
-                tag_report_topic(site, name),
+                tag_position_topic(site, name),
             ):
                 self._link.forget(topic)
         else:

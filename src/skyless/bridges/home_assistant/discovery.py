@@ -11,7 +11,7 @@ import msgspec
 import skyless
 from skyless.bridges.feed import BridgedSite
 from skyless.mqtt.messages import Zone
-from skyless.mqtt.topics import tag_report_topic, tag_zones_topic
+from skyless.mqtt.topics import tag_position_topic, tag_zones_topic
 
 OUTSIDE: Final = "outside"
 """The room of a tag that is in no zone."""
@@ -46,9 +46,9 @@ def birth_topic(prefix: str) -> str:
 def document(site: BridgedSite, tag: str, status_topic: str, removed: Mapping[str, str]) -> bytes:
     """The document of a tag.
 
-    It has the sensors Room and Accuracy, a binary sensor for each zone, and a tracker where the site is georeferenced.
-    All are unavailable while the bridge is offline or the tag has no usable fix. ``status_topic`` is the bridge's, and
-    ``removed`` has the platforms of components that an earlier document had, by key.
+    It has the sensor Accuracy; where there are zones, the sensor Room and a binary sensor for each of them; a tracker
+    where the site is georeferenced. All are unavailable while the bridge is offline or the tag has no usable fix.
+    ``status_topic`` is the bridge's; ``removed`` has the platforms of components that an earlier document had, by key.
     """
     components = _components(site, tag)
     for key, component in components.items():
@@ -74,15 +74,8 @@ def document(site: BridgedSite, tag: str, status_topic: str, removed: Mapping[st
 
 
 def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
-    zones_topic, report_topic = tag_zones_topic(site.id, tag), tag_report_topic(site.id, tag)
+    zones_topic, position_topic = tag_zones_topic(site.id, tag), tag_position_topic(site.id, tag)
     components: dict[str, Component] = {
-        "room": {
-            "platform": "sensor",
-            "name": "Room",
-            "icon": "mdi:floor-plan",
-            "state_topic": zones_topic,
-            "value_template": _ROOM,
-        },
         "accuracy": {
             "platform": "sensor",
             "name": "Accuracy",
@@ -91,7 +84,7 @@ def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
             "unit_of_measurement": "m",
             "suggested_display_precision": 2,
             "entity_category": "diagnostic",
-            "state_topic": report_topic,
+            "state_topic": position_topic,
             "value_template": "{{ value_json.std_m }}",
         },
     }
@@ -100,8 +93,16 @@ def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
             "platform": "device_tracker",
             "name": "Position",
             "source_type": "gps",
-            "json_attributes_topic": report_topic,
+            "json_attributes_topic": position_topic,
             "json_attributes_template": _ATTRIBUTES,
+        }
+    if site.zones:
+        components["room"] = {
+            "platform": "sensor",
+            "name": "Room",
+            "icon": "mdi:floor-plan",
+            "state_topic": zones_topic,
+            "value_template": _ROOM,
         }
     return components | {zone_key(zone): _occupancy(zone, zones_topic) for zone in site.zones}
 

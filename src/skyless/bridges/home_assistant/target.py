@@ -5,7 +5,6 @@ import platform
 import re
 import time
 from typing import Final
-from urllib.parse import urlsplit
 
 from msgspec import Struct
 
@@ -21,6 +20,11 @@ from skyless.mqtt.messages import FixMessage, StatusMessage
 _PREFIX: Final = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
 
 
+SETTLE_S: Final = 3
+"""The site is known for so long before tags are announced, as its zones come after it: Home Assistant would forget what
+a user has set for sensors of zones that are missing."""
+
+
 class Settings(Struct, frozen=True):
     """How tags are announced."""
 
@@ -30,7 +34,7 @@ class Settings(Struct, frozen=True):
 
 
 class HomeAssistant(Target):
-    """Connects when the first tag has a fix.
+    """Connects when the first tag has a fix, and the site has been known for ``SETTLE_S``.
 
     The bridge's name on MQTT has that tag's name in it, so that bridges on one computer are distinct.
     """
@@ -42,6 +46,8 @@ class HomeAssistant(Target):
         self._announcer: Announcer | None = None
         self._link: Link | None = None
         self._begun = asyncio.Event()
+        self._known_s = 0
+        """For how many seconds the site has been known."""
 
     def on_site(self, site: BridgedSite) -> None:
         """Announce what has changed. Raises SkylessError: it is another site."""
@@ -58,8 +64,8 @@ class HomeAssistant(Target):
 
     def on_fix(self, fix: FixMessage) -> None:
         """Its rooms and its position."""
-        if self._announcer is None:
-            self._begin(fix.tag)
+        if self._announcer is None and self._site is not None and self._known_s >= SETTLE_S:
+            self._begin(self._site, fix.tag)
         if self._announcer is not None:
             self._announcer.on_fix(fix)
 
@@ -70,6 +76,7 @@ class HomeAssistant(Target):
 
     def on_second(self, unix_s: float) -> None:
         """Positions that have changed."""
+        self._known_s += self._site is not None
         if self._announcer is not None:
             self._announcer.on_second(unix_s)
 
@@ -84,14 +91,11 @@ class HomeAssistant(Target):
         assert self._link is not None
         await self._link.run()
 
-    def _begin(self, tag: str) -> None:
-        if self._site is None:
-            return
+    def _begin(self, site: BridgedSite, tag: str) -> None:
         name = re.sub(r"[^A-Za-z0-9_-]", "-", f"{platform.node()}-{tag}")
-        link = Link(self._settings.address, name, site=self._site.id, kind=NODE_KIND)
-        self._announcer = Announcer(link, self._site, name, self._settings.prefix, self._settings.move_m)
+        self._link = Link(self._settings.address, name, site=site.id, kind=NODE_KIND)
+        self._announcer = Announcer(self._link, site, name, self._settings.prefix, self._settings.move_m)
         self._announcer.dropped = self.dropped
-        self._link = link
         self._begun.set()
 
 
@@ -113,12 +117,10 @@ def make_target(url: TargetUrl, context: BridgeContext) -> HomeAssistant:
 
 def _broker(url: TargetUrl, context: BridgeContext, *, tls: bool) -> MqttAddress:
     expected = url.wrong("homeassistant: with --mqtt, or homeassistant://[USER[:PASSWORD]@]HOST[:PORT]")
-    parts = urlsplit(url.given)
-    if url.path not in ("", "/"):
-        raise expected
-    if parts.netloc:
+    netloc = url.netloc()
+    if netloc:
         try:
-            return mqtt_address(f"mqtt{'s' if tls else ''}://{parts.netloc}")
+            return mqtt_address(f"mqtt{'s' if tls else ''}://{netloc}")
         except SkylessError:
             raise expected from None
     if context.mqtt is None:

@@ -13,10 +13,12 @@ from skyless.bridges.feed import BridgedSite
 from skyless.bridges.prometheus.exposition import Labels, Sample, family, histograms
 from skyless.mqtt.messages import AnchorHealth, Counters, FixMessage, StatusMessage, TagHealth
 
-FRESH_S: Final = 5.0
+GAUGE_AGE_S: Final = 5.0
 """Gauges of an older fix or an older health are not given."""
 
 LATENCY_BOUNDS_S: Final = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
+
+_FIXES: Final = "skyless_tag_fixes_total"
 
 _MOST_NAMES: Final = 2000
 _MOST_REASONS: Final = 50
@@ -51,6 +53,7 @@ class _Node:
         self.health_s = 0.0
         """When its last health came."""
         self.counters: dict[str, Rising] = {}
+        """By the metric's name."""
         self.dropped: dict[str, Rising] = {}
 
     def update(
@@ -59,7 +62,11 @@ class _Node:
         """Process the counters of its health."""
         restarted = uptime_s < self.uptime_s
         self.uptime_s, self.health_s = uptime_s, now_s
-        link = {"mqtt_published": mqtt.published, "mqtt_dropped": mqtt.dropped, "mqtt_reconnects": mqtt.reconnects}
+        link = {
+            "skyless_mqtt_published_total": mqtt.published,
+            "skyless_mqtt_dropped_total": mqtt.dropped,
+            "skyless_mqtt_reconnects_total": mqtt.reconnects,
+        }
         for name, value in {**values, **link}.items():
             self.counters.setdefault(name, Rising()).update(value, restarted=restarted)
         for reason, value in dropped.items():
@@ -108,7 +115,7 @@ class SiteMetrics:
         if tag is None:
             return
         tag.fix, tag.fix_s = fix, now_s - fix.latency_s
-        tag.counters.setdefault("fixes", Rising()).update(fix.serial)
+        tag.counters.setdefault(_FIXES, Rising()).update(fix.serial)
         tag.latency_counts[bisect_left(LATENCY_BOUNDS_S, fix.latency_s)] += 1
         tag.latency_sum_s += fix.latency_s
 
@@ -118,13 +125,21 @@ class SiteMetrics:
             tag = _known(self._tags, health.tag, _Tag)
             if tag is not None:
                 tag.health = health
-                values = {"fixes": health.fixes, "receptions": health.receptions, "late": health.late}
+                values = {
+                    _FIXES: health.fixes,
+                    "skyless_tag_receptions_total": health.receptions,
+                    "skyless_tag_late_total": health.late,
+                }
                 tag.update(health.uptime_s, now_s, values, health.counters, health.mqtt)
             return
         anchor = _known(self._anchors, str(health.anchor), _Anchor)
         if anchor is not None:
             anchor.health = health
-            values = {"sent": health.sent, "late": health.late, "heard": health.heard}
+            values = {
+                "skyless_anchor_sent_total": health.sent,
+                "skyless_anchor_late_total": health.late,
+                "skyless_anchor_heard_total": health.heard,
+            }
             anchor.update(health.uptime_s, now_s, values, health.counters, health.mqtt)
 
     def on_status(self, status: StatusMessage) -> None:
@@ -156,39 +171,43 @@ class SiteMetrics:
     def _tag_lines(self, now_s: float) -> Iterator[str]:
         tags = [({"tag": name}, tag) for name, tag in sorted(self._tags.items())]
         fixed = [(labels, fix, now_s - tag.fix_s) for labels, tag in tags if (fix := tag.fix) is not None]
-        fresh = [(labels, fix) for labels, fix, age_s in fixed if age_s <= FRESH_S]
-        healthy = [(labels, tag.health) for labels, tag in tags if tag.health and now_s - tag.health_s <= FRESH_S]
+        fresh = [(labels, fix) for labels, fix, age_s in fixed if age_s <= GAUGE_AGE_S]
+        healthy = [(labels, tag.health) for labels, tag in tags if tag.health and now_s - tag.health_s <= GAUGE_AGE_S]
         yield from family("skyless_tag_online", "gauge", "Whether the tag's program is connected.", _online(tags))
         for name, text in (
-            ("fixes", "Fixes that the tag has made."),
-            ("receptions", "Beacons that the tag has received."),
-            ("late", "Receptions and fixes of the tag that were dropped because they were too old."),
+            (_FIXES, "Fixes that the tag has made."),
+            ("skyless_tag_receptions_total", "Beacons that the tag has received."),
+            ("skyless_tag_late_total", "Receptions and fixes of the tag that were dropped because they were too old."),
         ):
-            yield from family(f"skyless_tag_{name}_total", "counter", text, _totals(tags, name))
+            yield from family(name, "counter", text, _totals(tags, name))
         text = "Frames that the tag has dropped, by reason."
         yield from family("skyless_tag_dropped_frames_total", "counter", text, _dropped(tags))
         text = "From the end of a fix's last frame to the fix; of those fixes that came to the bridge."
         latencies = [(labels, tag.latency_counts, tag.latency_sum_s) for labels, tag in tags if tag.fix is not None]
         yield from histograms("skyless_tag_latency_seconds", text, LATENCY_BOUNDS_S, latencies)
         text = "Time since the tag's last usable fix."
-        yield from _gauge("tag_fix_age_seconds", text, [(labels, max(age_s, 0.0)) for labels, _, age_s in fixed])
+        yield from _gauge(
+            "skyless_tag_fix_age_seconds", text, [(labels, max(age_s, 0.0)) for labels, _, age_s in fixed]
+        )
         text = "One-sigma radial error of the tag's last fix."
-        yield from _gauge("tag_error_std_metres", text, [(labels, fix.std_m) for labels, fix in fresh])
+        yield from _gauge("skyless_tag_error_std_metres", text, [(labels, fix.std_m) for labels, fix in fresh])
         text = "Anchors that the tag's last fix used."
-        yield from _gauge("tag_anchors", text, [(labels, len(fix.anchors)) for labels, fix in fresh])
+        yield from _gauge("skyless_tag_anchors", text, [(labels, len(fix.anchors)) for labels, fix in fresh])
         text = "Position dilution of precision of the tag's last fix."
-        yield from _gauge("tag_pdop", text, [(labels, fix.pdop) for labels, fix in fresh])
+        yield from _gauge("skyless_tag_pdop", text, [(labels, fix.pdop) for labels, fix in fresh])
         text = "Protection level of the tag's last fix, horizontal or vertical."
         levels = [
             ({**labels, "axis": axis}, value)
             for labels, fix in fresh
             for axis, value in (("horizontal", fix.hpl_m), ("vertical", fix.vpl_m))
         ]
-        yield from _gauge("tag_protection_level_metres", text, levels)
+        yield from _gauge("skyless_tag_protection_level_metres", text, levels)
         text = "Share of a processor core that the tag uses."
-        yield from _gauge("tag_cpu_ratio", text, [(labels, health.cpu) for labels, health in healthy])
+        yield from _gauge("skyless_tag_cpu_ratio", text, [(labels, health.cpu) for labels, health in healthy])
         text = "Resident memory of the tag's process."
-        yield from _gauge("tag_memory_bytes", text, [(labels, health.memory_bytes) for labels, health in healthy])
+        yield from _gauge(
+            "skyless_tag_memory_bytes", text, [(labels, health.memory_bytes) for labels, health in healthy]
+        )
         if self._positions:
             text = "Position of the tag's last fix in the site's frame."
             positions = [
@@ -196,45 +215,51 @@ class SiteMetrics:
                 for labels, fix in fresh
                 for axis, value in zip("xyz", fix.position_m, strict=True)
             ]
-            yield from _gauge("tag_position_metres", text, positions)
+            yield from _gauge("skyless_tag_position_metres", text, positions)
 
     def _anchor_lines(self, now_s: float) -> Iterator[str]:
         anchors = [({"anchor": name}, anchor) for name, anchor in sorted(self._anchors.items())]
         known = [(labels, health, now_s - a.health_s) for labels, a in anchors if (health := a.health) is not None]
-        fresh = [(labels, health) for labels, health, age_s in known if age_s <= FRESH_S]
+        fresh = [(labels, health) for labels, health, age_s in known if age_s <= GAUGE_AGE_S]
         text = "Whether the anchor's program is connected."
         yield from family("skyless_anchor_online", "gauge", text, _online(anchors))
         for name, text in (
-            ("sent", "Beacons that the anchor has sent."),
-            ("late", "Transmissions of the anchor that came too late and were skipped."),
-            ("heard", "Beacons of other anchors that the anchor has received."),
+            ("skyless_anchor_sent_total", "Beacons that the anchor has sent."),
+            ("skyless_anchor_late_total", "Transmissions of the anchor that came too late and were skipped."),
+            ("skyless_anchor_heard_total", "Beacons of other anchors that the anchor has received."),
         ):
-            yield from family(f"skyless_anchor_{name}_total", "counter", text, _totals(anchors, name))
+            yield from family(name, "counter", text, _totals(anchors, name))
         text = "Frames that the anchor has dropped, by reason."
         yield from family("skyless_anchor_dropped_frames_total", "counter", text, _dropped(anchors))
-        text = "Time since the anchor's last report of its state."
-        yield from _gauge("anchor_health_age_seconds", text, [(labels, max(age_s, 0.0)) for labels, _, age_s in known])
+        text = "Time since the anchor's last health message."
+        yield from _gauge(
+            "skyless_anchor_health_age_seconds", text, [(labels, max(age_s, 0.0)) for labels, _, age_s in known]
+        )
         text = "Whether the anchor follows the site's time, so that it may send."
         yield from _gauge(
-            "anchor_synchronised", text, [(labels, float(health.synchronised)) for labels, health in fresh]
+            "skyless_anchor_synchronised", text, [(labels, float(health.synchronised)) for labels, health in fresh]
         )
         text = "Standard deviation of the anchor's clock against the site's time, as a distance."
-        yield from _gauge("anchor_offset_std_metres", text, [(labels, health.offset_std_m) for labels, health in fresh])
+        yield from _gauge(
+            "skyless_anchor_offset_std_metres", text, [(labels, health.offset_std_m) for labels, health in fresh]
+        )
         text = "Rate of the anchor's clock against the site's time, as a share."
         rates = [(labels, None if h.rate_ppm is None else h.rate_ppm * 1e-6) for labels, h in fresh]
-        yield from _gauge("anchor_rate_ratio", text, rates)
+        yield from _gauge("skyless_anchor_rate_ratio", text, rates)
         text = "Share of the anchor's transmissions of the last second that came too late."
-        yield from _gauge("anchor_missed_ratio", text, [(labels, health.missed_share) for labels, health in fresh])
+        yield from _gauge(
+            "skyless_anchor_missed_ratio", text, [(labels, health.missed_share) for labels, health in fresh]
+        )
 
     def _link_lines(self) -> Iterator[str]:
         groups: tuple[tuple[str, Mapping[str, _Node]], ...] = (("tag", self._tags), ("anchor", self._anchors))
         nodes = [({"kind": kind, "name": name}, node) for kind, group in groups for name, node in sorted(group.items())]
         for name, text in (
-            ("published", "Messages that the node has sent to the broker."),
-            ("dropped", "Messages that the node dropped because the broker was slow or away."),
-            ("reconnects", "Connections that the node has made again."),
+            ("skyless_mqtt_published_total", "Messages that the node has sent to the broker."),
+            ("skyless_mqtt_dropped_total", "Messages that the node dropped because the broker was slow or away."),
+            ("skyless_mqtt_reconnects_total", "Connections that the node has made again."),
         ):
-            yield from family(f"skyless_mqtt_{name}_total", "counter", text, _totals(nodes, f"mqtt_{name}"))
+            yield from family(name, "counter", text, _totals(nodes, name))
 
 
 _N = TypeVar("_N", bound=_Node)
@@ -249,7 +274,7 @@ def _known(nodes: dict[str, _N], name: str, make: type[_N]) -> _N | None:
 
 def _gauge(name: str, text: str, values: Iterable[tuple[Labels, float | None]]) -> list[str]:
     samples = [(labels, float(value)) for labels, value in values if value is not None]
-    return family(f"skyless_{name}", "gauge", text, samples)
+    return family(name, "gauge", text, samples)
 
 
 def _online(nodes: Iterable[tuple[Labels, _Node]]) -> list[Sample]:
