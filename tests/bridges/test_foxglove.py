@@ -95,17 +95,6 @@ def is_status(text):
     return text["op"] == "status"
 
 
-def test_the_end_of_the_server_ends_its_connections():
-    async def run():
-        async with served() as server:
-            connection = await connect(f"ws://127.0.0.1:{server.port}", subprotocols=list(SUBPROTOCOLS))
-        with pytest.raises(ConnectionClosed):
-            while True:
-                await connection.recv()
-
-    asyncio.run(run())
-
-
 @pytest.mark.parametrize("subprotocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])
 def test_a_client_gets_each_form_of_a_fix(subprotocol):
     async def run():

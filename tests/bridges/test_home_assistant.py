@@ -293,12 +293,12 @@ def test_garbage_from_the_broker_changes_nothing(payload):
 
 
 def test_random_documents_raise_nothing():
-    """Half of them are a real document with a few bytes changed; ``SKYLESS_FUZZ_INPUTS=1000000`` for a full run."""
+    """Half of them are a real document with a few bytes changed; ``SKYLESS_FUZZ_FRAMES=1000000`` for a full run."""
     draws = random.Random(5)
     real = document(HALL, "tag1", "status", {"zone_z9": "binary_sensor"})
     broker = Broker()
     announcer_of(broker).on_fix(at(1.0))
-    for number in range(int(os.environ.get("SKYLESS_FUZZ_INPUTS", "3000"))):
+    for number in range(int(os.environ.get("SKYLESS_FUZZ_FRAMES", "3000"))):
         noise = bytearray(real if number % 2 else draws.randbytes(draws.randrange(80)))
         for _ in range(draws.randrange(4)):
             if noise:

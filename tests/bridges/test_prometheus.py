@@ -284,10 +284,10 @@ def test_connections_that_send_nothing_keep_no_scrape_out_and_end_with_the_serve
 
 
 def test_random_requests_get_an_answer():
-    """Half of them begin as a real one does; ``SKYLESS_FUZZ_INPUTS=1000000`` for a full run."""
+    """Half of them begin as a real one does; ``SKYLESS_FUZZ_FRAMES=1000000`` for a full run."""
     draws = random.Random(6)
     target = make_target(TargetUrl("prometheus://"), CONTEXT)
-    for number in range(int(os.environ.get("SKYLESS_FUZZ_INPUTS", "3000"))):
+    for number in range(int(os.environ.get("SKYLESS_FUZZ_FRAMES", "3000"))):
         noise = b"GET /metr" * (number % 2) + draws.randbytes(draws.randrange(40))
         assert target._answer(noise).startswith(b"HTTP/1.1 ")
 

@@ -101,7 +101,7 @@ class FoxgloveTarget(Target):
             raise cannot_listen(self.text, self._host, self.port, error) from None
         async with server:
             self.port = next(iter(server.sockets)).getsockname()[1]
-            await asyncio.Event().wait()  # serve_forever, when cancelled, waits until all clients have left
+            await server.serve_forever()
 
     async def _serve(self, connection: ServerConnection) -> None:
         """Serve one client until it goes."""
