@@ -16,6 +16,7 @@ from skyless.bridges.home_assistant.discovery import document, platforms
 from skyless.bridges.home_assistant.target import SETTLE_S, make_target
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.target_url import TargetUrl
+from skyless.bridges.targets import open_route
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import TagPosition, TagZones, Zone
@@ -338,5 +339,5 @@ def test_the_broker_is_the_sites_or_the_one_of_the_address(broker):
 )
 def test_wrong_addresses_say_what_would_be_right(text, context, expected):
     with pytest.raises(SkylessError, match=expected) as caught:
-        make_target(TargetUrl(text), context)
+        open_route(text, context)
     assert "pw" not in str(caught.value)

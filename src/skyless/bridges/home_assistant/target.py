@@ -5,7 +5,6 @@ import platform
 import re
 import time
 from typing import Final
-from urllib.parse import urlsplit
 
 from msgspec import Struct
 
@@ -123,12 +122,10 @@ def make_target(url: TargetUrl, context: BridgeContext) -> HomeAssistant:
 
 def _broker(url: TargetUrl, context: BridgeContext, *, tls: bool) -> MqttAddress:
     expected = url.wrong("homeassistant: with --mqtt, or homeassistant://[USER[:PASSWORD]@]HOST[:PORT]")
-    parts = urlsplit(url.given)
-    if url.path not in ("", "/"):
-        raise expected
-    if parts.netloc:
+    netloc = url.netloc()
+    if netloc:
         try:
-            return mqtt_address(f"mqtt{'s' if tls else ''}://{parts.netloc}")
+            return mqtt_address(f"mqtt{'s' if tls else ''}://{netloc}")
         except SkylessError:
             raise expected from None
     if context.mqtt is None:
