@@ -61,8 +61,9 @@ class TcpServer:
             raise cannot_listen(self._text, self._host, self.port, error) from None
         self.port = server.sockets[0].getsockname()[1]
         try:
-            await server.serve_forever()
+            await asyncio.Event().wait()  # serve_forever, when cancelled, waits until all readers have left
         finally:
+            server.close()
             for reader in tuple(self._readers):
                 reader.end()
 
