@@ -44,7 +44,7 @@ def make_target(url: TargetUrl, context: BridgeContext) -> Target:
     if not _NAMESPACE.fullmatch(namespace):
         raise url.wrong("with namespace= as topics of ROS begin: letters, digits and _, not a digit first")
     transforms = url.choice("tf", ("no", "yes"), "no") == "yes"
-    domain = round(url.number("domain", 0, 0, _MOST_DOMAIN))
+    domain = url.whole_number("domain", 0, 0, _MOST_DOMAIN)
     if not url.text_option("domain"):
         domain = _usual_domain(url.text)
     url.check_all_read()
@@ -71,10 +71,13 @@ class Ros2Target(Target):
         self._publisher, self._encoder, self._log = publisher, RosEncoder(settings), context.log
         self._waiting: queue.Queue[list[RosMessage] | None] = queue.Queue(_MOST_WAITING)
         self._troubles: set[str] = set()
+        self._knows_no_earth = False
+        """Whether it was logged that the site does not know where it is."""
 
     def on_site(self, site: BridgedSite) -> None:
         """Publish its anchors."""
-        if site.georeference is None:
+        if site.georeference is None and not self._knows_no_earth:
+            self._knows_no_earth = True
             self._log(f"{self.text}: no topic fix (NavSatFix), as the site file has no [georeference]")
         self._give(self._encoder.on_site(site))
 
