@@ -127,7 +127,7 @@ class SkylessNode(Node):
         name = self.name(fix["tag"])
         covariance_m2 = floored(fix["covariance_m2"])
         messages: list[tuple[str, Any]] = [("pose", pose(fix, covariance_m2))]
-        if fix["velocity_mps"] is not None:
+        if fix["velocity_mps"] is not None and None not in fix["velocity_mps"] + fix["velocity_covariance"]:
             messages.append(("velocity", velocity(fix)))
         if self.origin is not None:
             messages.append(("fix", nav_sat_fix(name, fix, covariance_m2, self.origin)))

@@ -3,7 +3,7 @@
 from hypothesis import strategies as st
 
 from skyless.bridges.feed import BridgedSite
-from skyless.mqtt.messages import FixMessage
+from skyless.mqtt.messages import Counters, FixMessage, TagHealth
 from skyless.site.model import GeoreferenceSite
 
 BERLIN = GeoreferenceSite(latitude_deg=52.512345678, longitude_deg=13.326, height_m=34.5, heading_deg=30.0)
@@ -35,6 +35,10 @@ def a_fix(**changes):
         latency_s=0.004,
     )
     return FixMessage(**values | changes)
+
+
+def tag_health(tag):
+    return TagHealth(tag, 0.0, 1.0, "joint", 1, 1, 1.0, None, 0.1, None, None, {}, Counters(0, 0, 0), 0.0, 0, ())
 
 
 _metres = st.floats(-8000.0, 8000.0)

@@ -117,6 +117,8 @@ async def tpvs_of(transport, fixes, folder):
     if transport == "tcp":
         (await connected(port))[1].close()
     hub.on_site(SITE)
+    while transport == "pty" and not path.exists():
+        await asyncio.sleep(0.001)
     device = path.resolve() if transport == "pty" else f"{transport}://127.0.0.1:{port}"
     reports, gsts, now_s = {}, {}, 0.0
     try:

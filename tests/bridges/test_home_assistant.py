@@ -11,11 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.bridges.home_assistant.announcer import STALE_S, Announcer
+from skyless.bridges.home_assistant.announcer import MOST_TAGS, STALE_S, Announcer
 from skyless.bridges.home_assistant.discovery import document, platforms
 from skyless.bridges.home_assistant.target import SETTLE_S, make_target
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.target_url import TargetUrl
+from skyless.bridges.targets import open_route
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import TagPosition, TagZones, Zone
@@ -38,14 +39,23 @@ class Broker:
     """In the place of a link: keeps what is retained, and echoes it as a broker does."""
 
     def __init__(self):
-        self.sent, self.kept, self.handlers, self.forgotten = [], {}, {}, []
+        self.sent, self.kept, self.handlers, self.forgotten, self.others = [], {}, {}, [], []
+
+    def next_link(self):
+        """Another link to the same broker."""
+        other = Broker()
+        other.sent, other.kept, other.others = self.sent, self.kept, self.others
+        self.others.append(other)
+        return other
 
     def publish(self, topic, message, *, qos=0, retain=False):
         assert (qos, retain) == (1, True)
         payload = message if isinstance(message, bytes) else msgspec.json.encode(message)
         self.sent.append(topic)
         self.kept[topic] = payload
-        self.deliver(topic, payload)
+        assert len(self.sent) < 1000, "without end"
+        for link in self.others or [self]:
+            link.deliver(topic, payload)
 
     def subscribe(self, topic_filter, handler, qos=0):
         self.handlers[topic_filter] = handler
@@ -191,11 +201,42 @@ def test_a_bridge_that_is_started_again_removes_what_was_deleted_meanwhile(broke
     later.kept = dict(broker.kept)
     announcer = announcer_of(later, replace(HALL, zones=(WEST,)))
     announcer.on_fix(at(1.0))
-    later.deliver(CONFIG, broker.kept[CONFIG])
     assert later.components()["zone_z2"] == {"platform": "binary_sensor"}
     count = later.sent.count(CONFIG)
     later.deliver(CONFIG, later.kept[CONFIG])
     assert later.sent.count(CONFIG) == count
+
+
+def test_two_bridges_that_know_different_zones_do_not_answer_each_other_without_end(broker):
+    for name, zone in (("pi-tag1", WEST), ("nas-tag1", EAST)):
+        announcer_of(broker.next_link(), replace(HALL, zones=(zone,)), name).on_fix(at(1.0))
+    assert broker.sent.count(CONFIG) < 6
+
+
+def test_the_link_keeps_all_that_is_sent_of_as_many_tags_as_there_may_be():
+    zones = tuple(replace(WEST, id=f"z{k:063d}", name=f"{k:0100d}") for k in range(100))
+    target = make_target(TargetUrl("homeassistant:"), CONTEXT)
+    target.on_site(replace(HALL, zones=zones))
+    for second in range(SETTLE_S):
+        target.on_second(float(second))
+    for number in range(MOST_TAGS + 1):
+        target.on_fix(at(1e5, tag=f"tag{number}"))
+    assert target._link.counters.dropped == 0
+    assert target._link.unacknowledged == 3 * MOST_TAGS
+    assert target.dropped == {"too-many-tags": 1}
+
+
+def test_a_bridge_that_comes_to_another_site_leaves_nothing_available(broker):
+    target = make_target(TargetUrl("homeassistant:"), CONTEXT)
+    target.on_site(HALL)
+    target._announcer = announcer_of(broker)
+    target.on_fix(at(1.0))
+    with pytest.raises(SkylessError, match="serves site 7, not site 8"):
+        target.on_site(replace(HALL, id=8))
+    assert not broker.value(ZONE, TagZones).usable
+    target.on_site(HALL)
+    target.on_fix(at(4.0))
+    assert broker.value(ZONE, TagZones).name == "East"
 
 
 def test_what_was_so_before_a_restart_does_not_stay_where_the_tag_has_gone(broker):
@@ -253,12 +294,12 @@ def test_garbage_from_the_broker_changes_nothing(payload):
 
 
 def test_random_documents_raise_nothing():
-    """Half of them are a real document with a few bytes changed; ``SKYLESS_FUZZ_INPUTS=1000000`` for a full run."""
+    """Half of them are a real document with a few bytes changed; ``SKYLESS_FUZZ_FRAMES=1000000`` for a full run."""
     draws = random.Random(5)
     real = document(HALL, "tag1", "status", {"zone_z9": "binary_sensor"})
     broker = Broker()
     announcer_of(broker).on_fix(at(1.0))
-    for number in range(int(os.environ.get("SKYLESS_FUZZ_INPUTS", "3000"))):
+    for number in range(int(os.environ.get("SKYLESS_FUZZ_FRAMES", "3000"))):
         noise = bytearray(real if number % 2 else draws.randbytes(draws.randrange(80)))
         for _ in range(draws.randrange(4)):
             if noise:
@@ -298,5 +339,5 @@ def test_the_broker_is_the_sites_or_the_one_of_the_address(broker):
 )
 def test_wrong_addresses_say_what_would_be_right(text, context, expected):
     with pytest.raises(SkylessError, match=expected) as caught:
-        make_target(TargetUrl(text), context)
+        open_route(text, context)
     assert "pw" not in str(caught.value)

@@ -3,7 +3,7 @@
 from math import nan
 
 import pytest
-from bridged_values import BARE_SITE, SITE, a_fix, covariances
+from bridged_values import BARE_SITE, SITE, a_fix, covariances, tag_health
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
@@ -12,6 +12,7 @@ from skyless.bridges.feed import MIN_STD_M, bridged_site, floored, is_usable, re
 from skyless.bridges.hub import Hub, Route, open_hub
 from skyless.bridges.target import Target
 from skyless.errors import SkylessError
+from skyless.mqtt.messages import StatusMessage
 from skyless.positioning.integrity import Alert
 from skyless.site.lab import lab_site
 
@@ -22,7 +23,7 @@ class Recorded(Target):
     def __init__(self, text="test:", *, one_tag=False, needs_earth=False):
         super().__init__(text)
         self.one_tag, self.needs_earth = one_tag, needs_earth
-        self.fixes, self.none, self.seconds = [], [], 0
+        self.fixes, self.none, self.states, self.seconds = [], [], [], 0
 
     def on_site(self, site):
         if self.needs_earth:
@@ -36,6 +37,12 @@ class Recorded(Target):
 
     def on_second(self, unix_s):
         self.seconds += 1
+
+    def on_health(self, health):
+        self.states.append(health.tag)
+
+    def on_status(self, status):
+        self.states.append(status.name)
 
 
 def hub_of(*targets, hz=1000.0, tag=None, said=None):
@@ -120,11 +127,21 @@ def test_a_tag_whose_fixes_are_rare_has_none_only_when_some_are_missing():
         for quarter in range(8):
             hub.on_tick(2.0 * step + 0.25 * quarter, 100.0 + 2.0 * step + 0.25 * quarter)
     assert (len(target.fixes), target.seconds) == (4, 8)
-    assert [when_s for _, when_s, _ in target.none] == [101.0], "its interval was not known then"
+    assert [when_s for _, when_s, _ in target.none] == [101.0, 103.0], "its interval was not known then"
     target.none.clear()
     for quarter in range(1, 33):
         hub.on_tick(8.0 + 0.25 * quarter, 108.0 + 0.25 * quarter)
     assert [when_s for _, when_s, _ in target.none] == [111.0 + second for second in range(6)]
+
+
+def test_a_single_fix_after_an_outage_does_not_make_a_tag_slow():
+    target = Recorded()
+    hub = hub_of(target)
+    for step in range(50):
+        hub.on_fix(a_fix(serial=step), 0.02 * step)
+    hub.on_fix(a_fix(serial=50), 30.0)
+    hub.on_tick(31.25, 131.25)
+    assert [when_s for _, when_s, _ in target.none] == [131.25]
 
 
 def test_no_fix_of_a_tag_at_the_targets_own_rate_is_missed_because_it_came_early():
@@ -146,6 +163,37 @@ def test_a_target_for_one_tag_keeps_to_the_first_and_says_so_once():
     assert {fix.tag for fix in target.fixes} == {"tag1"}
     assert {tag for tag, _, _ in target.none} == {"tag1"}
     assert said == ["test: carries one tag, tag1; ?tag=NAME chooses another, as tag2"]
+
+
+def test_a_tag_that_has_never_had_a_fix_does_not_hold_a_target_for_one_tag():
+    target = Recorded(one_tag=True)
+    hub = hub_of(target)
+    hub.on_health(tag_health("tag1"), 0.0)
+    hub.on_tick(2.0, 102.0)
+    assert [tag for tag, _, _ in target.none] == ["tag1"]
+    hub.on_fix(a_fix(tag="tag2"), 2.1)
+    hub.on_tick(2.9, 102.9)
+    assert [fix.tag for fix in target.fixes] == ["tag2"]
+    assert len(target.none) == 1, "it is another tag's now"
+
+
+def test_a_target_that_is_for_one_tag_by_the_users_choice_gets_no_other_tags_state():
+    target, all_tags = Recorded(), Recorded("all:")
+    hub = Hub([Route(target, "tag1", 50.0), Route(all_tags, None, 50.0)], print)
+    for tag in ("tag1", "tag2"):
+        hub.on_health(tag_health(tag), 0.0)
+        hub.on_status(StatusMessage(True, "tag", tag))
+    hub.on_status(StatusMessage(True, "anchor", "2"))
+    assert target.states == ["tag1", "tag1", "2"]
+    assert all_tags.states == ["tag1", "tag1", "tag2", "tag2", "2"]
+
+
+def test_what_a_growing_site_lacks_is_logged_once():
+    said = []
+    hub = Hub([Route(Recorded("earthly:", needs_earth=True), None, 1.0), Route(Recorded(), None, 1.0)], said.append)
+    for anchor in range(5):
+        hub.on_site(structs.replace(BARE_SITE, anchors_m={anchor: (1.0, 0.0, 2.0)}))
+    assert len(said) == 1
 
 
 def test_a_fault_in_one_target_costs_the_others_nothing_and_is_logged_once():

@@ -134,11 +134,9 @@ def test_version_1_and_signed_frames_are_read(message):
     assert [decoded(one) for one in found] == [message, message]
 
 
-@given(message=messages, data=st.data())
+@given(message=READ, data=st.data())
 def test_a_damaged_frame_is_dropped_and_the_next_is_read(message, data):
     damaged = bytearray(encoded(message, sequence=0, system=1, component=1))
-    if type(message) not in (Heartbeat, Timesync, GpsGlobalOrigin):
-        return
     at = data.draw(st.integers(1, len(damaged) - 1))
     damaged[at] ^= data.draw(st.integers(1, 255))
     good = Heartbeat(custom_mode=5)
@@ -359,6 +357,49 @@ def test_the_origin_goes_out_with_the_heartbeat_until_the_vehicle_has_one():
     assert names(made.on_second(0.0)) == ["HEARTBEAT"]
 
 
+def heard(made, message):
+    """The vehicle has sent a message."""
+    made.on_bytes(encoded(message, sequence=0, system=1, component=1), 1_795_000_000 * 10**9)
+
+
+ORIGIN = GpsGlobalOrigin(525_123_457, 133_260_000, 34_500)
+
+
+def test_a_vehicle_that_was_away_gets_the_origin_again():
+    """It may have another battery, and no origin."""
+    made = encoder("px4")
+    heard(made, Heartbeat())
+    heard(made, ORIGIN)
+    for _ in range(10):
+        assert names(made.on_second(0.0)) == ["HEARTBEAT"]
+        heard(made, Heartbeat())
+    sent = [names(made.on_second(0.0))[1:] for _ in range(4)]
+    assert sent == [[], [], ["SET_GPS_GLOBAL_ORIGIN"], ["SET_GPS_GLOBAL_ORIGIN"]]
+
+
+def test_an_armed_vehicle_that_was_away_gets_no_origin():
+    made = encoder("px4")
+    heard(made, Heartbeat(base_mode=0x81))
+    assert [names(made.on_second(0.0)) for _ in range(9)] == [["HEARTBEAT"]] * 9
+
+
+@profiles
+def test_an_origin_that_is_not_the_sites_is_logged_once(profile):
+    said = []
+    made = encoder(profile, text="mavlink+udpout:", log=said.append)
+    heard(made, ORIGIN)
+    heard(made, structs.replace(ORIGIN, latitude_1e7=ORIGIN.latitude_1e7 - 10, altitude_mm=34_400))
+    assert said == []
+    heard(made, structs.replace(ORIGIN, longitude_1e7=ORIGIN.longitude_1e7 + 11))
+    heard(made, structs.replace(ORIGIN, altitude_mm=34_399))
+    if profile == "gps":  # gives none, and the vehicle has what it found itself
+        assert said == []
+        return
+    (line,) = said
+    assert "states the origin 52.5123457, 13.3260011, 34.50 m" in line
+    assert "the site's is 52.5123457, 13.3260000, 34.50 m" in line
+
+
 def test_no_origin_is_sent_to_an_armed_vehicle():
     made = encoder("px4")
     made.on_bytes(encoded(Heartbeat(base_mode=0x81), sequence=0, system=1, component=1), 0)
@@ -376,6 +417,40 @@ def test_a_site_that_does_not_know_where_it_is_gives_no_origin_and_no_gps():
         MavlinkEncoder("gps", text="mavlink+udpout:").on_site(BARE_SITE)
 
 
+@pytest.mark.parametrize(("site", "heading_deg", "lines"), [(BARE_SITE, None, 1), (BARE_SITE, 0.0, 0), (SITE, None, 0)])
+def test_that_north_is_assumed_is_logged_once(site, heading_deg, lines):
+    said = []
+    made = encoder("px4", site, text="mavlink+udpout:", heading_deg=heading_deg, log=said.append)
+    assert said == [], "a tag by itself may still learn it"
+    for serial in range(1, 4):
+        made.on_fix(a_fix(serial=serial))
+        made.on_site(structs.replace(site, anchors_m=site.anchors_m | {9: (0.0, serial, 2.0)}))
+    assert len(said) == lines
+    assert all(
+        line.startswith("mavlink+udpout:: site 7 (hall) does not say where north is") and "heading=" in line
+        for line in said
+    )
+
+
+@profiles
+def test_that_a_height_is_assumed_is_logged_where_the_message_cannot_say_it(profile):
+    said = []
+    made = encoder(profile, log=said.append)
+    made.on_fix(a_fix())
+    assert said == []
+    for serial in (2, 3):
+        made.on_fix(a_fix(serial=serial, height_known=True))
+    assert [("EK3_SRC1_POSZ 1" in line) for line in said] == ([True] if profile == "ardupilot" else [])
+
+
+def test_targets_log_what_they_assume():
+    said = []
+    target = open_route("mavlink+udpout://127.0.0.1:9?profile=px4", BridgeContext(said.append)).target
+    target.on_site(BARE_SITE)
+    target.on_fix(a_fix())
+    assert len([line for line in said if "where north is" in line]) == 1
+
+
 def test_the_heading_of_a_site_that_has_none_can_be_given():
     made = encoder("ardupilot", BARE_SITE, heading_deg=90.0)
     (found,) = parse(b"".join(made.on_fix(a_fix(position_m=(1.0, 2.0, 3.0)))))
@@ -390,7 +465,11 @@ def test_the_heading_of_a_site_that_has_none_can_be_given():
         ("mavlink+udpout://", "profile=; it should be ardupilot, px4 or gps"),
         ("mavlink+udpout://?profile=betaflight", "ardupilot, px4 or gps"),
         ("mavlink+udpout://?profile=px4&system=0", "system=0; it should be a number from 1 to 255"),
+        ("mavlink+udpout://?profile=px4&system=1.5", "system=1.5; it should be a whole number from 1 to 255"),
         ("mavlink+udpout://?profile=gps&satellites=many", "satellites=many"),
+        ("mavlink+udpout://?profile=gps&satellites=6.5", "satellites=6.5; it should be a whole number"),
+        ("mavlink+udpout://?profile=gps&satellites=", "satellites=; it should be a number"),
+        ("mavlink+udpout://?profile=px4&heading=", "heading=; it should be a number"),
         ("mavlink+udpout://?profile=px4&heading=north", "heading=north"),
         ("mavlink+udpout://?profile=px4&yaw=3", "yaw"),
         ("mavlink+serial:?profile=px4", "PATH@BAUD"),

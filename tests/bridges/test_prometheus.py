@@ -1,6 +1,7 @@
 """The figures for Prometheus, read by its own Python client and promtool: counters rise, ages grow, nothing is old."""
 
 import asyncio
+import contextlib
 import json
 import os
 import random
@@ -15,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 
+from skyless.bridges.prometheus import target as prometheus_target
 from skyless.bridges.prometheus.exposition import CONTENT_TYPE, family, histograms
 from skyless.bridges.prometheus.metrics import GAUGE_AGE_S, LATENCY_BOUNDS_S, Rising, SiteMetrics
 from skyless.bridges.prometheus.target import make_target
@@ -158,7 +160,12 @@ def test_nobody_can_fill_the_memory_with_names():
     for k in range(3000):
         metrics.on_fix(a_fix(tag=f"t{k}"), 0.0)
     metrics.on_health(tag_health("t1", counters={f"reason{k}": 1 for k in range(200)}), 0.0)
+    for name in ("x" * 100_000, "a/b", ""):
+        metrics.on_fix(a_fix(tag=name), 0.0)
+        metrics.on_status(StatusMessage(online=True, kind="anchor", name=name))
+    assert metrics.dropped == {"too-many-names": 1000, "name": 6}
     text = metrics.text(0.0)
+    assert len(text) < 2_000_000
     assert text.count("skyless_tag_fixes_total{") == 2000
     assert text.count("skyless_tag_dropped_frames_total{") == 50
 
@@ -169,6 +176,13 @@ def test_any_label_and_value_comes_back(labels, value):
     (one,) = text_string_to_metric_families(text)
     (sample,) = one.samples
     assert (sample.labels, sample.value) == (labels, value)
+
+
+def test_a_fix_from_the_future_is_not_younger_than_new_and_lets_no_sum_fall():
+    metrics = SiteMetrics()
+    metrics.on_fix(a_fix(latency_s=-100.0), 0.0)
+    assert read(metrics, 10.0)[of_tag("tag_fix_age_seconds")] == 10.0
+    assert read(metrics)[of_tag("tag_latency_seconds_sum")] == 0.0
 
 
 @given(st.lists(st.floats(0.0, 1.0), max_size=30))
@@ -218,10 +232,11 @@ def exchange(*requests):
 
 
 def test_it_answers_scrapes_and_nothing_else():
-    _, (whole, head, other, posted) = exchange(
+    _, (whole, head, other, no_page, posted) = exchange(
         b"GET /metrics?x=1 HTTP/1.1\r\nHost: a\r\n\r\n",
         b"HEAD /metrics HTTP/1.1\r\n\r\n",
         b"GET / HTTP/1.1\r\n\r\n",
+        b"HEAD / HTTP/1.1\r\n\r\n",
         b"POST /metrics HTTP/1.1\r\n\r\n",
     )
     first, _, body = whole.partition(b"\r\n\r\n")
@@ -231,6 +246,7 @@ def test_it_answers_scrapes_and_nothing_else():
     assert b"skyless_tag_fixes_total" in body
     assert head.startswith(b"HTTP/1.1 200")
     assert head.endswith(b"\r\n\r\n")
+    assert no_page.endswith(b"\r\n\r\n")
     assert other.startswith(b"HTTP/1.1 404")
     assert posted.startswith(b"HTTP/1.1 405")
 
@@ -243,11 +259,35 @@ def test_what_is_no_request_is_counted_and_harms_nobody():
     assert answers[-1].startswith(b"HTTP/1.1 200")
 
 
+def test_connections_that_send_nothing_keep_no_scrape_out_and_end_with_the_server(monkeypatch):
+    monkeypatch.setattr(prometheus_target, "_ANSWER_S", 3600.0)
+
+    async def talk():
+        target = make_target(TargetUrl("prometheus://"), CONTEXT)
+        target.port = 0
+        serving = asyncio.ensure_future(target.run())
+        while not target.port:
+            await asyncio.sleep(0.01)
+        silent = [await asyncio.open_connection("127.0.0.1", target.port) for _ in range(100)]
+        reader, writer = await asyncio.open_connection("127.0.0.1", target.port)
+        writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
+        answer = await reader.read()
+        serving.cancel()
+        await asyncio.wait([serving])
+        for one, other in silent:
+            with contextlib.suppress(ConnectionError):
+                assert await one.read() == b""
+            other.close()
+        return answer
+
+    assert asyncio.run(talk()).startswith(b"HTTP/1.1 200")
+
+
 def test_random_requests_get_an_answer():
-    """Half of them begin as a real one does; ``SKYLESS_FUZZ_INPUTS=1000000`` for a full run."""
+    """Half of them begin as a real one does; ``SKYLESS_FUZZ_FRAMES=1000000`` for a full run."""
     draws = random.Random(6)
     target = make_target(TargetUrl("prometheus://"), CONTEXT)
-    for number in range(int(os.environ.get("SKYLESS_FUZZ_INPUTS", "3000"))):
+    for number in range(int(os.environ.get("SKYLESS_FUZZ_FRAMES", "3000"))):
         noise = b"GET /metr" * (number % 2) + draws.randbytes(draws.randrange(40))
         assert target._answer(noise).startswith(b"HTTP/1.1 ")
 

@@ -86,6 +86,7 @@ def test_more_connections_than_allowed_are_closed_at_once():
             with contextlib.suppress(ConnectionResetError):
                 assert await reader.read() == b""
             assert len(server._readers) == MOST_READERS
+            assert server.dropped == {"too-many-readers": 1}
             del held
 
     asyncio.run(work())
@@ -145,8 +146,40 @@ def test_a_pseudo_terminal_that_nobody_reads_holds_only_what_is_new(tmp_path):
 def test_a_path_in_the_way_of_a_link_is_named(tmp_path):
     (tmp_path / "file").write_text("keep me")
     with pytest.raises(SkylessError, match=r"'p:' has the path .*; it should be a free name"):
-        PtySender("p:", str(tmp_path / "file"), print)
+        asyncio.run(PtySender("p:", str(tmp_path / "file"), print).run())
     assert (tmp_path / "file").read_text() == "keep me"
+
+
+def test_a_pseudo_terminal_and_its_link_are_there_only_while_it_runs(tmp_path):
+    link = tmp_path / "tag1"
+
+    async def work():
+        sender = PtySender("p:", str(link), lambda _line: None)
+        sender.send(b"early")
+        assert not link.is_symlink(), "another target may be wrong, and the program end"
+        async with running(sender):
+            assert link.exists()
+        assert not link.is_symlink()
+        sender.send(b"late")
+        assert sender.dropped == {"not-read": 2}
+
+    asyncio.run(work())
+
+
+def test_a_message_longer_than_what_may_wait_reaches_a_reader_for_whom_nothing_waits():
+    greeting = b"x" * 200_000 + b"\n"  # a site of thousands of anchors
+
+    async def work():
+        async with running(TcpServer("t:", "127.0.0.1", 0, lambda: [greeting])) as server:
+            reader, writer = await asyncio.open_connection("127.0.0.1", await listening(server), limit=1 << 20)
+            assert await reader.readline() == greeting
+            server.send(greeting)
+            server.send(b"missed\n")
+            assert await reader.readline() == greeting
+            assert server.dropped == {"slow-reader": 1}
+            writer.close()
+
+    asyncio.run(asyncio.wait_for(work(), 30))
 
 
 def test_a_serial_port_gets_bytes_once_it_is_there(tmp_path):

@@ -8,15 +8,18 @@ import pytest
 from bridged_values import SITE, a_fix
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 from pythonosc.osc_message import OscMessage
 
 from skyless.bridges.osc import OscEncoder, make_encoder
 from skyless.bridges.psn import MOST_PACKET_BYTES, PsnFrames
 from skyless.bridges.stage_axes import turned
+from skyless.bridges.target import BridgeContext
 from skyless.bridges.target_url import TargetUrl
 from skyless.errors import SkylessError
 
 START_UNIX_S = 1_795_000_000.0
+CONTEXT = BridgeContext(print)
 names = st.from_regex(r"[A-Za-z0-9_-]{1,32}", fullmatch=True)
 vectors = st.tuples(*[st.floats(-1e30, 1e30)] * 3)
 
@@ -60,6 +63,18 @@ def test_osc_states_that_there_is_no_fix_and_that_there_is_one_again():
     assert [OscMessage(data).address for data in encoder.on_fix(a_fix())] == ["/skyless/tag1/fix", "/skyless/tag1/xyz"]
 
 
+def test_osc_repeats_each_second_which_tags_have_a_fix():
+    """For programs that began later, or lost the datagram that said so."""
+    encoder = OscEncoder()
+    assert encoder.on_second(0.0) == []
+    for tag in ("tag2", "tag1"):
+        encoder.on_fix(a_fix(tag=tag))
+    states = [OscMessage(data) for data in encoder.on_second(0.0)]
+    assert [(one.address, one.params) for one in states] == [("/skyless/tag1/fix", [1]), ("/skyless/tag2/fix", [1])]
+    encoder.on_no_fix("tag1", 0.0, "lost")
+    assert [OscMessage(data).address for data in encoder.on_second(0.0)] == ["/skyless/tag2/fix"]
+
+
 def test_osc_drops_what_no_float_holds():
     encoder = OscEncoder()
     assert encoder.on_fix(a_fix(position_m=(1e39, 0.0, 0.0))) == []
@@ -67,9 +82,9 @@ def test_osc_drops_what_no_float_holds():
 
 
 def test_the_axis_that_is_up_is_checked():
-    assert OscMessage(make_encoder(TargetUrl("osc+udp://?up=y")).on_fix(a_fix())[1]).params == [1.0, 1.5, -2.0]
+    assert OscMessage(make_encoder(TargetUrl("osc+udp://?up=y"), CONTEXT).on_fix(a_fix())[1]).params == [1.0, 1.5, -2.0]
     with pytest.raises(SkylessError, match="y or z"):
-        make_encoder(TargetUrl("osc+udp://?up=x"))
+        make_encoder(TargetUrl("osc+udp://?up=x"), CONTEXT)
 
 
 # PosiStageNet
@@ -123,6 +138,13 @@ def test_a_tag_has_the_number_of_its_name_where_it_is_free():
     (info,) = made.info_packets(START_UNIX_S)
     found = {tracker.tracker_id: tracker.tracker_name for tracker in pypsn.parse_psn_packet(info).trackers}
     assert found == {3: b"tag3", 1: b"singer", 2: b"old3", 4: b"tag99999", 5: b"tag0", 6: b"tag2"}
+
+
+def test_a_long_name_of_a_site_is_cut_between_characters():
+    made = frames([a_fix()])
+    made.on_site(structs.replace(SITE, name=200 * "ä"))
+    (info,) = made.info_packets(START_UNIX_S)
+    assert pypsn.parse_psn_packet(info).name.decode() == 127 * "ä"
 
 
 def test_nothing_is_sent_while_there_is_no_tag():

@@ -24,7 +24,7 @@ def test_the_parts_of_an_address():
     url.check_all_read()
     bare = TargetUrl("jsonl+tcp://")
     assert (bare.host(), bare.port(7010), bare.tag()) == ("127.0.0.1", 7010, None)
-    assert TargetUrl("nmea+pty:/run/skyless/tag%201").path == "/run/skyless/tag 1"
+    assert TargetUrl("nmea+pty:/run/skyless/tag%201").path() == "/run/skyless/tag 1"
 
 
 WRONG = {
@@ -41,6 +41,13 @@ WRONG = {
     "jsonl+udp://no.such.host.invalid:1": "a host that cannot be found",
     "gopher://:70": "one of ",
     "jsonl+pty:/dev": "one of ",
+    "nmea+tcp:10110": "it should be nmea+tcp://HOST:PORT",
+    "nmea+tcp://:10110/gps": "it should be nmea+tcp://HOST:PORT",
+    "nmea+serial://dev/ttyUSB0": "it should be nmea+serial:PATH",
+    "nmea+pty://run/gps": "it should be nmea+pty:PATH",
+    "foxglove:8765": "it should be foxglove://HOST:PORT",
+    "osc+udp:9000": "it should be osc+udp://HOST:PORT",
+    "mavlink+udpout://:14550": "has no profile=; it should be ardupilot",
 }
 
 
@@ -67,4 +74,7 @@ def test_no_text_costs_a_traceback(text):
 def test_a_password_is_not_shown():
     with pytest.raises(SkylessError) as raised:
         TargetUrl("homeassistant://me:secret@house:99999")
+    assert "secret" not in str(raised.value)
+    with pytest.raises(SkylessError, match="it should be jsonl") as raised:
+        open_route("jsonl+tcp://me:secret@:7010", CONTEXT)
     assert "secret" not in str(raised.value)

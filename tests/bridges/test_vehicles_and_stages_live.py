@@ -23,19 +23,20 @@ HEADING_DEG = SITE.georeference.heading_deg
 
 
 @contextlib.asynccontextmanager
-async def serving(address, site=SITE):
-    """A target that runs and knows its site."""
+async def serving(address, logged=()):
+    """A target that runs and knows its site; ``logged``: what each line that it logs contains."""
     said = []
     target = open_route(address, BridgeContext(said.append)).target
     task = asyncio.ensure_future(target.run())
     await asyncio.sleep(0)
-    target.on_site(site)
+    target.on_site(SITE)
     try:
         yield target
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-        assert said == []
+        assert len(said) == len(logged)
+        assert all(words in line for words, line in zip(logged, said, strict=True))
 
 
 def within(work):
@@ -136,8 +137,10 @@ def as_float32(value):
 def test_mavsdk_decodes_every_field(profile, moving, vehicle):
     fix = a_fix() if moving else a_fix(velocity_mps=None, velocity_covariance=None, hdop=None, height_known=True)
 
+    logged = ["EK3_SRC1_POSZ 1"] if fix.height_known and profile == "ardupilot" else []
+
     async def work():
-        async with serving(f"mavlink+udpout://127.0.0.1:{vehicle.port}?profile={profile}&system=3") as target:
+        async with serving(f"mavlink+udpout://127.0.0.1:{vehicle.port}?profile={profile}&system=3", logged) as target:
             serial = 0
             while not {"HEARTBEAT", NAMES[profile]} <= set(vehicle.messages):
                 serial += 1

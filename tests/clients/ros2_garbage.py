@@ -67,7 +67,8 @@ def main():
         left -= count
     before = len(node.fixes)
     node.fixes.clear()
-    node.read(Connection(json.dumps(FIX).encode() + b"\n"))
+    for velocity_mps in ([1.0, 0.0, 0.0], [None, 0.0, 0.0]):  # null is what JSON makes of NaN
+        node.read(Connection(json.dumps(FIX | {"velocity_mps": velocity_mps}).encode() + b"\n"))
     print(json.dumps({"tags": before, "last": node.fixes}))
     rclpy.shutdown()
 

@@ -43,13 +43,18 @@ ZONES, ZONE = "skyless/v1/1/zones", "skyless/v1/1/tag/tag1/zone"
 CONFIG = "homeassistant/device/skyless_1_tag1/config"
 
 
+def runs(program):
+    """Whether it is one that runs: pyenv has programs in the path for versions that are not chosen."""
+    return program is not None and subprocess.run([program, "-c", ""], capture_output=True, check=False).returncode == 0
+
+
 @pytest.fixture(scope="module")
 def python():
     """Of an environment with Home Assistant."""
     found = ENVIRONMENT / "bin" / "python"
     if not (ENVIRONMENT / "installed").exists():
-        versions = sorted(Path.home().glob(".pyenv/versions/3.13.*/bin/python3.13"))
-        base = shutil.which("python3.13") or (versions[-1] if versions else None)
+        versions = sorted(Path.home().glob(".pyenv/versions/3.13.*/bin/python3.13"), reverse=True)
+        base = next(filter(runs, (shutil.which("python3.13"), *versions)), None)
         if base is None:
             pytest.skip("Home Assistant 2025.4.4 needs Python 3.13, which is not installed")
         subprocess.run([base, "-m", "venv", ENVIRONMENT], check=True)

@@ -326,6 +326,15 @@ def test_maps_get_the_tags_as_geojson(browser, live, wire, times):
     assert [feature["id"] for feature in browser.get("/fixes.geojson").json()["features"]] == ["t3"]
 
 
+def test_a_tag_whose_covariance_is_none_takes_no_other_off_the_map(browser, live, wire):
+    wire.deliver(topics.site_topic(SITE_ID), EARTHLY)
+    wire.deliver(topics.fix_topic(SITE_ID, "t1"), fix(covariance_m2=(-1.0,) * 9))
+    wire.deliver(topics.fix_topic(SITE_ID, "t2"), fix("t2"))
+    first, second = browser.get("/fixes.geojson").json()["features"]
+    assert first["properties"]["horizontal_std_m"] == 0.0
+    assert second["properties"]["horizontal_std_m"] > 0.0
+
+
 def test_a_site_that_is_nowhere_on_the_earth_says_what_is_missing(browser, live, wire):
     assert browser.get("/fixes.geojson").status_code == 404
     wire.deliver(topics.site_topic(SITE_ID), SITE)

@@ -140,6 +140,27 @@ def test_a_bag_is_whole_or_not_there(export, tmp_path, walk):
     assert [one.name for one in folder.parent.iterdir()] == [folder.name]
 
 
+def test_of_a_recording_that_was_cut_off_its_beginning_is_written(export, tmp_path):
+    whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
+    live_site.record(whole, live_site.messages(4.0, tags=TAGS))
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
+    folder, code, out, _ = export(file=cut)
+    assert code == 0
+    assert "it was cut off" in out
+    stamps = [stamp_ns(one) for topic, _, one in content(folder) if topic == "/skyless/a/pose"]
+    wanted = [exact_ns(fix.unix_s) for fix in recorded_fixes(whole) if fix.tag == "a"]
+    assert 0 < len(stamps) < len(wanted)
+    assert stamps == wanted[: len(stamps)]
+
+
+@pytest.mark.parametrize("frame", ["", "a b", "/map", "site\n"])
+def test_a_frame_that_ros_would_refuse_is_named(export, frame):
+    folder, code, _, err = export("--frame", frame)
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"--frame is {frame!r}; it should be a frame's name" in err
+    assert not folder.exists()
+
+
 def test_a_recording_without_a_fix_of_the_tag_says_so(export):
     _, code, out, _ = export("--tag", "zorro")
     assert code == 1
@@ -150,5 +171,5 @@ def test_without_the_extra_the_message_names_it(export, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     folder, code, _, err = export()
     assert (code, err.count("\n")) == (2, 1)
-    assert "skyless[ros2]" in err
+    assert "pip install '.[ros2]' in a copy of Skyless's repository" in err
     assert not folder.exists()

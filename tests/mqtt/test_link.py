@@ -79,6 +79,25 @@ def move(broker, to):
     broker.address = to.address
 
 
+def test_what_the_broker_has_kept_comes_before_what_replaces_it(make_broker):
+    async def check():
+        broker = make_broker()
+        one, other = Inbox(broker.address), Inbox(broker.address, zones_topic(7))
+        async with running(broker, one.link):
+            one.link.publish(zones_topic(7), ZONES, qos=1, retain=True)
+            await until(lambda: one.link.connected and not one.link.unacknowledged)
+            other.link.publish(zones_topic(7), ZonesMessage(()), qos=1, retain=True)
+            task = asyncio.ensure_future(other.link.run())
+            await until(lambda: len(other.messages) == 2)
+            assert [len(msgspec.json.decode(payload, type=ZonesMessage).zones) for _, payload in other.messages] == [
+                1,
+                0,
+            ]
+            await stopped(task)
+
+    asyncio.run(check())
+
+
 NODE = """
 import asyncio, sys
 from skyless.mqtt.address import MqttAddress

@@ -5,21 +5,23 @@ import contextlib
 import json
 import signal
 import sys
+from types import SimpleNamespace
 
 import pytest
 from mqtt_brokers import Embedded, free_port, until
 from msgspec import structs
 
-from bridges.bridged_values import BERLIN, a_fix
+from bridges.bridged_values import BERLIN, a_fix, tag_health
 from machines.bench import LAB, tape
+from skyless.air.almanac import GeoreferencePage
 from skyless.air.reception import Reception
 from skyless.bridges.hub import Hub, Route
 from skyless.bridges.target import Target
 from skyless.errors import SkylessError
 from skyless.mqtt.link import Link
-from skyless.mqtt.messages import Counters, SiteMessage, StatusMessage, TagHealth, Zone, ZonesMessage
-from skyless.mqtt.topics import fix_topic, health_topic, site_topic, status_topic, zones_topic
-from skyless.nodes.bridge.broker_bridge import BridgeNode
+from skyless.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
+from skyless.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
+from skyless.nodes.bridge.broker_bridge import BridgeNode, run_route
 from skyless.nodes.bridge.tag_bridge import TagBridge, heard_site
 from skyless.nodes.process import end_with_parent
 from skyless.receiver import Receiver
@@ -52,12 +54,6 @@ class Recorded(Target):
 
     async def run(self):
         await asyncio.Event().wait()
-
-
-def health(tag, reason=None):
-    return TagHealth(
-        tag, 0.0, 1.0, "joint", 1, 1, 1.0, reason, 0.1, None, None, {}, Counters(0, 0, 0), 0.0, 0, ()
-    )  # fmt: skip
 
 
 @contextlib.asynccontextmanager
@@ -99,7 +95,7 @@ def test_all_that_targets_need_comes_from_the_broker_and_nonsense_is_counted(tmp
                 programs.publish(fix_topic(LAB.id, "tag1"), b'{"tag":"tag1"}')
                 programs.publish(site_topic(LAB.id), b"")
                 programs.publish(status_topic(LAB.id, "tag", "tag9"), StatusMessage(True, "tag", "tag9"))
-                programs.publish(health_topic(LAB.id, "tag", "tag1"), health("tag1"))
+                programs.publish(health_topic(LAB.id, "tag", "tag1"), tag_health("tag1"))
                 programs.publish(fix_topic(LAB.id, "tag1"), a_fix())
                 await until(lambda: target.fixes and target.health and target.status)
                 assert target.fixes == [a_fix()]
@@ -175,11 +171,11 @@ def test_a_tag_learns_its_site_from_the_air_with_the_georeference_where_one_is_s
     receiver = Receiver()
     for heard in tape(site, 2.0, 1, (3.0, 4.0, 0.0)):
         receiver.hear(Reception(heard.frame, heard.rx_ticks, heard.host_s))
-    bridge.on_health(health("tag1"), receiver)
+    bridge.on_health(tag_health("tag1"), receiver)
     if georeference is None:
         assert target.sites == [], "the page may still come"
         bridge._sites["tag1"]._complete_s -= 10.0
-        bridge.on_health(health("tag1"), receiver)
+        bridge.on_health(tag_health("tag1"), receiver)
     (learned,) = target.sites
     assert (learned.id, learned.simulated) == (site.id, True)
     assert learned.anchors_m == {one.id: (one.x_m, one.y_m, one.z_m) for one in site.anchors}
@@ -199,3 +195,93 @@ def test_tags_that_know_different_anchors_of_a_large_site_make_one_site():
         bridge.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, simulated=False))
         bridge.on_site(heard_site(5, {2: (9.0, 0.0, 2.0)}, simulated=False))
     assert [sorted(site.anchors_m) for site in target.sites] == [[1], [1, 2]]
+
+
+def heard_by(site, latitude_deg=50.0):
+    """What a tag's receiver knows of a site, which may be changed."""
+    page = None if latitude_deg is None else GeoreferencePage(latitude_deg, 8.0, 100.0, 0.0)
+    almanac = SimpleNamespace(complete=True, anchors_m={1: (0.0, 0.0, 2.0)}, georeference=page)
+    return SimpleNamespace(site=site, almanac=almanac, local_almanac=SimpleNamespace(pages=None))
+
+
+def test_no_fix_of_another_site_than_the_one_that_targets_know_is_given():
+    target = Recorded()
+    bridge = TagBridge(Hub([Route(target, None, 1e3)], print), lambda: False, print)
+    walking, staying = heard_by(5), heard_by(5)
+    bridge.on_health(tag_health("tag1"), walking)
+    bridge.on_health(tag_health("tag2"), staying)
+    walking.site = 6  # its positions are in another frame from now on
+    bridge.on_fix(a_fix(tag="tag1"))
+    assert target.fixes == []
+    for _ in range(3):
+        bridge.on_health(tag_health("tag1"), walking)
+        bridge.on_health(tag_health("tag2"), staying)
+    bridge.on_fix(a_fix(tag="tag1"))
+    bridge.on_fix(a_fix(tag="tag2"))
+    assert [fix.tag for fix in target.fixes] == ["tag2"]
+    assert [site.id for site in target.sites] == [5], "there is a tag in it"
+    staying.site = 6
+    bridge.on_health(tag_health("tag2"), staying)
+    bridge.on_fix(a_fix(tag="tag1", serial=2))
+    assert [site.id for site in target.sites] == [5, 6]
+    assert [fix.tag for fix in target.fixes] == ["tag2", "tag1"]
+
+
+def test_a_tag_that_has_missed_the_page_about_the_earth_does_not_undo_what_another_has_heard():
+    target = Recorded()
+    bridge = TagBridge(Hub([Route(target, None, 50.0)], print), lambda: False, print)
+    page = GeoreferencePage(50.0, 8.0, 100.0, 0.0)
+    for _ in range(3):
+        bridge.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, page, simulated=False))
+        bridge.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, None, simulated=False))
+    assert [site.georeference.latitude_deg for site in target.sites] == [50.0]
+
+
+def test_after_a_change_of_site_the_page_about_the_earth_is_awaited_again():
+    target = Recorded()
+    bridge = TagBridge(Hub([Route(target, None, 50.0)], print), lambda: False, print)
+    receiver = heard_by(5)
+    bridge.on_health(tag_health("tag1"), receiver)
+    bridge._sites["tag1"]._complete_s -= 10.0
+    receiver.site, receiver.almanac = 6, heard_by(6, None).almanac
+    bridge.on_health(tag_health("tag1"), receiver)
+    assert [site.id for site in target.sites] == [5]
+
+
+def test_that_no_target_can_serve_a_growing_site_is_logged_once():
+    said = []
+    bridge = TagBridge(Hub([Route(Recorded(refuses=True), None, 50.0)], said.append), lambda: False, said.append)
+    for anchor in range(5):
+        bridge.on_site(heard_site(5, {anchor: (1.0 * anchor, 0.0, 2.0)}, simulated=False))
+    assert said == ["test: needs more"]
+
+
+def test_a_target_that_has_ended_gets_nothing_more():
+    async def main():
+        target, said = Recorded(), []
+        route = Route(target, None, 1e3)
+        hub = Hub([route], said.append)
+        hub.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, simulated=False))
+        async with running(run_route(route, said.append)):
+            await asyncio.sleep(0)
+            hub.on_fix(a_fix(), 1.0)
+        hub.on_fix(a_fix(serial=2), 2.0)
+        hub.on_tick(9.0, 9.0)
+        assert (len(target.fixes), target.none, said) == (1, [], [])
+
+    asyncio.run(main())
+
+
+def test_a_bridge_that_is_started_again_leaves_no_second_status_on_the_broker(tmp_path):
+    async def main():
+        async with brokered(tmp_path) as (broker, programs):
+            statuses = {}
+            programs.subscribe(status_topic(LAB.id, "bridge", EVERY_NODE), statuses.__setitem__)
+            for _ in range(2):
+                node = BridgeNode(Hub([Route(Recorded(), None, 1.0)], print), broker.address, LAB.id, print)
+                async with running(node.run()):
+                    await until(lambda: any(b'"online":true' in status for status in statuses.values()))
+                await until(lambda: all(b'"online":false' in status for status in statuses.values()))
+            assert len(statuses) == 1
+
+    asyncio.run(main())

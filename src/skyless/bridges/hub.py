@@ -45,8 +45,10 @@ class Route(Struct):
     """Of each tag."""
     others: bool = False
     """Whether it needs no line that there are more tags than the target carries: there was one, or the user chose."""
-    refused: bool = False
-    """Whether the site lacks what the target needs, so that it gets nothing."""
+    refused: str = ""
+    """What the site lacks that the target needs, so that it gets nothing; empty where it serves the site."""
+    has_ended: bool = False
+    """Whether it has been closed: a broker's link still receives while it takes leave."""
     faults: int = 0
     """How often it failed."""
 
@@ -58,8 +60,8 @@ class _Tag(Struct):
     """When its last usable fix came, or when it was first heard of."""
     reason: str
     """Why there is none."""
-    interval_s: float = 0.0
-    """Between its last two usable fixes."""
+    intervals_s: tuple[float, float] = (0.0, 0.0)
+    """Between its last three usable fixes: a single long one is an outage, two are its rate."""
     reported_s: float = -inf
     """When targets were informed that it has none."""
 
@@ -85,21 +87,15 @@ class Hub:
         if site == self.site:
             return
         self.site = site
-        reasons = [reason for route in self.routes if (reason := self._refusal(route, site)) is not None]
-        if reasons and len(reasons) == len(self.routes):
-            raise SkylessError(reasons[0])
+        reasons = []
+        for route in self.routes:
+            before, route.refused = route.refused, _refusal(route.target, site)
+            if route.refused not in ("", before):
+                reasons.append(route.refused)
+        if self.routes and all(route.refused for route in self.routes):
+            raise SkylessError(self.routes[0].refused)
         for reason in reasons:
             self._log(reason)
-
-    def _refusal(self, route: Route, site: BridgedSite) -> str | None:
-        """Why a target cannot serve a site; None where it can."""
-        try:
-            route.target.on_site(site)
-        except SkylessError as error:
-            route.refused = True
-            return str(error)
-        route.refused = False
-        return None
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
         """A tag's fix; ``now_s`` is the host's monotonic clock. One before the site is known is not given."""
@@ -107,7 +103,8 @@ class Hub:
         if not is_usable(fix):
             tag.reason = fix.alert or "position is not finite"
             return
-        tag.interval_s, tag.usable_s, tag.reason = now_s - tag.usable_s, now_s, "no fix"
+        tag.intervals_s = (tag.intervals_s[1], now_s - tag.usable_s)
+        tag.usable_s, tag.reason = now_s, "no fix"
         if self.site is None:
             return
         self.fixes += 1
@@ -122,12 +119,14 @@ class Hub:
             if health.reason is not None:
                 tag.reason = health.reason
         for route in self.routes:
-            self._guard(route, lambda target: target.on_health(health))
+            if not isinstance(health, TagHealth) or route.tag in (None, health.tag):
+                self._guard(route, lambda target: target.on_health(health))
 
     def on_status(self, status: StatusMessage) -> None:
         """A program of the site has come or gone."""
         for route in self.routes:
-            self._guard(route, lambda target: target.on_status(status))
+            if status.kind != "tag" or route.tag in (None, status.name):
+                self._guard(route, lambda target: target.on_status(status))
 
     def on_tick(self, now_s: float, unix_s: float) -> None:
         """To be called every ``SILENCE_CHECK_S``."""
@@ -135,7 +134,7 @@ class Hub:
             age_s = now_s - tag.usable_s
             if age_s > _FORGET_S:
                 self._forget(name)
-            elif age_s >= _silence_s(tag.interval_s) and now_s - tag.reported_s >= _SECOND_S and self.site is not None:
+            elif age_s >= _silence_s(tag.intervals_s) and now_s - tag.reported_s >= _SECOND_S and self.site is not None:
                 tag.reported_s = now_s
                 self._give_no_fix(name, unix_s, tag.reason)
         if now_s - self._second_s >= _SECOND_S:
@@ -150,12 +149,12 @@ class Hub:
 
     def _give_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
         for route in self.routes:
-            if self._carries(route, tag):
+            if route.tag in (None, tag):  # one that carries a single tag waits for a tag that has fixes
                 self._guard(route, lambda target: target.on_no_fix(tag, unix_s, reason))
 
     def _guard(self, route: Route, call: Callable[[Target], None]) -> None:
         """Call a target; a fault in it costs neither a fix nor another target."""
-        if route.refused:
+        if route.refused or route.has_ended:
             return
         try:
             call(route.target)
@@ -171,7 +170,7 @@ class Hub:
         return route.rates[tag].is_due(now_s)
 
     def _carries(self, route: Route, tag: str) -> bool:
-        """Whether a target gets a tag; one that carries a single one keeps to the first."""
+        """Whether a target gets the fixes of a tag; one that carries a single one keeps to the first that has any."""
         if route.tag is None and route.target.one_tag:
             route.tag = tag
         if route.tag in (None, tag):
@@ -191,6 +190,15 @@ def open_hub(routes: Sequence[Route], log: Callable[[str], None]) -> Hub:
     return Hub(routes, log)
 
 
-def _silence_s(interval_s: float) -> float:
-    """How long a tag whose fixes come at an interval must be silent to have none."""
-    return min(max(NO_FIX_S, _MISSED * interval_s), _LONGEST_S)
+def _refusal(target: Target, site: BridgedSite) -> str:
+    """Why a target cannot serve a site; empty where it can."""
+    try:
+        target.on_site(site)
+    except SkylessError as error:
+        return str(error)
+    return ""
+
+
+def _silence_s(intervals_s: tuple[float, float]) -> float:
+    """How long a tag whose last fixes came at these intervals must be silent to have none."""
+    return min(max(NO_FIX_S, _MISSED * min(intervals_s)), _LONGEST_S)

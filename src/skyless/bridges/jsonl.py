@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.bridges.feed import BridgedSite
-from skyless.bridges.target import Encoder
+from skyless.bridges.target import BridgeContext, Encoder
 from skyless.bridges.target_url import TargetUrl
 from skyless.mqtt.messages import FixMessage, Vector
 from skyless.site.model import GeoreferenceSite
@@ -28,7 +28,7 @@ class SiteLine(Struct, frozen=True, tag="site"):
 
 
 class NoFixLine(Struct, frozen=True, tag="no_fix"):
-    """A tag that had a fix has none: once a second while that lasts."""
+    """A tag that runs, or ran, has no usable fix: once a second while that lasts."""
 
     tag: str
     unix_s: float
@@ -63,6 +63,6 @@ def _line(value: Struct) -> bytes:
     return _encode(value) + b"\n"
 
 
-def make_encoder(_url: TargetUrl) -> JsonLines:
+def make_encoder(_url: TargetUrl, _context: BridgeContext) -> JsonLines:
     """Lines have no settings."""
     return JsonLines()

@@ -12,7 +12,7 @@ from operator import xor
 from typing import Final
 
 from skyless.bridges.feed import BridgedSite, floored, require_georeference
-from skyless.bridges.target import Encoder
+from skyless.bridges.target import BridgeContext, Encoder
 from skyless.bridges.target_url import TargetUrl
 from skyless.mqtt.messages import FixMessage
 from skyless.site.earth import east_north_up, geodetic, rotated
@@ -85,7 +85,7 @@ class NmeaEncoder(Encoder):
         return [] if sentences is None else [sentences]
 
 
-def make_encoder(url: TargetUrl) -> Encoder:
+def make_encoder(url: TargetUrl, _context: BridgeContext) -> Encoder:
     """Of ``nmea+tcp``, ``nmea+udp``, ``nmea+pty``, ``nmea+serial``; keys ``quality`` and ``geoid_m``."""
     return NmeaEncoder(
         quality=url.choice("quality", ("auto", *_QUALITIES), "auto"),

@@ -8,13 +8,13 @@ from collections import Counter
 from typing import cast
 
 from skyless.bridges.stage_axes import UPS, Up, turned
-from skyless.bridges.target import Encoder
+from skyless.bridges.target import BridgeContext, Encoder
 from skyless.bridges.target_url import TargetUrl
 from skyless.mqtt.messages import FixMessage
 
 
 class OscEncoder(Encoder):
-    """A message for each fix; and ``/skyless/TAG/fix``: 1 when a tag gets a fix, 0 each second while it has none."""
+    """A message for each fix; and ``/skyless/TAG/fix``, at a change and each second: 1 with a fix, 0 without one."""
 
     def __init__(self, up: Up = "z") -> None:
         self._up = up
@@ -31,12 +31,20 @@ class OscEncoder(Encoder):
         if fix.tag in self._fixed:
             return [xyz]
         self._fixed.add(fix.tag)
-        return [message(f"/skyless/{fix.tag}/fix", (1,)), xyz]
+        return [_state(fix.tag, 1), xyz]
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:  # noqa: ARG002 - no field for them
         """That there is none."""
         self._fixed.discard(tag)
-        return [message(f"/skyless/{tag}/fix", (0,))]
+        return [_state(tag, 0)]
+
+    def on_second(self, unix_s: float) -> list[bytes]:  # noqa: ARG002 - no field for it
+        """Which tags have a fix, for programs that began later or lost a datagram."""
+        return [_state(tag, 1) for tag in sorted(self._fixed)]
+
+
+def _state(tag: str, fixed: int) -> bytes:
+    return message(f"/skyless/{tag}/fix", (fixed,))
 
 
 def message(address: str, values: tuple[float, ...]) -> bytes:
@@ -54,6 +62,6 @@ def _padded(text: str) -> bytes:
     return data.ljust(-(-len(data) // 4) * 4, b"\0")
 
 
-def make_encoder(url: TargetUrl) -> OscEncoder:
+def make_encoder(url: TargetUrl, _context: BridgeContext) -> OscEncoder:
     """Key: ``up``, the axis that points up (z, or y as in TouchDesigner). Raises SkylessError."""
     return OscEncoder(cast(Up, url.choice("up", UPS, "z")))

@@ -75,7 +75,7 @@ class PsnFrames:
 
     def on_site(self, site: BridgedSite) -> None:
         """Its name is the system's."""
-        self._name = site.name.encode()[:255]
+        self._name = site.name.encode()[:255].decode(errors="ignore").encode()
 
     def on_fix(self, fix: FixMessage) -> None:
         """The tag's position from now on."""

@@ -1,7 +1,7 @@
 """How bytes get to readers: over TCP, UDP, a pseudo-terminal or a serial port.
 
 Nothing waits for a reader: what it does not accept in time is dropped and counted, so that no fix comes late because of
-one, and what it reads afterwards is new.
+one. What waits for it in this process and in the system stays, with its own stamps, and is what it reads first.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ MOST_READERS: Final = 64
 """Connections to one TCP server."""
 
 _WAITING_BYTES: Final = 1 << 15
-"""Bytes that may wait for one reader in this process, and as many in the system."""
+"""Bytes that may wait for one reader in this process, or a single longer message; and as many in the system."""
 
 _MOST_DATAGRAM_BYTES: Final = 1 << 16
 
@@ -54,13 +54,16 @@ class TcpServer:
         """Serve until cancelled. Raises SkylessError: it cannot listen there."""
         loop = asyncio.get_running_loop()
         try:
-            server = await loop.create_server(lambda: _TcpReader(self._readers, self._greeting), self._host, self.port)
+            server = await loop.create_server(
+                lambda: _TcpReader(self._readers, self._greeting, self.dropped), self._host, self.port
+            )
         except OSError as error:
             raise cannot_listen(self._text, self._host, self.port, error) from None
         self.port = server.sockets[0].getsockname()[1]
         try:
-            await server.serve_forever()
+            await asyncio.Event().wait()  # serve_forever, when cancelled, waits until all readers have left
         finally:
+            server.close()
             for reader in tuple(self._readers):
                 reader.end()
 
@@ -68,8 +71,8 @@ class TcpServer:
 class _TcpReader(asyncio.Protocol):
     """One connection; what it sends is not read."""
 
-    def __init__(self, readers: "set[_TcpReader]", greeting: Callable[[], list[bytes]]) -> None:
-        self._readers, self._greeting = readers, greeting
+    def __init__(self, readers: "set[_TcpReader]", greeting: Callable[[], list[bytes]], dropped: Counter[str]) -> None:
+        self._readers, self._greeting, self._dropped = readers, greeting, dropped
         self._transport: asyncio.Transport | None = None
         self._stuck_since_s: float | None = None
 
@@ -77,6 +80,7 @@ class _TcpReader(asyncio.Protocol):
         """Greet it, if there are not too many."""
         assert isinstance(transport, asyncio.Transport)
         if len(self._readers) >= MOST_READERS:
+            self._dropped["too-many-readers"] += 1
             transport.abort()
             return
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _WAITING_BYTES)
@@ -90,10 +94,11 @@ class _TcpReader(asyncio.Protocol):
         self._readers.discard(self)
 
     def send(self, data: bytes) -> bool:
-        """Whether the connection accepts it; one that accepts nothing for long is ended."""
+        """Whether the connection accepts it, which it does where nothing waits; one that accepts nothing is ended."""
         if self._transport is None or self._transport.is_closing():
             return False
-        if self._transport.get_write_buffer_size() + len(data) <= _WAITING_BYTES:
+        waiting = self._transport.get_write_buffer_size()
+        if not waiting or waiting + len(data) <= _WAITING_BYTES:
             self._stuck_since_s = None
             self._transport.write(data)
             return True
@@ -176,29 +181,30 @@ class PtySender:
     """Sends to whatever program opens a pseudo-terminal, by its path or by a link to it."""
 
     def __init__(self, text: str, link: str, log: Callable[[str], None]) -> None:
-        """``link`` is where the user wants it; empty for none. Raises SkylessError: it cannot be made."""
+        """``link`` is where the user wants it; empty for none."""
         self.dropped: Counter[str] = Counter()
-        self._pty = Pty(Path(link) if link else None, held_bytes=0, asked=f"the target {text!r} has the path")
-        os.chmod(self._pty.path, _ANY_PROGRAM)  # noqa: PTH101 - a device, not a file of ours
-        log(f"{text}: programs read {self._pty.name}" + (f", which is {self._pty.path}" if link else ""))
-
-    @property
-    def path(self) -> str:
-        """What programs open."""
-        return self._pty.name
+        self._text, self._link, self._log = text, Path(link) if link else None, log
+        self._pty: Pty | None = None
+        """While it runs: a link that stayed would lead to whatever terminal the system opens next."""
 
     def send(self, data: bytes) -> None:
         """Write; where nobody reads, this and what nobody has read is dropped."""
-        if not self._pty.send(data):
+        if self._pty is None or not self._pty.send(data):
             self.dropped["not-read"] += 1
 
     async def run(self) -> None:
-        """Keep it until cancelled; what programs write is not read."""
-        self._pty.start(lambda _data: None)
+        """Keep it until cancelled; what programs write is not read. Raises SkylessError: it cannot be made."""
+        pty = Pty(self._link, held_bytes=0, asked=f"the target {self._text!r} has the path")
         try:
+            os.chmod(pty.path, _ANY_PROGRAM)  # noqa: PTH101 - a device, not a file of ours
+            which = "" if self._link is None else f", which is {pty.path}"
+            self._log(f"{self._text}: programs read {pty.name}{which}")
+            pty.start(lambda _data: None)
+            self._pty = pty
             await asyncio.Event().wait()
         finally:
-            self._pty.close()
+            self._pty = None
+            pty.close()
 
 
 class SerialSender:

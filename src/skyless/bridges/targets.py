@@ -28,20 +28,24 @@ class Kind(Struct, frozen=True):
 
 
 TARGET_KINDS: Final = {
+    "jsonl+tcp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a line, for programs that connect", 7010),
+    "jsonl+udp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a datagram", 7010),
     "nmea+tcp": Kind("nmea", 10.0, 50.0, "NMEA 0183 for programs that connect: gpsd, QGIS, OpenCPN", 10110),
     "nmea+udp": Kind("nmea", 10.0, 50.0, "NMEA 0183 as datagrams", 10110),
     "nmea+pty": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a pseudo-terminal"),
     "nmea+serial": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a serial port, as nmea+serial:/dev/ttyUSB0@115200"),
+    "ros2": Kind("ros2.target", 50.0, MOST_HZ, "topics of ROS 2, published by DDS without ROS being installed"),
+    "mavlink+udpout": Kind(
+        "mavlink.encoder", 30.0, 100.0, "MAVLink 2 for an autopilot; ?profile= ardupilot, px4 or gps", 14550
+    ),
+    "mavlink+serial": Kind(
+        "mavlink.encoder", 30.0, 100.0, "the same on a serial port, as mavlink+serial:/dev/ttyAMA0@921600"
+    ),
     "foxglove": Kind("foxglove.target", 20.0, MOST_HZ, "live pages of Foxglove and Lichtblick", 8765),
     "homeassistant": Kind("home_assistant.target", 10.0, 50.0, "tags as devices of Home Assistant, with their rooms"),
     "prometheus": Kind("prometheus.target", 50.0, MOST_HZ, "figures for Prometheus at /metrics", 9464),
-    "jsonl+tcp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a line, for programs that connect", 7010),
-    "jsonl+udp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a datagram", 7010),
-    "mavlink+udpout": Kind("mavlink.encoder", 30.0, 100.0, "MAVLink 2 for an autopilot, as datagrams", 14550),
-    "mavlink+serial": Kind("mavlink.encoder", 30.0, 100.0, "MAVLink 2 for an autopilot on a serial port"),
     "osc+udp": Kind("osc", 60.0, MOST_HZ, "Open Sound Control: TouchDesigner, Unreal, Max", 9000),
     "psn": Kind("psn", 60.0, 200.0, "PosiStageNet: media servers, lighting consoles", 56565),
-    "ros2": Kind("ros2.target", 50.0, MOST_HZ, "topics of ROS 2, published by DDS without ROS being installed"),
 }
 
 
@@ -54,11 +58,12 @@ def open_route(text: str, context: BridgeContext) -> Route:
     tag = url.tag()
     hz = url.number("hz", kind.hz, 0.1, kind.most_hz)
     module = import_module(f"skyless.bridges.{kind.module}")
-    target = (
-        _stream(url, kind, cast(Callable[[TargetUrl], Encoder], module.make_encoder)(url), context)
-        if "+" in url.scheme
-        else cast(Callable[[TargetUrl, BridgeContext], Target], module.make_target)(url, context)
-    )
+    target: Target
+    if "+" in url.scheme:
+        encoder = cast(Callable[[TargetUrl, BridgeContext], Encoder], module.make_encoder)(url, context)
+        target = _stream(url, kind, encoder, context)
+    else:
+        target = cast(Callable[[TargetUrl, BridgeContext], Target], module.make_target)(url, context)
     url.check_all_read()
     return Route(target, tag, hz, others=tag is not None)
 
@@ -70,9 +75,9 @@ def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext
         case "tcp":
             sender = TcpServer(url.text, url.host(), url.port(kind.port), encoder.greeting)
         case "pty":
-            sender = PtySender(url.text, url.path, context.log)
+            sender = PtySender(url.text, url.path(), context.log)
         case "serial":
-            path, _, baud = url.path.partition("@")
+            path, _, baud = url.path().partition("@")
             if not path or (baud and not (baud.isdecimal() and 300 <= int(baud) <= 10_000_000)):
                 raise url.wrong(f"{url.scheme}:PATH@BAUD, as {url.scheme}:/dev/ttyAMA0@921600")
             sender = SerialSender(url.text, path, int(baud or 115_200), context.log)

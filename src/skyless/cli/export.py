@@ -51,10 +51,13 @@ def export(
     json
         Write one JSON object instead of a table.
     """
-    from skyless.bridges.ros2.messages import RosSettings
+    from skyless.bridges.ros2.messages import FRAME_NAME, FRAME_RULE, RosSettings
+    from skyless.errors import SkylessError
     from skyless.exports.rosbag import write_bag
 
     check_output("to", to, file)
+    if not FRAME_NAME.fullmatch(frame):
+        raise SkylessError(f"--frame is {frame!r}; it should be {FRAME_RULE}")
     settings = RosSettings(frame=frame, transforms=transforms)
     bag = write_bag(file, to, settings, tag, 8 if bag_version == "8" else 9)
     if json:
@@ -77,6 +80,10 @@ def _show(bag: "Bag") -> None:
         table.add_row(Text(topic), Text(bag.types[topic]), str(count))
     console().print(table)
     warnings = [f"not readable: {reason} {count}" for reason, count in bag.drops.items()]
+    if not bag.finished:
+        warnings.append(
+            "the recording has no end: it was cut off, or is still being written; later messages are missing"
+        )
     if bag.unusable:
         warnings.append(f"{bag.unusable} fixes were left out: their alert forbids their use, or they are not finite")
     if not bag.fixes:

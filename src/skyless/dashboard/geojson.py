@@ -53,7 +53,7 @@ def features(site: BridgedSite, fixes: Iterable[tuple[FixMessage, float]], unix_
             unix_s=round(ended_unix_s, 3),
             age_s=round(max(unix_s - ended_unix_s, 0.0), 3),
             std_m=round(fix.std_m, 4),
-            horizontal_std_m=round(sqrt(fix.covariance_m2[0] + fix.covariance_m2[4]), 4),
+            horizontal_std_m=round(sqrt(max(fix.covariance_m2[0] + fix.covariance_m2[4], 0.0)), 4),
             speed_mps=None if fix.velocity_mps is None else round(hypot(*fix.velocity_mps), 3),
             method=fix.method,
             alert=fix.alert,

@@ -50,6 +50,8 @@ class Bag(Struct, frozen=True):
     """Fixes that were left out because an alert forbids their use, or they are not finite."""
     drops: dict[str, int]
     """What of the recording could not be read."""
+    finished: bool
+    """False where the recording was cut off, or is still being written."""
 
 
 def write_bag(
@@ -97,8 +99,10 @@ def _copy(
             fixes[is_usable(found.message)] += 1
         for message in _messages_of(found, encoder, tag):
             writer.write(message, found.time_s)
-    drops = {reason: count for reason, count in source.summary().drops.items() if count}
-    return Bag(str(folder), start_s, end_s, writer.counts(), writer.types(), fixes[True], fixes[False], drops)
+    summary = source.summary()
+    drops = {reason: count for reason, count in summary.drops.items() if count}
+    counts, types = writer.counts(), writer.types()
+    return Bag(str(folder), start_s, end_s, counts, types, fixes[True], fixes[False], drops, summary.finished)
 
 
 def _messages_of(found: Recorded, encoder: RosEncoder, tag: str | None) -> list[RosMessage]:
@@ -139,7 +143,9 @@ class _BagWriter:
         try:
             rosbag2, typesys = importlib.import_module("rosbags.rosbag2"), importlib.import_module("rosbags.typesys")
         except ImportError:
-            raise SkylessError("bags need the package rosbags: pip install 'skyless[ros2]' brings it") from None
+            raise SkylessError(
+                "bags need the package rosbags: pip install '.[ros2]' in a copy of Skyless's repository brings it"
+            ) from None
         self._writer: Writer = rosbag2.Writer(folder, version=version, storage_plugin=rosbag2.StoragePlugin.MCAP)
         self._writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
         self._types: Typestore = typesys.get_typestore(typesys.Stores.ROS2_KILTED)

@@ -181,13 +181,13 @@ class Link:
         return Introduction(self._client, self._keepalive_s, self._persistent, will)
 
     def _up(self, connection: Connection) -> None:
+        connection.subscribe(self._subscriptions.filters)  # first, so that what is kept comes before it is replaced
         self._connection = connection
         self._stopping = False
         self._reconnects += 1
         self._log_return()
         self._outbox.restart()
         self._publish_online()
-        connection.subscribe(self._subscriptions.filters)
         self._set_state(connected=True, trouble=None)
         self._pump()
 

@@ -33,7 +33,7 @@ def tag_position_topic(site: int | str, tag: str) -> str:
 
 
 def status_topic(site: int | str, kind: str, name: int | str) -> str:
-    """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard``, ``recorder`` or ``survey``.
+    """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard``, ``recorder`` or another kind.
 
     It is the node's last will, too.
     """

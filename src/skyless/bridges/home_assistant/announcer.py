@@ -26,7 +26,9 @@ NODE_KIND: Final = "homeassistant"
 STALE_S: Final = 5
 """A tag that this bridge had before it was started again must have a fix within this time."""
 
-_MOST_TAGS: Final = 500
+MOST_TAGS: Final = 500
+"""Further ones are not announced."""
+
 _STD_CHANGE: Final = 1.25
 """An accuracy that has changed by less than this factor counts as the same."""
 
@@ -49,6 +51,8 @@ class _Tag(Struct):
 
     name: str
     document: bytes = b""
+    was_kept: bool = False
+    """Whether a document of it that the broker had, or another bridge's, has been read."""
     removed: dict[str, str] = {}
     """Platforms of components that it had before, by key."""
     zones: TagZones | None = None
@@ -103,6 +107,11 @@ class Announcer:
             tag.fix = tag.position = None
             self._send_zones(tag, unix_s)
 
+    def on_site_left(self, unix_s: float) -> None:
+        """No tag has a fix of this site any more."""
+        for name in self._tags:
+            self.on_no_fix(name, unix_s)
+
     def on_second(self, unix_s: float) -> None:
         """Send what has changed by much; once a second."""
         for tag in self._tags.values():
@@ -116,18 +125,22 @@ class Announcer:
                 self._publish(tag_zones_topic(self._site.id, name), TagZones(name, unix_s, usable=False, by=self._name))
 
     def _add(self, name: str) -> _Tag | None:
-        if not TAG_NAME.fullmatch(name) or len(self._tags) >= _MOST_TAGS:
-            self.dropped["tag-name" if len(self._tags) < _MOST_TAGS else "too-many-tags"] += 1
+        if not TAG_NAME.fullmatch(name) or len(self._tags) >= MOST_TAGS:
+            self.dropped["tag-name" if len(self._tags) < MOST_TAGS else "too-many-tags"] += 1
             return None
         tag = self._tags[name] = _Tag(name)
+        # Before it is announced: what the broker has kept comes only as long as nothing has replaced it.
+        self._link.subscribe(self._config_topic(name), lambda _, kept: self._on_kept(name, kept))
         self._announce(tag)
-        self._link.subscribe(config_topic(self._prefix, self._site.id, name), lambda _, kept: self._on_kept(name, kept))
         return tag
+
+    def _config_topic(self, name: str) -> str:
+        return config_topic(self._prefix, self._site.id, name)
 
     def _announce(self, tag: _Tag) -> None:
         status = status_topic(self._site.id, NODE_KIND, self._name)
         tag.document = document(self._site, tag.name, status, tag.removed)
-        self._publish(config_topic(self._prefix, self._site.id, tag.name), tag.document)
+        self._publish(self._config_topic(tag.name), tag.document)
 
     def _remove(self, tag: _Tag, before: dict[str, str]) -> None:
         """Let Home Assistant remove components that an earlier document had."""
@@ -197,20 +210,21 @@ class Announcer:
                         self._publish(topic, message)
 
     def _on_kept(self, name: str, kept: bytes) -> None:
-        """A document of a tag: an empty one has removed it; an older one may have components that are no more."""
+        """A document of a tag: an empty one has removed it; an older one may have components that are no more.
+
+        Only one is read: two bridges that know different zones would answer each other without end.
+        """
         tag = self._tags.get(name)
         if tag is None or kept == tag.document:
             return
         if not kept:
             del self._tags[name]
+            self._monitor.remove_tag(name, 0.0)
             site = self._site.id
-            for topic in (
-                config_topic(self._prefix, site, name),
-                tag_zones_topic(site, name),
-                tag_position_topic(site, name),
-            ):
+            for topic in (self._config_topic(name), tag_zones_topic(site, name), tag_position_topic(site, name)):
                 self._link.forget(topic)
-        else:
+        elif not tag.was_kept:
+            tag.was_kept = True
             self._remove(tag, platforms(kept))
 
     def _on_kept_zones(self, _topic: str, payload: bytes) -> None:
@@ -219,7 +233,7 @@ class Announcer:
             kept = msgspec.json.decode(payload, type=TagZones)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return
-        if kept.usable and kept.by == self._name and TAG_NAME.fullmatch(kept.tag) and len(self._kept) < _MOST_TAGS:
+        if kept.usable and kept.by == self._name and TAG_NAME.fullmatch(kept.tag) and len(self._kept) < MOST_TAGS:
             self._kept[kept.tag] = STALE_S
 
 

@@ -5,21 +5,23 @@ import platform
 import re
 import time
 from typing import Final
-from urllib.parse import urlsplit
 
 from msgspec import Struct
 
 from skyless.bridges.feed import BridgedSite
-from skyless.bridges.home_assistant.announcer import NODE_KIND, Announcer
+from skyless.bridges.home_assistant.announcer import MOST_TAGS, NODE_KIND, Announcer
 from skyless.bridges.target import BridgeContext, Target
 from skyless.bridges.target_url import TargetUrl
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress, mqtt_address
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import FixMessage, StatusMessage
+from skyless.mqtt.outbox import Limits
 
 _PREFIX: Final = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
 
+_LIMITS: Final = Limits(topics=4 * MOST_TAGS + 1, topic_bytes=64_000_000)
+"""Three topics of each tag, one of each that was there before, and the status; 100 zones make a document of 50 kB."""
 
 SETTLE_S: Final = 3
 """The site is known for so long before tags are announced, as its zones come after it: Home Assistant would forget what
@@ -53,6 +55,8 @@ class HomeAssistant(Target):
     def on_site(self, site: BridgedSite) -> None:
         """Announce what has changed. Raises SkylessError: it is another site."""
         if self._site is not None and site.id != self._site.id:
+            if self._announcer is not None:
+                self._announcer.on_site_left(time.time())
             raise SkylessError(f"{self.text} serves site {self._site.id}, not site {site.id}; start the bridge again")
         if site.georeference is None and (self._site is None or self._site.georeference is not None):
             self._context.log(
@@ -94,7 +98,7 @@ class HomeAssistant(Target):
 
     def _begin(self, site: BridgedSite, tag: str) -> None:
         name = re.sub(r"[^A-Za-z0-9_-]", "-", f"{platform.node()}-{tag}")
-        self._link = Link(self._settings.address, name, site=site.id, kind=NODE_KIND)
+        self._link = Link(self._settings.address, name, site=site.id, kind=NODE_KIND, limits=_LIMITS)
         self._announcer = Announcer(self._link, site, name, self._settings.prefix, self._settings.move_m)
         self._announcer.dropped = self.dropped
         self._begun.set()
@@ -118,12 +122,10 @@ def make_target(url: TargetUrl, context: BridgeContext) -> HomeAssistant:
 
 def _broker(url: TargetUrl, context: BridgeContext, *, tls: bool) -> MqttAddress:
     expected = url.wrong("homeassistant: with --mqtt, or homeassistant://[USER[:PASSWORD]@]HOST[:PORT]")
-    parts = urlsplit(url.given)
-    if url.path not in ("", "/"):
-        raise expected
-    if parts.netloc:
+    netloc = url.netloc()
+    if netloc:
         try:
-            return mqtt_address(f"mqtt{'s' if tls else ''}://{parts.netloc}")
+            return mqtt_address(f"mqtt{'s' if tls else ''}://{netloc}")
         except SkylessError:
             raise expected from None
     if context.mqtt is None:

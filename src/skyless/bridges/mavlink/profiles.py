@@ -30,7 +30,7 @@ MAVLINK_PROFILES: Final = ("ardupilot", "px4", "gps")
 GPS_EPOCH_UNIX_S: Final = 315_964_800
 """6 January 1980, when GPS time began."""
 LEAP_S: Final = 18
-"""GPS time less UTC, since 2017; IERS Bulletin C 72 announces no other."""
+"""GPS time less UTC, since 2017."""
 WEEK_MS: Final = 604_800_000
 
 UNKNOWN_ANGLE_RAD2: Final = pi**2
@@ -58,7 +58,11 @@ def micros(unix_s: float) -> int:
 
 
 def vision_position_estimate(fix: FixMessage, heading_deg: float, reset_counter: int) -> VisionPositionEstimate:
-    """For ArduPilot: every number is finite, angles are 0 with a variance that states that nothing is known."""
+    """For ArduPilot: every number is finite, angles are 0 with a variance that states that nothing is known.
+
+    A height that is not measured goes out as it is: ArduPilot makes one number of the three variances, so that a wide
+    one for the height would cost the vehicle its horizontal position as well.
+    """
     return VisionPositionEstimate(
         time_us=micros(fix.unix_s),
         position=_ned(fix.position_m, heading_deg),

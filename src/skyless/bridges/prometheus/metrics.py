@@ -5,12 +5,14 @@ given while what they come from is fresh, so that nothing old looks present.
 """
 
 from bisect import bisect_left
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Final, TypeVar
 
 import skyless
 from skyless.bridges.feed import BridgedSite
 from skyless.bridges.prometheus.exposition import Labels, Sample, family, histograms
+from skyless.bridges.target_url import TAG_NAME
 from skyless.mqtt.messages import AnchorHealth, Counters, FixMessage, StatusMessage, TagHealth
 
 GAUGE_AGE_S: Final = 5.0
@@ -95,11 +97,16 @@ class _Anchor(_Node):
         self.health: AnchorHealth | None = None
 
 
+_N = TypeVar("_N", bound=_Node)
+
+
 class SiteMetrics:
     """Gathers the figures of one site."""
 
     def __init__(self, *, positions: bool = False) -> None:
         """``positions``: whether to give where tags are."""
+        self.dropped: Counter[str] = Counter()
+        """Messages of nodes that are not counted, by reason."""
         self._positions = positions
         self._site: BridgedSite | None = None
         self._tags: dict[str, _Tag] = {}
@@ -111,18 +118,19 @@ class SiteMetrics:
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
         """A usable fix, which comes at ``now_s`` of the clock of ``text``."""
-        tag = _known(self._tags, fix.tag, _Tag)
+        tag = self._known(self._tags, fix.tag, _Tag)
         if tag is None:
             return
-        tag.fix, tag.fix_s = fix, now_s - fix.latency_s
+        latency_s = max(fix.latency_s, 0.0)
+        tag.fix, tag.fix_s = fix, now_s - latency_s
         tag.counters.setdefault(_FIXES, Rising()).update(fix.serial)
-        tag.latency_counts[bisect_left(LATENCY_BOUNDS_S, fix.latency_s)] += 1
-        tag.latency_sum_s += fix.latency_s
+        tag.latency_counts[bisect_left(LATENCY_BOUNDS_S, latency_s)] += 1
+        tag.latency_sum_s += latency_s
 
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
         """State of a tag or an anchor."""
         if isinstance(health, TagHealth):
-            tag = _known(self._tags, health.tag, _Tag)
+            tag = self._known(self._tags, health.tag, _Tag)
             if tag is not None:
                 tag.health = health
                 values = {
@@ -132,7 +140,7 @@ class SiteMetrics:
                 }
                 tag.update(health.uptime_s, now_s, values, health.counters, health.mqtt)
             return
-        anchor = _known(self._anchors, str(health.anchor), _Anchor)
+        anchor = self._known(self._anchors, str(health.anchor), _Anchor)
         if anchor is not None:
             anchor.health = health
             values = {
@@ -146,11 +154,22 @@ class SiteMetrics:
         """A tag or an anchor has come or gone."""
         node: _Node | None = None
         if status.kind == "tag":
-            node = _known(self._tags, status.name, _Tag)
+            node = self._known(self._tags, status.name, _Tag)
         elif status.kind == "anchor":
-            node = _known(self._anchors, status.name, _Anchor)
+            node = self._known(self._anchors, status.name, _Anchor)
         if node is not None:
             node.online = status.online
+
+    def _known(self, nodes: dict[str, _N], name: str, make: type[_N]) -> _N | None:
+        """The node of a name, a new one where there is none; None for what is no name, and where there are too many."""
+        if name not in nodes:
+            if not TAG_NAME.fullmatch(name):
+                self.dropped["name"] += 1
+            elif len(nodes) >= _MOST_NAMES:
+                self.dropped["too-many-names"] += 1
+            else:
+                nodes[name] = make()
+        return nodes.get(name)
 
     def text(self, now_s: float) -> str:
         """All of it in Prometheus's format."""
@@ -260,16 +279,6 @@ class SiteMetrics:
             ("skyless_mqtt_reconnects_total", "Connections that the node has made again."),
         ):
             yield from family(name, "counter", text, _totals(nodes, name))
-
-
-_N = TypeVar("_N", bound=_Node)
-
-
-def _known(nodes: dict[str, _N], name: str, make: type[_N]) -> _N | None:
-    """The node of a name, a new one where there is none; None where there are too many."""
-    if name not in nodes and len(nodes) < _MOST_NAMES:
-        nodes[name] = make()
-    return nodes.get(name)
 
 
 def _gauge(name: str, text: str, values: Iterable[tuple[Labels, float | None]]) -> list[str]:

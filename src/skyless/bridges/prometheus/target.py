@@ -20,15 +20,21 @@ _ANSWER_S: Final = 5.0
 
 
 class Prometheus(Target):
-    """An HTTP server with one page; each connection carries one request."""
+    """An HTTP server with one page; each connection carries one request.
+
+    Made by hand, as the servers of libraries wait for ever for the end of a request: here each connection has a limit
+    of time and of bytes, and where there are too many the oldest is ended, so that none keeps a scrape out.
+    """
 
     def __init__(self, text: str, host: str, port: int, *, positions: bool) -> None:
         super().__init__(text)
         self.metrics = SiteMetrics(positions=positions)
+        self.dropped = self.metrics.dropped
         self.port = port
         """The one that is used, where 0 was asked for and the server runs."""
         self._host = host
-        self._connections = 0
+        self._open: dict[asyncio.StreamWriter, None] = {}
+        """The oldest first."""
 
     def on_site(self, site: BridgedSite) -> None:
         """The site is known, or has changed."""
@@ -53,15 +59,19 @@ class Prometheus(Target):
         except OSError as error:
             raise cannot_listen(self.text, self._host, self.port, error) from None
         self.port = server.sockets[0].getsockname()[1]
-        async with server:
-            await server.serve_forever()
+        try:
+            await asyncio.Event().wait()  # serve_forever, when cancelled, waits until all connections have ended
+        finally:
+            server.close()
+            for writer in tuple(self._open):
+                writer.transport.abort()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._connections >= _MOST_CONNECTIONS:
-            self.dropped["connection"] += 1
-            writer.transport.abort()
-            return
-        self._connections += 1
+        if len(self._open) >= _MOST_CONNECTIONS:
+            oldest = next(iter(self._open))
+            del self._open[oldest]
+            oldest.transport.abort()
+        self._open[writer] = None
         try:
             async with asyncio.timeout(_ANSWER_S):
                 request = await reader.readuntil(b"\r\n\r\n")
@@ -72,7 +82,7 @@ class Prometheus(Target):
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             self.dropped["request"] += 1
         finally:
-            self._connections -= 1
+            self._open.pop(writer, None)
             writer.transport.abort()
 
     def _answer(self, request: bytes) -> bytes:
@@ -80,9 +90,10 @@ class Prometheus(Target):
         path = rest.partition(b" ")[0].partition(b"?")[0]
         if method not in (b"GET", b"HEAD"):
             return _response("405 Method Not Allowed", "only GET is answered here\n")
-        if path != b"/metrics":
-            return _response("404 Not Found", "the figures are at /metrics\n")
-        whole = _response("200 OK", self.metrics.text(time.monotonic()), CONTENT_TYPE)
+        if path == b"/metrics":
+            whole = _response("200 OK", self.metrics.text(time.monotonic()), CONTENT_TYPE)
+        else:
+            whole = _response("404 Not Found", "the figures are at /metrics\n")
         return whole if method == b"GET" else whole.partition(b"\r\n\r\n")[0] + b"\r\n\r\n"
 
 

@@ -1,5 +1,5 @@
 """ROS 2: fixes as its messages, and a target that publishes them by DDS without ROS being installed.
 
 Public: messages.
-Within the package: cdr, dds, idl, raw_writer, target.
+Within the package: cdr, dds, idl, target.
 """

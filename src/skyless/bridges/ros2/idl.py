@@ -1,7 +1,6 @@
 """Types of ROS 2's messages as Cyclone DDS announces them, so that subscribers of any vendor find them equal to theirs.
 
-Names as ROS gives them in DDS: ``package::msg::dds_::Name_``. Values are never made of these types: the messages come
-as bytes.
+Names as ROS gives them in DDS: ``package::msg::dds_::Name_``.
 """
 
 from importlib import import_module

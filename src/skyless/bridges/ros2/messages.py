@@ -19,6 +19,12 @@ from skyless.site.earth import geodetic, rotated
 SITE_FRAME: Final = "site"
 NAMESPACE: Final = "skyless"
 
+FRAME_NAME: Final = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_/-]{0,63}")
+"""What users may call the site's frame; tf2 refuses names that begin with a /."""
+
+FRAME_RULE: Final = "a frame's name: letters, digits, _, - and /, not a / first"
+"""In words, for messages."""
+
 UNKNOWN_VARIANCE: Final = 1e6
 """Of an angle in rad² and of its rate: a tag does not know how it is turned."""
 

@@ -14,9 +14,18 @@ from typing import Final
 
 from skyless.bridges.feed import BridgedSite
 from skyless.bridges.ros2.dds import DdsPublisher
-from skyless.bridges.ros2.messages import NAMESPACE, SITE_FRAME, RosEncoder, RosMessage, RosSettings
+from skyless.bridges.ros2.messages import (
+    FRAME_NAME,
+    FRAME_RULE,
+    NAMESPACE,
+    SITE_FRAME,
+    RosEncoder,
+    RosMessage,
+    RosSettings,
+)
 from skyless.bridges.target import BridgeContext, Target
 from skyless.bridges.target_url import TargetUrl
+from skyless.errors import SkylessError
 from skyless.mqtt.messages import AnchorHealth, FixMessage, TagHealth
 
 _MOST_DOMAIN: Final = 232
@@ -24,28 +33,34 @@ _MOST_DOMAIN: Final = 232
 
 _MOST_WAITING: Final = 500
 _CLOSE_S: Final = 1.0
-_FRAME: Final = re.compile(r"[A-Za-z0-9_/-]{1,64}")
 _NAMESPACE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}(/[A-Za-z][A-Za-z0-9_]{0,31}){0,3}")
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Target:
     """The target of an address. Raises SkylessError."""
     frame, namespace = url.text_option("frame", SITE_FRAME), url.text_option("namespace", NAMESPACE)
-    if not _FRAME.fullmatch(frame):
-        raise url.wrong("with frame= a frame's name: letters, digits, _, - and /")
+    if not FRAME_NAME.fullmatch(frame):
+        raise url.wrong(f"with frame= {FRAME_RULE}")
     if not _NAMESPACE.fullmatch(namespace):
         raise url.wrong("with namespace= as topics of ROS begin: letters, digits and _, not a digit first")
     transforms = url.choice("tf", ("no", "yes"), "no") == "yes"
-    domain = round(url.number("domain", _usual_domain(), 0, _MOST_DOMAIN))
+    domain = url.whole_number("domain", 0, 0, _MOST_DOMAIN)
+    if not url.text_option("domain"):
+        domain = _usual_domain(url.text)
     url.check_all_read()
     settings = RosSettings(frame=frame, namespace=namespace, transforms=transforms)
     return Ros2Target(url.text, DdsPublisher(url.text, domain), settings, context)
 
 
-def _usual_domain() -> int:
-    """As programs of ROS choose it."""
-    text = os.environ.get("ROS_DOMAIN_ID", "")
-    return int(text) if text.isdecimal() and int(text) <= _MOST_DOMAIN else 0
+def _usual_domain(target: str) -> int:
+    """As programs of ROS choose it. Raises SkylessError."""
+    text = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not text.isdecimal() or int(text) > _MOST_DOMAIN:
+        raise SkylessError(
+            f"the target {target!r} uses the domain of ROS_DOMAIN_ID, which is {text!r}; it should be a whole number "
+            f"from 0 to {_MOST_DOMAIN}"
+        )
+    return int(text)
 
 
 class Ros2Target(Target):
@@ -56,10 +71,13 @@ class Ros2Target(Target):
         self._publisher, self._encoder, self._log = publisher, RosEncoder(settings), context.log
         self._waiting: queue.Queue[list[RosMessage] | None] = queue.Queue(_MOST_WAITING)
         self._troubles: set[str] = set()
+        self._knows_no_earth = False
+        """Whether it was logged that the site does not know where it is."""
 
     def on_site(self, site: BridgedSite) -> None:
         """Publish its anchors."""
-        if site.georeference is None:
+        if site.georeference is None and not self._knows_no_earth:
+            self._knows_no_earth = True
             self._log(f"{self.text}: no topic fix (NavSatFix), as the site file has no [georeference]")
         self._give(self._encoder.on_site(site))
 
@@ -108,3 +126,4 @@ class Ros2Target(Target):
                     if message.topic not in self._troubles:
                         self._troubles.add(message.topic)
                         self._log(f"{self.text}: {message.topic} cannot be published: {error}")
+        self._publisher.close()

@@ -114,14 +114,15 @@ def tag(
             raise SkylessError(
                 "--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers and FiRa boards"
             )
-        tags, bridge = _on_sniffers, _bridge(asked, address)
+        tags = _on_sniffers
     elif asked.anchors is not None or asked.tag_height is not None:
         raise SkylessError(
             "--anchors and --tag-height are for sniffers and FiRa boards; other tags hear from the air where anchors "
             "stand"
         )
     else:
-        tags, bridge = _on_radios, _bridge(asked, address)
+        tags = _on_radios
+    bridge = _bridge(asked, address)
     serve = tags(names, asked, address, _listener(lines, bridge), bridge)
     others = [part.run() for part in (lines, bridge) if part is not None]
     with contextlib.suppress(KeyboardInterrupt):
@@ -130,11 +131,11 @@ def tag(
 
 def _bridge(asked: TagOptions, address: "MqttAddress | None") -> "TagBridge | None":
     """What gives fixes to --to; None where nobody gets them. Raises SkylessError."""
+    if not asked.to:
+        return None
     from skyless.cli.nodes.bridge import hub_of
     from skyless.nodes.bridge.tag_bridge import TagBridge
 
-    if not asked.to:
-        return None
     return TagBridge(hub_of(asked.to, address), lambda: is_simulated(asked.radio), log)
 
 

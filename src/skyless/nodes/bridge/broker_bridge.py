@@ -1,18 +1,19 @@
 """``skyless bridge``: gives a site's fixes, from its broker, to programs and devices of other kinds."""
 
 import asyncio
-import secrets
+import platform
+import re
 import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Final, TypeVar
+from zlib import crc32
 
 import msgspec
 from msgspec import Struct
 
 from skyless.bridges.feed import bridged_site
-from skyless.bridges.hub import SILENCE_CHECK_S, Hub
-from skyless.bridges.target import Target
+from skyless.bridges.hub import SILENCE_CHECK_S, Hub, Route
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Handler, Link
@@ -46,7 +47,7 @@ class BridgeNode:
 
     def __init__(self, hub: Hub, address: MqttAddress, site: int, log: Log) -> None:
         self.hub = hub
-        self.link = Link(address, f"bridge-{secrets.token_hex(4)}", site=site, kind="bridge")
+        self.link = Link(address, _name(hub), site=site, kind="bridge")
         self._log = log
         self._started_s = time.monotonic()
         self._last_fix_s = self._started_s
@@ -67,7 +68,7 @@ class BridgeNode:
     async def run(self) -> None:
         """Serve until cancelled. Raises SkylessError: a target cannot begin, or the site lacks what they need."""
         self._refused = asyncio.get_running_loop().create_future()
-        targets = (run_target(route.target, self._log) for route in self.hub.routes)
+        targets = (run_route(route, self._log) for route in self.hub.routes)
         await together(
             keep(self.link, self._log), _await(self._refused), *targets, every(SILENCE_CHECK_S, self._on_tick)
         )
@@ -132,26 +133,37 @@ class BridgeNode:
     def _on_tick(self) -> None:
         now_s = time.monotonic()
         self.hub.on_tick(now_s, time.time())
-        if self.link.connected and not self._is_silent and now_s - self._last_fix_s > _SILENT_S:
+        if not self.link.connected:
+            self._last_fix_s = now_s  # tags, too, need a moment to find a broker that is back
+        if not self._is_silent and now_s - self._last_fix_s > _SILENT_S:
             self._is_silent = True
             known = "no tag publishes fixes" if self._site is not None else "the site itself is not on the broker"
             self._log(f"no fix for {_SILENT_S:g} s: {known}; skyless dashboard shows why")
 
 
-async def run_target(target: Target, log: Log) -> None:
-    """Run a target until cancelled; a fault in it is logged, and costs neither a fix nor another target.
+def _name(hub: Hub) -> str:
+    """The bridge's name on MQTT: always the same for its targets, as the broker keeps the status of each name."""
+    targets = " ".join(route.target.text for route in hub.routes).encode()
+    return f"{re.sub(r'[^A-Za-z0-9_-]', '-', platform.node())}-{crc32(targets):08x}"
+
+
+async def run_route(route: Route, log: Log) -> None:
+    """Run a route's target until cancelled; a fault in it is logged, and costs neither a fix nor another target.
 
     Raises:
         SkylessError: it cannot begin.
     """
-    while True:
-        try:
-            await target.run()
-        except SkylessError:
-            raise
-        except Exception as error:  # noqa: BLE001 - whatever it is, the others go on
-            log(f"{target.text} failed ({error!r}); started again")
-        await asyncio.sleep(HEALTH_S)
+    try:
+        while True:
+            try:
+                await route.target.run()
+            except SkylessError:
+                raise
+            except Exception as error:  # noqa: BLE001 - whatever it is, the others go on
+                log(f"{route.target.text} failed ({error!r}); started again")
+            await asyncio.sleep(HEALTH_S)
+    finally:
+        route.has_ended = True
 
 
 async def _await(future: asyncio.Future[None]) -> None:

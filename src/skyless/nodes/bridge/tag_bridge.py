@@ -12,7 +12,7 @@ from skyless.bridges.feed import BridgedSite
 from skyless.bridges.hub import SILENCE_CHECK_S, Hub
 from skyless.errors import SkylessError
 from skyless.mqtt.messages import FixMessage, TagHealth
-from skyless.nodes.bridge.broker_bridge import run_target
+from skyless.nodes.bridge.broker_bridge import run_route
 from skyless.nodes.process import Log, every, together
 from skyless.receiver import Receiver
 from skyless.site.model import GeoreferenceSite
@@ -27,17 +27,22 @@ class TagBridge:
     def __init__(self, hub: Hub, is_simulated: Callable[[], bool], log: Log) -> None:
         self._hub, self._is_simulated, self._log = hub, is_simulated, log
         self._sites: dict[str, _HeardSite] = {}
+        self._receivers: dict[str, Receiver] = {}
+        self._refusal = ""
+        """Why no target can serve the site, as it was logged."""
 
     def on_fix(self, fix: FixMessage) -> None:
-        """A fix of one of them."""
-        self._hub.on_fix(fix, time.monotonic())
+        """A fix of one of them; not given where the tag is in another site than the one that targets know."""
+        if self._is_here(fix.tag):
+            self._hub.on_fix(fix, time.monotonic())
 
     def on_health(self, health: TagHealth, receiver: Receiver) -> None:
         """State of one of them, once a second, and what it has learned of the site."""
         now_s = time.monotonic()
+        self._receivers[health.tag] = receiver
         heard = self._sites.setdefault(health.tag, _HeardSite())
         site = heard.update(receiver, now_s, simulated=self._is_simulated())
-        if site is not None:
+        if site is not None and (self._is_here(health.tag) or not any(map(self._is_here, self._receivers))):
             self.on_site(site)
         self._hub.on_health(health, now_s)
 
@@ -49,15 +54,23 @@ class TagBridge:
         """The site as one of them knows it: in a large one no tag receives all anchors."""
         known = self._hub.site
         if known is not None and known.id == site.id:
-            site = structs.replace(site, anchors_m=known.anchors_m | site.anchors_m)
+            anchors_m, georeference = known.anchors_m | site.anchors_m, site.georeference or known.georeference
+            site = structs.replace(site, anchors_m=anchors_m, georeference=georeference)
         try:
             self._hub.on_site(site)
         except SkylessError as error:  # positioning goes on
-            self._log(str(error))
+            if str(error) != self._refusal:
+                self._refusal = str(error)
+                self._log(self._refusal)
+
+    def _is_here(self, tag: str) -> bool:
+        """Whether a tag is in the site that targets know, if they know one; a sniffer's is always."""
+        receiver, known = self._receivers.get(tag), self._hub.site
+        return receiver is None or known is None or receiver.site == known.id
 
     async def run(self) -> None:
         """Serve until cancelled. Raises SkylessError: a target cannot begin."""
-        targets = (run_target(route.target, self._log) for route in self._hub.routes)
+        targets = (run_route(route, self._log) for route in self._hub.routes)
         await together(*targets, every(SILENCE_CHECK_S, lambda: self._hub.on_tick(time.monotonic(), time.time())))
 
 
@@ -65,12 +78,15 @@ class _HeardSite:
     """The site of a receiver, once all of it is known."""
 
     def __init__(self) -> None:
+        self._number: int | None = None
         self._complete_s: float | None = None
         """Since when the rest is known."""
 
     def update(self, receiver: Receiver, now_s: float, *, simulated: bool) -> BridgedSite | None:
         """The site; None while it is not complete. ``now_s`` is the host's monotonic clock."""
         number, common = receiver.site, receiver.local_almanac.pages
+        if number != self._number:
+            self._number, self._complete_s = number, None
         if number is None or (common is None and not receiver.almanac.complete):
             self._complete_s = None
             return None
