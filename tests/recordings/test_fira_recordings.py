@@ -188,7 +188,7 @@ def test_any_record_is_a_packet_or_counted(records):
 def test_random_lines_never_raise(reader):
     rng, found = random.Random(5), 0
     whole = b"".join(synthetic.uci_text(90) if reader is fira.read_text else synthetic.phone_records(90))
-    lines = whole.splitlines(keepends=True)
+    lines = whole.splitlines(keepends=True) + ([ios(0), ios(1)] * 20 if reader is phones.read else [])
     for _ in range(LINES // 100):
         data = bytearray(b"".join(rng.choices(lines, k=100)))
         for _ in range(60):
