@@ -64,6 +64,9 @@ ELSEWHERE = {
         "tests/nodes/test_fix_lines.py::test_lines_for_people_have_time_tag_position_and_sigma"
     ),
     "skyless dashboard": "tests/dashboard/test_dashboard_end_to_end.py::test_a_site_is_found_shown_and_watched",
+    "skyless bridge foxglove://:8765 jsonl+tcp://:7010": (
+        "tests/nodes/test_bridge_nodes.py::test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did"
+    ),
     "skyless record walk.mcap": (
         "tests/nodes/test_record_command.py::test_a_recording_replays_bit_by_bit_and_ctrl_c_closes_it"
     ),
@@ -130,7 +133,7 @@ NEVER_RUN = (
 )
 """Lines that need a Raspberry Pi, systemd or Docker begin like this; the pages that show them say so."""
 
-UNTIL_CTRL_C = {"anchor", "board", "broker", "dashboard", "demo", "ether", "record", "tag"}
+UNTIL_CTRL_C = {"anchor", "board", "bridge", "broker", "dashboard", "demo", "ether", "record", "tag"}
 
 
 def blocks(page, language):
