@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.bridges.home_assistant.announcer import MOST_TAGS, STALE_S, Announcer
+from skyless.bridges.home_assistant.announcer import MOST_ANNOUNCED, STALE_S, Announcer
 from skyless.bridges.home_assistant.discovery import document, platforms
 from skyless.bridges.home_assistant.target import SETTLE_S, make_target
 from skyless.bridges.target import BridgeContext
@@ -219,10 +219,10 @@ def test_the_link_keeps_all_that_is_sent_of_as_many_tags_as_there_may_be():
     target.on_site(replace(HALL, zones=zones))
     for second in range(SETTLE_S):
         target.on_second(float(second))
-    for number in range(MOST_TAGS + 1):
+    for number in range(MOST_ANNOUNCED + 1):
         target.on_fix(at(1e5, tag=f"tag{number}"))
     assert target._link.counters.dropped == 0
-    assert target._link.unacknowledged == 3 * MOST_TAGS
+    assert target._link.unacknowledged == 3 * MOST_ANNOUNCED
     assert target.dropped == {"too-many-tags": 1}
 
 

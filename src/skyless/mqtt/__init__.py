@@ -1,5 +1,4 @@
 """MQTT: topics, messages, the link to a broker.
 
-Public: address, connection, fix_message, leases, link, messages, survey_facts, topics, truth_buffer.
-Within the package: outbox.
+Public: address, connection, fix_message, leases, link, messages, outbox, survey_facts, topics, truth_buffer.
 """

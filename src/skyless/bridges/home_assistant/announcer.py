@@ -26,7 +26,7 @@ NODE_KIND: Final = "homeassistant"
 STALE_S: Final = 5
 """A tag that this bridge had before it was started again must have a fix within this time."""
 
-MOST_TAGS: Final = 500
+MOST_ANNOUNCED: Final = 500
 """Further ones are not announced."""
 
 _STD_CHANGE: Final = 1.25
@@ -125,8 +125,8 @@ class Announcer:
                 self._publish(tag_zones_topic(self._site.id, name), TagZones(name, unix_s, usable=False, by=self._name))
 
     def _add(self, name: str) -> _Tag | None:
-        if not TAG_NAME.fullmatch(name) or len(self._tags) >= MOST_TAGS:
-            self.dropped["tag-name" if len(self._tags) < MOST_TAGS else "too-many-tags"] += 1
+        if not TAG_NAME.fullmatch(name) or len(self._tags) >= MOST_ANNOUNCED:
+            self.dropped["tag-name" if len(self._tags) < MOST_ANNOUNCED else "too-many-tags"] += 1
             return None
         tag = self._tags[name] = _Tag(name)
         # Before it is announced: what the broker has kept comes only as long as nothing has replaced it.
@@ -233,7 +233,7 @@ class Announcer:
             kept = msgspec.json.decode(payload, type=TagZones)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return
-        if kept.usable and kept.by == self._name and TAG_NAME.fullmatch(kept.tag) and len(self._kept) < MOST_TAGS:
+        if kept.usable and kept.by == self._name and TAG_NAME.fullmatch(kept.tag) and len(self._kept) < MOST_ANNOUNCED:
             self._kept[kept.tag] = STALE_S
 
 

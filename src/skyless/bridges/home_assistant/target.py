@@ -9,7 +9,7 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.bridges.feed import BridgedSite
-from skyless.bridges.home_assistant.announcer import MOST_TAGS, NODE_KIND, Announcer
+from skyless.bridges.home_assistant.announcer import MOST_ANNOUNCED, NODE_KIND, Announcer
 from skyless.bridges.target import BridgeContext, Target
 from skyless.bridges.target_url import TargetUrl
 from skyless.errors import SkylessError
@@ -20,7 +20,7 @@ from skyless.mqtt.outbox import Limits
 
 _PREFIX: Final = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
 
-_LIMITS: Final = Limits(topics=4 * MOST_TAGS + 1, topic_bytes=64_000_000)
+_LIMITS: Final = Limits(topics=4 * MOST_ANNOUNCED + 1, topic_bytes=64_000_000)
 """Three topics of each tag, one of each that was there before, and the status; 100 zones make a document of 50 kB."""
 
 SETTLE_S: Final = 3
