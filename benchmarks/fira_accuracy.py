@@ -1,4 +1,4 @@
-"""The emulated FiRa tag's errors beside what ``skyless plan`` predicts for the site.
+"""The emulated FiRa tag's errors, next to what ``skyless plan`` predicts for the site.
 
     python benchmarks/fira_accuracy.py [--worlds N] [--seeds N] [--json]
 

@@ -1,4 +1,4 @@
-"""The emulated FiRa tag beside the plan: within a tenth, where initiator and responders relay each other.
+"""The emulated FiRa tag next to the plan: within a tenth, where initiator and responders relay each other.
 
 Ten worlds are few; ``benchmarks/fira_accuracy.py`` has more, with several seeds.
 """

@@ -171,10 +171,10 @@ def test_recordings_that_say_where_their_anchors_are_need_no_table(run):
 
 @pytest.mark.parametrize("name", DL_TDOA)
 def test_anchors_of_dl_tdoa_state_where_they_are(run, name):
-    told = report(run(name, "--truth", "truth.csv", "--settle", "1", "--json"))
-    assert told["measurements"] == "packets"
-    assert told["fixes"] > 0.98 * ROWS
-    assert told["rmse_2d_m"] < 0.05
+    packets = report(run(name, "--truth", "truth.csv", "--settle", "1", "--json"))
+    assert packets["measurements"] == "packets"
+    assert packets["fixes"] > 0.98 * ROWS
+    assert packets["rmse_2d_m"] < 0.05
     differences = report(run(name, "--truth", "truth.csv", "--measurements", "differences", "--json"))
     assert differences["measurements"] == "differences"
 

@@ -71,7 +71,7 @@ def exact_ns(unix_s):
 def test_count_stamps_and_positions_are_those_of_the_recording(export, walk):
     folder, code, out, err = export("--json")
     assert (code, err) == (0, "")
-    told = json.loads(out)
+    summary = json.loads(out)
     assert (folder / "metadata.yaml").is_file()
     found = content(folder)
     fixes = recorded_fixes(walk)
@@ -90,8 +90,8 @@ def test_count_stamps_and_positions_are_those_of_the_recording(export, walk):
         ]
         truth = [one.pose.position for topic, _, one in found if topic == f"/skyless/{tag}/truth"]
         assert {(p.x, p.y, p.z) for p in truth} == {live_site.PLACES[tag]}
-    assert told["topics"] == dict(sorted(Counter(topic for topic, _, _ in found).items()))
-    assert (told["fixes"], told["unusable"]) == (len(fixes), 1)
+    assert summary["topics"] == dict(sorted(Counter(topic for topic, _, _ in found).items()))
+    assert (summary["fixes"], summary["unusable"]) == (len(fixes), 1)
     times = [time_ns for _, time_ns, _ in found]
     assert times == sorted(times)
     assert found[0][0] == "/skyless/anchors"

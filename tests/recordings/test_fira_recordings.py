@@ -22,7 +22,7 @@ from skyless.air.uci_measurements import (
 )
 from skyless.constants import TICK_M, TICK_RATE_HZ
 from skyless.recordings.foreign import fira, phones
-from skyless.recordings.foreign.anchor_frame import AnchorFrame, east_north_up_m
+from skyless.recordings.foreign.anchor_frame import AnchorFrame
 from skyless.recordings.foreign.formats import open_recording
 from skyless.replays.capture_run import CaptureRequest, CaptureRun
 from skyless.site.earth import geodetic
@@ -96,7 +96,9 @@ def test_positions_on_the_earth_are_in_the_frame_of_the_first():
     origin = GeoreferenceSite(latitude_deg=48.1, longitude_deg=11.5, height_m=500.0, heading_deg=0.0)
     latitude, longitude, height = geodetic((30.0, -40.0, 2.5), origin)
     here = GeodeticPoint(48.1, 11.5, 500.0)
-    assert dist(east_north_up_m(GeodeticPoint(latitude, longitude, height), here), (30.0, -40.0, 2.5)) < 1e-3
+    frame = AnchorFrame()
+    assert frame.position_m(here) == (0.0, 0.0, 0.0)
+    assert dist(frame.position_m(GeodeticPoint(latitude, longitude, height)), (30.0, -40.0, 2.5)) < 1e-3
     tag = fira.DtTag(Counter())
 
     def heard(address, point):
@@ -269,5 +271,7 @@ def test_anchors_that_state_other_positions_later_are_where_they_state(tmp_path)
 def test_degrees_of_a_metre():
     """The frame's scale, from the Earth's radius."""
     metre_deg = degrees(1.0 / 6_371_000.0)
-    east_m, north_m, _ = east_north_up_m(GeodeticPoint(metre_deg, metre_deg, 0.0), GeodeticPoint(0.0, 0.0, 0.0))
+    frame = AnchorFrame()
+    frame.position_m(GeodeticPoint(0.0, 0.0, 0.0))
+    east_m, north_m, _ = frame.position_m(GeodeticPoint(metre_deg, metre_deg, 0.0))
     assert (east_m, north_m) == pytest.approx((1.0, 1.0), abs=0.007)

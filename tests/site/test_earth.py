@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from skyless.site.earth import east_north_up, geodetic, rotated
+from skyless.site.earth import east_north_up, east_north_up_of, geodetic, rotated
 from skyless.site.model import GeoreferenceSite
 
 A_M, F = 6_378_137.0, 1 / 298.257223563
@@ -64,6 +64,12 @@ def test_a_point_is_found_again_within_a_hundredth_of_a_millimetre(origin, point
     # The vertical of the place meets the point's own height above the tangent plane somewhat higher.
     found = local(brentq(lambda height_m: local(height_m)[2] - point_m[2], height_m - 1, height_m + 1, xtol=1e-9))
     assert found == pytest.approx(east_north_up(point_m, origin.heading_deg), abs=1e-5)
+
+
+@given(ORIGINS, POINTS)
+def test_a_point_on_the_earth_is_where_it_was_in_the_site(origin, point_m):
+    found = east_north_up_of(*geodetic(point_m, origin), origin)
+    assert found == pytest.approx(east_north_up(point_m, origin.heading_deg), abs=5e-5)
 
 
 def test_headings_are_azimuths_of_the_y_axis():

@@ -24,7 +24,7 @@ class Kind(Struct, frozen=True):
     most_hz: float
     summary: str
     port: int = 0
-    """Usual port."""
+    """Usual port of a stream; other targets know their own."""
 
 
 TARGET_KINDS: Final = {
@@ -41,11 +41,11 @@ TARGET_KINDS: Final = {
     "mavlink+serial": Kind(
         "mavlink.encoder", 30.0, 100.0, "the same on a serial port, as mavlink+serial:/dev/ttyAMA0@921600"
     ),
-    "foxglove": Kind("foxglove.target", 20.0, MOST_HZ, "live pages of Foxglove and Lichtblick", 8765),
+    "foxglove": Kind("foxglove.target", 20.0, MOST_HZ, "live pages of Foxglove and Lichtblick"),
     "homeassistant": Kind("home_assistant.target", 10.0, 50.0, "tags as devices of Home Assistant, with their rooms"),
-    "prometheus": Kind("prometheus.target", 50.0, MOST_HZ, "figures for Prometheus at /metrics", 9464),
+    "prometheus": Kind("prometheus.target", 50.0, MOST_HZ, "figures for Prometheus at /metrics"),
     "osc+udp": Kind("osc", 60.0, MOST_HZ, "Open Sound Control: TouchDesigner, Unreal, Max", 9000),
-    "psn": Kind("psn", 60.0, 200.0, "PosiStageNet: media servers, lighting consoles", 56565),
+    "psn": Kind("psn", 60.0, 200.0, "PosiStageNet: media servers, lighting consoles"),
 }
 
 

@@ -39,7 +39,7 @@ VISUAL_POSITIONING: Final = 197
 """Ours, MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""
 
 _GONE_S: Final = 3
-"""A vehicle that was silent for so many seconds may have been restarted, and has no origin then."""
+"""A vehicle that was silent for this long, in seconds, may have been restarted, and has no origin then."""
 
 _NEAR_1E7: Final = 10
 """Difference of a degree's 10⁷th parts by which an origin is still the same: 11 cm."""

@@ -20,7 +20,7 @@ from skyless.mqtt.link import Handler, Link
 from skyless.mqtt.messages import AnchorHealth, FixMessage, SiteMessage, StatusMessage, TagHealth, ZonesMessage
 from skyless.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
 from skyless.nodes.process import HEALTH_S, Log, every, keep, together
-from skyless.zones.zone_list import BadZonesError, check_zones, zones_of
+from skyless.zones.zone_list import BadZonesError, read_zones, zones_of
 
 _SILENT_S: Final = 5.0
 """After so long without a fix a line says where to look."""
@@ -58,7 +58,7 @@ class BridgeNode:
         self._refused: asyncio.Future[None] | None = None
         subscribe = self.link.subscribe
         subscribe(site_topic(site), self._reader(SiteMessage, self._on_site))
-        subscribe(zones_topic(site), self._reader(ZonesMessage, self._on_zones))
+        subscribe(zones_topic(site), self._on_zones)
         subscribe(fix_topic(site, EVERY_NODE), self._reader(FixMessage, self._on_fix))
         subscribe(health_topic(site, "tag", EVERY_NODE), self._reader(TagHealth, self._on_health))
         subscribe(health_topic(site, "anchor", EVERY_NODE), self._reader(AnchorHealth, self._on_health))
@@ -102,14 +102,14 @@ class BridgeNode:
         self._site = message
         self._update_site()
 
-    def _on_zones(self, message: ZonesMessage) -> None:
+    def _on_zones(self, _topic: str, payload: bytes) -> None:
+        if not payload:
+            return
         try:
-            for zones in (message.zones, *(other.zones for other in message.others)):
-                check_zones(zones)
+            self._zones = read_zones(payload)
         except BadZonesError:
             self._drops["zones"] += 1
         else:
-            self._zones = message
             self._update_site()
 
     def _update_site(self) -> None:
