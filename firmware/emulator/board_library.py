@@ -50,7 +50,7 @@ class Hardware(Protocol):
     def transfer(self, out: bytes) -> bytes:
         """One SPI transaction; as many bytes come back."""
 
-    def set_spi_fast(self, fast: bool) -> None:  # noqa: FBT001
+    def set_spi_fast(self, fast: bool) -> None:
         """Clock the SPI slowly or fast."""
 
     def reset_chip(self) -> None:
