@@ -51,6 +51,12 @@ Write = Callable[[int, int, int], None]
 """Address, bytes and value of a store to a peripheral."""
 
 
+_READ = ctypes.CFUNCTYPE(ctypes.c_uint64, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint, ctypes.c_void_p)
+_WRITE = ctypes.CFUNCTYPE(
+    None, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint, ctypes.c_uint64, ctypes.c_void_p
+)
+
+
 class EmulationError(Exception):
     """The firmware used something that the emulator does not model, or that hardware has not."""
 
@@ -81,8 +87,7 @@ class Core:
 
     def stop_at(self, cycles: int) -> None:
         """Stop the present run there at the latest, at the next end of a block."""
-        if cycles < self.state[c.LIMIT]:
-            self.state[c.LIMIT] = cycles
+        self.state[c.LIMIT] = min(self.state[c.LIMIT], cycles)
 
     def spend(self, cycles: int) -> None:
         """Let the processor wait."""
@@ -123,7 +128,9 @@ class Core:
     def _in_ram(self, address: int, size: int) -> int:
         at = address - RAM_BASE
         if at < 0 or at + size > RAM_BYTES:
-            raise EmulationError(f"DMA of {size} bytes at 0x{address:08x}, behind PC 0x{self.pc:x}: it reaches RAM only")
+            raise EmulationError(
+                f"DMA of {size} bytes at 0x{address:08x}, behind PC 0x{self.pc:x}: it reaches RAM only"
+            )
         return at
 
     @property
@@ -137,6 +144,7 @@ class Core:
         """Begin at the reset vector."""
         if not keep_ram:
             ctypes.memset(self.ram, _GARBAGE, RAM_BYTES)
+        self._kept: list[object] = []
         uc = self._uc = Uc(UC_ARCH_ARM, UC_MODE_THUMB | UC_MODE_MCLASS)
         uc.ctl_set_cpu_model(arm.UC_CPU_ARM_CORTEX_M4)
         uc.mem_map(0, FLASH_BYTES, UC_PROT_READ | UC_PROT_EXEC)
@@ -147,7 +155,7 @@ class Core:
         handle = ctypes.c_size_t()
         # Directly, since Unicorn's Python binding only takes functions of Python, which cost a microsecond a block.
         uclib.uc_hook_add(
-            uc._uch,  # noqa: SLF001
+            uc._uch,
             ctypes.byref(handle),
             UC_HOOK_BLOCK,
             ctypes.cast(c.on_block.address, ctypes.c_void_p),
@@ -157,6 +165,7 @@ class Core:
         )
         uc.hook_add(UC_HOOK_INTR, self._on_exception)
         uc.hook_add(UC_HOOK_MEM_INVALID, self._on_invalid_access)
+        self._error: Exception | None = None
         self._exception: str | None = None
         self._invalid: tuple[int, int] | None = None
         self._in_fault = False
@@ -168,15 +177,32 @@ class Core:
         self.use_cache(False)
 
     def _map_window(self, base: int, size: int) -> None:
-        def read(_uc: Uc, offset: int, width: int, _data: object) -> int:
-            self.state[c.CYCLES] += c.PERIPHERAL_WAIT_CYCLES
-            return self._read(base + offset, width)
+        """Directly too: the binding's own wrappers double the time of an access."""
 
-        def write(_uc: Uc, offset: int, width: int, value: int, _data: object) -> None:
+        def read(_engine: int, offset: int, width: int, _data: int) -> int:
             self.state[c.CYCLES] += c.PERIPHERAL_WAIT_CYCLES
-            self._write(base + offset, width, value)
+            try:
+                return self._read(base + offset, width)
+            except Exception as error:  # noqa: BLE001 - raised again when the engine has stopped
+                self._fail(error)
+                return 0
 
-        self._uc.mmio_map(base, size, read, None, write, None)
+        def write(_engine: int, offset: int, width: int, value: int, _data: int) -> None:
+            self.state[c.CYCLES] += c.PERIPHERAL_WAIT_CYCLES
+            try:
+                self._write(base + offset, width, value)
+            except Exception as error:  # noqa: BLE001
+                self._fail(error)
+
+        functions = _READ(read), _WRITE(write)
+        self._kept.append(functions)  # ctypes keeps no reference
+        status = uclib.uc_mmio_map(self._uc._uch, ctypes.c_uint64(base), ctypes.c_size_t(size), functions[0], None, functions[1], None)
+        if status:
+            raise UcError(status)
+
+    def _fail(self, error: Exception) -> None:
+        self._error = self._error or error
+        self.stop_at(0)
 
     def run(self, limit: int) -> Stop:
         """Execute until the count of cycles reaches a limit (or a few cycles more), or the processor sleeps."""
@@ -188,6 +214,9 @@ class Core:
             except UcError as caught:
                 error = caught
             self._next = self.pc
+            if self._error is not None:
+                failed, self._error = self._error, None
+                raise failed
             if error is not None or self._exception is not None:
                 if not self._enter_fault(error):
                     return "lockup"
@@ -247,7 +276,9 @@ def load_elf(path: Path) -> bytes:
     data = path.read_bytes()
     if len(data) < 52 or data[:6] != b"\x7fELF\x01\x01" or struct.unpack_from("<H", data, 18)[0] != 40:
         raise EmulationError(f"{path} is not a 32-bit ELF file for Arm, little-endian")
-    table, width, count = (struct.unpack_from("<" + kind, data, at)[0] for kind, at in (("I", 28), ("H", 42), ("H", 44)))
+    table, width, count = (
+        struct.unpack_from("<" + kind, data, at)[0] for kind, at in (("I", 28), ("H", 42), ("H", 44))
+    )
     code = bytearray()
     for row in range(count):
         kind, offset, _, address, size = struct.unpack_from("<5I", data, table + row * width)

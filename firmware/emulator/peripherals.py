@@ -38,8 +38,11 @@ class System(Protocol):
     def run_task(self, address: int) -> None:
         """Start a task by its address, as PPI does."""
 
-    def announce(self, address: int) -> None:
-        """An event has happened at this address: serve PPI and the interrupts."""
+    def run_channels(self, address: int) -> None:
+        """Start what PPI connects to the event at this address."""
+
+    def update_interrupt(self, peripheral: "Peripheral") -> None:
+        """A peripheral's line may have changed."""
 
 
 class Peripheral:
@@ -50,7 +53,10 @@ class Peripheral:
 
     def __init__(self, system: System) -> None:
         self.system = system
-        self.events: dict[int, int] = dict.fromkeys(self.event_offsets(), 0)
+        self.event_bits = {offset: 1 << ((offset - 0x100) >> 2) for offset in self.event_offsets()}
+        """Of each event its bit in INTEN, by offset."""
+        self.events = 0
+        """Bits of the events that have happened and were not cleared."""
         self.inten = 0
         self.registers: dict[int, int] = dict.fromkeys(self.register_offsets(), 0)
         self.tasks = self.make_tasks()
@@ -69,11 +75,11 @@ class Peripheral:
 
     def read(self, offset: int) -> int:
         """A load."""
-        if offset in self.events:
-            return self.events[offset]
+        if offset in self.event_bits:
+            return int(bool(self.events & self.event_bits[offset]))
         if offset in self.registers:
             return self.registers[offset]
-        if offset in {0x304, 0x308} and self.events:
+        if offset in {0x304, 0x308} and self.event_bits:
             return self.inten
         raise self.unknown(offset)
 
@@ -82,14 +88,16 @@ class Peripheral:
         if offset in self.tasks:
             if value == 1:
                 self.tasks[offset]()
-        elif offset in self.events:
-            self.events[offset] = value
+        elif offset in self.event_bits:
+            bit = self.event_bits[offset]
+            self.events = self.events | bit if value else self.events & ~bit
+            self.system.update_interrupt(self)
         elif offset in self.registers:
             self.registers[offset] = value
-        elif offset in {0x300, 0x304, 0x308} and self.events:
+        elif offset in {0x300, 0x304, 0x308} and self.event_bits:
             changed = {0x300: value, 0x304: self.inten | value, 0x308: self.inten & ~value}
             self.inten = changed[offset]
-            self.system.announce(0)
+            self.system.update_interrupt(self)
         else:
             raise self.unknown(offset)
 
@@ -98,14 +106,15 @@ class Peripheral:
         return EmulationError(f"{type(self).__name__} has no register 0x{offset:03x} (0x{self.base + offset:08x})")
 
     def happen(self, offset: int) -> None:
-        """An event."""
-        self.events[offset] = 1
-        self.system.announce(self.base + offset)
+        """An event: it runs PPI's tasks, and may ask for an interrupt."""
+        self.events |= self.event_bits[offset]
+        self.system.run_channels(self.base + offset)
+        self.system.update_interrupt(self)
 
     @property
     def line(self) -> bool:
         """Whether the peripheral asks for an interrupt."""
-        return any(value and self.inten >> ((offset - 0x100) >> 2) & 1 for offset, value in self.events.items())
+        return bool(self.events & self.inten)
 
 
 class Clock(Peripheral):
@@ -159,7 +168,7 @@ class Clock(Peripheral):
         for event, ready in self._ready.items():
             if ready <= self.system.cycles:
                 self._ready[event] = _NEVER
-                self.events[event] = 1
+                self.events |= self.event_bits[event]
         return super().read(offset)
 
     def write(self, offset: int, value: int) -> None:
@@ -185,7 +194,12 @@ class Timer(Peripheral):
 
     def make_tasks(self) -> dict[int, Callable[[], None]]:
         """START, STOP, COUNT, CLEAR, CAPTURE."""
-        tasks: dict[int, Callable[[], None]] = {0x000: self.start, 0x004: self.stop, 0x008: self.count, 0x00C: self.clear}
+        tasks: dict[int, Callable[[], None]] = {
+            0x000: self.start,
+            0x004: self.stop,
+            0x008: self.count,
+            0x00C: self.clear,
+        }
         return tasks | {0x040 + 4 * n: partial(self.capture, n) for n in range(4)}
 
     def event_offsets(self) -> tuple[int, ...]:
@@ -213,12 +227,12 @@ class Timer(Peripheral):
         """Start."""
         if self._started_cycles is None:
             self._started_cycles = self.system.cycles
-        self._foresee()
+        self._foresee_all()
 
     def stop(self) -> None:
         """Stop."""
         self._counted, self._started_cycles = self._value(), None
-        self._foresee()
+        self._foresee_all()
 
     def count(self) -> None:
         """Count one event."""
@@ -230,29 +244,34 @@ class Timer(Peripheral):
         self._counted = 0
         if self._started_cycles is not None:
             self._started_cycles = self.system.cycles
-        self._foresee()
+        self._foresee_all()
 
     def capture(self, n: int) -> None:
         """Copy the count."""
         self.registers[0x540 + 4 * n] = self._value()
-        self._foresee()
+        self._foresee(n)
 
     def write(self, offset: int, value: int) -> None:
         """A store."""
         super().write(offset, value)
-        if offset >= 0x504:
-            self._foresee()
+        if offset >= 0x540:
+            self._foresee((offset - 0x540) >> 2)
+        elif offset >= 0x504:
+            self._foresee_all()
 
-    def _foresee(self) -> None:
-        """When the count will next become equal to each CC; one that is equal already has to wait for a whole turn."""
-        if self._started_cycles is None or self.registers[0x504]:
-            self._next_match = [_NEVER] * 4
-            return
-        step, mask, value = self._cycles_per_count, self._mask, self._value()
-        elapsed = (self.system.cycles - self._started_cycles) // step
+    def _foresee_all(self) -> None:
         for n in range(4):
-            ahead = (self.registers[0x540 + 4 * n] - value) & mask or mask + 1
-            self._next_match[n] = self._started_cycles + (elapsed + ahead) * step
+            self._foresee(n)
+
+    def _foresee(self, n: int) -> None:
+        """When the count will next become equal to a CC; one that is equal already has to wait for a whole turn."""
+        if self._started_cycles is None or self.registers[0x504]:
+            self._next_match[n] = _NEVER
+            return
+        step, mask = self._cycles_per_count, self._mask
+        elapsed = (self.system.cycles - self._started_cycles) // step
+        ahead = (self.registers[0x540 + 4 * n] - self._counted - elapsed) & mask or mask + 1
+        self._next_match[n] = self._started_cycles + (elapsed + ahead) * step
 
     def update(self) -> None:
         """Raise the events of counts that have been reached."""
@@ -265,7 +284,7 @@ class Timer(Peripheral):
     @property
     def due_cycles(self) -> int:
         """When the next interrupt will be asked for."""
-        return min((at for n, at in enumerate(self._next_match) if self.inten >> 16 + n & 1), default=_NEVER)
+        return min((at for n, at in enumerate(self._next_match) if self.inten >> (16 + n) & 1), default=_NEVER)
 
     def read(self, offset: int) -> int:
         """A load."""
@@ -274,7 +293,7 @@ class Timer(Peripheral):
 
 
 class Gpio(Peripheral):
-    """Pins of port 0; ``level`` gives what is on an input from outside, ``on_output`` is called at every change."""
+    """Pins of port 0; one whose input buffer is off reads 0. ``level`` gives what is on an input from outside, ``on_output`` is called at every change."""
 
     base = 0x50000000
 
@@ -282,6 +301,8 @@ class Gpio(Peripheral):
         super().__init__(system)
         self.out = self.directions = 0
         self.configured = [2] * 32
+        self._inputs: list[int] = []
+        """Pins whose input buffer is on."""
         self._level, self._on_output = level, on_output
 
     def is_driven(self, pin: int, high: bool) -> bool:
@@ -291,23 +312,25 @@ class Gpio(Peripheral):
     def read(self, offset: int) -> int:
         """A load."""
         if offset == 0x510:
-            return sum(self._input(pin) << pin for pin in range(32))
+            return sum(self._input(pin) << pin for pin in self._inputs)
         if 0x700 <= offset < 0x780:
             pin = (offset - 0x700) >> 2
             return self.configured[pin] & ~1 | (self.directions >> pin & 1)
-        values = {0x504: self.out, 0x508: self.out, 0x50C: self.out, **dict.fromkeys((0x514, 0x518, 0x51C), self.directions)}
+        values = {
+            0x504: self.out,
+            0x508: self.out,
+            0x50C: self.out,
+            **dict.fromkeys((0x514, 0x518, 0x51C), self.directions),
+        }
         if offset not in values:
             raise self.unknown(offset)
         return values[offset]
 
     def _input(self, pin: int) -> int:
-        """A pin whose input buffer is off reads 0; 3 in the pull's bits is a pull-up."""
-        settings = self.configured[pin]
-        if settings & 2:
-            return 0
+        """A pin that the processor drives reads as driven."""
         if self.directions >> pin & 1:
             return self.out >> pin & 1
-        return int(self._level(pin, settings >> 2 & 3))
+        return int(self._level(pin, self.configured[pin] >> 2 & 3))
 
     def write(self, offset: int, value: int) -> None:
         """A store."""
@@ -326,6 +349,7 @@ class Gpio(Peripheral):
         elif 0x700 <= offset < 0x780:
             pin = (offset - 0x700) >> 2
             self.configured[pin] = value
+            self._inputs = [pin for pin in range(32) if not self.configured[pin] & 2]
             self.directions = self.directions & ~(1 << pin) | (value & 1) << pin
         else:
             raise self.unknown(offset)
@@ -494,7 +518,9 @@ class Nvic(Peripheral):
 
     base = 0xE000E000
 
-    def __init__(self, system: System, fault_status: Callable[[], tuple[int, int, int]], reset: Callable[[], None]) -> None:
+    def __init__(
+        self, system: System, fault_status: Callable[[], tuple[int, int, int]], reset: Callable[[], None]
+    ) -> None:
         super().__init__(system)
         self.enabled = self.pending = self.asserted = 0
         self._fault_status, self._reset = fault_status, reset
@@ -508,10 +534,13 @@ class Nvic(Peripheral):
         """Whether an interrupt is pending that ends WFI."""
         return bool(self.pending & self.enabled)
 
-    def set_lines(self, asserted: int) -> None:
-        """The peripherals' lines have changed."""
-        self.asserted = asserted
-        self.pending |= asserted
+    def set_line(self, irq: int, asserted: bool) -> None:
+        """A peripheral's line is high or low now."""
+        if asserted:
+            self.asserted |= 1 << irq
+            self.pending |= 1 << irq
+        else:
+            self.asserted &= ~(1 << irq)
 
     def read(self, offset: int) -> int:
         """A load."""

@@ -26,7 +26,8 @@ class Processor(Protocol):
 
     def advance(self, due_ticks: int, until_ticks: int) -> int | None:
         """Run from when it is due up to a true time; when to run it again (not before ``until_ticks``, unless it has
-        just been woken or has planned an event), None while it sleeps until something happens."""
+        just been woken or has planned an event), None while it sleeps until something happens.
+        """
 
 
 class Processors:
