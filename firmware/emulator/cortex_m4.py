@@ -52,9 +52,7 @@ Write = Callable[[int, int, int], None]
 
 
 _READ = ctypes.CFUNCTYPE(ctypes.c_uint64, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint, ctypes.c_void_p)
-_WRITE = ctypes.CFUNCTYPE(
-    None, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint, ctypes.c_uint64, ctypes.c_void_p
-)
+_WRITE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint, ctypes.c_uint64, ctypes.c_void_p)
 
 
 class EmulationError(Exception):
@@ -196,7 +194,7 @@ class Core:
 
         functions = _READ(read), _WRITE(write)
         self._kept.append(functions)  # ctypes keeps no reference
-        status = uclib.uc_mmio_map(self._uc._uch, ctypes.c_uint64(base), ctypes.c_size_t(size), functions[0], None, functions[1], None)
+        status = uclib.uc_mmio_map(self._uc._uch, base, size, functions[0], None, functions[1], None)
         if status:
             raise UcError(status)
 
@@ -273,13 +271,9 @@ def load_elf(path: Path) -> bytes:
     Raises:
         EmulationError: it is not an executable for this processor.
     """
-    data = path.read_bytes()
-    if len(data) < 52 or data[:6] != b"\x7fELF\x01\x01" or struct.unpack_from("<H", data, 18)[0] != 40:
-        raise EmulationError(f"{path} is not a 32-bit ELF file for Arm, little-endian")
-    table, width, count = (
-        struct.unpack_from("<" + kind, data, at)[0] for kind, at in (("I", 28), ("H", 42), ("H", 44))
-    )
+    data = _read_elf(path)
     code = bytearray()
+    table, width, count = (struct.unpack_from("<" + kind, data, at)[0] for kind, at in _PROGRAM_HEADERS)
     for row in range(count):
         kind, offset, _, address, size = struct.unpack_from("<5I", data, table + row * width)
         if kind != 1 or size == 0:
@@ -291,3 +285,37 @@ def load_elf(path: Path) -> bytes:
     if len(code) < 16:
         raise EmulationError(f"{path} has no vectors at address 0")
     return bytes(code)
+
+
+def functions_of(path: Path) -> list[tuple[int, int, str]]:
+    """Address, size in bytes and name of every function of an ELF file, in order of their addresses.
+
+    Raises:
+        EmulationError: it is not an executable for this processor.
+    """
+    data = _read_elf(path)
+    found: set[tuple[int, int, str]] = set()
+    table, width, count = (struct.unpack_from("<" + kind, data, at)[0] for kind, at in _SECTION_HEADERS)
+    sections = [struct.unpack_from("<10I", data, table + row * width) for row in range(count)]
+    for _, kind, _, _, offset, size, link, *_ in sections:
+        if kind != 2:
+            continue
+        names = sections[link][4]
+        for at in range(offset, offset + size, 16):
+            name, address, length, info = struct.unpack_from("<IIIB", data, at)
+            if info & 15 == 2 and length:
+                end = data.index(b"\0", names + name)
+                found.add((address & ~1, length, data[names + name : end].decode()))
+    return sorted(found)
+
+
+_PROGRAM_HEADERS: Final = (("I", 28), ("H", 42), ("H", 44))
+_SECTION_HEADERS: Final = (("I", 32), ("H", 46), ("H", 48))
+"""Type and offset of the tables' address, entry size and count in an ELF file's header."""
+
+
+def _read_elf(path: Path) -> bytes:
+    data = path.read_bytes()
+    if len(data) < 52 or data[:6] != b"\x7fELF\x01\x01" or struct.unpack_from("<H", data, 18)[0] != 40:
+        raise EmulationError(f"{path} is not a 32-bit ELF file for Arm, little-endian")
+    return data

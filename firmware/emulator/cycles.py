@@ -42,7 +42,9 @@ BLOCKS: Final = 5
 CODE_HALFWORDS: Final = 6
 _TAGS: Final = 8
 _COSTS: Final = _TAGS + CACHE_LINES
-"""Columns of the counter's state: one int64 each, then the cache's tags, costs of blocks and the code."""
+"""Columns of the counter's state: one int64 each, then the cache's tags; then by halfword the costs of blocks, the code,
+and the cycles spent in each block.
+"""
 
 _stop = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(("uc_emu_stop", uclib))
 
@@ -50,11 +52,16 @@ _stop = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(("uc_emu_stop", uclib))
 def make_state(code: bytes) -> NDArray[np.int64]:
     """State of a counter for the code that stands in flash from address 0."""
     halfwords = np.frombuffer(code + bytes(-len(code) % 2), dtype="<u2")
-    state = np.zeros(_COSTS + 2 * len(halfwords), dtype=np.int64)
+    state = np.zeros(_COSTS + 3 * len(halfwords), dtype=np.int64)
     state[CODE_HALFWORDS] = len(halfwords)
-    state[_COSTS + len(halfwords) :] = halfwords
+    state[_COSTS + len(halfwords) : _COSTS + 2 * len(halfwords)] = halfwords
     forget_fetched(state)
     return state
+
+
+def spent_at(state: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cycles spent in the blocks that begin at each halfword; a view, which may be set to 0."""
+    return state[_COSTS + 2 * int(state[CODE_HALFWORDS]) :]
 
 
 def forget_fetched(state: NDArray[np.int64]) -> None:
@@ -123,14 +130,15 @@ def _cost(state, address, size):  # noqa: ANN001, ANN202
 @njit
 def charge(state, address, size):  # noqa: ANN001, ANN201
     """Add the cycles of a block of ``size`` bytes that is about to be executed."""
+    refill = _REFILL_CYCLES if address != state[BLOCK_END] else 0
     if (address + size) >> 1 > state[CODE_HALFWORDS]:
-        cost = size >> 1  # code in RAM
+        cost = (size >> 1) + refill  # code in RAM
     else:
         entry = state[_COSTS + (address >> 1)]
         if entry >> 32 != size:
             entry = (size << 32) | _cost(state, address, size)
             state[_COSTS + (address >> 1)] = entry
-        cost = entry & 0xFFFFFFFF
+        cost = (entry & 0xFFFFFFFF) + refill
         for line in range(address >> _LINE_SHIFT, ((address + size - 1) >> _LINE_SHIFT) + 1):
             if state[CACHE_ON]:
                 if state[_TAGS + line % CACHE_LINES] != line:
@@ -139,8 +147,7 @@ def charge(state, address, size):  # noqa: ANN001, ANN201
             elif state[LAST_LINE] != line:
                 state[LAST_LINE] = line
                 cost += _WAITS_UNCACHED
-    if address != state[BLOCK_END]:
-        cost += _REFILL_CYCLES
+        state[_COSTS + 2 * state[CODE_HALFWORDS] + (address >> 1)] += cost
     state[BLOCK_END] = address + size
     state[CYCLES] += cost
     state[BLOCKS] += 1
@@ -153,5 +160,5 @@ def on_block(engine, address, size, data):  # noqa: ANN001, ANN201
     if head[CYCLES] >= head[LIMIT]:
         _stop(engine)
         return
-    state = carray(data, (_COSTS + 2 * head[CODE_HALFWORDS],), np.int64)
+    state = carray(data, (_COSTS + 3 * head[CODE_HALFWORDS],), np.int64)
     charge(state, np.int64(address), np.int64(size))

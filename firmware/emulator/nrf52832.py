@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import peripherals as p
-from cortex_m4 import Core, EmulationError, load_elf
-from cycles import CPU_HZ
+from cortex_m4 import Core, EmulationError, functions_of, load_elf
+from cycles import spent_at
 from msgspec import Struct
 from paths import PathCost, Paths
 from processors import TICKS_PER_CYCLE, Processors
@@ -60,8 +60,9 @@ class Image:
         identity: bytes,
         clock_ppm: float = 0.0,
     ) -> None:
-        """``send`` gets bytes when they have left the UART's pin completely. Without ``can_transmit`` the role's pin is
-        connected to ground.
+        """``send`` gets bytes when they have left the UART's pin completely.
+
+        Without ``can_transmit`` the role's pin is connected to ground.
 
         Raises:
             EmulationError: the file is no image for this processor, here or where the firmware uses what is not
@@ -75,7 +76,7 @@ class Image:
         self.resets: Counter[str] = Counter()
         """Resets after the first start, by their cause."""
         self._timeline, self._chip, self._send = timeline, chip, send
-        self._can_transmit, self._identity = can_transmit, identity
+        self._can_transmit, self._identity, self._elf = can_transmit, identity, elf
         self._ticks_per_cycle = TICKS_PER_CYCLE * (1 + 1e-6 * clock_ppm)
         self._processors = Processors.of(timeline)
         self._epoch_ticks = timeline.now_ticks
@@ -130,8 +131,15 @@ class Image:
         """Cycles from each wake-up to the next WFI, by what was done (``paths.py``)."""
         return self._paths.costs()
 
+    def cycles_by_function(self) -> dict[str, int]:
+        """Cycles spent in each function, waits for peripherals apart; the costliest first."""
+        spent = spent_at(self.core.state)
+        rows = [(name, int(spent[at >> 1 : (at + size) >> 1].sum())) for at, size, name in functions_of(self._elf)]
+        return {name: cycles for name, cycles in sorted(rows, key=lambda row: -row[1]) if cycles}
+
     def forget_paths(self) -> None:
-        """Measure paths and latencies from now on."""
+        """Measure paths, functions and latencies from now on."""
+        spent_at(self.core.state)[:] = 0
         self._paths = Paths()
         self._paths.begin(self.cycles)
         self._latency = (0, 0, 0)
@@ -187,7 +195,7 @@ class Image:
             self._slept_cycles += max(self._cycle_at(self._timeline.now_ticks) - self._asleep_since, 0)
         self._asleep = False
         self.core.cycles = max(self.core.cycles, self._cycle_at(self._timeline.now_ticks))
-        self._paths.begin(self.core.cycles)
+        self._paths.begin_start(self.core.cycles)
         self._processors.plan(self, self._ticks_at(self.core.cycles))
 
     def _ask_for_reset(self) -> None:
@@ -362,6 +370,11 @@ class Image:
             )
         return peripheral
 
+    @property
+    def _where(self) -> str:
+        """The instruction that is executed, as well as it is known during an access."""
+        return f"in the block at PC 0x{self.core.pc:x}"
+
     # Pins
 
     def _level(self, pin: int, pull: int) -> bool:
@@ -416,6 +429,3 @@ class Image:
             count, total, most = self._latency
             self._latency = count + 1, total + taken, max(most, taken)
             self._rise_ticks = None
-
-
-assert CPU_HZ == 64_000_000

@@ -10,6 +10,8 @@ from skyless.simulation.dw1000.memory import decode_header
 
 IDLE: Final = "idle"
 """Nothing came from the chip or the host; a timer ended the sleep."""
+START: Final = "start"
+"""From a reset."""
 BYTE: Final = "byte"
 """Bytes came from the host, but not a record's end."""
 COMMAND: Final = "command"
@@ -20,7 +22,7 @@ TRANSMISSION: Final = "transmission"
 """A frame was handed to the chip."""
 END_OF_TRANSMISSION: Final = "end of transmission"
 
-_ABOVE: Final = {BYTE: {COMMAND}, POLL: {RECEPTION, TRANSMISSION, END_OF_TRANSMISSION}}
+_ABOVE: Final = {BYTE: {COMMAND, START}, POLL: {RECEPTION, TRANSMISSION, END_OF_TRANSMISSION}}
 """Work that says more than this."""
 
 
@@ -57,6 +59,12 @@ class Paths:
     def begin(self, cycles: int) -> None:
         """The processor has woken up."""
         self._begin_cycles, self._transfer_cycles = cycles, 0
+
+    def begin_start(self, cycles: int) -> None:
+        """The processor begins after a reset."""
+        self._work.clear()
+        self._work[START] = 1
+        self.begin(cycles)
 
     def note_bytes(self, data: bytes) -> None:
         """These came from the host."""

@@ -293,7 +293,10 @@ class Timer(Peripheral):
 
 
 class Gpio(Peripheral):
-    """Pins of port 0; one whose input buffer is off reads 0. ``level`` gives what is on an input from outside, ``on_output`` is called at every change."""
+    """Pins of port 0; one whose input buffer is off reads 0.
+
+    ``level`` gives what is on an input from outside, by pin and pull; ``on_output`` is called at every change.
+    """
 
     base = 0x50000000
 
@@ -508,7 +511,7 @@ class Ficr(Peripheral):
         super().__init__(system)
         self.registers = {0x060 + 4 * n: int.from_bytes(identity[4 * n : 4 * n + 4], "little") for n in range(2)}
 
-    def write(self, offset: int, value: int) -> None:
+    def write(self, offset: int, value: int) -> None:  # noqa: ARG002
         """A store, which hardware has not."""
         raise self.unknown(offset)
 

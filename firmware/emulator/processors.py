@@ -7,7 +7,7 @@ instructions. The order is that of the timeline, so runs repeat themselves.
 """
 
 import heapq
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol
 from weakref import WeakKeyDictionary
 
 from cycles import CPU_HZ
@@ -25,15 +25,17 @@ class Processor(Protocol):
     """One that is to be run."""
 
     def advance(self, due_ticks: int, until_ticks: int) -> int | None:
-        """Run from when it is due up to a true time; when to run it again (not before ``until_ticks``, unless it has
-        just been woken or has planned an event), None while it sleeps until something happens.
+        """Run from when it is due up to a true time; when to run it again.
+
+        Not before ``until_ticks``, unless it has just been woken or has planned an event; None while it sleeps until
+        something happens.
         """
 
 
 class Processors:
     """All processors of one timeline."""
 
-    _of: "WeakKeyDictionary[Timeline[Any], Processors]" = WeakKeyDictionary()
+    _of: ClassVar["WeakKeyDictionary[Timeline[Any], Processors]"] = WeakKeyDictionary()
 
     @classmethod
     def of(cls, timeline: "Timeline[Any]") -> "Processors":
