@@ -104,7 +104,7 @@ def cost_32(first, second):  # noqa: ANN001, ANN201, PLR0911
         return 2 if first & 0xFFE0 == 0xE840 else 3  # strd, ldrd
     if first & 0xFE00 == 0xF800:
         return 2 + (_WAITS_LITERAL if first & 0x1F == 0x1F else 0)
-    if first & 0xFF80 == 0xFB00:  # mul; mla and mls
+    if first & 0xFFF0 == 0xFB00:  # mul; mla and mls
         return 1 if second & 0xF000 == 0xF000 else 2
     if first & 0xFFD0 == 0xFB90 and second & 0xF0 == 0xF0:
         return _DIVISION_CYCLES

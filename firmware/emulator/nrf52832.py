@@ -363,11 +363,9 @@ class Image:
     def _peripheral(self, address: int, size: int) -> p.Peripheral:
         peripheral = self._pages.get(address >> 12)
         if peripheral is None:
-            raise EmulationError(f"no peripheral is modelled at 0x{address:08x} (PC behind 0x{self.core.pc:x})")
+            raise EmulationError(f"no peripheral is modelled at 0x{address:08x} ({self._where})")
         if size != 4 or address & 3:
-            raise EmulationError(
-                f"access of {size} bytes at 0x{address:08x} (PC behind 0x{self.core.pc:x}): whole words only"
-            )
+            raise EmulationError(f"access of {size} bytes at 0x{address:08x} ({self._where}): whole words only")
         return peripheral
 
     @property
