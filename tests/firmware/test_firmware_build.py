@@ -6,9 +6,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from board_library import FIRMWARE, HAS_HOST_COMPILER
+from build import FIRMWARE, HAS_ARM_COMPILER, HAS_HOST_COMPILER, build
 
-HAS_ARM_COMPILER = shutil.which("arm-none-eabi-gcc") is not None and shutil.which("make") is not None
 needs_arm = pytest.mark.skipif(not HAS_ARM_COMPILER, reason="gcc-arm-none-eabi or make is not installed")
 
 MOST_FLASH, MOST_RAM = 32 * 1024, 16 * 1024
@@ -97,8 +96,7 @@ def test_the_image_starts_at_the_processors_vectors_and_stays_in_its_flash(built
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_ten_million_random_bytes_and_any_chip_stop_nothing(seed):
     """With the address and undefined-behaviour sanitizers; what is checked stands in firmware/host/fuzz.c."""
-    run("make", "fuzz", cwd=FIRMWARE)
-    done = run(str(FIRMWARE / "build" / "fuzz"), "10000000", str(seed))
+    done = run(str(build("fuzz")), "10000000", str(seed))
     received, _, frames = map(int, re.findall(r"\d+", done.stdout)[:3])
     assert received >= 10_000_000
     assert frames > 1000
@@ -107,8 +105,7 @@ def test_ten_million_random_bytes_and_any_chip_stop_nothing(seed):
 def test_the_fuzzer_says_what_it_needs():
     if not HAS_HOST_COMPILER:
         pytest.skip("make and gcc are not installed")
-    run("make", "fuzz", cwd=FIRMWARE)
-    done = subprocess.run([str(FIRMWARE / "build" / "fuzz")], capture_output=True, text=True, check=False)
+    done = subprocess.run([str(build("fuzz"))], capture_output=True, text=True, check=False)
     assert (done.returncode, "10000000" in done.stderr) == (2, True)
 
 
