@@ -88,7 +88,7 @@ def test_a_frame_is_read_whole_before_the_receiver_goes_on(here):
     ]  # fmt: skip
     assert second[2] == "r 11 127"
     assert here["quiet"] == ["0 ['r 0f 5']"]
-    assert here["untold"] == ["-32768 -32768 -32768"]
+    assert here["unmeasured"] == ["-32768 -32768 -32768"]
     assert here["short"] == ["1 ['r 0f 5', 'r 10 4', 'r 11 9', 'r 15 9', 'w 8f 006f000000', 'w 8d 0001']"]
 
 
