@@ -4,8 +4,9 @@ import re
 
 import pytest
 from board_stage import line_of
+from build import build
 from cobs import cobs
-from processor_stage import DELAYS, IDENTITY, Stage, build_firmware, build_program, needs_processor
+from processor_stage import DELAYS, IDENTITY, Stage, build_program, needs_processor
 
 from skyless.air.ieee802154 import after_rmarker_s, fcs
 from skyless.air.reception import Diagnostics
@@ -25,8 +26,8 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def firmware(tmp_path_factory):
-    return build_firmware(tmp_path_factory.mktemp("firmware"))
+def firmware():
+    return build("all")
 
 
 # The line
