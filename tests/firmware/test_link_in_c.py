@@ -5,7 +5,8 @@ import itertools
 from binascii import crc_hqx
 
 import pytest
-from board_library import HAS_HOST_COMPILER, library
+from board_library import library
+from build import HAS_HOST_COMPILER
 from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
