@@ -17,7 +17,7 @@ OVERDUE_TICKS: Final = from_seconds(1e-3)
 CHECK_S: Final = 1.0
 """A chip from which nothing came for this time is asked whether it still has its settings."""
 
-_LEAD_S: Final = 1.8e-3
+SPI_LEAD_S: Final = 1.8e-3
 """The preamble, seven transfers of up to 0.1 ms, a reception that is served before, and a host's timers
 (``benchmarks/host_latency.py``)."""
 
@@ -131,7 +131,7 @@ class Dw1000Radio:
     def __init__(self, port: Port, name: str, delays: AntennaDelays) -> None:
         self.name = name
         self.counters: Counter[str] = Counter()
-        self.lead_s = _LEAD_S
+        self.lead_s = SPI_LEAD_S
         self._port, self._delays = port, delays
         self._listener: Listener = ignore
         self._session: ChipSession | None = None
