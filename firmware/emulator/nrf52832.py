@@ -22,6 +22,7 @@ from serial_peripherals import Spim, Uarte
 
 from skyless.constants import TICK_S
 from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.dw1000.registers import SYS_STATUS
 from skyless.simulation.medium import Timeline
 
 WAKE_UP_CYCLES: Final = 3 * 64
@@ -41,10 +42,12 @@ _SPIM_END: Final = 0x40003118
 _COUNT_OF_BYTES: Final = 0x40009040
 """TIMER1's CAPTURE[0], with which the firmware reads how many bytes have come."""
 _WATCHDOG_FED: Final = 0x40010600
+_READS_STATUS: Final = bytes((SYS_STATUS.file,))
+"""Header of the transaction with which the firmware asks what has happened."""
 
 
 class Latency(Struct, frozen=True):
-    """From a rise of the chip's interrupt line to the start of the firmware's next SPI transfer, in s of true time."""
+    """From a rise of the chip's interrupt line until the firmware begins to read SYS_STATUS, in s of true time."""
 
     count: int
     mean_s: float
@@ -89,7 +92,8 @@ class Image:
         self._irq_was_high = False
         self._rise_ticks: int | None = None
         self._latency = (0, 0, 0)
-        self._executing = False
+        self._executing = self._asleep = self._holds_chip = False
+        self._asleep_since = self._slept_cycles = 0
         self._life = 0
         self.core = Core(load_elf(elf), _WINDOWS, self._read, self._write)
         self._start(cause=0, watchdog=None, retained=(0, 0))
@@ -160,7 +164,6 @@ class Image:
     def _start(self, cause: int, watchdog: p.Watchdog | None, retained: tuple[int, int]) -> None:
         """Peripherals as after a reset; a watchdog that is given runs on."""
         self._life += 1
-        self._cause = 0
         self._reset_asked = False
         self._clock = p.Clock(self, cause, retained)
         self._timers = [p.Timer(self, number) for number in range(3)]
@@ -189,14 +192,12 @@ class Image:
             )
         }
         self._selected = False
-        if getattr(self, "_holds_chip", False):
+        if self._holds_chip:
             self._chip.pull_reset()
         self._holds_chip = False
         self._stalled_until: int | None = None
-        if not hasattr(self, "_slept_cycles"):
-            self._slept_cycles = self._asleep_since = 0
-            self._asleep = False
-        elif self._asleep:
+        self._rise_ticks = None
+        if self._asleep:
             self._slept_cycles += max(self._cycle_at(self._timeline.now_ticks) - self._asleep_since, 0)
         self._asleep = False
         self.core.cycles = max(self.core.cycles, self._cycle_at(self._timeline.now_ticks))
@@ -366,9 +367,7 @@ class Image:
         if peripheral is None or size != 4 or address & 3:
             raise self._unknown_access(address, size)
         if address == _SPIM_START:
-            self._measure_latency()
-            sent = self.core.load(self._spim.registers[0x544], self._spim.registers[0x548])
-            self._paths.note_transaction(sent)
+            self._note_transaction(self.core.load(self._spim.registers[0x544], self._spim.registers[0x548]))
         elif address == _COUNT_OF_BYTES:
             self._paths.note_count_of_bytes()
         elif address == _WATCHDOG_FED:
@@ -428,8 +427,10 @@ class Image:
         self._rise_ticks = self._timeline.now_ticks if high else None
         self._gpiote.on_edge(INTERRUPT_PIN, high)
 
-    def _measure_latency(self) -> None:
-        if self._rise_ticks is not None:
+    def _note_transaction(self, out: bytes) -> None:
+        """The firmware begins a transfer to the chip."""
+        self._paths.note_transaction(out)
+        if self._rise_ticks is not None and out[:1] == _READS_STATUS:
             taken = self._ticks_at(self.core.cycles) - self._rise_ticks
             count, total, most = self._latency
             self._latency = count + 1, total + taken, max(most, taken)

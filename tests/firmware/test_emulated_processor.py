@@ -358,3 +358,15 @@ def test_a_run_repeats_itself(firmware):
         start_radio(stage)
         runs.append((stage.lines, stage.image.core.cycles, stage.image.cycles_by_path()))
     assert runs[0] == runs[1]
+
+
+def test_a_supply_that_fails_cuts_a_record_off_and_lets_the_chip_go(firmware):
+    stage = Stage(firmware)
+    stage.run(1e-3)  # HELLO is on the line
+    stage.image.power_cycle()
+    assert len(stage.sent) == 1
+    stage.run(5e-3)
+    records = [record for record in records_of(stage) if record]
+    assert [record[0] for record in records] == [1]
+    assert stage.image.resets == {"power": 1}
+    assert stage.chip.misuse.total() == 0
