@@ -7,7 +7,8 @@ import pytest
 from board_stage import line_of
 from build import build
 from cobs import cobs
-from processor_stage import DELAYS, IDENTITY, Stage, build_program, needs_processor
+from lone_board import DELAYS, IDENTITY, LoneBoard
+from processor_stage import build_program, needs_processor
 
 from skyless.air.ieee802154 import after_rmarker_s, fcs
 from skyless.air.reception import Diagnostics
@@ -35,7 +36,7 @@ def firmware():
 
 
 def test_bytes_take_their_time_both_ways(folder):
-    stage = Stage(build_program(folder, "START"))
+    stage = LoneBoard(build_program(folder, "START"))
     stage.run(1e-3)
     assert stage.sent == b"\0"
     for value in (10, 20, 255):
@@ -48,7 +49,7 @@ def test_bytes_take_their_time_both_ways(folder):
 
 
 def test_a_long_transfer_arrives_record_by_record(folder, firmware):
-    stage = Stage(firmware)
+    stage = LoneBoard(firmware)
     stage.run(5e-3)
     (zero_us, zero), (hello_us, hello) = stage.lines
     assert zero == b"\0"
@@ -58,7 +59,7 @@ def test_a_long_transfer_arrives_record_by_record(folder, firmware):
 
 
 def test_the_ring_goes_round_without_the_processor(folder):
-    stage = Stage(build_program(folder, "RING"))
+    stage = LoneBoard(build_program(folder, "RING"))
     stage.run(1e-3)
     total = 0
     for length in (3, 254, 255, 256, 700):
@@ -72,7 +73,7 @@ def test_the_ring_goes_round_without_the_processor(folder):
 
 
 def test_what_comes_to_a_receiver_that_is_off_is_lost_and_counted(folder):
-    stage = Stage(build_program(folder, "SLEEP"))
+    stage = LoneBoard(build_program(folder, "SLEEP"))
     stage.run(1e-3)
     stage.write(b"abc")
     stage.run(1e-3)
@@ -83,7 +84,7 @@ def test_what_comes_to_a_receiver_that_is_off_is_lost_and_counted(folder):
 
 
 def test_the_chip_answers_over_spi_and_its_line_wakes_the_processor(folder):
-    stage = Stage(build_program(folder, "CHIP"))
+    stage = LoneBoard(build_program(folder, "CHIP"))
     stage.run(2e-3)
     assert stage.sent == r.DEV_ID.reset.to_bytes(4, "little")
     (came_us, _), *_ = stage.lines
@@ -108,7 +109,7 @@ def test_the_chip_answers_over_spi_and_its_line_wakes_the_processor(folder):
 
 @pytest.mark.parametrize("clock_ppm", [0.0, 40.0])
 def test_the_timer_ends_sleeps(folder, clock_ppm):
-    stage = Stage(build_program(folder, "SLEEP"), clock_ppm=clock_ppm)
+    stage = LoneBoard(build_program(folder, "SLEEP"), clock_ppm=clock_ppm)
     stage.run(10e-3)
     slept = [int.from_bytes(stage.sent[at : at + 4], "little") for at in (0, 4)]
     assert 1003 <= slept[0] <= 1006  # 3 µs to wake up
@@ -121,7 +122,7 @@ def test_the_timer_ends_sleeps(folder, clock_ppm):
 
 @pytest.mark.parametrize("macros", [{}, {"AWAKE": 1}])
 def test_a_watchdog_that_is_not_fed_resets(folder, macros):
-    stage = Stage(build_program(folder, "WATCHDOG", **macros))
+    stage = LoneBoard(build_program(folder, "WATCHDOG", **macros))
     stage.run(36e-3)
     assert stage.sent == b"\0"
     stage.run(36e-3)
@@ -132,7 +133,7 @@ def test_a_watchdog_that_is_not_fed_resets(folder, macros):
 
 
 def test_a_power_cycle_leaves_no_cause(folder):
-    stage = Stage(build_program(folder, "WATCHDOG"))
+    stage = LoneBoard(build_program(folder, "WATCHDOG"))
     stage.run(40e-3)
     stage.image.power_cycle()
     stage.run(5e-3)
@@ -152,7 +153,7 @@ JUMP_NOWHERE = "((void(*)(void))0x60000001u)()"
     [(READ_NOWHERE, "0x90000000"), (UNDEFINED, None), (INTO_FLASH, "0x00000100"), (JUMP_NOWHERE, "0x60000000")],
 )
 def test_a_fault_ends_in_its_handler(folder, forbidden, address):
-    stage = Stage(build_program(folder, "FAULT", FORBIDDEN=forbidden))
+    stage = LoneBoard(build_program(folder, "FAULT", FORBIDDEN=forbidden))
     stage.run(5e-3)
     assert stage.sent[0] == 0
     assert stage.sent[2:] == bytes((SOFTWARE, 0x77))
@@ -162,7 +163,7 @@ def test_a_fault_ends_in_its_handler(folder, forbidden, address):
 
 
 def test_a_fault_in_the_handler_is_a_lockup(folder):
-    stage = Stage(build_program(folder, "FAULT", FORBIDDEN=UNDEFINED, FAULT_IN_HANDLER=1))
+    stage = LoneBoard(build_program(folder, "FAULT", FORBIDDEN=UNDEFINED, FAULT_IN_HANDLER=1))
     stage.run(5e-3)
     assert stage.sent[2:] == bytes((LOCKUP, 0x77))
     assert len(stage.image.faults) == 2
@@ -181,7 +182,7 @@ def test_a_fault_in_the_handler_is_a_lockup(folder):
 def test_what_is_not_modelled_is_an_error_that_names_it(folder, forbidden, message):
     from cortex_m4 import EmulationError
 
-    stage = Stage(build_program(folder, "SILENT", FORBIDDEN=forbidden))
+    stage = LoneBoard(build_program(folder, "SILENT", FORBIDDEN=forbidden))
     with pytest.raises(EmulationError, match=message):
         stage.run(1e-3)
 
@@ -200,7 +201,7 @@ def test_a_file_that_is_no_image_is_refused(tmp_path):
 
 
 def test_conditional_instructions_around_peripherals(folder):
-    stage = Stage(build_program(folder, "CONDITIONAL"))
+    stage = LoneBoard(build_program(folder, "CONDITIONAL"))
     for _ in range(400):
         stage.run(7.3e-6)  # many stops within the program
     stage.run(5e-3)
@@ -231,7 +232,7 @@ def test_cycles_of_a_loop(folder, body, cycles, cached):
     spent = []
     for count in (1000, 3000):
         macros = {"COUNT": f'"{count}"', "BODY": f'"{body}"'} | ({"CACHED": 1} if cached else {})
-        stage = Stage(build_program(folder, "LOOP", **macros))
+        stage = LoneBoard(build_program(folder, "LOOP", **macros))
         stage.run(10e-3)
         spent.append(stage.image.cycles_by_path()["idle"].most)
     assert spent[1] - spent[0] == 2000 * cycles
@@ -243,7 +244,7 @@ def test_code_in_two_lines_of_flash_waits_unless_it_is_cached(folder):
     for cached in (False, True):
         for count in (1000, 3000):
             macros = {"COUNT": f'"{count}"', "BODY": f'"{body}"'} | ({"CACHED": 1} if cached else {})
-            stage = Stage(build_program(folder, "LOOP", **macros))
+            stage = LoneBoard(build_program(folder, "LOOP", **macros))
             stage.run(10e-3)
             spent[cached, count] = stage.image.cycles_by_path()["idle"].most
     turn = 10 + 1 + 4
@@ -308,7 +309,7 @@ def records_of(stage):
 
 
 def test_the_firmware_receives_and_sends(firmware):
-    stage = Stage(firmware)
+    stage = LoneBoard(firmware)
     start_radio(stage)
     records = records_of(stage)
     assert [record[0] for record in records] == [1, 5, 5]
@@ -345,7 +346,7 @@ def test_the_firmware_receives_and_sends(firmware):
 def test_a_grounded_pin_makes_a_tag(firmware):
     capabilities = []
     for can_transmit in (True, False):
-        stage = Stage(firmware, can_transmit=can_transmit)
+        stage = LoneBoard(firmware, can_transmit=can_transmit)
         stage.run(5e-3)
         capabilities.append(decode(records_of(stage)[0][:-2]).can_transmit)
     assert capabilities == [True, False]
@@ -354,14 +355,14 @@ def test_a_grounded_pin_makes_a_tag(firmware):
 def test_a_run_repeats_itself(firmware):
     runs = []
     for _ in range(2):
-        stage = Stage(firmware)
+        stage = LoneBoard(firmware)
         start_radio(stage)
         runs.append((stage.lines, stage.image.core.cycles, stage.image.cycles_by_path()))
     assert runs[0] == runs[1]
 
 
 def test_a_supply_that_fails_cuts_a_record_off_and_lets_the_chip_go(firmware):
-    stage = Stage(firmware)
+    stage = LoneBoard(firmware)
     stage.run(1e-3)  # HELLO is on the line
     stage.image.power_cycle()
     assert len(stage.sent) == 1

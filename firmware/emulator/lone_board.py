@@ -1,0 +1,78 @@
+"""One emulated board with its chip, alone in an air of its own, on a line of 1 Mbaud."""
+
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from nrf52832 import Image
+
+from skyless.constants import TICK_RATE_HZ
+from skyless.radios.interface import AntennaDelays
+from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.medium import Timeline
+from skyless.ticks import from_seconds, wrap
+
+DELAYS: Final = AntennaDelays(16_500, 16_300)
+IDENTITY: Final = b"identity"
+
+
+class LoneAir:
+    """An air with one antenna, whose counter is true time."""
+
+    def __init__(self) -> None:
+        self.timeline: Timeline[None] = Timeline()
+        self.sent: list[tuple[bytes, int]] = []
+
+    def now_ticks(self) -> int:
+        """The counter."""
+        return wrap(self.timeline.now_ticks)
+
+    def now_s(self) -> float:
+        """True time."""
+        return self.timeline.now_ticks / TICK_RATE_HZ
+
+    def transmit(self, frame: bytes, leaves_ticks: int) -> bool:
+        """Note a frame and its stamp."""
+        self.sent.append((frame, leaves_ticks))
+        return True
+
+    def withdraw(self) -> None:
+        """The last frame will not be sent."""
+        self.sent.pop()
+
+
+class LoneBoard:
+    """One image on a line of 1 Mbaud."""
+
+    def __init__(self, elf: Path, *, can_transmit: bool = True, clock_ppm: float = 0.0) -> None:
+        self.air = LoneAir()
+        self.timeline = self.air.timeline
+        self.chip = Chip(self.air, DELAYS.tx_ticks, DELAYS.rx_ticks, self.air.now_s)
+        self.lines: list[tuple[float, bytes]] = []
+        """What has come, with its time in µs."""
+        self.image = Image(
+            self.timeline,
+            self.chip,
+            lambda data: self.lines.append((1e6 * self.air.now_s(), data)),
+            elf=elf,
+            can_transmit=can_transmit,
+            identity=IDENTITY,
+            clock_ppm=clock_ppm,
+        )
+
+    @property
+    def sent(self) -> bytes:
+        """All bytes that have come."""
+        return b"".join(data for _, data in self.lines)
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        for _ in self.timeline.run(self.timeline.now_ticks + from_seconds(seconds)):
+            pass
+
+    def write(self, data: bytes, gap_s: float = 10e-6) -> float:
+        """Bytes that arrive one after the other from now on; when the last has, in µs."""
+        for at, byte in enumerate(data):
+            ticks = self.timeline.now_ticks + from_seconds((at + 1) * gap_s)
+            self.timeline.at(ticks, partial(self.image.receive, bytes((byte,))))
+        return 1e6 * (self.air.now_s() + len(data) * gap_s)

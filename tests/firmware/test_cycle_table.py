@@ -1,0 +1,36 @@
+"""The table of cycles in docs/hardware.md is what the emulated processor needs for the present firmware."""
+
+import re
+
+import pytest
+from build import FIRMWARE, build
+from cycle_table import markdown, measure_cycles
+from processor_stage import needs_processor
+
+PAGE = FIRMWARE.parent / "docs" / "hardware.md"
+RENEW = "python benchmarks/firmware_cycles.py --write renews docs/hardware.md"
+
+
+def figures(text):
+    """Microseconds by path, as a table states them."""
+    return {path: float(most) for path, most in re.findall(r"^\| ([^|]+) \| (\d+) \|", text, re.MULTILINE)}
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return figures(markdown(measure_cycles(build("all"))))
+
+
+@needs_processor
+def test_the_page_has_what_is_measured(measured):
+    """Another release of the compiler may change a figure a little."""
+    page = PAGE.read_text("utf-8").partition("<!-- cycles")[2].partition("<!-- end -->")[0]
+    assert figures(page) == {path: pytest.approx(most, rel=0.1, abs=2) for path, most in measured.items()}, RENEW
+
+
+@needs_processor
+def test_a_reception_takes_less_than_the_shortest_slot_leaves(measured):
+    (reception,) = (most for path, most in measured.items() if path.startswith("reception"))
+    assert 100 < reception <= 400
+    (latency,) = (most for path, most in measured.items() if "latency" in path)
+    assert latency < 400
