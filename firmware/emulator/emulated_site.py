@@ -31,7 +31,7 @@ from skyless.mqtt.messages import FixMessage
 from skyless.nodes.anchor import AnchorNode, Anchors
 from skyless.nodes.open_radio import open_radios
 from skyless.nodes.tag import TagNode, Tags, TagSettings
-from skyless.radios.interface import AntennaDelays, Radio
+from skyless.radios.interface import AntennaDelays, Late, Radio
 from skyless.simulation.dw1000.chip import Chip
 from skyless.simulation.medium import Delivery, Medium, Timeline
 from skyless.simulation.stations import TagSpec
@@ -138,7 +138,7 @@ class EmulatedSite:
         wire: WireSettings = WireSettings(),
         settings: TagSettings = TagSettings(publish_hz=1000.0),
     ) -> None:
-        self.site, self.seed, self._make_board, self._wire, self._settings = site, seed, make_board, wire, settings
+        self.site, self.seed, self._make_board, self._wire, self.settings = site, seed, make_board, wire, settings
         self.trajectories = list(trajectories)
         faults = replace(impairments_of(Request(site, seed=seed), site), diagnostics=True)
         tags = [TagSpec(trajectory) for trajectory in trajectories]
@@ -221,25 +221,23 @@ class EmulatedSite:
 
     def start_host(self, node: SiteNode) -> None:
         """Start the program of a node."""
-        assert node.wire is not None
-        radio = self._radio(node)
+        radio = WatchedRadio(self._radio(node), node.air)
         node.radio = radio
         if node in self.anchors:
             anchors = Anchors(self.site, [radio], None, self.log.append, simulated=lambda: True)
             self.programs[node.name] = anchors.nodes[0]
             work = anchors.run()
         else:
-            tags = Tags(self._settings, [radio], None, self.log.append, lambda fix: self._on_fix(node, fix))
+            tags = Tags(self.settings, [radio], None, self.log.append, lambda fix: self._on_fix(node, fix))
             self.programs[node.name] = tags.tags[0].node
             work = tags.run()
         node.task = asyncio.ensure_future(work)
 
-    def _radio(self, node: SiteNode) -> WatchedRadio:
+    def _radio(self, node: SiteNode) -> Radio:
         """The radio of a node's program."""
         assert node.wire is not None
         kind: Literal["anchor", "tag"] = "anchor" if node in self.anchors else "tag"
-        radios: tuple[Radio, ...] = open_radios(f"serial:{node.wire.path}", kind, (node.name,), [node.delays])
-        return WatchedRadio(radios[0], node.air)
+        return open_radios(f"serial:{node.wire.path}", kind, (node.name,), [node.delays])[0]
 
     async def stop_host(self, node: SiteNode) -> None:
         """Let the program of a node vanish."""
